@@ -1,0 +1,72 @@
+# What a contributor does, and what CI does. `make` alone lists it.
+#   PYTHON=python3.12   the interpreter that `make setup` builds on
+#   ARGS="-k gate"      further arguments for demo, test and bench
+#   UPGRADE=1           lets `make lock` take the newest versions allowed
+
+PYTHON ?=
+ARGS ?=
+UPGRADE ?=
+
+# A sourced ROS workspace sets these; its packages and pytest plugins must not leak into ours.
+unexport PYTHONPATH PYTHONHOME PYTHONSTARTUP PYTEST_ADDOPTS VIRTUAL_ENV
+
+bin := .venv/bin
+stamp := .venv/.setup
+bootstrap := $(or $(PYTHON),python3) deploy/bootstrap.py
+packages := $(wildcard snakesim_*)
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help setup demo test check bench schemas docs lock clean FORCE
+
+help: ## List these targets
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' Makefile
+
+setup: $(stamp) ## Make .venv from the hashed lock (PYTHON=python3.12 to choose)
+
+demo: $(stamp) ## Run the simulated snake through a triplet of obstacles, into runs/demo
+	$(bin)/snakesim run triplet --out runs/demo $(ARGS)
+
+test: $(stamp) ## Run the tests (ARGS="-k gate -n auto")
+	$(bin)/python -m pytest $(ARGS)
+
+check: $(stamp) ## Lint, format, types and import rules, without changing anything
+	$(bin)/ruff check
+	$(bin)/ruff format --check
+	$(bin)/basedpyright
+	@for package in $(packages); do \
+	  grep -q "^root_packages = .*\"$$package\"" pyproject.toml || \
+	    { echo "check: add $$package to root_packages under [tool.importlinter] in pyproject.toml"; exit 1; }; \
+	done
+	$(bin)/lint-imports
+
+bench: $(stamp) ## Measure the ratios in benchmarks/
+	$(bin)/python -m benchmarks $(ARGS)
+
+schemas: $(stamp) ## Write the JSON Schemas of every message and config anew
+	$(bin)/snakesim schemas --write schemas
+
+docs: $(stamp) ## Write the API reference into build/docs
+	PDOC_ALLOW_EXEC=1 $(bin)/python -m pdoc --output-directory build/docs $(packages)
+
+lock: ## Resolve the lock files anew (UPGRADE=1 for newer versions)
+	$(bootstrap) lock $(if $(UPGRADE),--upgrade)
+
+clean: ## Remove what setup, builds and caches left; recordings in runs/ stay
+	rm -rf .venv .tools build dist *.egg-info .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# Setup runs again after a change of its inputs, in a folder that was moved, when the environment's Python is gone,
+# or for another PYTHON.
+$(stamp): requirements.lock pyproject.toml deploy/bootstrap.lock deploy/bootstrap.py
+	@$(bootstrap) setup --python "$(PYTHON)"
+
+made_in := $(shell sed -n 1p $(stamp) 2>/dev/null)
+made_with := $(shell sed -n 2p $(stamp) 2>/dev/null)
+ifneq ($(made_in),$(CURDIR))
+$(stamp): FORCE
+else ifeq ($(wildcard $(bin)/python),)
+$(stamp): FORCE
+else ifneq ($(made_with),$(or $(PYTHON),$(made_with)))
+$(stamp): FORCE
+endif

@@ -1,0 +1,260 @@
+"""Who may move the robot, and what the motors are told: lifecycle, lease and gate in one place, without any I/O.
+
+The host passes in commands, requests, states and the time; it gets back set-points. `now_ns` is safety time: the
+monotonic clock, or simulated time in lockstep.
+"""
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+
+from snakesim_hal import gate, lifecycle
+from snakesim_hal.backend import SetPoints
+from snakesim_hal.gate import Applied, JointLimits, Measured
+from snakesim_hal.lease import Lease, freed, renewed, rule
+from snakesim_hal.messages import (
+    Answer,
+    Description,
+    EstopRequest,
+    Fault,
+    JointCommand,
+    JointState,
+    LeaseRequest,
+    LifecycleRequest,
+    LifecycleState,
+    Mode,
+)
+
+MAX_FAULTS_KEPT = 32
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What the motors get for one tick."""
+
+    set_points: SetPoints
+    sequence: int | None  # of the command behind it; None: the host's own safe action
+    limited: dict[int, str]  # joint index -> which limit changed its target
+
+
+class Authority:
+    """Lifecycle, lease and gate of one robot."""
+
+    def __init__(self, description: Description) -> None:
+        self.description = description
+        self.limits = JointLimits.of(description)
+        self.state: LifecycleState = "disarmed"
+        self.why = "not armed yet"
+        self.arming = 0
+        self.lease = Lease()
+        self.faults: list[Fault] = []
+        self.accepted = 0
+        self.standby = 0
+        self.rejected: Counter[str] = Counter()
+        self.limited: Counter[str] = Counter()
+        count = len(description.joints)
+        self._applied = Applied(np.zeros(count, dtype=np.int64), np.zeros(count), self.limits.torque_nm)
+        self._measured = Measured(np.zeros(count), np.zeros(count), np.zeros(count))
+        self._state_valid = False
+        self._command: JointCommand | None = None
+        self._last_sequence = -1
+        self._hold_at = np.zeros(count)
+
+    # --- what comes in -------------------------------------------------------------------------------------
+
+    def observe(self, joints: JointState) -> None:
+        """Take the newest joint state."""
+        self._measured = Measured(
+            np.array(joints.angle_rad), np.array(joints.velocity_rad_s), np.array(joints.torque_nm)
+        )
+        self._state_valid = all(joints.valid) and max(joints.age_ns, default=0) <= self.description.lease_ns
+
+    def offer(self, command: JointCommand, *, now_ns: int, tick: int, age_ns: int) -> str | None:
+        """Take a command, or return why not. `age_ns`: time since the state that it answers was published."""
+        refusal = gate.refuse(
+            command,
+            lease=self.lease,
+            now_ns=now_ns,
+            tick=tick,
+            last_sequence=self._last_sequence,
+            age_ns=age_ns,
+            limits=self.limits,
+        )
+        if refusal is not None:
+            self.rejected[refusal] += 1
+            return refusal
+        self._last_sequence = command.sequence
+        self._command = command
+        self.lease = renewed(self.lease, now_ns, self.description.lease_ns)
+        if self.state == "armed":
+            self.accepted += 1
+        else:
+            self.standby += 1
+        return None
+
+    def reject(self, reason: str) -> None:
+        """Count a sample that never became a command."""
+        self.rejected[reason] += 1
+
+    def on_lease(self, request: LeaseRequest, now_ns: int) -> Answer:
+        """Decide a lease request; when the lease changes hands the robot stops in between."""
+        ruling = rule(self.lease, request, now_ns, self.description.lease_ns)
+        self.lease = ruling.lease
+        if ruling.changed_hands:
+            self._forget_commands()
+            if self.state == "armed":
+                self._go("disarm", f"lease passed to {ruling.lease.holder or 'nobody'}")
+        return self._answer(ruling.refusal)
+
+    def on_lifecycle(self, request: LifecycleRequest, now_ns: int) -> Answer:
+        """Arm, disarm or clear. Arming says no with every condition that is not met."""
+        match request.action:
+            case "arm":
+                against = self.against_arming(now_ns)
+                if request.robot is None or request.robot != self.description.robot:
+                    against.append(f"this robot is {self.description.robot!r}, the request names {request.robot!r}")
+                if request.backend is None or request.backend != self.description.backend:
+                    against.append(
+                        f"this backend is {self.description.backend!r}, the request names {request.backend!r}"
+                    )
+                if against:
+                    return self._answer("; ".join(against))
+                self._go("arm", f"armed, commanded by {self.lease.holder}")
+                self.arming += 1
+                self._command = None
+                self._hold_at = self._measured.angle_rad
+                self.lease = renewed(self.lease, now_ns, self.description.lease_ns)
+            case "disarm":
+                if lifecycle.after(self.state, "disarm") is None:
+                    return self._answer(f"cannot disarm in state {self.state}; clear it first")
+                self._go("disarm", "disarmed on request")
+            case "clear":
+                if lifecycle.after(self.state, "clear") is None:
+                    return self._answer(f"nothing to clear in state {self.state}")
+                self._go("clear", "cleared; arm to move again")
+                self.faults.clear()
+            case "finish":
+                if self.state == "armed":
+                    self._go("disarm", "run finished")
+        return self._answer(None)
+
+    def on_estop(self, request: EstopRequest, tick: int) -> Answer:
+        """Stop now, whoever asks."""
+        self.note(Fault(tick=tick, what="estop", cause=f"emergency stop by {request.who}"))
+        self._go("estop", f"emergency stop by {request.who}; clear it to go on")
+        return self._answer(None)
+
+    def fault(self, fault: Fault) -> None:
+        """Latch a fault: the joints go to the safe action until someone clears it."""
+        self.note(fault)
+        if self.state != "estop":
+            self._go("fault", fault.cause)
+        self._drop_lease()
+
+    def note(self, fault: Fault) -> None:
+        """Keep a fault that people should know of but that stops nothing by itself."""
+        if len(self.faults) < MAX_FAULTS_KEPT:
+            self.faults.append(fault)
+
+    def holder_gone(self, cause: str) -> None:
+        """The lease holder's process is known to be gone while disarmed: free the lease at once."""
+        if self.state != "armed":
+            self._drop_lease()
+            self.why = cause
+
+    # --- what goes out -------------------------------------------------------------------------------------
+
+    def against_arming(self, now_ns: int) -> list[str]:
+        """Every condition for arming that is not met; empty when ready."""
+        against: list[str] = []
+        if self.state != "disarmed":
+            against.append(f"state is {self.state}, must be disarmed")
+        if not self._state_valid:
+            against.append("joint state is missing, stale or invalid")
+        if not self.lease.live(now_ns):
+            against.append("nobody holds the lease")
+        elif self._command is None:
+            against.append(f"no commands from {self.lease.holder} yet")
+        else:
+            against.extend(self._far_targets(self._command))
+        return against
+
+    def expire(self, now_ns: int, tick: int) -> None:
+        """Let the lease run out: armed, that is a fault; disarmed, the lease is simply free again."""
+        if self.lease.holder is None or self.lease.live(now_ns):
+            return
+        holder, term_ms = self.lease.holder, self.description.lease_ns / 1e6
+        if self.state == "armed":
+            cause = f"lease of {holder} expired: no good command for {term_ms:.0f} ms"
+            self.fault(Fault(tick=tick, what="lease_expired", cause=cause))
+        else:
+            self._drop_lease()
+
+    def decide(self) -> Decision:
+        """The set-points for the next period. Call `expire` first."""
+        command = self._command
+        if self.state != "armed":
+            applied = self._safe()
+            self._applied = applied
+            return Decision(gate.as_set_points(applied), None, {})
+        if command is None:  # armed a moment ago: hold the pose until the first command
+            applied = self._holding(self._hold_at)
+            self._applied = applied
+            return Decision(gate.as_set_points(applied), None, {})
+        applied, asked = gate.limit(command, measured=self._measured, last=self._applied, limits=self.limits)
+        self._applied = applied
+        limited: dict[int, str] = {}
+        if (applied.target != asked).any():
+            limited = gate.why_limited(applied, asked, self.limits)
+            self.limited.update(limited.values())
+        return Decision(gate.as_set_points(applied), command.sequence, limited)
+
+    # --- inside --------------------------------------------------------------------------------------------
+
+    def _safe(self) -> Applied:
+        if self.state != "fault" or self.description.safe_action == "passive":
+            return self._uniform(Mode.PASSIVE, np.zeros_like(self._measured.angle_rad))
+        if self.description.safe_action == "damp":
+            return self._uniform(Mode.VELOCITY, np.zeros_like(self._measured.angle_rad))
+        return self._holding(self._hold_at)
+
+    def _holding(self, angle_rad: gate.Floats) -> Applied:
+        return self._uniform(Mode.POSITION, np.clip(angle_rad, self.limits.angle_min_rad, self.limits.angle_max_rad))
+
+    def _uniform(self, mode: Mode, target: gate.Floats) -> Applied:
+        return Applied(np.full(len(target), int(mode), dtype=np.int64), target, self.limits.torque_nm)
+
+    def _far_targets(self, command: JointCommand) -> list[str]:
+        far: list[str] = []
+        for i, joint in enumerate(self.description.joints):
+            gap = command.target[i] - self._measured.angle_rad[i]
+            if command.mode[i] == Mode.POSITION and abs(gap) > self.limits.max_step_rad:
+                far.append(
+                    f"{joint.name} is asked to go {gap:+.2f} rad from where it is; at most "
+                    f"{self.limits.max_step_rad} rad at arming"
+                )
+        return far
+
+    def _go(self, event: lifecycle.Event, why: str) -> None:
+        following = lifecycle.after(self.state, event)
+        if following is None:
+            return
+        if following != "armed" and self.state == "armed":
+            self._hold_at = self._measured.angle_rad
+            self._command = None
+        self.state = following
+        self.why = why
+
+    def _drop_lease(self) -> None:
+        self.lease = freed(self.lease)
+        self._forget_commands()
+
+    def _forget_commands(self) -> None:
+        self._command = None
+        self._last_sequence = -1
+
+    def _answer(self, refusal: str | None) -> Answer:
+        return Answer(
+            ok=refusal is None, reason=(refusal or self.why)[:500], epoch=self.lease.epoch, lifecycle=self.state
+        )

@@ -1,0 +1,87 @@
+"""What a backend implements, and how one is found.
+
+A backend is opened from the run's settings, asked for samples once a tick, given set-points once a tick, and told
+when to let a period pass. It never sees Zenoh, leases or lifecycle: the host does those, for every backend alike.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib.metadata import EntryPoint, entry_points
+from typing import TYPE_CHECKING, Any, Protocol
+
+import msgspec
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.messages import Description, Fault, JointState, Message, Mode
+
+if TYPE_CHECKING:
+    from snakesim_hal.scenario import RunConfig
+
+
+@dataclass(frozen=True)
+class SetPoints:
+    """What the joints are to do from now on, tail to head; already inside every limit."""
+
+    mode: list[Mode]
+    target: list[float]  # rad, rad/s or N·m, as the mode says
+    torque_limit_nm: list[float]
+
+
+@dataclass(frozen=True)
+class Samples:
+    """What the sensors gave for one tick. `others` holds only what was due: key -> message."""
+
+    joints: JointState
+    others: Mapping[str, Message] = field(default_factory=dict[str, Message])
+
+
+class Backend(Protocol):
+    """A robot, simulated or real."""
+
+    def describe(self) -> Description:
+        """The robot as this backend has it; readable at once after opening."""
+        ...
+
+    def sample(self, tick: int, stamp_ns: int) -> Samples:
+        """Read every sensor that is due at `tick`. Raises BackendError when no state can be trusted any more."""
+        ...
+
+    def enact(self, set_points: SetPoints) -> None:
+        """Hand set-points to the motors; they hold until the next call."""
+        ...
+
+    def advance(self) -> None:
+        """Let one control period pass: a simulator steps, a driver sends and listens. Raises BackendError."""
+        ...
+
+    def faults(self) -> list[Fault]:
+        """Faults found since the last call; empty when all is well."""
+        ...
+
+    def close(self) -> None:
+        """Make the joints safe and let go of everything. Called once, also after an error."""
+        ...
+
+
+class BackendFactory(Protocol):
+    """What stands behind an entry point in the group `snakesim.backends`: usually the backend's class."""
+
+    Settings: type[msgspec.Struct]  # the scenario's [backend.<name>] section
+
+    def __call__(self, config: "RunConfig", settings: Any) -> Backend:
+        """Open the backend for a run."""
+        ...
+
+
+def find_plugin(group: str, name: str) -> Any:
+    """Load the object behind an entry point. Raises ConfigError that lists what is installed."""
+    found: dict[str, EntryPoint] = {entry.name: entry for entry in entry_points(group=group)}
+    if name not in found:
+        kind = group.rpartition(".")[2].removesuffix("s")
+        raise ConfigError(f"no {kind} called {name!r} is installed; installed are {', '.join(sorted(found)) or 'none'}")
+    return found[name].load()
+
+
+BACKENDS = "snakesim.backends"
+CONTROLLERS = "snakesim.controllers"
+SERVICES = "snakesim.services"

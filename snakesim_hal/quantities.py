@@ -1,0 +1,55 @@
+"""Numbers with a unit and bounds, as types. A decoder that meets NaN, infinity or an absurd value refuses it.
+
+The bounds here are sanity bounds of the wire (no snake robot has them); a robot's own limits stand in its robot
+file and are held by the gate.
+"""
+
+from typing import Annotated
+
+from msgspec import Meta
+
+MAX_JOINTS = 256
+MAX_CONTACTS = 512
+
+
+def _bounded(low: float, high: float, unit: str) -> Meta:
+    return Meta(ge=low, le=high, extra_json_schema={"unit": unit})
+
+
+Angle = Annotated[float, _bounded(-1e4, 1e4, "rad")]
+AngularVelocity = Annotated[float, _bounded(-1e5, 1e5, "rad/s")]
+Torque = Annotated[float, _bounded(-1e5, 1e5, "N·m")]
+Force = Annotated[float, _bounded(-1e7, 1e7, "N")]
+Length = Annotated[float, _bounded(-1e6, 1e6, "m")]
+Velocity = Annotated[float, _bounded(-1e5, 1e5, "m/s")]
+Acceleration = Annotated[float, _bounded(-1e7, 1e7, "m/s²")]
+Unit = Annotated[float, _bounded(-1.001, 1.001, "1")]
+Scalar = Annotated[float, _bounded(-1e12, 1e12, "1")]
+Fraction = Annotated[float, _bounded(0.0, 1.0, "1")]
+
+Target = Annotated[float, _bounded(-1e5, 1e5, "rad, rad/s or N·m, as the joint's mode says")]
+TorqueLimit = Annotated[float, _bounded(0.0, 1e5, "N·m")]
+
+Tick = Annotated[int, Meta(ge=0, le=2**62)]
+Nanoseconds = Annotated[int, Meta(ge=0, le=2**62, extra_json_schema={"unit": "ns"})]
+LinkIndex = Annotated[int, Meta(ge=0, le=MAX_JOINTS)]
+JointIndex = Annotated[int, Meta(ge=0, lt=MAX_JOINTS)]
+Name = Annotated[str, Meta(min_length=1, max_length=64)]
+Reason = Annotated[str, Meta(max_length=500)]
+
+Vector = tuple[Length, Length, Length]
+UnitVector = tuple[Unit, Unit, Unit]
+Quaternion = tuple[Unit, Unit, Unit, Unit]
+ForceVector = tuple[Force, Force, Force]
+TorqueVector = tuple[Torque, Torque, Torque]
+VelocityVector = tuple[Velocity, Velocity, Velocity]
+AngularVelocityVector = tuple[AngularVelocity, AngularVelocity, AngularVelocity]
+AccelerationVector = tuple[Acceleration, Acceleration, Acceleration]
+
+Angles = Annotated[list[Angle], Meta(max_length=MAX_JOINTS)]
+AngularVelocities = Annotated[list[AngularVelocity], Meta(max_length=MAX_JOINTS)]
+Torques = Annotated[list[Torque], Meta(max_length=MAX_JOINTS)]
+Targets = Annotated[list[Target], Meta(max_length=MAX_JOINTS)]
+TorqueLimits = Annotated[list[TorqueLimit], Meta(max_length=MAX_JOINTS)]
+Flags = Annotated[list[bool], Meta(max_length=MAX_JOINTS)]
+Ages = Annotated[list[Nanoseconds], Meta(max_length=MAX_JOINTS)]

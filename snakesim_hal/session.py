@@ -1,0 +1,262 @@
+"""The Zenoh session: explicit endpoints, no scouting, one namespace a robot, and the quality of service per kind.
+
+Without a router of its own, a robot's HAL host is the place where its loopback sessions meet: it listens (mode
+`router`), and everything else connects to it (mode `client`). Zenoh peers do not forward for one another unless gossip
+tells them of each other, and gossip is off here. With `--router` the host too is a client of the lab's router.
+"""
+
+import json
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic
+
+import zenoh
+from zenoh import ext, handlers
+
+from snakesim_hal import keys
+from snakesim_hal.codec import Decoder, MessageT, encode, encoding_of
+from snakesim_hal.errors import ConfigError, NotConnectedError, RefusedError, WireError
+from snakesim_hal.messages import Answer, Message
+
+DEFAULT_PORT = 7447
+DEFAULT_ENDPOINT = f"tcp/127.0.0.1:{DEFAULT_PORT}"
+READER_DEPTH = 16
+
+
+@dataclass(frozen=True)
+class Link:
+    """How a process joins the robot's network."""
+
+    endpoint: str = DEFAULT_ENDPOINT
+    namespace: str | None = None  # None: the whole network, for tools that look for robots
+    listen: bool = False  # True: be the meeting point; False: connect to it
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """A sample as it came in, not decoded yet."""
+
+    key: str
+    payload: bytes
+    encoding: str
+    monotonic_ns: int
+
+
+class Publisher(Generic[MessageT]):
+    """Puts one message type on one key."""
+
+    def __init__(self, publisher: Any, message: type[MessageT]) -> None:
+        self._put = publisher.put
+        self.message = message
+
+        self._publisher = publisher
+
+    def put(self, message: MessageT) -> None:
+        """Send it; may wait for a slow reader only when the publisher was declared lossless."""
+        self._put(encode(message))
+
+    def heard(self) -> bool:
+        """Whether anybody subscribes to it now."""
+        return bool(self._publisher.matching_status.matching)
+
+
+class Reader(Generic[MessageT]):
+    """The newest samples of one key, decoded when they are asked for, in the asking thread."""
+
+    def __init__(self, subscriber: Any, message: type[MessageT], rejected: Counter[str]) -> None:
+        self._subscriber = subscriber
+        self._decoder = Decoder(message)
+        self._rejected = rejected
+
+    def drain(self) -> list[MessageT]:
+        """Everything that arrived since the last call, oldest first. What cannot be decoded is counted and left out."""
+        taken: list[MessageT] = []
+        while (sample := self._subscriber.try_recv()) is not None:
+            try:
+                taken.append(self._decoder.decode(sample.payload.to_bytes(), str(sample.encoding)))
+            except WireError as error:
+                self._rejected[error.reason] += 1
+        return taken
+
+
+@dataclass(frozen=True)
+class Question:
+    """A query that waits for its answer."""
+
+    key: str
+    payload: bytes
+    encoding: str
+    _query: Any
+
+    def reply(self, answer: Answer) -> None:
+        """Answer and close it."""
+        self._query.reply(self._query.key_expr, encode(answer), encoding=encoding_of(Answer))
+        self._query.drop()
+
+
+class Session:
+    """What SnakeSIM uses of Zenoh. Open one with `open_session`."""
+
+    def __init__(self, zenoh_session: zenoh.Session) -> None:
+        self._zenoh = zenoh_session
+        self._declared: list[Any] = []
+        self.rejected: Counter[str] = Counter()  # samples that readers could not take, by reason
+
+    def publisher(self, key: str, message: type[MessageT], *, lossless: bool = False) -> Publisher[MessageT]:
+        """A publisher for a stream. Lossless waits for slow readers (lockstep); otherwise samples are dropped."""
+        command = key == keys.JOINT_COMMAND
+        publisher = self._zenoh.declare_publisher(
+            key,
+            encoding=encoding_of(message),
+            congestion_control=zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.REAL_TIME if command else zenoh.Priority.DATA_HIGH,
+            express=True,
+        )
+        self._declared.append(publisher)
+        return Publisher(publisher, message)
+
+    def latched_publisher(self, key: str, message: type[MessageT]) -> Publisher[MessageT]:
+        """A publisher whose last value is given to readers that come later."""
+        publisher = ext.declare_advanced_publisher(
+            self._zenoh, key, encoding=encoding_of(message), cache=ext.CacheConfig(1), publisher_detection=True
+        )
+        self._declared.append(publisher)
+        return Publisher(publisher, message)
+
+    def reader(self, key: str, message: type[MessageT], *, depth: int = READER_DEPTH) -> Reader[MessageT]:
+        """The newest `depth` samples of a stream; older ones are dropped, nothing ever blocks."""
+        subscriber = self._zenoh.declare_subscriber(key, handlers.RingChannel(depth))
+        self._declared.append(subscriber)
+        return Reader(subscriber, message, self.rejected)
+
+    def latched_reader(self, key: str, message: type[MessageT]) -> Reader[MessageT]:
+        """Like `reader`, and it gets the value that was latched before it came."""
+        subscriber = ext.declare_advanced_subscriber(
+            self._zenoh,
+            key,
+            handlers.RingChannel(READER_DEPTH),
+            history=ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
+        )
+        self._declared.append(subscriber)
+        return Reader(subscriber, message, self.rejected)
+
+    def on_arrival(self, key: str, take: Callable[[Arrival], None]) -> None:
+        """Call `take` for every sample, in Zenoh's thread: it must only store, never compute."""
+
+        def handle(sample: zenoh.Sample) -> None:
+            take(
+                Arrival(
+                    str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding), time.monotonic_ns()
+                )
+            )
+
+        self._declared.append(self._zenoh.declare_subscriber(key, handle))
+
+    def on_question(self, key: str, take: Callable[[Question], None]) -> None:
+        """Call `take` for every query, in Zenoh's thread; answer it from your own."""
+
+        def handle(query: zenoh.Query) -> None:
+            payload = b"" if query.payload is None else query.payload.to_bytes()
+            take(Question(str(query.key_expr), payload, str(query.encoding or ""), query))
+
+        self._declared.append(self._zenoh.declare_queryable(key, handle))
+
+    def ask(self, key: str, request: Message, timeout_s: float = 2.0) -> Answer:
+        """Ask the HAL and wait. Raises NotConnectedError when nobody answers, RefusedError on no."""
+        answer = self.ask_politely(key, request, timeout_s)
+        if not answer.ok:
+            raise RefusedError(answer.reason)
+        return answer
+
+    def ask_politely(self, key: str, request: Message, timeout_s: float = 2.0) -> Answer:
+        """Like `ask`, but a no is returned, not raised."""
+        decoder = Decoder(Answer)
+        replies = self._zenoh.get(
+            key, payload=encode(request), encoding=encoding_of(type(request)), timeout=timeout_s
+        )
+        for reply in replies:
+            if reply.ok is not None:
+                return decoder.decode(reply.ok.payload.to_bytes(), str(reply.ok.encoding))
+        raise NotConnectedError(f"nobody answers on {key} within {timeout_s} s; is the robot's HAL host running?")
+
+    def declare_alive(self, service: str) -> None:
+        """Show the liveliness token of a service for as long as the session lives."""
+        self._declared.append(self._zenoh.liveliness().declare_token(keys.alive(service)))
+
+    def on_alive(self, take: Callable[[str, bool], None], key: str = keys.ALIVE_ALL) -> None:
+        """Call `take(key, present)` when a service comes or goes, in Zenoh's thread."""
+
+        def handle(sample: zenoh.Sample) -> None:
+            take(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+
+        self._declared.append(self._zenoh.liveliness().declare_subscriber(key, handle, history=True))
+
+    def close(self) -> None:
+        """Undeclare everything, then close."""
+        for declared in reversed(self._declared):
+            declared.undeclare()
+        self._declared.clear()
+        self._zenoh.close()
+
+
+@contextmanager
+def open_session(link: Link, connect_timeout_s: float = 5.0) -> Iterator[Session]:
+    """Join the network. Raises NotConnectedError when the endpoint does not answer or cannot be listened on."""
+    session = Session(_open(_settings(link, connect_timeout_s), link))
+    try:
+        yield session
+    finally:
+        session.close()
+
+
+def _settings(link: Link, connect_timeout_s: float) -> dict[str, Any]:
+    settings: dict[str, Any] = {
+        "mode": "router" if link.listen else "client",
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "timestamping": {"enabled": {"router": True, "peer": True, "client": True}},
+        "transport": {"link": {"tx": {"lease": 2000}}},
+        "listen": {"endpoints": [link.endpoint] if link.listen else [], "exit_on_failure": True},
+        "connect": {
+            "endpoints": [] if link.listen else [link.endpoint],
+            "timeout_ms": round(connect_timeout_s * 1000),
+            "exit_on_failure": True,
+            "retry": {"period_init_ms": 50, "period_max_ms": 250, "period_increase_factor": 1.5},
+        },
+    }
+    if link.namespace is not None:
+        settings["namespace"] = link.namespace
+    return settings
+
+
+def _open(settings: dict[str, Any], link: Link) -> zenoh.Session:
+    zenoh.init_log_from_env_or("off")
+    try:
+        return zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
+    except zenoh.ZError as error:
+        if link.listen:
+            raise NotConnectedError(
+                f"cannot listen on {link.endpoint}: {str(error).split(' at /')[0]}. Another run may hold the port; "
+                f"choose one with --endpoint tcp/127.0.0.1:PORT"
+            ) from error
+        raise NotConnectedError(f"nobody listens on {link.endpoint}; start a run or a router there first") from error
+
+
+@contextmanager
+def open_router(config: Path) -> Iterator[None]:
+    """Run a Zenoh router from a JSON5 file for as long as the context lives. Raises ConfigError."""
+    zenoh.init_log_from_env_or("error")
+    try:
+        settings = zenoh.Config.from_file(str(config))
+        if json.loads(settings.get_json("mode")) != "router":
+            raise ConfigError(f'{config}: `mode` must be "router"')
+        session = zenoh.open(settings)
+    except zenoh.ZError as error:
+        raise ConfigError(f"{config}: Zenoh refuses it: {error}") from error
+    try:
+        yield
+    finally:
+        session.close()
