@@ -256,5 +256,8 @@ class Authority:
 
     def _answer(self, refusal: str | None) -> Answer:
         return Answer(
-            ok=refusal is None, reason=(refusal or self.why)[:500], epoch=self.lease.epoch, lifecycle=self.state
+            ok=refusal is None,
+            reason=(refusal or self.why)[:500],
+            epoch=self.lease.epoch,
+            lifecycle=self.state,
         )

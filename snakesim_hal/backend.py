@@ -1,4 +1,4 @@
-"""What a backend implements, and how one is found.
+"""What a backend implements.
 
 A backend is opened from the run's settings, asked for samples once a tick, given set-points once a tick, and told
 when to let a period pass. It never sees Zenoh, leases or lifecycle: the host does those, for every backend alike.
@@ -6,12 +6,10 @@ when to let a period pass. It never sees Zenoh, leases or lifecycle: the host do
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING, Any, Protocol
 
 import msgspec
 
-from snakesim_hal.errors import ConfigError
 from snakesim_hal.messages import Description, Fault, JointState, Message, Mode
 
 if TYPE_CHECKING:
@@ -71,17 +69,3 @@ class BackendFactory(Protocol):
     def __call__(self, config: "RunConfig", settings: Any) -> Backend:
         """Open the backend for a run."""
         ...
-
-
-def find_plugin(group: str, name: str) -> Any:
-    """Load the object behind an entry point. Raises ConfigError that lists what is installed."""
-    found: dict[str, EntryPoint] = {entry.name: entry for entry in entry_points(group=group)}
-    if name not in found:
-        kind = group.rpartition(".")[2].removesuffix("s")
-        raise ConfigError(f"no {kind} called {name!r} is installed; installed are {', '.join(sorted(found)) or 'none'}")
-    return found[name].load()
-
-
-BACKENDS = "snakesim.backends"
-CONTROLLERS = "snakesim.controllers"
-SERVICES = "snakesim.services"

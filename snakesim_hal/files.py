@@ -153,7 +153,8 @@ def _explain(error: msgspec.ValidationError, table: Table, struct: type[msgspec.
         return f"{table.source}: field `{full}` is missing; add it ({_wanted(fields.get(name))})."
     value: Any = table.values
     for step in steps:
-        value = value[int(step)] if isinstance(value, list) and step.isdigit() else value.get(step, value)
+        if isinstance(value, list | dict):
+            value = value[int(step)] if isinstance(value, list) else value.get(step)
     info = fields_type(struct, steps)
     unit = _unit_of(info)
     origin = table.origin_of(dotted)

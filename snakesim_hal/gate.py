@@ -19,7 +19,14 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 Refusal = Literal[
-    "no_lease", "wrong_epoch", "replayed", "from_the_future", "stale", "wrong_layout", "wrong_length", "not_finite"
+    "no_lease",
+    "wrong_epoch",
+    "replayed",
+    "from_the_future",
+    "stale",
+    "wrong_layout",
+    "wrong_length",
+    "not_finite",
 ]
 
 
@@ -81,7 +88,14 @@ class Applied:
 
 
 def refuse(
-    command: JointCommand, *, lease: Lease, now_ns: int, tick: int, last_sequence: int, age_ns: int, limits: JointLimits
+    command: JointCommand,
+    *,
+    lease: Lease,
+    now_ns: int,
+    tick: int,
+    last_sequence: int,
+    age_ns: int,
+    limits: JointLimits,
 ) -> Refusal | None:
     """Why a command may not be used at all, or None. `age_ns` is how long ago the state it answers was published."""
     if not lease.live(now_ns):

@@ -40,7 +40,7 @@ from snakesim_hal.session import Arrival, Publisher, Question, Session
 
 INBOX_LIMIT = 4096
 STATUS_PERIOD_NS = 200_000_000
-STANDBY_PERIOD_S = 0.02
+STANDBY_PERIOD_NS = 20_000_000
 STAMPS_KEPT = 4096
 REANCHOR_PERIODS = 10
 
@@ -106,6 +106,8 @@ class Host:
         self._advance_ns = 0.0  # how long a period takes the backend, smoothed
         self._inbox: SimpleQueue[Any] = SimpleQueue()
         self._stopping = False
+        self._armed_at_ns: int | None = None
+        self._ended_ns = 0
         self._faulted_at_ns: int | None = None
         self._status_due_ns = 0
         self._status_shown: Any = None
@@ -135,13 +137,20 @@ class Host:
                     break
                 self._publish(last)
                 if self._pace == "lockstep" and self.authority.arming == 0:
-                    self._take(STANDBY_PERIOD_S)
+                    self._take_until(time.monotonic_ns() + STANDBY_PERIOD_NS)
+                    self._show_status()
                     continue
                 self._wait_for_answers()
                 self._finish_tick(last)
         finally:
+            self._ended_ns = time.monotonic_ns()
             self.authority.on_lifecycle(LifecycleRequest(action="finish"), self._safety_now())
             self._show_status(force=True)
+
+    @property
+    def wall_s(self) -> float:
+        """Wall-clock time from the first arming to the end of the run."""
+        return 0.0 if self._armed_at_ns is None else (self._ended_ns - self._armed_at_ns) * 1e-9
 
     # --- one tick ------------------------------------------------------------------------------------------
 
@@ -173,6 +182,7 @@ class Host:
             pace=self._pace,
             lifecycle=self.authority.state,
             arming=self.authority.arming,
+            lease_epoch=self.authority.lease.epoch if self.authority.lease.holder else 0,
             newest=self._newest,
         )
         self._published_ns.append((tick, self._safety_now(), time.monotonic_ns()))
@@ -182,6 +192,7 @@ class Host:
         self.authority.expire(self._safety_now(), self._tick)
         decision = self.authority.decide()
         if self.authority.arming:
+            self._armed_at_ns = self._armed_at_ns or time.monotonic_ns()
             self.black_box.record(self._tick, self._tick * self._period_ns, samples, decision)
         if self.authority.state == "armed":
             self.tally.ticks += 1
@@ -240,8 +251,7 @@ class Host:
             if late_ns > REANCHOR_PERIODS * self._period_ns:
                 self._anchor_ns += late_ns
             return
-        while (left_ns := deadline - time.monotonic_ns()) > 0 and self._take(left_ns * 1e-9):
-            pass
+        self._take_until(deadline)
 
     # --- what comes in -------------------------------------------------------------------------------------
 
@@ -272,6 +282,11 @@ class Host:
             return False
         self._handle(item)
         return True
+
+    def _take_until(self, monotonic_ns: int) -> None:
+        """Handle everything that comes in until a moment has come."""
+        while (left_ns := monotonic_ns - time.monotonic_ns()) > 0 and self._take(left_ns * 1e-9):
+            pass
 
     def _take_all(self) -> None:
         for _ in range(self._inbox.qsize()):
@@ -305,7 +320,8 @@ class Host:
     def _take_done(self, arrival: Arrival) -> None:
         try:
             self._delivered(
-                keys.service_of(arrival.key), self._done_decoder.decode(arrival.payload, arrival.encoding).tick
+                keys.service_of(arrival.key),
+                self._done_decoder.decode(arrival.payload, arrival.encoding).tick,
             )
         except WireError as error:
             self.authority.reject(error.reason)

@@ -51,6 +51,8 @@ def link_frames(
 ) -> tuple[Floats, Floats]:
     """Origins (n_links, 3) and rotations world_from_link (n_links, 3, 3), tail to head."""
     count = len(axes) + 1
+    if "pitch" not in axes:
+        return _yaw_only_frames(np.asarray(base_position_w), base_rotation, np.asarray(angles_rad), link_lengths_m)
     origins = np.empty((count, 3))
     rotations = np.empty((count, 3, 3))
     origins[0] = base_position_w
@@ -58,6 +60,21 @@ def link_frames(
     for i, axis in enumerate(axes):
         origins[i + 1] = origins[i] + rotations[i][:, 0] * link_lengths_m[i]
         rotations[i + 1] = rotations[i] @ joint_rotation(axis, float(angles_rad[i]))
+    return origins, rotations
+
+
+def _yaw_only_frames(
+    base_w: Floats, base_rotation: Floats, angles_rad: Floats, link_lengths_m: Sequence[float]
+) -> tuple[Floats, Floats]:
+    """All joints turn about one and the same axis, so angles add up; the loop over links becomes a sum."""
+    turn = np.concatenate(([0.0], np.cumsum(angles_rad)))
+    c, s = np.cos(turn)[:, None], np.sin(turn)[:, None]
+    x, y, z = base_rotation.T
+    forward = c * x + s * y
+    rotations = np.stack([forward, c * y - s * x, np.broadcast_to(z, forward.shape)], axis=2)
+    origins = np.empty_like(forward)
+    origins[0] = base_w
+    origins[1:] = base_w + np.cumsum(forward[:-1] * np.asarray(link_lengths_m)[:-1, None], axis=0)
     return origins, rotations
 
 

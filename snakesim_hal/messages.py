@@ -36,7 +36,7 @@ class Message(msgspec.Struct, frozen=True):
 # --- sensors ---------------------------------------------------------------------------------------------------
 
 
-class JointState(Message, kw_only=True):
+class JointState(Message, frozen=True, kw_only=True):
     """`sensor/joints`: every joint at one instant."""
 
     tick: q.Tick
@@ -48,7 +48,7 @@ class JointState(Message, kw_only=True):
     age_ns: q.Ages
 
 
-class Contact(Message, kw_only=True):
+class Contact(Message, frozen=True, kw_only=True):
     """One touch of a link by something that is not the ground; all vectors in the link's frame."""
 
     link: q.LinkIndex
@@ -61,7 +61,7 @@ class Contact(Message, kw_only=True):
     torque_l: q.TorqueVector  # on the body about the contact point
 
 
-class Contacts(Message, kw_only=True):
+class Contacts(Message, frozen=True, kw_only=True):
     """`sensor/contacts`: all touches at one instant; an empty list says that nothing is touched."""
 
     tick: q.Tick
@@ -69,7 +69,7 @@ class Contacts(Message, kw_only=True):
     contacts: Annotated[list[Contact], Meta(max_length=q.MAX_CONTACTS)]
 
 
-class Imu(Message, kw_only=True):
+class Imu(Message, frozen=True, kw_only=True):
     """`sensor/imu`: one entry a link that carries an IMU, in the link's frame."""
 
     tick: q.Tick
@@ -79,7 +79,7 @@ class Imu(Message, kw_only=True):
     acceleration_m_s2: Annotated[list[q.AccelerationVector], Meta(max_length=q.MAX_JOINTS + 1)]
 
 
-class Pose(Message, kw_only=True):
+class Pose(Message, frozen=True, kw_only=True):
     """`sensor/pose`: the base (tail end of link 0) as a motion-capture system gives it."""
 
     tick: q.Tick
@@ -93,7 +93,7 @@ class Pose(Message, kw_only=True):
 # --- actuators -------------------------------------------------------------------------------------------------
 
 
-class JointCommand(Message, kw_only=True):
+class JointCommand(Message, frozen=True, kw_only=True):
     """`actuator/joints`: what the lease holder wants of every joint.
 
     `target[i]` is in the unit of `mode[i]`. `torque_limit_nm[i]` bounds the motor below the robot's own limit.
@@ -110,7 +110,7 @@ class JointCommand(Message, kw_only=True):
     torque_limit_nm: q.TorqueLimits | None = None
 
 
-class AppliedCommand(Message, kw_only=True):
+class AppliedCommand(Message, frozen=True, kw_only=True):
     """`hal/applied`: what really went to the motors in a tick, and where that differs from what was asked."""
 
     tick: q.Tick
@@ -125,11 +125,11 @@ class AppliedCommand(Message, kw_only=True):
 # --- the HAL itself --------------------------------------------------------------------------------------------
 
 
-class Clock(Message, kw_only=True):
+class Clock(Message, frozen=True, kw_only=True):
     """`hal/clock`: the only time that GNC knows, and the table of contents of everything published so far.
 
-    `newest` maps a key to the tick of its newest sample that counts at this tick. It is published last, so a
-    reader that waits for what `newest` names reads the same data in every lockstep run.
+    `newest` maps a sensor key, or the name of a service, to the tick of the newest sample that counts now. The clock is
+    published last, so a reader that takes what `newest` names reads the same data in every lockstep run.
     """
 
     tick: q.Tick
@@ -137,11 +137,12 @@ class Clock(Message, kw_only=True):
     period_ns: q.Nanoseconds
     pace: Pace
     lifecycle: LifecycleState
-    arming: q.Tick  # how often the robot has been armed; a new value tells services to start afresh
+    arming: q.Tick  # how often the robot has been armed; a new value tells a controller to start afresh
+    lease_epoch: q.Tick  # of the live lease; 0 when nobody holds one
     newest: Annotated[dict[q.Name, q.Tick], Meta(max_length=64)]
 
 
-class JointDescription(Message, kw_only=True):
+class JointDescription(Message, frozen=True, kw_only=True):
     """One joint: its name, its place in every vector, and what it can do."""
 
     name: q.Name
@@ -156,7 +157,7 @@ class JointDescription(Message, kw_only=True):
     damping_nm_s_per_rad: Annotated[float, Meta(ge=0, le=1e6)]
 
 
-class LinkDescription(Message, kw_only=True):
+class LinkDescription(Message, frozen=True, kw_only=True):
     """One rigid link, tail to head: a capsule along its own x axis."""
 
     name: q.Name
@@ -165,7 +166,7 @@ class LinkDescription(Message, kw_only=True):
     mass_kg: Annotated[float, Meta(gt=0, le=1e4)]
 
 
-class SensorDescription(Message, kw_only=True):
+class SensorDescription(Message, frozen=True, kw_only=True):
     """What a sensor delivers, and how often."""
 
     key: q.Name
@@ -173,7 +174,7 @@ class SensorDescription(Message, kw_only=True):
     delay_s: Annotated[float, Meta(ge=0, le=10)]
 
 
-class Description(Message, kw_only=True):
+class Description(Message, frozen=True, kw_only=True):
     """`hal/description`, latched: the robot as the backend has it. The order of joints is defined here only."""
 
     robot: q.Name
@@ -189,7 +190,7 @@ class Description(Message, kw_only=True):
     sensors: Annotated[list[SensorDescription], Meta(max_length=32)]
 
 
-class Fault(Message, kw_only=True):
+class Fault(Message, frozen=True, kw_only=True):
     """One thing that went wrong, and where."""
 
     tick: q.Tick
@@ -198,7 +199,7 @@ class Fault(Message, kw_only=True):
     joint: q.Name | None = None
 
 
-class Status(Message, kw_only=True):
+class Status(Message, frozen=True, kw_only=True):
     """`hal/status`, latched: how the robot is, and why."""
 
     tick: q.Tick
@@ -222,7 +223,7 @@ class Status(Message, kw_only=True):
     ready_to_arm: bool
 
 
-class LeaseRequest(Message, kw_only=True):
+class LeaseRequest(Message, frozen=True, kw_only=True):
     """Query payload on `hal/lease`."""
 
     action: Literal["acquire", "renew", "release"]
@@ -231,7 +232,7 @@ class LeaseRequest(Message, kw_only=True):
     priority: Annotated[int, Meta(ge=0, le=255)] = 100
 
 
-class LifecycleRequest(Message, kw_only=True):
+class LifecycleRequest(Message, frozen=True, kw_only=True):
     """Query payload on `hal/lifecycle`. Arming names robot and backend, so that the two cannot be mixed up."""
 
     action: Literal["arm", "disarm", "clear", "finish"]
@@ -239,13 +240,13 @@ class LifecycleRequest(Message, kw_only=True):
     backend: q.Name | None = None
 
 
-class EstopRequest(Message, kw_only=True):
+class EstopRequest(Message, frozen=True, kw_only=True):
     """Query payload on `hal/estop`; needs no lease. Latched until `clear` on `hal/lifecycle`."""
 
     who: q.Name
 
 
-class Answer(Message, kw_only=True):
+class Answer(Message, frozen=True, kw_only=True):
     """Reply to every query: whether it was done, and if not, why not."""
 
     ok: bool
@@ -254,7 +255,7 @@ class Answer(Message, kw_only=True):
     lifecycle: LifecycleState = "disarmed"
 
 
-class Done(Message, kw_only=True):
+class Done(Message, frozen=True, kw_only=True):
     """`hal/done/<service>`: a lockstep participant has published all that it owes for a tick."""
 
     tick: q.Tick
@@ -263,7 +264,7 @@ class Done(Message, kw_only=True):
 # --- guidance, navigation, control -----------------------------------------------------------------------------
 
 
-class Obstacle(Message, kw_only=True):
+class Obstacle(Message, frozen=True, kw_only=True):
     """Something known to stand in the world: an upright shape with its outline."""
 
     name: q.Name
@@ -276,7 +277,7 @@ class Obstacle(Message, kw_only=True):
     confidence: q.Fraction = 1.0
 
 
-class WorldContact(Message, kw_only=True):
+class WorldContact(Message, frozen=True, kw_only=True):
     """A contact in the world frame, and where along the body it is."""
 
     link: q.LinkIndex
@@ -289,7 +290,7 @@ class WorldContact(Message, kw_only=True):
     confidence: q.Fraction = 1.0
 
 
-class World(Message, kw_only=True):
+class World(Message, frozen=True, kw_only=True):
     """`guidance/world`: where the body is, what it touches, what stands near it."""
 
     tick: q.Tick
@@ -301,7 +302,7 @@ class World(Message, kw_only=True):
     obstacles: Annotated[list[Obstacle], Meta(max_length=4096)]
 
 
-class Trajectory(Message, kw_only=True):
+class Trajectory(Message, frozen=True, kw_only=True):
     """`navigation/trajectory`: the path to take, how fast, and the push-points expected along it."""
 
     tick: q.Tick
@@ -313,7 +314,7 @@ class Trajectory(Message, kw_only=True):
     finished: bool
 
 
-class ControlState(Message, kw_only=True):
+class ControlState(Message, frozen=True, kw_only=True):
     """`control/state`: what the controller thinks it is doing, and why. Telemetry; nothing depends on it."""
 
     tick: q.Tick
@@ -335,7 +336,7 @@ class ControlState(Message, kw_only=True):
     jammed: bool = False
 
 
-class Intent(Message, kw_only=True):
+class Intent(Message, frozen=True, kw_only=True):
     """`operator/intent`: what a person or a mission wants."""
 
     stamp_ns: q.Nanoseconds
@@ -344,9 +345,8 @@ class Intent(Message, kw_only=True):
     go: bool = True
 
 
-VERSIONS: dict[type[Message], int] = {
-    message: 1
-    for message in (
+VERSIONS: dict[type[Message], int] = dict.fromkeys(
+    (
         JointState,
         Contacts,
         Imu,
@@ -365,6 +365,7 @@ VERSIONS: dict[type[Message], int] = {
         Trajectory,
         ControlState,
         Intent,
-    )
-}
+    ),
+    1,
+)
 """Every message that may stand alone on the wire, with its version."""

@@ -11,7 +11,14 @@ from msgspec import Meta
 
 from snakesim_hal import keys
 from snakesim_hal.files import FileStruct
-from snakesim_hal.messages import Axis, Description, JointDescription, LinkDescription, SafeAction, SensorDescription
+from snakesim_hal.messages import (
+    Axis,
+    Description,
+    JointDescription,
+    LinkDescription,
+    SafeAction,
+    SensorDescription,
+)
 from snakesim_hal.quantities import MAX_JOINTS
 
 
@@ -23,14 +30,14 @@ def _from_zero(high: float, unit: str) -> Meta:
     return Meta(ge=0, le=high, extra_json_schema={"unit": unit})
 
 
-class Chain(FileStruct, kw_only=True):
+class Chain(FileStruct, frozen=True, kw_only=True):
     """How many modules, and how their joints are turned."""
 
     modules: Annotated[int, Meta(ge=1, le=MAX_JOINTS)]
     axes: Annotated[list[Axis], Meta(min_length=1, max_length=MAX_JOINTS)]  # repeated from tail to head
 
 
-class Module(FileStruct, kw_only=True):
+class Module(FileStruct, frozen=True, kw_only=True):
     """Body of one module."""
 
     length_m: Annotated[float, _above(2, "m")]
@@ -38,7 +45,7 @@ class Module(FileStruct, kw_only=True):
     mass_kg: Annotated[float, _above(100, "kg")]
 
 
-class Limits(FileStruct, kw_only=True):
+class Limits(FileStruct, frozen=True, kw_only=True):
     """What a joint may do; held by the gate and by the motor."""
 
     angle_rad: Annotated[float, _above(3.14159, "rad")]  # to either side
@@ -48,7 +55,7 @@ class Limits(FileStruct, kw_only=True):
     torque_rate_nm_s: Annotated[float, _above(1e5, "N·m/s")]
 
 
-class Motor(FileStruct, kw_only=True):
+class Motor(FileStruct, frozen=True, kw_only=True):
     """How a joint answers."""
 
     stiffness_nm_per_rad: Annotated[float, _above(1e5, "N·m/rad")]  # position mode
@@ -60,14 +67,14 @@ class Motor(FileStruct, kw_only=True):
     viscous_nm_s_per_rad: Annotated[float, _from_zero(100, "N·m·s/rad")] = 0.0
 
 
-class Safety(FileStruct, kw_only=True):
+class Safety(FileStruct, frozen=True, kw_only=True):
     """What the joints do when nobody may command them."""
 
     action: SafeAction = "damp"
     max_step_rad: Annotated[float, _above(3.2, "rad")] = 0.35  # furthest a position target may be from the measured
 
 
-class JointSensor(FileStruct, kw_only=True):
+class JointSensor(FileStruct, frozen=True, kw_only=True):
     """Angle, velocity and torque of every joint. No rate: a sample every tick."""
 
     delay_s: Annotated[float, _from_zero(1, "s")] = 0.0
@@ -76,7 +83,7 @@ class JointSensor(FileStruct, kw_only=True):
     torque_noise_nm: Annotated[float, _from_zero(100, "N·m")] = 0.0
 
 
-class ContactSensor(FileStruct, kw_only=True):
+class ContactSensor(FileStruct, frozen=True, kw_only=True):
     """Touches of the links by obstacles."""
 
     rate_hz: Annotated[float, _above(1e4, "Hz")] = 100.0
@@ -86,7 +93,7 @@ class ContactSensor(FileStruct, kw_only=True):
     threshold_n: Annotated[float, _from_zero(100, "N")] = 0.0  # weaker touches go unfelt
 
 
-class ImuSensor(FileStruct, kw_only=True):
+class ImuSensor(FileStruct, frozen=True, kw_only=True):
     """Angular velocity and acceleration (gravity included) of every link."""
 
     rate_hz: Annotated[float, _above(1e4, "Hz")] = 100.0
@@ -95,7 +102,7 @@ class ImuSensor(FileStruct, kw_only=True):
     acceleration_noise_m_s2: Annotated[float, _from_zero(100, "m/s²")] = 0.0
 
 
-class PoseSensor(FileStruct, kw_only=True):
+class PoseSensor(FileStruct, frozen=True, kw_only=True):
     """Pose of the base, as motion capture gives it."""
 
     rate_hz: Annotated[float, _above(1e4, "Hz")] = 100.0
@@ -104,7 +111,7 @@ class PoseSensor(FileStruct, kw_only=True):
     angle_noise_rad: Annotated[float, _from_zero(1, "rad")] = 0.0
 
 
-class Sensors(FileStruct, kw_only=True):
+class Sensors(FileStruct, frozen=True, kw_only=True):
     """The sensors that the robot has; a section that is left out is a sensor that it lacks."""
 
     joints: JointSensor = JointSensor()
@@ -113,7 +120,7 @@ class Sensors(FileStruct, kw_only=True):
     pose: PoseSensor | None = None
 
 
-class RobotFile(FileStruct, kw_only=True):
+class RobotFile(FileStruct, frozen=True, kw_only=True):
     """A whole robot file."""
 
     name: Annotated[str, Meta(min_length=1, max_length=40, pattern="^[A-Za-z0-9_-]+$")]
@@ -151,9 +158,7 @@ class RobotFile(FileStruct, kw_only=True):
         return [0.5] + [1.0] * (self.chain.modules - 1) + [0.5]
 
 
-def describe(
-    robot: RobotFile, *, backend: str, period_ns: int, lease_ns: int, config_hash: str
-) -> Description:
+def describe(robot: RobotFile, *, backend: str, period_ns: int, lease_ns: int, config_hash: str) -> Description:
     """The description that the HAL publishes, from a robot file."""
     axes = robot.axes
     joints = [
@@ -183,9 +188,7 @@ def describe(
         (keys.POSE, robot.sensors.pose),
     ):
         if sensor is not None:
-            sensors.append(
-                SensorDescription(key=key, rate_hz=min(sensor.rate_hz, rate_hz), delay_s=sensor.delay_s)
-            )
+            sensors.append(SensorDescription(key=key, rate_hz=min(sensor.rate_hz, rate_hz), delay_s=sensor.delay_s))
     return Description(
         robot=robot.name,
         backend=backend,
@@ -205,5 +208,3 @@ def layout_hash(joints: list[JointDescription]) -> str:
     """Hash of names, order and axes: two robots with the same hash take the same vectors."""
     text = ";".join(f"{joint.name}:{joint.axis}" for joint in joints)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-

@@ -1,5 +1,8 @@
 """A route on the ground: a smooth planar curve by arc length, and how a chain lies on it. Pure geometry."""
 
+import itertools
+import math
+from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -25,6 +28,9 @@ class Route:
         self._first_direction = steps[0] / lengths[0]
         self._last_direction = steps[-1] / lengths[-1]
         self._segment_direction = steps / lengths[:, None]
+        self._s_list: list[float] = self._s.tolist()
+        self._start_list: list[tuple[float, float]] = [(x, y) for x, y in self.points_w.tolist()]
+        self._direction_list: list[tuple[float, float]] = [(x, y) for x, y in self._segment_direction.tolist()]
 
     @property
     def length_m(self) -> float:
@@ -41,10 +47,17 @@ class Route:
         beyond = np.maximum(s - self.length_m, 0.0)[..., None] * self._last_direction
         return points + before + beyond
 
+    def at(self, s_m: float) -> tuple[float, float]:
+        """The point at arc length `s_m`; like `position_w`, and much faster for a single point."""
+        i = min(max(bisect_right(self._s_list, s_m) - 1, 0), len(self._direction_list) - 1)
+        beyond = s_m - self._s_list[i]
+        (x, y), (dx, dy) = self._start_list[i], self._direction_list[i]
+        return x + beyond * dx, y + beyond * dy
+
     def heading_rad(self, s_m: float) -> float:
         """Direction of travel at arc length `s_m`, averaged over 10 mm."""
-        back, front = self.position_w(np.array([s_m - 0.005, s_m + 0.005]))
-        return float(np.arctan2(front[1] - back[1], front[0] - back[0]))
+        (x0, y0), (x1, y1) = self.at(s_m - 0.005), self.at(s_m + 0.005)
+        return math.atan2(y1 - y0, x1 - x0)
 
     def tangent_w(self, s_m: float) -> Floats:
         """Unit vector of travel at arc length `s_m`, shape (2,)."""
@@ -84,7 +97,7 @@ class Route:
         heading = np.unwrap(np.arctan2(self._segment_direction[:, 1], self._segment_direction[:, 0]))
         bend = np.diff(heading)
         moving = np.flatnonzero(np.abs(bend) > 1e-9)
-        flips = [(a, b) for a, b in zip(moving[:-1], moving[1:], strict=True) if bend[a] * bend[b] < 0]
+        flips = [(a, b) for a, b in itertools.pairwise(moving) if bend[a] * bend[b] < 0]
         return [float(0.5 * (self._s[a + 1] + self._s[b + 1])) for a, b in flips]
 
 
@@ -95,15 +108,15 @@ def sine_points(amplitude_m: float, wavelength_m: float, length_m: float, spacin
     return np.column_stack([x, amplitude_m * np.sin(2 * np.pi * x / wavelength_m)])
 
 
-def next_on_route(route: Route, from_w: Floats, from_s_m: float, distance_m: float) -> float:
+def next_on_route(route: Route, from_w: tuple[float, float], from_s_m: float, distance_m: float) -> float:
     """Arc length beyond `from_s_m` of the route's point at straight distance `distance_m` from `from_w`."""
     s = from_s_m + distance_m
     for _ in range(20):
-        point = route.position_w(s)
-        error = distance_m - float(np.hypot(*(point - from_w)))
+        x, y = route.at(s)
+        error = distance_m - math.hypot(x - from_w[0], y - from_w[1])
+        s += error
         if abs(error) < 1e-7:
             break
-        s += error
     return s
 
 
@@ -111,7 +124,7 @@ def next_on_route(route: Route, from_w: Floats, from_s_m: float, distance_m: flo
 class ChainOnRoute:
     """How a chain of straight segments lies with every joint on a route."""
 
-    tail_w: Floats  # (2,)
+    tail_w: tuple[float, float]
     heading_rad: float  # of the first segment
     angles_rad: Floats  # (n_segments - 1,), tail to head, left turn positive
 
@@ -119,16 +132,15 @@ class ChainOnRoute:
 def lay_chain(route: Route, tail_s_m: float, segment_lengths_m: Sequence[float]) -> ChainOnRoute:
     """Lay straight segments, tail to head, with the tail end at `tail_s_m` and every joint on the route."""
     s = tail_s_m
-    point = route.position_w(s)
-    tail = point
+    tail = point = route.at(s)
     headings: list[float] = []
     for length in segment_lengths_m:
         s = next_on_route(route, point, s, length)
-        ahead = route.position_w(s)
-        headings.append(float(np.arctan2(ahead[1] - point[1], ahead[0] - point[0])))
+        ahead = route.at(s)
+        headings.append(math.atan2(ahead[1] - point[1], ahead[0] - point[0]))
         point = ahead
     turns = np.diff(headings)
-    return ChainOnRoute(tail, headings[0], np.arctan2(np.sin(turns), np.cos(turns)))
+    return ChainOnRoute(tail, headings[0], (turns + np.pi) % (2 * np.pi) - np.pi)
 
 
 def yaw_segments_m(axes: Sequence[str], link_lengths_m: Sequence[float]) -> list[float]:

@@ -25,8 +25,13 @@ from snakesim_hal.robot import RobotFile
 from snakesim_hal.route import chain_angles, lay_chain, yaw_segments_m
 from snakesim_hal.scene import Capsule, Heading, Placed, Point, SceneFile, check_clear, place, route_of
 
+CHOSEN = (
+    "control.",
+    "backend.",
+)  # --set control.x=1 changes the chosen controller, --set backend.x=1 the backend
 
-class Start(FileStruct, kw_only=True):
+
+class Start(FileStruct, frozen=True, kw_only=True):
     """Where the snake lies when the run begins: along the scene's route, or straight at a pose."""
 
     on_route: bool = True
@@ -35,13 +40,13 @@ class Start(FileStruct, kw_only=True):
     yaw_rad: Heading = 0.0
 
 
-class Mission(FileStruct, kw_only=True):
+class Mission(FileStruct, frozen=True, kw_only=True):
     """What navigation is asked for."""
 
     speed_m_s: Annotated[float, Meta(ge=0, le=10, extra_json_schema={"unit": "m/s"})] = 0.2
 
 
-class Service(FileStruct, kw_only=True):
+class Service(FileStruct, frozen=True, kw_only=True):
     """A process that takes part in the run: it acts every so many ticks.
 
     In lockstep what it says of tick t counts from tick t + lag_ticks on, whenever it really arrived, so that a slow
@@ -57,7 +62,7 @@ class Service(FileStruct, kw_only=True):
         return due - due % self.every_ticks
 
 
-class RunConfig(FileStruct, kw_only=True):
+class RunConfig(FileStruct, frozen=True, kw_only=True):
     """Everything that a run is made of."""
 
     name: Annotated[str, Meta(min_length=1, max_length=60)]
@@ -74,8 +79,18 @@ class RunConfig(FileStruct, kw_only=True):
     start: Start = Start()
     mission: Mission = Mission()
     services: dict[str, Service]
-    control: dict[str, Any] = {}  # settings of the controller, checked by the controller
+    controllers: dict[str, dict[str, Any]] = {}  # settings of each controller, checked by the controller
     backends: dict[str, dict[str, Any]] = {}  # settings of each backend, checked by the backend
+
+    @property
+    def control_section(self) -> str:
+        """Where the settings of the chosen controller stand; for `./file.py:Wave` that is `controllers.Wave`."""
+        return f"controllers.{self.controller.rpartition(':')[2]}"
+
+    @property
+    def control_settings(self) -> dict[str, Any]:
+        """The settings of the chosen controller."""
+        return self.controllers.get(self.controller.rpartition(":")[2], {})
 
     @property
     def period_ns(self) -> int:
@@ -137,9 +152,18 @@ def load(scenario: str, overrides: Sequence[Override] = ()) -> Loaded:
             from_flag = any(o.key == part for o in picks)
             inner = read_table(find(named, kind, None if from_flag else path.parent))
             table.put(part, inner.values, inner.source)
-    for override in overrides:
-        if override not in picks:
-            table.put(override.key, override.value, override.flag)
+    for override in sorted(overrides, key=lambda o: o.key.startswith(CHOSEN)):
+        if override in picks:
+            continue
+        key = override.key
+        for alias, choice, section in (
+            (CHOSEN[0], "controller", "controllers"),
+            (CHOSEN[1], "backend", "backends"),
+        ):
+            if key.startswith(alias):
+                chosen = str(table.values.get(choice, "sim")).rpartition(":")[2]
+                key = f"{section}.{chosen}.{key.removeprefix(alias)}"
+        table.put(key, override.value, override.flag)
     config = decode(table, RunConfig)
     check(config)
     return Loaded(config, table)
@@ -179,9 +203,7 @@ def start_of(config: RunConfig) -> StartPose:
     if not start.on_route or route is None:
         return StartPose(start.position_m, start.yaw_rad, np.zeros(robot.chain.modules))
     lay = lay_chain(route, start.tail_s_m, yaw_segments_m(robot.axes, robot.link_lengths_m))
-    return StartPose(
-        (float(lay.tail_w[0]), float(lay.tail_w[1])), lay.heading_rad, chain_angles(robot.axes, lay.angles_rad)
-    )
+    return StartPose(lay.tail_w, lay.heading_rad, chain_angles(robot.axes, lay.angles_rad))
 
 
 def capsules_at_start(config: RunConfig) -> list[Capsule]:

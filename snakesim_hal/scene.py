@@ -5,7 +5,7 @@ fields into plain obstacles; `check_clear` refuses a scene in which one of them 
 """
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from msgspec import Meta
@@ -33,7 +33,7 @@ Heading = Annotated[float, Meta(ge=-6.3, le=6.3, extra_json_schema={"unit": "rad
 Point = tuple[Coordinate, Coordinate]
 
 
-class Uneven(FileStruct, kw_only=True):
+class Uneven(FileStruct, frozen=True, kw_only=True):
     """Smooth random hills."""
 
     height_m: Annotated[float, _length(0, 1)]  # from lowest to highest point
@@ -42,14 +42,14 @@ class Uneven(FileStruct, kw_only=True):
     seed: Annotated[int, Meta(ge=0, le=2**31)] = 0
 
 
-class Ground(FileStruct, kw_only=True):
+class Ground(FileStruct, frozen=True, kw_only=True):
     """The ground, and how it grips."""
 
     friction: Friction
     uneven: Uneven | None = None
 
 
-class SineRoute(FileStruct, kw_only=True, tag="sine", tag_field="kind"):
+class SineRoute(FileStruct, frozen=True, kw_only=True, tag="sine", tag_field="kind"):
     """y = amplitude sin(2 pi x / wavelength), from x = 0."""
 
     amplitude_m: Annotated[float, Meta(ge=0, le=10, extra_json_schema={"unit": "m"})]
@@ -57,13 +57,13 @@ class SineRoute(FileStruct, kw_only=True, tag="sine", tag_field="kind"):
     length_m: Size  # along x
 
 
-class WaypointRoute(FileStruct, kw_only=True, tag="waypoints", tag_field="kind"):
+class WaypointRoute(FileStruct, frozen=True, kw_only=True, tag="waypoints", tag_field="kind"):
     """Straight from point to point; give points densely for a smooth curve."""
 
     points_m: Annotated[list[Point], Meta(min_length=2, max_length=20000)]
 
 
-class Cylinder(FileStruct, kw_only=True):
+class Cylinder(FileStruct, frozen=True, kw_only=True):
     """An upright peg."""
 
     position_m: Point
@@ -73,7 +73,7 @@ class Cylinder(FileStruct, kw_only=True):
     name: str | None = None
 
 
-class Box(FileStruct, kw_only=True):
+class Box(FileStruct, frozen=True, kw_only=True):
     """An upright block."""
 
     position_m: Point
@@ -83,7 +83,7 @@ class Box(FileStruct, kw_only=True):
     name: str | None = None
 
 
-class Sphere(FileStruct, kw_only=True):
+class Sphere(FileStruct, frozen=True, kw_only=True):
     """A ball fixed at its centre."""
 
     position_m: Point
@@ -93,7 +93,7 @@ class Sphere(FileStruct, kw_only=True):
     name: str | None = None
 
 
-class Wall(FileStruct, kw_only=True):
+class Wall(FileStruct, frozen=True, kw_only=True):
     """A straight wall from point to point."""
 
     from_m: Point
@@ -104,7 +104,7 @@ class Wall(FileStruct, kw_only=True):
     name: str | None = None
 
 
-class Step(FileStruct, kw_only=True):
+class Step(FileStruct, frozen=True, kw_only=True):
     """A low platform that the snake may lie on or climb."""
 
     position_m: Point
@@ -115,7 +115,7 @@ class Step(FileStruct, kw_only=True):
     name: str | None = None
 
 
-class PegsAlongRoute(FileStruct, kw_only=True):
+class PegsAlongRoute(FileStruct, frozen=True, kw_only=True):
     """Pegs beside the route where a snake can push forward: at its inflections, on alternating sides.
 
     `corridor_m` is the distance from the route to a peg's surface, so a body of radius r has `corridor_m - r` of
@@ -130,7 +130,7 @@ class PegsAlongRoute(FileStruct, kw_only=True):
     friction: Friction = 0.0
 
 
-class RandomField(FileStruct, kw_only=True):
+class RandomField(FileStruct, frozen=True, kw_only=True):
     """Pegs strewn by chance, the same for the same seed."""
 
     seed: Annotated[int, Meta(ge=0, le=2**31)]
@@ -144,7 +144,7 @@ class RandomField(FileStruct, kw_only=True):
     friction: Friction = 0.0
 
 
-class SceneFile(FileStruct, kw_only=True):
+class SceneFile(FileStruct, frozen=True, kw_only=True):
     """A whole scene file."""
 
     name: Annotated[str, Meta(min_length=1, max_length=40, pattern="^[A-Za-z0-9_-]+$")]
@@ -174,7 +174,7 @@ def route_of(scene: SceneFile) -> Route | None:
                 raise ConfigError(f"scene {scene.name!r}: `route.points_m`: {error}") from None
 
 
-class Placed(FileStruct, kw_only=True):
+class Placed(FileStruct, frozen=True, kw_only=True):
     """An obstacle as placed, with what only the simulator needs to know of it."""
 
     obstacle: Obstacle
@@ -318,7 +318,7 @@ def _strewn(
     return strewn
 
 
-class Capsule(FileStruct, kw_only=True):
+class Capsule(FileStruct, frozen=True, kw_only=True):
     """A link lying on the ground, seen from above."""
 
     name: str

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Generic
 
 import zenoh
-from zenoh import ext, handlers
+from zenoh import ext, handlers  # pyright: ignore[reportMissingModuleSource]
 
 from snakesim_hal import keys
 from snakesim_hal.codec import Decoder, MessageT, encode, encoding_of
@@ -122,7 +122,11 @@ class Session:
     def latched_publisher(self, key: str, message: type[MessageT]) -> Publisher[MessageT]:
         """A publisher whose last value is given to readers that come later."""
         publisher = ext.declare_advanced_publisher(
-            self._zenoh, key, encoding=encoding_of(message), cache=ext.CacheConfig(1), publisher_detection=True
+            self._zenoh,
+            key,
+            encoding=encoding_of(message),
+            cache=ext.CacheConfig(1),
+            publisher_detection=True,
         )
         self._declared.append(publisher)
         return Publisher(publisher, message)
@@ -146,15 +150,12 @@ class Session:
 
     def on_arrival(self, key: str, take: Callable[[Arrival], None]) -> None:
         """Call `take` for every sample, in Zenoh's thread: it must only store, never compute."""
+        self._declared.append(self._zenoh.declare_subscriber(key, _storing(take)))
 
-        def handle(sample: zenoh.Sample) -> None:
-            take(
-                Arrival(
-                    str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding), time.monotonic_ns()
-                )
-            )
-
-        self._declared.append(self._zenoh.declare_subscriber(key, handle))
+    def on_latched_arrival(self, key: str, take: Callable[[Arrival], None]) -> None:
+        """Like `on_arrival`, and it gets the values that were latched before it came."""
+        history = ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
+        self._declared.append(ext.declare_advanced_subscriber(self._zenoh, key, _storing(take), history=history))
 
     def on_question(self, key: str, take: Callable[[Question], None]) -> None:
         """Call `take` for every query, in Zenoh's thread; answer it from your own."""
@@ -175,9 +176,7 @@ class Session:
     def ask_politely(self, key: str, request: Message, timeout_s: float = 2.0) -> Answer:
         """Like `ask`, but a no is returned, not raised."""
         decoder = Decoder(Answer)
-        replies = self._zenoh.get(
-            key, payload=encode(request), encoding=encoding_of(type(request)), timeout=timeout_s
-        )
+        replies = self._zenoh.get(key, payload=encode(request), encoding=encoding_of(type(request)), timeout=timeout_s)
         for reply in replies:
             if reply.ok is not None:
                 return decoder.decode(reply.ok.payload.to_bytes(), str(reply.ok.encoding))
@@ -203,6 +202,14 @@ class Session:
         self._zenoh.close()
 
 
+def _storing(take: Callable[[Arrival], None]) -> Callable[[zenoh.Sample], None]:
+    def handle(sample: zenoh.Sample) -> None:
+        payload, encoding = sample.payload.to_bytes(), str(sample.encoding)
+        take(Arrival(str(sample.key_expr), payload, encoding, time.monotonic_ns()))
+
+    return handle
+
+
 @contextmanager
 def open_session(link: Link, connect_timeout_s: float = 5.0) -> Iterator[Session]:
     """Join the network. Raises NotConnectedError when the endpoint does not answer or cannot be listened on."""
@@ -218,7 +225,7 @@ def _settings(link: Link, connect_timeout_s: float) -> dict[str, Any]:
         "mode": "router" if link.listen else "client",
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "timestamping": {"enabled": {"router": True, "peer": True, "client": True}},
-        "transport": {"link": {"tx": {"lease": 2000}}},
+        "transport": {"link": {"tx": {"lease": 2000}}, "shared_memory": {"enabled": False}},
         "listen": {"endpoints": [link.endpoint] if link.listen else [], "exit_on_failure": True},
         "connect": {
             "endpoints": [] if link.listen else [link.endpoint],

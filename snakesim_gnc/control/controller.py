@@ -1,0 +1,75 @@
+"""What a controller is: settings in, then a view of the world each tick, set-points out. No clock, no I/O.
+
+A controller is a class with a `Settings` Struct, a constructor that takes the robot and the settings, and `update`.
+It is made anew at every arming, and called once a tick while the robot is armed.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import msgspec
+
+from snakesim_hal.backend import SetPoints
+from snakesim_hal.messages import Description, JointState, Mode, Trajectory, World, WorldContact
+
+
+@dataclass(frozen=True)
+class View:
+    """What a controller sees at one tick."""
+
+    tick: int
+    time_s: float  # since arming, by the robot's clock
+    period_s: float
+    joints: JointState
+    world: World | None  # None: guidance has said nothing yet
+    trajectory: Trajectory | None
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a controller tells of itself; everything is optional, and shows in `control/state` and in the report."""
+
+    why: str = ""
+    usable_push_points: int | None = None  # None: this controller does not push off obstacles
+    path_s_m: float | None = None
+    propulsion_joint: int | None = None
+    propulsion_n: float | None = None
+    push_points: Sequence[WorldContact] = ()
+    solved_force_n: Sequence[float] = ()
+    propulsion_torque_nm: float | None = None
+    bending_torque_nm: Sequence[float] = ()
+    reference_rad: Sequence[float] = ()
+    condition: float | None = None
+    torque_headroom_nm: float | None = None
+    saturated: bool = False
+    jammed: bool = False
+
+
+@dataclass(frozen=True)
+class Action:
+    """A controller's answer to a view."""
+
+    set_points: SetPoints
+    report: Report = field(default_factory=Report)
+
+
+class Controller(Protocol):
+    """What stands behind an entry point in the group `snakesim.controllers`, or behind `./file.py:Name`."""
+
+    Settings: type[msgspec.Struct]  # the scenario's [control] section
+
+    def __init__(self, robot: Description, settings: Any) -> None: ...
+
+    def update(self, view: View) -> Action:
+        """Set-points for the next period, in the order of `robot.joints`."""
+        ...
+
+
+def positions(robot: Description, angles_rad: Sequence[float]) -> SetPoints:
+    """Every joint to an angle, tail to head, with its full torque."""
+    return SetPoints(
+        [Mode.POSITION] * len(robot.joints),
+        [float(angle) for angle in angles_rad],
+        [joint.torque_limit_nm for joint in robot.joints],
+    )

@@ -1,0 +1,90 @@
+"""The world model: body pose, contacts in the world frame, and the known obstacles near the body. Pure."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from snakesim_hal.kinematics import link_frames, rotation_from_quaternion
+from snakesim_hal.messages import (
+    Contact,
+    Contacts,
+    Description,
+    JointState,
+    Obstacle,
+    Pose,
+    World,
+    WorldContact,
+)
+from snakesim_hal.scene import outline_distance_m
+
+POSE_MEMORY_S = 0.5  # confidence in a pose falls to 1/e after this long without a new one
+
+
+class WorldModel:
+    """Turns the sensors of one instant into a World."""
+
+    def __init__(self, robot: Description, known: Sequence[Obstacle], *, reach_m: float = 0.5) -> None:
+        """known: the surveyed obstacles; only those within `reach_m` of the body are passed on."""
+        self._axes = [joint.axis for joint in robot.joints]
+        self._lengths = [link.length_m for link in robot.links]
+        self._radii = [link.radius_m for link in robot.links]
+        self._rear_s = np.concatenate(([0.0], np.cumsum(self._lengths)))[:-1]
+        self._known = list(known)
+        self._centres = np.array([o.position_w[:2] for o in known]).reshape(-1, 2)
+        self._sizes = np.array([_outer_radius_m(o) for o in known])
+        self._reach_m = reach_m
+
+    def update(self, tick: int, stamp_ns: int, joints: JointState, contacts: Contacts | None, pose: Pose) -> World:
+        """The world as it stands at `tick`."""
+        rotation = rotation_from_quaternion(pose.orientation_wxyz)
+        origins, rotations = link_frames(pose.position_w, rotation, joints.angle_rad, self._axes, self._lengths)
+        felt = [] if contacts is None else contacts.contacts
+        age_s = max(stamp_ns - pose.stamp_ns, 0) * 1e-9
+        return World(
+            tick=tick,
+            stamp_ns=stamp_ns,
+            base_position_w=pose.position_w,
+            base_orientation_wxyz=pose.orientation_wxyz,
+            base_confidence=math.exp(-age_s / POSE_MEMORY_S),
+            contacts=[self._in_world(c, origins, rotations) for c in felt if c.link < len(origins)],
+            obstacles=self._near(origins),
+        )
+
+    def _in_world(self, contact: Contact, origins: np.ndarray, rotations: np.ndarray) -> WorldContact:
+        rotation = rotations[contact.link]
+        local = np.array([contact.position_l, contact.normal_l, contact.tangent_1_l, contact.force_l])
+        position, normal, tangent, force = local @ rotation.T
+        position = position + origins[contact.link]
+        return WorldContact(
+            link=contact.link,
+            obstacle=contact.obstacle or self._touching(position),
+            body_s_m=float(self._rear_s[contact.link]) + contact.position_l[0],
+            position_w=tuple(position.tolist()),
+            normal_w=tuple(normal.tolist()),
+            tangent_w=tuple(tangent.tolist()),
+            force_w=tuple(force.tolist()),
+        )
+
+    def _touching(self, position_w: np.ndarray) -> str | None:
+        """Which known obstacle a sensor that cannot tell must have touched."""
+        if not self._known:
+            return None
+        candidates = np.flatnonzero(np.hypot(*(self._centres - position_w[:2]).T) < self._sizes + 0.1)
+        gaps = {int(i): outline_distance_m(self._known[i], position_w[:2]) for i in candidates}
+        best = min(gaps, key=lambda i: gaps[i], default=None)
+        return self._known[best].name if best is not None and gaps[best] < 0.03 else None
+
+    def _near(self, origins: np.ndarray) -> list[Obstacle]:
+        if not self._known:
+            return []
+        gaps = np.hypot(
+            self._centres[:, None, 0] - origins[None, :, 0], self._centres[:, None, 1] - origins[None, :, 1]
+        ).min(axis=1)
+        return [self._known[i] for i in np.flatnonzero(gaps - self._sizes < self._reach_m)]
+
+
+def _outer_radius_m(obstacle: Obstacle) -> float:
+    if obstacle.shape == "box":
+        return math.hypot(obstacle.half_size_m[0], obstacle.half_size_m[1])
+    return obstacle.radius_m

@@ -1,0 +1,47 @@
+"""The guidance process: sensors in, `guidance/world` out."""
+
+import sys
+from collections.abc import Sequence
+
+from snakesim_gnc.guidance.core import WorldModel
+from snakesim_gnc.service import Service, serve
+from snakesim_hal import keys
+from snakesim_hal.client import Client
+from snakesim_hal.messages import Clock, Contacts, Description, JointState, Message, Pose
+from snakesim_hal.scenario import RunConfig, place_all
+
+
+class Guidance(Service):
+    """Sensors to world model."""
+
+    name = "guidance"
+
+    def __init__(self, client: Client, config: RunConfig) -> None:
+        """The scene file is the survey: its obstacles are what guidance knows beforehand."""
+        self._known = [placed.obstacle for placed in place_all(config) if not placed.walkable]
+        self._joints = client.subscribe(keys.JOINTS, JointState)
+        self._contacts = client.subscribe(keys.CONTACTS, Contacts)
+        self._pose = client.subscribe(keys.POSE, Pose)
+        self._client = client
+        self._model: WorldModel | None = None
+
+    def meet(self, robot: Description) -> None:
+        """Make the model for the robot that is there."""
+        self._model = WorldModel(robot, self._known)
+
+    def outputs(self, clock: Clock) -> list[tuple[str, Message]] | None:
+        """The world at this tick; None while the joints or the pose are unknown."""
+        joints, pose = self._client.read(self._joints), self._client.read(self._pose)
+        if self._model is None or joints is None or pose is None:
+            return None
+        contacts = self._client.read(self._contacts)
+        return [(keys.WORLD, self._model.update(clock.tick, clock.stamp_ns, joints, contacts, pose))]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run guidance until its robot is gone."""
+    return serve(Guidance, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,79 @@
+"""The thin shell around a pure core: join, wait for ticks, publish what the core says, report it done."""
+
+import sys
+from collections.abc import Sequence
+from typing import Protocol
+
+from snakesim_hal.client import Client
+from snakesim_hal.errors import SnakesimError
+from snakesim_hal.messages import Clock, Description, Message
+from snakesim_hal.process import settle_for_timing
+from snakesim_hal.scenario import RunConfig
+from snakesim_hal.scenario import Service as Schedule
+from snakesim_hal.serve import arguments, duty
+from snakesim_hal.session import open_session
+
+SILENCE_S = 1.0
+
+
+class Service(Protocol):
+    """What a service process is made of. The constructor subscribes to everything that it will read."""
+
+    name: str
+
+    def __init__(self, client: Client, config: RunConfig) -> None: ...
+
+    def meet(self, robot: Description) -> None:
+        """Learn what robot is there; called once, before the first tick."""
+        ...
+
+    def outputs(self, clock: Clock) -> list[tuple[str, Message]] | None:
+        """What to publish for a tick, as (key, message); None when the service is not able to say anything yet."""
+        ...
+
+    def silence(self) -> list[tuple[str, Message]]:
+        """What to publish when the HAL's clock has been silent for a second."""
+        return []
+
+
+def serve(service_type: type[Service], argv: Sequence[str] | None = None) -> int:
+    """Run a service process. Ends when it is told to stop; exit code 1 when it could not go on."""
+    name = service_type.name
+    given = duty(arguments(f"Run the {name} service of a robot."), argv)
+    try:
+        with open_session(given.link, connect_timeout_s=20.0) as session:
+            client = Client(session, name)
+            service = service_type(client, given.config)
+            service.meet(client.description(timeout_s=20.0))
+            client.announce()
+            settle_for_timing()
+            loop(client, service, given.config.services.get(name, Schedule()))
+    except SnakesimError as error:
+        print(f"snakesim {name}: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 0
+    return 0
+
+
+def loop(client: Client, service: Service, schedule: Schedule) -> None:
+    """Act on every tick that is due. A tick that is shown again, because time stands still, is answered again."""
+    acted = -schedule.every_ticks
+    for clock in client.ticks(SILENCE_S):
+        if clock is None:
+            for key, message in service.silence():
+                client.put(key, message)
+            continue
+        if clock.pace == "lockstep":
+            due = clock.tick % schedule.every_ticks == 0
+        else:
+            due = not 0 <= clock.tick - acted < schedule.every_ticks
+        if not due:
+            continue
+        acted = clock.tick
+        outputs = service.outputs(clock)
+        if outputs is None:
+            continue
+        for key, message in outputs:
+            client.put(key, message)
+        client.done(clock.tick)

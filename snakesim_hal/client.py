@@ -1,0 +1,224 @@
+"""What guidance, navigation and control use of the HAL: ticks, readings, outputs, and the right to command.
+
+A service loops over `ticks()`. What it reads at a tick is what the clock's table of contents names, so a lockstep run
+gives every service the same inputs however the processes happened to be scheduled.
+"""
+
+import time
+from collections import OrderedDict
+from collections.abc import Iterator
+from queue import Empty, SimpleQueue
+from typing import Any, Generic
+
+from snakesim_hal import keys
+from snakesim_hal.backend import SetPoints
+from snakesim_hal.codec import Decoder, MessageT
+from snakesim_hal.errors import NotConnectedError, StalledError, WireError
+from snakesim_hal.messages import (
+    Answer,
+    Clock,
+    Description,
+    Done,
+    JointCommand,
+    JointState,
+    LeaseRequest,
+    Message,
+    Mode,
+)
+from snakesim_hal.session import Arrival, Publisher, Reader, Session
+
+KEPT_PER_KEY = 32
+MISSING_LIMIT_S = 2.0
+LEASE_RETRY_S = 0.25
+
+
+class Feed(Generic[MessageT]):
+    """The samples of one key, found by the tick that they are of."""
+
+    def __init__(self, reader: Reader[MessageT], key: str) -> None:
+        self._reader = reader
+        self._kept: OrderedDict[int, MessageT] = OrderedDict()
+        self.key = key
+
+    def take_in(self) -> None:
+        """Move what arrived into the shelf."""
+        for message in self._reader.drain():
+            tick: int = message.tick  # pyright: ignore[reportAttributeAccessIssue]
+            self._kept[tick] = message
+            self._kept.move_to_end(tick)
+        while len(self._kept) > KEPT_PER_KEY:
+            self._kept.popitem(last=False)
+
+    def clear(self) -> None:
+        """Forget everything: the HAL started over."""
+        self._kept.clear()
+
+    def newest(self) -> MessageT | None:
+        """The sample that came last."""
+        return self._kept[next(reversed(self._kept))] if self._kept else None
+
+    def at(self, tick: int) -> MessageT | None:
+        """The sample of exactly this tick."""
+        return self._kept.get(tick)
+
+
+class Client:
+    """A service's connection to one robot's HAL."""
+
+    def __init__(self, session: Session, service: str) -> None:
+        self.service = service
+        self.session = session
+        self._clocks: SimpleQueue[Arrival] = SimpleQueue()
+        self._clock_decoder = Decoder(Clock)
+        self._feeds: dict[str, Feed[Any]] = {}
+        self._publishers: dict[str, Publisher[Any]] = {}
+        self._done: Publisher[Done] | None = None
+        self._clock: Clock | None = None
+        self.commanded_tick = -1
+        session.on_arrival(keys.CLOCK, self._clocks.put)
+        self._descriptions = session.latched_reader(keys.DESCRIPTION, Description)
+
+    def description(self, timeout_s: float = 10.0) -> Description:
+        """The robot. Raises NotConnectedError when no HAL shows one in time."""
+        deadline = time.monotonic() + timeout_s
+        while time.monotonic() < deadline:
+            found = self._descriptions.drain()
+            if found:
+                return found[-1]
+            time.sleep(0.01)
+        raise NotConnectedError(f"no robot description within {timeout_s} s; is the robot's HAL host running?")
+
+    def subscribe(self, key: str, message: type[MessageT]) -> Feed[MessageT]:
+        """Start listening to a key; do this for everything before `announce`."""
+        feed = Feed(self.session.reader(key, message), key)
+        self._feeds[key] = feed
+        return feed
+
+    def announce(self) -> None:
+        """Show that the service is here. A lockstep run waits for it from now on."""
+        self.session.declare_alive(self.service)
+
+    def ticks(self, silence_s: float | None = None) -> Iterator[Clock | None]:
+        """Every tick in lockstep; the newest one otherwise. None after each `silence_s` without a clock."""
+        while True:
+            try:
+                arrival = self._clocks.get(timeout=silence_s)
+                clock = self._clock_decoder.decode(arrival.payload, arrival.encoding)
+                while clock.pace != "lockstep" and not self._clocks.empty():
+                    arrival = self._clocks.get()
+                    clock = self._clock_decoder.decode(arrival.payload, arrival.encoding)
+            except Empty:
+                yield None
+                continue
+            except WireError as error:
+                self.session.rejected[error.reason] += 1
+                continue
+            if self._clock is not None and clock.tick < self._clock.tick:
+                for feed in self._feeds.values():
+                    feed.clear()
+            self._clock = clock
+            for feed in self._feeds.values():
+                feed.take_in()
+            yield clock
+
+    def read(self, feed: Feed[MessageT]) -> MessageT | None:
+        """What counts at this tick at the feed's key; None when there is none (yet).
+
+        Raises StalledError when a lockstep run promises a sample that does not come.
+        """
+        clock = self._clock
+        if clock is None:
+            return None
+        wanted = clock.newest.get(feed.key)
+        if wanted is None:
+            wanted = clock.newest.get(feed.key.partition("/")[0])
+        if clock.pace != "lockstep" or wanted is None:
+            return feed.newest()
+        found = feed.at(wanted)
+        if found is not None or clock.lifecycle != "armed":
+            return found
+        deadline = time.monotonic() + MISSING_LIMIT_S
+        while time.monotonic() < deadline:
+            time.sleep(0.0002)
+            feed.take_in()
+            found = feed.at(wanted)
+            if found is not None:
+                return found
+        raise StalledError(f"{feed.key} of tick {wanted} was promised at tick {clock.tick} and never came")
+
+    def age_s(self, message: Message) -> float | None:
+        """How old a reading is by the robot's clock; None before the first tick."""
+        stamp_ns: int | None = getattr(message, "stamp_ns", None)
+        if self._clock is None or stamp_ns is None:
+            return None
+        return (self._clock.stamp_ns - stamp_ns) * 1e-9
+
+    def put(self, key: str, message: Message) -> None:
+        """Publish an output of this service."""
+        publisher = self._publishers.get(key)
+        if publisher is None:
+            lossless = self._clock is not None and self._clock.pace == "lockstep"
+            publisher = self.session.publisher(key, type(message), lossless=lossless)
+            self._publishers[key] = publisher
+        publisher.put(message)
+
+    def done(self, tick: int) -> None:
+        """Say that everything owed for a tick is published. A command that answers the tick says so itself."""
+        if self.commanded_tick == tick:
+            return
+        if self._done is None:
+            self._done = self.session.publisher(keys.done(self.service), Done, lossless=True)
+        self._done.put(Done(tick=tick))
+
+
+class Commander:
+    """The right to command: acquires the lease, and stamps every command with it."""
+
+    def __init__(self, client: Client, description: Description, *, priority: int = 100) -> None:
+        self._client = client
+        self._description = description
+        self._priority = priority
+        self._epoch = 0
+        self._sequence = 0
+        self._asked_at = 0.0
+        self.refusal: str | None = None
+
+    def holds(self, clock: Clock) -> bool:
+        """Whether the lease is ours at this tick; asks for it when nobody holds it."""
+        if self._epoch and clock.lease_epoch == self._epoch:
+            return True
+        now = time.monotonic()
+        if clock.lifecycle == "armed" or now - self._asked_at < LEASE_RETRY_S:
+            return False
+        self._asked_at = now
+        request = LeaseRequest(action="acquire", holder=self._client.service, priority=self._priority)
+        try:
+            answer: Answer = self._client.session.ask_politely(keys.LEASE, request)
+        except NotConnectedError as error:
+            self.refusal = str(error)
+            return False
+        self.refusal = None if answer.ok else answer.reason
+        self._epoch = answer.epoch if answer.ok else 0
+        return answer.ok
+
+    def send(self, tick: int, set_points: SetPoints) -> None:
+        """Publish set-points that answer the state of `tick`; they are good for one lease term."""
+        self._sequence += 1
+        command = JointCommand(
+            tick=tick,
+            sequence=self._sequence,
+            lease_epoch=self._epoch,
+            layout=self._description.layout,
+            valid_for_ns=self._description.lease_ns,
+            mode=set_points.mode,
+            target=set_points.target,
+            torque_limit_nm=set_points.torque_limit_nm,
+        )
+        self._client.put(keys.JOINT_COMMAND, command)
+        self._client.commanded_tick = tick
+
+    def stay(self, joints: JointState) -> SetPoints:
+        """Set-points that keep every joint where it is: what is streamed while the robot is not armed."""
+        count = len(self._description.joints)
+        limits = [joint.torque_limit_nm for joint in self._description.joints]
+        return SetPoints([Mode.POSITION] * count, list(joints.angle_rad), limits)

@@ -1,0 +1,64 @@
+"""Running one process of a robot from its effective configuration: argument parsing that host and services share."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.plugins import SERVICES, find_plugin
+from snakesim_hal.process import die_with_parent
+from snakesim_hal.scenario import RunConfig, read
+from snakesim_hal.session import DEFAULT_ENDPOINT, Link
+
+
+@dataclass(frozen=True)
+class Duty:
+    """What a process was started for."""
+
+    config: RunConfig
+    link: Link
+    out: Path | None
+    arguments: argparse.Namespace
+
+
+def arguments(about: str) -> argparse.ArgumentParser:
+    """The arguments that every process of a run takes."""
+    parser = argparse.ArgumentParser(description=about)
+    parser.add_argument(
+        "--config", type=Path, required=True, help="effective configuration, as `snakesim run` saves it"
+    )
+    parser.add_argument("--endpoint", default=DEFAULT_ENDPOINT, help="where the robot's network meets")
+    parser.add_argument("--namespace", help="Zenoh namespace of the robot (default: the robot's name)")
+    parser.add_argument("--out", type=Path, help="folder for what the process leaves behind")
+    parser.add_argument("--parent", type=int, help="process id of the parent; this process dies with it")
+    return parser
+
+
+def duty(parser: argparse.ArgumentParser, argv: Sequence[str] | None, *, listen: bool = False) -> Duty:
+    """Parse, and tie this process to its parent when it has one."""
+    parsed = parser.parse_args(argv)
+    if parsed.parent is not None:
+        die_with_parent(parsed.parent)
+    config = read(parsed.config)
+    link = Link(parsed.endpoint, parsed.namespace or config.robot.name, listen)
+    return Duty(config, link, parsed.out, parsed)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """`python -m snakesim_hal.serve NAME ...`: run the service that an installed package offers under a name."""
+    given = list(sys.argv[1:] if argv is None else argv)
+    if not given or given[0].startswith("-"):
+        print("usage: python -m snakesim_hal.serve NAME [--help]", file=sys.stderr)
+        return 2
+    try:
+        service_main = find_plugin(SERVICES, given[0])
+        return service_main(given[1:])
+    except ConfigError as error:
+        print(f"snakesim {given[0]}: {error}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

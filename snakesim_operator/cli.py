@@ -1,0 +1,185 @@
+"""The `snakesim` command."""
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from snakesim_hal.errors import ConfigError, SnakesimError
+from snakesim_hal.scenario import Loaded, Override, load, parse_set
+
+OK, FAILED, BAD_INPUT = 0, 1, 2
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Exit code: 0 done, 1 a fault, 2 wrong input and nothing started, 130 interrupted."""
+    arguments = _parser().parse_args(argv)
+    try:
+        return arguments.act(arguments)
+    except ConfigError as error:
+        print(f"snakesim: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except SnakesimError as error:
+        print(f"snakesim: {error}", file=sys.stderr)
+        return FAILED
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return OK
+    except KeyboardInterrupt:
+        return 130
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="snakesim",
+        description="Snake robots that push themselves off obstacles: one controller, simulator or robot.",
+    )
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    run = commands.add_parser("run", help="run a scenario: backend, guidance, navigation and control")
+    _add_scenario(run)
+    run.add_argument("--out", type=Path, help="folder for what the run leaves (default: runs/NAME-TIME)")
+    _add_network(run)
+    run.set_defaults(act=_run)
+
+    config = commands.add_parser("config", help="show every effective value, and the file or flag it came from")
+    _add_scenario(config)
+    config.set_defaults(act=_config)
+
+    scenarios = commands.add_parser("scenarios", help="list the scenarios, robots and scenes that are shipped")
+    scenarios.set_defaults(act=_scenarios)
+
+    echo = commands.add_parser("echo", help="print what is published on a key")
+    echo.add_argument("key", help="such as sensor/joints; `snakesim echo --help` lists none, docs/keys.md all")
+    echo.add_argument("--hz", action="store_true", help="print only how often, and how regularly")
+    echo.add_argument("--count", type=int, help="end after so many messages")
+    _add_network(echo)
+    echo.set_defaults(act=_echo)
+
+    status = commands.add_parser("status", help="say how the robots on the network are, and why")
+    _add_network(status)
+    status.set_defaults(act=_status)
+
+    router = commands.add_parser("router", help="run a Zenoh router from a JSON5 file")
+    router.add_argument("config", type=Path, nargs="?", help="JSON5 file (default: deploy/router.json5's settings)")
+    router.set_defaults(act=_router)
+
+    schemas = commands.add_parser("schemas", help="write the JSON Schemas and the key space")
+    schemas.add_argument("--write", type=Path, required=True, metavar="FOLDER")
+    schemas.set_defaults(act=_schemas)
+    return parser
+
+
+def _add_scenario(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "scenario", help="name of a shipped scenario, or path of a scenario file or a run's config.json"
+    )
+    parser.add_argument("--backend", help="sim or can: what stands behind the keys")
+    parser.add_argument("--controller", help="installed controller, or ./file.py:Class")
+    parser.add_argument("--pace", choices=["realtime", "lockstep", "free"])
+    parser.add_argument("--duration", type=float, metavar="S", help="seconds of robot time")
+    parser.add_argument("--seed", type=int)
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="SECTION.KEY=VALUE",
+        help="change any value; may be repeated",
+    )
+
+
+def _add_network(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--endpoint", help="where the robot's own network meets (default: tcp/127.0.0.1:7447)")
+    parser.add_argument(
+        "--router", metavar="ENDPOINT", help="join a lab's Zenoh router instead, such as tcp/10.0.0.1:7447"
+    )
+    parser.add_argument("--namespace", help="namespace of the robot (default: the robot's name)")
+
+
+def _load(arguments: argparse.Namespace) -> Loaded:
+    flags = {
+        "backend": arguments.backend,
+        "controller": arguments.controller,
+        "pace": arguments.pace,
+        "duration_s": arguments.duration,
+        "seed": arguments.seed,
+    }
+    overrides = [parse_set(text) for text in arguments.set]
+    for key, value in flags.items():
+        if value is not None:
+            flag = f"--{key.removesuffix('_s')} {value}"
+            overrides.append(Override(key, value, flag))
+    return load(arguments.scenario, overrides)
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.run import RunRequest, run
+
+    config = _load(arguments).config
+    return run(RunRequest(config, arguments.out, arguments.endpoint, arguments.router, arguments.namespace))
+
+
+def _config(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.run import check_plugins
+
+    loaded = _load(arguments)
+    check_plugins(loaded.config, loaded.table)
+    rows = [(key, _shown(value), origin) for key, value, origin in loaded.explain()]
+    key_width = max(len(key) for key, _, _ in rows)
+    value_width = min(max(len(value) for _, value, _ in rows), 48)
+    for key, value, origin in rows:
+        print(f"{key:<{key_width}}  {value:<{value_width}}  {origin}")
+    return OK
+
+
+def _shown(value: object) -> str:
+    text = repr(value) if isinstance(value, str) else str(value)
+    return text if len(text) <= 120 else text[:117] + "..."
+
+
+def _scenarios(_arguments: argparse.Namespace) -> int:
+    from snakesim_hal.files import find, read_table, shipped
+
+    for kind, about in (("scenarios", "title"), ("robots", "about"), ("scenes", "about")):
+        print(f"{kind}:")
+        for name in shipped(kind):
+            table = read_table(find(name, kind))
+            print(f"  {name:<18}{table.values.get(about, '')}")
+    return OK
+
+
+def _echo(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.watch import echo
+
+    return echo(arguments.key, _link(arguments), rate_only=arguments.hz, count=arguments.count)
+
+
+def _status(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.watch import show_status
+
+    return show_status(_link(arguments))
+
+
+def _link(arguments: argparse.Namespace):
+    from snakesim_hal.session import DEFAULT_ENDPOINT, Link
+
+    return Link(arguments.router or arguments.endpoint or DEFAULT_ENDPOINT, arguments.namespace)
+
+
+def _router(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.watch import run_router
+
+    return run_router(arguments.config)
+
+
+def _schemas(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.schemas import write_schemas
+
+    for path in write_schemas(arguments.write):
+        print(path)
+    return OK
+
+
+if __name__ == "__main__":
+    sys.exit(main())

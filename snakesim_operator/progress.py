@@ -1,0 +1,71 @@
+"""The live line of a run: rewritten in place on a terminal, a line now and then elsewhere."""
+
+import sys
+import time
+from types import TracebackType
+from typing import Self
+
+from snakesim_hal.messages import ControlState, Status
+from snakesim_hal.scenario import RunConfig
+
+TERMINAL_PERIOD_S = 0.1
+PLAIN_PERIOD_S = 5.0
+
+
+class Progress:
+    """Shows where a run is."""
+
+    def __init__(self, config: RunConfig) -> None:
+        self._duration_s = config.duration_s
+        self._rate_hz = config.rate_hz
+        self._terminal = sys.stdout.isatty()
+        self._next = 0.0
+        self._shown = 0
+        self._origin: tuple[float, float] | None = None  # wall and robot time at arming
+        self._last = ""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._terminal and self._shown:
+            sys.stdout.write("\n")
+            sys.stdout.flush()
+
+    def show(self, status: Status | None, control: ControlState | None, *, armed: bool) -> None:
+        """Update the line, if it is time to."""
+        now = time.monotonic()
+        if now < self._next or status is None:
+            return
+        self._next = now + (TERMINAL_PERIOD_S if self._terminal else PLAIN_PERIOD_S)
+        text = self._running(status, control, now) if armed else f"starting: {status.why}"
+        if self._terminal:
+            line = text[:118]
+            sys.stdout.write("\r" + line.ljust(self._shown))
+            self._shown = len(line)
+        elif text != self._last:
+            print(text)
+        self._last = text
+        sys.stdout.flush()
+
+    def _running(self, status: Status, control: ControlState | None, now: float) -> str:
+        time_s = status.tick / self._rate_hz
+        if self._origin is None:
+            self._origin = (now, time_s)
+        done_s, wall_s = time_s - self._origin[1], now - self._origin[0]
+        parts = [f"{done_s:6.2f} of {self._duration_s:g} s"]
+        if wall_s > 0.3:
+            parts.append(f"{done_s / wall_s:.1f}x real time")
+        if status.lifecycle != "armed":
+            parts.append(f"{status.lifecycle}: {status.why}")
+        elif control is not None:
+            parts.append(control.state)
+            if control.propulsion_joint is not None:
+                parts.append(f"{control.propulsion_joint} at {control.propulsion_torque_nm or 0:+.1f} N·m")
+            if control.state == "NotLocomoting":
+                parts.append(control.reason)
+            if control.path_s_m is not None:
+                parts.append(f"tail at {control.path_s_m:.2f} m")
+        return "  ".join(parts)

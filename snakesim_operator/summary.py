@@ -1,0 +1,148 @@
+"""The numbers of a run, in one file that scripts can read: `summary.json`."""
+
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from snakesim_hal.messages import Fault, Pace
+from snakesim_operator.record import RunRecord
+
+SATURATED_FROM = 0.99  # of a joint's torque limit
+
+
+def _number(unit: str, about: str) -> Meta:
+    return Meta(description=about, extra_json_schema={"unit": unit})
+
+
+class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
+    """What a run amounted to. Unknown is null, never zero."""
+
+    scenario: str
+    robot: str
+    scene: str
+    backend: str
+    controller: str
+    seed: int
+    pace: Pace
+    rate_hz: Annotated[float, _number("Hz", "control rate")]
+    duration_s: Annotated[float, _number("s", "robot time from the first arming to the end")]
+    wall_s: Annotated[float, _number("s", "wall-clock time of the same")]
+    real_time_factor: Annotated[float | None, _number("1", "duration over wall time")]
+    ticks: int
+    overruns: Annotated[int, Meta(description="ticks that missed their deadline (realtime)")]
+    answered_fraction: Annotated[float | None, _number("1", "ticks whose command came within the tick")]
+    command_digest: Annotated[str, Meta(description="SHA-256 of every set-point as applied")]
+    path_distance_m: Annotated[float | None, _number("m", "advance of the body along the scene's route")]
+    net_displacement_m: Annotated[float | None, _number("m", "distance of the centre of mass from where it was")]
+    mean_speed_m_s: Annotated[float | None, _number("m/s", "path distance (or displacement) over duration")]
+    locomoting_fraction: Annotated[float | None, _number("1", "share of the time in state Locomoting")]
+    propulsion_joints: Annotated[list[str], Meta(description="in order of use")]
+    jammed: Annotated[bool, Meta(description="whether the controller reported a jam at any time")]
+    last_state: str | None
+    last_reason: str | None
+    peak_joint_torque_nm: Annotated[float | None, _number("N·m", "largest torque of any joint")]
+    torque_saturated_fraction: Annotated[float | None, _number("1", "ticks with a joint at its torque limit")]
+    peak_contact_force_n: Annotated[float | None, _number("N", "largest force of one contact")]
+    energy_j: Annotated[float | None, _number("J", "sum over joints of |torque x velocity| over time")]
+    state_to_command_us: Annotated[dict[str, float | None], _number("µs", "state published to command received")]
+    rejected_commands: Annotated[dict[str, int], Meta(description="by reason")]
+    limited_commands: Annotated[dict[str, int], Meta(description="joint set-points changed by the gate, by limit")]
+    faults: list[Fault]
+    ended: Annotated[str, Meta(description="complete, interrupted, or what failed")]
+    config: Annotated[dict[str, Any], Meta(description="the effective configuration; repeats the run")]
+
+
+def summarise(record: RunRecord, ended: str) -> RunSummary:
+    """Work out the numbers of a run."""
+    config, host = record.config, record.host
+    count = len(record.time_s)
+    duration_s = count * config.period_ns * 1e-9
+    path_m, net_m = _distances(record)
+    moved_m = path_m if path_m is not None else net_m
+    has_contacts = config.robot.sensors.contacts is not None and count > 0
+    last = record.control[-1] if record.control else None
+    limits = np.array([joint.torque_limit_nm for joint in record.description.joints])
+    power = np.abs(record.torque_nm * record.velocity_rad_s).sum(axis=1)
+    return RunSummary(
+        scenario=config.name,
+        robot=config.robot.name,
+        scene=config.scene.name,
+        backend=config.backend,
+        controller=config.controller,
+        seed=config.seed,
+        pace=config.pace,
+        rate_hz=config.rate_hz,
+        duration_s=duration_s,
+        wall_s=host.wall_s,
+        real_time_factor=duration_s / host.wall_s if host.wall_s > 0 else None,
+        ticks=host.ticks,
+        overruns=host.overruns,
+        answered_fraction=host.answered_ticks / host.armed_ticks if host.armed_ticks else None,
+        command_digest=host.command_digest,
+        path_distance_m=path_m,
+        net_displacement_m=net_m,
+        mean_speed_m_s=moved_m / duration_s if moved_m is not None and duration_s > 0 else None,
+        locomoting_fraction=_locomoting_fraction(record),
+        propulsion_joints=propulsion_sequence(record),
+        jammed=any(state.jammed for state in record.control),
+        last_state=last.state if last else None,
+        last_reason=last.reason if last else None,
+        peak_joint_torque_nm=float(np.abs(record.torque_nm).max()) if count else None,
+        torque_saturated_fraction=float((np.abs(record.torque_nm) >= SATURATED_FROM * limits).any(axis=1).mean())
+        if count
+        else None,
+        peak_contact_force_n=float(record.contact_peak_n.max()) if has_contacts else None,
+        energy_j=float(power.sum() * config.period_ns * 1e-9) if count else None,
+        state_to_command_us=host.state_to_command_us,
+        rejected_commands=host.rejected_commands,
+        limited_commands=host.limited_commands,
+        faults=host.faults,
+        ended=ended,
+        config=msgspec.to_builtins(config),
+    )
+
+
+def propulsion_sequence(record: RunRecord) -> list[str]:
+    """Joints that propelled, in order, each named anew when it takes over again."""
+    names: list[str] = []
+    for state in record.control:
+        joint = state.propulsion_joint
+        if joint is not None and (not names or names[-1] != joint):
+            names.append(joint)
+    return names
+
+
+def arc_position_m(record: RunRecord, row: int) -> float | None:
+    """Mean arc length along the route of the tail end, the joints and the head end."""
+    nodes = record.nodes_w(row)
+    if nodes is None or record.route is None:
+        return None
+    return float(np.mean([record.route.project(node[:2]) for node in nodes]))
+
+
+def _distances(record: RunRecord) -> tuple[float | None, float | None]:
+    if len(record.time_s) < 2:
+        return None, None
+    first, last = record.nodes_w(0), record.nodes_w(len(record.time_s) - 1)
+    if first is None or last is None:
+        return None, None
+    masses = np.array([link.mass_kg for link in record.description.links])[:, None]
+
+    def centre(nodes: np.ndarray) -> np.ndarray:
+        return (0.5 * (nodes[:-1] + nodes[1:]) * masses).sum(axis=0) / masses.sum()
+
+    net = float(np.linalg.norm((centre(last) - centre(first))[:2]))
+    start, end = arc_position_m(record, 0), arc_position_m(record, len(record.time_s) - 1)
+    return (None if start is None or end is None else end - start), net
+
+
+def _locomoting_fraction(record: RunRecord) -> float | None:
+    """A state holds until the next one is told."""
+    if not record.control or len(record.time_s) == 0:
+        return None
+    begin, end = float(record.time_s[0]), float(record.time_s[-1])
+    stamps = [min(max(state.stamp_ns * 1e-9, begin), end) for state in record.control] + [end]
+    moving = sum(stamps[i + 1] - stamps[i] for i, state in enumerate(record.control) if state.state == "Locomoting")
+    return moving / (end - begin) if end > begin else None

@@ -1,0 +1,11 @@
+"""MuJoCo behind the HAL: the simulated robot, that a controller cannot tell from the real one.
+
+`backend`    SimBackend: samples, enacts and advances, tick by tick; the entry point `sim`
+`settings`   what a scenario's [backends.sim] section may say
+`model`      robot file + scene -> compiled MuJoCo model; `ground` and `obstacles` are its parts
+`start`      lays the snake on the ground and lets it come to rest
+`actuators`  the motors' modes; `sensors`, `contacts` and `pace` what is sampled, and when it is due
+`tether`, `truth`, `divergence`  the rope of the static checks, the state without noise, the watch for a blown-up run
+
+Imports the HAL and MuJoCo, never guidance, navigation, control or Zenoh. Nothing heavy is imported here.
+"""

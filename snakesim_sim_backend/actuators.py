@@ -1,0 +1,122 @@
+"""The motors: four modes in one native MuJoCo actuator, so that no Python runs between physics steps.
+
+Each joint has a `dcmotor` with motor constant 1, so that its current is its torque. At every physics step
+
+    demand = kp (position - angle) + kd (velocity - speed) + feed-forward       the mode chooses the gains
+    demand is held below the line that falls from `ROLL_OFF` times full torque at rest to 0 at the limit of speed
+    torque follows the demand as a first-order lag of `response_time_s`, integrated exactly
+    torque is clipped to the joint's limit and the command's
+
+The torque is the motor's state; a change of mode changes the demand alone. So torque never jumps on a change of mode:
+it goes to the new demand as the motor's response lets it, also to zero in passive mode.
+"""
+
+import math
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_hal.backend import SetPoints
+from snakesim_hal.messages import Mode
+from snakesim_hal.robot import RobotFile
+
+Floats = NDArray[np.float64]
+
+ROLL_OFF = 10.0  # full torque is there up to 1 - 1/10 of the limit of speed, and fades to 0 at it
+# Where MuJoCo keeps a dcmotor's parameters in actuator_gainprm; held against the compiled model in `Motors`.
+KP, KD, MOST_VOLTS = 4, 6, 7
+INPUTS = 3  # position, velocity, feed-forward torque
+INPUT_OF_MODE = {Mode.PASSIVE: 2, Mode.POSITION: 0, Mode.VELOCITY: 1, Mode.TORQUE: 2}
+
+
+def add_motor(spec: mujoco.MjSpec, joint: str, robot: RobotFile) -> None:
+    """Put the motor of one joint into a model; it starts passive."""
+    limits = robot.limits
+    motor = spec.add_actuator(name=f"motor_{joint}", target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    inputs = mujoco.mjtCtrlInput
+    motor.set_to_dcmotor(
+        motorconst=[1.0, 0.0],
+        # With constant 1, volts are rad/s, and torque at rest under full volts is limits.speed / resistance.
+        resistance=limits.speed_rad_s / (ROLL_OFF * limits.torque_nm),
+        inductance=[0.0, robot.motor.response_time_s],
+        controller=[1.0, 0.0, 1.0, 0.0, 0.0, limits.speed_rad_s],
+        saturation=[limits.torque_nm, 0.0, 0.0],
+        ctrlspec=int(inputs.mjINPUT_POS | inputs.mjINPUT_VEL | inputs.mjINPUT_FF),
+    )
+
+
+class Motors:
+    """All motors of a compiled model."""
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, robot: RobotFile, period_s: float) -> None:
+        self.count = robot.chain.modules
+        self._gains = model.actuator_gainprm[: self.count]
+        self._force_range = model.actuator_forcerange[: self.count]
+        self._least, self._most = self._force_range[:, 0], self._force_range[:, 1]
+        self._torque = data.act  # empty when the motors answer at once
+        self._applied = data.actuator_force[: self.count]
+        self._inputs = data.ctrl[: INPUTS * self.count]
+        self._full_limit = np.full(self.count, robot.limits.torque_nm)
+        self._limit = self._full_limit.copy()
+        self._limit_asked: list[float] = self._limit.tolist()
+        self._fading = False
+        response = robot.motor.response_time_s
+        self._decay = math.exp(-period_s / response) if response > 0 else 0.0
+        motor, speed = robot.motor, robot.limits.speed_rad_s
+        self._gains_of_mode: dict[Mode, tuple[float, float, float]] = {  # kp, kd, volts (0: unbounded)
+            Mode.PASSIVE: (0.0, 0.0, 0.0),
+            Mode.POSITION: (motor.stiffness_nm_per_rad, motor.damping_nm_s_per_rad, speed),
+            Mode.VELOCITY: (0.0, motor.velocity_gain_nm_s_per_rad, speed),
+            Mode.TORQUE: (0.0, 0.0, speed),
+        }
+        assert np.all(self._gains[:, [KP, KD, MOST_VOLTS]] == [1.0, 1.0, speed])
+        self._mode: list[Mode] = []
+        self._slots = np.empty(0, dtype=np.intp)
+        self.switch_off()
+
+    def enact(self, set_points: SetPoints) -> None:
+        """Take set-points, tail to head; they hold until the next call."""
+        if set_points.mode != self._mode:
+            self._change_modes(set_points.mode)
+        self._inputs[self._slots] = set_points.target
+        if self._passive:
+            self._inputs[self._passive] = 0.0
+        if set_points.torque_limit_nm != self._limit_asked:
+            self._limit_asked = list(set_points.torque_limit_nm)
+            self._limit = np.minimum(self._limit_asked, self._full_limit)
+            self._fading = True
+
+    def switch_off(self) -> None:
+        """All joints passive."""
+        zeros = [0.0] * self.count
+        self.enact(SetPoints([Mode.PASSIVE] * self.count, zeros, self._full_limit.tolist()))
+
+    def before_steps(self) -> None:
+        """Once a tick: let a lowered limit take hold as fast as the motor can follow, and end wind-up above it."""
+        if len(self._torque) == 0:
+            if self._fading:
+                self._set_range(self._limit)
+                self._fading = False
+            return
+        if self._fading:
+            left = np.abs(self._applied) * self._decay
+            self._fading = bool(np.any(left > self._limit))
+            self._set_range(np.maximum(self._limit, left))
+        np.minimum(self._torque, self._most, out=self._torque)
+        np.maximum(self._torque, self._least, out=self._torque)
+
+    def applied_nm(self) -> Floats:
+        """Torque of every motor over the last physics step, (n_joints,) float64."""
+        return self._applied
+
+    def _set_range(self, limit_nm: Floats) -> None:
+        self._most[:] = limit_nm
+        self._least[:] = -limit_nm
+
+    def _change_modes(self, modes: list[Mode]) -> None:
+        self._mode = list(modes)
+        self._gains[:, [KP, KD, MOST_VOLTS]] = [self._gains_of_mode[mode] for mode in modes]
+        self._slots = np.array([INPUTS * i + INPUT_OF_MODE[mode] for i, mode in enumerate(modes)], dtype=np.intp)
+        self._passive = [INPUTS * i + 2 for i, mode in enumerate(modes) if mode == Mode.PASSIVE]
+        self._inputs[:] = 0.0

@@ -1,0 +1,127 @@
+"""The simulated robot behind the HAL. Thin: every job has its own module."""
+
+import mujoco
+import numpy as np
+
+from snakesim_hal.backend import Samples, SetPoints
+from snakesim_hal.errors import BackendError
+from snakesim_hal.messages import Description, Fault
+from snakesim_hal.robot import describe
+from snakesim_hal.scenario import RunConfig, config_hash
+from snakesim_sim_backend.actuators import Motors
+from snakesim_sim_backend.contacts import TouchReader
+from snakesim_sim_backend.divergence import DivergenceWatch
+from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS, SimModel, build
+from snakesim_sim_backend.sensors import Sensors, rotate
+from snakesim_sim_backend.settings import Settings
+from snakesim_sim_backend.start import lay_down
+from snakesim_sim_backend.tether import Rope
+from snakesim_sim_backend.truth import TrueContact, TrueState
+
+NAME = "sim"
+
+
+class SimBackend:
+    """A `snakesim_hal.backend.Backend` on MuJoCo. Deterministic: seed and commands decide every byte."""
+
+    Settings = Settings
+
+    def __init__(self, config: RunConfig, settings: Settings) -> None:
+        """Build the scene, lay the snake down and let it come to rest. Raises ConfigError."""
+        self._description = describe(
+            config.robot,
+            backend=NAME,
+            period_ns=config.period_ns,
+            lease_ns=config.lease_ns,
+            config_hash=config_hash(config),
+        )
+        self._sim = build(config, settings)
+        self._data = mujoco.MjData(self._sim.model)
+        self._motors = Motors(self._sim.model, self._data, config.robot, config.period_ns * 1e-9)
+        lay_down(self._sim, self._data, config, self._motors, settings.settle_s)
+        self._rope = None
+        if settings.tether is not None:
+            self._rope = Rope(self._sim.model, self._data, settings.tether)
+            self._rope.tighten()
+        self._sensors = Sensors(self._sim, self._data, config, self._motors)
+        self._watch = DivergenceWatch(self._sim.model, self._data)
+        self._model, self._option = self._sim.model, self._sim.model.opt
+        self._with_sensors = int(self._option.disableflags)
+        self._without_sensors = self._with_sensors | int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+        self._unread_steps = self._sim.steps_per_tick - 1 if self._model.nsensor else 0
+        self._read_steps = self._sim.steps_per_tick - self._unread_steps
+        self._tick = 0
+        self._open = True
+
+    def describe(self) -> Description:
+        """The robot as its file says."""
+        return self._description
+
+    def sample(self, tick: int, stamp_ns: int) -> Samples:
+        """What the sensors give at `tick`; after a divergence, of the last good state."""
+        return self._sensors.sample(tick, stamp_ns)
+
+    def enact(self, set_points: SetPoints) -> None:
+        """Give the motors new set-points."""
+        self._motors.enact(set_points)
+
+    def advance(self) -> None:
+        """Step the physics through one control period. Raises BackendError when it has diverged."""
+        if not self._open:
+            raise BackendError("the simulation is closed; open a new backend")
+        model, data, option = self._model, self._data, self._option
+        self._motors.before_steps()
+        if self._unread_steps:  # IMUs cost time, and only their values in the last step are read
+            option.disableflags = self._without_sensors
+            mujoco.mj_step(model, data, self._unread_steps)
+            option.disableflags = self._with_sensors
+        mujoco.mj_step(model, data, self._read_steps)
+        self._tick += 1
+        self._watch.check(self._tick)
+
+    def faults(self) -> list[Fault]:
+        """A simulated robot has no faults of its own: a divergence is raised by `advance`."""
+        return []
+
+    def close(self) -> None:
+        """Switch the motors off; nothing moves any more. `true_state` stays readable."""
+        if self._open:
+            self._motors.switch_off()
+            self._open = False
+
+    # --- for tests, benchmarks and reports; GNC cannot see these --------------------------------------------
+
+    @property
+    def sim(self) -> SimModel:
+        """The compiled model."""
+        return self._sim
+
+    @property
+    def data(self) -> mujoco.MjData:
+        """MuJoCo's state."""
+        return self._data
+
+    @property
+    def tether_tension_n(self) -> float | None:
+        """Force in the tether over the last physics step; None without a tether."""
+        return None if self._rope is None else self._rope.tension_n()
+
+    def true_state(self) -> TrueState:
+        """The state as it is, without noise, rate or delay."""
+        data, sim = self._data, self._sim
+        w, x, y, z, ox, oy, oz = *data.qpos[3:FREE_QPOS].tolist(), *data.qvel[3:FREE_DOFS].tolist()
+        contacts = [
+            TrueContact(t.body - sim.first_link_body, t.obstacle, *map(np.array, (t.position_w, t.normal_w, t.force_w)))
+            for t in TouchReader(sim, data).read()
+        ]
+        return TrueState(
+            time_s=data.time,
+            base_position_w=data.qpos[:3].copy(),
+            base_orientation_wxyz=data.qpos[3:FREE_QPOS].copy(),
+            base_velocity_w=data.qvel[:3].copy(),
+            base_angular_velocity_w=np.array(rotate((w, x, y, z), (ox, oy, oz))),
+            angles_rad=data.qpos[FREE_QPOS:].copy(),
+            velocities_rad_s=data.qvel[FREE_DOFS:].copy(),
+            torques_nm=self._motors.applied_nm().copy(),
+            contacts=contacts,
+        )

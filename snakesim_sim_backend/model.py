@@ -1,0 +1,128 @@
+"""Robot file + scene -> compiled MuJoCo model.
+
+The snake is a chain of capsules, tail to head. The free joint sits on link 0, whose body frame is the base: origin at
+the tail end, x forward. Every other body's frame is the link frame of `snakesim_hal.kinematics`: origin at the rear
+joint. Bodies, hinges and motors therefore stand in the order of the robot description.
+"""
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.messages import Axis
+from snakesim_hal.robot import RobotFile
+from snakesim_hal.scenario import RunConfig, place_all
+from snakesim_sim_backend.actuators import add_motor
+from snakesim_sim_backend.ground import add_ground
+from snakesim_sim_backend.imu import add_imus
+from snakesim_sim_backend.obstacles import OBSTACLE, add_obstacle
+from snakesim_sim_backend.settings import Settings
+from snakesim_sim_backend.surface import surface
+from snakesim_sim_backend.tether import add_tether
+
+FREE_QPOS = 7  # of the base: position and quaternion
+FREE_DOFS = 6
+AXES: dict[Axis, list[float]] = {"yaw": [0.0, 0.0, 1.0], "pitch": [0.0, 1.0, 0.0]}
+
+
+@dataclass(frozen=True)
+class SimModel:
+    """A compiled model, and where in MuJoCo's arrays the robot and the obstacles are."""
+
+    model: mujoco.MjModel
+    steps_per_tick: int
+    first_link_body: int  # bodies of the links are consecutive
+    obstacle_of_geom: list[str | None]  # (ngeom,); None: link, ground or step
+
+
+def build(config: RunConfig, settings: Settings) -> SimModel:
+    """Compile the model of a run. Raises ConfigError when settings and robot do not go together."""
+    steps = int(np.ceil(config.period_ns * 1e-9 / settings.timestep_s - 1e-9))
+    step_s = config.period_ns * 1e-9 / steps
+    if settings.contact_time_s < 2 * step_s:
+        raise ConfigError(
+            f"`backends.sim.contact_time_s` = {settings.contact_time_s} s must be at least two physics steps, here "
+            f"{2 * step_s:g} s; raise it or lower `timestep_s`"
+        )
+    spec = mujoco.MjSpec()
+    _set_options(spec, step_s, settings)
+    scene = config.scene
+    add_ground(spec, scene.ground, settings.contact_time_s)
+    hills_m = scene.ground.uneven.height_m if scene.ground.uneven else 0.0
+    for placed in place_all(config):
+        add_obstacle(
+            spec,
+            placed,
+            contact_time_s=settings.contact_time_s,
+            body_radius_m=config.robot.module.radius_m,
+            hills_m=hills_m,
+        )
+    _add_snake(spec, config.robot, settings)
+    if config.robot.sensors.imu is not None:
+        add_imus(spec, config.robot.link_lengths_m)
+    if settings.tether is not None:
+        add_tether(spec, settings.tether, config.robot, settings.contact_time_s)
+    model = spec.compile()
+    names = [model.geom(i).name for i in range(model.ngeom)]
+    obstacles = [name.removeprefix(OBSTACLE) if name.startswith(OBSTACLE) else None for name in names]
+    return SimModel(
+        model=model,
+        steps_per_tick=steps,
+        first_link_body=model.body("link_0").id,
+        obstacle_of_geom=obstacles,
+    )
+
+
+def _set_options(spec: mujoco.MjSpec, step_s: float, settings: Settings) -> None:
+    spec.compiler.degree = False
+    option = spec.option
+    option.timestep = step_s
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST  # damping of the joints is taken implicitly
+    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC  # a pyramid would grip less along its diagonals
+    option.impratio = settings.friction_hold
+    option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE  # faster for a snake; 4.0.0's sparse Newton factor has a defect
+    # A run that blows up is reported, not quietly started anew. One snake is one constraint island.
+    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET | mujoco.mjtDisableBit.mjDSBL_ISLAND
+
+
+def _add_snake(spec: mujoco.MjSpec, robot: RobotFile, settings: Settings) -> None:
+    lengths, masses, axes = robot.link_lengths_m, robot.link_masses_kg, robot.axes
+    skin = surface(settings.self_friction, settings.contact_time_s, priority=0)
+    body = spec.worldbody
+    for i, (length, mass) in enumerate(zip(lengths, masses, strict=True)):
+        rear = [0.0, 0.0, robot.module.radius_m] if i == 0 else [lengths[i - 1], 0.0, 0.0]
+        body = body.add_body(name=f"link_{i}", pos=rear)
+        if i == 0:
+            body.add_freejoint(name="base")
+        else:
+            _add_joint(body, f"joint_{i}", axes[i - 1], robot)
+            add_motor(spec, f"joint_{i}", robot)
+        body.add_geom(
+            name=f"link_{i}",
+            type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+            size=[robot.module.radius_m, 0.0, 0.0],
+            fromto=[0.0, 0.0, 0.0, length, 0.0, 0.0],
+            mass=mass,
+            **skin,
+        )
+    for i in range(len(lengths)):
+        for j in range(i + 2, len(lengths)):
+            if sum(lengths[i + 1 : j]) < 2.05 * robot.module.radius_m:  # they would touch when the snake is straight
+                spec.add_exclude(bodyname1=f"link_{i}", bodyname2=f"link_{j}")
+
+
+def _add_joint(body: mujoco.MjsBody, name: str, axis: Axis, robot: RobotFile) -> None:
+    motor = robot.motor
+    body.add_joint(
+        name=name,
+        type=mujoco.mjtJoint.mjJNT_HINGE,
+        axis=AXES[axis],
+        limited=True,
+        range=[-robot.limits.angle_rad, robot.limits.angle_rad],
+        armature=motor.armature_kg_m2,
+        damping=motor.viscous_nm_s_per_rad,
+        frictionloss=motor.friction_nm,
+    )

@@ -1,0 +1,50 @@
+"""When a sensor is due, and how long its samples are under way."""
+
+from collections import deque
+from typing import Generic, TypeVar
+
+import msgspec
+
+from snakesim_hal.messages import Contacts, Imu, Pose
+
+SampleT = TypeVar("SampleT", Contacts, Imu, Pose)
+
+
+class Due:
+    """Which ticks a sensor of a given rate samples: those at which floor(stamp * rate) advances, computed exactly."""
+
+    def __init__(self, sensor_hz: float, tick_hz: float, period_ns: int) -> None:
+        self._always = sensor_hz >= tick_hz
+        top, bottom = sensor_hz.as_integer_ratio()
+        self._top, self._bottom = top, bottom * 10**9
+        self._period_ns = period_ns
+
+    def at(self, stamp_ns: int) -> bool:
+        """Whether the sensor samples at the tick of this stamp."""
+        if self._always or stamp_ns == 0:
+            return True
+        before = (stamp_ns - self._period_ns) * self._top // self._bottom
+        return stamp_ns * self._top // self._bottom > before
+
+
+def ticks_of(delay_s: float, period_ns: int) -> int:
+    """A delay in whole ticks, to the nearest."""
+    return round(delay_s * 1e9 / period_ns)
+
+
+class DelayLine(Generic[SampleT]):
+    """Holds samples back. Their stamp stays that of taking; their tick becomes that of handing over."""
+
+    def __init__(self, ticks: int) -> None:
+        self._ticks = ticks
+        self._under_way: deque[SampleT] = deque()
+
+    def pass_on(self, tick: int, taken: SampleT | None) -> SampleT | None:
+        """Put in what was taken at this tick, if anything; get out what arrives at it, if anything."""
+        if not self._ticks:
+            return taken
+        if taken is not None:
+            self._under_way.append(taken)
+        if not self._under_way or self._under_way[0].tick + self._ticks > tick:
+            return None
+        return msgspec.structs.replace(self._under_way.popleft(), tick=tick)

@@ -1,0 +1,37 @@
+"""What a scenario's `[backends.sim]` section may say."""
+
+from typing import Annotated
+
+from msgspec import Meta
+
+from snakesim_hal.files import FileStruct
+from snakesim_hal.quantities import MAX_JOINTS
+
+
+class Tether(FileStruct, kw_only=True):
+    """A rope from a point of the snake to an anchor far away on the ground's plane.
+
+    It can only pull towards `direction_w`: the point cannot move against that direction, and moves almost freely
+    across it and along it. With `reel_in_m_s` above 0 a winch at the anchor tows the snake at that speed instead.
+    """
+
+    link: Annotated[int, Meta(ge=0, le=MAX_JOINTS)] = 0
+    point_m: Annotated[float, Meta(ge=-10, le=10, extra_json_schema={"unit": "m"})] = 0.0  # from the link's rear joint
+    direction_w: tuple[float, float]  # x and y; any length but 0
+    reel_in_m_s: Annotated[float, Meta(ge=0, le=10, extra_json_schema={"unit": "m/s"})] = 0.0
+
+
+class Settings(FileStruct, kw_only=True):
+    """How the physics is computed. The defaults suit robots of centimetres to decimetres and of a few kilograms."""
+
+    # The longest physics step; it is shortened so that a whole number of steps makes a control period.
+    timestep_s: Annotated[float, Meta(ge=1e-5, le=0.01, extra_json_schema={"unit": "s"})] = 0.001
+    # How fast a penetration is pushed out; softer contacts are more forgiving at long steps. At least two steps.
+    contact_time_s: Annotated[float, Meta(ge=1e-4, le=0.1, extra_json_schema={"unit": "s"})] = 0.005
+    # How much stiffer friction holds than normals push: higher values slide less at rest, and cost time.
+    friction_hold: Annotated[float, Meta(ge=1, le=1000, extra_json_schema={"unit": "1"})] = 10.0
+    # Between links of the snake itself.
+    self_friction: Annotated[float, Meta(ge=0, le=5, extra_json_schema={"unit": "1 (Coulomb coefficient)"})] = 0.3
+    # Longest time that the snake may take to come to rest before the run begins.
+    settle_s: Annotated[float, Meta(ge=0, le=60, extra_json_schema={"unit": "s"})] = 3.0
+    tether: Tether | None = None

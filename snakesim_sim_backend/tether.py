@@ -1,0 +1,76 @@
+"""The rope of the static checks and of towing: a tendon from a point of the snake to an anchor far away.
+
+A tendon that may not grow longer than it is holds the point on a circle of `ROPE_M` around the anchor, which over
+0.1 m to the side departs from a straight line by 0.1 mm.
+"""
+
+import mujoco
+import numpy as np
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.robot import RobotFile
+from snakesim_sim_backend.settings import Tether
+
+ROPE_M = 50.0
+SLACK_M = 1e4
+WINCH_N_S_PER_M = 300.0
+WINCH_MOST_N = 1000.0
+HOOK, ANCHOR, TENDON, WINCH = "tether_hook", "tether_anchor", "tether", "tether_winch"
+
+
+def add_tether(spec: mujoco.MjSpec, tether: Tether, robot: RobotFile, contact_time_s: float) -> None:
+    """Put a slack tether into a model whose motors are complete. Raises ConfigError for a link that is not there."""
+    if tether.link > robot.chain.modules:
+        raise ConfigError(
+            f"`backends.sim.tether.link` = {tether.link}: robot {robot.name!r} has links 0 to {robot.chain.modules}"
+        )
+    if np.hypot(*tether.direction_w) == 0:
+        raise ConfigError("`backends.sim.tether.direction_w` = (0, 0) is no direction; give x and y, such as [-1, 0]")
+    spec.body(f"link_{tether.link}").add_site(name=HOOK, pos=[tether.point_m, 0.0, 0.0])
+    spec.worldbody.add_site(name=ANCHOR, pos=[0.0, 0.0, 0.0])
+    tendon = spec.add_tendon(
+        name=TENDON,
+        limited=True,
+        range=[0.0, SLACK_M],
+        solref_limit=[contact_time_s, 1.0],
+        solimp_limit=[0.99, 0.999, 0.001, 0.5, 2.0],
+    )
+    tendon.wrap_site(ANCHOR)
+    tendon.wrap_site(HOOK)
+    if tether.reel_in_m_s > 0:
+        spec.add_actuator(
+            name=WINCH,
+            target=TENDON,
+            trntype=mujoco.mjtTrn.mjTRN_TENDON,
+            gainprm=[WINCH_N_S_PER_M] + [0.0] * 9,
+            biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+            biasprm=[0.0, 0.0, -WINCH_N_S_PER_M] + [0.0] * 7,
+            forcelimited=True,
+            forcerange=[-WINCH_MOST_N, 0.0],  # shortens the rope, and never pushes it
+        )
+
+
+class Rope:
+    """The tether of a compiled model."""
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, tether: Tether) -> None:
+        self._model, self._data, self._tether = model, data, tether
+        self._winch = model.actuator(WINCH).id if tether.reel_in_m_s > 0 else None
+
+    def tighten(self) -> None:
+        """Put the anchor where it belongs for the snake's present place, and take up the slack."""
+        model, data = self._model, self._data
+        mujoco.mj_forward(model, data)
+        along = np.array([*self._tether.direction_w, 0.0])
+        hook = data.site(HOOK).xpos
+        model.site_pos[model.site(ANCHOR).id] = hook + ROPE_M * along / np.linalg.norm(along)
+        model.tendon_range[model.tendon(TENDON).id] = [0.0, ROPE_M]
+        if self._winch is not None:
+            data.ctrl[model.actuator(WINCH).ctrladr[0]] = -self._tether.reel_in_m_s
+
+    def tension_n(self) -> float:
+        """Force in the rope over the last physics step."""
+        data = self._data
+        held = data.efc_force[data.efc_type == mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON].sum()
+        wound = 0.0 if self._winch is None else -data.actuator_force[self._winch]
+        return float(held + wound)

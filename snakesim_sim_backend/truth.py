@@ -1,0 +1,34 @@
+"""The state of the simulation as it is, without noise, rate or delay: for tests, benchmarks and reports."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class TrueContact:
+    """One touch of a link by an obstacle over the last physics step; world frame."""
+
+    link: int
+    obstacle: str
+    position_w: Floats  # (3,), m
+    normal_w: Floats  # (3,), from the obstacle into the body
+    force_w: Floats  # (3,), N, on the body
+
+
+@dataclass(frozen=True)
+class TrueState:
+    """The whole snake at one instant."""
+
+    time_s: float
+    base_position_w: Floats  # (3,), m: the tail end of link 0
+    base_orientation_wxyz: Floats  # (4,)
+    base_velocity_w: Floats  # (3,), m/s
+    base_angular_velocity_w: Floats  # (3,), rad/s
+    angles_rad: Floats  # (n_joints,), tail to head
+    velocities_rad_s: Floats  # (n_joints,)
+    torques_nm: Floats  # (n_joints,), of the motors over the last physics step
+    contacts: list[TrueContact]
