@@ -23,6 +23,7 @@ class Progress:
         self._shown = 0
         self._origin: tuple[float, float] | None = None  # wall and robot time at arming
         self._last = ""
+        self._armed = False
 
     def __enter__(self) -> Self:
         return self
@@ -37,8 +38,9 @@ class Progress:
     def show(self, status: Status | None, control: ControlState | None, *, armed: bool) -> None:
         """Update the line, if it is time to."""
         now = time.monotonic()
-        if now < self._next or status is None:
+        if status is None or (now < self._next and armed == self._armed):
             return
+        self._armed = armed
         self._next = now + (TERMINAL_PERIOD_S if self._terminal else PLAIN_PERIOD_S)
         text = self._running(status, control, now) if armed else f"starting: {status.why}"
         if self._terminal:

@@ -8,7 +8,7 @@ from snakesim_hal.files import FileStruct
 from snakesim_hal.quantities import MAX_JOINTS
 
 
-class Tether(FileStruct, kw_only=True):
+class Tether(FileStruct, frozen=True, kw_only=True):
     """A rope from a point of the snake to an anchor far away on the ground's plane.
 
     It can only pull towards `direction_w`: the point cannot move against that direction, and moves almost freely
@@ -21,7 +21,7 @@ class Tether(FileStruct, kw_only=True):
     reel_in_m_s: Annotated[float, Meta(ge=0, le=10, extra_json_schema={"unit": "m/s"})] = 0.0
 
 
-class Settings(FileStruct, kw_only=True):
+class Settings(FileStruct, frozen=True, kw_only=True):
     """How the physics is computed. The defaults suit robots of centimetres to decimetres and of a few kilograms."""
 
     # The longest physics step; it is shortened so that a whole number of steps makes a control period.

@@ -1,0 +1,120 @@
+"""A chain on a path: the angles with which the body lies on it, and where along it a measured body is. Pure."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from snakesim_hal.route import Route, next_on_route
+
+Floats = NDArray[np.float64]
+
+SPACING_M = 0.005
+MOST_STEP_M = 0.05  # of one correction of the arc length
+
+
+@dataclass(frozen=True)
+class Lie:
+    """How the body lies on the path when its tail end is at `tail_s_m`.
+
+    Its nodes are the tail end, the joints that bend, and the head end: all on the path.
+    """
+
+    tail_s_m: float
+    angles_rad: Floats  # (n_nodes - 2,), tail to head, left turn positive
+    nodes_w: Floats  # (2, n_nodes): all x, then all y
+    node_s_m: Floats  # (n_nodes,), arc length along the path
+
+
+class BodyOnPath:
+    """Lays one body on one path; what it has computed it keeps, in rows `SPACING_M` apart.
+
+    segments_m: lengths of the straight pieces between the joints that bend, tail to head.
+    """
+
+    def __init__(self, route: Route, segments_m: list[float]) -> None:
+        self.route = route
+        self.segments_m = segments_m
+        self._bends = len(segments_m) - 1
+        self._nodes = len(segments_m) + 1
+        self._xy = slice(self._bends, self._bends + 2 * self._nodes)
+        self._rows: dict[int, Floats] = {}
+
+    def at(self, tail_s_m: float) -> Lie:
+        """The body with its tail end at an arc length, which may be before the path's start or beyond its end."""
+        row, _ = self._between(tail_s_m)
+        return Lie(
+            tail_s_m,
+            row[: self._bends],
+            row[self._xy].reshape(2, self._nodes),
+            row[self._xy.stop :],
+        )
+
+    def find(self, nodes_w: Floats) -> float:
+        """Arc length of the tail of a body that may be anywhere; nodes_w: (2, n_nodes) as measured."""
+        return self.fit(nodes_w, self.route.project(nodes_w[:, 0]), steps=8)
+
+    def fit(self, nodes_w: Floats, near_s_m: float, *, steps: int = 2) -> float:
+        """Arc length at which the body on the path lies nearest to a measured one (least squares over the nodes)."""
+        measured = nodes_w.ravel()
+        s = near_s_m
+        for _ in range(steps):
+            row, slope = self._between(s)
+            along = slope[self._xy]
+            step = float((measured - row[self._xy]) @ along / (along @ along))
+            s += min(max(step, -MOST_STEP_M), MOST_STEP_M)
+        return s
+
+    def _between(self, s_m: float) -> tuple[Floats, Floats]:
+        """A row at any arc length, and its derivative."""
+        place = s_m / SPACING_M
+        k = math.floor(place)
+        low = self._row(k)
+        rise = self._row(k + 1) - low
+        return low + (place - k) * rise, rise / SPACING_M
+
+    def _row(self, k: int) -> Floats:
+        """Angles, node x, node y, node arc lengths with the tail at row k."""
+        row = self._rows.get(k)
+        if row is None:
+            row = self._rows[k] = self._lay(k * SPACING_M)
+        return row
+
+    def _lay(self, tail_s_m: float) -> Floats:
+        route, s = self.route, tail_s_m
+        point = route.at(s)
+        places, xs, ys = [s], [point[0]], [point[1]]
+        headings: list[float] = []
+        for length in self.segments_m:
+            s = next_on_route(route, point, s, length)
+            ahead = route.at(s)
+            headings.append(math.atan2(ahead[1] - point[1], ahead[0] - point[0]))
+            point = ahead
+            places.append(s)
+            xs.append(point[0])
+            ys.append(point[1])
+        turns = [math.remainder(b - a, math.tau) for a, b in zip(headings[:-1], headings[1:], strict=True)]
+        return np.array([*turns, *xs, *ys, *places])
+
+
+def chain_nodes(
+    tail_w: ArrayLike, heading_rad: float, angles_rad: Floats, segments_m: Floats
+) -> Floats:
+    """Nodes (2, n_nodes) of a planar chain: tail end, joints that bend, head end."""
+    nodes = np.empty((2, len(segments_m) + 1))
+    headings = np.empty(len(segments_m))
+    headings[0] = heading_rad
+    headings[1:] = angles_rad
+    np.cumsum(headings, out=headings)
+    nodes[0, 1:] = np.cos(headings)
+    nodes[1, 1:] = np.sin(headings)
+    nodes[:, 1:] *= segments_m
+    nodes[:, 0] = tail_w
+    return np.cumsum(nodes, axis=1, out=nodes)
+
+
+def heading_of(wxyz: tuple[float, float, float, float]) -> float:
+    """Heading on the ground of a frame's x axis, from its quaternion."""
+    w, x, y, z = wxyz
+    return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))

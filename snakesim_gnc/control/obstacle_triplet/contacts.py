@@ -1,0 +1,134 @@
+"""Push-points: where the path passes an obstacle, and which of these places the body is at. Pure.
+
+The geometry is the planned one: the path's point nearest to the obstacle, and the path's normal there. A measured
+contact point wanders over the flank of a link as joints move; the planned one does not, and the body is meant to be
+there. What is measured decides only whether the body is near enough to push.
+"""
+
+import math
+from bisect import bisect_right
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_gnc.control.body_on_path import Lie
+from snakesim_hal.messages import Obstacle
+from snakesim_hal.route import Route
+
+Floats = NDArray[np.float64]
+Planar = tuple[float, float]
+
+COARSE_M = 0.005
+FINE_M = 0.0002
+
+
+@dataclass(frozen=True)
+class PlannedContact:
+    """Where the path passes an obstacle."""
+
+    obstacle: str
+    path_s_m: float
+    point_w: Planar
+    normal_w: Planar  # from the obstacle into the body, across the path
+    tangent_w: Planar  # along the path
+    side: int  # +1: the obstacle is on the right of the path, and pushes to the left
+    clearance_m: float  # from the obstacle to a body that lies on the path; negative when it would overlap
+
+
+@dataclass(frozen=True)
+class PushPoint:
+    """A planned contact, and the place along the body that is at it now."""
+
+    contact: PlannedContact
+    body_s_m: float  # from the tail end
+    gap_m: float  # from the obstacle to the body as measured, across the path
+
+
+def plan_contact(
+    route: Route, obstacle: Obstacle, body_radius_m: float, *, near_s_m: float, window_m: float
+) -> PlannedContact:
+    """The place on the route nearest to an obstacle of any shape, within `window_m` of `near_s_m`."""
+    if obstacle.shape == "box":
+        s, push, distance = _past_box(route, obstacle, near_s_m, window_m)
+    else:
+        centre = np.array(obstacle.position_w[:2])
+        s = route.project(centre, near_s_m, window_m)
+        x, y = route.at(s)
+        push = (x - float(centre[0]), y - float(centre[1]))
+        distance = math.hypot(*push) - obstacle.radius_m
+    heading = route.heading_rad(s)
+    tangent = (math.cos(heading), math.sin(heading))
+    side = 1 if tangent[0] * push[1] - tangent[1] * push[0] >= 0 else -1
+    return PlannedContact(
+        obstacle=obstacle.name,
+        path_s_m=s,
+        point_w=route.at(s),
+        normal_w=(-side * tangent[1], side * tangent[0]),
+        tangent_w=tangent,
+        side=side,
+        clearance_m=distance - body_radius_m,
+    )
+
+
+def _past_box(route: Route, box: Obstacle, near_s_m: float, window_m: float) -> tuple[float, Planar, float]:
+    """Arc length nearest to a box, the way from the box to there, and the distance."""
+    step, low, high = COARSE_M, near_s_m - window_m, near_s_m + window_m
+    s, away, distance = near_s_m, np.zeros(2), 0.0
+    for finer in (FINE_M, 0.0):
+        places = np.arange(low, high, step)
+        away_all, distances = _from_box(box, route.position_w(places))
+        best = int(np.argmin(distances))
+        s, away, distance = float(places[best]), away_all[best], float(distances[best])
+        low, high, step = s - step, s + step, finer
+    return s, (float(away[0]), float(away[1])), distance
+
+
+def _from_box(box: Obstacle, points_w: Floats) -> tuple[Floats, Floats]:
+    """The way from a box's nearest point to each point (k, 2), and the distances (k,); negative inside."""
+    c, s = math.cos(box.yaw_rad), math.sin(box.yaw_rad)
+    world_from_box = np.array([[c, -s], [s, c]])
+    local = (points_w - np.array(box.position_w[:2])) @ world_from_box
+    half = np.array(box.half_size_m[:2])
+    beyond = np.abs(local) - half
+    inside = np.minimum(beyond.max(axis=1), 0.0)
+    outside = np.sign(local) * np.maximum(beyond, 0.0)
+    way = np.where(inside[:, None] < 0, np.sign(local) * (beyond == beyond.max(axis=1)[:, None]), outside)
+    return way @ world_from_box.T, np.hypot(outside[:, 0], outside[:, 1]) + inside
+
+
+def push_points(
+    planned: Sequence[PlannedContact],
+    touched: Collection[str],
+    lie: Lie,
+    measured_w: Floats,
+    node_body_s_m: Sequence[float],
+    *,
+    gap_m: float,
+    end_m: float,
+) -> list[PushPoint]:
+    """The planned contacts that the body can push at now, tail to head.
+
+    One counts when the body covers it, `end_m` from either tip or more, and is felt to touch it or is at most `gap_m`
+    from it as measured. measured_w: (2, n_nodes). node_body_s_m: (n_nodes,), arc lengths along the body.
+    """
+    places: list[float] = lie.node_s_m.tolist()
+    xs, ys = measured_w.tolist()
+    length = node_body_s_m[-1]
+    found: list[PushPoint] = []
+    for contact in planned:
+        i = bisect_right(places, contact.path_s_m) - 1
+        if not 0 <= i < len(places) - 1:
+            continue
+        share = (contact.path_s_m - places[i]) / (places[i + 1] - places[i])
+        body_s = node_body_s_m[i] + share * (node_body_s_m[i + 1] - node_body_s_m[i])
+        if not end_m < body_s < length - end_m:
+            continue
+        off_x = xs[i] + share * (xs[i + 1] - xs[i]) - contact.point_w[0]
+        off_y = ys[i] + share * (ys[i + 1] - ys[i]) - contact.point_w[1]
+        gap = contact.clearance_m + off_x * contact.normal_w[0] + off_y * contact.normal_w[1]
+        if gap < gap_m or contact.obstacle in touched:
+            found.append(PushPoint(contact, body_s, gap))
+    found.sort(key=lambda p: p.body_s_m)
+    return found

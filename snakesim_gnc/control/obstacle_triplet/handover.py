@@ -1,0 +1,61 @@
+"""Passing joints between position and torque mode without a jump. Pure but for its own memory.
+
+A joint that is released goes on from the position target with which its servo gives the torque that it has
+(`q + (torque + kd speed) / kp`), and the difference to its reference fades. A joint that takes over goes on from the
+torque that it has, and the propulsion torque fades in. Both fades move by `fade` a tick.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_hal.messages import Description, JointState
+
+Floats = NDArray[np.float64]
+
+
+class HandOver:
+    """The fading differences of all joints. Indices here are those of the robot's joints."""
+
+    def __init__(self, robot: Description) -> None:
+        self._stiffness = np.maximum(np.array([j.stiffness_nm_per_rad for j in robot.joints]), 1e-9)
+        self._damping = np.array([j.damping_nm_s_per_rad for j in robot.joints])
+        self._offset = np.zeros(len(robot.joints))
+        self._turn: int | None = None
+        self._torque_before_nm = 0.0
+        self._share = 1.0  # of the propulsion torque that has faded in
+
+    def start(self, joints: JointState, reference_rad: Floats) -> None:
+        """Take the joints as they are, all in position mode."""
+        torque, speed = np.array(joints.torque_nm), np.array(joints.velocity_rad_s)
+        held = np.array(joints.angle_rad) + (torque + self._damping * speed) / self._stiffness
+        self._offset = held - reference_rad
+        self._turn = None
+
+    def shift(self, change_rad: Floats) -> None:
+        """The reference has jumped by this much: keep the targets where they are."""
+        self._offset -= change_rad
+
+    def fade(self, fade: float) -> None:
+        """Let differences fade by a share."""
+        self._offset *= max(0.0, 1.0 - fade)
+        self._share = min(1.0, self._share + fade)
+
+    def pass_to(self, turn: int | None, joints: JointState, reference_rad: Floats) -> None:
+        """Give the turn to propel to a joint, or to none."""
+        if turn == self._turn:
+            return
+        if self._turn is not None:
+            i = self._turn
+            push = joints.torque_nm[i] + self._damping[i] * joints.velocity_rad_s[i]
+            self._offset[i] = joints.angle_rad[i] + push / self._stiffness[i] - reference_rad[i]
+        if turn is not None:
+            self._torque_before_nm, self._share, self._offset[turn] = joints.torque_nm[turn], 0.0, 0.0
+        self._turn = turn
+
+    def positions_rad(self, reference_rad: Floats) -> Floats:
+        """Targets of the joints in position mode."""
+        return reference_rad + self._offset
+
+    def torque_nm(self, wanted_nm: float) -> float:
+        """Target of the joint in torque mode."""
+        return (1.0 - self._share) * self._torque_before_nm + self._share * wanted_nm

@@ -1,0 +1,159 @@
+"""Which three push-points, and which joint: the choice that a propulsion torque needs. Pure.
+
+Only neighbours on alternating sides make a triplet: from the middle contact, the nearest one on the other side behind
+it and the nearest one on the other side ahead of it. So a body of thirty modules has a handful of candidates, and the
+choice moves along the body instead of jumping between all threes.
+"""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_gnc.control.obstacle_triplet.contacts import PlannedContact, PushPoint
+from snakesim_gnc.control.obstacle_triplet.statics import UnitForces, no_authority, torque_per_newton, unit_forces
+
+Floats = NDArray[np.float64]
+Names = tuple[str, str, str]
+
+
+@dataclass(frozen=True)
+class Triplet:
+    """Three planned contacts, solved once; nothing here depends on where the body is."""
+
+    names: Names
+    contacts: tuple[PlannedContact, PlannedContact, PlannedContact]
+    points_w: Floats  # (3, 2)
+    normals_w: Floats  # (3, 2)
+    unit: UnitForces
+    torque_per_n: float  # the most that a joint between o_2 and o_3 needs: with its lever from o_2 on; absolute
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A triplet, where on the body it is now, and the joint that propels."""
+
+    triplet: Triplet
+    body_s_m: tuple[float, float, float]
+    joint: int  # among the joints that bend, tail to head
+    torque_per_n: float  # N·m/N, on the part ahead of that joint
+
+
+def solve(contacts: tuple[PlannedContact, PlannedContact, PlannedContact], *, condition_max: float) -> Triplet:
+    """Unit forces of three contacts, tail to head."""
+    points = np.array([c.point_w for c in contacts])
+    normals = np.array([c.normal_w for c in contacts])
+    unit = unit_forces(points, normals, np.array(contacts[0].tangent_w), condition_max=condition_max)
+    torque = abs(torque_per_newton(unit.forces[2], points[2], normals[2], points[1]))
+    names = (contacts[0].obstacle, contacts[1].obstacle, contacts[2].obstacle)
+    return Triplet(names, contacts, points, normals, unit, torque)
+
+
+def alternating(sides: Sequence[int]) -> list[tuple[int, int, int]]:
+    """Index triples of neighbours on alternating sides, by their middle, tail to head."""
+    found: list[tuple[int, int, int]] = []
+    for j, side in enumerate(sides):
+        behind = next((i for i in range(j - 1, -1, -1) if sides[i] != side), None)
+        ahead = next((k for k in range(j + 1, len(sides)) if sides[k] != side), None)
+        if behind is not None and ahead is not None:
+            found.append((behind, j, ahead))
+    return found
+
+
+def propulsion_joint(
+    node_body_s_m: Sequence[float], behind_m: float, ahead_m: float, present: int | None, hold_on_m: float
+) -> int | None:
+    """The first joint ahead of o_2 and behind o_3, or None: it has the longest lever.
+
+    Joint i is node i + 1. The present joint keeps its turn until the one behind it is `hold_on_m` past o_2, so that
+    noise does not pass the turn to and fro.
+    """
+    for joint in range(len(node_body_s_m) - 2):
+        place = node_body_s_m[joint + 1]
+        if place >= ahead_m:
+            return None
+        if place <= behind_m:
+            continue
+        late = place - behind_m < hold_on_m
+        if late and present == joint + 1 and node_body_s_m[joint + 2] < ahead_m:
+            return present
+        return joint
+    return None
+
+
+def choose(
+    choices: Sequence[Choice], present: Triplet | None, *, switch_share: float, banned: Collection[Names] = ()
+) -> Choice | None:
+    """The triplet to push with, or None when there is none.
+
+    The present one stays as long as it can be used, unless another needs less than `switch_share` of its torque. Its
+    successor shares as many push-points with it as possible, among those that need little more torque than the least;
+    then the one with the least torque, and of equals the one nearest to the head, which lasts longest.
+    """
+    free = [c for c in choices if c.triplet.names not in banned]
+    if not free:
+        return None
+    least = min(c.triplet.torque_per_n for c in free)
+    names: Collection[str] = () if present is None else present.names
+    for choice in free:
+        if choice.triplet is present and least >= switch_share * present.torque_per_n:
+            return choice
+    cheap = [c for c in free if switch_share * c.triplet.torque_per_n <= least]
+    return max(cheap, key=lambda c: (_shared(c, names), -round(c.triplet.torque_per_n, 3), c.body_s_m[1]))
+
+
+def _shared(choice: Choice, names: Collection[str]) -> int:
+    return sum(name in names for name in choice.triplet.names)
+
+
+class Triplets:
+    """All choices that the push-points leave now; solves each three contacts once."""
+
+    def __init__(self, *, condition_max: float, authority_min: float, hold_on_m: float) -> None:
+        self._condition_max = condition_max
+        self._authority_min = authority_min
+        self._hold_on_m = hold_on_m
+        self._solved: dict[Names, Triplet] = {}
+
+    def choices(
+        self,
+        points: Sequence[PushPoint],
+        nodes_w: Floats,
+        node_body_s_m: Sequence[float],
+        present: Choice | None,
+        barred_joint: int | None,
+    ) -> tuple[list[Choice], list[str]]:
+        """Every triplet that can propel with some joint, and why the others cannot. nodes_w: (2, n_nodes)."""
+        found: list[Choice] = []
+        refused: list[str] = []
+        for i, j, k in alternating([p.contact.side for p in points]):
+            triplet = self._solve((points[i].contact, points[j].contact, points[k].contact))
+            where = "/".join(triplet.names)
+            if triplet.unit.reason:
+                refused.append(f"{where}: {triplet.unit.reason}")
+                continue
+            turn = present.joint if present is not None and present.triplet is triplet else None
+            joint = propulsion_joint(node_body_s_m, points[j].body_s_m, points[k].body_s_m, turn, self._hold_on_m)
+            if joint is None:
+                refused.append(f"{where}: no joint between o_2 and o_3")
+                continue
+            if joint == barred_joint:
+                refused.append(f"{where}: its propulsion joint has left its reference too far")
+                continue
+            spot = (float(nodes_w[0, joint + 1]), float(nodes_w[1, joint + 1]))
+            ahead = triplet.contacts[2]
+            blocked = no_authority(ahead.point_w, ahead.normal_w, spot, self._authority_min)
+            if blocked:
+                refused.append(f"{where}: {blocked}")
+                continue
+            torque = torque_per_newton(float(triplet.unit.forces[2]), ahead.point_w, ahead.normal_w, spot)
+            found.append(Choice(triplet, (points[i].body_s_m, points[j].body_s_m, points[k].body_s_m), joint, torque))
+        return found, refused
+
+    def _solve(self, contacts: tuple[PlannedContact, PlannedContact, PlannedContact]) -> Triplet:
+        names = (contacts[0].obstacle, contacts[1].obstacle, contacts[2].obstacle)
+        known = self._solved.get(names)
+        if known is None or known.contacts != contacts:
+            known = self._solved[names] = solve(contacts, condition_max=self._condition_max)
+        return known

@@ -1,0 +1,60 @@
+"""Standing still although pushing: noticed, told apart by cause, and let go of. Pure but for its own memory."""
+
+from collections import deque
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Stall:
+    """Why the snake stands."""
+
+    jammed: bool  # False: the propulsion is simply too little
+    why: str
+
+
+class StallWatch:
+    """Compares progress with propulsion over a sliding window."""
+
+    def __init__(self, *, stall_m: float, stall_s: float, propulsion_n: float) -> None:
+        self._stall_m = stall_m
+        self._stall_s = stall_s
+        self._least_n = propulsion_n / 2
+        self._recent: deque[tuple[float, float, float]] = deque()
+        self._pushed_n = 0.0  # sum over the window
+
+    def forget(self) -> None:
+        """Start a new window."""
+        self._recent.clear()
+        self._pushed_n = 0.0
+
+    def stands(self, time_s: float, tail_s_m: float, force_n: float) -> bool:
+        """Whether the body has stood still through a whole window while pushing; call while propelling."""
+        recent = self._recent
+        recent.append((time_s, tail_s_m, force_n))
+        self._pushed_n += force_n
+        while recent[-1][0] - recent[0][0] > self._stall_s + 1e-9:
+            self._pushed_n -= recent.popleft()[2]
+        if time_s - recent[0][0] < self._stall_s - 1e-9:
+            return False
+        return abs(tail_s_m - recent[0][1]) < self._stall_m and self._pushed_n > self._least_n * len(recent)
+
+
+def explain(
+    *,
+    force_n: float,
+    contact_force_n: float,
+    weight_n: float,
+    saturated_joint: str | None,
+    jam_force_n: float,
+    drag_share: float,
+) -> Stall:
+    """The cause of a stall: wedged between obstacles, held by friction, at the end of the motor, or too little push."""
+    pushing = f"standing still with {force_n:.1f} N of propulsion"
+    if contact_force_n > jam_force_n:
+        return Stall(True, f"jammed: {pushing} and a contact force of {contact_force_n:.0f} N")
+    if saturated_joint is not None:
+        return Stall(True, f"jammed: {pushing} and {saturated_joint} at its limit of torque")
+    if force_n > drag_share * weight_n:
+        share = force_n / weight_n
+        return Stall(True, f"jammed: {pushing}, {share:.2f} of the weight; no sliding on the ground takes so much")
+    return Stall(False, f"{pushing}: below the drag of the ground; raise propulsion_n")

@@ -1,0 +1,125 @@
+"""SVG by hand: elements with escaped text and finite numbers, arrows, and ticks at round numbers.
+
+What it looks like stands in figure.css and palette.py; a figure only names classes.
+"""
+
+import math
+from html import escape
+
+Point = tuple[float, float]
+Attribute = str | float | int | None
+
+
+def number(value: float) -> str:
+    """A coordinate, to a tenth of a unit. Raises ValueError when it is not finite: a browser would draw nothing."""
+    if not math.isfinite(value):
+        raise ValueError(f"a coordinate of a figure is {value}; leave the element out instead")
+    text = f"{value:.1f}"
+    return "0" if text in ("-0.0", "0.0") else text.removesuffix(".0")
+
+
+def element(name: str, *children: str, **attributes: Attribute) -> str:
+    """An element around children that are markup already. `class_` is class, `stroke_width` is stroke-width."""
+    parts = [name]
+    for key, value in attributes.items():
+        if value is None:
+            continue
+        shown = escape(value) if isinstance(value, str) else number(value)
+        parts.append(f'{key.rstrip("_").replace("_", "-")}="{shown}"')
+    opening = " ".join(parts)
+    return f"<{opening}>{''.join(children)}</{name}>" if children else f"<{opening}/>"
+
+
+def text(x: float, y: float, words: str, class_: str = "", *, anchor: str = "start", turn: float = 0) -> str:
+    """A line of text. anchor: start, middle or end; turn: degrees."""
+    return element(
+        "text",
+        escape(words, quote=False),
+        x=x,
+        y=y,
+        class_=class_ or None,
+        text_anchor=None if anchor == "start" else anchor,
+        transform=f"rotate({number(turn)} {number(x)} {number(y)})" if turn else None,
+    )
+
+
+def line(a: Point, b: Point, class_: str) -> str:
+    """A straight line."""
+    return element("line", x1=a[0], y1=a[1], x2=b[0], y2=b[1], class_=class_)
+
+
+def points_text(points: list[Point]) -> str:
+    """Points as the `points` attribute wants them."""
+    return " ".join(f"{number(x)},{number(y)}" for x, y in points)
+
+
+def polyline(points: list[Point], class_: str) -> str:
+    """An open line through points."""
+    return element("polyline", points=points_text(points), class_=class_)
+
+
+def arrow(tail: Point, tip: Point, class_: str, *, head: float = 9.0, both: bool = False) -> str:
+    """A shaft and a filled head; `both` puts a head at either end. Too short an arrow is a dot."""
+    dx, dy = tip[0] - tail[0], tip[1] - tail[1]
+    length = math.hypot(dx, dy)
+    if length < 1.5:
+        return element("circle", cx=tip[0], cy=tip[1], r=1.5, class_=f"{class_} head")
+    ux, uy = dx / length, dy / length
+    size = min(head, length / (2.2 if both else 1.1))
+
+    def triangle(at: Point, sign: float) -> str:
+        back = (at[0] - sign * ux * size, at[1] - sign * uy * size)
+        wide = 0.38 * size
+        corners = [at, (back[0] - uy * wide, back[1] + ux * wide), (back[0] + uy * wide, back[1] - ux * wide)]
+        return element("polygon", points=points_text(corners), class_=f"{class_} head")
+
+    neck = (tip[0] - ux * size * 0.8, tip[1] - uy * size * 0.8)
+    start = (tail[0] + ux * size * 0.8, tail[1] + uy * size * 0.8) if both else tail
+    heads = triangle(tip, 1.0) + (triangle(tail, -1.0) if both else "")
+    return line(start, neck, f"{class_} shaft") + heads
+
+
+def figure(width: float, height: float, label: str, *children: str, **attributes: Attribute) -> str:
+    """A whole drawing. label: what it shows, for those who cannot see it."""
+    return element(
+        "svg",
+        *children,
+        viewBox=f"0 0 {number(width)} {number(height)}",
+        class_="figure",
+        role="img",
+        aria_label=label,
+        style=f"max-width:{number(width)}px",
+        **attributes,
+    )
+
+
+def text_width(words: str, size: float = 13.0) -> float:
+    """About how wide a text is; generous, for placing labels."""
+    return 0.58 * size * len(words)
+
+
+def round_step(span: float, most: int) -> float:
+    """1, 2 or 5 times a power of ten, so that `span` holds at most `most` of them."""
+    rough = max(span, 1e-9) / max(most, 1)
+    power = 10.0 ** math.floor(math.log10(rough))
+    return next(factor * power for factor in (1, 2, 5, 10) if factor * power >= rough * (1 - 1e-9))
+
+
+def round_below(value: float) -> float:
+    """The largest 1, 2 or 5 times a power of ten that is not above `value`."""
+    power = 10.0 ** math.floor(math.log10(max(value, 1e-9)))
+    return max(factor * power for factor in (1, 2, 5) if factor * power <= value * (1 + 1e-9))
+
+
+def ticks(low: float, high: float, most: int) -> list[float]:
+    """Round numbers within [low, high]."""
+    step = round_step(high - low, most)
+    first, last = math.ceil(low / step - 1e-6), math.floor(high / step + 1e-6)
+    return [k * step for k in range(first, last + 1)]
+
+
+def tick_text(value: float, step: float) -> str:
+    """A tick's number with as many decimals as its step needs."""
+    decimals = max(0, -math.floor(math.log10(step) + 1e-9))
+    shown = f"{value:.{decimals}f}"
+    return shown.replace("-", "−") if float(shown) else shown.replace("-", "")

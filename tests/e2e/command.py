@@ -1,0 +1,139 @@
+"""Drives the real `snakesim` command, in real processes, on loopback ports of its own."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+
+from snakesim_operator.record import SUMMARY
+from snakesim_operator.summary import RunSummary
+
+SNAKESIM = [sys.executable, "-m", "snakesim_operator.cli"]
+LIMIT_S = 90.0
+
+
+@dataclass(frozen=True)
+class Ended:
+    """A finished command."""
+
+    code: int
+    out: str
+    err: str
+
+
+def environment(home: Path, **more: str) -> dict[str, str]:
+    """The caller's environment, but with a state folder of the test's own."""
+    return {**os.environ, "XDG_STATE_HOME": str(home), "PYTHONUNBUFFERED": "1", **more}
+
+
+def snakesim(*arguments: str, cwd: Path, limit_s: float = LIMIT_S, **more: str) -> Ended:
+    """Run a command to its end."""
+    done = subprocess.run(
+        [*SNAKESIM, *arguments],
+        cwd=cwd,
+        env=environment(cwd, **more),
+        capture_output=True,
+        text=True,
+        timeout=limit_s,
+        check=False,
+    )
+    return Ended(done.returncode, done.stdout, done.stderr)
+
+
+def free_endpoint() -> str:
+    """A loopback endpoint that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def run_to_summary(out: Path, *arguments: str, **more: str) -> tuple[Ended, RunSummary]:
+    """`snakesim run ... --out out`, and the summary that it left."""
+    ended = snakesim("run", *arguments, "--out", str(out), "--endpoint", free_endpoint(), cwd=out.parent, **more)
+    assert (out / SUMMARY).is_file(), ended.out + ended.err
+    return ended, msgspec.json.decode((out / SUMMARY).read_bytes(), type=RunSummary)
+
+
+@dataclass(frozen=True)
+class Running:
+    """A run in progress."""
+
+    process: subprocess.Popen[str]
+    out: Path
+    endpoint: str
+
+    def part(self, name: str) -> int:
+        """Process id of one of its parts: `host`, `control`, ..."""
+        wanted = "snakesim_hal.host_process" if name == "host" else f"snakesim_hal.serve\0{name}\0"
+        return next(pid for pid, line in processes_of(self.out) if wanted in line)
+
+    def wait_for(self, what: str, limit_s: float = LIMIT_S) -> None:
+        """Until the run's output contains a text."""
+        wait_until(lambda: what in self.said(), f"{what!r} in the run's output", limit_s)
+
+    def said(self) -> str:
+        """What the command has printed so far."""
+        return self.out.with_suffix(".said").read_text(encoding="utf-8")
+
+    def end(self, limit_s: float = LIMIT_S) -> int:
+        """Wait for the exit code."""
+        return self.process.wait(limit_s)
+
+
+@contextmanager
+def running(out: Path, *arguments: str) -> Iterator[Running]:
+    """A `snakesim run` in the background; whatever is left of it at the end is killed."""
+    endpoint = free_endpoint()
+    with out.with_suffix(".said").open("w") as said:
+        process = subprocess.Popen(
+            [*SNAKESIM, "run", *arguments, "--out", str(out), "--endpoint", endpoint],
+            cwd=out.parent,
+            env=environment(out.parent),
+            stdout=said,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+    run = Running(process, out, endpoint)
+    try:
+        yield run
+    finally:
+        if process.poll() is None:
+            process.send_signal(signal.SIGKILL)
+            process.wait(10)
+
+
+def processes_of(out: Path) -> list[tuple[int, str]]:
+    """(pid, NUL-separated command line) of every live process that was started for a run's folder."""
+    found: list[tuple[int, str]] = []
+    for entry in Path("/proc").iterdir():
+        if not entry.name.isdigit():
+            continue
+        try:
+            line = (entry / "cmdline").read_bytes().decode(errors="replace")
+            state = (entry / "stat").read_text().rpartition(")")[2].split()[0]
+        except OSError:
+            continue
+        if f"{out}/config.json" in line and state != "Z":
+            found.append((int(entry.name), line))
+    return found
+
+
+def nothing_left(out: Path, limit_s: float = 10.0) -> None:
+    """Fail unless every process of a run is gone soon."""
+    wait_until(lambda: not processes_of(out), f"no process of {out} left", limit_s)
+
+
+def wait_until(condition: Callable[[], bool], what: str, limit_s: float = LIMIT_S) -> None:
+    """Poll a condition until a deadline."""
+    deadline = time.monotonic() + limit_s
+    while not condition():
+        assert time.monotonic() < deadline, f"not within {limit_s:.0f} s: {what}"
+        time.sleep(0.02)

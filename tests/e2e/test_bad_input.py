@@ -1,0 +1,62 @@
+"""Wrong files and flags: one clear error, exit code 2, nothing started, nothing left."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.e2e.command import snakesim
+
+pytestmark = pytest.mark.e2e
+
+ROBOT = Path("snakesim_hal/shipped/robots/planar13.toml").resolve()
+SCENE = Path("snakesim_hal/shipped/scenes/triplet.toml").resolve()
+SCENARIO = Path("snakesim_hal/shipped/scenarios/triplet.toml").resolve()
+
+WRONG = {
+    "absent": (["nowhere"], ["no scenario called 'nowhere'", "triplet"]),
+    "unknown flag value": (["triplet", "--set", "pace=fast"], ["pace", "'fast'", "lockstep"]),
+    "out of range": (["triplet", "--set", "robot.module.length_m=-0.1"], ["length_m", "-0.1 m", "> 0"]),
+    "wrong unit": (["triplet", "--set", "robot.module.length_m=110"], ["length_m", "110 m", "<= 2"]),
+    "not a number": (["triplet", "--set", "rate_hz=nan"], ["rate_hz", "nan"]),
+    "unknown key": (["triplet", "--set", "robot.module.lenght_m=0.1"], ["lenght_m", "did you mean `length_m`"]),
+    "overlap": (["triplet", "--set", "scene.pegs_along_route.0.corridor_m=0.02"], ["overlaps", "link_", "mm"]),
+    "controller setting": (["triplet", "--set", "control.propulsion_n=-1"], ["propulsion_n", "-1"]),
+    "unknown controller": (["triplet", "--controller", "wiggle"], ["'wiggle'", "hold", "obstacle_triplet"]),
+    "controller file": (["triplet", "--controller", "./no.py:No"], ["no file"]),
+    "backend to come": (["triplet", "--backend", "can"], ["can", "--backend sim"]),
+    "set without value": (["triplet", "--set", "rate_hz"], ["section.key=value"]),
+    "not TOML": (["./broken.toml"], ["broken.toml", "not valid TOML", "line"]),
+    "missing field": (["./missing.toml"], ["missing.toml", "`controller` is missing"]),
+    "robot file": (["./bad_robot.toml"], ["my_robot.toml", "mass_kg", "heavy"]),
+    "scene file": (["./bad_scene.toml"], ["my_scene.toml", "friction"]),
+}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    scenario = SCENARIO.read_text()
+    (tmp_path / "broken.toml").write_text("robot = \n")
+    (tmp_path / "missing.toml").write_text(scenario.replace('controller = "obstacle_triplet"\n', ""))
+    (tmp_path / "my_robot.toml").write_text(ROBOT.read_text().replace("mass_kg = 0.3", 'mass_kg = "heavy"'))
+    (tmp_path / "bad_robot.toml").write_text(scenario.replace('"planar13"', '"my_robot.toml"'))
+    (tmp_path / "my_scene.toml").write_text(SCENE.read_text().replace("friction = 0.1", "friction = 99.0"))
+    (tmp_path / "bad_scene.toml").write_text(scenario.replace('scene = "triplet"', 'scene = "my_scene.toml"'))
+    return tmp_path
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_one_clear_error_and_nothing_started(folder: Path, wrong: str) -> None:
+    arguments, words = WRONG[wrong]
+    ended = snakesim("run", *arguments, "--out", "run", cwd=folder)
+    assert ended.code == 2, ended.out + ended.err
+    assert ended.out == ""
+    assert ended.err.startswith("snakesim: ") and ended.err.count("\n") == 1, ended.err
+    for word in words:
+        assert word in ended.err, ended.err
+    assert not (folder / "run").exists()
+
+
+def test_output_folder_that_cannot_be_made(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    ended = snakesim("run", "triplet", "--out", "file/run", cwd=tmp_path)
+    assert ended.code == 2 and "--out" in ended.err

@@ -1,0 +1,89 @@
+"""Robots and scenes for the tests: small, noiseless, and changed in one place at a time."""
+
+from typing import Any
+
+import msgspec
+
+from snakesim_hal.backend import Samples, SetPoints
+from snakesim_hal.files import find, read_table
+from snakesim_hal.messages import Mode
+from snakesim_hal.scenario import RunConfig, check
+from snakesim_sim_backend.backend import SimBackend
+from snakesim_sim_backend.settings import Settings
+
+G = 9.81
+QUIET = {
+    "joints": {},
+    "contacts": {"rate_hz": 10000.0},
+    "imu": {"rate_hz": 10000.0},
+    "pose": {"rate_hz": 10000.0},
+}
+
+
+def merged(base: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
+    """`base` with the leaves of `change` put over it; a key `x!` replaces the whole of x."""
+    result = dict(base)
+    for key, value in change.items():
+        if key.endswith("!"):
+            result[key[:-1]] = value
+        elif isinstance(value, dict) and isinstance(result.get(key), dict):
+            result[key] = merged(result[key], value)
+        else:
+            result[key] = value
+    return result
+
+
+def make_config(
+    robot: dict[str, Any] | None = None,
+    scene: dict[str, Any] | None = None,
+    *,
+    base_robot: str = "planar13",
+    **top: Any,
+) -> RunConfig:
+    """A run of a straight, noiseless robot at the origin, heading along x, on flat ground of friction 0.3."""
+    quiet = merged(read_table(find(base_robot, "robots")).values, {"sensors!": QUIET})
+    table = {
+        "name": "test",
+        "controller": "hold",
+        "services": {},
+        "start": {"on_route": False},
+        "robot": merged(quiet, robot or {}),
+        "scene": merged({"name": "test", "ground": {"friction": 0.3}}, scene or {}),
+    }
+    config = msgspec.convert(merged(table, top), RunConfig)
+    check(config)
+    return config
+
+
+def open_sim(config: RunConfig, **settings: Any) -> SimBackend:
+    """A backend on that configuration."""
+    return SimBackend(config, msgspec.convert(settings, Settings))
+
+
+class Run:
+    """Drives a backend tick by tick, as the host does."""
+
+    def __init__(self, config: RunConfig, **settings: Any) -> None:
+        self.config = config
+        self.sim = open_sim(config, **settings)
+        self.count = config.robot.chain.modules
+        self.tick = 0
+
+    def command(
+        self, mode: Mode | list[Mode], target: float | list[float] = 0.0, limit: float | None = None
+    ) -> None:
+        """The same for all joints, or one each."""
+        modes = mode if isinstance(mode, list) else [mode] * self.count
+        targets = target if isinstance(target, list) else [target] * self.count
+        limits = [self.config.robot.limits.torque_nm if limit is None else limit] * self.count
+        self.sim.enact(SetPoints(modes, targets, limits))
+
+    def sample(self) -> Samples:
+        """The samples of the present tick."""
+        return self.sim.sample(self.tick, self.tick * self.config.period_ns)
+
+    def go(self, seconds: float = 0.0) -> None:
+        """At least one tick."""
+        for _ in range(max(round(seconds * 1e9 / self.config.period_ns), 1)):
+            self.sim.advance()
+            self.tick += 1

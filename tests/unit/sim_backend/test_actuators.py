@@ -1,0 +1,169 @@
+"""The motors: four modes, their limits, and what happens between the modes."""
+
+import numpy as np
+import pytest
+
+from snakesim_hal.messages import Mode
+from tests.unit.sim_backend.rig import Run, make_config
+
+RESPONSE_S = 0.01
+NOTHING = 1e-12  # N·m
+TWO_LINKS = {"chain": {"modules": 1}, "limits": {"angle_rad": 3.0}, "motor": {"response_time_s": RESPONSE_S}}
+HEAVY_ROTOR = {**TWO_LINKS, "motor": {"response_time_s": RESPONSE_S, "armature_kg_m2": 10.0}}  # hardly moves
+ICE = {"ground": {"friction": 0.0}}
+
+
+def fast_run(robot=None, **settings):
+    """One joint on ice, sampled at every physics step of 1 ms."""
+    return Run(make_config(robot or TWO_LINKS, ICE, rate_hz=1000), **settings)
+
+
+def torque(run):
+    return float(run.sim.true_state().torques_nm[0])
+
+
+def test_position_mode_goes_to_its_target_and_stays():
+    run = fast_run()
+    run.command(Mode.POSITION, 0.3)
+    run.go(0.5)
+    angles = []
+    for _ in range(100):
+        run.go()
+        angles.append(run.sim.true_state().angles_rad[0])
+    assert angles == pytest.approx([0.3] * 100, abs=1e-3)
+
+
+def test_velocity_mode_reaches_its_speed_and_holds_it_against_friction():
+    run = fast_run({**TWO_LINKS, "motor": {"response_time_s": RESPONSE_S, "viscous_nm_s_per_rad": 0.1}})
+    run.command(Mode.VELOCITY, 2.0)
+    run.go(0.4)
+    gain, viscous = run.config.robot.motor.velocity_gain_nm_s_per_rad, 0.1
+    speed = run.sim.true_state().velocities_rad_s[0]
+    assert speed == pytest.approx(2.0 * gain / (gain + viscous), rel=0.01)
+    assert torque(run) == pytest.approx(viscous * speed, rel=0.01)
+
+
+def test_torque_mode_follows_as_a_first_order_lag():
+    run = fast_run()
+    run.command(Mode.TORQUE, 0.02)
+    for k in range(1, 40):
+        run.go()
+        assert torque(run) == pytest.approx(0.02 * (1 - np.exp(-k * 1e-3 / RESPONSE_S)), rel=1e-6)
+
+
+def test_a_motor_without_response_time_answers_at_once():
+    run = fast_run({**TWO_LINKS, "motor": {"response_time_s": 0.0}})
+    run.command(Mode.TORQUE, 0.02)
+    run.go()
+    assert torque(run) == pytest.approx(0.02)
+    run.command(Mode.PASSIVE)
+    run.go()
+    assert torque(run) == pytest.approx(0.0, abs=NOTHING)
+
+
+def test_passive_means_no_torque_even_when_spun_beyond_the_limit_of_speed():
+    run = fast_run()
+    run.sim.data.qvel[6] = 20.0
+    for _ in range(50):
+        run.go()
+        assert torque(run) == pytest.approx(0.0, abs=NOTHING)
+
+
+def test_joints_are_passive_before_the_first_command():
+    run = Run(make_config())
+    run.sim.data.qvel[6:] = 1.0
+    run.go(0.1)
+    assert run.sim.true_state().torques_nm == pytest.approx([0.0] * 13, abs=NOTHING)
+
+
+@pytest.mark.parametrize("mode", [Mode.POSITION, Mode.VELOCITY, Mode.TORQUE])
+def test_torque_stays_within_the_robot_s_and_the_command_s_limit(mode):
+    run = fast_run(HEAVY_ROTOR)
+    run.command(mode, -100.0, limit=50.0)
+    run.go(0.2)
+    assert torque(run) == pytest.approx(-run.config.robot.limits.torque_nm)
+    run.command(mode, -100.0, limit=1.5)
+    run.go(0.1)
+    assert torque(run) == pytest.approx(-1.5)
+
+
+def test_a_lowered_limit_takes_hold_no_faster_than_the_motor_can_follow():
+    run = fast_run(HEAVY_ROTOR)
+    run.command(Mode.TORQUE, 6.0)
+    run.go(0.2)
+    run.command(Mode.TORQUE, 6.0, limit=1.0)
+    before = torque(run)
+    for _ in range(100):
+        run.go()
+        assert torque(run) >= before * np.exp(-1e-3 / RESPONSE_S) - 1e-9
+        before = torque(run)
+    assert before == pytest.approx(1.0)
+
+
+def test_the_motor_does_not_drive_a_joint_beyond_its_speed():
+    run = fast_run()
+    limit = run.config.robot.limits.speed_rad_s
+    run.command(Mode.TORQUE, 3.0)
+    speeds, torques = [], []
+    for _ in range(200):
+        run.go()
+        speeds.append(run.sim.true_state().velocities_rad_s[0])
+        torques.append(torque(run))
+        if abs(run.sim.true_state().angles_rad[0]) > 2.5:
+            break
+    assert 0.9 * limit < max(speeds) < 1.15 * limit  # beyond it by what the motor's response lets through
+    assert speeds[-1] == pytest.approx(limit, rel=0.02)
+    assert torques[-1] < 0.1
+
+
+def test_below_nine_tenths_of_the_speed_the_full_torque_is_there():
+    run = fast_run(HEAVY_ROTOR)
+    limit = run.config.robot.limits.speed_rad_s
+    run.sim.data.qvel[6] = 0.85 * limit
+    run.command(Mode.TORQUE, 7.0)
+    run.go(0.1)
+    assert run.sim.true_state().velocities_rad_s[0] > 0.8 * limit
+    assert torque(run) == pytest.approx(7.0, rel=1e-3)
+
+
+@pytest.mark.parametrize("before", list(Mode))
+@pytest.mark.parametrize("after", list(Mode))
+def test_a_change_of_mode_moves_the_torque_only_as_the_motor_responds(before, after):
+    targets = {Mode.PASSIVE: 0.0, Mode.POSITION: 0.1, Mode.VELOCITY: 1.5, Mode.TORQUE: -2.0}
+    run = fast_run(HEAVY_ROTOR)
+    robot = run.config.robot
+    run.command(before, targets[before])
+    run.go(0.1)
+    run.command(after, targets[after])
+    for _ in range(30):
+        state, had = run.sim.true_state(), torque(run)
+        angle, speed = state.angles_rad[0], state.velocities_rad_s[0]
+        demand = {
+            Mode.PASSIVE: 0.0,
+            Mode.POSITION: robot.motor.stiffness_nm_per_rad * (targets[after] - angle)
+            - robot.motor.damping_nm_s_per_rad * speed,
+            Mode.VELOCITY: robot.motor.velocity_gain_nm_s_per_rad * (targets[after] - speed),
+            Mode.TORQUE: targets[after],
+        }[after]
+        run.go()
+        wanted = had + (demand - had) * (1 - np.exp(-1e-3 / RESPONSE_S))
+        assert torque(run) == pytest.approx(wanted, abs=1e-6)
+
+
+def test_joints_may_be_in_different_modes():
+    run = Run(make_config({"chain": {"modules": 4}}, ICE))
+    run.command([Mode.POSITION, Mode.PASSIVE, Mode.TORQUE, Mode.VELOCITY], [0.2, 9.0, 0.05, 0.0])
+    run.go(0.1)
+    torques = run.sim.true_state().torques_nm
+    assert torques[1] == pytest.approx(0.0, abs=NOTHING)
+    assert torques[2] == pytest.approx(0.05, rel=1e-3)
+    run.command(Mode.POSITION, 0.1)
+    run.go(1.0)
+    assert run.sim.true_state().angles_rad == pytest.approx([0.1] * 4, abs=2e-3)
+
+
+def test_a_joint_stops_at_its_limit():
+    run = fast_run({**TWO_LINKS, "limits": {"angle_rad": 0.5}})
+    run.command(Mode.TORQUE, 1.0)
+    run.go(0.5)
+    assert run.sim.true_state().angles_rad[0] == pytest.approx(0.5, abs=0.01)

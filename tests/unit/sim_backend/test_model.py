@@ -1,0 +1,97 @@
+"""The compiled model against the files that it comes from."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from snakesim_hal.errors import ConfigError
+from tests.unit.sim_backend.rig import Run, make_config, open_sim
+
+
+@pytest.mark.parametrize("name", ["planar13", "mamba"])
+def test_masses_lengths_limits_and_motors_are_those_of_the_robot_file(name):
+    config = make_config(base_robot=name)
+    robot, model = config.robot, open_sim(config).sim.model
+    links = [model.body(f"link_{i}") for i in range(robot.chain.modules + 1)]
+    assert sum(float(link.mass[0]) for link in links) == pytest.approx(robot.chain.modules * robot.module.mass_kg)
+    for i, link in enumerate(links):
+        assert link.mass[0] == pytest.approx(robot.link_masses_kg[i])
+        assert link.ipos == pytest.approx([robot.link_lengths_m[i] / 2, 0, 0])
+        geom = model.geom(f"link_{i}")
+        assert geom.size[0] == robot.module.radius_m
+        assert 2 * geom.size[1] == pytest.approx(robot.link_lengths_m[i])
+    for i, axis in enumerate(robot.axes):
+        joint = model.joint(f"joint_{i + 1}")
+        assert joint.axis == pytest.approx([0, 0, 1] if axis == "yaw" else [0, 1, 0])
+        assert joint.range == pytest.approx([-robot.limits.angle_rad, robot.limits.angle_rad])
+        assert model.dof_armature[joint.dofadr[0]] == robot.motor.armature_kg_m2
+        assert model.body_pos[joint.bodyid[0]] == pytest.approx([robot.link_lengths_m[i], 0, 0])
+    assert model.actuator_forcerange[:, 1] == pytest.approx(robot.limits.torque_nm)
+    assert [model.actuator(i).name for i in range(robot.chain.modules)] == [
+        f"motor_joint_{i + 1}" for i in range(robot.chain.modules)
+    ]
+
+
+def test_joint_friction_and_viscosity_are_those_of_the_robot_file():
+    config = make_config({"motor": {"friction_nm": 0.12, "viscous_nm_s_per_rad": 0.03}})
+    model = open_sim(config).sim.model
+    assert model.dof_frictionloss[6:] == pytest.approx(0.12)
+    assert model.dof_damping[6:] == pytest.approx(0.03)
+
+
+def test_inertia_of_a_link_is_that_of_a_capsule_of_its_mass():
+    config = make_config()
+    model = open_sim(config).sim.model
+    r, length, mass = config.robot.module.radius_m, config.robot.module.length_m, config.robot.module.mass_kg
+    cylinder, sphere = np.pi * r**2 * length, 4 / 3 * np.pi * r**3
+    m_c, m_s = mass * np.array([cylinder, sphere]) / (cylinder + sphere)
+    about_axis = m_c * r**2 / 2 + m_s * 2 / 5 * r**2
+    across = m_c * (r**2 / 4 + length**2 / 12) + m_s * (2 / 5 * r**2 + length**2 / 4 + 3 / 8 * length * r)
+    assert sorted(model.body("link_5").inertia) == pytest.approx(sorted([about_axis, across, across]), rel=1e-6)
+
+
+@pytest.mark.parametrize(("rate_hz", "timestep_s", "steps"), [(100, 0.001, 10), (100, 0.003, 4), (1000, 0.004, 1), (300, 0.001, 4)])
+def test_a_whole_number_of_steps_makes_a_period(rate_hz, timestep_s, steps):
+    config = make_config(rate_hz=rate_hz)
+    sim = open_sim(config, timestep_s=timestep_s, contact_time_s=0.01).sim
+    assert sim.steps_per_tick == steps
+    assert sim.model.opt.timestep * steps == pytest.approx(config.period_ns * 1e-9, rel=1e-12)
+
+
+def test_contacts_too_stiff_for_the_step_are_refused():
+    with pytest.raises(ConfigError, match="contact_time_s"):
+        open_sim(make_config(), timestep_s=0.005, contact_time_s=0.002)
+
+
+def test_neighbours_pass_through_each_other_and_distant_links_do_not():
+    config = make_config({"chain": {"modules": 8}, "limits": {"angle_rad": 1.5}})
+    run = Run(config)
+    data, model = run.sim.data, run.sim.sim.model
+    assert not any(data.contact.geom.min(axis=1) > 0)  # straight: only touches of the ground, which is geom 0
+    data.qpos[7:] = 1.0  # rolled up: far more than a full turn
+    mujoco.mj_forward(model, data)
+    pairs = {tuple(sorted(pair)) for pair in data.contact.geom.tolist() if min(pair) > 0}
+    assert pairs
+    assert all(second - first > 1 for first, second in pairs)
+
+
+@pytest.mark.parametrize("walls", [[0.0, 0.7], [0.7, 0.0]])
+def test_each_pair_of_surfaces_has_the_friction_of_the_ground_or_the_obstacle(walls):
+    boxes = [
+        {"position_m": [0.5, side * 0.0901], "size_m": [0.4, 0.1, 0.2], "friction": mu}
+        for side, mu in zip((-1, 1), walls, strict=True)
+    ]
+    run = Run(make_config(scene={"box": boxes}), self_friction=2.0)
+    data, model = run.sim.data, run.sim.sim.model
+    seen = set()
+    for aside in (-0.001, 0.001):
+        data.qpos[1] = aside
+        mujoco.mj_forward(model, data)
+        for contact in data.contact:
+            name = next(n for n in (model.geom(g).name for g in contact.geom) if not n.startswith("link"))
+            mu = {"ground": 0.3, "obstacle:box_0": walls[0], "obstacle:box_1": walls[1]}[name]
+            assert contact.dim == (3 if mu else 1)
+            if mu:
+                assert contact.friction[:2] == pytest.approx(mu)
+            seen.add(name)
+    assert seen == {"ground", "obstacle:box_0", "obstacle:box_1"}
