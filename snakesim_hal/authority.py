@@ -56,7 +56,7 @@ class Authority:
         count = len(description.joints)
         self._applied = Applied(np.zeros(count, dtype=np.int64), np.zeros(count), self.limits.torque_nm)
         self._measured = Measured(np.zeros(count), np.zeros(count), np.zeros(count))
-        self._state_valid = False
+        self._state_trouble: str | None = "no joint state yet"
         self._command: JointCommand | None = None
         self._last_sequence = -1
         self._hold_at = np.zeros(count)
@@ -64,11 +64,18 @@ class Authority:
     # --- what comes in -------------------------------------------------------------------------------------
 
     def observe(self, joints: JointState) -> None:
-        """Take the newest joint state."""
-        self._measured = Measured(
-            np.array(joints.angle_rad), np.array(joints.velocity_rad_s), np.array(joints.torque_nm)
-        )
-        self._state_valid = all(joints.valid) and max(joints.age_ns, default=0) <= self.description.lease_ns
+        """Take the newest joint state. What is not finite is no measurement: the last good one stays."""
+        columns = np.array([joints.angle_rad, joints.velocity_rad_s, joints.torque_nm])
+        finite = bool(np.isfinite(columns).all())
+        if finite:
+            self._measured = Measured(*columns)
+        if finite and all(joints.valid) and max(joints.age_ns) <= self.description.lease_ns:
+            self._state_trouble = None
+            return
+        fresh = np.array(joints.age_ns) <= self.description.lease_ns
+        good = np.isfinite(columns).all(axis=0) & fresh & np.array(joints.valid)
+        bad = [self.description.joints[i].name for i in np.flatnonzero(~good)]
+        self._state_trouble = f"no valid and fresh state of {', '.join(bad)}"[:400] if bad else None
 
     def offer(self, command: JointCommand, *, now_ns: int, tick: int, age_ns: int) -> str | None:
         """Take a command, or return why not. `age_ns`: time since the state that it answers was published."""
@@ -100,6 +107,8 @@ class Authority:
     def on_lease(self, request: LeaseRequest, now_ns: int) -> Answer:
         """Decide a lease request; when the lease changes hands the robot stops in between."""
         ruling = rule(self.lease, request, now_ns, self.description.lease_ns)
+        if self.state == "armed" and request.action == "renew":
+            return self._answer(ruling.refusal)  # armed, only a good command renews: asking is not commanding
         self.lease = ruling.lease
         if ruling.changed_hands:
             self._forget_commands()
@@ -161,6 +170,7 @@ class Authority:
         """The lease holder's process is known to be gone while disarmed: free the lease at once."""
         if self.state != "armed":
             self._drop_lease()
+        if self.state == "disarmed":
             self.why = cause
 
     # --- what goes out -------------------------------------------------------------------------------------
@@ -170,8 +180,8 @@ class Authority:
         against: list[str] = []
         if self.state != "disarmed":
             against.append(f"state is {self.state}, must be disarmed")
-        if not self._state_valid:
-            against.append("joint state is missing, stale or invalid")
+        if self._state_trouble is not None:
+            against.append(self._state_trouble)
         if not self.lease.live(now_ns):
             against.append("nobody holds the lease")
         elif self._command is None:
@@ -181,7 +191,12 @@ class Authority:
         return against
 
     def expire(self, now_ns: int, tick: int) -> None:
-        """Let the lease run out: armed, that is a fault; disarmed, the lease is simply free again."""
+        """Let the lease run out: armed, that is a fault; disarmed, the lease is simply free again.
+
+        A robot that is armed and does not know its joints any more is at fault too.
+        """
+        if self.state == "armed" and self._state_trouble is not None:
+            self.fault(Fault(tick=tick, what="state_invalid", cause=self._state_trouble))
         if self.lease.holder is None or self.lease.live(now_ns):
             return
         holder, term_ms = self.lease.holder, self.description.lease_ns / 1e6
@@ -240,8 +255,9 @@ class Authority:
         following = lifecycle.after(self.state, event)
         if following is None:
             return
-        if following != "armed" and self.state == "armed":
+        if following != self.state:
             self._hold_at = self._measured.angle_rad
+        if following != "armed" and self.state == "armed":
             self._command = None
         self.state = following
         self.why = why

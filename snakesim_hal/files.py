@@ -50,11 +50,13 @@ class Table:
                     f"`{dotted}` cannot be set inside it"
                 )
         if isinstance(place, list):
-            raise ConfigError(f"{origin}: `{'.'.join(parents)}` is a list; name an entry by its number, from 0")
-        place[last] = value
+            _list_entry(place, last, dotted, origin)
+            place[int(last)] = value
+        else:
+            place[last] = value
         for key in [k for k in self.origin if k == dotted or k.startswith(dotted + ".")]:
             del self.origin[key]
-        self.origin.update({k: origin for k, _ in leaves(value, dotted)})
+        self.origin.update(_origins(value, origin, dotted))
 
     def origin_of(self, dotted: str) -> str:
         """The file or flag behind a dotted key; `default` when nobody set it."""
@@ -65,10 +67,26 @@ class Table:
             key = key.rpartition(".")[0]
         return "default"
 
+    def file_of(self, dotted: str) -> str:
+        """The file in which a field stands, or in which its nearest neighbours do when it is missing."""
+        place = dotted
+        while place:
+            for key, origin in self.origin.items():
+                if (key == place or key.startswith(place + ".")) and not origin.startswith("--"):
+                    return origin
+            place = place.rpartition(".")[0]
+        return self.source
+
+
+def _origins(value: Any, origin: str, prefix: str = "") -> dict[str, str]:
+    """An empty section sets nothing, so everything in it is still a default."""
+    return {key: origin for key, leaf in leaves(value, prefix) if leaf != {}}
+
 
 def _list_entry(place: list[Any], name: str, dotted: str, origin: str) -> Any:
     if not name.isdigit() or int(name) >= len(place):
-        raise ConfigError(f"{origin}: `{dotted}`: the list has entries 0 to {len(place) - 1}")
+        has = f"has entries 0 to {len(place) - 1}; name one by its number" if place else "is empty"
+        raise ConfigError(f"{origin}: `{dotted}`: the list {has}")
     return place[int(name)]
 
 
@@ -95,11 +113,11 @@ def read_table(path: Path) -> Table:
         raise ConfigError(f"{path}: cannot be read as text: {error}") from error
     try:
         values = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, json.JSONDecodeError) as error:
+    except (tomllib.TOMLDecodeError, json.JSONDecodeError, RecursionError) as error:
         raise ConfigError(f"{path}: not valid {path.suffix[1:].upper() or 'TOML'}: {error}") from error
     if not isinstance(values, dict):
         raise ConfigError(f"{path}: holds a {type(values).__name__}, not a table of settings")
-    return Table(values, str(path), {k: str(path) for k, _ in leaves(values)})
+    return Table(values, str(path), _origins(values, str(path)))
 
 
 def find(name: str, kind: str, beside: Path | None = None) -> Path:
@@ -136,7 +154,7 @@ def _explain(error: msgspec.ValidationError, table: Table, struct: type[msgspec.
     match = _AT.match(str(error))
     assert match is not None
     what, where = match["what"], (match["where"] or "$").removeprefix("$").lstrip(".")
-    steps = [step for step in re.split(r"\.|\[|\]", where) if step]
+    steps = _steps(where, table.values, struct)
     dotted = ".".join(filter(None, [under, *steps]))
     unknown = re.match(r"Object contains unknown field `(.*)`", what)
     missing = re.match(r"Object missing required field `(.*)`", what)
@@ -146,11 +164,12 @@ def _explain(error: msgspec.ValidationError, table: Table, struct: type[msgspec.
         close = difflib.get_close_matches(name, fields, 1, 0.6)
         full = f"{dotted}.{name}" if dotted else name
         hint = f"did you mean `{close[0]}`?" if close else f"known here: {', '.join(sorted(fields))}."
-        return f"{table.origin_of(full) if full in table.origin else table.source}: unknown field `{full}`; {hint}"
+        set_by = [origin for key, origin in table.origin.items() if key == full or key.startswith(full + ".")]
+        return f"{set_by[0] if set_by else table.file_of(full)}: unknown field `{full}`; {hint}"
     if missing:
         name = missing[1]
         full = f"{dotted}.{name}" if dotted else name
-        return f"{table.source}: field `{full}` is missing; add it ({_wanted(fields.get(name))})."
+        return f"{table.file_of(full)}: field `{full}` is missing; add it ({_wanted(fields.get(name))})."
     value: Any = table.values
     for step in steps:
         if isinstance(value, list | dict):
@@ -158,9 +177,38 @@ def _explain(error: msgspec.ValidationError, table: Table, struct: type[msgspec.
     info = fields_type(struct, steps)
     unit = _unit_of(info)
     origin = table.origin_of(dotted)
-    origin = table.source if origin == "default" else origin
+    origin = table.file_of(dotted) if origin == "default" else origin
     shown = f"{value!r}{' ' + unit if unit and isinstance(value, int | float) else ''}"
     return f"{origin}: `{dotted}` = {shown} is not allowed: {what[:1].lower() + what[1:]}; wanted is {_wanted(info)}."
+
+
+def _steps(where: str, values: dict[str, Any], struct: type[msgspec.Struct]) -> list[str]:
+    """The way to a wrong value. For a free key of a section msgspec says `[...]`: look which entry it is."""
+    steps: list[str] = []
+    value: Any = values
+    for match in re.finditer(r"\[(\.\.\.|\d+)\]|[^.\[\]]+", where):
+        step = match[1] or match[0]
+        if step == "...":
+            step = _wrong_entry(value, fields_type(struct, steps)) if isinstance(value, dict) else step
+        steps.append(step)
+        if isinstance(value, dict):
+            value = value.get(step)
+        elif isinstance(value, list) and step.isdigit() and int(step) < len(value):
+            value = value[int(step)]
+    return steps
+
+
+def _wrong_entry(section: dict[str, Any], info: inspect.Type | None) -> str:
+    wanted: Any = dict
+    for option in _options(info):
+        if isinstance(option, inspect.DictType) and isinstance(option.value_type, inspect.StructType):
+            wanted = option.value_type.cls
+    for key, value in section.items():
+        try:
+            msgspec.convert(value, wanted)
+        except msgspec.ValidationError:
+            return key
+    return "..."
 
 
 def _fields_at(struct: type[msgspec.Struct], steps: list[str]) -> dict[str, inspect.Type]:

@@ -8,6 +8,7 @@ lockstep  until every participant that owes something has delivered; frozen at t
 free      not at all
 """
 
+import contextlib
 import time
 from collections import deque
 from dataclasses import dataclass, field
@@ -145,6 +146,8 @@ class Host:
         finally:
             self._ended_ns = time.monotonic_ns()
             self.authority.on_lifecycle(LifecycleRequest(action="finish"), self._safety_now())
+            with contextlib.suppress(BackendError):
+                self._backend.enact(self.authority.decide().set_points)
             self._show_status(force=True)
 
     @property
@@ -259,7 +262,8 @@ class Host:
         session, inbox = self._session, self._inbox
 
         def take(item: Any) -> None:
-            if inbox.qsize() < INBOX_LIMIT:
+            # Only samples may be dropped: a flood of commands must not keep an emergency stop out.
+            if not isinstance(item, Arrival) or inbox.qsize() < INBOX_LIMIT:
                 inbox.put(item)
             else:
                 self.tally.inbox_dropped += 1
@@ -308,7 +312,8 @@ class Host:
         except WireError as error:
             self.authority.reject(error.reason)
             return
-        self._delivered(self.authority.lease.holder, command.tick)
+        if command.lease_epoch == self.authority.lease.epoch:
+            self._delivered(self.authority.lease.holder, command.tick)
         safety_ns, monotonic_ns = self._published_at(command.tick)
         now_ns = self._safety_now(arrival.monotonic_ns)
         refusal = self.authority.offer(command, now_ns=now_ns, tick=self._tick, age_ns=now_ns - safety_ns)
@@ -337,7 +342,7 @@ class Host:
             request = self._request_decoders[question.key].decode(question.payload, question.encoding)
         except WireError as error:
             self.authority.reject(error.reason)
-            question.reply(Answer(ok=False, reason=str(error)[:500]))
+            question.reply(Answer(ok=False, reason=str(error)[:500], lifecycle=self.authority.state))
             return
         if isinstance(request, LeaseRequest):
             answer = self.authority.on_lease(request, now_ns)

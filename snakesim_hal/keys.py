@@ -71,7 +71,7 @@ def alive(service: str) -> str:
 
 def service_of(key: str) -> str:
     """The service that a done or alive key names."""
-    return key.rsplit("/", 1)[1]
+    return key.rpartition("/")[2]
 
 
 def message_at(key: str) -> type[m.Message] | None:

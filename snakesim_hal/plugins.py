@@ -58,11 +58,16 @@ def _from_file(name: str, kind: str) -> Any:
         raise ConfigError(f"{kind} {name!r} cannot be loaded: {type(error).__name__}: {error}") from error
 
 
-def plugin_settings(plugin: Any, section: dict[str, Any], source: str, where: str) -> Any:
-    """A plugin's section of the configuration, checked by its own `Settings`."""
+def plugin_settings(
+    plugin: Any, section: dict[str, Any], source: str, where: str, origin: dict[str, str] | None = None
+) -> Any:
+    """A plugin's section of the configuration, checked by its own `Settings`.
+
+    source, origin: the file, and what is known of where each of its dotted keys came from.
+    """
     settings = getattr(plugin, "Settings", None)
     if not (isinstance(settings, type) and issubclass(settings, msgspec.Struct)):
         raise ConfigError(
             f"{plugin!r} has no `Settings` Struct; a plugin states its settings there, if only an empty one"
         )
-    return decode(Table(section, source), settings, where)
+    return decode(Table(section, source, origin or {}), settings, where)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.files import FileStruct
 from snakesim_hal.messages import Obstacle
+from snakesim_hal.quantities import Name
 from snakesim_hal.route import Route, sine_points
 
 Floats = NDArray[np.float64]
@@ -70,7 +71,7 @@ class Cylinder(FileStruct, frozen=True, kw_only=True):
     radius_m: Size
     height_m: Size = 0.2
     friction: Friction = 0.0
-    name: str | None = None
+    name: Name | None = None
 
 
 class Box(FileStruct, frozen=True, kw_only=True):
@@ -80,7 +81,7 @@ class Box(FileStruct, frozen=True, kw_only=True):
     size_m: tuple[Size, Size, Size]
     yaw_rad: Heading = 0.0
     friction: Friction = 0.0
-    name: str | None = None
+    name: Name | None = None
 
 
 class Sphere(FileStruct, frozen=True, kw_only=True):
@@ -90,7 +91,7 @@ class Sphere(FileStruct, frozen=True, kw_only=True):
     radius_m: Size
     centre_height_m: Coordinate = 0.0
     friction: Friction = 0.0
-    name: str | None = None
+    name: Name | None = None
 
 
 class Wall(FileStruct, frozen=True, kw_only=True):
@@ -101,7 +102,7 @@ class Wall(FileStruct, frozen=True, kw_only=True):
     thickness_m: Size = 0.05
     height_m: Size = 0.3
     friction: Friction = 0.0
-    name: str | None = None
+    name: Name | None = None
 
 
 class Step(FileStruct, frozen=True, kw_only=True):
@@ -112,7 +113,7 @@ class Step(FileStruct, frozen=True, kw_only=True):
     height_m: Annotated[float, _length(0, 2)]
     yaw_rad: Heading = 0.0
     friction: Friction = 0.5
-    name: str | None = None
+    name: Name | None = None
 
 
 class PegsAlongRoute(FileStruct, frozen=True, kw_only=True):

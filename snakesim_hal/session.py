@@ -94,7 +94,7 @@ class Question:
 
     def reply(self, answer: Answer) -> None:
         """Answer and close it."""
-        self._query.reply(self._query.key_expr, encode(answer), encoding=encoding_of(Answer))
+        self._query.reply(self.key, encode(answer), encoding=encoding_of(Answer))
         self._query.drop()
 
 
@@ -109,12 +109,14 @@ class Session:
     def publisher(self, key: str, message: type[MessageT], *, lossless: bool = False) -> Publisher[MessageT]:
         """A publisher for a stream. Lossless waits for slow readers (lockstep); otherwise samples are dropped."""
         command = key == keys.JOINT_COMMAND
+        # What ends a tick is sent at once, and takes along what was put just before it: one packet instead of five.
+        ends_a_tick = command or key == keys.CLOCK or key.startswith(keys.done(""))
         publisher = self._zenoh.declare_publisher(
             key,
             encoding=encoding_of(message),
             congestion_control=zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP,
             priority=zenoh.Priority.REAL_TIME if command else zenoh.Priority.DATA_HIGH,
-            express=True,
+            express=ends_a_tick,
         )
         self._declared.append(publisher)
         return Publisher(publisher, message)
@@ -162,7 +164,8 @@ class Session:
 
         def handle(query: zenoh.Query) -> None:
             payload = b"" if query.payload is None else query.payload.to_bytes()
-            take(Question(str(query.key_expr), payload, str(query.encoding or ""), query))
+            # The query's own key may be a pattern, such as `hal/*`; the question is always about ours.
+            take(Question(key, payload, str(query.encoding or ""), query))
 
         self._declared.append(self._zenoh.declare_queryable(key, handle))
 

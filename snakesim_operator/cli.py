@@ -114,10 +114,11 @@ def _load(arguments: argparse.Namespace) -> Loaded:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.run import RunRequest, run
+    from snakesim_operator.run import RunRequest, check_plugins, run
 
-    config = _load(arguments).config
-    return run(RunRequest(config, arguments.out, arguments.endpoint, arguments.router, arguments.namespace))
+    loaded = _load(arguments)
+    check_plugins(loaded.config, loaded.table)  # here, because only the table knows which flag set what
+    return run(RunRequest(loaded.config, arguments.out, arguments.endpoint, arguments.router, arguments.namespace))
 
 
 def _config(arguments: argparse.Namespace) -> int:

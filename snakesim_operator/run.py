@@ -20,7 +20,7 @@ import msgspec
 from snakesim_hal import keys
 from snakesim_hal.errors import ConfigError, NotConnectedError, SnakesimError
 from snakesim_hal.files import Table
-from snakesim_hal.host_process import HOST_RECORD, backend_settings
+from snakesim_hal.host_process import HOST_RECORD
 from snakesim_hal.messages import ControlState, LifecycleRequest, Message, Status, World
 from snakesim_hal.plugins import BACKENDS, CONTROLLERS, SERVICES, find_plugin, plugin_settings
 from snakesim_hal.scenario import RunConfig, write
@@ -96,11 +96,11 @@ def check_plugins(config: RunConfig, table: Table | None = None) -> None:
             "--backend can: the SocketCAN backend is not part of this release; it comes with the next one. "
             "Run the same scenario with --backend sim"
         )
-    backend_settings(config, find_plugin(BACKENDS, config.backend))
     source = table.source if table is not None else f"scenario {config.name!r}"
-    plugin_settings(
-        find_plugin(CONTROLLERS, config.controller), config.control_settings, source, config.control_section
-    )
+    origin = table.origin if table is not None else None
+    backend, controller = find_plugin(BACKENDS, config.backend), find_plugin(CONTROLLERS, config.controller)
+    plugin_settings(backend, config.backends.get(config.backend, {}), source, f"backends.{config.backend}", origin)
+    plugin_settings(controller, config.control_settings, source, config.control_section, origin)
     for service in config.services:
         find_plugin(SERVICES, service)
 

@@ -44,7 +44,7 @@ class SimBackend:
             self._rope = Rope(self._sim.model, self._data, settings.tether)
             self._rope.tighten()
         self._sensors = Sensors(self._sim, self._data, config, self._motors)
-        self._watch = DivergenceWatch(self._sim.model, self._data)
+        self._watch = DivergenceWatch(self._sim.model, self._data, self._sim.steps_per_tick)
         self._model, self._option = self._sim.model, self._sim.model.opt
         self._with_sensors = int(self._option.disableflags)
         self._without_sensors = self._with_sensors | int(mujoco.mjtDisableBit.mjDSBL_SENSOR)

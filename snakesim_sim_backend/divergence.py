@@ -4,75 +4,83 @@ import mujoco
 import numpy as np
 
 from snakesim_hal.errors import BackendError
-from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS
+from snakesim_sim_backend.model import FREE_DOFS
 
 MOST_POSITION = 1e4  # m or rad: of any coordinate
 MOST_SPEED = 1e3  # m/s or rad/s
 MOST_ACCELERATION = 1e9  # m/s² or rad/s²
-BASE = ["x", "y", "z", "roll", "pitch", "yaw"]
-GRAVE = [
-    mujoco.mjtWarning.mjWARN_INERTIA,
-    mujoco.mjtWarning.mjWARN_CONTACTFULL,
-    mujoco.mjtWarning.mjWARN_CNSTRFULL,
-    mujoco.mjtWarning.mjWARN_BADQPOS,
-    mujoco.mjtWarning.mjWARN_BADQVEL,
-    mujoco.mjtWarning.mjWARN_BADQACC,
-    mujoco.mjtWarning.mjWARN_BADCTRL,
-]
+BASE = ["the base along x", "the base along y", "the base along z"] + ["the base, turning,"] * 3
+WHOLE = mujoco.mjtState.mjSTATE_INTEGRATION
+INPUTS = mujoco.mjtState.mjSTATE_USER
 
 
 class DivergenceWatch:
     """Checks the state once a tick."""
 
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-        self._model, self._data = model, data
-        self._good = np.empty(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_INTEGRATION))
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, steps_per_tick: int) -> None:
+        self._model, self._data, self._steps = model, data, steps_per_tick
+        self._good = np.empty(mujoco.mj_stateSize(model, WHOLE))
         self._qpos, self._qvel, self._qacc = data.qpos, data.qvel, data.qacc
         self._warnings = data.warning.number
         self._why: str | None = None
-        self.keep()
-
-    def keep(self) -> None:
-        """Remember the present state as a good one."""
-        mujoco.mj_getState(self._model, self._data, self._good, mujoco.mjtState.mjSTATE_INTEGRATION)
+        self._keep()
 
     def check(self, tick: int) -> None:
         """Keep a good state. For a bad one, go back to the last good one and raise BackendError, from now on always."""
-        if self._why is not None:
-            raise BackendError(self._why)
+        if self._why is None:
+            if self._is_good():
+                self._keep()
+                return
+            warned = [mujoco.mjtWarning(i).name for i in self._warnings.nonzero()[0].tolist()]
+            said = f" MuJoCo says {', '.join(warned)}." if warned else ""
+            self._why = (
+                f"the simulation diverged at tick {tick}: {self._find_culprit()}.{said} Lower "
+                f"`backends.sim.timestep_s` or the gains in [motor]; stiff gains want armature"
+            )
+            self._go_back()
+        raise BackendError(self._why)
+
+    def _is_good(self) -> bool:
         qpos, qvel, qacc, warnings = self._qpos, self._qvel, self._qacc, self._warnings
         # One comparison each, which NaN fails too: the squared length bounds every coordinate.
-        if (
+        return bool(
             qpos.dot(qpos) < MOST_POSITION**2
             and qvel.dot(qvel) < MOST_SPEED**2
             and qacc.dot(qacc) < MOST_ACCELERATION**2
             and warnings.dot(warnings) == 0
-        ):
-            self.keep()
-            return
-        self._why = self._explain(tick)
-        data = self._data
-        mujoco.mj_setState(self._model, data, self._good, mujoco.mjtState.mjSTATE_INTEGRATION)
-        self._warnings[:] = 0
-        mujoco.mj_forward(self._model, data)
-        raise BackendError(self._why)
-
-    def _explain(self, tick: int) -> str:
-        data = self._data
-        found = ""
-        for what, unit, values, most in (
-            ("angle", "rad", data.qpos[FREE_QPOS - FREE_DOFS :], MOST_POSITION),
-            ("velocity", "rad/s", data.qvel, MOST_SPEED),
-            ("acceleration", "rad/s²", data.qacc, MOST_ACCELERATION),
-        ):
-            size = np.nan_to_num(np.abs(values), nan=np.inf)
-            worst = int(np.argmax(size))
-            if size[worst] >= most / 10 and not found:
-                where = f"base {BASE[worst]}" if worst < FREE_DOFS else f"joint_{worst - FREE_DOFS + 1}"
-                found = f"{where} has {what} {values[worst]:g} {unit if worst >= FREE_DOFS else '(SI)'}"
-        warned = [mujoco.mjtWarning(i).name for i in self._warnings.nonzero()[0]]
-        said = f"; MuJoCo says {', '.join(warned)}" if warned else ""
-        return (
-            f"the simulation diverged at tick {tick}: {found or 'the state as a whole is too large'}{said}. "
-            f"Lower `backends.sim.timestep_s` or the gains in [motor]; stiff gains want armature"
         )
+
+    def _keep(self) -> None:
+        mujoco.mj_getState(self._model, self._data, self._good, WHOLE)
+
+    def _go_back(self) -> None:
+        mujoco.mj_setState(self._model, self._data, self._good, WHOLE)
+        self._warnings[:] = 0
+
+    def _find_culprit(self) -> str:
+        """Where it began. A diverged state is bad all over; so the tick is gone through again, step by step."""
+        model, data = self._model, self._data
+        inputs = np.empty(mujoco.mj_stateSize(model, INPUTS))
+        mujoco.mj_getState(model, data, inputs, INPUTS)
+        bad = self._worst()
+        self._go_back()
+        mujoco.mj_setState(model, data, inputs, INPUTS)
+        for _ in range(self._steps):
+            mujoco.mj_step(model, data)
+            found = self._worst()
+            if found is not None:
+                bad = found
+            if not self._is_good():
+                break
+        return bad or "no number is left"
+
+    def _worst(self) -> str | None:
+        """The greatest speed, or acceleration if that is nearer to its bound; None when they are no numbers."""
+        share_v, share_a = np.abs(self._qvel) / MOST_SPEED, np.abs(self._qacc) / MOST_ACCELERATION
+        shares = np.maximum(share_v, share_a)
+        if not np.all(np.isfinite(shares)):
+            return None
+        dof = int(np.argmax(shares))
+        who = BASE[dof] if dof < FREE_DOFS else f"joint_{dof - FREE_DOFS + 1}"
+        unit = "m" if dof < 3 else "rad"
+        return f"{who} moves at {self._qvel[dof]:.4g} {unit}/s and accelerates at {self._qacc[dof]:.4g} {unit}/s²"

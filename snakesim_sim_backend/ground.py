@@ -1,15 +1,16 @@
 """The ground as MuJoCo has it: a plane, or a height field of smooth random hills."""
 
+from typing import Any
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.scene import Ground, Uneven
-from snakesim_sim_backend.surface import Surface, surface
 
 Floats = NDArray[np.float64]
 
-GROUND = "ground"
+GROUND, HILLS = "ground", "hills"
 GROUND_GROUP = 1  # MuJoCo geom group of all that the snake may lie on, steps too
 SAMPLES_PER_WAVE = 12
 MOST_SAMPLES = 500  # along an edge
@@ -17,31 +18,29 @@ WAVES = 40
 DEPTH_M = 0.5  # of the height field below its lowest point
 
 
-def add_ground(spec: mujoco.MjSpec, ground: Ground, contact_time_s: float) -> None:
-    """Put the ground into a model: geoms whose names begin with `ground`."""
-    grip = surface(ground.friction, contact_time_s)
+def add_ground(spec: mujoco.MjSpec, ground: Ground) -> dict[str, float]:
+    """Put the ground into a model. Returns the names of its geoms, each with its friction."""
     uneven = ground.uneven
     lowest = 0.0 if uneven is None else -uneven.height_m / 2
-    _add_plane(spec, lowest, grip)
+    _add(spec, GROUND, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=[0, 0, lowest])
     if uneven is None:
-        return
+        return {GROUND: ground.friction}
     heights = hills(uneven)
     rows = len(heights)
     spec.add_hfield(
-        name="hills",
+        name=HILLS,
         nrow=rows,
         ncol=rows,
         size=[uneven.area_m / 2, uneven.area_m / 2, uneven.height_m, DEPTH_M],
         userdata=((heights - lowest) / uneven.height_m).ravel().tolist(),
     )
-    hfield = mujoco.mjtGeom.mjGEOM_HFIELD
-    spec.worldbody.add_geom(name=f"{GROUND}_hills", type=hfield, hfieldname="hills", pos=[0, 0, lowest], group=GROUND_GROUP, **grip)
+    _add(spec, HILLS, type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname=HILLS, pos=[0, 0, lowest])
+    return {GROUND: ground.friction, HILLS: ground.friction}  # the plane below catches what leaves the hills
 
 
-def _add_plane(spec: mujoco.MjSpec, height_m: float, grip: Surface) -> None:
-    """The flat ground, which under hills only catches what leaves them."""
-    plane = mujoco.mjtGeom.mjGEOM_PLANE
-    spec.worldbody.add_geom(name=GROUND, type=plane, size=[0, 0, 1], pos=[0, 0, height_m], group=GROUND_GROUP, **grip)
+def _add(spec: mujoco.MjSpec, name: str, **shape: Any) -> None:
+    """A geom that touches nothing by itself, only what it is paired with."""
+    spec.worldbody.add_geom(name=name, contype=0, conaffinity=0, group=GROUND_GROUP, **shape)
 
 
 def hills(uneven: Uneven) -> Floats:

@@ -15,11 +15,11 @@ from snakesim_hal.messages import Axis
 from snakesim_hal.robot import RobotFile
 from snakesim_hal.scenario import RunConfig, place_all
 from snakesim_sim_backend.actuators import add_motor
-from snakesim_sim_backend.ground import add_ground
+from snakesim_sim_backend.ground import GROUND, add_ground
 from snakesim_sim_backend.imu import add_imus
 from snakesim_sim_backend.obstacles import OBSTACLE, add_obstacle
 from snakesim_sim_backend.settings import Settings
-from snakesim_sim_backend.surface import surface
+from snakesim_sim_backend.surface import ground_sole, link_skin
 from snakesim_sim_backend.tether import add_tether
 
 FREE_QPOS = 7  # of the base: position and quaternion
@@ -49,17 +49,13 @@ def build(config: RunConfig, settings: Settings) -> SimModel:
     spec = mujoco.MjSpec()
     _set_options(spec, step_s, settings)
     scene = config.scene
-    add_ground(spec, scene.ground, settings.contact_time_s)
+    grounds = add_ground(spec, scene.ground)
     hills_m = scene.ground.uneven.height_m if scene.ground.uneven else 0.0
+    radius_m = config.robot.module.radius_m
     for placed in place_all(config):
-        add_obstacle(
-            spec,
-            placed,
-            contact_time_s=settings.contact_time_s,
-            body_radius_m=config.robot.module.radius_m,
-            hills_m=hills_m,
-        )
+        grounds |= add_obstacle(spec, placed, settings, body_radius_m=radius_m, hills_m=hills_m)
     _add_snake(spec, config.robot, settings)
+    _pair_with_ground(spec, grounds, config.robot, settings)
     if config.robot.sensors.imu is not None:
         add_imus(spec, config.robot.link_lengths_m)
     if settings.tether is not None:
@@ -90,7 +86,7 @@ def _set_options(spec: mujoco.MjSpec, step_s: float, settings: Settings) -> None
 
 def _add_snake(spec: mujoco.MjSpec, robot: RobotFile, settings: Settings) -> None:
     lengths, masses, axes = robot.link_lengths_m, robot.link_masses_kg, robot.axes
-    skin = surface(settings.self_friction, settings.contact_time_s, priority=0)
+    skin = link_skin(settings)
     body = spec.worldbody
     for i, (length, mass) in enumerate(zip(lengths, masses, strict=True)):
         rear = [0.0, 0.0, robot.module.radius_m] if i == 0 else [lengths[i - 1], 0.0, 0.0]
@@ -108,10 +104,34 @@ def _add_snake(spec: mujoco.MjSpec, robot: RobotFile, settings: Settings) -> Non
             mass=mass,
             **skin,
         )
+        _add_foot(body, f"foot_{i}", 0.0, robot)
+    _add_foot(body, f"foot_{len(lengths)}", lengths[-1], robot)
     for i in range(len(lengths)):
         for j in range(i + 2, len(lengths)):
             if sum(lengths[i + 1 : j]) < 2.05 * robot.module.radius_m:  # they would touch when the snake is straight
                 spec.add_exclude(bodyname1=f"link_{i}", bodyname2=f"link_{j}")
+
+
+def _add_foot(body: mujoco.MjsBody, name: str, along_m: float, robot: RobotFile) -> None:
+    """A massless ball as thick as the body, at a joint or an end."""
+    ball = mujoco.mjtGeom.mjGEOM_SPHERE
+    size = [robot.module.radius_m, 0.0, 0.0]
+    body.add_geom(name=name, type=ball, size=size, pos=[along_m, 0.0, 0.0], mass=0.0, contype=0, conaffinity=0)
+
+
+def _pair_with_ground(
+    spec: mujoco.MjSpec, grounds: dict[str, float], robot: RobotFile, settings: Settings
+) -> None:
+    """Let the snake lie on ground and steps.
+
+    A plane bears a chain of capsules at the balls around joints and ends, and nowhere else. Each is there once, while
+    capsules would bring two of them to every joint. Hills and steps bear the capsules.
+    """
+    for name, friction in grounds.items():
+        flat = name == GROUND
+        for i in range(robot.chain.modules + (2 if flat else 1)):
+            sole = ground_sole(friction, settings)
+            spec.add_pair(geomname1=name, geomname2=f"foot_{i}" if flat else f"link_{i}", **sole)
 
 
 def _add_joint(body: mujoco.MjsBody, name: str, axis: Axis, robot: RobotFile) -> None:

@@ -8,7 +8,8 @@ from snakesim_hal.kinematics import quaternion_from_yaw
 from snakesim_hal.messages import Obstacle
 from snakesim_hal.scene import Placed
 from snakesim_sim_backend.ground import GROUND_GROUP
-from snakesim_sim_backend.surface import surface
+from snakesim_sim_backend.settings import Settings
+from snakesim_sim_backend.surface import obstacle_skin
 
 OBSTACLE = "obstacle:"
 STEP = "step:"
@@ -25,17 +26,22 @@ class Shape(TypedDict):
 
 
 def add_obstacle(
-    spec: mujoco.MjSpec, placed: Placed, *, contact_time_s: float, body_radius_m: float, hills_m: float
-) -> None:
-    """Put an obstacle into a model; its geom is called `obstacle:<name>`, or `step:<name>` when it is walkable.
+    spec: mujoco.MjSpec, placed: Placed, settings: Settings, *, body_radius_m: float, hills_m: float
+) -> dict[str, float]:
+    """Put an obstacle into a model; its geom is called `obstacle:<name>`.
 
+    A walkable one is called `step:<name>` and belongs to the ground: its name and friction are returned.
     body_radius_m: of the snake; hills_m: from the ground's lowest to its highest point.
     """
     obstacle = placed.obstacle
-    name = f"{STEP if placed.walkable else OBSTACLE}{obstacle.name}"
-    grip = surface(placed.friction, contact_time_s)
-    group = GROUND_GROUP if placed.walkable else OBSTACLE_GROUP
-    spec.worldbody.add_geom(name=name, group=group, **_shape(obstacle, body_radius_m, hills_m), **grip)
+    shape = _shape(obstacle, body_radius_m, hills_m)
+    if placed.walkable:
+        name = f"{STEP}{obstacle.name}"
+        spec.worldbody.add_geom(name=name, contype=0, conaffinity=0, group=GROUND_GROUP, **shape)
+        return {name: placed.friction}
+    skin = obstacle_skin(placed.friction, settings)
+    spec.worldbody.add_geom(name=f"{OBSTACLE}{obstacle.name}", group=OBSTACLE_GROUP, **shape, **skin)
+    return {}
 
 
 def _shape(obstacle: Obstacle, body_radius_m: float, hills_m: float) -> Shape:

@@ -8,14 +8,15 @@ from snakesim_hal.kinematics import link_frames, quaternion_from_yaw, rotation_f
 from snakesim_hal.messages import Mode
 from snakesim_hal.scenario import RunConfig, StartPose, start_of
 from snakesim_sim_backend.actuators import Motors
-from snakesim_sim_backend.ground import GROUND, GROUND_GROUP
+from snakesim_sim_backend.ground import GROUND_GROUP
 from snakesim_sim_backend.model import FREE_QPOS, SimModel
-from snakesim_sim_backend.obstacles import STEP
 
 REST = 1e-3  # m/s and rad/s: slower is at rest
 REST_ROUNDS = 5
 ROUND_S = 0.01
-GRIP = 2.0  # friction of the ground while settling, so that the snake stays where it is put
+# Friction of the ground while settling (sliding, torsion and rolling): the snake stays where it is put.
+GRIP = np.array([2.0, 2.0, 0.1, 0.1, 0.1])
+ALL_FRICTION = 6  # condim with which all three act
 
 
 def lay_down(sim: SimModel, data: mujoco.MjData, config: RunConfig, motors: Motors, settle_s: float) -> None:
@@ -68,9 +69,8 @@ def _settle(
     count = motors.count
     limits = [config.robot.limits.torque_nm] * count
     motors.enact(SetPoints([Mode.POSITION] * count, pose.angles_rad.tolist(), limits))
-    grounds = [i for i in range(model.ngeom) if model.geom(i).name.startswith((GROUND, STEP))]
-    friction = model.geom_friction[grounds, 0]
-    model.geom_friction[grounds, 0] = np.maximum(friction, GRIP)
+    friction, condim = model.pair_friction.copy(), model.pair_dim.copy()
+    model.pair_friction[:], model.pair_dim[:] = np.maximum(friction, GRIP), ALL_FRICTION
     steps = max(round(ROUND_S / model.opt.timestep), 1)
     at_rest = 0
     for _ in range(round(settle_s / (steps * model.opt.timestep))):
@@ -78,4 +78,4 @@ def _settle(
         at_rest = at_rest + 1 if np.abs(data.qvel).max() < REST else 0
         if at_rest == REST_ROUNDS:
             break
-    model.geom_friction[grounds, 0] = friction
+    model.pair_friction[:], model.pair_dim[:] = friction, condim

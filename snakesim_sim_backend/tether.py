@@ -27,7 +27,7 @@ def add_tether(spec: mujoco.MjSpec, tether: Tether, robot: RobotFile, contact_ti
     if np.hypot(*tether.direction_w) == 0:
         raise ConfigError("`backends.sim.tether.direction_w` = (0, 0) is no direction; give x and y, such as [-1, 0]")
     spec.body(f"link_{tether.link}").add_site(name=HOOK, pos=[tether.point_m, 0.0, 0.0])
-    spec.worldbody.add_site(name=ANCHOR, pos=[0.0, 0.0, 0.0])
+    spec.worldbody.add_site(name=ANCHOR, pos=[ROPE_M, 0.0, 0.0])  # at the origin MuJoCo would take it as unmovable
     tendon = spec.add_tendon(
         name=TENDON,
         limited=True,
@@ -66,11 +66,11 @@ class Rope:
         model.site_pos[model.site(ANCHOR).id] = hook + ROPE_M * along / np.linalg.norm(along)
         model.tendon_range[model.tendon(TENDON).id] = [0.0, ROPE_M]
         if self._winch is not None:
-            data.ctrl[model.actuator(WINCH).ctrladr[0]] = -self._tether.reel_in_m_s
+            data.ctrl[model.actuator_ctrladr[self._winch]] = -self._tether.reel_in_m_s
 
     def tension_n(self) -> float:
         """Force in the rope over the last physics step."""
         data = self._data
-        held = data.efc_force[data.efc_type == mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON].sum()
+        held = data.efc_force[data.efc_type == int(mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON)].sum()
         wound = 0.0 if self._winch is None else -data.actuator_force[self._winch]
         return float(held + wound)

@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 
 from snakesim_gnc.control.body_on_path import BodyOnPath, Lie, chain_nodes, heading_of
 from snakesim_gnc.control.controller import View
-from snakesim_hal.messages import Description, Trajectory, World
-from snakesim_hal.route import Route, yaw_segments_m
+from snakesim_gnc.control.planar_body import PlanarBody
+from snakesim_hal.messages import Trajectory, World
+from snakesim_hal.route import Route
 
 Floats = NDArray[np.float64]
 
@@ -21,6 +22,7 @@ class Located:
     """The body on its path at one tick."""
 
     lie: Lie  # as it would lie on the path
+    on_path: BodyOnPath
     tail_s_m: float
     speed_m_s: float
     nodes_w: Floats  # (2, n_nodes), as measured at the newest world model's tick
@@ -37,12 +39,9 @@ class Progress:
     the speed last seen, so what is returned is always the present.
     """
 
-    def __init__(self, robot: Description, *, speed_filter_s: float, oldest_world_s: float) -> None:
-        axes = [joint.axis for joint in robot.joints]
-        self.bends = [i for i, axis in enumerate(axes) if axis == "yaw"]
-        self.segments_m = yaw_segments_m(axes, [link.length_m for link in robot.links])
-        self._all_bend = len(self.bends) == len(axes)
-        self._segments = np.array(self.segments_m)
+    def __init__(self, body: PlanarBody, *, speed_filter_s: float, oldest_world_s: float) -> None:
+        self._planar = body
+        self._segments = np.array(body.segments_m)
         self._speed_filter_s = speed_filter_s
         self._oldest_s = oldest_world_s
         self._angles: deque[tuple[int, list[float]]] = deque(maxlen=TICKS_KEPT)
@@ -66,7 +65,7 @@ class Progress:
             return f"the world model is {age_s:.2f} s old; at most {self._oldest_s} s"
         new_path = self._body is None or trajectory.path_id != self._path_id
         if new_path:
-            self._body = BodyOnPath(Route(trajectory.path_w), self.segments_m)
+            self._body = BodyOnPath(Route(trajectory.path_w), self._planar.segments_m)
             self._path_id = trajectory.path_id
         body = self._body
         assert body is not None
@@ -79,11 +78,11 @@ class Progress:
             self._filter(body, world, view.period_s)
         self._world = world
         s = self._s_m + self._speed_m_s * age_s
-        return Located(body.at(s), s, self._speed_m_s, self._nodes, fresh, new_path, world, trajectory)
+        return Located(body.at(s), body, s, self._speed_m_s, self._nodes, fresh, new_path, world, trajectory)
 
     def _measure(self, world: World) -> None:
         angles = next((a for tick, a in reversed(self._angles) if tick <= world.tick), self._angles[0][1])
-        bending = np.array(angles if self._all_bend else [angles[i] for i in self.bends])
+        bending = np.array(angles)[self._planar.bends]
         heading = heading_of(world.base_orientation_wxyz)
         self._nodes = chain_nodes(world.base_position_w[:2], heading, bending, self._segments)
 

@@ -79,7 +79,7 @@ def arrow(tail: Point, tip: Point, class_: str, *, head: float = 9.0, both: bool
     return line(start, neck, f"{class_} shaft") + heads
 
 
-def figure(width: float, height: float, label: str, *children: str, **attributes: Attribute) -> str:
+def figure(width: float, height: float, label: str, /, *children: str, **attributes: Attribute) -> str:
     """A whole drawing. label: what it shows, for those who cannot see it."""
     return element(
         "svg",

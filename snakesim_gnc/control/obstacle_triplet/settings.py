@@ -1,4 +1,4 @@
-"""What a scenario's `[control]` section may say to the obstacle-triplet controller."""
+"""What a scenario's `[controllers.obstacle_triplet]` section may say."""
 
 from typing import Annotated
 
@@ -15,7 +15,7 @@ def _from_zero(high: float, unit: str) -> Meta:
     return Meta(ge=0, le=high, extra_json_schema={"unit": unit})
 
 
-class Settings(FileStruct, kw_only=True):
+class Settings(FileStruct, frozen=True, kw_only=True):
     """The defaults suit modules of about 0.1 m and some hundred grams. Speed comes from the mission."""
 
     # Greatest propulsion force (the paper's f_s). It fades to zero as the snake reaches the mission's speed.

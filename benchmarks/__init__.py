@@ -1,0 +1,4 @@
+"""Measured ratios: each compares SnakeSIM with the least that could do the same job, in one run, on one machine.
+
+`python -m benchmarks` prints them all; absolute times on a shared machine mean little, so medians of ratios are quoted.
+"""

@@ -1,0 +1,68 @@
+"""`python -m benchmarks [--write]`: measure, print, and keep the table in benchmarks/RESULTS.md."""
+
+import argparse
+import platform
+import statistics
+from pathlib import Path
+
+from benchmarks.echo import echo_us
+from benchmarks.physics import bare_physics_us, config_of, sensing, wire_bytes
+from benchmarks.size import core_install_mb
+from benchmarks.table import HEADER, compare
+from benchmarks.whole import controller_us, highest_rate_hz, latency_us, lockstep_tick_us
+
+RESULTS = Path(__file__).parent / "RESULTS.md"
+REPEATS = 3
+
+
+def main() -> int:
+    """Print every line as soon as it is known."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--write", action="store_true", help=f"keep the table in {RESULTS.name}")
+    write = parser.parse_args().write
+    text: list[str] = []
+
+    def say(line: str) -> None:
+        print(line, flush=True)
+        text.append(line)
+
+    say("# Benchmarks\n")
+    say(f"Printed by `make bench`. {platform.machine()}, Python {platform.python_version()}, two cores, shared machine:")
+    say("read the ratios, not the times. Each ratio is a median of pairs measured in turn in one run.\n")
+    say(HEADER)
+    ours, theirs = sensing()
+    say(compare("simulator tick, all sensors published", "bare `mj_step`", ours, theirs, 1.25).row())
+
+    config = config_of()
+    state, command = wire_bytes(config)
+    ticks: list[float] = []
+    floors: list[float] = []
+    for _ in range(REPEATS):
+        ticks.append(lockstep_tick_us())
+        floors.append(bare_physics_us(config) + echo_us(state, command) + controller_us())
+    what = "lockstep tick, three GNC processes"
+    say(compare(what, "bare physics + raw echo + controller", ticks, floors, 1.5).row())
+
+    latencies: list[float] = []
+    echoes: list[float] = []
+    for _ in range(REPEATS):
+        latencies.append(latency_us())
+        echoes.append(echo_us(state, command))
+    say(compare("realtime state-to-command, p50", "raw echo of the same bytes", latencies, echoes, 2.0).row())
+
+    period_us = config.period_ns / 1000
+    say(f"\nLockstep, 13 joints at 100 Hz: {period_us / statistics.median(ticks):.1f} times real time.")
+    best, shares = highest_rate_hz()
+    listed = ", ".join(f"{rate} Hz {100 * share:.1f} %" for rate, share in shares.items())
+    say(f"Highest rate at which 99 % of ticks get their command within the tick: {best} Hz ({listed}).")
+    total, sizes = core_install_mb()
+    largest = sorted(sizes.items(), key=lambda item: -item[1])[:6]
+    listed = ", ".join(f"{name} {size:.0f}" for name, size in largest)
+    say(f"Core install: {total:.0f} MB of 400 MB allowed ({listed}).")
+    if write:
+        RESULTS.write_text("\n".join(text) + "\n", encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

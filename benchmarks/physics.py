@@ -1,0 +1,146 @@
+"""The simulator in this process: with everything published, and as a bare loop of `mj_step`."""
+
+import socket
+import statistics
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import mujoco
+
+from snakesim_hal.backend import Samples, SetPoints
+from snakesim_hal.codec import encode
+from snakesim_hal.keys import CLOCK, JOINTS
+from snakesim_hal.messages import Clock, JointCommand, Mode
+from snakesim_hal.plugins import BACKENDS, find_plugin, plugin_settings
+from snakesim_hal.scenario import RunConfig, load
+from snakesim_hal.session import Link, Publisher, Session, open_session
+from snakesim_sim_backend.backend import SimBackend
+
+BLOCKS, TICKS_A_BLOCK = 15, 200
+
+
+def config_of(scenario: str = "triplet") -> RunConfig:
+    """The scenario that is measured."""
+    return load(scenario).config
+
+
+def open_simulator(config: RunConfig) -> SimBackend:
+    """As the host opens it."""
+    factory = find_plugin(BACKENDS, "sim")
+    backend = factory(config, plugin_settings(factory, config.backends.get("sim", {}), "benchmarks", "backends.sim"))
+    assert isinstance(backend, SimBackend)
+    return backend
+
+
+def holding(backend: SimBackend) -> SetPoints:
+    """Every joint stays where it is."""
+    joints = backend.describe().joints
+    angles = list(backend.sample(0, 0).joints.angle_rad)
+    return SetPoints([Mode.POSITION] * len(joints), angles, [joint.torque_limit_nm for joint in joints])
+
+
+@contextmanager
+def listened_session() -> Iterator[tuple[Session, Session]]:
+    """A listening session and one that is connected to it, so that what is published really goes over the wire."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    with open_session(Link(endpoint, "bench", True)) as host, open_session(Link(endpoint, "bench")) as other:
+        yield host, other
+
+
+class Publishing:
+    """What the host does with samples, and nothing else."""
+
+    def __init__(self, session: Session, period_ns: int) -> None:
+        self._session = session
+        self._period_ns = period_ns
+        self._publishers: dict[str, Publisher[JointCommand]] = {}
+
+    def put(self, tick: int, samples: Samples) -> None:
+        """Publish every sample and the clock."""
+        clock = Clock(
+            tick=tick,
+            stamp_ns=tick * self._period_ns,
+            period_ns=self._period_ns,
+            pace="free",
+            lifecycle="armed",
+            arming=1,
+            lease_epoch=1,
+            newest={key: tick for key in samples.others},
+        )
+        for key, message in ((JOINTS, samples.joints), *samples.others.items(), (CLOCK, clock)):
+            if key not in self._publishers:
+                self._publishers[key] = self._session.publisher(key, type(message))  # pyright: ignore
+            self._publishers[key].put(message)  # pyright: ignore
+
+
+def bare_tick_us(backend: SimBackend, ticks: int) -> float:
+    """Mean time of one control period of nothing but `mj_step`; MuJoCo's own sensors are left out too."""
+    model, data, steps = backend.sim.model, backend.data, backend.sim.steps_per_tick
+    kept = int(model.opt.disableflags)
+    model.opt.disableflags = kept | int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+    begin = time.perf_counter()
+    for _ in range(ticks):
+        mujoco.mj_step(model, data, steps)
+    spent = time.perf_counter() - begin
+    model.opt.disableflags = kept
+    return spent / ticks * 1e6
+
+
+def sensing() -> tuple[list[float], list[float]]:
+    """Per block, the time of a tick (in µs) with all sensors published, and of a tick of bare physics."""
+    config = config_of()
+    full, bare = open_simulator(config), open_simulator(config)
+    points = holding(full)
+    bare.enact(points)
+    ours: list[float] = []
+    theirs: list[float] = []
+    with listened_session() as (session, other):
+        first = full.sample(0, 0)
+        readers = [other.reader(key, type(message)) for key, message in ((JOINTS, first.joints), *first.others.items())]
+        publishing = Publishing(session, config.period_ns)
+        tick = 0
+        for _ in range(BLOCKS):
+            begin = time.perf_counter()
+            for _ in range(TICKS_A_BLOCK):
+                tick += 1
+                publishing.put(tick, full.sample(tick, tick * config.period_ns))
+                full.enact(points)
+                full.advance()
+            ours.append((time.perf_counter() - begin) / TICKS_A_BLOCK * 1e6)
+            theirs.append(bare_tick_us(bare, TICKS_A_BLOCK))
+        assert all(reader.drain() for reader in readers), "nobody heard what was published"
+    full.close()
+    bare.close()
+    return ours, theirs
+
+
+def wire_bytes(config: RunConfig) -> tuple[bytes, bytes]:
+    """All state of one tick, and one command, as they stand on the wire."""
+    backend = open_simulator(config)
+    samples = backend.sample(0, 0)
+    points = holding(backend)
+    backend.close()
+    command = JointCommand(
+        tick=10**6,
+        sequence=10**6,
+        lease_epoch=1,
+        layout=backend.describe().layout,
+        valid_for_ns=50_000_000,
+        mode=points.mode,
+        target=points.target,
+        torque_limit_nm=points.torque_limit_nm,
+    )
+    state = encode(samples.joints) + b"".join(encode(message) for message in samples.others.values())
+    return state, encode(command)
+
+
+def bare_physics_us(config: RunConfig, ticks: int = 400) -> float:
+    """Bare physics of one control period, at the scenario's start."""
+    backend = open_simulator(config)
+    backend.enact(holding(backend))
+    spent = statistics.median(bare_tick_us(backend, ticks // 4) for _ in range(4))
+    backend.close()
+    return spent

@@ -1,0 +1,65 @@
+"""Whole runs, as a user starts them: time of a lockstep tick, latency in real time, and the highest rate."""
+
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import msgspec
+
+from snakesim_operator.record import SUMMARY
+from snakesim_operator.summary import RunSummary
+from tests.in_process import views_of
+
+RATES_HZ = (200, 300, 400, 500, 600, 700, 800, 900, 1000, 1200, 1500, 2000)
+
+
+def run(*arguments: str) -> RunSummary:
+    """One `snakesim run triplet`."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "run"
+        subprocess.run(
+            [sys.executable, "-m", "snakesim_operator.cli", "run", "triplet", "--out", str(out), *arguments],
+            check=True,
+            stdout=subprocess.DEVNULL,
+            timeout=300,
+        )
+        return msgspec.json.decode((out / SUMMARY).read_bytes(), type=RunSummary)
+
+
+def lockstep_tick_us(duration_s: float = 10.0) -> float:
+    """Wall time of one tick of a whole lockstep run with guidance, navigation and control as processes."""
+    summary = run("--pace", "lockstep", "--duration", str(duration_s))
+    return summary.wall_s / summary.ticks * 1e6
+
+
+def controller_us(ticks: int = 600) -> float:
+    """What the controller alone takes for a tick, in this process, in the same scenario."""
+    times: list[float] = []
+    for controller, view in views_of("triplet", ticks):
+        begin = time.perf_counter()
+        controller.update(view)
+        times.append((time.perf_counter() - begin) * 1e6)
+    return statistics.fmean(times)
+
+
+def latency_us(duration_s: float = 5.0) -> float:
+    """State published to command received, median, in real time."""
+    found = run("--pace", "realtime", "--duration", str(duration_s)).state_to_command_us["p50"]
+    assert found is not None
+    return found
+
+
+def highest_rate_hz(seconds: float = 3.0, share: float = 0.99) -> tuple[int, dict[int, float]]:
+    """The highest control rate at which this share of the ticks got their command within the tick."""
+    shares: dict[int, float] = {}
+    best = 0
+    for rate in RATES_HZ:
+        summary = run("--pace", "realtime", "--duration", str(seconds), "--set", f"rate_hz={rate}")
+        shares[rate] = summary.answered_fraction or 0.0
+        if shares[rate] < share:
+            break
+        best = rate
+    return best, shares

@@ -1,0 +1,242 @@
+"""The obstacle-triplet controller: one joint pushes with a torque, all others keep the body on its path.
+
+Each time the world model is new it finds the push-points that the body is at, solves every triplet of neighbours
+among them, and chooses one; its propulsion joint is the first joint ahead of o_2. As the body moves on, o_2 passes
+joint after joint towards the tail, and the turn to propel with it, until the triplet's last obstacle is lost.
+
+The propulsion force is `propulsion_n (1 - speed / mission speed)`, never below zero. A force below the drag moves
+nothing: positions follow the path at the measured arc length, with no look-ahead that would push by itself.
+
+Nothing jumps at a hand-over. In the tick of a change of mode, a position target is within `fade` times the joint's
+angle from its reference, and a torque target within `fade` times (measured torque - propulsion torque), of the target
+with which the motor goes on as it is; `fade = period / blend_s + |speed| period / blend_m`, 0.07 with the defaults at
+100 Hz and 0.2 m/s. The gate of the HAL bounds it once more: `speed_limit * period` and `torque_rate_limit * period`.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_gnc.control.controller import Action, Report, View, positions
+from snakesim_gnc.control.planar_body import PlanarBody
+from snakesim_gnc.control.obstacle_triplet.contacts import PlannedContact, PushPoint, plan_contact, push_points
+from snakesim_gnc.control.bumpless import HandOver
+from snakesim_gnc.control.obstacle_triplet.selection import Choice, Names, Triplets, choose
+from snakesim_gnc.control.obstacle_triplet.settings import Settings
+from snakesim_gnc.control.obstacle_triplet.stall import Stall, StallWatch, explain
+from snakesim_gnc.control.obstacle_triplet.telemetry import bending, largest_contact_force_n, planned_contacts
+from snakesim_gnc.control.progress import Located, Progress
+from snakesim_hal.backend import SetPoints
+from snakesim_hal.messages import Description, Mode, Obstacle
+
+Floats = NDArray[np.float64]
+
+PLAN_WINDOW_M = 1.0  # beyond the body's ends: where the path may pass an obstacle that is near the body
+
+
+class ObstacleTriplet:
+    """Obstacle-aided locomotion after the paper's section IV."""
+
+    Settings = Settings
+
+    def __init__(self, robot: Description, settings: Settings) -> None:
+        self._robot = robot
+        self._set = settings
+        self._body = PlanarBody(robot)
+        self._progress = Progress(
+            self._body, speed_filter_s=settings.speed_filter_s, oldest_world_s=settings.world_age_s
+        )
+        self._hand_over = HandOver(robot)
+        self._triplets = Triplets(
+            condition_max=settings.condition_max,
+            authority_min=settings.authority_min,
+            hold_on_m=settings.hold_on_m,
+        )
+        self._stall_watch = StallWatch(
+            stall_m=settings.stall_m, stall_s=settings.stall_s, propulsion_n=settings.propulsion_n
+        )
+        self._reference: Floats | None = None
+        self._planned: dict[str, tuple[Obstacle, PlannedContact]] = {}
+        self._points: list[PushPoint] = []
+        self._choice: Choice | None = None
+        self._refused: list[str] = []
+        self._banned: dict[Names, float] = {}  # -> arc length at which it stood still
+        self._barred: tuple[int, float] | None = None  # joint among those that bend, time until which
+        self._position_until_s = 0.0
+        self._stall: tuple[Stall, float] | None = None  # and the arc length at which it began
+
+    def update(self, view: View) -> Action:
+        """Set-points for the next period."""
+        located = self._progress.update(view)
+        if isinstance(located, str):
+            return self._wait(view, located)
+        reference = self._body.all_angles(located.lie)
+        self._keep_smooth(view, reference, located.new_path)
+        speed_m_s = located.trajectory.speed_m_s
+        if located.fresh:
+            self._look(located)
+            self._choose(view, located, speed_m_s)
+        self._guard(view, located)
+        choice, set_ = self._choice, self._set
+        turn = None if choice is None else self._body.bends[choice.joint]
+        self._hand_over.pass_to(turn, view.joints, reference)
+        self._hand_over.fade(view.period_s / set_.blend_s + abs(located.speed_m_s) * view.period_s / set_.blend_m)
+        targets: list[float] = self._hand_over.positions_rad(reference).tolist()
+        mode = [Mode.POSITION] * len(targets)
+        limits_nm = self._body.torque_limit_nm
+        if choice is None or turn is None:
+            return Action(SetPoints(mode, targets, limits_nm), self._report_rest(located, reference))
+        asked_n = set_.propulsion_n * min(max(1.0 - located.speed_m_s / speed_m_s, 0.0), 1.0)
+        limit_nm = limits_nm[turn]
+        force_n = min(asked_n, limit_nm / max(abs(choice.torque_per_n), 1e-12))
+        wanted_nm = self._hand_over.torque_nm(force_n * choice.torque_per_n)
+        targets[turn] = min(max(wanted_nm, -limit_nm), limit_nm)
+        mode[turn] = Mode.TORQUE
+        self._watch_progress(view, located, choice, asked_n, force_n)
+        report = self._report_push(located, reference, choice, asked_n, force_n, targets[turn])
+        return Action(SetPoints(mode, targets, limits_nm), report)
+
+    # --- what there is to push on ----------------------------------------------------------------------------
+
+    def _look(self, located: Located) -> None:
+        """Plan the contacts with the obstacles near the body, and see which of them it is at."""
+        world = located.world
+        if located.new_path:
+            self._planned.clear()
+        near = {obstacle.name: obstacle for obstacle in world.obstacles}
+        for name in [name for name in self._planned if name not in near]:
+            del self._planned[name]
+        for name, obstacle in near.items():
+            known = self._planned.get(name)
+            if known is None or known[0] != obstacle:
+                self._planned[name] = (obstacle, self._plan(located, obstacle))
+        self._points = push_points(
+            [contact for _, contact in self._planned.values()],
+            {contact.obstacle for contact in world.contacts if contact.obstacle is not None},
+            located.lie,
+            located.nodes_w,
+            self._body.node_s_m,
+            gap_m=self._set.gap_m,
+            end_m=self._set.end_m,
+        )
+
+    def _plan(self, located: Located, obstacle: Obstacle) -> PlannedContact:
+        half_m = self._body.length_m / 2
+        near_s_m, window_m = located.tail_s_m + half_m, half_m + PLAN_WINDOW_M
+        return plan_contact(located.on_path.route, obstacle, self._body.radius_m, near_s_m=near_s_m, window_m=window_m)
+
+    def _choose(self, view: View, located: Located, speed_m_s: float) -> None:
+        """Take a triplet, or none."""
+        s, blend_m, share = located.tail_s_m, self._set.blend_m, self._set.switch_share
+        self._banned = {names: at for names, at in self._banned.items() if abs(s - at) < blend_m}
+        if self._stall is not None and abs(s - self._stall[1]) > blend_m:
+            self._stall = None
+        if self._barred is not None and view.time_s >= self._barred[1]:
+            self._barred = None
+        barred = None if self._barred is None else self._barred[0]
+        choices, self._refused = self._triplets.choices(
+            self._points, located.lie.nodes_w, self._body.node_s_m, self._choice, barred
+        )
+        if speed_m_s <= 0:
+            self._stall_watch.forget()
+        if speed_m_s <= 0 or view.time_s < self._position_until_s:
+            self._choice = None
+            return
+        present = None if self._choice is None else self._choice.triplet
+        self._choice = choose(choices, present, switch_share=share, banned=self._banned) or choose(
+            choices, present, switch_share=share
+        )
+
+    # --- keeping out of trouble ------------------------------------------------------------------------------
+
+    def _keep_smooth(self, view: View, reference: Floats, new_path: bool) -> None:
+        if self._reference is None:
+            self._hand_over.start(view.joints, reference)
+        elif new_path:
+            self._hand_over.shift(reference - self._reference)
+        self._reference = reference
+
+    def _guard(self, view: View, located: Located) -> None:
+        """Take the turn from a propulsion joint that has left its reference too far."""
+        if self._choice is None:
+            return
+        joint, guard_s = self._choice.joint, self._set.guard_s
+        turn = self._body.bends[joint]
+        off_rad = view.joints.angle_rad[turn] - float(located.lie.angles_rad[joint])
+        if abs(off_rad) > self._set.angle_guard_rad:
+            self._barred = (joint, view.time_s + guard_s)
+            name = self._body.names[turn]
+            self._refused = [f"{name} left its reference by {off_rad:+.2f} rad; in position mode for {guard_s} s"]
+            self._choice = None
+
+    def _watch_progress(
+        self, view: View, located: Located, choice: Choice, asked_n: float, force_n: float
+    ) -> None:
+        """Notice standing still; let go of a triplet that is jammed."""
+        if not self._stall_watch.stands(view.time_s, located.tail_s_m, asked_n):
+            return
+        self._stall_watch.forget()
+        stall = explain(
+            force_n=force_n,
+            contact_force_n=largest_contact_force_n(located.world),
+            weight_n=self._body.weight_n,
+            saturated_joint=self._body.names[self._body.bends[choice.joint]] if force_n < asked_n else None,
+            jam_force_n=self._set.jam_force_n,
+            drag_share=self._set.drag_share,
+        )
+        if self._stall is None or stall.jammed:
+            self._stall = (stall, located.tail_s_m)
+        if stall.jammed:
+            self._banned[choice.triplet.names] = located.tail_s_m
+            self._position_until_s = view.time_s + self._set.release_s
+
+    # --- what it tells ---------------------------------------------------------------------------------------
+
+    def _wait(self, view: View, why: str) -> Action:
+        """Without knowing where the body is: every joint stays where it was meant to be."""
+        self._choice = None
+        if self._reference is None:
+            return Action(positions(self._robot, view.joints.angle_rad), Report(why=why))
+        self._hand_over.pass_to(None, view.joints, self._reference)
+        targets = self._hand_over.positions_rad(self._reference).tolist()
+        return Action(positions(self._robot, targets), Report(why=why, reference_rad=self._reference.tolist()))
+
+    def _report_rest(self, located: Located, reference: Floats) -> Report:
+        """Why nothing pushes."""
+        speed_m_s = located.trajectory.speed_m_s
+        if self._stall is not None:
+            why = self._stall[0].why
+        elif speed_m_s > 0:
+            why = "; ".join(self._refused) or "no three neighbours on alternating sides"
+        else:
+            why = "" if speed_m_s == 0 else "cannot go backward"
+        return Report(
+            why=why[:400],
+            usable_push_points=len(self._points),
+            path_s_m=located.tail_s_m,
+            reference_rad=reference.tolist(),
+            jammed=self._stall is not None and self._stall[0].jammed,
+        )
+
+    def _report_push(
+        self, located: Located, reference: Floats, choice: Choice, asked_n: float, force_n: float, torque_nm: float
+    ) -> Report:
+        """What pushes, and how hard."""
+        turn = self._body.bends[choice.joint]
+        forces_n: list[float] = (force_n * choice.triplet.unit.forces).tolist()
+        full_nm = abs(self._set.propulsion_n * choice.torque_per_n)
+        return Report(
+            why="" if self._stall is None else self._stall[0].why,
+            usable_push_points=len(self._points),
+            path_s_m=located.tail_s_m,
+            propulsion_joint=turn,
+            propulsion_n=force_n,
+            push_points=planned_contacts(self._body, located.world, choice, forces_n),
+            solved_force_n=forces_n,
+            propulsion_torque_nm=torque_nm,
+            bending_torque_nm=bending(self._body, located, choice, forces_n, force_n),
+            reference_rad=reference.tolist(),
+            condition=choice.triplet.unit.condition,
+            torque_headroom_nm=self._body.torque_limit_nm[turn] - full_nm,
+            saturated=force_n < asked_n,
+            jammed=self._stall is not None and self._stall[0].jammed,
+        )

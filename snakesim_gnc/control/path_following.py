@@ -1,0 +1,69 @@
+"""Path following: every joint in position mode, towards a body that lies a little further along the path.
+
+The obstacles turn the change of shape into motion. The reference moves with the mission's speed, but never more than
+`look_ahead_m` ahead of where the body is measured to be, so a snake that is held up does not wind up.
+"""
+
+from typing import Annotated
+
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from snakesim_gnc.control.controller import Action, Report, View, positions
+from snakesim_gnc.control.planar_body import PlanarBody
+from snakesim_gnc.control.bumpless import HandOver
+from snakesim_gnc.control.progress import Progress
+from snakesim_hal.backend import SetPoints
+from snakesim_hal.files import FileStruct
+from snakesim_hal.messages import Description
+
+Floats = NDArray[np.float64]
+
+
+class PathFollowing:
+    """Shape control along a path; knows of no obstacles."""
+
+    class Settings(FileStruct, frozen=True, kw_only=True):
+        """Too little look-ahead does not overcome the drag; too much wedges the body between tight obstacles."""
+
+        look_ahead_m: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "m"})] = 0.03
+        blend_s: Annotated[float, Meta(gt=0, le=10, extra_json_schema={"unit": "s"})] = 0.3
+        speed_filter_s: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "s"})] = 0.02
+        world_age_s: Annotated[float, Meta(gt=0, le=10, extra_json_schema={"unit": "s"})] = 0.25
+
+    def __init__(self, robot: Description, settings: Settings) -> None:
+        self._robot = robot
+        self._set = settings
+        self._body = PlanarBody(robot)
+        self._progress = Progress(
+            self._body, speed_filter_s=settings.speed_filter_s, oldest_world_s=settings.world_age_s
+        )
+        self._hand_over = HandOver(robot)
+        self._reference: Floats | None = None
+        self._ahead_s_m = 0.0
+
+    def update(self, view: View) -> Action:
+        """Angles of the body a little further on."""
+        located = self._progress.update(view)
+        if isinstance(located, str):
+            if self._reference is None:
+                return Action(positions(self._robot, view.joints.angle_rad), Report(why=located))
+            return Action(self._towards(), Report(why=located, reference_rad=self._reference.tolist()))
+        tail_s_m = located.tail_s_m
+        if located.new_path:
+            self._ahead_s_m = tail_s_m
+        advanced = self._ahead_s_m + located.trajectory.speed_m_s * view.period_s
+        self._ahead_s_m = min(max(advanced, tail_s_m), tail_s_m + self._set.look_ahead_m)
+        reference = self._body.all_angles(located.on_path.at(self._ahead_s_m))
+        if self._reference is None:
+            self._hand_over.start(view.joints, reference)
+        elif located.new_path:
+            self._hand_over.shift(reference - self._reference)
+        self._reference = reference
+        self._hand_over.fade(view.period_s / self._set.blend_s)
+        return Action(self._towards(), Report(path_s_m=tail_s_m, reference_rad=reference.tolist()))
+
+    def _towards(self) -> SetPoints:
+        assert self._reference is not None
+        return positions(self._robot, self._hand_over.positions_rad(self._reference).tolist())

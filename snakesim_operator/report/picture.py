@@ -1,0 +1,104 @@
+"""The best instant of a run as a picture of its own, for a README: top view, force polygon, and what they show."""
+
+from pathlib import Path
+
+import numpy as np
+
+from snakesim_operator.record import RunRecord
+from snakesim_operator.report.instants import Balance, Instant, plain_instants, pushing_instants
+from snakesim_operator.report.page import HERE
+from snakesim_operator.report.palette import LIGHT, baked
+from snakesim_operator.report.polygon import polygon_drawing
+from snakesim_operator.report.svg import arrow, element, figure, line, text, text_width
+from snakesim_operator.report.top_view import drawing, nodes_xy_w, views
+from snakesim_operator.summary import RunSummary
+
+WIDTH, EDGE = 920.0, 20.0
+POLYGON_WIDTH = 250.0
+HEAD, FOOT = 62.0, 40.0
+
+
+def write_picture(record: RunRecord, summary: RunSummary, path: Path) -> None:
+    """Write the picture. Raises ValueError when the run has no instant that can be drawn."""
+    path.write_text(picture(record, summary), encoding="utf-8")
+
+
+def picture(record: RunRecord, summary: RunSummary) -> str:
+    """The SVG on a light ground, with its colours baked in, for viewers that know no CSS variables."""
+    instant = best_instant(record)
+    if instant is None:
+        raise ValueError("no instant of this run can be drawn: it has no ticks, or the robot has no pose sensor")
+    view_width = WIDTH - 2 * EDGE - (POLYGON_WIDTH if instant.balance is not None else 0.0)
+    view = views(record, [instant], view_width)[0]
+    height = HEAD + view.height + FOOT
+    style = baked((HERE / "figure.css").read_text(encoding="utf-8"), LIGHT)
+    parts = [
+        element("style", style),
+        element("rect", x=0, y=0, width=WIDTH, height=height, rx=8, style=f"fill:{LIGHT['card']}"),
+        _words(record, summary, instant),
+        _inset(EDGE, HEAD, view.width, view.height, drawing(record, instant, view, nodes_xy_w(record, instant))),
+    ]
+    if instant.balance is not None:
+        tall = min(view.height, 300.0)
+        drawn = polygon_drawing(instant.balance, POLYGON_WIDTH, tall, upright=view.upright)
+        left = EDGE + view.width
+        parts.append(line((left + 4, HEAD), (left + 4, HEAD + view.height), "zero"))
+        parts.append(_inset(left, HEAD + (view.height - tall) / 2, POLYGON_WIDTH, tall, drawn))
+        parts.append(text(left + POLYGON_WIDTH / 2, HEAD + 4, "force polygon", "small soft", anchor="middle"))
+    parts.append(_legend(instant, height - 16))
+    label = f"{record.config.title or summary.scenario}: the snake from above at {instant.time_s:.2f} s"
+    return figure(WIDTH, height, label, *parts, xmlns="http://www.w3.org/2000/svg", width=WIDTH, height=height) + "\n"
+
+
+def best_instant(record: RunRecord) -> Instant | None:
+    """The pushing instant whose measured forces are nearest to the solved ones."""
+    chosen = pushing_instants(record)
+    if chosen:
+        return min(chosen, key=_mismatch)
+    plain = plain_instants(record)
+    return plain[len(plain) // 2] if plain else None
+
+
+def _mismatch(instant: Instant) -> float:
+    balance = instant.balance
+    if balance is None:
+        return float("inf")
+    return sum(abs(size - _felt_n(instant, balance, i)) for i, size in enumerate(balance.size_n)) / sum(balance.size_n)
+
+
+def _felt_n(instant: Instant, balance: Balance, index: int) -> float:
+    felt = [np.hypot(*c.force_w[:2]) for c in instant.felt if c.obstacle == balance.contacts[index].obstacle]
+    return float(sum(felt))
+
+
+def _inset(x: float, y: float, width: float, height: float, content: str) -> str:
+    return element("svg", content, x=x, y=y, width=width, height=height, overflow="hidden")
+
+
+def _words(record: RunRecord, summary: RunSummary, instant: Instant) -> str:
+    second = f"{summary.robot} in {summary.scene}, {summary.controller}, t = {instant.time_s:.2f} s"
+    if instant.propulsion_joint is not None:
+        second += f"; {record.description.joints[instant.propulsion_joint].name} propels"
+    if instant.balance is not None:
+        second += f", resultant {np.hypot(*instant.balance.resultant_n):.0f} N along the path"
+    title = text(EDGE, 30, record.config.title or summary.scenario, "strong")
+    return title + text(EDGE, 50, second, "small soft")
+
+
+def _legend(instant: Instant, y: float) -> str:
+    entries: list[tuple[str, str]] = []
+    if instant.balance is not None:
+        entries += [
+            ("solved", "solved contact force"),
+            ("resultant", "resultant propulsion force"),
+            ("tether", "tether fₛ of the model"),
+            ("frame", "contact normal, tangent"),
+        ]
+    if instant.felt:
+        entries.append(("felt", "measured contact force"))
+    parts: list[str] = []
+    x = EDGE
+    for class_, name in entries:
+        parts.append(arrow((x, y - 4), (x + 26, y - 4), class_, head=9) + text(x + 32, y, name, "small soft"))
+        x += 32 + text_width(name, 10.8) + 14
+    return "".join(parts)

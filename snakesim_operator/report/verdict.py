@@ -1,0 +1,115 @@
+"""What a run amounted to, in one sentence, and its key numbers."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from snakesim_operator.record import RunRecord
+from snakesim_operator.report.timeline import propulsion_intervals
+from snakesim_operator.summary import RunSummary
+
+MOVED_M = 0.02  # less than this is no locomotion
+SHOWN_HANDOVERS = 8
+Kind = Literal["good", "poor", "bad"]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """One sentence, and how good the news is."""
+
+    kind: Kind
+    words: str
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A key number."""
+
+    name: str
+    value: str
+    unit: str = ""
+    alarming: bool = False
+
+
+def verdict(record: RunRecord, summary: RunSummary) -> Verdict:
+    """The run in plain words."""
+    if summary.ticks == 0 and len(record.time_s) == 0 and not summary.faults:
+        return Verdict("bad", f"Nothing was recorded: the robot was never armed ({summary.ended}).")
+    moved = _moved(summary)
+    if summary.faults:
+        fault = summary.faults[0]
+        at_s = fault.tick / summary.rate_hz - (float(record.time_s[0]) if len(record.time_s) else 0.0)
+        joint = f" at {fault.joint}" if fault.joint else ""
+        what = f"Stopped by a fault after {max(at_s, 0.0):.1f} s{joint}: {_sentence(fault.cause)}"
+        return Verdict("bad", f"{what} Before that: {moved[0].lower()}{moved[1:]}.")
+    ending = "" if summary.ended == "complete" else f" The run ended early: {_sentence(summary.ended)}"
+    distance = _distance_m(summary)
+    if distance is None:
+        return Verdict("poor", f"{moved}; {_handed_over(record, summary)}no fault.{ending}")
+    if abs(distance) < MOVED_M or summary.locomoting_fraction == 0:
+        why = summary.last_reason or "the controller gave no reason"
+        kind = "Jammed" if summary.jammed else "Did not locomote"
+        return Verdict("poor", f"{kind}: {_sentence(why)} {moved}; no fault.{ending}")
+    jam = "it jammed on the way; " if summary.jammed else ""
+    good: Kind = "poor" if ending or distance < 0 else "good"
+    return Verdict(good, f"{moved}; {_handed_over(record, summary)}{jam}no fault.{ending}")
+
+
+def tiles(record: RunRecord, summary: RunSummary) -> list[Tile]:
+    """The numbers to see first."""
+    limit = max(joint.torque_limit_nm for joint in record.description.joints)
+    saturated = summary.torque_saturated_fraction
+    along = summary.path_distance_m is not None
+    distance = _distance_m(summary)
+    rejected = sum(summary.rejected_commands.values())
+    return [
+        Tile("along the path" if along else "net displacement", _shown(distance, "{:.2f}"), "m"),
+        Tile("mean speed", _shown(summary.mean_speed_m_s, "{:.3f}"), "m/s"),
+        Tile("robot time", f"{summary.duration_s:.1f}", "s"),
+        Tile("time locomoting", _shown(_percent(summary.locomoting_fraction), "{:.0f}"), "%"),
+        Tile(f"peak joint torque (limit {limit:g})", _shown(summary.peak_joint_torque_nm, "{:.1f}"), "N·m"),
+        Tile("ticks at a torque limit", _shown(_percent(saturated), "{:.1f}"), "%", (saturated or 0) > 0.05),
+        Tile("peak contact force", _shown(summary.peak_contact_force_n, "{:.0f}"), "N"),
+        Tile("ticks answered in time", _shown(_percent(summary.answered_fraction), "{:.1f}"), "%"),
+        Tile("commands refused", str(rejected), "", rejected > 0),
+        Tile("faults", str(len(summary.faults)), "", bool(summary.faults)),
+    ]
+
+
+def _distance_m(summary: RunSummary) -> float | None:
+    return summary.path_distance_m if summary.path_distance_m is not None else summary.net_displacement_m
+
+
+def _moved(summary: RunSummary) -> str:
+    duration = f"in {summary.duration_s:.1f} s"
+    if summary.path_distance_m is not None:
+        back = " backward" if summary.path_distance_m <= -MOVED_M else ""
+        return f"Moved {abs(summary.path_distance_m):.2f} m{back} along the path {duration}"
+    if summary.net_displacement_m is not None:
+        return f"Moved {summary.net_displacement_m:.2f} m {duration}"
+    return f"Ran for {summary.duration_s:.1f} s; nobody measured how far it moved, for the robot has no pose sensor"
+
+
+def _handed_over(record: RunRecord, summary: RunSummary) -> str:
+    names = summary.propulsion_joints
+    if not names:
+        return ""
+    if len(names) == 1:
+        return f"{names[0]} propelled throughout; "
+    if len(names) <= SHOWN_HANDOVERS:
+        return f"propulsion handed over {' → '.join(names)}; "
+    distinct = len({one.joint for one in propulsion_intervals(record)})
+    shown = " → ".join([*names[:4], "…", names[-1]])
+    return f"propulsion handed over {len(names) - 1} times among {distinct} joints ({shown}); "
+
+
+def _sentence(words: str) -> str:
+    words = words.strip().rstrip(".;")
+    return f"{words}." if words else ""
+
+
+def _percent(share: float | None) -> float | None:
+    return None if share is None else 100 * share
+
+
+def _shown(value: float | None, form: str) -> str:
+    return "–" if value is None else form.format(value).replace("-", "−")

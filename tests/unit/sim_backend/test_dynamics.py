@@ -1,0 +1,168 @@
+"""Conservation laws, friction and contact forces: the physics itself."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from snakesim_hal.messages import Mode
+from tests.unit.sim_backend.rig import G, Run, make_config
+
+ICE = {"ground": {"friction": 0.0}}
+
+
+def kinetic_energy(run):
+    data, model = run.sim.data, run.sim.sim.model
+    mujoco.mj_forward(model, data)
+    mujoco.mj_energyVel(model, data)
+    return data.energy[1]
+
+
+def momentum(run):
+    """Linear and angular momentum, the latter about the world's origin, z component."""
+    data, model = run.sim.data, run.sim.sim.model
+    mujoco.mj_forward(model, data)
+    mujoco.mj_subtreeVel(model, data)
+    snake = model.body("link_0").id
+    linear = model.body_subtreemass[snake] * data.subtree_linvel[snake]
+    return np.array([*linear[:2], (data.subtree_angmom[snake] + np.cross(data.subtree_com[snake], linear))[2]])
+
+
+def mass_kg(config):
+    return config.robot.chain.modules * config.robot.module.mass_kg
+
+
+def test_a_writhing_snake_on_ice_keeps_its_momentum():
+    run = Run(make_config(scene=ICE), timestep_s=0.0002)
+    run.sim.data.qvel[:2] = 0.3, -0.1
+    start = momentum(run)
+    run.command([Mode.POSITION] * 13, [0.4 * np.sin(0.9 * i) for i in range(13)])
+    run.go(1.0)
+    assert np.ptp(run.sim.true_state().angles_rad) > 0.5
+    assert momentum(run) == pytest.approx(start, abs=2e-3 * mass_kg(run.config) * 0.3)
+
+
+def test_passive_joints_on_ice_keep_their_energy():
+    run = Run(make_config(scene=ICE), timestep_s=0.0005)
+    run.sim.data.qvel[6:] = [0.5 * np.cos(i) for i in range(13)]
+    start = kinetic_energy(run)
+    run.go(0.5)
+    assert kinetic_energy(run) == pytest.approx(start, rel=0.01)
+
+
+def test_motors_give_the_energy_that_the_snake_has():
+    run = Run(make_config({"chain": {"modules": 3}}, ICE, rate_hz=1000))
+    work = 0.0
+    run.command(Mode.TORQUE, [0.02, -0.03, 0.01])
+    for _ in range(300):
+        before = run.sim.true_state().velocities_rad_s
+        run.go()
+        state = run.sim.true_state()
+        work += float(state.torques_nm @ (before + state.velocities_rad_s)) / 2 * 1e-3
+    assert kinetic_energy(run) == pytest.approx(work, rel=0.01)
+
+
+def test_a_sliding_snake_slows_at_friction_times_g():
+    run = Run(make_config(scene={"ground": {"friction": 0.2}}))
+    run.sim.data.qvel[0] = 1.0
+    run.command(Mode.POSITION)
+    run.go(0.05)
+    early = run.sim.true_state().base_velocity_w[0]
+    run.go(0.3)
+    late = run.sim.true_state().base_velocity_w[0]
+    assert (early - late) / 0.3 == pytest.approx(0.2 * G, rel=0.03)
+
+
+BENT = [0.8, -0.8, 0.8, -0.8]  # a straight, round body would roll
+
+
+@pytest.mark.parametrize("along", [(1.0, 0.0), (0.0, 1.0), (1.0, 1.0)])
+@pytest.mark.parametrize("friction", [0.1, 0.6])
+def test_towing_drags_with_friction_times_weight_in_every_direction(along, friction):
+    config = make_config({"chain": {"modules": 4}}, {"ground": {"friction": friction}})
+    tether = {"link": 2, "point_m": 0.055, "direction_w": along, "reel_in_m_s": 0.1}
+    run = Run(config, tether=tether)
+    run.command([Mode.POSITION] * 4, BENT)
+    run.go(3.0)
+    tensions = []
+    for _ in range(50):
+        run.go()
+        tensions.append(run.sim.tether_tension_n)
+    assert np.mean(tensions) == pytest.approx(friction * mass_kg(config) * G, rel=0.03)
+
+
+@pytest.mark.parametrize("along", [(1.0, 0.0), (0.0, 1.0), (0.7, -0.7)])
+@pytest.mark.parametrize(("tilt", "slides"), [(0.9, False), (1.1, True)])
+def test_a_snake_on_a_slope_slides_only_beyond_the_angle_of_friction(along, tilt, slides):
+    friction = 0.3
+    run = Run(make_config({"chain": {"modules": 4}}, {"ground": {"friction": friction}}))
+    run.command([Mode.POSITION] * 4, BENT)
+    run.go(0.5)
+    before = run.sim.true_state().base_position_w
+    slope = np.arctan(friction) * tilt
+    downhill = np.array(along) / np.hypot(*along)
+    run.sim.sim.model.opt.gravity[:] = [*(G * np.sin(slope) * downhill), -G * np.cos(slope)]
+    run.go(1.0)
+    moved = (run.sim.true_state().base_position_w - before)[:2] @ downhill
+    if slides:
+        acted = (np.sin(slope) - 2 * moved / G) / np.cos(slope)
+        assert acted == pytest.approx(friction, rel=0.03)
+    else:
+        assert abs(moved) < 3e-3
+
+
+@pytest.mark.parametrize(
+    "obstacle",
+    [
+        {"wall": [{"from_m": [-1, 0.07], "to_m": [2, 0.07], "friction": 0.4}]},
+        {"wall": [{"from_m": [-1, 0.07], "to_m": [2, 0.07], "friction": 0.0}]},
+        {"cylinder": [{"position_m": [0.22, 0.0905], "radius_m": 0.05, "friction": 0.25}]},
+        {"cylinder": [{"position_m": [0.22, 0.0905], "radius_m": 0.05, "height_m": 0.1, "friction": 0.25}]},
+    ],
+)
+def test_sliding_along_an_obstacle_rubs_with_the_obstacle_s_friction(obstacle):
+    friction = next(iter(obstacle.values()))[0]["friction"]
+    run = Run(make_config({"chain": {"modules": 4}}, {**ICE, **obstacle}))
+    run.command(Mode.POSITION)
+    data, model = run.sim.data, run.sim.sim.model
+    body = model.body("link_2").id
+    data.xfrc_applied[body, 1] = 8.0
+    data.qvel[0] = 0.5
+    ratios = []
+    for _ in range(10):
+        run.go()
+        contacts = run.sim.true_state().contacts
+        if not contacts:
+            continue
+        force = sum(c.force_w for c in contacts)
+        normal = contacts[0].normal_w
+        push = force @ normal
+        ratios.append(np.linalg.norm(force - push * normal) / push)
+        assert force[0] <= 1e-6
+    assert np.median(ratios) == pytest.approx(friction, rel=0.02, abs=1e-6)
+
+
+def test_the_contact_force_of_a_snake_pushed_at_a_peg_is_the_push():
+    peg = {"cylinder": [{"position_m": [0.22, 0.0905], "radius_m": 0.05, "name": "post"}]}
+    run = Run(make_config({"chain": {"modules": 4}}, {**ICE, **peg}))
+    run.command(Mode.POSITION)
+    body = run.sim.sim.model.body("link_2").id
+    run.sim.data.xfrc_applied[body, 1] = 20.0
+    run.go(0.3)
+    (contact,) = run.sim.true_state().contacts
+    assert contact.obstacle == "post"
+    assert contact.link == 2
+    assert contact.force_w == pytest.approx([0.0, -20.0, 0.0], abs=0.2)
+    assert contact.normal_w == pytest.approx([0.0, -1.0, 0.0], abs=1e-2)
+    assert contact.position_w == pytest.approx([0.22, 0.0405, 0.04], abs=3e-3)
+
+
+def test_the_ground_carries_the_weight():
+    config = make_config()
+    run = Run(config)
+    run.go(0.1)
+    data, model = run.sim.data, run.sim.sim.model
+    total, wrench = 0.0, np.zeros(6)
+    for i in range(data.ncon):
+        mujoco.mj_contactForce(model, data, i, wrench)
+        total += wrench[0]
+    assert total == pytest.approx(mass_kg(config) * G, rel=1e-3)

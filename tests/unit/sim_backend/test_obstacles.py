@@ -1,0 +1,85 @@
+"""Every kind of obstacle stands where its outline says, for rays and for bodies."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from snakesim_hal.scenario import place_all
+from snakesim_hal.scene import outline_distance_m
+from tests.unit.sim_backend.rig import Run, make_config
+
+KINDS = {
+    "tall_peg": {"cylinder": [{"position_m": [3.0, 1.0], "radius_m": 0.1, "height_m": 0.4}]},
+    "short_peg": {"cylinder": [{"position_m": [3.0, 1.0], "radius_m": 0.2, "height_m": 0.1}]},
+    "box": {"box": [{"position_m": [3.0, 1.0], "size_m": [0.4, 0.2, 0.3], "yaw_rad": 0.5}]},
+    "sphere": {"sphere": [{"position_m": [3.0, 1.0], "radius_m": 0.15, "centre_height_m": 0.04}]},
+    "wall": {"wall": [{"from_m": [2.5, 0.8], "to_m": [3.4, 1.3], "thickness_m": 0.06}]},
+}
+
+
+@pytest.mark.parametrize("scene", KINDS.values(), ids=KINDS.keys())
+def test_rays_at_body_height_meet_the_outline(scene):
+    config = make_config(scene=scene)
+    run = Run(config)
+    (placed,) = place_all(config)
+    x, y, _ = placed.obstacle.position_w
+    height = config.robot.module.radius_m
+    hit = np.zeros(1, dtype=np.int32)
+    for angle in np.linspace(0, 2 * np.pi, 24, endpoint=False):
+        start = np.array([x + np.cos(angle), y + np.sin(angle), height])
+        aim = np.array([-np.cos(angle), -np.sin(angle), 0.0])
+        distance = mujoco.mj_ray(run.sim.sim.model, run.sim.data, start, aim, None, 1, -1, hit)
+        assert run.sim.sim.obstacle_of_geom[hit[0]] == placed.obstacle.name
+        meets = start + distance * aim
+        assert outline_distance_m(placed.obstacle, meets[:2]) == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("scene", KINDS.values(), ids=KINDS.keys())
+def test_the_body_touches_exactly_when_it_reaches_the_outline(scene):
+    """Link 0's rear cap, a sphere of the body's radius, moved in along a line."""
+    config = make_config(scene=scene)
+    run = Run(config)
+    data, model = run.sim.data, run.sim.sim.model
+    (placed,) = place_all(config)
+    centre = np.array(placed.obstacle.position_w[:2])
+    radius = config.robot.module.radius_m
+    for angle in (0.2, 2.5, 4.6):
+        outward = np.array([np.cos(angle), np.sin(angle)])
+        data.qpos[3:7] = [np.cos(angle / 2), 0, 0, np.sin(angle / 2)]  # the snake points away from the obstacle
+        data.qpos[7:] = 0.0
+        reach = np.linspace(0.0, 1.0, 20001)
+        gaps = np.array([outline_distance_m(placed.obstacle, centre + r * outward) for r in reach[::20]])
+        touching = float(np.interp(radius, gaps, reach[::20]))
+        for offset, expected in ((1e-3, 0), (-1e-3, 1)):
+            data.qpos[:3] = [*(centre + (touching + offset) * outward), radius]
+            mujoco.mj_forward(model, data)
+            assert (len(run.sim.true_state().contacts) > 0) == bool(expected)
+
+
+def test_steps_and_ground_and_the_snake_itself_are_no_contacts():
+    step = {"step": [{"position_m": [0.7, 0.0], "size_m": [3.0, 2.0], "height_m": 0.05}]}
+    run = Run(make_config(scene=step))
+    run.go(0.2)
+    assert run.sim.data.ncon > 0
+    assert run.sim.true_state().contacts == []
+    run.sim.data.qpos[7:] = 1.0
+    mujoco.mj_forward(run.sim.sim.model, run.sim.data)
+    assert run.sim.true_state().contacts == []
+
+
+def test_pegs_along_the_route_are_all_there():
+    scene = {
+        "route": {"kind": "sine", "amplitude_m": 0.1, "wavelength_m": 0.8, "length_m": 4.0},
+        "pegs_along_route": [{"radius_m": 0.05, "corridor_m": 0.045, "count": 7}],
+    }
+    config = make_config(scene=scene, start={"on_route": True})
+    run = Run(config)
+    names = [name for name in run.sim.sim.obstacle_of_geom if name]
+    assert names == [placed.obstacle.name for placed in place_all(config)]
+    assert len(names) == 7
+
+
+def test_an_obstacle_may_be_called_as_a_link_or_the_ground():
+    pegs = [{"position_m": [2.0 + i, 1.0], "radius_m": 0.05, "name": name} for i, name in enumerate(["ground", "link_3"])]
+    run = Run(make_config(scene={"cylinder": pegs}))
+    assert [name for name in run.sim.sim.obstacle_of_geom if name] == ["ground", "link_3"]

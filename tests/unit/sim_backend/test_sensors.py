@@ -1,0 +1,267 @@
+"""Sensors: frames, noise, rate, delay, and that the same seed gives the same bytes."""
+
+import numpy as np
+import pytest
+
+from snakesim_hal import keys
+from snakesim_hal.codec import Decoder, encode, encoding_of
+from snakesim_hal.kinematics import link_frames, rotation_from_quaternion
+from snakesim_hal.messages import Contacts, Imu, Mode, Pose
+from snakesim_hal.scenario import load
+from tests.unit.sim_backend.rig import G, Run, make_config
+
+CORNER = {
+    "ground": {"friction": 0.0},
+    "cylinder": [{"position_m": [0.22, 0.0905], "radius_m": 0.05, "friction": 0.3, "name": "post"}],
+}
+
+
+def pushed(sensors=None, **top):
+    """A bent snake that is pushed at a peg."""
+    robot = {"chain": {"modules": 6}, "sensors": sensors or {}}
+    run = Run(make_config(robot, CORNER, **top))
+    run.command([Mode.POSITION] * 6, [0.1, -0.2, 0.3, 0.1, -0.2, 0.3])
+    run.sim.data.xfrc_applied[run.sim.sim.model.body("link_2").id, 1] = 15.0
+    return run
+
+
+def frames_of(run):
+    """Origins and rotations of the links, from what the robot itself publishes."""
+    samples, robot = run.sample(), run.config.robot
+    pose = samples.others[keys.POSE]
+    assert isinstance(pose, Pose)
+    rotation = rotation_from_quaternion(pose.orientation_wxyz)
+    return samples, *link_frames(
+        pose.position_w, rotation, samples.joints.angle_rad, robot.axes, robot.link_lengths_m
+    )
+
+
+@pytest.mark.parametrize("robot", ["planar13", "mamba"])
+def test_links_are_where_the_published_pose_and_angles_say(robot):
+    run = Run(make_config(base_robot=robot))
+    n = run.count
+    run.command([Mode.POSITION] * n, [0.3 * np.sin(i) for i in range(n)])
+    run.go(0.3)
+    _, origins, rotations = frames_of(run)
+    data, model = run.sim.data, run.sim.sim.model
+    import mujoco
+
+    mujoco.mj_kinematics(model, data)
+    first = run.sim.sim.first_link_body
+    assert np.abs(data.xpos[first:] - origins).max() < 1e-6
+    assert np.abs(data.xmat[first:].reshape(-1, 3, 3) - rotations).max() < 1e-6
+
+
+def test_contacts_in_link_frames_are_the_true_contacts():
+    run = pushed()
+    run.go(0.5)
+    samples, origins, rotations = frames_of(run)
+    truth = run.sim.true_state().contacts
+    message = samples.others[keys.CONTACTS]
+    assert isinstance(message, Contacts)
+    assert message.contacts
+    assert len(message.contacts) == len(truth)
+    for felt, true in zip(message.contacts, truth, strict=True):
+        rotation = rotations[felt.link]
+        assert (felt.link, felt.obstacle) == (true.link, true.obstacle) == (2, "post")
+        # Positions are those at the beginning of the last physics step.
+        assert origins[felt.link] + rotation @ felt.position_l == pytest.approx(true.position_w, abs=1e-4)
+        assert rotation @ felt.normal_l == pytest.approx(true.normal_w, abs=1e-3)
+        assert rotation @ felt.force_l == pytest.approx(true.force_w, abs=0.05)
+        axes = np.array([felt.normal_l, felt.tangent_1_l, felt.tangent_2_l])
+        assert axes @ axes.T == pytest.approx(np.eye(3), abs=1e-9)
+        assert np.linalg.det(axes) == pytest.approx(1.0)
+        assert felt.tangent_1_l[0] > 0  # towards the head
+        assert np.dot(felt.force_l, felt.normal_l) > 0  # an obstacle pushes, it does not pull
+        assert np.hypot(felt.position_l[1], felt.position_l[2]) == pytest.approx(0.04, abs=1e-3)  # on the skin
+
+
+def test_weak_touches_go_unfelt():
+    run = pushed({"contacts": {"rate_hz": 1000.0, "threshold_n": 100.0}})
+    run.go(0.5)
+    assert run.sim.true_state().contacts
+    assert run.sample().others[keys.CONTACTS].contacts == []  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_an_imu_at_rest_feels_gravity_alone():
+    run = Run(make_config(base_robot="mamba"))
+    run.go(0.5)
+    imu = run.sample().others[keys.IMU]
+    assert isinstance(imu, Imu)
+    assert imu.link == list(range(19))
+    assert np.array(imu.acceleration_m_s2) == pytest.approx(np.tile([0, 0, G], (19, 1)), abs=0.02)
+    assert np.array(imu.angular_velocity_rad_s) == pytest.approx(0.0, abs=0.01)
+
+
+def test_an_imu_on_a_spinning_snake_feels_the_pull_to_the_centre():
+    run = Run(make_config(scene={"ground": {"friction": 0.0}}))
+    spin, middle = 2.0, 13 * 0.11 / 2
+    run.sim.data.qvel[5] = spin
+    run.sim.data.qvel[1] = -spin * middle  # about its centre
+    run.command(Mode.POSITION)
+    run.go(0.02)
+    imu = run.sample().others[keys.IMU]
+    assert isinstance(imu, Imu)
+    lengths = np.array(run.config.robot.link_lengths_m)
+    centres = np.cumsum(lengths) - lengths / 2
+    assert np.array(imu.angular_velocity_rad_s)[:, 2] == pytest.approx(spin, rel=0.01)
+    assert np.array(imu.acceleration_m_s2)[:, 0] == pytest.approx(-(spin**2) * (centres - middle), abs=0.05)
+
+
+def test_pose_velocities_are_the_change_of_the_pose_in_the_world():
+    run = Run(make_config(scene={"ground": {"friction": 0.0}}, rate_hz=1000))
+    run.sim.data.qvel[:6] = [0.3, -0.2, 0.0, 0.0, 0.0, 1.5]
+    run.go(0.3)
+    before = run.sample().others[keys.POSE]
+    run.go()
+    after = run.sample().others[keys.POSE]
+    assert isinstance(before, Pose)
+    assert isinstance(after, Pose)
+    change = (np.array(after.position_w) - before.position_w) / 1e-3
+    assert after.velocity_w == pytest.approx(change, abs=5e-3)
+    turned = rotation_from_quaternion(after.orientation_wxyz) @ rotation_from_quaternion(before.orientation_wxyz).T
+    assert after.angular_velocity_w[2] == pytest.approx((turned[1, 0] - turned[0, 1]) / 2 / 1e-3, rel=1e-3)
+
+
+def test_the_angular_velocity_of_the_pose_is_in_the_world_frame():
+    run = Run(make_config({"chain": {"modules": 1}}, start={"yaw_rad": 1.0}))
+    run.sim.data.qvel[3:6] = [1.0, 0.0, 0.0]  # rolls about its own axis
+    pose = run.sample().others[keys.POSE]
+    assert isinstance(pose, Pose)
+    assert pose.angular_velocity_w == pytest.approx([np.cos(1.0), np.sin(1.0), 0.0], abs=1e-5)
+
+
+def test_noise_has_the_deviations_of_the_robot_file():
+    sensors = {
+        "joints": {"angle_noise_rad": 0.01, "velocity_noise_rad_s": 0.2, "torque_noise_nm": 0.5},
+        "imu": {"angular_velocity_noise_rad_s": 0.03, "acceleration_noise_m_s2": 0.4},
+        "pose": {"position_noise_m": 0.002, "angle_noise_rad": 0.01},
+        "contacts": {"position_noise_m": 0.003, "force_noise_n": 0.7},
+    }
+    quiet, noisy = pushed(), pushed(sensors)
+    for run in (quiet, noisy):
+        run.go(0.5)
+    errors: dict[str, list[np.ndarray]] = {}
+    plain = quiet.sample()
+    contact = plain.others[keys.CONTACTS].contacts[0]  # pyright: ignore[reportAttributeAccessIssue]
+    orientation = rotation_from_quaternion(plain.others[keys.POSE].orientation_wxyz)  # pyright: ignore[reportAttributeAccessIssue]
+    for _ in range(1000):
+        sample = noisy.sample()
+        imu, pose, touches = (sample.others[key] for key in (keys.IMU, keys.POSE, keys.CONTACTS))
+        turn = rotation_from_quaternion(pose.orientation_wxyz) @ orientation.T  # pyright: ignore[reportAttributeAccessIssue]
+        felt = touches.contacts[0]  # pyright: ignore[reportAttributeAccessIssue]
+        for name, got, true in (
+            ("angle", sample.joints.angle_rad, plain.joints.angle_rad),
+            ("velocity", sample.joints.velocity_rad_s, plain.joints.velocity_rad_s),
+            ("torque", sample.joints.torque_nm, plain.joints.torque_nm),
+            ("gyro", imu.angular_velocity_rad_s, plain.others[keys.IMU].angular_velocity_rad_s),  # pyright: ignore[reportAttributeAccessIssue]
+            ("accelerometer", imu.acceleration_m_s2, plain.others[keys.IMU].acceleration_m_s2),  # pyright: ignore[reportAttributeAccessIssue]
+            ("position", pose.position_w, plain.others[keys.POSE].position_w),  # pyright: ignore[reportAttributeAccessIssue]
+            ("attitude", [turn[2, 1], turn[0, 2], turn[1, 0]], [0.0, 0.0, 0.0]),
+            ("contact position", felt.position_l, contact.position_l),
+            ("contact force", felt.force_l, contact.force_l),
+        ):
+            errors.setdefault(name, []).append((np.array(got) - np.array(true)).ravel())
+    wanted = {
+        "angle": 0.01,
+        "velocity": 0.2,
+        "torque": 0.5,
+        "gyro": 0.03,
+        "accelerometer": 0.4,
+        "position": 0.002,
+        "attitude": 0.01,
+        "contact position": 0.003,
+        "contact force": 0.7,
+    }
+    for name, sigma in wanted.items():
+        error = np.array(errors[name])
+        assert error.std() == pytest.approx(sigma, rel=0.06), name
+        assert np.abs(error.mean(axis=0)).max() < 0.2 * sigma, name
+
+
+@pytest.mark.parametrize(
+    ("tick_hz", "sensor_hz", "due"),
+    [
+        (100, 100.0, [0, 1, 2, 3, 4]),
+        (100, 50.0, [0, 2, 4, 6, 8]),
+        (100, 30.0, [0, 4, 7, 10, 14]),
+        (300, 300.0, [0, 1, 2, 3, 4]),
+        (100, 1000.0, [0, 1, 2, 3, 4]),
+    ],
+)
+def test_a_sensor_is_due_whenever_a_period_of_its_own_has_passed(tick_hz, sensor_hz, due):
+    run = Run(make_config({"chain": {"modules": 1}, "sensors": {"pose": {"rate_hz": sensor_hz}}}, rate_hz=tick_hz))
+    ticks = []
+    for _ in range(due[-1] + 1):
+        if keys.POSE in run.sample().others:
+            ticks.append(run.tick)
+        run.go()
+    assert ticks == due
+
+
+def test_over_a_long_run_the_number_of_samples_is_exact():
+    from snakesim_sim_backend.pace import Due
+
+    due = Due(70.0, 1000.0, 1_000_000)
+    assert sum(due.at(tick * 1_000_000) for tick in range(1, 10_001)) == 700
+
+
+def test_a_delayed_sensor_gives_what_was_there_before():
+    slow = pushed({"pose": {"delay_s": 0.03}, "joints": {"delay_s": 0.02}})
+    prompt = pushed()
+    history = []
+    for tick in range(12):
+        late, now = slow.sample(), prompt.sample()
+        history.append(now)
+        taken = history[max(tick - 2, 0)]
+        assert late.joints.tick == tick
+        assert late.joints.stamp_ns == tick * 10_000_000
+        assert late.joints.age_ns == [min(tick, 2) * 10_000_000] * 6
+        assert late.joints.angle_rad == taken.joints.angle_rad
+        if tick < 3:
+            assert keys.POSE not in late.others
+        else:
+            pose, then = late.others[keys.POSE], history[tick - 3].others[keys.POSE]
+            assert isinstance(pose, Pose)
+            assert isinstance(then, Pose)
+            assert (pose.tick, pose.stamp_ns) == (tick, (tick - 3) * 10_000_000)
+            assert pose.position_w == then.position_w
+        slow.go()
+        prompt.go()
+
+
+def test_a_sensor_that_the_robot_lacks_is_never_published():
+    run = Run(make_config({"sensors!": {"joints": {}}}))
+    assert run.sample().others == {}
+    assert [sensor.key for sensor in run.sim.describe().sensors] == [keys.JOINTS]
+    run.go()
+
+
+def bytes_of_a_run(seed):
+    config = load("triplet").config
+    import msgspec
+
+    run = Run(msgspec.structs.replace(config, seed=seed))
+    told = bytearray()
+    for tick in range(60):
+        samples = run.sample()
+        told += encode(samples.joints)
+        for key, message in samples.others.items():
+            told += key.encode() + encode(message)
+        run.command([Mode.POSITION] * 13, [0.5 * np.sin(0.1 * tick + 0.6 * i) for i in range(13)])
+        run.go()
+    return bytes(told)
+
+
+def test_the_same_seed_and_commands_give_the_same_bytes():
+    assert bytes_of_a_run(3) == bytes_of_a_run(3)
+    assert bytes_of_a_run(3) != bytes_of_a_run(4)
+
+
+def test_what_is_published_can_be_decoded():
+    run = pushed({"joints": {"angle_noise_rad": 0.01}})
+    run.go(0.3)
+    samples = run.sample()
+    for message in (samples.joints, *samples.others.values()):
+        kind = type(message)
+        assert Decoder(kind).decode(encode(message), encoding_of(kind)) == message

@@ -1,0 +1,73 @@
+"""The tether of the static checks: holds one way, and hardly any other."""
+
+import numpy as np
+import pytest
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.messages import Mode
+from tests.unit.sim_backend.rig import Run, make_config, open_sim
+
+ICE = {"ground": {"friction": 0.0}}
+BACKWARD = {"link": 0, "point_m": 0.0, "direction_w": [-1.0, 0.0]}
+
+
+def tethered(force, tether=None):
+    """A stiff snake on ice that hangs on a rope and is pulled at link 2."""
+    run = Run(make_config({"chain": {"modules": 4}}, ICE), tether=tether or BACKWARD)
+    run.command(Mode.POSITION)
+    run.sim.data.xfrc_applied[run.sim.sim.model.body("link_2").id, :3] = force
+    return run
+
+
+def test_the_tension_is_the_pull():
+    run = tethered([12.0, 0.0, 0.0])
+    run.go(1.0)
+    assert run.sim.tether_tension_n == pytest.approx(12.0, rel=0.01)
+    assert abs(run.sim.true_state().base_position_w[0]) < 1e-3
+
+
+def test_it_does_not_hold_along_its_own_pull():
+    run = tethered([-1.0, 0.0, 0.0])
+    run.go(1.0)
+    assert run.sim.tether_tension_n == pytest.approx(0.0, abs=1e-9)
+    assert run.sim.true_state().base_position_w[0] == pytest.approx(-0.5 * 1.0 / 1.2, rel=0.05)
+
+
+def test_it_hardly_holds_to_the_side():
+    run = tethered([0.0, 0.5, 0.0])
+    run.go(0.5)
+    assert run.sim.tether_tension_n == pytest.approx(0.0, abs=0.1)
+    free = Run(make_config({"chain": {"modules": 4}}, ICE))
+    free.command(Mode.POSITION)
+    free.sim.data.xfrc_applied[free.sim.sim.model.body("link_2").id, 1] = 0.5
+    free.go(0.5)
+    moved = run.sim.true_state().base_position_w[1]
+    assert moved == pytest.approx(free.sim.true_state().base_position_w[1], rel=0.02)
+    assert moved > 0.04
+
+
+def test_it_pulls_towards_its_direction_from_any_point():
+    run = tethered([0.0, -9.0, 0.0], {"link": 2, "point_m": 0.0, "direction_w": [0.0, 3.0]})
+    run.go(1.0)
+    assert run.sim.tether_tension_n == pytest.approx(9.0, rel=0.01)
+
+
+def test_without_a_tether_there_is_no_tension():
+    assert open_sim(make_config()).tether_tension_n is None
+
+
+@pytest.mark.parametrize(
+    ("change", "word"), [({"link": 14}, "links 0 to 13"), ({"direction_w": [0.0, 0.0]}, "direction_w")]
+)
+def test_a_tether_that_cannot_be_is_refused(change, word):
+    with pytest.raises(ConfigError, match=word):
+        open_sim(make_config(), tether={**BACKWARD, **change})
+
+
+def test_towing_goes_at_the_winch_s_speed():
+    run = Run(make_config({"chain": {"modules": 4}}), tether={**BACKWARD, "reel_in_m_s": 0.2})
+    run.command(Mode.POSITION)
+    run.go(1.0)
+    drag = 0.3 * 1.2 * 9.81
+    assert run.sim.true_state().base_velocity_w[0] == pytest.approx(-0.2 + drag / 300.0, rel=0.02)
+    assert np.hypot(*run.sim.true_state().base_velocity_w[1:]) < 1e-3
