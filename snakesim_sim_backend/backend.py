@@ -10,7 +10,7 @@ from snakesim_hal.robot import describe
 from snakesim_hal.scenario import RunConfig, config_hash
 from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.contacts import TouchReader
-from snakesim_sim_backend.divergence import DivergenceWatch
+from snakesim_sim_backend.divergence import DivergenceWatch, log_warnings
 from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS, SimModel, build
 from snakesim_sim_backend.sensors import Sensors, rotate
 from snakesim_sim_backend.settings import Settings
@@ -35,6 +35,7 @@ class SimBackend:
             lease_ns=config.lease_ns,
             config_hash=config_hash(config),
         )
+        log_warnings()
         self._sim = build(config, settings)
         self._data = mujoco.MjData(self._sim.model)
         self._motors = Motors(self._sim.model, self._data, config.robot, config.period_ns * 1e-9)

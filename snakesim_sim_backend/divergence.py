@@ -1,10 +1,14 @@
 """Watches that the numbers stay numbers, and keeps the last state that was good."""
 
+import logging
+
 import mujoco
 import numpy as np
 
 from snakesim_hal.errors import BackendError
 from snakesim_sim_backend.model import FREE_DOFS
+
+_log = logging.getLogger("snakesim.sim")
 
 MOST_POSITION = 1e4  # m or rad: of any coordinate
 MOST_SPEED = 1e3  # m/s or rad/s
@@ -12,6 +16,11 @@ MOST_ACCELERATION = 1e9  # m/s² or rad/s²
 BASE = ["the base along x", "the base along y", "the base along z"] + ["the base, turning,"] * 3
 WHOLE = mujoco.mjtState.mjSTATE_INTEGRATION
 INPUTS = mujoco.mjtState.mjSTATE_USER
+
+
+def log_warnings() -> None:
+    """Have MuJoCo's warnings logged; by itself it writes them into a file in the working directory."""
+    mujoco.set_mju_user_warning(_log.warning)
 
 
 class DivergenceWatch:
@@ -38,6 +47,7 @@ class DivergenceWatch:
                 f"`backends.sim.timestep_s` or the gains in [motor]; stiff gains want armature"
             )
             self._go_back()
+            mujoco.mj_forward(self._model, self._data)
         raise BackendError(self._why)
 
     def _is_good(self) -> bool:
@@ -62,17 +72,15 @@ class DivergenceWatch:
         model, data = self._model, self._data
         inputs = np.empty(mujoco.mj_stateSize(model, INPUTS))
         mujoco.mj_getState(model, data, inputs, INPUTS)
-        bad = self._worst()
+        bad = self._worst() or "no number is left"
         self._go_back()
         mujoco.mj_setState(model, data, inputs, INPUTS)
         for _ in range(self._steps):
             mujoco.mj_step(model, data)
-            found = self._worst()
-            if found is not None:
-                bad = found
+            bad = self._worst() or bad
             if not self._is_good():
-                break
-        return bad or "no number is left"
+                return bad
+        return "not by its own physics: something from outside has written to its state"
 
     def _worst(self) -> str | None:
         """The greatest speed, or acceleration if that is nearer to its bound; None when they are no numbers."""

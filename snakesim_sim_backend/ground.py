@@ -18,13 +18,13 @@ WAVES = 40
 DEPTH_M = 0.5  # of the height field below its lowest point
 
 
-def add_ground(spec: mujoco.MjSpec, ground: Ground) -> dict[str, float]:
-    """Put the ground into a model. Returns the names of its geoms, each with its friction."""
+def add_ground(spec: mujoco.MjSpec, ground: Ground) -> list[str]:
+    """Put the ground into a model. Returns the names of its geoms, which touch nothing until they are paired."""
     uneven = ground.uneven
     lowest = 0.0 if uneven is None else -uneven.height_m / 2
     _add(spec, GROUND, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=[0, 0, lowest])
     if uneven is None:
-        return {GROUND: ground.friction}
+        return [GROUND]
     heights = hills(uneven)
     rows = len(heights)
     spec.add_hfield(
@@ -35,11 +35,10 @@ def add_ground(spec: mujoco.MjSpec, ground: Ground) -> dict[str, float]:
         userdata=((heights - lowest) / uneven.height_m).ravel().tolist(),
     )
     _add(spec, HILLS, type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname=HILLS, pos=[0, 0, lowest])
-    return {GROUND: ground.friction, HILLS: ground.friction}  # the plane below catches what leaves the hills
+    return [GROUND, HILLS]  # the plane below catches what leaves the hills
 
 
 def _add(spec: mujoco.MjSpec, name: str, **shape: Any) -> None:
-    """A geom that touches nothing by itself, only what it is paired with."""
     spec.worldbody.add_geom(name=name, contype=0, conaffinity=0, group=GROUND_GROUP, **shape)
 
 

@@ -14,12 +14,12 @@ from snakesim_hal.errors import ConfigError
 from snakesim_hal.messages import Axis
 from snakesim_hal.robot import RobotFile
 from snakesim_hal.scenario import RunConfig, place_all
-from snakesim_sim_backend.actuators import add_motor
+from snakesim_sim_backend.actuators import add_motor, check_gains
 from snakesim_sim_backend.ground import GROUND, add_ground
 from snakesim_sim_backend.imu import add_imus
 from snakesim_sim_backend.obstacles import OBSTACLE, add_obstacle
 from snakesim_sim_backend.settings import Settings
-from snakesim_sim_backend.surface import ground_sole, link_skin
+from snakesim_sim_backend.surface import Grip, grip, link_skin
 from snakesim_sim_backend.tether import add_tether
 
 FREE_QPOS = 7  # of the base: position and quaternion
@@ -46,16 +46,11 @@ def build(config: RunConfig, settings: Settings) -> SimModel:
             f"`backends.sim.contact_time_s` = {settings.contact_time_s} s must be at least two physics steps, here "
             f"{2 * step_s:g} s; raise it or lower `timestep_s`"
         )
+    check_gains(config.robot)
     spec = mujoco.MjSpec()
     _set_options(spec, step_s, settings)
-    scene = config.scene
-    grounds = add_ground(spec, scene.ground)
-    hills_m = scene.ground.uneven.height_m if scene.ground.uneven else 0.0
-    radius_m = config.robot.module.radius_m
-    for placed in place_all(config):
-        grounds |= add_obstacle(spec, placed, settings, body_radius_m=radius_m, hills_m=hills_m)
+    _add_scene(spec, config, settings)
     _add_snake(spec, config.robot, settings)
-    _pair_with_ground(spec, grounds, config.robot, settings)
     if config.robot.sensors.imu is not None:
         add_imus(spec, config.robot.link_lengths_m)
     if settings.tether is not None:
@@ -84,6 +79,30 @@ def _set_options(spec: mujoco.MjSpec, step_s: float, settings: Settings) -> None
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET | mujoco.mjtDisableBit.mjDSBL_ISLAND
 
 
+def _add_scene(spec: mujoco.MjSpec, config: RunConfig, settings: Settings) -> None:
+    """Ground and obstacles, paired with the links that are to come.
+
+    A plane bears a chain of capsules at the balls around joints and ends, and nowhere else. Each ball is there once,
+    while capsules would bring two of them to every joint. Hills, steps and obstacles meet the capsules.
+    """
+    scene, robot = config.scene, config.robot
+    hills_m = scene.ground.uneven.height_m if scene.ground.uneven else 0.0
+    links = [f"link_{i}" for i in range(robot.chain.modules + 1)]
+    feet = [f"foot_{i}" for i in range(robot.chain.modules + 2)]
+    for name in add_ground(spec, scene.ground):
+        sole = grip(scene.ground.friction, settings, bears_weight=True)
+        _pair(spec, name, feet if name == GROUND else links, sole)
+    for placed in place_all(config):
+        rough = add_obstacle(spec, placed, settings, body_radius_m=robot.module.radius_m, hills_m=hills_m)
+        if rough is not None:
+            _pair(spec, rough, links, grip(placed.friction, settings, bears_weight=placed.walkable))
+
+
+def _pair(spec: mujoco.MjSpec, name: str, others: list[str], with_grip: Grip) -> None:
+    for other in others:
+        spec.add_pair(geomname1=name, geomname2=other, **with_grip)
+
+
 def _add_snake(spec: mujoco.MjSpec, robot: RobotFile, settings: Settings) -> None:
     lengths, masses, axes = robot.link_lengths_m, robot.link_masses_kg, robot.axes
     skin = link_skin(settings)
@@ -95,7 +114,7 @@ def _add_snake(spec: mujoco.MjSpec, robot: RobotFile, settings: Settings) -> Non
             body.add_freejoint(name="base")
         else:
             _add_joint(body, f"joint_{i}", axes[i - 1], robot)
-            add_motor(spec, f"joint_{i}", robot)
+            add_motor(spec, f"joint_{i}", robot, spec.option.timestep)
         body.add_geom(
             name=f"link_{i}",
             type=mujoco.mjtGeom.mjGEOM_CAPSULE,
@@ -117,21 +136,6 @@ def _add_foot(body: mujoco.MjsBody, name: str, along_m: float, robot: RobotFile)
     ball = mujoco.mjtGeom.mjGEOM_SPHERE
     size = [robot.module.radius_m, 0.0, 0.0]
     body.add_geom(name=name, type=ball, size=size, pos=[along_m, 0.0, 0.0], mass=0.0, contype=0, conaffinity=0)
-
-
-def _pair_with_ground(
-    spec: mujoco.MjSpec, grounds: dict[str, float], robot: RobotFile, settings: Settings
-) -> None:
-    """Let the snake lie on ground and steps.
-
-    A plane bears a chain of capsules at the balls around joints and ends, and nowhere else. Each is there once, while
-    capsules would bring two of them to every joint. Hills and steps bear the capsules.
-    """
-    for name, friction in grounds.items():
-        flat = name == GROUND
-        for i in range(robot.chain.modules + (2 if flat else 1)):
-            sole = ground_sole(friction, settings)
-            spec.add_pair(geomname1=name, geomname2=f"foot_{i}" if flat else f"link_{i}", **sole)
 
 
 def _add_joint(body: mujoco.MjsBody, name: str, axis: Axis, robot: RobotFile) -> None:

@@ -9,7 +9,7 @@ from snakesim_hal.messages import Obstacle
 from snakesim_hal.scene import Placed
 from snakesim_sim_backend.ground import GROUND_GROUP
 from snakesim_sim_backend.settings import Settings
-from snakesim_sim_backend.surface import obstacle_skin
+from snakesim_sim_backend.surface import frictionless_skin
 
 OBSTACLE = "obstacle:"
 STEP = "step:"
@@ -27,30 +27,28 @@ class Shape(TypedDict):
 
 def add_obstacle(
     spec: mujoco.MjSpec, placed: Placed, settings: Settings, *, body_radius_m: float, hills_m: float
-) -> dict[str, float]:
-    """Put an obstacle into a model; its geom is called `obstacle:<name>`.
+) -> str | None:
+    """Put an obstacle into a model; its geom is called `obstacle:<name>`, or `step:<name>` when it is walkable.
 
-    A walkable one is called `step:<name>` and belongs to the ground: its name and friction are returned.
+    Returns the geom's name when it touches nothing until it is paired: a walkable or a rough one. A smooth one, the
+    usual kind, meets the links by itself, which keeps large fields of pegs fast.
     body_radius_m: of the snake; hills_m: from the ground's lowest to its highest point.
     """
-    obstacle = placed.obstacle
-    shape = _shape(obstacle, body_radius_m, hills_m)
-    if placed.walkable:
-        name = f"{STEP}{obstacle.name}"
-        spec.worldbody.add_geom(name=name, contype=0, conaffinity=0, group=GROUND_GROUP, **shape)
-        return {name: placed.friction}
-    skin = obstacle_skin(placed.friction, settings)
-    spec.worldbody.add_geom(name=f"{OBSTACLE}{obstacle.name}", group=OBSTACLE_GROUP, **shape, **skin)
-    return {}
+    shape = _shape(placed.obstacle, body_radius_m, hills_m)
+    name = f"{STEP if placed.walkable else OBSTACLE}{placed.obstacle.name}"
+    group = GROUND_GROUP if placed.walkable else OBSTACLE_GROUP
+    if placed.walkable or placed.friction > 0:
+        spec.worldbody.add_geom(name=name, contype=0, conaffinity=0, group=group, **shape)
+        return name
+    spec.worldbody.add_geom(name=name, group=group, **shape, **frictionless_skin(settings))
+    return None
 
 
 def _shape(obstacle: Obstacle, body_radius_m: float, hills_m: float) -> Shape:
     x, y, z = obstacle.position_w
     upright = [1.0, 0.0, 0.0, 0.0]
     if obstacle.shape == "sphere":
-        return Shape(
-            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[obstacle.radius_m, 0.0, 0.0], pos=[x, y, z], quat=upright
-        )
+        return Shape(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[obstacle.radius_m, 0.0, 0.0], pos=[x, y, z], quat=upright)
     top = z + obstacle.height_m / 2
     bottom = z - obstacle.height_m / 2 - hills_m / 2  # no gap below it over a hollow
     if obstacle.shape == "box":
@@ -74,4 +72,3 @@ def _shape(obstacle: Obstacle, body_radius_m: float, hills_m: float) -> Shape:
         pos=[x, y, (top + bottom) / 2],
         quat=upright,
     )
-

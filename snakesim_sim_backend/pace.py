@@ -7,7 +7,7 @@ import msgspec
 
 from snakesim_hal.messages import Contacts, Imu, Pose
 
-SampleT = TypeVar("SampleT", Contacts, Imu, Pose)
+SampleT = TypeVar("SampleT", bound=Contacts | Imu | Pose)
 
 
 class Due:

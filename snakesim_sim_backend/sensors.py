@@ -83,9 +83,7 @@ class JointReader:
     reading of the start serves.
     """
 
-    def __init__(
-        self, data: mujoco.MjData, sensor: JointSensor, motors: Motors, noise: Noise, period_ns: int
-    ) -> None:
+    def __init__(self, data: mujoco.MjData, sensor: JointSensor, motors: Motors, noise: Noise, period_ns: int) -> None:
         count = motors.count
         self._count = count
         self._angles, self._velocities = data.qpos[FREE_QPOS:], data.qvel[FREE_DOFS:]
@@ -243,4 +241,3 @@ def rotate(wxyz: Quaternion, v: Vector) -> Vector:
         v[1] + w * ty + z * tx - x * tz,
         v[2] + w * tz + x * ty - y * tx,
     )
-

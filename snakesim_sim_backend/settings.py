@@ -25,13 +25,13 @@ class Settings(FileStruct, frozen=True, kw_only=True):
     """How the physics is computed. The defaults suit robots of centimetres to decimetres and of a few kilograms."""
 
     # The longest physics step; it is shortened so that a whole number of steps makes a control period.
-    timestep_s: Annotated[float, Meta(ge=1e-5, le=0.01, extra_json_schema={"unit": "s"})] = 0.001
+    timestep_s: Annotated[float, Meta(ge=1e-5, le=0.01, extra_json_schema={"unit": "s"})] = 0.002
     # How fast a penetration is pushed out; softer contacts are more forgiving at long steps. At least two steps.
     contact_time_s: Annotated[float, Meta(ge=1e-4, le=0.1, extra_json_schema={"unit": "s"})] = 0.005
     # How fast friction brings slip to rest, as far as it reaches. Short times make sliding bodies hop: see surface.py.
-    slip_time_s: Annotated[float, Meta(ge=1e-4, le=1, extra_json_schema={"unit": "s"})] = 0.05
+    slip_time_s: Annotated[float, Meta(ge=1e-4, le=1, extra_json_schema={"unit": "s"})] = 0.03
     # How much stiffer friction holds than normals push: higher values slide less at rest, and cost time.
-    friction_hold: Annotated[float, Meta(ge=1, le=1000, extra_json_schema={"unit": "1"})] = 10.0
+    friction_hold: Annotated[float, Meta(ge=1, le=1000, extra_json_schema={"unit": "1"})] = 100.0
     # Between links of the snake itself.
     self_friction: Annotated[float, Meta(ge=0, le=5, extra_json_schema={"unit": "1 (Coulomb coefficient)"})] = 0.3
     # Longest time that the snake may take to come to rest before the run begins.

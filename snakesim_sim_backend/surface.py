@@ -11,8 +11,10 @@ from typing import TypedDict
 
 from snakesim_sim_backend.settings import Settings
 
-HARD = [0.95, 0.99, 0.001, 0.5, 2.0]  # solimp, see MuJoCo's manual
-SLIDING = [0.9, 0.95, 0.001, 0.5, 2.0]
+# solimp, see MuJoCo's manual: how hard a contact is at first touch, and 1 mm deeper.
+BARE = [0.95, 0.99, 0.001, 0.5, 2.0]
+RUBBING = [0.9, 0.95, 0.001, 0.5, 2.0]
+LYING = [0.5, 0.9, 0.001, 0.5, 2.0]  # takes up the push of sliding under the body's own weight; sinks in by 0.1 mm
 
 
 class Skin(TypedDict):
@@ -25,7 +27,7 @@ class Skin(TypedDict):
     solimp: list[float]
 
 
-class Sole(TypedDict):
+class Grip(TypedDict):
     """Keyword arguments of MjSpec.add_pair."""
 
     friction: list[float]
@@ -35,15 +37,9 @@ class Sole(TypedDict):
     solimp: list[float]
 
 
-def obstacle_skin(friction: float, settings: Settings) -> Skin:
-    """Of an obstacle. Its priority is above the links', or MuJoCo would take the greater friction of the two."""
-    return Skin(
-        friction=[friction, 0.0, 0.0],
-        condim=3 if friction > 0 else 1,
-        priority=1,
-        solref=[settings.slip_time_s if friction > 0 else settings.contact_time_s, 1.0],
-        solimp=SLIDING if friction > 0 else HARD,
-    )
+def frictionless_skin(settings: Settings) -> Skin:
+    """Of an obstacle that only pushes. Its priority is above the links', or their friction would act."""
+    return Skin(friction=[0.0, 0.0, 0.0], condim=1, priority=1, solref=[settings.contact_time_s, 1.0], solimp=BARE)
 
 
 def link_skin(settings: Settings) -> Skin:
@@ -53,16 +49,16 @@ def link_skin(settings: Settings) -> Skin:
         condim=3 if settings.self_friction > 0 else 1,
         priority=0,
         solref=[settings.contact_time_s, 1.0],
-        solimp=HARD,
+        solimp=RUBBING,
     )
 
 
-def ground_sole(friction: float, settings: Settings) -> Sole:
-    """Between the ground, or a step, and a link."""
-    return Sole(
+def grip(friction: float, settings: Settings, *, bears_weight: bool) -> Grip:
+    """Between a link and ground, step or rough obstacle. Only a pair of geoms can have a slip time of its own."""
+    return Grip(
         friction=[friction, friction, 0.0, 0.0, 0.0],
         condim=3 if friction > 0 else 1,
         solref=[settings.contact_time_s, 1.0],
         solreffriction=[settings.slip_time_s, 1.0],
-        solimp=SLIDING if friction > 0 else HARD,
+        solimp=BARE if friction == 0 else LYING if bears_weight else RUBBING,
     )

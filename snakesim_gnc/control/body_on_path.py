@@ -40,6 +40,7 @@ class BodyOnPath:
         self._nodes = len(segments_m) + 1
         self._xy = slice(self._bends, self._bends + 2 * self._nodes)
         self._rows: dict[int, Floats] = {}
+        self._chord_ends: dict[float, dict[int, float]] = {length: {} for length in segments_m}
 
     def at(self, tail_s_m: float) -> Lie:
         """The body with its tail end at an arc length, which may be before the path's start or beyond its end."""
@@ -82,20 +83,35 @@ class BodyOnPath:
         return row
 
     def _lay(self, tail_s_m: float) -> Floats:
-        route, s = self.route, tail_s_m
-        point = route.at(s)
-        places, xs, ys = [s], [point[0]], [point[1]]
+        at, s = self.route.at, tail_s_m
+        x, y = at(s)
+        places, xs, ys = [s], [x], [y]
         headings: list[float] = []
         for length in self.segments_m:
-            s = next_on_route(route, point, s, length)
-            ahead = route.at(s)
-            headings.append(math.atan2(ahead[1] - point[1], ahead[0] - point[0]))
-            point = ahead
+            s = self._ahead(s, length)
+            ahead_x, ahead_y = at(s)
+            headings.append(math.atan2(ahead_y - y, ahead_x - x))
+            x, y = ahead_x, ahead_y
             places.append(s)
-            xs.append(point[0])
-            ys.append(point[1])
+            xs.append(x)
+            ys.append(y)
         turns = [math.remainder(b - a, math.tau) for a, b in zip(headings[:-1], headings[1:], strict=True)]
         return np.array([*turns, *xs, *ys, *places])
+
+    def _ahead(self, s_m: float, length_m: float) -> float:
+        """Arc length of the path's point at a straight distance ahead; between grid points it is nearly linear."""
+        place = s_m / SPACING_M
+        k = math.floor(place)
+        low, high = self._chord_end(k, length_m), self._chord_end(k + 1, length_m)
+        return low + (place - k) * (high - low)
+
+    def _chord_end(self, k: int, length_m: float) -> float:
+        ends = self._chord_ends[length_m]
+        end = ends.get(k)
+        if end is None:
+            s = k * SPACING_M
+            end = ends[k] = next_on_route(self.route, self.route.at(s), s, length_m)
+        return end
 
 
 def chain_nodes(

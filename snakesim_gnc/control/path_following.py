@@ -29,7 +29,7 @@ class PathFollowing:
 
         look_ahead_m: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "m"})] = 0.03
         blend_s: Annotated[float, Meta(gt=0, le=10, extra_json_schema={"unit": "s"})] = 0.3
-        speed_filter_s: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "s"})] = 0.02
+        speed_filter_s: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "s"})] = 0.03
         world_age_s: Annotated[float, Meta(gt=0, le=10, extra_json_schema={"unit": "s"})] = 0.25
 
     def __init__(self, robot: Description, settings: Settings) -> None:
@@ -37,7 +37,10 @@ class PathFollowing:
         self._set = settings
         self._body = PlanarBody(robot)
         self._progress = Progress(
-            self._body, speed_filter_s=settings.speed_filter_s, oldest_world_s=settings.world_age_s
+            self._body,
+            speed_filter_s=settings.speed_filter_s,
+            slack_m=0.0,
+            oldest_world_s=settings.world_age_s,
         )
         self._hand_over = HandOver(robot)
         self._reference: Floats | None = None

@@ -21,7 +21,7 @@ TICKS_KEPT = 128
 class Located:
     """The body on its path at one tick."""
 
-    lie: Lie  # as it would lie on the path
+    lie: Lie  # as it would lie on the path; follows `tail_s_m` with slack, so that it is still when the body is
     on_path: BodyOnPath
     tail_s_m: float
     speed_m_s: float
@@ -39,10 +39,13 @@ class Progress:
     the speed last seen, so what is returned is always the present.
     """
 
-    def __init__(self, body: PlanarBody, *, speed_filter_s: float, oldest_world_s: float) -> None:
+    def __init__(
+        self, body: PlanarBody, *, speed_filter_s: float, slack_m: float, oldest_world_s: float
+    ) -> None:
         self._planar = body
         self._segments = np.array(body.segments_m)
         self._speed_filter_s = speed_filter_s
+        self._slack_m = slack_m
         self._oldest_s = oldest_world_s
         self._angles: deque[tuple[int, list[float]]] = deque(maxlen=TICKS_KEPT)
         self._body: BodyOnPath | None = None
@@ -51,6 +54,7 @@ class Progress:
         self._nodes = np.empty((2, 0))
         self._s_m = 0.0  # at the tick of the newest world model
         self._speed_m_s = 0.0
+        self._held_s_m = 0.0
 
     def update(self, view: View) -> Located | str:
         """Where the body is at this tick, or why that is unknown."""
@@ -78,7 +82,8 @@ class Progress:
             self._filter(body, world, view.period_s)
         self._world = world
         s = self._s_m + self._speed_m_s * age_s
-        return Located(body.at(s), body, s, self._speed_m_s, self._nodes, fresh, new_path, world, trajectory)
+        self._held_s_m = s if new_path else min(max(self._held_s_m, s - self._slack_m), s + self._slack_m)
+        return Located(body.at(self._held_s_m), body, s, self._speed_m_s, self._nodes, fresh, new_path, world, trajectory)
 
     def _measure(self, world: World) -> None:
         angles = next((a for tick, a in reversed(self._angles) if tick <= world.tick), self._angles[0][1])

@@ -3,12 +3,13 @@
 import numpy as np
 
 from snakesim_operator.record import RunRecord
-from snakesim_operator.report.html import absent, paragraph, section, words
+from snakesim_operator.report.html import absent, paragraph, section, shown, words
 from snakesim_operator.report.instants import Balance, Instant, felt_along_n, plain_instants, pushing_instants
 from snakesim_operator.report.palette import joint_class
 from snakesim_operator.report.polygon import force_polygon, pretty
 from snakesim_operator.report.svg import arrow, element
-from snakesim_operator.report.top_view import View, top_view, views
+from snakesim_operator.report.top_view import top_view
+from snakesim_operator.report.view import View, nodes_xy_w, views
 from snakesim_operator.summary import RunSummary
 
 WIDTH = 500.0
@@ -41,9 +42,9 @@ def instants_section(record: RunRecord, summary: RunSummary) -> str:
 
 EXPLANATION = (
     "The red polygon is the balance that the controller solved for: fₛ + f₁ + f₂ + f₃ = 0. fₛ is the tether of the "
-    "static model, pulling back along the path at o₁. The resultant of the contact forces, f₁ + f₂ + f₃ = −fₛ, is the heavy "
-    "arrow: it points forward along the path at o₁. The robot has no tether, so this force is what drives it against "
-    "friction and inertia."
+    "static model, pulling back along the path at o₁. The resultant of the contact forces, f₁ + f₂ + f₃ = −fₛ, is the "
+    "heavy arrow: it points forward along the path at o₁. The robot has no tether, so this force is what drives it "
+    "against friction and inertia."
 )
 
 
@@ -74,7 +75,9 @@ def _card(record: RunRecord, instant: Instant, view: View, letter: str) -> str:
         drawn = force_polygon(instant.balance, 236.0, 210.0, upright=view.upright)
         parts.append(f'<div class="balance"><div class="polygon">{drawn}</div>{_facts(instant, instant.balance)}</div>')
     elif instant.felt:
-        parts.append(paragraph(f"{_touches(instant)}; they push {felt_along_n(instant):.1f} N along the body.", "note"))
+        nodes = nodes_xy_w(record, instant)
+        pushed = shown(felt_along_n(instant, nodes[-1] - nodes[0]), 3)
+        parts.append(paragraph(f"{_touches(instant)}, in sum {pushed} N in the direction from tail to head.", "note"))
     head = f"<h3>({letter}) {instant.time_s:.2f} s <small>{named}</small></h3>"
     return f'<article class="card instant">{head}{"".join(parts)}</article>'
 
@@ -97,8 +100,8 @@ def _facts(instant: Instant, balance: Balance) -> str:
     state = instant.state
     lines = [("resultant, solved", f"{np.hypot(*balance.resultant_n):.1f} N")]
     if instant.felt:
-        lines.append(("Σ f·t̂, measured", f"{felt_along_n(instant):.1f} N"))
-    lines.append(("polygon closes to", f"{balance.gap_n:.1g} N"))
+        lines.append(("resultant, felt", f"{felt_along_n(instant, balance.resultant_n):.1f} N"))
+    lines.append(("polygon closes to", f"{balance.gap_n:.2f} N" if balance.gap_n >= 0.01 else "< 0.01 N"))
     if state is not None and state.propulsion_torque_nm is not None:
         lines.append(("propulsion torque", f"{state.propulsion_torque_nm:.2f} N·m"))
     if state is not None and state.torque_headroom_nm is not None:

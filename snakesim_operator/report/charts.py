@@ -38,10 +38,16 @@ class Frame:
     right: float = 14.0
     top: float = 12.0
     bottom: float = 36.0
+    begin_s: float = 0.0
 
     def x(self, time_s: float) -> float:
-        """Where a time is drawn."""
-        return self.left + (self.width - self.left - self.right) * time_s / max(self.end_s, 1e-9)
+        """Where a time is drawn; what lies outside is drawn at the edge."""
+        share = (min(max(time_s, self.begin_s), self.end_s) - self.begin_s) / max(self.end_s - self.begin_s, 1e-9)
+        return self.left + (self.width - self.left - self.right) * share
+
+    def holds(self, time_s: Floats) -> NDArray[np.bool_]:
+        """Which times are drawn, (n,)."""
+        return (time_s >= self.begin_s) & (time_s <= self.end_s)
 
     def y(self, value: float) -> float:
         """Where a value is drawn."""
@@ -63,41 +69,45 @@ def range_of(values: Iterable[Floats], *, least: float, always: tuple[float, ...
     return low - air, high + air
 
 
-def axes(frame: Frame, unit_words: str, *, time_words: str = "time, s", grid: bool = True) -> str:
+def axes(frame: Frame, unit_words: str) -> str:
     """Both axes with ticks, grid and names."""
+    return value_axis(frame, unit_words) + time_axis(frame)
+
+
+def value_axis(frame: Frame, unit_words: str) -> str:
+    """The grid with its numbers at the left, and the name."""
     parts: list[str] = []
     inner = frame.height - frame.top - frame.bottom
     step = round_step(frame.high - frame.low, max(int(inner / 34), 2))
     for value in ticks(frame.low, frame.high, max(int(inner / 34), 2)):
         y = frame.y(value)
-        if grid:
-            parts.append(line((frame.left, y), (frame.width - frame.right, y), "zero" if value == 0 else "grid"))
+        parts.append(line((frame.left, y), (frame.width - frame.right, y), "zero" if value == 0 else "grid"))
         parts.append(text(frame.left - 7, y + 4, tick_text(value, step), "small", anchor="end"))
-    parts.append(time_axis(frame, time_words))
     middle = frame.top + inner / 2
     parts.append(text(14, middle, unit_words, "small soft", anchor="middle", turn=-90))
     return "".join(parts)
 
 
-def time_axis(frame: Frame, words: str = "time, s") -> str:
+def time_axis(frame: Frame) -> str:
     """The line at the bottom with its ticks."""
     bottom = frame.height - frame.bottom
     most = max(int((frame.width - frame.left - frame.right) / 62), 2)
-    step = round_step(frame.end_s, most)
+    step = round_step(frame.end_s - frame.begin_s, most)
     parts = [line((frame.left, bottom), (frame.width - frame.right, bottom), "axis")]
-    for value in ticks(0.0, frame.end_s, most):
+    for value in ticks(frame.begin_s, frame.end_s, most):
         x = frame.x(value)
         parts.append(line((x, bottom), (x, bottom + 4), "axis"))
         parts.append(text(x, bottom + 16, tick_text(value, step), "small", anchor="middle"))
     middle = (frame.left + frame.width - frame.right) / 2
-    parts.append(text(middle, frame.height - 5, words, "small soft", anchor="middle"))
+    parts.append(text(middle, frame.height - 5, "time, s", "small soft", anchor="middle"))
     return "".join(parts)
 
 
 def curve(frame: Frame, time_s: Floats, values: Floats, class_: str, *, steps: bool = False) -> str:
     """A line through a series, thinned, broken where it is unknown. steps: a value holds until the next."""
     parts: list[str] = []
-    for piece in thinned(time_s, values):
+    within = frame.holds(time_s)
+    for piece in thinned(time_s[within], values[within]):
         points = [(frame.x(t), frame.y(v)) for t, v in piece]
         if steps:
             points = [p for a, b in pairwise(points) for p in (a, (b[0], a[1]))] + points[-1:]
@@ -128,9 +138,11 @@ def shades(frame: Frame, intervals: list[Propulsion]) -> str:
                 class_=f"shade {colour}",
             )
         )
-        if right - left > 5:
-            y = frame.top + 7
+        y = frame.top + 7
+        if right - left > 18:
             parts.append(arrow((left + 0.5, y), (right - 0.5, y), f"span {colour}", head=8, both=True))
+        else:
+            parts.append(line((left, y), (right, y), f"span {colour} shaft"))
     return "".join(parts)
 
 
@@ -159,7 +171,7 @@ def fault_marks(frame: Frame, times_s: list[float]) -> str:
     parts = [
         line((frame.x(t), frame.top), (frame.x(t), frame.height - frame.bottom), "fault-mark")
         for t in times_s
-        if 0 <= t <= frame.end_s
+        if frame.begin_s <= t <= frame.end_s
     ]
     return "".join(parts)
 
@@ -175,5 +187,6 @@ def chart(frame: Frame, label: str, *parts: str) -> str:
         data_right=frame.width - frame.right,
         data_top=frame.top,
         data_bottom=frame.height - frame.bottom,
+        data_begin_s=f"{frame.begin_s:.6g}",
         data_end_s=f"{frame.end_s:.6g}",
     )

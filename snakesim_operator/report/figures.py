@@ -20,6 +20,8 @@ from snakesim_operator.report.timeline import (
 )
 
 Floats = NDArray[np.float64]
+LOWERED = 0.995  # of the joint's limit: a controller's own limit below that is drawn
+Phase = tuple[float, float]  # from when to when, s
 STEP = 19.0  # height of a joint's row in the hand-over staircase
 
 
@@ -42,7 +44,7 @@ def overview(record: RunRecord, moved: Series | None, intervals: list[Propulsion
     parts = [charts.strip(frame, state_bands(record), band_top, band)]
     parts.append(charts.strip(frame, jam_bands(record), band_top + band, 5, named=False))
     if moved is not None:
-        parts.append(charts.axes(frame, "advance, m", time_words="").replace('class="axis"', 'class="grid"'))
+        parts.append(charts.value_axis(frame, "advance, m"))
         for one in intervals:
             left, right = frame.x(one.start_s), frame.x(one.end_s)
             parts.append(
@@ -76,13 +78,14 @@ def _staircase(record: RunRecord, frame: Frame, joints: list[int], intervals: li
     return "".join(parts)
 
 
-def joint_angle(record: RunRecord, joint: int, intervals: list[Propulsion], width: float) -> str:
+def joint_angle(record: RunRecord, joint: int, intervals: list[Propulsion], phase_s: Phase, width: float) -> str:
     """Measured angle against its reference (paper, Fig. 12)."""
     time_s = record.time_s - zero_s(record)
     measured, reference = record.angle_rad[:, joint], reference_rad(record, joint)
-    low, high = charts.range_of([measured, reference], least=0.05)
+    shown = (time_s >= phase_s[0]) & (time_s <= phase_s[1])
+    low, high = charts.range_of([measured[shown], reference[shown]], least=0.05)
     high += 0.08 * (high - low)  # room for the arrows
-    frame = Frame(width, 210, end_s(record), low, high)
+    frame = Frame(width, 210, phase_s[1], low, high, begin_s=phase_s[0])
     return charts.chart(
         frame,
         f"Angle of {record.description.joints[joint].name} over time",
@@ -94,15 +97,15 @@ def joint_angle(record: RunRecord, joint: int, intervals: list[Propulsion], widt
     )
 
 
-def joint_torque(record: RunRecord, joint: int, intervals: list[Propulsion], width: float) -> str:
+def joint_torque(record: RunRecord, joint: int, intervals: list[Propulsion], phase_s: Phase, width: float) -> str:
     """Measured torque, what torque mode asked for, and the limits (paper, Fig. 13)."""
     time_s = record.time_s - zero_s(record)
     limit = record.description.joints[joint].torque_limit_nm
     measured, commanded = record.torque_nm[:, joint], commanded_torque_nm(record, joint)
     lowered = record.torque_limit_nm[:, joint]
-    lowered = np.where(lowered < 0.995 * limit, lowered, np.nan)
+    lowered = np.where(lowered < LOWERED * limit, lowered, np.nan)
     low, high = charts.range_of([measured, commanded], least=0.1, always=(-limit, limit))
-    frame = Frame(width, 210, end_s(record), low, high + 0.08 * (high - low))
+    frame = Frame(width, 210, phase_s[1], low, high + 0.08 * (high - low), begin_s=phase_s[0])
     return charts.chart(
         frame,
         f"Torque of {record.description.joints[joint].name} over time",

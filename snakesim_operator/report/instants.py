@@ -75,6 +75,20 @@ def balance_of(state: ControlState) -> Balance | None:
 
 def pushing_instants(record: RunRecord) -> list[Instant]:
     """Up to four moments spread over the time of propelling, each with solved forces that balance."""
+    return _spread(balanced_instants(record))
+
+
+def best_instant(record: RunRecord) -> Instant | None:
+    """The moment at which the push-points were felt and drove the snake hardest; else one from the middle."""
+    found = balanced_instants(record)
+    if not found:
+        plain = plain_instants(record)
+        return plain[len(plain) // 2] if plain else None
+    return min(found, key=lambda one: (unfelt(one), _saturated(one), -_drive_n(one)))
+
+
+def balanced_instants(record: RunRecord) -> list[Instant]:
+    """Every moment of locomotion whose solved forces balance, in order of time."""
     if not len(record.time_s):
         return []
     found: list[Instant] = []
@@ -87,7 +101,7 @@ def pushing_instants(record: RunRecord) -> list[Instant]:
         instant = _instant(record, told_at_s(record, state), state, balance)
         if record.nodes_w(instant.row) is not None:
             found.append(instant)
-    return _spread(found)
+    return found
 
 
 def plain_instants(record: RunRecord) -> list[Instant]:
@@ -103,9 +117,10 @@ def plain_instants(record: RunRecord) -> list[Instant]:
     return chosen
 
 
-def felt_along_n(instant: Instant) -> float:
-    """Sum of the measured contact forces along the body at each contact: what really drove the snake."""
-    return sum(float(np.dot(c.force_w[:2], c.tangent_w[:2])) for c in instant.felt)
+def felt_along_n(instant: Instant, direction_w: Floats) -> float:
+    """How much the measured contact forces push along a direction, (2,) of any length."""
+    unit = direction_w / max(float(np.hypot(*direction_w)), 1e-12)
+    return sum(float(np.dot(contact.force_w[:2], unit)) for contact in instant.felt)
 
 
 def _instant(record: RunRecord, time_s: float, state: ControlState | None, balance: Balance | None) -> Instant:
@@ -136,7 +151,7 @@ def _spread(found: list[Instant]) -> list[Instant]:
     for quarter in np.array_split(np.arange(len(found)), HOW_MANY):
         members = [found[i] for i in quarter]
         middle = members[len(members) // 2].time_s
-        chosen.append(min(members, key=lambda one: (_unfelt(one), _saturated(one), abs(one.time_s - middle))))
+        chosen.append(min(members, key=lambda one: (unfelt(one), _saturated(one), abs(one.time_s - middle))))
     return chosen
 
 
@@ -144,9 +159,13 @@ def _saturated(instant: Instant) -> bool:
     return instant.state is not None and instant.state.saturated
 
 
-def _unfelt(instant: Instant) -> int:
-    """How many solved contacts no sensor felt; zero when nothing is known of touches."""
-    if instant.balance is None or not instant.felt:
+def _drive_n(instant: Instant) -> float:
+    return felt_along_n(instant, instant.balance.resultant_n) if instant.balance is not None else 0.0
+
+
+def unfelt(instant: Instant) -> int:
+    """How many solved contacts no sensor felt."""
+    if instant.balance is None:
         return 0
     touched = {contact.obstacle for contact in instant.felt}
     return sum(contact.obstacle not in touched for contact in instant.balance.contacts)

@@ -27,7 +27,15 @@ class Labels:
             x, y = a[0] + (b[0] - a[0]) * k / steps, a[1] + (b[1] - a[1]) * k / steps
             self._taken.append(((x - half, y - half, x + half, y + half), weight))
 
-    def put(self, at: Point, words: str, class_: str, *, gaps: tuple[float, ...] = (12, 20, 30, 44)) -> str:
+    def put(
+        self,
+        at: Point,
+        words: str,
+        class_: str,
+        *,
+        gaps: tuple[float, ...] = (12, 20, 30, 44),
+        away_from: Point | None = None,
+    ) -> str:
         """A label near a point, at the distance and in the direction that covers least."""
         width = text_width(words, SIZE)
         best: tuple[float, Box] | None = None
@@ -36,7 +44,7 @@ class Labels:
                 c, s = math.cos(math.radians(turn)), math.sin(math.radians(turn))
                 x, y = at[0] + c * (gap + width / 2), at[1] + s * (gap + SIZE / 2)
                 box = (x - width / 2, y - SIZE / 2, x + width / 2, y + SIZE / 2)
-                cost = self._cost(box) + 0.15 * gap
+                cost = self._cost(box) + 0.15 * gap + _towards(at, (c, s), away_from)
                 if best is None or cost < best[0]:
                     best = (cost, box)
         assert best is not None
@@ -48,6 +56,14 @@ class Labels:
         covered = sum(weight * _overlap(box, taken) for taken, weight in self._taken)
         area = (box[2] - box[0]) * (box[3] - box[1])
         return covered + 10 * (area - _overlap(box, self._frame))
+
+
+def _towards(at: Point, direction: Point, away_from: Point | None) -> float:
+    """Cost of a direction that leads towards a point that the label had better keep away from."""
+    if away_from is None:
+        return 0.0
+    x, y = away_from[0] - at[0], away_from[1] - at[1]
+    return 60 * (direction[0] * x + direction[1] * y) / max(math.hypot(x, y), 1e-9)
 
 
 def _overlap(a: Box, b: Box) -> float:

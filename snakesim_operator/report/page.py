@@ -3,21 +3,24 @@
 from pathlib import Path
 
 import msgspec
+import numpy as np
 
 from snakesim_operator.record import CONFIG, REPORT, RunRecord
 from snakesim_operator.report import figures, tables
 from snakesim_operator.report.cards import instants_section
-from snakesim_operator.report.html import absent, paragraph, responsive, section, words
+from snakesim_operator.report.html import absent, paragraph, responsive, section, shown, words
 from snakesim_operator.report.palette import DARK, LIGHT, joint_class, variables
 from snakesim_operator.report.svg import line
 from snakesim_operator.report.timeline import (
     Propulsion,
     distance,
+    end_s,
     most_used_joints,
     propulsion_intervals,
+    propulsion_phase_s,
     zero_s,
 )
-from snakesim_operator.report.torque_map import torque_map
+from snakesim_operator.report.torque_map import full_colour_nm, torque_map
 from snakesim_operator.report.verdict import tiles, verdict
 from snakesim_operator.summary import RunSummary
 
@@ -74,7 +77,7 @@ def _header(record: RunRecord, summary: RunSummary) -> str:
         f"{summary.pace}, {summary.rate_hz:g} Hz",
         f"seed {summary.seed}",
     ]
-    shown = "".join(
+    shown_tiles = "".join(
         f'<div class="tile{" alarming" if tile.alarming else ""}"><b>{words(tile.value)}'
         f"{f'<small>{words(tile.unit)}</small>' if tile.unit and tile.value != '–' else ''}</b>"
         f"<span>{words(tile.name)}</span></div>"
@@ -84,7 +87,7 @@ def _header(record: RunRecord, summary: RunSummary) -> str:
         f'<header id="header"><p class="kicker">SnakeSIM run report <span>{words(summary.scenario)}</span></p>'
         f"<h1>{words(record.config.title or summary.scenario)}</h1>"
         f'<p class="facts">{" · ".join(f"<span>{words(fact)}</span>" for fact in facts)}</p>'
-        f'<p class="verdict {judged.kind}">{words(judged.words)}</p><div class="tiles">{shown}</div></header>'
+        f'<p class="verdict {judged.kind}">{words(judged.words)}</p><div class="tiles">{shown_tiles}</div></header>'
     )
 
 
@@ -119,28 +122,35 @@ def _joints(record: RunRecord, summary: RunSummary, intervals: list[Propulsion])
     lead = (
         f"The {len(joints)} of {among} that propelled longest. " if among > len(joints) else ""
     ) + "Left the angle, right the torque; the two-sided arrows span the time in which the joint propelled."
+    phase_s = propulsion_phase_s(record, intervals)
+    if phase_s[1] - phase_s[0] < 0.99 * end_s(record):
+        lead += f" Shown is the propulsion phase, {phase_s[0]:.1f} to {phase_s[1]:.1f} s of the run."
     blocks: list[str] = []
     for joint in joints:
         own = [one for one in intervals if one.joint == joint]
         spans = ", ".join(f"{one.start_s:.2f}–{one.end_s:.2f} s" for one in own[:4])
         spans += f" and {len(own) - 4} more times" if len(own) > 4 else ""
         name = record.description.joints[joint].name
+        angle = figures.joint_angle(record, joint, intervals, phase_s, HALF_WIDTH)
+        torque = figures.joint_torque(record, joint, intervals, phase_s, HALF_WIDTH)
         blocks.append(
             f'<article class="joint-pair" data-joint="{words(name)}"><h3><i class="chip {joint_class(joint)}"></i>'
             f"{words(name)} <small>propelled {words(spans)}</small></h3><div class='pair'>"
-            f'<div class="angle">{figures.joint_angle(record, joint, intervals, HALF_WIDTH)}</div>'
-            f'<div class="torque">{figures.joint_torque(record, joint, intervals, HALF_WIDTH)}</div></div></article>'
+            f'<div class="angle">{angle}</div>'
+            f'<div class="torque">{torque}</div></div></article>'
         )
-    return section("joints", title, paragraph(lead, "lead"), _line_legend(), *blocks)
+    return section("joints", title, paragraph(lead, "lead"), _line_legend(record), *blocks)
 
 
-def _line_legend() -> str:
+def _line_legend(record: RunRecord) -> str:
     entries = [
         ("curve measured", "measured"),
         ("curve reference", "reference angle; commanded torque while in torque mode"),
         ("limit", "torque limit of the joint"),
-        ("curve lowered", "limit that the controller set below it"),
     ]
+    limits = [joint.torque_limit_nm for joint in record.description.joints]
+    if bool((record.torque_limit_nm < figures.LOWERED * np.array(limits)).any()):
+        entries.append(("curve lowered", "limit that the controller set below it"))
     items = "".join(
         f'<li><svg class="figure swatch" viewBox="0 0 30 14">{line((1, 7), (29, 7), class_)}</svg>{words(name)}</li>'
         for class_, name in entries
@@ -156,13 +166,19 @@ def _loads(record: RunRecord, summary: RunSummary, intervals: list[Propulsion]) 
     parts = [
         "<h3>Torque of every joint</h3>",
         paragraph(
-            "A row a joint, head on top. Orange turns the part ahead of the joint to the left, blue to the right; full "
-            "colour is the joint's limit." + (" Frames mark propulsion." if intervals else ""),
+            "A row a joint, head on top. Orange is positive, a yaw joint turning what is ahead of it to the left; blue "
+            f"is negative; full colour is {shown(full_colour_nm(record), 2)} N·m."
+            + (" Frames mark propulsion." if intervals else ""),
             "lead",
         ),
         responsive(lambda width: torque_map(record, intervals, width)),
         "<h3>Hardest-worked joint</h3>",
-        paragraph(f"At a torque limit in {100 * saturated:.1f} % of the ticks; those are drawn in red.", "lead"),
+        paragraph(
+            f"At a torque limit in {100 * saturated:.1f} % of the ticks; those are drawn in red."
+            if saturated
+            else "No joint was at its torque limit at any tick.",
+            "lead",
+        ),
         responsive(lambda width: figures.torque_use(record, width)),
         "<h3>Contacts</h3>",
     ]
@@ -190,7 +206,9 @@ def _numbers(record: RunRecord, summary: RunSummary) -> str:
 
 
 def _again(record: RunRecord, summary: RunSummary) -> str:
-    command = f"snakesim run {record.folder / CONFIG} --backend {summary.backend} --seed {summary.seed}"
+    here = Path.cwd()
+    folder = record.folder.relative_to(here) if record.folder.is_relative_to(here) else record.folder
+    command = f"snakesim run {folder / CONFIG} --backend {summary.backend} --seed {summary.seed}"
     plain = msgspec.json.format(msgspec.json.encode(summary.config), indent=2).decode()
     same = (
         f"In lockstep it gives the same command digest, {summary.command_digest[:16]}…"

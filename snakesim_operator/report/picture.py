@@ -5,16 +5,18 @@ from pathlib import Path
 import numpy as np
 
 from snakesim_operator.record import RunRecord
-from snakesim_operator.report.instants import Balance, Instant, plain_instants, pushing_instants
+from snakesim_operator.report.instants import Instant, best_instant
 from snakesim_operator.report.page import HERE
 from snakesim_operator.report.palette import LIGHT, baked
 from snakesim_operator.report.polygon import polygon_drawing
 from snakesim_operator.report.svg import arrow, element, figure, line, text, text_width
-from snakesim_operator.report.top_view import drawing, nodes_xy_w, views
+from snakesim_operator.report.top_view import drawing
+from snakesim_operator.report.view import nodes_xy_w, views
 from snakesim_operator.summary import RunSummary
 
 WIDTH, EDGE = 920.0, 20.0
 POLYGON_WIDTH = 250.0
+ARROW = 150.0  # of the strongest force
 HEAD, FOOT = 62.0, 40.0
 
 
@@ -29,7 +31,7 @@ def picture(record: RunRecord, summary: RunSummary) -> str:
     if instant is None:
         raise ValueError("no instant of this run can be drawn: it has no ticks, or the robot has no pose sensor")
     view_width = WIDTH - 2 * EDGE - (POLYGON_WIDTH if instant.balance is not None else 0.0)
-    view = views(record, [instant], view_width)[0]
+    view = views(record, [instant], view_width, ARROW)[0]
     height = HEAD + view.height + FOOT
     style = baked((HERE / "figure.css").read_text(encoding="utf-8"), LIGHT)
     parts = [
@@ -50,27 +52,6 @@ def picture(record: RunRecord, summary: RunSummary) -> str:
     return figure(WIDTH, height, label, *parts, xmlns="http://www.w3.org/2000/svg", width=WIDTH, height=height) + "\n"
 
 
-def best_instant(record: RunRecord) -> Instant | None:
-    """The pushing instant whose measured forces are nearest to the solved ones."""
-    chosen = pushing_instants(record)
-    if chosen:
-        return min(chosen, key=_mismatch)
-    plain = plain_instants(record)
-    return plain[len(plain) // 2] if plain else None
-
-
-def _mismatch(instant: Instant) -> float:
-    balance = instant.balance
-    if balance is None:
-        return float("inf")
-    return sum(abs(size - _felt_n(instant, balance, i)) for i, size in enumerate(balance.size_n)) / sum(balance.size_n)
-
-
-def _felt_n(instant: Instant, balance: Balance, index: int) -> float:
-    felt = [np.hypot(*c.force_w[:2]) for c in instant.felt if c.obstacle == balance.contacts[index].obstacle]
-    return float(sum(felt))
-
-
 def _inset(x: float, y: float, width: float, height: float, content: str) -> str:
     return element("svg", content, x=x, y=y, width=width, height=height, overflow="hidden")
 
@@ -89,16 +70,16 @@ def _legend(instant: Instant, y: float) -> str:
     entries: list[tuple[str, str]] = []
     if instant.balance is not None:
         entries += [
-            ("solved", "solved contact force"),
-            ("resultant", "resultant propulsion force"),
+            ("solved", "solved force"),
+            ("resultant", "their resultant, which propels"),
             ("tether", "tether fₛ of the model"),
-            ("frame", "contact normal, tangent"),
+            ("frame", "normal, tangent"),
         ]
     if instant.felt:
-        entries.append(("felt", "measured contact force"))
+        entries.append(("felt", "measured force"))
     parts: list[str] = []
     x = EDGE
     for class_, name in entries:
         parts.append(arrow((x, y - 4), (x + 26, y - 4), class_, head=9) + text(x + 32, y, name, "small soft"))
-        x += 32 + text_width(name, 10.8) + 14
+        x += 32 + text_width(name, 11.5) + 18
     return "".join(parts)

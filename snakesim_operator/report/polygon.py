@@ -40,10 +40,13 @@ def polygon_drawing(balance: Balance, width: float, height: float, *, upright: b
         parts.append(arrow(a, b, "solved", head=11))
     parts.append(_resultant(corners, labels))
     names = ["f_s", *(f"f_{i + 1}" for i in range(len(balance.contacts)))]
+    inside = (sum(x for x, _ in corners) / len(corners), sum(y for _, y in corners) / len(corners))
     sizes = [float(np.hypot(*balance.tether_n)), *balance.size_n]
     for name, size, a, b in zip(names, sizes, corners[:-1], corners[1:], strict=True):
         class_ = "halo tether-text" if name == "f_s" else "halo solved-text"
-        parts.append(labels.put(_mid(a, b), f"{pretty(name)} {size:.0f} N", class_, gaps=(5, 9, 14, 22, 34)))
+        parts.append(
+            labels.put(_mid(a, b), f"{pretty(name)} {size:.0f} N", class_, gaps=(5, 9, 14, 22), away_from=inside)
+        )
     return "".join(parts)
 
 

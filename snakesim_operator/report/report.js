@@ -10,16 +10,17 @@
     return { line, label };
   });
   const show = (time) => charts.forEach((chart, i) => {
-    const { left, right, top, bottom, endS } = chart.dataset;
+    const { left, right, top, bottom, beginS, endS } = chart.dataset;
     const { line, label } = marks[i];
-    const hidden = time === null ? "none" : "";
+    const outside = time === null || time < beginS || time > +endS;
+    const hidden = outside ? "none" : "";
     line.style.display = label.style.display = hidden;
-    if (time === null) return;
-    const x = +left + (right - left) * time / endS;
+    if (outside) return;
+    const x = +left + (right - left) * (time - beginS) / (endS - beginS);
     for (const end of ["x1", "x2"]) line.setAttribute(end, x);
     line.setAttribute("y1", top);
     line.setAttribute("y2", bottom);
-    const late = time > 0.85 * endS;
+    const late = x > 0.85 * right;
     label.setAttribute("x", x + (late ? -4 : 4));
     label.setAttribute("y", bottom - 5);
     label.setAttribute("text-anchor", late ? "end" : "start");
@@ -27,10 +28,10 @@
   });
   charts.forEach((chart) => {
     chart.addEventListener("pointermove", (event) => {
-      const box = chart.getBoundingClientRect(), { left, right, endS } = chart.dataset;
+      const box = chart.getBoundingClientRect(), { left, right, beginS, endS } = chart.dataset;
       const x = (event.clientX - box.left) * chart.viewBox.baseVal.width / box.width;
-      const time = (x - left) / (right - left) * endS;
-      show(time >= 0 && time <= +endS ? time : null);
+      const time = +beginS + (x - left) / (right - left) * (endS - beginS);
+      show(time >= beginS && time <= +endS ? time : null);
     });
     chart.addEventListener("pointerleave", () => show(null));
   });

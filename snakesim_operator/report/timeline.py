@@ -53,9 +53,9 @@ def zero_s(record: RunRecord) -> float:
 
 
 def end_s(record: RunRecord) -> float:
-    """The last tick, on the time axis."""
+    """The end of the last tick, on the time axis."""
     if len(record.time_s):
-        return float(record.time_s[-1]) - zero_s(record)
+        return float(record.time_s[-1]) - zero_s(record) + record.config.period_ns * 1e-9
     return record.control[-1].stamp_ns * 1e-9 - zero_s(record) if record.control else 0.0
 
 
@@ -89,6 +89,16 @@ def most_used_joints(intervals: list[Propulsion], most: int = 6) -> list[int]:
         spent[interval.joint] = spent.get(interval.joint, 0.0) + interval.length_s
     longest = sorted(spent, key=lambda joint: -spent[joint])[:most]
     return sorted(longest, reverse=True)
+
+
+def propulsion_phase_s(record: RunRecord, intervals: list[Propulsion]) -> tuple[float, float]:
+    """From a little before the first propulsion to a little after the last; the whole run when that is most of it."""
+    end = end_s(record)
+    first, last = min(one.start_s for one in intervals), max(one.end_s for one in intervals)
+    air = 0.15 * (last - first)
+    if last - first + 2 * air > 0.7 * end:
+        return 0.0, end
+    return max(first - air, 0.0), min(last + air, end)
 
 
 def reference_rad(record: RunRecord, joint: int) -> Floats:

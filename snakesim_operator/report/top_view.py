@@ -1,7 +1,6 @@
 """The snake seen from above at one instant: body to scale, route, obstacles, contact frames, forces (Fig. 7-10)."""
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,72 +24,10 @@ from snakesim_operator.report.svg import (
     text,
     text_width,
 )
+from snakesim_operator.report.view import EDGE, FELT_SHARE, FOOT, View, nodes_xy_w
 
 Floats = NDArray[np.float64]
-LONGEST_ARROW = 92.0  # of the strongest force, in units of the drawing
 UNIT_VECTOR = 24.0
-EDGE = 16.0
-FOOT = 30.0  # under the drawing, for the scales
-
-
-@dataclass(frozen=True)
-class View:
-    """How the ground is laid on the drawing: one scale for length and one for force, shared by all instants."""
-
-    low_w: Floats  # (2,), m: the corner that is drawn at left and bottom, in the turned frame
-    scale: float  # units per metre
-    force_scale: float  # units per newton
-    width: float
-    height: float
-    upright: bool  # the snake lies along y: the ground is turned by a quarter
-
-    def turned(self, vectors_w: Floats) -> Floats:
-        """World vectors (..., 2) in the frame of the drawing, y still up."""
-        return np.stack([vectors_w[..., 1], -vectors_w[..., 0]], axis=-1) if self.upright else vectors_w
-
-    def at(self, point_w: Floats | tuple[float, ...]) -> Point:
-        """Where a point of the ground is drawn."""
-        x, y = (self.turned(np.asarray(point_w, dtype=np.float64)[:2]) - self.low_w) * self.scale
-        return float(x), float(self.height - FOOT - y)
-
-    def along(self, start: Point, vector_w: Floats | tuple[float, ...], units: float) -> Point:
-        """`start` moved by `units` times a world vector."""
-        x, y = self.turned(np.asarray(vector_w, dtype=np.float64)[:2])
-        return float(start[0] + units * x), float(start[1] - units * y)
-
-
-def views(record: RunRecord, instants: list[Instant], width: float) -> list[View]:
-    """A view for each instant: one window for all when the snake stays within it, else one that goes along."""
-    if not instants:
-        return []
-    forces = [0.0]
-    for one in instants:
-        if one.balance is not None:
-            forces += [*np.hypot(*one.balance.contact_n.T).tolist(), float(np.hypot(*one.balance.resultant_n))]
-        forces += [math.hypot(*contact.force_w[:2]) for contact in one.felt]
-    strongest = max(forces)
-    force_scale = LONGEST_ARROW / strongest if strongest > 0 else 0.0
-    bodies = [nodes_xy_w(record, one) for one in instants]
-    ends = bodies[0][-1] - bodies[0][0]
-    upright = bool(abs(ends[1]) > 1.3 * abs(ends[0]))
-    unturned = View(np.zeros(2), 1.0, 0.0, 0.0, 0.0, upright)
-    boxes = [(unturned.turned(b).min(axis=0), unturned.turned(b).max(axis=0)) for b in bodies]
-    margin = 1.6 * max(link.radius_m for link in record.description.links)
-    widest = max(high[0] - low[0] for low, high in boxes) + 2 * margin
-    low_all, high_all = np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
-    union = high_all[0] - low_all[0] + 2 * margin
-    fixed = bool(union < 1.5 * widest)
-    across = union if fixed else widest
-    scale = (width - 2 * EDGE) / across
-    tallest = (high_all[1] - low_all[1]) if fixed else max(high[1] - low[1] for low, high in boxes)
-    spare = max(LONGEST_ARROW if strongest > 0 else 0.0, margin * scale) + EDGE
-    height = min(tallest * scale + 2 * spare, 1.1 * width) + FOOT
-    laid: list[View] = []
-    for low, high in boxes:
-        middle = (low_all + high_all) / 2 if fixed else (low + high) / 2
-        corner = middle - np.array([width, height - FOOT]) / (2 * scale)
-        laid.append(View(corner, scale, force_scale, width, height, upright))
-    return laid
 
 
 def top_view(record: RunRecord, instant: Instant, view: View) -> str:
@@ -104,19 +41,12 @@ def top_view(record: RunRecord, instant: Instant, view: View) -> str:
 def drawing(record: RunRecord, instant: Instant, view: View, nodes: Floats) -> str:
     """Everything inside the drawing."""
     labels = Labels(view.width, view.height - FOOT)
-    parts = [_route(record, view), *(_obstacle(item, view) for item in place_all(record.config))]
+    parts = [_route(record, view), *(_obstacle(item, view, labels) for item in place_all(record.config))]
     parts.append(_body(record, instant, view, nodes, labels))
     parts += [_felt(contact, view, labels) for contact in instant.felt]
     parts.append(_solved(instant, view, labels))
     parts.append(_names(record, instant, view, nodes, labels))
     return "".join(parts) + _scales(view)
-
-
-def nodes_xy_w(record: RunRecord, instant: Instant) -> Floats:
-    """Tail end, joints and head end on the ground, (joints + 2, 2)."""
-    nodes = record.nodes_w(instant.row)
-    assert nodes is not None, "instants without a pose are not chosen"
-    return nodes[:, :2]
 
 
 def _route(record: RunRecord, view: View) -> str:
@@ -136,13 +66,14 @@ def _route(record: RunRecord, view: View) -> str:
     return "".join(lines)
 
 
-def _obstacle(item: Placed, view: View) -> str:
+def _obstacle(item: Placed, view: View, labels: Labels) -> str:
     obstacle: Obstacle = item.obstacle
     x, y = view.at(obstacle.position_w)
     class_ = "step" if item.walkable else "peg"
     reach = max(obstacle.radius_m, math.hypot(*obstacle.half_size_m[:2])) * view.scale
     if not (-reach < x < view.width + reach and -reach < y < view.height - FOOT + reach):
         return ""
+    labels.keep_off((x - reach, y - reach, x + reach, y + reach), 0.1)
     title = element("title", obstacle.name.replace("&", "&amp;").replace("<", "&lt;"))
     if obstacle.shape != "box":
         return element("circle", title, cx=x, cy=y, r=obstacle.radius_m * view.scale, class_=class_)
@@ -170,18 +101,18 @@ def _body(record: RunRecord, instant: Instant, view: View, nodes: Floats, labels
     for i, point in enumerate(points[1:-1]):
         if i != instant.propulsion_joint:
             parts.append(element("circle", cx=point[0], cy=point[1], r=2.4, class_="joint"))
-    if instant.propulsion_joint is not None:
-        x, y = points[instant.propulsion_joint + 1]
-        parts.append(element("circle", cx=x, cy=y, r=7, class_=f"propelling {joint_class(instant.propulsion_joint)}"))
     return "".join(parts)
 
 
 def _felt(contact: WorldContact, view: View, labels: Labels) -> str:
-    """A measured force, drawn beside the solved one."""
+    """A measured force, drawn beside the solved one; too long an arrow is cut, and says how long it would be."""
+    size = math.hypot(*contact.force_w[:2])
+    cut = min(1.0, FELT_SHARE * view.longest / max(size * view.force_scale, 1e-9))
     start = view.along(view.at(contact.position_w), contact.tangent_w, 7.0)
-    tip = view.along(start, contact.force_w, view.force_scale)
+    tip = view.along(start, contact.force_w, cut * view.force_scale)
     labels.keep_off_line(start, tip, 3)
-    return arrow(start, tip, "felt", head=8)
+    drawn = arrow(start, tip, "felt", head=8)
+    return drawn + labels.put(tip, f"{size:.0f} N", "halo felt-text", gaps=(6, 12)) if cut < 1.0 else drawn
 
 
 def _solved(instant: Instant, view: View, labels: Labels) -> str:
@@ -216,6 +147,8 @@ def _names(record: RunRecord, instant: Instant, view: View, nodes: Floats, label
     if instant.propulsion_joint is not None:
         name = record.description.joints[instant.propulsion_joint].name
         at = view.at(nodes[instant.propulsion_joint + 1])
+        colour = joint_class(instant.propulsion_joint)
+        parts.append(element("circle", cx=at[0], cy=at[1], r=6.5, class_=f"propelling {colour}"))
         parts.append(labels.put(at, name, "halo strong", gaps=(20, 34, 48)))
     parts.append(labels.put(view.at(nodes[0]), "tail", "halo soft", gaps=(16, 24, 34)))
     parts.append(labels.put(view.at(nodes[-1]), "head", "halo soft", gaps=(16, 24, 34)))
@@ -234,7 +167,7 @@ def _scales(view: View) -> str:
     parts = [_bar(x, y, metres * view.scale, f"{metres * 100:g} cm" if metres < 1 else f"{metres:g} m")]
     x += metres * view.scale + text_width(f"{metres * 100:g} cm") + 34
     if view.force_scale > 0:
-        newtons = round_below(0.8 * LONGEST_ARROW / view.force_scale)
+        newtons = round_below(0.8 * view.longest / view.force_scale)
         parts.append(_bar(x, y, newtons * view.force_scale, f"{newtons:g} N", "force-bar"))
     corner = (view.width - 46, view.height - 8)
     for vector, name in (((1.0, 0.0), "x"), ((0.0, 1.0), "y")):

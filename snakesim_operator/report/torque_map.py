@@ -3,6 +3,7 @@
 import base64
 import struct
 import zlib
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,12 +19,11 @@ COLUMNS = 480
 
 
 def torque_map(record: RunRecord, intervals: list[Propulsion], width: float) -> str:
-    """Every joint's torque over time as a share of its limit; propulsion is framed."""
+    """Every joint's torque over time as a share of the run's largest; propulsion is framed."""
     joints = record.description.joints
     cell = min(max(230.0 / len(joints), 3.0), 18.0)
     frame = Frame(width, 12 + cell * len(joints) + 36, end_s(record), 0.0, float(len(joints)), left=66.0)
-    limits = np.array([max(joint.torque_limit_nm, 1e-9) for joint in joints])
-    share = strongest(record.torque_nm / limits, COLUMNS)
+    share = strongest(record.torque_nm / full_colour_nm(record), COLUMNS)
     picture = element(
         "image",
         x=frame.left,
@@ -62,12 +62,19 @@ def torque_map(record: RunRecord, intervals: list[Propulsion], width: float) -> 
     return chart(frame, "Torque of every joint over time", *parts, time_axis(frame))
 
 
+def full_colour_nm(record: RunRecord) -> float:
+    """The torque that is drawn in full colour: the run's largest, unless that is next to nothing."""
+    least = 0.05 * max(joint.torque_limit_nm for joint in record.description.joints)
+    return max(float(np.nanmax(np.abs(record.torque_nm))), least, 1e-9)
+
+
 def strongest(values: Floats, columns: int) -> Floats:
     """At most `columns` rows, each with the value of largest size in its stretch of time."""
     if len(values) <= columns:
         return values
     kept: list[Floats] = []
-    for part in np.array_split(values, columns):
+    edges = np.round(np.linspace(0, len(values), columns + 1)).astype(int)
+    for part in (values[first:last] for first, last in pairwise(edges.tolist())):
         kept.append(part[np.abs(part).argmax(axis=0), np.arange(values.shape[1])])
     return np.array(kept)
 

@@ -4,10 +4,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 from snakesim_operator.record import RunRecord
-from snakesim_operator.report.timeline import propulsion_intervals
+from snakesim_operator.report.timeline import end_s, propulsion_intervals, state_bands, told_at_s
 from snakesim_operator.summary import RunSummary
 
 MOVED_M = 0.02  # less than this is no locomotion
+STOPPED_S = 0.5  # a shorter stop at the end is not worth a word
 SHOWN_HANDOVERS = 8
 Kind = Literal["good", "poor", "bad"]
 
@@ -51,7 +52,7 @@ def verdict(record: RunRecord, summary: RunSummary) -> Verdict:
         return Verdict("poor", f"{kind}: {_sentence(why)} {moved}; no fault.{ending}")
     jam = "it jammed on the way; " if summary.jammed else ""
     good: Kind = "poor" if ending or distance < 0 else "good"
-    return Verdict(good, f"{moved}; {_handed_over(record, summary)}{jam}no fault.{ending}")
+    return Verdict(good, f"{moved}; {_handed_over(record, summary)}{jam}no fault.{_stopped(record)}{ending}")
 
 
 def tiles(record: RunRecord, summary: RunSummary) -> list[Tile]:
@@ -70,7 +71,7 @@ def tiles(record: RunRecord, summary: RunSummary) -> list[Tile]:
         Tile("ticks at a torque limit", _shown(_percent(saturated), "{:.1f}"), "%", (saturated or 0) > 0.05),
         Tile("peak contact force", _shown(summary.peak_contact_force_n, "{:.0f}"), "N"),
         Tile("ticks answered in time", _shown(_percent(summary.answered_fraction), "{:.1f}"), "%"),
-        Tile("commands refused", str(rejected), "", rejected > 0),
+        Tile("commands refused", str(rejected)),
         Tile("faults", str(len(summary.faults)), "", bool(summary.faults)),
     ]
 
@@ -102,6 +103,16 @@ def _handed_over(record: RunRecord, summary: RunSummary) -> str:
     return f"propulsion handed over {len(names) - 1} times among {distinct} joints ({shown}); "
 
 
+def _stopped(record: RunRecord) -> str:
+    """When and why locomotion came to its end before the run did."""
+    bands = state_bands(record)
+    if len(bands) < 2 or bands[-1].what == "Locomoting" or end_s(record) - bands[-1].start_s < STOPPED_S:
+        return ""
+    at_s = bands[-1].start_s
+    reason = next(state.reason for state in record.control if told_at_s(record, state) >= at_s)
+    return f" Locomotion ended at {at_s:.1f} s: {_sentence(reason)}"
+
+
 def _sentence(words: str) -> str:
     words = words.strip().rstrip(".;")
     return f"{words}." if words else ""
@@ -112,4 +123,7 @@ def _percent(share: float | None) -> float | None:
 
 
 def _shown(value: float | None, form: str) -> str:
-    return "–" if value is None else form.format(value).replace("-", "−")
+    if value is None:
+        return "–"
+    text = form.format(value)
+    return text.removeprefix("-") if float(text) == 0 else text.replace("-", "−")

@@ -100,18 +100,20 @@ def _from_box(box: Obstacle, points_w: Floats) -> tuple[Floats, Floats]:
 
 def push_points(
     planned: Sequence[PlannedContact],
-    touched: Collection[str],
+    kept: Collection[str],
     lie: Lie,
     measured_w: Floats,
     node_body_s_m: Sequence[float],
     *,
     gap_m: float,
+    give_up_gap_m: float,
     end_m: float,
 ) -> list[PushPoint]:
     """The planned contacts that the body can push at now, tail to head.
 
-    One counts when the body covers it, `end_m` from either tip or more, and is felt to touch it or is at most `gap_m`
-    from it as measured. measured_w: (2, n_nodes). node_body_s_m: (n_nodes,), arc lengths along the body.
+    One counts when the body covers it, `end_m` from either tip or more, and is at most `gap_m` from it as measured, or
+    `give_up_gap_m` if it is among `kept`: felt to touch it, or pushing on it already. measured_w: (2, n_nodes).
+    node_body_s_m: (n_nodes,), arc lengths along the body.
     """
     places: list[float] = lie.node_s_m.tolist()
     xs, ys = measured_w.tolist()
@@ -128,7 +130,7 @@ def push_points(
         off_x = xs[i] + share * (xs[i + 1] - xs[i]) - contact.point_w[0]
         off_y = ys[i] + share * (ys[i + 1] - ys[i]) - contact.point_w[1]
         gap = contact.clearance_m + off_x * contact.normal_w[0] + off_y * contact.normal_w[1]
-        if gap < gap_m or contact.obstacle in touched:
+        if gap <= gap_m or (gap <= give_up_gap_m and contact.obstacle in kept):
             found.append(PushPoint(contact, body_s, gap))
     found.sort(key=lambda p: p.body_s_m)
     return found

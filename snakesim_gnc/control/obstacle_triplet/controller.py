@@ -43,7 +43,10 @@ class ObstacleTriplet:
         self._set = settings
         self._body = PlanarBody(robot)
         self._progress = Progress(
-            self._body, speed_filter_s=settings.speed_filter_s, oldest_world_s=settings.world_age_s
+            self._body,
+            speed_filter_s=settings.speed_filter_s,
+            slack_m=settings.slack_m,
+            oldest_world_s=settings.world_age_s,
         )
         self._hand_over = HandOver(robot)
         self._triplets = Triplets(
@@ -85,11 +88,11 @@ class ObstacleTriplet:
         limits_nm = self._body.torque_limit_nm
         if choice is None or turn is None:
             return Action(SetPoints(mode, targets, limits_nm), self._report_rest(located, reference))
-        asked_n = set_.propulsion_n * min(max(1.0 - located.speed_m_s / speed_m_s, 0.0), 1.0)
+        asked_n = self._asked_n(view, located, choice, turn)
         limit_nm = limits_nm[turn]
         force_n = min(asked_n, limit_nm / max(abs(choice.torque_per_n), 1e-12))
-        wanted_nm = self._hand_over.torque_nm(force_n * choice.torque_per_n)
-        targets[turn] = min(max(wanted_nm, -limit_nm), limit_nm)
+        wanted_nm = force_n * choice.torque_per_n - set_.damping_nm_s_per_rad * view.joints.velocity_rad_s[turn]
+        targets[turn] = min(max(self._hand_over.torque_nm(wanted_nm), -limit_nm), limit_nm)
         mode[turn] = Mode.TORQUE
         self._watch_progress(view, located, choice, asked_n, force_n)
         report = self._report_push(located, reference, choice, asked_n, force_n, targets[turn])
@@ -109,13 +112,17 @@ class ObstacleTriplet:
             known = self._planned.get(name)
             if known is None or known[0] != obstacle:
                 self._planned[name] = (obstacle, self._plan(located, obstacle))
+        kept = [contact.obstacle for contact in world.contacts if contact.obstacle is not None]
+        if self._choice is not None:
+            kept += self._choice.triplet.names
         self._points = push_points(
             [contact for _, contact in self._planned.values()],
-            {contact.obstacle for contact in world.contacts if contact.obstacle is not None},
+            kept,
             located.lie,
             located.nodes_w,
             self._body.node_s_m,
             gap_m=self._set.gap_m,
+            give_up_gap_m=self._set.give_up_gap_m,
             end_m=self._set.end_m,
         )
 
@@ -145,6 +152,15 @@ class ObstacleTriplet:
         self._choice = choose(choices, present, switch_share=share, banned=self._banned) or choose(
             choices, present, switch_share=share
         )
+
+    def _asked_n(self, view: View, located: Located, choice: Choice, turn: int) -> float:
+        """The propulsion force: less the faster the body moves, and the further the joint has swung out."""
+        set_ = self._set
+        slow = 1.0 - located.speed_m_s / located.trajectory.speed_m_s
+        off_rad = view.joints.angle_rad[turn] - float(located.lie.angles_rad[choice.joint])
+        swung_rad = off_rad if choice.torque_per_n > 0 else -off_rad
+        near = 2.0 - swung_rad / set_.angle_fade_rad
+        return set_.propulsion_n * min(max(slow, 0.0), 1.0) * min(max(near, 0.0), 1.0)
 
     # --- keeping out of trouble ------------------------------------------------------------------------------
 

@@ -53,11 +53,15 @@ def solve(contacts: tuple[PlannedContact, PlannedContact, PlannedContact], *, co
 def alternating(sides: Sequence[int]) -> list[tuple[int, int, int]]:
     """Index triples of neighbours on alternating sides, by their middle, tail to head."""
     found: list[tuple[int, int, int]] = []
-    for j, side in enumerate(sides):
-        behind = next((i for i in range(j - 1, -1, -1) if sides[i] != side), None)
-        ahead = next((k for k in range(j + 1, len(sides)) if sides[k] != side), None)
-        if behind is not None and ahead is not None:
-            found.append((behind, j, ahead))
+    last: dict[int, int] = {}  # side -> the newest contact on it
+    waiting: list[tuple[int, int]] = []  # (behind, middle) of triples that lack their third
+    for k, side in enumerate(sides):
+        found += [(i, j, k) for i, j in waiting if sides[j] != side]
+        waiting = [(i, j) for i, j in waiting if sides[j] == side]
+        behind = last.get(-side)
+        if behind is not None:
+            waiting.append((behind, k))
+        last[side] = k
     return found
 
 
@@ -89,7 +93,8 @@ def choose(
 
     The present one stays as long as it can be used, unless another needs less than `switch_share` of its torque. Its
     successor shares as many push-points with it as possible, among those that need little more torque than the least;
-    then the one with the least torque, and of equals the one nearest to the head, which lasts longest.
+    then the one with the least torque, and of equals the one nearest to the tail: what swings with the propulsion
+    joint is then the short end of the body, and the long one stays in its corridor.
     """
     free = [c for c in choices if c.triplet.names not in banned]
     if not free:
@@ -100,7 +105,7 @@ def choose(
         if choice.triplet is present and least >= switch_share * present.torque_per_n:
             return choice
     cheap = [c for c in free if switch_share * c.triplet.torque_per_n <= least]
-    return max(cheap, key=lambda c: (_shared(c, names), -round(c.triplet.torque_per_n, 3), c.body_s_m[1]))
+    return max(cheap, key=lambda c: (_shared(c, names), -round(c.triplet.torque_per_n, 3), -c.body_s_m[1]))
 
 
 def _shared(choice: Choice, names: Collection[str]) -> int:

@@ -21,8 +21,10 @@ class Settings(FileStruct, frozen=True, kw_only=True):
     # Greatest propulsion force (the paper's f_s). It fades to zero as the snake reaches the mission's speed.
     propulsion_n: Annotated[float, _above(1e4, "N")] = 35.0
 
-    # Push-points: how far the skin may be from an obstacle that is to be pushed, and how near to a tip it may be.
-    gap_m: Annotated[float, _from_zero(1, "m")] = 0.04
+    # Push-points: how far the skin may be from an obstacle that is to be pushed, how far before one that is being pushed
+    # is given up, and how near to a tip it may be.
+    gap_m: Annotated[float, _from_zero(1, "m")] = 0.06
+    give_up_gap_m: Annotated[float, _from_zero(1, "m")] = 0.12
     end_m: Annotated[float, _from_zero(10, "m")] = 0.03
 
     # Triplets: those above this condition number are refused, and joints whose lever is nearly along o_3's normal.
@@ -37,6 +39,10 @@ class Settings(FileStruct, frozen=True, kw_only=True):
     # The joint behind o_2 takes over when it is so far past it; more than the noise of the arc length.
     hold_on_m: Annotated[float, _from_zero(0.1, "m")] = 0.003
 
+    # The propulsion joint swings out until its contacts carry; damping and a fading propulsion keep it from racing. The
+    # propulsion fades from this far off the reference to twice as far.
+    damping_nm_s_per_rad: Annotated[float, _from_zero(1e4, "N·m·s/rad")] = 0.5
+    angle_fade_rad: Annotated[float, _above(3.2, "rad")] = 0.2
     # A propulsion joint further than this from its reference goes back to position mode, for this long at least.
     angle_guard_rad: Annotated[float, _above(3.2, "rad")] = 0.7
     guard_s: Annotated[float, _from_zero(60, "s")] = 0.5
@@ -51,6 +57,8 @@ class Settings(FileStruct, frozen=True, kw_only=True):
     # Then all joints go to position mode for this long, and the same triplet waits until the body has moved.
     release_s: Annotated[float, _from_zero(60, "s")] = 0.5
 
-    # Filter of the speed along the path, and the oldest world model that is still acted on.
-    speed_filter_s: Annotated[float, _from_zero(1, "s")] = 0.02
+    # Filter of the speed along the path; slack in the arc length that joints are told to follow, so that noise does not
+    # shake the body forward; and the oldest world model that is still acted on.
+    speed_filter_s: Annotated[float, _from_zero(1, "s")] = 0.03
+    slack_m: Annotated[float, _from_zero(0.1, "m")] = 0.001
     world_age_s: Annotated[float, _above(10, "s")] = 0.25

@@ -136,7 +136,10 @@ def bending_torque_nm(
     points = np.asarray(points_w, dtype=np.float64)
     forces = np.asarray(forces_w, dtype=np.float64)
     ahead = np.asarray(points_s_m)[None, :] > np.asarray(joints_s_m)[:, None]
-    carried = ahead.astype(np.float64) @ np.column_stack([forces, _cross(points, forces)])
+    wrenches = np.empty((len(points), 3))
+    wrenches[:, :2] = forces
+    wrenches[:, 2] = _cross(points, forces)
+    carried = ahead @ wrenches
     return joints[:, 0] * carried[:, 1] - joints[:, 1] * carried[:, 0] - carried[:, 2]
 
 

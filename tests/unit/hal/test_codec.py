@@ -183,7 +183,9 @@ def test_deep_nesting_is_refused(depth: int, nest: bytes) -> None:
         assert take(message, b"\x81\xa5other" + nest * depth) is None
 
 
-@pytest.mark.parametrize("head", [b"\xdd", b"\xdf", b"\xdb", b"\xc6", b"\xc9"], ids=["array", "map", "str", "bin", "ext"])
+@pytest.mark.parametrize(
+    "head", [b"\xdd", b"\xdf", b"\xdb", b"\xc6", b"\xc9"], ids=["array", "map", "str", "bin", "ext"]
+)
 def test_huge_lengths_are_refused_without_taking_the_memory(head: bytes) -> None:
     for prefix in (b"", b"\x81\xa9angle_rad", b"\x81\xa5other", b"\x81\xa6newest"):
         for message in (JointState, Clock):

@@ -69,12 +69,10 @@ class Run:
         self.count = config.robot.chain.modules
         self.tick = 0
 
-    def command(
-        self, mode: Mode | list[Mode], target: float | list[float] = 0.0, limit: float | None = None
-    ) -> None:
+    def command(self, mode: Mode | list[Mode], target: float | list[float] = 0.0, limit: float | None = None) -> None:
         """The same for all joints, or one each."""
         modes = mode if isinstance(mode, list) else [mode] * self.count
-        targets = target if isinstance(target, list) else [target] * self.count
+        targets = target if isinstance(target, list) else [float(target)] * self.count
         limits = [self.config.robot.limits.torque_nm if limit is None else limit] * self.count
         self.sim.enact(SetPoints(modes, targets, limits))
 

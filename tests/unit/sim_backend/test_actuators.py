@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from snakesim_hal.errors import ConfigError
 from snakesim_hal.messages import Mode
 from tests.unit.sim_backend.rig import Run, make_config
 
@@ -167,3 +168,19 @@ def test_a_joint_stops_at_its_limit():
     run.command(Mode.TORQUE, 1.0)
     run.go(0.5)
     assert run.sim.true_state().angles_rad[0] == pytest.approx(0.5, abs=0.01)
+
+
+@pytest.mark.parametrize("response_s", [0.0, 0.005])
+@pytest.mark.parametrize(("torque_nm", "speed"), [(7.0, 7.5), (1000.0, 100.0)])
+def test_very_stiff_joints_are_stable(response_s, torque_nm, speed):
+    stiff = {"stiffness_nm_per_rad": 4000.0, "damping_nm_s_per_rad": 40.0, "response_time_s": response_s}
+    run = Run(make_config({"motor": stiff, "limits": {"torque_nm": torque_nm, "speed_rad_s": speed}}))
+    zigzag = [0.3 * (-1) ** i for i in range(13)]
+    run.command([Mode.POSITION] * 13, zigzag)
+    run.go(1.0)
+    assert run.sim.true_state().angles_rad == pytest.approx(zigzag, abs=1e-3)
+
+
+def test_gains_that_swing_up_are_refused():
+    with pytest.raises(ConfigError, match=r"damping_nm_s_per_rad` above 0\.9"):
+        Run(make_config({"motor": {"response_time_s": 0.015, "damping_nm_s_per_rad": 0.5}}))

@@ -50,7 +50,9 @@ def test_inertia_of_a_link_is_that_of_a_capsule_of_its_mass():
     assert sorted(model.body("link_5").inertia) == pytest.approx(sorted([about_axis, across, across]), rel=1e-6)
 
 
-@pytest.mark.parametrize(("rate_hz", "timestep_s", "steps"), [(100, 0.001, 10), (100, 0.003, 4), (1000, 0.004, 1), (300, 0.001, 4)])
+@pytest.mark.parametrize(
+    ("rate_hz", "timestep_s", "steps"), [(100, 0.001, 10), (100, 0.003, 4), (1000, 0.004, 1), (300, 0.001, 4)]
+)
 def test_a_whole_number_of_steps_makes_a_period(rate_hz, timestep_s, steps):
     config = make_config(rate_hz=rate_hz)
     sim = open_sim(config, timestep_s=timestep_s, contact_time_s=0.01).sim

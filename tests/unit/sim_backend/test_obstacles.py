@@ -80,6 +80,8 @@ def test_pegs_along_the_route_are_all_there():
 
 
 def test_an_obstacle_may_be_called_as_a_link_or_the_ground():
-    pegs = [{"position_m": [2.0 + i, 1.0], "radius_m": 0.05, "name": name} for i, name in enumerate(["ground", "link_3"])]
+    pegs = [
+        {"position_m": [2.0 + i, 1.0], "radius_m": 0.05, "name": name} for i, name in enumerate(["ground", "link_3"])
+    ]
     run = Run(make_config(scene={"cylinder": pegs}))
     assert [name for name in run.sim.sim.obstacle_of_geom if name] == ["ground", "link_3"]

@@ -1,5 +1,7 @@
 """Sensors: frames, noise, rate, delay, and that the same seed gives the same bytes."""
 
+import msgspec
+import mujoco
 import numpy as np
 import pytest
 
@@ -8,6 +10,7 @@ from snakesim_hal.codec import Decoder, encode, encoding_of
 from snakesim_hal.kinematics import link_frames, rotation_from_quaternion
 from snakesim_hal.messages import Contacts, Imu, Mode, Pose
 from snakesim_hal.scenario import load
+from snakesim_sim_backend.pace import Due
 from tests.unit.sim_backend.rig import G, Run, make_config
 
 CORNER = {
@@ -31,9 +34,7 @@ def frames_of(run):
     pose = samples.others[keys.POSE]
     assert isinstance(pose, Pose)
     rotation = rotation_from_quaternion(pose.orientation_wxyz)
-    return samples, *link_frames(
-        pose.position_w, rotation, samples.joints.angle_rad, robot.axes, robot.link_lengths_m
-    )
+    return samples, *link_frames(pose.position_w, rotation, samples.joints.angle_rad, robot.axes, robot.link_lengths_m)
 
 
 @pytest.mark.parametrize("robot", ["planar13", "mamba"])
@@ -44,8 +45,6 @@ def test_links_are_where_the_published_pose_and_angles_say(robot):
     run.go(0.3)
     _, origins, rotations = frames_of(run)
     data, model = run.sim.data, run.sim.sim.model
-    import mujoco
-
     mujoco.mj_kinematics(model, data)
     first = run.sim.sim.first_link_body
     assert np.abs(data.xpos[first:] - origins).max() < 1e-6
@@ -200,8 +199,6 @@ def test_a_sensor_is_due_whenever_a_period_of_its_own_has_passed(tick_hz, sensor
 
 
 def test_over_a_long_run_the_number_of_samples_is_exact():
-    from snakesim_sim_backend.pace import Due
-
     due = Due(70.0, 1000.0, 1_000_000)
     assert sum(due.at(tick * 1_000_000) for tick in range(1, 10_001)) == 700
 
@@ -239,8 +236,6 @@ def test_a_sensor_that_the_robot_lacks_is_never_published():
 
 def bytes_of_a_run(seed):
     config = load("triplet").config
-    import msgspec
-
     run = Run(msgspec.structs.replace(config, seed=seed))
     told = bytearray()
     for tick in range(60):

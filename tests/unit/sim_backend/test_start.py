@@ -14,6 +14,11 @@ HILLS = {"ground": {"friction": 0.6, "uneven": {"height_m": 0.06, "wavelength_m"
 CURVE = {"route": {"kind": "sine", "amplitude_m": 0.1, "wavelength_m": 0.8, "length_m": 4.0}}  # cannot roll
 
 
+def uneven_of(config):
+    assert config.scene.ground.uneven is not None
+    return config.scene.ground.uneven
+
+
 def deepest_m(run):
     """How far the snake is inside anything."""
     return max(0.0, -min(run.sim.data.contact.dist, default=0.0))
@@ -43,7 +48,7 @@ def test_on_flat_ground_it_lies_at_its_start_at_rest_at_time_0():
 
 
 def test_hills_have_the_height_asked_for_and_repeat_for_a_seed():
-    uneven = make_config(scene=HILLS).scene.ground.uneven
+    uneven = uneven_of(make_config(scene=HILLS))
     heights = hills(uneven)
     assert (heights.min(), heights.max()) == pytest.approx((-0.03, 0.03))
     assert np.array_equal(heights, hills(uneven))
@@ -56,7 +61,7 @@ def test_hills_have_the_height_asked_for_and_repeat_for_a_seed():
 def test_the_height_field_is_where_the_heights_say():
     config = make_config(scene=HILLS)
     run = Run(config, settle_s=0.0)
-    heights = hills(config.scene.ground.uneven)
+    heights = hills(uneven_of(config))
     grid = np.linspace(-3.0, 3.0, len(heights))
     hit = np.zeros(1, dtype=np.int32)
     for i, j in ((5, 80), (60, 12), (33, 40)):

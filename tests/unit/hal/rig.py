@@ -1,0 +1,164 @@
+"""Small robots, configurations and files for the tests of the HAL."""
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from snakesim_hal.messages import Description, JointCommand, JointState, Mode
+from snakesim_hal.robot import RobotFile, describe
+from snakesim_hal.scenario import RunConfig
+
+PERIOD_NS = 10_000_000
+LEASE_NS = 50_000_000
+
+ROBOT: dict[str, Any] = {
+    "name": "worm",
+    "chain": {"modules": 3, "axes": ["yaw"]},
+    "module": {"length_m": 0.1, "radius_m": 0.03, "mass_kg": 0.2},
+    "limits": {
+        "angle_rad": 1.5,
+        "speed_rad_s": 5.0,
+        "acceleration_rad_s2": 100.0,
+        "torque_nm": 4.0,
+        "torque_rate_nm_s": 80.0,
+    },
+    "motor": {
+        "stiffness_nm_per_rad": 40.0,
+        "damping_nm_s_per_rad": 1.0,
+        "velocity_gain_nm_s_per_rad": 1.0,
+        "response_time_s": 0.01,
+        "armature_kg_m2": 0.005,
+    },
+    "safety": {"action": "damp", "max_step_rad": 0.3},
+}
+SCENE: dict[str, Any] = {"name": "plain", "ground": {"friction": 0.1}}
+RUN: dict[str, Any] = {
+    "name": "crawl",
+    "robot": ROBOT,
+    "scene": SCENE,
+    "backend": "lag",
+    "controller": "hold",
+    "pace": "lockstep",
+    "services": {"control": {}},
+    "start": {"on_route": False},
+}
+
+ROBOT_TOML = """\
+name = "worm"
+[chain]
+modules = 3
+axes = ["yaw"]
+[module]
+length_m = 0.1
+radius_m = 0.03
+mass_kg = 0.2
+[limits]
+angle_rad = 1.5
+speed_rad_s = 5.0
+acceleration_rad_s2 = 100.0
+torque_nm = 4.0
+torque_rate_nm_s = 80.0
+[motor]
+stiffness_nm_per_rad = 40.0
+damping_nm_s_per_rad = 1.0
+velocity_gain_nm_s_per_rad = 1.0
+response_time_s = 0.01
+armature_kg_m2 = 0.005
+[sensors.pose]
+rate_hz = 50.0
+"""
+SCENE_TOML = """\
+name = "bend"
+[ground]
+friction = 0.1
+[route]
+kind = "sine"
+amplitude_m = 0.05
+wavelength_m = 0.8
+length_m = 2.0
+[[cylinder]]
+position_m = [1.0, 1.0]
+radius_m = 0.05
+[[cylinder]]
+position_m = [1.5, 1.0]
+radius_m = 0.05
+"""
+SCENARIO_TOML = """\
+title = "A test"
+robot = "worm.toml"
+scene = "bend.toml"
+controller = "hold"
+rate_hz = 100
+[start]
+tail_s_m = 0.1
+[services.control]
+[services.guidance]
+every_ticks = 2
+[controllers.hold]
+"""
+
+
+def changed(base: dict[str, Any], **dotted: Any) -> dict[str, Any]:
+    """A copy with other values; `__` in a name stands for the dot: limits__torque_nm=0.1."""
+    copied = copy.deepcopy(base)
+    for name, value in dotted.items():
+        *parents, last = name.split("__")
+        place = copied
+        for parent in parents:
+            place = place.setdefault(parent, {})
+        place[last] = value
+    return copied
+
+
+def robot_file(**dotted: Any) -> RobotFile:
+    """The test robot, with changes."""
+    return msgspec.convert(changed(ROBOT, **dotted), RobotFile)
+
+
+def run_config(**dotted: Any) -> RunConfig:
+    """The test run, with changes."""
+    return msgspec.convert(changed(RUN, **dotted), RunConfig)
+
+
+def description(**dotted: Any) -> Description:
+    """The test robot as a HAL publishes it."""
+    return describe(robot_file(**dotted), backend="lag", period_ns=PERIOD_NS, lease_ns=LEASE_NS, config_hash="0" * 16)
+
+
+def state(robot: Description, angle: Any = 0.0, velocity: Any = 0.0, torque: Any = 0.0, **other: Any) -> JointState:
+    """A joint state; single numbers stand for all joints."""
+    count = len(robot.joints)
+
+    def column(value: Any) -> list[Any]:
+        return list(value) if isinstance(value, list | tuple) else [value] * count
+
+    values: dict[str, Any] = {"tick": 0, "stamp_ns": 0, "valid": [True] * count, "age_ns": [0] * count, **other}
+    return JointState(angle_rad=column(angle), velocity_rad_s=column(velocity), torque_nm=column(torque), **values)
+
+
+def command(robot: Description, target: Any = 0.0, mode: Any = Mode.POSITION, **other: Any) -> JointCommand:
+    """A command, good unless changed; a single target or mode stands for all joints."""
+    count = len(robot.joints)
+    values: dict[str, Any] = {
+        "tick": 0,
+        "sequence": 1,
+        "lease_epoch": 1,
+        "layout": robot.layout,
+        "valid_for_ns": LEASE_NS,
+        "mode": mode if isinstance(mode, list) else [mode] * count,
+        "target": list(target) if isinstance(target, list | tuple) else [target] * count,
+        **other,
+    }
+    return JointCommand(**values)
+
+
+def write_files(
+    folder: Path, *, robot: str = ROBOT_TOML, scene: str = SCENE_TOML, scenario: str = SCENARIO_TOML
+) -> str:
+    """A scenario with its robot and scene beside it; returns the scenario's path."""
+    (folder / "worm.toml").write_text(robot)
+    (folder / "bend.toml").write_text(scene)
+    (folder / "crawl.toml").write_text(scenario)
+    return str(folder / "crawl.toml")

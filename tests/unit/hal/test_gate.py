@@ -1,0 +1,354 @@
+"""The gate: what is refused and why, and that nothing beyond a limit ever comes out of it."""
+
+from typing import Any, get_args
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from snakesim_hal.gate import (
+    Applied,
+    JointLimits,
+    Measured,
+    Refusal,
+    as_set_points,
+    bumpless_target,
+    limit,
+    refuse,
+    why_limited,
+)
+from snakesim_hal.lease import Lease
+from snakesim_hal.messages import JointCommand, Mode
+from tests.unit.hal.rig import LEASE_NS, command, description
+
+ROBOT = description()
+LIMITS = JointLimits.of(ROBOT)
+JOINTS = len(ROBOT.joints)
+LEASE = Lease("control", 1, 100, 1000)
+ANGLE_STEP = 5.0 * 0.01  # rad a period
+SPEED_STEP = 100.0 * 0.01  # rad/s a period
+TORQUE_STEP = 80.0 * 0.01  # N·m a period
+TINY = 1e-9
+
+
+def judge(given: JointCommand, **changes: Any) -> Refusal | None:
+    values: dict[str, Any] = {"lease": LEASE, "now_ns": 900, "tick": 5, "last_sequence": 0, "age_ns": 0} | changes
+    return refuse(given, limits=LIMITS, **values)
+
+
+# --- refusals --------------------------------------------------------------------------------------------------
+
+NAN, INF = float("nan"), float("inf")
+REFUSED: dict[Refusal, list[tuple[dict[str, Any], dict[str, Any]]]] = {
+    "no_lease": [({}, {"lease": Lease(epoch=1)}), ({}, {"now_ns": 1001})],
+    "wrong_epoch": [({"lease_epoch": 0}, {}), ({"lease_epoch": 2}, {})],
+    "replayed": [({"sequence": 1}, {"last_sequence": 1}), ({"sequence": 1}, {"last_sequence": 2})],
+    "from_the_future": [({"tick": 6}, {})],
+    "stale": [
+        ({"valid_for_ns": 10}, {"age_ns": 11}),
+        ({"valid_for_ns": 2**62}, {"age_ns": LEASE_NS + 1}),  # nobody may ask for more than a lease term
+        ({"valid_for_ns": 2**62}, {"age_ns": 2**61}),
+    ],
+    "wrong_layout": [({"layout": "of another robot"}, {})],
+    "wrong_length": [
+        ({"target": [0.0] * (JOINTS - 1)}, {}),
+        ({"target": [0.0] * (JOINTS + 1)}, {}),
+        ({"target": []}, {}),
+        ({"mode": [Mode.POSITION] * (JOINTS + 1)}, {}),
+        ({"mode": [], "target": []}, {}),
+        ({"torque_limit_nm": [1.0]}, {}),
+        ({"torque_limit_nm": []}, {}),
+    ],
+    "not_finite": [
+        ({"target": [0.0, NAN, 0.0]}, {}),
+        ({"target": [INF, 0.0, 0.0]}, {}),
+        ({"target": [0.0, 0.0, -INF]}, {}),
+        ({"target": [NAN] * JOINTS, "mode": [Mode.PASSIVE] * JOINTS}, {}),
+        ({"torque_limit_nm": [1.0, NAN, 1.0]}, {}),
+        ({"torque_limit_nm": [1.0, INF, 1.0]}, {}),
+    ],
+}
+
+
+def test_a_good_command_passes() -> None:
+    assert judge(command(ROBOT)) is None
+    assert judge(command(ROBOT, torque_limit_nm=[0.0] * JOINTS)) is None
+    assert judge(command(ROBOT, tick=5), now_ns=1000) is None
+    assert judge(command(ROBOT, valid_for_ns=10), age_ns=10) is None
+    assert judge(command(ROBOT, valid_for_ns=0), age_ns=0) is None
+
+
+@pytest.mark.parametrize(("reason", "case"), [(reason, case) for reason, cases in REFUSED.items() for case in cases])
+def test_refused_with_its_reason(reason: Refusal, case: tuple[dict[str, Any], dict[str, Any]]) -> None:
+    changes, circumstances = case
+    assert judge(command(ROBOT, **changes), **circumstances) == reason
+
+
+def test_every_reason_is_tried() -> None:
+    assert list(REFUSED) == list(get_args(Refusal))
+
+
+def test_what_is_checked_first_is_told_first() -> None:
+    worse: list[tuple[Refusal, dict[str, Any], dict[str, Any]]] = [
+        ("not_finite", {"target": [NAN] * JOINTS}, {}),
+        ("wrong_length", {"torque_limit_nm": [1.0]}, {}),
+        ("wrong_layout", {"layout": "other"}, {}),
+        ("stale", {"valid_for_ns": 10}, {"age_ns": 11}),
+        ("from_the_future", {"tick": 6}, {}),
+        ("replayed", {}, {"last_sequence": 1}),
+        ("wrong_epoch", {"lease_epoch": 0}, {}),
+        ("no_lease", {}, {"now_ns": 1001}),
+    ]
+    worst: dict[str, Any] = {}
+    around: dict[str, Any] = {}
+    for reason, changes, circumstances in worse:
+        worst |= changes
+        around |= circumstances
+        assert judge(command(ROBOT, **worst), **around) == reason
+
+
+# --- what comes out is inside every limit ----------------------------------------------------------------------
+
+
+def bumpless(modes: list[Mode], measured: Measured) -> list[float]:
+    now = zip(measured.angle_rad, measured.velocity_rad_s, measured.torque_nm, strict=True)
+    return [bumpless_target(joint, mode, *state) for joint, mode, state in zip(ROBOT.joints, modes, now, strict=True)]
+
+
+HUGE = st.floats(-1e5, 1e5)
+ANY_ANGLE = st.floats(-3, 3) | st.floats(-1e4, 1e4)
+
+
+def per_joint(values: st.SearchStrategy[Any]) -> st.SearchStrategy[list[Any]]:
+    return st.lists(values, min_size=JOINTS, max_size=JOINTS)
+
+
+@st.composite
+def situations(draw: st.DrawFn) -> tuple[JointCommand, Measured, Applied]:
+    """Any command that passes the refusals, any state, and any set-points that were applied before."""
+    any_target = st.floats(-2, 2) | HUGE
+    torque_limit = draw(st.none() | per_joint(st.sampled_from([0.0, 1e-12, 2.0, 4.0, 1e5]) | st.floats(0, 10)))
+    modes = draw(per_joint(st.sampled_from(list(Mode))))
+    asked = command(ROBOT, draw(per_joint(any_target)), modes, torque_limit_nm=torque_limit)
+    measured = Measured(
+        np.array(draw(per_joint(ANY_ANGLE))),
+        np.array(draw(per_joint(st.floats(-10, 10) | HUGE))),
+        np.array(draw(per_joint(st.floats(-5, 5) | HUGE))),
+    )
+    last = Applied(
+        np.array(draw(per_joint(st.sampled_from([0, 1, 2, 3])))),
+        np.array(draw(per_joint(any_target))),
+        LIMITS.torque_nm,
+    )
+    return asked, measured, last
+
+
+@given(situations())
+@settings(max_examples=500)
+def test_whatever_is_asked_what_is_applied_is_inside_every_limit(case: tuple[JointCommand, Measured, Applied]) -> None:
+    asked, measured, last = case
+    applied, _ = limit(asked, measured=measured, last=last, limits=LIMITS)
+    assert np.isfinite(applied.target).all() and np.isfinite(applied.torque_limit_nm).all()
+    assert (applied.torque_limit_nm >= 0).all() and (applied.torque_limit_nm <= LIMITS.torque_nm).all()
+    if asked.torque_limit_nm is not None:
+        assert (applied.torque_limit_nm <= np.array(asked.torque_limit_nm)).all()
+    start = np.where(applied.mode == last.mode, last.target, bumpless(asked.mode, measured))
+    for i in range(JOINTS):
+        target, moved = applied.target[i], abs(applied.target[i] - start[i])
+        assert applied.mode[i] == asked.mode[i]
+        match asked.mode[i]:
+            case Mode.PASSIVE:
+                assert target == 0.0
+            case Mode.POSITION:
+                assert LIMITS.angle_min_rad[i] <= target <= LIMITS.angle_max_rad[i]
+                near = abs(target - measured.angle_rad[i])
+                inside = abs(measured.angle_rad[i]) <= 1.5 + 0.3
+                assert not inside or near <= 0.3 + TINY
+                if not inside:  # pushed beyond its end: straight back to the end, no further
+                    assert target == np.clip(measured.angle_rad[i], -1.5, 1.5)
+                # Only where staying near the measured angle, or inside the limits, leaves no choice:
+                edges = np.clip(measured.angle_rad[i] + np.array([-0.3, 0.3]), -1.5, 1.5)
+                assert moved <= ANGLE_STEP + TINY * abs(start[i]) + TINY or np.abs(edges - target).min() < TINY
+            case Mode.VELOCITY:
+                assert abs(target) <= 5.0
+                assert moved <= SPEED_STEP + TINY * abs(start[i]) + TINY or abs(target) == 5.0
+            case Mode.TORQUE:
+                assert abs(target) <= applied.torque_limit_nm[i]
+                assert moved <= TORQUE_STEP + TINY * abs(start[i]) + TINY or abs(target) == applied.torque_limit_nm[i]
+
+
+@given(situations())
+def test_what_needs_no_change_is_not_changed_and_what_was_changed_is_named(
+    case: tuple[JointCommand, Measured, Applied],
+) -> None:
+    asked, measured, last = case
+    applied, wanted = limit(asked, measured=measured, last=last, limits=LIMITS)
+    assert wanted.tolist() == list(asked.target)
+    words = why_limited(applied, wanted, LIMITS)
+    changed = {i for i in range(JOINTS) if asked.mode[i] != Mode.PASSIVE and applied.target[i] != asked.target[i]}
+    assert set(words) == changed
+    again, _ = limit(
+        msgspec.structs.replace(asked, target=applied.target.tolist()), measured=measured, last=applied, limits=LIMITS
+    )
+    assert (again.target == applied.target).all()  # what came out once passes unchanged
+
+
+@given(st.lists(per_joint(st.floats(-1.5, 1.5)), min_size=2, max_size=30))
+def test_a_stream_of_wild_targets_never_moves_faster_than_the_limit(stream: list[list[float]]) -> None:
+    """A joint that follows at once, so that nearness to the measured angle never overrides the rate."""
+    zero = np.zeros(JOINTS)
+    last = Applied(np.full(JOINTS, int(Mode.POSITION)), zero, LIMITS.torque_nm)
+    for target in stream:
+        measured = Measured(last.target, zero, zero)
+        applied, _ = limit(command(ROBOT, target), measured=measured, last=last, limits=LIMITS)
+        assert np.abs(applied.target - last.target).max() <= ANGLE_STEP + TINY
+        last = applied
+
+
+def test_a_target_that_waits_is_reached() -> None:
+    zero = np.zeros(JOINTS)
+    for mode, wanted, step in (
+        (Mode.POSITION, 0.2, ANGLE_STEP),
+        (Mode.VELOCITY, 4.0, SPEED_STEP),
+        (Mode.TORQUE, 3.0, TORQUE_STEP),
+    ):
+        last = Applied(np.full(JOINTS, int(mode)), zero, LIMITS.torque_nm)
+        measured = Measured(zero, zero, zero)
+        steps = int(np.ceil(wanted / step - 1e-9))
+        for k in range(1, steps + 1):
+            last, _ = limit(command(ROBOT, wanted, mode), measured=measured, last=last, limits=LIMITS)
+            assert last.target[0] == pytest.approx(min(k * step, wanted))
+
+
+# --- edges -----------------------------------------------------------------------------------------------------
+
+
+def applied_for(
+    asked: JointCommand, angle: float = 0.0, velocity: float = 0.0, torque: float = 0.0, before: Mode = Mode.PASSIVE
+) -> Applied:
+    """What is applied when every joint is in the same situation; the target before was 1."""
+    measured = Measured(np.full(JOINTS, angle), np.full(JOINTS, velocity), np.full(JOINTS, torque))
+    last = Applied(np.full(JOINTS, int(before)), np.ones(JOINTS), LIMITS.torque_nm)
+    return limit(asked, measured=measured, last=last, limits=LIMITS)[0]
+
+
+@pytest.mark.parametrize("angle", [1.6, 1.8, 2.5, 1e4])
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_joint_beyond_its_end_is_only_ever_sent_back_inside(angle: float, side: int) -> None:
+    for wanted in (-1e4, -1.5, 0.0, 1.5, 1e4):
+        target = applied_for(command(ROBOT, wanted), angle=side * angle).target
+        assert (np.abs(target) <= 1.5).all()
+        assert (side * target >= min(angle - 0.3, 1.5) - TINY).all()  # and not past what is near
+
+
+def test_with_no_torque_allowed_there_is_none() -> None:
+    none = [0.0] * JOINTS
+    for mode in Mode:
+        applied = applied_for(command(ROBOT, 1.0, mode, torque_limit_nm=none), torque=3.0)
+        assert (applied.torque_limit_nm == 0).all()
+    assert (applied_for(command(ROBOT, 1.0, Mode.TORQUE, torque_limit_nm=none), torque=3.0).target == 0).all()
+
+
+def test_a_torque_limit_never_raises_the_robots_own() -> None:
+    applied = applied_for(command(ROBOT, 0.0, torque_limit_nm=[1e5, 4.0, 1.0]))
+    assert applied.torque_limit_nm.tolist() == [4.0, 4.0, 1.0]
+    assert applied_for(command(ROBOT, 0.0)).torque_limit_nm.tolist() == [4.0] * JOINTS
+
+
+def test_modes_may_differ_from_joint_to_joint() -> None:
+    mixed = command(ROBOT, 9.0, [Mode.POSITION, Mode.VELOCITY, Mode.TORQUE])
+    assert applied_for(mixed).target == pytest.approx([ANGLE_STEP, SPEED_STEP, TORQUE_STEP])
+
+
+# --- bumpless --------------------------------------------------------------------------------------------------
+
+
+def motor_torque(mode: int, target: float, angle: float, velocity: float) -> float:
+    """What a joint's motor does with a target in position and torque mode, by the description's gains."""
+    return 40.0 * (target - angle) - 1.0 * velocity if mode == Mode.POSITION else target
+
+
+@given(
+    angle=st.floats(-1.0, 1.0),
+    velocity=st.floats(-2, 2),
+    torque=st.floats(-4, 4),
+    wanted=st.floats(-10, 10),
+    before=st.sampled_from([Mode.PASSIVE, Mode.VELOCITY, Mode.TORQUE]),
+)
+def test_a_switch_to_position_mode_goes_on_with_the_torque_that_is_there(
+    angle: float, velocity: float, torque: float, wanted: float, before: Mode
+) -> None:
+    applied = applied_for(command(ROBOT, wanted), angle, velocity, torque, before)
+    implied = motor_torque(Mode.POSITION, applied.target[0], angle, velocity)
+    assert abs(implied - torque) <= 40.0 * ANGLE_STEP + 1e-6
+
+
+@given(
+    torque=st.floats(-4, 4),
+    wanted=st.floats(-10, 10),
+    before=st.sampled_from([Mode.PASSIVE, Mode.POSITION, Mode.VELOCITY]),
+)
+def test_a_switch_to_torque_mode_goes_on_with_the_torque_that_is_there(
+    torque: float, wanted: float, before: Mode
+) -> None:
+    applied = applied_for(command(ROBOT, wanted, Mode.TORQUE), 0.3, 1.0, torque, before)
+    assert abs(applied.target[0] - torque) <= TORQUE_STEP + TINY
+
+
+@given(velocity=st.floats(-5, 5), wanted=st.floats(-10, 10))
+def test_a_switch_to_velocity_mode_goes_on_with_the_velocity_that_is_there(velocity: float, wanted: float) -> None:
+    applied = applied_for(command(ROBOT, wanted, Mode.VELOCITY), 0.3, velocity, 1.0, Mode.POSITION)
+    assert abs(applied.target[0] - velocity) <= SPEED_STEP + TINY
+
+
+def test_a_switch_asked_to_stay_changes_nothing_at_all() -> None:
+    measured = Measured(np.array([0.1, -0.2, 0.3]), np.array([0.5, 0.0, -0.5]), np.array([1.0, -2.0, 0.0]))
+    hold = bumpless([Mode.POSITION] * JOINTS, measured)
+    implied = [motor_torque(1, *row) for row in zip(hold, measured.angle_rad, measured.velocity_rad_s, strict=True)]
+    assert implied == pytest.approx(measured.torque_nm.tolist())
+    assert bumpless([Mode.TORQUE] * JOINTS, measured) == measured.torque_nm.tolist()
+
+
+def test_a_joint_without_stiffness_gives_a_finite_target() -> None:
+    joints = [msgspec.structs.replace(joint, stiffness_nm_per_rad=0.0) for joint in ROBOT.joints]
+    soft = JointLimits.of(msgspec.structs.replace(ROBOT, joints=joints))
+    measured = Measured(np.zeros(JOINTS), np.zeros(JOINTS), np.full(JOINTS, 4.0))
+    last = Applied(np.zeros(JOINTS, dtype=np.int64), np.zeros(JOINTS), LIMITS.torque_nm)
+    applied, _ = limit(command(ROBOT, 0.0), measured=measured, last=last, limits=soft)
+    assert np.abs(applied.target).max() <= 0.3
+
+
+# --- words -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("mode", "wanted", "word"),
+    [
+        (Mode.POSITION, 2.0, "angle"),
+        (Mode.POSITION, -2.0, "angle"),
+        (Mode.POSITION, 1.0, "angle_rate"),
+        (Mode.VELOCITY, 6.0, "speed"),
+        (Mode.VELOCITY, -4.0, "acceleration"),
+        (Mode.TORQUE, 5.0, "torque"),
+        (Mode.TORQUE, -3.0, "torque_rate"),
+        (Mode.POSITION, 0.01, None),
+        (Mode.VELOCITY, 0.5, None),
+        (Mode.TORQUE, 0.5, None),
+        (Mode.PASSIVE, 3.0, None),
+    ],
+)
+def test_a_changed_target_is_named_by_its_limit(mode: Mode, wanted: float, word: str | None) -> None:
+    zero = np.zeros(JOINTS)
+    asked = command(ROBOT, [0.0, wanted, 0.0], mode)
+    last = Applied(np.full(JOINTS, int(mode)), zero, LIMITS.torque_nm)
+    applied, wanted_all = limit(asked, measured=Measured(zero, zero, zero), last=last, limits=LIMITS)
+    assert why_limited(applied, wanted_all, LIMITS) == ({} if word is None else {1: word})
+
+
+def test_set_points_for_the_backend_are_plain_python() -> None:
+    applied = applied_for(command(ROBOT, 0.01))
+    points = as_set_points(applied)
+    assert points.mode == [Mode.POSITION] * JOINTS and all(type(m) is Mode for m in points.mode)
+    assert all(type(value) is float for value in points.target + points.torque_limit_nm)

@@ -1,0 +1,63 @@
+"""The key space: every key that is built parses back, and strange keys parse to nothing."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from snakesim_hal import keys
+from snakesim_hal.messages import Done
+
+CHUNK = st.text(st.characters(categories=("L", "N"), include_characters="_-"), min_size=1, max_size=12)
+NAMESPACE = st.lists(CHUNK, min_size=1, max_size=3).map("/".join)
+
+
+def concrete(key: str) -> str:
+    return key.replace("*", "control")
+
+
+@pytest.mark.parametrize("row", keys.SPACE, ids=lambda row: row.key)
+def test_every_key_of_the_space_parses_back(row: keys.Row) -> None:
+    key = concrete(row.key)
+    assert keys.message_at(key) is row.message
+    assert keys.split_namespace(f"planar13/{key}") == ("planar13", key)
+    assert keys.split_namespace(f"lab/west/planar13/{key}") == ("lab/west/planar13", key)
+    assert keys.split_namespace(key) is None  # without a namespace there is nothing to split off
+    assert row.kind in ("stream", "latched", "query", "liveliness") and row.writer and row.about
+
+
+def test_no_key_stands_twice_and_none_begins_or_ends_with_a_slash() -> None:
+    found = [row.key for row in keys.SPACE]
+    assert len(set(found)) == len(found)
+    assert not any(key.startswith("/") or key.endswith("/") or "//" in key for key in found)
+
+
+def test_every_key_constant_is_in_the_space() -> None:
+    constants = {value for name, value in vars(keys).items() if name.isupper() and isinstance(value, str)}
+    assert constants == {row.key for row in keys.SPACE}
+
+
+@given(service=CHUNK)
+def test_services_are_found_in_their_keys(service: str) -> None:
+    assert keys.service_of(keys.done(service)) == service
+    assert keys.service_of(keys.alive(service)) == service
+    assert keys.message_at(keys.done(service)) is Done
+
+
+@given(namespace=NAMESPACE, row=st.sampled_from(keys.SPACE))
+def test_namespaces_split_off(namespace: str, row: keys.Row) -> None:
+    key = concrete(row.key)
+    assert keys.split_namespace(f"{namespace}/{key}") == (namespace, key)
+
+
+@pytest.mark.parametrize(
+    "key", ["", "sensor", "sensor/joint", "sensor/joints/0", "hal/done", "hal/done/a/b", "alive", "planar13"]
+)
+def test_keys_outside_the_space_parse_to_nothing(key: str) -> None:
+    assert keys.message_at(key) is None
+    assert keys.split_namespace(key) is None
+
+
+@pytest.mark.parametrize("pattern", ["**", "*", "hal/done/*", "alive/**"])
+def test_a_pattern_put_by_a_stranger_names_no_service_and_breaks_nothing(pattern: str) -> None:
+    """Zenoh lets anybody put on a pattern; the host then sees the pattern as the key."""
+    assert keys.service_of(pattern) in ("**", "*")

@@ -1,0 +1,98 @@
+"""The lease: one holder at a time, for one term, and a new epoch for every new holder."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from snakesim_hal.lease import Lease, Ruling, freed, renewed, rule
+from snakesim_hal.messages import LeaseRequest
+
+TERM = 50
+HELD = Lease(holder="control", epoch=4, priority=100, expires_ns=1000)
+FREE = Lease(epoch=4)
+DURING, AFTER = 990, 1001
+
+
+def request(action: str, holder: str = "control", epoch: int = 4, priority: int = 100) -> LeaseRequest:
+    return LeaseRequest(action=action, holder=holder, epoch=epoch, priority=priority)  # pyright: ignore[reportArgumentType]
+
+
+def taken(holder: str, now: int, priority: int = 100) -> Ruling:
+    return Ruling(Lease(holder, 5, priority, now + TERM), None, True)
+
+
+GRANTED = {
+    "acquire a free lease": (FREE, request("acquire", "teleop", 0), DURING, taken("teleop", DURING)),
+    "acquire a lease that ran out": (HELD, request("acquire", "teleop", 0), AFTER, taken("teleop", AFTER)),
+    "acquire again after it ran out": (HELD, request("acquire"), AFTER, taken("control", AFTER)),
+    "preempt": (HELD, request("acquire", "teleop", 0, 101), DURING, taken("teleop", DURING, 101)),
+    "renew": (HELD, request("renew"), DURING, Ruling(Lease("control", 4, 100, DURING + TERM))),
+    "renew at the last moment": (HELD, request("renew"), 1000, Ruling(Lease("control", 4, 100, 1000 + TERM))),
+    "release": (HELD, request("release"), DURING, Ruling(Lease(epoch=4), None, True)),
+}
+
+
+@pytest.mark.parametrize("case", GRANTED)
+def test_granted(case: str) -> None:
+    lease, asked, now, ruling = GRANTED[case]
+    assert rule(lease, asked, now, TERM) == ruling
+
+
+REFUSED = {
+    "acquire, held at the same priority": (HELD, request("acquire", "teleop", 0), DURING, "priority above 100"),
+    "acquire, held at a higher one": (HELD, request("acquire", "teleop", 0, 99), DURING, "held by control (epoch 4"),
+    "acquire one's own": (HELD, request("acquire"), DURING, "held by control"),
+    "renew another's": (HELD, request("renew", "teleop"), DURING, "teleop does not hold epoch 4"),
+    "renew an old epoch": (HELD, request("renew", epoch=3), DURING, "does not hold epoch 3"),
+    "renew what ran out": (HELD, request("renew"), AFTER, "acquire the lease first"),
+    "renew nothing": (FREE, request("renew"), DURING, "does not hold"),
+    "release another's": (HELD, request("release", "teleop"), DURING, "nothing to release"),
+    "release an old epoch": (HELD, request("release", epoch=3), DURING, "does not hold epoch 3"),
+    "release what ran out": (HELD, request("release"), AFTER, "nothing to release"),
+    "priority does not renew": (HELD, request("renew", "teleop", 4, 255), DURING, "does not hold"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_refused_and_nothing_changed(case: str) -> None:
+    lease, asked, now, words = REFUSED[case]
+    ruling = rule(lease, asked, now, TERM)
+    assert ruling.lease == lease and not ruling.changed_hands
+    assert ruling.refusal is not None and words in ruling.refusal
+
+
+def test_the_refusal_says_how_long_it_may_take() -> None:
+    lease = Lease("control", 4, 100, 50_000_000)
+    ruling = rule(lease, request("acquire", "teleop"), 20_000_000, TERM)
+    assert ruling.refusal is not None and "for another 30 ms" in ruling.refusal
+
+
+def test_live_until_the_last_nanosecond() -> None:
+    assert HELD.live(1000) and not HELD.live(1001) and not FREE.live(0)
+    assert freed(HELD) == Lease(epoch=4) and renewed(HELD, 2000, TERM).expires_ns == 2050
+
+
+REQUESTS = st.tuples(
+    st.sampled_from(["acquire", "renew", "release"]),
+    st.sampled_from(["control", "teleop"]),
+    st.integers(0, 6),
+    st.sampled_from([50, 100, 200]),
+    st.integers(0, 80),
+)
+
+
+@given(st.lists(REQUESTS, max_size=30))
+def test_over_any_history_every_holder_has_an_epoch_of_its_own(history: list[tuple[str, str, int, int, int]]) -> None:
+    lease, now, holders = Lease(), 0, {}
+    for action, holder, epoch, priority, passes in history:
+        now += passes
+        before = lease
+        ruling = rule(lease, request(action, holder, epoch, priority), now, TERM)
+        lease = ruling.lease
+        assert lease.epoch in (before.epoch, before.epoch + 1)
+        assert (lease.epoch > before.epoch) == (ruling.changed_hands and lease.holder is not None)
+        assert lease.expires_ns <= now + TERM or lease == before
+        if lease.holder is not None:
+            assert holders.setdefault(lease.epoch, lease.holder) == lease.holder
+        if before.live(now) and ruling.changed_hands and lease.holder is not None:
+            assert priority > before.priority

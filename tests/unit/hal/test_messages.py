@@ -1,0 +1,81 @@
+"""The message set: complete, frozen, and fit for readers of an older or a newer release."""
+
+import re
+from typing import Any
+
+import msgspec
+import pytest
+from msgspec import inspect
+
+from snakesim_hal import keys, messages
+from snakesim_hal.messages import VERSIONS, Message, Mode
+from tests.unit.hal.strategies import places, plain_example
+
+each_message = pytest.mark.parametrize("message", list(VERSIONS), ids=lambda message: message.__name__)
+
+
+def declared() -> set[type[Message]]:
+    """Every message that the module declares."""
+    found = (getattr(messages, name) for name in dir(messages))
+    return {thing for thing in found if isinstance(thing, type) and issubclass(thing, Message) and thing is not Message}
+
+
+def parts_of(message: type[Message]) -> set[type[Any]]:
+    """Every Struct inside a message."""
+    found = places(plain_example(message), inspect.type_info(message))
+    return {info.cls for _, info in found if isinstance(info, inspect.StructType)} - {message}
+
+
+def test_every_declared_message_stands_alone_or_inside_one_that_does() -> None:
+    inner = set[type[Any]]().union(*(parts_of(message) for message in VERSIONS))
+    assert declared() == set(VERSIONS) | inner
+
+
+def test_every_message_has_its_place_in_the_key_space_and_the_other_way_round() -> None:
+    at_a_key = {row.message for row in keys.SPACE if row.message is not None}
+    assert at_a_key | {messages.Answer} == set(VERSIONS)
+
+
+@each_message
+def test_versions_are_whole_and_names_are_fit_for_an_encoding(message: type[Message]) -> None:
+    assert VERSIONS[message] >= 1
+    assert re.fullmatch("[A-Za-z]+", message.__name__)
+
+
+@each_message
+def test_messages_are_frozen_keyword_only_and_documented(message: type[Message]) -> None:
+    value = msgspec.convert(plain_example(message), message)
+    field = value.__struct_fields__[0]
+    with pytest.raises(AttributeError):
+        setattr(value, field, None)
+    with pytest.raises(TypeError):
+        message(*(getattr(value, name) for name in value.__struct_fields__))
+    assert message.__doc__ and message.__doc__ != Message.__doc__
+
+
+@each_message
+def test_numbers_carry_their_unit_in_type_or_name(message: type[Message]) -> None:
+    """A float says its unit in the published schema, or its field's name ends in it."""
+    schema = msgspec.json.schema_components([message])[1]
+    for name, struct in schema.items():
+        for field, about in struct.get("properties", {}).items():
+            for leaf in floats_of(about):
+                assert "unit" in leaf or re.search("_(hz|s|m|kg|rad|nm|rad_s2|nm_s|per_rad)$", field), (name, field)
+
+
+def floats_of(about: Any) -> list[dict[str, Any]]:
+    if isinstance(about, dict):
+        own = [about] if about.get("type") == "number" else []
+        return own + [leaf for value in about.values() for leaf in floats_of(value)]
+    return [leaf for value in about for leaf in floats_of(value)] if isinstance(about, list) else []
+
+
+def test_modes_keep_their_numbers() -> None:
+    """The numbers are the contract with other languages and with recordings."""
+    assert {mode.name: mode.value for mode in Mode} == {"PASSIVE": 0, "POSITION": 1, "VELOCITY": 2, "TORQUE": 3}
+
+
+def test_everything_that_a_sensor_tells_has_a_tick_and_a_stamp() -> None:
+    for row in keys.SPACE:
+        if row.kind == "stream" and row.message is not None and row.key.startswith("sensor/"):
+            assert {"tick", "stamp_ns"} <= set(row.message.__struct_fields__), row.key

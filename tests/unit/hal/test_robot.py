@@ -1,0 +1,118 @@
+"""The robot file: numbers in, a description out that says the same."""
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from snakesim_hal import keys
+from snakesim_hal.codec import Decoder, encode, encoding_of
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.files import Table, decode, find, read_table, shipped
+from snakesim_hal.messages import Description
+from snakesim_hal.robot import RobotFile, describe, layout_hash
+from tests.unit.hal.rig import LEASE_NS, PERIOD_NS, ROBOT, changed, description, robot_file
+
+
+@pytest.mark.parametrize("name", shipped("robots"))
+def test_every_shipped_robot_can_be_published(name: str) -> None:
+    robot = decode(read_table(find(name, "robots")), RobotFile)
+    described = describe(robot, backend="sim", period_ns=PERIOD_NS, lease_ns=LEASE_NS, config_hash="0")
+    assert Decoder(Description).decode(encode(described), encoding_of(Description)) == described
+    assert len(described.joints) == robot.chain.modules == len(described.links) - 1
+    for joint in described.joints:
+        assert joint.angle_min_rad < 0 < joint.angle_max_rad
+        assert min(joint.speed_limit_rad_s, joint.torque_limit_nm, joint.stiffness_nm_per_rad) > 0
+
+
+@given(
+    modules=st.integers(1, 40),
+    axes=st.lists(st.sampled_from(["yaw", "pitch"]), min_size=1, max_size=5),
+    length_m=st.floats(0.01, 2),
+)
+def test_links_add_up_to_the_modules(modules: int, axes: list[str], length_m: float) -> None:
+    robot = robot_file(chain={"modules": modules, "axes": axes}, module__length_m=length_m)
+    assert sum(robot.link_lengths_m) == pytest.approx(modules * length_m) == pytest.approx(robot.length_m)
+    assert sum(robot.link_masses_kg) == pytest.approx(modules * robot.module.mass_kg)
+    assert robot.link_lengths_m[0] == robot.link_lengths_m[-1] == 0.5 * length_m
+    assert robot.axes == [axes[i % len(axes)] for i in range(modules)]
+
+
+def test_the_description_says_what_the_file_says() -> None:
+    described = description(chain__axes=["yaw", "pitch"])
+    assert [joint.name for joint in described.joints] == ["joint_1", "joint_2", "joint_3"]
+    assert [joint.axis for joint in described.joints] == ["yaw", "pitch", "yaw"]
+    joint = described.joints[1]
+    limits, motor = ROBOT["limits"], ROBOT["motor"]
+    assert (joint.angle_min_rad, joint.angle_max_rad) == (-limits["angle_rad"], limits["angle_rad"])
+    assert joint.speed_limit_rad_s == limits["speed_rad_s"]
+    assert joint.acceleration_limit_rad_s2 == limits["acceleration_rad_s2"]
+    assert joint.torque_limit_nm == limits["torque_nm"]
+    assert joint.torque_rate_limit_nm_s == limits["torque_rate_nm_s"]
+    assert joint.stiffness_nm_per_rad == motor["stiffness_nm_per_rad"]
+    assert joint.damping_nm_s_per_rad == motor["damping_nm_s_per_rad"]
+    assert (described.safe_action, described.max_step_rad) == ("damp", 0.3)
+
+
+def test_only_the_sensors_that_a_robot_has_are_described_and_none_is_faster_than_the_loop() -> None:
+    assert [sensor.key for sensor in description().sensors] == [keys.JOINTS]
+    rich = description(sensors={"contacts": {"rate_hz": 1000.0}, "imu": {"rate_hz": 20.0, "delay_s": 0.1}, "pose": {}})
+    rates = {sensor.key: sensor.rate_hz for sensor in rich.sensors}
+    assert rates == {keys.JOINTS: 100.0, keys.CONTACTS: 100.0, keys.IMU: 20.0, keys.POSE: 100.0}
+    assert {sensor.key: sensor.delay_s for sensor in rich.sensors}[keys.IMU] == 0.1
+
+
+def test_the_layout_tells_robots_apart_that_take_other_vectors() -> None:
+    three, four = description(), description(chain__modules=4)
+    mixed = description(chain__axes=["yaw", "pitch"])
+    swapped = list(reversed(three.joints))
+    found = {layout_hash(joints) for joints in (three.joints, four.joints, mixed.joints, swapped)}
+    assert len(found) == 4
+    assert description(limits__torque_nm=1.0).layout == three.layout  # the same vectors, other numbers
+
+
+WRONG = {
+    "no modules": ({"chain__modules": 0}, ["`chain.modules` = 0", ">= 1"]),
+    "half a module": ({"chain__modules": 2.5}, ["`chain.modules` = 2.5", "a whole number"]),
+    "no axes": ({"chain__axes": []}, ["`chain.axes` = []", "a list"]),
+    "unknown axis": ({"chain__axes": ["yaw", "roll"]}, ["`chain.axes.1` = 'roll'", "'pitch'", "'yaw'"]),
+    "length in mm": ({"module__length_m": 110}, ["`module.length_m` = 110 m", "<= 2 in m"]),
+    "angle in degrees": ({"limits__angle_rad": 90}, ["`limits.angle_rad` = 90 rad", "<= 3.14159 in rad"]),
+    "no mass": ({"module__mass_kg": 0}, ["`module.mass_kg` = 0 kg", "> 0"]),
+    "negative friction": ({"motor__friction_nm": -1}, ["`motor.friction_nm` = -1 N·m", ">= 0"]),
+    "unknown safe action": ({"safety__action": "freeze"}, ["`safety.action` = 'freeze'", "'damp'", "'hold'"]),
+    "typo": ({"motor__dampign_nm_s_per_rad": 1}, ["unknown field `motor.dampign_nm_s_per_rad`", "did you mean"]),
+    "unknown sensor": ({"sensors__camera": {}}, ["unknown field `sensors.camera`", "contacts, imu, joints, pose"]),
+    "negative noise": ({"sensors__joints__angle_noise_rad": -1e-3}, ["`sensors.joints.angle_noise_rad` = -0.001 rad"]),
+    "name with a space": ({"name": "my worm"}, ["`name` = 'my worm'"]),
+    "name with a slash": ({"name": "lab/worm"}, ["`name` = 'lab/worm'"]),
+    "nan": ({"limits__torque_nm": float("nan")}, ["`limits.torque_nm` = nan N·m"]),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_wrong_robots_are_refused_in_words(wrong: str) -> None:
+    changes, words = WRONG[wrong]
+    with pytest.raises(ConfigError) as caught:
+        decode(Table(changed(ROBOT, **changes), "worm.toml"), RobotFile)
+    assert str(caught.value).startswith("worm.toml: ")
+    assert all(word in str(caught.value) for word in words), str(caught.value)
+
+
+@pytest.mark.parametrize("section", ["chain", "module", "limits", "motor"])
+def test_sections_without_defaults_must_be_there(section: str) -> None:
+    values = {key: value for key, value in ROBOT.items() if key != section}
+    with pytest.raises(ConfigError, match=f"field `{section}` is missing"):
+        decode(Table(values, "worm.toml"), RobotFile)
+    for field in ROBOT[section]:
+        less = {key: value for key, value in ROBOT[section].items() if key != field}
+        with pytest.raises(ConfigError, match=rf"field `{section}\.{field}` is missing"):
+            decode(Table({**ROBOT, section: less}, "worm.toml"), RobotFile)
+
+
+def test_a_robot_file_is_read_only() -> None:
+    with pytest.raises(AttributeError):
+        robot_file().name = "other"  # pyright: ignore[reportAttributeAccessIssue]
+    assert msgspec.to_builtins(robot_file()) == msgspec.to_builtins(robot_file())
+    assert np.isclose(sum(robot_file().link_masses_kg), 0.6)

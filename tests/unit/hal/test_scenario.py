@@ -1,0 +1,317 @@
+"""Scenarios: files and flags in, one effective configuration out, that says where each value came from."""
+
+import itertools
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.files import shipped
+from snakesim_hal.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
+from snakesim_hal.scenario import (
+    Loaded,
+    Override,
+    Service,
+    capsules_at_start,
+    config_hash,
+    load,
+    parse_set,
+    place_all,
+    read,
+    start_of,
+    write,
+)
+from snakesim_hal.scene import route_of
+from tests.unit.hal.rig import ROBOT_TOML, SCENARIO_TOML, SCENE_TOML, run_config, write_files
+
+
+def with_flags(path: str, *flags: str) -> Loaded:
+    return load(path, [parse_set(flag) for flag in flags])
+
+
+# --- what is good ----------------------------------------------------------------------------------------------
+
+
+def test_a_scenario_is_put_together_from_its_files(tmp_path: Path) -> None:
+    config = load(write_files(tmp_path)).config
+    assert (config.name, config.robot.name, config.scene.name) == ("crawl", "worm", "bend")
+    assert config.services == {"control": Service(), "guidance": Service(every_ticks=2)}
+    assert config.robot.sensors.pose is not None and config.robot.sensors.contacts is None
+    assert (config.pace, config.seed, config.start.tail_s_m) == ("lockstep", 1, 0.1)
+    assert config.period_ns == 10_000_000
+
+
+def test_parts_stand_beside_the_scenario_or_are_shipped_and_flags_name_them_from_here(tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    path = write_files(tmp_path, scenario=SCENARIO_TOML.replace('"worm.toml"', '"planar13"'))
+    assert load(path).config.robot.name == "planar13"
+    other = tmp_path / "elsewhere" / "other.toml"
+    other.write_text(ROBOT_TOML.replace('"worm"', '"other"'))
+    flag = Override("robot", str(other), f"--set robot={other}")
+    found = load(path, [flag])
+    assert found.config.robot.name == "other"
+    assert found.table.origin_of("robot.name") == str(other)
+
+
+@pytest.mark.parametrize("name", shipped("scenarios"))
+def test_every_shipped_scenario_repeats_itself_from_its_effective_configuration(name: str, tmp_path: Path) -> None:
+    config = load(name).config
+    write(config, tmp_path / "config.json")
+    assert read(tmp_path / "config.json") == config
+    again = load(str(tmp_path / "config.json")).config
+    assert again == config and config_hash(again) == config_hash(config)
+
+
+def test_an_effective_configuration_keeps_flags_and_takes_new_ones(tmp_path: Path) -> None:
+    first = with_flags(write_files(tmp_path), "robot.limits.torque_nm=2.5", "control.gain=3", "seed=9").config
+    write(first, tmp_path / "config.json")
+    assert read(tmp_path / "config.json") == first
+    again = with_flags(str(tmp_path / "config.json"), "seed=10")
+    assert again.config == msgspec.structs.replace(first, seed=10)
+    assert again.table.origin_of("seed") == "--set seed=10"
+    assert again.table.origin_of("robot.limits.torque_nm") == str(tmp_path / "config.json")
+
+
+@pytest.mark.parametrize(
+    ("change", "same"),
+    [({}, True), ({"seed": 2}, False), ({"robot__limits__torque_nm": 3.0}, False), ({"rate_hz": 50.0}, False)],
+)
+def test_the_hash_follows_everything_that_matters(change: dict[str, Any], same: bool) -> None:
+    assert (config_hash(run_config(**change)) == config_hash(run_config())) == same
+    assert 1 <= len(config_hash(run_config())) <= 64
+
+
+@given(rate_hz=st.floats(1, 5000))
+def test_the_lease_is_five_periods_but_never_less_than_50_nor_more_than_100_ms(rate_hz: float) -> None:
+    config = run_config(rate_hz=rate_hz)
+    assert 50_000_000 <= config.lease_ns <= 100_000_000
+    if 50_000_000 < config.lease_ns < 100_000_000:
+        assert config.lease_ns == 5 * config.period_ns
+
+
+@given(tick=st.integers(0, 10_000), every=st.integers(1, 50), lag=st.integers(1, 50))
+def test_what_counts_at_a_tick_was_due_and_is_old_enough(tick: int, every: int, lag: int) -> None:
+    service = Service(every_ticks=every, lag_ticks=lag)
+    counting = service.counting_at(tick)
+    assert counting % every == 0 and counting >= 0
+    assert counting == 0 or counting <= tick - lag
+    assert tick - lag - counting < every  # and it is the newest such
+    assert service.counting_at(tick + 1) >= counting
+
+
+# --- flags and where values come from --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "value"),
+    [
+        ("seed=3", "seed", 3),
+        (" rate_hz = 50.5", "rate_hz", 50.5),
+        ("start.on_route=false", "start.on_route", False),
+        ("start.position_m=[1.0, 2.0]", "start.position_m", [1.0, 2.0]),
+        ("pace=free", "pace", "free"),
+        ('pace="free"', "pace", "free"),
+        ("controller=./wave.py:Wave", "controller", "./wave.py:Wave"),
+        ("title=a = b", "title", "a = b"),
+        ("title=", "title", ""),
+        ("services={control = {}}", "services", {"control": {}}),
+    ],
+)
+def test_set_reads_values_as_toml_and_else_as_text(text: str, key: str, value: Any) -> None:
+    assert parse_set(text) == Override(key, value, f"--set {text}")
+
+
+@pytest.mark.parametrize("text", ["", "seed", "=3", " = 3"])
+def test_set_without_key_or_value_is_refused(text: str) -> None:
+    with pytest.raises(ConfigError, match=r"give section\.key=value"):
+        parse_set(text)
+
+
+def test_every_value_says_where_it_came_from(tmp_path: Path) -> None:
+    loaded = with_flags(write_files(tmp_path), "robot.limits.torque_nm=2.0", "start.tail_s_m=0.2", "control.gain=1")
+    told = {key: (value, origin) for key, value, origin in loaded.explain()}
+    assert told["robot.limits.torque_nm"] == (2.0, "--set robot.limits.torque_nm=2.0")
+    assert told["start.tail_s_m"] == (0.2, "--set start.tail_s_m=0.2")
+    assert told["controllers.hold.gain"] == (1, "--set control.gain=1")
+    assert told["robot.limits.speed_rad_s"] == (5.0, str(tmp_path / "worm.toml"))
+    assert told["robot.sensors.pose.rate_hz"] == (50.0, str(tmp_path / "worm.toml"))
+    assert told["scene.cylinder.1.position_m"] == ((1.5, 1.0), str(tmp_path / "bend.toml"))
+    assert told["rate_hz"] == (100.0, str(tmp_path / "crawl.toml"))
+    assert told["services.guidance.every_ticks"] == (2, str(tmp_path / "crawl.toml"))
+    for key in ("seed", "robot.motor.friction_nm", "services.control.every_ticks", "scene.cylinder.0.friction", "pace"):
+        assert told[key][1] == "default", key
+    assert set(told) == {key for key, _ in flat(msgspec.to_builtins(loaded.config))}
+
+
+def flat(value: Any, at: str = "") -> list[tuple[str, Any]]:
+    if isinstance(value, dict) and value:
+        return [leaf for key, inner in value.items() for leaf in flat(inner, f"{at}.{key}".lstrip("."))]
+    if isinstance(value, list) and value and isinstance(value[0], dict):
+        return [leaf for i, inner in enumerate(value) for leaf in flat(inner, f"{at}.{i}")]
+    return [(at, value)]
+
+
+def test_the_control_alias_means_the_chosen_controller_whatever_the_order_of_flags(tmp_path: Path) -> None:
+    path = write_files(tmp_path)
+    assert with_flags(path, "control.gain=3").config.controllers == {"hold": {"gain": 3}}
+    for flags in (["control.gain=3", "controller=./w.py:Wave"], ["controller=./w.py:Wave", "control.gain=3"]):
+        config = with_flags(path, *flags).config
+        assert config.controllers == {"hold": {}, "Wave": {"gain": 3}}
+        assert config.control_settings == {"gain": 3} and config.control_section == "controllers.Wave"
+    assert with_flags(path, "backend.step=1").config.backends == {"sim": {"step": 1}}
+    assert with_flags(path, "backend=twin", "backend.step=1").config.backends == {"twin": {"step": 1}}
+
+
+# --- what is wrong: one error, in words ------------------------------------------------------------------------
+
+FLAGS = {
+    "unknown key": ("sede=1", ["unknown field `sede`", "did you mean `seed`?"]),
+    "unknown section": ("robt.limits.torque_nm=1", ["unknown field `robt`", "did you mean `robot`?"]),
+    "unknown inside": ("robot.limits.torque=1", ["unknown field `robot.limits.torque`", "`torque_nm`"]),
+    "type": ("rate_hz=fast", ["`rate_hz` = 'fast'", "a number >= 1 and <= 5000 in Hz"]),
+    "range": ("rate_hz=0.5", ["`rate_hz` = 0.5 Hz", ">= 1"]),
+    "nan": ("duration_s=nan", ["`duration_s` = nan s"]),
+    "choice": ("pace=fast", ["`pace` = 'fast'", "'free', 'lockstep', 'realtime'"]),
+    "index": ("scene.cylinder.2.radius_m=1", ["`scene.cylinder.2`", "entries 0 to 1"]),
+    "no index": ("scene.cylinder.radius_m=1", ["`scene.cylinder.radius_m`", "entries 0 to 1"]),
+    "into a value": ("rate_hz.x=1", ["`rate_hz` is the value 100, not a section"]),
+    "service": ("services.guidance.every_ticks=0", ["`services.guidance.every_ticks` = 0", ">= 1"]),
+    "new service": ("services.sonar.evry_ticks=1", ["unknown field `services.sonar.evry_ticks`", "`every_ticks`"]),
+    "negative seed": ("seed=-1", ["`seed` = -1", ">= 0"]),
+    "section by value": ("start=3", ["`start` = 3", "a section with on_route"]),
+}
+
+
+@pytest.mark.parametrize("wrong", FLAGS)
+def test_a_wrong_flag_is_named(wrong: str, tmp_path: Path) -> None:
+    flag, words = FLAGS[wrong]
+    with pytest.raises(ConfigError) as caught:
+        with_flags(write_files(tmp_path), flag)
+    said = str(caught.value)
+    assert said.startswith(f"--set {flag}: "), said
+    assert all(word in said for word in words), said
+
+
+FILES = {
+    "scenario type": ("crawl.toml", "rate_hz = 100", 'rate_hz = "100"', ["`rate_hz` = '100'", "a number"]),
+    "scenario missing": ("crawl.toml", 'controller = "hold"\n', "", ["`controller` is missing", "a text"]),
+    "scenario missing robot": ("crawl.toml", 'robot = "worm.toml"\n', "", ["`robot` is missing"]),
+    "scenario unknown": ("crawl.toml", "rate_hz = 100", "rate = 100", ["unknown field `rate`", "`rate_hz`"]),
+    "scenario service": ("crawl.toml", "every_ticks = 2", "every_ticks = 0", ["`services.guidance.every_ticks` = 0"]),
+    "not TOML": ("crawl.toml", "rate_hz = 100", "rate_hz = ", ["not valid TOML", "line"]),
+    "robot range": ("worm.toml", "mass_kg = 0.2", "mass_kg = 200.0", ["`robot.module.mass_kg` = 200.0 kg", "<= 100"]),
+    "robot missing": ("worm.toml", "torque_nm = 4.0\n", "", ["`robot.limits.torque_nm` is missing", "in N·m"]),
+    "robot section missing": ("worm.toml", "[module]", "[motors]", ["unknown field `robot.motors`", "`motor`"]),
+    "robot not TOML": ("worm.toml", "[chain]", "[chain", ["not valid TOML"]),
+    "robot empty": ("worm.toml", ROBOT_TOML, "", ["`robot.name` is missing"]),
+    "scene range": ("bend.toml", "friction = 0.1", "friction = -0.1", ["`scene.ground.friction` = -0.1", ">= 0"]),
+    "scene list": (
+        "bend.toml",
+        "radius_m = 0.05\n[[",
+        "radius_m = 0\n[[",
+        ["`scene.cylinder.0.radius_m` = 0 m", "> 0"],
+    ),
+}
+
+
+@pytest.mark.parametrize("wrong", FILES)
+def test_a_wrong_file_is_named(wrong: str, tmp_path: Path) -> None:
+    name, old, new, words = FILES[wrong]
+    path = write_files(tmp_path)
+    text = (tmp_path / name).read_text()
+    assert old in text
+    (tmp_path / name).write_text(text.replace(old, new, 1))
+    with pytest.raises(ConfigError) as caught:
+        load(path)
+    said = str(caught.value)
+    if wrong != "robot empty":  # an empty file has no neighbour that could tell whose the field is
+        assert said.startswith(f"{tmp_path / name}: "), said
+    assert all(word in said for word in words), said
+    assert "\n" not in said
+
+
+def test_absent_files_are_named(tmp_path: Path) -> None:
+    path = write_files(tmp_path)
+    with pytest.raises(ConfigError, match=r"no scenario called 'nowhere'; shipped are .*triplet"):
+        load("nowhere")
+    with pytest.raises(ConfigError, match=r"none\.toml: no such file"):
+        load(str(tmp_path / "none.toml"))
+    (tmp_path / "worm.toml").unlink()
+    with pytest.raises(ConfigError, match=r"worm\.toml: no such file"):
+        load(path)
+    with pytest.raises(ConfigError, match="no robot called 'wurm'"):
+        with_flags(path, "robot=wurm")
+
+
+def test_an_empty_scenario_lacks_its_robot(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"crawl\.toml: field `robot` is missing"):
+        load(write_files(tmp_path, scenario=""))
+
+
+SCENES = {
+    "overlap": ("position_m = [1.0, 1.0]", "position_m = [0.2, 0.0]", ["'cylinder_0' overlaps link_", "mm", "[start]"]),
+    "one name": ("radius_m = 0.05", 'radius_m = 0.05\nname = "post"', ["two obstacles are called 'post'"]),
+    "no route": ('[route]\nkind = "sine"\namplitude_m = 0.05\nwavelength_m = 0.8\nlength_m = 2.0\n', "",
+                 ["`start.on_route` is true", "'bend' has no route", "start.on_route = false"]),
+    "too sharp": ("wavelength_m = 0.8", "wavelength_m = 0.1", ["joint_", "rad", "+-1.5 rad", "smoother route"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("wrong", SCENES)
+def test_scenes_that_do_not_fit_the_robot_are_refused(wrong: str, tmp_path: Path) -> None:
+    old, new, words = SCENES[wrong]
+    assert old in SCENE_TOML
+    with pytest.raises(ConfigError) as caught:
+        load(write_files(tmp_path, scene=SCENE_TOML.replace(old, new)))
+    said = str(caught.value)
+    assert ("'crawl'" in said or "'bend'" in said) and all(word in said for word in words), said
+
+
+# --- the start -------------------------------------------------------------------------------------------------
+
+
+def test_the_snake_lies_on_its_route_with_every_joint(tmp_path: Path) -> None:
+    config = load(write_files(tmp_path)).config
+    route = route_of(config.scene)
+    assert route is not None
+    pose = start_of(config)
+    assert pose.position_w == pytest.approx(route.at(0.1))
+    rotation = rotation_from_quaternion(quaternion_from_yaw(pose.yaw_rad))
+    lengths = config.robot.link_lengths_m
+    origins, _ = link_frames((*pose.position_w, 0.0), rotation, pose.angles_rad, config.robot.axes, lengths)
+    for origin in origins:
+        assert np.hypot(*(route.position_w(route.project(origin[:2])) - origin[:2])) < 1e-5
+
+
+def test_a_snake_with_pitch_joints_lies_flat_on_its_route(tmp_path: Path) -> None:
+    mixed = ROBOT_TOML.replace('axes = ["yaw"]', 'axes = ["pitch", "yaw"]').replace("modules = 3", "modules = 6")
+    pose = start_of(load(write_files(tmp_path, robot=mixed)).config)
+    assert pose.angles_rad[0::2].tolist() == [0.0, 0.0, 0.0]
+    assert np.abs(pose.angles_rad[1::2]).min() > 0
+
+
+def test_off_the_route_the_snake_lies_straight_where_told() -> None:
+    config = run_config(start={"on_route": False, "position_m": [1.0, 2.0], "yaw_rad": 0.5})
+    pose = start_of(config)
+    assert pose.position_w == (1.0, 2.0) and pose.yaw_rad == 0.5 and not pose.angles_rad.any()
+    capsules = capsules_at_start(config)
+    assert len(capsules) == 4 and capsules[0].rear_m == (1.0, 2.0)
+    assert capsules[-1].front_m == pytest.approx((1.0 + 0.3 * np.cos(0.5), 2.0 + 0.3 * np.sin(0.5)))
+    assert all(a.front_m == pytest.approx(b.rear_m) for a, b in itertools.pairwise(capsules))
+
+
+def test_random_fields_stay_clear_of_the_start() -> None:
+    field = {"seed": 1, "low_m": [-0.3, -0.3], "high_m": [0.7, 0.3], "density_per_m2": 30.0}
+    field |= {"radius_m": [0.02, 0.03], "clearance_m": 0.01}
+    config = run_config(scene__random_field=[field])
+    placed = place_all(config)
+    assert len(placed) == 18
+    for item in placed:
+        centre = np.array(item.obstacle.position_w[:2])
+        gap = min(link.distance_m(centre) for link in capsules_at_start(config)) - item.obstacle.radius_m
+        assert gap >= 0.01 - 1e-9

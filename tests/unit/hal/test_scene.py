@@ -1,0 +1,277 @@
+"""Scenes: how obstacles are placed, and which scenes are refused."""
+
+import itertools
+import math
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from snakesim_hal.codec import Decoder, encode, encoding_of
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.files import Table, decode
+from snakesim_hal.messages import Obstacle, World
+from snakesim_hal.scene import (
+    Capsule,
+    Placed,
+    SceneFile,
+    check_clear,
+    outline_distance_m,
+    place,
+    route_of,
+)
+from tests.unit.hal.rig import SCENE
+
+SINE = {"kind": "sine", "amplitude_m": 0.1, "wavelength_m": 0.8, "length_m": 4.0}
+FIELD: dict[str, Any] = {
+    "seed": 7,
+    "low_m": [0.0, -1.0],
+    "high_m": [2.0, 1.0],
+    "density_per_m2": 5.0,
+    "radius_m": [0.02, 0.05],
+    "clearance_m": 0.05,
+}
+SNAKE = [
+    Capsule(name=f"link_{i}", rear_m=(0.2 * i, 0.0), front_m=(0.2 * i + 0.2, 0.0), radius_m=0.04) for i in range(3)
+]
+
+
+def scene(**sections: Any) -> SceneFile:
+    return decode(Table({**SCENE, **sections}, "bend.toml"), SceneFile)
+
+
+def test_every_kind_of_obstacle_is_placed_as_described() -> None:
+    placed = place(
+        scene(
+            cylinder=[{"position_m": [1, 2], "radius_m": 0.1, "height_m": 0.4, "friction": 0.3, "name": "post"}],
+            box=[{"position_m": [3, 0], "size_m": [0.4, 0.2, 0.6], "yaw_rad": 0.5}],
+            sphere=[{"position_m": [0, 3], "radius_m": 0.2, "centre_height_m": 0.05}],
+            wall=[{"from_m": [0, 5], "to_m": [3, 9], "thickness_m": 0.1, "height_m": 0.5}],
+            step=[{"position_m": [0, -4], "size_m": [1.0, 0.5], "height_m": 0.03}],
+        )
+    )
+    post, box, ball, wall, step = placed
+    assert post == Placed(
+        obstacle=Obstacle(name="post", shape="cylinder", position_w=(1, 2, 0.2), radius_m=0.1, height_m=0.4),
+        friction=0.3,
+    )
+    assert box.obstacle.half_size_m == pytest.approx((0.2, 0.1, 0.3)) and box.obstacle.position_w[2] == 0.3
+    assert box.obstacle.yaw_rad == 0.5 and box.obstacle.name == "box_0"
+    assert ball.obstacle.position_w == (0, 3, 0.05) and ball.obstacle.radius_m == 0.2
+    assert wall.obstacle.position_w == pytest.approx((1.5, 7, 0.25))
+    assert wall.obstacle.half_size_m == pytest.approx((2.5, 0.05, 0.25))
+    assert wall.obstacle.yaw_rad == pytest.approx(math.atan2(4, 3))
+    assert step.walkable and not any(item.walkable for item in placed[:4])
+
+
+def test_everything_that_is_placed_can_be_published() -> None:
+    placed = place(scene(route=SINE, pegs_along_route=[{"corridor_m": 0.05, "radius_m": 0.05, "count": 3}]))
+    world = World(
+        tick=0,
+        stamp_ns=0,
+        base_position_w=(0, 0, 0),
+        base_orientation_wxyz=(1, 0, 0, 0),
+        base_confidence=1,
+        contacts=[],
+        obstacles=[item.obstacle for item in placed],
+    )
+    assert Decoder(World).decode(encode(world), encoding_of(World)) == world
+
+
+# --- pegs along the route --------------------------------------------------------------------------------------
+
+
+@given(
+    corridor_m=st.floats(0.03, 0.1),
+    radius_m=st.floats(0.02, 0.08),
+    count=st.integers(1, 7),
+    first=st.integers(0, 2),
+    amplitude_m=st.floats(0.02, 0.12),
+)
+def test_pegs_stand_at_their_distance_on_the_side_that_pushes_forward(
+    corridor_m: float, radius_m: float, count: int, first: int, amplitude_m: float
+) -> None:
+    row = {"corridor_m": corridor_m, "radius_m": radius_m, "count": count, "first": first}
+    made = scene(route={**SINE, "amplitude_m": amplitude_m}, pegs_along_route=[row])
+    route = route_of(made)
+    assert route is not None
+    pegs = [item.obstacle for item in place(made)]
+    assert [peg.name for peg in pegs] == [f"peg_0_{first + k}" for k in range(count)]
+    spots = route.inflections_s_m()[first:]
+    for k, peg in enumerate(pegs):
+        centre, foot = np.array(peg.position_w[:2]), route.position_w(spots[k])
+        push = (foot - centre) / np.linalg.norm(foot - centre)  # from the peg onto the body
+        assert np.linalg.norm(foot - centre) - radius_m == pytest.approx(corridor_m)
+        assert push @ route.tangent_w(spots[k]) == pytest.approx(0.0, abs=1e-6)
+        assert push[0] > 0  # the route runs along x
+    sides = [math.copysign(1, peg.position_w[1] - route.at(s)[1]) for peg, s in zip(pegs, spots, strict=False)]
+    assert all(a == -b for a, b in itertools.pairwise(sides))
+
+
+def test_too_many_pegs_and_pegs_without_a_route_are_refused() -> None:
+    row = {"corridor_m": 0.05, "radius_m": 0.05}
+    with pytest.raises(ConfigError) as caught:
+        place(scene(route=SINE, pegs_along_route=[{**row, "count": 12, "first": 1}]))
+    said = str(caught.value)
+    assert all(word in said for word in ("pegs_along_route.0", "`count` = 12", "has 9 inflections", "at most 8")), said
+    with pytest.raises(ConfigError, match=r"`pegs_along_route\.0`: the scene has no route; add a \[route\] section"):
+        place(scene(pegs_along_route=[{**row, "count": 1}]))
+    with pytest.raises(ConfigError, match="at most 0"):
+        place(scene(route=SINE, pegs_along_route=[{**row, "count": 1, "first": 50}]))
+
+
+# --- random fields ---------------------------------------------------------------------------------------------
+
+
+@given(seed=st.integers(0, 2**31), clearance_m=st.floats(0, 0.1), route_clearance_m=st.floats(0, 0.1))
+@settings(max_examples=20)
+def test_a_random_field_keeps_its_clearances(seed: int, clearance_m: float, route_clearance_m: float) -> None:
+    field = {**FIELD, "seed": seed, "clearance_m": clearance_m, "route_clearance_m": route_clearance_m}
+    post = {"position_m": [1.0, 0.5], "radius_m": 0.1, "name": "post"}
+    made = scene(route=SINE, cylinder=[post], random_field=[field])
+    route = route_of(made)
+    assert route is not None
+    pegs = [item.obstacle for item in place(made, SNAKE)]
+    strewn = pegs[1:]
+    assert len(strewn) == round(5.0 * 4.0)
+    for i, peg in enumerate(strewn):
+        centre = np.array(peg.position_w[:2])
+        assert 0.02 <= peg.radius_m <= 0.05
+        assert -1e-9 <= centre[0] <= 2 and -1 <= centre[1] <= 1
+        for other in [pegs[0], *strewn[:i]]:
+            assert outline_distance_m(other, centre) - peg.radius_m >= clearance_m - 1e-9
+        assert min(link.distance_m(centre) for link in SNAKE) - peg.radius_m >= clearance_m - 1e-9
+        dense = route.position_w(np.linspace(0, route.length_m, 2000))
+        assert np.hypot(*(dense - centre).T).min() - peg.radius_m >= route_clearance_m - 1e-5
+
+
+def test_the_same_seed_gives_the_same_pegs_and_another_seed_others() -> None:
+    first, again = (place(scene(random_field=[FIELD])) for _ in range(2))
+    assert first == again
+    assert place(scene(random_field=[{**FIELD, "seed": 8}])) != first
+    two = place(scene(random_field=[FIELD, {**FIELD, "low_m": [3, -1], "high_m": [5, 1]}]))
+    assert two[: len(first)] == first  # a second field does not stir the first
+    assert {peg.obstacle.name for peg in two[len(first) :]} == {f"random_1_{k}" for k in range(20)}
+    assert [p.obstacle.radius_m for p in two[len(first) :]] != [p.obstacle.radius_m for p in first]
+
+
+IMPOSSIBLE = {
+    "too dense": ({"density_per_m2": 60.0, "radius_m": [0.1, 0.1]}, ["pegs fit", "`density_per_m2` = 60.0", "only"]),
+    "empty area": ({"high_m": [0.0, 1.0]}, ["`high_m` = (0.0, 1.0) must exceed `low_m` = (0.0, -1.0)"]),
+    "radii swapped": ({"radius_m": [0.05, 0.02]}, ["`radius_m` = (0.05, 0.02)", "smallest first"]),
+    "route that is not there": ({"route_clearance_m": 0.1}, ["`route_clearance_m` is set", "no route"]),
+}
+
+
+@pytest.mark.parametrize("wrong", IMPOSSIBLE)
+def test_impossible_fields_are_refused_in_words(wrong: str) -> None:
+    changes, words = IMPOSSIBLE[wrong]
+    field = {**FIELD, "high_m": [1.0, 0.0], **changes}
+    with pytest.raises(ConfigError) as caught:
+        place(scene(random_field=[field]))
+    said = str(caught.value)
+    assert said.startswith("scene 'plain': `random_field.0`: ")
+    assert all(word in said for word in words), said
+
+
+# --- what a scene must not be ----------------------------------------------------------------------------------
+
+
+def test_two_obstacles_with_one_name_are_refused() -> None:
+    post = {"position_m": [1, 2], "radius_m": 0.1, "name": "post"}
+    with pytest.raises(ConfigError, match="scene 'plain': two obstacles are called 'post'; rename one"):
+        place(scene(cylinder=[post, {**post, "position_m": [2, 2]}]))
+    with pytest.raises(ConfigError, match="'box_0'"):
+        place(scene(cylinder=[{**post, "name": "box_0"}], box=[{"position_m": [5, 5], "size_m": [1, 1, 1]}]))
+
+
+def test_a_wall_of_no_length_and_a_route_of_equal_points_are_refused() -> None:
+    with pytest.raises(ConfigError, match=r"`wall\.0`: `from_m` and `to_m` are the same point"):
+        place(scene(wall=[{"from_m": [1, 1], "to_m": [1, 1]}]))
+    with pytest.raises(ConfigError, match=r"`route\.points_m`: .*no two neighbours"):
+        route_of(scene(route={"kind": "waypoints", "points_m": [[0, 0], [0, 0]]}))
+
+
+WRONG = {
+    "friction": ({"ground": {"friction": 9}}, ["`ground.friction` = 9 1 (Coulomb", "<= 5"]),
+    "no ground": ({"ground": None}, ["`ground` = None", "friction"]),
+    "radius": ({"cylinder": [{"position_m": [0, 0], "radius_m": 0}]}, ["`cylinder.0.radius_m` = 0 m", "> 0"]),
+    "typo": ({"cylinder": [{"position_m": [0, 0], "radius": 1}]}, ["`cylinder.0.radius`", "did you mean `radius_m`"]),
+    "obstacle kind": ({"pyramid": []}, ["unknown field `pyramid`", "cylinder"]),
+    "point": ({"box": [{"position_m": [1], "size_m": [1, 1, 1]}]}, ["`box.0.position_m` = [1]", "2 values"]),
+    "far away": ({"box": [{"position_m": [1e9, 0], "size_m": [1, 1, 1]}]}, ["`box.0.position_m.0` = 1000000000.0 m"]),
+    "degrees": ({"box": [{"position_m": [1, 0], "size_m": [1, 1, 1], "yaw_rad": 90}]}, ["yaw_rad` = 90 rad", "6.3"]),
+    "route kind": ({"route": {"kind": "spiral"}}, ["`route.kind`", "'spiral'"]),
+    "route without kind": ({"route": {"amplitude_m": 1}}, ["`route.kind`"]),
+    "name": ({"cylinder": [{"position_m": [0, 0], "radius_m": 1, "name": "x" * 65}]}, ["`cylinder.0.name`", "64"]),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_wrong_scenes_are_refused_in_words(wrong: str) -> None:
+    changes, words = WRONG[wrong]
+    with pytest.raises(ConfigError) as caught:
+        scene(**changes)
+    said = str(caught.value)
+    assert said.startswith("bend.toml: ")
+    assert all(word in said for word in words), said
+
+
+# --- clear of the start ----------------------------------------------------------------------------------------
+
+
+@given(x=st.floats(-0.3, 0.9), y=st.floats(-0.3, 0.3), radius_m=st.floats(0.02, 0.1))
+def test_a_peg_is_refused_exactly_when_it_overlaps_the_snake(x: float, y: float, radius_m: float) -> None:
+    gap = math.dist((x, y), (min(max(x, 0.0), 0.6), 0.0)) - 0.04 - radius_m
+    assume(abs(gap) > 2e-4)
+    made = scene(cylinder=[{"position_m": [x, y], "radius_m": radius_m, "name": "post"}])
+    if gap > 0:
+        check_clear(made, place(made), SNAKE)
+        return
+    with pytest.raises(ConfigError, match=r"obstacle 'post' overlaps link_\d of the snake at its start by [\d.]+ mm"):
+        check_clear(made, place(made), SNAKE)
+
+
+def test_how_deep_a_peg_overlaps_is_told() -> None:
+    made = scene(cylinder=[{"position_m": [0.1, 0.08], "radius_m": 0.05}])
+    with pytest.raises(ConfigError, match=r"scene 'plain': obstacle 'cylinder_0' overlaps link_0 .* by 10\.0 mm"):
+        check_clear(made, place(made), SNAKE)
+
+
+@given(x=st.floats(-0.5, 1.1), y=st.floats(-0.5, 0.5), yaw_rad=st.floats(-3, 3))
+def test_a_block_is_refused_exactly_when_it_overlaps_the_snake(x: float, y: float, yaw_rad: float) -> None:
+    made = scene(box=[{"position_m": [x, y], "size_m": [0.3, 0.1, 0.2], "yaw_rad": yaw_rad}])
+    placed = place(made)
+    line = np.column_stack([np.linspace(0, 0.6, 1200), np.zeros(1200)])
+    gap = min(outline_distance_m(placed[0].obstacle, point) for point in line) - 0.04
+    assume(abs(gap) > 2e-3)
+    if gap > 0:
+        check_clear(made, placed, SNAKE)
+        return
+    with pytest.raises(ConfigError, match="obstacle 'box_0' overlaps"):
+        check_clear(made, placed, SNAKE)
+
+
+def test_a_snake_may_start_on_a_step() -> None:
+    made = scene(step=[{"position_m": [0.3, 0], "size_m": [2, 1], "height_m": 0.02}])
+    check_clear(made, place(made), SNAKE)
+
+
+def test_distances_to_outlines() -> None:
+    peg = Obstacle(name="p", shape="cylinder", position_w=(1, 0, 0), radius_m=0.2)
+    assert outline_distance_m(peg, np.array([2.0, 0.0])) == pytest.approx(0.8)
+    block = Obstacle(name="b", shape="box", position_w=(0, 0, 0), yaw_rad=math.pi / 2, half_size_m=(2, 1, 1))
+    assert outline_distance_m(block, np.array([0.0, 3.0])) == pytest.approx(1.0)
+    assert outline_distance_m(block, np.array([4.0, 6.0])) == pytest.approx(5.0)
+    assert outline_distance_m(block, np.array([0.5, 0.0])) == pytest.approx(-0.5)
+    link = Capsule(name="l", rear_m=(0, 0), front_m=(1, 0), radius_m=0.1)
+    assert link.distance_m(np.array([0.5, 0.3])) == pytest.approx(0.2)
+    assert link.distance_m(np.array([-3.0, 4.0])) == pytest.approx(4.9)
+
+
+def test_a_scene_survives_its_own_json() -> None:
+    made = scene(route=SINE, random_field=[FIELD], wall=[{"from_m": [0, 5], "to_m": [3, 9]}])
+    assert msgspec.json.decode(msgspec.json.encode(made), type=SceneFile) == made

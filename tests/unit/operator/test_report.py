@@ -1,0 +1,627 @@
+"""The report: sections, figures and words, on a made-up run whose forces are solved as the paper solves them."""
+
+import dataclasses
+import itertools
+import math
+import re
+import xml.etree.ElementTree as ET
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from snakesim_hal.host_process import HostRecord
+from snakesim_hal.kinematics import quaternion_from_yaw
+from snakesim_hal.messages import ControlState, Fault, Mode, World, WorldContact
+from snakesim_hal.robot import Chain, ContactSensor, Limits, Module, Motor, PoseSensor, RobotFile, Sensors, describe
+from snakesim_hal.route import Route, lay_chain, sine_points
+from snakesim_hal.scenario import RunConfig, Service, Start
+from snakesim_hal.scene import Cylinder, Ground, SceneFile, SineRoute, place, route_of
+from snakesim_operator.record import RunRecord
+from snakesim_operator.report import write_picture, write_report
+from snakesim_operator.report.instants import best_instant, pushing_instants
+from snakesim_operator.report.polygon import force_polygon
+from snakesim_operator.report.svg import number, ticks
+from snakesim_operator.report.tables import ELSEWHERE
+from snakesim_operator.report.timeline import propulsion_intervals, reference_rad, state_bands, thinned
+from snakesim_operator.report.torque_map import coloured, strongest
+from snakesim_operator.summary import RunSummary, summarise
+
+SECTIONS = ["instants", "overview", "joints", "loads", "numbers", "again"]
+RATE_HZ, SECONDS, FORCE_N, SPEED_M_S = 100.0, 10.0, 35.0, 0.05
+RADIUS_M = 0.04
+INTERVALS_S = {6: (0.6, 2.9), 5: (2.9, 5.6), 4: (5.6, 7.8), 3: (7.8, 9.2)}  # joints 7, 6, 5, 4
+
+
+# --- a made-up run ---------------------------------------------------------------------------------------------
+
+
+def pegs() -> list[Cylinder]:
+    """On alternating sides, alternately a little ahead of the inflections and behind them."""
+    route = Route(sine_points(0.05, 0.6, 3.2))
+    row: list[Cylinder] = []
+    for k, s in enumerate(route.inflections_s_m()):
+        s += 0.08 if k % 2 == 0 else -0.08
+        (x, y), (tx, ty), side = route.at(s), route.tangent_w(s), (1 if k % 2 == 0 else -1)
+        centre = (float(x + side * ty * 0.095), float(y - side * tx * 0.095))
+        row.append(Cylinder(position_m=centre, radius_m=0.05, name=f"peg_{k}"))
+    return row
+
+
+def config() -> RunConfig:
+    robot = RobotFile(
+        name="planar13",
+        chain=Chain(modules=13, axes=["yaw"]),
+        module=Module(length_m=0.11, radius_m=RADIUS_M, mass_kg=0.3),
+        limits=Limits(angle_rad=1.57, speed_rad_s=7.5, acceleration_rad_s2=400, torque_nm=7.0, torque_rate_nm_s=200),
+        motor=Motor(
+            stiffness_nm_per_rad=60,
+            damping_nm_s_per_rad=1.5,
+            velocity_gain_nm_s_per_rad=1.5,
+            response_time_s=0.01,
+            armature_kg_m2=0.005,
+        ),
+        sensors=Sensors(contacts=ContactSensor(), pose=PoseSensor()),
+    )
+    scene = SceneFile(
+        name="sine",
+        ground=Ground(friction=0.1),
+        route=SineRoute(amplitude_m=0.05, wavelength_m=0.6, length_m=3.2),
+        cylinder=pegs(),
+    )
+    return RunConfig(
+        name="made_up",
+        title="Three push-points, made up",
+        robot=robot,
+        scene=scene,
+        controller="obstacle_triplet",
+        rate_hz=RATE_HZ,
+        duration_s=SECONDS,
+        services={"control": Service()},
+    )
+
+
+def propelling(time_s: float) -> int | None:
+    return next((joint for joint, (start, end) in INTERVALS_S.items() if start <= time_s < end), None)
+
+
+def push_points(run: RunConfig, route: Route, tail_s_m: float) -> list[WorldContact]:
+    """The first three pegs beside the body whose forces balance."""
+    body_m = run.robot.length_m
+    pegs = [item.obstacle for item in place(run.scene)]
+    beside = [(peg, route.project(np.array(peg.position_w[:2]))) for peg in pegs]
+    beside = [(peg, s) for peg, s in beside if tail_s_m + 0.1 < s < tail_s_m + body_m - 0.02]
+    contacts: list[WorldContact] = []
+    for peg, s in beside:
+        (x, y), (tx, ty) = route.at(s), route.tangent_w(s)
+        side = np.sign((x - peg.position_w[0]) * -ty + (y - peg.position_w[1]) * tx)
+        normal = (float(-ty * side), float(tx * side), 0.0)
+        contacts.append(
+            WorldContact(
+                link=min(int((s - tail_s_m) / 0.11 + 0.5), 13),
+                obstacle=peg.name,
+                body_s_m=s - tail_s_m,
+                position_w=(x - RADIUS_M * normal[0], y - RADIUS_M * normal[1], RADIUS_M),
+                normal_w=normal,
+                tangent_w=(float(tx), float(ty), 0.0),
+                force_w=(0.0, 0.0, 0.0),
+            )
+        )
+    for i in range(len(contacts) - 2):
+        if min(solved(contacts[i : i + 3])) > 1:
+            return contacts[i : i + 3]
+    return []
+
+
+def solved(contacts: list[WorldContact]) -> list[float]:
+    """Equations (10) and (11) of the paper."""
+    normals = np.array([c.normal_w[:2] for c in contacts])
+    points = np.array([c.position_w[:2] for c in contacts])
+    tether = -FORCE_N * np.array(contacts[0].tangent_w[:2])
+    moments = points[:, 0] * normals[:, 1] - points[:, 1] * normals[:, 0]
+    about = points[0, 0] * tether[1] - points[0, 1] * tether[0]
+    return np.linalg.solve(np.vstack([normals.T, moments]), -np.array([*tether, about])).tolist()
+
+
+def made_up(folder: Path) -> RunRecord:
+    run = config()
+    route = route_of(run.scene)
+    assert route is not None
+    random = np.random.default_rng(3)
+    count = int(SECONDS * RATE_HZ)
+    time_s = 0.37 + np.arange(count) / RATE_HZ
+    lengths = run.robot.link_lengths_m
+    angle, target, position, orientation = (np.zeros((count, k)) for k in (13, 13, 3, 4))
+    waves = np.sin(np.linspace(0, 9, count).reshape(-1, 1) + np.arange(13))
+    torque = 0.4 * waves + 0.05 * random.normal(size=(count, 13))
+    mode = np.full((count, 13), Mode.POSITION, dtype=np.int8)
+    peak, touched = np.zeros(count), np.zeros(count)
+    control: list[ControlState] = []
+    worlds: list[World] = []
+    for row, t in enumerate(time_s - time_s[0]):
+        tail_s = 0.05 + SPEED_M_S * min(max(t - 0.6, 0.0), 8.6)
+        lie = lay_chain(route, tail_s, lengths)
+        angle[row] = lie.angles_rad + 0.004 * random.normal(size=13)
+        target[row] = lie.angles_rad
+        position[row] = (*lie.tail_w, RADIUS_M)
+        orientation[row] = quaternion_from_yaw(lie.heading_rad)
+        joint = propelling(t)
+        points = push_points(run, route, tail_s) if joint is not None else []
+        forces = solved(points) if points else []
+        if joint is not None:
+            ramp = min(1.0, 4 * (t - INTERVALS_S[joint][0]))
+            asked = 9.0 * np.sin(2.2 * t + joint)
+            angle[row, joint] += 0.05 * ramp * np.sin(3 * t)
+            mode[row, joint], target[row, joint] = Mode.TORQUE, np.clip(asked, -7, 7)
+            torque[row, joint] = np.clip(asked + 0.2 * random.normal(), -7, 7)
+            peak[row], touched[row] = max(forces) * (1 + 0.1 * random.normal()), 3
+        stamp_ns = round((0.37 + t) * 1e9)
+        if row % 5 == 0 or joint != propelling(t - 1 / RATE_HZ):
+            control.append(
+                ControlState(
+                    tick=row + 37,
+                    stamp_ns=stamp_ns,
+                    controller="obstacle_triplet",
+                    state="Locomoting" if joint is not None else "NotLocomoting",
+                    reason="pushing" if joint is not None else "2 usable push-points, 3 are needed",
+                    path_s_m=tail_s,
+                    propulsion_joint=None if joint is None else f"joint_{joint + 1}",
+                    propulsion_n=FORCE_N if joint is not None else None,
+                    push_points=points,
+                    solved_force_n=forces,
+                    propulsion_torque_nm=None if joint is None else float(target[row, joint]),
+                    reference_rad=lie.angles_rad.tolist(),
+                    torque_headroom_nm=1.5 if joint is not None else None,
+                    condition=12.0,
+                )
+            )
+        if row % 10 == 0:
+            felt = [
+                msgspec.structs.replace(
+                    point,
+                    force_w=(
+                        force * point.normal_w[0] * 0.8 - 0.5 * point.tangent_w[0],
+                        force * point.normal_w[1] * 0.8 - 0.5 * point.tangent_w[1],
+                        0.0,
+                    ),
+                )
+                for point, force in zip(points, forces, strict=True)
+            ]
+            worlds.append(
+                World(
+                    tick=row + 37,
+                    stamp_ns=stamp_ns,
+                    base_position_w=(*lie.tail_w, RADIUS_M),
+                    base_orientation_wxyz=quaternion_from_yaw(lie.heading_rad),
+                    base_confidence=1.0,
+                    contacts=felt,
+                    obstacles=[],
+                )
+            )
+    return RunRecord(
+        folder=folder,
+        config=run,
+        description=describe(run.robot, backend="sim", period_ns=run.period_ns, lease_ns=run.lease_ns, config_hash="x"),
+        host=HostRecord(
+            ticks=count,
+            wall_s=2.5,
+            overruns=0,
+            answered_ticks=count - 1,
+            armed_ticks=count,
+            command_digest="0123456789abcdef" * 4,
+            state_to_command_us={"p50": 310.0, "p99": 905.5},
+            rejected_commands={"stale": 2},
+            limited_commands={"torque_rate": 41, "max_step": 7},
+            faults=[],
+            lifecycle="disarmed",
+            why="finished",
+        ),
+        control=control,
+        worlds=worlds,
+        time_s=time_s,
+        angle_rad=angle,
+        velocity_rad_s=np.diff(angle, axis=0, prepend=angle[:1]) * RATE_HZ,
+        torque_nm=torque,
+        mode=mode,
+        target=target,
+        torque_limit_nm=np.full((count, 13), 7.0),
+        position_w=position,
+        orientation_wxyz=orientation,
+        contact_peak_n=peak,
+        contact_count=touched,
+    )
+
+
+# --- reading the page ------------------------------------------------------------------------------------------
+
+
+class Reader(HTMLParser):
+    """Collects what the tests ask for, and refuses tags that do not match."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.ids: list[str] = []
+        self.words: list[str] = []
+        self.attributes: list[tuple[str, str, str | None]] = []
+        self.titles: list[str] = []
+        self.joint_charts: dict[str, list[str]] = {}
+        self._open: list[str] = []
+        self._joint: str | None = None
+        self.feed(page)
+        self.close()
+        assert self._open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag not in ("meta", "br", "link"):
+            self._open.append(tag)
+        self._note(tag, attrs)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self._note(tag, attrs)
+
+    def _note(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given = dict(attrs)
+        self.attributes += [(tag, name, value) for name, value in attrs]
+        if given.get("id"):
+            self.ids.append(str(given["id"]))
+        if tag == "article" and given.get("data-joint"):
+            self._joint = str(given["data-joint"])
+            self.joint_charts[self._joint] = []
+        if tag == "svg" and given.get("aria-label"):
+            self.titles.append(str(given["aria-label"]))
+            if self._joint is not None:
+                self.joint_charts[self._joint].append(str(given["aria-label"]))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self._open.pop() == tag
+        if tag == "article":
+            self._joint = None
+
+    def handle_data(self, data: str) -> None:
+        if not {"style", "script", "pre"} & set(self._open):
+            self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(self.words)
+
+
+def read(record: RunRecord, ended: str = "complete") -> Reader:
+    path = write_report(record, summarise(record, ended))
+    assert path == record.folder / "report.html"
+    page = path.read_text(encoding="utf-8")
+    reader = Reader(page)
+    assert [i for i in reader.ids if i in SECTIONS] == SECTIONS
+    assert len(page.encode()) < 1_500_000
+    assert not [a for a in reader.attributes if a[2] is not None and re.search(r"\b(nan|inf|None)\b", a[2])]
+    assert not re.search(r"\b(None|nan|inf)\b", reader.text)
+    assert not [a for a in reader.attributes if a[1] in ("src", "href") and not str(a[2]).startswith("data:")]
+    assert "@import" not in page and "url(" not in page
+    return reader
+
+
+@pytest.fixture(scope="module")
+def record(tmp_path_factory: pytest.TempPathFactory) -> RunRecord:
+    return made_up(tmp_path_factory.mktemp("run"))
+
+
+@pytest.fixture(scope="module")
+def page(record: RunRecord) -> Reader:
+    return read(record)
+
+
+def changed(record: RunRecord, **fields: Any) -> RunRecord:
+    return dataclasses.replace(record, **fields)
+
+
+# --- a whole run -----------------------------------------------------------------------------------------------
+
+
+def test_the_verdict_tells_distance_and_hand_over(page: Reader) -> None:
+    said = (
+        "Moved 0.43 m along the path in 10.0 s; propulsion handed over joint_7 → joint_6 → joint_5 → joint_4; no fault."
+    )
+    assert said in page.text
+    assert "Locomotion ended at 9.2 s: 2 usable push-points, 3 are needed." in page.text
+
+
+def test_every_joint_that_propelled_has_its_angle_and_its_torque(page: Reader) -> None:
+    assert page.joint_charts == {
+        f"joint_{n}": [f"Angle of joint_{n} over time", f"Torque of joint_{n} over time"] for n in (7, 6, 5, 4)
+    }
+
+
+def test_the_charts_of_the_whole_run_are_there(page: Reader) -> None:
+    for title in (
+        "Advance, states and propulsion joint over time",
+        "Torque of every joint over time",
+        "Largest torque of any joint as a share of its limit",
+        "Strongest contact force over time",
+        "Obstacles touched over time",
+    ):
+        assert page.titles.count(title) == 2, title  # once for wide, once for narrow screens
+
+
+def test_four_instants_each_with_top_view_and_polygon(page: Reader) -> None:
+    assert len([title for title in page.titles if title.startswith("Top view at")]) == 4
+    assert len([title for title in page.titles if title.startswith("Force polygon")]) == 4
+
+
+def test_the_instants_are_spread_and_their_polygons_close(record: RunRecord) -> None:
+    chosen = pushing_instants(record)
+    assert [one.propulsion_joint for one in chosen] == [6, 5, 4, 3]
+    for one in chosen:
+        assert one.balance is not None
+        assert one.balance.gap_n < 1e-9 * FORCE_N
+        assert np.allclose(one.balance.corners_n[0], one.balance.corners_n[-1], atol=1e-9)
+
+
+def test_the_resultant_is_the_propulsion_force_along_the_path_at_the_first_contact(record: RunRecord) -> None:
+    for one in pushing_instants(record):
+        assert one.balance is not None
+        ahead = FORCE_N * np.array(one.balance.contacts[0].tangent_w[:2])
+        assert np.allclose(one.balance.resultant_n, ahead, atol=1e-9)
+
+
+def test_the_drawn_polygon_is_closed_and_in_proportion(record: RunRecord) -> None:
+    balance = pushing_instants(record)[0].balance
+    assert balance is not None
+    corners = drawn_edges(force_polygon(balance, 236, 210))
+    assert math.dist(corners[0][0], corners[-1][1]) < 0.2
+    lengths = [math.dist(a, b) for a, b in corners]
+    forces = [FORCE_N, *balance.size_n]
+    assert np.allclose(np.array(lengths) / lengths[0], np.array(forces) / forces[0], rtol=0.02)
+
+
+def test_no_text_of_a_figure_covers_another(record: RunRecord) -> None:
+    page = write_report(record, summarise(record, "complete")).read_text(encoding="utf-8")
+    figures = [ET.fromstring(found) for found in re.findall(r'<svg viewBox="[^"]*" class="figure" role.*?</svg>', page)]
+    assert len(figures) >= 20
+    for figure in figures:
+        boxes = [(item.text, box_of(item)) for item in figure.iter("text") if "transform" not in item.attrib]
+        for (a, first), (b, second) in itertools.combinations(boxes, 2):
+            wide = min(first[2], second[2]) - max(first[0], second[0])
+            high = min(first[3], second[3]) - max(first[1], second[1])
+            assert wide <= 1 or high <= 2, f"{a!r} and {b!r} in {figure.get('aria-label')}"
+
+
+def box_of(item: ET.Element) -> tuple[float, float, float, float]:
+    x, y, width = float(item.attrib["x"]), float(item.attrib["y"]), 6.2 * len(item.text or "")
+    left = {"start": x, "middle": x - width / 2, "end": x - width}[item.get("text-anchor", "start")]
+    return left, y - 10, left + width, y + 1
+
+
+def drawn_edges(svg: str) -> list[tuple[tuple[float, float], tuple[float, float]]]:
+    """From where a shaft starts to where its head ends, in the order of drawing."""
+    edges: list[tuple[tuple[float, float], tuple[float, float]]] = []
+    shaft: tuple[float, float] | None = None
+    for item in ET.fromstring(svg).iter():
+        kind = item.get("class", "")
+        if kind in ("tether shaft", "solved shaft"):
+            shaft = float(item.attrib["x1"]), float(item.attrib["y1"])
+        elif kind in ("tether head", "solved head") and shaft is not None:
+            x, y = item.attrib["points"].split()[0].split(",")
+            edges.append((shaft, (float(x), float(y))))
+    return edges
+
+
+def test_a_polygon_that_does_not_close_is_no_instant(record: RunRecord) -> None:
+    wrong = [
+        msgspec.structs.replace(state, solved_force_n=[1.3 * f for f in state.solved_force_n])
+        for state in record.control
+    ]
+    assert pushing_instants(changed(record, control=wrong)) == []
+    assert "whose forces balance" in read(changed(record, control=wrong)).text
+
+
+def test_every_number_of_the_summary_stands_in_the_table_with_its_unit(record: RunRecord, page: Reader) -> None:
+    for field in msgspec.structs.fields(RunSummary):
+        if field.name not in ELSEWHERE:
+            assert field.name in page.words, field.name
+    assert {"N·m", "m/s", "µs", "J", "Hz"} <= set(page.words)
+    assert "torque_rate" in page.words and "41" in page.words  # limited by the gate
+    assert "stale" in page.words
+
+
+def test_the_page_says_how_to_repeat_the_run(record: RunRecord) -> None:
+    page = write_report(record, summarise(record, "complete")).read_text(encoding="utf-8")
+    assert f"snakesim run {record.folder}/config.json --backend sim --seed 1" in page
+    assert "&quot;amplitude_m&quot;: 0.05" in page
+
+
+# --- runs with something missing -------------------------------------------------------------------------------
+
+
+def test_without_telemetry(record: RunRecord) -> None:
+    page = read(changed(record, control=[], worlds=[]))
+    assert "telemetry holds no message of the controller" in page.text
+    assert "No joint propelled" in page.text
+    assert len([title for title in page.titles if title.startswith("Top view")]) == 4  # the pose is known
+
+
+def test_without_a_pose(record: RunRecord) -> None:
+    count = len(record.time_s)
+    blind = changed(record, position_w=np.full((count, 3), np.nan), orientation_wxyz=np.full((count, 4), np.nan))
+    page = read(blind)
+    assert "the robot has no pose sensor" in page.text
+    assert not [title for title in page.titles if title.startswith("Top view")]
+    assert "as the controller knew it" in page.text  # distance from the controller's own place on the path
+
+
+def test_without_a_route(record: RunRecord) -> None:
+    scene = msgspec.structs.replace(record.config.scene, route=None)
+    start = Start(on_route=False, position_m=(-5.0, 0.0))
+    page = read(changed(record, config=msgspec.structs.replace(record.config, scene=scene, start=start)))
+    assert "distance of the tail end" in page.text
+    assert "net displacement" in page.text
+
+
+def test_without_ticks(record: RunRecord) -> None:
+    fields = [field.name for field in dataclasses.fields(record)]
+    empty = {name: getattr(record, name)[:0] for name in fields if isinstance(getattr(record, name), np.ndarray)}
+    host = msgspec.structs.replace(record.host, ticks=0, armed_ticks=0, answered_ticks=0)
+    page = read(changed(record, control=[], worlds=[], host=host, **empty), "the host never became ready")
+    assert "Nothing was recorded: the robot was never armed (the host never became ready)." in page.text
+
+
+def test_without_a_contact_sensor(record: RunRecord) -> None:
+    sensors = msgspec.structs.replace(record.config.robot.sensors, contacts=None)
+    robot = msgspec.structs.replace(record.config.robot, sensors=sensors)
+    page = read(changed(record, config=msgspec.structs.replace(record.config, robot=robot)))
+    assert "No contact forces: the robot has no contact sensor." in page.text
+
+
+def test_a_controller_without_push_points(record: RunRecord) -> None:
+    plain = [
+        msgspec.structs.replace(
+            state, controller="hold", push_points=[], solved_force_n=[], propulsion_joint=None, propulsion_n=None
+        )
+        for state in record.control
+    ]
+    config_ = msgspec.structs.replace(record.config, controller="hold")
+    page = read(changed(record, control=plain, config=config_))
+    assert "controller hold solved for no push-points" in page.text
+    assert "controller hold named no propulsion joint" in page.text
+    assert "measured contacts, in sum" in page.text
+
+
+def test_a_run_that_ended_by_a_fault(record: RunRecord) -> None:
+    fault = Fault(tick=537, what="diverged", cause="joint_3 at 1e9 rad/s", joint="joint_3")
+    page = read(changed(record, host=msgspec.structs.replace(record.host, faults=[fault])), fault.cause)
+    assert "Stopped by a fault after 5.0 s at joint_3: joint_3 at 1e9 rad/s." in page.text
+    assert "diverged" in page.words
+    assert any(name == "class" and value == "fault-mark" for _, name, value in page.attributes)
+
+
+def test_a_run_that_jammed(record: RunRecord) -> None:
+    still = np.repeat(record.position_w[:1], len(record.time_s), axis=0)
+    stuck = [msgspec.structs.replace(state, jammed=True, reason="jammed at peg_2") for state in record.control]
+    flat = np.repeat(record.orientation_wxyz[:1], len(record.time_s), axis=0)
+    angles = np.repeat(record.angle_rad[:1], len(record.time_s), axis=0)
+    page = read(changed(record, position_w=still, orientation_wxyz=flat, angle_rad=angles, control=stuck))
+    assert "Jammed: jammed at peg_2. Moved 0.00 m along the path in 10.0 s; no fault." in page.text
+    assert any(name == "class" and value == "band band-jammed" for _, name, value in page.attributes)
+
+
+def test_text_from_outside_is_escaped(record: RunRecord) -> None:
+    nasty = '<script>alert("x")</script>&'
+    config_ = msgspec.structs.replace(record.config, title=nasty)
+    told = [msgspec.structs.replace(state, reason=nasty, state="NotLocomoting") for state in record.control]
+    host = msgspec.structs.replace(record.host, faults=[Fault(tick=90, what=nasty, cause=nasty)])
+    hurt = changed(record, config=config_, control=told, host=host)
+    page = write_report(hurt, summarise(hurt, nasty)).read_text(encoding="utf-8")
+    assert "<script>alert" not in page
+    assert page.count("&lt;script&gt;alert") >= 5
+    assert nasty in Reader(page).text
+
+
+def test_a_snake_that_lies_upwards_is_turned(record: RunRecord) -> None:
+    count = len(record.time_s)
+    up = changed(
+        record,
+        position_w=record.position_w[:, [1, 0, 2]] * np.array([-1.0, 1.0, 1.0]),
+        orientation_wxyz=np.tile(quaternion_from_yaw(math.pi / 2 + 0.4), (count, 1)),
+        worlds=[],
+        control=[],
+    )
+    sizes = [
+        [float(n) for n in value.split()][2:]
+        for _, name, value in read(up).attributes
+        if name == "viewbox" and value and value.startswith("0 0 500 ")
+    ]
+    assert len(sizes) == 4
+    assert all(height < width for width, height in sizes)
+
+
+# --- the picture -----------------------------------------------------------------------------------------------
+
+
+def test_the_picture_stands_alone(record: RunRecord, tmp_path: Path) -> None:
+    write_picture(record, summarise(record, "complete"), tmp_path / "triplet.svg")
+    root = ET.fromstring((tmp_path / "triplet.svg").read_text(encoding="utf-8"))
+    assert root.tag == "{http://www.w3.org/2000/svg}svg"
+    drawing = ET.tostring(root, encoding="unicode")
+    assert "var(" not in drawing and "nan" not in drawing
+    assert {"solved shaft", "resultant shaft", "tether shaft", "felt shaft", "route"} <= {
+        item.get("class") for item in root.iter()
+    }
+
+
+def test_the_picture_shows_the_instant_that_was_felt_most(record: RunRecord) -> None:
+    unfelt = [msgspec.structs.replace(world, contacts=[]) for world in record.worlds if world.stamp_ns < 7.37e9]
+    late = [
+        msgspec.structs.replace(
+            world,
+            contacts=[
+                msgspec.structs.replace(c, force_w=(2 * c.force_w[0], 2 * c.force_w[1], 0.0)) for c in world.contacts
+            ],
+        )
+        if 8.2e9 < world.stamp_ns < 8.7e9
+        else world
+        for world in record.worlds
+        if world.stamp_ns >= 7.37e9
+    ]
+    best = best_instant(changed(record, worlds=unfelt + late))
+    assert best is not None and 7.8 < best.time_s < 8.4
+
+
+def test_no_picture_of_a_run_that_nobody_saw(record: RunRecord, tmp_path: Path) -> None:
+    blind = changed(record, position_w=np.full_like(record.position_w, np.nan))
+    with pytest.raises(ValueError, match="pose sensor"):
+        write_picture(blind, summarise(blind, "complete"), tmp_path / "triplet.svg")
+
+
+# --- parts -----------------------------------------------------------------------------------------------------
+
+
+def test_intervals_and_bands_follow_the_telemetry(record: RunRecord) -> None:
+    intervals = propulsion_intervals(record)
+    assert [one.joint for one in intervals] == list(INTERVALS_S)
+    for one in intervals:
+        assert (one.start_s, one.end_s) == pytest.approx(INTERVALS_S[one.joint], abs=0.051)
+    assert [band.what for band in state_bands(record)] == ["NotLocomoting", "Locomoting", "NotLocomoting"]
+    assert state_bands(record)[-1].end_s == pytest.approx(SECONDS)
+
+
+def test_the_reference_is_the_target_in_position_mode_and_the_controllers_word_in_torque_mode(
+    record: RunRecord,
+) -> None:
+    reference = reference_rad(record, 6)
+    free = record.mode[:, 6] == Mode.TORQUE
+    assert np.array_equal(reference[~free], record.target[~free, 6])
+    assert np.abs(reference[free] - record.target[free, 6]).max() > 1  # no torque is taken for an angle
+    assert np.abs(np.diff(reference)).max() < 0.05  # one smooth line
+
+
+def test_thinning_keeps_extremes_and_breaks_at_gaps() -> None:
+    time_s = np.linspace(0.0, 100.0, 100_000)
+    values = np.sin(time_s)
+    values[54_321], values[12_345] = 9.0, -9.0
+    values[70_000:71_000] = np.nan
+    pieces = thinned(time_s, values)
+    kept = [v for piece in pieces for _, v in piece]
+    assert len(pieces) == 2 and len(kept) <= 810
+    assert max(kept) == 9.0 and min(kept) == -9.0
+
+
+def test_the_torque_map_keeps_time_and_the_strongest() -> None:
+    values = np.zeros((1000, 2))
+    values[500, 0], values[501, 1] = -3.0, 2.0
+    columns = strongest(values, 480)
+    assert columns.shape == (480, 2)
+    assert np.argmax(np.abs(columns), axis=0).tolist() == [240, 240]
+    assert columns.min() == -3.0 and columns.max() == 2.0
+    assert coloured(np.array([[0.0, 1.0, -1.0]]))[0, :, 3].tolist() == [0, 255, 255]
+
+
+def test_a_coordinate_that_is_no_number_is_refused() -> None:
+    with pytest.raises(ValueError, match="nan"):
+        number(float("nan"))
+
+
+def test_ticks_are_round_and_inside() -> None:
+    assert ticks(-0.1, 10.0, 6) == [0, 2, 4, 6, 8, 10]
+    assert ticks(-7.8, 7.8, 4) == [-5, 0, 5]
