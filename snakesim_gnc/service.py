@@ -42,12 +42,13 @@ def serve(service_type: type[Service], argv: Sequence[str] | None = None) -> int
     given = duty(arguments(f"Run the {name} service of a robot."), argv)
     try:
         with open_session(given.link, connect_timeout_s=20.0) as session:
-            client = Client(session, name)
+            schedule = given.config.services.get(name, Schedule())
+            client = Client(session, name, every_ticks=schedule.every_ticks)
             service = service_type(client, given.config)
             service.meet(client.description(timeout_s=20.0))
             client.announce()
             settle_for_timing()
-            loop(client, service, given.config.services.get(name, Schedule()))
+            loop(client, service)
     except SnakesimError as error:
         print(f"snakesim {name}: {error}", file=sys.stderr)
         return 1
@@ -56,21 +57,13 @@ def serve(service_type: type[Service], argv: Sequence[str] | None = None) -> int
     return 0
 
 
-def loop(client: Client, service: Service, schedule: Schedule) -> None:
+def loop(client: Client, service: Service) -> None:
     """Act on every tick that is due. A tick that is shown again, because time stands still, is answered again."""
-    acted = -schedule.every_ticks
     for clock in client.ticks(SILENCE_S):
         if clock is None:
             for key, message in service.silence():
                 client.put(key, message)
             continue
-        if clock.pace == "lockstep":
-            due = clock.tick % schedule.every_ticks == 0
-        else:
-            due = not 0 <= clock.tick - acted < schedule.every_ticks
-        if not due:
-            continue
-        acted = clock.tick
         outputs = service.outputs(clock)
         if outputs is None:
             continue

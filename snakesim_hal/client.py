@@ -65,17 +65,20 @@ class Feed(Generic[MessageT]):
 class Client:
     """A service's connection to one robot's HAL."""
 
-    def __init__(self, session: Session, service: str) -> None:
+    def __init__(self, session: Session, service: str, *, every_ticks: int = 1) -> None:
+        """every_ticks: the service acts on ticks that are multiples of this, and sleeps through the others."""
         self.service = service
         self.session = session
-        self._clocks: SimpleQueue[Arrival] = SimpleQueue()
+        self._every_ticks = every_ticks
+        self._clocks: SimpleQueue[Clock] = SimpleQueue()
+        self._heard_at = time.monotonic()
         self._clock_decoder = Decoder(Clock)
         self._feeds: dict[str, Feed[Any]] = {}
         self._publishers: dict[str, Publisher[Any]] = {}
         self._done: Publisher[Done] | None = None
         self._clock: Clock | None = None
         self.commanded_tick = -1
-        session.on_arrival(keys.CLOCK, self._clocks.put)
+        session.on_arrival(keys.CLOCK, self._take_clock)
         self._descriptions = session.latched_reader(keys.DESCRIPTION, Description)
 
     def description(self, timeout_s: float = 10.0) -> Description:
@@ -99,19 +102,15 @@ class Client:
         self.session.declare_alive(self.service)
 
     def ticks(self, silence_s: float | None = None) -> Iterator[Clock | None]:
-        """Every tick in lockstep; the newest one otherwise. None after each `silence_s` without a clock."""
+        """Every due tick in lockstep; the newest one otherwise. None after each `silence_s` without any clock."""
         while True:
             try:
-                arrival = self._clocks.get(timeout=silence_s)
-                clock = self._clock_decoder.decode(arrival.payload, arrival.encoding)
+                clock = self._clocks.get(timeout=silence_s)
                 while clock.pace != "lockstep" and not self._clocks.empty():
-                    arrival = self._clocks.get()
-                    clock = self._clock_decoder.decode(arrival.payload, arrival.encoding)
+                    clock = self._clocks.get()
             except Empty:
-                yield None
-                continue
-            except WireError as error:
-                self.session.rejected[error.reason] += 1
+                if silence_s is None or time.monotonic() - self._heard_at >= silence_s:
+                    yield None
                 continue
             if self._clock is not None and clock.tick < self._clock.tick:
                 for feed in self._feeds.values():
@@ -120,6 +119,17 @@ class Client:
             for feed in self._feeds.values():
                 feed.take_in()
             yield clock
+
+    def _take_clock(self, arrival: Arrival) -> None:
+        """Runs in Zenoh's thread: wakes the service only for ticks that are its own."""
+        self._heard_at = arrival.monotonic_ns * 1e-9
+        try:
+            clock = self._clock_decoder.decode(arrival.payload, arrival.encoding)
+        except WireError as error:
+            self.session.rejected[error.reason] += 1
+            return
+        if clock.tick % self._every_ticks == 0:
+            self._clocks.put(clock)
 
     def read(self, feed: Feed[MessageT]) -> MessageT | None:
         """What counts at this tick at the feed's key; None when there is none (yet).

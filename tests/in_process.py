@@ -39,13 +39,13 @@ from snakesim_hal.messages import (
 from snakesim_hal.plugins import CONTROLLERS, find_plugin, plugin_settings
 from snakesim_hal.route import Route
 from snakesim_hal.scenario import Override, RunConfig, load, parse_set, place_all, start_of
-from snakesim_hal.scene import route_of
 from snakesim_hal.scenario import Service as Schedule
+from snakesim_hal.scene import route_of
 from snakesim_sim_backend.backend import SimBackend
 
 Floats = NDArray[np.float64]
 
-SHIPPED: dict[str, type[Controller]] = {  # also without an installed distribution
+SHIPPED: dict[str, Any] = {  # also without an installed distribution
     "hold": Hold,
     "obstacle_triplet": ObstacleTriplet,
     "path_following": PathFollowing,
@@ -62,7 +62,7 @@ class Run:
     states: list[str]
     reasons: list[str]
     time_s: Floats
-    base_w: Floats  # (ticks, 3): true x, y and heading are not needed by the controller; these are the pose's
+    base_w: Floats  # (ticks, 3): the tail end, as the pose sensor has it
     angle_rad: Floats
     torque_nm: Floats
     velocity_rad_s: Floats
@@ -272,4 +272,5 @@ def _route(config: RunConfig) -> Route:
 
 def _make_controller(config: RunConfig, robot: Description) -> Controller:
     plugin = SHIPPED.get(config.controller) or find_plugin(CONTROLLERS, config.controller)
-    return plugin(robot, plugin_settings(plugin, config.control_settings, f"scenario {config.name!r}", config.control_section))
+    source = f"scenario {config.name!r}"
+    return plugin(robot, plugin_settings(plugin, config.control_settings, source, config.control_section))

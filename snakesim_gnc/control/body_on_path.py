@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -95,7 +96,7 @@ class BodyOnPath:
             places.append(s)
             xs.append(x)
             ys.append(y)
-        turns = [math.remainder(b - a, math.tau) for a, b in zip(headings[:-1], headings[1:], strict=True)]
+        turns = [math.remainder(b - a, math.tau) for a, b in pairwise(headings)]
         return np.array([*turns, *xs, *ys, *places])
 
     def _ahead(self, s_m: float, length_m: float) -> float:
@@ -114,9 +115,7 @@ class BodyOnPath:
         return end
 
 
-def chain_nodes(
-    tail_w: ArrayLike, heading_rad: float, angles_rad: Floats, segments_m: Floats
-) -> Floats:
+def chain_nodes(tail_w: ArrayLike, heading_rad: float, angles_rad: Floats, segments_m: Floats) -> Floats:
     """Nodes (2, n_nodes) of a planar chain: tail end, joints that bend, head end."""
     nodes = np.empty((2, len(segments_m) + 1))
     headings = np.empty(len(segments_m))

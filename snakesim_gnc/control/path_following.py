@@ -10,9 +10,9 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from snakesim_gnc.control.bumpless import HandOver
 from snakesim_gnc.control.controller import Action, Report, View, positions
 from snakesim_gnc.control.planar_body import PlanarBody
-from snakesim_gnc.control.bumpless import HandOver
 from snakesim_gnc.control.progress import Progress
 from snakesim_hal.backend import SetPoints
 from snakesim_hal.files import FileStruct
@@ -37,10 +37,7 @@ class PathFollowing:
         self._set = settings
         self._body = PlanarBody(robot)
         self._progress = Progress(
-            self._body,
-            speed_filter_s=settings.speed_filter_s,
-            slack_m=0.0,
-            oldest_world_s=settings.world_age_s,
+            self._body, speed_filter_s=settings.speed_filter_s, oldest_world_s=settings.world_age_s
         )
         self._hand_over = HandOver(robot)
         self._reference: Floats | None = None

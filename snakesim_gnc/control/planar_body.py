@@ -45,7 +45,7 @@ class PlanarBody:
         x, y = lie.nodes_w
         if self._all_bend:
             return lie.nodes_w[:, 1:-1].T
-        return np.column_stack([np.interp(self.joint_s_m, self.node_s_m, x), np.interp(self.joint_s_m, self.node_s_m, y)])
+        return np.column_stack([np.interp(self.joint_s_m, self.node_s_m, values) for values in (x, y)])
 
     def link_at(self, body_s_m: float) -> int:
         """Index of the link at an arc length along the body."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_gnc.control.body_on_path import BodyOnPath, Lie, chain_nodes, heading_of
+from snakesim_gnc.control.body_on_path import BodyOnPath, chain_nodes, heading_of
 from snakesim_gnc.control.controller import View
 from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_hal.messages import Trajectory, World
@@ -21,9 +21,8 @@ TICKS_KEPT = 128
 class Located:
     """The body on its path at one tick."""
 
-    lie: Lie  # as it would lie on the path; follows `tail_s_m` with slack, so that it is still when the body is
     on_path: BodyOnPath
-    tail_s_m: float
+    tail_s_m: float  # arc length of the tail end
     speed_m_s: float
     nodes_w: Floats  # (2, n_nodes), as measured at the newest world model's tick
     fresh: bool  # a new world model has come
@@ -39,13 +38,10 @@ class Progress:
     the speed last seen, so what is returned is always the present.
     """
 
-    def __init__(
-        self, body: PlanarBody, *, speed_filter_s: float, slack_m: float, oldest_world_s: float
-    ) -> None:
+    def __init__(self, body: PlanarBody, *, speed_filter_s: float, oldest_world_s: float) -> None:
         self._planar = body
         self._segments = np.array(body.segments_m)
         self._speed_filter_s = speed_filter_s
-        self._slack_m = slack_m
         self._oldest_s = oldest_world_s
         self._angles: deque[tuple[int, list[float]]] = deque(maxlen=TICKS_KEPT)
         self._body: BodyOnPath | None = None
@@ -54,7 +50,6 @@ class Progress:
         self._nodes = np.empty((2, 0))
         self._s_m = 0.0  # at the tick of the newest world model
         self._speed_m_s = 0.0
-        self._held_s_m = 0.0
 
     def update(self, view: View) -> Located | str:
         """Where the body is at this tick, or why that is unknown."""
@@ -82,8 +77,7 @@ class Progress:
             self._filter(body, world, view.period_s)
         self._world = world
         s = self._s_m + self._speed_m_s * age_s
-        self._held_s_m = s if new_path else min(max(self._held_s_m, s - self._slack_m), s + self._slack_m)
-        return Located(body.at(self._held_s_m), body, s, self._speed_m_s, self._nodes, fresh, new_path, world, trajectory)
+        return Located(body, s, self._speed_m_s, self._nodes, fresh, new_path, world, trajectory)
 
     def _measure(self, world: World) -> None:
         angles = next((a for tick, a in reversed(self._angles) if tick <= world.tick), self._angles[0][1])

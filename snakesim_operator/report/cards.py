@@ -78,6 +78,8 @@ def _card(record: RunRecord, instant: Instant, view: View, letter: str) -> str:
         nodes = nodes_xy_w(record, instant)
         pushed = shown(felt_along_n(instant, nodes[-1] - nodes[0]), 3)
         parts.append(paragraph(f"{_touches(instant)}, in sum {pushed} N in the direction from tail to head.", "note"))
+    elif record.worlds and record.config.robot.sensors.contacts is not None:
+        parts.append(paragraph("No contact was felt.", "note"))
     head = f"<h3>({letter}) {instant.time_s:.2f} s <small>{named}</small></h3>"
     return f'<article class="card instant">{head}{"".join(parts)}</article>'
 

@@ -17,7 +17,7 @@ from snakesim_operator.report.timeline import told_at_s
 Floats = NDArray[np.float64]
 HOW_MANY = 4
 NEEDED = 3
-WORLD_WITHIN_S = 0.25  # a world this far from the instant still counts as its own
+WORLD_WITHIN_S = 0.021  # measured forces this far from the solved ones still count as simultaneous
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ def _instant(record: RunRecord, time_s: float, state: ControlState | None, balan
     at_s = float(record.time_s[0]) + time_s
     names = [joint.name for joint in record.description.joints]
     joint = state.propulsion_joint if state is not None else None
-    world = _world_near(record, at_s)
+    world = _world_near(record, at_s, WORLD_WITHIN_S if balance is not None else 3 * WORLD_WITHIN_S)
     return Instant(
         time_s=time_s,
         row=record.row_at(at_s),
@@ -138,9 +138,9 @@ def _instant(record: RunRecord, time_s: float, state: ControlState | None, balan
     )
 
 
-def _world_near(record: RunRecord, at_s: float) -> World | None:
+def _world_near(record: RunRecord, at_s: float, within_s: float) -> World | None:
     near = min(record.worlds, key=lambda world: abs(world.stamp_ns * 1e-9 - at_s), default=None)
-    return near if near is not None and abs(near.stamp_ns * 1e-9 - at_s) <= WORLD_WITHIN_S else None
+    return near if near is not None and abs(near.stamp_ns * 1e-9 - at_s) <= within_s else None
 
 
 def _spread(found: list[Instant]) -> list[Instant]:

@@ -73,7 +73,7 @@ def _obstacle(item: Placed, view: View, labels: Labels) -> str:
     reach = max(obstacle.radius_m, math.hypot(*obstacle.half_size_m[:2])) * view.scale
     if not (-reach < x < view.width + reach and -reach < y < view.height - FOOT + reach):
         return ""
-    labels.keep_off((x - reach, y - reach, x + reach, y + reach), 0.1)
+    labels.keep_off((x - reach, y - reach, x + reach, y + reach), 0.15)
     title = element("title", obstacle.name.replace("&", "&amp;").replace("<", "&lt;"))
     if obstacle.shape != "box":
         return element("circle", title, cx=x, cy=y, r=obstacle.radius_m * view.scale, class_=class_)
@@ -97,7 +97,7 @@ def _body(record: RunRecord, instant: Instant, view: View, nodes: Floats, labels
             parts.append(
                 element("line", x1=a[0], y1=a[1], x2=b[0], y2=b[1], class_=class_, stroke_width=max(width, 1.0))
             )
-        labels.keep_off_line(points[i], points[i + 1], wide / 2, 0.15)
+        labels.keep_off_line(points[i], points[i + 1], wide / 2, 0.4)
     for i, point in enumerate(points[1:-1]):
         if i != instant.propulsion_joint:
             parts.append(element("circle", cx=point[0], cy=point[1], r=2.4, class_="joint"))
@@ -138,18 +138,19 @@ def _solved(instant: Instant, view: View, labels: Labels) -> str:
 
 def _names(record: RunRecord, instant: Instant, view: View, nodes: Floats, labels: Labels) -> str:
     parts: list[str] = []
-    if instant.balance is not None:
-        for i, (contact, size) in enumerate(zip(instant.balance.contacts, instant.balance.size_n, strict=True)):
-            at = view.along(view.at(contact.position_w), contact.normal_w, -18.0)
-            parts.append(labels.put(at, f"o{_index(i + 1)}", "halo strong"))
-            tip = view.along(view.at(contact.position_w), contact.normal_w, size * view.force_scale)
-            parts.append(labels.put(tip, f"{size:.0f} N", "halo solved-text", gaps=(6, 12, 20)))
     if instant.propulsion_joint is not None:
         name = record.description.joints[instant.propulsion_joint].name
         at = view.at(nodes[instant.propulsion_joint + 1])
         colour = joint_class(instant.propulsion_joint)
         parts.append(element("circle", cx=at[0], cy=at[1], r=6.5, class_=f"propelling {colour}"))
-        parts.append(labels.put(at, name, "halo strong", gaps=(20, 34, 48)))
+        parts.append(labels.put(at, name, "halo strong", gaps=(16, 22, 30, 40)))
+    if instant.balance is not None:
+        for i, (contact, size) in enumerate(zip(instant.balance.contacts, instant.balance.size_n, strict=True)):
+            foot = view.at(contact.position_w)
+            tip = view.along(foot, contact.normal_w, size * view.force_scale)
+            parts.append(labels.put(tip, f"{size:.0f} N", "halo solved-text", gaps=(6, 10, 16), away_from=foot))
+            behind = view.along(foot, contact.normal_w, -18.0)
+            parts.append(labels.put(behind, f"o{_index(i + 1)}", "halo strong", away_from=foot))
     parts.append(labels.put(view.at(nodes[0]), "tail", "halo soft", gaps=(16, 24, 34)))
     parts.append(labels.put(view.at(nodes[-1]), "head", "halo soft", gaps=(16, 24, 34)))
     return "".join(parts)

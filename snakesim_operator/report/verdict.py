@@ -48,11 +48,16 @@ def verdict(record: RunRecord, summary: RunSummary) -> Verdict:
         return Verdict("poor", f"{moved}; {_handed_over(record, summary)}no fault.{ending}")
     if abs(distance) < MOVED_M or summary.locomoting_fraction == 0:
         why = summary.last_reason or "the controller gave no reason"
+        if summary.last_state == "Locomoting":
+            why = "the snake stayed where it was, although its controller reported Locomoting"
         kind = "Jammed" if summary.jammed else "Did not locomote"
         return Verdict("poor", f"{kind}: {_sentence(why)} {moved}; no fault.{ending}")
+    stopped = _stopped(record)
+    if summary.jammed and stopped:
+        return Verdict("poor", f"Jammed. {moved}; {_handed_over(record, summary)}no fault.{stopped}{ending}")
     jam = "it jammed on the way; " if summary.jammed else ""
     good: Kind = "poor" if ending or distance < 0 else "good"
-    return Verdict(good, f"{moved}; {_handed_over(record, summary)}{jam}no fault.{_stopped(record)}{ending}")
+    return Verdict(good, f"{moved}; {_handed_over(record, summary)}{jam}no fault.{stopped}{ending}")
 
 
 def tiles(record: RunRecord, summary: RunSummary) -> list[Tile]:

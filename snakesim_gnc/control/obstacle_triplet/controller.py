@@ -13,17 +13,20 @@ with which the motor goes on as it is; `fade = period / blend_s + |speed| period
 100 Hz and 0.2 m/s. The gate of the HAL bounds it once more: `speed_limit * period` and `torque_rate_limit * period`.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_gnc.control.controller import Action, Report, View, positions
-from snakesim_gnc.control.planar_body import PlanarBody
-from snakesim_gnc.control.obstacle_triplet.contacts import PlannedContact, PushPoint, plan_contact, push_points
+from snakesim_gnc.control.body_on_path import Lie
 from snakesim_gnc.control.bumpless import HandOver
+from snakesim_gnc.control.controller import Action, Report, View, positions
+from snakesim_gnc.control.obstacle_triplet.contacts import PlannedContact, PushPoint, plan_contact, push_points
 from snakesim_gnc.control.obstacle_triplet.selection import Choice, Names, Triplets, choose
 from snakesim_gnc.control.obstacle_triplet.settings import Settings
 from snakesim_gnc.control.obstacle_triplet.stall import Stall, StallWatch, explain
 from snakesim_gnc.control.obstacle_triplet.telemetry import bending, largest_contact_force_n, planned_contacts
+from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_gnc.control.progress import Located, Progress
 from snakesim_hal.backend import SetPoints
 from snakesim_hal.messages import Description, Mode, Obstacle
@@ -31,6 +34,18 @@ from snakesim_hal.messages import Description, Mode, Obstacle
 Floats = NDArray[np.float64]
 
 PLAN_WINDOW_M = 1.0  # beyond the body's ends: where the path may pass an obstacle that is near the body
+
+
+@dataclass(frozen=True)
+class Push:
+    """What the propulsion joint is told, and why."""
+
+    turn: int  # index of the joint
+    wanted_n: float  # propulsion force by the speed alone
+    force_n: float  # after fading and within the joint's torque
+    torque_nm: float
+    saturated: bool  # the limit of torque took from the force
+    swung: bool  # the joint is so far from its reference that the force is faded
 
 
 class ObstacleTriplet:
@@ -43,10 +58,7 @@ class ObstacleTriplet:
         self._set = settings
         self._body = PlanarBody(robot)
         self._progress = Progress(
-            self._body,
-            speed_filter_s=settings.speed_filter_s,
-            slack_m=settings.slack_m,
-            oldest_world_s=settings.world_age_s,
+            self._body, speed_filter_s=settings.speed_filter_s, oldest_world_s=settings.world_age_s
         )
         self._hand_over = HandOver(robot)
         self._triplets = Triplets(
@@ -57,7 +69,8 @@ class ObstacleTriplet:
         self._stall_watch = StallWatch(
             stall_m=settings.stall_m, stall_s=settings.stall_s, propulsion_n=settings.propulsion_n
         )
-        self._reference: Floats | None = None
+        self._lie: Lie | None = None  # of the body that the joints in position mode follow
+        self._reference = np.empty(0)  # the same as angles of all joints
         self._planned: dict[str, tuple[Obstacle, PlannedContact]] = {}
         self._points: list[PushPoint] = []
         self._choice: Choice | None = None
@@ -72,35 +85,62 @@ class ObstacleTriplet:
         located = self._progress.update(view)
         if isinstance(located, str):
             return self._wait(view, located)
-        reference = self._body.all_angles(located.lie)
-        self._keep_smooth(view, reference, located.new_path)
-        speed_m_s = located.trajectory.speed_m_s
-        if located.fresh:
-            self._look(located)
-            self._choose(view, located, speed_m_s)
-        self._guard(view, located)
+        lie = self._follow(view, located)
+        if located.trajectory.speed_m_s <= 0:
+            self._choice = None
+            self._stall_watch.forget()
+        if located.fresh or located.new_path:
+            self._look(located, lie)
+            self._choose(view, located, lie)
+        self._guard(view, lie)
         choice, set_ = self._choice, self._set
         turn = None if choice is None else self._body.bends[choice.joint]
-        self._hand_over.pass_to(turn, view.joints, reference)
+        self._hand_over.pass_to(turn, view.joints, self._reference)
         self._hand_over.fade(view.period_s / set_.blend_s + abs(located.speed_m_s) * view.period_s / set_.blend_m)
-        targets: list[float] = self._hand_over.positions_rad(reference).tolist()
+        targets: list[float] = self._hand_over.positions_rad(self._reference).tolist()
         mode = [Mode.POSITION] * len(targets)
         limits_nm = self._body.torque_limit_nm
         if choice is None or turn is None:
-            return Action(SetPoints(mode, targets, limits_nm), self._report_rest(located, reference))
-        asked_n = self._asked_n(view, located, choice, turn)
-        limit_nm = limits_nm[turn]
+            return Action(SetPoints(mode, targets, limits_nm), self._report_rest(located))
+        push = self._push(view, located, choice, turn)
+        mode[turn], targets[turn] = Mode.TORQUE, push.torque_nm
+        self._watch_progress(view, located, choice, push)
+        return Action(SetPoints(mode, targets, limits_nm), self._report_push(located, lie, choice, push))
+
+    def _follow(self, view: View, located: Located) -> Lie:
+        """Where the joints in position mode want the body; starts, and goes on to a new path, without a jump."""
+        set_, s, before = self._set, located.tail_s_m, self._lie
+        if before is None or located.new_path:
+            lie = located.on_path.at(s)
+        else:
+            most_m = max(located.trajectory.speed_m_s, 0.0) * set_.overspeed_share * view.period_s
+            followed = min(max(before.tail_s_m, s - set_.slack_m), s + set_.slack_m, before.tail_s_m + most_m)
+            lie = located.on_path.at(max(followed, s - set_.brake_m))
+        reference = self._body.all_angles(lie)
+        if before is None:
+            self._hand_over.start(view.joints, reference)
+        elif located.new_path:
+            self._hand_over.shift(reference - self._reference)
+        self._lie, self._reference = lie, reference
+        return lie
+
+    def _push(self, view: View, located: Located, choice: Choice, turn: int) -> Push:
+        """The propulsion: less the faster the body moves, and the further the joint has swung out."""
+        set_, limit_nm = self._set, self._body.torque_limit_nm[turn]
+        slow = 1.0 - located.speed_m_s / located.trajectory.speed_m_s
+        off_rad = view.joints.angle_rad[turn] - float(self._reference[turn])
+        swung_rad = off_rad if choice.torque_per_n > 0 else -off_rad
+        near = 2.0 - swung_rad / set_.angle_fade_rad
+        wanted_n = set_.propulsion_n * min(max(slow, 0.0), 1.0)
+        asked_n = wanted_n * min(max(near, 0.0), 1.0)
         force_n = min(asked_n, limit_nm / max(abs(choice.torque_per_n), 1e-12))
-        wanted_nm = force_n * choice.torque_per_n - set_.damping_nm_s_per_rad * view.joints.velocity_rad_s[turn]
-        targets[turn] = min(max(self._hand_over.torque_nm(wanted_nm), -limit_nm), limit_nm)
-        mode[turn] = Mode.TORQUE
-        self._watch_progress(view, located, choice, asked_n, force_n)
-        report = self._report_push(located, reference, choice, asked_n, force_n, targets[turn])
-        return Action(SetPoints(mode, targets, limits_nm), report)
+        torque_nm = force_n * choice.torque_per_n - set_.damping_nm_s_per_rad * view.joints.velocity_rad_s[turn]
+        torque_nm = min(max(self._hand_over.torque_nm(torque_nm), -limit_nm), limit_nm)
+        return Push(turn, wanted_n, force_n, torque_nm, saturated=force_n < asked_n, swung=near < 1.0)
 
     # --- what there is to push on ----------------------------------------------------------------------------
 
-    def _look(self, located: Located) -> None:
+    def _look(self, located: Located, lie: Lie) -> None:
         """Plan the contacts with the obstacles near the body, and see which of them it is at."""
         world = located.world
         if located.new_path:
@@ -118,7 +158,7 @@ class ObstacleTriplet:
         self._points = push_points(
             [contact for _, contact in self._planned.values()],
             kept,
-            located.lie,
+            lie,
             located.nodes_w,
             self._body.node_s_m,
             gap_m=self._set.gap_m,
@@ -131,7 +171,7 @@ class ObstacleTriplet:
         near_s_m, window_m = located.tail_s_m + half_m, half_m + PLAN_WINDOW_M
         return plan_contact(located.on_path.route, obstacle, self._body.radius_m, near_s_m=near_s_m, window_m=window_m)
 
-    def _choose(self, view: View, located: Located, speed_m_s: float) -> None:
+    def _choose(self, view: View, located: Located, lie: Lie) -> None:
         """Take a triplet, or none."""
         s, blend_m, share = located.tail_s_m, self._set.blend_m, self._set.switch_share
         self._banned = {names: at for names, at in self._banned.items() if abs(s - at) < blend_m}
@@ -141,11 +181,9 @@ class ObstacleTriplet:
             self._barred = None
         barred = None if self._barred is None else self._barred[0]
         choices, self._refused = self._triplets.choices(
-            self._points, located.lie.nodes_w, self._body.node_s_m, self._choice, barred
+            self._points, lie.nodes_w, self._body.node_s_m, self._choice, barred
         )
-        if speed_m_s <= 0:
-            self._stall_watch.forget()
-        if speed_m_s <= 0 or view.time_s < self._position_until_s:
+        if located.trajectory.speed_m_s <= 0 or view.time_s < self._position_until_s:
             self._choice = None
             return
         present = None if self._choice is None else self._choice.triplet
@@ -153,49 +191,33 @@ class ObstacleTriplet:
             choices, present, switch_share=share
         )
 
-    def _asked_n(self, view: View, located: Located, choice: Choice, turn: int) -> float:
-        """The propulsion force: less the faster the body moves, and the further the joint has swung out."""
-        set_ = self._set
-        slow = 1.0 - located.speed_m_s / located.trajectory.speed_m_s
-        off_rad = view.joints.angle_rad[turn] - float(located.lie.angles_rad[choice.joint])
-        swung_rad = off_rad if choice.torque_per_n > 0 else -off_rad
-        near = 2.0 - swung_rad / set_.angle_fade_rad
-        return set_.propulsion_n * min(max(slow, 0.0), 1.0) * min(max(near, 0.0), 1.0)
-
     # --- keeping out of trouble ------------------------------------------------------------------------------
 
-    def _keep_smooth(self, view: View, reference: Floats, new_path: bool) -> None:
-        if self._reference is None:
-            self._hand_over.start(view.joints, reference)
-        elif new_path:
-            self._hand_over.shift(reference - self._reference)
-        self._reference = reference
-
-    def _guard(self, view: View, located: Located) -> None:
+    def _guard(self, view: View, lie: Lie) -> None:
         """Take the turn from a propulsion joint that has left its reference too far."""
         if self._choice is None:
             return
         joint, guard_s = self._choice.joint, self._set.guard_s
         turn = self._body.bends[joint]
-        off_rad = view.joints.angle_rad[turn] - float(located.lie.angles_rad[joint])
+        off_rad = view.joints.angle_rad[turn] - float(lie.angles_rad[joint])
         if abs(off_rad) > self._set.angle_guard_rad:
             self._barred = (joint, view.time_s + guard_s)
             name = self._body.names[turn]
             self._refused = [f"{name} left its reference by {off_rad:+.2f} rad; in position mode for {guard_s} s"]
             self._choice = None
 
-    def _watch_progress(
-        self, view: View, located: Located, choice: Choice, asked_n: float, force_n: float
-    ) -> None:
+    def _watch_progress(self, view: View, located: Located, choice: Choice, push: Push) -> None:
         """Notice standing still; let go of a triplet that is jammed."""
-        if not self._stall_watch.stands(view.time_s, located.tail_s_m, asked_n):
+        if not self._stall_watch.stands(view.time_s, located.tail_s_m, push.wanted_n):
             return
         self._stall_watch.forget()
+        name = self._body.names[push.turn]
         stall = explain(
-            force_n=force_n,
+            force_n=push.wanted_n,
             contact_force_n=largest_contact_force_n(located.world),
             weight_n=self._body.weight_n,
-            saturated_joint=self._body.names[self._body.bends[choice.joint]] if force_n < asked_n else None,
+            saturated=name if push.saturated else None,
+            swung=name if push.swung else None,
             jam_force_n=self._set.jam_force_n,
             drag_share=self._set.drag_share,
         )
@@ -210,13 +232,13 @@ class ObstacleTriplet:
     def _wait(self, view: View, why: str) -> Action:
         """Without knowing where the body is: every joint stays where it was meant to be."""
         self._choice = None
-        if self._reference is None:
+        if self._lie is None:
             return Action(positions(self._robot, view.joints.angle_rad), Report(why=why))
         self._hand_over.pass_to(None, view.joints, self._reference)
         targets = self._hand_over.positions_rad(self._reference).tolist()
         return Action(positions(self._robot, targets), Report(why=why, reference_rad=self._reference.tolist()))
 
-    def _report_rest(self, located: Located, reference: Floats) -> Report:
+    def _report_rest(self, located: Located) -> Report:
         """Why nothing pushes."""
         speed_m_s = located.trajectory.speed_m_s
         if self._stall is not None:
@@ -229,30 +251,27 @@ class ObstacleTriplet:
             why=why[:400],
             usable_push_points=len(self._points),
             path_s_m=located.tail_s_m,
-            reference_rad=reference.tolist(),
+            reference_rad=self._reference.tolist(),
             jammed=self._stall is not None and self._stall[0].jammed,
         )
 
-    def _report_push(
-        self, located: Located, reference: Floats, choice: Choice, asked_n: float, force_n: float, torque_nm: float
-    ) -> Report:
+    def _report_push(self, located: Located, lie: Lie, choice: Choice, push: Push) -> Report:
         """What pushes, and how hard."""
-        turn = self._body.bends[choice.joint]
-        forces_n: list[float] = (force_n * choice.triplet.unit.forces).tolist()
+        forces_n: list[float] = (push.force_n * choice.triplet.unit.forces).tolist()
         full_nm = abs(self._set.propulsion_n * choice.torque_per_n)
         return Report(
             why="" if self._stall is None else self._stall[0].why,
             usable_push_points=len(self._points),
             path_s_m=located.tail_s_m,
-            propulsion_joint=turn,
-            propulsion_n=force_n,
+            propulsion_joint=push.turn,
+            propulsion_n=push.force_n,
             push_points=planned_contacts(self._body, located.world, choice, forces_n),
             solved_force_n=forces_n,
-            propulsion_torque_nm=torque_nm,
-            bending_torque_nm=bending(self._body, located, choice, forces_n, force_n),
-            reference_rad=reference.tolist(),
+            propulsion_torque_nm=push.torque_nm,
+            bending_torque_nm=bending(self._body, lie, choice, forces_n, push.force_n),
+            reference_rad=self._reference.tolist(),
             condition=choice.triplet.unit.condition,
-            torque_headroom_nm=self._body.torque_limit_nm[turn] - full_nm,
-            saturated=force_n < asked_n,
+            torque_headroom_nm=self._body.torque_limit_nm[push.turn] - full_nm,
+            saturated=push.saturated,
             jammed=self._stall is not None and self._stall[0].jammed,
         )

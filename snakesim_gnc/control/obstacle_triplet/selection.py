@@ -102,7 +102,7 @@ def choose(
     least = min(c.triplet.torque_per_n for c in free)
     names: Collection[str] = () if present is None else present.names
     for choice in free:
-        if choice.triplet is present and least >= switch_share * present.torque_per_n:
+        if choice.triplet is present and least >= switch_share * choice.triplet.torque_per_n:
             return choice
     cheap = [c for c in free if switch_share * c.triplet.torque_per_n <= least]
     return max(cheap, key=lambda c: (_shared(c, names), -round(c.triplet.torque_per_n, 3), -c.body_s_m[1]))

@@ -21,8 +21,8 @@ class Settings(FileStruct, frozen=True, kw_only=True):
     # Greatest propulsion force (the paper's f_s). It fades to zero as the snake reaches the mission's speed.
     propulsion_n: Annotated[float, _above(1e4, "N")] = 35.0
 
-    # Push-points: how far the skin may be from an obstacle that is to be pushed, how far before one that is being pushed
-    # is given up, and how near to a tip it may be.
+    # Push-points: how far the skin may be from an obstacle that is to be pushed, how far it may get from one that is
+    # being pushed, and how near to a tip the point may be.
     gap_m: Annotated[float, _from_zero(1, "m")] = 0.06
     give_up_gap_m: Annotated[float, _from_zero(1, "m")] = 0.12
     end_m: Annotated[float, _from_zero(10, "m")] = 0.03
@@ -57,8 +57,13 @@ class Settings(FileStruct, frozen=True, kw_only=True):
     # Then all joints go to position mode for this long, and the same triplet waits until the body has moved.
     release_s: Annotated[float, _from_zero(60, "s")] = 0.5
 
-    # Filter of the speed along the path; slack in the arc length that joints are told to follow, so that noise does not
-    # shake the body forward; and the oldest world model that is still acted on.
-    speed_filter_s: Annotated[float, _from_zero(1, "s")] = 0.03
+    # The arc length that the joints in position mode follow: with slack, so that noise does not shake the body forward,
+    # and no faster than this share of the mission's speed, so that they brake a body that runs away; but never further
+    # behind the body than `brake_m`.
     slack_m: Annotated[float, _from_zero(0.1, "m")] = 0.001
+    overspeed_share: Annotated[float, Meta(ge=1, le=100, extra_json_schema={"unit": "1"})] = 1.2
+    brake_m: Annotated[float, _from_zero(1, "m")] = 0.02
+
+    # Filter of the speed along the path, and the oldest world model that is still acted on.
+    speed_filter_s: Annotated[float, _from_zero(1, "s")] = 0.03
     world_age_s: Annotated[float, _above(10, "s")] = 0.25

@@ -44,17 +44,24 @@ def explain(
     force_n: float,
     contact_force_n: float,
     weight_n: float,
-    saturated_joint: str | None,
+    saturated: str | None,
+    swung: str | None,
     jam_force_n: float,
     drag_share: float,
 ) -> Stall:
-    """The cause of a stall: wedged between obstacles, held by friction, at the end of the motor, or too little push."""
+    """The cause of a stall: wedged between obstacles, at the end of the motor, held by friction, or too little push.
+
+    force_n: what the speed alone would have propelled with. saturated, swung: name of the propulsion joint if it is at
+    its limit of torque, or has swung out so far that the propulsion was faded.
+    """
     pushing = f"standing still with {force_n:.1f} N of propulsion"
     if contact_force_n > jam_force_n:
         return Stall(True, f"jammed: {pushing} and a contact force of {contact_force_n:.0f} N")
-    if saturated_joint is not None:
-        return Stall(True, f"jammed: {pushing} and {saturated_joint} at its limit of torque")
+    if saturated is not None:
+        return Stall(True, f"jammed: {pushing} and {saturated} at its limit of torque")
     if force_n > drag_share * weight_n:
         share = force_n / weight_n
         return Stall(True, f"jammed: {pushing}, {share:.2f} of the weight; no sliding on the ground takes so much")
+    if swung is not None:
+        return Stall(True, f"jammed: {pushing}; {swung} swings out instead of moving the body")
     return Stall(False, f"{pushing}: below the drag of the ground; raise propulsion_n")

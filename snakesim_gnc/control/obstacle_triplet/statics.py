@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
+Planar = tuple[float, float] | Floats
 
 CONDITION_MAX = 100.0
 AUTHORITY_MIN = 0.02
@@ -99,23 +100,22 @@ def unit_forces(
     if not condition <= condition_max:
         why = f"ill-conditioned: the three normals (nearly) meet in a point or are parallel (condition {condition:.3g})"
         return UnitForces(unknown, condition, why)
-    forces = np.linalg.solve(balance, np.append(tangent_1_w, _cross(arms[0], tangent_1_w)))
+    pull = np.append(tangent_1_w, _cross(arms[0], tangent_1_w))
+    forces = np.asarray(np.linalg.solve(balance, pull), dtype=np.float64)
     pulling = [f"lambda_{i + 1} = {force:.3g} N/N" for i, force in enumerate(forces.tolist()) if force <= 0.0]
     reason = f"a contact would have to pull: {', '.join(pulling)}" if pulling else ""
     return UnitForces(forces, condition, reason)
 
 
-def torque_per_newton(
-    unit_force_3: float, point_3_w: ArrayLike, normal_3_w: ArrayLike, joint_w: ArrayLike
-) -> float:
+def torque_per_newton(unit_force_3: float, point_3_w: Planar, normal_3_w: Planar, joint_w: Planar) -> float:
     """Torque on the part ahead of a joint between o_2 and o_3, per newton of propulsion: -lambda_3 (r x n_3)."""
-    (x, y), (nx, ny), (px, py) = point_3_w, normal_3_w, joint_w  # type: ignore[misc]
+    (x, y), (nx, ny), (px, py) = point_3_w, normal_3_w, joint_w
     return float(-unit_force_3 * ((x - px) * ny - (y - py) * nx))
 
 
-def no_authority(point_3_w: ArrayLike, normal_3_w: ArrayLike, joint_w: ArrayLike, least: float) -> str:
+def no_authority(point_3_w: Planar, normal_3_w: Planar, joint_w: Planar, least: float) -> str:
     """Why a torque of the joint does not reach the contact at o_3; empty when it does."""
-    (x, y), (nx, ny), (px, py) = point_3_w, normal_3_w, joint_w  # type: ignore[misc]
+    (x, y), (nx, ny), (px, py) = point_3_w, normal_3_w, joint_w
     lever = math.hypot(x - px, y - py)
     if lever > 0 and abs((x - px) * ny - (y - py) * nx) >= least * lever:
         return ""

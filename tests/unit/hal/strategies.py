@@ -132,9 +132,9 @@ def replaced(value: Any, at: Place, by: Any) -> Any:
     """A copy of plain data with another value in one place."""
     if not at:
         return by
-    step, *rest = at
+    step: Any = at[0]
     copy: Any = list(value) if isinstance(value, list) else dict(value)
-    copy[step] = replaced(value[step], tuple(rest), by)
+    copy[step] = replaced(value[step], at[1:], by)
     return copy
 
 

@@ -31,7 +31,7 @@ def take(message: type[Message], payload: bytes) -> Message | None:
 
 @each_message
 @given(data=st.data())
-@settings(max_examples=40)
+@settings(max_examples=25)
 def test_round_trip(message: type[Message], data: st.DataObject) -> None:
     sent = data.draw(messages_of(message))
     payload = encode(sent)

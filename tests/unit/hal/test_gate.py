@@ -146,7 +146,7 @@ def situations(draw: st.DrawFn) -> tuple[JointCommand, Measured, Applied]:
 
 
 @given(situations())
-@settings(max_examples=500)
+@settings(max_examples=300)
 def test_whatever_is_asked_what_is_applied_is_inside_every_limit(case: tuple[JointCommand, Measured, Applied]) -> None:
     asked, measured, last = case
     applied, _ = limit(asked, measured=measured, last=last, limits=LIMITS)

@@ -22,17 +22,26 @@ from snakesim_hal.scenario import RunConfig, Service, Start
 from snakesim_hal.scene import Cylinder, Ground, SceneFile, SineRoute, place, route_of
 from snakesim_operator.record import RunRecord
 from snakesim_operator.report import write_picture, write_report
+from snakesim_operator.report.figures import joint_angle, joint_torque
 from snakesim_operator.report.instants import best_instant, pushing_instants
+from snakesim_operator.report.labels import Labels
 from snakesim_operator.report.polygon import force_polygon
-from snakesim_operator.report.svg import number, ticks
+from snakesim_operator.report.svg import element, number, text, ticks
 from snakesim_operator.report.tables import ELSEWHERE
-from snakesim_operator.report.timeline import propulsion_intervals, reference_rad, state_bands, thinned
+from snakesim_operator.report.timeline import (
+    commanded_torque_nm,
+    propulsion_intervals,
+    reference_rad,
+    state_bands,
+    thinned,
+)
 from snakesim_operator.report.torque_map import coloured, strongest
 from snakesim_operator.summary import RunSummary, summarise
 
 SECTIONS = ["instants", "overview", "joints", "loads", "numbers", "again"]
 RATE_HZ, SECONDS, FORCE_N, SPEED_M_S = 100.0, 10.0, 35.0, 0.05
 RADIUS_M = 0.04
+MOVING = ("position_w", "orientation_wxyz", "angle_rad")
 INTERVALS_S = {6: (0.6, 2.9), 5: (2.9, 5.6), 4: (5.6, 7.8), 3: (7.8, 9.2)}  # joints 7, 6, 5, 4
 
 
@@ -334,6 +343,20 @@ def test_every_joint_that_propelled_has_its_angle_and_its_torque(page: Reader) -
     }
 
 
+def test_a_joint_chart_has_its_lines_its_limits_and_an_arrow_over_its_propulsion(record: RunRecord) -> None:
+    for draw in (joint_angle, joint_torque):
+        svg = ET.fromstring(draw(record, 6, propulsion_intervals(record), (0.0, SECONDS), 500))
+        classes = [item.get("class") for item in svg.iter()]
+        assert {"curve measured", "curve reference"} <= set(classes)
+        assert classes.count("limit") == (2 if draw is joint_torque else 0)
+        assert classes.count("span joint-6 head") == 2  # a two-sided arrow
+        shade = next(item for item in svg.iter() if item.get("class") == "shade joint-6")
+        left, width = float(shade.attrib["x"]), float(shade.attrib["width"])
+        start_s, end_s = INTERVALS_S[6]
+        assert (left - 54) / 432 * SECONDS == pytest.approx(start_s, abs=0.1)
+        assert width / 432 * SECONDS == pytest.approx(end_s - start_s, abs=0.1)
+
+
 def test_the_charts_of_the_whole_run_are_there(page: Reader) -> None:
     for title in (
         "Advance, states and propulsion joint over time",
@@ -493,17 +516,33 @@ def test_a_run_that_ended_by_a_fault(record: RunRecord) -> None:
     page = read(changed(record, host=msgspec.structs.replace(record.host, faults=[fault])), fault.cause)
     assert "Stopped by a fault after 5.0 s at joint_3: joint_3 at 1e9 rad/s." in page.text
     assert "diverged" in page.words
-    assert any(name == "class" and value == "fault-mark" for _, name, value in page.attributes)
+    # twice in the overview, in 4 x 2 joint charts, twice in torque use, twice in contact force
+    assert [value for _, name, value in page.attributes if name == "class"].count("fault-mark") == 14
 
 
 def test_a_run_that_jammed(record: RunRecord) -> None:
-    still = np.repeat(record.position_w[:1], len(record.time_s), axis=0)
+    still = {name: np.repeat(getattr(record, name)[:1], len(record.time_s), axis=0) for name in MOVING}
     stuck = [msgspec.structs.replace(state, jammed=True, reason="jammed at peg_2") for state in record.control]
-    flat = np.repeat(record.orientation_wxyz[:1], len(record.time_s), axis=0)
-    angles = np.repeat(record.angle_rad[:1], len(record.time_s), axis=0)
-    page = read(changed(record, position_w=still, orientation_wxyz=flat, angle_rad=angles, control=stuck))
+    page = read(changed(record, control=stuck, **still))
     assert "Jammed: jammed at peg_2. Moved 0.00 m along the path in 10.0 s; no fault." in page.text
     assert any(name == "class" and value == "band band-jammed" for _, name, value in page.attributes)
+
+
+def test_a_run_that_moved_and_then_jammed_is_called_jammed(record: RunRecord) -> None:
+    stuck = [
+        msgspec.structs.replace(state, jammed=True, reason="jammed: wedged") if state.stamp_ns > 9.565e9 else state
+        for state in record.control
+    ]
+    page = read(changed(record, control=stuck))
+    assert "Jammed. Moved 0.43 m along the path" in page.text
+    assert "Locomotion ended at 9.2 s: jammed: wedged." in page.text
+
+
+def test_a_controller_that_says_it_moves_and_does_not(record: RunRecord) -> None:
+    still = {name: np.repeat(getattr(record, name)[:1], len(record.time_s), axis=0) for name in MOVING}
+    told = [msgspec.structs.replace(state, state="Locomoting", reason="moving") for state in record.control]
+    page = read(changed(record, control=told, **still))
+    assert "Did not locomote: the snake stayed where it was, although its controller reported Locomoting." in page.text
 
 
 def test_text_from_outside_is_escaped(record: RunRecord) -> None:
@@ -596,6 +635,12 @@ def test_the_reference_is_the_target_in_position_mode_and_the_controllers_word_i
     assert np.abs(np.diff(reference)).max() < 0.05  # one smooth line
 
 
+def test_a_commanded_torque_is_known_in_torque_mode_only(record: RunRecord) -> None:
+    asked, free = commanded_torque_nm(record, 6), record.mode[:, 6] == Mode.TORQUE
+    assert np.isnan(asked[~free]).all()
+    assert np.array_equal(asked[free], record.target[free, 6])
+
+
 def test_thinning_keeps_extremes_and_breaks_at_gaps() -> None:
     time_s = np.linspace(0.0, 100.0, 100_000)
     values = np.sin(time_s)
@@ -615,6 +660,21 @@ def test_the_torque_map_keeps_time_and_the_strongest() -> None:
     assert np.argmax(np.abs(columns), axis=0).tolist() == [240, 240]
     assert columns.min() == -3.0 and columns.max() == 2.0
     assert coloured(np.array([[0.0, 1.0, -1.0]]))[0, :, 3].tolist() == [0, 255, 255]
+
+
+def test_a_label_finds_a_free_place() -> None:
+    labels = Labels(300, 200)
+    labels.keep_off_line((150, 20), (150, 100), 6)  # above the point a line comes down to it
+    placed = [ET.fromstring(labels.put((150, 100), words, "")) for words in ("first", "second", "third")]
+    boxes = [box_of(item) for item in placed]
+    for (left, top, right, bottom), (left_2, top_2, right_2, bottom_2) in itertools.combinations(boxes, 2):
+        assert min(right, right_2) <= max(left, left_2) or min(bottom, bottom_2) <= max(top, top_2)
+    assert all(right < 145 or left > 155 or top > 100 for left, top, right, _ in boxes)
+
+
+def test_text_in_a_drawing_is_escaped() -> None:
+    assert "&lt;b&gt; &amp;" in text(0, 0, "<b> &")
+    assert element("g", class_='"><script>') == '<g class="&quot;&gt;&lt;script&gt;"/>'
 
 
 def test_a_coordinate_that_is_no_number_is_refused() -> None:

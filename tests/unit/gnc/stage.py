@@ -1,0 +1,131 @@
+"""A robot, a wavy path with pegs, and views of a body on it, without any physics."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from snakesim_gnc.control.body_on_path import chain_nodes
+from snakesim_gnc.control.controller import View
+from snakesim_hal.kinematics import quaternion_from_yaw
+from snakesim_hal.messages import Axis, Description, JointState, Obstacle, Trajectory, World, WorldContact
+from snakesim_hal.robot import Chain, Limits, Module, Motor, RobotFile, describe
+from snakesim_hal.route import Route, chain_angles, lay_chain, sine_points, yaw_segments_m
+
+PERIOD_S = 0.01
+AMPLITUDE_M, WAVELENGTH_M, LENGTH_M = 0.045, 0.6, 6.0
+BODY_RADIUS_M, PEG_RADIUS_M, CLEARANCE_M = 0.04, 0.05, 0.005
+
+
+def make_robot(modules: int = 13, axes: tuple[Axis, ...] = ("yaw",), torque_nm: float = 7.0) -> Description:
+    """A chain of modules of 0.11 m."""
+    file = RobotFile(
+        name="test",
+        chain=Chain(modules=modules, axes=list(axes)),
+        module=Module(length_m=0.11, radius_m=BODY_RADIUS_M, mass_kg=0.3),
+        limits=Limits(
+            angle_rad=1.5, speed_rad_s=7.5, acceleration_rad_s2=400, torque_nm=torque_nm, torque_rate_nm_s=200
+        ),
+        motor=Motor(
+            stiffness_nm_per_rad=60,
+            damping_nm_s_per_rad=1.5,
+            velocity_gain_nm_s_per_rad=1.5,
+            response_time_s=0.01,
+            armature_kg_m2=0.005,
+        ),
+    )
+    return describe(file, backend="none", period_ns=round(PERIOD_S * 1e9), lease_ns=10**8, config_hash="0")
+
+
+def make_route(amplitude_m: float = AMPLITUDE_M, wavelength_m: float = WAVELENGTH_M) -> Route:
+    """A sine along x."""
+    return Route(sine_points(amplitude_m, wavelength_m, LENGTH_M))
+
+
+def make_pegs(route: Route) -> list[Obstacle]:
+    """Pegs at the inflections, on the side from which they push forward."""
+    pegs: list[Obstacle] = []
+    for k, s in enumerate(route.inflections_s_m()):
+        tangent = route.tangent_w(s)
+        left = np.array([-tangent[1], tangent[0]])
+        push = left if left[0] > 0 else -left
+        x, y = (route.position_w(s) - push * (BODY_RADIUS_M + CLEARANCE_M + PEG_RADIUS_M)).tolist()
+        pegs.append(
+            Obstacle(name=f"peg_{k}", shape="cylinder", position_w=(x, y, 0.1), radius_m=PEG_RADIUS_M, height_m=0.2)
+        )
+    return pegs
+
+
+@dataclass
+class Stage:
+    """Makes views of a body that lies on the route, with whatever is to be different."""
+
+    robot: Description
+    route: Route
+    pegs: list[Obstacle]
+    speed_m_s: float = 0.2
+    path_id: int = 0
+
+    def view(
+        self,
+        tick: int,
+        tail_s_m: float,
+        *,
+        world_age_ticks: int = 0,
+        world_tail_s_m: float | None = None,
+        turned: dict[int, float] | None = None,
+        torque_nm: float = 0.0,
+        contacts: list[WorldContact] | None = None,
+    ) -> View:
+        """turned: joint -> how far it is from where the route has it."""
+        axes = [joint.axis for joint in self.robot.joints]
+        segments = yaw_segments_m(axes, [link.length_m for link in self.robot.links])
+        lay = lay_chain(self.route, tail_s_m, segments)
+        angles = chain_angles(axes, lay.angles_rad)
+        for joint, by in (turned or {}).items():
+            angles[joint] += by
+        seen = lay if world_tail_s_m is None else lay_chain(self.route, world_tail_s_m, segments)
+        world = World(
+            tick=tick - world_age_ticks,
+            stamp_ns=0,
+            base_position_w=(*seen.tail_w, BODY_RADIUS_M),
+            base_orientation_wxyz=quaternion_from_yaw(seen.heading_rad),
+            base_confidence=1.0,
+            contacts=contacts or [],
+            obstacles=self.pegs,
+        )
+        count = len(axes)
+        joints = JointState(
+            tick=tick,
+            stamp_ns=0,
+            angle_rad=angles.tolist(),
+            velocity_rad_s=[0.0] * count,
+            torque_nm=[torque_nm] * count,
+            valid=[True] * count,
+            age_ns=[0] * count,
+        )
+        trajectory = Trajectory(
+            tick=0,
+            stamp_ns=0,
+            path_id=self.path_id,
+            path_w=[(x, y) for x, y in self.route.points_w.tolist()],
+            speed_m_s=self.speed_m_s,
+            push_points=[],
+            finished=False,
+        )
+        return View(
+            tick=tick, time_s=tick * PERIOD_S, period_s=PERIOD_S, joints=joints, world=world, trajectory=trajectory
+        )
+
+
+def make_stage(modules: int = 13, axes: tuple[Axis, ...] = ("yaw",), torque_nm: float = 7.0) -> Stage:
+    """A robot among pegs."""
+    route = make_route()
+    return Stage(make_robot(modules, axes, torque_nm), route, make_pegs(route))
+
+
+def nodes_of(stage: Stage, tail_s_m: float) -> np.ndarray:
+    """Nodes (2, n_nodes) of the body on the route."""
+    axes = [joint.axis for joint in stage.robot.joints]
+    segments = yaw_segments_m(axes, [link.length_m for link in stage.robot.links])
+    lay = lay_chain(stage.route, tail_s_m, segments)
+    return chain_nodes(lay.tail_w, lay.heading_rad, lay.angles_rad, np.array(segments))

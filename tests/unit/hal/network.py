@@ -1,0 +1,253 @@
+"""A real backend of first-order joints, a host that runs it in a thread, and a client in another, over real Zenoh."""
+
+import math
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import msgspec
+
+from snakesim_hal import keys
+from snakesim_hal.backend import Samples, SetPoints
+from snakesim_hal.client import Client, Commander
+from snakesim_hal.errors import BackendError
+from snakesim_hal.host import Host
+from snakesim_hal.messages import (
+    Answer,
+    Clock,
+    Description,
+    Fault,
+    JointState,
+    LifecycleRequest,
+    Message,
+    Mode,
+    Pose,
+    Status,
+)
+from snakesim_hal.robot import describe
+from snakesim_hal.scenario import RunConfig, config_hash
+from snakesim_hal.session import Link, Reader, Session, open_session
+
+LIMIT_S = 20.0
+
+
+def wait_until(happened: Callable[[], Any], what: str, limit_s: float = LIMIT_S) -> None:
+    """Until a condition holds; fails with its name when it does not in time."""
+    deadline = time.monotonic() + limit_s
+    while not happened():
+        assert time.monotonic() < deadline, f"not within {limit_s} s: {what}"
+        time.sleep(0.002)
+
+
+def free_endpoint() -> str:
+    """A loopback endpoint that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+class LagBackend:
+    """Joints that follow their set-points with a first-order lag. Neither mass nor contacts."""
+
+    class Settings(msgspec.Struct):
+        """None."""
+
+    def __init__(self, config: RunConfig, settings: Any = None) -> None:
+        self._config = config
+        count = config.robot.chain.modules
+        self._period_s = config.period_ns * 1e-9
+        self.angles = [0.0] * count
+        self._points = SetPoints([Mode.PASSIVE] * count, [0.0] * count, [0.0] * count)
+        self.enacted: list[SetPoints] = []
+        self.advanced = 0
+        self.fails_in: str | None = None  # sample, enact or advance
+        self.next_faults: list[Fault] = []
+
+    def describe(self) -> Description:
+        """From the robot file."""
+        config = self._config
+        return describe(
+            config.robot,
+            backend="lag",
+            period_ns=config.period_ns,
+            lease_ns=config.lease_ns,
+            config_hash=config_hash(config),
+        )
+
+    def sample(self, tick: int, stamp_ns: int) -> Samples:
+        """Joints every tick, the pose every fifth."""
+        self._fail("sample")
+        count = len(self.angles)
+        joints = JointState(
+            tick=tick,
+            stamp_ns=stamp_ns,
+            angle_rad=list(self.angles),
+            velocity_rad_s=[0.0] * count,
+            torque_nm=[0.0] * count,
+            valid=[True] * count,
+            age_ns=[0] * count,
+        )
+        if tick % 5:
+            return Samples(joints)
+        still = (0.0, 0.0, 0.0)
+        pose = Pose(
+            tick=tick,
+            stamp_ns=stamp_ns,
+            position_w=(0.001 * tick, 0.0, 0.0),
+            orientation_wxyz=(1.0, 0.0, 0.0, 0.0),
+            velocity_w=still,
+            angular_velocity_w=still,
+        )
+        return Samples(joints, {keys.POSE: pose})
+
+    def enact(self, set_points: SetPoints) -> None:
+        """From now on."""
+        self._fail("enact")
+        self._points = set_points
+        self.enacted.append(set_points)
+
+    def advance(self) -> None:
+        """One period."""
+        self._fail("advance")
+        self.advanced += 1
+        for i, (mode, target) in enumerate(zip(self._points.mode, self._points.target, strict=True)):
+            if mode == Mode.POSITION:
+                self.angles[i] += 0.5 * (target - self.angles[i])
+            elif mode == Mode.VELOCITY:
+                self.angles[i] += target * self._period_s
+
+    def faults(self) -> list[Fault]:
+        """Those that the test planted."""
+        found, self.next_faults = self.next_faults, []
+        return found
+
+    def close(self) -> None:
+        """Nothing to let go of."""
+
+    def _fail(self, where: str) -> None:
+        if self.fails_in == where:
+            raise BackendError(f"the test lets {where} fail")
+
+
+@dataclass
+class Follower:
+    """A control service: holds the lease and has every joint follow a sine of the robot's time."""
+
+    amplitude_rad: float = 0.2
+    name: str = "control"
+    ticks_seen: list[int] = field(default_factory=list[int])
+    armed_ticks: list[int] = field(default_factory=list[int])
+    stopped: threading.Event = field(default_factory=threading.Event)
+    silent: threading.Event = field(default_factory=threading.Event)  # hears everything, says nothing
+
+    def run(self, link: Link) -> None:
+        """Until stopped."""
+        with open_session(link) as session:
+            client = Client(session, self.name)
+            robot = client.description()
+            joints = client.subscribe(keys.JOINTS, JointState)
+            commander = Commander(client, robot)
+            client.announce()
+            for clock in client.ticks(silence_s=0.02):
+                if self.stopped.is_set():
+                    return
+                if clock is None or self.silent.is_set():
+                    continue
+                self._act(clock, client, commander, client.read(joints), robot)
+
+    def _act(
+        self, clock: Clock, client: Client, commander: Commander, joints: JointState | None, robot: Description
+    ) -> None:
+        self.ticks_seen.append(clock.tick)
+        if joints is not None and commander.holds(clock):
+            points = commander.stay(joints)
+            if clock.lifecycle == "armed":
+                self.armed_ticks.append(clock.tick)
+                wave = self.amplitude_rad * math.sin(2 * math.pi * clock.stamp_ns * 1e-9)
+                points = SetPoints(points.mode, [wave] * len(robot.joints), points.torque_limit_nm)
+            commander.send(clock.tick, points)
+        client.done(clock.tick)
+
+
+@dataclass
+class Running:
+    """A host at work."""
+
+    host: Host
+    backend: LagBackend
+    link: Link  # for clients
+    session: Session  # of somebody who watches
+    thread: threading.Thread
+    _statuses: Reader[Status]
+    _status: Status | None = None
+
+    @property
+    def status(self) -> Status:
+        """The newest that was published."""
+        found = self._statuses.drain()
+        self._status = found[-1] if found else self._status
+        wait_until(lambda: self._status is not None or self._refresh(), "a status")
+        assert self._status is not None
+        return self._status
+
+    def _refresh(self) -> bool:
+        found = self._statuses.drain()
+        self._status = found[-1] if found else self._status
+        return self._status is not None
+
+    def ask(self, key: str, request: Message) -> Answer:
+        """Ask the host; a no is an answer too."""
+        return self.session.ask_politely(key, request)
+
+    def lifecycle(self, action: Any) -> Answer:
+        """Arm (naming the robot rightly), disarm, clear or finish."""
+        return self.ask(keys.LIFECYCLE, LifecycleRequest(action=action, robot="worm", backend="lag"))
+
+    def arm(self) -> None:
+        """As soon as the host is ready."""
+        wait_until(lambda: self.status.ready_to_arm, f"ready to arm; last: {self.status.why}")
+        answer = self.lifecycle("arm")
+        assert answer.ok, answer.reason
+
+    def reaches(self, lifecycle: str) -> None:
+        """Wait for a state to be shown."""
+        wait_until(lambda: self.status.lifecycle == lifecycle, f"lifecycle {lifecycle}")
+
+    def ended(self) -> bool:
+        """Whether the host's loop is over."""
+        return not self.thread.is_alive()
+
+
+@contextmanager
+def running(config: RunConfig, **host: Any) -> Iterator[Running]:
+    """A host of a `LagBackend`, and somebody who watches it. The host is stopped at the end."""
+    endpoint, backend = free_endpoint(), LagBackend(config)
+    link = Link(endpoint, "lab/worm")
+    with open_session(Link(endpoint, "lab/worm", listen=True)) as own, open_session(link) as watcher:
+        made = Host(config, backend, own, **host)
+        thread = threading.Thread(target=made.run, name="host")
+        statuses = watcher.latched_reader(keys.STATUS, Status)
+        thread.start()
+        try:
+            yield Running(made, backend, link, watcher, thread, statuses)
+        finally:
+            made.stop()
+            thread.join(LIMIT_S)
+            assert not thread.is_alive(), "the host did not stop"
+
+
+@contextmanager
+def following(link: Link, follower: Follower) -> Iterator[Follower]:
+    """A follower in a thread of its own."""
+    thread = threading.Thread(target=follower.run, args=(link,), name=follower.name)
+    thread.start()
+    try:
+        yield follower
+    finally:
+        follower.stopped.set()
+        thread.join(LIMIT_S)
+        assert not thread.is_alive(), "the follower did not stop"

@@ -1,0 +1,448 @@
+"""A client and a host, in one process but over real Zenoh: ticks, leases, stops, and strangers on the network."""
+
+import itertools
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+
+from snakesim_hal import keys
+from snakesim_hal.backend import SetPoints
+from snakesim_hal.client import Client, Commander, Feed
+from snakesim_hal.codec import ENCODING_PREFIX, Decoder, encode, encoding_of
+from snakesim_hal.errors import RefusedError, StalledError
+from snakesim_hal.host import INBOX_LIMIT, Host
+from snakesim_hal.messages import (
+    Answer,
+    AppliedCommand,
+    Clock,
+    Description,
+    Done,
+    EstopRequest,
+    Fault,
+    JointCommand,
+    JointState,
+    LeaseRequest,
+    Mode,
+    Pose,
+)
+from snakesim_hal.session import Arrival, Link, open_session
+from tests.unit.hal.network import Follower, LagBackend, following, free_endpoint, running, wait_until
+from tests.unit.hal.rig import command, description, run_config, state
+
+
+@pytest.fixture(autouse=True)
+def quick_threads() -> Iterator[None]:
+    """Host and client share one interpreter here; in real life they are processes."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(0.0005)
+    yield
+    sys.setswitchinterval(before)
+
+
+def passive(points: SetPoints) -> bool:
+    return set(points.mode) == {Mode.PASSIVE}
+
+
+# --- lockstep --------------------------------------------------------------------------------------------------
+
+
+def lockstep_run(amplitude_rad: float, ticks: int) -> tuple[str, dict[str, Any]]:
+    with running(run_config(), max_ticks=ticks) as run, following(run.link, Follower(amplitude_rad)) as control:
+        run.arm()
+        wait_until(run.ended, "the end of the run")
+        tally, box = run.host.tally, run.host.black_box
+        assert (tally.ticks, tally.answered_ticks, box.ticks, run.backend.advanced) == (ticks,) * 4
+        assert control.armed_ticks == list(range(ticks)) or control.armed_ticks == list(range(1, ticks))
+        assert set(itertools.pairwise(control.ticks_seen)) <= {(0, 0)} | {(t, t + 1) for t in range(ticks)}
+        assert not run.host.authority.faults and not run.host.authority.rejected
+        assert run.host.authority.state == "disarmed" and passive(run.backend.enacted[-1])
+        return box.command_digest, box.arrays()
+
+
+def test_lockstep_answers_every_tick_and_repeats_itself() -> None:
+    first, columns = lockstep_run(0.2, 150)
+    again, _ = lockstep_run(0.2, 150)
+    other, _ = lockstep_run(0.21, 150)
+    assert first == again != other
+    assert columns["time_s"] == pytest.approx(0.01 * np.arange(150))
+    asked = 0.2 * np.sin(2 * np.pi * columns["time_s"])
+    assert np.abs(columns["target"][1:, 0] - asked[1:]).max() < 1e-9  # the answer to a tick counts in that tick
+    followed = columns["angle_rad"][1:, 0] - columns["angle_rad"][:-1, 0]
+    assert followed == pytest.approx(0.5 * (columns["target"][:-1, 0] - columns["angle_rad"][:-1, 0]))
+
+
+def test_time_stands_still_before_the_first_arming() -> None:
+    with running(run_config()) as run, following(run.link, Follower()) as control:
+        wait_until(lambda: len(control.ticks_seen) >= 3, "three showings of tick 0")
+        assert set(control.ticks_seen) == {0} and run.backend.advanced == 0 and not run.backend.enacted
+        assert run.status.tick == 0 and run.host.black_box.ticks == 0
+
+
+def test_a_slow_participant_is_waited_for() -> None:
+    """Guidance owes tick t only at the end of tick t + lag - 1, and no tick passes without it."""
+    config = run_config(services={"control": {}, "guidance": {"every_ticks": 5, "lag_ticks": 5}})
+    with running(config, max_ticks=40) as run, following(run.link, Follower()), open_session(run.link) as session:
+        client = Client(session, "guidance")
+        client.description()
+        client.announce()
+        newest: dict[int, int] = {}
+        wait = iter(client.ticks(silence_s=0.05))
+        client.done(next(clock.tick for clock in wait if clock is not None))
+        run.arm()
+        due = 5
+        for clock in wait:
+            if clock is not None:
+                newest[clock.tick] = clock.newest["guidance"]
+                if clock.tick == due + 4:  # at the last moment
+                    assert run.host.black_box.ticks <= due + 4
+                    client.done(due)
+                    due += 5
+            if run.ended():
+                break
+        assert run.host.black_box.ticks == 40 and not run.host.authority.faults
+        assert all(counted == max(tick - 5, 0) // 5 * 5 for tick, counted in newest.items())
+
+
+def test_a_client_that_falls_silent_is_a_stall_then_an_expired_lease_and_the_joints_are_damped() -> None:
+    config = run_config(stall_limit_s=0.2)
+    with running(config, end_after_fault_s=0.1) as run, following(run.link, Follower()) as control:
+        run.arm()
+        wait_until(lambda: len(control.armed_ticks) > 20, "twenty ticks")
+        control.silent.set()
+        wait_until(run.ended, "the end of the run")
+        stalled, expired = run.host.authority.faults
+        assert stalled.what == "service_stalled" and "control owes tick" in stalled.cause
+        assert expired.what == "lease_expired" and expired.cause.startswith("lease of control expired")
+        assert expired.tick - stalled.tick in (4, 5, 6)  # one term of 50 ms in the robot's time
+        assert run.host.authority.state == "fault"
+        after = run.backend.enacted[-3:]
+        assert all(p.mode == [Mode.VELOCITY] * 3 and p.target == [0.0] * 3 for p in after)
+
+
+def test_a_client_that_leaves_is_named_and_the_robot_can_be_armed_again_after_clear() -> None:
+    with running(run_config()) as run:
+        with following(run.link, Follower()) as control:
+            run.arm()
+            wait_until(lambda: len(control.armed_ticks) > 5, "five ticks")
+        run.reaches("fault")
+        faults = {fault.what: fault.cause for fault in run.status.faults}
+        assert "control is gone" in faults["service_lost"] and "lease of control" in faults["lease_expired"]
+        assert not run.lifecycle("arm").ok
+        assert run.lifecycle("clear").ok
+        with following(run.link, Follower()) as control:
+            run.arm()
+            wait_until(lambda: len(control.armed_ticks) > 5, "five more ticks")
+            assert run.status.lifecycle == "armed" and not run.status.faults
+
+
+# --- stops and refusals ----------------------------------------------------------------------------------------
+
+
+def test_an_estop_by_anybody_stops_the_robot_until_cleared_and_armed() -> None:
+    with running(run_config(pace="realtime")) as run, following(run.link, Follower()) as control:
+        run.arm()
+        wait_until(lambda: len(control.armed_ticks) > 5, "five ticks")
+        answer = run.ask(keys.ESTOP, EstopRequest(who="passer-by"))
+        assert answer.ok and answer.lifecycle == "estop"
+        at = len(run.backend.enacted)
+        wait_until(lambda: len(run.backend.enacted) > at + 5, "five ticks more")
+        assert all(passive(points) for points in run.backend.enacted[at + 1 :])
+        assert "passer-by" in run.status.why and run.status.faults[-1].what == "estop"
+        assert "must be disarmed" in run.lifecycle("arm").reason
+        assert run.lifecycle("clear").lifecycle == "disarmed"
+        run.arm()
+        assert run.lifecycle("finish").ok
+        wait_until(run.ended, "the end of the run")
+        assert passive(run.backend.enacted[-1])
+
+
+def test_a_second_holder_is_refused_with_a_typed_answer_and_a_higher_priority_is_not() -> None:
+    with running(run_config(pace="realtime")) as run, following(run.link, Follower()) as control:
+        run.arm()
+        request = LeaseRequest(action="acquire", holder="teleop")
+        answer = run.ask(keys.LEASE, request)
+        assert not answer.ok and answer.reason.startswith("held by control (epoch 1, priority 100)")
+        assert answer.epoch == 1 and answer.lifecycle == "armed"
+        with pytest.raises(RefusedError, match="held by control"):
+            run.session.ask(keys.LEASE, request)
+        wait_until(lambda: len(control.armed_ticks) > 5, "the robot going on undisturbed")
+        answer = run.ask(keys.LEASE, LeaseRequest(action="acquire", holder="teleop", priority=200))
+        assert answer.ok and answer.lifecycle == "disarmed"
+        at = len(run.backend.enacted)
+        late = command(run.host.description, 0.2, lease_epoch=1, sequence=10**6)  # the old holder has not heard yet
+        run.session.publisher(keys.JOINT_COMMAND, JointCommand, lossless=True).put(late)
+        refused = run.host.authority.rejected
+        wait_until(lambda: refused["wrong_epoch"] + refused["no_lease"] > 0, "the old holder's command refused")
+        wait_until(lambda: len(run.backend.enacted) > at + 3, "three ticks")
+        assert all(passive(points) for points in run.backend.enacted[at + 1 :])
+
+
+def test_arming_waits_for_everybody_and_says_for_whom() -> None:
+    with running(run_config()) as run:
+        assert run.status.waiting_for == ["control"] and "waiting for control" in run.status.why
+        answer = run.lifecycle("arm")
+        assert not answer.ok and answer.reason == "waiting for control"
+        with following(run.link, Follower()):
+            run.arm()
+        assert run.status.alive == ["control"] or run.host.authority.faults
+
+
+@pytest.mark.parametrize("where", ["sample", "enact", "advance"])
+def test_a_backend_that_fails_ends_the_run_with_its_words(where: str) -> None:
+    with running(run_config()) as run, following(run.link, Follower()) as control:
+        run.arm()
+        wait_until(lambda: len(control.armed_ticks) > 3, "three ticks")
+        run.backend.fails_in = where
+        wait_until(run.ended, "the end of the run")
+        (fault,) = (f for f in run.host.authority.faults if f.what == "backend_failed")
+        assert fault.cause == f"the test lets {where} fail"
+        assert run.host.authority.state == "fault"
+        if where != "enact":  # the joints were told to be safe even so
+            assert run.backend.enacted[-1].mode == [Mode.VELOCITY] * 3
+
+
+def test_a_fault_of_the_backend_stops_the_robot() -> None:
+    with running(run_config(), end_after_fault_s=0.05) as run, following(run.link, Follower()) as control:
+        run.arm()
+        wait_until(lambda: len(control.armed_ticks) > 3, "three ticks")
+        run.backend.next_faults = [Fault(tick=1, what="hot", cause="joint_2 is at 90 degrees", joint="joint_2")]
+        wait_until(run.ended, "the end of the run")
+        assert run.host.authority.faults[0].joint == "joint_2"
+        assert run.backend.enacted[-1].mode == [Mode.VELOCITY] * 3
+
+
+# --- strangers -------------------------------------------------------------------------------------------------
+
+
+def test_nothing_that_is_put_on_the_network_ends_the_host_and_all_of_it_is_counted() -> None:
+    garbage = [b"", b"\xff" * 50, b"\x91" * 100_000, encode(description())]
+    foreign = [
+        "zenoh/bytes",
+        ENCODING_PREFIX + "Gone/1",
+        ENCODING_PREFIX + "JointCommand/9",
+        ENCODING_PREFIX + "Done/9",
+    ]
+    own = [encoding_of(JointCommand), encoding_of(Done), encoding_of(LeaseRequest), encoding_of(EstopRequest)]
+    samples = [keys.JOINT_COMMAND, keys.done("control"), keys.done("stranger"), "actuator/*", "hal/done/*", "**"]
+    with running(run_config()) as run, following(run.link, Follower()) as control:
+        run.arm()
+        put, get = run.session._zenoh.put, run.session._zenoh.get  # a stranger does not keep to our session
+        for key, payload, encoding in itertools.product(samples, garbage, own + foreign):
+            put(key, payload, encoding=encoding, congestion_control=zenoh.CongestionControl.BLOCK)
+        counted = run.host.authority.rejected
+        # `**` reaches the host twice, by its two subscriptions.
+        wait_until(lambda: sum(counted.values()) >= 7 * 32, "every sample counted")
+        assert set(counted) == {"malformed", "unknown_message", "unknown_version"}
+        for key in (keys.LEASE, keys.LIFECYCLE, keys.ESTOP):
+            for payload, encoding in itertools.product(garbage, own[2:] + foreign[:2]):
+                (reply,) = get(key, payload=payload, encoding=encoding, timeout=5.0)
+                assert reply.ok is not None
+                answer = Decoder(Answer).decode(reply.ok.payload.to_bytes(), str(reply.ok.encoding))
+                assert not answer.ok and answer.lifecycle == "armed"
+        for pattern in ("hal/*", "**"):  # a tool that looks what is there
+            assert all(reply.ok is not None for reply in get(pattern, timeout=1.0))
+        seen = len(control.armed_ticks)
+        wait_until(lambda: len(control.armed_ticks) > seen + 5, "the robot going on undisturbed")
+        assert run.host.authority.state == "armed" and not run.host.authority.faults
+        wait_until(lambda: run.status.commands_rejected == dict(counted), "the counts in the status")
+
+
+def test_a_strangers_command_neither_moves_the_robot_nor_passes_for_the_holders_answer() -> None:
+    """In lockstep a tick ends when the holder has answered; a refused command of somebody else is no answer."""
+    endpoint = free_endpoint()
+    with open_session(Link(endpoint, "worm", listen=True)) as session:
+        host = Host(run_config(), LagBackend(run_config()), session)
+        host.authority.observe(state(host.description))
+        host.authority.on_lease(LeaseRequest(action="acquire", holder="control"), 0)
+        for epoch, done_tick in ((0, -1), (7, -1), (1, 0)):
+            sent = command(host.description, 0.1, lease_epoch=epoch)
+            arrival = Arrival(keys.JOINT_COMMAND, encode(sent), encoding_of(JointCommand), time.monotonic_ns())
+            host._handle(arrival)
+            assert host.participants["control"].done_tick == done_tick
+        assert host.authority.rejected["wrong_epoch"] == 2
+
+
+def test_a_flood_of_commands_does_not_keep_an_estop_out() -> None:
+    endpoint = free_endpoint()
+    config = run_config(pace="realtime")
+    with (
+        open_session(Link(endpoint, "worm", listen=True)) as own,
+        open_session(Link(endpoint, "worm")) as stranger,
+    ):
+        host = Host(config, LagBackend(config), own)
+        publisher = stranger.publisher(keys.JOINT_COMMAND, JointCommand, lossless=True)
+        for sequence in range(INBOX_LIMIT + 500):
+            publisher.put(command(host.description, sequence=sequence))
+        wait_until(lambda: host.tally.inbox_dropped >= 400, "a full inbox")
+        answers: list[Any] = []
+        request = EstopRequest(who="a person")
+        asking = threading.Thread(target=lambda: answers.append(stranger.ask_politely(keys.ESTOP, request, 10.0)))
+        asking.start()
+        wait_until(lambda: host._inbox.qsize() > INBOX_LIMIT, "the estop in the inbox")
+        thread = threading.Thread(target=host.run)
+        thread.start()
+        asking.join(15.0)
+        host.stop()
+        thread.join(15.0)
+        assert answers[0].ok and answers[0].lifecycle == "estop"
+        assert host.authority.rejected["no_lease"] >= INBOX_LIMIT - 1  # the host's own token stands in the inbox too
+
+
+# --- realtime and free -----------------------------------------------------------------------------------------
+
+
+def test_realtime_keeps_its_deadlines_on_average() -> None:
+    config = run_config(pace="realtime", rate_hz=50.0)
+    with running(config, max_ticks=50) as run, following(run.link, Follower()):
+        run.arm()
+        wait_until(run.ended, "the end of the run")
+        assert run.host.wall_s == pytest.approx(1.0, rel=0.1)
+        assert run.host.tally.ticks == 50 and run.host.tally.overruns <= 10
+        assert run.host.tally.answered_ticks >= 35
+        assert not run.host.authority.faults
+        latency = np.array(run.host.tally.state_to_command_us)
+        assert len(latency) >= 35 and 0 < np.median(latency) < 20_000
+
+
+def test_realtime_goes_on_with_the_last_command_for_one_lease_term_only() -> None:
+    config = run_config(pace="realtime")
+    with running(config, end_after_fault_s=0.05) as run, following(run.link, Follower()) as control:
+        run.arm()
+        wait_until(lambda: len(control.armed_ticks) > 10, "ten ticks")
+        control.silent.set()
+        began = time.monotonic()
+        wait_until(run.ended, "the end of the run")
+        assert time.monotonic() - began < 2.0
+        assert [fault.what for fault in run.host.authority.faults] == ["lease_expired"]
+        assert run.backend.enacted[-2].mode == [Mode.VELOCITY] * 3
+
+
+def test_free_waits_for_nobody() -> None:
+    with running(run_config(pace="free")) as run:
+        wait_until(lambda: run.backend.advanced > 200, "two hundred ticks without anybody")
+        assert run.host.authority.state == "disarmed" and all(passive(points) for points in run.backend.enacted)
+
+
+# --- what readers see ------------------------------------------------------------------------------------------
+
+
+def test_somebody_who_comes_late_gets_description_status_and_what_is_applied() -> None:
+    with running(run_config()) as run, following(run.link, Follower()) as control:
+        run.arm()
+        wait_until(lambda: len(control.armed_ticks) > 5, "five ticks")
+        with open_session(run.link) as late:
+            descriptions = late.latched_reader(keys.DESCRIPTION, Description)
+            found: list[Description] = []
+            wait_until(lambda: found or found.extend(descriptions.drain()), "the description")
+            assert found == [run.host.description]
+            applied, poses = late.reader(keys.APPLIED, AppliedCommand), late.reader(keys.POSE, Pose)
+            commands: list[AppliedCommand] = []
+            wait_until(lambda: commands.extend(applied.drain()) or len(commands) > 3, "applied commands")
+            assert all(c.sequence is not None and c.mode == [Mode.POSITION] * 3 for c in commands)
+            seen: list[Pose] = []
+            wait_until(lambda: seen.extend(poses.drain()) or seen, "a pose")
+            assert all(pose.tick % 5 == 0 for pose in seen)
+
+
+# --- the client alone ------------------------------------------------------------------------------------------
+
+
+class Listing:
+    """A reader that has what the test puts in."""
+
+    def __init__(self) -> None:
+        self.arrived: list[JointState] = []
+
+    def drain(self) -> list[JointState]:
+        taken, self.arrived = self.arrived, []
+        return taken
+
+
+def test_a_feed_finds_samples_by_their_tick_and_forgets_old_ones() -> None:
+    robot, reader = description(), Listing()
+    feed: Feed[JointState] = Feed(reader, keys.JOINTS)  # pyright: ignore[reportArgumentType]
+    assert feed.newest() is None and feed.at(0) is None
+    reader.arrived = [state(robot, 0.1 * tick, tick=tick) for tick in range(100)]
+    feed.take_in()
+    newest, kept = feed.newest(), feed.at(99)
+    assert newest is not None and newest.tick == 99 and kept is newest
+    assert feed.at(50) is None and feed.at(90) is not None
+    reader.arrived = [state(robot, 0.0, tick=90)]  # shown again: it came last
+    feed.take_in()
+    newest = feed.newest()
+    assert newest is not None and newest.tick == 90
+    feed.clear()
+    assert feed.newest() is None
+
+
+def clock(tick: int, lifecycle: Any = "armed", **newest: int) -> Clock:
+    return Clock(
+        tick=tick,
+        stamp_ns=tick * 10_000_000,
+        period_ns=10_000_000,
+        pace="lockstep",
+        lifecycle=lifecycle,
+        arming=1,
+        lease_epoch=1,
+        newest={key.replace("__", "/"): value for key, value in newest.items()},
+    )
+
+
+def test_a_client_reads_what_the_clock_names_waits_for_it_and_reports_what_never_comes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    endpoint, robot = free_endpoint(), description()
+    monkeypatch.setattr("snakesim_hal.client.MISSING_LIMIT_S", 0.1)
+    with open_session(Link(endpoint, "worm", listen=True)) as hal, open_session(Link(endpoint, "worm")) as session:
+        client = Client(session, "control")
+        feed = client.subscribe(keys.JOINTS, JointState)
+        clocks = hal.publisher(keys.CLOCK, Clock, lossless=True)
+        joints = hal.publisher(keys.JOINTS, JointState, lossless=True)
+        wait_until(lambda: clocks.heard() and joints.heard(), "the client's subscriptions")
+        ticks = iter(client.ticks(silence_s=5.0))
+        for tick in (3, 4):
+            joints.put(state(robot, tick=tick))
+        clocks.put(clock(5, sensor__joints=3))
+        assert client.read(feed) is None  # no clock yet
+        assert next(ticks) == clock(5, sensor__joints=3)
+        found = client.read(feed)
+        assert found is not None and found.tick == 3  # what is named, not what is newest
+        assert client.age_s(found) == pytest.approx(0.05)
+        clocks.put(clock(6, sensor__joints=6))
+        next(ticks)
+        late = threading.Timer(0.03, lambda: joints.put(state(robot, tick=6)))
+        late.start()
+        found = client.read(feed)
+        assert found is not None and found.tick == 6
+        clocks.put(clock(7, sensor__joints=7))
+        next(ticks)
+        with pytest.raises(StalledError, match="sensor/joints of tick 7 was promised at tick 7 and never came"):
+            client.read(feed)
+        hal._zenoh.put(keys.CLOCK, b"garbage", encoding="zenoh/bytes")
+        clocks.put(clock(0, "disarmed", sensor__joints=0))  # the HAL started over
+        again = next(ticks)
+        assert again is not None and again.tick == 0 and client.read(feed) is None
+        wait_until(lambda: session.rejected == {"unknown_message": 1}, "the garbage counted")
+
+
+def test_a_commander_asks_for_a_free_lease_and_gives_up_one_that_passed_on() -> None:
+    with running(run_config(pace="realtime", services={})) as run, open_session(run.link) as session:
+        client = Client(session, "pilot")
+        commander = Commander(client, client.description())
+        other = LeaseRequest(action="acquire", holder="teleop", priority=200)
+        assert run.ask(keys.LEASE, other).ok
+        ticks = (found for found in client.ticks(silence_s=1.0) if found is not None)
+        held = [commander.holds(next(ticks)) for _ in range(2)]
+        assert held[0] is False and commander.refusal is not None and "held by teleop" in commander.refusal
+        deadline = time.monotonic() + 10.0
+        while not commander.holds(next(ticks)):  # teleop's lease runs out
+            assert time.monotonic() < deadline
+        assert commander.refusal is None and run.host.authority.lease.holder == "pilot"
+        assert run.ask(keys.LEASE, other).ok
+        wait_until(lambda: not commander.holds(next(ticks)), "the lease seen to have passed on")

@@ -1,0 +1,148 @@
+"""Plugins by name and by file, their settings, and the rules of who may import whom."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.files import FileStruct
+from snakesim_hal.plugins import BACKENDS, CONTROLLERS, SERVICES, find_plugin, installed, plugin_settings
+
+REPOSITORY = Path(__file__).parents[3]
+WAVE = """\
+import msgspec
+
+class Wave:
+    class Settings(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
+        gain: float = 1.0
+
+    def __init__(self, robot, settings):
+        self.settings = settings
+"""
+
+
+@pytest.mark.parametrize("group", [BACKENDS, CONTROLLERS, SERVICES])
+def test_everything_installed_loads_and_states_its_settings(group: str) -> None:
+    assert installed(group) == sorted(set(installed(group))) != []
+    for name in installed(group):
+        plugin: Any = find_plugin(group, name)
+        assert callable(plugin)
+        if group != SERVICES:
+            assert issubclass(getattr(plugin, "Settings"), msgspec.Struct), name  # noqa: B009
+
+
+def test_an_unknown_name_says_what_is_installed_and_how_one_is_added() -> None:
+    with pytest.raises(ConfigError) as caught:
+        find_plugin(CONTROLLERS, "wiggle")
+    said = str(caught.value)
+    assert said.startswith("no controller called 'wiggle' is installed; installed are ")
+    assert all(name in said for name in installed(CONTROLLERS)) and "'snakesim.controllers'" in said
+
+
+def test_a_class_of_a_file_is_a_plugin(tmp_path: Path) -> None:
+    (tmp_path / "wave.py").write_text(WAVE)
+    wave = find_plugin(CONTROLLERS, f"{tmp_path}/wave.py:Wave")
+    assert wave.__name__ == "Wave" and plugin_settings(wave, {"gain": 2.0}, "a.toml", "c").gain == 2.0
+
+
+BROKEN = {
+    "no such class": (WAVE, "Wove", "AttributeError"),
+    "not Python": ("class Wave(:\n", "Wave", "SyntaxError"),
+    "import that fails": ("import no_such_module_anywhere\n", "Wave", "no_such_module_anywhere"),
+    "name that is not there": ("x = undefined_thing\n", "Wave", "undefined_thing"),
+}
+
+
+@pytest.mark.parametrize("broken", BROKEN)
+def test_a_file_that_cannot_be_loaded_is_one_error(broken: str, tmp_path: Path) -> None:
+    text, name, words = BROKEN[broken]
+    (tmp_path / "wave.py").write_text(text)
+    with pytest.raises(ConfigError, match=words) as caught:
+        find_plugin(CONTROLLERS, f"{tmp_path}/wave.py:{name}")
+    assert "controller '" in str(caught.value)
+
+
+def test_an_absent_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"there is no file .*none\.py"):
+        find_plugin(BACKENDS, f"{tmp_path}/none.py:None")
+
+
+class Plugin:
+    class Settings(FileStruct, frozen=True):
+        gain: float = 1.0
+
+
+def test_settings_are_checked_by_the_plugins_own_struct_and_name_file_or_flag() -> None:
+    assert plugin_settings(Plugin, {}, "a.toml", "controllers.p").gain == 1.0
+    with pytest.raises(ConfigError, match=r"^a\.toml: unknown field `controllers\.p\.gian`; did you mean `gain`\?"):
+        plugin_settings(Plugin, {"gian": 1}, "a.toml", "controllers.p")
+    origin = {"controllers.p.gain": "--set control.gain=x"}
+    with pytest.raises(ConfigError, match=r"^--set control\.gain=x: `controllers\.p\.gain` = 'x'"):
+        plugin_settings(Plugin, {"gain": "x"}, "a.toml", "controllers.p", origin)
+
+
+def test_a_plugin_without_settings_is_told_to_state_them() -> None:
+    for bad in (object(), type("Bare", (), {}), type("Odd", (), {"Settings": dict})):
+        with pytest.raises(ConfigError, match="has no `Settings` Struct"):
+            plugin_settings(bad, {}, "a.toml", "x")
+
+
+# --- who may import whom ---------------------------------------------------------------------------------------
+
+LINTER = Path(sys.executable).parent / "lint-imports"
+needs_linter = pytest.mark.skipif(not LINTER.is_file(), reason="import-linter is not installed in this environment")
+
+
+def lint(folder: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [str(LINTER), "--config", "pyproject.toml", "--no-cache"],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+
+
+@pytest.fixture(scope="module")
+def copy_of_the_packages(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("packages")
+    shutil.copy(REPOSITORY / "pyproject.toml", folder)
+    for package in REPOSITORY.glob("snakesim_*"):
+        if package.is_dir():
+            shutil.copytree(package, folder / package.name, ignore=shutil.ignore_patterns("__pycache__"))
+    return folder
+
+
+@needs_linter
+def test_the_packages_keep_the_import_rules(copy_of_the_packages: Path) -> None:
+    done = lint(copy_of_the_packages)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@needs_linter
+@pytest.mark.parametrize(
+    ("package", "line", "contract"),
+    [
+        ("snakesim_gnc", "import mujoco", "Only the simulator runs MuJoCo"),
+        ("snakesim_gnc", "import snakesim_sim_backend", "know nothing of each other"),
+        ("snakesim_hal", "import snakesim_gnc", "Everything stands on the HAL"),
+        ("snakesim_operator", "import zenoh", "Only the HAL talks Zenoh"),
+        ("snakesim_gnc", "import can", "Only the CAN backend touches CAN"),
+    ],
+)
+def test_a_forbidden_import_is_found(copy_of_the_packages: Path, package: str, line: str, contract: str) -> None:
+    planted = copy_of_the_packages / package / "planted.py"
+    planted.write_text(f'"""Breaks a rule."""\n\n{line}\n')
+    try:
+        done = lint(copy_of_the_packages)
+    finally:
+        planted.unlink()
+    assert done.returncode != 0
+    broken = next(row for row in done.stdout.splitlines() if contract in row)
+    assert "BROKEN" in broken and "planted" in done.stdout, done.stdout

@@ -1,0 +1,219 @@
+"""The Zenoh session over real loopback links: latched values, queries, liveliness, and robots kept apart."""
+
+import socket
+import time
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from snakesim_hal import keys
+from snakesim_hal.codec import ENCODING_PREFIX, encode
+from snakesim_hal.errors import ConfigError, NotConnectedError, RefusedError
+from snakesim_hal.messages import Answer, Done, EstopRequest, JointState, LeaseRequest
+from snakesim_hal.session import Arrival, Link, Question, open_router, open_session
+from tests.unit.hal.network import free_endpoint, wait_until
+from tests.unit.hal.rig import description, state
+
+ROBOT = description()
+
+
+def test_a_latched_value_reaches_readers_that_come_later_and_only_the_newest() -> None:
+    endpoint = free_endpoint()
+    with open_session(Link(endpoint, "worm", listen=True)) as hal:
+        publisher = hal.latched_publisher(keys.JOINTS, JointState)
+        for tick in range(3):
+            publisher.put(state(ROBOT, tick=tick))
+        with open_session(Link(endpoint, "worm")) as late:
+            reader, arrived = late.latched_reader(keys.JOINTS, JointState), list[Arrival]()
+            late.on_latched_arrival(keys.JOINTS, arrived.append)
+            found: list[JointState] = []
+            wait_until(lambda: found.extend(reader.drain()) or found, "the latched value")
+            wait_until(lambda: arrived, "the latched arrival")
+            assert [joints.tick for joints in found] == [2] and arrived[0].key == keys.JOINTS
+            publisher.put(state(ROBOT, tick=3))
+            wait_until(lambda: found.extend(reader.drain()) or len(found) > 1, "the next value")
+            assert [joints.tick for joints in found] == [2, 3]
+
+
+def test_a_reader_that_comes_first_gets_the_value_when_the_publisher_comes() -> None:
+    endpoint = free_endpoint()
+    with open_session(Link(endpoint, "worm", listen=True)), open_session(Link(endpoint, "worm")) as early:
+        reader = early.latched_reader(keys.JOINTS, JointState)
+        with open_session(Link(endpoint, "worm")) as hal:
+            hal.latched_publisher(keys.JOINTS, JointState).put(state(ROBOT, tick=7))
+            found: list[JointState] = []
+            wait_until(lambda: found.extend(reader.drain()) or found, "the value")
+            assert found[0].tick == 7
+
+
+def test_a_stream_is_not_given_to_those_who_come_late() -> None:
+    endpoint = free_endpoint()
+    with open_session(Link(endpoint, "worm", listen=True)) as hal:
+        publisher = hal.publisher(keys.JOINTS, JointState)
+        publisher.put(state(ROBOT, tick=1))
+        with open_session(Link(endpoint, "worm")) as late:
+            reader = late.reader(keys.JOINTS, JointState)
+            wait_until(publisher.heard, "the subscription")
+            publisher.put(state(ROBOT, tick=2))
+            found: list[JointState] = []
+            wait_until(lambda: found.extend(reader.drain()) or found, "the sample")
+            assert [joints.tick for joints in found] == [2]
+
+
+def test_a_reader_keeps_the_newest_and_counts_what_it_cannot_take() -> None:
+    endpoint = free_endpoint()
+    with open_session(Link(endpoint, "worm", listen=True)) as hal, open_session(Link(endpoint, "worm")) as session:
+        reader = session.reader(keys.JOINTS, JointState, depth=4)
+        publisher = hal.publisher(keys.JOINTS, JointState, lossless=True)
+        wait_until(publisher.heard, "the subscription")
+        arrived: list[Arrival] = []
+        session.on_arrival(keys.done("end"), arrived.append)
+        end = hal.publisher(keys.done("end"), Done, lossless=True)
+        wait_until(end.heard, "the second subscription")
+        for tick in range(20):
+            publisher.put(state(ROBOT, tick=tick))
+        end.put(Done(tick=0))
+        wait_until(lambda: arrived, "the last sample")
+        assert [joints.tick for joints in reader.drain()] == [16, 17, 18, 19] and reader.drain() == []
+        good = encode(state(ROBOT, tick=20))
+        bad = [
+            (good, ENCODING_PREFIX + "JointState/2"),
+            (good, "zenoh/bytes"),
+            (good[:-3], ENCODING_PREFIX + "JointState/1"),
+        ]
+        for payload, encoding in [*bad, (good, ENCODING_PREFIX + "JointState/1")]:
+            hal._zenoh.put(keys.JOINTS, payload, encoding=encoding, congestion_control=zenoh.CongestionControl.BLOCK)
+        found: list[JointState] = []
+        wait_until(lambda: found.extend(reader.drain()) or found, "the good one")
+        assert [joints.tick for joints in found] == [20]
+        assert session.rejected == {"unknown_version": 1, "unknown_message": 1, "malformed": 1}
+
+
+def test_robots_of_two_namespaces_do_not_hear_each_other_and_a_tool_hears_both() -> None:
+    endpoint = free_endpoint()
+    with (
+        open_session(Link(endpoint, "lab/a", listen=True)) as a,
+        open_session(Link(endpoint, "lab/b")) as b,
+        open_session(Link(endpoint)) as tool,
+    ):
+        heard: dict[str, list[Arrival]] = {"a": [], "b": [], "tool": []}
+        a.on_arrival(keys.DONE_ALL, heard["a"].append)
+        b.on_arrival(keys.DONE_ALL, heard["b"].append)
+        tool.on_arrival(f"**/{keys.DONE_ALL}", heard["tool"].append)
+        for session, name in ((a, "a"), (b, "b")):
+            publisher = session.publisher(keys.done(name), Done, lossless=True)
+            wait_until(publisher.heard, "a subscription")
+            publisher.put(Done(tick=1))
+        wait_until(lambda: len(heard["tool"]) == 2 and heard["a"] and heard["b"], "everybody's sample")
+        assert [arrival.key for arrival in heard["a"]] == ["hal/done/a"]
+        assert [arrival.key for arrival in heard["b"]] == ["hal/done/b"]
+        split = [keys.split_namespace(arrival.key) for arrival in heard["tool"]]
+        assert split == [("lab/a", "hal/done/a"), ("lab/b", "hal/done/b")]
+
+
+def test_questions_are_answered_and_a_no_is_raised_or_returned() -> None:
+    endpoint = free_endpoint()
+    request = LeaseRequest(action="acquire", holder="control")
+
+    def answer(question: Question) -> None:
+        assert question.payload == encode(request) and question.encoding.endswith("LeaseRequest/1")
+        question.reply(Answer(ok=False, reason="held by teleop", epoch=3, lifecycle="armed"))
+
+    with open_session(Link(endpoint, "worm", listen=True)) as hal, open_session(Link(endpoint, "worm")) as session:
+        hal.on_question(keys.LEASE, answer)
+        wanted = Answer(ok=False, reason="held by teleop", epoch=3, lifecycle="armed")
+        assert session.ask_politely(keys.LEASE, request) == wanted
+        with pytest.raises(RefusedError, match="held by teleop"):
+            session.ask(keys.LEASE, request)
+
+
+def test_a_question_by_pattern_is_about_the_key_that_was_declared() -> None:
+    endpoint = free_endpoint()
+    questions: list[Question] = []
+    with open_session(Link(endpoint, "worm", listen=True)) as hal, open_session(Link(endpoint)) as tool:
+        hal.on_question(keys.ESTOP, questions.append)
+        for pattern in ("**", "worm/hal/*"):
+            replies = tool._zenoh.get(pattern, timeout=5.0)
+            wait_until(lambda: questions, "the question")
+            assert questions[0].key == keys.ESTOP and questions[0].payload == b""
+            questions.pop().reply(Answer(ok=True, reason=""))
+            (reply,) = replies
+            assert reply.ok is not None and str(reply.ok.key_expr) == "worm/hal/estop"
+
+
+def test_an_answer_to_somebody_who_has_gone_hurts_nobody() -> None:
+    endpoint = free_endpoint()
+    questions: list[Question] = []
+    with open_session(Link(endpoint, "worm", listen=True)) as hal:
+        hal.on_question(keys.ESTOP, questions.append)
+        with open_session(Link(endpoint, "worm")) as session, pytest.raises(NotConnectedError):
+            session.ask(keys.ESTOP, EstopRequest(who="a person"), timeout_s=0.1)
+        wait_until(lambda: questions, "the question")
+        questions[0].reply(Answer(ok=True, reason=""))
+
+
+def test_nobody_there_is_told_soon() -> None:
+    endpoint = free_endpoint()
+    began = time.monotonic()
+    with (
+        pytest.raises(NotConnectedError, match=f"nobody listens on {endpoint}"),
+        open_session(Link(endpoint, "worm"), connect_timeout_s=0.2),
+    ):
+        pass
+    with (
+        open_session(Link(endpoint, "worm", listen=True)),
+        open_session(Link(endpoint, "worm")) as session,
+        pytest.raises(NotConnectedError, match="nobody answers on hal/lease"),
+    ):
+        session.ask(keys.LEASE, LeaseRequest(action="acquire", holder="control"), timeout_s=0.2)
+    assert time.monotonic() - began < 5.0
+    with pytest.raises(ConnectionError):
+        raise NotConnectedError("it is the matching builtin, too")
+
+
+def test_a_port_that_is_taken_is_named() -> None:
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        endpoint = f"tcp/127.0.0.1:{other.getsockname()[1]}"
+        with (
+            pytest.raises(NotConnectedError, match=f"cannot listen on {endpoint}.*--endpoint"),
+            open_session(Link(endpoint, "worm", listen=True)),
+        ):
+            pass
+
+
+def test_liveliness_shows_who_comes_who_was_there_and_who_goes() -> None:
+    endpoint = free_endpoint()
+    seen: list[tuple[str, bool]] = []
+    with open_session(Link(endpoint, "worm", listen=True)) as hal:
+        with open_session(Link(endpoint, "worm")) as first:
+            first.declare_alive("guidance")
+            with open_session(Link(endpoint, "worm")) as second:
+                second.declare_alive("control")
+                hal.on_alive(lambda key, present: seen.append((keys.service_of(key), present)))
+                wait_until(lambda: len(seen) >= 2, "both tokens")
+                assert set(seen) == {("guidance", True), ("control", True)}
+            wait_until(lambda: ("control", False) in seen, "control's going")
+            assert ("guidance", False) not in seen
+        wait_until(lambda: ("guidance", False) in seen, "guidance's going")
+
+
+def test_a_router_wants_a_file_that_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "router.json5"
+    for text, words in (('{mode: "client"}', 'must be "router"'), ("{mode: ", "Zenoh refuses it")):
+        path.write_text(text)
+        with pytest.raises(ConfigError, match=words), open_router(path):
+            pass
+    endpoint = free_endpoint()
+    path.write_text(
+        f'{{mode: "router", listen: {{endpoints: ["{endpoint}"]}}, scouting: {{multicast: {{enabled: false}}}}}}'
+    )
+    with open_router(path), open_session(Link(endpoint, "a")) as one, open_session(Link(endpoint, "a")) as two:
+        arrived: list[Arrival] = []
+        two.on_arrival(keys.DONE_ALL, arrived.append)
+        publisher = one.publisher(keys.done("x"), Done)
+        wait_until(publisher.heard, "the subscription")
+        publisher.put(Done(tick=1))
+        wait_until(lambda: arrived, "the sample through the router")
