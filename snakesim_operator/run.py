@@ -164,7 +164,7 @@ def _watch(config: RunConfig, session: Session, started: Sequence[Child], out: P
             if _somebody_failed(started[1:], ending) or ending.interrupted:
                 break
             if status is not None and status.faults:
-                ending.because("; ".join(fault.cause for fault in status.faults))
+                ending.because(status.faults[0].cause)
             if not armed and status is not None and status.ready_to_arm:
                 _arm(session, status)
                 armed = True
@@ -232,9 +232,9 @@ def _conclude(out: Path, ending: Ending) -> int:
     from snakesim_operator.report import write_report
 
     record = RunRecord.load(out)
-    if record.host.faults:
-        ending.because("; ".join(fault.cause for fault in record.host.faults))
-    ended = "interrupted" if ending.interrupted else ending.reason or "complete"
+    causes = dict.fromkeys([ending.reason, *(fault.cause for fault in record.host.faults)])
+    wrong = "; ".join(cause for cause in causes if cause)
+    ended = "interrupted" if ending.interrupted else wrong or "complete"
     summary = summarise(record, ended)
     (out / SUMMARY).write_bytes(msgspec.json.format(msgspec.json.encode(summary), indent=2))
     write_report(record, summary)

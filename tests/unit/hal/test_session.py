@@ -101,15 +101,18 @@ def test_robots_of_two_namespaces_do_not_hear_each_other_and_a_tool_hears_both()
         a.on_arrival(keys.DONE_ALL, heard["a"].append)
         b.on_arrival(keys.DONE_ALL, heard["b"].append)
         tool.on_arrival(f"**/{keys.DONE_ALL}", heard["tool"].append)
-        for session, name in ((a, "a"), (b, "b")):
-            publisher = session.publisher(keys.done(name), Done, lossless=True)
-            wait_until(publisher.heard, "a subscription")
-            publisher.put(Done(tick=1))
-        wait_until(lambda: len(heard["tool"]) == 2 and heard["a"] and heard["b"], "everybody's sample")
-        assert [arrival.key for arrival in heard["a"]] == ["hal/done/a"]
-        assert [arrival.key for arrival in heard["b"]] == ["hal/done/b"]
-        split = [keys.split_namespace(arrival.key) for arrival in heard["tool"]]
-        assert split == [("lab/a", "hal/done/a"), ("lab/b", "hal/done/b")]
+        publishers = [session.publisher(keys.done(name), Done) for session, name in ((a, "a"), (b, "b"))]
+
+        def heard_everywhere() -> bool:
+            for publisher in publishers:
+                publisher.put(Done(tick=1))
+            return len({arrival.key for arrival in heard["tool"]}) == 2 and bool(heard["a"] and heard["b"])
+
+        wait_until(heard_everywhere, "everybody's sample")  # put again until every subscription has been made
+        assert {arrival.key for arrival in heard["a"]} == {"hal/done/a"}
+        assert {arrival.key for arrival in heard["b"]} == {"hal/done/b"}
+        split = {keys.split_namespace(arrival.key) for arrival in heard["tool"]}
+        assert split == {("lab/a", "hal/done/a"), ("lab/b", "hal/done/b")}
 
 
 def test_questions_are_answered_and_a_no_is_raised_or_returned() -> None:

@@ -1,0 +1,112 @@
+"""A chain on a path: as the HAL lays it, found again where it is, followed from old world models."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from snakesim_gnc.control.body_on_path import BodyOnPath, chain_nodes, heading_of
+from snakesim_gnc.control.planar_body import PlanarBody
+from snakesim_gnc.control.progress import Located, Progress
+from snakesim_hal.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
+from snakesim_hal.route import lay_chain
+from tests.unit.gnc.stage import PERIOD_S, make_robot, make_route, make_stage, nodes_of
+
+SEGMENTS = [0.055, *[0.11] * 12, 0.055]
+ROUTE = make_route()
+BODY = BodyOnPath(ROUTE, SEGMENTS)
+
+
+@given(st.floats(-1.0, 7.0))
+def test_it_lies_as_the_hal_lays_a_chain(tail_s_m):
+    lay, lie = lay_chain(ROUTE, tail_s_m, SEGMENTS), BODY.at(tail_s_m)
+    assert lie.angles_rad == pytest.approx(lay.angles_rad, abs=2e-3)
+    assert lie.nodes_w[:, 0] == pytest.approx(lay.tail_w, abs=1e-4)
+    assert np.hypot(*np.diff(lie.nodes_w)) == pytest.approx(SEGMENTS, abs=2e-4)
+    assert np.all(np.diff(lie.node_s_m) > 0)
+
+
+@given(st.floats(-0.3, 4.0), st.floats(-0.03, 0.03))
+def test_a_body_on_the_path_is_found_again(tail_s_m, off_m):
+    lay = lay_chain(ROUTE, tail_s_m, SEGMENTS)
+    nodes = chain_nodes(lay.tail_w, lay.heading_rad, lay.angles_rad, np.array(SEGMENTS))
+    assert BODY.find(nodes) == pytest.approx(tail_s_m, abs=1e-4)
+    assert BODY.fit(nodes, tail_s_m + off_m) == pytest.approx(tail_s_m, abs=1e-4)
+
+
+def test_a_body_beside_the_path_is_where_it_fits_best():
+    nodes = nodes_of(make_stage(), 0.4) + np.array([[0.0], [0.02]])
+    assert BODY.find(nodes) == pytest.approx(0.4, abs=0.003)
+
+
+def test_nodes_are_those_of_the_3d_kinematics():
+    angles = np.linspace(-0.5, 0.6, 13)
+    rotation = rotation_from_quaternion(quaternion_from_yaw(0.7))
+    origins, rotations = link_frames((1.0, 2.0, 0.0), rotation, angles, ["yaw"] * 13, SEGMENTS)
+    nodes = chain_nodes((1.0, 2.0), 0.7, angles, np.array(SEGMENTS))
+    assert nodes[:, :-1].T == pytest.approx(origins[:, :2])
+    assert nodes[:, -1] == pytest.approx((origins[-1] + 0.055 * rotations[-1][:, 0])[:2])
+
+
+@given(st.floats(-3.1, 3.1))
+def test_heading_of_a_quaternion(yaw_rad):
+    assert heading_of(quaternion_from_yaw(yaw_rad)) == pytest.approx(yaw_rad)
+
+
+def test_pitch_joints_count_as_straight():
+    body = PlanarBody(make_robot(4, ("yaw", "pitch")))
+    assert body.bends == [0, 2]
+    assert body.segments_m == pytest.approx([0.055, 0.22, 0.165])
+    assert body.node_s_m == pytest.approx([0.0, 0.055, 0.275, 0.44])
+    lie = BodyOnPath(ROUTE, body.segments_m).at(0.1)
+    assert body.all_angles(lie) == pytest.approx([lie.angles_rad[0], 0.0, lie.angles_rad[1], 0.0])
+    joints = body.joints_w(lie)
+    assert joints[1] == pytest.approx((joints[0] + joints[2]) / 2)
+    assert [body.link_at(s) for s in (0.0, 0.06, 0.2, 0.43)] == [0, 1, 2, 4]
+
+
+def make_progress(**more) -> Progress:
+    settings = {"speed_filter_s": 0.03, "oldest_world_s": 0.25}
+    return Progress(PlanarBody(make_robot()), **{**settings, **more})
+
+
+def follow(progress, stage, speed_m_s, ticks, lag_ticks=2, every=2):
+    """Feed a body that moves steadily, through world models that are some ticks old."""
+    located = None
+    for tick in range(ticks):
+        seen = max(tick - lag_ticks, 0) // every * every
+        view = stage.view(
+            tick,
+            0.3 + speed_m_s * tick * PERIOD_S,
+            world_age_ticks=tick - seen,
+            world_tail_s_m=0.3 + speed_m_s * seen * PERIOD_S,
+        )
+        located = progress.update(view)
+    assert isinstance(located, Located)
+    return located
+
+
+@pytest.mark.parametrize("speed_m_s", [0.0, 0.2, 0.5])
+def test_progress_gives_the_present_from_an_old_world_model(speed_m_s):
+    located = follow(make_progress(), make_stage(), speed_m_s, 61)
+    assert located.speed_m_s == pytest.approx(speed_m_s, abs=0.01)
+    assert located.tail_s_m == pytest.approx(0.3 + speed_m_s * 60 * PERIOD_S, abs=1e-3)
+
+
+def test_progress_says_what_it_lacks():
+    stage = make_stage()
+    view = stage.view(40, 0.3, world_age_ticks=30)
+    progress = make_progress()
+    assert "0.30 s old" in str(progress.update(view))
+
+
+def test_a_new_path_is_noticed():
+    stage, progress = make_stage(), make_progress()
+    first = progress.update(stage.view(0, 0.3))
+    again = progress.update(stage.view(1, 0.3))
+    stage.path_id = 7
+    other = progress.update(stage.view(2, 0.3))
+    assert isinstance(first, Located)
+    assert isinstance(again, Located)
+    assert isinstance(other, Located)
+    assert (first.new_path, again.new_path, other.new_path) == (True, False, True)

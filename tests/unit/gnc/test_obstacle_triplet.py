@@ -1,0 +1,234 @@
+"""The controller on views made by hand: what it commands and reports, without physics."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from snakesim_gnc.control.obstacle_triplet import ObstacleTriplet, Settings
+from snakesim_hal.messages import Mode, WorldContact
+from tests.unit.gnc.stage import PERIOD_S, make_stage
+
+TAIL_S_M = 0.3
+
+
+def make_controller(stage, **settings) -> ObstacleTriplet:
+    return ObstacleTriplet(stage.robot, Settings(**settings))
+
+
+def torque_joints(action) -> list[int]:
+    return [i for i, mode in enumerate(action.set_points.mode) if mode == Mode.TORQUE]
+
+
+def stay(controller, stage, ticks, **more):
+    """The last of many updates of a body that does not move."""
+    action = None
+    for tick in range(ticks):
+        action = controller.update(stage.view(tick, TAIL_S_M, **more))
+    assert action is not None
+    return action
+
+
+def test_one_joint_pushes_and_all_others_hold_the_shape():
+    stage = make_stage()
+    action = stay(make_controller(stage), stage, 100)
+    report = action.report
+    assert torque_joints(action) == [report.propulsion_joint]
+    assert report.why == ""
+    assert report.usable_push_points == 4
+    assert report.propulsion_n == pytest.approx(35.0, rel=0.01)
+    assert report.path_s_m == pytest.approx(TAIL_S_M, abs=1e-3)
+    others = [i for i in range(13) if i != report.propulsion_joint]
+    targets, angles = np.array(action.set_points.target), np.array(report.reference_rad)
+    assert targets[others] == pytest.approx(angles[others], abs=1e-3)
+
+
+def test_the_report_is_the_solved_triplet():
+    stage = make_stage()
+    report = stay(make_controller(stage), stage, 100).report
+    forces = np.array([point.force_w for point in report.push_points])[:, :2]
+    tangent = np.array(report.push_points[0].tangent_w)[:2]
+    assert forces.sum(axis=0) == pytest.approx(report.propulsion_n * tangent, abs=1e-6)
+    assert np.hypot(*forces.T) == pytest.approx(report.solved_force_n)
+    assert min(report.solved_force_n) > 0
+    places = [point.body_s_m for point in report.push_points]
+    assert places == sorted(places)
+    torque = report.bending_torque_nm[report.propulsion_joint]
+    assert report.propulsion_torque_nm == pytest.approx(torque, rel=1e-6)
+    assert report.torque_headroom_nm == pytest.approx(7.0 - abs(torque), abs=0.05)
+    assert len(report.bending_torque_nm) == len(report.reference_rad) == 13
+    assert 1 < report.condition < 20
+
+
+def test_the_joint_is_the_first_ahead_of_the_middle_contact():
+    stage = make_stage()
+    report = stay(make_controller(stage), stage, 3).report
+    middle = report.push_points[1].body_s_m
+    joints_s = 0.055 + 0.11 * np.arange(13)
+    assert report.propulsion_joint == int(np.searchsorted(joints_s, middle))
+
+
+def test_the_turn_passes_backward_as_the_body_moves_on():
+    stage = make_stage()
+    controller = make_controller(stage)
+    turns = []
+    for tick in range(300):
+        report = controller.update(stage.view(tick, 0.0 + 0.2 * tick * PERIOD_S)).report
+        if report.propulsion_joint is not None and report.propulsion_joint not in turns[-1:]:
+            turns.append(report.propulsion_joint)
+    first = [turns[0] - k for k in range(4)]
+    assert turns[:4] == first
+
+
+def test_the_faster_it_moves_the_less_it_pushes():
+    stage = make_stage()
+    controller = make_controller(stage)
+    forces = [controller.update(stage.view(t, 0.1 + 0.1 * t * PERIOD_S)).report.propulsion_n for t in range(60)]
+    assert forces[-1] == pytest.approx(35.0 * 0.5, rel=0.1)
+
+
+def test_a_joint_that_has_swung_out_pushes_less():
+    stage = make_stage()
+    settled = stay(make_controller(stage), stage, 50).report
+    joint, way = settled.propulsion_joint, np.sign(settled.propulsion_torque_nm)
+    out = stay(make_controller(stage, angle_guard_rad=3.0), stage, 50, turned={joint: 0.3 * way}).report
+    back = stay(make_controller(stage, angle_guard_rad=3.0), stage, 50, turned={joint: -0.3 * way}).report
+    assert out.propulsion_n < 0.7 * 35.0
+    assert back.propulsion_n == pytest.approx(35.0, rel=0.1)
+
+
+def test_a_joint_that_has_left_its_reference_goes_back_to_position_mode():
+    stage = make_stage()
+    controller = make_controller(stage, guard_s=0.5)
+    joint = stay(controller, stage, 10).report.propulsion_joint
+    action = controller.update(stage.view(10, TAIL_S_M, turned={joint: 0.9}))
+    assert torque_joints(action) == []
+    assert f"joint_{joint + 1} left its reference" in action.report.why
+    turns = [controller.update(stage.view(t, TAIL_S_M)).report.propulsion_joint for t in range(11, 40)]
+    assert joint not in turns
+    assert joint in [controller.update(stage.view(t, TAIL_S_M)).report.propulsion_joint for t in range(60, 80)]
+
+
+def test_saturation_is_told_and_the_force_is_what_the_joint_can_give():
+    stage = make_stage(torque_nm=1.0)
+    action = stay(make_controller(stage), stage, 100)
+    report = action.report
+    assert report.saturated
+    assert report.torque_headroom_nm < 0
+    assert report.propulsion_n < 35.0
+    assert abs(action.set_points.target[report.propulsion_joint]) == pytest.approx(1.0, rel=1e-3)
+    assert abs(report.bending_torque_nm[report.propulsion_joint]) == pytest.approx(1.0, rel=1e-2)
+
+
+def test_without_a_world_model_it_holds_and_says_so():
+    stage = make_stage()
+    view = stage.view(0, TAIL_S_M)
+    controller = make_controller(stage)
+    blind = controller.update(type(view)(**{**vars(view), "world": None}))
+    assert blind.report.why == "no world model yet"
+    assert blind.set_points.target == view.joints.angle_rad
+    assert torque_joints(blind) == []
+
+
+def test_an_old_world_model_stops_the_push():
+    stage = make_stage()
+    controller = make_controller(stage)
+    stay(controller, stage, 10)
+    action = controller.update(stage.view(60, TAIL_S_M, world_age_ticks=50))
+    assert torque_joints(action) == []
+    assert "0.50 s old" in action.report.why
+
+
+def test_nobody_wants_to_move():
+    stage = make_stage()
+    controller = make_controller(stage)
+    assert torque_joints(stay(controller, stage, 10))
+    stage.speed_m_s = 0.0
+    action = controller.update(stage.view(11, TAIL_S_M, world_age_ticks=1))
+    assert torque_joints(action) == []
+    assert action.report.why == ""
+    assert action.report.usable_push_points == 4
+
+
+@pytest.mark.parametrize("pegs", [0, 2])
+def test_fewer_than_three_push_points_do_not_push(pegs):
+    stage = make_stage()
+    stage.pegs = stage.pegs[:pegs]
+    action = stay(make_controller(stage), stage, 5)
+    assert torque_joints(action) == []
+    assert action.report.usable_push_points == pegs
+    assert action.report.why
+
+
+def test_standing_still_is_told_and_a_jam_is_let_go_of():
+    stage = make_stage()
+    controller = make_controller(stage, stall_s=0.5, release_s=0.2)
+    touch = WorldContact(
+        link=3,
+        obstacle="peg_1",
+        body_s_m=0.4,
+        position_w=(0.0, 0.0, 0.0),
+        normal_w=(1.0, 0.0, 0.0),
+        tangent_w=(0.0, 1.0, 0.0),
+        force_w=(400.0, 0.0, 0.0),
+    )
+    pushed, released, jams = 0, 0, []
+    for tick in range(200):
+        report = controller.update(stage.view(tick, TAIL_S_M, contacts=[touch])).report
+        if report.jammed:
+            jams.append(report.why)
+            pushed += report.propulsion_joint is not None
+            released += report.propulsion_joint is None
+    assert "400 N" in jams[0]
+    assert pushed
+    assert released
+    moved = stay(controller, stage, 3)
+    assert moved.report.jammed
+    report = [controller.update(stage.view(200 + t, TAIL_S_M + 0.002 * t)).report for t in range(40)][-1]
+    assert not report.jammed
+    assert report.why == ""
+
+
+def test_too_little_propulsion_is_told_apart():
+    stage = make_stage()
+    report = stay(make_controller(stage, propulsion_n=2.0), stage, 150).report
+    assert not report.jammed
+    assert "below the drag" in report.why
+    assert report.propulsion_joint is not None
+
+
+def test_pitch_joints_stay_straight():
+    stage = make_stage(26, ("yaw", "pitch"))
+    action = stay(make_controller(stage), stage, 100)
+    assert action.report.propulsion_joint % 2 == 0
+    assert action.report.why == ""
+    pitch = np.array(action.set_points.target)[1::2]
+    assert np.abs(pitch).max() < 1e-6
+    assert len(action.report.bending_torque_nm) == 26
+
+
+def test_a_new_path_moves_no_target_at_once():
+    stage = make_stage()
+    controller = make_controller(stage)
+    before = stay(controller, stage, 50).set_points
+    stage.path_id = 1
+    after = controller.update(stage.view(50, TAIL_S_M + 0.05)).set_points
+    for mode, was, now in zip(after.mode, before.target, after.target, strict=True):
+        if mode == Mode.POSITION:
+            assert now == pytest.approx(was, abs=0.03)
+
+
+def test_the_same_views_give_the_same_commands():
+    def targets():
+        stage = make_stage(30)
+        controller = make_controller(stage)
+        return [controller.update(stage.view(t, 0.1 + 0.15 * t * PERIOD_S)).set_points.target for t in range(120)]
+
+    assert targets() == targets()
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"propulsion_n": 0.0}, {"propulsion_n": float("nan")}, {"blend_s": -1.0}, {"fs": 35.0}, {"gap_m": -0.1}]
+)
+def test_settings_are_bounded(wrong):
+    with pytest.raises(msgspec.ValidationError):
+        msgspec.convert(wrong, Settings)

@@ -1,0 +1,75 @@
+"""Path following on views made by hand."""
+
+import numpy as np
+import pytest
+
+from snakesim_gnc.control.path_following import PathFollowing
+from snakesim_hal.messages import Mode
+from tests.unit.gnc.stage import PERIOD_S, make_stage, nodes_of
+
+TAIL_S_M = 0.3
+
+
+def make_controller(stage, **settings) -> PathFollowing:
+    return PathFollowing(stage.robot, PathFollowing.Settings(**settings))
+
+
+def test_a_held_body_is_asked_for_no_more_than_the_look_ahead():
+    stage = make_stage()
+    controller = make_controller(stage, look_ahead_m=0.03)
+    action = None
+    for tick in range(200):
+        action = controller.update(stage.view(tick, TAIL_S_M))
+    assert action is not None
+    assert set(action.set_points.mode) == {Mode.POSITION}
+    nodes = nodes_of(stage, TAIL_S_M + 0.03)
+    headings = np.arctan2(*np.diff(nodes)[::-1])
+    assert action.set_points.target == pytest.approx(np.diff(headings), abs=0.01)
+    assert action.report.path_s_m == pytest.approx(TAIL_S_M, abs=1e-3)
+    assert action.report.usable_push_points is None
+
+
+def test_the_reference_moves_with_the_mission():
+    stage = make_stage()
+    stage.speed_m_s = 0.1
+    controller = make_controller(stage, look_ahead_m=0.2)
+    first = controller.update(stage.view(0, TAIL_S_M)).report.reference_rad
+    for tick in range(1, 31):
+        report = controller.update(stage.view(tick, TAIL_S_M)).report
+    slow = np.abs(np.array(report.reference_rad) - first).max()
+    other = make_controller(stage, look_ahead_m=0.2)
+    stage.speed_m_s = 0.3
+    other.update(stage.view(0, TAIL_S_M))
+    for tick in range(1, 31):
+        report = other.update(stage.view(tick, TAIL_S_M)).report
+    fast = np.abs(np.array(report.reference_rad) - first).max()
+    assert fast > 2 * slow > 0
+
+
+def test_it_starts_without_a_jump():
+    stage = make_stage()
+    view = stage.view(0, TAIL_S_M)
+    action = make_controller(stage).update(view)
+    steps = np.abs(np.array(action.set_points.target) - view.joints.angle_rad)
+    assert steps.max() < 0.02
+
+
+def test_it_holds_while_it_knows_nothing():
+    stage = make_stage()
+    view = stage.view(0, TAIL_S_M)
+    controller = make_controller(stage)
+    blind = type(view)(**{**vars(view), "trajectory": None})
+    assert controller.update(blind).report.why == "no trajectory yet"
+    assert controller.update(blind).set_points.target == view.joints.angle_rad
+    controller.update(view)
+    later = controller.update(stage.view(100, TAIL_S_M, world_age_ticks=60))
+    assert "old" in later.report.why
+    assert later.set_points.target == pytest.approx(view.joints.angle_rad, abs=0.02)
+
+
+def test_a_stopped_mission_stops_the_reference():
+    stage = make_stage()
+    stage.speed_m_s = 0.0
+    controller = make_controller(stage)
+    reports = [controller.update(stage.view(t, TAIL_S_M + 0 * PERIOD_S)).report for t in range(20)]
+    assert reports[-1].reference_rad == pytest.approx(reports[0].reference_rad, abs=1e-3)

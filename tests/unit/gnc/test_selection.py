@@ -1,0 +1,185 @@
+"""Push-points and the choice of a triplet and a joint."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from snakesim_gnc.control.body_on_path import BodyOnPath
+from snakesim_gnc.control.obstacle_triplet.contacts import PushPoint, plan_contact, push_points
+from snakesim_gnc.control.obstacle_triplet.selection import (
+    Choice,
+    Triplets,
+    alternating,
+    choose,
+    propulsion_joint,
+    solve,
+)
+from snakesim_hal.messages import Obstacle
+from snakesim_hal.route import Route
+from tests.unit.gnc.stage import BODY_RADIUS_M, CLEARANCE_M, make_pegs, make_route, make_stage, nodes_of
+
+SEGMENTS = [0.055, *[0.11] * 12, 0.055]
+NODE_S = [0.0, *np.cumsum(SEGMENTS).tolist()]
+STRAIGHT = Route([(0.0, 0.0), (5.0, 0.0)])
+NEAR = {"near_s_m": 1.5, "window_m": 3.0}
+LIMITS = {"gap_m": 0.06, "give_up_gap_m": 0.12, "end_m": 0.03}
+
+
+def planned_row():
+    route = make_route()
+    return [plan_contact(route, peg, BODY_RADIUS_M, **NEAR) for peg in make_pegs(route)[:9]]
+
+
+def points_at(tail_s_m, *, kept=(), off_w=(0.0, 0.0)):
+    stage = make_stage()
+    lie = BodyOnPath(stage.route, SEGMENTS).at(tail_s_m)
+    measured = nodes_of(stage, tail_s_m) + np.array(off_w)[:, None]
+    return push_points(planned_row(), kept, lie, measured, NODE_S, **LIMITS), lie
+
+
+def test_a_peg_is_met_at_its_inflection():
+    route = make_route()
+    for contact, s in zip(planned_row(), route.inflections_s_m(), strict=False):
+        assert contact.path_s_m == pytest.approx(s, abs=1e-3)
+        assert contact.clearance_m == pytest.approx(CLEARANCE_M, abs=1e-5)
+        assert contact.normal_w[0] > 0  # it pushes forward
+        assert np.dot(contact.normal_w, contact.tangent_w) == pytest.approx(0.0, abs=1e-12)
+    assert [c.side for c in planned_row()[:4]] in ([1, -1, 1, -1], [-1, 1, -1, 1])
+
+
+@pytest.mark.parametrize(("y", "side"), [(0.1, -1), (-0.1, 1)])
+def test_a_sphere_beside_a_straight_path(y, side):
+    ball = Obstacle(name="ball", shape="sphere", position_w=(2.0, y, 0.0), radius_m=0.03)
+    contact = plan_contact(STRAIGHT, ball, 0.04, **NEAR)
+    assert contact.point_w == pytest.approx((2.0, 0.0))
+    assert contact.normal_w == pytest.approx((0.0, -math.copysign(1.0, y)))
+    assert contact.side == side
+    assert contact.clearance_m == pytest.approx(0.03)
+
+
+def test_the_corner_of_a_turned_box_is_what_is_met():
+    box = Obstacle(
+        name="box", shape="box", position_w=(2.0, 0.3, 0.0), yaw_rad=math.pi / 4, half_size_m=(0.1, 0.1, 0.1)
+    )
+    contact = plan_contact(STRAIGHT, box, 0.04, **NEAR)
+    assert contact.point_w == pytest.approx((2.0, 0.0), abs=1e-3)
+    assert contact.normal_w == pytest.approx((0.0, -1.0))
+    assert contact.clearance_m == pytest.approx(0.3 - 0.1 * math.sqrt(2) - 0.04, abs=1e-4)
+
+
+def test_a_box_that_the_path_runs_into_has_no_clearance():
+    box = Obstacle(name="box", shape="box", position_w=(2.0, -0.05, 0.0), half_size_m=(0.1, 0.1, 0.1))
+    contact = plan_contact(STRAIGHT, box, 0.04, **NEAR)
+    assert contact.clearance_m < -0.04
+    assert contact.side == 1
+
+
+def test_push_points_are_those_that_the_body_covers():
+    points, lie = points_at(0.2)
+    assert [p.contact.obstacle for p in points] == ["peg_0", "peg_1", "peg_2", "peg_3"]
+    for point in points:
+        on_body = [np.interp(point.contact.path_s_m, lie.node_s_m, NODE_S)]
+        assert [point.body_s_m] == pytest.approx(on_body)
+        assert point.gap_m == pytest.approx(CLEARANCE_M, abs=2e-3)
+
+
+def test_a_body_that_is_off_the_path_is_too_far_from_its_push_points():
+    near, _ = points_at(0.2, off_w=(0.07, 0.0))
+    assert near  # the pegs lie across the path, mostly beside it
+    far, _ = points_at(0.2, off_w=(0.0, 0.08))
+    assert len({p.contact.side for p in far}) == 1
+
+
+def test_what_is_being_pushed_may_get_further_away():
+    off = (0.0, 0.08)
+    names = [p.contact.obstacle for p in points_at(0.2)[0]]
+    assert len(points_at(0.2, kept=names, off_w=off)[0]) > len(points_at(0.2, off_w=off)[0])
+    assert not points_at(0.2, kept=names, off_w=(5.0, 5.0))[0]
+
+
+def test_contacts_at_the_tips_do_not_count():
+    s = make_route().inflections_s_m()[0]
+    assert "peg_0" in [p.contact.obstacle for p in points_at(s - 0.04)[0]]
+    assert "peg_0" not in [p.contact.obstacle for p in points_at(s - 0.02)[0]]
+
+
+@given(st.lists(st.sampled_from([-1, 1]), max_size=10))
+def test_triples_alternate_and_are_neighbours(sides):
+    found = alternating(sides)
+    for i, j, k in found:
+        assert i < j < k
+        assert sides[i] == -sides[j] == sides[k]
+        assert all(side == sides[j] for side in sides[i + 1 : k])
+    middles = [j for j in range(len(sides)) if -sides[j] in sides[:j] and -sides[j] in sides[j + 1 :]]
+    assert [j for _, j, _ in sorted(found, key=lambda t: t[1])] == middles
+
+
+@given(st.floats(0.0, 1.2), st.floats(0.05, 0.5), st.one_of(st.none(), st.integers(0, 12)))
+def test_the_propulsion_joint_is_the_first_ahead_of_the_middle_contact(behind, distance, present):
+    joint = propulsion_joint(NODE_S, behind, behind + distance, present, 0.003)
+    between = [i for i in range(13) if behind < NODE_S[i + 1] < behind + distance]
+    if joint is None:
+        assert not between
+    else:
+        assert joint in between
+        assert joint == between[0] or (joint == present == between[0] + 1 and NODE_S[between[0] + 1] - behind < 0.003)
+
+
+def test_noise_does_not_pass_the_turn_to_and_fro():
+    place = NODE_S[6]
+    assert propulsion_joint(NODE_S, place - 0.001, 1.2, 6, 0.003) == 6
+    assert propulsion_joint(NODE_S, place - 0.004, 1.2, 6, 0.003) == 5
+    assert propulsion_joint(NODE_S, place - 0.001, 1.2, 5, 0.003) == 5
+    assert propulsion_joint(NODE_S, place - 0.001, 1.2, None, 0.003) == 5
+
+
+def choices_in_row(count=7):
+    row = planned_row()
+    triplets = [solve((row[i], row[i + 1], row[i + 2]), condition_max=100.0) for i in range(count)]
+    return [Choice(t, (0.1 + 0.3 * i, 0.4 + 0.3 * i, 0.7 + 0.3 * i), 3 + i, 0.1) for i, t in enumerate(triplets)]
+
+
+def test_the_present_triplet_stays():
+    row = choices_in_row()
+    assert choose(row, row[3].triplet, switch_share=0.5) is row[3]
+
+
+def test_its_successor_shares_most_push_points():
+    row = choices_in_row()
+    rest = [row[0], row[1], row[4], row[6]]
+    assert choose(rest, row[3].triplet, switch_share=0.5) is row[4]
+
+
+def test_of_equals_the_one_nearest_to_the_tail_is_chosen():
+    row = choices_in_row()
+    assert choose(row, None, switch_share=0.5) is row[0]
+    assert choose(row, None, switch_share=0.5, banned=[row[0].triplet.names]) is row[1]
+    assert choose(row, None, switch_share=0.5, banned=[c.triplet.names for c in row]) is None
+
+
+def test_points_become_choices_with_a_joint_each():
+    points, lie = points_at(0.2)
+    triplets = Triplets(condition_max=100.0, authority_min=0.02, hold_on_m=0.003)
+    found, refused = triplets.choices(points, lie.nodes_w, NODE_S, None, None)
+    assert [c.triplet.names for c in found] == [("peg_0", "peg_1", "peg_2"), ("peg_1", "peg_2", "peg_3")]
+    assert not refused
+    for choice in found:
+        assert choice.body_s_m[1] < NODE_S[choice.joint + 1] < choice.body_s_m[2]
+        assert abs(choice.torque_per_n) <= choice.triplet.torque_per_n + 1e-9
+    barred, why = triplets.choices(points, lie.nodes_w, NODE_S, None, found[0].joint)
+    assert [c.joint for c in barred] == [found[1].joint]
+    assert len(why) == 1
+
+
+def test_a_steep_row_is_refused_with_the_contact_that_would_pull():
+    route = make_route(amplitude_m=0.08)
+    planned = [plan_contact(route, peg, BODY_RADIUS_M, **NEAR) for peg in make_pegs(route)[:3]]
+    points = [PushPoint(contact, 0.2 + 0.3 * i, 0.0) for i, contact in enumerate(planned)]
+    triplets = Triplets(condition_max=100.0, authority_min=0.02, hold_on_m=0.003)
+    found, refused = triplets.choices(points, BodyOnPath(route, SEGMENTS).at(0.2).nodes_w, NODE_S, None, None)
+    assert not found
+    assert "lambda_1" in refused[0]
+    assert "peg_0/peg_1/peg_2" in refused[0]
