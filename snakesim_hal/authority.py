@@ -7,6 +7,7 @@ monotonic clock, or simulated time in lockstep.
 from collections import Counter
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from snakesim_hal import gate, lifecycle
@@ -41,14 +42,16 @@ class Decision:
 class Authority:
     """Lifecycle, lease and gate of one robot."""
 
-    def __init__(self, description: Description) -> None:
+    def __init__(self, description: Description, *, first_epoch: int = 0) -> None:
+        """first_epoch: unlike that of any host before, so that what was meant for another host is refused."""
         self.description = description
         self.limits = JointLimits.of(description)
         self.state: LifecycleState = "disarmed"
         self.why = "not armed yet"
         self.arming = 0
-        self.lease = Lease()
-        self.faults: list[Fault] = []
+        self.lease = Lease(epoch=first_epoch)
+        self.faults: list[Fault] = []  # since the last clear
+        self.fault_log: list[Fault] = []  # since the start
         self.accepted = 0
         self.standby = 0
         self.rejected: Counter[str] = Counter()
@@ -60,6 +63,7 @@ class Authority:
         self._command: JointCommand | None = None
         self._last_sequence = -1
         self._hold_at = np.zeros(count)
+        self._was_armed = False  # when the present fault came: only then is there a motion to stop
 
     # --- what comes in -------------------------------------------------------------------------------------
 
@@ -163,8 +167,10 @@ class Authority:
 
     def note(self, fault: Fault) -> None:
         """Keep a fault that people should know of but that stops nothing by itself."""
-        if len(self.faults) < MAX_FAULTS_KEPT:
-            self.faults.append(fault)
+        fault = msgspec.structs.replace(fault, cause=fault.cause[:500])
+        for kept in (self.faults, self.fault_log):
+            if len(kept) < MAX_FAULTS_KEPT:
+                kept.append(fault)
 
     def holder_gone(self, cause: str) -> None:
         """The lease holder's process is known to be gone while disarmed: free the lease at once."""
@@ -228,7 +234,7 @@ class Authority:
     # --- inside --------------------------------------------------------------------------------------------
 
     def _safe(self) -> Applied:
-        if self.state != "fault" or self.description.safe_action == "passive":
+        if self.state != "fault" or not self._was_armed or self.description.safe_action == "passive":
             return self._uniform(Mode.PASSIVE, np.zeros_like(self._measured.angle_rad))
         if self.description.safe_action == "damp":
             return self._uniform(Mode.VELOCITY, np.zeros_like(self._measured.angle_rad))
@@ -244,6 +250,9 @@ class Authority:
         far: list[str] = []
         for i, joint in enumerate(self.description.joints):
             gap = command.target[i] - self._measured.angle_rad[i]
+            if command.mode[i] not in (Mode.POSITION, Mode.PASSIVE):
+                asked = command.mode[i].name.lower()
+                far.append(f"{joint.name} is asked for {asked}; only staying is allowed at arming")
             if command.mode[i] == Mode.POSITION and abs(gap) > self.limits.max_step_rad:
                 far.append(
                     f"{joint.name} is asked to go {gap:+.2f} rad from where it is; at most "
@@ -257,6 +266,7 @@ class Authority:
             return
         if following != self.state:
             self._hold_at = self._measured.angle_rad
+            self._was_armed = self.state == "armed"
         if following != "armed" and self.state == "armed":
             self._command = None
         self.state = following

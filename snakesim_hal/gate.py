@@ -125,10 +125,11 @@ def refuse(
 
 def limit(command: JointCommand, *, measured: Measured, last: Applied, limits: JointLimits) -> tuple[Applied, Floats]:
     """Bring an accepted command inside every limit. Returns what is applied, and what was asked for (n_joints,)."""
-    torque_limits: list[float] = limits.torque_nm.tolist()
-    if command.torque_limit_nm is not None:
-        asked_limits = command.torque_limit_nm
-        torque_limits = [min(max(asked, 0.0), most) for asked, most in zip(asked_limits, torque_limits, strict=True)]
+    asked_limits = limits.torque_nm.tolist() if command.torque_limit_nm is None else command.torque_limit_nm
+    torque_limits = [  # may fall at once, but rises no faster than a torque may
+        min(max(asked, 0.0), joint.torque_limit_nm, held + joint.torque_rate_limit_nm_s * limits.period_s)
+        for asked, joint, held in zip(asked_limits, limits.joints, last.torque_limit_nm.tolist(), strict=True)
+    ]
     before = zip(last.mode.tolist(), last.target.tolist(), strict=True)
     now = zip(measured.angle_rad.tolist(), measured.velocity_rad_s.tolist(), measured.torque_nm.tolist(), strict=True)
     targets: list[float] = []
@@ -176,7 +177,7 @@ def bumpless_target(
         push_nm = torque_nm + joint.damping_nm_s_per_rad * velocity_rad_s
         return angle_rad + push_nm / max(joint.stiffness_nm_per_rad, 1e-9)
     if mode is Mode.VELOCITY:
-        return velocity_rad_s
+        return velocity_rad_s + torque_nm / joint.velocity_gain_nm_s_per_rad
     return torque_nm if mode is Mode.TORQUE else 0.0
 
 

@@ -88,7 +88,7 @@ class Host:
         end_after_fault_s: end so long after a fault; None: stay, so that a person can clear it.
         """
         self.description: Description = backend.describe()
-        self.authority = Authority(self.description)
+        self.authority = Authority(self.description, first_epoch=time.time_ns() // 1_000_000)
         self.black_box = BlackBox(self.description)
         self.tally = Tally()
         self.participants = {name: Participant(service) for name, service in config.services.items()}
@@ -469,6 +469,8 @@ class Host:
     def _watch_fault(self) -> None:
         """After a fault nobody is waited for: what follows is shown in real time, and may end the run."""
         if self.authority.state not in ("fault", "estop"):
+            if self._faulted_at_ns is not None:
+                self._pace = self._config.pace
             self._faulted_at_ns = None
         elif self._faulted_at_ns is None:
             self._faulted_at_ns = time.monotonic_ns()

@@ -70,7 +70,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SnakesimError as error:
         print(f"snakesim host: {error}", file=sys.stderr)
         return 1
-    return 1 if host.authority.faults else 0
+    return 1 if host.authority.fault_log else 0
 
 
 def backend_settings(config: RunConfig, factory: BackendFactory) -> Any:
@@ -95,7 +95,7 @@ def leave_record(host: Host, out: Path) -> None:
         },
         rejected_commands=dict(host.authority.rejected),
         limited_commands=dict(host.authority.limited),
-        faults=host.authority.faults,
+        faults=host.authority.fault_log,
         lifecycle=host.authority.state,
         why=host.authority.why,
     )

@@ -155,6 +155,7 @@ class JointDescription(Message, frozen=True, kw_only=True):
     torque_rate_limit_nm_s: Annotated[float, Meta(gt=0, le=1e6)]
     stiffness_nm_per_rad: Annotated[float, Meta(ge=0, le=1e6)]  # of position mode
     damping_nm_s_per_rad: Annotated[float, Meta(ge=0, le=1e6)]
+    velocity_gain_nm_s_per_rad: Annotated[float, Meta(gt=0, le=1e6)]  # of velocity mode
 
 
 class LinkDescription(Message, frozen=True, kw_only=True):

@@ -173,6 +173,7 @@ def describe(robot: RobotFile, *, backend: str, period_ns: int, lease_ns: int, c
             torque_rate_limit_nm_s=robot.limits.torque_rate_nm_s,
             stiffness_nm_per_rad=robot.motor.stiffness_nm_per_rad,
             damping_nm_s_per_rad=robot.motor.damping_nm_s_per_rad,
+            velocity_gain_nm_s_per_rad=robot.motor.velocity_gain_nm_s_per_rad,
         )
         for i, axis in enumerate(axes)
     ]

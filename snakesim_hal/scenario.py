@@ -72,7 +72,7 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
     backend: str = "sim"
     controller: str
     pace: Pace = "lockstep"
-    rate_hz: Annotated[float, Meta(ge=1, le=5000, extra_json_schema={"unit": "Hz"})] = 100.0
+    rate_hz: Annotated[float, Meta(ge=20, le=5000, extra_json_schema={"unit": "Hz"})] = 100.0
     duration_s: Annotated[float, Meta(gt=0, le=86400, extra_json_schema={"unit": "s"})] = 10.0
     seed: Annotated[int, Meta(ge=0, le=2**31)] = 1
     stall_limit_s: Annotated[float, Meta(gt=0, le=600, extra_json_schema={"unit": "s"})] = 10.0

@@ -145,6 +145,9 @@ class RandomField(FileStruct, frozen=True, kw_only=True):
     friction: Friction = 0.0
 
 
+MOST_STREWN = 1000
+
+
 class SceneFile(FileStruct, frozen=True, kw_only=True):
     """A whole scene file."""
 
@@ -291,6 +294,11 @@ def _strewn(
     if field.route_clearance_m is not None and route is None:
         raise ConfigError(f"{where}: `route_clearance_m` is set but the scene has no route; add a [route] section")
     wanted = round(field.density_per_m2 * float(np.prod(high - low)))
+    if wanted > MOST_STREWN:
+        raise ConfigError(
+            f"{where}: `density_per_m2` = {field.density_per_m2} asks for {wanted} pegs on this area; at most "
+            f"{MOST_STREWN}"
+        )
     random = np.random.default_rng([field.seed, index])
     strewn: list[Placed] = []
     fixed = [p.obstacle for p in others if not p.walkable]

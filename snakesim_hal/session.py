@@ -24,7 +24,7 @@ from snakesim_hal.messages import Answer, Message
 
 DEFAULT_PORT = 7447
 DEFAULT_ENDPOINT = f"tcp/127.0.0.1:{DEFAULT_PORT}"
-READER_DEPTH = 16
+READER_DEPTH = 256  # deep enough that a burst of noise on a key does not push out the sample that counts
 
 
 @dataclass(frozen=True)
@@ -226,7 +226,7 @@ def open_session(link: Link, connect_timeout_s: float = 5.0) -> Iterator[Session
 def _settings(link: Link, connect_timeout_s: float) -> dict[str, Any]:
     settings: dict[str, Any] = {
         "mode": "router" if link.listen else "client",
-        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "timestamping": {"enabled": {"router": True, "peer": True, "client": True}},
         "transport": {"link": {"tx": {"lease": 2000}}, "shared_memory": {"enabled": False}},
         "listen": {"endpoints": [link.endpoint] if link.listen else [], "exit_on_failure": True},

@@ -40,7 +40,6 @@ class Progress:
 
     def __init__(self, body: PlanarBody, *, speed_filter_s: float, oldest_world_s: float) -> None:
         self._planar = body
-        self._segments = np.array(body.segments_m)
         self._speed_filter_s = speed_filter_s
         self._oldest_s = oldest_world_s
         self._angles: deque[tuple[int, list[float]]] = deque(maxlen=TICKS_KEPT)
@@ -81,16 +80,16 @@ class Progress:
 
     def _measure(self, world: World) -> None:
         angles = next((a for tick, a in reversed(self._angles) if tick <= world.tick), self._angles[0][1])
-        bending = np.array(angles)[self._planar.bends]
+        bending = [angles[i] for i in self._planar.bends]
         heading = heading_of(world.base_orientation_wxyz)
-        self._nodes = chain_nodes(world.base_position_w[:2], heading, bending, self._segments)
+        self._nodes = chain_nodes(world.base_position_w[:2], heading, bending, self._planar.segments_m)
 
     def _filter(self, body: BodyOnPath, world: World, period_s: float) -> None:
         """Critically damped alpha-beta filter with the time constant `speed_filter_s`."""
         assert self._world is not None
         passed_s = max((world.tick - self._world.tick) * period_s, period_s)
         expected = self._s_m + self._speed_m_s * passed_s
-        off = body.fit(self._nodes, expected) - expected
+        off = body.fit(self._nodes, expected, steps=1) - expected
         keep = float(np.exp(-passed_s / self._speed_filter_s)) if self._speed_filter_s > 0 else 0.0
         self._s_m = expected + (1 - keep * keep) * off
         self._speed_m_s += (1 - keep) ** 2 * off / passed_s

@@ -130,7 +130,7 @@ def push_points(
         off_x = xs[i] + share * (xs[i + 1] - xs[i]) - contact.point_w[0]
         off_y = ys[i] + share * (ys[i + 1] - ys[i]) - contact.point_w[1]
         gap = contact.clearance_m + off_x * contact.normal_w[0] + off_y * contact.normal_w[1]
-        if gap <= gap_m or (gap <= give_up_gap_m and contact.obstacle in kept):
+        if abs(gap) <= (give_up_gap_m if contact.obstacle in kept else gap_m):  # deep inside: it is on the other side
             found.append(PushPoint(contact, body_s, gap))
     found.sort(key=lambda p: p.body_s_m)
     return found

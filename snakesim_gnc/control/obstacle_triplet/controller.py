@@ -268,7 +268,7 @@ class ObstacleTriplet:
             push_points=planned_contacts(self._body, located.world, choice, forces_n),
             solved_force_n=forces_n,
             propulsion_torque_nm=push.torque_nm,
-            bending_torque_nm=bending(self._body, lie, choice, forces_n, push.force_n),
+            bending_torque_nm=bending(self._body, lie, choice, push.force_n),
             reference_rad=self._reference.tolist(),
             condition=choice.triplet.unit.condition,
             torque_headroom_nm=self._body.torque_limit_nm[push.turn] - full_nm,

@@ -5,6 +5,7 @@ it and the nearest one on the other side ahead of it. So a body of thirty module
 choice moves along the body instead of jumping between all threes.
 """
 
+from bisect import bisect_right
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
@@ -12,7 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_gnc.control.obstacle_triplet.contacts import PlannedContact, PushPoint
-from snakesim_gnc.control.obstacle_triplet.statics import UnitForces, no_authority, torque_per_newton, unit_forces
+from snakesim_gnc.control.obstacle_triplet.statics import (
+    UnitForces,
+    loads,
+    no_authority,
+    torque_per_newton,
+    unit_forces,
+    wrenches,
+)
 
 Floats = NDArray[np.float64]
 Names = tuple[str, str, str]
@@ -24,9 +32,9 @@ class Triplet:
 
     names: Names
     contacts: tuple[PlannedContact, PlannedContact, PlannedContact]
-    points_w: Floats  # (3, 2)
-    normals_w: Floats  # (3, 2)
     unit: UnitForces
+    unit_wrenches: Floats  # (3, 3): of the three contacts for 1 N, the tether's at o_1 included
+    unit_force_3: float
     torque_per_n: float  # the most that a joint between o_2 and o_3 needs: with its lever from o_2 on; absolute
 
 
@@ -45,9 +53,16 @@ def solve(contacts: tuple[PlannedContact, PlannedContact, PlannedContact], *, co
     points = np.array([c.point_w for c in contacts])
     normals = np.array([c.normal_w for c in contacts])
     unit = unit_forces(points, normals, np.array(contacts[0].tangent_w), condition_max=condition_max)
-    torque = abs(torque_per_newton(unit.forces[2], points[2], normals[2], points[1]))
-    names = (contacts[0].obstacle, contacts[1].obstacle, contacts[2].obstacle)
-    return Triplet(names, contacts, points, normals, unit, torque)
+    tangent = np.array(contacts[0].tangent_w)
+    unit_force_3 = float(unit.forces[2])
+    return Triplet(
+        names=(contacts[0].obstacle, contacts[1].obstacle, contacts[2].obstacle),
+        contacts=contacts,
+        unit=unit,
+        unit_wrenches=wrenches(points, loads(unit.forces, normals, -tangent)),
+        unit_force_3=unit_force_3,
+        torque_per_n=abs(torque_per_newton(unit_force_3, points[2], normals[2], points[1])),
+    )
 
 
 def alternating(sides: Sequence[int]) -> list[tuple[int, int, int]]:
@@ -73,17 +88,14 @@ def propulsion_joint(
     Joint i is node i + 1. The present joint keeps its turn until the one behind it is `hold_on_m` past o_2, so that
     noise does not pass the turn to and fro.
     """
-    for joint in range(len(node_body_s_m) - 2):
-        place = node_body_s_m[joint + 1]
-        if place >= ahead_m:
-            return None
-        if place <= behind_m:
-            continue
-        late = place - behind_m < hold_on_m
-        if late and present == joint + 1 and node_body_s_m[joint + 2] < ahead_m:
-            return present
-        return joint
-    return None
+    joint = max(bisect_right(node_body_s_m, behind_m) - 1, 0)
+    last = len(node_body_s_m) - 3
+    if joint > last or node_body_s_m[joint + 1] >= ahead_m:
+        return None
+    late = node_body_s_m[joint + 1] - behind_m < hold_on_m
+    if late and present == joint + 1 <= last and node_body_s_m[joint + 2] < ahead_m:
+        return present
+    return joint
 
 
 def choose(
@@ -134,27 +146,40 @@ class Triplets:
         refused: list[str] = []
         for i, j, k in alternating([p.contact.side for p in points]):
             triplet = self._solve((points[i].contact, points[j].contact, points[k].contact))
-            where = "/".join(triplet.names)
-            if triplet.unit.reason:
-                refused.append(f"{where}: {triplet.unit.reason}")
-                continue
+            places = (points[i].body_s_m, points[j].body_s_m, points[k].body_s_m)
             turn = present.joint if present is not None and present.triplet is triplet else None
-            joint = propulsion_joint(node_body_s_m, points[j].body_s_m, points[k].body_s_m, turn, self._hold_on_m)
-            if joint is None:
-                refused.append(f"{where}: no joint between o_2 and o_3")
-                continue
-            if joint == barred_joint:
-                refused.append(f"{where}: its propulsion joint has left its reference too far")
-                continue
-            spot = (float(nodes_w[0, joint + 1]), float(nodes_w[1, joint + 1]))
-            ahead = triplet.contacts[2]
-            blocked = no_authority(ahead.point_w, ahead.normal_w, spot, self._authority_min)
-            if blocked:
-                refused.append(f"{where}: {blocked}")
-                continue
-            torque = torque_per_newton(float(triplet.unit.forces[2]), ahead.point_w, ahead.normal_w, spot)
-            found.append(Choice(triplet, (points[i].body_s_m, points[j].body_s_m, points[k].body_s_m), joint, torque))
+            choice = self._choice(triplet, places, nodes_w, node_body_s_m, turn, barred_joint)
+            if isinstance(choice, Choice):
+                found.append(choice)
+            else:
+                refused.append(f"{'/'.join(triplet.names)}: {choice}")
         return found, refused
+
+    def _choice(
+        self,
+        triplet: Triplet,
+        places_m: tuple[float, float, float],
+        nodes_w: Floats,
+        node_body_s_m: Sequence[float],
+        turn: int | None,
+        barred_joint: int | None,
+    ) -> Choice | str:
+        """The triplet with its joint, or why it cannot propel."""
+        if triplet.unit.reason:
+            return triplet.unit.reason
+        joint = propulsion_joint(node_body_s_m, places_m[1], places_m[2], turn, self._hold_on_m)
+        if joint is None:
+            return "no joint between o_2 and o_3"
+        if joint == barred_joint:
+            return "its propulsion joint has left its reference too far"
+        spot = (float(nodes_w[0, joint + 1]), float(nodes_w[1, joint + 1]))
+        ahead = triplet.contacts[2]
+        blocked = no_authority(ahead.point_w, ahead.normal_w, spot, self._authority_min)
+        if blocked:
+            return blocked
+        return Choice(
+            triplet, places_m, joint, torque_per_newton(triplet.unit_force_3, ahead.point_w, ahead.normal_w, spot)
+        )
 
     def _solve(self, contacts: tuple[PlannedContact, PlannedContact, PlannedContact]) -> Triplet:
         names = (contacts[0].obstacle, contacts[1].obstacle, contacts[2].obstacle)

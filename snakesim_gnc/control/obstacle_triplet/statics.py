@@ -132,18 +132,25 @@ def bending_torque_nm(
     left turn positive: the negative sum of the moments about the joint of all forces ahead of it. With forces in
     balance that is the sum of the moments of all forces behind it.
     """
-    joints = np.asarray(joints_w, dtype=np.float64)
-    points = np.asarray(points_w, dtype=np.float64)
-    forces = np.asarray(forces_w, dtype=np.float64)
-    ahead = np.asarray(points_s_m)[None, :] > np.asarray(joints_s_m)[:, None]
-    wrenches = np.empty((len(points), 3))
-    wrenches[:, :2] = forces
-    wrenches[:, 2] = _cross(points, forces)
-    carried = ahead @ wrenches
-    return joints[:, 0] * carried[:, 1] - joints[:, 1] * carried[:, 0] - carried[:, 2]
+    return torque_under(
+        np.asarray(joints_w), np.asarray(joints_s_m), np.asarray(points_s_m), wrenches(points_w, forces_w)
+    )
 
 
-def loads(points_w: ArrayLike, forces_n: ArrayLike, normals_w: ArrayLike, tether_w: ArrayLike) -> Floats:
+def wrenches(points_w: ArrayLike, forces_w: ArrayLike) -> Floats:
+    """Force and moment about the world's origin of each push, (k, 3): N, N, N·m."""
+    points, forces = np.asarray(points_w, dtype=np.float64), np.asarray(forces_w, dtype=np.float64)
+    return np.column_stack([forces, _cross(points, forces)])
+
+
+def torque_under(joints_w: Floats, joints_s_m: Floats, points_s_m: Floats, wrenches: Floats) -> Floats:
+    """`bending_torque_nm` for pushes whose wrenches (k, 3) are known already."""
+    ahead = (points_s_m > joints_s_m[:, None]).astype(np.float64)
+    x_force, y_force, moment = (ahead @ wrenches).T
+    return joints_w[:, 0] * y_force - joints_w[:, 1] * x_force - moment
+
+
+def loads(forces_n: ArrayLike, normals_w: ArrayLike, tether_w: ArrayLike) -> Floats:
     """The forces at the three points, (3, 2) N: the contacts', and at o_1 the tether's as well."""
     forces = np.asarray(forces_n)[:, None] * np.asarray(normals_w)
     forces[0] += tether_w

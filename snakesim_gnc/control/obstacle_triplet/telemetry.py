@@ -3,23 +3,20 @@
 import math
 from collections.abc import Sequence
 
+import numpy as np
+
 from snakesim_gnc.control.body_on_path import Lie
 from snakesim_gnc.control.obstacle_triplet.selection import Choice
-from snakesim_gnc.control.obstacle_triplet.statics import bending_torque_nm, loads
+from snakesim_gnc.control.obstacle_triplet.statics import torque_under
 from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_hal.messages import World, WorldContact
 
 
-def bending(body: PlanarBody, lie: Lie, choice: Choice, forces_n: Sequence[float], force_n: float) -> list[float]:
+def bending(body: PlanarBody, lie: Lie, choice: Choice, force_n: float) -> list[float]:
     """Torque that the solved forces ask of every joint, tail to head; the tether's force stands for all resistance."""
-    triplet = choice.triplet
-    tangent = triplet.contacts[0].tangent_w
-    pushed = loads(triplet.points_w, forces_n, triplet.normals_w, (-force_n * tangent[0], -force_n * tangent[1]))
-    joints_w = body.joints_w(lie)
-    torques: list[float] = bending_torque_nm(
-        joints_w, body.joint_s_m, triplet.points_w, choice.body_s_m, pushed
-    ).tolist()
-    return torques
+    places = np.array(choice.body_s_m)
+    torques = force_n * torque_under(body.joints_w(lie), body.joint_s_m, places, choice.triplet.unit_wrenches)
+    return torques.tolist()
 
 
 def planned_contacts(body: PlanarBody, world: World, choice: Choice, forces_n: Sequence[float]) -> list[WorldContact]:

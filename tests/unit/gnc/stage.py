@@ -128,4 +128,4 @@ def nodes_of(stage: Stage, tail_s_m: float) -> np.ndarray:
     axes = [joint.axis for joint in stage.robot.joints]
     segments = yaw_segments_m(axes, [link.length_m for link in stage.robot.links])
     lay = lay_chain(stage.route, tail_s_m, segments)
-    return chain_nodes(lay.tail_w, lay.heading_rad, lay.angles_rad, np.array(segments))
+    return chain_nodes(lay.tail_w, lay.heading_rad, lay.angles_rad.tolist(), segments)

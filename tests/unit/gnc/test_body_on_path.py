@@ -20,7 +20,7 @@ BODY = BodyOnPath(ROUTE, SEGMENTS)
 @given(st.floats(-1.0, 7.0))
 def test_it_lies_as_the_hal_lays_a_chain(tail_s_m):
     lay, lie = lay_chain(ROUTE, tail_s_m, SEGMENTS), BODY.at(tail_s_m)
-    assert lie.angles_rad == pytest.approx(lay.angles_rad, abs=2e-3)
+    assert lie.angles_rad == pytest.approx(lay.angles_rad, abs=5e-3)
     assert lie.nodes_w[:, 0] == pytest.approx(lay.tail_w, abs=1e-4)
     assert np.hypot(*np.diff(lie.nodes_w)) == pytest.approx(SEGMENTS, abs=2e-4)
     assert np.all(np.diff(lie.node_s_m) > 0)
@@ -29,7 +29,7 @@ def test_it_lies_as_the_hal_lays_a_chain(tail_s_m):
 @given(st.floats(-0.3, 4.0), st.floats(-0.03, 0.03))
 def test_a_body_on_the_path_is_found_again(tail_s_m, off_m):
     lay = lay_chain(ROUTE, tail_s_m, SEGMENTS)
-    nodes = chain_nodes(lay.tail_w, lay.heading_rad, lay.angles_rad, np.array(SEGMENTS))
+    nodes = chain_nodes(lay.tail_w, lay.heading_rad, lay.angles_rad.tolist(), SEGMENTS)
     assert BODY.find(nodes) == pytest.approx(tail_s_m, abs=1e-4)
     assert BODY.fit(nodes, tail_s_m + off_m) == pytest.approx(tail_s_m, abs=1e-4)
 
@@ -43,8 +43,8 @@ def test_nodes_are_those_of_the_3d_kinematics():
     angles = np.linspace(-0.5, 0.6, 13)
     rotation = rotation_from_quaternion(quaternion_from_yaw(0.7))
     origins, rotations = link_frames((1.0, 2.0, 0.0), rotation, angles, ["yaw"] * 13, SEGMENTS)
-    nodes = chain_nodes((1.0, 2.0), 0.7, angles, np.array(SEGMENTS))
-    assert nodes[:, :-1].T == pytest.approx(origins[:, :2])
+    nodes = chain_nodes((1.0, 2.0), 0.7, angles.tolist(), SEGMENTS)
+    assert nodes[:, :-1].T.ravel() == pytest.approx(origins[:, :2].ravel())
     assert nodes[:, -1] == pytest.approx((origins[-1] + 0.055 * rotations[-1][:, 0])[:2])
 
 

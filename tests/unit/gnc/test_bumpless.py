@@ -6,12 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from snakesim_gnc.control.bumpless import HandOver
-from snakesim_hal.gate import JointLimits, Measured, bumpless_target
+from snakesim_hal.gate import bumpless_target
 from snakesim_hal.messages import JointState, Mode
 from tests.unit.gnc.stage import make_robot
 
 ROBOT = make_robot(4)
-LIMITS = JointLimits.of(ROBOT)
 values = st.lists(st.floats(-1, 1), min_size=4, max_size=4)
 
 
@@ -28,8 +27,9 @@ def joints(angle, velocity, torque) -> JointState:
 
 
 def bumpless(mode: Mode, angle, velocity, torque):
-    measured = Measured(np.array(angle), np.array(velocity), np.array(torque))
-    return bumpless_target(np.full(4, int(mode)), measured, LIMITS)
+    """What the HAL's own gate takes for the target that changes nothing."""
+    parts = zip(ROBOT.joints, angle, velocity, torque, strict=True)
+    return [bumpless_target(joint, mode, q, speed, push) for joint, q, speed, push in parts]
 
 
 @given(values, values, values, values)

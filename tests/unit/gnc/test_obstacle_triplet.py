@@ -88,19 +88,21 @@ def test_the_faster_it_moves_the_less_it_pushes():
 
 def test_a_joint_that_has_swung_out_pushes_less():
     stage = make_stage()
-    settled = stay(make_controller(stage), stage, 50).report
+    controller = make_controller(stage)
+    settled = stay(controller, stage, 50).report
     joint, way = settled.propulsion_joint, np.sign(settled.propulsion_torque_nm)
-    out = stay(make_controller(stage, angle_guard_rad=3.0), stage, 50, turned={joint: 0.3 * way}).report
-    back = stay(make_controller(stage, angle_guard_rad=3.0), stage, 50, turned={joint: -0.3 * way}).report
-    assert out.propulsion_n < 0.7 * 35.0
-    assert back.propulsion_n == pytest.approx(35.0, rel=0.1)
+    out = controller.update(stage.view(50, TAIL_S_M, world_age_ticks=1, turned={joint: 0.3 * way})).report
+    back = controller.update(stage.view(51, TAIL_S_M, world_age_ticks=2, turned={joint: -0.3 * way})).report
+    assert out.propulsion_n == pytest.approx(0.5 * 35.0, rel=0.05)
+    assert back.propulsion_n == pytest.approx(35.0, rel=0.05)
 
 
 def test_a_joint_that_has_left_its_reference_goes_back_to_position_mode():
     stage = make_stage()
+    stage.pegs = stage.pegs[1:4]
     controller = make_controller(stage, guard_s=0.5)
     joint = stay(controller, stage, 10).report.propulsion_joint
-    action = controller.update(stage.view(10, TAIL_S_M, turned={joint: 0.9}))
+    action = controller.update(stage.view(10, TAIL_S_M, world_age_ticks=1, turned={joint: 0.9}))
     assert torque_joints(action) == []
     assert f"joint_{joint + 1} left its reference" in action.report.why
     turns = [controller.update(stage.view(t, TAIL_S_M)).report.propulsion_joint for t in range(11, 40)]
@@ -152,7 +154,7 @@ def test_nobody_wants_to_move():
 @pytest.mark.parametrize("pegs", [0, 2])
 def test_fewer_than_three_push_points_do_not_push(pegs):
     stage = make_stage()
-    stage.pegs = stage.pegs[:pegs]
+    stage.pegs = stage.pegs[1 : 1 + pegs]
     action = stay(make_controller(stage), stage, 5)
     assert torque_joints(action) == []
     assert action.report.usable_push_points == pegs
@@ -212,9 +214,10 @@ def test_a_new_path_moves_no_target_at_once():
     before = stay(controller, stage, 50).set_points
     stage.path_id = 1
     after = controller.update(stage.view(50, TAIL_S_M + 0.05)).set_points
-    for mode, was, now in zip(after.mode, before.target, after.target, strict=True):
-        if mode == Mode.POSITION:
-            assert now == pytest.approx(was, abs=0.03)
+    steady = [i for i in range(13) if before.mode[i] == after.mode[i] == Mode.POSITION]
+    assert len(steady) >= 11
+    for i in steady:
+        assert after.target[i] == pytest.approx(before.target[i], abs=0.03)
 
 
 def test_the_same_views_give_the_same_commands():

@@ -79,7 +79,7 @@ def test_a_box_that_the_path_runs_into_has_no_clearance():
 
 def test_push_points_are_those_that_the_body_covers():
     points, lie = points_at(0.2)
-    assert [p.contact.obstacle for p in points] == ["peg_0", "peg_1", "peg_2", "peg_3"]
+    assert [p.contact.obstacle for p in points] == ["peg_0", "peg_1", "peg_2", "peg_3", "peg_4"]
     for point in points:
         on_body = [np.interp(point.contact.path_s_m, lie.node_s_m, NODE_S)]
         assert [point.body_s_m] == pytest.approx(on_body)
@@ -88,9 +88,9 @@ def test_push_points_are_those_that_the_body_covers():
 
 def test_a_body_that_is_off_the_path_is_too_far_from_its_push_points():
     near, _ = points_at(0.2, off_w=(0.07, 0.0))
-    assert near  # the pegs lie across the path, mostly beside it
+    assert near  # that is mostly along the path
     far, _ = points_at(0.2, off_w=(0.0, 0.08))
-    assert len({p.contact.side for p in far}) == 1
+    assert not far
 
 
 def test_what_is_being_pushed_may_get_further_away():
@@ -164,13 +164,14 @@ def test_points_become_choices_with_a_joint_each():
     points, lie = points_at(0.2)
     triplets = Triplets(condition_max=100.0, authority_min=0.02, hold_on_m=0.003)
     found, refused = triplets.choices(points, lie.nodes_w, NODE_S, None, None)
-    assert [c.triplet.names for c in found] == [("peg_0", "peg_1", "peg_2"), ("peg_1", "peg_2", "peg_3")]
+    names = [f"peg_{i}" for i in range(5)]
+    assert [c.triplet.names for c in found] == [tuple(names[i : i + 3]) for i in range(3)]
     assert not refused
     for choice in found:
         assert choice.body_s_m[1] < NODE_S[choice.joint + 1] < choice.body_s_m[2]
         assert abs(choice.torque_per_n) <= choice.triplet.torque_per_n + 1e-9
     barred, why = triplets.choices(points, lie.nodes_w, NODE_S, None, found[0].joint)
-    assert [c.joint for c in barred] == [found[1].joint]
+    assert [c.joint for c in barred] == [c.joint for c in found[1:]]
     assert len(why) == 1
 
 

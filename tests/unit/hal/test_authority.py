@@ -294,10 +294,19 @@ def test_a_fault_takes_the_robots_safe_action(action: str, mode: Mode, target: f
     assert rig.acquire("control").lifecycle != "armed" and not rig.arm().ok
 
 
-def test_a_fault_while_disarmed_holds_the_pose_that_is_there_and_not_an_old_one() -> None:
-    rig = Rig(safety__action="hold")
+@pytest.mark.parametrize("action", ["passive", "damp", "hold"])
+def test_a_fault_while_disarmed_switches_no_motor_on(action: str) -> None:
+    rig = Rig(safety__action=action)
     rig.observe(0.7)
     rig.authority.fault(Fault(tick=1, what="hot", cause="joint_2 is hot"))
+    assert set(rig.pass_tick().set_points.mode) == {Mode.PASSIVE}
+
+
+def test_a_fault_is_held_where_the_joints_were_when_it_came() -> None:
+    rig = armed(safety__action="hold")
+    rig.observe(0.7)
+    rig.authority.fault(Fault(tick=1, what="hot", cause="joint_2 is hot"))
+    rig.observe(0.2)
     assert rig.pass_tick().set_points.target == [0.7] * JOINTS
 
 
@@ -517,7 +526,7 @@ class AnythingMayHappen(RuleBasedStateMachine):
         match self.authority.state:
             case "disarmed" | "estop":
                 assert set(points.mode) == {Mode.PASSIVE} and decision.sequence is None
-            case "fault":  # this robot damps
+            case "fault" if set(points.mode) != {Mode.PASSIVE}:  # this robot damps what was moving
                 assert set(points.mode) == {Mode.VELOCITY} and points.target == [0.0] * JOINTS
         for i, (mode, target, torque_limit) in enumerate(
             zip(points.mode, points.target, points.torque_limit_nm, strict=True)

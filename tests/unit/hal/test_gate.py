@@ -298,9 +298,20 @@ def test_a_switch_to_torque_mode_goes_on_with_the_torque_that_is_there(
 
 
 @given(velocity=st.floats(-5, 5), wanted=st.floats(-10, 10))
-def test_a_switch_to_velocity_mode_goes_on_with_the_velocity_that_is_there(velocity: float, wanted: float) -> None:
+def test_a_switch_to_velocity_mode_goes_on_with_the_torque_that_is_there(velocity: float, wanted: float) -> None:
     applied = applied_for(command(ROBOT, wanted, Mode.VELOCITY), 0.3, velocity, 1.0, Mode.POSITION)
-    assert abs(applied.target[0] - velocity) <= SPEED_STEP + TINY
+    joint = ROBOT.joints[0]
+    bumpless_rad_s = velocity + 1.0 / joint.velocity_gain_nm_s_per_rad
+    top = joint.speed_limit_rad_s
+    assert min(max(bumpless_rad_s - SPEED_STEP, -top), top) - TINY <= applied.target[0]
+    assert applied.target[0] <= max(min(bumpless_rad_s + SPEED_STEP, top), -top) + TINY
+
+
+def test_a_torque_limit_rises_no_faster_than_a_torque() -> None:
+    before = Applied(np.zeros(JOINTS, dtype=np.int64), np.zeros(JOINTS), np.zeros(JOINTS))
+    measured = Measured(np.zeros(JOINTS), np.zeros(JOINTS), np.zeros(JOINTS))
+    applied, _ = limit(command(ROBOT, 0.3, Mode.POSITION), measured=measured, last=before, limits=LIMITS)
+    assert applied.torque_limit_nm == pytest.approx(np.full(JOINTS, TORQUE_STEP))
 
 
 def test_a_switch_asked_to_stay_changes_nothing_at_all() -> None:

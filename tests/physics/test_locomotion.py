@@ -1,0 +1,205 @@
+"""Whole runs of the shipped scenarios in one process, with noise, gate and lockstep schedule: where the snake gets."""
+
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from snakesim_hal.gate import bumpless_target
+from snakesim_hal.messages import Mode
+from tests.in_process import Run, configure, run
+
+TRIPLET = "controllers.obstacle_triplet"
+FADE_MOST = 0.13  # period / blend_s + speed * period / blend_m at 0.5 m/s
+
+
+@cache
+def triplet() -> Run:
+    """The case study, as shipped; several tests look at the same run."""
+    return run(configure("triplet"))
+
+
+@cache
+def peg_row() -> Run:
+    """The long row, as shipped."""
+    return run(configure("peg_row"))
+
+
+def propelled(whole: Run) -> list[int]:
+    return [turn for turn in whole.turns if turn is not None]
+
+
+# --- the case study -------------------------------------------------------------------------------------------
+
+
+def test_35_newtons_move_the_snake_half_a_metre_in_10_seconds():
+    whole = triplet()
+    assert whole.time_s[-1] <= 10.0
+    assert whole.moved_m >= 0.5
+
+
+def test_the_turn_to_propel_passes_backward_over_at_least_four_joints():
+    turns = propelled(triplet())
+    assert len(turns) >= 4
+    assert turns == [turns[0] - k for k in range(len(turns))]
+
+
+def test_it_ends_when_the_obstacle_at_the_tail_is_lost():
+    whole = triplet()
+    assert whole.states[0] == "Locomoting"
+    assert whole.states[-1] == "NotLocomoting"
+    assert "2 usable push-points, 3 are needed" in whole.reasons[-1]
+    changes = sum(a != b for a, b in pairwise(whole.states))
+    assert changes == 1
+
+
+def test_one_joint_is_in_torque_mode_and_all_others_in_position_mode():
+    whole = triplet()
+    pushing = np.array([report.propulsion_joint is not None for report in whole.reports])
+    assert ((whole.mode == Mode.TORQUE).sum(axis=1) == pushing).all()
+    assert np.isin(whole.mode, [Mode.TORQUE, Mode.POSITION]).all()
+
+
+def test_the_propulsion_joint_leaves_its_reference_and_the_others_do_not():
+    """As in the paper's Figure 12."""
+    whole = triplet()
+    off = np.abs(whole.angle_rad - np.array([report.reference_rad for report in whole.reports]))
+    torque = whole.mode == Mode.TORQUE
+    assert 0.1 < off[torque].max() < 0.7
+    settled = np.array([whole.mode[max(i - 40, 0) : i + 1].max(axis=0) == Mode.POSITION for i in range(len(off))])
+    assert np.median(off[settled]) < 0.02
+
+
+def test_nothing_is_saturated_or_limited_in_the_case_study():
+    whole = triplet()
+    assert not any(report.saturated for report in whole.reports)
+    assert not any(whole.limited)
+    assert np.abs(whole.torque_nm).max() < whole.config.robot.limits.torque_nm
+    headroom = [r.torque_headroom_nm for r in whole.reports if r.torque_headroom_nm is not None]
+    assert min(headroom) > 0
+
+
+def test_no_command_jumps_at_a_hand_over():
+    """In the tick of a change of mode the applied target is within the stated bound of what would change nothing."""
+    whole = triplet()
+    robot = whole.backend.describe()
+    switches = 0
+    for i, j in zip(*np.nonzero(np.diff(whole.mode, axis=0)), strict=True):
+        tick, mode = i + 1, Mode(int(whole.mode[i + 1, j]))
+        angle, speed, torque = whole.angle_rad[tick, j], whole.velocity_rad_s[tick, j], whole.torque_nm[tick, j]
+        steady = bumpless_target(robot.joints[j], mode, angle, speed, torque)
+        report = whole.reports[tick]
+        if mode == Mode.POSITION:
+            way = abs(steady - report.reference_rad[j])
+        else:
+            full_nm = robot.joints[j].torque_limit_nm - report.torque_headroom_nm
+            way = full_nm + 0.5 * abs(speed) + abs(torque)
+        assert abs(whole.target[tick, j] - steady) <= FADE_MOST * way + 1e-9
+        switches += 1
+    assert switches >= 8
+
+
+def test_commands_are_smooth_through_the_whole_run():
+    whole = triplet()
+    steps = np.abs(np.diff(whole.target, axis=0))
+    same = np.diff(whole.mode, axis=0) == 0
+    limits = whole.config.robot.limits
+    assert steps[same & (whole.mode[1:] == Mode.TORQUE)].max() < limits.torque_rate_nm_s * 0.01
+    assert steps[same & (whole.mode[1:] == Mode.POSITION)].max() < 0.6 * limits.speed_rad_s * 0.01
+
+
+def test_the_same_seed_gives_the_same_run():
+    config = configure("triplet")
+    first, again = (run(config, duration_s=2.0) for _ in range(2))
+    assert np.array_equal(first.target, again.target)
+    assert np.array_equal(first.angle_rad, again.angle_rad)
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_other_noise_gives_the_same_picture(seed):
+    whole = run(configure("triplet", f"seed={seed}"))
+    turns = propelled(whole)
+    assert whole.moved_m >= 0.5
+    assert turns == [turns[0] - k for k in range(len(turns))]
+
+
+# --- the controls: what must not move -------------------------------------------------------------------------
+
+
+def test_two_newtons_are_below_the_drag_and_said_to_be():
+    whole = run(configure("triplet", f"{TRIPLET}.propulsion_n=2"))
+    assert abs(whole.moved_m) < 0.02
+    assert whole.states[-1] == "NotLocomoting"
+    assert "below the drag" in whole.reasons[-1]
+    assert not any(report.jammed for report in whole.reports)
+
+
+def test_holding_does_not_move():
+    whole = run(configure("triplet", "controller=hold"))
+    assert abs(whole.moved_m) < 0.02
+
+
+# --- long rows, other bodies ----------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_three_body_lengths_without_a_stop():
+    whole = peg_row()
+    body_m = whole.config.robot.length_m
+    assert whole.moved_m >= 3 * body_m >= 4.29
+    assert set(whole.states) == {"Locomoting"}
+    every_second = whole.path_s_m[::100]
+    assert np.diff(every_second).min() > 0.05
+    assert not any(report.jammed or report.saturated for report in whole.reports)
+
+
+@pytest.mark.slow
+def test_each_triplet_is_handed_over_backward():
+    turns = propelled(peg_row())
+    backward = sum(b == a - 1 for a, b in pairwise(turns))
+    forward = sum(b > a for a, b in pairwise(turns))
+    assert backward + forward == len(turns) - 1
+    assert backward > 1.5 * forward
+
+
+@pytest.mark.parametrize(("modules", "least_m"), [(8, 0.8), (13, 0.8), pytest.param(30, 0.5, marks=pytest.mark.slow)])
+def test_any_number_of_modules_moves_with_the_same_code(modules, least_m):
+    whole = run(configure("peg_row", f"robot.chain.modules={modules}"), duration_s=6.0)
+    assert whole.moved_m >= least_m
+    assert set(whole.states) == {"Locomoting"}
+    assert not any(report.jammed for report in whole.reports)
+
+
+def test_path_following_moves_steadily_along_the_row():
+    whole = run(configure("peg_row", "controller=path_following"), duration_s=6.0)
+    wanted = whole.config.mission.speed_m_s * 6.0
+    assert 0.7 * wanted < whole.moved_m < 1.2 * wanted
+    assert set(whole.states) == {"Locomoting"}
+
+
+# --- jams -----------------------------------------------------------------------------------------------------
+
+
+def test_a_jam_is_reported_as_one():
+    whole = run(configure("jam"))
+    jammed = np.array([report.jammed for report in whole.reports])
+    assert jammed[-1]
+    start = int(np.argmax(jammed))
+    assert whole.path_s_m[start:].max() - whole.path_s_m[start] < 0.1
+    assert set(whole.states[start:]) == {"NotLocomoting"}
+    assert all(reason.startswith("jammed: standing still") for reason in whole.reasons[start:])
+
+
+def test_pegs_that_grip_are_a_jam_too():
+    whole = run(configure("triplet", "scene.pegs_along_route.0.friction=1.0"), duration_s=4.0)
+    assert whole.moved_m < 0.15
+    assert whole.reports[-1].jammed
+
+
+def test_a_motor_that_is_too_weak_says_so():
+    whole = run(configure("triplet", "robot.limits.torque_nm=0.4"), duration_s=3.0)
+    saturated = [report for report in whole.reports if report.saturated]
+    assert saturated
+    assert all(report.torque_headroom_nm < 0 for report in saturated)
+    assert max(report.propulsion_n for report in saturated) < 35.0
