@@ -27,7 +27,7 @@ def main() -> int:
         text.append(line)
 
     say("# Benchmarks\n")
-    say(f"Printed by `make bench`. {platform.machine()}, Python {platform.python_version()}, two cores, shared machine:")
+    say(f"Printed by `make bench` on {platform.machine()}, Python {platform.python_version()}, a shared machine:")
     say("read the ratios, not the times. Each ratio is a median of pairs measured in turn in one run.\n")
     say(HEADER)
     ours, theirs = sensing()

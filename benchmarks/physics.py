@@ -68,7 +68,7 @@ class Publishing:
             lifecycle="armed",
             arming=1,
             lease_epoch=1,
-            newest={key: tick for key in samples.others},
+            newest=dict.fromkeys(samples.others, tick),
         )
         for key, message in ((JOINTS, samples.joints), *samples.others.items(), (CLOCK, clock)):
             if key not in self._publishers:

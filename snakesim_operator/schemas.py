@@ -78,8 +78,8 @@ def _key_space() -> str:
     rows += [
         "",
         "Kinds: a *stream* is published every so often and old samples are worthless; a *latched* value is given to",
-        "readers that come later; a *query* is answered with an [Answer](messages/Answer.json); *liveliness* is a token",
-        "that vanishes with its process.",
+        "readers that come later; a *query* is answered with an [Answer](messages/Answer.json); *liveliness* is a",
+        "token that vanishes with its process.",
         "",
     ]
     return "\n".join(rows)

@@ -73,6 +73,7 @@ class ObstacleTriplet:
         self._reference = np.empty(0)  # the same as angles of all joints
         self._planned: dict[str, tuple[Obstacle, PlannedContact]] = {}
         self._points: list[PushPoint] = []
+        self._asked_n = 0.0  # propulsion force of the tick before
         self._choice: Choice | None = None
         self._refused: list[str] = []
         self._banned: dict[Names, float] = {}  # -> arc length at which it stood still
@@ -101,6 +102,7 @@ class ObstacleTriplet:
         mode = [Mode.POSITION] * len(targets)
         limits_nm = self._body.torque_limit_nm
         if choice is None or turn is None:
+            self._asked_n = 0.0
             return Action(SetPoints(mode, targets, limits_nm), self._report_rest(located))
         push = self._push(view, located, choice, turn)
         mode[turn], targets[turn] = Mode.TORQUE, push.torque_nm
@@ -133,6 +135,8 @@ class ObstacleTriplet:
         near = 2.0 - swung_rad / set_.angle_fade_rad
         wanted_n = set_.propulsion_n * min(max(slow, 0.0), 1.0)
         asked_n = wanted_n * min(max(near, 0.0), 1.0)
+        step_n = set_.propulsion_rate_n_s * view.period_s
+        asked_n = self._asked_n = min(max(asked_n, self._asked_n - step_n), self._asked_n + step_n)
         force_n = min(asked_n, limit_nm / max(abs(choice.torque_per_n), 1e-12))
         torque_nm = force_n * choice.torque_per_n - set_.damping_nm_s_per_rad * view.joints.velocity_rad_s[turn]
         torque_nm = min(max(self._hand_over.torque_nm(torque_nm), -limit_nm), limit_nm)

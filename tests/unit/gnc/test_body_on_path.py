@@ -21,7 +21,7 @@ BODY = BodyOnPath(ROUTE, SEGMENTS)
 def test_it_lies_as_the_hal_lays_a_chain(tail_s_m):
     lay, lie = lay_chain(ROUTE, tail_s_m, SEGMENTS), BODY.at(tail_s_m)
     assert lie.angles_rad == pytest.approx(lay.angles_rad, abs=5e-3)
-    assert lie.nodes_w[:, 0] == pytest.approx(lay.tail_w, abs=1e-4)
+    assert lie.nodes_w[:, 0] == pytest.approx(lay.tail_w, abs=3e-4)
     assert np.hypot(*np.diff(lie.nodes_w)) == pytest.approx(SEGMENTS, abs=2e-4)
     assert np.all(np.diff(lie.node_s_m) > 0)
 
@@ -30,8 +30,8 @@ def test_it_lies_as_the_hal_lays_a_chain(tail_s_m):
 def test_a_body_on_the_path_is_found_again(tail_s_m, off_m):
     lay = lay_chain(ROUTE, tail_s_m, SEGMENTS)
     nodes = chain_nodes(lay.tail_w, lay.heading_rad, lay.angles_rad.tolist(), SEGMENTS)
-    assert BODY.find(nodes) == pytest.approx(tail_s_m, abs=1e-4)
-    assert BODY.fit(nodes, tail_s_m + off_m) == pytest.approx(tail_s_m, abs=1e-4)
+    assert BODY.find(nodes) == pytest.approx(tail_s_m, abs=3e-4)
+    assert BODY.fit(nodes, tail_s_m + off_m) == pytest.approx(tail_s_m, abs=3e-4)
 
 
 def test_a_body_beside_the_path_is_where_it_fits_best():
