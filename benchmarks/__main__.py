@@ -6,10 +6,10 @@ import statistics
 from pathlib import Path
 
 from benchmarks.echo import echo_us
-from benchmarks.physics import bare_physics_us, config_of, sensing, wire_bytes
+from benchmarks.physics import BareLoop, config_of, motion, sensing, wire_bytes
 from benchmarks.size import core_install_mb
 from benchmarks.table import HEADER, compare
-from benchmarks.whole import controller_us, highest_rate_hz, latency_us, lockstep_tick_us
+from benchmarks.whole import highest_rate_hz, latency_us, lockstep_tick_us
 
 RESULTS = Path(__file__).parent / "RESULTS.md"
 REPEATS = 3
@@ -30,16 +30,17 @@ def main() -> int:
     say(f"Printed by `make bench` on {platform.machine()}, Python {platform.python_version()}, a shared machine:")
     say("read the ratios, not the times. Each ratio is a median of pairs measured in turn in one run.\n")
     say(HEADER)
-    ours, theirs = sensing()
+    config = config_of()
+    ours, theirs = sensing(config)
     say(compare("simulator tick, all sensors published", "bare `mj_step`", ours, theirs, 1.25).row())
 
-    config = config_of()
     state, command = wire_bytes(config)
     ticks: list[float] = []
     floors: list[float] = []
     for _ in range(REPEATS):
         ticks.append(lockstep_tick_us())
-        floors.append(bare_physics_us(config) + echo_us(state, command) + controller_us())
+        points, controller_us = motion(config)
+        floors.append(BareLoop(config).tick_us(points) + echo_us(state, command) + controller_us)
     what = "lockstep tick, three GNC processes"
     say(compare(what, "bare physics + raw echo + controller", ticks, floors, 1.5).row())
 

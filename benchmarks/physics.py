@@ -1,9 +1,8 @@
 """The simulator in this process: with everything published, and as a bare loop of `mj_step`."""
 
 import socket
-import statistics
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 import mujoco
@@ -16,8 +15,9 @@ from snakesim_hal.plugins import BACKENDS, find_plugin, plugin_settings
 from snakesim_hal.scenario import RunConfig, load
 from snakesim_hal.session import Link, Publisher, Session, open_session
 from snakesim_sim_backend.backend import SimBackend
+from tests.in_process import run as run_in_process
 
-BLOCKS, TICKS_A_BLOCK = 15, 200
+TICKS_A_BLOCK = 50
 
 
 def config_of(scenario: str = "triplet") -> RunConfig:
@@ -76,25 +76,41 @@ class Publishing:
             self._publishers[key].put(message)  # pyright: ignore
 
 
-def bare_tick_us(backend: SimBackend, ticks: int) -> float:
-    """Mean time of one control period of nothing but `mj_step`; MuJoCo's own sensors are left out too."""
-    model, data, steps = backend.sim.model, backend.data, backend.sim.steps_per_tick
-    kept = int(model.opt.disableflags)
-    model.opt.disableflags = kept | int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
-    begin = time.perf_counter()
-    for _ in range(ticks):
-        mujoco.mj_step(model, data, steps)
-    spent = time.perf_counter() - begin
-    model.opt.disableflags = kept
-    return spent / ticks * 1e6
+class BareLoop:
+    """The same motion computed by nothing but `mj_step`; MuJoCo's own sensors are left out too."""
+
+    def __init__(self, config: RunConfig) -> None:
+        self._backend = open_simulator(config)
+        option = self._backend.sim.model.opt
+        option.disableflags = int(option.disableflags) | int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+
+    def tick_us(self, points: Sequence[SetPoints]) -> float:
+        """Mean time of a control period over these set-points; handing them over is not counted."""
+        model, data, steps = self._backend.sim.model, self._backend.data, self._backend.sim.steps_per_tick
+        spent = 0.0
+        for now in points:
+            self._backend.enact(now)
+            begin = time.perf_counter()
+            mujoco.mj_step(model, data, steps)
+            spent += time.perf_counter() - begin
+        return spent / len(points) * 1e6
 
 
-def sensing() -> tuple[list[float], list[float]]:
+def motion(config: RunConfig) -> tuple[list[SetPoints], float]:
+    """Every set-point of a run of the scenario, and the mean µs of the controller alone; all in this process."""
+    whole = run_in_process(config)
+    limits = [joint.torque_limit_nm for joint in whole.backend.describe().joints]
+    points = [
+        SetPoints([Mode(code) for code in mode], target, limits)
+        for mode, target in zip(whole.mode.tolist(), whole.target.tolist(), strict=True)
+    ]
+    return points, float(whole.update_us.mean())
+
+
+def sensing(config: RunConfig) -> tuple[list[float], list[float]]:
     """Per block, the time of a tick (in µs) with all sensors published, and of a tick of bare physics."""
-    config = config_of()
-    full, bare = open_simulator(config), open_simulator(config)
-    points = holding(full)
-    bare.enact(points)
+    full, bare = open_simulator(config), BareLoop(config)
+    points, _ = motion(config)
     ours: list[float] = []
     theirs: list[float] = []
     with listened_session() as (session, other):
@@ -102,18 +118,18 @@ def sensing() -> tuple[list[float], list[float]]:
         readers = [other.reader(key, type(message)) for key, message in ((JOINTS, first.joints), *first.others.items())]
         publishing = Publishing(session, config.period_ns)
         tick = 0
-        for _ in range(BLOCKS):
+        for start in range(0, len(points) - TICKS_A_BLOCK + 1, TICKS_A_BLOCK):
+            block = points[start : start + TICKS_A_BLOCK]
             begin = time.perf_counter()
-            for _ in range(TICKS_A_BLOCK):
+            for now in block:
                 tick += 1
                 publishing.put(tick, full.sample(tick, tick * config.period_ns))
-                full.enact(points)
+                full.enact(now)
                 full.advance()
             ours.append((time.perf_counter() - begin) / TICKS_A_BLOCK * 1e6)
-            theirs.append(bare_tick_us(bare, TICKS_A_BLOCK))
+            theirs.append(bare.tick_us(block))
         assert all(reader.drain() for reader in readers), "nobody heard what was published"
     full.close()
-    bare.close()
     return ours, theirs
 
 
@@ -135,12 +151,3 @@ def wire_bytes(config: RunConfig) -> tuple[bytes, bytes]:
     )
     state = encode(samples.joints) + b"".join(encode(message) for message in samples.others.values())
     return state, encode(command)
-
-
-def bare_physics_us(config: RunConfig, ticks: int = 400) -> float:
-    """Bare physics of one control period, at the scenario's start."""
-    backend = open_simulator(config)
-    backend.enact(holding(backend))
-    spent = statistics.median(bare_tick_us(backend, ticks // 4) for _ in range(4))
-    backend.close()
-    return spent

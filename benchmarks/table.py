@@ -33,6 +33,4 @@ def compare(what: str, against: str, ours_us: Sequence[float], theirs_us: Sequen
     """Pair the measurements up, in the order in which they were taken, and quote the median of their ratios."""
     ratio = statistics.median(a / b for a, b in zip(ours_us, theirs_us, strict=True))
     aim = f"<= {limit:g}"
-    return Line(
-        what, against, statistics.median(ours_us), statistics.median(theirs_us), ratio, aim, ratio <= limit
-    )
+    return Line(what, against, statistics.median(ours_us), statistics.median(theirs_us), ratio, aim, ratio <= limit)

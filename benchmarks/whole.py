@@ -1,17 +1,14 @@
 """Whole runs, as a user starts them: time of a lockstep tick, latency in real time, and the highest rate."""
 
-import statistics
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 import msgspec
 
 from snakesim_operator.record import SUMMARY
 from snakesim_operator.summary import RunSummary
-from tests.in_process import views_of
 
 RATES_HZ = (200, 300, 400, 500, 600, 700, 800, 900, 1000, 1200, 1500, 2000)
 
@@ -33,16 +30,6 @@ def lockstep_tick_us(duration_s: float = 10.0) -> float:
     """Wall time of one tick of a whole lockstep run with guidance, navigation and control as processes."""
     summary = run("--pace", "lockstep", "--duration", str(duration_s))
     return summary.wall_s / summary.ticks * 1e6
-
-
-def controller_us(ticks: int = 600) -> float:
-    """What the controller alone takes for a tick, in this process, in the same scenario."""
-    times: list[float] = []
-    for controller, view in views_of("triplet", ticks):
-        begin = time.perf_counter()
-        controller.update(view)
-        times.append((time.perf_counter() - begin) * 1e6)
-    return statistics.fmean(times)
 
 
 def latency_us(duration_s: float = 5.0) -> float:

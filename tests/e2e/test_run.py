@@ -76,9 +76,11 @@ def test_a_run_repeats_from_the_configuration_that_it_left(tmp_path: Path) -> No
 
 @pytest.mark.parametrize("pace", ["realtime", "free"])
 def test_other_paces_complete(tmp_path: Path, pace: str) -> None:
-    ended, summary = run_to_summary(tmp_path / "run", "triplet", "--duration", "2", "--pace", pace)
+    # 50 Hz has the longest lease, 100 ms: a busy test machine may well forget a process for 50 ms.
+    arguments = ["triplet", "--controller", "hold", "--duration", "2", "--pace", pace, "--set", "rate_hz=50"]
+    ended, summary = run_to_summary(tmp_path / "run", *arguments)
     assert ended.code == 0, ended.out + ended.err
-    assert summary.ticks == 200 and summary.pace == pace
+    assert summary.ticks == 100 and summary.pace == pace
     if pace == "realtime":
         assert summary.real_time_factor == pytest.approx(1.0, abs=0.05)
         assert summary.state_to_command_us["p50"] is not None
@@ -87,10 +89,10 @@ def test_other_paces_complete(tmp_path: Path, pace: str) -> None:
 @pytest.mark.parametrize("modules", [8, 13, 30])
 def test_any_number_of_modules_without_a_code_change(tmp_path: Path, modules: int) -> None:
     ended, summary = run_to_summary(
-        tmp_path / "run", "modules", "--duration", "6", "--set", f"robot.chain.modules={modules}"
+        tmp_path / "run", "peg_row", "--duration", "6", "--set", f"robot.chain.modules={modules}"
     )
     assert ended.code == 0, ended.out + ended.err
-    assert summary.path_distance_m is not None and summary.path_distance_m > 0.2
+    assert summary.path_distance_m is not None and summary.path_distance_m > 0.4
     assert summary.propulsion_joints
 
 
@@ -99,6 +101,12 @@ def test_a_jam_is_reported_as_such(tmp_path: Path) -> None:
     assert ended.code == 0, ended.out + ended.err
     assert summary.jammed
     assert "jam" in ended.out.lower()
+
+
+def test_another_robot_in_another_world(tmp_path: Path) -> None:
+    ended, summary = run_to_summary(tmp_path / "run", "clutter")
+    assert ended.code == 0, ended.out + ended.err
+    assert summary.robot == "mamba" and summary.path_distance_m is not None and summary.path_distance_m > 0.3
 
 
 def test_run_from_a_file_of_ones_own_in_another_folder(tmp_path: Path) -> None:

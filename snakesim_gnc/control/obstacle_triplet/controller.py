@@ -5,7 +5,12 @@ among them, and chooses one; its propulsion joint is the first joint ahead of o_
 joint after joint towards the tail, and the turn to propel with it, until the triplet's last obstacle is lost.
 
 The propulsion force is `propulsion_n (1 - speed / mission speed)`, never below zero. A force below the drag moves
-nothing: positions follow the path at the measured arc length, with no look-ahead that would push by itself.
+nothing: positions follow the path at the measured arc length, with no look-ahead that would push by itself. They follow
+it no faster than the mission wants, and so brake a body that runs away.
+
+Between push-points the propulsion joint swings freely until its contacts carry. It is damped, the force fades as it
+swings out, and a joint that has left its reference too far goes back to position mode. A body that stands still while
+it pushes is reported with the cause; when it is a jam, the triplet is let go of for a while and others are tried.
 
 Nothing jumps at a hand-over. In the tick of a change of mode, a position target is within `fade` times the joint's
 angle from its reference, and a torque target within `fade` times (measured torque - propulsion torque), of the target

@@ -21,7 +21,7 @@ class Settings(FileStruct, frozen=True, kw_only=True):
     # Greatest propulsion force (the paper's f_s). It fades to zero as the snake reaches the mission's speed.
     propulsion_n: Annotated[float, _above(1e4, "N")] = 35.0
     # How fast the propulsion force changes; a body that starts and stops by jerks would shake the command.
-    propulsion_rate_n_s: Annotated[float, _above(1e6, "N/s")] = 350.0
+    propulsion_rate_n_s: Annotated[float, _above(1e6, "N/s")] = 700.0
 
     # Push-points: how far the skin may be from an obstacle that is to be pushed, how far it may get from one that is
     # being pushed, and how near to a tip the point may be.

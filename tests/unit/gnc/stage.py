@@ -1,6 +1,7 @@
 """A robot, a wavy path with pegs, and views of a body on it, without any physics."""
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -11,9 +12,17 @@ from snakesim_hal.messages import Axis, Description, JointState, Obstacle, Traje
 from snakesim_hal.robot import Chain, Limits, Module, Motor, RobotFile, describe
 from snakesim_hal.route import Route, chain_angles, lay_chain, sine_points, yaw_segments_m
 
+T = TypeVar("T")
+
 PERIOD_S = 0.01
 AMPLITUDE_M, WAVELENGTH_M, LENGTH_M = 0.045, 0.6, 6.0
 BODY_RADIUS_M, PEG_RADIUS_M, CLEARANCE_M = 0.04, 0.05, 0.005
+
+
+def known(value: T | None) -> T:
+    """A value that must be there."""
+    assert value is not None
+    return value
 
 
 def make_robot(modules: int = 13, axes: tuple[Axis, ...] = ("yaw",), torque_nm: float = 7.0) -> Description:

@@ -6,7 +6,7 @@ import pytest
 
 from snakesim_gnc.control.obstacle_triplet import ObstacleTriplet, Settings
 from snakesim_hal.messages import Mode, WorldContact
-from tests.unit.gnc.stage import PERIOD_S, make_stage
+from tests.unit.gnc.stage import PERIOD_S, known, make_stage
 
 TAIL_S_M = 0.3
 
@@ -52,11 +52,11 @@ def test_the_report_is_the_solved_triplet():
     assert min(report.solved_force_n) > 0
     places = [point.body_s_m for point in report.push_points]
     assert places == sorted(places)
-    torque = report.bending_torque_nm[report.propulsion_joint]
+    torque = report.bending_torque_nm[known(report.propulsion_joint)]
     assert report.propulsion_torque_nm == pytest.approx(torque, rel=1e-6)
     assert report.torque_headroom_nm == pytest.approx(7.0 - abs(torque), abs=0.05)
     assert len(report.bending_torque_nm) == len(report.reference_rad) == 13
-    assert 1 < report.condition < 20
+    assert 1 < known(report.condition) < 20
 
 
 def test_the_joint_is_the_first_ahead_of_the_middle_contact():
@@ -90,18 +90,24 @@ def test_a_joint_that_has_swung_out_pushes_less():
     stage = make_stage()
     controller = make_controller(stage)
     settled = stay(controller, stage, 50).report
-    joint, way = settled.propulsion_joint, np.sign(settled.propulsion_torque_nm)
-    out = controller.update(stage.view(50, TAIL_S_M, world_age_ticks=1, turned={joint: 0.3 * way})).report
-    back = controller.update(stage.view(51, TAIL_S_M, world_age_ticks=2, turned={joint: -0.3 * way})).report
-    assert out.propulsion_n == pytest.approx(0.5 * 35.0, rel=0.05)
-    assert back.propulsion_n == pytest.approx(35.0, rel=0.05)
+    joint, way = known(settled.propulsion_joint), np.sign(known(settled.propulsion_torque_nm))
+    swung = [
+        controller.update(stage.view(50 + t, TAIL_S_M, world_age_ticks=1 + t, turned={joint: 0.3 * way})).report
+        for t in range(10)
+    ]
+    assert swung[-1].propulsion_n == pytest.approx(0.5 * 35.0, rel=0.05)
+    back = [
+        controller.update(stage.view(60 + t, TAIL_S_M, world_age_ticks=11 + t, turned={joint: -0.3 * way})).report
+        for t in range(10)
+    ]
+    assert back[-1].propulsion_n == pytest.approx(35.0, rel=0.05)
 
 
 def test_a_joint_that_has_left_its_reference_goes_back_to_position_mode():
     stage = make_stage()
     stage.pegs = stage.pegs[1:4]
     controller = make_controller(stage, guard_s=0.5)
-    joint = stay(controller, stage, 10).report.propulsion_joint
+    joint = known(stay(controller, stage, 10).report.propulsion_joint)
     action = controller.update(stage.view(10, TAIL_S_M, world_age_ticks=1, turned={joint: 0.9}))
     assert torque_joints(action) == []
     assert f"joint_{joint + 1} left its reference" in action.report.why
@@ -115,10 +121,10 @@ def test_saturation_is_told_and_the_force_is_what_the_joint_can_give():
     action = stay(make_controller(stage), stage, 100)
     report = action.report
     assert report.saturated
-    assert report.torque_headroom_nm < 0
-    assert report.propulsion_n < 35.0
-    assert abs(action.set_points.target[report.propulsion_joint]) == pytest.approx(1.0, rel=1e-3)
-    assert abs(report.bending_torque_nm[report.propulsion_joint]) == pytest.approx(1.0, rel=1e-2)
+    assert known(report.torque_headroom_nm) < 0
+    assert known(report.propulsion_n) < 35.0
+    assert abs(action.set_points.target[known(report.propulsion_joint)]) == pytest.approx(1.0, rel=1e-3)
+    assert abs(report.bending_torque_nm[known(report.propulsion_joint)]) == pytest.approx(1.0, rel=1e-2)
 
 
 def test_without_a_world_model_it_holds_and_says_so():
@@ -201,7 +207,7 @@ def test_too_little_propulsion_is_told_apart():
 def test_pitch_joints_stay_straight():
     stage = make_stage(26, ("yaw", "pitch"))
     action = stay(make_controller(stage), stage, 100)
-    assert action.report.propulsion_joint % 2 == 0
+    assert known(action.report.propulsion_joint) % 2 == 0
     assert action.report.why == ""
     pitch = np.array(action.set_points.target)[1::2]
     assert np.abs(pitch).max() < 1e-6
