@@ -4,7 +4,7 @@ The host passes in commands, requests, states and the time; it gets back set-poi
 monotonic clock, or simulated time in lockstep.
 """
 
-from collections import Counter
+from collections import Counter, deque
 from dataclasses import dataclass
 
 import msgspec
@@ -28,6 +28,7 @@ from snakesim_hal.messages import (
 )
 
 MAX_FAULTS_KEPT = 32
+COMMANDS_KEPT = 1024
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,7 @@ class Authority:
         self._measured = Measured(np.zeros(count), np.zeros(count), np.zeros(count))
         self._state_trouble: str | None = "no joint state yet"
         self._command: JointCommand | None = None
+        self._recent: deque[JointCommand] = deque(maxlen=COMMANDS_KEPT)  # good ones since arming, oldest first
         self._last_sequence = -1
         self._hold_at = np.zeros(count)
         self._was_armed = False  # when the present fault came: only then is there a motion to stop
@@ -96,13 +98,21 @@ class Authority:
             self.rejected[refusal] += 1
             return refusal
         self._last_sequence = command.sequence
-        self._command = command
         self.lease = renewed(self.lease, now_ns, self.description.lease_ns)
+        if not self.answers_arming(command):
+            self.standby += 1
+            return "before_arming"
+        self._command = command
         if self.state == "armed":
             self.accepted += 1
+            self._recent.append(command)
         else:
             self.standby += 1
         return None
+
+    def answers_arming(self, command: JointCommand) -> bool:
+        """Whether a command was sent in the knowledge that the robot is armed, if it is."""
+        return self.state != "armed" or command.arming is None or command.arming == self.arming
 
     def reject(self, reason: str) -> None:
         """Count a sample that never became a command."""
@@ -136,6 +146,7 @@ class Authority:
                 self._go("arm", f"armed, commanded by {self.lease.holder}")
                 self.arming += 1
                 self._command = None
+                self._recent.clear()
                 self._hold_at = self._measured.angle_rad
                 self.lease = renewed(self.lease, now_ns, self.description.lease_ns)
             case "disarm":
@@ -212,9 +223,14 @@ class Authority:
         else:
             self._drop_lease()
 
-    def decide(self) -> Decision:
-        """The set-points for the next period. Call `expire` first."""
+    def decide(self, up_to: int | None = None) -> Decision:
+        """The set-points for the next period. Call `expire` first.
+
+        up_to: newest tick whose command counts already, in lockstep; None: the command that came last.
+        """
         command = self._command
+        if up_to is not None:
+            command = next((c for c in reversed(self._recent) if c.tick <= up_to), None)
         if self.state != "armed":
             applied = self._safe()
             self._applied = applied

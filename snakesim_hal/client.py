@@ -211,11 +211,12 @@ class Commander:
         self._epoch = answer.epoch if answer.ok else 0
         return answer.ok
 
-    def send(self, tick: int, set_points: SetPoints) -> None:
-        """Publish set-points that answer the state of `tick`; they are good for one lease term."""
+    def send(self, clock: Clock, set_points: SetPoints) -> None:
+        """Publish set-points that answer the state at `clock`; they are good for one lease term."""
         self._sequence += 1
         command = JointCommand(
-            tick=tick,
+            tick=clock.tick,
+            arming=clock.arming,
             sequence=self._sequence,
             lease_epoch=self._epoch,
             layout=self._description.layout,
@@ -225,7 +226,7 @@ class Commander:
             torque_limit_nm=set_points.torque_limit_nm,
         )
         self._client.put(keys.JOINT_COMMAND, command)
-        self._client.commanded_tick = tick
+        self._client.commanded_tick = clock.tick
 
     def stay(self, joints: JointState) -> SetPoints:
         """Set-points that keep every joint where it is: what is streamed while the robot is not armed."""

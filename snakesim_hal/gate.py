@@ -126,15 +126,17 @@ def refuse(
 def limit(command: JointCommand, *, measured: Measured, last: Applied, limits: JointLimits) -> tuple[Applied, Floats]:
     """Bring an accepted command inside every limit. Returns what is applied, and what was asked for (n_joints,)."""
     asked_limits = limits.torque_nm.tolist() if command.torque_limit_nm is None else command.torque_limit_nm
-    torque_limits = [  # may fall at once, but rises no faster than a torque may
-        min(max(asked, 0.0), joint.torque_limit_nm, held + joint.torque_rate_limit_nm_s * limits.period_s)
-        for asked, joint, held in zip(asked_limits, limits.joints, last.torque_limit_nm.tolist(), strict=True)
-    ]
+    torque_limits: list[float] = []
+    for asked, joint, held in zip(asked_limits, limits.joints, last.torque_limit_nm.tolist(), strict=True):
+        # It may fall at once, but rises no faster than a torque may.
+        rise = held + joint.torque_rate_limit_nm_s * limits.period_s
+        torque_limits.append(_within(asked, 0.0, min(joint.torque_limit_nm, rise)))
     before = zip(last.mode.tolist(), last.target.tolist(), strict=True)
     now = zip(measured.angle_rad.tolist(), measured.velocity_rad_s.tolist(), measured.torque_nm.tolist(), strict=True)
+    period_s, max_step_rad = limits.period_s, limits.max_step_rad
     targets: list[float] = []
     # Plain numbers, joint by joint: for a dozen joints that is several times faster than vectors.
-    for joint, mode, target, torque_limit, (last_mode, last_target), (angle, velocity, torque) in zip(
+    for joint, mode, wanted, torque_limit, (last_mode, last_target), (angle, velocity, torque) in zip(
         limits.joints, command.mode, command.target, torque_limits, before, now, strict=True
     ):
         if mode is Mode.PASSIVE:
@@ -142,31 +144,24 @@ def limit(command: JointCommand, *, measured: Measured, last: Applied, limits: J
             continue
         same = mode.value == last_mode
         start = last_target if same else bumpless_target(joint, mode, angle, velocity, torque)
-        low, high = _reach(joint, mode, start, angle, torque_limit, limits)
-        targets.append(min(max(target, low), high))
+        if mode is Mode.POSITION:
+            step, low, high = joint.speed_limit_rad_s, joint.angle_min_rad, joint.angle_max_rad
+            # The measured angle moves on its own: staying near it outranks the rate limit, and being in range both.
+            low, high = _within(angle - max_step_rad, low, high), _within(angle + max_step_rad, low, high)
+        elif mode is Mode.VELOCITY:
+            step, high = joint.acceleration_limit_rad_s2, joint.speed_limit_rad_s
+            low = -high
+        else:
+            step, high = joint.torque_rate_limit_nm_s, torque_limit
+            low = -high
+        step *= period_s
+        targets.append(_within(_within(wanted, start - step, start + step), low, high))
     applied = Applied(np.array(command.mode, dtype=np.int64), np.array(targets), np.array(torque_limits))
     return applied, np.array(command.target, dtype=np.float64)
 
 
-def _reach(
-    joint: JointDescription, mode: Mode, start: float, angle_rad: float, torque_limit_nm: float, limits: JointLimits
-) -> tuple[float, float]:
-    """Lowest and highest target that a joint may be given now, in its mode's unit, coming from `start`."""
-    if mode is Mode.POSITION:
-        step, bottom, top = joint.speed_limit_rad_s, joint.angle_min_rad, joint.angle_max_rad
-        # The measured angle moves on its own: staying near it outranks the rate limit, and being in range both.
-        bottom, top = (
-            min(max(angle_rad - limits.max_step_rad, bottom), top),
-            max(min(angle_rad + limits.max_step_rad, top), bottom),
-        )
-    elif mode is Mode.VELOCITY:
-        step, top = joint.acceleration_limit_rad_s2, joint.speed_limit_rad_s
-        bottom = -top
-    else:
-        step, top = joint.torque_rate_limit_nm_s, torque_limit_nm
-        bottom = -top
-    step *= limits.period_s
-    return min(max(start - step, bottom), top), max(min(start + step, top), bottom)
+def _within(value: float, low: float, high: float) -> float:
+    return low if value < low else high if value > high else value
 
 
 def bumpless_target(

@@ -102,6 +102,7 @@ class Host:
         self._tick = 0
         self._anchor_ns = 0  # monotonic time of tick 0 in realtime
         self._published_ns: deque[tuple[int, int, int]] = deque(maxlen=STAMPS_KEPT)  # tick, safety, monotonic
+        self._published_arming = 0
         self._newest: dict[str, int] = {}
         self._answered = -1  # newest tick that a good command answered
         self._advance_ns = 0.0  # how long a period takes the backend, smoothed
@@ -141,7 +142,7 @@ class Host:
                     self._take_until(time.monotonic_ns() + STANDBY_PERIOD_NS)
                     self._show_status()
                     continue
-                self._wait_for_answers()
+                self._wait_for_answers(last)
                 self._finish_tick(last)
         finally:
             self._ended_ns = time.monotonic_ns()
@@ -188,18 +189,22 @@ class Host:
             lease_epoch=self.authority.lease.epoch if self.authority.lease.holder else 0,
             newest=self._newest,
         )
+        if self._published_ns and self._published_ns[-1][0] == tick:
+            self._published_ns.pop()
+        self._published_arming = self.authority.arming
         self._published_ns.append((tick, self._safety_now(), time.monotonic_ns()))
         self._put(keys.CLOCK, clock)
 
     def _finish_tick(self, samples: Samples) -> None:
         self.authority.expire(self._safety_now(), self._tick)
-        decision = self.authority.decide()
+        counting = self._counting_tick()
+        decision = self.authority.decide(counting)
         if self.authority.arming:
             self._armed_at_ns = self._armed_at_ns or time.monotonic_ns()
             self.black_box.record(self._tick, self._tick * self._period_ns, samples, decision)
         if self.authority.state == "armed":
             self.tally.ticks += 1
-            self.tally.answered_ticks += self._answered == self._tick
+            self.tally.answered_ticks += self._answered >= (self._tick if counting is None else counting)
         if self._applied_heard:
             self._put(keys.APPLIED, self._as_message(decision))
         started = time.monotonic_ns()
@@ -217,9 +222,9 @@ class Host:
         self._watch_fault()
         self._show_status()
 
-    def _wait_for_answers(self) -> None:
+    def _wait_for_answers(self, samples: Samples) -> None:
         if self._pace == "lockstep":
-            self._wait_for_participants()
+            self._wait_for_participants(samples)
         elif self._pace == "realtime":
             spare_ns = 1.5 * self._advance_ns + 50_000
             while self._answered < self._tick and not self._stopping:
@@ -228,10 +233,12 @@ class Host:
                     break
         self._take_all()
 
-    def _wait_for_participants(self) -> None:
+    def _wait_for_participants(self, samples: Samples) -> None:
         give_up_ns = time.monotonic_ns() + round(self._config.stall_limit_s * 1e9)
         while (behind := [n for n, p in self.participants.items() if p.behind(self._tick)]) and not self._stopping:
             left_ns = give_up_ns - time.monotonic_ns()
+            if self._published_arming != self.authority.arming:  # armed in this very tick: tell everybody
+                self._publish(samples)
             if left_ns > 0:
                 self._take(min(left_ns * 1e-9, 0.5))
                 self._show_status()
@@ -312,7 +319,7 @@ class Host:
         except WireError as error:
             self.authority.reject(error.reason)
             return
-        if command.lease_epoch == self.authority.lease.epoch:
+        if command.lease_epoch == self.authority.lease.epoch and self.authority.answers_arming(command):
             self._delivered(self.authority.lease.holder, command.tick)
         safety_ns, monotonic_ns = self._published_at(command.tick)
         now_ns = self._safety_now(arrival.monotonic_ns)
@@ -352,10 +359,28 @@ class Host:
             answer = Answer(ok=False, reason=f"waiting for {', '.join(missing)}", lifecycle=self.authority.state)
         else:
             answer = self.authority.on_lifecycle(request, now_ns)
+            if request.action == "arm" and answer.ok:
+                self._expect_first_command()
             if request.action == "finish":
                 self._stopping = True
         self._show_status(force=True)
         question.reply(answer)
+
+    def _holder(self) -> Participant | None:
+        return self.participants.get(self.authority.lease.holder or "")
+
+    def _expect_first_command(self) -> None:
+        """What was streamed before the arming does not answer the tick of arming."""
+        holder = self._holder()
+        if holder is not None:
+            holder.done_tick = self._answered = -1
+
+    def _counting_tick(self) -> int | None:
+        """In lockstep: the newest tick whose command counts at the end of this one."""
+        holder = self._holder()
+        if self._pace != "lockstep" or holder is None:
+            return None
+        return holder.service.counting_at(self._tick + 1)
 
     def _came_or_went(self, service: str, present: bool) -> None:
         participant = self.participants.get(service)

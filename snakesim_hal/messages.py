@@ -97,7 +97,8 @@ class JointCommand(Message, frozen=True, kw_only=True):
     """`actuator/joints`: what the lease holder wants of every joint.
 
     `target[i]` is in the unit of `mode[i]`. `torque_limit_nm[i]` bounds the motor below the robot's own limit.
-    `tick` names the state that the command answers; `layout` is the hash from the description.
+    `tick` and `arming` are those of the clock that the command answers; what was sent before an arming does not count
+    after it. `layout` is the hash from the description.
     """
 
     tick: q.Tick
@@ -108,6 +109,7 @@ class JointCommand(Message, frozen=True, kw_only=True):
     mode: Annotated[list[Mode], Meta(max_length=q.MAX_JOINTS)]
     target: q.Targets
     torque_limit_nm: q.TorqueLimits | None = None
+    arming: q.Tick | None = None  # None: the sender does not tell
 
 
 class AppliedCommand(Message, frozen=True, kw_only=True):

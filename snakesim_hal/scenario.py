@@ -50,7 +50,8 @@ class Service(FileStruct, frozen=True, kw_only=True):
     """A process that takes part in the run: it acts every so many ticks.
 
     In lockstep what it says of tick t counts from tick t + lag_ticks on, whenever it really arrived, so that a slow
-    service costs no determinism, and runs beside the simulator instead of holding it up.
+    service costs no determinism, and runs beside the simulator instead of holding it up. For control, a lag of 1 is a
+    command that acts in the period after its state; 2 adds a period of latency, in which control and physics overlap.
     """
 
     every_ticks: Annotated[int, Meta(ge=1, le=1000)] = 1

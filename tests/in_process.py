@@ -176,11 +176,10 @@ class _Runner:
             action = self.controller.update(view)
             took_us = (time.perf_counter_ns() - started) / 1000
             set_points = action.set_points if intercept is None else intercept(tick, action.set_points)
-            if tick > 0:  # the tick of arming is over before its command is there: the host holds the pose
-                refusal = self.authority.offer(self._command(tick, set_points), now_ns=stamp_ns, tick=tick, age_ns=0)
-                assert refusal is None, refusal
+            refusal = self.authority.offer(self._command(tick, set_points), now_ns=stamp_ns, tick=tick, age_ns=0)
+            assert refusal is None, refusal
             self.authority.expire(stamp_ns, tick)
-            decision = self.authority.decide()
+            decision = self.authority.decide(self.config.services["control"].counting_at(tick + 1))
             if each_tick is not None:
                 each_tick(tick, self.backend)
             self.backend.enact(decision.set_points)

@@ -58,7 +58,7 @@ class Control(Service):
             return self._tell(clock, Report(why=why[:400]), armed=False, wants=False)
         if clock.lifecycle != "armed":
             self._controller = None
-            self._commander.send(clock.tick, self._commander.stay(joints))
+            self._commander.send(clock, self._commander.stay(joints))
             return self._tell(clock, Report(), armed=False, wants=False)
         if self._controller is None or clock.arming != self._arming:
             self._controller = self._plugin(self._robot, self._settings)
@@ -73,7 +73,7 @@ class Control(Service):
             trajectory=trajectory,
         )
         action = self._controller.update(view)
-        self._commander.send(clock.tick, action.set_points)
+        self._commander.send(clock, action.set_points)
         wants = trajectory is not None and trajectory.speed_m_s != 0.0
         return self._tell(clock, action.report, armed=True, wants=wants)
 

@@ -169,7 +169,7 @@ class Follower:
                 self.armed_ticks.append(clock.tick)
                 wave = self.amplitude_rad * math.sin(2 * math.pi * clock.stamp_ns * 1e-9)
                 points = SetPoints(points.mode, [wave] * len(robot.joints), points.torque_limit_nm)
-            commander.send(clock.tick, points)
+            commander.send(clock, points)
         client.done(clock.tick)
 
 
