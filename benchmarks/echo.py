@@ -31,8 +31,8 @@ def _publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:
     )
 
 
-def echo_us(request: bytes, reply: bytes, rounds: int = 2000) -> float:
-    """Median round trip of `request` one way and `reply` back, in microseconds."""
+def echo_us(request: bytes, reply: bytes, rounds: int = 2000, period_s: float = 0.0) -> float:
+    """Median round trip of `request` one way and `reply` back, in microseconds; one every `period_s`."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
@@ -56,6 +56,7 @@ def echo_us(request: bytes, reply: bytes, rounds: int = 2000) -> float:
                 publisher.put(request)
                 replies.recv()
                 times.append((time.perf_counter() - begin) * 1e6)
+                time.sleep(max(begin + period_s - time.perf_counter(), 0.0))
         finally:
             other.kill()
             other.wait()

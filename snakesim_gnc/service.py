@@ -7,7 +7,7 @@ from typing import Protocol
 from snakesim_hal.client import Client
 from snakesim_hal.errors import SnakesimError
 from snakesim_hal.messages import Clock, Description, Message
-from snakesim_hal.process import settle_for_timing
+from snakesim_hal.process import settle_for_timing, take_priority
 from snakesim_hal.scenario import RunConfig
 from snakesim_hal.scenario import Service as Schedule
 from snakesim_hal.serve import arguments, duty
@@ -20,6 +20,7 @@ class Service(Protocol):
     """What a service process is made of. The constructor subscribes to everything that it will read."""
 
     name: str
+    urgent: bool = False  # whether the robot waits for this service in every tick
 
     def __init__(self, client: Client, config: RunConfig) -> None: ...
 
@@ -41,6 +42,8 @@ def serve(service_type: type[Service], argv: Sequence[str] | None = None) -> int
     name = service_type.name
     given = duty(arguments(f"Run the {name} service of a robot."), argv)
     try:
+        if service_type.urgent and given.config.pace == "realtime":
+            take_priority()
         with open_session(given.link, connect_timeout_s=20.0) as session:
             schedule = given.config.services.get(name, Schedule())
             client = Client(session, name, every_ticks=schedule.every_ticks)

@@ -13,7 +13,7 @@ from snakesim_hal.errors import SnakesimError
 from snakesim_hal.host import Host
 from snakesim_hal.messages import Fault
 from snakesim_hal.plugins import BACKENDS, find_plugin, plugin_settings
-from snakesim_hal.process import on_stop_signal, settle_for_timing
+from snakesim_hal.process import on_stop_signal, settle_for_timing, take_priority
 from snakesim_hal.scenario import RunConfig
 from snakesim_hal.serve import arguments, duty
 from snakesim_hal.session import open_session
@@ -52,6 +52,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         factory = find_plugin(BACKENDS, given.config.backend)
         backend = factory(given.config, backend_settings(given.config, factory))
         try:
+            if given.config.pace == "realtime":
+                take_priority()
             with open_session(given.link) as session:
                 host = Host(
                     given.config,

@@ -19,6 +19,7 @@ class Control(Service):
     """Runs the scenario's controller."""
 
     name = "control"
+    urgent = True
 
     def __init__(self, client: Client, config: RunConfig) -> None:
         """Finds the controller and checks its settings."""
