@@ -34,12 +34,12 @@ def environment(home: Path, **more: str) -> dict[str, str]:
     return {**os.environ, "XDG_STATE_HOME": str(home), "PYTHONUNBUFFERED": "1", **more}
 
 
-def snakesim(*arguments: str, cwd: Path, limit_s: float = LIMIT_S, **more: str) -> Ended:
+def snakesim(*arguments: str, cwd: Path, limit_s: float = LIMIT_S, more: dict[str, str] | None = None) -> Ended:
     """Run a command to its end."""
     done = subprocess.run(
         [*SNAKESIM, *arguments],
         cwd=cwd,
-        env=environment(cwd, **more),
+        env=environment(cwd, **(more or {})),
         capture_output=True,
         text=True,
         timeout=limit_s,
@@ -57,7 +57,8 @@ def free_endpoint() -> str:
 
 def run_to_summary(out: Path, *arguments: str, **more: str) -> tuple[Ended, RunSummary]:
     """`snakesim run ... --out out`, and the summary that it left."""
-    ended = snakesim("run", *arguments, "--out", str(out), "--endpoint", free_endpoint(), cwd=out.parent, **more)
+    network = [] if "--router" in arguments else ["--endpoint", free_endpoint()]
+    ended = snakesim("run", *arguments, "--out", str(out), *network, cwd=out.parent, more=more)
     assert (out / SUMMARY).is_file(), ended.out + ended.err
     return ended, msgspec.json.decode((out / SUMMARY).read_bytes(), type=RunSummary)
 

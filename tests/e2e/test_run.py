@@ -1,6 +1,7 @@
 """The main job, with real processes: it runs, it moves, it repeats itself, and it can be told apart from not moving."""
 
 import multiprocessing
+from multiprocessing.synchronize import Event
 from pathlib import Path
 
 import pytest
@@ -35,7 +36,7 @@ def test_control_experiments_stay_where_they_are(tmp_path: Path, arguments: list
     assert summary.net_displacement_m is not None and summary.net_displacement_m < 0.02
 
 
-def _burn(stop: "multiprocessing.synchronize.Event") -> None:
+def _burn(stop: Event) -> None:
     while not stop.is_set():
         sum(range(1000))
 
