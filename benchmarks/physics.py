@@ -12,7 +12,7 @@ from snakesim_hal.codec import encode
 from snakesim_hal.keys import CLOCK, JOINTS
 from snakesim_hal.messages import Clock, JointCommand, Mode
 from snakesim_hal.plugins import BACKENDS, find_plugin, plugin_settings
-from snakesim_hal.scenario import RunConfig, load
+from snakesim_hal.scenario import RunConfig, load, parse_set
 from snakesim_hal.session import Link, Publisher, Session, open_session
 from snakesim_sim_backend.backend import SimBackend
 from tests.in_process import run as run_in_process
@@ -20,9 +20,9 @@ from tests.in_process import run as run_in_process
 TICKS_A_BLOCK = 50
 
 
-def config_of(scenario: str = "triplet") -> RunConfig:
-    """The scenario that is measured."""
-    return load(scenario).config
+def config_of(*sets: str) -> RunConfig:
+    """The scenario that is measured, with `--set` texts."""
+    return load("triplet", [parse_set(text) for text in sets]).config
 
 
 def open_simulator(config: RunConfig) -> SimBackend:
@@ -77,12 +77,10 @@ class Publishing:
 
 
 class BareLoop:
-    """The same motion computed by nothing but `mj_step`; MuJoCo's own sensors are left out too."""
+    """The same motion on the same model, computed by nothing but `mj_step`."""
 
     def __init__(self, config: RunConfig) -> None:
         self._backend = open_simulator(config)
-        option = self._backend.sim.model.opt
-        option.disableflags = int(option.disableflags) | int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 
     def tick_us(self, points: Sequence[SetPoints]) -> float:
         """Mean time of a control period over these set-points; handing them over is not counted."""
