@@ -10,13 +10,12 @@ free      not at all
 
 import contextlib
 import time
-from collections import deque
 from dataclasses import dataclass, field
 from queue import Empty, SimpleQueue
 from typing import Any
 
 from snakesim_hal import keys
-from snakesim_hal.authority import Authority, Decision
+from snakesim_hal.authority import Authority
 from snakesim_hal.backend import Backend, Samples
 from snakesim_hal.blackbox import BlackBox
 from snakesim_hal.codec import Decoder
@@ -36,28 +35,16 @@ from snakesim_hal.messages import (
     Pace,
     Status,
 )
-from snakesim_hal.scenario import RunConfig, Service
+from snakesim_hal.participants import Participant, Participants
+from snakesim_hal.publish_times import PublishTimes
+from snakesim_hal.scenario import RunConfig
 from snakesim_hal.session import Arrival, Publisher, Question, Session
+from snakesim_hal.telling import applied_message, status_message
 
 INBOX_LIMIT = 4096
 STATUS_PERIOD_NS = 200_000_000
 STANDBY_PERIOD_NS = 20_000_000
-STAMPS_KEPT = 4096
 REANCHOR_PERIODS = 10
-
-
-@dataclass
-class Participant:
-    """A service that a lockstep run waits for."""
-
-    service: Service
-    done_tick: int = -1
-    present: bool = False
-    given_up: bool = False
-
-    def behind(self, tick: int) -> bool:
-        """Whether the end of `tick` has to wait for this service."""
-        return self.present and not self.given_up and self.done_tick < self.service.counting_at(tick + 1)
 
 
 @dataclass
@@ -91,7 +78,7 @@ class Host:
         self.authority = Authority(self.description, first_epoch=time.time_ns() // 1_000_000)
         self.black_box = BlackBox(self.description)
         self.tally = Tally()
-        self.participants = {name: Participant(service) for name, service in config.services.items()}
+        self.participants = Participants(config.services)
         self._config = config
         self._backend = backend
         self._session = session
@@ -101,7 +88,7 @@ class Host:
         self._period_ns = config.period_ns
         self._tick = 0
         self._anchor_ns = 0  # monotonic time of tick 0 in realtime
-        self._published_ns: deque[tuple[int, int, int]] = deque(maxlen=STAMPS_KEPT)  # tick, safety, monotonic
+        self._published = PublishTimes()
         self._published_arming = 0
         self._newest: dict[str, int] = {}
         self._answered = -1  # newest tick that a good command answered
@@ -160,7 +147,7 @@ class Host:
 
     def _sample(self, last: Samples | None) -> Samples | None:
         """Sensors of this tick. While frozen at tick 0 the same sample serves again."""
-        if last is not None and self._published_ns and self._published_ns[-1][0] == self._tick:
+        if last is not None and self._published.last_tick == self._tick:
             return last
         try:
             samples = self._backend.sample(self._tick, self._tick * self._period_ns)
@@ -189,10 +176,8 @@ class Host:
             lease_epoch=self.authority.lease.epoch if self.authority.lease.holder else 0,
             newest=self._newest,
         )
-        if self._published_ns and self._published_ns[-1][0] == tick:
-            self._published_ns.pop()
         self._published_arming = self.authority.arming
-        self._published_ns.append((tick, self._safety_now(), time.monotonic_ns()))
+        self._published.put(tick, self._safety_now(), time.monotonic_ns())
         self._put(keys.CLOCK, clock)
 
     def _finish_tick(self, samples: Samples) -> None:
@@ -206,7 +191,7 @@ class Host:
             self.tally.ticks += 1
             self.tally.answered_ticks += self._answered >= (self._tick if counting is None else counting)
         if self._applied_heard:
-            self._put(keys.APPLIED, self._as_message(decision))
+            self._put(keys.APPLIED, applied_message(self.description, self._tick, decision))
         started = time.monotonic_ns()
         try:
             self._backend.enact(decision.set_points)
@@ -235,7 +220,7 @@ class Host:
 
     def _wait_for_participants(self, samples: Samples) -> None:
         give_up_ns = time.monotonic_ns() + round(self._config.stall_limit_s * 1e9)
-        while (behind := [n for n, p in self.participants.items() if p.behind(self._tick)]) and not self._stopping:
+        while (behind := self.participants.behind(self._tick)) and not self._stopping:
             left_ns = give_up_ns - time.monotonic_ns()
             if self._published_arming != self.authority.arming:  # armed in this very tick: tell everybody
                 self._publish(samples)
@@ -321,7 +306,7 @@ class Host:
             return
         if command.lease_epoch == self.authority.lease.epoch and self.authority.answers_arming(command):
             self._delivered(self.authority.lease.holder, command.tick)
-        safety_ns, monotonic_ns = self._published_at(command.tick)
+        safety_ns, monotonic_ns = self._published.of(command.tick)
         now_ns = self._safety_now(arrival.monotonic_ns)
         refusal = self.authority.offer(command, now_ns=now_ns, tick=self._tick, age_ns=now_ns - safety_ns)
         if refusal is None and command.tick > self._answered:
@@ -339,9 +324,8 @@ class Host:
             self.authority.reject(error.reason)
 
     def _delivered(self, service: str | None, tick: int) -> None:
-        participant = self.participants.get(service or "")
-        if participant is not None and tick <= self._tick:
-            participant.done_tick = max(participant.done_tick, tick)
+        if tick <= self._tick:
+            self.participants.delivered(service, tick)
 
     def _answer(self, question: Question) -> None:
         now_ns = self._safety_now()
@@ -383,14 +367,11 @@ class Host:
         return holder.service.counting_at(self._tick + 1)
 
     def _came_or_went(self, service: str, present: bool) -> None:
-        participant = self.participants.get(service)
-        if participant is None:
-            return
-        participant.present = present
         if present:
-            participant.given_up = False
+            self.participants.came(service)
             return
-        participant.done_tick = -1
+        if not self.participants.went(service):
+            return
         if self.authority.arming and not self._stopping:
             cause = f"{service} is gone: its process ended or its connection broke"
             self.authority.note(Fault(tick=self._tick, what="service_lost", cause=cause))
@@ -406,47 +387,16 @@ class Host:
             self._publishers[key] = publisher
         publisher.put(message)
 
-    def _as_message(self, decision: Decision) -> AppliedCommand:
-        points = decision.set_points
-        return AppliedCommand(
-            tick=self._tick,
-            stamp_ns=self._tick * self._period_ns,
-            sequence=decision.sequence,
-            mode=points.mode,
-            target=points.target,
-            torque_limit_nm=points.torque_limit_nm,
-            limited={self.description.joints[i].name: word for i, word in decision.limited.items()},
-        )
-
     def status(self) -> Status:
         """How the robot is now, and why."""
-        authority = self.authority
-        against = authority.against_arming(self._safety_now())
-        why = authority.why
-        missing = self._missing()
-        if authority.state == "disarmed" and (against or missing):
-            waits = [f"waiting for {name}" for name in missing]
-            why = "; ".join([authority.why, *waits, *against])[:500]
-        return Status(
+        return status_message(
+            self.authority,
+            self.participants,
             tick=self._tick,
-            stamp_ns=self._tick * self._period_ns,
-            robot=self.description.robot,
-            backend=self.description.backend,
             pace=self._pace,
-            rate_hz=1e9 / self._period_ns,
-            lifecycle=authority.state,
-            why=why,
-            lease_holder=authority.lease.holder,
-            lease_epoch=authority.lease.epoch,
-            commands_accepted=authority.accepted,
-            commands_standby=authority.standby,
-            commands_rejected=dict(authority.rejected),
-            commands_limited=dict(authority.limited),
-            faults=authority.faults,
-            alive=sorted(name for name, p in self.participants.items() if p.present),
-            waiting_for=missing,
+            safety_now_ns=self._safety_now(),
+            missing=self._missing(),
             overruns=self.tally.overruns,
-            ready_to_arm=not against and not missing,
         )
 
     def _show_status(self, *, force: bool = False) -> None:
@@ -471,20 +421,9 @@ class Host:
             return self._tick * self._period_ns
         return time.monotonic_ns() if monotonic_ns is None else monotonic_ns
 
-    def _published_at(self, tick: int) -> tuple[int, int]:
-        """Safety and monotonic time at which a tick's state went out; long ago when it is not kept any more."""
-        if self._published_ns and tick <= self._published_ns[-1][0]:
-            back = self._published_ns[-1][0] - tick
-            if back < len(self._published_ns):
-                found = self._published_ns[-1 - back]
-                if found[0] == tick:
-                    return found[1], found[2]
-        return -(2**60), -(2**60)
-
     def _missing(self) -> list[str]:
         """Participants that are not here, or in lockstep have not answered tick 0 yet."""
-        lockstep = self._config.pace == "lockstep"
-        return [n for n, p in self.participants.items() if not p.present or (lockstep and p.done_tick < 0)]
+        return self.participants.missing(must_have_answered=self._config.pace == "lockstep")
 
     def _backend_failed(self, error: BackendError) -> None:
         self.authority.fault(Fault(tick=self._tick, what="backend_failed", cause=str(error)[:500]))

@@ -52,14 +52,20 @@ class RunRequest:
 
 @dataclass
 class Ending:
-    """How the run ended, as it becomes known; the first word counts."""
+    """How the run ended, as it becomes known."""
 
-    reason: str | None = None
+    causes: list[str] = field(default_factory=list[str])
     interrupted: bool = False
 
-    def because(self, reason: str) -> None:
-        """Note why, unless something earlier explains it already."""
-        self.reason = self.reason or reason
+    @property
+    def reason(self) -> str | None:
+        """Everything that went wrong, in the order in which it was noticed; None when nothing did."""
+        return "; ".join(self.causes) or None
+
+    def because(self, cause: str) -> None:
+        """Note what went wrong."""
+        if cause not in self.causes:
+            self.causes.append(cause)
 
 
 @dataclass
@@ -144,6 +150,7 @@ def _conduct(request: RunRequest, out: Path, ending: Ending) -> None:
         ending.because(str(error))
     finally:
         _await_host(started[0], ending)
+        _somebody_failed(started[1:], ending)
         children.stop_all(started)
         _print_last_words(started, ending)
 
@@ -232,9 +239,9 @@ def _conclude(out: Path, ending: Ending) -> int:
     from snakesim_operator.report import write_report
 
     record = RunRecord.load(out)
-    causes = dict.fromkeys([ending.reason, *(fault.cause for fault in record.host.faults)])
-    wrong = "; ".join(cause for cause in causes if cause)
-    ended = "interrupted" if ending.interrupted else wrong or "complete"
+    for fault in record.host.faults:
+        ending.because(fault.cause)
+    ended = "interrupted" if ending.interrupted else ending.reason or "complete"
     summary = summarise(record, ended)
     (out / SUMMARY).write_bytes(msgspec.json.format(msgspec.json.encode(summary), indent=2))
     write_report(record, summary)
