@@ -381,11 +381,14 @@ class Host:
     # --- what goes out -------------------------------------------------------------------------------------
 
     def _put(self, key: str, message: Message) -> None:
+        self._publisher(key, type(message)).put(message)
+
+    def _publisher(self, key: str, message: type[Message]) -> Publisher[Any]:
         publisher = self._publishers.get(key)
         if publisher is None:
-            publisher = self._session.publisher(key, type(message), lossless=self._config.pace == "lockstep")
+            publisher = self._session.publisher(key, message, lossless=self._config.pace == "lockstep")
             self._publishers[key] = publisher
-        publisher.put(message)
+        return publisher
 
     def status(self) -> Status:
         """How the robot is now, and why."""
@@ -408,10 +411,7 @@ class Host:
         self._status_shown = mark
         self._status_due_ns = now_ns + STATUS_PERIOD_NS
         self._publishers[keys.STATUS].put(self.status())
-        if keys.APPLIED not in self._publishers:
-            lossless = self._config.pace == "lockstep"
-            self._publishers[keys.APPLIED] = self._session.publisher(keys.APPLIED, AppliedCommand, lossless=lossless)
-        self._applied_heard = self._publishers[keys.APPLIED].heard()
+        self._applied_heard = self._publisher(keys.APPLIED, AppliedCommand).heard()
 
     # --- time and endings ----------------------------------------------------------------------------------
 

@@ -16,6 +16,16 @@ def _bounded(low: float, high: float, unit: str) -> Meta:
     return Meta(ge=low, le=high, extra_json_schema={"unit": unit})
 
 
+def above(high: float, unit: str) -> Meta:
+    """For a setting: more than zero, at most `high`."""
+    return Meta(gt=0, le=high, extra_json_schema={"unit": unit})
+
+
+def from_zero(high: float, unit: str) -> Meta:
+    """For a setting: from zero to `high`."""
+    return Meta(ge=0, le=high, extra_json_schema={"unit": unit})
+
+
 Angle = Annotated[float, _bounded(-1e4, 1e4, "rad")]
 AngularVelocity = Annotated[float, _bounded(-1e5, 1e5, "rad/s")]
 Torque = Annotated[float, _bounded(-1e5, 1e5, "N·m")]

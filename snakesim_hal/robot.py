@@ -19,15 +19,7 @@ from snakesim_hal.messages import (
     SafeAction,
     SensorDescription,
 )
-from snakesim_hal.quantities import MAX_JOINTS
-
-
-def _above(high: float, unit: str) -> Meta:
-    return Meta(gt=0, le=high, extra_json_schema={"unit": unit})
-
-
-def _from_zero(high: float, unit: str) -> Meta:
-    return Meta(ge=0, le=high, extra_json_schema={"unit": unit})
+from snakesim_hal.quantities import MAX_JOINTS, above, from_zero
 
 
 class Chain(FileStruct, frozen=True, kw_only=True):
@@ -40,75 +32,75 @@ class Chain(FileStruct, frozen=True, kw_only=True):
 class Module(FileStruct, frozen=True, kw_only=True):
     """Body of one module."""
 
-    length_m: Annotated[float, _above(2, "m")]
-    radius_m: Annotated[float, _above(1, "m")]
-    mass_kg: Annotated[float, _above(100, "kg")]
+    length_m: Annotated[float, above(2, "m")]
+    radius_m: Annotated[float, above(1, "m")]
+    mass_kg: Annotated[float, above(100, "kg")]
 
 
 class Limits(FileStruct, frozen=True, kw_only=True):
     """What a joint may do; held by the gate and by the motor."""
 
-    angle_rad: Annotated[float, _above(3.14159, "rad")]  # to either side
-    speed_rad_s: Annotated[float, _above(100, "rad/s")]
-    acceleration_rad_s2: Annotated[float, _above(1e5, "rad/s²")]
-    torque_nm: Annotated[float, _above(1000, "N·m")]
-    torque_rate_nm_s: Annotated[float, _above(1e5, "N·m/s")]
+    angle_rad: Annotated[float, above(3.14159, "rad")]  # to either side
+    speed_rad_s: Annotated[float, above(100, "rad/s")]
+    acceleration_rad_s2: Annotated[float, above(1e5, "rad/s²")]
+    torque_nm: Annotated[float, above(1000, "N·m")]
+    torque_rate_nm_s: Annotated[float, above(1e5, "N·m/s")]
 
 
 class Motor(FileStruct, frozen=True, kw_only=True):
     """How a joint answers."""
 
-    stiffness_nm_per_rad: Annotated[float, _above(1e5, "N·m/rad")]  # position mode
-    damping_nm_s_per_rad: Annotated[float, _from_zero(1e4, "N·m·s/rad")]  # position mode
-    velocity_gain_nm_s_per_rad: Annotated[float, _above(1e4, "N·m·s/rad")]  # velocity mode
-    response_time_s: Annotated[float, _from_zero(1, "s")]  # first-order lag of the torque
-    armature_kg_m2: Annotated[float, _from_zero(10, "kg·m²")]  # rotor inertia seen at the joint
-    friction_nm: Annotated[float, _from_zero(100, "N·m")] = 0.0
-    viscous_nm_s_per_rad: Annotated[float, _from_zero(100, "N·m·s/rad")] = 0.0
+    stiffness_nm_per_rad: Annotated[float, above(1e5, "N·m/rad")]  # position mode
+    damping_nm_s_per_rad: Annotated[float, from_zero(1e4, "N·m·s/rad")]  # position mode
+    velocity_gain_nm_s_per_rad: Annotated[float, above(1e4, "N·m·s/rad")]  # velocity mode
+    response_time_s: Annotated[float, from_zero(1, "s")]  # first-order lag of the torque
+    armature_kg_m2: Annotated[float, from_zero(10, "kg·m²")]  # rotor inertia seen at the joint
+    friction_nm: Annotated[float, from_zero(100, "N·m")] = 0.0
+    viscous_nm_s_per_rad: Annotated[float, from_zero(100, "N·m·s/rad")] = 0.0
 
 
 class Safety(FileStruct, frozen=True, kw_only=True):
     """What the joints do when nobody may command them."""
 
     action: SafeAction = "damp"
-    max_step_rad: Annotated[float, _above(3.2, "rad")] = 0.35  # furthest a position target may be from the measured
+    max_step_rad: Annotated[float, above(3.2, "rad")] = 0.35  # furthest a position target may be from the measured
 
 
 class JointSensor(FileStruct, frozen=True, kw_only=True):
     """Angle, velocity and torque of every joint. No rate: a sample every tick."""
 
-    delay_s: Annotated[float, _from_zero(1, "s")] = 0.0
-    angle_noise_rad: Annotated[float, _from_zero(1, "rad")] = 0.0  # standard deviation, as all noise here
-    velocity_noise_rad_s: Annotated[float, _from_zero(10, "rad/s")] = 0.0
-    torque_noise_nm: Annotated[float, _from_zero(100, "N·m")] = 0.0
+    delay_s: Annotated[float, from_zero(1, "s")] = 0.0
+    angle_noise_rad: Annotated[float, from_zero(1, "rad")] = 0.0  # standard deviation, as all noise here
+    velocity_noise_rad_s: Annotated[float, from_zero(10, "rad/s")] = 0.0
+    torque_noise_nm: Annotated[float, from_zero(100, "N·m")] = 0.0
 
 
 class ContactSensor(FileStruct, frozen=True, kw_only=True):
     """Touches of the links by obstacles."""
 
-    rate_hz: Annotated[float, _above(1e4, "Hz")] = 100.0
-    delay_s: Annotated[float, _from_zero(1, "s")] = 0.0
-    position_noise_m: Annotated[float, _from_zero(1, "m")] = 0.0
-    force_noise_n: Annotated[float, _from_zero(100, "N")] = 0.0
-    threshold_n: Annotated[float, _from_zero(100, "N")] = 0.0  # weaker touches go unfelt
+    rate_hz: Annotated[float, above(1e4, "Hz")] = 100.0
+    delay_s: Annotated[float, from_zero(1, "s")] = 0.0
+    position_noise_m: Annotated[float, from_zero(1, "m")] = 0.0
+    force_noise_n: Annotated[float, from_zero(100, "N")] = 0.0
+    threshold_n: Annotated[float, from_zero(100, "N")] = 0.0  # weaker touches go unfelt
 
 
 class ImuSensor(FileStruct, frozen=True, kw_only=True):
     """Angular velocity and acceleration (gravity included) of every link."""
 
-    rate_hz: Annotated[float, _above(1e4, "Hz")] = 100.0
-    delay_s: Annotated[float, _from_zero(1, "s")] = 0.0
-    angular_velocity_noise_rad_s: Annotated[float, _from_zero(10, "rad/s")] = 0.0
-    acceleration_noise_m_s2: Annotated[float, _from_zero(100, "m/s²")] = 0.0
+    rate_hz: Annotated[float, above(1e4, "Hz")] = 100.0
+    delay_s: Annotated[float, from_zero(1, "s")] = 0.0
+    angular_velocity_noise_rad_s: Annotated[float, from_zero(10, "rad/s")] = 0.0
+    acceleration_noise_m_s2: Annotated[float, from_zero(100, "m/s²")] = 0.0
 
 
 class PoseSensor(FileStruct, frozen=True, kw_only=True):
     """Pose of the base, as motion capture gives it."""
 
-    rate_hz: Annotated[float, _above(1e4, "Hz")] = 100.0
-    delay_s: Annotated[float, _from_zero(1, "s")] = 0.0
-    position_noise_m: Annotated[float, _from_zero(1, "m")] = 0.0
-    angle_noise_rad: Annotated[float, _from_zero(1, "rad")] = 0.0
+    rate_hz: Annotated[float, above(1e4, "Hz")] = 100.0
+    delay_s: Annotated[float, from_zero(1, "s")] = 0.0
+    position_noise_m: Annotated[float, from_zero(1, "m")] = 0.0
+    angle_noise_rad: Annotated[float, from_zero(1, "rad")] = 0.0
 
 
 class Sensors(FileStruct, frozen=True, kw_only=True):

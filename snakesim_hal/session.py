@@ -145,7 +145,7 @@ class Session:
             self._zenoh,
             key,
             handlers.RingChannel(READER_DEPTH),
-            history=ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
+            history=_last_value(),
         )
         self._declared.append(subscriber)
         return Reader(subscriber, message, self.rejected)
@@ -156,8 +156,7 @@ class Session:
 
     def on_latched_arrival(self, key: str, take: Callable[[Arrival], None]) -> None:
         """Like `on_arrival`, and it gets the values that were latched before it came."""
-        history = ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
-        self._declared.append(ext.declare_advanced_subscriber(self._zenoh, key, _storing(take), history=history))
+        self._declared.append(ext.declare_advanced_subscriber(self._zenoh, key, _storing(take), history=_last_value()))
 
     def on_question(self, key: str, take: Callable[[Question], None]) -> None:
         """Call `take` for every query, in Zenoh's thread; answer it from your own."""
@@ -203,6 +202,11 @@ class Session:
             declared.undeclare()
         self._declared.clear()
         self._zenoh.close()
+
+
+def _last_value() -> ext.HistoryConfig:
+    """What a reader of a latched key wants: the value that was there before it, or before its writer."""
+    return ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
 
 
 def _storing(take: Callable[[Arrival], None]) -> Callable[[zenoh.Sample], None]:

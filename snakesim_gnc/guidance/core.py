@@ -28,7 +28,6 @@ class WorldModel:
         """known: the surveyed obstacles; only those within `reach_m` of the body are passed on."""
         self._axes = [joint.axis for joint in robot.joints]
         self._lengths = [link.length_m for link in robot.links]
-        self._radii = [link.radius_m for link in robot.links]
         self._rear_s = np.concatenate(([0.0], np.cumsum(self._lengths)))[:-1]
         self._known = list(known)
         self._centres = np.array([o.position_w[:2] for o in known]).reshape(-1, 2)
