@@ -87,7 +87,7 @@ class BareLoop:
         model, data, steps = self._backend.sim.model, self._backend.data, self._backend.sim.steps_per_tick
         spent = 0.0
         for now in points:
-            self._backend.enact(now)
+            self._backend.enact(now, "armed")
             begin = time.perf_counter()
             mujoco.mj_step(model, data, steps)
             spent += time.perf_counter() - begin
@@ -122,7 +122,7 @@ def sensing(config: RunConfig) -> tuple[list[float], list[float]]:
             for now in block:
                 tick += 1
                 publishing.put(tick, full.sample(tick, tick * config.period_ns))
-                full.enact(now)
+                full.enact(now, "armed")
                 full.advance()
             ours.append((time.perf_counter() - begin) / TICKS_A_BLOCK * 1e6)
             theirs.append(bare.tick_us(block))

@@ -1,7 +1,7 @@
 """What a backend implements.
 
 A backend is opened from the run's settings, asked for samples once a tick, given set-points once a tick, and told
-when to let a period pass. It never sees Zenoh, leases or lifecycle: the host does those, for every backend alike.
+when to let a period pass. It never sees Zenoh or leases: the host does those, for every backend alike.
 """
 
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import msgspec
 
-from snakesim_hal.messages import Description, Fault, JointState, Message, Mode
+from snakesim_hal.messages import Description, Fault, JointState, LifecycleState, Message, Mode, Pace
 
 if TYPE_CHECKING:
     from snakesim_hal.scenario import RunConfig
@@ -44,8 +44,12 @@ class Backend(Protocol):
         """Read every sensor that is due at `tick`. Raises BackendError when no state can be trusted any more."""
         ...
 
-    def enact(self, set_points: SetPoints) -> None:
-        """Hand set-points to the motors; they hold until the next call."""
+    def enact(self, set_points: SetPoints, lifecycle: LifecycleState) -> None:
+        """Hand set-points to the motors; they hold until the next call.
+
+        The set-points are safe in every state, so a simulator needs no more. A robot whose modules have states of their
+        own makes them follow `lifecycle`: armed on "armed", and stopped by itself on anything else.
+        """
         ...
 
     def advance(self) -> None:
@@ -64,7 +68,14 @@ class Backend(Protocol):
 class BackendFactory(Protocol):
     """What stands behind an entry point in the group `snakesim.backends`: usually the backend's class."""
 
-    Settings: type[msgspec.Struct]  # the scenario's [backend.<name>] section
+    Settings: type[msgspec.Struct]  # the scenario's [backends.<name>] section
+
+    def check(self, config: "RunConfig", settings: Any) -> tuple[Pace, ...]:
+        """Which paces it could keep, the preferred one first; a real robot waits for nobody. Opens nothing.
+
+        Raises ConfigError for a run that this backend cannot do, whatever the pace, so that nothing is started for it.
+        """
+        ...
 
     def __call__(self, config: "RunConfig", settings: Any) -> Backend:
         """Open the backend for a run."""

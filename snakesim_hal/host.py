@@ -135,7 +135,7 @@ class Host:
             self._ended_ns = time.monotonic_ns()
             self.authority.on_lifecycle(LifecycleRequest(action="finish"), self._safety_now())
             with contextlib.suppress(BackendError):
-                self._backend.enact(self.authority.decide().set_points)
+                self._backend.enact(self.authority.decide().set_points, self.authority.state)
             self._show_status(force=True)
 
     @property
@@ -194,7 +194,7 @@ class Host:
             self._put(keys.APPLIED, applied_message(self.description, self._tick, decision))
         started = time.monotonic_ns()
         try:
-            self._backend.enact(decision.set_points)
+            self._backend.enact(decision.set_points, self.authority.state)
             self._backend.advance()
         except BackendError as error:
             self._backend_failed(error)

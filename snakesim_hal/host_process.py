@@ -77,8 +77,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def backend_settings(config: RunConfig, factory: BackendFactory) -> Any:
     """The scenario's [backends.<name>] section, checked by the backend's own Struct."""
-    section = config.backends.get(config.backend, {})
-    return plugin_settings(factory, section, f"scenario {config.name!r}", f"backends.{config.backend}")
+    return plugin_settings(factory, config.backend_settings, f"scenario {config.name!r}", config.backend_section)
 
 
 def leave_record(host: Host, out: Path) -> None:

@@ -8,6 +8,7 @@ JOINTS = "sensor/joints"
 CONTACTS = "sensor/contacts"
 IMU = "sensor/imu"
 POSE = "sensor/pose"
+POWER = "sensor/power"
 JOINT_COMMAND = "actuator/joints"
 DESCRIPTION = "hal/description"
 STATUS = "hal/status"
@@ -40,6 +41,7 @@ SPACE: tuple[Row, ...] = (
     Row(CONTACTS, m.Contacts, "HAL", "stream", "every touch of a link by an obstacle"),
     Row(IMU, m.Imu, "HAL", "stream", "angular velocity and acceleration of the links"),
     Row(POSE, m.Pose, "HAL", "stream", "base pose as a motion-capture system gives it"),
+    Row(POWER, m.Power, "HAL", "stream", "supply, temperatures and leaks of the joint modules"),
     Row(JOINT_COMMAND, m.JointCommand, "lease holder", "stream", "mode and set-point of every joint"),
     Row(DESCRIPTION, m.Description, "HAL", "latched", "joints, order, limits, geometry, sensors"),
     Row(STATUS, m.Status, "HAL", "latched", "lifecycle and why, lease holder, faults, counters"),

@@ -4,10 +4,13 @@ Link i's frame has its origin at the joint at its rear and x along the link; lin
 frame is the base. A yaw joint turns about z of its link, a pitch joint about y.
 """
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from snakesim_hal.quantities import Vector
 
 Floats = NDArray[np.float64]
 
@@ -81,3 +84,12 @@ def _yaw_only_frames(
 def joint_positions_s_m(link_lengths_m: Sequence[float]) -> Floats:
     """Arc length of every joint along the body from the tail end, (n_joints,)."""
     return np.cumsum(np.asarray(link_lengths_m, dtype=np.float64))[:-1]
+
+
+def tangents(normal: Vector) -> tuple[Vector, Vector]:
+    """Two unit vectors across a contact normal: as near as can be to the link's x axis, and normal times that."""
+    x, y, z = normal
+    across = math.sqrt(max(1.0 - x * x, 0.0))
+    if across < 1e-6:
+        return (0.0, 1.0, 0.0), (0.0, 0.0, math.copysign(1.0, x))
+    return (across, -x * y / across, -x * z / across), (0.0, z / across, -y / across)

@@ -90,6 +90,19 @@ class Pose(Message, frozen=True, kw_only=True):
     angular_velocity_w: q.AngularVelocityVector
 
 
+class Power(Message, frozen=True, kw_only=True):
+    """`sensor/power`: what the joint modules say of their supply and their health, one entry a joint."""
+
+    tick: q.Tick
+    stamp_ns: q.Nanoseconds
+    voltage_v: Annotated[list[q.Voltage], Meta(max_length=q.MAX_JOINTS)]
+    current_a: Annotated[list[q.Current], Meta(max_length=q.MAX_JOINTS)]
+    motor_c: Annotated[list[q.Temperature], Meta(max_length=q.MAX_JOINTS)]
+    board_c: Annotated[list[q.Temperature], Meta(max_length=q.MAX_JOINTS)]
+    leak: q.Flags
+    valid: q.Flags
+
+
 # --- actuators -------------------------------------------------------------------------------------------------
 
 
@@ -170,7 +183,7 @@ class LinkDescription(Message, frozen=True, kw_only=True):
 
 
 class SensorDescription(Message, frozen=True, kw_only=True):
-    """What a sensor delivers, and how often."""
+    """What a sensor delivers, and how often; of IMUs it is the rate of each link, which need not come together."""
 
     key: q.Name
     rate_hz: Annotated[float, Meta(gt=0, le=1e5)]
@@ -354,6 +367,7 @@ VERSIONS: dict[type[Message], int] = dict.fromkeys(
         Contacts,
         Imu,
         Pose,
+        Power,
         JointCommand,
         AppliedCommand,
         Clock,

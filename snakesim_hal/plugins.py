@@ -1,4 +1,4 @@
-"""Backends, controllers and services are found by name: an entry point of an installed package, or a file.
+"""Backends, controllers, services and the like are found by name: an entry point of an installed package, or a file.
 
 `wave` is looked up among the entry points; `./wave.py:Wave` is the object `Wave` of that file, for trying things out.
 """
@@ -15,7 +15,9 @@ from snakesim_hal.errors import ConfigError
 from snakesim_hal.files import Table, decode
 
 BACKENDS = "snakesim.backends"
+COMMANDS = "snakesim.commands"
 CONTROLLERS = "snakesim.controllers"
+PLANTS = "snakesim.plants"
 SERVICES = "snakesim.services"
 
 
@@ -37,8 +39,18 @@ def find_plugin(group: str, name: str) -> Any:
         )
     try:
         return found[name].load()
+    except ModuleNotFoundError as error:
+        raise ConfigError(f"{kind} {name!r} cannot be loaded: {error}.{_extras_of(found[name])}") from error
     except (ImportError, AttributeError) as error:
         raise ConfigError(f"{kind} {name!r} ({found[name].value}) cannot be loaded: {error}") from error
+
+
+def _extras_of(entry: EntryPoint) -> str:
+    """How to install what a plugin needs and its package does not install by itself."""
+    extras = entry.dist.metadata.get_all("Provides-Extra") if entry.dist is not None else None
+    if entry.dist is None or not extras:
+        return ""
+    return f" Install it with: pip install '{entry.dist.name}[{','.join(extras)}]'"
 
 
 def _from_file(name: str, kind: str) -> Any:

@@ -94,6 +94,16 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
         return self.controllers.get(self.controller.rpartition(":")[2], {})
 
     @property
+    def backend_section(self) -> str:
+        """Where the settings of the chosen backend stand; for `./file.py:Bench` that is `backends.Bench`."""
+        return f"backends.{self.backend.rpartition(':')[2]}"
+
+    @property
+    def backend_settings(self) -> dict[str, Any]:
+        """The settings of the chosen backend."""
+        return self.backends.get(self.backend.rpartition(":")[2], {})
+
+    @property
     def period_ns(self) -> int:
         """One control period."""
         return round(1e9 / self.rate_hz)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from snakesim_hal.errors import ConfigError, SnakesimError
+from snakesim_hal.plugins import COMMANDS, find_plugin, installed
 from snakesim_hal.scenario import Loaded, Override, load, parse_set
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
@@ -14,8 +15,11 @@ OK, FAILED, BAD_INPUT = 0, 1, 2
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Exit code: 0 done, 1 a fault, 2 wrong input and nothing started, 130 interrupted."""
-    arguments = _parser().parse_args(argv)
+    given = list(sys.argv[1:] if argv is None else argv)
     try:
+        if given and given[0] in installed(COMMANDS):
+            return find_plugin(COMMANDS, given[0])(given[1:])
+        arguments = _parser().parse_args(given)
         return arguments.act(arguments)
     except ConfigError as error:
         print(f"snakesim: {error}", file=sys.stderr)
@@ -35,6 +39,9 @@ def _parser() -> argparse.ArgumentParser:
         prog="snakesim",
         description="Snake robots that push themselves off obstacles: one controller, simulator or robot.",
     )
+    more = installed(COMMANDS)
+    if more:
+        parser.epilog = f"From installed backends: {', '.join(more)}; each explains itself with --help."
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     run = commands.add_parser("run", help="run a scenario: backend, guidance, navigation and control")
@@ -42,6 +49,19 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--out", type=Path, help="folder for what the run leaves (default: runs/NAME-TIME)")
     _add_network(run)
     run.set_defaults(act=_run)
+
+    compare = commands.add_parser("compare", help="tell how two runs differ, as a table and as a page with plots")
+    compare.add_argument(
+        "run_a", type=Path, metavar="RUN_A", help="folder that a run left; percentages are of this one"
+    )
+    compare.add_argument(
+        "run_b", type=Path, metavar="RUN_B", help="folder of the other run, of a robot with the same joints"
+    )
+    compare.add_argument("--out", type=Path, metavar="FILE.html", help="the page (default: RUN_B/compare.html)")
+    compare.add_argument(
+        "--within", type=float, metavar="PERCENT", help="exit with 1 when the distances moved differ by more"
+    )
+    compare.set_defaults(act=_compare)
 
     config = commands.add_parser("config", help="show every effective value, and the file or flag it came from")
     _add_scenario(config)
@@ -51,7 +71,7 @@ def _parser() -> argparse.ArgumentParser:
     scenarios.set_defaults(act=_scenarios)
 
     echo = commands.add_parser("echo", help="print what is published on a key")
-    echo.add_argument("key", help="such as sensor/joints; `snakesim echo --help` lists none, docs/keys.md all")
+    echo.add_argument("key", help="such as sensor/joints; `snakesim echo --help` lists none, schemas/keys.md all")
     echo.add_argument("--hz", action="store_true", help="print only how often, and how regularly")
     echo.add_argument("--count", type=int, help="end after so many messages")
     _add_network(echo)
@@ -117,8 +137,14 @@ def _run(arguments: argparse.Namespace) -> int:
     from snakesim_operator.run import RunRequest, check_plugins, run
 
     loaded = _load(arguments)
-    check_plugins(loaded.config, loaded.table)  # here, because only the table knows which flag set what
-    return run(RunRequest(loaded.config, arguments.out, arguments.endpoint, arguments.router, arguments.namespace))
+    config = check_plugins(loaded.config, loaded.table)  # here, because only the table knows which flag set what
+    return run(RunRequest(config, arguments.out, arguments.endpoint, arguments.router, arguments.namespace))
+
+
+def _compare(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.compare import compare
+
+    return compare(arguments.run_a, arguments.run_b, arguments.out, arguments.within)
 
 
 def _config(arguments: argparse.Namespace) -> int:

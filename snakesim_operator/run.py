@@ -9,7 +9,7 @@ import signal
 import socket
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from types import FrameType
@@ -34,6 +34,7 @@ from snakesim_operator.summary import RunSummary, summarise
 START_LIMIT_S = 60.0
 AFTER_FAULT_S = 1.5
 POLL_S = 0.05
+CONNECT_S = 0.5
 TELEMETRY_DEPTH = 8192
 WORLDS_PER_S = 20.0  # as often as control tells its state
 JOINTS_SHOWN = 8
@@ -93,28 +94,30 @@ class Telemetry:
         self.file.write(msgspec.json.encode({"key": key, "message": message}) + b"\n")
 
 
-def check_plugins(config: RunConfig, table: Table | None = None) -> None:
-    """Everything that a run needs is installed and agrees with its settings. Raises ConfigError."""
-    if config.backend == "can":
-        with contextlib.suppress(ConfigError):
-            find_plugin(BACKENDS, "can")
-            return
-        raise ConfigError(
-            "--backend can: the SocketCAN backend is not part of this release; it comes with the next one. "
-            "Run the same scenario with --backend sim"
-        )
+def check_plugins(config: RunConfig, table: Table | None = None) -> RunConfig:
+    """Everything that a run needs is installed and agrees with its settings. Raises ConfigError.
+
+    Returns the configuration, with a pace that the backend can keep: a scenario is written for any backend.
+    """
     source = table.source if table is not None else f"scenario {config.name!r}"
     origin = table.origin if table is not None else None
     backend, controller = find_plugin(BACKENDS, config.backend), find_plugin(CONTROLLERS, config.controller)
-    plugin_settings(backend, config.backends.get(config.backend, {}), source, f"backends.{config.backend}", origin)
+    settings = plugin_settings(backend, config.backend_settings, source, config.backend_section, origin)
     plugin_settings(controller, config.control_settings, source, config.control_section, origin)
     for service in config.services:
         find_plugin(SERVICES, service)
+    paces = backend.check(config, settings)
+    if config.pace in paces:
+        return config
+    asked_by = table.origin_of("pace") if table is not None else source
+    if asked_by.startswith("--"):
+        raise ConfigError(f"{asked_by}: backend {config.backend!r} cannot keep this pace, only {' or '.join(paces)}")
+    return msgspec.structs.replace(config, pace=paces[0])
 
 
 def run(request: RunRequest) -> int:
     """Run it. Returns 0, 1 on a fault, 130 when interrupted."""
-    check_plugins(request.config)
+    request = replace(request, config=check_plugins(request.config))
     out = _folder(request)
     write(request.config, out / CONFIG)
     ending = Ending()
@@ -142,7 +145,7 @@ def _conduct(request: RunRequest, out: Path, ending: Ending) -> None:
         for name in config.services:
             log = out / f"{name}.log"
             started.append(children.start(name, ["snakesim_hal.serve", name, *common], log))
-        with open_session(Link(endpoint, namespace), connect_timeout_s=START_LIMIT_S) as session:
+        with _joined(Link(endpoint, namespace), started) as session:
             _say(f"{config.name}: {config.robot.name} in {config.scene.name}, {config.controller}, {config.pace}")
             _say(f"network: {endpoint}, namespace {namespace}")
             _watch(config, session, started, out, ending)
@@ -153,6 +156,23 @@ def _conduct(request: RunRequest, out: Path, ending: Ending) -> None:
         _somebody_failed(started[1:], ending)
         children.stop_all(started)
         _print_last_words(started, ending)
+
+
+@contextlib.contextmanager
+def _joined(link: Link, started: Sequence[Child]) -> Iterator[Session]:
+    """A session on the run's network, as soon as there is one. Raises NotConnectedError when a part has ended."""
+    give_up = time.monotonic() + START_LIMIT_S
+    with contextlib.ExitStack() as stack:
+        while True:
+            try:
+                yield stack.enter_context(open_session(link, connect_timeout_s=CONNECT_S))
+                return
+            except NotConnectedError:
+                ended = [how for child in started if (how := child.how_it_ended()) is not None]
+                if ended:
+                    raise NotConnectedError(ended[0]) from None
+                if time.monotonic() > give_up:
+                    raise
 
 
 def _watch(config: RunConfig, session: Session, started: Sequence[Child], out: Path, ending: Ending) -> None:

@@ -5,10 +5,10 @@ import numpy as np
 
 from snakesim_hal.backend import Samples, SetPoints
 from snakesim_hal.errors import BackendError
-from snakesim_hal.messages import Description, Fault
+from snakesim_hal.messages import Description, Fault, LifecycleState, Pace
 from snakesim_hal.robot import describe
 from snakesim_hal.scenario import RunConfig, config_hash
-from snakesim_sim_backend.actuators import Motors
+from snakesim_sim_backend.actuators import Motors, check_gains
 from snakesim_sim_backend.contacts import TouchReader
 from snakesim_sim_backend.divergence import DivergenceWatch, log_warnings
 from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS, SimModel, build
@@ -19,12 +19,19 @@ from snakesim_sim_backend.tether import Rope
 from snakesim_sim_backend.truth import TrueContact, TrueState
 
 NAME = "sim"
+OFF: tuple[LifecycleState, ...] = ("disarmed", "estop")
 
 
 class SimBackend:
     """A `snakesim_hal.backend.Backend` on MuJoCo. Deterministic: seed and commands decide every byte."""
 
     Settings = Settings
+
+    @staticmethod
+    def check(config: RunConfig, _settings: Settings) -> tuple[Pace, ...]:
+        """Simulated time goes as one likes. Raises ConfigError."""
+        check_gains(config.robot)
+        return ("lockstep", "realtime", "free")
 
     def __init__(self, config: RunConfig, settings: Settings) -> None:
         """Build the scene, lay the snake down and let it come to rest. Raises ConfigError."""
@@ -62,9 +69,12 @@ class SimBackend:
         """What the sensors give at `tick`; after a divergence, of the last good state."""
         return self._sensors.sample(tick, stamp_ns)
 
-    def enact(self, set_points: SetPoints) -> None:
-        """Give the motors new set-points."""
-        self._motors.enact(set_points)
+    def enact(self, set_points: SetPoints, lifecycle: LifecycleState) -> None:
+        """Give the motors new set-points. Disarmed, they are off, whatever the set-points say."""
+        if lifecycle in OFF:
+            self._motors.switch_off()
+        else:
+            self._motors.enact(set_points)
 
     def advance(self) -> None:
         """Step the physics through one control period. Raises BackendError when it has diverged."""

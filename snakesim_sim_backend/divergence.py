@@ -14,8 +14,8 @@ MOST_POSITION = 1e4  # m or rad: of any coordinate
 MOST_SPEED = 1e3  # m/s or rad/s
 MOST_ACCELERATION = 1e9  # m/s² or rad/s²
 BASE = ["the base along x", "the base along y", "the base along z"] + ["the base, turning,"] * 3
-WHOLE = mujoco.mjtState.mjSTATE_INTEGRATION
-INPUTS = mujoco.mjtState.mjSTATE_USER
+WHOLE = int(mujoco.mjtState.mjSTATE_INTEGRATION)  # plain numbers: the binding converts an enumeration at every call
+INPUTS = int(mujoco.mjtState.mjSTATE_USER)
 
 
 def log_warnings() -> None:
@@ -24,17 +24,18 @@ def log_warnings() -> None:
 
 
 class DivergenceWatch:
-    """Checks the state once a tick."""
+    """Checks the state once a tick, or once in whatever else is counted."""
 
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, steps_per_tick: int) -> None:
-        self._model, self._data, self._steps = model, data, steps_per_tick
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, steps: int, counted: str = "tick") -> None:
+        """steps: from one check to the next, under the same inputs; counted: what the number of a check counts."""
+        self._model, self._data, self._steps, self._counted = model, data, steps, counted
         self._good = np.empty(mujoco.mj_stateSize(model, WHOLE))
         self._qpos, self._qvel, self._qacc = data.qpos, data.qvel, data.qacc
         self._warnings = data.warning.number
         self._why: str | None = None
         self._keep()
 
-    def check(self, tick: int) -> None:
+    def check(self, number: int) -> None:
         """Keep a good state. For a bad one, go back to the last good one and raise BackendError, from now on always."""
         if self._why is None:
             if self._is_good():
@@ -43,8 +44,8 @@ class DivergenceWatch:
             warned = [mujoco.mjtWarning(i).name for i in self._warnings.nonzero()[0].tolist()]
             said = f" MuJoCo says {', '.join(warned)}." if warned else ""
             self._why = (
-                f"the simulation diverged at tick {tick}: {self._find_culprit()}.{said} Lower "
-                f"`backends.sim.timestep_s` or the gains in [motor]; stiff gains want armature"
+                f"the simulation diverged at {self._counted} {number}: {self._find_culprit()}.{said} Lower "
+                f"`timestep_s` or the gains in [motor]; stiff gains want armature"
             )
             self._go_back()
             mujoco.mj_forward(self._model, self._data)

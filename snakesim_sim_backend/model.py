@@ -37,20 +37,26 @@ class SimModel:
     obstacle_of_geom: list[str | None]  # (ngeom,); None: link, ground or step
 
 
-def build(config: RunConfig, settings: Settings) -> SimModel:
-    """Compile the model of a run. Raises ConfigError when settings and robot do not go together."""
+def build(config: RunConfig, settings: Settings, *, motors: bool = True) -> SimModel:
+    """Compile the model of a run. Raises ConfigError when settings and robot do not go together.
+
+    Without motors the joints are only hinges with a rotor's inertia and friction, for torques that come from outside.
+    """
     steps = int(np.ceil(config.period_ns * 1e-9 / settings.timestep_s - 1e-9))
     step_s = config.period_ns * 1e-9 / steps
     if settings.contact_time_s < 2 * step_s:
         raise ConfigError(
-            f"`backends.sim.contact_time_s` = {settings.contact_time_s} s must be at least two physics steps, here "
+            f"`contact_time_s` = {settings.contact_time_s} s must be at least two physics steps, here "
             f"{2 * step_s:g} s; raise it or lower `timestep_s`"
         )
-    check_gains(config.robot)
     spec = mujoco.MjSpec()
     _set_options(spec, step_s, settings)
     _add_scene(spec, config, settings)
     _add_snake(spec, config.robot, settings)
+    if motors:
+        check_gains(config.robot)
+        for i in range(config.robot.chain.modules):
+            add_motor(spec, f"joint_{i + 1}", config.robot, step_s)
     if config.robot.sensors.imu is not None:
         add_imus(spec, config.robot.link_lengths_m)
     if settings.tether is not None:
@@ -114,7 +120,6 @@ def _add_snake(spec: mujoco.MjSpec, robot: RobotFile, settings: Settings) -> Non
             body.add_freejoint(name="base")
         else:
             _add_joint(body, f"joint_{i}", axes[i - 1], robot)
-            add_motor(spec, f"joint_{i}", robot, spec.option.timestep)
         body.add_geom(
             name=f"link_{i}",
             type=mujoco.mjtGeom.mjGEOM_CAPSULE,

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from snakesim_hal import keys
 from snakesim_hal.backend import Samples
+from snakesim_hal.kinematics import tangents
 from snakesim_hal.messages import Contact, Contacts, Imu, JointState, Message, Pose
 from snakesim_hal.quantities import MAX_CONTACTS, Quaternion, Vector
 from snakesim_hal.robot import ContactSensor, ImuSensor, JointSensor, PoseSensor
@@ -221,15 +222,6 @@ def into(rotation: list[float], v: Vector) -> Vector:
     a, b, c, d, e, f, g, h, i = rotation
     x, y, z = v
     return (a * x + d * y + g * z, b * x + e * y + h * z, c * x + f * y + i * z)
-
-
-def tangents(normal_l: Vector) -> tuple[Vector, Vector]:
-    """Two unit vectors across a contact normal: as near as can be to the link's x axis, and normal times that."""
-    x, y, z = normal_l
-    across = math.sqrt(max(1.0 - x * x, 0.0))
-    if across < 1e-6:
-        return (0.0, 1.0, 0.0), (0.0, 0.0, math.copysign(1.0, x))
-    return (across, -x * y / across, -x * z / across), (0.0, z / across, -y / across)
 
 
 def rotate(wxyz: Quaternion, v: Vector) -> Vector:

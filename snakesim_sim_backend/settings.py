@@ -1,4 +1,4 @@
-"""What a scenario's `[backends.sim]` section may say."""
+"""What a scenario may say of the physics: its `[backends.sim]` section, and a plant's settings."""
 
 from typing import Annotated
 
@@ -37,3 +37,9 @@ class Settings(FileStruct, frozen=True, kw_only=True):
     # Longest time that the snake may take to come to rest before the run begins.
     settle_s: Annotated[float, Meta(ge=0, le=60, extra_json_schema={"unit": "s"})] = 3.0
     tether: Tether | None = None
+
+
+class PlantSettings(Settings, frozen=True, kw_only=True):
+    """The same for the physics under emulated joint modules, whose firmware sets the pace: one step at a time."""
+
+    timestep_s: Annotated[float, Meta(ge=1e-5, le=0.01, extra_json_schema={"unit": "s"})] = 0.001

@@ -21,11 +21,9 @@ HOOK, ANCHOR, TENDON, WINCH = "tether_hook", "tether_anchor", "tether", "tether_
 def add_tether(spec: mujoco.MjSpec, tether: Tether, robot: RobotFile, contact_time_s: float) -> None:
     """Put a slack tether into a model whose motors are complete. Raises ConfigError for a link that is not there."""
     if tether.link > robot.chain.modules:
-        raise ConfigError(
-            f"`backends.sim.tether.link` = {tether.link}: robot {robot.name!r} has links 0 to {robot.chain.modules}"
-        )
+        raise ConfigError(f"`tether.link` = {tether.link}: robot {robot.name!r} has links 0 to {robot.chain.modules}")
     if np.hypot(*tether.direction_w) == 0:
-        raise ConfigError("`backends.sim.tether.direction_w` = (0, 0) is no direction; give x and y, such as [-1, 0]")
+        raise ConfigError("`tether.direction_w` = (0, 0) is no direction; give x and y, such as [-1, 0]")
     spec.body(f"link_{tether.link}").add_site(name=HOOK, pos=[tether.point_m, 0.0, 0.0])
     spec.worldbody.add_site(name=ANCHOR, pos=[ROPE_M, 0.0, 0.0])  # at the origin MuJoCo would take it as unmovable
     tendon = spec.add_tendon(

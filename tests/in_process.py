@@ -182,7 +182,7 @@ class _Runner:
             decision = self.authority.decide(self.config.services["control"].counting_at(tick + 1))
             if each_tick is not None:
                 each_tick(tick, self.backend)
-            self.backend.enact(decision.set_points)
+            self.backend.enact(decision.set_points, self.authority.state)
             self.backend.advance()
             assert self.pose is not None
             rows.append((view, action.report, decision, took_us, self.pose.position_w, self._strongest_n()))

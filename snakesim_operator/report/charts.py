@@ -166,6 +166,14 @@ def strip(frame: Frame, bands: list[Band], top: float, height: float, *, named: 
     return "".join(parts)
 
 
+def mark(frame: Frame, time_s: float, words: str = "") -> str:
+    """A dashed line at an instant, with its name beside it at the top."""
+    x = frame.x(time_s)
+    left = x + 4 + text_width(words, 12) > frame.width - frame.right
+    named = text(x - 4 if left else x + 4, frame.top + 10, words, "small soft halo", anchor="end" if left else "start")
+    return line((x, frame.top), (x, frame.height - frame.bottom), "mark") + (named if words else "")
+
+
 def fault_marks(frame: Frame, times_s: list[float]) -> str:
     """A dashed line at every fault, named once."""
     parts = [

@@ -39,6 +39,23 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]], class_: str = "") 
     )
 
 
+def tile(name: str, value: str, unit: str = "", *, alarming: bool = False) -> str:
+    """A key number; a dash stands for what is unknown, and has no unit."""
+    small = f"<small>{words(unit)}</small>" if unit and value != "–" else ""
+    class_ = "tile alarming" if alarming else "tile"
+    return f'<div class="{class_}"><b>{words(value)}{small}</b><span>{words(name)}</span></div>'
+
+
+def document(title: str, style: str, body: str, script: str) -> str:
+    """A whole page that needs no other file. style, body and script are markup already."""
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f'<meta name="color-scheme" content="light dark"><title>{words(title)} – SnakeSIM</title>'
+        f"<style>{style}</style></head><body><main>{body}</main><script>{script}</script></body></html>\n"
+    )
+
+
 def responsive(draw: Callable[[float], str], wide: float = 1040.0, narrow: float = 440.0) -> str:
     """A drawing made twice, for wide screens and paper and for phones, so that its text keeps its size."""
     return f'<div class="for-wide">{draw(wide)}</div><div class="for-narrow">{draw(narrow)}</div>'

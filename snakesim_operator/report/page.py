@@ -8,7 +8,7 @@ import numpy as np
 from snakesim_operator.record import CONFIG, REPORT, RunRecord
 from snakesim_operator.report import figures, tables
 from snakesim_operator.report.cards import instants_section
-from snakesim_operator.report.html import absent, paragraph, responsive, section, shown, words
+from snakesim_operator.report.html import absent, document, paragraph, responsive, section, shown, tile, words
 from snakesim_operator.report.palette import DARK, LIGHT, joint_class, variables
 from snakesim_operator.report.svg import line
 from snakesim_operator.report.timeline import (
@@ -51,13 +51,7 @@ def page(record: RunRecord, summary: RunSummary) -> str:
         ]
     )
     title = record.config.title or summary.scenario
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f'<meta name="color-scheme" content="light dark"><title>{words(title)} – SnakeSIM</title>'
-        f"<style>{styles()}</style></head><body><main>{body}</main>"
-        f"<script>{(HERE / 'report.js').read_text(encoding='utf-8')}</script></body></html>\n"
-    )
+    return document(title, styles(), body, script())
 
 
 def styles() -> str:
@@ -65,6 +59,11 @@ def styles() -> str:
     light, dark = variables(LIGHT), variables(DARK)
     themes = f":root{{{light}}}@media screen and (prefers-color-scheme:dark){{:root{{{dark}}}}}"
     return themes + "".join((HERE / name).read_text(encoding="utf-8") for name in ("figure.css", "report.css"))
+
+
+def script() -> str:
+    """One time cursor through all charts of a page."""
+    return (HERE / "report.js").read_text(encoding="utf-8")
 
 
 def _header(record: RunRecord, summary: RunSummary) -> str:
@@ -77,12 +76,7 @@ def _header(record: RunRecord, summary: RunSummary) -> str:
         f"{summary.pace}, {summary.rate_hz:g} Hz",
         f"seed {summary.seed}",
     ]
-    shown_tiles = "".join(
-        f'<div class="tile{" alarming" if tile.alarming else ""}"><b>{words(tile.value)}'
-        f"{f'<small>{words(tile.unit)}</small>' if tile.unit and tile.value != '–' else ''}</b>"
-        f"<span>{words(tile.name)}</span></div>"
-        for tile in tiles(record, summary)
-    )
+    shown_tiles = "".join(tile(one.name, one.value, one.unit, alarming=one.alarming) for one in tiles(record, summary))
     return (
         f'<header id="header"><p class="kicker">SnakeSIM run report <span>{words(summary.scenario)}</span></p>'
         f"<h1>{words(record.config.title or summary.scenario)}</h1>"

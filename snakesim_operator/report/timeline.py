@@ -131,12 +131,17 @@ def distance(record: RunRecord) -> Series | None:
             return Series(time_s, along - along[0], "advance along the route, mean over the body")
         moved = record.position_w[rows, :2] - record.position_w[rows[0], :2]
         return Series(time_s, np.hypot(*moved.T), "distance of the tail end from where it was")
+    return told_distance(record)
+
+
+def told_distance(record: RunRecord) -> Series | None:
+    """Advance of the tail since the controller first told its place on the path."""
     told = [state for state in record.control if state.path_s_m is not None]
-    if len(told) > 1:
-        along = np.array([state.path_s_m for state in told], dtype=np.float64)
-        stamps = np.array([told_at_s(record, state) for state in told])
-        return Series(stamps, along - along[0], "advance of the tail along the path, as the controller knew it")
-    return None
+    if len(told) < 2:
+        return None
+    along = np.array([state.path_s_m for state in told], dtype=np.float64)
+    stamps = np.array([told_at_s(record, state) for state in told])
+    return Series(stamps, along - along[0], "advance of the tail along the path, as the controller knew it")
 
 
 def thinned(time_s: Floats, values: Floats, buckets: int = 400) -> list[list[tuple[float, float]]]:

@@ -1,4 +1,4 @@
-"""All joint torques in one picture (paper, Fig. 11): a row a joint, blue one way, orange the other, clear at rest."""
+"""All joints in one picture (paper, Fig. 11): a row a joint, blue one way, orange the other, clear at rest."""
 
 import base64
 import struct
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from snakesim_operator.record import RunRecord
 from snakesim_operator.report.charts import Frame, chart, time_axis
 from snakesim_operator.report.palette import LIGHT
-from snakesim_operator.report.svg import element, text
+from snakesim_operator.report.svg import element, line, text
 from snakesim_operator.report.timeline import Propulsion, end_s
 
 Floats = NDArray[np.float64]
@@ -20,10 +20,24 @@ COLUMNS = 480
 
 def torque_map(record: RunRecord, intervals: list[Propulsion], width: float) -> str:
     """Every joint's torque over time as a share of the run's largest; propulsion is framed."""
-    joints = record.description.joints
+    names = [joint.name for joint in record.description.joints]
+    share = record.torque_nm / full_colour_nm(record)
+    return joint_map("Torque of every joint over time", names, share, end_s(record), intervals, width)
+
+
+def joint_map(
+    label: str,
+    joints: list[str],
+    share: Floats,
+    until_s: float,
+    intervals: list[Propulsion],
+    width: float,
+    *marks: float,
+) -> str:
+    """Shares in [-1, 1], (n, joints), over time; frames around intervals, dashed lines at `marks`."""
     cell = min(max(230.0 / len(joints), 3.0), 18.0)
-    frame = Frame(width, 12 + cell * len(joints) + 36, end_s(record), 0.0, float(len(joints)), left=66.0)
-    share = strongest(record.torque_nm / full_colour_nm(record), COLUMNS)
+    frame = Frame(width, 12 + cell * len(joints) + 36, until_s, 0.0, float(len(joints)), left=66.0)
+    share = strongest(np.nan_to_num(share), COLUMNS)
     picture = element(
         "image",
         x=frame.left,
@@ -48,7 +62,7 @@ def torque_map(record: RunRecord, intervals: list[Propulsion], width: float) -> 
     every = max(int(np.ceil(14 / cell)), 1)
     for i, joint in enumerate(joints):
         if i % every == 0:
-            parts.append(text(frame.left - 6, frame.y(i + 0.5) + 4, joint.name, "small", anchor="end"))
+            parts.append(text(frame.left - 6, frame.y(i + 0.5) + 4, joint, "small", anchor="end"))
     for one in intervals:
         box = element(
             "rect",
@@ -59,7 +73,8 @@ def torque_map(record: RunRecord, intervals: list[Propulsion], width: float) -> 
             class_="map-frame",
         )
         parts.append(box)
-    return chart(frame, "Torque of every joint over time", *parts, time_axis(frame))
+    parts += [line((frame.x(t), frame.top), (frame.x(t), frame.height - frame.bottom), "mark") for t in marks]
+    return chart(frame, label, *parts, time_axis(frame))
 
 
 def full_colour_nm(record: RunRecord) -> float:

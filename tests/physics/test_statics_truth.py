@@ -131,7 +131,7 @@ def test_tension_and_contact_forces_are_those_solved_for(bench: Bench):
     for tick in range(round((RISE_S + HOLD_S) * 100)):
         target = list(angles)
         target[bench.joint] = bench.solved.torque_nm * min(tick / (RISE_S * 100), 1.0)
-        backend.enact(SetPoints(mode, target, [1000.0] * count))
+        backend.enact(SetPoints(mode, target, [1000.0] * count), "armed")
         backend.advance()
         pushed = {f"cylinder_{k}": 0.0 for k in range(3)}
         for contact in backend.true_state().contacts:

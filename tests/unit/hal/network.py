@@ -23,6 +23,7 @@ from snakesim_hal.messages import (
     Fault,
     JointState,
     LifecycleRequest,
+    LifecycleState,
     Message,
     Mode,
     Pose,
@@ -104,7 +105,7 @@ class LagBackend:
         )
         return Samples(joints, {keys.POSE: pose})
 
-    def enact(self, set_points: SetPoints) -> None:
+    def enact(self, set_points: SetPoints, lifecycle: LifecycleState) -> None:
         """From now on."""
         self._fail("enact")
         self._points = set_points

@@ -34,6 +34,9 @@ def files_under(folder: Path) -> dict[str, str]:
 
 def test_the_published_files_are_what_the_code_says() -> None:
     published, generated = files_under(PUBLISHED), dict(contract())
+    published = {
+        name: text for name, text in published.items() if not name.startswith("can/")
+    }  # tests/unit/can_backend
     published.pop("README.md", None)  # written by hand
     assert sorted(published) == sorted(generated), "run `make schemas` and commit what it changes"
     for name, text in generated.items():

@@ -74,7 +74,7 @@ class Run:
         modes = mode if isinstance(mode, list) else [mode] * self.count
         targets = target if isinstance(target, list) else [float(target)] * self.count
         limits = [self.config.robot.limits.torque_nm if limit is None else limit] * self.count
-        self.sim.enact(SetPoints(modes, targets, limits))
+        self.sim.enact(SetPoints(modes, targets, limits), "armed")
 
     def sample(self) -> Samples:
         """The samples of the present tick."""

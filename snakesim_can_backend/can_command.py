@@ -1,0 +1,234 @@
+"""`snakesim can`: what a configuration asks of its buses, who answers on them, and the DBC file spelled out."""
+
+import argparse
+from collections.abc import Iterator, Sequence
+from math import ceil
+from pathlib import Path
+
+from snakesim_can_backend.bring_up import Bus, Identity, find
+from snakesim_can_backend.bus_load import (
+    LEAST_RATE_HZ,
+    MOST_LOAD,
+    arithmetic,
+    busiest_s,
+    load,
+    on_bus,
+    reports_at,
+    reports_of,
+    shares,
+    what_fits,
+)
+from snakesim_can_backend.codec import codec
+from snakesim_can_backend.expanded import EXPANDED, expanded_dbc
+from snakesim_can_backend.protocol import FIRST_NODE, LAST_NODE, Opcode
+from snakesim_can_backend.reading import Module, Reading
+from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.wire import SocketCanWire, Wire
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.files import Table, decode
+from snakesim_hal.scenario import Loaded, Override, RunConfig, parse_set
+from snakesim_hal.scenario import load as load_scenario
+
+OK, FAILED = 0, 1
+MOST_RATE_HZ = 5000  # of a scenario
+COLUMNS = (
+    *("channel", "node", "serial", "firmware", "protocol", "emulated", "state", "faults", "uptime"),
+    *("voltage", "motor", "board", "shaft"),
+)
+UNKNOWN = "-"
+
+
+def main(argv: Sequence[str]) -> int:
+    """Exit code: 0 done, 1 does not fit or nobody answers. Raises SnakesimError."""
+    arguments = _parser().parse_args(list(argv))
+    return arguments.act(arguments)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="snakesim can", description="Joint modules and their buses.")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    asked = commands.add_parser("load", help="the sum of what a scenario asks of its buses, at worst")
+    asked.add_argument("scenario", help="name of a shipped scenario, or path of a scenario file or a run's config.json")
+    asked.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change any value")
+    asked.add_argument("--joints", type=_joints, nargs="+", metavar="N", help="as if the robot had so many joints")
+    asked.add_argument("--rates", type=_rate, nargs="+", metavar="HZ", help="as if it ran at these rates")
+    asked.set_defaults(act=_load)
+
+    answering = commands.add_parser(
+        "scan", help="list every module that answers; asks who is there, and changes nothing"
+    )
+    answering.add_argument("channel", nargs="+", help="SocketCAN interface, such as can0")
+    answering.add_argument("--seconds", type=_seconds, default=1.0, help="how long to listen on each (default: 1)")
+    answering.set_defaults(act=_scan)
+
+    expand = commands.add_parser("expand", help=f"write {EXPANDED}: every message of every node spelled out")
+    expand.add_argument("--write", type=Path, required=True, metavar="FOLDER")
+    expand.set_defaults(act=_expand)
+    return parser
+
+
+# --- load --------------------------------------------------------------------------------------------------
+
+
+def _load(arguments: argparse.Namespace) -> int:
+    overrides = [Override("backend", "can", "snakesim can"), *(parse_set(text) for text in arguments.set)]
+    loaded = load_scenario(arguments.scenario, overrides)
+    settings = settings_of(loaded)
+    if arguments.joints is None and arguments.rates is None:
+        lines, fits = one(loaded.config, settings)
+        print("\n".join(lines))
+        return OK if fits else FAILED
+    config = loaded.config
+    print("\n".join(table(config, settings, arguments.joints or [config.robot.chain.modules], arguments.rates)))
+    return OK
+
+
+def settings_of(loaded: Loaded) -> Settings:
+    """The section `backends.can` of a scenario. Raises ConfigError."""
+    table = loaded.table
+    section = Table(loaded.config.backends.get("can", {}), table.source, table.origin)
+    return decode(section, Settings, "backends.can")
+
+
+def one(config: RunConfig, settings: Settings) -> tuple[list[str], bool]:
+    """The sum for every bus as lines, and whether all fit."""
+    joints, reports = shares(config, settings), reports_of(config, settings)
+    period_ms = 1e3 / config.rate_hz
+    lines: list[str] = []
+    for i, count in enumerate(joints):
+        name = settings.channels[i] if settings.channels else "one bus"
+        busiest_ms = 1e3 * busiest_s(count, on_bus(i, reports))
+        lines += [f"{name}: {count} joints at {config.rate_hz:g} Hz", arithmetic(count, on_bus(i, reports))]
+        lines.append(f"  Sync, answers, forces and set-points of one period: {busiest_ms:.2f} of {period_ms:.2f} ms")
+    fits = all(load(count, on_bus(i, reports)) <= MOST_LOAD for i, count in enumerate(joints))
+    return (lines if fits else [*lines, f"Refused. {what_fits(joints, config, settings)}"]), fits
+
+
+def table(
+    config: RunConfig, settings: Settings, joints: Sequence[int], rates_hz: Sequence[float] | None = None
+) -> Iterator[str]:
+    """The load of the fullest bus for every number of joints and every rate, as lines."""
+    buses = max(len(settings.channels), 1)
+    rates = rates_hz or [config.rate_hz]
+    yield "joints" + "".join(f"{f'{rate:g} Hz':>16}" for rate in rates)
+    for count in joints:
+        loads = [load(ceil(count / buses), reports_at(rate, config, settings)) for rate in rates]
+        yield f"{count:6}" + "".join(f"{_cell(share):>16}" for share in loads)
+    on = "one bus" if buses == 1 else f"the fullest of {buses} buses"
+    yield f"Worst-case load of {on}, 1 Mbit/s; above {MOST_LOAD:.0%} it is refused."
+
+
+def _cell(share: float) -> str:
+    return f"{100 * share:.1f} %" + ("" if share <= MOST_LOAD else " refused")
+
+
+# --- scan --------------------------------------------------------------------------------------------------
+
+
+def _scan(arguments: argparse.Namespace) -> int:
+    found = 0
+    for channel in arguments.channel:
+        wire = SocketCanWire(channel)
+        try:
+            rows = scan(wire, arguments.seconds)
+        finally:
+            wire.close()
+        print("\n".join(aligned(rows)) if rows else f"{channel}: nobody answers")
+        found += len(rows)
+    return OK if found else FAILED
+
+
+def scan(wire: Wire, seconds: float) -> list[dict[str, str]]:
+    """Ask who is on a bus, and listen; one row a module, as text by `COLUMNS`. Sends nothing but identify."""
+    reading = Reading(LAST_NODE)
+    everybody = Bus(wire, range(FIRST_NODE, LAST_NODE + 1))
+    return [_row(identity, reading) for identity in find([everybody], seconds, reading.take)]
+
+
+def aligned(rows: Sequence[dict[str, str]]) -> Iterator[str]:
+    """The rows as lines with a heading."""
+    every = [dict(zip(COLUMNS, COLUMNS, strict=True)), *rows]
+    widths = [max(len(row[column]) for row in every) for column in COLUMNS]
+    for row in every:
+        yield "  ".join(f"{row[name]:<{width}}" for name, width in zip(COLUMNS, widths, strict=True)).rstrip()
+
+
+def _row(identity: Identity, reading: Reading) -> dict[str, str]:
+    node = identity.node
+    known = FIRST_NODE <= node <= LAST_NODE
+    emulated = "stepped" if identity.stepped else "yes" if identity.emulated else "no"
+    return {
+        "channel": identity.channel,
+        "node": str(node),
+        "serial": f"{identity.serial:08X}",
+        "firmware": identity.firmware,
+        "protocol": str(identity.protocol),
+        "emulated": emulated,
+        **(_heart(reading.modules[node - 1]) if known else dict.fromkeys(("state", "faults", "uptime"), UNKNOWN)),
+        **_inside(reading.health()[node - 1] if known else None),
+        "shaft": _shaft(reading.shaft_raw[node - 1] if known else None),
+    }
+
+
+def _heart(module: Module) -> dict[str, str]:
+    if module.uptime_ms < 0:  # no heartbeat
+        return {"state": UNKNOWN, "faults": UNKNOWN, "uptime": UNKNOWN}
+    return {
+        "state": module.state.name.lower(),
+        "faults": "+".join(module.fault_names()) or "none",
+        "uptime": f"{module.uptime_ms / 1000:.1f} s",
+    }
+
+
+def _inside(raw: Sequence[int] | None) -> dict[str, str]:
+    if raw is None:
+        return {"voltage": UNKNOWN, "motor": UNKNOWN, "board": UNKNOWN}
+    signals = codec()[Opcode.HEALTH].signals
+    return {
+        "voltage": f"{signals['voltage'].value(raw[0]):.1f} V",
+        "motor": f"{signals['motor_temperature'].value(raw[2]):.0f} °C",
+        "board": f"{signals['board_temperature'].value(raw[3]):.0f} °C",
+    }
+
+
+def _shaft(raw: int | None) -> str:
+    """Known only while somebody sends Syncs, and modules report their IMUs."""
+    return UNKNOWN if raw is None else f"{codec()[Opcode.SHAFT_LOAD].signals['torque'].value(raw):.3f} N·m"
+
+
+# --- expand ------------------------------------------------------------------------------------------------
+
+
+def _expand(arguments: argparse.Namespace) -> int:
+    path = arguments.write / EXPANDED
+    try:
+        path.write_text(expanded_dbc(), encoding="cp1252", newline="\n")
+    except OSError as error:
+        raise ConfigError(f"--write {arguments.write}: {error.strerror}; give a folder that is there") from error
+    print(path)
+    return OK
+
+
+# --- arguments ---------------------------------------------------------------------------------------------
+
+
+def _joints(text: str) -> int:
+    count = int(text)
+    if not 1 <= count <= LAST_NODE:
+        raise argparse.ArgumentTypeError(f"{text} joints; from 1 to {LAST_NODE}, the last node id")
+    return count
+
+
+def _rate(text: str) -> float:
+    rate_hz = float(text)
+    if not LEAST_RATE_HZ <= rate_hz <= MOST_RATE_HZ:
+        raise argparse.ArgumentTypeError(f"{text} Hz; from {LEAST_RATE_HZ} to {MOST_RATE_HZ}")
+    return rate_hz
+
+
+def _seconds(text: str) -> float:
+    seconds = float(text)
+    if not 0 < seconds <= 3600:
+        raise argparse.ArgumentTypeError(f"{text} s; from above 0 to 3600")
+    return seconds

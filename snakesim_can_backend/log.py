@@ -1,0 +1,61 @@
+"""Everything that goes over the wires, in candump's format: `(1700000000.000000) can0 105#00112233`."""
+
+import time
+from pathlib import Path
+from typing import TextIO
+
+from snakesim_can_backend.protocol import Frame
+from snakesim_can_backend.wire import Trouble, Wire
+from snakesim_hal.errors import ConfigError
+
+FLUSH_BYTES = 1 << 16
+
+
+def open_log(path: Path) -> TextIO:
+    """Begin a log. Raises ConfigError."""
+    try:
+        return path.open("w", encoding="ascii", buffering=FLUSH_BYTES)
+    except OSError as error:
+        raise ConfigError(f"`backends.can.log` = {str(path)!r}: {error.strerror}; choose another file") from error
+
+
+class LoggedWire:
+    """A wire that keeps a log. Several may share one file."""
+
+    def __init__(self, wire: Wire, log: TextIO) -> None:
+        self._wire, self._log = wire, log
+        self.channel = wire.channel
+
+    def send(self, frame: Frame) -> bool:
+        """Send, and log what was taken."""
+        taken = self._wire.send(frame)
+        if taken:
+            self._write(frame)
+        return taken
+
+    def receive(self) -> list[Frame]:
+        """Receive, and log it."""
+        frames = self._wire.receive()
+        for frame in frames:
+            self._write(frame)
+        return frames
+
+    def troubles(self) -> list[Trouble]:
+        """As the wire says."""
+        return self._wire.troubles()
+
+    def fileno(self) -> int | None:
+        """As the wire says."""
+        return self._wire.fileno()
+
+    def idle(self) -> float | None:
+        """As the wire does."""
+        return self._wire.idle()
+
+    def close(self) -> None:
+        """Close the wire; the log is complete."""
+        self._wire.close()
+        self._log.flush()
+
+    def _write(self, frame: Frame) -> None:
+        self._log.write(f"({time.time():.6f}) {self.channel} {frame.id:03X}#{frame.data.hex().upper()}\n")

@@ -1,0 +1,205 @@
+"""The bus protocol of the joint modules, version 1: ids, states, actions and parameters.
+
+Layouts and scales stand in `schemas/can/snakesim.dbc` and nowhere else; the numbers here are held against its value
+tables by the tests. `docs/can-protocol.md` explains it all.
+"""
+
+from binascii import crc_hqx
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import NamedTuple
+
+VERSION = 1
+BROADCAST = 0
+FIRST_NODE, LAST_NODE = 1, 62
+NODE_BITS = 6
+NODE_MASK = (1 << NODE_BITS) - 1
+COMMAND_KEY = 0x5AAE
+COUNTS = 16  # set-point and state counters go round in four bits
+WRONG_COUNTS = 5  # in a row, and a module stops: its command stream is not one
+HEARTBEAT_PERIOD_S = 0.1
+HEALTH_PERIOD_S = 0.5
+
+
+class Opcode(IntEnum):
+    """Upper five bits of an id; the lowest wins the bus."""
+
+    EMERGENCY = 0
+    COMMAND = 1
+    SYNC = 2
+    SET_POINT = 3
+    JOINT_STATE = 4
+    CONTACT = 5
+    TAIL_CONTACT = 6
+    HEARTBEAT = 7
+    GYRO = 8
+    ACCELEROMETER = 9
+    SHAFT_LOAD = 10
+    HEALTH = 11
+    IDENTITY = 12
+    PARAMETER_ANSWER = 13
+    PARAMETER_REQUEST = 16
+
+
+FROM_HOST = frozenset((Opcode.EMERGENCY, Opcode.COMMAND, Opcode.SYNC, Opcode.SET_POINT, Opcode.PARAMETER_REQUEST))
+WITH_CHECKSUM = frozenset((Opcode.COMMAND, Opcode.SET_POINT, Opcode.JOINT_STATE))
+
+
+class ModuleState(IntEnum):
+    """Where a module stands. Only `ARMED` follows set-points; only `ARMED` and `STOPPING` drive the motor."""
+
+    BOOT = 0
+    DISARMED = 1
+    ARMED = 2
+    STOPPING = 3  # damps until at rest, at most for the watchdog's time; then passive and DISARMED
+    FAULT = 4  # passive; latched until cleared or rebooted
+    EMERGENCY = 5  # passive; latched until cleared or rebooted
+
+
+class Action(IntEnum):
+    """What a Command asks for."""
+
+    ARM = 1
+    DISARM = 2  # passive at once
+    STOP = 3  # safe action, then disarmed
+    CLEAR = 4
+    REBOOT = 5
+    IDENTIFY = 6
+
+
+class LastStop(IntEnum):
+    """Why a module left `ARMED` the last time."""
+
+    NONE = 0
+    DISARM = 1
+    STOP = 2
+    WATCHDOG = 3
+    STREAM = 4
+    OVERHEAT = 5
+    LEAK = 6
+    VOLTAGE = 7
+    SENSOR = 8
+    EMERGENCY = 9
+    REBOOT = 10
+
+
+class ModuleFault(IntEnum):
+    """Fault bits of a heartbeat, lowest first."""
+
+    WATCHDOG = 0
+    STREAM = 1
+    OVERHEAT = 2
+    LEAK = 3
+    VOLTAGE = 4
+    SENSOR = 5
+
+
+class EmergencyReason(IntEnum):
+    """Who called an emergency."""
+
+    UNSPECIFIED = 0
+    PERSON = 1
+    HOST = 2
+
+
+class Operation(IntEnum):
+    """What a ParameterRequest asks for."""
+
+    READ = 0
+    WRITE = 1
+    SAVE = 2
+
+
+class Result(IntEnum):
+    """How a ParameterRequest went."""
+
+    DONE = 0
+    UNKNOWN_INDEX = 1
+    READ_ONLY = 2
+    OUT_OF_RANGE = 3
+    NOT_WHILE_ARMED = 4
+    UNKNOWN_OPERATION = 5
+
+
+class SafeMotion(IntEnum):
+    """Parameter `safe_action`: what `STOPPING` does."""
+
+    PASSIVE = 0
+    DAMP = 1
+
+
+class Parameter(IntEnum):
+    """Index of every parameter."""
+
+    STIFFNESS = 1
+    DAMPING = 2
+    VELOCITY_GAIN = 3
+    TORQUE_LIMIT = 4
+    SPEED_LIMIT = 5
+    ANGLE_LIMIT = 6
+    WATCHDOG = 7
+    SAFE_ACTION = 8
+    CONTACT_EVERY = 9
+    IMU_EVERY = 10
+    TAIL = 11
+    RATED_TORQUE = 12
+    RATED_SPEED = 13
+
+
+@dataclass(frozen=True)
+class ParameterRange:
+    """What a parameter may be, and its unit."""
+
+    low: float
+    high: float
+    unit: str
+    writable: bool = True
+
+
+PARAMETERS: dict[Parameter, ParameterRange] = {
+    Parameter.STIFFNESS: ParameterRange(0.0, 1e5, "N·m/rad"),
+    Parameter.DAMPING: ParameterRange(0.0, 1e4, "N·m·s/rad"),
+    Parameter.VELOCITY_GAIN: ParameterRange(0.0, 1e4, "N·m·s/rad"),
+    Parameter.TORQUE_LIMIT: ParameterRange(0.0, 32.767, "N·m"),
+    Parameter.SPEED_LIMIT: ParameterRange(0.0, 32.767, "rad/s"),
+    Parameter.ANGLE_LIMIT: ParameterRange(0.0, 3.2767, "rad"),
+    Parameter.WATCHDOG: ParameterRange(0.02, 0.1, "s"),
+    Parameter.SAFE_ACTION: ParameterRange(0, 1, "0 passive, 1 damp"),
+    Parameter.CONTACT_EVERY: ParameterRange(0, 255, "Syncs, 0 never"),
+    Parameter.IMU_EVERY: ParameterRange(0, 255, "Syncs, 0 never"),
+    Parameter.TAIL: ParameterRange(0, 1, "1: sends TailContact too"),
+    Parameter.RATED_TORQUE: ParameterRange(0.0, 32.767, "N·m", writable=False),
+    Parameter.RATED_SPEED: ParameterRange(0.0, 32.767, "rad/s", writable=False),
+}
+
+
+class Frame(NamedTuple):
+    """A data frame on the bus."""
+
+    id: int
+    data: bytes
+
+
+def frame_id(opcode: Opcode, node: int) -> int:
+    """The id of a message to or from a node; node 0 is everybody."""
+    return opcode << NODE_BITS | node
+
+
+def opcode_of(identifier: int) -> int:
+    """Which message an id stands for."""
+    return identifier >> NODE_BITS
+
+
+def node_of(identifier: int) -> int:
+    """Whom an id is from, or for."""
+    return identifier & NODE_MASK
+
+
+def checksum(identifier: int, data: bytes) -> int:
+    """Low byte of CRC-16/XMODEM over `data`, begun with the id, so that no frame passes for another's."""
+    return crc_hqx(data, identifier) & 0xFF
+
+
+def intact(frame: Frame) -> bool:
+    """Whether the last byte of a frame is the checksum of the others."""
+    return crc_hqx(frame.data[:-1], frame.id) & 0xFF == frame.data[-1]

@@ -1,0 +1,247 @@
+"""What the modules say, as it comes in: raw numbers per joint, and how their frames depart from what is right.
+
+Pure: frames and Sync numbers in, no clock and no bus. Everything is kept as raw integers, and scaled for all joints at
+once when a tick asks for it.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_can_backend.codec import codec
+from snakesim_can_backend.protocol import (
+    COUNTS,
+    FROM_HOST,
+    Frame,
+    LastStop,
+    ModuleFault,
+    ModuleState,
+    Opcode,
+    frame_id,
+    intact,
+    node_of,
+    opcode_of,
+)
+
+Floats = NDArray[np.float64]
+TOLD_WITHIN = 3  # Syncs from a module's fault to its heartbeat, at most
+LATE_SYNCS = 3  # a state this many Syncs late is still taken, with its age; older counts are wrong ones
+LATCHED = (ModuleState.FAULT, ModuleState.EMERGENCY)
+
+
+@dataclass
+class Module:
+    """What is known of one module. Numbers of Syncs are whole, not modulo."""
+
+    node: int
+    sync: int = -1  # that the newest good state answers; -1: none yet
+    state: ModuleState = ModuleState.BOOT
+    derated: bool = False
+    last_count: int = -1
+    repeats: int = 0  # states in a row with one and the same count
+    wrong_counts: int = 0  # in a row
+    corrupt: int = 0  # in a row
+    twice: int = 0  # Syncs in a row that were answered more than once
+    twice_at: int = -1
+    frames: int = 0  # in this tick
+    uptime_ms: int = -1
+    restarts: int = 0
+    faults: int = 0  # bits, from the newest heartbeat
+    last_stop: LastStop = LastStop.NONE
+    heartbeat_sync: int = -1
+    stopped_syncs: int = 0  # in a row, in which its state was fault or emergency
+
+    @property
+    def needs_clearing(self) -> bool:
+        """Whether it is in a latched state, and its heartbeat had the time to say why."""
+        return bool(self.faults) or self.stopped_syncs >= TOLD_WITHIN
+
+    def fault_names(self) -> list[str]:
+        """The fault bits in words."""
+        return [fault.name.lower() for fault in ModuleFault if self.faults >> fault & 1]
+
+
+class Reading:
+    """Everything that the modules of a robot have said so far; joint i is node i + 1."""
+
+    def __init__(self, joints: int) -> None:
+        self.modules = [Module(node) for node in range(1, joints + 1)]
+        self.sync = -1  # the newest one sent
+        self.states_missing = joints
+        self.contacts_missing = 0
+        self.strangers: Counter[int] = Counter()  # frames of nodes that should not be there, since the last tick
+        self.from_other_host: Counter[Opcode] = Counter()
+        self.malformed = 0
+        layouts = codec().layouts
+        self._joint = [[0, 0, 0] for _ in range(joints)]
+        self._contact: list[list[int] | None] = [None] * (joints + 1)  # by link
+        self._gyro: list[list[int] | None] = [None] * joints
+        self._acceleration: list[list[int] | None] = [None] * joints
+        self._health: list[list[int] | None] = [None] * joints
+        self.shaft_raw: list[int | None] = [None] * joints
+        self._read_state = layouts[Opcode.JOINT_STATE].reader(
+            "angle", "velocity", "torque", "count", "state", "derated"
+        )
+        signals = layouts[Opcode.JOINT_STATE].signals
+        self._state_scale = np.array([[signals[name].scale] for name in ("angle", "velocity", "torque")])
+        names = ("force_x", "force_y", "force_z", "along", "bearing", "touched", "count")
+        self._read_contact = layouts[Opcode.CONTACT].reader(*names)
+        self._read_gyro = layouts[Opcode.GYRO].reader("rate_x", "rate_y", "rate_z", "count")
+        names = ("acceleration_x", "acceleration_y", "acceleration_z", "count")
+        self._read_acceleration = layouts[Opcode.ACCELEROMETER].reader(*names)
+        names = ("voltage", "current", "motor_temperature", "board_temperature", "leak")
+        self._read_health = layouts[Opcode.HEALTH].reader(*names)
+        self._read_shaft = layouts[Opcode.SHAFT_LOAD].reader("torque")
+        faults = [f"fault_{fault.name.lower()}" for fault in ModuleFault]
+        self._read_heartbeat = layouts[Opcode.HEARTBEAT].reader("state", "last_stop", "uptime", *faults)
+        takers = {
+            Opcode.JOINT_STATE: self._take_state,
+            Opcode.CONTACT: self._take_contact,
+            Opcode.TAIL_CONTACT: self._take_tail_contact,
+            Opcode.HEARTBEAT: self._take_heartbeat,
+            Opcode.GYRO: self._take_gyro,
+            Opcode.ACCELEROMETER: self._take_acceleration,
+            Opcode.SHAFT_LOAD: self._take_shaft,
+            Opcode.HEALTH: self._take_health,
+        }
+        self._known = {
+            frame_id(opcode, module.node): (take, module, layouts[opcode].length)
+            for opcode, take in takers.items()
+            for module in self.modules
+        }
+
+    def begin(self, sync: int, *, contacts: bool, tail: bool) -> None:
+        """A Sync goes out. Only modules that answered of late are waited for.
+
+        contacts, tail: whether it asks for force reports, and whether the tail link sends one of its own.
+        """
+        self.sync = sync
+        expected = [module.sync >= sync - 1 - LATE_SYNCS or module.sync < 0 for module in self.modules]
+        self.states_missing = sum(expected)
+        self.contacts_missing = (self.states_missing + (tail and expected[0])) if contacts else 0
+        if contacts:
+            self._contact = [None] * len(self._contact)
+        for module in self.modules:
+            module.frames = 0
+
+    @property
+    def complete(self) -> bool:
+        """Whether everybody has answered who can be expected to."""
+        return self.states_missing <= 0 and self.contacts_missing <= 0
+
+    def take(self, frame: Frame) -> None:
+        """Take in one frame."""
+        known = self._known.get(frame.id)
+        if known is None:
+            self._take_other(frame)
+            return
+        take, module, length = known
+        module.frames += 1
+        if len(frame.data) == length:
+            take(module, frame)
+        else:
+            self.malformed += 1
+
+    def _take_other(self, frame: Frame) -> None:
+        opcode, node = opcode_of(frame.id), node_of(frame.id)
+        if opcode in FROM_HOST:
+            self.from_other_host[Opcode(opcode)] += 1
+        elif not 1 <= node <= len(self.modules):
+            self.strangers[node] += 1
+        else:
+            self.modules[node - 1].frames += 1
+
+    # --- what the joints are, in SI units ---------------------------------------------------------------------
+
+    def joints(self) -> Floats:
+        """Angle, velocity and torque of every joint, (3, n_joints)."""
+        return np.array(self._joint).T * self._state_scale
+
+    def links_touched(self) -> list[tuple[int, list[int]]]:
+        """(link, raw contact) of every link that reported a touch at this Sync."""
+        return [(link, raw) for link, raw in enumerate(self._contact) if raw is not None and raw[5]]
+
+    def imus(self) -> list[tuple[int, Sequence[int], Sequence[int]]]:
+        """(link, raw rates, raw accelerations) of every link whose IMU has reported since the last call."""
+        found = []
+        for i, (gyro, acceleration) in enumerate(zip(self._gyro, self._acceleration, strict=True)):
+            if gyro is not None and acceleration is not None:
+                found.append((i + 1, gyro[:3], acceleration[:3]))
+                self._gyro[i] = self._acceleration[i] = None
+        return found
+
+    def health(self) -> list[list[int] | None]:
+        """Raw voltage, current, two temperatures and leak of every module; None: not told yet."""
+        return self._health
+
+    # --- one kind of frame each ---------------------------------------------------------------------------------
+
+    def _take_state(self, module: Module, frame: Frame) -> None:
+        if not intact(frame):
+            module.corrupt += 1
+            return
+        angle, velocity, torque, count, state, derated = self._read_state(frame.data)
+        late = (self.sync - count) % COUNTS
+        if count == module.last_count:
+            module.repeats += 1
+        else:
+            module.repeats = 0
+        module.last_count = count
+        if late > LATE_SYNCS:
+            module.wrong_counts += 1
+            return
+        sync = self.sync - late
+        if sync <= module.sync:
+            if late == 0:
+                self._answered_twice(module)
+            return
+        module.corrupt = module.wrong_counts = 0
+        module.sync = sync
+        module.state = ModuleState(state) if state < len(ModuleState) else ModuleState.FAULT
+        module.stopped_syncs = module.stopped_syncs + 1 if module.state in LATCHED else 0
+        module.derated = bool(derated)
+        self._joint[module.node - 1] = [angle, velocity, torque]
+        if late == 0:
+            self.states_missing -= 1
+
+    def _answered_twice(self, module: Module) -> None:
+        if module.twice_at < self.sync:
+            module.twice = module.twice + 1 if module.twice_at == self.sync - 1 else 1
+            module.twice_at = self.sync
+
+    def _take_contact(self, module: Module, frame: Frame) -> None:
+        self._take_link(module.node, frame)
+
+    def _take_tail_contact(self, module: Module, frame: Frame) -> None:
+        self._take_link(module.node - 1, frame)
+
+    def _take_link(self, link: int, frame: Frame) -> None:
+        raw = self._read_contact(frame.data)
+        if (self.sync - raw[6]) % COUNTS == 0 and self._contact[link] is None:
+            self._contact[link] = raw
+            self.contacts_missing -= 1
+
+    def _take_heartbeat(self, module: Module, frame: Frame) -> None:
+        state, last_stop, uptime_ms, *bits = self._read_heartbeat(frame.data)
+        if uptime_ms < module.uptime_ms:
+            module.restarts += 1
+        module.uptime_ms = uptime_ms
+        module.heartbeat_sync = self.sync
+        module.faults = sum(bit << i for i, bit in enumerate(bits))
+        module.last_stop = LastStop(last_stop) if last_stop < len(LastStop) else LastStop.NONE
+        module.state = ModuleState(state) if state < len(ModuleState) else ModuleState.FAULT
+
+    def _take_gyro(self, module: Module, frame: Frame) -> None:
+        self._gyro[module.node - 1] = self._read_gyro(frame.data)
+
+    def _take_acceleration(self, module: Module, frame: Frame) -> None:
+        self._acceleration[module.node - 1] = self._read_acceleration(frame.data)
+
+    def _take_shaft(self, module: Module, frame: Frame) -> None:
+        self.shaft_raw[module.node - 1] = self._read_shaft(frame.data)[0]
+
+    def _take_health(self, module: Module, frame: Frame) -> None:
+        self._health[module.node - 1] = self._read_health(frame.data)

@@ -1,0 +1,155 @@
+"""What a bus of 1 Mbit/s makes of the frames that are sent over one that has no bit rate.
+
+Every frame takes as long as it would with as many stuffed bits as there can be. A module's frames wait in its order;
+whenever the bus is free the lowest id among the first of all modules wins it. The host's frames are seen when they are
+there already: they take their time on the bus, but cannot be held back. A newer frame of a module takes the place of an
+unsent one with the same id, as in the one mailbox that firmware has for it, so that nothing piles up for ever.
+"""
+
+from dataclasses import dataclass
+from heapq import heappop, heappush
+from math import inf
+
+from snakesim_can_backend.bus_load import BIT_RATE, worst_bits
+from snakesim_can_backend.protocol import NODE_BITS, Frame, Opcode
+
+OPCODES = 32
+US_PER_BIT = 1e6 / BIT_RATE
+FRAME_US = [worst_bits(length) * US_PER_BIT for length in range(9)]
+MOST_AHEAD_US = 20_000.0  # of frames that the host sends faster than any bus could take
+IN_ORDER = frozenset((Opcode.PARAMETER_ANSWER,))  # each answers another question: none replaces another
+MOST_ANSWERS = 64
+
+
+@dataclass(frozen=True)
+class Traffic:
+    """What went over a bus until some moment, by opcode."""
+
+    now_us: float
+    frames: tuple[int, ...]
+    bits: tuple[float, ...]
+    replaced: int  # frames that a newer one overtook before the bus was free for them
+    late_us: float  # the longest that a frame waited for the bus
+
+    def load_since(self, before: "Traffic") -> float:
+        """Share of the bus's time that was taken."""
+        took = self.now_us - before.now_us
+        return (sum(self.bits) - sum(before.bits)) * US_PER_BIT / took if took > 0 else 0.0
+
+
+class BusTime:
+    """One bus. Times are microseconds, and must not go backward."""
+
+    def __init__(self) -> None:
+        self._free_us = 0.0
+        self._waiting: dict[int, dict[int, tuple[Frame, float]]] = {}  # sender -> slot -> frame, since when
+        self._first: list[tuple[int, int, int]] = []  # heap: id, sender, slot of the first frame of every sender
+        self._under_way: tuple[Frame, float] | None = None
+        self._through: list[Frame] = []
+        self._answers = 0
+        self._endless: dict[int, Frame] = {}
+        self._frames, self._bits = [0] * OPCODES, [0.0] * OPCODES
+        self._replaced, self._late_us = 0, 0.0
+
+    def heard(self, frame: Frame, now_us: float) -> None:
+        """A frame of the host is there."""
+        self._proceed(now_us)
+        took = FRAME_US[len(frame.data)]
+        self._free_us = min(max(self._free_us, now_us) + took, now_us + MOST_AHEAD_US)
+        self._count(frame, took)
+
+    def offer(self, sender: int, frame: Frame, now_us: float) -> None:
+        """A module has a frame to send."""
+        self._proceed(now_us)
+        queue = self._waiting.setdefault(sender, {})
+        slot = frame.id
+        if frame.id >> NODE_BITS in IN_ORDER:
+            self._answers += 1
+            slot |= (self._answers % MOST_ANSWERS + 1) << 11
+        if slot in queue:
+            queue[slot] = (frame, queue[slot][1])
+            self._replaced += 1
+            return
+        queue[slot] = (frame, now_us)
+        if len(queue) == 1:
+            heappush(self._first, (frame.id, sender, slot))
+
+    def released(self, now_us: float) -> list[Frame]:
+        """Frames whose last bit is through by now, in their order, each once."""
+        self._proceed(now_us)
+        through, self._through = self._through, []
+        return through
+
+    def next_us(self) -> float:
+        """When the next frame will be through; inf when none waits."""
+        if self._under_way is not None:
+            return self._under_way[1]
+        if not self._first:
+            return inf
+        frame, since = self._waiting[self._first[0][1]][self._first[0][2]]
+        return max(self._free_us, since) + FRAME_US[len(frame.data)]
+
+    def count(self, frame: Frame) -> None:
+        """A frame that takes bus time which nobody waits for."""
+        self._count(frame, FRAME_US[len(frame.data)])
+
+    def babble(self, sender: int, frame: Frame | None, now_us: float) -> None:
+        """From now on a module sends a frame over and over, as often as the bus lets it; None ends that."""
+        self._proceed(now_us)
+        if frame is None:
+            self._endless.pop(sender, None)
+        else:
+            self._endless[sender] = frame
+            self.offer(sender, frame, now_us)
+
+    def traffic(self, now_us: float) -> Traffic:
+        """What went over the bus until now."""
+        return Traffic(now_us, tuple(self._frames), tuple(self._bits), self._replaced, self._late_us)
+
+    def _proceed(self, now_us: float) -> None:
+        """Let the bus run until now; a frame that would begin now waits for what else is offered now."""
+        while True:
+            if self._under_way is not None:
+                frame, end_us = self._under_way
+                if end_us > now_us:
+                    return
+                self._through.append(frame)
+                self._under_way = None
+            if not self._first:
+                return
+            _, sender, slot = self._first[0]
+            frame, since_us = self._waiting[sender][slot]
+            start_us = max(self._free_us, since_us)
+            if start_us >= now_us:
+                return
+            heappop(self._first)
+            self._begin(sender, slot, frame, since_us, start_us)
+
+    def _begin(self, sender: int, slot: int, frame: Frame, since_us: float, start_us: float) -> None:
+        queue = self._waiting[sender]
+        del queue[slot]
+        took = FRAME_US[len(frame.data)]
+        if sender in self._endless and slot == self._endless[sender].id:
+            queue[slot] = (self._endless[sender], start_us + took)
+        if queue:
+            following, (next_frame, _) = next(iter(queue.items()))
+            heappush(self._first, (next_frame.id, sender, following))
+        self._free_us = start_us + took
+        self._under_way = (frame, self._free_us)
+        self._late_us = max(self._late_us, start_us - since_us)
+        self._count(frame, took)
+
+    def _count(self, frame: Frame, took_us: float) -> None:
+        opcode = frame.id >> NODE_BITS
+        self._frames[opcode] += 1
+        self._bits[opcode] += took_us / US_PER_BIT
+
+
+def by_opcode(before: Traffic, after: Traffic) -> list[tuple[Opcode, int, float]]:
+    """What went over between two moments: message, frames, share of the bus's time; only what was there."""
+    took_us = max(after.now_us - before.now_us, 1.0)
+    return [
+        (opcode, frames, (after.bits[opcode] - before.bits[opcode]) * US_PER_BIT / took_us)
+        for opcode in Opcode
+        if (frames := after.frames[opcode] - before.frames[opcode])
+    ]

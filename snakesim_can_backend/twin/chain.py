@@ -1,0 +1,294 @@
+"""All modules of a robot, their motors and what those move, on one clock.
+
+    at a Sync: the plant is brought up to now, sensors are read, every module answers, then enacts its set-point
+
+With `stepped`, time passes only when a Sync's time is later than that of the one before, and frames go out at once: a
+host may think for as long as it likes, and every run is the same. Otherwise whoever serves the chain tells it the time.
+"""
+
+from collections.abc import Callable
+from itertools import accumulate
+from math import inf
+from zlib import crc32
+
+import msgspec
+
+from snakesim_can_backend.bus_load import shares
+from snakesim_can_backend.protocol import BROADCAST, FROM_HOST, Frame, Opcode, Parameter, node_of, opcode_of
+from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.twin import thermal
+from snakesim_can_backend.twin.bus_time import FRAME_US, BusTime, Traffic
+from snakesim_can_backend.twin.faults import Change, Fault, Plan, parse
+from snakesim_can_backend.twin.firmware import BOOT_US, Module
+from snakesim_can_backend.twin.frames import LENGTHS, read_sync
+from snakesim_can_backend.twin.motors import Motors
+from snakesim_can_backend.twin.parameters import Parameters, from_factory
+from snakesim_can_backend.twin.seat import Seat
+from snakesim_can_backend.twin.senses import PoseCamera, Senses
+from snakesim_hal.messages import Mode
+from snakesim_hal.plant import Plant
+from snakesim_hal.scenario import RunConfig
+
+MOST_AT_ONCE_US = 200_000.0  # after a longer hiccup of this process, the modules have missed the rest of it
+HEAT_EVERY = 10  # steps
+ROUND_US = 1 << 32  # Sync times go round: what is less than half a round ahead is later
+NEW_HOST_US = 1_000_000  # a Sync that is so much earlier is no latecomer on another bus, but a host that began anew
+OTHER_SERIAL = 0x0D0B1E00
+
+
+class ModuleChain:
+    """Every module, tail to head; joint_i is node i."""
+
+    def __init__(
+        self,
+        config: RunConfig,
+        settings: Settings,
+        plant: Plant,
+        *,
+        stepped: bool,
+        send_pose: Callable[[bytes], None] | None = None,
+    ) -> None:
+        """send_pose: is given a MocapSample as JSON after every Sync, before the joint states. Raises ConfigError."""
+        robot, self.stepped, self.plant = config.robot, stepped, plant
+        self.count = robot.chain.modules
+        self.counts = shares(config, settings)  # modules on each bus
+        self.motors, self.thermal = Motors(robot, plant.step_s), thermal.Thermal(self.count, robot.limits.torque_nm)
+        self.buses = [BusTime() for _ in self.counts]
+        self.now_us = 0.0  # module time: since the twins were started
+        self.skipped_us = 0.0  # what this process slept through
+        self.refused = 0  # frames that no host sends
+        self.happened: list[str] = []  # faults on request, as they began and ended
+        self._plan = Plan(parse(text, self.count) for text in settings.faults)
+        self._flash = from_factory(robot.limits.torque_nm, robot.limits.speed_rad_s)
+        self._step_us, self._steps, self._due_us = plant.step_s * 1e6, 0, 0.0
+        self._derated = False
+        self._sync_time: int | None = None
+        self._pose_time: int | None = None
+        self._seed = config.seed
+        starts = [0, *accumulate(self.counts)]
+        self.seats: list[Seat] = []
+        for channel, count in enumerate(self.counts):
+            for joint in range(starts[channel], starts[channel] + count):
+                self._seat(joint, channel, self._serial(joint), -BOOT_US if stepped else 0.0)
+        self._senses = [
+            Senses(robot, plant, start, count, (config.seed, channel))
+            for channel, (start, count) in enumerate(zip(starts, self.counts, strict=False))
+        ]
+        self._send_pose = send_pose
+        self._camera: PoseCamera | None = None
+        if send_pose is not None and robot.sensors.pose is not None:
+            self._camera = PoseCamera(robot.sensors.pose, plant, (config.seed, len(self.counts)))
+        self._encode = msgspec.json.Encoder().encode
+        self._out: list[list[Frame]] = [[] for _ in self.counts]
+        self._babblers: dict[Seat, float] = {}  # in stepped time: until when they have spoken
+        self._poll(0.0)
+
+    # --- time ----------------------------------------------------------------------------------------------
+
+    def advance_to(self, clock_us: float) -> None:
+        """Bring everything up to a time since the start. Not for stepped chains, whose time passes at Syncs."""
+        now_us = clock_us - self.skipped_us
+        if now_us - self.now_us > MOST_AT_ONCE_US:
+            self.skipped_us += now_us - self.now_us - MOST_AT_ONCE_US
+            now_us = self.now_us + MOST_AT_ONCE_US
+        if now_us > self.now_us:
+            self._pass(now_us, int(now_us / self._step_us) - self._steps)
+
+    def next_us(self) -> float:
+        """Module time at which a frame is through or a module wants to do something; inf for a stepped chain."""
+        if self.stepped:
+            return inf
+        return min(self._due_us, *(bus.next_us() for bus in self.buses))
+
+    def _pass(self, until_us: float, steps: int) -> None:
+        plant, motors, step_us = self.plant, self.motors, self._step_us
+        for _ in range(steps):
+            plant.advance(motors.step(plant.angle_rad, plant.velocity_rad_s))
+            self._steps += 1
+            if self._steps % HEAT_EVERY == 0:
+                self._warm()
+            time_us = self._steps * step_us
+            if time_us >= self._due_us:
+                self.now_us = max(min(time_us, until_us), self.now_us)
+                self._poll(self.now_us)
+        self.now_us = until_us
+        if until_us >= self._due_us:
+            self._poll(until_us)
+
+    def _warm(self) -> None:
+        self.thermal.pass_time(HEAT_EVERY * self.plant.step_s, self.motors.take_heat())
+        hottest = self.thermal.winding_c.max()
+        if hottest > thermal.FADES_FROM_C:
+            self.motors.derate(self.thermal.share_left())
+            if hottest >= thermal.OVERHEAT_C:
+                self._due_us = -inf
+            self._derated = True
+        elif self._derated:
+            self.motors.derate(self.thermal.share_left())
+            self._derated = False
+
+    def _poll(self, now_us: float) -> None:
+        """Everything that time brings, but the physics."""
+        for change in self._plan.until(now_us):
+            self._go_wrong(change, now_us)
+        speeds, torques = self.plant.velocity_rad_s.tolist(), self.motors.torque_nm.tolist()
+        windings, rated = self.thermal.winding_c.tolist(), self.motors.rated_nm
+        due_us = self._plan.next_us()
+        for seat in self.seats:
+            j = seat.joint
+            seat.feel(speeds[j], torques[j], rated, windings[j], thermal.AMBIENT_C)
+            due_us = min(due_us, seat.module.poll(now_us))
+            self._follow_up(seat)
+        for seat, since_us in self._babblers.items():
+            burst = int((now_us - since_us) / FRAME_US[8])
+            self._out[seat.channel].extend([seat.module.heartbeat(now_us)] * burst)
+            self._babblers[seat] = since_us + burst * FRAME_US[8]
+        self._due_us = now_us if self._babblers else due_us
+
+    # --- what comes from the bus ---------------------------------------------------------------------------
+
+    def hear(self, channel: int, frame: Frame) -> None:
+        """A frame of the host is there now."""
+        opcode, node = opcode_of(frame.id), node_of(frame.id)
+        wrong_length = opcode != Opcode.EMERGENCY and len(frame.data) != LENGTHS.get(opcode)  # a stop is a stop
+        if opcode not in FROM_HOST or wrong_length:
+            self.refused += 1
+            return
+        if self.stepped:
+            self.buses[channel].count(frame)
+        else:
+            self.buses[channel].heard(frame, self.now_us)
+        if opcode == Opcode.SYNC:
+            self._sync(channel, frame)
+        elif opcode == Opcode.SET_POINT:
+            for seat in self._at(channel, node):
+                seat.module.hear_set_point(frame, self.now_us)
+                if seat.module.frames:
+                    self._follow_up(seat)
+        else:
+            everybody = node == BROADCAST and opcode != Opcode.PARAMETER_REQUEST
+            for seat in self.seats if everybody else self._at(channel, node):
+                if seat.channel == channel:
+                    seat.module.hear(frame, self.now_us)
+                    self._follow_up(seat)
+            if opcode != Opcode.PARAMETER_REQUEST:
+                self._poll(self.now_us)
+
+    def take(self, channel: int) -> list[Frame]:
+        """Frames that are on the bus by now, in the order in which they won it, each once."""
+        if not self.stepped:
+            return self.buses[channel].released(self.now_us)
+        frames, self._out[channel] = self._out[channel], []
+        for frame in frames:
+            self.buses[channel].count(frame)
+        return frames
+
+    def traffic(self) -> list[Traffic]:
+        """What went over each bus until now."""
+        return [bus.traffic(self.now_us) for bus in self.buses]
+
+    def _sync(self, channel: int, frame: Frame) -> None:
+        count, time = read_sync(frame.data)
+        sent = len(self._out[channel])
+        if self.stepped:
+            self._step_to(time)
+        if self._camera is not None and self._send_pose is not None and time != self._pose_time:
+            self._pose_time = time
+            sample = self._camera.look()
+            if sample is not None:
+                self._send_pose(self._encode(sample))
+        first = sum(self.counts[:channel])
+        seats = self.seats[first : first + self.counts[channel]]
+        imu_due = [seat.module.imu_is_due() for seat in seats]
+        sights = self._senses[channel].look(self.motors.torque_nm, self.motors.derated(), imu_due)
+        for seat, sight in zip(seats, sights, strict=True):
+            seat.module.sync(count, sight)
+            self._follow_up(seat)
+        for seat in self.seats[self.count :]:
+            if seat.channel == channel:
+                seat.module.sync(count, sights[seat.joint - first])
+                self._follow_up(seat)
+        out = self._out[channel]
+        out[sent:] = sorted(out[sent:], key=lambda frame: frame.id)  # as they would win the bus
+
+    def _step_to(self, sync_time: int) -> None:
+        """Let the time from the latest Sync to this one pass. The first sets zero, as does one of a new host."""
+        later_us = 0 if self._sync_time is None else (sync_time - self._sync_time) % ROUND_US
+        if 0 < later_us < ROUND_US // 2:
+            until_us = self.now_us + later_us
+            self._pass(until_us, round(until_us / self._step_us) - self._steps)
+        elif 0 < ROUND_US - later_us < NEW_HOST_US:
+            return
+        self._sync_time = sync_time
+
+    def _at(self, channel: int, node: int) -> list[Seat]:
+        found = [self.seats[node - 1]] if 1 <= node <= self.count else []
+        if len(self.seats) > self.count:
+            found += [seat for seat in self.seats[self.count :] if seat.module.node == node]
+        return [seat for seat in found if seat.channel == channel]
+
+    # --- what goes out -------------------------------------------------------------------------------------
+
+    def _follow_up(self, seat: Seat) -> None:
+        """Send what a module has to say, and do with its motor what it wants."""
+        for frame in seat.outgoing():
+            if self.stepped:
+                self._out[seat.channel].append(frame)
+            else:
+                self.buses[seat.channel].offer(seat.sender, frame, self.now_us)
+        demand = seat.module.demand
+        if demand is seat.driven or not seat.drives:
+            return
+        seat.driven = demand
+        values = seat.module.parameters.values
+        damping = Parameter.DAMPING if demand.mode == Mode.POSITION else Parameter.VELOCITY_GAIN
+        self.motors.drive(
+            seat.joint,
+            demand.mode,
+            demand.target,
+            min(demand.torque_limit_nm, values[Parameter.TORQUE_LIMIT]) if demand.mode else self.motors.rated_nm,
+            values[Parameter.STIFFNESS],
+            values[damping],
+            values[Parameter.SPEED_LIMIT],
+        )
+
+    # --- faults on request ---------------------------------------------------------------------------------
+
+    def inject(self, fault: Fault, *, begins: bool = True) -> None:
+        """Let something go wrong now, or end."""
+        self._go_wrong(Change(self.now_us, fault, begins), self.now_us)
+        self._poll(self.now_us)
+
+    def _go_wrong(self, change: Change, now_us: float) -> None:
+        fault, seat = change.fault, self.seats[change.fault.joint]
+        self.happened.append(f"{now_us * 1e-6:.2f} s {fault} {'begins' if change.begins else 'ends'}")
+        match fault.kind:
+            case "overheat":
+                self.thermal.inject(fault.joint, heat=change.begins, hold=change.begins and fault.end_s != inf)
+                self.motors.derate(self.thermal.share_left())
+                self._derated = True
+            case "duplicate":
+                if change.begins:
+                    self._seat(
+                        fault.joint, seat.channel, seat.module.serial ^ OTHER_SERIAL, now_us - BOOT_US, drives=False
+                    )
+                else:
+                    self.seats[self.count :] = [s for s in self.seats[self.count :] if s.joint != fault.joint]
+            case "babble" if self.stepped:
+                self._babblers.pop(seat, None)
+                if change.begins:
+                    self._babblers[seat] = now_us
+            case "babble":
+                frame = seat.module.heartbeat(now_us) if change.begins else None
+                self.buses[seat.channel].babble(seat.sender, frame, now_us)
+            case kind if change.begins:
+                seat.begin(kind, now_us)
+            case kind:
+                seat.end(kind)
+
+    def _seat(self, joint: int, channel: int, serial: int, now_us: float, *, drives: bool = True) -> None:
+        module = Module(joint + 1, serial, Parameters(self._flash), stepped=self.stepped, now_us=now_us)
+        self.seats.append(Seat(len(self.seats), channel, joint, module, drives))
+
+    def _serial(self, joint: int) -> int:
+        return crc32(f"{self._seed}:{joint + 1}".encode())

@@ -1,0 +1,209 @@
+"""`snakesim modules`: the joint modules of a robot, emulated, as a process on SocketCAN interfaces."""
+
+import argparse
+import select
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+
+import msgspec
+
+from snakesim_can_backend.bus_load import shares
+from snakesim_can_backend.protocol import FROM_HOST
+from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.twin.bus_time import Traffic, by_opcode
+from snakesim_can_backend.twin.chain import ModuleChain
+from snakesim_can_backend.twin.faults import explain, parse, parse_typed
+from snakesim_can_backend.twin.server import PoseSender, TwinServer, make_plant
+from snakesim_can_backend.wire import SocketCanWire, wait
+from snakesim_hal.errors import ConfigError, SnakesimError
+from snakesim_hal.files import Table, decode
+from snakesim_hal.process import die_with_parent, on_stop_signal, settle_for_timing
+from snakesim_hal.scenario import Loaded, Override, load, parse_set
+
+OK, FAILED, BAD_INPUT = 0, 1, 2
+DEFAULT_CHANNEL = "vcan0"
+DEFAULT_POSE, NO_POSE = "127.0.0.1:7450", "none"
+VIRTUAL = "vcan"
+STATS_EVERY_S = 1.0
+LONGEST_PAUSE_S = 0.5  # until a stop signal is looked at
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Exit code: 0 when stopped or done, 1 a fault, 2 wrong input and nothing started."""
+    arguments = _parser().parse_args(argv)
+    if arguments.parent is not None:
+        die_with_parent(arguments.parent)
+    try:
+        with ExitStack() as open_things:
+            return _serve(arguments, open_things)
+    except ConfigError as error:
+        print(f"snakesim modules: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except SnakesimError as error:
+        print(f"snakesim modules: {error}", file=sys.stderr)
+        return FAILED
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="snakesim modules",
+        description=__doc__,
+        epilog=f"faults:\n{explain()}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("scenario", help="name of a shipped scenario, or path of a scenario file or a run's config.json")
+    add("--channel", action="append", metavar="vcan0", help="interface; repeat for several buses, tail to head")
+    add("--plant", help="what the motors move: mujoco, inertia, or ./file.py:Class")
+    add("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change any value; may be repeated")
+    add("--fault", action="append", default=[], metavar="KIND:JOINT@START[-END]", help="what goes wrong, and when")
+    add("--interactive", action="store_true", help="read `KIND joint_N` and `KIND joint_N off` from the terminal")
+    add("--stepped", action="store_true", help="let time pass only from Sync to Sync, for a host in lockstep")
+    add(
+        "--pose",
+        default=DEFAULT_POSE,
+        metavar="HOST:PORT",
+        help=f"where to send poses, or none (default: {DEFAULT_POSE})",
+    )
+    add("--duration", type=float, metavar="S", help="end after so many seconds")
+    add("--seed", type=int, help="of the sensors' noise and the serial numbers")
+    add("--stats", action="store_true", help="print the load of every bus once a second")
+    add("--on-real-bus", action="store_true", help="allow interfaces that are not called vcan...")
+    add("--parent", type=int, help="process id of the parent; this process dies with it")
+    return parser
+
+
+def _serve(arguments: argparse.Namespace, open_things: ExitStack) -> int:
+    loaded = _configuration(arguments)
+    settings = _settings(arguments, loaded)
+    _check_channels(settings.channels, on_real_bus=arguments.on_real_bus)
+    shares(loaded.config, settings)
+    for text in settings.faults:
+        parse(text, loaded.config.robot.chain.modules)
+    send_pose = None
+    if arguments.pose != NO_POSE:
+        send_pose = PoseSender(arguments.pose)
+        open_things.callback(send_pose.close)
+    wires: list[SocketCanWire] = []
+    for channel in settings.channels:
+        wires.append(SocketCanWire(channel, FROM_HOST))
+        open_things.callback(wires[-1].close)
+    plant = make_plant(loaded.config, settings)
+    chain = ModuleChain(loaded.config, settings, plant, stepped=arguments.stepped, send_pose=send_pose)
+    loop = Loop(TwinServer(wires, chain), arguments)
+    on_stop_signal(loop.stop)
+    settle_for_timing()
+    count = loaded.config.robot.chain.modules
+    print(f"modules ready: {count} on {', '.join(settings.channels)}", flush=True)
+    loop.run()
+    print("\n".join(loop.summary()), flush=True)
+    return OK
+
+
+def _configuration(arguments: argparse.Namespace) -> Loaded:
+    overrides = [parse_set(text) for text in arguments.set]
+    if arguments.seed is not None:
+        overrides.append(Override("seed", arguments.seed, f"--seed {arguments.seed}"))
+    # The twins are the robot of `--backend can`, whatever the scenario runs on otherwise.
+    return load(arguments.scenario, [Override("backend", "can", "snakesim modules"), *overrides])
+
+
+def _settings(arguments: argparse.Namespace, loaded: Loaded) -> Settings:
+    section = loaded.config.backends.get("can", {})
+    settings: Settings = decode(Table(section, arguments.scenario), Settings, "backends.can")
+    return msgspec.structs.replace(
+        settings,
+        channels=arguments.channel or settings.channels or [DEFAULT_CHANNEL],
+        plant=arguments.plant or settings.plant,
+        faults=[*settings.faults, *arguments.fault],
+    )
+
+
+def _check_channels(channels: Sequence[str], *, on_real_bus: bool) -> None:
+    for channel in channels:
+        if not channel.startswith(VIRTUAL) and not on_real_bus:
+            raise ConfigError(
+                f"--channel {channel}: this does not look like a virtual bus, and emulated modules beside real ones "
+                f"with the same node ids are dangerous. Use an interface called {VIRTUAL}..., or add --on-real-bus"
+            )
+
+
+class Loop:
+    """Serves until it is stopped, and keeps count."""
+
+    def __init__(self, server: TwinServer, arguments: argparse.Namespace) -> None:
+        self._server, self._chain = server, server.chain
+        self._duration_s, self._stats = arguments.duration, arguments.stats
+        self._interactive = arguments.interactive
+        self._running = True
+        self._late_s = 0.0
+        self._start = self._chain.traffic()
+        self._start_s = time.monotonic()
+
+    def stop(self) -> None:
+        """End after this round."""
+        self._running = False
+
+    def run(self) -> None:
+        """Handle, send, sleep."""
+        server, wires = self._server, self._server.wires
+        end_s = None if self._duration_s is None else self._start_s + self._duration_s
+        shown, shown_s = self._start, self._start_s
+        while self._running:
+            pause_s = server.run_due(time.monotonic_ns())
+            now_s = time.monotonic()
+            if end_s is not None and now_s >= end_s:
+                return
+            if self._stats and now_s - shown_s >= STATS_EVERY_S:
+                shown, shown_s = self._show(shown, now_s), now_s
+            if self._interactive:
+                self._read_terminal()
+            asked_s = LONGEST_PAUSE_S if pause_s is None else pause_s
+            wait(wires, asked_s)
+            if pause_s is not None:
+                self._late_s = max(self._late_s, time.monotonic() - now_s - asked_s)
+
+    def summary(self) -> list[str]:
+        """What went over the buses, and how well time was kept."""
+        seconds = time.monotonic() - self._start_s
+        lines = [f"{seconds:.1f} s; latest wake-up {1e3 * self._late_s:.1f} ms after its time"]
+        for wire, before, after in zip(self._server.wires, self._start, self._chain.traffic(), strict=True):
+            frames = sum(after.frames) - sum(before.frames)
+            lines.append(
+                f"{wire.channel}: {frames} frames, {after.load_since(before):.1%} of 1 Mbit/s; longest wait for the "
+                f"bus {after.late_us / 1e3:.1f} ms, {after.replaced} frames replaced by newer ones"
+            )
+            lines += [f"  {op.name.lower():<18}{n:8d} frames {share:7.2%}" for op, n, share in by_opcode(before, after)]
+        if self._server.unsent:
+            lines.append(f"{self._server.unsent} frames were not taken by their interface")
+        if self._chain.skipped_us:
+            lines.append(f"{self._chain.skipped_us / 1e3:.0f} ms slept through: this computer was too busy")
+        return lines + [f"fault: {text}" for text in self._chain.happened]
+
+    def _show(self, before: list[Traffic], now_s: float) -> list[Traffic]:
+        after = self._chain.traffic()
+        loads = [
+            f"{wire.channel} {b.load_since(a):.1%}"
+            for wire, a, b in zip(self._server.wires, before, after, strict=True)
+        ]
+        print(f"{now_s - self._start_s:7.1f} s  load {', '.join(loads)}", flush=True)
+        return after
+
+    def _read_terminal(self) -> None:
+        while self._interactive and select.select([sys.stdin], [], [], 0)[0]:
+            line = sys.stdin.readline()
+            if not line:
+                self._interactive = False
+            elif line.strip():
+                try:
+                    fault, begins = parse_typed(line, self._chain.count, self._chain.now_us * 1e-6)
+                except ConfigError as error:
+                    print(error, flush=True)
+                else:
+                    self._chain.inject(fault, begins=begins)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

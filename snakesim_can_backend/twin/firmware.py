@@ -1,0 +1,315 @@
+"""One joint module's firmware, as a state machine: frames and time in, frames and a demand on the motor out.
+
+    BOOT -> DISARMED -> ARMED -> STOPPING -> DISARMED
+               ^          |         |
+               +-- clear -- FAULT <-+          EMERGENCY from everywhere, left by clear only
+
+Only ARMED and STOPPING drive the motor. Only a valid set-point feeds the watchdog. Times are microseconds on one clock,
+passed in; nothing here waits. `frames` collects what is to be sent; whoever runs the module empties it.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from snakesim_can_backend.protocol import (
+    COMMAND_KEY,
+    COUNTS,
+    HEALTH_PERIOD_S,
+    HEARTBEAT_PERIOD_S,
+    VERSION,
+    WRONG_COUNTS,
+    Action,
+    Frame,
+    LastStop,
+    ModuleFault,
+    ModuleState,
+    Opcode,
+    Parameter,
+    SafeMotion,
+    intact,
+)
+from snakesim_can_backend.twin.frames import (
+    LENGTHS,
+    LIMIT_STEP,
+    STEPS,
+    read_command,
+    read_set_point,
+    write_acceleration,
+    write_contact,
+    write_gyro,
+    write_health,
+    write_heartbeat,
+    write_identity,
+    write_joint_state,
+    write_shaft_load,
+    write_tail_contact,
+)
+from snakesim_can_backend.twin.parameters import Parameters
+from snakesim_can_backend.twin.reports import Inside, Sight, health
+from snakesim_can_backend.twin.thermal import COOLED_C, OVERHEAT_C
+from snakesim_hal.messages import Mode
+
+BOOT_US = 100_000
+HEARTBEAT_US = round(HEARTBEAT_PERIOD_S * 1e6)
+HEALTH_US = round(HEALTH_PERIOD_S * 1e6)
+AT_REST_RAD_S = 0.05
+LEAST_VOLTAGE_V = 18.0
+FIRMWARE = (1, 0)
+MODES = tuple(Mode)
+STOP_OF_FAULT = {fault: LastStop[fault.name] for fault in ModuleFault}
+
+
+class Demand(NamedTuple):
+    """What the motor is to do."""
+
+    mode: Mode
+    target: float  # rad, rad/s or N·m, as the mode says
+    torque_limit_nm: float
+
+
+PASSIVE = Demand(Mode.PASSIVE, 0.0, 0.0)
+
+
+class Module:
+    """One module on the bus."""
+
+    def __init__(
+        self, node: int, serial: int, parameters: Parameters, *, stepped: bool = False, now_us: float = 0.0
+    ) -> None:
+        self.node, self.serial, self.parameters = node, serial, parameters
+        self.frames: list[Frame] = []
+        self.inside = Inside()
+        self.hangs = False  # its main loop stands still; only hardware still works
+        self.refused = 0  # frames with a wrong checksum, count or length
+        self._stepped = stepped
+        self._last_joint_state: Frame | None = None
+        self._do: dict[int, Callable[[float], None]] = {
+            Action.ARM: self._arm,
+            Action.DISARM: self._disarm,
+            Action.STOP: self._stop,
+            Action.CLEAR: self._clear,
+            Action.REBOOT: self.reboot,
+            Action.IDENTIFY: self._identify,
+        }
+        self._forget(now_us)
+        self.last_stop = LastStop.NONE
+
+    # --- what comes from the bus ---------------------------------------------------------------------------
+
+    def hear(self, frame: Frame, now_us: float) -> None:
+        """An Emergency, Command or ParameterRequest for this node or, the first two, for all."""
+        opcode = frame.id >> 6
+        if self.hangs:
+            return
+        if opcode == Opcode.EMERGENCY:
+            self._emergency(now_us)
+        elif self.state == ModuleState.BOOT or len(frame.data) != LENGTHS[opcode]:
+            self.refused += self.state != ModuleState.BOOT
+        elif opcode == Opcode.PARAMETER_REQUEST:
+            driven = self.state in (ModuleState.ARMED, ModuleState.STOPPING)
+            self.frames.append(self.parameters.answer(self.node, frame.data, driven))
+        elif opcode == Opcode.COMMAND and intact(frame):
+            action, key = read_command(frame.data)
+            if key == COMMAND_KEY and action in self._do:
+                self._do[action](now_us)
+        else:
+            self.refused += 1
+
+    def hear_set_point(self, frame: Frame, now_us: float) -> None:
+        """A SetPoint for this node. It waits for the next Sync."""
+        if self.state != ModuleState.ARMED or self.hangs:
+            return
+        if len(frame.data) != LENGTHS[Opcode.SET_POINT] or not intact(frame):
+            self.refused += 1
+            return
+        mode, count, number, limit = read_set_point(frame.data)
+        expected, self._expected = self._expected, (count + 1) % COUNTS
+        if expected is not None and count != expected:
+            self.refused += 1
+            self._wrong_counts += 1
+            if self._wrong_counts >= WRONG_COUNTS:
+                self._fail(ModuleFault.STREAM, now_us)
+            return
+        self._wrong_counts = 0
+        if mode > Mode.TORQUE:
+            self.refused += 1
+            return
+        self._fed_us = now_us
+        target = number * STEPS[mode]  # position, velocity and torque stand in the same place
+        if mode == Mode.POSITION:
+            target = self._within(target)
+        self._pending = Demand(MODES[mode], target, limit * LIMIT_STEP)
+
+    def sync(self, count: int, sight: Sight) -> None:
+        """Answer a Sync with what the sensors gave at that instant, then enact the newest set-point."""
+        if self.state == ModuleState.BOOT:
+            return
+        if self.hangs:
+            if self._last_joint_state is not None:  # a mailbox of the CAN controller that nobody refills
+                self.frames.append(self._last_joint_state)
+            return
+        values = self.parameters.values
+        joint = (sight.angle, sight.velocity, sight.torque, count, self.state, sight.derated)
+        self._last_joint_state = write_joint_state(self.node, joint)
+        self.frames.append(self._last_joint_state)
+        every = int(values[Parameter.CONTACT_EVERY])
+        if every and count % every == 0:
+            self.frames.append(write_contact(self.node, (*sight.contact, count)))
+            if values[Parameter.TAIL]:
+                self.frames.append(write_tail_contact(self.node, (*sight.tail_contact, count)))
+        if self.imu_is_due():
+            self._report_imu(count, sight)
+        self._syncs += 1
+        if self._pending is not None:
+            self.demand, self._pending = self._pending, None
+
+    def imu_is_due(self) -> bool:
+        """Whether gyro, accelerometer and shaft load answer the next Sync; neighbours take turns."""
+        every = int(self.parameters.values[Parameter.IMU_EVERY])
+        return every > 0 and (self._syncs + self.node) % every == 0
+
+    # --- what time brings ----------------------------------------------------------------------------------
+
+    def poll(self, now_us: float) -> float:
+        """Do what is due, by `inside` as it is now; returns when there is something to do again."""
+        if self.hangs:
+            return self._poll_hanging(now_us)
+        if self.state == ModuleState.BOOT:
+            if now_us < self._booted_us + BOOT_US:
+                return self._booted_us + BOOT_US
+            self._heartbeat_us = now_us + HEARTBEAT_US
+            self._health_us = now_us + HEALTH_US * (1 + self.node % 16) / 16  # not all at once
+            self._enter(self._after_boot, now_us)
+        self._watch_conditions(now_us)
+        if self.state == ModuleState.ARMED and now_us >= self._fed_us + self.watchdog_us:
+            self._fail(ModuleFault.WATCHDOG, now_us)
+        elif self.state == ModuleState.STOPPING and (
+            abs(self.inside.speed_rad_s) < AT_REST_RAD_S or now_us >= self._stopping_us + self.watchdog_us
+        ):
+            self._enter(ModuleState.DISARMED, now_us)
+        if now_us >= self._heartbeat_us:
+            self._heartbeat_us = max(self._heartbeat_us + HEARTBEAT_US, now_us)
+            self.frames.append(self.heartbeat(now_us))
+        if now_us >= self._health_us:
+            self._health_us = max(self._health_us + HEALTH_US, now_us)
+            self.frames.append(write_health(self.node, health(self.inside)))
+        return self._next_due(now_us)
+
+    @property
+    def watchdog_us(self) -> float:
+        """How long a module lives on one set-point."""
+        return self.parameters.values[Parameter.WATCHDOG] * 1e6
+
+    def reboot(self, now_us: float) -> None:
+        """Forget everything unsaved, and start again."""
+        driven = self.state in (ModuleState.ARMED, ModuleState.STOPPING)
+        self.parameters.restart()
+        self._forget(now_us)
+        self.last_stop = LastStop.REBOOT if driven else LastStop.NONE
+
+    # --- states --------------------------------------------------------------------------------------------
+
+    def _forget(self, now_us: float) -> None:
+        self.state, self._after_boot = ModuleState.BOOT, ModuleState.DISARMED
+        self.faults = 0  # bits of ModuleFault
+        self.demand = PASSIVE
+        self._pending: Demand | None = None
+        self._expected: int | None = None
+        self._wrong_counts = 0
+        self._booted_us = self._fed_us = self._stopping_us = self._heartbeat_us = self._health_us = now_us
+        self._syncs = 0
+
+    def _enter(self, state: ModuleState, now_us: float, why: LastStop | None = None, demand: Demand = PASSIVE) -> None:
+        """Change state, and drop what was demanded; why: said of a module that was ARMED."""
+        if self.state == ModuleState.ARMED and why is not None:
+            self.last_stop = why
+        self.state = state
+        self.demand, self._pending = demand, None
+        self._expected, self._wrong_counts = None, 0
+        self.frames.append(self.heartbeat(now_us))
+
+    def _arm(self, now_us: float) -> None:
+        if self.state == ModuleState.DISARMED and not self._conditions():
+            self._fed_us = now_us
+            self._enter(ModuleState.ARMED, now_us)
+
+    def _disarm(self, now_us: float) -> None:
+        if self.state in (ModuleState.ARMED, ModuleState.STOPPING):
+            self._enter(ModuleState.DISARMED, now_us, LastStop.DISARM)
+
+    def _stop(self, now_us: float) -> None:
+        if self.state == ModuleState.ARMED:
+            self._stopping_us = now_us
+            values = self.parameters.values
+            damped = Demand(Mode.VELOCITY, 0.0, values[Parameter.TORQUE_LIMIT])
+            safe = damped if values[Parameter.SAFE_ACTION] == SafeMotion.DAMP else PASSIVE
+            self._enter(ModuleState.STOPPING, now_us, LastStop.STOP, safe)
+
+    def _clear(self, now_us: float) -> None:
+        if self.state in (ModuleState.FAULT, ModuleState.EMERGENCY) and not self._conditions():
+            self.faults = 0
+            self._enter(ModuleState.DISARMED, now_us)
+
+    def _emergency(self, now_us: float) -> None:
+        if self.state == ModuleState.BOOT:
+            self._after_boot = ModuleState.EMERGENCY
+        elif self.state != ModuleState.EMERGENCY:
+            self._enter(ModuleState.EMERGENCY, now_us, LastStop.EMERGENCY)
+
+    def _fail(self, fault: ModuleFault, now_us: float) -> None:
+        self.faults |= 1 << fault
+        if self.state == ModuleState.EMERGENCY:
+            self.frames.append(self.heartbeat(now_us))
+        else:
+            self._enter(ModuleState.FAULT, now_us, STOP_OF_FAULT[fault])
+
+    def _conditions(self) -> int:
+        """Bits of the faults whose cause is there now. A winding that overheated must cool well below that."""
+        inside = self.inside
+        hot = COOLED_C if self.faults >> ModuleFault.OVERHEAT & 1 else OVERHEAT_C
+        return (
+            (inside.winding_c >= hot) << ModuleFault.OVERHEAT
+            | inside.leak << ModuleFault.LEAK
+            | (inside.voltage_v < LEAST_VOLTAGE_V) << ModuleFault.VOLTAGE
+        )
+
+    def _watch_conditions(self, now_us: float) -> None:
+        new = self._conditions() & ~self.faults
+        for fault in ModuleFault if new else ():
+            if new >> fault & 1:
+                self._fail(fault, now_us)
+
+    def _within(self, angle_rad: float) -> float:
+        most = self.parameters.values[Parameter.ANGLE_LIMIT]
+        return min(max(angle_rad, -most), most)
+
+    def _next_due(self, now_us: float) -> float:
+        due = min(self._heartbeat_us, self._health_us)
+        if self.state == ModuleState.ARMED:
+            return min(due, self._fed_us + self.watchdog_us)
+        return now_us if self.state == ModuleState.STOPPING else due
+
+    def _poll_hanging(self, now_us: float) -> float:
+        """The hardware watchdog, which the main loop fed with every valid set-point, opens the motor's bridge."""
+        if self.demand.mode != Mode.PASSIVE and now_us >= self._fed_us + self.watchdog_us:
+            self.demand = PASSIVE
+        return now_us + HEARTBEAT_US if self.demand.mode == Mode.PASSIVE else self._fed_us + self.watchdog_us
+
+    # --- reports -------------------------------------------------------------------------------------------
+
+    def heartbeat(self, now_us: float) -> Frame:
+        """The heartbeat of this moment."""
+        uptime_ms = round(now_us - self._booted_us) // 1000
+        faults = [self.faults >> fault & 1 for fault in ModuleFault]
+        state = (self.state, self.demand.mode, self.last_stop, *faults, uptime_ms)
+        return write_heartbeat(self.node, state)
+
+    def _identify(self, _now_us: float) -> None:
+        self.frames.append(write_identity(self.node, (self.serial, *FIRMWARE, VERSION, 1, self._stepped)))
+
+    def _report_imu(self, count: int, sight: Sight) -> None:
+        if sight.gyro is not None and sight.acceleration is not None:
+            self.frames.append(write_gyro(self.node, (*sight.gyro, count)))
+            self.frames.append(write_acceleration(self.node, (*sight.acceleration, count)))
+        if sight.shaft_load is not None:
+            self.frames.append(write_shaft_load(self.node, (sight.shaft_load, count)))

@@ -1,0 +1,99 @@
+"""A plant without a world: every joint turns an inertia of its own. For tests of the bus, where physics is a burden.
+
+It does *not* simulate: gravity, ground, obstacles, what one joint does to the next.
+"""
+
+from typing import Annotated
+
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from snakesim_hal.errors import BackendError
+from snakesim_hal.files import FileStruct
+from snakesim_hal.messages import Imu, Pose
+from snakesim_hal.plant import LinkLoad
+from snakesim_hal.quantities import from_zero
+from snakesim_hal.scenario import RunConfig, start_of
+
+Floats = NDArray[np.float64]
+
+LEAST_INERTIA_KG_M2 = 1e-6
+
+
+class InertiaSettings(FileStruct, frozen=True, kw_only=True):
+    """How time is cut, and what stands for gears and ground."""
+
+    timestep_s: Annotated[float, Meta(ge=1e-5, le=0.01, extra_json_schema={"unit": "s"})] = 0.001
+    # Dry friction of every joint, beside the robot file's: without it a joint that is let go turns for ever.
+    drag_nm: Annotated[float, from_zero(100, "N·m")] = 0.1
+
+
+class InertiaPlant:
+    """A `snakesim_hal.plant.Plant`: rotor and one link, turned about the link's middle, with friction and end stops."""
+
+    Settings = InertiaSettings
+
+    def __init__(self, config: RunConfig, settings: InertiaSettings) -> None:
+        """At the run's start pose, at rest. The step is shortened so that a whole number makes a control period."""
+        robot, motor = config.robot, config.robot.motor
+        period_s = config.period_ns * 1e-9
+        self.step_s = period_s / max(int(np.ceil(period_s / settings.timestep_s - 1e-9)), 1)
+        links = [mass * length**2 / 12 for mass, length in zip(robot.link_masses_kg, robot.link_lengths_m, strict=True)]
+        inertia = np.maximum(motor.armature_kg_m2 + np.array(links[1:]), LEAST_INERTIA_KG_M2)
+        self._speed_per_nm = self.step_s / inertia
+        self._keep = 1.0 / (1.0 + self._speed_per_nm * motor.viscous_nm_s_per_rad)  # implicit: stable at any friction
+        self._rubbed_off = self._speed_per_nm * (motor.friction_nm + settings.drag_nm)
+        self._most = robot.limits.angle_rad
+        self._angle: Floats = np.array(start_of(config).angles_rad, dtype=np.float64)
+        self._velocity = np.zeros(len(self._angle))
+        self._torque = np.zeros(len(self._angle))
+        self._change = np.zeros(len(self._angle))
+
+    def advance(self, torque_nm: Floats) -> None:
+        """One step, semi-implicit; dry friction never turns a joint round, and end stops take all its motion."""
+        angle, velocity, change = self._angle, self._velocity, self._change
+        self._torque[:] = torque_nm
+        np.multiply(torque_nm, self._speed_per_nm, out=change)
+        velocity += change
+        velocity *= self._keep
+        np.clip(velocity, -self._rubbed_off, self._rubbed_off, out=change)
+        velocity -= change
+        np.multiply(velocity, self.step_s, out=change)
+        angle += change
+        if np.abs(angle, out=change).max() > self._most:
+            self._stop()
+
+    @property
+    def angle_rad(self) -> Floats:
+        """Joint angles now, (n_joints,); a view."""
+        return self._angle
+
+    @property
+    def velocity_rad_s(self) -> Floats:
+        """Joint velocities now, (n_joints,); a view."""
+        return self._velocity
+
+    def shaft_torque_nm(self) -> Floats:
+        """The motors' torques of the last step, as if rotors weighed nothing, (n_joints,)."""
+        return self._torque
+
+    def loads(self) -> list[LinkLoad]:
+        """Nothing is there to touch."""
+        return []
+
+    def imu(self) -> Imu | None:
+        """No world, no IMU."""
+        return None
+
+    def pose(self) -> Pose | None:
+        """No world, no pose."""
+        return None
+
+    def _stop(self) -> None:
+        if not np.isfinite(self._angle).all():
+            raise BackendError("inertia plant: a joint angle is no number; a torque was none")
+        beyond = np.abs(self._angle) > self._most
+        outward = beyond & (self._velocity * self._angle > 0)
+        self._velocity[outward] = 0.0
+        np.clip(self._angle, -self._most, self._most, out=self._angle)

@@ -1,0 +1,120 @@
+"""All motors of a chain as vectors, by the law of the simulator's motors, so that the two agree.
+
+At every step of the plant
+
+    demand = kp (position - angle) + kd (velocity - speed) + feed-forward       the mode chooses the gains
+    demand is held below the line that falls from some times full torque at rest to 0 at the limit of speed
+    torque follows the demand as a first-order lag of `response_time_s`, integrated exactly
+    torque is clipped to the least of rated, parameter's and set-point's limit, less what heat takes from it
+
+The torque is the motor's state, and a change of mode or limit moves the demand alone, so torque never jumps. Torque is
+brought up to date before the joint moves under it, which keeps explicit steps stable far beyond 1 ms.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_hal.messages import Mode
+from snakesim_hal.robot import RobotFile
+
+Floats = NDArray[np.float64]
+
+STEEPEST_ROLL_OFF = 10.0  # full torque is there up to 1 - 1/10 of the limit of speed, and fades to 0 at it
+
+
+def fading_nm_s(robot: RobotFile, step_s: float) -> float:
+    """N·m less a rad/s nearer to the limit of speed: less steep where steps would not resolve it.
+
+    The fading acts on the rotor as a damper behind the motor's lag, which explicit steps only bear up to a strength.
+    """
+    motor, module, limits = robot.motor, robot.module, robot.limits
+    inertia_kg_m2 = motor.armature_kg_m2 + module.mass_kg * module.length_m**2 / 12
+    strongest = inertia_kg_m2 / step_s * max(min(motor.response_time_s / step_s, 1e3), 0.5)
+    flattest = limits.torque_nm / limits.speed_rad_s
+    return float(np.clip(strongest, flattest, STEEPEST_ROLL_OFF * flattest))
+
+
+class Motors:
+    """What the power stages of all modules do. All passive at first."""
+
+    def __init__(self, robot: RobotFile, step_s: float) -> None:
+        count = robot.chain.modules
+        response = robot.motor.response_time_s
+        self.rated_nm = robot.limits.torque_nm
+        self._decay = math.exp(-step_s / response) if response > 0 else 0.0
+        self._fading = fading_nm_s(robot, step_s)
+        self.torque_nm: Floats = np.zeros(count)
+        self.heat: Floats = np.zeros(count)  # sum of torque squared over the steps since `take_heat`
+        self._steps = 0
+        self._kp, self._kd = np.zeros(count), np.zeros(count)
+        self._position, self._velocity, self._feed = np.zeros(count), np.zeros(count), np.zeros(count)
+        self._slope, self._top = np.zeros(count), np.full(count, np.inf)
+        self._asked_limit = np.full(count, self.rated_nm)
+        self._share_left = np.ones(count)
+        self._limit = self._asked_limit.copy()
+        self._demand, self._cap, self._spare = np.zeros(count), np.zeros(count), np.zeros(count)
+
+    def drive(
+        self, i: int, mode: Mode, target: float, limit_nm: float, gain: float, damping: float, speed: float
+    ) -> None:
+        """From now on motor i does this.
+
+        target: rad, rad/s or N·m as the mode says; gain, damping: kp and kd of the mode; speed: the limit, rad/s.
+        """
+        on = mode != Mode.PASSIVE
+        self._kp[i] = gain if mode == Mode.POSITION else 0.0
+        self._kd[i] = damping if mode in (Mode.POSITION, Mode.VELOCITY) else 0.0
+        self._position[i] = target if mode == Mode.POSITION else 0.0
+        self._velocity[i] = target if mode == Mode.VELOCITY else 0.0
+        self._feed[i] = target if mode == Mode.TORQUE else 0.0
+        self._slope[i] = self._fading if on else 0.0
+        self._top[i] = self._fading * speed if on else math.inf
+        self._asked_limit[i] = min(limit_nm, self.rated_nm)
+        self._limit[i] = self._asked_limit[i] * self._share_left[i]
+
+    def derate(self, share_left: Floats) -> None:
+        """Heat leaves this share of each limit, (n_joints,), from 0 to 1."""
+        self._share_left = share_left
+        np.multiply(self._asked_limit, share_left, out=self._limit)
+
+    def derated(self) -> NDArray[np.bool_]:
+        """Whether heat holds a torque below what is asked for, (n_joints,)."""
+        return np.minimum(np.abs(self._demand), self._asked_limit) > self._limit
+
+    def step(self, angle_rad: Floats, speed_rad_s: Floats) -> Floats:
+        """Torques for the next step of the plant, (n_joints,); always the same array."""
+        demand, cap, spare, torque = self._demand, self._cap, self._spare, self.torque_nm
+        np.subtract(self._position, angle_rad, out=demand)
+        demand *= self._kp
+        np.subtract(self._velocity, speed_rad_s, out=spare)
+        spare *= self._kd
+        demand += spare
+        demand += self._feed
+        np.multiply(self._slope, speed_rad_s, out=spare)
+        np.subtract(self._top, spare, out=cap)
+        np.minimum(demand, cap, out=demand)
+        spare += self._top
+        np.negative(spare, out=spare)
+        np.maximum(demand, spare, out=demand)
+        np.abs(torque, out=cap)
+        cap *= self._decay
+        np.maximum(cap, self._limit, out=cap)  # a lowered limit takes hold no faster than the motor can follow
+        torque -= demand
+        torque *= self._decay
+        torque += demand
+        np.minimum(torque, cap, out=torque)
+        np.negative(cap, out=cap)
+        np.maximum(torque, cap, out=torque)
+        np.multiply(torque, torque, out=spare)
+        self.heat += spare
+        self._steps += 1
+        return torque
+
+    def take_heat(self) -> Floats:
+        """Mean square of each torque since the last call, N²·m², (n_joints,)."""
+        mean = self.heat / max(self._steps, 1)
+        self.heat[:] = 0.0
+        self._steps = 0
+        return mean

@@ -1,0 +1,100 @@
+"""A module's parameters: what is in force, and what its flash keeps over a restart."""
+
+import math
+from struct import Struct
+
+from snakesim_can_backend.codec import codec
+from snakesim_can_backend.protocol import (
+    PARAMETERS,
+    Frame,
+    Opcode,
+    Operation,
+    Parameter,
+    ParameterRange,
+    Result,
+    SafeMotion,
+)
+
+WHOLE = frozenset((Parameter.SAFE_ACTION, Parameter.CONTACT_EVERY, Parameter.IMU_EVERY, Parameter.TAIL))
+_single = Struct("<f")
+
+
+def from_factory(rated_torque_nm: float, rated_speed_rad_s: float) -> dict[Parameter, float]:
+    """What is in a new module's flash. Gains are 0: a module that nobody has told its robot's gains holds nothing."""
+    torque = min(rated_torque_nm, PARAMETERS[Parameter.RATED_TORQUE].high)
+    speed = min(rated_speed_rad_s, PARAMETERS[Parameter.RATED_SPEED].high)
+    return {
+        Parameter.STIFFNESS: 0.0,
+        Parameter.DAMPING: 0.0,
+        Parameter.VELOCITY_GAIN: 0.0,
+        Parameter.TORQUE_LIMIT: torque,
+        Parameter.SPEED_LIMIT: speed,
+        Parameter.ANGLE_LIMIT: PARAMETERS[Parameter.ANGLE_LIMIT].high,
+        Parameter.WATCHDOG: 0.1,
+        Parameter.SAFE_ACTION: float(SafeMotion.DAMP),
+        Parameter.CONTACT_EVERY: 1.0,
+        Parameter.IMU_EVERY: 0.0,
+        Parameter.TAIL: 0.0,
+        Parameter.RATED_TORQUE: torque,
+        Parameter.RATED_SPEED: speed,
+    }
+
+
+class Parameters:
+    """Reads, writes and saves; writing takes effect at once and is forgotten at a restart unless saved."""
+
+    def __init__(self, flash: dict[Parameter, float]) -> None:
+        self._flash = dict(flash)
+        self.values = dict(flash)
+
+    def restart(self) -> None:
+        """Only what was saved is left."""
+        self.values = dict(self._flash)
+
+    def answer(self, node: int, data: bytes, armed: bool) -> Frame:
+        """Do what a ParameterRequest asks, and the frame that says how it went."""
+        index, operation, raw = _read_request(data)
+        parameter = _known(index)
+        result = Result.UNKNOWN_INDEX if parameter is None else self._do(parameter, operation, raw, armed)
+        value = 0.0 if parameter is None else self.values[parameter]
+        return _write_answer(node, (index, operation, result, int.from_bytes(_single.pack(value), "little")))
+
+    def _do(self, parameter: Parameter, operation: int, raw: int, armed: bool) -> Result:
+        if operation == Operation.READ:
+            return Result.DONE
+        if operation not in (Operation.WRITE, Operation.SAVE):
+            return Result.UNKNOWN_OPERATION
+        allowed = PARAMETERS[parameter]
+        if not allowed.writable:
+            return Result.READ_ONLY
+        if armed:
+            return Result.NOT_WHILE_ARMED
+        if operation == Operation.SAVE:
+            self._flash[parameter] = self.values[parameter]
+            return Result.DONE
+        value = within(allowed, _single.unpack((raw & 0xFFFFFFFF).to_bytes(4, "little"))[0])
+        if value is None or (parameter in WHOLE and value != int(value)):
+            return Result.OUT_OF_RANGE
+        self.values[parameter] = value
+        return Result.DONE
+
+
+def within(allowed: ParameterRange, value: float) -> float | None:
+    """The value if it is in range, None if not. On the bus bounds are single precision, a little off: 0.1 is more."""
+    if not math.isfinite(value):
+        return None
+    slack = 1e-6 * max(abs(allowed.low), abs(allowed.high))
+    if not allowed.low - slack <= value <= allowed.high + slack:
+        return None
+    return min(max(value, allowed.low), allowed.high)
+
+
+def _known(index: int) -> Parameter | None:
+    try:
+        return Parameter(index)
+    except ValueError:
+        return None
+
+
+_read_request = codec()[Opcode.PARAMETER_REQUEST].reader("index", "operation", "value")
+_write_answer = codec()[Opcode.PARAMETER_ANSWER].writer("index", "operation", "result", "value")

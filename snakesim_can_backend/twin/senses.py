@@ -1,0 +1,129 @@
+"""What the sensors of modules give at a Sync: the plant as it is, with the noise and threshold of the robot file.
+
+Rates are what the host asks of the modules, and the bus is the delay: those of the robot file mean nothing here.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_can_backend.mocap import MocapSample
+from snakesim_can_backend.twin.reports import (
+    ACCELERATION,
+    ANGLE,
+    RATE,
+    SHAFT_LOAD,
+    TORQUE,
+    UNTOUCHED,
+    VELOCITY,
+    Sight,
+    touch,
+)
+from snakesim_hal.plant import LinkLoad, Plant
+from snakesim_hal.robot import PoseSensor, RobotFile
+
+Floats = NDArray[np.float64]
+
+
+class Senses:
+    """Sensors of neighbouring modules on one bus, with a source of noise of their own."""
+
+    def __init__(self, robot: RobotFile, plant: Plant, first: int, count: int, seed: Sequence[int]) -> None:
+        """first: index of their first joint, 0 at the tail."""
+        self._plant, self._first, self._count = plant, first, count
+        self._noise = np.random.default_rng(seed).standard_normal
+        joints = robot.sensors.joints
+        sigma = [joints.angle_noise_rad, joints.velocity_noise_rad_s, joints.torque_noise_nm]
+        self._joint_sigma = np.repeat(sigma, count).reshape(3, count)
+        self._noisy = any(sigma)
+        self._contacts, self._imu = robot.sensors.contacts, robot.sensors.imu
+        self._torque_sigma = joints.torque_noise_nm
+
+    def look(self, torque_nm: Floats, derated: NDArray[np.bool_], imu_due: Sequence[bool]) -> list[Sight]:
+        """What every module sees now; torque and derating are those of all motors of the chain."""
+        here = slice(self._first, self._first + self._count)
+        joints = np.stack((self._plant.angle_rad[here], self._plant.velocity_rad_s[here], torque_nm[here]))
+        if self._noisy:
+            joints += self._joint_sigma * self._noise((3, self._count))
+        sights = [
+            Sight(angle, velocity, torque, bool(hot))
+            for angle, velocity, torque, hot in zip(
+                ANGLE.many(joints[0]), VELOCITY.many(joints[1]), TORQUE.many(joints[2]), derated[here], strict=True
+            )
+        ]
+        self._feel(sights)
+        if any(imu_due):
+            self._weigh(sights, imu_due)
+        return sights
+
+    def _feel(self, sights: list[Sight]) -> None:
+        sensor = self._contacts
+        if sensor is None:
+            return
+        touches = {
+            load.link: touch(self._blurred(load))
+            for load in self._plant.loads()
+            if math.hypot(*load.force_l) >= sensor.threshold_n
+        }
+        for i, sight in enumerate(sights if touches else ()):
+            sight.tail_contact = touches.get(self._first + i, UNTOUCHED)
+            sight.contact = touches.get(self._first + i + 1, UNTOUCHED)
+
+    def _blurred(self, load: LinkLoad) -> LinkLoad:
+        sensor = self._contacts
+        if sensor is None or not (sensor.position_noise_m or sensor.force_noise_n):
+            return load
+        a, b, c, d, e, f = self._noise(6).tolist()
+        (x, y, z), (fx, fy, fz) = load.position_l, load.force_l
+        m, n = sensor.position_noise_m, sensor.force_noise_n
+        return LinkLoad(load.link, (x + m * a, y + m * b, z + m * c), (fx + n * d, fy + n * e, fz + n * f))
+
+    def _weigh(self, sights: list[Sight], due: Sequence[bool]) -> None:
+        shaft = self._plant.shaft_torque_nm()[self._first : self._first + self._count]
+        shafts = SHAFT_LOAD.many(shaft + self._torque_sigma * self._noise(self._count))
+        imu = self._plant.imu() if self._imu is not None else None
+        for i, sight in enumerate(sights):
+            if not due[i]:
+                continue
+            sight.shaft_load = shafts[i]
+            if imu is not None and self._imu is not None and self._first + i + 1 in imu.link:
+                at = imu.link.index(self._first + i + 1)
+                rate = np.array(imu.angular_velocity_rad_s[at])
+                force = np.array(imu.acceleration_m_s2[at])
+                sight.gyro = RATE.many(rate + self._imu.angular_velocity_noise_rad_s * self._noise(3))
+                sight.acceleration = ACCELERATION.many(force + self._imu.acceleration_noise_m_s2 * self._noise(3))
+
+
+class PoseCamera:
+    """Motion capture of the base."""
+
+    def __init__(self, sensor: PoseSensor, plant: Plant, seed: Sequence[int]) -> None:
+        self._plant = plant
+        self._noise = np.random.default_rng(seed).standard_normal
+        self._sigma = np.repeat([sensor.position_noise_m, 0.5 * sensor.angle_noise_rad], 3)  # quaternions halve angles
+
+    def look(self) -> MocapSample | None:
+        """The base now; None in a plant without a world. Velocities carry no noise of their own."""
+        pose = self._plant.pose()
+        if pose is None:
+            return None
+        ex, ey, ez, a, b, c = (self._sigma * self._noise(6)).tolist()
+        px, py, pz = pose.position_w
+        w, x, y, z = pose.orientation_wxyz
+        turned = np.array(
+            (
+                w - a * x - b * y - c * z,
+                x + a * w + b * z - c * y,
+                y + b * w + c * x - a * z,
+                z + c * w + a * y - b * x,
+            )
+        )
+        w, x, y, z = (turned / np.linalg.norm(turned)).tolist()
+        return MocapSample(
+            position_w=(px + ex, py + ey, pz + ez),
+            orientation_wxyz=(w, x, y, z),
+            velocity_w=pose.velocity_w,
+            angular_velocity_w=pose.angular_velocity_w,
+        )

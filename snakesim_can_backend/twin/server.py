@@ -1,0 +1,146 @@
+"""Serves a chain of module twins on its buses: frames in, frames out, and the time for what runs by the clock.
+
+server = TwinServer(wires, chain)
+while ...:
+    pause_s = server.run_due(time.monotonic_ns())
+    wait(wires, pause_s)
+"""
+
+import contextlib
+import socket
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from snakesim_can_backend.protocol import NODE_BITS, Frame, Opcode
+from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.twin.chain import ModuleChain
+from snakesim_can_backend.wire import VirtualWire, Wire
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.plant import Plant
+from snakesim_hal.plugins import PLANTS, find_plugin, plugin_settings
+from snakesim_hal.scenario import RunConfig
+
+IN_STEP_US = 2000.0  # the plant is kept this near to now, so that a Sync finds little left to do
+FINEST_US = 200.0  # frames are let through in groups of this length, to wake up less often
+
+
+class TwinServer:
+    """The far end of one or more buses, tail to head."""
+
+    def __init__(self, wires: Sequence[Wire], chain: ModuleChain) -> None:
+        if len(wires) != len(chain.counts):
+            raise ConfigError(f"{len(wires)} channels for modules on {len(chain.counts)} buses")
+        self.wires, self.chain = wires, chain
+        self.unsent = 0  # frames that an interface did not take
+        self._start_ns: int | None = None
+
+    def run_due(self, now_ns: int) -> float | None:
+        """Handle every frame that is there, send what is due; seconds until it wants to run again. None: never."""
+        arrived = [wire.receive() for wire in self.wires]
+        if self.chain.stepped:
+            for channel, frames in enumerate(arrived):
+                self._hear(channel, frames)
+            self._send()
+            return None
+        if self._start_ns is None:
+            self._start_ns = now_ns
+        clock_us = (now_ns - self._start_ns) / 1000
+        self._hear_in_time(arrived, clock_us)
+        self.chain.advance_to(clock_us)
+        self._send()
+        now_us = self.chain.now_us
+        wait_us = min(self.chain.next_us() - now_us, IN_STEP_US)
+        return max(wait_us, FINEST_US) * 1e-6
+
+    def _hear(self, channel: int, frames: Sequence[Frame]) -> None:
+        for frame in frames:
+            self.chain.hear(channel, frame)
+
+    def _hear_in_time(self, arrived: Sequence[Sequence[Frame]], clock_us: float) -> None:
+        """Frames as if they had come when they did, as far as that can be known.
+
+        After a hiccup of this process several periods lie in the queue: they are spread over the time that it took, so
+        that what slept here does not look like a host that slept.
+        """
+        before_us = self.chain.now_us + self.chain.skipped_us
+        for channel, frames in enumerate(arrived):
+            if not frames:
+                continue
+            syncs = sum(frame.id >> NODE_BITS == Opcode.SYNC for frame in frames)
+            met = 0
+            if not syncs:
+                self.chain.advance_to(clock_us)
+            for frame in frames:
+                if frame.id >> NODE_BITS == Opcode.SYNC:
+                    met += 1
+                    self.chain.advance_to(before_us + (clock_us - before_us) * met / syncs)
+                self.chain.hear(channel, frame)
+
+    def _send(self) -> None:
+        for channel, wire in enumerate(self.wires):
+            for frame in self.chain.take(channel):
+                self.unsent += not wire.send(frame)
+
+
+class PoseSender:
+    """Sends datagrams and never complains: motion capture does not know whether anybody listens."""
+
+    def __init__(self, address: str) -> None:
+        """address: HOST:PORT. Raises ConfigError."""
+        host, _, port = address.rpartition(":")
+        if not host or not port.isdigit() or not 0 < int(port) < 65536:
+            raise ConfigError(f"pose address {address!r}: give HOST:PORT, such as 127.0.0.1:7450")
+        self._address = (host, int(port))
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+
+    def __call__(self, datagram: bytes) -> None:
+        """Send one."""
+        with contextlib.suppress(OSError):
+            self._socket.sendto(datagram, self._address)
+
+    def close(self) -> None:
+        """Let go of the socket."""
+        self._socket.close()
+
+
+def make_plant(config: RunConfig, settings: Settings) -> Plant:
+    """The plant that the settings name. Raises ConfigError."""
+    factory: Any = find_plugin(PLANTS, settings.plant)
+    where = "backends.can.plant_settings"
+    return factory(config, plugin_settings(factory, settings.plant_settings, f"plant {settings.plant!r}", where))
+
+
+class Here:
+    """Twins in this process, at the other end of a virtual bus: calling it lets them run."""
+
+    def __init__(self, server: TwinServer, send_pose: PoseSender | None, clock_ns: Callable[[], int]) -> None:
+        self.server = server
+        self._send_pose, self._clock_ns = send_pose, clock_ns
+
+    def __call__(self) -> float | None:
+        """Handle what is there and send what is due; seconds until it wants to run again, None for never."""
+        return self.server.run_due(self._clock_ns())
+
+    def close(self) -> None:
+        """Leave the bus."""
+        for wire in self.server.wires:
+            wire.close()
+        if self._send_pose is not None:
+            self._send_pose.close()
+
+
+def here(
+    config: RunConfig,
+    settings: Settings,
+    channel: str,
+    pose: str | None = None,
+    *,
+    stepped: bool,
+    clock_ns: Callable[[], int] = time.monotonic_ns,
+) -> Here:
+    """All twins of a run on one virtual bus; pose: where to send poses, HOST:PORT. Raises ConfigError."""
+    send_pose = None if pose is None else PoseSender(pose)
+    chain = ModuleChain(config, settings, make_plant(config, settings), stepped=stepped, send_pose=send_pose)
+    return Here(TwinServer([VirtualWire(channel)], chain), send_pose, clock_ns)

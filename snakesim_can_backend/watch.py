@@ -1,0 +1,177 @@
+"""Says what is wrong with which module, or with the bus, in words that tell a person where to look.
+
+Pure: looks at a `Reading` and at the troubles of the wires once a tick. Each finding is told once, until somebody
+clears the robot's fault; what persists is then told again.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from snakesim_can_backend.protocol import ModuleState, Opcode
+from snakesim_can_backend.reading import Module, Reading
+from snakesim_can_backend.wire import Trouble
+from snakesim_hal.messages import LifecycleState
+
+SILENT_AFTER = 3  # Syncs without an answer
+IN_A_ROW = 3  # bad frames of one kind before they are a fault and not a glitch
+CLEAR_GRACE = 5  # Syncs that a module may take to follow a clearing
+ARM_GRACE = 5  # Syncs that a module may take to follow an arming
+STRANGER_FRAMES = 3  # of a node that should not be there, within a tick or two
+MOST_FRAMES = 16  # of one module in a tick; a healthy one sends 8 at most
+
+BUS_FAULTS = {
+    "bus_off": "the controller has left the bus after too many errors: look for a short, a wrong bit rate, a missing "
+    "terminator; bring the interface down and up again, then clear and arm",
+    "error_passive": "more than 127 errors: the bus is about to fail; look at cables, terminators and bit rate",
+    "interface_down": "nothing is sent or received; bring it up again, then clear and arm",
+    "restarted": "the controller has restarted after bus-off; clear and arm when the bus is sound",
+    "receive_overflow": "states may be missing",
+}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that is wrong."""
+
+    what: str
+    cause: str
+    joint: int | None = None  # index, tail to head
+
+
+class Watch:
+    """Remembers what has been told."""
+
+    def __init__(self, joints: Sequence[str], channel_of: Sequence[str], period_s: float, lease_s: float) -> None:
+        """joints, channel_of: name and bus of every joint, tail to head."""
+        self._names, self._channels = joints, channel_of
+        self._period_s, self._lease_s = period_s, lease_s
+        self._told: set[tuple[str, int | str | None]] = set()
+        self._restarts = [0] * len(joints)
+        self._unarmed = [0] * len(joints)  # Syncs in a row that found a module not armed, while the robot was
+        self._restart_at: dict[int, int] = {}  # joint -> Sync at which its uptime went back
+        self._quiet_until = -1  # Sync until which modules may take to follow a clearing
+        self._armed_sync: int | None = None
+        self._unsent: dict[str, int] = {}  # ticks in a row in which a bus did not take everything
+        self.restarted: set[int] = set()  # joints that have lost their parameters
+        self.seen: dict[str, int] = {}  # troubles that are no faults, counted
+
+    def forget(self, sync: int) -> None:
+        """Somebody has cleared the fault: tell again what is still there once the modules have followed."""
+        self._told.clear()
+        self._quiet_until = sync + CLEAR_GRACE
+
+    def look(
+        self,
+        reading: Reading,
+        lifecycle: LifecycleState,
+        troubles: Iterable[Trouble] = (),
+        unsent: Iterable[str] = (),
+    ) -> list[Finding]:
+        """What is newly wrong. unsent: buses that did not take every frame of this tick."""
+        if lifecycle != "armed":
+            self._armed_sync = None
+        elif self._armed_sync is None:
+            self._armed_sync = reading.sync
+        found = [*self._of_bus(troubles, list(unsent)), *self._of_strangers(reading)]
+        for i, module in enumerate(reading.modules):
+            found += self._of_module(i, module, reading, lifecycle)
+        fresh = [f for f in found if (f.what, f.joint if f.joint is not None else f.cause) not in self._told]
+        self._told.update((f.what, f.joint if f.joint is not None else f.cause) for f in fresh)
+        return fresh
+
+    # --- one module -------------------------------------------------------------------------------------------
+
+    def _of_module(self, i: int, module: Module, reading: Reading, lifecycle: LifecycleState) -> list[Finding]:
+        who = f"{self._names[i]} (node {module.node} on {self._channels[i]})"
+        found: list[Finding] = []
+
+        def tell(what: str, cause: str) -> None:
+            found.append(Finding(what, f"{who} {cause}", i))
+
+        missed = reading.sync - module.sync
+        if self._has_restarted(i, module, reading):
+            self.restarted.add(i)
+            tell("module_restarted", f"has restarted: its uptime went back to {module.uptime_ms / 1000:.2f} s")
+        if module.repeats >= IN_A_ROW:
+            tell("module_frozen", f"is frozen: it repeats its answer number {module.last_count} to every Sync")
+        elif module.wrong_counts >= IN_A_ROW:
+            tell("wrong_counter", f"answers Syncs that were not sent: {module.wrong_counts} wrong counters in a row")
+        if module.corrupt >= IN_A_ROW:
+            tell("bad_checksum", f"sends corrupt states: {module.corrupt} wrong checksums in a row")
+        if module.twice >= IN_A_ROW:
+            tell("duplicate_node", "is there twice: every Sync is answered two times; give each module its own node id")
+        if module.frames > MOST_FRAMES:
+            tell("module_babbling", f"floods the bus: {module.frames} frames within one period")
+        if missed >= SILENT_AFTER and not found and not module.corrupt and not module.wrong_counts:
+            tell(
+                "module_silent",
+                f"is silent: no state for {missed * self._period_s * 1000:.0f} ms{_alive(module, reading)}",
+            )
+        as_told = lifecycle == "estop" and module.state == ModuleState.EMERGENCY
+        if module.needs_clearing and not as_told and reading.sync >= self._quiet_until:
+            words = ", ".join(module.fault_names()) or module.state.name.lower()
+            tell(
+                f"module_{words.split(', ')[0]}",
+                f"reports {words}; it stopped because of {module.last_stop.name.lower()}",
+            )
+        elif self._refuses_to_arm(i, module, reading, missed):
+            tell("module_not_armed", f"does not arm: it is {module.state.name.lower()}")
+        return found
+
+    def _has_restarted(self, i: int, module: Module, reading: Reading) -> bool:
+        """A second module with the same id lets the uptime go back too, and then every Sync is answered twice."""
+        if module.restarts > self._restarts[i]:
+            self._restarts[i] = module.restarts
+            self._restart_at.setdefault(i, reading.sync)
+        if module.twice or reading.sync - self._restart_at.get(i, reading.sync) <= IN_A_ROW:
+            return False
+        del self._restart_at[i]
+        return True
+
+    def _refuses_to_arm(self, i: int, module: Module, reading: Reading, missed: int) -> bool:
+        late = self._armed_sync is not None and reading.sync - self._armed_sync > ARM_GRACE
+        apart = late and missed == 0 and module.state != ModuleState.ARMED and not module.twice
+        self._unarmed[i] = self._unarmed[i] + 1 if apart else 0
+        return self._unarmed[i] >= IN_A_ROW
+
+    # --- the bus ----------------------------------------------------------------------------------------------
+
+    def _of_bus(self, troubles: Iterable[Trouble], unsent: list[str]) -> list[Finding]:
+        found: list[Finding] = []
+        for trouble in troubles:
+            advice = BUS_FAULTS.get(trouble.kind)
+            if advice is not None:
+                found.append(Finding(trouble.kind, f"{trouble.channel}: {trouble.detail}; {advice}"))
+            else:
+                self.seen[trouble.kind] = self.seen.get(trouble.kind, 0) + 1
+        self._unsent = {channel: self._unsent.get(channel, 0) + 1 for channel in set(unsent)}
+        for channel, ticks in self._unsent.items():
+            if ticks * self._period_s >= self._lease_s:
+                cause = (
+                    f"{channel}: set-points do not get out for {self._lease_s * 1000:.0f} ms, its transmit queue stays "
+                    f"full: nobody acknowledges (power, cable, terminator, bit rate), or txqueuelen is below 64"
+                )
+                found.append(Finding("bus_stuck", cause))
+        return found
+
+    def _of_strangers(self, reading: Reading) -> list[Finding]:
+        found: list[Finding] = []
+        for node, frames in reading.strangers.items():
+            if frames >= STRANGER_FRAMES:
+                found.append(Finding("unknown_node", f"node {node} is on the bus, and this robot has no such joint"))
+        reading.strangers.clear()
+        others = reading.from_other_host
+        if others[Opcode.EMERGENCY]:
+            found.append(Finding("emergency", "somebody on the bus called an emergency"))
+        if others[Opcode.SYNC] or others[Opcode.SET_POINT] or others[Opcode.COMMAND]:
+            found.append(Finding("second_host", "another program commands the modules on this bus; end one of the two"))
+        others.clear()
+        return found
+
+
+def _alive(module: Module, reading: Reading) -> str:
+    if module.heartbeat_sync > module.sync:
+        return "; its heart still beats, so it hears no Sync or its main loop hangs"
+    if reading.sync < 0 or module.uptime_ms < 0:
+        return ""
+    return "; no heartbeat either: power, cable or reset"

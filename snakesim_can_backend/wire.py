@@ -1,0 +1,315 @@
+"""One CAN bus, seen from one end: frames in, frames out, and what is wrong with it.
+
+`SocketCanWire` is a kernel interface (can0, vcan0). python-can opens and filters it; frames go through its socket
+directly, which costs a third of a `can.Message` each. `VirtualWire` is python-can's virtual bus between two ends in one
+process, for machines whose kernel has no CAN. It does *not* simulate: errors, arbitration, bit rate, a full queue,
+an interface that goes down.
+"""
+
+import contextlib
+import errno
+import math
+import select
+import socket
+import struct
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, Protocol
+
+import can
+from can.interfaces.socketcan.socketcan import SocketcanBus
+from can.interfaces.virtual import VirtualBus
+
+from snakesim_can_backend.protocol import NODE_BITS, Frame, Opcode
+from snakesim_hal.errors import BackendError, ConfigError
+
+Kind = Literal[
+    "bus_off",
+    "error_passive",
+    "error_warning",
+    "not_acknowledged",
+    "restarted",
+    "interface_down",
+    "interface_up",
+    "queue_full",
+    "receive_overflow",
+    "error_frames",
+]
+
+EXTENDED, REMOTE, ERROR = 0x80000000, 0x40000000, 0x20000000
+RECEIVE_BUFFER_BYTES = 1 << 20
+MOST_AT_ONCE = 4096  # a bus that babbles must not keep its reader for ever
+SO_MEMINFO, MEMINFO_DROPS, MEMINFO_BYTES = 55, 8, 36  # linux/sock_diag.h
+NOTHING_KNOWN: list[Kind] = ["error_frames"]
+ERROR_CLASSES: tuple[tuple[int, Kind], ...] = ((0x40, "bus_off"), (0x20, "not_acknowledged"), (0x100, "restarted"))
+CONTROLLER_STATES: tuple[tuple[int, Kind], ...] = (
+    (0x30, "error_passive"),
+    (0x0C, "error_warning"),
+    (0x01, "receive_overflow"),
+)
+_wire_format = struct.Struct("<IB3x8s")
+
+
+@dataclass(frozen=True)
+class Trouble:
+    """Something that is wrong with a bus, not with a module on it."""
+
+    kind: Kind
+    channel: str
+    detail: str
+
+
+class Wire(Protocol):
+    """One end of a bus."""
+
+    channel: str
+
+    def send(self, frame: Frame) -> bool:
+        """Hand over a frame. False when it was not taken; `troubles` says why, and nothing is queued for later."""
+        ...
+
+    def receive(self) -> list[Frame]:
+        """Every frame that is there now, in its order; never waits."""
+        ...
+
+    def troubles(self) -> list[Trouble]:
+        """What was found since the last call."""
+        ...
+
+    def fileno(self) -> int | None:
+        """What to wait on; None for a bus inside this process."""
+        ...
+
+    def idle(self) -> float | None:
+        """Let the other end run, if it lives in this process.
+
+        Seconds until a frame may be there, 0 for one that is; None: not before this end sends something.
+        """
+        ...
+
+    def close(self) -> None:
+        """Let go of the bus."""
+        ...
+
+
+class SocketCanWire:
+    """A SocketCAN interface."""
+
+    def __init__(self, channel: str, only: Iterable[Opcode] | None = None) -> None:
+        """only: messages to receive, filtered in the kernel; None: all with 11-bit ids. Raises ConfigError."""
+        check_interface(channel)
+        self.channel = channel
+        self._bus = SocketcanBus(channel=channel, ignore_rx_error_frames=False)
+        self._socket = self._bus.socket
+        self._set_filters(only)
+        self._socket.setblocking(False)
+        with contextlib.suppress(OSError):
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+        self._buffer = bytearray(_wire_format.size)
+        self._found: list[Trouble] = []
+        self._down = False
+        self._dropped = 0
+
+    def send(self, frame: Frame) -> bool:
+        """Hand over a frame; False when the queue is full or the interface is down."""
+        try:
+            self._socket.send(_wire_format.pack(frame.id, len(frame.data), frame.data))
+        except OSError as error:
+            self._note_failure(error)
+            return False
+        if self._down:
+            self._note_up()
+        return True
+
+    def receive(self) -> list[Frame]:
+        """Every frame that is there now."""
+        frames: list[Frame] = []
+        try:
+            drain(self._socket, self._buffer, frames, self._note_error)
+        except OSError as error:
+            self._note_failure(error)
+        return frames
+
+    def troubles(self) -> list[Trouble]:
+        """What was found since the last call."""
+        dropped = self._count_drops()
+        if dropped > self._dropped:
+            detail = f"the kernel dropped {dropped - self._dropped} frames: this process reads too slowly"
+            self._found.append(Trouble("receive_overflow", self.channel, detail))
+            self._dropped = dropped
+        if self._down and is_up(self.channel):
+            self._note_up()
+        found, self._found = self._found, []
+        return found
+
+    def fileno(self) -> int | None:
+        """The socket."""
+        return self._socket.fileno()
+
+    def idle(self) -> float | None:
+        """The other end runs by itself."""
+        return math.inf
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._bus.shutdown()
+
+    def _set_filters(self, only: Iterable[Opcode] | None) -> None:
+        wanted = (
+            [(0, 0)] if only is None else [(opcode << NODE_BITS, 0x7FF & ~((1 << NODE_BITS) - 1)) for opcode in only]
+        )
+        data = b"".join(struct.pack("=II", id_, mask | EXTENDED | REMOTE) for id_, mask in wanted)
+        self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, data)
+
+    def _note_error(self, identifier: int, data: bytes) -> None:
+        self._found.extend(troubles_of(identifier, data, self.channel))
+
+    def _note_failure(self, error: OSError) -> None:
+        if error.errno == errno.ENOBUFS:
+            self._found.append(Trouble("queue_full", self.channel, "the transmit queue is full"))
+        elif error.errno in (errno.ENETDOWN, errno.ENODEV, errno.ENXIO):
+            if not self._down:
+                gone = "is down" if error.errno == errno.ENETDOWN else "is gone"
+                self._found.append(Trouble("interface_down", self.channel, f"the interface {gone}"))
+            self._down = True
+        else:
+            raise BackendError(f"{self.channel}: {error.strerror}") from error
+
+    def _note_up(self) -> None:
+        self._down = False
+        self._found.append(Trouble("interface_up", self.channel, "the interface is up again"))
+
+    def _count_drops(self) -> int:
+        try:
+            raw = self._socket.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, MEMINFO_BYTES)
+        except OSError:
+            return 0
+        return struct.unpack("=9I", raw)[MEMINFO_DROPS] if len(raw) == MEMINFO_BYTES else 0
+
+
+class OtherEnd(Protocol):
+    """What is at the other end of a virtual bus, in the same process."""
+
+    def __call__(self) -> float | None:
+        """Run for a moment; seconds until it wants to run again, None: not before it hears something."""
+        ...
+
+    def close(self) -> None:
+        """Leave the bus."""
+        ...
+
+
+class VirtualWire:
+    """One end of python-can's virtual bus."""
+
+    def __init__(self, channel: str, other_end: OtherEnd | None = None) -> None:
+        """other_end: lets the other end run whenever this one has nothing to do; returns when it wants to run again."""
+        self.channel = channel
+        self.other_end = other_end
+        self._bus = VirtualBus(channel=channel)
+
+    def send(self, frame: Frame) -> bool:
+        """Hand over a frame; a virtual bus takes everything."""
+        self._bus.send(can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False))
+        return True
+
+    def receive(self) -> list[Frame]:
+        """Every frame that is there now."""
+        frames: list[Frame] = []
+        while (message := self._bus.recv(0)) is not None:
+            frames.append(Frame(message.arbitration_id, bytes(message.data)))
+        return frames
+
+    def troubles(self) -> list[Trouble]:
+        """A virtual bus has none."""
+        return []
+
+    def fileno(self) -> int | None:
+        """There is nothing to wait on."""
+        return None
+
+    def idle(self) -> float | None:
+        """Let the other end run."""
+        pause_s = math.inf if self.other_end is None else self.other_end()
+        return pause_s if self._bus.queue.empty() else 0.0
+
+    def close(self) -> None:
+        """Leave the bus; the other end, if it lives on this one, leaves too."""
+        if self.other_end is not None:
+            self.other_end.close()
+        self._bus.shutdown()
+
+
+def drain(
+    source: socket.socket, buffer: bytearray, frames: list[Frame], on_error: Callable[[int, bytes], None]
+) -> None:
+    """Append everything that a non-blocking raw CAN socket has; error frames of the kernel go to `on_error`."""
+    receive_into, unpack, append = source.recv_into, _wire_format.unpack, frames.append
+    new = tuple.__new__  # what Frame(...) does, without its argument handling
+    with contextlib.suppress(BlockingIOError):
+        for _ in range(MOST_AT_ONCE):
+            receive_into(buffer)
+            identifier, length, data = unpack(buffer)
+            if identifier & ERROR:
+                on_error(identifier, data)
+            else:
+                append(new(Frame, (identifier, data[:length])))
+
+
+def wait(wires: Sequence[Wire], timeout_s: float) -> bool:
+    """Until a frame may be there on any of them, or the time is over. Other ends in this process run meanwhile.
+
+    False when nothing can come any more before this end sends something.
+    """
+    pauses = [pause for wire in wires if (pause := wire.idle()) is not None]
+    if not pauses:
+        return False
+    files = [number for wire in wires if (number := wire.fileno()) is not None]
+    timeout_s = max(min([timeout_s, *pauses]), 0.0)
+    if files:
+        select.select(files, [], [], timeout_s)
+    elif timeout_s > 0:
+        time.sleep(timeout_s)
+    return True
+
+
+def troubles_of(identifier: int, data: bytes, channel: str) -> list[Trouble]:
+    """What an error frame of the kernel says."""
+    kinds: list[Kind] = [kind for bit, kind in ERROR_CLASSES if identifier & bit]
+    if identifier & 0x04:
+        states: list[Kind] = [kind for bits, kind in CONTROLLER_STATES if data[1] & bits]
+        kinds.extend(states)
+    counters = f"transmit errors {data[6]}, receive errors {data[7]}"
+    return [Trouble(kind, channel, counters) for kind in kinds or NOTHING_KNOWN]
+
+
+def check_interface(channel: str) -> None:
+    """Raise ConfigError unless a SocketCAN interface is there and up; the message says how to bring it up."""
+    if not hasattr(socket, "AF_CAN") or not _kernel_has_can():
+        raise ConfigError(
+            f"channel {channel!r}: this kernel has no CAN. Leave `backends.can.channels` empty for a virtual bus, or "
+            f"run in a VM that has CAN: see docs/hil.md"
+        )
+    bring_up = "deploy/can/up.sh"
+    if not Path("/sys/class/net", channel).exists():
+        raise ConfigError(f"channel {channel!r}: there is no such interface; `{bring_up} {channel}` makes it")
+    if not is_up(channel):
+        raise ConfigError(f"channel {channel!r}: the interface is down; `{bring_up} {channel}` brings it up")
+
+
+def is_up(channel: str) -> bool:
+    """Whether an interface is there and administratively up."""
+    try:
+        return bool(int(Path("/sys/class/net", channel, "flags").read_text(encoding="ascii"), 16) & 1)
+    except OSError:
+        return False
+
+
+def _kernel_has_can() -> bool:
+    try:
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+    except OSError:
+        return False
+    return True

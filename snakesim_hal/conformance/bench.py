@@ -1,0 +1,123 @@
+"""One backend with its settings, as the contract tests use it: opened by one user at a time, like a robot."""
+
+from collections.abc import Callable
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from snakesim_hal.backend import Backend, BackendFactory
+from snakesim_hal.conformance.loopback import Hosted
+from snakesim_hal.conformance.rig import HOLDER, Rig
+from snakesim_hal.messages import Pace
+from snakesim_hal.plugins import BACKENDS, find_plugin, plugin_settings
+from snakesim_hal.scenario import Override, RunConfig, Service, load, parse_set
+
+SCENARIO = str(Path(__file__).parent / "scenario.toml")
+Mute = Callable[[Any, int], None]
+
+
+class Bench:
+    """A column of the contract's table."""
+
+    def __init__(
+        self,
+        name: str,
+        backend: str | BackendFactory,
+        *,
+        scenario: str = SCENARIO,
+        sets: tuple[str, ...] = (),
+        mute: Mute | None = None,
+        unavailable: str | None = None,
+    ) -> None:
+        """backend: an installed one's name, `./file.py:Class`, or the class itself.
+
+        sets: as `--set` of `snakesim run`; mute: `mute(backend, joint)` makes one joint's module fall silent, as by a
+        broken wire; unavailable: why the bench cannot be used on this machine.
+        """
+        self.name = name
+        self.unavailable = unavailable
+        self.mute = mute
+        self._backend = backend
+        self._scenario, self._sets = scenario, sets
+        self._rig: Rig | None = None
+        self._hosted: Hosted | None = None
+        self._kept: dict[str, Any] = {}
+
+    # --- what it is ----------------------------------------------------------------------------------------
+
+    @cached_property
+    def factory(self) -> BackendFactory:
+        """What opens the backend. Raises ConfigError when there is no such backend."""
+        return find_plugin(BACKENDS, self._backend) if isinstance(self._backend, str) else self._backend
+
+    @cached_property
+    def config(self) -> RunConfig:
+        """The scenario with the backend, at the pace of the bench. Raises ConfigError."""
+        backend = self._backend if isinstance(self._backend, str) else self.name
+        overrides = [Override("backend", backend, "--backend"), *map(parse_set, self._sets)]
+        config = load(self._scenario, overrides).config
+        # The tests' own controller is the only service.
+        return msgspec.structs.replace(config, pace=self.pace_of(config), services={HOLDER: Service()})
+
+    def pace_of(self, config: RunConfig) -> Pace:
+        """Lockstep where time can wait: quick, and the same on every machine. Else real time."""
+        paces = self.factory.check(config, self._settings(config))
+        return "lockstep" if "lockstep" in paces else "realtime"
+
+    @property
+    def pace(self) -> Pace:
+        """At which pace the tests run it."""
+        return self.config.pace
+
+    # --- opening and closing -------------------------------------------------------------------------------
+
+    def open(self) -> Backend:
+        """A fresh backend; whatever was open is closed before."""
+        self.close()
+        return self.factory(self.config, self._settings(self.config))
+
+    def fresh_rig(self) -> Rig:
+        """A rig on a fresh backend."""
+        backend = self.open()
+        try:
+            self._rig = Rig(backend, self.pace, self.config.period_ns)
+        except BaseException:
+            backend.close()
+            raise
+        return self._rig
+
+    def rig(self) -> Rig:
+        """The rig that tests share, since opening may be slow; a fresh one where that is spoiled."""
+        return self._rig if self._rig is not None and not self._rig.spoiled else self.fresh_rig()
+
+    def hosted(self) -> Hosted:
+        """The backend behind a real host, shared like the rig."""
+        if self._hosted is None:
+            self._hosted = Hosted(self.open(), self.config)
+            self._hosted.start()
+        return self._hosted
+
+    def spoil(self) -> None:
+        """Open anew for the next test: after this one nobody knows how the backend is."""
+        self.close()
+
+    def close(self) -> None:
+        """Close whatever is open."""
+        rig, hosted = self._rig, self._hosted
+        self._rig = self._hosted = None
+        if hosted is not None:
+            hosted.close()
+        if rig is not None and not rig.spoiled:
+            rig.close()
+
+    def keep(self, name: str, make: Callable[[], Any]) -> Any:
+        """A recording that several tests read, made by the first of them."""
+        if name not in self._kept:
+            self._kept[name] = make()
+        return self._kept[name]
+
+    def _settings(self, config: RunConfig) -> Any:
+        source = f"scenario {config.name!r}"
+        return plugin_settings(self.factory, config.backend_settings, source, config.backend_section)

@@ -1,0 +1,304 @@
+"""The pytest plugin: options, fixtures and the table at the end. It does nothing until a contract test runs.
+
+Options of its own: --backend, --scenario, --set, --mute, --contract-table. A repository with several benches implements
+`pytest_snakesim_benches` in a conftest.py and imports the tests; see docs/backends.md.
+"""
+
+from collections.abc import Generator, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+if TYPE_CHECKING:  # nothing of ours is imported before it is used: every pytest run loads this module
+    from snakesim_hal.conformance.bench import Bench
+    from snakesim_hal.conformance.loopback import Hosted
+    from snakesim_hal.conformance.recordings import Pushing
+    from snakesim_hal.conformance.rig import Floats, Record, Rig
+    from snakesim_hal.messages import Mode
+
+pytest.register_assert_rewrite("snakesim_hal.conformance.loopback", "snakesim_hal.conformance.rig")
+
+CLAUSE, BENCH = "snakesim_clause", "snakesim_bench"  # properties that a test's report carries, also between workers
+PACKAGE = "snakesim_hal.conformance."
+WORST_FIRST = ("error", "fail", "skip", "pass")
+# What shares an opening of the backend stands together; what needs openings of its own comes last.
+SUBJECTS = ("description", "samples", "modes", "limits", "switching", "lifecycle", "faults", "host", "closing")
+_failed = pytest.StashKey[bool]()
+
+
+class Hooks:
+    """What a conftest.py may implement."""
+
+    @staticmethod
+    def pytest_snakesim_benches(config: pytest.Config) -> "list[Bench] | None":  # pyright: ignore[reportReturnType]
+        """Benches that the contract tests below this folder run on, when no --backend is given."""
+
+
+def pytest_addhooks(pluginmanager: pytest.PytestPluginManager) -> None:
+    """Make the hook known."""
+    pluginmanager.add_hookspecs(Hooks)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """The options."""
+    group = parser.getgroup("snakesim", "contract tests of SnakeSIM backends (--pyargs snakesim_hal.conformance)")
+    group.addoption("--backend", metavar="NAME", help="backend to test: an installed one, or ./file.py:Class")
+    group.addoption("--scenario", metavar="FILE", help="scenario instead of the shipped bench; a name or a path")
+    group.addoption("--set", action="append", default=[], metavar="KEY=VALUE", help="change a value of the scenario")
+    group.addoption(
+        "--mute",
+        metavar="./FILE.py:FUNCTION",
+        help="function(backend, joint) that makes a joint's module fall silent",
+    )
+    group.addoption("--contract-table", metavar="FILE.md", help="write the table of tests and benches as Markdown")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """A place for the benches, and somebody who collects the outcomes."""
+    config.stash[_benches] = {}
+    config.pluginmanager.register(Outcomes(), "snakesim-outcomes")
+
+
+# --- benches ---------------------------------------------------------------------------------------------------
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Run every contract test on every bench; all tests of a bench in one go, so that it is opened seldom."""
+    if "bench" not in metafunc.fixturenames or not metafunc.function.__module__.startswith(PACKAGE):
+        return
+    benches = _from_options(metafunc.config)
+    if not benches:
+        benches = _from_hook(metafunc)
+    if not benches:
+        raise pytest.UsageError("contract tests need a backend: give --backend NAME or --backend ./file.py:Class")
+    metafunc.parametrize("bench", benches, ids=[bench.name for bench in benches], indirect=True, scope="session")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put contract tests into the order of `SUBJECTS`; all other tests stay where they are."""
+    ours = [i for i, item in enumerate(items) if _module_of(item).startswith(PACKAGE)]
+    ordered = sorted((items[i] for i in ours), key=lambda item: _place(_module_of(item).removeprefix(PACKAGE)))
+    for i, item in zip(ours, ordered, strict=True):
+        items[i] = item
+
+
+def _module_of(item: pytest.Item) -> str:
+    """Where a test was written, which is not always the file that it is collected from."""
+    return getattr(getattr(item, "function", None), "__module__", "")
+
+
+_benches = pytest.StashKey["dict[str, Bench]"]()
+COMMAND_LINE = "--backend"
+
+
+def _from_hook(metafunc: pytest.Metafunc) -> "list[Bench]":
+    """What conftest.py files offer. The hook is asked for every test; tests share the bench that came first."""
+    found: list[list[Bench] | None] = metafunc.definition.ihook.pytest_snakesim_benches(config=metafunc.config)
+    known = metafunc.config.stash[_benches]
+    return [known.setdefault(bench.name, bench) for some in found if some for bench in some]
+
+
+def _from_options(config: pytest.Config) -> "list[Bench]":
+    backend = config.getoption("--backend")
+    if not backend:
+        return []
+    known = config.stash[_benches]
+    if COMMAND_LINE not in known:
+        from snakesim_hal.conformance.bench import SCENARIO, Bench
+        from snakesim_hal.errors import ConfigError
+        from snakesim_hal.plugins import BACKENDS, find_plugin
+
+        sets: list[str] = config.getoption("--set") or []
+        try:
+            mute: Any = config.getoption("--mute")
+            bench = Bench(
+                backend.rpartition(":")[2],
+                backend,
+                scenario=str(config.getoption("--scenario") or SCENARIO),
+                sets=tuple(sets),
+                mute=find_plugin(BACKENDS, mute) if mute else None,
+            )
+            assert bench.config  # a wrong setting is said once, not by every test
+        except ConfigError as error:
+            raise pytest.UsageError(str(error)) from error
+        known[COMMAND_LINE] = bench
+    return [known[COMMAND_LINE]]
+
+
+@pytest.fixture(scope="session")
+def bench(request: pytest.FixtureRequest) -> "Iterator[Bench]":
+    """A backend under test, not opened yet."""
+    bench: Bench = request.param
+    if bench.unavailable is not None:
+        pytest.skip(bench.unavailable)
+    yield bench
+    bench.close()
+
+
+@pytest.fixture
+def rig(bench: "Bench", request: pytest.FixtureRequest) -> "Iterator[Rig]":
+    """The backend, opened, at its start pose, at rest and disarmed. After a failed test it is opened anew."""
+    rig = bench.rig()
+    rig.go_home()
+    yield rig
+    if rig.late_periods > 1:
+        what = f"{bench.name}: this machine fell {rig.late_periods:.1f} periods behind real time"
+        request.node.add_report_section("call", "pace", what)
+        rig.late_periods = 0.0
+    if request.node.stash.get(_failed, False):
+        bench.spoil()
+
+
+@pytest.fixture
+def hosted(bench: "Bench", request: pytest.FixtureRequest) -> "Iterator[Hosted]":
+    """The backend behind a real host, with a controller. After a failed test both are opened anew."""
+    yield bench.hosted()
+    if request.node.stash.get(_failed, False):
+        bench.spoil()
+
+
+@pytest.fixture
+def healthy(bench: "Bench", request: pytest.FixtureRequest) -> "Record":
+    """A second of a robot at work: every joint sways. Recorded once for all tests that read it."""
+    from snakesim_hal.conformance.recordings import sway
+
+    return bench.keep("healthy", lambda: sway(request.getfixturevalue("rig")))
+
+
+@pytest.fixture
+def pushing(bench: "Bench", request: pytest.FixtureRequest) -> "Pushing":
+    """Two joints pushing against their stops. Recorded once."""
+    from snakesim_hal.conformance.recordings import push
+
+    return bench.keep("pushing", lambda: push(request.getfixturevalue("rig")))
+
+
+@pytest.fixture
+def switching(bench: "Bench", request: pytest.FixtureRequest) -> "dict[tuple[Mode, Mode], Floats]":
+    """One joint through every change of mode. Recorded once."""
+    from snakesim_hal.conformance.recordings import switch
+
+    return bench.keep("switching", lambda: switch(request.getfixturevalue("rig")))
+
+
+# --- outcomes --------------------------------------------------------------------------------------------------
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item, call: pytest.CallInfo[None]
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Note on the report which clause it is about, and on the item whether it failed."""
+    report = yield
+    module = _module_of(item)
+    if module.startswith(PACKAGE) and isinstance(item, pytest.Function) and hasattr(item, "callspec"):
+        clause = f"{module.removeprefix(PACKAGE)}::{item.originalname}"
+        bench: Any = item.callspec.params["bench"]
+        for name, value in ((CLAUSE, clause), (BENCH, bench.name)):
+            if (name, value) not in report.user_properties:
+                report.user_properties.append((name, value))
+        if report.failed:
+            item.stash[_failed] = True
+    return report
+
+
+class Outcomes:
+    """Collects what every contract test came to on every bench, and shows it as one table."""
+
+    def __init__(self) -> None:
+        self._rows: dict[tuple[str, str], dict[str, list[tuple[str, str]]]] = {}  # clause -> bench -> (word, why)
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Keep an outcome; with pytest-xdist this runs where the reports meet."""
+        told = dict(report.user_properties)
+        if CLAUSE not in told or (report.when != "call" and report.passed):
+            return
+        module, _, clause = str(told[CLAUSE]).partition("::")
+        cell = self._rows.setdefault((module, clause), {}).setdefault(str(told[BENCH]), [])
+        if (outcome := _outcome(report)) not in cell:
+            cell.append(outcome)
+
+    def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+        """Show the table, and write it where asked."""
+        if not self._rows:
+            return
+        rows = dict(sorted(self._rows.items(), key=lambda row: _place(row[0][0])))
+        benches = list(dict.fromkeys(bench for row in rows.values() for bench in row))
+        lines = [
+            [module, _sentence(clause), *(_worst(row.get(bench, [])) for bench in benches)]
+            for (module, clause), row in rows.items()
+        ]
+        reasons = [
+            f"{_sentence(clause)}, on {bench}: {why}"
+            for (_, clause), row in rows.items()
+            for bench, cell in row.items()
+            for _, why in cell
+            if why
+        ]
+        reasons = _without_repetition(reasons)
+        terminalreporter.section("contract")
+        for line in plain(benches, lines):
+            terminalreporter.write_line(line)
+        for reason in reasons:
+            terminalreporter.write_line(f"skipped: {reason}")
+        if path := config.getoption("--contract-table"):
+            Path(path).write_text(markdown(benches, lines, reasons))
+            terminalreporter.write_line(f"written to {path}")
+
+
+def plain(benches: list[str], lines: list[list[str]]) -> list[str]:
+    """The table for a terminal: one line a clause, grouped by subject."""
+    width = max(len(line[1]) for line in lines)
+    columns = [max(len(bench), 5) for bench in benches]
+    text = [" " * width + "".join(f"  {bench:>{column}}" for bench, column in zip(benches, columns, strict=True))]
+    subject = ""
+    for module, clause, *words in lines:
+        if module != subject:
+            subject = module
+            text.append(_subject(module).upper())
+        text.append(f"{clause:<{width}}" + "".join(f"  {w:>{c}}" for w, c in zip(words, columns, strict=True)))
+    return text
+
+
+def markdown(benches: list[str], lines: list[list[str]], reasons: list[str]) -> str:
+    """The table as Markdown."""
+    table = [["subject", "contract", *benches], ["---"] * (2 + len(benches))]
+    table += [[_subject(module), *rest] for module, *rest in lines]
+    text = "\n".join("| " + " | ".join(line) + " |" for line in table) + "\n"
+    return text + "".join(f"\nSkipped: {reason}\n" for reason in reasons)
+
+
+def _outcome(report: pytest.TestReport) -> tuple[str, str]:
+    if report.skipped:
+        where: Any = report.longrepr  # (file, line, reason) of a skip; something else of an expected failure
+        return "skip", where[2].removeprefix("Skipped: ") if isinstance(where, tuple) else "expected to fail"
+    if report.failed:
+        return ("fail" if report.when == "call" else "error"), ""
+    return "pass", ""
+
+
+def _worst(outcomes: list[tuple[str, str]]) -> str:
+    words = [word for word, _ in outcomes]
+    return next((word for word in WORST_FIRST if word in words), "-")
+
+
+def _without_repetition(reasons: list[str]) -> list[str]:
+    """A bench that is not there at all is said once, not for every clause."""
+    seen: dict[str, list[str]] = {}
+    for reason in reasons:
+        seen.setdefault(reason.partition(", on ")[2], []).append(reason)
+    return [same[0] if len(same) == 1 else f"{len(same)} clauses, on {why}" for why, same in seen.items()]
+
+
+def _subject(module: str) -> str:
+    return module.removeprefix("test_")
+
+
+def _sentence(clause: str) -> str:
+    return clause.removeprefix("test_").replace("_", " ")
+
+
+def _place(module: str) -> int:
+    return SUBJECTS.index(_subject(module)) if _subject(module) in SUBJECTS else len(SUBJECTS)

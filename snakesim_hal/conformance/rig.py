@@ -1,0 +1,254 @@
+"""An open backend on the bench, driven tick by tick as the host does it, through the real authority and its gate."""
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_hal.authority import Authority
+from snakesim_hal.backend import Backend, Samples, SetPoints
+from snakesim_hal.conformance import tolerances as t
+from snakesim_hal.messages import (
+    EstopRequest,
+    Fault,
+    JointCommand,
+    JointState,
+    LeaseRequest,
+    LifecycleRequest,
+    LifecycleState,
+    Mode,
+    Pace,
+)
+
+Floats = NDArray[np.float64]
+Asked = Mapping[int, tuple[Mode, float]]  # joint index -> mode and target
+HOLDER = "control"
+REANCHOR_PERIODS = 10
+
+
+@dataclass
+class Record:
+    """What the joints did over some ticks, and what they were told. All arrays are (ticks, n_joints)."""
+
+    samples: list[Samples]
+    told: list[SetPoints]
+    faults: list[Fault]  # that the backend reported meanwhile
+
+    @property
+    def joints(self) -> list[JointState]:
+        """The joint states, oldest first."""
+        return [sample.joints for sample in self.samples]
+
+    @property
+    def angle_rad(self) -> Floats:
+        """Measured angles."""
+        return np.array([joints.angle_rad for joints in self.joints])
+
+    @property
+    def velocity_rad_s(self) -> Floats:
+        """Measured velocities."""
+        return np.array([joints.velocity_rad_s for joints in self.joints])
+
+    @property
+    def torque_nm(self) -> Floats:
+        """Measured torques."""
+        return np.array([joints.torque_nm for joints in self.joints])
+
+
+@dataclass
+class Rig:
+    """One opening of a backend. Every clause that needs no network is tested on it."""
+
+    backend: Backend
+    pace: Pace
+    period_ns: int
+    spoiled: bool = False  # of no use for further tests: closed, or a joint is silent
+    tick: int = 0
+    late_periods: float = 0.0  # how far this machine fell behind real time at worst
+    _found: list[tuple[int, Fault]] = field(default_factory=list[tuple[int, Fault]])
+
+    def __post_init__(self) -> None:
+        self.robot = self.backend.describe()
+        self.count = len(self.robot.joints)
+        self.full_torque_nm = [joint.torque_limit_nm for joint in self.robot.joints]
+        self.authority = Authority(self.robot)
+        self._sequence = 0
+        self._anchor_ns = time.monotonic_ns()
+        self._samples: list[Samples] = []
+        self._told: list[SetPoints] = []
+        self.first = self._sample()
+        # A robot on a bus may know its joints only after a few periods.
+        for _ in range(t.ARMING_PERIODS):
+            self.idle()
+            if all(self.now.valid):
+                break
+        self.home_rad = list(self.now.angle_rad)
+        self.faults_at_opening = self.faults
+
+    # --- what there is to read -----------------------------------------------------------------------------
+
+    @property
+    def faults(self) -> list[Fault]:
+        """Everything that the backend reported since it was opened."""
+        return [fault for _, fault in self._found]
+
+    @property
+    def now(self) -> JointState:
+        """The newest joint state."""
+        return self._samples[-1].joints
+
+    def since(self, tick: int) -> Record:
+        """Everything after a tick."""
+        first = len(self._samples) - (self.tick - tick)
+        faults = [fault for found_at, fault in self._found if found_at >= tick]
+        return Record(self._samples[first:], self._told[first - 1 :], faults)
+
+    def periods(self, seconds: float) -> int:
+        """How many periods make so many seconds, rounded up."""
+        return int(np.ceil(seconds * 1e9 / self.period_ns))
+
+    # --- one period ----------------------------------------------------------------------------------------
+
+    def hand(self, points: SetPoints, lifecycle: LifecycleState) -> None:
+        """Hand set-points to the backend past every gate, and let a period pass."""
+        self.backend.enact(points, lifecycle)
+        self.let_pass(points)
+
+    def let_pass(self, told: SetPoints | None = None) -> None:
+        """Let a period pass and sample, as the host does. Faults go to the authority, as in the host."""
+        self._told.append(told or self._told[-1])
+        self.backend.advance()
+        for fault in self.backend.faults():
+            self._found.append((self.tick, fault))
+            self.authority.fault(fault)
+        self.tick += 1
+        if self.pace == "realtime":
+            self._wait_for_deadline()
+        self._sample()
+
+    def idle(self, periods: int = 1) -> Record:
+        """Periods without a new command: what was commanded goes on while its lease lasts."""
+        began = self.tick
+        for _ in range(periods):
+            self.authority.expire(self._now_ns, self.tick)
+            self.hand(self.authority.decide().set_points, self.authority.state)
+        return self.since(began)
+
+    def drive(self, asked: Asked, periods: int = 1, *, torque_limit_nm: list[float] | None = None) -> Record:
+        """Command some joints, while the others stay at home; through lease, gate and lifecycle."""
+        began = self.tick
+        for _ in range(periods):
+            self._offer(self.points(asked, torque_limit_nm))
+            self.idle()
+        return self.since(began)
+
+    def points(self, asked: Asked, torque_limit_nm: list[float] | None = None) -> SetPoints:
+        """Set-points of all joints; those that nothing is asked of stay at home."""
+        mode, target = [Mode.POSITION] * self.count, list(self.home_rad)
+        for joint, (wanted_mode, wanted) in asked.items():
+            mode[joint], target[joint] = wanted_mode, wanted
+        return SetPoints(mode, target, torque_limit_nm or self.full_torque_nm)
+
+    # --- the lifecycle -------------------------------------------------------------------------------------
+
+    def arm(self) -> None:
+        """Arm where the robot is, and give its modules time to follow."""
+        if self.authority.state == "armed":
+            return
+        if self.authority.state != "disarmed":
+            self.disarm()
+            self.idle(t.TRANSPORT_PERIODS)
+        here = {i: (Mode.POSITION, angle) for i, angle in enumerate(self.now.angle_rad)}
+        self._offer(self.points(here))
+        request = LifecycleRequest(action="arm", robot=self.robot.robot, backend=self.robot.backend)
+        answer = self.authority.on_lifecycle(request, self._now_ns)
+        assert answer.ok, f"the robot cannot be armed: {answer.reason}"
+        self.drive(here, t.ARMING_PERIODS)
+        self.must_be_armed()
+
+    def must_be_armed(self) -> None:
+        """Fail with the reason when the robot has left `armed`."""
+        assert self.authority.state == "armed", f"no longer armed: {self.authority.why}"
+
+    def disarm(self) -> None:
+        """Disarm, or clear a stop."""
+        action = "disarm" if self.authority.state == "armed" else "clear"
+        self.authority.on_lifecycle(LifecycleRequest(action=action), self._now_ns)
+
+    def estop(self) -> None:
+        """Emergency stop."""
+        self.authority.on_estop(EstopRequest(who="bench"), self.tick)
+
+    def fault(self) -> None:
+        """A fault that somebody else found."""
+        self.authority.fault(Fault(tick=self.tick, what="bench", cause="the contract tests say so"))
+
+    def cruise(self, joint: int = 0) -> Record:
+        """Arm, and set one joint going."""
+        self.arm()
+        record = self.drive({joint: (Mode.VELOCITY, t.CRUISE_RAD_S)}, self.periods(t.CRUISE_S))
+        self.must_be_armed()
+        moved = record.angle_rad[-1, joint] - record.angle_rad[0, joint]
+        assert moved > t.STILL_RAD, f"joint {joint} does not move in velocity mode, so stopping cannot be tested"
+        return record
+
+    def go_home(self) -> None:
+        """Bring every joint back to where it was at opening, at rest and disarmed; no work when it is there."""
+        if self.authority.state == "armed" or not self._is_home():
+            if not self._is_home():
+                self.arm()
+                self.drive({}, self.periods(t.SETTLE_S))
+            self.disarm()
+            self.idle(t.TRANSPORT_PERIODS)
+        elif self.authority.state != "disarmed":
+            self.disarm()
+            self.idle()
+
+    def close(self) -> None:
+        """Close the backend; safe to call again."""
+        self.spoiled = True
+        self.backend.close()
+
+    # --- inside --------------------------------------------------------------------------------------------
+
+    @property
+    def _now_ns(self) -> int:
+        return self.tick * self.period_ns
+
+    def _is_home(self) -> bool:
+        away = np.abs(np.array(self.now.angle_rad) - self.home_rad)
+        return bool(away.max() < t.REACHED_RAD and np.abs(self.now.velocity_rad_s).max() < t.STILL_RAD_S)
+
+    def _offer(self, points: SetPoints) -> None:
+        """Send a command; a refusal shows in what the joints do."""
+        if self.authority.state == "disarmed" and not self.authority.lease.live(self._now_ns):
+            self.authority.on_lease(LeaseRequest(action="acquire", holder=HOLDER), self._now_ns)
+        self._sequence += 1
+        command = JointCommand(
+            tick=self.tick,
+            sequence=self._sequence,
+            lease_epoch=self.authority.lease.epoch,
+            layout=self.robot.layout,
+            valid_for_ns=self.robot.lease_ns,
+            mode=points.mode,
+            target=points.target,
+            torque_limit_nm=points.torque_limit_nm,
+        )
+        self.authority.offer(command, now_ns=self._now_ns, tick=self.tick, age_ns=0)
+
+    def _sample(self) -> Samples:
+        samples = self.backend.sample(self.tick, self._now_ns)
+        self.authority.observe(samples.joints)
+        self._samples.append(samples)
+        return samples
+
+    def _wait_for_deadline(self) -> None:
+        left_ns = self._anchor_ns + self._now_ns - time.monotonic_ns()
+        if left_ns > 0:
+            time.sleep(left_ns * 1e-9)
+            return
+        self.late_periods = max(self.late_periods, -left_ns / self.period_ns)
+        if -left_ns > REANCHOR_PERIODS * self.period_ns:
+            self._anchor_ns -= left_ns

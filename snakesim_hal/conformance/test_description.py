@@ -1,0 +1,86 @@
+"""The description: what the robot is, readable before anything moves."""
+
+from collections import Counter
+
+from snakesim_hal import keys
+from snakesim_hal.codec import Decoder, encode, encoding_of
+from snakesim_hal.conformance import tolerances as t
+from snakesim_hal.conformance.bench import Bench
+from snakesim_hal.conformance.rig import Record, Rig
+from snakesim_hal.messages import Description, Imu
+from snakesim_hal.robot import describe, layout_hash
+from snakesim_hal.scenario import config_hash
+
+
+def test_the_description_is_what_the_robot_file_says(bench: Bench, rig: Rig) -> None:
+    """Joints (count, order, names, axes, limits, gains), links, period, lease and safety come from the run's files."""
+    config, robot = bench.config, rig.robot
+    wanted = describe(
+        config.robot,
+        backend=robot.backend,
+        period_ns=config.period_ns,
+        lease_ns=config.lease_ns,
+        config_hash=config_hash(config),
+    )
+    assert [joint.name for joint in robot.joints] == [joint.name for joint in wanted.joints], "names and order"
+    for told, right in zip(robot.joints, wanted.joints, strict=True):
+        assert told == right
+    assert robot.links == wanted.links
+    for name in ("robot", "config_hash", "period_ns", "lease_ns", "max_step_rad", "safe_action"):
+        assert getattr(robot, name) == getattr(wanted, name), name
+
+
+def test_the_layout_is_the_hash_of_the_joints(rig: Rig) -> None:
+    """Commands carry the layout, so that one made for another order of joints is refused."""
+    assert rig.robot.layout == layout_hash(rig.robot.joints)
+
+
+def test_the_description_is_readable_at_once_and_stays(bench: Bench, rig: Rig, healthy: Record) -> None:
+    """It is there before the first sample (the rig has read it then), and the same after running."""
+    assert healthy.samples
+    assert rig.backend.describe() == rig.robot
+
+
+def test_the_description_survives_the_wire(rig: Rig) -> None:
+    """Encoded and decoded by the HAL's codec, with its bounds, it is the same."""
+    description = rig.robot
+    assert Decoder(Description).decode(encode(description), encoding_of(Description)) == description
+
+
+def test_every_sensor_listed_is_a_key_of_the_hal_once(rig: Rig) -> None:
+    """Sensors stand at the sensor keys, with a rate that the control rate can carry; the joints are always there."""
+    listed = [sensor.key for sensor in rig.robot.sensors]
+    assert len(set(listed)) == len(listed), f"listed twice: {listed}"
+    assert keys.JOINTS in listed
+    for sensor in rig.robot.sensors:
+        assert sensor.key.startswith("sensor/") and sensor.key in keys.MESSAGE_AT, sensor.key
+        assert sensor.rate_hz <= 1.001e9 / rig.period_ns, f"{sensor.key}: faster than the control rate"
+
+
+def test_every_sensor_listed_delivers_at_about_its_rate(rig: Rig, healthy: Record) -> None:
+    """A sensor that is listed comes; one that this robot lacks is left out of the list."""
+    seconds = len(healthy.samples) * rig.period_ns * 1e-9
+    for sensor in rig.robot.sensors:
+        if sensor.key == keys.JOINTS:
+            continue
+        came = how_often(sensor.key, healthy)
+        wanted = seconds * sensor.rate_hz
+        slack = 1 + t.RATE_SHARE * wanted
+        assert came >= 1 or wanted < 2, f"{sensor.key} is listed and never comes"
+        assert abs(came - wanted) <= slack, f"{sensor.key}: {came} in {seconds} s, stated are {sensor.rate_hz} Hz"
+
+
+def how_often(key: str, record: Record) -> int:
+    """How many readings came. IMUs may answer in turns, so there the link that came most often counts."""
+    messages = [sample.others[key] for sample in record.samples if key in sample.others]
+    links = Counter(link for message in messages if isinstance(message, Imu) for link in message.link)
+    return max(links.values()) if links else len(messages)
+
+
+def test_nothing_comes_that_is_not_listed(rig: Rig, healthy: Record) -> None:
+    """Whoever reads the description knows every key; and each key has the message that belongs there."""
+    listed = {sensor.key for sensor in rig.robot.sensors}
+    for sample in healthy.samples:
+        for key, message in sample.others.items():
+            assert key in listed, f"{key} comes and is not listed"
+            assert type(message) is keys.MESSAGE_AT[key], f"{key}: {type(message).__name__}"

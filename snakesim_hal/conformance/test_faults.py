@@ -1,0 +1,58 @@
+"""Faults: none while all is well; a silent joint shows, and stops the robot."""
+
+import math
+
+import numpy as np
+import pytest
+
+from snakesim_hal.conformance import tolerances as t
+from snakesim_hal.conformance.bench import Bench
+from snakesim_hal.conformance.rig import Record, Rig
+from snakesim_hal.conformance.test_lifecycle import must_rest
+from snakesim_hal.messages import Mode
+
+MUTED = 1
+
+
+def test_a_healthy_robot_reports_no_fault(rig: Rig, healthy: Record) -> None:
+    """`faults()` is empty after opening, and at work."""
+    assert not rig.faults_at_opening, rig.faults_at_opening
+    assert healthy.samples and not healthy.faults, healthy.faults
+
+
+def test_a_silent_joint_grows_old_and_the_robot_stops(bench: Bench, rig: Rig) -> None:
+    """No news is never good news: the joint is invalid, or its age grows with time, until the robot is at fault.
+
+    The others stay fresh. Faults that the backend reports besides say what and why, and each is reported once.
+    """
+    if bench.mute is None:
+        pytest.skip("this bench has no way to make a joint fall silent; give --mute")
+    rig.cruise()
+    rig.spoiled = True
+    began = rig.tick
+    bench.mute(rig.backend, MUTED)
+    lease = math.ceil(rig.robot.lease_ns / rig.period_ns)
+    record = rig.drive({0: (Mode.VELOCITY, t.CRUISE_RAD_S)}, lease + t.TRANSPORT_PERIODS + 2)
+    for joints in record.joints[t.TRANSPORT_PERIODS :]:
+        silent_ns = (joints.tick - began - t.TRANSPORT_PERIODS) * rig.period_ns
+        known = joints.valid[MUTED] and joints.age_ns[MUTED] < silent_ns
+        assert not known, f"silent for {silent_ns * 1e-6} ms, reported as {joints.age_ns[MUTED] * 1e-6} ms old"
+        others = [i for i in range(rig.count) if i != MUTED]
+        assert all(joints.valid[i] and joints.age_ns[i] <= rig.period_ns for i in others), "the others are fresh"
+    assert rig.authority.state == "fault", "the robot goes on with a joint that it does not know"
+    must_rest_but_the_muted(rig)
+    told = len(rig.faults)
+    assert all(fault.what and fault.cause for fault in rig.faults)
+    rig.idle(t.TRANSPORT_PERIODS)
+    assert len(rig.faults) == told, f"reported again: {rig.faults[told:]}"
+    rig.close()
+
+
+def must_rest_but_the_muted(rig: Rig) -> None:
+    """Nobody knows where the silent joint is; the others rest."""
+    record = rig.idle(rig.periods(t.SETTLE_S))
+    for sample in record.samples:
+        sample.joints.velocity_rad_s[MUTED] = 0.0
+        sample.joints.angle_rad[MUTED] = 0.0
+    must_rest(record, rig)
+    assert np.isfinite(record.angle_rad).all()

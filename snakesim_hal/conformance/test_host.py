@@ -1,0 +1,118 @@
+"""Behind the real host, commanded by a real client over Zenoh: lease, staleness, faults."""
+
+import math
+from collections import Counter
+from collections.abc import Callable
+
+import numpy as np
+
+from snakesim_hal.conformance import tolerances as t
+from snakesim_hal.conformance.bench import Bench
+from snakesim_hal.conformance.loopback import Hosted, stay, wait_until
+from snakesim_hal.conformance.rig import Asked
+from snakesim_hal.messages import Fault, JointState, Mode
+
+
+def undisturbed(hosted: Hosted, act: Callable[[], None]) -> None:
+    """Do it, and again when a lease ran out meanwhile: then this machine was too slow, and no backend is to blame."""
+    for left in reversed(range(t.ATTEMPTS)):
+        try:
+            act()
+            return
+        except AssertionError:
+            faults = [fault.what for fault in hosted.host.authority.faults]
+            if "lease_expired" not in faults or not left:
+                raise
+
+
+def moves_then(silent: bool, hosted: Hosted) -> int:
+    """Arm and set a joint going for a while; returns how many ticks that is."""
+    angle = hosted.backend.seen[-1].angle_rad[0]
+    go: Asked = {0: (Mode.VELOCITY, -math.copysign(t.CRUISE_RAD_S, angle))}  # away from the nearer stop
+    ticks = t.ARMING_PERIODS + math.ceil(t.CRUISE_S * 1e9 / hosted.config.period_ns)
+
+    def plan(since_arming: int) -> Asked | None:
+        if since_arming < t.ARMING_PERIODS:
+            return {}
+        return go if since_arming < ticks or not silent else None
+
+    hosted.arm(plan)
+    return ticks
+
+
+def must_have_moved(hosted: Hosted) -> None:
+    """Fail when joint 0 did not move lately: then its stopping would prove nothing."""
+    lately = [abs(joints.velocity_rad_s[0]) for joints in hosted.backend.seen[-2 * t.ARMING_PERIODS :]]
+    assert max(lately) > t.STILL_RAD_S, "the joint did not move, so stopping cannot be tested"
+
+
+def must_come_to_rest(hosted: Hosted) -> None:
+    """Fail when a joint still moves after SETTLE_S."""
+    states: list[JointState] = hosted.passes(math.ceil(t.SETTLE_S * 1e9 / hosted.config.period_ns) + 1)
+    assert np.abs(states[-1].velocity_rad_s).max() < t.STILL_RAD_S, f"still moving: {states[-1].velocity_rad_s} rad/s"
+    tail = np.array([state.angle_rad for state in states[-len(states) // 3 :]])
+    assert np.ptp(tail, axis=0).max() < t.STILL_RAD, f"still moving: {np.ptp(tail, axis=0)} rad"
+
+
+def test_bad_commands_are_refused_and_counted_and_move_nothing(bench: Bench, hosted: Hosted) -> None:
+    """Of another lease, for another robot, too long, not a number, too old, from the future: each by its own name."""
+    undisturbed(hosted, lambda: refuses_bad_commands(hosted))
+
+
+def refuses_bad_commands(hosted: Hosted) -> None:
+    """One go of it."""
+    hosted.arm(stay)
+    hosted.passes(t.ARMING_PERIODS)
+    count = len(hosted.robot.joints)
+    lease = math.ceil(hosted.robot.lease_ns / hosted.robot.period_ns)
+    wait_until(lambda: hosted.tick > 2 * lease, "ticks enough to be late by")
+    refused = Counter(hosted.host.authority.rejected)
+    home = hosted.backend.seen[-1].angle_rad
+    hosted.forge(lease_epoch=hosted.controller.epoch + 7)
+    hosted.forge(layout="f" * 16)
+    hosted.forge(mode=[Mode.VELOCITY] * (count + 1), target=[0.5] * (count + 1))
+    hosted.forge(target=[math.nan] * count)
+    hosted.forge(tick=0)
+    hosted.forge(tick=hosted.tick + 1_000_000)
+    wanted = ("wrong_epoch", "wrong_layout", "wrong_length", "malformed", "stale", "from_the_future")
+    rejected = hosted.host.authority.rejected
+    wait_until(lambda: all(rejected[name] > refused[name] for name in wanted), f"all refused, so far: {rejected}")
+    after = hosted.passes(t.ARMING_PERIODS)
+    assert hosted.host.authority.state == "armed", hosted.host.authority.why
+    away = np.array([state.angle_rad for state in after]) - home
+    assert np.abs(away).max() < t.STILL_RAD, f"it moved by {np.abs(away).max():.3f} rad"
+
+
+def test_a_fault_of_the_backend_latches_and_stops_the_joints(bench: Bench, hosted: Hosted) -> None:
+    """Whatever the controller still sends; and only a clear leads out."""
+    undisturbed(hosted, lambda: stops_at_a_fault(hosted))
+
+
+def stops_at_a_fault(hosted: Hosted) -> None:
+    """One go of it."""
+    ticks = moves_then(silent=False, hosted=hosted)
+    at = hosted.armed_at + ticks
+    hosted.backend.planted = lambda tick: Fault(tick=tick, what="planted", cause="by the test") if tick >= at else None
+    hosted.reaches("fault")
+    hosted.backend.planted = None
+    must_have_moved(hosted)
+    assert {fault.what for fault in hosted.host.authority.faults} == {"planted"}
+    must_come_to_rest(hosted)
+    assert not hosted.lifecycle("arm").ok, "a fault has to be cleared first"
+    answer = hosted.lifecycle("clear")
+    assert answer.ok and answer.lifecycle == "disarmed", answer
+
+
+def test_a_controller_that_falls_silent_stops_the_joints_within_the_lease(bench: Bench, hosted: Hosted) -> None:
+    """The lease is the deadman: it runs out, that is a fault, and the joints come to rest."""
+    try:
+        moves_then(silent=True, hosted=hosted)
+        hosted.reaches("fault")
+        must_have_moved(hosted)
+        expired = next(fault for fault in hosted.host.authority.faults if fault.what == "lease_expired")
+        lease = math.ceil(hosted.robot.lease_ns / hosted.robot.period_ns)
+        late = expired.tick - hosted.controller.last_sent_tick - lease
+        assert late <= t.TRANSPORT_PERIODS, f"{late} periods after the end of the lease"
+        must_come_to_rest(hosted)
+    finally:
+        bench.spoil()  # a lockstep host does not wait again for a service that it has given up

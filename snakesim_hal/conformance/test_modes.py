@@ -1,0 +1,91 @@
+"""Modes and units: rad, rad/s and N·m, the right joint, the right way round."""
+
+import numpy as np
+
+from snakesim_hal.conformance import tolerances as t
+from snakesim_hal.conformance.recordings import Pushing
+from snakesim_hal.conformance.rig import Rig
+from snakesim_hal.messages import Mode
+
+
+def test_position_mode_turns_the_joint_that_is_asked_and_no_other(rig: Rig) -> None:
+    """Each joint in turn goes STEP_RAD from home, in rad, in the right direction, and stays there."""
+    rig.arm()
+    for joint in range(rig.count):
+        angles = rig.drive({joint: (Mode.POSITION, rig.home_rad[joint] + t.STEP_RAD)}, rig.periods(t.SETTLE_S))
+        moved = angles.angle_rad[-1] - rig.home_rad
+        assert abs(moved[joint] - t.STEP_RAD) < t.REACHED_RAD, f"joint {joint} asked for {t.STEP_RAD} rad: {moved} rad"
+        others = np.delete(moved, joint)
+        assert np.abs(others).max() < t.REACHED_RAD, f"only joint {joint} was asked to move: {moved} rad"
+
+
+def test_velocity_mode_turns_at_the_speed_that_is_asked(rig: Rig) -> None:
+    """Each way, in rad/s; a motor may lag behind by what friction takes."""
+    rig.arm()
+    for speed in (t.CRUISE_RAD_S, -t.CRUISE_RAD_S):
+        record = rig.drive({0: (Mode.VELOCITY, speed)}, rig.periods(t.CRUISE_S))
+        last = record.velocity_rad_s[-rig.periods(t.CRUISE_S / 3) :, 0].mean()
+        assert abs(last - speed) < t.SPEED_SHARE * abs(speed), f"asked for {speed} rad/s: {last:.3f} rad/s"
+
+
+def test_the_reported_velocity_is_the_change_of_the_reported_angle(rig: Rig) -> None:
+    """Integrated over a motion, velocity gives the angle: same unit, same sign, same joint."""
+    rig.arm()
+    joint = rig.count - 1
+    record = rig.drive({joint: (Mode.VELOCITY, -t.CRUISE_RAD_S)}, rig.periods(t.CRUISE_S))
+    velocity, angle = record.velocity_rad_s, record.angle_rad
+    integral = 0.5 * (velocity[1:] + velocity[:-1]).sum(axis=0) * rig.period_ns * 1e-9
+    turned = angle[-1] - angle[0]
+    assert turned[joint] < -t.STILL_RAD, "the joint did not move, so nothing can be compared"
+    assert np.abs(integral - turned).max() < t.INTEGRAL_RAD, f"velocity says {integral} rad, angle says {turned} rad"
+
+
+def test_torque_mode_pushes_with_the_torque_that_is_asked(pushing: Pushing) -> None:
+    """Against a stop the reported torque is the one asked for, in N·m, with its sign."""
+    felt, asked = pushing.torque_mode.torque_nm[-1], pushing.asked_nm
+    slack = t.TORQUE_SHARE * asked + t.TORQUE_NM
+    assert abs(felt[0] - asked) < slack, f"asked for {asked:.2f} N·m: {felt[0]:.3f} N·m"
+    assert abs(felt[1] + asked) < slack, f"asked for {-asked:.2f} N·m: {felt[1]:.3f} N·m"
+
+
+def test_a_passive_joint_has_no_torque_and_moves_by_itself_nowhere(rig: Rig) -> None:
+    """Armed and passive: let go away from home, a joint stays where it is, without torque."""
+    rig.arm()
+    rig.drive({0: (Mode.POSITION, rig.home_rad[0] + t.STEP_RAD)}, rig.periods(t.SETTLE_S))
+    record = rig.drive({0: (Mode.PASSIVE, 0.0)}, rig.periods(t.SETTLE_S))
+    assert abs(record.torque_nm[-1, 0]) < t.TORQUE_NM, f"{record.torque_nm[-1, 0]:.3f} N·m"
+    settled = record.angle_rad[t.TRANSPORT_PERIODS :, 0]
+    assert np.ptp(settled) < t.REACHED_RAD, f"it moved by {np.ptp(settled):.3f} rad"
+
+
+def test_joints_may_be_in_different_modes_at_once(rig: Rig) -> None:
+    """Position, velocity, passive and position again, side by side: each does its own."""
+    rig.arm()
+    step, speed = rig.home_rad[0] - t.STEP_RAD, t.CRUISE_RAD_S
+    asked = {0: (Mode.POSITION, step), 1: (Mode.VELOCITY, speed), rig.count - 1: (Mode.PASSIVE, 0.0)}
+    record = rig.drive(asked, rig.periods(t.CRUISE_S))
+    assert abs(record.angle_rad[-1, 0] - step) < 2 * t.REACHED_RAD  # still on its way
+    assert abs(record.velocity_rad_s[-1, 1] - speed) < t.SPEED_SHARE * speed
+    still = record.angle_rad[-1] - rig.home_rad
+    assert abs(still[-1]) < t.REACHED_RAD, f"the passive joint moved by {still[-1]:.3f} rad"
+
+
+def test_set_points_hold_until_the_next_ones(rig: Rig) -> None:
+    """Commands may stay away for less than a lease: the joint goes on as it was told."""
+    rig.cruise()
+    rig.idle(t.LAPSE_PERIODS)
+    must_cruise(rig)
+
+
+def test_set_points_hold_without_being_handed_over_again(rig: Rig) -> None:
+    """`advance` alone lets the last set-points act."""
+    rig.cruise()
+    for _ in range(t.HELD_PERIODS):
+        rig.let_pass()
+    must_cruise(rig)
+
+
+def must_cruise(rig: Rig) -> None:
+    """Fail when joint 0 has slowed down."""
+    speed = rig.now.velocity_rad_s[0]
+    assert speed > (1 - t.SPEED_SHARE) * t.CRUISE_RAD_S, f"{speed:.3f} rad/s, told to keep {t.CRUISE_RAD_S} rad/s"

@@ -1,0 +1,78 @@
+"""Samples: what the sensors say at a tick."""
+
+import math
+from itertools import chain, pairwise
+
+import numpy as np
+
+from snakesim_hal import keys
+from snakesim_hal.codec import Decoder, encode, encoding_of
+from snakesim_hal.conformance import tolerances as t
+from snakesim_hal.conformance.rig import Record, Rig
+from snakesim_hal.messages import Message
+
+COLUMNS = ("angle_rad", "velocity_rad_s", "torque_nm", "valid", "age_ns")
+
+
+def test_joints_carry_the_tick_and_stamp_that_were_asked_for(rig: Rig, healthy: Record) -> None:
+    """One joint state a tick, stamped with the robot's own time."""
+    ticks = [joints.tick for joints in healthy.joints]
+    assert ticks == list(range(ticks[0], ticks[0] + len(ticks)))
+    assert all(joints.stamp_ns == joints.tick * rig.period_ns for joints in healthy.joints)
+
+
+def test_other_sensors_are_stamped_when_they_were_read(rig: Rig, healthy: Record) -> None:
+    """Never from the future, never older than delay, interval and transport explain; and in order."""
+    for sensor in rig.robot.sensors:
+        if sensor.key == keys.JOINTS:
+            continue
+        oldest_ns = 1e9 * (sensor.delay_s + 1 / sensor.rate_hz) + t.SENSOR_PERIODS * rig.period_ns
+        stamps: list[int] = []
+        for sample in healthy.samples:
+            if (message := sample.others.get(sensor.key)) is not None:
+                stamp_ns: int = message.stamp_ns  # pyright: ignore[reportAttributeAccessIssue]
+                stamps.append(stamp_ns)
+                age_ns = sample.joints.stamp_ns - stamp_ns
+                assert 0 <= age_ns <= oldest_ns, f"{sensor.key}: {age_ns * 1e-6} ms old"
+        assert all(before < after for before, after in pairwise(stamps)), f"{sensor.key}: out of order"
+
+
+def test_every_vector_has_one_entry_a_joint(rig: Rig, healthy: Record) -> None:
+    """Angle, velocity, torque, validity and age, tail to head."""
+    for joints in healthy.joints:
+        lengths = {name: len(getattr(joints, name)) for name in COLUMNS}
+        assert set(lengths.values()) == {rig.count}, lengths
+
+
+def test_every_sample_survives_the_wire(healthy: Record) -> None:
+    """Finite and within the bounds of the messages: encoded and decoded by the HAL's codec it is the same."""
+    for sample in healthy.samples:
+        messages: chain[Message] = chain([sample.joints], sample.others.values())
+        for message in messages:
+            decoder = Decoder(type(message))
+            assert decoder.decode(encode(message), encoding_of(type(message))) == message
+        assert all(math.isfinite(number) for name in COLUMNS[:3] for number in getattr(sample.joints, name))
+
+
+def test_every_joint_is_valid_and_fresh_at_every_tick(rig: Rig, healthy: Record) -> None:
+    """A healthy robot knows all its joints; a reading is at most a period old, besides the delay that is stated."""
+    delay_s = next(sensor.delay_s for sensor in rig.robot.sensors if sensor.key == keys.JOINTS)
+    oldest_ns = t.AGE_PERIODS * rig.period_ns + delay_s * 1e9
+    for joints in healthy.joints:
+        assert all(joints.valid), f"tick {joints.tick}: {joints.valid}"
+        assert max(joints.age_ns) <= oldest_ns, f"tick {joints.tick}: {joints.age_ns} ns"
+
+
+def test_what_is_not_known_yet_is_not_reported_as_valid(rig: Rig) -> None:
+    """The very first sample: a joint is where it is found to be afterwards, or it is not valid."""
+    for i, valid in enumerate(rig.first.joints.valid):
+        away = rig.first.joints.angle_rad[i] - rig.home_rad[i]
+        assert not valid or abs(away) < t.STILL_RAD, f"joint {i} was {away:+.3f} rad off and called valid"
+
+
+def test_readings_follow_the_motion(healthy: Record) -> None:
+    """A moving robot gives new readings: no joint repeats one old reading for long."""
+    angles = np.round(healthy.angle_rad, 6)
+    for i in range(angles.shape[1]):
+        fresh = len(np.unique(angles[:, i]))
+        assert fresh > len(angles) // 3, f"joint {i}: only {fresh} different readings in {len(angles)} ticks"

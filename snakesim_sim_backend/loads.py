@@ -1,0 +1,46 @@
+"""What the force sensors of the links feel: per link, the resultant of all touches by obstacles."""
+
+import math
+
+import mujoco
+
+from snakesim_hal.plant import LinkLoad
+from snakesim_sim_backend.contacts import TouchReader
+from snakesim_sim_backend.model import SimModel
+from snakesim_sim_backend.sensors import into
+
+Sums = tuple[float, float, float, float, float, float, float]
+
+
+class LoadReader:
+    """Adds up the touches in a simulation's data."""
+
+    def __init__(self, sim: SimModel, data: mujoco.MjData) -> None:
+        self._touches = TouchReader(sim, data)
+        self._first_body = sim.first_link_body
+        self._origins, self._rotations = data.xpos, data.xmat  # (nbody, 3), (nbody, 9)
+
+    def read(self) -> list[LinkLoad]:
+        """Loads of the links that are pushed, tail to head; a touch without force is none."""
+        sums: dict[int, Sums] = {}
+        for touch in self._touches.read():
+            (fx, fy, fz), (x, y, z) = touch.force_w, touch.position_w
+            weight = math.sqrt(fx * fx + fy * fy + fz * fz)
+            if weight > 0.0:
+                w, wx, wy, wz, sx, sy, sz = sums.get(touch.body, (0.0,) * 7)
+                sums[touch.body] = (
+                    *(w + weight, wx + weight * x, wy + weight * y, wz + weight * z),
+                    *(sx + fx, sy + fy, sz + fz),
+                )
+        return [self._load(body, sums[body]) for body in sorted(sums)]
+
+    def _load(self, body: int, sums: Sums) -> LinkLoad:
+        weight, x, y, z, *force_w = sums
+        rotation = self._rotations[body].tolist()  # world_from_link, row by row
+        ox, oy, oz = self._origins[body].tolist()
+        fx, fy, fz = force_w
+        return LinkLoad(
+            link=body - self._first_body,
+            position_l=into(rotation, (x / weight - ox, y / weight - oy, z / weight - oz)),
+            force_l=into(rotation, (fx, fy, fz)),
+        )

@@ -1,0 +1,173 @@
+"""The simulated body for joint modules that are emulated elsewhere: MuJoCo without motors.
+
+The modules' firmware is no part of this model. It computes its motors' torques, hands them over for one physics step
+at a time, and reads back what its encoders, strain gauges and force sensors feel.
+"""
+
+import msgspec
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_hal.errors import BackendError
+from snakesim_hal.messages import Imu, Pose
+from snakesim_hal.plant import LinkLoad
+from snakesim_hal.robot import ImuSensor, PoseSensor
+from snakesim_hal.scenario import RunConfig
+from snakesim_sim_backend.actuators import Motors
+from snakesim_sim_backend.divergence import MOST_ACCELERATION, DivergenceWatch, log_warnings
+from snakesim_sim_backend.loads import LoadReader
+from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS, SimModel, build
+from snakesim_sim_backend.sensors import ImuReader, PoseReader
+from snakesim_sim_backend.settings import PlantSettings, Settings
+from snakesim_sim_backend.start import lay_down
+from snakesim_sim_backend.tether import Rope
+
+Floats = NDArray[np.float64]
+
+STEPS_PER_CHECK = 10  # the search for a culprit goes through them again under the last torques
+MOST_SQUARED = MOST_ACCELERATION**2
+NO_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+
+
+class MujocoPlant:
+    """A `snakesim_hal.plant.Plant` on MuJoCo. Deterministic: start and torques decide every byte.
+
+    Angles, velocities and the pose are those of now. Loads, shaft torques and what the IMUs feel are forces and
+    accelerations, so they are those that acted over the step just made; before the first one, at the start.
+    """
+
+    Settings = PlantSettings
+
+    def __init__(self, config: RunConfig, settings: PlantSettings) -> None:
+        """Lay the snake down as `SimBackend` does, at rest. Raises ConfigError."""
+        log_warnings()
+        self._sim = build(config, settings, motors=False)
+        self._model, self._data = self._sim.model, mujoco.MjData(self._sim.model)
+        model, data = self._model, self._data
+        self.step_s: float = model.opt.timestep
+        data.qpos[:] = _rest(config, settings)
+        mujoco.mj_forward(model, data)
+        if settings.tether is not None:
+            Rope(model, data, settings.tether).tighten()
+        count = config.robot.chain.modules
+        self._angles, self._velocities = data.qpos[FREE_QPOS:], data.qvel[FREE_DOFS:]
+        self._torques, self._passive = data.qfrc_applied[FREE_DOFS:], data.qfrc_passive[FREE_DOFS:]
+        self._qacc, self._accelerations = data.qacc, data.qacc[FREE_DOFS:]
+        self._armature = model.dof_armature[FREE_DOFS:]
+        # Of all constraints MuJoCo lists equalities first, of which there are none, then the friction of the joints.
+        self._rubbing = slice(0, count if config.robot.motor.friction_nm > 0 else 0)
+        self._speeds, self._speeds_before = data.qvel, data.qvel.copy()
+        self._loads = LoadReader(self._sim, data)
+        self._pose = PoseReader(data, PoseSensor(), np.zeros)
+        self._imu = None
+        if config.robot.sensors.imu is not None:
+            self._imu = ImuReader(data, ImuSensor(), count + 1, np.zeros)
+        self._flags = int(model.opt.disableflags)
+        model.opt.disableflags = self._flags | NO_SENSORS  # IMUs cost more than all else here; see `imu`
+        self._steps, self._unchecked, self._diverged = 0, 0, False
+        self._watch = DivergenceWatch(model, data, STEPS_PER_CHECK, "step")
+
+    def advance(self, torque_nm: Floats) -> None:
+        """One physics step under these motor torques, (n_joints,).
+
+        Raises BackendError when it has diverged, and from then on always; the last state known to be good stays.
+        """
+        if self._diverged:
+            self._watch.check(self._steps)  # raises again
+        self._torques[:] = torque_nm
+        self._speeds_before[:] = self._speeds
+        mujoco.mj_step(self._model, self._data)
+        self._steps += 1
+        self._unchecked += 1
+        # What blows up does so here first; it is caught in its very step, or firmware would read what is no number.
+        if self._unchecked == STEPS_PER_CHECK or not self._qacc.dot(self._qacc) < MOST_SQUARED:
+            self._check()
+
+    @property
+    def angle_rad(self) -> Floats:
+        """Joint angles now, (n_joints,), tail to head; a view."""
+        return self._angles
+
+    @property
+    def velocity_rad_s(self) -> Floats:
+        """Joint velocities now, (n_joints,); a view."""
+        return self._velocities
+
+    def shaft_torque_nm(self) -> Floats:
+        """Torque through each joint's shaft, as a strain gauge between gear and outer link feels it, (n_joints,).
+
+        The rotor, seen through its gear, stands between motor and gauge, and with it what rubs inside the module:
+
+            armature * acceleration = motor torque + viscous and dry friction - shaft torque
+
+        So at rest it is the motor's torque, less what dry friction holds, and in motion it lacks what speeds up the
+        rotor. End stops act on the outer link, past the gauge: a motor that pushes against its stop is felt in full,
+        and a load that the stop bears is not.
+        """
+        torque = self._torques + self._passive
+        torque -= self._armature * self._accelerations
+        if self._rubbing.stop:
+            torque += self._data.efc_force[self._rubbing]
+        return torque
+
+    def loads(self) -> list[LinkLoad]:
+        """Resultant of the touches of every link that obstacles push."""
+        return self._loads.read()
+
+    def imu(self) -> Imu | None:
+        """Angular velocity and specific force of every link, without noise; None for a robot that has no IMUs.
+
+        Its stamp is the time since the start.
+        """
+        if self._imu is None:
+            return None
+        model, data = self._model, self._data
+        speeds = self._speeds.copy()
+        self._speeds[:] = self._speeds_before  # all that MuJoCo computes sensors from, but these, is of the step made
+        model.opt.disableflags = self._flags
+        mujoco.mj_sensorVel(model, data)
+        mujoco.mj_sensorAcc(model, data)
+        model.opt.disableflags = self._flags | NO_SENSORS
+        self._speeds[:] = speeds
+        return self._imu.read(0, self._stamp_ns())
+
+    def pose(self) -> Pose:
+        """Pose and velocity of the base, without noise. Its stamp is the time since the start."""
+        return self._pose.read(0, self._stamp_ns())
+
+    def _check(self) -> None:
+        self._diverged = True
+        try:
+            self._watch.check(self._steps)
+        except BackendError:
+            self._speeds_before[:] = self._speeds  # those of the last good state, to which the watch has gone back
+            raise
+        self._diverged, self._unchecked = False, 0
+
+    def _stamp_ns(self) -> int:
+        return round(self._data.time * 1e9)
+
+    # --- for tests and benchmarks ---------------------------------------------------------------------------
+
+    @property
+    def sim(self) -> SimModel:
+        """The compiled model."""
+        return self._sim
+
+    @property
+    def data(self) -> mujoco.MjData:
+        """MuJoCo's state."""
+        return self._data
+
+
+def _rest(config: RunConfig, settings: PlantSettings) -> Floats:
+    """Where `SimBackend` comes to rest, (nq,): motors are needed to hold the start angles until then.
+
+    On rough ground that depends on the step by millimetres, so the step is the one that `SimBackend` has by default.
+    """
+    step_s = min(Settings().timestep_s, settings.contact_time_s / 2)
+    sim = build(config, msgspec.structs.replace(settings, timestep_s=step_s))
+    data = mujoco.MjData(sim.model)
+    lay_down(sim, data, config, Motors(sim.model, data, config.robot, config.period_ns * 1e-9), settings.settle_s)
+    return data.qpos

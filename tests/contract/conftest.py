@@ -1,0 +1,32 @@
+"""The benches that our own backends have to stand on."""
+
+import os
+from typing import Any
+
+import pytest
+
+from snakesim_can_backend.protocol import Frame, node_of
+from snakesim_hal.conformance.bench import Bench
+
+VCAN = "SNAKESIM_VCAN"  # set by deploy/vm/with_vcan.py: the kernel here has vcan0, and it is up
+ON_VCAN = ('backend.channels=["vcan0"]', 'backend.twins="process"')
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_snakesim_benches() -> list[Bench]:
+    """Simulator, CAN on a bus inside the process, CAN on the kernel's virtual bus with modules as processes."""
+    benches = [Bench("sim", "sim"), Bench("can-virtual", "can", mute=cut_off)]
+    if os.environ.get(VCAN):  # `make test` runs this one apart, where there is a bus
+        benches.append(Bench("can-vcan", "can", sets=ON_VCAN, mute=cut_off))
+    return benches
+
+
+def cut_off(backend: Any, joint: int) -> None:
+    """From now on the driver hears nothing of a joint's module."""
+    take = backend._reading.take
+
+    def hear(frame: Frame) -> None:
+        if node_of(frame.id) != joint + 1:
+            take(frame)
+
+    backend._reading.take = hear

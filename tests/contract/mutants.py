@@ -1,0 +1,459 @@
+"""Backends that break the contract, each in one way, and the clauses that have to notice.
+
+As a pytest plugin (`-p tests.contract.mutants`) it runs each mutant against those clauses only.
+"""
+
+import random
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from snakesim_hal import keys
+from snakesim_hal.backend import Samples, SetPoints
+from snakesim_hal.conformance.bench import Bench
+from snakesim_hal.errors import BackendError
+from snakesim_hal.messages import Description, Fault, JointState, Mode, Pose, SensorDescription
+from tests.contract.workbench import Workbench, mute
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """A broken backend."""
+
+    name: str
+    backend: Any
+    breaks: tuple[str, ...]
+
+
+MUTANTS: list[Mutant] = []
+
+
+def breaks(*clauses: str) -> Callable[[Any], Any]:
+    """Register a broken backend with the clauses that must fail on it."""
+
+    def register(backend: Any) -> Any:
+        MUTANTS.append(Mutant(backend.__name__, backend, tuple(f"test_{clause}" for clause in clauses)))
+        return backend
+
+    return register
+
+
+# --- the description -------------------------------------------------------------------------------------------
+
+
+class Misdescribed(Workbench):
+    """Says something else than it is."""
+
+    def __init__(self, config: Any, settings: Any) -> None:
+        super().__init__(config, settings)
+        self.description = self.mistold(self.description)
+
+    def mistold(self, robot: Description) -> Description:
+        raise NotImplementedError
+
+
+@breaks("the_description_is_what_the_robot_file_says")
+class NamedFromTheHead(Misdescribed):
+    def mistold(self, robot):
+        return replace(robot, joints=robot.joints[::-1])
+
+
+@breaks("the_description_is_what_the_robot_file_says")
+class LimitsInDegrees(Misdescribed):
+    def mistold(self, robot):
+        return replace(robot, joints=[replace(j, angle_max_rad=np.degrees(j.angle_max_rad)) for j in robot.joints])
+
+
+@breaks("the_layout_is_the_hash_of_the_joints")
+class LayoutOfAnother(Misdescribed):
+    def mistold(self, robot):
+        return replace(robot, layout="0" * 16)
+
+
+@breaks("the_description_survives_the_wire")
+class BeyondBounds(Misdescribed):
+    def mistold(self, robot):
+        return replace(robot, max_step_rad=20.0)
+
+
+@breaks("every_sensor_listed_is_a_key_of_the_hal_once")
+class ListsASonar(Misdescribed):
+    def mistold(self, robot):
+        sonar = SensorDescription(key="sensor/sonar", rate_hz=10, delay_s=0)
+        return replace(robot, sensors=[*robot.sensors, sonar])
+
+
+@breaks("every_sensor_listed_delivers_at_about_its_rate")
+class ListsWhatItLacks(Misdescribed):
+    def mistold(self, robot):
+        return replace(robot, sensors=[*robot.sensors, SensorDescription(key=keys.IMU, rate_hz=25, delay_s=0)])
+
+
+@breaks("the_description_is_readable_at_once_and_stays")
+class NoisyDescription(Workbench):
+    calls = 0
+
+    def describe(self):
+        self.calls += 1
+        return replace(self.description, max_step_rad=self.description.max_step_rad + 0.001 * self.calls)
+
+
+# --- samples ---------------------------------------------------------------------------------------------------
+
+
+class Misread(Workbench):
+    """Reports something else than what is."""
+
+    def sample(self, tick: int, stamp_ns: int) -> Samples:
+        return Samples(self.misread(super().sample(tick, stamp_ns).joints))
+
+    def misread(self, joints: JointState) -> JointState:
+        raise NotImplementedError
+
+
+@breaks("joints_carry_the_tick_and_stamp_that_were_asked_for")
+class StampedByItself(Misread):
+    def misread(self, joints):
+        return replace(joints, stamp_ns=joints.stamp_ns + 1_000_000)
+
+
+@breaks("every_vector_has_one_entry_a_joint")
+class OneTooMany(Misread):
+    def misread(self, joints):
+        return replace(joints, valid=[*joints.valid, True])
+
+
+@breaks("every_sample_survives_the_wire")
+class AbsurdTorque(Misread):
+    def misread(self, joints):
+        return replace(joints, torque_nm=[*joints.torque_nm[:-1], 1e6])
+
+
+@breaks("every_joint_is_valid_and_fresh_at_every_tick")
+class ReadsEveryThirdTick(Misread):
+    def misread(self, joints):
+        return replace(joints, age_ns=[joints.tick % 3 * self.description.period_ns] * len(joints.age_ns))
+
+
+@breaks("what_is_not_known_yet_is_not_reported_as_valid")
+class ZeroForUnknown(Misread):
+    def misread(self, joints):
+        return joints if joints.tick else replace(joints, angle_rad=[0.0] * len(joints.angle_rad))
+
+
+@breaks("readings_follow_the_motion")
+class OldReadingsAsNew(Workbench):
+    held: Any = None
+
+    def sample(self, tick, stamp_ns):
+        if tick % 8 == 0:
+            self.held = super().sample(tick, stamp_ns)
+        return Samples(replace(self.held.joints, tick=tick, stamp_ns=stamp_ns))
+
+
+class WithPose(Workbench):
+    """Sends a pose every tick."""
+
+    ahead_ns = 0
+
+    def sample(self, tick, stamp_ns):
+        still = (0.0, 0.0, 0.0)
+        pose = Pose(
+            tick=tick,
+            stamp_ns=stamp_ns + self.ahead_ns,
+            position_w=still,
+            orientation_wxyz=(1.0, 0.0, 0.0, 0.0),
+            velocity_w=still,
+            angular_velocity_w=still,
+        )
+        return Samples(super().sample(tick, stamp_ns).joints, {keys.POSE: pose})
+
+
+@breaks("nothing_comes_that_is_not_listed")
+class Unlisted(WithPose):
+    pass
+
+
+@breaks("other_sensors_are_stamped_when_they_were_read")
+class FromTheFuture(WithPose):
+    ahead_ns = 5_000_000
+
+    def __init__(self, config, settings):
+        super().__init__(config, settings)
+        pose = SensorDescription(key=keys.POSE, rate_hz=50, delay_s=0)
+        self.description = replace(self.description, sensors=[*self.description.sensors, pose])
+
+
+# --- modes and units -------------------------------------------------------------------------------------------
+
+
+class Mistold(Workbench):
+    """Makes something else of its set-points."""
+
+    def enact(self, set_points, lifecycle):
+        super().enact(self.heard(set_points, lifecycle), lifecycle)
+
+    def heard(self, points: SetPoints, lifecycle: Any) -> SetPoints:
+        raise NotImplementedError
+
+
+@breaks("position_mode_turns_the_joint_that_is_asked_and_no_other")
+class TargetsInDegrees(Mistold):
+    def heard(self, points, lifecycle):
+        return SetPoints(points.mode, [float(np.radians(target)) for target in points.target], points.torque_limit_nm)
+
+
+@breaks("position_mode_turns_the_joint_that_is_asked_and_no_other")
+class HeadToTail(Mistold):
+    def heard(self, points, lifecycle):
+        return SetPoints(points.mode[::-1], points.target[::-1], points.torque_limit_nm[::-1])
+
+
+@breaks("position_mode_turns_the_joint_that_is_asked_and_no_other", "torque_mode_pushes_with_the_torque_that_is_asked")
+class WrongWayRound(Mistold):
+    def heard(self, points, lifecycle):
+        return SetPoints(points.mode, [-target for target in points.target], points.torque_limit_nm)
+
+
+@breaks("velocity_mode_turns_at_the_speed_that_is_asked", "joints_may_be_in_different_modes_at_once")
+class SpeedInTurns(Mistold):
+    def heard(self, points, lifecycle):
+        scale = [0.16 if mode == Mode.VELOCITY else 1.0 for mode in points.mode]
+        return SetPoints(
+            points.mode, [a * b for a, b in zip(points.target, scale, strict=True)], points.torque_limit_nm
+        )
+
+
+@breaks("joints_may_be_in_different_modes_at_once")
+class OneModeForAll(Mistold):
+    def heard(self, points, lifecycle):
+        return SetPoints([points.mode[1]] * len(points.mode), points.target, points.torque_limit_nm)
+
+
+@breaks("the_reported_velocity_is_the_change_of_the_reported_angle", "velocity_mode_turns_at_the_speed_that_is_asked")
+class NoSpeedometer(Misread):
+    def misread(self, joints):
+        return replace(joints, velocity_rad_s=[0.0] * len(joints.velocity_rad_s))
+
+
+@breaks("the_reported_velocity_is_the_change_of_the_reported_angle")
+class AngleInDegrees(Misread):
+    def misread(self, joints):
+        return replace(joints, velocity_rad_s=[float(np.degrees(speed)) for speed in joints.velocity_rad_s])
+
+
+@breaks("torque_mode_pushes_with_the_torque_that_is_asked", "the_torque_limit_of_the_set_points_is_kept")
+class NoTorqueSensor(Misread):
+    def misread(self, joints):
+        return replace(joints, torque_nm=[0.0] * len(joints.torque_nm))
+
+
+@breaks(
+    "a_passive_joint_has_no_torque_and_moves_by_itself_nowhere", "nothing_moves_while_disarmed_whatever_is_commanded"
+)
+class PassiveGoesToZero(Workbench):
+    def step(self):
+        passive = self.mode == Mode.PASSIVE
+        self.mode[passive], self.target[passive], self.limit[passive] = int(Mode.POSITION), 0.0, 4.0
+        super().step()
+
+
+@breaks("disarmed_joints_have_no_torque", "a_passive_joint_has_no_torque_and_moves_by_itself_nowhere")
+class PassivePushes(Workbench):
+    def step(self):
+        passive = self.mode == Mode.PASSIVE
+        self.mode[passive], self.target[passive], self.limit[passive] = int(Mode.TORQUE), 0.3, 4.0
+        super().step()
+
+
+@breaks("set_points_hold_until_the_next_ones")
+class ForgetsWhatIsRepeated(Mistold):
+    last: Any = None
+
+    def heard(self, points, lifecycle):
+        repeated, self.last = points == self.last, points
+        return SetPoints([Mode.PASSIVE] * len(points.mode), points.target, []) if repeated else points
+
+    def step(self):
+        self.limit = np.full(len(self.angle), 4.0)
+        super().step()
+
+
+@breaks("set_points_hold_without_being_handed_over_again")
+class ForgetsAfterAPeriod(Workbench):
+    def advance(self):
+        super().advance()
+        self.mode[:] = Mode.PASSIVE
+
+
+# --- limits and switching --------------------------------------------------------------------------------------
+
+
+@breaks("the_torque_limit_of_the_set_points_is_kept", "a_torque_limit_of_zero_lets_nothing_move")
+class IgnoresTorqueLimit(Mistold):
+    def heard(self, points, lifecycle):
+        return SetPoints(points.mode, points.target, [4.0] * len(points.mode))
+
+
+@breaks("a_torque_limit_of_zero_lets_nothing_move")
+class ZeroIsNoLimit(Mistold):
+    def heard(self, points, lifecycle):
+        return SetPoints(points.mode, points.target, [limit or 4.0 for limit in points.torque_limit_nm])
+
+
+@breaks("no_joint_goes_beyond_its_limits")
+class NoStops(Workbench):
+    def __init__(self, config, settings):
+        super().__init__(config, settings)
+        self.robot = replace(config.robot, limits=replace(config.robot.limits, angle_rad=3.0))
+
+
+@breaks("a_mode_switch_makes_no_jump")
+class JumpsOnSwitch(Workbench):
+    """A change of mode starts with full torque."""
+
+    def enact(self, set_points, lifecycle):
+        before = self.mode
+        super().enact(set_points, lifecycle)
+        self.torque = np.where(self.mode != before, 3.5, self.torque)
+
+    def advance(self):
+        kicked = self.torque >= 3.5
+        super().advance()
+        self.torque[kicked] = 3.4
+
+
+# --- lifecycle and faults --------------------------------------------------------------------------------------
+
+
+@breaks("a_robot_with_modules_stops_them_itself_when_not_armed")
+class RobotThatTrustsTheHost(Workbench):
+    @staticmethod
+    def check(config, settings):
+        return ("realtime",)
+
+    def enact(self, set_points, lifecycle):
+        super().enact(set_points, "armed")
+
+
+@breaks(
+    "leaving_armed_brings_a_moving_joint_to_rest",
+    "a_fault_of_the_backend_latches_and_stops_the_joints",
+    "a_controller_that_falls_silent_stops_the_joints_within_the_lease",
+)
+class GoesOnAfterArmed(Workbench):
+    def enact(self, set_points, lifecycle):
+        if lifecycle == "armed" or (self.mode == Mode.PASSIVE).all():
+            super().enact(set_points, lifecycle)
+
+
+@breaks("arming_again_goes_on_from_where_the_robot_is")
+class TakesUpTheOldTarget(Workbench):
+    old: Any = None
+    armed_for = 0
+    was_armed = False
+
+    def enact(self, set_points, lifecycle):
+        armed = lifecycle == "armed"
+        self.armed_for = self.armed_for + 1 if armed else 0
+        resume = self.was_armed and armed and self.armed_for <= 6
+        super().enact(self.old if resume else set_points, lifecycle)
+        if armed and not resume:
+            self.old = set_points
+        self.was_armed = self.was_armed or (not armed and self.old is not None)
+
+
+@breaks("after_clear_and_arm_it_moves_again")
+class NeverWakesAgain(Workbench):
+    stopped = False
+
+    def enact(self, set_points, lifecycle):
+        self.stopped = self.stopped or lifecycle in ("fault", "estop")
+        super().enact(set_points, "estop" if self.stopped else lifecycle)
+
+
+@breaks("a_healthy_robot_reports_no_fault")
+class CriesWolf(Workbench):
+    told = False
+
+    def faults(self):
+        told, self.told = self.told, True
+        return [] if told else [Fault(tick=0, what="wolf", cause="none to be seen")]
+
+
+@breaks("a_silent_joint_grows_old_and_the_robot_stops")
+class NeverOld(Misread):
+    def misread(self, joints):
+        return replace(joints, age_ns=[0] * len(joints.age_ns))
+
+
+@breaks("a_silent_joint_grows_old_and_the_robot_stops")
+class RepeatsItsFaults(Workbench):
+    def faults(self):
+        return [Fault(tick=0, what="silent", cause=f"joint {i} is silent") for i in self.silent]
+
+
+@breaks("bad_commands_are_refused_and_counted_and_move_nothing")
+class Creeps(Mistold):
+    crept = 0.0
+
+    def heard(self, points, lifecycle):
+        self.crept += 0.004 * (lifecycle == "armed")
+        return SetPoints(points.mode, [target + self.crept for target in points.target], points.torque_limit_nm)
+
+
+# --- closing ---------------------------------------------------------------------------------------------------
+
+
+@breaks("a_closed_backend_drives_nothing")
+class DrivesAfterClose(Workbench):
+    def close(self):
+        """Forgotten."""
+
+
+@breaks("closing_twice_does_no_harm")
+class ClosesOnce(Workbench):
+    def close(self):
+        if not self.open:
+            raise ValueError("closed already")
+        super().close()
+
+
+@breaks("a_backend_opens_again_after_it_was_closed")
+class KeepsItsBus(Workbench):
+    taken: ClassVar[bool] = False
+
+    def __init__(self, config, settings):
+        if type(self).taken:
+            raise BackendError("the bus is in use")
+        type(self).taken = True
+        super().__init__(config, settings)
+
+
+@breaks("in_lockstep_the_same_seed_and_commands_give_the_same_samples")
+class OwnDice(Misread):
+    def misread(self, joints):
+        return replace(joints, torque_nm=[torque + random.gauss(0, 1e-4) for torque in joints.torque_nm])
+
+
+# --- as a plugin -----------------------------------------------------------------------------------------------
+
+
+def pytest_snakesim_benches() -> list[Bench]:
+    """Every mutant on a bench of its own."""
+    return [Bench(mutant.name, mutant.backend, mute=mute) for mutant in MUTANTS]
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave only the clauses that a mutant has to fail."""
+    wanted = {(mutant.name, clause) for mutant in MUTANTS for clause in mutant.breaks}
+
+    def is_wanted(item: Any) -> bool:
+        return (item.callspec.params["bench"].name, item.originalname) in wanted
+
+    config.hook.pytest_deselected(items=[item for item in items if not is_wanted(item)])
+    items[:] = [item for item in items if is_wanted(item)]

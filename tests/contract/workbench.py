@@ -1,0 +1,100 @@
+"""The backend that docs/backends.md shows, taken from there, and one like it that behaves as a robot on a bus does."""
+
+import importlib.util
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from snakesim_hal.backend import Samples, SetPoints
+from snakesim_hal.messages import LifecycleState, Mode
+
+DOCS = Path(__file__).parents[2] / "docs" / "backends.md"
+
+
+def text_of_the_example() -> str:
+    """The Python file in the documentation."""
+    found = re.search(r"```python\n(.*?)```", DOCS.read_text(), re.DOTALL)
+    assert found is not None
+    return found[1]
+
+
+def load_example() -> Any:
+    """The example as a module."""
+    name = "workbench_of_the_docs"
+    if name not in sys.modules:
+        spec = importlib.util.spec_from_loader(name, loader=None)
+        assert spec is not None
+        module = importlib.util.module_from_spec(spec)
+        sys.modules[name] = module
+        exec(compile(text_of_the_example(), str(DOCS), "exec"), module.__dict__)
+    return sys.modules[name]
+
+
+Workbench: Any = load_example().Workbench
+mute: Any = load_example().mute
+
+
+class BusWorkbench(Workbench):
+    """As late, coarse and slow to wake as a robot on a bus may be, and at rest by itself when it is not armed."""
+
+    WAKES_AFTER = 4  # periods until joint 0 is armed; each further joint takes one more
+    KNOWN_AT_ONCE = True  # in lockstep time stands still until arming, and arming needs to know every joint
+
+    def __init__(self, config: Any, settings: Any) -> None:
+        super().__init__(config, settings)
+        joints = len(self.angle)
+        self.on_its_way: SetPoints | None = None
+        self.lifecycle: LifecycleState = "disarmed"
+        self.armed_for = 0
+        self.samples = 0
+        self.old = (np.zeros(joints), np.zeros(joints), np.zeros(joints))
+
+    def sample(self, tick: int, stamp_ns: int) -> Samples:
+        """The synchronisation: what was handed over acts from here on. Odd joints answer a period late."""
+        if self.on_its_way is not None:
+            self.armed_for = self.armed_for + 1 if self.lifecycle == "armed" else 0
+            asleep = np.arange(len(self.angle)) + self.WAKES_AFTER > self.armed_for
+            super().enact(self.on_its_way, self.lifecycle)
+            self.mode = np.where(asleep, int(Mode.PASSIVE), self.mode)
+            self.limit = np.round(self.limit, 2)
+        fresh = super().sample(tick, stamp_ns).joints
+        now = (
+            np.round(fresh.angle_rad, 4),
+            np.round(fresh.velocity_rad_s, 3),
+            np.round(fresh.torque_nm, 3),
+        )
+        late = np.arange(len(self.angle)) % 2 == 1
+        if self.samples == 0 and self.KNOWN_AT_ONCE:
+            self.old = now
+        angle, velocity, torque = (np.where(late, old, new).tolist() for old, new in zip(self.old, now, strict=True))
+        age_ns = [
+            age + self.description.period_ns * int(is_late) for age, is_late in zip(fresh.age_ns, late, strict=True)
+        ]
+        known = [self.KNOWN_AT_ONCE or not is_late or self.samples > 0 for is_late in late]
+        self.old, self.samples = now, self.samples + 1
+        return Samples(
+            msgspec.structs.replace(
+                fresh, angle_rad=angle, velocity_rad_s=velocity, torque_nm=torque, age_ns=age_ns, valid=known
+            )
+        )
+
+    def enact(self, set_points: SetPoints, lifecycle: LifecycleState) -> None:
+        """Put it on the bus."""
+        if not self.open:
+            super().enact(set_points, lifecycle)
+        self.on_its_way, self.lifecycle = set_points, lifecycle
+
+
+class RealTimeWorkbench(BusWorkbench):
+    """And its time does not wait, nor does it know all joints at once."""
+
+    KNOWN_AT_ONCE = False
+
+    @staticmethod
+    def check(_config: Any, _settings: Any) -> Any:
+        """As a real robot."""
+        return ("realtime",)

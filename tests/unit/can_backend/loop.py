@@ -1,0 +1,95 @@
+"""A driver and module twins on a virtual bus, stepped, with the robot's lifecycle as the HAL host would have it."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from snakesim_can_backend.backend import CanBackend
+from snakesim_can_backend.protocol import ModuleState
+from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.twin.server import Here
+from snakesim_can_backend.wire import VirtualWire
+from snakesim_hal.backend import Samples, SetPoints
+from snakesim_hal.messages import Fault, LifecycleState, Mode
+from snakesim_hal.plant import Plant
+from snakesim_hal.scenario import RunConfig
+from tests.unit.hal.rig import run_config
+
+JOINTS = 4
+
+
+def config(**dotted: Any) -> RunConfig:
+    """Four joints at 100 Hz, without an obstacle."""
+    return run_config(**{"backend": "can", "robot__chain__modules": JOINTS, "rate_hz": 100, **dotted})
+
+
+@dataclass
+class Loop:
+    """Ticks of one run."""
+
+    backend: CanBackend
+    config: RunConfig
+    lifecycle: LifecycleState = "disarmed"
+    tick: int = 0
+    samples: list[Samples] = field(default_factory=list[Samples])
+    faults: list[Fault] = field(default_factory=list[Fault])
+    wanted: SetPoints | None = None
+    true_speed_rad_s: list[float] = field(default_factory=list[float])  # of the fastest joint, at every tick
+
+    def run(self, ticks: int, wish: Callable[[int], SetPoints] | None = None) -> None:
+        """So many periods; a fault takes the robot out of `armed`, as the authority does."""
+        for _ in range(ticks):
+            samples = self.backend.sample(self.tick, self.tick * self.config.period_ns)
+            self.samples.append(samples)
+            self.true_speed_rad_s.append(float(np.abs(self.plant.velocity_rad_s).max()))
+            if wish is not None:
+                self.wanted = wish(self.tick)
+            self.backend.enact(self.wanted or self.staying(samples), self.lifecycle)
+            self.backend.advance()
+            found = self.backend.faults()
+            self.faults += found
+            if found and self.lifecycle in ("armed", "disarmed"):
+                self.lifecycle = "fault"
+            self.tick += 1
+
+    def arm(self, ticks: int = 8) -> None:
+        """Arm, holding the pose, until every module is armed."""
+        self.lifecycle = "armed"
+        self.run(ticks)
+        assert self.states() == [ModuleState.ARMED] * len(self.states()), self.faults
+
+    def staying(self, samples: Samples) -> SetPoints:
+        """Every joint stays where it is."""
+        angles = list(samples.joints.angle_rad)
+        return SetPoints([Mode.POSITION] * len(angles), angles, [4.0] * len(angles))
+
+    def waving(self, tick: int) -> SetPoints:
+        """Every joint swings by 0.3 rad at 1 Hz."""
+        swing = 0.3 * np.sin(2 * np.pi * tick / 100)
+        count = len(self.samples[-1].joints.angle_rad)
+        return SetPoints([Mode.POSITION] * count, [float(swing)] * count, [4.0] * count)
+
+    def states(self) -> list[ModuleState]:
+        """What the modules last said."""
+        return [module.state for module in self.backend._reading.modules]
+
+    @property
+    def plant(self) -> Plant:
+        """What the twins' motors move."""
+        (wire,) = self.backend._wires
+        assert isinstance(wire, VirtualWire) and isinstance(wire.other_end, Here)
+        return wire.other_end.server.chain.plant
+
+
+@contextmanager
+def loop(run: RunConfig | None = None, **settings: Any) -> Iterator[Loop]:
+    """Open, and close at the end."""
+    run = run or config()
+    backend = CanBackend(run, Settings(plant=settings.pop("plant", "inertia"), **settings))
+    try:
+        yield Loop(backend, run)
+    finally:
+        backend.close()

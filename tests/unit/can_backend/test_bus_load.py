@@ -1,0 +1,297 @@
+"""Bus time: the worst case is never too little, and what is refused is told with ways out that work."""
+
+import re
+from itertools import pairwise
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from snakesim_can_backend.bus_load import (
+    BIT_RATE,
+    MOST_EVERY,
+    MOST_LOAD,
+    Reports,
+    arithmetic,
+    busiest_s,
+    check_load,
+    every,
+    load,
+    most_rate_hz,
+    reports_of,
+    shares,
+    streams,
+    worst_bits,
+)
+from snakesim_can_backend.codec import codec
+from snakesim_can_backend.protocol import LAST_NODE, Opcode, frame_id
+from snakesim_can_backend.settings import Settings
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.scenario import RunConfig
+from snakesim_hal.scenario import load as load_scenario
+
+TRIPLET = load_scenario("triplet").config
+BEST_OF_8, WORST_OF_8 = 111, 135
+
+
+def run_of(joints: int, rate_hz: float = 100.0) -> RunConfig:
+    chain = msgspec.structs.replace(TRIPLET.robot.chain, modules=joints)
+    robot = msgspec.structs.replace(TRIPLET.robot, chain=chain)
+    return msgspec.structs.replace(TRIPLET, robot=robot, rate_hz=rate_hz)
+
+
+def channels(count: int) -> list[str]:
+    return [f"can{i}" for i in range(count)]
+
+
+# --- one frame ---------------------------------------------------------------------------------------------
+
+
+def bits_of(identifier: int, data: bytes) -> list[int]:
+    """What is sent from start of frame to the end of the CRC, before stuffing (ISO 11898-1, base format)."""
+    text = f"0{identifier:011b}000{len(data):04b}" + "".join(f"{byte:08b}" for byte in data)
+    bits = [int(bit) for bit in text]
+    crc = 0
+    for bit in bits:
+        crc = (crc << 1 ^ (0x4599 if bit ^ crc >> 14 else 0)) & 0x7FFF
+    return [*bits, *(crc >> i & 1 for i in range(14, -1, -1))]
+
+
+def stuffed(bits: list[int]) -> list[int]:
+    """After five equal bits comes one of the other kind, which counts towards the next five."""
+    out: list[int] = []
+    run = 0
+    for bit in bits:
+        run = run + 1 if out and bit == out[-1] else 1
+        out.append(bit)
+        if run == 5:
+            out.append(1 - bit)
+            run = 1
+    return out
+
+
+def frame_bits(identifier: int, data: bytes) -> int:
+    delimiters_acknowledge_end_and_gap = 1 + 1 + 1 + 7 + 3
+    return len(stuffed(bits_of(identifier, data))) + delimiters_acknowledge_end_and_gap
+
+
+def test_the_crc_is_that_of_can() -> None:
+    bits = bits_of(0x123, b"\x01\x02\x03")
+    remainder = 0
+    for bit in bits:  # a frame with its own CRC leaves nothing
+        remainder = (remainder << 1 ^ (0x4599 if bit ^ remainder >> 14 else 0)) & 0x7FFF
+    assert remainder == 0
+
+
+def test_stuffing() -> None:
+    assert stuffed([0] * 5) == [0, 0, 0, 0, 0, 1]
+    assert stuffed([0] * 5 + [1] * 4 + [0]) == [0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 0, 0]
+    assert stuffed([1, 0] * 10) == [1, 0] * 10
+
+
+def test_eight_bytes_take_111_bits_at_best_and_135_at_worst() -> None:
+    assert worst_bits(8) == WORST_OF_8
+    assert BEST_OF_8 == 47 + 8 * 8
+    assert BIT_RATE // BEST_OF_8 == 9009 and BIT_RATE // WORST_OF_8 == 7407
+
+
+@given(st.integers(0, 0x7FF), st.binary(max_size=8))
+@example(0, bytes(8))
+@example(0x7FF, b"\xff" * 8)
+@example(0x078, b"\x3c\x3c\x3c\x3c\x3c\x3c\x3c\x3c")
+@example(0x078, b"\x87\x87\x87\x87\x87\x87\x87\x87")
+@example(0x787, b"\x0f\x0f\x0f\x0f\x0f\x0f\x0f\x0f")
+def test_no_frame_is_ever_longer_than_the_worst_case(identifier: int, data: bytes) -> None:
+    assert 47 + 8 * len(data) <= frame_bits(identifier, data) <= worst_bits(len(data))
+
+
+@given(st.sampled_from(list(Opcode)), st.integers(1, LAST_NODE), st.data())
+def test_nor_is_a_frame_of_ours(opcode: Opcode, node: int, data: st.DataObject) -> None:
+    length = codec()[opcode].length
+    nibbles = data.draw(st.lists(st.sampled_from((0x0F, 0xF0, 0x3C, 0xC3, 0x87, 0x78, 0, 255)), min_size=8, max_size=8))
+    assert frame_bits(frame_id(opcode, node), bytes(nibbles[:length])) <= worst_bits(length)
+
+
+def test_the_worst_case_is_nearly_met() -> None:
+    frames = [(i, bytes([b]) * 8) for i in range(0, 0x800, 8) for b in (0, 255, 0x0F, 0xF0, 0x87, 0x78, 0x3C, 0xC3)]
+    assert max(frame_bits(*frame) for frame in frames) >= WORST_OF_8 - 4
+
+
+# --- the sum -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("joints", "rate_hz", "percent"),
+    [(13, 100, 53), (18, 100, 73), (18, 200, 146)],
+)
+def test_commands_states_and_forces_at_eight_bytes_are_what_everybody_reckons(
+    joints: int, rate_hz: int, percent: int
+) -> None:
+    """Three 8-byte frames a joint and period; ours are shorter for commands, and there are more kinds of them."""
+    assert round(100 * joints * rate_hz * 3 * worst_bits(8) / BIT_RATE) == percent
+
+
+def test_the_sum_is_that_of_its_streams_by_hand() -> None:
+    per_s = 100 * 105 + 1300 * (115 + 135 + 135) + 100 * 135 + 65 * (125 + 125 + 85) + 130 * 135 + 26 * 125
+    assert load(13, Reports(100.0)) == pytest.approx(per_s / 1e6)
+    assert sum(s.bits_per_s for s in streams(13, Reports(100.0))) == pytest.approx(per_s)
+
+
+def test_what_is_not_reported_costs_nothing() -> None:
+    kinds = {s.opcode for s in streams(13, Reports(100.0, 0, 0)) if s.frames_per_s}
+    assert kinds == {Opcode.SYNC, Opcode.SET_POINT, Opcode.JOINT_STATE, Opcode.HEARTBEAT, Opcode.HEALTH}
+    without_tail = load(13, Reports(100.0, tail=False))
+    assert load(13, Reports(100.0)) - without_tail == pytest.approx(100 * 135 / 1e6)
+
+
+def test_the_busiest_period_is_one_with_forces() -> None:
+    expected_us = 105 + 13 * (115 + 135 + 135) + 135
+    for contact_every in (1, 2, 7):
+        assert busiest_s(13, Reports(100.0, contact_every)) == pytest.approx(expected_us * 1e-6)
+    assert busiest_s(13, Reports(100.0, 0)) == pytest.approx((105 + 13 * (115 + 135)) * 1e-6)
+
+
+@given(st.floats(20, 5000), st.floats(0.001, 1e4))
+def test_reports_come_as_nearly_as_wanted_as_whole_syncs_allow(rate_hz: float, wanted_hz: float) -> None:
+    apart = every(rate_hz, wanted_hz)
+    assert 1 <= apart <= MOST_EVERY
+    if 1 < apart < MOST_EVERY:
+        assert abs(rate_hz / wanted_hz - apart) <= 0.5
+    assert every(rate_hz, 0.0) == 0
+
+
+def test_reports_are_those_of_the_robot_and_of_the_settings() -> None:
+    assert reports_of(run_of(13), Settings()) == Reports(100.0, 1, 20)
+    assert reports_of(run_of(13, 200.0), Settings(contact_rate_hz=50.0, imu_rate_hz=0.0)) == Reports(200.0, 4, 0)
+    blind = msgspec.structs.replace(
+        TRIPLET.robot, sensors=msgspec.structs.replace(TRIPLET.robot.sensors, contacts=None, imu=None)
+    )
+    assert reports_of(msgspec.structs.replace(TRIPLET, robot=blind), Settings()) == Reports(100.0, 0, 0)
+
+
+# --- shares ------------------------------------------------------------------------------------------------
+
+
+@given(st.integers(1, LAST_NODE), st.integers(0, 8))
+def test_joints_are_shared_out_evenly_tail_first(joints: int, buses: int) -> None:
+    if buses > joints:
+        return
+    found = shares(run_of(joints), Settings(channels=channels(buses)))
+    assert sum(found) == joints and len(found) == max(buses, 1)
+    assert max(found) - min(found) <= 1 and found == sorted(found, reverse=True)
+
+
+def test_given_shares_are_kept() -> None:
+    assert shares(run_of(13), Settings(channels=channels(2), joints_per_channel=[3, 10])) == [3, 10]
+
+
+@pytest.mark.parametrize(
+    ("joints", "settings", "words"),
+    [
+        (13, Settings(channels=["can0", "can0"]), "names a channel twice"),
+        (63, Settings(), "63 joints; node ids of protocol version 1 go to 62"),
+        (13, Settings(channels=channels(2), joints_per_channel=[13]), "2 numbers that add up to the 13 joints"),
+        (13, Settings(channels=channels(2), joints_per_channel=[6, 6]), "2 numbers that add up to the 13 joints"),
+        (2, Settings(channels=channels(3)), "3 channels for 2 joints"),
+    ],
+)
+def test_shares_that_cannot_be_are_refused(joints: int, settings: Settings, words: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(words)):
+        shares(run_of(joints), settings)
+
+
+# --- refusal -----------------------------------------------------------------------------------------------
+
+
+def refusal(config: RunConfig, settings: Settings) -> str | None:
+    try:
+        check_load(config, settings)
+    except ConfigError as error:
+        return str(error)
+    return None
+
+
+def ways_out(text: str, config: RunConfig, settings: Settings) -> list[tuple[RunConfig, Settings]]:
+    """The configurations that a refusal suggests."""
+    advice = text.rpartition("What would fit: ")[2].rstrip(".")
+    if advice == "nothing on classic CAN":
+        return []
+    found = []
+    for way in advice.split("; or "):
+        changes: dict[str, Any] = {}
+        if rate := re.fullmatch(r"rate_hz = (\d+) on (\d+) bus(?:es)?", way):
+            assert int(rate[2]) == max(len(settings.channels), 1)
+            found.append((msgspec.structs.replace(config, rate_hz=float(rate[1])), settings))
+            continue
+        if more := re.fullmatch(r"(\d+) channels with up to (\d+) joints each", way):
+            changes = {"channels": channels(int(more[1])), "joints_per_channel": []}
+            assert max(shares(config, Settings(channels=channels(int(more[1]))))) == int(more[2])
+        elif fewer := re.fullmatch(r"backends\.can\.contact_rate_hz = (\S+)", way):
+            changes = {"contact_rate_hz": float(fewer[1])}
+        assert changes, way
+        found.append((config, msgspec.structs.replace(settings, **changes)))
+    return found
+
+
+def test_18_joints_at_200_hz_are_refused_with_the_sum_and_ways_out() -> None:
+    config, settings = run_of(18, 200.0), Settings(channels=["can7"])
+    text = refusal(config, settings)
+    assert text is not None and text.startswith("18 joints at 200 Hz do not fit on can7:\n")
+    assert arithmetic(18, Reports(200.0, 2, 40)) in text
+    for words in ("SetPoint         3600 frames/s x 115 bits (6 bytes) =  41.4 %", "together 123.6 % of 1 Mbit/s"):
+        assert words in text
+    ways = ways_out(text, config, settings)
+    assert len(ways) == 2
+    assert [refusal(*way) for way in ways] == [None, None]
+
+
+def test_fewer_forces_are_suggested_when_that_is_enough() -> None:
+    config, settings = run_of(13, 190.0), Settings(contact_rate_hz=190.0)
+    text = refusal(config, settings)
+    assert text is not None and "backends.can.contact_rate_hz = 47.5" in text
+
+
+@given(
+    joints=st.integers(1, LAST_NODE),
+    rate_hz=st.floats(20, 2000),
+    contact_hz=st.none() | st.floats(0, 2000),
+    imu_hz=st.floats(0, 200),  # down to 5e-324: hardly ever is not a division by nothing
+    buses=st.integers(0, 4),
+    data=st.data(),
+)
+def test_everything_that_is_suggested_really_fits(
+    joints: int, rate_hz: float, contact_hz: float | None, imu_hz: float, buses: int, data: st.DataObject
+) -> None:
+    buses = min(buses, joints)
+    split: list[int] = []
+    if buses > 1 and data.draw(st.booleans()):
+        cuts = data.draw(st.lists(st.integers(1, joints - 1), min_size=buses - 1, max_size=buses - 1, unique=True))
+        ends = [0, *sorted(cuts), joints]
+        split = [b - a for a, b in pairwise(ends)]
+    settings = Settings(
+        channels=channels(buses), joints_per_channel=split, contact_rate_hz=contact_hz, imu_rate_hz=imu_hz
+    )
+    config = run_of(joints, rate_hz)
+    text = refusal(config, settings)
+    if text is None:
+        assert all(share <= MOST_LOAD for share in check_load(config, settings))
+        return
+    for way in ways_out(text, config, settings):
+        assert refusal(*way) is None
+
+
+def test_the_rate_that_is_suggested_is_the_highest_whole_one() -> None:
+    config, settings = run_of(18, 200.0), Settings()
+    best = most_rate_hz(18, config, settings)
+    assert best is not None
+    for rate in range(best + 1, 201):
+        assert refusal(run_of(18, float(rate)), settings) is not None
+    assert most_rate_hz(LAST_NODE, run_of(LAST_NODE, 21.0), Settings(imu_rate_hz=5.0)) in (None, 20)
+
+
+def test_a_bus_that_nothing_helps() -> None:
+    text = refusal(run_of(LAST_NODE, 5000.0), Settings(channels=channels(8)))
+    assert text is not None and "rate_hz = " in text  # slower always helps
+    assert "channels with" not in text and "contact_rate_hz" not in text

@@ -1,0 +1,160 @@
+"""`snakesim can`: the sum of a bus, who answers on it, and the spelled-out DBC file."""
+
+import uuid
+from pathlib import Path
+
+import pytest
+
+from snakesim_can_backend import can_command
+from snakesim_can_backend.bus_load import check_load, load, reports_at
+from snakesim_can_backend.can_command import COLUMNS, UNKNOWN, aligned, main, scan, settings_of
+from snakesim_can_backend.codec import codec
+from snakesim_can_backend.expanded import EXPANDED, expanded_dbc
+from snakesim_can_backend.protocol import Action, Frame, ModuleState, Opcode, opcode_of
+from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.wire import VirtualWire
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.scenario import load as load_scenario
+from snakesim_hal.scenario import parse_set
+
+TRIPLET = load_scenario("triplet").config
+
+# --- load --------------------------------------------------------------------------------------------------
+
+
+def test_load_prints_the_sum(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["load", "triplet"]) == 0
+    said = capsys.readouterr().out
+    assert "one bus: 13 joints at 100 Hz" in said
+    assert "JointState       1300 frames/s x 135 bits (8 bytes) =  17.6 %" in said
+    assert "together 56.7 %" in said and "5.24 of 10.00 ms" in said and "Refused" not in said
+
+
+def test_load_says_what_is_refused_and_what_would_fit(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["load", "triplet", "--set", "rate_hz=300"]) == 1
+    assert "Refused. What would fit: rate_hz = " in capsys.readouterr().out
+
+
+def test_load_takes_the_settings_of_the_backend(capsys: pytest.CaptureFixture[str]) -> None:
+    flags = ["--set", 'backend.channels=["can0", "can1"]', "--set", "backend.contact_rate_hz=0"]
+    assert main(["load", "triplet", *flags]) == 0
+    said = capsys.readouterr().out
+    assert "can0: 7 joints" in said and "can1: 6 joints" in said and "Contact" not in said
+    with pytest.raises(ConfigError, match=r"backends\.can\.imu_rate_hz"):
+        main(["load", "triplet", "--set", "backend.imu_rate_hz=-1"])
+
+
+def test_load_prints_a_table(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["load", "triplet", "--joints", "13", "18", "30", "--rates", "50", "100", "200"]) == 0
+    heading, *rows, about = capsys.readouterr().out.splitlines()
+    assert heading.split() == ["joints", "50", "Hz", "100", "Hz", "200", "Hz"]
+    for row, joints in zip(rows, (13, 18, 30), strict=True):
+        cells = [f"{100 * load(joints, reports_at(rate, TRIPLET, Settings())):.1f}" for rate in (50, 100, 200)]
+        assert [word for word in row.split() if "." in word] == cells
+        assert row.count("refused") == sum(float(cell) > 80 for cell in cells)
+    assert "80%" in about
+
+
+def test_a_table_of_several_buses_is_of_the_fullest(capsys: pytest.CaptureFixture[str]) -> None:
+    two = 'backend.channels=["can0", "can1"]'
+    assert main(["load", "triplet", "--set", two, "--joints", "13"]) == 0
+    said = capsys.readouterr().out
+    loaded = load_scenario("triplet", [parse_set("backend=can"), parse_set(two)])
+    assert f"{100 * max(check_load(loaded.config, settings_of(loaded))):.1f} %" in said
+    assert "the fullest of 2 buses" in said
+
+
+@pytest.mark.parametrize("flags", [["--joints", "0"], ["--joints", "63"], ["--rates", "19"], ["--rates", "fast"]])
+def test_load_refuses_what_no_robot_is(flags: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(["load", "triplet", *flags])
+    assert caught.value.code == 2 and flags[1] in capsys.readouterr().err
+
+
+# --- expand ------------------------------------------------------------------------------------------------
+
+
+def test_expand_writes_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["expand", "--write", str(tmp_path)]) == 0
+    assert (tmp_path / EXPANDED).read_bytes() == expanded_dbc().encode("cp1252")
+    assert capsys.readouterr().out.strip() == str(tmp_path / EXPANDED)
+
+
+def test_expand_needs_a_folder(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="give a folder that is there"):
+        main(["expand", "--write", str(tmp_path / "nowhere")])
+
+
+# --- scan --------------------------------------------------------------------------------------------------
+
+
+class Bystanders:
+    """The other end of a virtual bus: modules that answer to identify, and say now and then how they are."""
+
+    def __init__(self, channel: str, modules: list[tuple[int, int]], chatter: list[Frame]) -> None:
+        self.wire = VirtualWire(channel)
+        self.modules, self.chatter = modules, chatter
+        self.heard: list[Frame] = []
+
+    def __call__(self) -> None:
+        identity, command = codec()[Opcode.IDENTITY], codec()[Opcode.COMMAND]
+        for frame in self.wire.receive():
+            self.heard.append(frame)
+            if opcode_of(frame.id) == Opcode.COMMAND and command.values(frame.data)["action"] == Action.IDENTIFY:
+                for node, serial in self.modules:
+                    self.wire.send(identity.frame(node, serial=serial, firmware_major=1, protocol=1, emulated=1))
+        for frame in self.chatter:
+            self.wire.send(frame)
+        self.chatter = []
+
+    def close(self) -> None:
+        self.wire.close()
+
+
+def scanned(modules: list[tuple[int, int]], chatter: list[Frame]) -> tuple[list[dict[str, str]], list[Frame]]:
+    channel = f"scan-{uuid.uuid4().hex[:8]}"
+    others = Bystanders(channel, modules, chatter)
+    wire = VirtualWire(channel, others)
+    try:
+        return scan(wire, 0.25), others.heard
+    finally:
+        wire.close()
+
+
+def test_scan_lists_everybody_and_only_asks_who_is_there() -> None:
+    layouts = codec()
+    chatter = [
+        layouts[Opcode.HEARTBEAT].frame(3, state=ModuleState.FAULT, fault_leak=1, fault_voltage=1, uptime=12.34),
+        layouts[Opcode.HEALTH].frame(3, voltage=23.9, motor_temperature=41, board_temperature=33),
+        layouts[Opcode.SHAFT_LOAD].frame(3, torque=-1.25),
+        layouts[Opcode.HEARTBEAT].frame(62, state=ModuleState.DISARMED, uptime=1.0),
+    ]
+    rows, heard = scanned([(62, 0xBEEF), (3, 0xCAFE), (3, 0xF00D)], chatter)
+    assert [(row["node"], row["serial"]) for row in rows] == [("3", "0000CAFE"), ("3", "0000F00D"), ("62", "0000BEEF")]
+    assert rows[0]["state"] == "fault" and rows[0]["faults"] == "leak+voltage" and rows[0]["uptime"] == "12.3 s"
+    assert (rows[0]["voltage"], rows[0]["motor"], rows[0]["board"]) == ("23.9 V", "41 °C", "33 °C")
+    assert rows[0]["shaft"] == "-1.250 N·m" and rows[0]["emulated"] == "yes" and rows[0]["firmware"] == "1.0"
+    assert rows[2]["state"] == "disarmed" and rows[2]["faults"] == "none"
+    assert rows[2]["voltage"] == rows[2]["shaft"] == UNKNOWN
+    assert heard and {frame.data[0] for frame in heard} == {Action.IDENTIFY}
+    assert {opcode_of(frame.id) for frame in heard} == {Opcode.COMMAND}
+    heading, *lines = aligned(rows)
+    assert heading.split() == list(COLUMNS) and len(lines) == 3
+
+
+def test_a_module_that_only_says_who_it_is_has_nothing_made_up() -> None:
+    rows, _ = scanned([(5, 1), (0, 2), (63, 3)], [])
+    assert [row["node"] for row in rows] == ["0", "5", "63"]
+    for row in rows:
+        assert {row[name] for name in ("state", "faults", "uptime", "voltage", "motor", "shaft")} == {UNKNOWN}
+
+
+def test_scan_of_an_empty_bus_is_a_failure(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(can_command, "SocketCanWire", VirtualWire)
+    assert main(["scan", f"scan-{uuid.uuid4().hex[:8]}", "--seconds", "0.05"]) == 1
+    assert "nobody answers" in capsys.readouterr().out
+
+
+def test_scan_of_an_interface_that_is_not_there() -> None:
+    with pytest.raises(ConfigError, match="nocan7"):
+        main(["scan", "nocan7"])

@@ -1,0 +1,176 @@
+"""Every signal of every message goes over the bus and back, and cantools reads and writes the same bytes."""
+
+import math
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from snakesim_can_backend.codec import CodecError, Layout, Signal, codec, dbc_path, load_database
+from snakesim_can_backend.protocol import LAST_NODE, WITH_CHECKSUM, Opcode, checksum, intact, node_of, opcode_of
+from snakesim_hal.messages import Mode
+
+DATABASE = load_database()
+TARGETS = ("position", "velocity", "torque")
+EVERY_SIGNAL = [
+    (layout, signal)
+    for layout in codec().layouts.values()
+    for signal in layout.signals.values()
+    if signal.name != "checksum"
+]
+each_signal = pytest.mark.parametrize(
+    ("layout", "signal"), EVERY_SIGNAL, ids=[f"{m.name}.{s.name}" for m, s in EVERY_SIGNAL]
+)
+each_layout = pytest.mark.parametrize("layout", list(codec().layouts.values()), ids=lambda layout: layout.name)
+nodes = st.integers(1, LAST_NODE)
+
+
+def slack(signal: Signal, value: float) -> float:
+    """Half a step, and what double precision makes of it."""
+    half = abs(value) * 2**-24 + 2**-150 if signal.is_float else signal.scale / 2
+    return half * (1 + 1e-9) + 1e-12 * abs(value)
+
+
+def raw_numbers(signal: Signal) -> st.SearchStrategy[int]:
+    if signal.is_float:
+        return st.floats(-(2.0**127), 2.0**127, width=32).map(lambda v: Signal.raw(signal, v))
+    return st.integers(
+        round((signal.low - signal.offset) / signal.scale), round((signal.high - signal.offset) / signal.scale)
+    )
+
+
+@st.composite
+def contents(draw: st.DrawFn, layout: Layout) -> dict[str, int]:
+    """Raw numbers of the signals that a frame really carries: of the targets of a set-point one at most."""
+    names = [name for name in layout.signals if name != "checksum"]
+    numbers = {name: draw(raw_numbers(layout.signals[name])) for name in names}
+    if layout.opcode == Opcode.SET_POINT:
+        carried = ("", *TARGETS)[numbers["mode"]]
+        numbers = {name: number for name, number in numbers.items() if name not in TARGETS or name == carried}
+    return numbers
+
+
+def by_cantools(layout: Layout, data: bytes) -> dict[str, Any]:
+    found = DATABASE.decode_message(layout.name, data, decode_choices=False)
+    assert isinstance(found, dict)
+    return found
+
+
+# --- signals -----------------------------------------------------------------------------------------------
+
+
+@each_signal
+@given(data=st.data(), node=nodes)
+def test_every_value_comes_back_within_half_a_step(
+    layout: Layout, signal: Signal, data: st.DataObject, node: int
+) -> None:
+    value = data.draw(st.floats(signal.low, signal.high))
+    frame = layout.frame(node, **{signal.name: value})
+    assert (opcode_of(frame.id), node_of(frame.id), len(frame.data)) == (layout.opcode, node, layout.length)
+    back = layout.values(frame.data)[signal.name]
+    assert abs(back - value) <= slack(signal, value)
+
+
+@each_signal
+def test_both_ends_of_a_range_fit_and_come_back(layout: Layout, signal: Signal) -> None:
+    for end in (signal.low, signal.high):
+        back = layout.values(layout.frame(1, **{signal.name: end}).data)[signal.name]
+        assert abs(back - end) <= slack(signal, end)
+        if not signal.is_float:
+            assert back == pytest.approx(end, abs=1e-9 * max(abs(end), 1.0))
+
+
+@each_signal
+@pytest.mark.parametrize("wrong", ["above", "below", math.nan, math.inf, -math.inf])
+def test_what_does_not_fit_is_refused_in_words(layout: Layout, signal: Signal, wrong: float | str) -> None:
+    step = 1e32 if signal.is_float else signal.scale
+    value = {"above": signal.high + step, "below": signal.low - step}[wrong] if isinstance(wrong, str) else wrong
+    with pytest.raises(CodecError) as caught:
+        layout.frame(1, **{signal.name: value})
+    assert isinstance(caught.value, ValueError)
+    for part in (signal.name, str(value), signal.unit, str(signal.low), str(signal.high)):
+        assert part in str(caught.value)
+
+
+@each_signal
+@given(data=st.data())
+def test_a_raw_number_means_one_value_and_the_value_that_number(
+    layout: Layout, signal: Signal, data: st.DataObject
+) -> None:
+    raw = data.draw(raw_numbers(signal))
+    value = signal.value(raw)
+    held = min(max(value, signal.low), signal.high)  # 32767 x 0.001 is a hair more than 32.767
+    assert abs(held - value) <= slack(signal, value) and signal.raw(held) == raw
+
+
+# --- against cantools --------------------------------------------------------------------------------------
+
+
+@each_layout
+@given(data=st.data(), node=nodes)
+def test_cantools_writes_the_same_bytes_and_reads_them_alike(layout: Layout, data: st.DataObject, node: int) -> None:
+    numbers = data.draw(contents(layout))
+    values = {n: min(max(s.value(numbers[n]), s.low), s.high) for n, s in layout.signals.items() if n in numbers}
+    frame = layout.frame(node, **values)
+    theirs: dict[str, Any] = dict(values)
+    if layout.opcode in WITH_CHECKSUM:
+        theirs["checksum"] = frame.data[-1]
+    assert DATABASE.encode_message(layout.name, theirs, strict=False) == frame.data
+    ours, read = layout.values(frame.data), by_cantools(layout, frame.data)
+    for name, value in read.items():
+        assert ours[name] == pytest.approx(value, rel=1e-12, abs=1e-15), name
+    assert set(read) == set(theirs)
+
+
+@each_layout
+@given(data=st.data())
+def test_any_bytes_are_read_as_cantools_reads_them(layout: Layout, data: st.DataObject) -> None:
+    content = data.draw(st.binary(min_size=layout.length, max_size=layout.length))
+    if layout.opcode == Opcode.SET_POINT:
+        content = bytes((content[0] & 0xF0 | content[0] & 0x03,)) + content[1:]  # cantools knows no other mode
+    ours = layout.values(content)
+    for name, value in by_cantools(layout, content).items():
+        assert ours[name] == pytest.approx(value, rel=1e-12, abs=1e-15, nan_ok=True), name
+
+
+# --- frames ------------------------------------------------------------------------------------------------
+
+
+@each_layout
+@given(data=st.data(), node=nodes)
+def test_a_writer_writes_what_a_reader_reads(layout: Layout, data: st.DataObject, node: int) -> None:
+    numbers = data.draw(contents(layout))
+    names = data.draw(st.permutations(list(numbers)))
+    frame = layout.writer(*names)(node, [numbers[name] for name in names])
+    assert layout.reader(*names)(frame.data) == [numbers[name] for name in names]
+    if layout.opcode in WITH_CHECKSUM:
+        assert intact(frame) and frame.data[-1] == checksum(frame.id, frame.data[:-1])
+
+
+@each_layout
+def test_what_is_not_named_is_zero(layout: Layout) -> None:
+    frame = layout.frame(7)
+    payload = frame.data[:-1] if layout.opcode in WITH_CHECKSUM else frame.data
+    assert not any(payload)
+
+
+@each_layout
+def test_a_frame_of_another_length_is_refused(layout: Layout) -> None:
+    for length in set(range(9)) - {layout.length}:
+        with pytest.raises(CodecError, match=f"{layout.name} has {layout.length} bytes, this one {length}"):
+            layout.values(bytes(length))
+
+
+def test_a_set_point_carries_the_target_of_its_mode_in_one_place() -> None:
+    signals = codec()[Opcode.SET_POINT].signals
+    assert len({(signals[name].shift, signals[name].bits, signals[name].signed) for name in TARGETS}) == 1
+    message = DATABASE.get_message_by_name("SetPoint")
+    for mode in (Mode.POSITION, Mode.VELOCITY, Mode.TORQUE):
+        signal = next(s for s in message.signals if s.name == mode.name.lower())
+        assert signal.multiplexer_ids == [int(mode)]
+
+
+def test_the_layouts_come_from_the_published_file() -> None:
+    assert dbc_path().parts[-3:] == ("schemas", "can", "snakesim.dbc")
+    assert set(codec().layouts) == set(Opcode)

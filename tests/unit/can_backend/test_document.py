@@ -1,0 +1,282 @@
+"""`docs/can-protocol.md` says what the DBC file, the parameters and the twins' firmware say."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from snakesim_can_backend import commands
+from snakesim_can_backend.bus_load import load, reports_at, worst_bits
+from snakesim_can_backend.codec import codec, load_database
+from snakesim_can_backend.protocol import (
+    FIRST_NODE,
+    FROM_HOST,
+    LAST_NODE,
+    NODE_BITS,
+    PARAMETERS,
+    WRONG_COUNTS,
+    Action,
+    Frame,
+    ModuleState,
+    Opcode,
+    Parameter,
+)
+from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.twin.firmware import BOOT_US, Module
+from snakesim_can_backend.twin.parameters import Parameters, from_factory
+from snakesim_hal.scenario import load as load_scenario
+
+TEXT = (Path(__file__).parents[3] / "docs" / "can-protocol.md").read_text(encoding="utf-8")
+NODE = 5
+
+
+def section(heading: str) -> str:
+    """The text under a heading, up to the next one."""
+    found = re.search(rf"^#+ {re.escape(heading)}\n(.*?)(?=^#|\Z)", TEXT, re.MULTILINE | re.DOTALL)
+    assert found, f"docs/can-protocol.md has no heading {heading!r}"
+    return found[1]
+
+
+def rows(heading: str) -> list[list[str]]:
+    """The first table under a heading, without its head; code marks and links are taken off."""
+    text = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", section(heading))
+    first = text.partition("\n|")[2].partition("\n\n")[0]
+    lines = ["|" + line.removeprefix("|") for line in first.splitlines()]
+    return [[cell.strip().replace("`", "") for cell in line[1:-1].split("|")] for line in lines[2:]]
+
+
+def number(value: float) -> str:
+    return f"{value:.6g}"
+
+
+# --- layouts -----------------------------------------------------------------------------------------------
+
+
+def message_row(opcode: Opcode) -> list[str]:
+    layout = codec()[opcode]
+    first = opcode << NODE_BITS
+    to_all = opcode in (Opcode.EMERGENCY, Opcode.COMMAND, Opcode.SYNC)
+    to_one = opcode not in (Opcode.EMERGENCY, Opcode.SYNC)
+    low, high = (first if to_all else first + FIRST_NODE), (first + LAST_NODE if to_one else first)
+    ids = f"{low:03X}" if low == high else f"{low:03X}–{high:03X}"
+    return [layout.name, str(int(opcode)), ids, "host" if opcode in FROM_HOST else "module", str(layout.length)]
+
+
+def signal_rows(opcode: Opcode) -> list[list[str]]:
+    found = []
+    for signal in sorted(codec()[opcode].signals.values(), key=lambda s: (s.shift, s.name)):
+        last = signal.shift + signal.bits - 1
+        bits = str(signal.shift) if signal.bits == 1 else f"{signal.shift}–{last}"
+        kind = "float" if signal.is_float else "signed" if signal.signed else "unsigned"
+        step = "" if signal.is_float else number(signal.scale)
+        zero = f", raw 0 is {number(signal.offset)}" if signal.offset else ""
+        found.append(
+            [
+                *(signal.name, bits, kind, step + zero, f"{number(signal.low)} to {number(signal.high)}"),
+                signal.unit.replace("N.m", "N·m").replace("m/s^2", "m/s²").replace("degC", "°C"),
+            ]
+        )
+    return found
+
+
+def test_the_table_of_messages() -> None:
+    assert [row[:5] for row in rows("Messages")] == [message_row(opcode) for opcode in Opcode]
+
+
+@pytest.mark.parametrize("opcode", list(Opcode))
+def test_the_layout_of_every_message(opcode: Opcode) -> None:
+    assert [row[:6] for row in rows(codec()[opcode].name)] == signal_rows(opcode)
+
+
+def test_every_number_that_has_a_name_is_listed() -> None:
+    for message in load_database().messages:
+        for signal in message.signals:
+            if signal.choices and signal.name != "index":  # those are the parameters
+                listed = ", ".join(f"{value} {name}" for value, name in sorted(signal.choices.items()))
+                assert f"`{signal.name}`: {listed}" in TEXT, signal.name
+
+
+def test_the_table_of_parameters() -> None:
+    expected = [
+        [
+            *(str(int(parameter)), parameter.name.lower(), f"{number(allowed.low)} to {number(allowed.high)}"),
+            *(allowed.unit, "yes" if allowed.writable else "no"),
+        ]
+        for parameter, allowed in PARAMETERS.items()
+    ]
+    assert [row[:5] for row in rows("Parameters")] == expected
+
+
+# --- numbers -----------------------------------------------------------------------------------------------
+
+
+def test_the_worked_example_of_the_checksum() -> None:
+    frame = commands.command(Action.ARM, NODE)
+    text = section("Checksum")
+    assert f"`{frame.id:03X}`" in text and f"`{frame.data.hex(' ').upper()}`" in text
+    crc = frame.id
+    for byte in frame.data[:-1]:  # as the C code there does it
+        crc ^= byte << 8
+        for _ in range(8):
+            crc = (crc << 1 ^ (0x1021 if crc & 0x8000 else 0)) & 0xFFFF
+        assert f"`{crc:04X}`" in text
+    assert crc & 0xFF == frame.data[-1]
+    set_point = codec()[Opcode.SET_POINT].frame(NODE, mode=1, count=3, position=-0.5, torque_limit=7.0)
+    assert f"`{set_point.data.hex(' ').upper()}`" in section("SetPoint")
+
+
+def test_the_bits_of_a_frame() -> None:
+    table = rows("Bus load")
+    assert table[0][1:] == [str(47 + 8 * length) for length in (1, 3, 4, 5, 6, 7, 8)]
+    assert table[1][1:] == [str(worst_bits(length)) for length in (1, 3, 4, 5, 6, 7, 8)]
+
+
+def test_the_table_of_loads() -> None:
+    config = load_scenario("triplet").config
+    found = rows("What fits")
+    assert [row[0] for row in found] == ["13", "18", "30"]
+    for row in found:
+        loads = [100 * load(int(row[0]), reports_at(rate, config, Settings())) for rate in (50, 100, 200)]
+        assert row[1:] == [f"{share:.1f} %" + (" refused" if share > 80 else "") for share in loads]
+
+
+# --- state machine -----------------------------------------------------------------------------------------
+
+
+def module_in(state: ModuleState) -> Module:
+    """A module that has just come to be in a state, at 1 s."""
+    module = Module(NODE, 1, Parameters(from_factory(7.0, 7.5)))
+    if state == ModuleState.BOOT:
+        module.poll(BOOT_US / 2)
+        return module
+    module.poll(BOOT_US)
+    now_us = 1e6
+    module.poll(now_us)
+    module.inside.speed_rad_s = 1.0
+    for opened_by in {
+        ModuleState.DISARMED: [],
+        ModuleState.ARMED: [Action.ARM],
+        ModuleState.STOPPING: [Action.ARM, Action.STOP],
+        ModuleState.FAULT: [Action.ARM],
+        ModuleState.EMERGENCY: [],
+    }[state]:
+        module.hear(commands.command(opened_by, NODE), now_us)
+    if state == ModuleState.FAULT:
+        module.poll(now_us + 1e5)
+    if state == ModuleState.EMERGENCY:
+        module.hear(commands.emergency(), now_us)
+    assert module.state == state
+    module.frames.clear()
+    return module
+
+
+def now_of(module: Module) -> float:
+    return {ModuleState.BOOT: BOOT_US / 2, ModuleState.FAULT: 1.1e6}.get(module.state, 1e6)
+
+
+def command(action: Action) -> Callable[[Module], None]:
+    return lambda module: module.hear(commands.command(action, NODE), now_of(module))
+
+
+def emergency(module: Module) -> None:
+    module.hear(commands.emergency(), now_of(module))
+
+
+def time_passes(module: Module) -> None:
+    """The watchdog's time, and no more than that."""
+    module.poll(now_of(module) + 99_000)
+    module.poll(now_of(module) + 100_000)
+
+
+def rest(module: Module) -> None:
+    module.inside.speed_rad_s = 0.0
+    module.poll(now_of(module))
+
+
+def wrong_counts(module: Module) -> None:
+    layout = codec()[Opcode.SET_POINT]
+    for _ in range(WRONG_COUNTS + 1):
+        module.hear_set_point(layout.frame(NODE, mode=0, count=9), now_of(module))
+
+
+def leak(module: Module) -> None:
+    module.inside.leak = True
+    module.poll(now_of(module))
+
+
+EVENTS: dict[str, Callable[[Module], None]] = {
+    "Command arm": command(Action.ARM),
+    "Command disarm": command(Action.DISARM),
+    "Command stop": command(Action.STOP),
+    "Command clear": command(Action.CLEAR),
+    "Command reboot": command(Action.REBOOT),
+    "Emergency": emergency,
+    "watchdog's time without a set-point": time_passes,
+    "five wrong counters in a row": wrong_counts,
+    "heat, leak, voltage, sensor": leak,
+    "at rest": rest,
+}
+
+
+def table_of_states() -> dict[str, list[str]]:
+    return {row[0]: row[1:] for row in rows("States and events")}
+
+
+@pytest.mark.parametrize("event", list(EVENTS))
+@pytest.mark.parametrize("state", list(ModuleState))
+def test_the_firmware_of_the_twins_does_what_the_table_says(event: str, state: ModuleState) -> None:
+    table = table_of_states()
+    assert table["motor"][:2] == ["off", "off"] and set(EVENTS) | {"motor"} == set(table)
+    said = table[event][state]
+    module = module_in(state)
+    happens = EVENTS[event]
+    happens(module)
+    if said.startswith("after boot"):
+        module.poll(2e5)
+    expected = next((s for s in ModuleState if s.name in said), None)
+    if state == ModuleState.BOOT and event == "watchdog's time without a set-point":
+        expected = ModuleState.DISARMED  # boot is over meanwhile
+    assert module.state == (state if expected is None else expected)
+
+
+def test_only_armed_and_stopping_modules_drive_their_motor() -> None:
+    driving = {state.name for state, cell in zip(ModuleState, table_of_states()["motor"], strict=True) if cell != "off"}
+    assert driving == {"ARMED", "STOPPING"}
+    for state in ModuleState:
+        assert module_in(state).demand.mode == 0 or state.name in driving
+
+
+# --- pictures and neighbours -------------------------------------------------------------------------------
+
+
+def test_pictures_and_files_that_are_named_are_there() -> None:
+    here = Path(__file__).parents[3] / "docs"
+    for target in re.findall(r"\]\(([^)#:]+)\)", TEXT):
+        assert (here / target).exists(), target
+
+
+def test_the_picture_of_a_cycle_is_in_proportion() -> None:
+    picture = (Path(__file__).parents[3] / "docs" / "can-cycle.svg").read_text(encoding="utf-8")
+    bars: list[dict[str, Any]] = [
+        dict(re.findall(r'([\w-]+)="([^"]*)"', bar)) for bar in re.findall(r"<rect [^>]*data-bits[^>]*>", picture)
+    ]
+    kinds = {name: sum(bar["data-of"] == name for bar in bars) for name in {bar["data-of"] for bar in bars}}
+    assert kinds == {"Sync": 2, "JointState": 13, "Contact": 13, "TailContact": 1, "SetPoint": 13}
+    names = {layout.name: layout for layout in codec().layouts.values()}
+    wide = {round(float(bar["width"]) / worst_bits(names[bar["data-of"]].length), 4) for bar in bars}
+    assert len(wide) == 1, "bars are as wide as frames are long"
+    syncs = sorted(float(bar["x"]) for bar in bars if bar["data-of"] == "Sync")
+    assert (syncs[1] - syncs[0]) / wide.pop() == pytest.approx(10_000), "10 ms of 1 Mbit/s"
+
+
+def test_what_is_no_frame_of_ours_is_not_in_the_examples() -> None:
+    lengths = {int(opcode): codec()[opcode].length for opcode in Opcode}
+    for identifier, data in re.findall(r"\b([0-9A-F]{3})#([0-9A-F]*)", TEXT):
+        frame = Frame(int(identifier, 16), bytes.fromhex(data))
+        assert lengths[frame.id >> NODE_BITS] == len(frame.data)
+
+
+def test_parameters_are_described_by_those_of_the_protocol() -> None:
+    assert {int(row[0]) for row in rows("Parameters")} == {int(parameter) for parameter in Parameter}

@@ -1,0 +1,154 @@
+"""The spelled-out DBC file is the one that is generated, and stock cantools reads our logs with it."""
+
+import io
+import subprocess
+import sys
+
+import cantools
+from cantools.database.can import Database
+
+from snakesim_can_backend import commands
+from snakesim_can_backend.codec import codec, dbc_path, load_database
+from snakesim_can_backend.expanded import EXPANDED, expanded_dbc, nodes_of
+from snakesim_can_backend.log import LoggedWire
+from snakesim_can_backend.protocol import (
+    BROADCAST,
+    FIRST_NODE,
+    LAST_NODE,
+    NODE_BITS,
+    Action,
+    Frame,
+    ModuleState,
+    Opcode,
+    Operation,
+    Parameter,
+)
+from snakesim_can_backend.wire import VirtualWire
+from snakesim_hal.messages import Mode
+
+PUBLISHED = dbc_path().with_name(EXPANDED)
+EVERYBODY = list(range(FIRST_NODE, LAST_NODE + 1))
+
+
+def published() -> Database:
+    database = cantools.database.load_file(PUBLISHED)
+    assert isinstance(database, Database)
+    return database
+
+
+def test_the_published_file_is_the_generated_one() -> None:
+    assert PUBLISHED.read_bytes() == expanded_dbc().encode("cp1252"), "run `make schemas` and commit what it changes"
+
+
+def test_every_message_of_every_node_is_there_and_no_other() -> None:
+    expected = {
+        opcode << NODE_BITS | node: layout.name if node == BROADCAST else f"{layout.name}_{node:02d}"
+        for opcode, layout in codec().layouts.items()
+        for node in nodes_of(opcode)
+    }
+    assert {message.frame_id: message.name for message in published().messages} == expected
+
+
+def test_who_can_be_meant() -> None:
+    for opcode in Opcode:
+        to_all = opcode in (Opcode.EMERGENCY, Opcode.COMMAND, Opcode.SYNC)
+        to_one = opcode not in (Opcode.EMERGENCY, Opcode.SYNC)
+        assert list(nodes_of(opcode)) == [BROADCAST] * to_all + EVERYBODY * to_one
+
+
+def test_signals_are_the_same_for_every_node() -> None:
+    source = {message.name: message for message in load_database().messages}
+    for message in published().messages:
+        original = source[message.name.partition("_")[0]]
+        assert message.length == original.length and message.senders == original.senders
+        assert {
+            s.name: (
+                s.start,
+                s.length,
+                s.is_signed,
+                s.conversion.scale,
+                s.conversion.offset,
+                s.conversion.is_float,
+                s.unit,
+                s.minimum,
+                s.maximum,
+                s.choices,
+                s.multiplexer_ids,
+            )
+            for s in message.signals
+        } == {
+            s.name: (
+                s.start,
+                s.length,
+                s.is_signed,
+                s.conversion.scale,
+                s.conversion.offset,
+                s.conversion.is_float,
+                s.unit,
+                s.minimum,
+                s.maximum,
+                s.choices,
+                s.multiplexer_ids,
+            )
+            for s in original.signals
+        }
+
+
+def sent() -> list[tuple[Frame, str]]:
+    """Frames of every kind, and what stock cantools is to say of them."""
+    layouts = codec()
+    set_point = layouts[Opcode.SET_POINT].frame(5, mode=Mode.POSITION, count=3, position=-0.5, torque_limit=7.0)
+    state = layouts[Opcode.JOINT_STATE].frame(
+        62, angle=1.0, velocity=-2.0, torque=0.5, count=3, state=ModuleState.ARMED, derated=1
+    )
+    request = layouts[Opcode.PARAMETER_REQUEST].frame(
+        13, index=Parameter.STIFFNESS, operation=Operation.WRITE, value=60.0
+    )
+    return [
+        (commands.emergency(), "Emergency(reason: host)"),
+        (commands.command(Action.ARM), "Command(action: arm, key: 23214, checksum: 50)"),
+        (commands.command(Action.STOP, 7), "Command_07(action: stop"),
+        (commands.sync(200, 12345678), "Sync(count: 200, time: 12345678 us)"),
+        (set_point, "SetPoint_05(mode: position, count: 3, position: -0.5 rad, torque_limit: 7.0 N.m"),
+        (state, "JointState_62(angle: 1.0 rad, velocity: -2.0 rad/s, torque: 0.5 N.m, count: 3, state: armed"),
+        (
+            layouts[Opcode.TAIL_CONTACT].frame(1, force_y=-3.5, touched=1),
+            "TailContact_01(force_x: 0.0 N, force_y: -3.5 N",
+        ),
+        (layouts[Opcode.HEARTBEAT].frame(9, fault_leak=1, uptime=2.5), "Heartbeat_09(state: boot"),
+        (layouts[Opcode.HEALTH].frame(9, voltage=24.0), "Health_09(voltage: 24.0 V"),
+        (request, "ParameterRequest_13(index: stiffness, operation: write, value: 60.0)"),
+    ]
+
+
+def decoded(lines: list[str]) -> list[str]:
+    """What `python -m cantools decode` makes of candump's lines."""
+    command = [sys.executable, "-m", "cantools", "decode", "--single-line", str(PUBLISHED)]
+    done = subprocess.run(command, input="\n".join(lines) + "\n", capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
+def test_stock_cantools_decodes_our_log() -> None:
+    log = io.StringIO()
+    wire = LoggedWire(VirtualWire("expanded-log"), log)
+    other = VirtualWire("expanded-log")
+    frames = sent()
+    for i, (frame, _) in enumerate(frames):
+        if i % 2:
+            wire.send(frame)
+        else:
+            other.send(frame)
+            assert wire.receive() == [frame]
+    wire.close()
+    other.close()
+    found = decoded(log.getvalue().splitlines())
+    assert len(found) == len(frames)
+    for line, (_, words) in zip(found, frames, strict=True):
+        assert words in line
+
+
+def test_stock_cantools_decodes_what_candump_prints_to_a_terminal() -> None:
+    lines = [f"  can0  {frame.id:03X}   [{len(frame.data)}]  {frame.data.hex(' ').upper()}" for frame, _ in sent()]
+    for line, (_, words) in zip(decoded(lines), sent(), strict=True):
+        assert words in line

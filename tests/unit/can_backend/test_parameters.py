@@ -1,0 +1,105 @@
+"""A robot file as parameters: what the protocol holds, and what modules can do."""
+
+from typing import Any
+
+import msgspec
+import pytest
+
+from snakesim_can_backend.bus_load import Reports
+from snakesim_can_backend.codec import codec
+from snakesim_can_backend.parameters import SPEED_ROOM, check_ratings, parameters_of
+from snakesim_can_backend.protocol import PARAMETERS, Opcode, Parameter, SafeMotion
+from snakesim_can_backend.settings import Settings
+from snakesim_hal.errors import BackendError, ConfigError
+from snakesim_hal.files import decode, find, read_table, shipped
+from snakesim_hal.robot import RobotFile
+from snakesim_hal.scenario import load
+
+ROBOT = load("triplet").config.robot
+RATED = (Parameter.RATED_TORQUE, Parameter.RATED_SPEED)
+
+
+def changed(section: str, **values: Any) -> RobotFile:
+    part = msgspec.structs.replace(getattr(ROBOT, section), **values)
+    return msgspec.structs.replace(ROBOT, **{section: part})
+
+
+def rated(torque_nm: float, speed_rad_s: float) -> dict[int, dict[Parameter, float]]:
+    return {4: {Parameter.RATED_TORQUE: torque_nm, Parameter.RATED_SPEED: speed_rad_s}}
+
+
+@pytest.mark.parametrize("name", shipped("robots"))
+def test_every_module_is_told_everything_but_its_ratings_and_within_the_ranges(name: str) -> None:
+    robot = decode(read_table(find(name, "robots")), RobotFile)
+    wanted = parameters_of(robot, Settings(), Reports(100.0))
+    assert list(wanted) == list(range(1, robot.chain.modules + 1))
+    for values in wanted.values():
+        assert set(values) == set(Parameter) - set(RATED)
+        for parameter, value in values.items():
+            allowed = PARAMETERS[parameter]
+            assert allowed.writable and allowed.low <= value <= allowed.high, parameter.name
+
+
+def test_values_are_those_of_the_robot_file_and_of_the_settings() -> None:
+    first = parameters_of(ROBOT, Settings(watchdog_s=0.05), Reports(100.0, 3, 17))[1]
+    assert first == {
+        Parameter.STIFFNESS: 60.0,
+        Parameter.DAMPING: 1.5,
+        Parameter.VELOCITY_GAIN: 1.5,
+        Parameter.TORQUE_LIMIT: 7.0,
+        Parameter.SPEED_LIMIT: 7.5,
+        Parameter.ANGLE_LIMIT: 1.5708,
+        Parameter.WATCHDOG: 0.05,
+        Parameter.SAFE_ACTION: SafeMotion.DAMP,
+        Parameter.CONTACT_EVERY: 3.0,
+        Parameter.IMU_EVERY: 17.0,
+        Parameter.TAIL: 1.0,
+    }
+
+
+@pytest.mark.parametrize("tail", [True, False])
+def test_only_the_first_module_reports_the_tail_link(tail: bool) -> None:
+    wanted = parameters_of(ROBOT, Settings(), Reports(100.0, tail=tail))
+    assert [values[Parameter.TAIL] for values in wanted.values()] == [float(tail)] + [0.0] * 12
+
+
+@pytest.mark.parametrize(("action", "motion"), [("damp", SafeMotion.DAMP), ("passive", SafeMotion.PASSIVE)])
+def test_the_safe_action_is_the_robots(action: str, motion: SafeMotion) -> None:
+    robot = changed("safety", action=action)
+    assert parameters_of(robot, Settings(), Reports(100.0))[1][Parameter.SAFE_ACTION] == motion
+    check_ratings(robot)
+
+
+def test_stiff_holding_is_nothing_a_module_does_by_itself() -> None:
+    with pytest.raises(ConfigError, match='Use "damp" or "passive"'):
+        check_ratings(changed("safety", action="hold"))
+
+
+@pytest.mark.parametrize(
+    ("field", "signal", "room", "unit"),
+    [
+        ("angle_rad", "angle", 1.0, "rad"),
+        ("speed_rad_s", "velocity", SPEED_ROOM, "rad/s"),
+        ("torque_nm", "torque", 1.0, "N·m"),
+    ],
+)
+def test_limits_end_where_the_bus_ends(field: str, signal: str, room: float, unit: str) -> None:
+    most = codec()[Opcode.JOINT_STATE].signals[signal].high / room
+    if field != "angle_rad" or most <= 3.1:
+        check_ratings(changed("limits", **{field: most * 0.999}))
+    with pytest.raises(ConfigError, match=rf"planar13.*limits\.{field}` = .* {unit} does not go through the bus"):
+        check_ratings(changed("limits", **{field: most * 1.001}))
+
+
+def test_modules_that_can_do_what_the_robot_asks_for_are_taken() -> None:
+    check_ratings(ROBOT, rated(7.0, 7.5))
+    check_ratings(ROBOT, rated(9.0, 9.0))
+
+
+@pytest.mark.parametrize(
+    ("torque_nm", "speed_rad_s", "words"),
+    [(6.9, 7.5, "rated for 6.9 N·m.*asks for 7"), (7.0, 7.0, "rated for 7 rad/s.*asks for 7.5")],
+)
+def test_a_weaker_module_is_named_with_what_to_do(torque_nm: float, speed_rad_s: float, words: str) -> None:
+    with pytest.raises(BackendError, match=f"joint_4 is {words}: lower the limit in the robot file"):
+        check_ratings(ROBOT, rated(torque_nm, speed_rad_s))

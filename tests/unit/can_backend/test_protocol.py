@@ -1,0 +1,155 @@
+"""The numbers of the protocol are those of the DBC file."""
+
+from enum import IntEnum
+from itertools import combinations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from snakesim_can_backend.codec import codec, load_database
+from snakesim_can_backend.protocol import (
+    FIRST_NODE,
+    FROM_HOST,
+    LAST_NODE,
+    NODE_BITS,
+    NODE_MASK,
+    PARAMETERS,
+    WITH_CHECKSUM,
+    Action,
+    EmergencyReason,
+    Frame,
+    LastStop,
+    ModuleFault,
+    ModuleState,
+    Opcode,
+    Operation,
+    Parameter,
+    Result,
+    checksum,
+    frame_id,
+    intact,
+    node_of,
+    opcode_of,
+)
+from snakesim_hal.messages import Mode
+
+DATABASE = load_database()
+NAMED: dict[str, type[IntEnum]] = {
+    "state": ModuleState,
+    "mode": Mode,
+    "action": Action,
+    "reason": EmergencyReason,
+    "last_stop": LastStop,
+    "operation": Operation,
+    "result": Result,
+    "index": Parameter,
+}
+nodes = st.integers(FIRST_NODE, LAST_NODE)
+
+
+def test_every_opcode_is_a_message_of_the_same_name() -> None:
+    found = {message.name: message.frame_id for message in DATABASE.messages}
+    assert found == {opcode.name.title().replace("_", ""): opcode << NODE_BITS for opcode in Opcode}
+    assert max(found.values()) | NODE_MASK <= 0x7FF
+
+
+def test_every_enumeration_is_a_value_table() -> None:
+    tables = {(m.name, s.name): s.choices for m in DATABASE.messages for s in m.signals if s.choices}
+    assert {signal for _, signal in tables} == set(NAMED)
+    for (message, signal), table in tables.items():
+        ours = {int(member): member.name.lower() for member in NAMED[signal]}
+        assert {number: str(name) for number, name in table.items()} == ours, (message, signal)
+
+
+def test_every_signal_of_that_name_has_its_table_and_no_narrower_range() -> None:
+    for message in DATABASE.messages:
+        for signal in message.signals:
+            if signal.name in NAMED:
+                assert signal.choices, (message.name, signal.name)
+                most = max(NAMED[signal.name])
+                assert float(signal.maximum or 0) >= most and most < 1 << signal.length, (message.name, signal.name)
+
+
+def test_fault_bits_stand_in_the_heartbeat_in_their_order() -> None:
+    signals = codec()[Opcode.HEARTBEAT].signals
+    first = signals["fault_watchdog"].shift
+    found = {name: signal.shift - first for name, signal in signals.items() if name.startswith("fault_")}
+    assert found == {f"fault_{fault.name.lower()}": int(fault) for fault in ModuleFault}
+
+
+def test_a_fault_is_also_a_reason_to_have_stopped() -> None:
+    assert {fault.name for fault in ModuleFault} <= {reason.name for reason in LastStop}
+
+
+def test_directions() -> None:
+    for message in DATABASE.messages:
+        host = Opcode(message.frame_id >> NODE_BITS) in FROM_HOST
+        assert message.senders == (["Host"] if host else ["Module"]), message.name
+        assert message.receivers == ({"Module"} if host else {"Host"}), message.name
+
+
+def test_checksums_are_the_last_byte_of_the_messages_that_have_one() -> None:
+    for opcode, layout in codec().layouts.items():
+        assert ("checksum" in layout.signals) == (opcode in WITH_CHECKSUM)
+        if opcode in WITH_CHECKSUM:
+            signal = layout.signals["checksum"]
+            assert (signal.shift, signal.bits) == (8 * layout.length - 8, 8)
+
+
+def test_signals_of_a_message_do_not_overlap_but_for_the_targets_of_a_set_point() -> None:
+    for opcode, layout in codec().layouts.items():
+        for a, b in combinations(layout.signals.values(), 2):
+            shared = (a.mask << a.shift) & (b.mask << b.shift)
+            targets = opcode == Opcode.SET_POINT and {a.name, b.name} <= {"position", "velocity", "torque"}
+            assert bool(shared) == targets, (opcode, a.name, b.name)
+            assert (a.mask << a.shift).bit_length() <= 8 * layout.length
+
+
+def test_every_parameter_has_a_range_that_holds_zero_or_more() -> None:
+    assert set(PARAMETERS) == set(Parameter)
+    assert all(0 <= allowed.low < allowed.high and allowed.unit for allowed in PARAMETERS.values())
+
+
+@given(st.sampled_from(list(Opcode)), st.integers(0, NODE_MASK))
+def test_an_id_is_opcode_and_node(opcode: Opcode, node: int) -> None:
+    identifier = frame_id(opcode, node)
+    assert (opcode_of(identifier), node_of(identifier)) == (opcode, node)
+
+
+# --- checksum ----------------------------------------------------------------------------------------------
+
+
+def checked(opcode: Opcode, node: int, payload: bytes) -> Frame:
+    identifier = frame_id(opcode, node)
+    data = payload[: codec()[opcode].length - 1]
+    return Frame(identifier, data + bytes((checksum(identifier, data),)))
+
+
+each_checked = pytest.mark.parametrize("opcode", sorted(WITH_CHECKSUM))
+payloads = st.binary(min_size=7, max_size=7)
+
+
+@each_checked
+@given(node=nodes, payload=payloads)
+def test_every_single_wrong_bit_is_found(opcode: Opcode, node: int, payload: bytes) -> None:
+    frame = checked(opcode, node, payload)
+    assert intact(frame)
+    number = int.from_bytes(frame.data, "little")
+    for bit in range(8 * len(frame.data)):
+        wrong = (number ^ 1 << bit).to_bytes(len(frame.data), "little")
+        assert not intact(Frame(frame.id, wrong)), bit
+    for bit in range(11):
+        assert not intact(Frame(frame.id ^ 1 << bit, frame.data)), bit
+
+
+@each_checked
+@given(node=nodes, payload=payloads)
+def test_a_frame_never_passes_for_another_nodes(opcode: Opcode, node: int, payload: bytes) -> None:
+    frame = checked(opcode, node, payload)
+    for other in range(NODE_MASK + 1):
+        assert intact(Frame(frame_id(opcode, other), frame.data)) == (other == node)
+
+
+def test_messages_with_a_checksum_differ_in_length_so_that_none_passes_for_another() -> None:
+    assert len({codec()[opcode].length for opcode in WITH_CHECKSUM}) == len(WITH_CHECKSUM)

@@ -1,0 +1,136 @@
+"""One module, and whole chains, for the tests of the twins."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from snakesim_can_backend.codec import codec
+from snakesim_can_backend.protocol import (
+    COMMAND_KEY,
+    Action,
+    Frame,
+    ModuleState,
+    Opcode,
+    Operation,
+    Parameter,
+    node_of,
+    opcode_of,
+)
+from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.twin.chain import ModuleChain
+from snakesim_can_backend.twin.firmware import Module
+from snakesim_can_backend.twin.inertia import InertiaPlant, InertiaSettings
+from snakesim_can_backend.twin.parameters import Parameters, from_factory
+from snakesim_can_backend.twin.reports import Sight
+from snakesim_hal.messages import Mode
+from snakesim_hal.scenario import RunConfig
+from tests.unit.hal.rig import run_config
+
+NODE = 3
+SERIAL = 0xC0FFEE
+MS = 1000.0
+BOOTED = 100 * MS
+QUIET = Sight(0, 0, 0)
+
+
+def emergency() -> Frame:
+    return codec()[Opcode.EMERGENCY].frame(0, reason=1)
+
+
+def command(action: Action, node: int = 0, key: int = COMMAND_KEY) -> Frame:
+    return codec()[Opcode.COMMAND].frame(node, action=action, key=key)
+
+
+def sync(count: int, time_us: int = 0) -> Frame:
+    return codec()[Opcode.SYNC].frame(0, count=count % 256, time=time_us % (1 << 32))
+
+
+def set_point(count: int, mode: Mode = Mode.TORQUE, target: float = 1.0, limit: float = 3.0, node: int = NODE) -> Frame:
+    signal = {Mode.POSITION: "position", Mode.VELOCITY: "velocity", Mode.TORQUE: "torque", Mode.PASSIVE: "torque"}[mode]
+    values: dict[str, float] = {"mode": mode, "count": count % 16, signal: target, "torque_limit": limit}
+    return codec()[Opcode.SET_POINT].frame(node, **values)
+
+
+def parameter(index: int, value: float = 0.0, operation: int = Operation.WRITE, node: int = NODE) -> Frame:
+    frame = codec()[Opcode.PARAMETER_REQUEST].frame(node, index=index, value=value)
+    return Frame(frame.id, frame.data[:1] + bytes((operation,)) + frame.data[2:])  # also operations that there are not
+
+
+def spoilt(frame: Frame) -> Frame:
+    return Frame(frame.id, frame.data[:-1] + bytes((frame.data[-1] ^ 1,)))
+
+
+def read(frame: Frame) -> dict[str, float]:
+    return dict(codec()[Opcode(opcode_of(frame.id))].values(frame.data))
+
+
+def only(frames: Sequence[Frame], opcode: Opcode, node: int | None = None) -> list[dict[str, float]]:
+    return [read(f) for f in frames if opcode_of(f.id) == opcode and node in (None, node_of(f.id))]
+
+
+def new_module(**flash: float) -> Module:
+    values = from_factory(5.0, 6.0) | {Parameter[name.upper()]: value for name, value in flash.items()}
+    return Module(NODE, SERIAL, Parameters(values))
+
+
+def booted(**flash: float) -> Module:
+    module = new_module(**flash)
+    module.poll(BOOTED)
+    module.frames.clear()
+    assert module.state == ModuleState.DISARMED
+    return module
+
+
+def armed(**flash: float) -> Module:
+    module = booted(**flash)
+    module.hear(command(Action.ARM), BOOTED)
+    module.frames.clear()
+    assert module.state == ModuleState.ARMED
+    return module
+
+
+def config(joints: int = 4, **dotted: Any) -> RunConfig:
+    return run_config(**{"backend": "can", "robot__chain__modules": joints, "rate_hz": 100, **dotted})
+
+
+def chain(run: RunConfig | None = None, *, stepped: bool = True, **given: Any) -> ModuleChain:
+    """On the inertia plant, with the robot's gains in every flash."""
+    run = run or config()
+    plant = given.pop("plant", None) or InertiaPlant(run, InertiaSettings())
+    settings = Settings(**{k: given.pop(k) for k in list(given) if k in Settings.__struct_fields__})
+    made = ModuleChain(run, settings, plant, stepped=stepped, **given)
+    motor = run.robot.motor
+    for seat in made.seats:
+        seat.module.parameters.values |= {
+            Parameter.STIFFNESS: motor.stiffness_nm_per_rad,
+            Parameter.DAMPING: motor.damping_nm_s_per_rad,
+            Parameter.VELOCITY_GAIN: motor.velocity_gain_nm_s_per_rad,
+        }
+    return made
+
+
+class Host:
+    """Ticks of a stepped chain with one bus: Sync, answers, set-points."""
+
+    def __init__(self, made: ModuleChain, period_us: int = 10_000) -> None:
+        self.chain, self.period_us, self.count = made, period_us, -1
+        made.take(0)
+
+    def arm(self) -> None:
+        self.tick()
+        self.chain.hear(0, command(Action.ARM))
+
+    def tick(self, target: float | None = None, mode: Mode = Mode.POSITION) -> list[Frame]:
+        self.count += 1
+        self.chain.hear(0, sync(self.count, self.count * self.period_us))
+        frames = self.chain.take(0)
+        if target is not None:
+            for node in range(1, self.chain.count + 1):
+                self.chain.hear(0, set_point(self.count, mode, target, 4.0, node))
+        return frames
+
+    def ticks(self, count: int, target: float | None = None, mode: Mode = Mode.POSITION) -> list[Frame]:
+        """So many; the frames of the last."""
+        return [self.tick(target, mode) for _ in range(count)][-1]
+
+    def states(self) -> list[ModuleState]:
+        return [seat.module.state for seat in self.chain.seats[: self.chain.count]]

@@ -1,0 +1,194 @@
+"""All modules together: stepped and wall-clock time, what they feel, and that a run repeats."""
+
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from snakesim_can_backend.mocap import MocapSample
+from snakesim_can_backend.protocol import Action, ModuleState, Opcode, Parameter
+from snakesim_can_backend.twin.chain import MOST_AT_ONCE_US
+from snakesim_can_backend.twin.reports import ALONG, ANGLE, FORCE
+from snakesim_hal.messages import Imu, Mode, Pose
+from snakesim_hal.plant import LinkLoad
+from tests.unit.can_backend.twin.rig import Host, chain, command, config, only, set_point, sync
+
+G = 9.81
+POSE = Pose(
+    tick=0,
+    stamp_ns=0,
+    position_w=(1.0, 2.0, 0.1),
+    orientation_wxyz=(1.0, 0.0, 0.0, 0.0),
+    velocity_w=(0.1, 0.0, 0.0),
+    angular_velocity_w=(0.0, 0.0, 0.5),
+)
+
+
+class Pushed:
+    """A plant that stands still and is pushed at two links."""
+
+    step_s = 0.001
+
+    def __init__(self, joints: int) -> None:
+        self.angle_rad, self.velocity_rad_s = np.linspace(-0.5, 0.5, joints), np.zeros(joints)
+        self.steps = 0
+
+    def advance(self, torque_nm) -> None:
+        self.steps += 1
+
+    def shaft_torque_nm(self):
+        return np.full(len(self.angle_rad), 0.25)
+
+    def loads(self):
+        return [LinkLoad(0, (0.02, 0.03, 0.0), (0.0, -5.0, 0.0)), LinkLoad(2, (0.05, -0.03, 0.0), (1.0, 12.0, 999.0))]
+
+    def imu(self):
+        links = list(range(len(self.angle_rad) + 1))
+        return Imu(
+            tick=0,
+            stamp_ns=0,
+            link=links,
+            angular_velocity_rad_s=[(float(i), 0.0, 0.0) for i in links],
+            acceleration_m_s2=[(0.0, 0.0, G)] * len(links),
+        )
+
+    def pose(self):
+        return POSE
+
+
+SENSORS: dict[str, Any] = {"robot__sensors": {"contacts": {"threshold_n": 0.1}, "imu": {}, "pose": {}}}
+
+
+def test_time_passes_only_when_a_sync_is_later_also_across_the_round_of_32_bits():
+    plant = Pushed(4)
+    made = chain(plant=plant)
+    start = (1 << 32) - 15_000
+    for time_us, steps in ((start, 0), (start, 0), (start + 10_000, 10), (start + 20_000, 20), (start + 10_000, 20)):
+        made.hear(0, sync(0, time_us))
+        assert plant.steps == steps
+    made.hear(0, command(Action.IDENTIFY))
+    assert plant.steps == 20 and len(only(made.take(0), Opcode.IDENTITY)) == 4
+
+
+def test_a_latecomer_on_another_bus_takes_no_time_and_a_new_host_begins_at_its_own_zero():
+    plant = Pushed(4)
+    made = chain(plant=plant)
+    for time_s, steps in ((0, 0), (5.01, 5010), (5.0, 5010), (5.01, 5010), (5.02, 5020), (0.0, 5020), (0.01, 5030)):
+        made.hear(0, sync(0, round(time_s * 1e6)))
+        assert plant.steps == steps
+
+
+def test_two_buses_with_one_sync_time_share_one_step_of_time():
+    plant = Pushed(5)
+    made = chain(config(5), plant=plant, channels=["vcan0", "vcan1"])
+    for tick in range(3):
+        for channel in (0, 1):
+            made.hear(channel, sync(tick, tick * 10_000))
+    assert plant.steps == 20 and made.counts == [3, 2]
+    assert [s["count"] for s in only(made.take(1), Opcode.JOINT_STATE)] == [0, 0, 1, 1, 2, 2]
+    made.hear(1, command(Action.ARM))
+    assert [s.module.state for s in made.seats] == [1, 1, 1, 2, 2]
+    made.hear(0, set_point(0, node=4))
+    assert made.seats[3].module._pending is None, "node 4 is on the other bus"
+
+
+def test_forces_are_felt_by_the_link_in_front_and_the_tail():
+    made = chain(config(**SENSORS), plant=Pushed(4))
+    made.seats[0].module.parameters.values[Parameter.TAIL] = 1.0
+    made.hear(0, sync(0))
+    frames = made.take(0)
+    contacts = only(frames, Opcode.CONTACT)
+    assert [c["touched"] for c in contacts] == [0, 1, 0, 0]
+    assert contacts[1]["force_y"] == pytest.approx(12.0) and contacts[1]["force_z"] == pytest.approx(204.75)
+    assert contacts[1]["along"] == pytest.approx(0.05) and contacts[1]["bearing"] == pytest.approx(-np.pi), (
+        "half a turn"
+    )
+    [tail] = only(frames, Opcode.TAIL_CONTACT)
+    assert tail["force_y"] == pytest.approx(-5.0) and tail["bearing"] == 0.0
+
+
+def test_neighbours_take_turns_with_their_imus():
+    made = chain(config(**SENSORS), plant=Pushed(4))
+    for seat in made.seats:
+        seat.module.parameters.values[Parameter.IMU_EVERY] = 4.0
+    for tick in range(4):
+        made.hear(0, sync(tick))
+        gyros = only(made.take(0), Opcode.GYRO)
+        assert len(gyros) == 1 and gyros[0]["rate_x"] in (1.0, 2.0, 3.0, 4.0)
+    made.hear(0, sync(4))
+    frames = made.take(0)
+    assert only(frames, Opcode.ACCELEROMETER)[0]["acceleration_z"] == pytest.approx(G)
+    assert only(frames, Opcode.SHAFT_LOAD)[0]["torque"] == pytest.approx(0.25)
+
+
+def test_the_pose_is_sent_once_a_sync_before_the_answers():
+    sent: list[bytes] = []
+    made = chain(config(6, **SENSORS), plant=Pushed(6), channels=["a", "b"], send_pose=sent.append)
+    for tick in range(3):
+        for channel in (0, 1):
+            made.hear(channel, sync(tick, tick * 10_000))
+    assert len(sent) == 3
+    sample = msgspec.json.decode(sent[0], type=MocapSample)
+    assert sample.position_w == POSE.position_w and sample.angular_velocity_w == POSE.angular_velocity_w
+
+
+def run_of(seed: int) -> tuple[list, list]:
+    noisy: dict[str, Any] = {"robot__sensors": {"joints": {"angle_noise_rad": 1e-3}}, "seed": seed}
+    host = Host(chain(config(**noisy)))
+    host.arm()
+    return [host.tick(0.3 if k < 50 else -0.3) for k in range(100)], host.states()
+
+
+def test_the_same_commands_give_the_same_frames():
+    frames, states = run_of(1)
+    assert (frames, states) == run_of(1) and states == [ModuleState.ARMED] * 4
+    assert frames != run_of(2)[0]
+    angles = [s["angle"] for s in only(frames[49], Opcode.JOINT_STATE)]
+    assert angles == pytest.approx([0.3] * 4, abs=0.01)
+
+
+def test_set_points_act_from_the_sync_after_them():
+    host = Host(chain())
+    host.arm()
+    host.tick(2.0, Mode.TORQUE)
+    assert only(host.tick(2.0, Mode.TORQUE), Opcode.JOINT_STATE)[0]["torque"] == 0.0
+    assert only(host.tick(2.0, Mode.TORQUE), Opcode.JOINT_STATE)[0]["torque"] > 1.0
+
+
+def test_the_watchdog_ends_within_the_step_in_stepped_time_too():
+    host = Host(chain())
+    host.arm()
+    for _ in range(5):
+        host.tick(2.0, Mode.TORQUE)
+    frames = [f for _ in range(12) for f in host.tick()]
+    assert host.states() == [ModuleState.FAULT] * 4
+    ups = [b["uptime"] for b in only(frames, Opcode.HEARTBEAT, 1) if b["last_stop"] == 3]
+    assert ups[0] == pytest.approx(0.1 + 0.05 + 0.1, abs=0.0011)
+
+
+def test_in_wall_clock_time_a_hiccup_is_caught_up_but_not_a_long_one():
+    plant = Pushed(4)
+    made = chain(plant=plant, stepped=False)
+    made.advance_to(150_000.0)
+    assert plant.steps == 150
+    made.advance_to(1_150_000.0)
+    assert plant.steps == 350 and made.skipped_us == 1e6 - MOST_AT_ONCE_US
+    made.advance_to(1_160_000.0)
+    assert plant.steps == 360
+
+
+def test_overheating_fades_torque_before_it_stops():
+    host = Host(chain(plant=Pushed(4)))
+    host.arm()
+    host.chain.thermal.winding_c[1] = 95.0
+    frames = host.ticks(10, 4.0, Mode.TORQUE)
+    states = only(frames, Opcode.JOINT_STATE)
+    assert [s["derated"] for s in states] == [0, 1, 0, 0]
+    assert 0.3 < states[1]["torque"] / 4.0 < 0.5 and states[0]["torque"] > 3.9
+
+
+def test_what_is_out_of_range_ends_at_the_end_of_the_range_and_nothing_raises():
+    assert ANGLE.one(99.0) == 32767 and ANGLE.one(-99.0) == -32768
+    assert ANGLE.many(np.array([np.nan, np.inf, -np.inf, 0.1])) == [0, 32767, -32768, 1000]
+    assert FORCE.one(float("inf")) == 4095 and ALONG.one(float("nan")) == 0

@@ -1,0 +1,312 @@
+"""The rules of one module's firmware, one by one, and what holds whatever a host sends."""
+
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from snakesim_can_backend.protocol import Action, LastStop, ModuleFault, ModuleState, Opcode, Parameter
+from snakesim_can_backend.twin.firmware import Module
+from snakesim_hal.messages import Mode
+from tests.unit.can_backend.twin.rig import (
+    BOOTED,
+    MS,
+    NODE,
+    QUIET,
+    SERIAL,
+    armed,
+    booted,
+    command,
+    emergency,
+    new_module,
+    only,
+    parameter,
+    set_point,
+    spoilt,
+    sync,
+)
+
+
+def drive(module: Module, count: int, now_us: float, **how: Any) -> None:
+    """A set-point, and the Sync that enacts it."""
+    module.hear_set_point(set_point(count, **how), now_us)
+    module.sync(count, QUIET)
+
+
+def test_it_boots_silent_and_answers_nothing_until_its_first_heartbeat():
+    module = new_module()
+    module.poll(0.0)
+    module.hear(command(Action.IDENTIFY), 50 * MS)
+    module.hear(command(Action.ARM), 50 * MS)
+    module.sync(1, QUIET)
+    module.poll(99 * MS)
+    assert module.frames == [] and module.state == ModuleState.BOOT
+    module.poll(100 * MS)
+    [beat] = only(module.frames, Opcode.HEARTBEAT)
+    assert beat["state"] == ModuleState.DISARMED and beat["uptime"] == pytest.approx(0.1)
+    assert len(module.frames) == 1
+
+
+def test_it_beats_ten_times_a_second_and_tells_its_health_twice():
+    module = booted()
+    for k in range(1, 1001):
+        module.poll(BOOTED + k * MS)
+    assert len(only(module.frames, Opcode.HEARTBEAT)) == 10
+    assert len(only(module.frames, Opcode.HEALTH)) == 2
+
+
+def test_a_set_point_is_enacted_at_the_next_sync():
+    module = armed()
+    module.hear_set_point(set_point(7, target=2.0, limit=1.5), BOOTED)
+    assert module.demand.mode == Mode.PASSIVE
+    module.sync(0, QUIET)
+    assert module.demand == (Mode.TORQUE, pytest.approx(2.0), pytest.approx(1.5))
+
+
+def test_position_targets_end_at_the_angle_limit():
+    module = armed(angle_limit=0.5)
+    drive(module, 0, BOOTED, mode=Mode.POSITION, target=-1.0)
+    assert module.demand.target == -0.5
+
+
+def test_arming_is_ignored_but_when_disarmed():
+    module = armed()
+    fed = module._fed_us
+    module.hear(command(Action.ARM), BOOTED + 50 * MS)
+    assert module._fed_us == fed and module.frames == []
+    module.hear(emergency(), BOOTED)
+    module.hear(command(Action.ARM), BOOTED)
+    assert module.state == ModuleState.EMERGENCY
+
+
+@pytest.mark.parametrize(("sensed", "fault"), [("leak", ModuleFault.LEAK), ("hot", ModuleFault.OVERHEAT)])
+def test_a_condition_is_a_fault_until_it_is_gone_and_cleared(sensed: str, fault: ModuleFault):
+    module = armed()
+    module.inside.leak, module.inside.winding_c = sensed == "leak", 110.0 if sensed == "hot" else 20.0
+    module.poll(BOOTED + MS)
+    [beat] = only(module.frames, Opcode.HEARTBEAT)
+    assert beat[f"fault_{fault.name.lower()}"] == 1 and beat["last_stop"] == LastStop[fault.name]
+    module.inside.winding_c = 71.0 if sensed == "hot" else 20.0
+    module.hear(command(Action.CLEAR), BOOTED + 2 * MS)
+    assert module.state == ModuleState.FAULT
+    module.inside.leak, module.inside.winding_c = False, 69.0
+    module.poll(BOOTED + 3 * MS)
+    assert module.state == ModuleState.FAULT, "latched"
+    module.hear(command(Action.CLEAR), BOOTED + 3 * MS)
+    assert module.state == ModuleState.DISARMED and module.faults == 0
+
+
+def test_the_watchdog_makes_it_passive_at_once_and_is_latched():
+    module = armed()
+    drive(module, 0, BOOTED)
+    module.poll(BOOTED + 99 * MS)
+    assert module.state == ModuleState.ARMED
+    module.poll(BOOTED + 100 * MS)
+    assert module.state == ModuleState.FAULT and module.demand.mode == Mode.PASSIVE
+    assert module.last_stop == LastStop.WATCHDOG and module.faults == 1 << ModuleFault.WATCHDOG
+    module.hear_set_point(set_point(1), BOOTED + 101 * MS)
+    module.sync(1, QUIET)
+    assert module.demand.mode == Mode.PASSIVE
+
+
+def test_the_watchdog_starts_at_arming():
+    module = armed()
+    assert module.poll(BOOTED) == BOOTED + 100 * MS
+    module.poll(BOOTED + 100 * MS)
+    assert module.last_stop == LastStop.WATCHDOG
+
+
+def test_the_first_count_may_be_anything_the_next_is_one_more():
+    module = armed()
+    drive(module, 15, BOOTED, target=1.0)
+    drive(module, 0, BOOTED, target=2.0)
+    assert module.demand.target == pytest.approx(2.0)
+    drive(module, 0, BOOTED, target=3.0)
+    assert module.demand.target == pytest.approx(2.0) and module.refused == 1
+
+
+def test_a_lost_set_point_costs_one_more_and_no_fault():
+    module = armed()
+    drive(module, 0, BOOTED, target=1.0)
+    drive(module, 2, BOOTED, target=2.0)
+    assert module.demand.target == pytest.approx(1.0)
+    drive(module, 3, BOOTED, target=3.0)
+    assert module.demand.target == pytest.approx(3.0) and module.state == ModuleState.ARMED
+
+
+def test_five_wrong_counts_in_a_row_are_no_stream():
+    module = armed()
+    for k in range(6):
+        assert module.state == ModuleState.ARMED
+        drive(module, 4, BOOTED + k * MS)
+    assert module.state == ModuleState.FAULT and module.last_stop == LastStop.STREAM
+
+
+def test_a_wrong_checksum_is_as_if_nothing_had_come():
+    module = armed()
+    drive(module, 0, BOOTED, target=1.0)
+    module.hear_set_point(spoilt(set_point(1, target=2.0)), BOOTED + 50 * MS)
+    module.sync(1, QUIET)
+    assert module.demand.target == pytest.approx(1.0) and module._fed_us == BOOTED and module.refused == 1
+
+
+def test_stopping_damps_until_at_rest():
+    module = armed()
+    drive(module, 0, BOOTED)
+    module.inside.speed_rad_s = 3.0
+    module.hear(command(Action.STOP), BOOTED)
+    assert module.state == ModuleState.STOPPING and module.demand[:2] == (Mode.VELOCITY, 0.0)
+    assert only(module.frames, Opcode.HEARTBEAT)[-1]["mode"] == Mode.VELOCITY
+    module.poll(BOOTED + 50 * MS)
+    assert module.state == ModuleState.STOPPING
+    module.inside.speed_rad_s = 0.04
+    module.poll(BOOTED + 51 * MS)
+    assert module.state == ModuleState.DISARMED and module.demand.mode == Mode.PASSIVE
+    assert module.last_stop == LastStop.STOP
+
+
+def test_stopping_ends_after_the_watchdog_s_time_and_may_be_passive():
+    module = armed(safe_action=0, watchdog=0.05)
+    module.inside.speed_rad_s = 3.0
+    module.hear(command(Action.STOP), BOOTED)
+    assert module.demand.mode == Mode.PASSIVE
+    module.poll(BOOTED + 50 * MS)
+    assert module.state == ModuleState.DISARMED
+
+
+def test_disarm_and_emergency_are_passive_at_once():
+    for frame, state in ((command(Action.DISARM), ModuleState.DISARMED), (emergency(), ModuleState.EMERGENCY)):
+        module = armed()
+        drive(module, 0, BOOTED)
+        module.hear_set_point(set_point(1), BOOTED)
+        module.hear(frame, BOOTED)
+        assert module.state == state and module.demand.mode == Mode.PASSIVE
+        module.sync(2, QUIET)
+        assert module.demand.mode == Mode.PASSIVE, "nothing pending is left"
+
+
+def test_an_emergency_while_booting_is_remembered():
+    module = new_module()
+    module.hear(emergency(), 10 * MS)
+    module.poll(100 * MS)
+    assert module.state == ModuleState.EMERGENCY
+    module.hear(command(Action.CLEAR), 101 * MS)
+    assert module.state == ModuleState.DISARMED
+
+
+@pytest.mark.parametrize("frame", [command(Action.ARM, key=1), spoilt(command(Action.ARM))])
+def test_commands_need_key_and_checksum(frame):
+    module = booted()
+    module.hear(frame, BOOTED)
+    assert module.state == ModuleState.DISARMED
+
+
+def test_identity_says_that_it_is_a_twin():
+    module = booted()
+    module.hear(command(Action.IDENTIFY), BOOTED)
+    [identity] = only(module.frames, Opcode.IDENTITY)
+    assert identity == {
+        "serial": SERIAL,
+        "firmware_major": 1,
+        "firmware_minor": 0,
+        "protocol": 1,
+        "emulated": 1,
+        "stepped": 0,
+    }
+
+
+def test_a_reboot_forgets_what_was_not_saved():
+    module = armed()
+    module.hear(command(Action.DISARM), BOOTED)
+    module.hear(parameter(Parameter.STIFFNESS, 12.0), BOOTED)
+    module.hear(parameter(Parameter.DAMPING, 2.0), BOOTED)
+    module.hear(parameter(Parameter.DAMPING, operation=2), BOOTED)
+    module.hear(command(Action.REBOOT, NODE), BOOTED)
+    assert module.state == ModuleState.BOOT
+    module.frames.clear()
+    module.poll(BOOTED + 100 * MS)
+    [beat] = only(module.frames, Opcode.HEARTBEAT)
+    assert beat["uptime"] == pytest.approx(0.1)
+    values = module.parameters.values
+    assert values[Parameter.STIFFNESS] == 0.0 and values[Parameter.DAMPING] == 2.0
+
+
+def test_every_sync_is_answered_with_its_own_count():
+    module = booted(contact_every=4, imu_every=5, tail=1)
+    for count in range(20):
+        module.sync(count, QUIET)
+    states = only(module.frames, Opcode.JOINT_STATE)
+    assert [s["count"] for s in states] == [c % 16 for c in range(20)]
+    assert [c["count"] for c in only(module.frames, Opcode.CONTACT)] == [0, 4, 8, 12, 0]
+    assert len(only(module.frames, Opcode.TAIL_CONTACT)) == 5
+
+
+def test_a_hanging_module_repeats_its_last_state_and_hardware_opens_the_bridge():
+    module = armed()
+    drive(module, 3, BOOTED)
+    module.hangs = True
+    module.frames.clear()
+    module.sync(4, QUIET)
+    [state] = only(module.frames, Opcode.JOINT_STATE)
+    assert state["count"] == 3 and module.demand.mode == Mode.TORQUE
+    for k in range(1, 300):
+        module.poll(BOOTED + k * MS)
+        assert (module.demand.mode == Mode.PASSIVE) == (k >= 100)
+    assert not only(module.frames, Opcode.HEARTBEAT)
+    module.hangs = False
+    module.poll(BOOTED + 301 * MS)
+    assert module.last_stop == LastStop.WATCHDOG
+
+
+# --- whatever a host sends ---------------------------------------------------------------------------------
+
+NOT_ARM = st.one_of(
+    st.sampled_from([Action.DISARM, Action.STOP, Action.CLEAR, Action.REBOOT, Action.IDENTIFY]).map(command),
+    st.just(emergency()),
+    st.builds(set_point, st.integers(0, 15), st.sampled_from(list(Mode))),
+    st.builds(spoilt, st.builds(set_point, st.integers(0, 15))),
+    st.builds(spoilt, st.just(command(Action.ARM))),
+    st.builds(parameter, st.integers(0, 20), st.floats(-1, 40, width=32), st.integers(0, 4)),
+    st.builds(sync, st.integers(0, 255)),
+)
+ANYTHING = st.one_of(NOT_ARM, st.just(command(Action.ARM)))
+PAUSES = st.sampled_from([0.0, 1.0 * MS, 20 * MS, 120 * MS])
+
+
+def give(module: Module, frame, now_us: float) -> None:
+    opcode = frame.id >> 6
+    if opcode == Opcode.SYNC:
+        module.sync(frame.data[0], QUIET)
+    elif opcode == Opcode.SET_POINT:
+        module.hear_set_point(frame, now_us)
+    else:
+        module.hear(frame, now_us)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(NOT_ARM, PAUSES), max_size=40))
+def test_nothing_but_arming_arms(sent):
+    module, now_us = booted(), BOOTED
+    for frame, pause_us in sent:
+        now_us += pause_us
+        give(module, frame, now_us)
+        module.poll(now_us)
+        assert module.state != ModuleState.ARMED
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.tuples(ANYTHING, PAUSES, st.booleans()), max_size=60))
+def test_only_armed_and_stopping_modules_drive_and_only_valid_set_points_feed(sent):
+    module, now_us = booted(), BOOTED
+    module.inside.speed_rad_s = 1.0
+    for frame, pause_us, leak in sent:
+        now_us += pause_us
+        module.inside.leak = leak and pause_us > 0
+        module.poll(now_us)
+        before, state, refused = module._fed_us, module.state, module.refused
+        give(module, frame, now_us)
+        if module._fed_us != before and state == ModuleState.ARMED and module.state == ModuleState.ARMED:
+            assert frame.id >> 6 == Opcode.SET_POINT and module.refused == refused
+        if module.state not in (ModuleState.ARMED, ModuleState.STOPPING):
+            assert module.demand.mode == Mode.PASSIVE

@@ -1,0 +1,112 @@
+"""The contract suite itself: what is good passes, and whatever breaks a clause fails that clause."""
+
+import ast
+import os
+import subprocess
+import sys
+from collections import defaultdict
+from importlib.metadata import entry_points
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from tests.contract.mutants import MUTANTS
+from tests.contract.workbench import text_of_the_example
+
+ROOT = Path(__file__).parents[3]
+SUITE = ROOT / "snakesim_hal" / "conformance"
+PLUGIN = "snakesim_hal.conformance.plugin"
+pytestmark = pytest.mark.timeout(900)  # whole suites, perhaps on an emulated machine
+BUS = "./tests/contract/workbench.py"
+
+
+def run_suite(*arguments: str, cwd: Path = ROOT, limit_s: float = 800.0) -> subprocess.CompletedProcess[str]:
+    """The suite in a process of its own, as a user runs it. pytest refuses a plugin that is named twice."""
+    environment = {name: value for name, value in os.environ.items() if name != "PYTEST_ADDOPTS"}
+    command = [sys.executable, "-m", "pytest", "--pyargs", "snakesim_hal.conformance", "-p", "no:cacheprovider"]
+    if not any(entry.value == PLUGIN for entry in entry_points(group="pytest11")):
+        command += ["-p", PLUGIN]
+    command += arguments
+    return subprocess.run(
+        command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=limit_s, check=False
+    )
+
+
+def clauses() -> set[str]:
+    """Names of all contract tests."""
+    return {
+        node.name
+        for path in SUITE.glob("test_*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")
+    }
+
+
+@pytest.fixture(scope="module")
+def mutant_outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], set[str]]:
+    """(mutant, clause) -> what came of it."""
+    report = tmp_path_factory.mktemp("mutants") / "report.xml"
+    ran = run_suite("-p", "tests.contract.mutants", f"--junitxml={report}", "--tb=no", "-q")
+    assert report.is_file(), ran.stdout + ran.stderr
+    outcomes: dict[tuple[str, str], set[str]] = defaultdict(set)
+    for case in ElementTree.parse(report).getroot().iter("testcase"):
+        clause, _, rest = case.attrib["name"].partition("[")
+        children = [child.tag for child in case if child.tag in ("failure", "error", "skipped")]
+        outcomes[rest.rstrip("]").partition("-")[0], clause].add(children[0] if children else "passed")
+    return outcomes
+
+
+def test_every_clause_has_a_backend_that_breaks_it() -> None:
+    broken = {clause for mutant in MUTANTS for clause in mutant.breaks}
+    assert broken == clauses()
+
+
+@pytest.mark.parametrize("mutant", MUTANTS, ids=[mutant.name for mutant in MUTANTS])
+def test_a_backend_that_breaks_a_clause_fails_it(mutant, mutant_outcomes) -> None:
+    for clause in mutant.breaks:
+        found = mutant_outcomes[mutant.name, clause]
+        assert found and found <= {"failure", "error"}, f"{clause} on {mutant.name}: {found or 'did not run'}"
+
+
+def test_the_example_of_the_docs_passes_from_anywhere(tmp_path) -> None:
+    (tmp_path / "workbench.py").write_text(text_of_the_example())
+    given = ["--backend", "./workbench.py:Workbench", "--mute", "./workbench.py:mute", "--contract-table", "table.md"]
+    ran = run_suite(*given, "-q", cwd=tmp_path)
+    assert ran.returncode == 0, ran.stdout
+    assert "skipped" not in ran.stdout
+    rows = [line for line in (tmp_path / "table.md").read_text().splitlines() if line.endswith("| pass |")]
+    assert len(rows) == len(clauses())
+
+
+def test_a_backend_that_is_late_coarse_and_slow_to_wake_passes() -> None:
+    ran = run_suite("--backend", f"{BUS}:BusWorkbench", "--mute", f"{BUS}:mute", "-q")
+    assert ran.returncode == 0, ran.stdout
+
+
+@pytest.mark.slow
+def test_a_backend_that_keeps_real_time_only_passes() -> None:
+    ran = run_suite("--backend", f"{BUS}:RealTimeWorkbench", "--mute", f"{BUS}:mute", "-q")
+    assert ran.returncode == 0, ran.stdout
+    assert "repeats nothing exactly" in ran.stdout
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ((), "give --backend"),
+        (("--backend", "nothing_of_that_name"), "no backend called 'nothing_of_that_name' is installed"),
+        (("--backend", "sim", "--set", "robot.limits.torque_nm=-1"), "robot.limits.torque_nm"),
+    ],
+)
+def test_a_wrong_call_is_said_once(given, said) -> None:
+    ran = run_suite(*given, "-q")
+    assert ran.returncode != 0
+    assert said in ran.stdout + ran.stderr
+    assert " failed" not in ran.stdout
+
+
+def test_the_plugin_loads_nothing_of_ours_until_it_is_used() -> None:
+    code = f"import sys, {PLUGIN}; print([name for name in sys.modules if name.startswith('snakesim_')])"
+    ran = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert ran.stdout.strip() == str(["snakesim_hal", "snakesim_hal.conformance", PLUGIN])

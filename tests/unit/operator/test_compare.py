@@ -1,0 +1,301 @@
+"""Comparing two runs: made-up records whose differences are known beforehand, and the words and pages on them."""
+
+import dataclasses
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.host_process import HostRecord
+from snakesim_hal.messages import ControlState, Mode
+from snakesim_hal.robot import Chain, describe
+from snakesim_hal.scenario import RunConfig, load, parse_set
+from snakesim_operator.compare.command import compare
+from snakesim_operator.compare.difference import Difference, differ
+from snakesim_operator.compare.page import page
+from snakesim_operator.compare.table import table
+from snakesim_operator.compare.verdict import within
+from snakesim_operator.record import RunRecord
+
+JOINTS = 13
+SPEED_M_S = 0.1
+
+
+def configured(**changes: Any) -> RunConfig:
+    return load("triplet", [parse_set(f"{key}={value}") for key, value in changes.items()]).config
+
+
+def made_up(
+    seconds: float = 2.0,
+    rate_hz: float = 100.0,
+    start_s: float = 0.5,
+    speed_m_s: float = SPEED_M_S,
+    propelled: tuple[tuple[float, int], ...] = ((0.0, 9), (0.6, 8), (1.2, 7)),
+    controller_knows: bool = True,
+) -> RunRecord:
+    """Joints that swing, each a little later; no pose, so the controller alone tells how far it came."""
+    run = msgspec.structs.replace(configured(), rate_hz=rate_hz, duration_s=seconds)
+    count = round(seconds * rate_hz)
+    since_s = np.arange(count) / rate_hz
+    phase = 2 * math.pi * since_s[:, None] + 0.3 * np.arange(JOINTS)
+    joints = [joint.name for joint in describe_of(run).joints]
+    control = [
+        ControlState(
+            tick=row,
+            stamp_ns=round((start_s + t) * 1e9),
+            controller="obstacle_triplet",
+            state="Locomoting",
+            reason="pushing",
+            path_s_m=speed_m_s * t if controller_knows else None,
+            propulsion_joint=next((joints[j] for at_s, j in reversed(propelled) if at_s <= t + 1e-9), None),
+        )
+        for row, t in enumerate(since_s.tolist())
+    ]
+    return RunRecord(
+        folder=Path("made-up"),
+        config=run,
+        description=describe_of(run),
+        host=HostRecord(
+            ticks=count,
+            wall_s=1.0,
+            overruns=0,
+            answered_ticks=count,
+            armed_ticks=count,
+            command_digest="0123456789abcdef" * 4,
+            state_to_command_us={},
+            rejected_commands={},
+            limited_commands={},
+            faults=[],
+            lifecycle="disarmed",
+            why="finished",
+        ),
+        control=control,
+        worlds=[],
+        time_s=start_s + since_s,
+        angle_rad=0.3 * np.sin(phase),
+        velocity_rad_s=0.6 * math.pi * np.cos(phase),
+        torque_nm=2.0 * np.cos(phase),
+        mode=np.full((count, JOINTS), Mode.POSITION, dtype=np.int8),
+        target=0.3 * np.sin(phase) + 0.01,
+        torque_limit_nm=np.full((count, JOINTS), 7.0),
+        position_w=np.full((count, 3), np.nan),
+        orientation_wxyz=np.full((count, 4), np.nan),
+        contact_peak_n=np.zeros(count),
+        contact_count=np.zeros(count),
+    )
+
+
+def describe_of(run: RunConfig):
+    return describe(run.robot, backend="sim", period_ns=run.period_ns, lease_ns=run.lease_ns, config_hash="x")
+
+
+def shown(difference: Difference) -> tuple[str, str]:
+    """Table and page; neither may show what is not a number."""
+    told = table(difference), page(difference, within(difference, 5))
+    for text in told:
+        assert not re.search(
+            r"\b(nan|inf|None)\b", re.sub(r"<(style|script)>.*?</\1>|base64,[^\"]*", "", text, flags=re.S)
+        )
+    return told
+
+
+def test_the_same_run_twice_differs_in_nothing() -> None:
+    difference = differ(made_up(), made_up())
+    assert difference.identical and difference.parted is None and difference.settings == []
+    assert [gap.rms for gap in difference.gaps] == [0.0] * 4  # angle, speed, torque, angle target
+    assert difference.torque.correlation == pytest.approx(1)
+    assert difference.advance is not None and difference.advance.percent == 0
+    assert difference.hand_overs.same_order and difference.hand_overs.later_s == [0, 0, 0]
+    text, html = shown(difference)
+    assert "The runs are the same, joint by joint, for all of their 200 common ticks." in text
+    assert "No difference: every angle is the same at every instant." in html
+
+
+def test_one_joint_that_is_off_is_named_with_its_time() -> None:
+    a = made_up()
+    angle = a.angle_rad.copy()
+    angle[120:, 4] += 0.2
+    angle[150, 4] += 0.1
+    difference = differ(a, dataclasses.replace(a, angle_rad=angle))
+    worst, parted = difference.angle.worst, difference.parted
+    assert worst is not None and (worst.joint, worst.time_s) == (4, pytest.approx(1.5))
+    assert worst.difference == pytest.approx(0.3)
+    assert difference.angle.joint_rms[4] == pytest.approx(math.sqrt((79 * 0.2**2 + 0.3**2) / 200))
+    assert difference.angle.joint_rms[[0, 3, 5, 12]].tolist() == [0, 0, 0, 0]
+    assert parted is not None and (parted.row, parted.joint) == (120, 4) and parted.time_s == pytest.approx(1.2)
+    assert difference.torque.rms == 0 and not difference.identical
+    text, html = shown(difference)
+    assert "The runs part at 1.20 s, when joint_5 is first more than 0.05 rad apart." in text
+    assert "joint_5 at 1.50 s" in text and 'data-joint="joint_5"' in html
+
+
+def test_runs_are_aligned_at_their_first_arming_whenever_that_was() -> None:
+    difference = differ(made_up(start_s=0.5), made_up(start_s=7.25))
+    assert difference.aligned.how == "tick by tick"
+    assert difference.angle.rms == pytest.approx(0, abs=1e-12)
+    assert difference.hand_overs.later_s == pytest.approx([0, 0, 0])
+
+
+def test_the_common_time_alone_counts() -> None:
+    difference = differ(made_up(seconds=2), made_up(seconds=1))
+    assert difference.aligned.time_s[-1] == pytest.approx(0.99) and difference.identical
+    assert [one.joint for one in difference.hand_overs.a] == [9, 8]  # the third comes later than B lasts
+    assert [one.key for one in difference.settings] == ["duration_s"]
+
+
+def test_a_run_that_is_late_is_seen_so() -> None:
+    a, late = made_up(), 0.05
+    since_s = a.time_s[:, None] - a.time_s[0] - late
+    b = dataclasses.replace(a, angle_rad=0.3 * np.sin(2 * math.pi * since_s + 0.3 * np.arange(JOINTS)))
+    difference = differ(a, b)
+    size = 0.3 * 2 * math.sin(math.pi * late)  # of the difference of two sines
+    assert difference.angle.rms == pytest.approx(size / math.sqrt(2), rel=0.01)
+    assert difference.angle.correlation == pytest.approx(math.cos(2 * math.pi * late), abs=0.005)
+
+
+def test_scaled_torques_correlate_fully() -> None:
+    a = made_up()
+    difference = differ(a, dataclasses.replace(a, torque_nm=1.5 * a.torque_nm))
+    assert difference.torque.correlation == pytest.approx(1)
+    assert difference.torque.rms == pytest.approx(1.0 / math.sqrt(2), rel=0.01)
+    assert difference.torque.worst is not None and abs(difference.torque.worst.difference) == pytest.approx(
+        1.0, rel=0.01
+    )
+    shown(difference)
+
+
+def test_rates_that_differ_are_compared_at_the_coarser_and_it_says_so() -> None:
+    difference = differ(made_up(rate_hz=100), made_up(rate_hz=30, seconds=1.5))
+    assert len(difference.aligned.time_s) == 45
+    assert difference.aligned.how == "A at 100 Hz, B at 30 Hz: A is interpolated at the ticks of B"
+    assert difference.angle.rms is not None and difference.angle.rms < 2e-4  # a sine between 10 ms ticks
+    assert {"rate_hz", "duration_s"} <= {one.key for one in difference.settings}
+    assert difference.aligned.how in shown(difference)[0]
+
+
+def test_a_set_point_holds_until_the_next_one() -> None:
+    a = made_up(rate_hz=50)
+    b = made_up(rate_hz=40)
+    steps = [np.repeat(np.floor((r.time_s - 0.5) * 10 + 1e-9)[:, None], JOINTS, axis=1) for r in (a, b)]
+    difference = differ(dataclasses.replace(a, target=steps[0]), dataclasses.replace(b, target=steps[1]))
+    assert difference.targets[0].rms == 0
+
+
+def test_ticks_that_are_missing_are_told() -> None:
+    a = made_up()
+    keep = np.arange(200) != 50
+    columns = ("time_s", "angle_rad", "velocity_rad_s", "torque_nm", "mode", "target")
+    difference = differ(a, dataclasses.replace(a, **{name: getattr(a, name)[keep] for name in columns}))
+    assert difference.aligned.how.startswith("both at 100 Hz, but some ticks are missing")
+    assert difference.identical
+
+
+def test_targets_are_compared_only_within_one_mode() -> None:
+    a = made_up()
+    mode, target = a.mode.copy(), a.target.copy()
+    mode[100:, 6], target[100:, 6] = Mode.TORQUE, 5.0
+    difference = differ(a, dataclasses.replace(a, mode=mode, target=target))
+    assert difference.other_mode == pytest.approx(100 / (200 * JOINTS))
+    assert [gap.what for gap in difference.targets] == ["angle target"]
+    assert difference.targets[0].rms == 0 and not difference.identical
+    assert difference.tracking_rad == pytest.approx((0.01, 0.01))
+    both = differ(
+        dataclasses.replace(a, mode=mode, target=target), dataclasses.replace(a, mode=mode, target=target + 1)
+    )
+    torque = both.targets[1]
+    assert torque.what == "torque target" and torque.worst is not None
+    assert (torque.worst.joint, torque.worst.time_s, torque.worst.difference) == (6, pytest.approx(1.0), 1.0)
+    assert [joint for joint, worst in enumerate(torque.joint_worst) if worst is not None] == [6]
+    shown(both)
+
+
+@pytest.mark.parametrize(("speed_m_s", "percent"), [(0.09, -10.0), (0.125, 25.0), (-0.1, -200.0)])
+def test_distance_is_relative_to_the_first_run(speed_m_s: float, percent: float) -> None:
+    difference = differ(made_up(), made_up(speed_m_s=speed_m_s))
+    assert difference.advance is not None and difference.advance.percent == pytest.approx(percent)
+    asked = within(difference, abs(percent) - 0.1)
+    assert asked is not None and not asked.holds
+    asked = within(difference, abs(percent) + 0.1)
+    assert asked is not None and asked.holds
+
+
+def test_nobody_makes_a_percentage_of_standing_still() -> None:
+    stood = made_up(speed_m_s=0)
+    both, one = differ(stood, made_up(speed_m_s=1e-5)), differ(stood, made_up())
+    assert both.advance is not None and both.advance.percent == 0
+    assert one.advance is not None and one.advance.percent is None
+    asked = within(one, 1000)
+    assert asked is not None and not asked.holds and "A stood still" in asked.words
+    shown(both)
+    shown(one)
+
+
+def test_a_distance_that_nobody_knows_is_not_made_up() -> None:
+    difference = differ(made_up(), made_up(controller_knows=False))
+    assert difference.advance is None and within(difference, 10) is None
+    text, html = shown(difference)
+    assert "no measure that both have" in text and "No distance" in html
+
+
+def test_hand_overs_agree_up_to_where_they_do_not() -> None:
+    b = made_up(propelled=((0.0, 9), (0.7, 8), (1.1, 6), (1.5, 7)))
+    difference = differ(made_up(), b)
+    both = difference.hand_overs
+    assert both.agreed == 2 and both.later_s == pytest.approx([0, 0.1]) and not both.same_order
+    said = "agrees for the first 2; then A goes on with joint_8 at 1.20 s, B goes on with joint_7 at 1.10 s"
+    text, html = shown(difference)
+    assert said in text and said in html
+
+
+def test_settings_that_differ_are_named_with_both_values() -> None:
+    a = made_up()
+    b = dataclasses.replace(a, config=configured(**{"robot.motor.stiffness_nm_per_rad": 50, "seed": 2}))
+    found = {one.key: (one.a, one.b) for one in differ(a, b).settings}
+    assert found["robot.motor.stiffness_nm_per_rad"] == ("60.0", "50.0") and found["seed"] == ("1", "2")
+    assert not [key for key in found if key.startswith("description.")]
+
+
+def test_a_robot_that_was_described_otherwise_is_told() -> None:
+    a = made_up()
+    joints = [msgspec.structs.replace(joint, torque_limit_nm=3.5) for joint in a.description.joints]
+    b = dataclasses.replace(a, description=msgspec.structs.replace(a.description, joints=joints))
+    assert ("description.joints.0.torque_limit_nm", "7.0", "3.5") in [
+        (one.key, one.a, one.b) for one in differ(a, b).settings
+    ]
+
+
+def test_robots_with_other_joints_are_not_compared() -> None:
+    a = made_up()
+    short = msgspec.structs.replace(a.config.robot, chain=Chain(modules=8, axes=["yaw"]))
+    description = describe(short, backend="sim", period_ns=10_000_000, lease_ns=50_000_000, config_hash="x")
+    with pytest.raises(ConfigError, match=r"13 joints.*8 joints.*one robot file"):
+        differ(a, dataclasses.replace(a, description=description))
+
+
+def test_a_run_that_never_armed_is_not_compared() -> None:
+    a = made_up()
+    empty = dataclasses.replace(a, folder=Path("idle"), time_s=np.zeros(0))
+    with pytest.raises(ConfigError, match=r"idle/blackbox.npz.*never armed"):
+        differ(a, empty)
+
+
+def test_a_single_common_tick_is_enough() -> None:
+    shown(differ(made_up(), made_up(seconds=0.01, controller_knows=False)))
+
+
+def test_folders_that_hold_no_run_are_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"nowhere: no such folder; .*--out FOLDER"):
+        compare(tmp_path / "nowhere", tmp_path)
+    with pytest.raises(ConfigError, match=r"not the folder of a run: config\.json is missing"):
+        compare(tmp_path, tmp_path)
+    for name in ("config.json", "blackbox.npz", "host.json", "description.json"):
+        (tmp_path / name).write_text("{")
+    with pytest.raises(ConfigError, match="holds a record that cannot be read"):
+        compare(tmp_path, tmp_path)
+    with pytest.raises(ConfigError, match="--within -1: give a percentage"):
+        compare(tmp_path, tmp_path, within_percent=-1)

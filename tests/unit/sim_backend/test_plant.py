@@ -1,0 +1,386 @@
+"""The body under emulated modules: it starts as the simulated robot does, obeys the same physics, and feels it."""
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike
+
+from snakesim_hal.errors import BackendError
+from snakesim_hal.kinematics import rotation_from_quaternion
+from snakesim_hal.messages import Mode
+from snakesim_hal.plant import LinkLoad, Plant
+from snakesim_hal.scenario import load, start_of
+from snakesim_sim_backend.plant import MujocoPlant
+from snakesim_sim_backend.settings import PlantSettings, Tether
+from snakesim_sim_backend.tether import WINCH_N_S_PER_M
+from tests.unit.sim_backend.rig import G, Run, make_config
+from tests.unit.sim_backend.test_start import CURVE, HILLS
+
+ICE = {"ground": {"friction": 0.0}}
+FOUR = {"chain": {"modules": 4}}
+RUBBING = {"armature_kg_m2": 0.01, "friction_nm": 0.05, "viscous_nm_s_per_rad": 0.02}
+PEG = {"cylinder": [{"position_m": [0.22, 0.0905], "radius_m": 0.05}]}
+
+
+def make_plant(config, **settings):
+    return MujocoPlant(config, PlantSettings(**settings))
+
+
+def pass_time(plant, torque_nm: ArrayLike = 0.0, seconds=0.0):
+    """At least one step under constant torques: one number for all joints, or one each."""
+    torques = np.broadcast_to(np.asarray(torque_nm, dtype=float), plant.angle_rad.shape)
+    for _ in range(max(round(seconds / plant.step_s), 1)):
+        plant.advance(torques)
+
+
+def touches_of(plant):
+    """Link -> (position, force) in the world's frame of every touch by an obstacle, by MuJoCo's own account."""
+    model, data = plant.sim.model, plant.data
+    found: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
+    wrench = np.zeros(6)
+    for i in range(data.ncon):
+        names = [model.geom(g).name for g in data.contact[i].geom]
+        if not any(name.startswith("obstacle:") for name in names):
+            continue
+        mujoco.mj_contactForce(model, data, i, wrench)
+        force = data.contact[i].frame.reshape(3, 3).T @ wrench[:3]  # on the second geom
+        (which,) = (k for k in (0, 1) if names[k].startswith("link_"))
+        link = int(names[which].removeprefix("link_"))
+        found.setdefault(link, []).append((data.contact[i].pos.copy(), force if which else -force))
+    return found
+
+
+def true_loads(plant):
+    """Link -> (position, force) in the link's frame."""
+    result = {}
+    for link, touches in touches_of(plant).items():
+        body = plant.data.body(f"link_{link}")
+        weights = [np.linalg.norm(force) for _, force in touches]
+        if sum(weights) == 0:
+            continue
+        link_from_world = body.xmat.reshape(3, 3).T
+        position = np.average([p for p, _ in touches], axis=0, weights=weights) - body.xpos
+        result[link] = link_from_world @ position, link_from_world @ np.sum([f for _, f in touches], axis=0)
+    return result
+
+
+def through_joints_nm(plant, torques):
+    """Torque about every joint's axis between its two links, from what the outer links will do under these torques."""
+    model, data = plant.sim.model, mujoco.MjData(plant.sim.model)
+    mujoco.mj_copyData(data, model, plant.data)
+    data.qfrc_applied[6:] = torques
+    mujoco.mj_forward(model, data)
+    mujoco.mj_rnePostConstraint(model, data)
+    return np.array([data.cdof[6 + i] @ data.cfrc_int[model.jnt_bodyid[1 + i]] for i in range(len(plant.angle_rad))])
+
+
+class Firmware:
+    """A module's position loop as the robot file describes it, computed once a step."""
+
+    def __init__(self, config, step_s):
+        self._motor, self._most_nm = config.robot.motor, config.robot.limits.torque_nm
+        self._gain = 1 - math.exp(-step_s / self._motor.response_time_s)
+        self.torque_nm = np.zeros(config.robot.chain.modules)
+
+    def drive(self, plant, target_rad):
+        error, speed = target_rad - plant.angle_rad, plant.velocity_rad_s
+        demand = self._motor.stiffness_nm_per_rad * error - self._motor.damping_nm_s_per_rad * speed
+        self.torque_nm = self.torque_nm + self._gain * (demand - self.torque_nm)
+        plant.advance(np.clip(self.torque_nm, -self._most_nm, self._most_nm))
+
+
+# --- time and start -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("rate_hz", "step_s"), [(100, 1e-3), (300, 1 / 1200), (2000, 5e-4)])
+def test_a_step_is_a_whole_part_of_a_period_and_one_advance_is_one_step(rate_hz, step_s):
+    plant = make_plant(make_config(FOUR, rate_hz=rate_hz))
+    assert plant.step_s == pytest.approx(step_s, rel=1e-6)
+    pass_time(plant)
+    assert plant.data.time == plant.step_s
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        make_config(),
+        load("triplet").config,
+        load("clutter").config,
+        make_config(scene={**HILLS, **CURVE}, start={"on_route": True}),
+        make_config(scene={**HILLS, **CURVE}, base_robot="mamba", start={"on_route": True}),
+    ],
+    ids=["flat", "triplet", "clutter", "hills", "hills_mamba"],
+)
+def test_it_starts_as_the_simulated_robot_does(config):
+    plant, state = make_plant(config), Run(config).sim.true_state()
+    pose = plant.pose()
+    assert plant.angle_rad == pytest.approx(state.angles_rad, abs=1e-4)
+    assert pose.position_w == pytest.approx(state.base_position_w, abs=1e-4)
+    assert pose.orientation_wxyz == pytest.approx(state.base_orientation_wxyz, abs=1e-4)
+    assert not plant.velocity_rad_s.any()
+    assert not any(pose.velocity_w + pose.angular_velocity_w)
+    assert plant.data.time == 0.0
+
+
+def test_without_torque_it_stays_where_it_lies():
+    plant: Plant = make_plant(load("triplet").config)
+    angles, before = plant.angle_rad.copy(), plant.pose()
+    pass_time(plant, seconds=1.0)
+    after = plant.pose()
+    assert before is not None
+    assert after is not None
+    assert plant.angle_rad == pytest.approx(angles, abs=1e-4)
+    assert after.position_w == pytest.approx(before.position_w, abs=1e-4)
+    assert np.abs(plant.velocity_rad_s).max() < 1e-4
+    assert (before.tick, before.stamp_ns, after.tick, after.stamp_ns) == (0, 0, 0, 10**9)
+
+
+# --- torques ------------------------------------------------------------------------------------------------------
+
+
+def test_a_free_joint_speeds_up_as_its_links_and_rotor_allow_and_the_gauge_feels_the_links_alone():
+    """Two equal bars, straight and free, open about their joint without pushing each other: inertia is half a bar's."""
+    rotor, torque = 0.004, 0.03
+    config = make_config({"chain": {"modules": 1}, "motor": {"armature_kg_m2": rotor}}, ICE)
+    plant = make_plant(config)
+    links = plant.sim.model.body("link_1").inertia.max() / 2  # about an axis across the bar
+    pass_time(plant, torque)
+    expected = torque / (links + rotor)
+    assert plant.velocity_rad_s[0] / plant.step_s == pytest.approx(expected, rel=1e-3)
+    assert plant.shaft_torque_nm()[0] == pytest.approx(torque - rotor * expected, rel=1e-3)
+
+
+def test_torques_accelerate_as_the_equations_of_motion_say():
+    plant = make_plant(make_config(FOUR, {**ICE, **CURVE}, start={"on_route": True}))
+    model, data = plant.sim.model, mujoco.MjData(plant.sim.model)
+    data.qpos[:] = plant.data.qpos
+    torques = np.array([0.0, 0.2, 0.0, -0.1])
+    data.qfrc_applied[6:] = torques
+    mujoco.mj_forward(model, data)
+    before = plant.velocity_rad_s.copy()
+    plant.advance(torques)
+    gained = (plant.velocity_rad_s - before) / plant.step_s
+    assert gained == pytest.approx(data.qacc[6:], rel=1e-9)
+    assert plant.shaft_torque_nm() == pytest.approx(torques - 0.005 * data.qacc[6:], rel=1e-9)
+
+
+def test_a_joint_stops_at_its_limit_and_the_gauge_feels_the_motor_push_there():
+    plant = make_plant(make_config({**FOUR, "limits": {"angle_rad": 0.3}}, ICE))
+    pass_time(plant, [0.0, 0.4, 0.0, 0.0], seconds=2.0)
+    assert plant.angle_rad[1] == pytest.approx(0.3, abs=5e-3)
+    assert abs(plant.velocity_rad_s[1]) < 1e-3
+    assert plant.shaft_torque_nm()[1] == pytest.approx(0.4, rel=1e-2)
+
+
+def test_at_rest_the_shaft_has_the_motor_s_torque_less_what_dry_friction_holds():
+    """Friction of the ground holds the links, so nothing moves: first without, then with dry friction in the joints."""
+    grippy = {"ground": {"friction": 1.0}}
+    held = [0.02, -0.01, 0.03, 0.0]
+    plant = make_plant(make_config(FOUR, grippy))
+    pass_time(plant, held, seconds=0.5)
+    assert np.abs(plant.velocity_rad_s).max() < 0.01
+    assert plant.shaft_torque_nm() == pytest.approx(held, abs=1e-3)
+    dry = make_plant(make_config({**FOUR, "motor": {"friction_nm": 0.1}}, ICE))
+    pass_time(dry, held, seconds=0.5)
+    assert np.abs(dry.velocity_rad_s).max() < 0.01
+    assert dry.shaft_torque_nm() == pytest.approx([0.0] * 4, abs=1e-3)
+
+
+@pytest.mark.parametrize("motor", [{}, RUBBING], ids=["smooth", "rubbing"])
+def test_in_motion_the_shafts_carry_what_the_outer_links_need(motor):
+    """Among pegs, with inertia, gravity, friction and touches: against the forces between the links."""
+    peg = {"cylinder": [{"position_m": [0.22 + 0.2 * k, 0.0905], "radius_m": 0.05, "friction": 0.3} for k in range(3)]}
+    robot = {"motor": motor, "limits": {"angle_rad": 3.1}}  # no end stops: they are not felt, but between the links
+    plant = make_plant(make_config(robot, {"ground": {"friction": 0.2}, **peg}))
+    plant.sim.model.opt.tolerance = 1e-14  # of the solver, whose default leaves 1e-3 N·m open
+    touched = 0
+    for k in range(1500):
+        torques = np.array([0.5 * np.sin(0.01 * k + 0.9 * i) for i in range(13)])
+        needed = through_joints_nm(plant, torques) if k % 20 == 0 else None
+        plant.advance(torques)
+        if needed is not None:
+            assert plant.shaft_torque_nm() == pytest.approx(needed, abs=1e-5)
+            touched += len(plant.loads())
+    assert touched > 5
+    assert np.ptp(plant.angle_rad) > 0.3
+
+
+def test_a_position_loop_run_once_a_step_moves_it_as_the_simulator_s_own_motors_do():
+    """All the way within a thousandth of the motion, and the torques within 3 % of the greatest."""
+    config = make_config({"chain": {"modules": 6}}, rate_hz=1000)
+    plant, run = make_plant(config), Run(config, timestep_s=0.001)
+    firmware = Firmware(config, plant.step_s)
+    worst_rad, worst_nm, most_rad, most_nm = 0.0, 0.0, 0.0, 0.0
+    for k in range(1000):
+        target = np.array([0.1 * np.sin(0.0063 * k - 0.8 * i) - 0.1 * np.sin(-0.8 * i) for i in range(6)])
+        run.command(Mode.POSITION, target.tolist())
+        run.go()
+        firmware.drive(plant, target)
+        state = run.sim.true_state()
+        worst_rad = max(worst_rad, np.abs(plant.angle_rad - state.angles_rad).max())
+        worst_nm = max(worst_nm, np.abs(firmware.torque_nm - state.torques_nm).max())
+        most_rad = max(most_rad, np.abs(state.angles_rad).max())
+        most_nm = max(most_nm, np.abs(state.torques_nm).max())
+    assert most_rad > 0.1
+    assert worst_rad < 1e-3 * most_rad
+    assert worst_nm < 0.03 * most_nm
+    assert plant.pose().position_w == pytest.approx(run.sim.true_state().base_position_w, abs=1e-4)
+
+
+# --- what is felt -------------------------------------------------------------------------------------------------
+
+
+def test_nothing_is_felt_where_nothing_touches_but_the_ground():
+    plant = make_plant(make_config())
+    assert plant.loads() == []
+    pass_time(plant)
+    assert plant.loads() == []
+
+
+def test_a_peg_pushes_back_on_the_link_that_is_pushed_at_it():
+    plant = make_plant(make_config(FOUR, {**ICE, **PEG}))
+    plant.data.xfrc_applied[plant.sim.model.body("link_2").id, 1] = 20.0
+    firmware = Firmware(make_config(FOUR), plant.step_s)
+    for _ in range(400):
+        firmware.drive(plant, 0.0)
+    (felt,) = plant.loads()
+    assert isinstance(felt, LinkLoad)
+    assert felt.link == 2
+    assert felt.force_l == pytest.approx((0.0, -20.0, 0.0), abs=0.3)
+    assert felt.position_l[1] == pytest.approx(0.04, abs=1e-3)  # on the body's left
+
+
+def test_a_motor_that_bends_the_snake_between_three_pegs_feels_the_moment_of_their_pushes():
+    """A peg on the left of its middle and one on the right of each end: bent to the right, it is jammed."""
+    places = [(0.03, -0.0905), (0.24, 0.0905), (0.62, -0.0905)]
+    pegs = {"cylinder": [{"position_m": list(place), "radius_m": 0.05} for place in places]}
+    config = make_config({"chain": {"modules": 6}}, {**ICE, **pegs})
+    plant = make_plant(config)
+    firmware = Firmware(config, plant.step_s)
+    for k in range(500):
+        firmware.drive(plant, np.array([0.0, 0.0, -min(k * 1e-4, 0.03), 0.0, 0.0, 0.0]))
+    tail, middle, head = plant.loads()
+    assert (tail.link, middle.link, head.link) == (0, 2, 6)
+    assert middle.force_l[1] < -1.0 < 1.0 < min(tail.force_l[1], head.force_l[1])
+    assert tail.position_l[1] < 0.0 < middle.position_l[1]
+    assert np.abs(plant.velocity_rad_s).max() < 0.02  # it is being squeezed out forwards, slowly
+    joint, body = plant.data.body("link_3").xpos, plant.data.body("link_6")
+    rotation = body.xmat.reshape(3, 3)
+    arm = body.xpos + rotation @ head.position_l - joint
+    moment = np.cross(arm, rotation @ head.force_l)[2]
+    assert plant.shaft_torque_nm()[2] == pytest.approx(-moment, rel=0.01)
+    assert plant.shaft_torque_nm() == pytest.approx(firmware.torque_nm, abs=0.01)
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.4])
+def test_loads_are_the_sums_of_the_true_touches(friction):
+    """Jammed between walls and pegs, links are touched at several places at once."""
+    walls = [{"from_m": [-1, y], "to_m": [3, y], "friction": friction} for y in (0.09, -0.09)]
+    pegs = [{"position_m": [0.4 + 0.3 * k, 0.06], "radius_m": 0.02, "friction": friction} for k in range(3)]
+    config = make_config(scene={"wall": walls, "cylinder": pegs})
+    plant = make_plant(config)
+    firmware = Firmware(config, plant.step_s)
+    links, most_on_one = set(), 0
+    for k in range(600):
+        firmware.drive(plant, np.array([0.5 * np.sin(0.01 * k + i) for i in range(13)]))
+        felt, true = plant.loads(), true_loads(plant)
+        assert [one.link for one in felt] == sorted(true)
+        for one in felt:
+            position, force = true[one.link]
+            assert one.force_l == pytest.approx(force, abs=1e-9)
+            assert one.position_l == pytest.approx(position, abs=1e-9)
+        links |= set(true)
+        most_on_one = max([most_on_one, *map(len, touches_of(plant).values())])
+    assert len(links) > 5
+    assert most_on_one > 1
+
+
+def test_imus_feel_what_they_would_if_they_were_computed_in_every_step():
+    plant = make_plant(make_config(scene=PEG))
+    model, other = plant.sim.model, mujoco.MjData(plant.sim.model)
+    for k in range(300):
+        torques = np.array([0.5 * np.sin(0.02 * k + i) for i in range(13)])
+        if k == 299:
+            mujoco.mj_copyData(other, model, plant.data)
+            model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+            other.qfrc_applied[6:] = torques
+            mujoco.mj_step(model, other)
+            model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+        plant.advance(torques)
+    imu = plant.imu()
+    assert imu is not None
+    assert imu == plant.imu()
+    assert imu.link == list(range(14))
+    assert np.ravel(imu.angular_velocity_rad_s + imu.acceleration_m_s2) == pytest.approx(other.sensordata, abs=1e-12)
+    assert np.abs(imu.angular_velocity_rad_s).max() > 0.1
+
+
+def test_at_the_start_imus_feel_gravity_alone():
+    config = make_config()
+    imu = make_plant(config).imu()
+    assert imu is not None
+    assert imu == Run(config).sample().others["sensor/imu"]
+    for turning, force in zip(imu.angular_velocity_rad_s, imu.acceleration_m_s2, strict=True):
+        assert turning == pytest.approx((0, 0, 0), abs=1e-6)
+        assert force == pytest.approx((0, 0, G), abs=0.05)
+
+
+def test_a_robot_without_imus_feels_none():
+    config = make_config({"sensors!": {"joints": {}}})
+    plant = make_plant(config)
+    assert plant.imu() is None
+    assert plant.pose() is not None
+
+
+def test_the_pose_is_true_and_of_now():
+    plant = make_plant(make_config(start={"yaw_rad": 0.7}))
+    plant.data.qvel[:6] = [0.3, -0.2, 0.0, 0.0, 0.0, 0.5]
+    pass_time(plant, 0.05, seconds=0.1)
+    pose = plant.pose()
+    assert pose.position_w == pytest.approx(plant.data.qpos[:3], abs=0)
+    assert pose.velocity_w == pytest.approx(plant.data.qvel[:3], abs=0)
+    mujoco.mj_kinematics(plant.sim.model, plant.data)
+    rotation = plant.data.body("link_0").xmat.reshape(3, 3)
+    assert rotation_from_quaternion(pose.orientation_wxyz) == pytest.approx(rotation, abs=1e-12)
+    assert pose.angular_velocity_w == pytest.approx(rotation @ plant.data.qvel[3:6], abs=1e-12)
+
+
+# --- the rest -----------------------------------------------------------------------------------------------------
+
+
+def test_a_tether_tows_it():
+    plant = make_plant(make_config(FOUR), tether=Tether(link=4, direction_w=(1.0, 0.0), reel_in_m_s=0.1))
+    pass_time(plant, seconds=1.0)
+    friction = 0.3 * 4 * 0.3 * G
+    assert plant.pose().velocity_w[0] == pytest.approx(0.1 - friction / WINCH_N_S_PER_M, rel=0.02)
+
+
+@pytest.mark.parametrize("torque", [math.nan, math.inf, 1e12])
+def test_what_blows_up_is_reported_at_once_and_for_good_and_no_number_is_lost(torque):
+    config = make_config()
+    plant = make_plant(config)
+    pass_time(plant, seconds=0.01)
+    bad = np.zeros(13)
+    bad[4] = torque
+    with pytest.raises(BackendError, match="diverged at step 11"):
+        plant.advance(bad)
+    assert plant.angle_rad == pytest.approx(start_of(config).angles_rad, abs=1e-3)
+    assert np.isfinite(plant.shaft_torque_nm()).all()
+    imu = plant.imu()
+    assert imu is not None
+    assert imu.acceleration_m_s2[7] == pytest.approx((0, 0, G), abs=0.05)
+    good = plant.angle_rad.copy()
+    with pytest.raises(BackendError, match="step 11"):
+        plant.advance(bad)
+    assert np.array_equal(plant.angle_rad, good)
+
+
+def test_a_firmware_that_swings_up_is_found_out_and_the_joint_named():
+    """A stiff loop, with a light rotor and no lag, whose damping acts too strongly for the step."""
+    plant = make_plant(make_config({"motor": {"armature_kg_m2": 1e-6}}, ICE))
+    with pytest.raises(BackendError, match=r"diverged at step \d+: joint_\d+ moves at"):
+        for _ in range(5000):
+            plant.advance(-20.0 * plant.velocity_rad_s + 1e-3)
+            assert np.isfinite(plant.angle_rad).all()
