@@ -1,11 +1,13 @@
 # What a contributor does, and what CI does. `make` alone lists it.
 #   PYTHON=python3.12   the interpreter that `make setup` builds on
 #   ARGS="-k gate"      further arguments for demo, test and bench
+#   WORKERS=1           how many tests run side by side (2)
 #   UPGRADE=1           lets `make lock` take the newest versions allowed
 
 PYTHON ?=
 ARGS ?=
 UPGRADE ?=
+WORKERS ?= 2
 
 # A sourced ROS workspace sets these; its packages and pytest plugins must not leak into ours.
 unexport PYTHONPATH PYTHONHOME PYTHONSTARTUP PYTEST_ADDOPTS VIRTUAL_ENV
@@ -17,18 +19,24 @@ packages := $(wildcard snakesim_*)
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test check bench schemas docs lock clean FORCE
+.PHONY: help setup demo test test-here test-vcan check bench schemas docs lock clean FORCE
 
 help: ## List these targets
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' Makefile
 
 setup: $(stamp) ## Make .venv from the hashed lock (PYTHON=python3.12 to choose)
 
 demo: $(stamp) ## Run the simulated snake through a triplet of obstacles, into runs/demo
 	$(bin)/snakesim run triplet --out runs/demo $(ARGS)
 
-test: $(stamp) ## Run the tests (ARGS="-k gate -n auto")
-	$(bin)/python -m pytest $(ARGS)
+test: test-here test-vcan ## Run all tests
+
+test-here: $(stamp) ## Run the tests that need no CAN bus (ARGS="-k gate")
+	$(bin)/python -m pytest -n $(WORKERS) --ignore tests/vcan $(ARGS)
+
+test-vcan: $(stamp) ## Run the tests on a real SocketCAN bus, in a small VM where the kernel has none
+	SNAKESIM_NEED_VCAN=1 $(bin)/python deploy/vm/with_vcan.py -- \
+	  $(bin)/python -m pytest tests/vcan tests/contract $(ARGS)
 
 check: $(stamp) ## Lint, format, types and import rules, without changing anything
 	$(bin)/ruff check

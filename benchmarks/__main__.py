@@ -3,8 +3,11 @@
 import argparse
 import platform
 import statistics
+from collections.abc import Callable
 from pathlib import Path
 
+from benchmarks.bus import FULLEST_FRAMES_PER_S, frame_costs, saturated_share
+from benchmarks.cycle import cycle, load_table
 from benchmarks.echo import echo_us
 from benchmarks.physics import BareLoop, config_of, motion, sensing, wire_bytes
 from benchmarks.size import core_install_mb
@@ -61,13 +64,37 @@ def main() -> int:
     best, shares = highest_rate_hz()
     listed = ", ".join(f"{rate} Hz {100 * share:.1f} %" for rate, share in shares.items())
     say(f"Highest rate at which 99 % of ticks get their command within the tick: {best} Hz ({listed}).")
+    say("\n## CAN\n")
+    tell_bus(say)
     total, sizes = core_install_mb()
     largest = sorted(sizes.items(), key=lambda item: -item[1])[:6]
     listed = ", ".join(f"{name} {size:.0f}" for name, size in largest)
-    say(f"Core install: {total:.0f} MB of 400 MB allowed ({listed}).")
+    say(f"\n## Size\n\nCore install: {total:.0f} MB of 400 MB allowed ({listed}).")
     if write:
         RESULTS.write_text("\n".join(text) + "\n", encoding="utf-8")
     return 0
+
+
+def tell_bus(say: Callable[[str], None]) -> None:
+    """What the bus costs, and how regular it is."""
+    costs = frame_costs(REPEATS)
+    say(HEADER)
+    what = f"driver: receive, check, decode and store a frame, on {costs.on}"
+    say(compare(what, "bare `recv_into` + `struct` loop", costs.ours, costs.bare, 3.0).row())
+    if costs.libraries:
+        say(compare(what, "python-can + cantools", costs.ours, costs.libraries, 1.0).row())
+    share = saturated_share(statistics.median(costs.ours))
+    say(f"\nA saturated bus, {FULLEST_FRAMES_PER_S:.0f} frames/s, takes {share:.1%} of one core (half of one allowed).")
+    took = cycle()
+    say(
+        f"Control cycle at 100 Hz, 13 joints: a command is ready, and its first set-point is on the bus "
+        f"{took.command_to_first_p50:.2f} ms later (p99 {took.command_to_first_p99:.2f}), its last "
+        f"{took.command_to_last_p50:.2f} ms (p99 {took.command_to_last_p99:.2f}). Sync is off its period by "
+        f"{took.sync_jitter_p50:.3f} ms (p99 {took.sync_jitter_p99:.3f}).\n"
+    )
+    for row in load_table():
+        say(row)
+    say("")
 
 
 if __name__ == "__main__":

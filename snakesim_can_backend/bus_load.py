@@ -145,8 +145,8 @@ def check_load(config: RunConfig, settings: Settings) -> list[float]:
     needed_s = busiest_s(joints[longest], on_bus(longest, reports))
     if needed_s * config.rate_hz > 1:
         raise ConfigError(
-            f"{joints[longest]} joints at {config.rate_hz:g} Hz do not fit on {_name(settings, longest)}: a "
-            f"period with force reports takes {needed_s * 1000:.2f} ms of bus time, and lasts {1000 / config.rate_hz:.2f} ms.\n"
+            f"{joints[longest]} joints at {config.rate_hz:g} Hz do not fit on {_name(settings, longest)}: a period "
+            f"with force reports takes {needed_s * 1000:.2f} ms of bus time and lasts {1000 / config.rate_hz:.2f} ms.\n"
             f"{what_fits(joints, config, settings)}"
         )
     return loads

@@ -1,13 +1,14 @@
 """The module twins that a driver starts for itself: in its own process on a virtual bus, or as a child on vcan."""
 
 import os
-import select
 import signal
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
+
+import msgspec
 
 from snakesim_can_backend.settings import Settings
 from snakesim_can_backend.wire import OtherEnd
@@ -17,6 +18,7 @@ from snakesim_hal.scenario import RunConfig, write
 READY = "modules ready"
 START_LIMIT_S = 120.0  # MuJoCo on a slow machine
 STOP_LIMIT_S = 5.0
+POLL_S = 0.02
 
 
 def check_twins(config: RunConfig, settings: Settings) -> None:
@@ -52,25 +54,25 @@ class TwinProcess:
     def __init__(self, config: RunConfig, settings: Settings, pose: str | None, *, stepped: bool) -> None:
         """Start it, and wait until its modules are on the bus. Raises BackendError."""
         self._folder = tempfile.TemporaryDirectory(prefix="snakesim-twins-")
-        run = Path(self._folder.name, "config.json")
-        write(config, run)
-        arguments = [str(run), "--parent", str(os.getpid())]
+        run, self._said = Path(self._folder.name, "config.json"), Path(self._folder.name, "modules.log")
+        write(msgspec.structs.replace(config, backends={**config.backends, "can": msgspec.to_builtins(settings)}), run)
+        arguments = [str(run), "--parent", str(os.getpid()), "--pose", pose or "none"]
         for channel in settings.channels:
             arguments += ["--channel", channel]
         arguments += ["--stepped"] if stepped else []
-        arguments += ["--pose", pose or "none"]
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "snakesim_can_backend.twin.command", *arguments],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            start_new_session=True,
-        )
+        with self._said.open("wb") as output:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "snakesim_can_backend.twin.command", *arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, "PYTHONUNBUFFERED": "1"},
+                start_new_session=True,
+            )
         self._await_ready()
 
     def stop(self) -> None:
-        """Ask it to end, then insist."""
+        """Ask it to end, then insist. What it said goes to this process's stderr."""
         if self._process.poll() is None:
             self._process.send_signal(signal.SIGTERM)
             try:
@@ -78,22 +80,17 @@ class TwinProcess:
             except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.wait()
-        if self._process.stdout is not None:
-            sys.stderr.write(self._process.stdout.read())
-            self._process.stdout.close()
+        sys.stderr.write(self._said.read_text(encoding="utf-8", errors="replace"))
         self._folder.cleanup()
 
     def _await_ready(self) -> None:
-        said: list[str] = []
         end = time.monotonic() + START_LIMIT_S
-        output = self._process.stdout
-        assert output is not None
-        while (left_s := end - time.monotonic()) > 0 and select.select([output], [], [], left_s)[0]:
-            line = output.readline()
-            if line.startswith(READY):
+        while time.monotonic() < end:
+            said = self._said.read_text(encoding="utf-8", errors="replace")
+            if READY in said:
                 return
-            if not line:
+            if self._process.poll() is not None:
                 break
-            said.append(line.rstrip())
-        self._process.kill()
-        raise BackendError("the module twins did not start: " + ("\n".join(said[-15:]) or "they said nothing"))
+            time.sleep(POLL_S)
+        self.stop()
+        raise BackendError("the module twins did not start; see what they said above")

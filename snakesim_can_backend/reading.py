@@ -4,6 +4,7 @@ Pure: frames and Sync numbers in, no clock and no bus. Everything is kept as raw
 once when a tick asks for it.
 """
 
+from binascii import crc_hqx
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,7 +22,6 @@ from snakesim_can_backend.protocol import (
     ModuleState,
     Opcode,
     frame_id,
-    intact,
     node_of,
     opcode_of,
 )
@@ -29,6 +29,9 @@ from snakesim_can_backend.protocol import (
 Floats = NDArray[np.float64]
 TOLD_WITHIN = 3  # Syncs from a module's fault to its heartbeat, at most
 LATE_SYNCS = 3  # a state this many Syncs late is still taken, with its age; older counts are wrong ones
+COUNT_AT, STATE_AT = 3, 4  # in what `_read_state` gives
+UNTOUCHED = b""
+STATES = [ModuleState(i) if i < len(ModuleState) else ModuleState.FAULT for i in range(16)]  # what is unknown is bad
 LATCHED = (ModuleState.FAULT, ModuleState.EMERGENCY)
 
 
@@ -39,12 +42,11 @@ class Module:
     node: int
     sync: int = -1  # that the newest good state answers; -1: none yet
     state: ModuleState = ModuleState.BOOT
-    derated: bool = False
     last_count: int = -1
     repeats: int = 0  # states in a row with one and the same count
     wrong_counts: int = 0  # in a row
     corrupt: int = 0  # in a row
-    twice: int = 0  # Syncs in a row that were answered more than once
+    twice: int = 0  # Syncs in a row that were answered more than once, up to `twice_at`
     twice_at: int = -1
     frames: int = 0  # in this tick
     uptime_ms: int = -1
@@ -58,6 +60,10 @@ class Module:
     def needs_clearing(self) -> bool:
         """Whether it is in a latched state, and its heartbeat had the time to say why."""
         return bool(self.faults) or self.stopped_syncs >= TOLD_WITHIN
+
+    def answered_twice(self, sync: int) -> int:
+        """Syncs in a row, up to now, that were answered more than once."""
+        return self.twice if self.twice_at >= sync - 1 else 0
 
     def fault_names(self) -> list[str]:
         """The fault bits in words."""
@@ -76,8 +82,8 @@ class Reading:
         self.from_other_host: Counter[Opcode] = Counter()
         self.malformed = 0
         layouts = codec().layouts
-        self._joint = [[0, 0, 0] for _ in range(joints)]
-        self._contact: list[list[int] | None] = [None] * (joints + 1)  # by link
+        self._joint = [[0] * 5 for _ in range(joints)]  # as `_read_state` gives it
+        self._contact: list[bytes | None] = [None] * (joints + 1)  # by link; None: not told yet
         self._gyro: list[list[int] | None] = [None] * joints
         self._acceleration: list[list[int] | None] = [None] * joints
         self._health: list[list[int] | None] = [None] * joints
@@ -87,8 +93,9 @@ class Reading:
         )
         signals = layouts[Opcode.JOINT_STATE].signals
         self._state_scale = np.array([[signals[name].scale] for name in ("angle", "velocity", "torque")])
-        names = ("force_x", "force_y", "force_z", "along", "bearing", "touched", "count")
-        self._read_contact = layouts[Opcode.CONTACT].reader(*names)
+        contact = layouts[Opcode.CONTACT]
+        self._read_contact = contact.reader("force_x", "force_y", "force_z", "along", "bearing")
+        self._read_touch = contact.reader("count", "touched")
         self._read_gyro = layouts[Opcode.GYRO].reader("rate_x", "rate_y", "rate_z", "count")
         names = ("acceleration_x", "acceleration_y", "acceleration_z", "count")
         self._read_acceleration = layouts[Opcode.ACCELEROMETER].reader(*names)
@@ -158,11 +165,11 @@ class Reading:
 
     def joints(self) -> Floats:
         """Angle, velocity and torque of every joint, (3, n_joints)."""
-        return np.array(self._joint).T * self._state_scale
+        return np.array(self._joint).T[:COUNT_AT] * self._state_scale
 
     def links_touched(self) -> list[tuple[int, list[int]]]:
-        """(link, raw contact) of every link that reported a touch at this Sync."""
-        return [(link, raw) for link, raw in enumerate(self._contact) if raw is not None and raw[5]]
+        """(link, raw force x y z, place along and bearing) of every link that reported a touch at this Sync."""
+        return [(link, self._read_contact(data)) for link, data in enumerate(self._contact) if data]
 
     def imus(self) -> list[tuple[int, Sequence[int], Sequence[int]]]:
         """(link, raw rates, raw accelerations) of every link whose IMU has reported since the last call."""
@@ -180,16 +187,15 @@ class Reading:
     # --- one kind of frame each ---------------------------------------------------------------------------------
 
     def _take_state(self, module: Module, frame: Frame) -> None:
-        if not intact(frame):
+        identifier, data = frame
+        if crc_hqx(data[:-1], identifier) & 0xFF != data[-1]:  # `intact`, without a call
             module.corrupt += 1
             return
-        angle, velocity, torque, count, state, derated = self._read_state(frame.data)
-        late = (self.sync - count) % COUNTS
-        if count == module.last_count:
-            module.repeats += 1
-        else:
-            module.repeats = 0
+        numbers = self._read_state(data)
+        count = numbers[COUNT_AT]
+        module.repeats = module.repeats + 1 if count == module.last_count else 0
         module.last_count = count
+        late = (self.sync - count) % COUNTS
         if late > LATE_SYNCS:
             module.wrong_counts += 1
             return
@@ -200,10 +206,9 @@ class Reading:
             return
         module.corrupt = module.wrong_counts = 0
         module.sync = sync
-        module.state = ModuleState(state) if state < len(ModuleState) else ModuleState.FAULT
+        module.state = STATES[numbers[STATE_AT]]
         module.stopped_syncs = module.stopped_syncs + 1 if module.state in LATCHED else 0
-        module.derated = bool(derated)
-        self._joint[module.node - 1] = [angle, velocity, torque]
+        self._joint[module.node - 1] = numbers
         if late == 0:
             self.states_missing -= 1
 
@@ -213,15 +218,15 @@ class Reading:
             module.twice_at = self.sync
 
     def _take_contact(self, module: Module, frame: Frame) -> None:
-        self._take_link(module.node, frame)
+        self._take_link(module.node, frame.data)
 
     def _take_tail_contact(self, module: Module, frame: Frame) -> None:
-        self._take_link(module.node - 1, frame)
+        self._take_link(module.node - 1, frame.data)
 
-    def _take_link(self, link: int, frame: Frame) -> None:
-        raw = self._read_contact(frame.data)
-        if (self.sync - raw[6]) % COUNTS == 0 and self._contact[link] is None:
-            self._contact[link] = raw
+    def _take_link(self, link: int, data: bytes) -> None:
+        count, touched = self._read_touch(data)
+        if (self.sync - count) % COUNTS == 0 and self._contact[link] is None:
+            self._contact[link] = data if touched else UNTOUCHED
             self.contacts_missing -= 1
 
     def _take_heartbeat(self, module: Module, frame: Frame) -> None:
@@ -232,7 +237,7 @@ class Reading:
         module.heartbeat_sync = self.sync
         module.faults = sum(bit << i for i, bit in enumerate(bits))
         module.last_stop = LastStop(last_stop) if last_stop < len(LastStop) else LastStop.NONE
-        module.state = ModuleState(state) if state < len(ModuleState) else ModuleState.FAULT
+        module.state = STATES[state]
 
     def _take_gyro(self, module: Module, frame: Frame) -> None:
         self._gyro[module.node - 1] = self._read_gyro(frame.data)

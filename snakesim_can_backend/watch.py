@@ -98,7 +98,7 @@ class Watch:
             tell("wrong_counter", f"answers Syncs that were not sent: {module.wrong_counts} wrong counters in a row")
         if module.corrupt >= IN_A_ROW:
             tell("bad_checksum", f"sends corrupt states: {module.corrupt} wrong checksums in a row")
-        if module.twice >= IN_A_ROW:
+        if module.answered_twice(reading.sync) >= IN_A_ROW:
             tell("duplicate_node", "is there twice: every Sync is answered two times; give each module its own node id")
         if module.frames > MOST_FRAMES:
             tell("module_babbling", f"floods the bus: {module.frames} frames within one period")
@@ -123,14 +123,14 @@ class Watch:
         if module.restarts > self._restarts[i]:
             self._restarts[i] = module.restarts
             self._restart_at.setdefault(i, reading.sync)
-        if module.twice or reading.sync - self._restart_at.get(i, reading.sync) <= IN_A_ROW:
+        if module.answered_twice(reading.sync) or reading.sync - self._restart_at.get(i, reading.sync) <= IN_A_ROW:
             return False
         del self._restart_at[i]
         return True
 
     def _refuses_to_arm(self, i: int, module: Module, reading: Reading, missed: int) -> bool:
         late = self._armed_sync is not None and reading.sync - self._armed_sync > ARM_GRACE
-        apart = late and missed == 0 and module.state != ModuleState.ARMED and not module.twice
+        apart = late and missed == 0 and module.state != ModuleState.ARMED and not module.answered_twice(reading.sync)
         self._unarmed[i] = self._unarmed[i] + 1 if apart else 0
         return self._unarmed[i] >= IN_A_ROW
 

@@ -16,6 +16,7 @@ from snakesim_can_backend.protocol import (
     opcode_of,
 )
 from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.twin.bus_time import Traffic
 from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_can_backend.twin.firmware import Module
 from snakesim_can_backend.twin.inertia import InertiaPlant, InertiaSettings
@@ -134,3 +135,26 @@ class Host:
 
     def states(self) -> list[ModuleState]:
         return [seat.module.state for seat in self.chain.seats[: self.chain.count]]
+
+
+def run_at(joints: int, rate_hz: int, seconds: float = 2.0) -> tuple[list[int], Traffic, Traffic, int]:
+    """A whole bus for some time; how late each joint state came, in periods, and the traffic."""
+    twins = chain(config(joints, rate_hz=rate_hz), stepped=False)
+    twins.seats[0].module.parameters.values[Parameter.TAIL] = 1.0
+    for seat in twins.seats:
+        seat.module.parameters.values |= {Parameter.CONTACT_EVERY: 1.0, Parameter.IMU_EVERY: 20.0}
+    twins.advance_to(110_000.0)
+    twins.hear(0, command(Action.ARM))
+    period_us, before = 1e6 / rate_hz, twins.traffic()[0]
+    late: list[int] = []
+    backlog = 0
+    for tick in range(round(seconds * rate_hz)):
+        twins.advance_to(110_000.0 + tick * period_us)
+        for answer in twins.take(0):
+            if opcode_of(answer.id) == Opcode.JOINT_STATE:
+                late.append(((tick - 1) - (answer.data[6] & 0xF)) % 16)
+        twins.hear(0, sync(tick))
+        for node in range(1, joints + 1):
+            twins.hear(0, set_point(tick, node=node, target=0.0))
+        backlog = max(backlog, sum(map(len, twins.buses[0]._waiting.values())))
+    return late, before, twins.traffic()[0], backlog

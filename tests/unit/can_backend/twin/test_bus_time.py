@@ -4,9 +4,9 @@ import pytest
 
 from snakesim_can_backend.bus_load import Reports, load, worst_bits
 from snakesim_can_backend.codec import codec
-from snakesim_can_backend.protocol import Action, Frame, Opcode, Parameter, frame_id, opcode_of
+from snakesim_can_backend.protocol import Frame, Opcode, frame_id, opcode_of
 from snakesim_can_backend.twin.bus_time import MOST_AHEAD_US, BusTime, by_opcode
-from tests.unit.can_backend.twin.rig import chain, command, config, set_point, sync
+from tests.unit.can_backend.twin.rig import run_at, set_point, sync
 
 FULL = worst_bits(8)
 
@@ -75,28 +75,6 @@ def test_a_babbler_fills_what_the_others_leave():
     bus.babble(5, None, 100_000.0)
     bus.released(101_000.0)
     assert bus.released(110_000.0) == []
-
-
-def run_at(joints: int, rate_hz: int, seconds: float = 2.0):
-    """A whole bus for some time; how late each joint state came, in periods, and the traffic."""
-    twins = chain(config(joints, rate_hz=rate_hz), stepped=False)
-    twins.seats[0].module.parameters.values[Parameter.TAIL] = 1.0
-    for seat in twins.seats:
-        seat.module.parameters.values |= {Parameter.CONTACT_EVERY: 1.0, Parameter.IMU_EVERY: 20.0}
-    twins.advance_to(110_000.0)
-    twins.hear(0, command(Action.ARM))
-    period_us, late, before = 1e6 / rate_hz, [], twins.traffic()[0]
-    backlog = 0
-    for tick in range(round(seconds * rate_hz)):
-        twins.advance_to(110_000.0 + tick * period_us)
-        for answer in twins.take(0):
-            if opcode_of(answer.id) == Opcode.JOINT_STATE:
-                late.append(((tick - 1) - (answer.data[6] & 0xF)) % 16)
-        twins.hear(0, sync(tick))
-        for node in range(1, joints + 1):
-            twins.hear(0, set_point(tick, node=node, target=0.0))
-        backlog = max(backlog, sum(map(len, twins.buses[0]._waiting.values())))
-    return late, before, twins.traffic()[0], backlog
 
 
 @pytest.mark.parametrize(("joints", "rate_hz"), [(13, 50), (13, 100), (18, 50), (18, 100), (30, 50)])

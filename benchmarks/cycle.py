@@ -1,0 +1,90 @@
+"""The control cycle on the bus, in real time: how soon a command is on it, and how regular Sync is.
+
+A whole run as a user starts it, with twins on a virtual bus in the driver's process. Its candump log says when each
+frame went out, and the controller writes down when it had each command ready.
+"""
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.whole import run
+from snakesim_can_backend.bus_load import MOST_LOAD, Reports, load
+from snakesim_can_backend.protocol import Opcode, opcode_of
+from tests.unit.can_backend.twin.rig import run_at
+
+WARM_UP = 100  # cycles
+JOINTS, RATES_HZ = (13, 18, 30), (50, 100, 200)
+
+
+@dataclass(frozen=True)
+class Cycle:
+    """Milliseconds."""
+
+    command_to_first_p50: float
+    command_to_first_p99: float
+    command_to_last_p50: float
+    command_to_last_p99: float
+    sync_jitter_p50: float
+    sync_jitter_p99: float
+
+
+def cycle(rate_hz: int = 100, duration_s: float = 10.0) -> Cycle:
+    """Measure one run."""
+    with tempfile.TemporaryDirectory() as folder:
+        log, stamps = Path(folder, "bus.log"), Path(folder, "commands.txt")
+        run(
+            *("--backend", "can", "--pace", "realtime", "--duration", str(duration_s)),
+            *("--set", f"rate_hz={rate_hz}", "--set", f"backend.log={log}"),
+            *("--controller", "benchmarks/stamped.py:Stamped", "--set", f"control.path={stamps}"),
+        )
+        ready = np.loadtxt(stamps)
+        syncs, bursts = _frames(log)
+    spacing = np.diff(syncs)[WARM_UP:-WARM_UP] * 1000
+    jitter = np.abs(spacing - 1000 / rate_hz)
+    waits = []
+    for first, last in bursts[WARM_UP:-WARM_UP]:
+        command = ready[np.searchsorted(ready, first) - 1]
+        waits.append(((first - command) * 1000, (last - command) * 1000))
+    to_first, to_last = np.array(waits).T
+    return Cycle(
+        *np.percentile(to_first, (50, 99)).tolist(),
+        *np.percentile(to_last, (50, 99)).tolist(),
+        *np.percentile(jitter, (50, 99)).tolist(),
+    )
+
+
+def _frames(log: Path) -> tuple[np.ndarray, list[tuple[float, float]]]:
+    """When each Sync went out, and first and last set-point between two Syncs."""
+    syncs: list[float] = []
+    bursts: list[tuple[float, float]] = []
+    first = last = 0.0
+    for line in log.read_text(encoding="ascii").splitlines():
+        stamp, _channel, frame = line.split()
+        opcode, at = opcode_of(int(frame[:3], 16)), float(stamp[1:-1])
+        if opcode == Opcode.SYNC:
+            syncs.append(at)
+            if first:
+                bursts.append((first, last))
+            first = 0.0
+        elif opcode == Opcode.SET_POINT:
+            first, last = first or at, at
+    return np.array(syncs), bursts
+
+
+def load_table() -> list[str]:
+    """Load of one bus, computed and measured by the twins' model of bus time, as rows of a Markdown table."""
+    rows = [
+        "| joints | rate | computed, worst case | measured | apart | the driver |",
+        "|---|---|---|---|---|---|",
+    ]
+    for joints in JOINTS:
+        for rate_hz in RATES_HZ:
+            _, before, after, _ = run_at(joints, rate_hz)
+            computed, measured = load(joints, Reports(rate_hz)), after.load_since(before)
+            apart = f"{100 * (measured / computed - 1):+.1f} %" if computed < 1 else "bus is full"
+            says = "takes it" if computed <= MOST_LOAD else "refuses it"
+            rows.append(f"| {joints} | {rate_hz} Hz | {computed:.1%} | {measured:.1%} | {apart} | {says} |")
+    return rows
