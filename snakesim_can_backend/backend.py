@@ -7,6 +7,7 @@ in the period before. So a command acts exactly one period after the state that 
 import logging
 import time
 import uuid
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import msgspec
@@ -17,27 +18,39 @@ from snakesim_can_backend.bus_load import BIT_RATE, Reports, check_load, reports
 from snakesim_can_backend.log import LoggedWire, open_log
 from snakesim_can_backend.mocap import MocapReceiver
 from snakesim_can_backend.own_twins import TwinProcess, check_twins, twins_here
-from snakesim_can_backend.parameters import check_ratings, parameters_of
-from snakesim_can_backend.protocol import Action, Frame, LastStop, ModuleState
+from snakesim_can_backend.parameters import check_ratings, check_watchdog, parameters_of
+from snakesim_can_backend.protocol import Action, Frame, ModuleState
 from snakesim_can_backend.reading import Reading
 from snakesim_can_backend.sensors import Sensors, contacts_due, described
 from snakesim_can_backend.settings import Settings
-from snakesim_can_backend.watch import Watch
+from snakesim_can_backend.watch import ARM_GRACE, Watch
 from snakesim_can_backend.wire import SocketCanWire, Trouble, VirtualWire, Wire, check_interface, wait
 from snakesim_hal.backend import Samples, SetPoints
 from snakesim_hal.errors import BackendError
 from snakesim_hal.messages import Description, Fault, LifecycleState, Pace
+from snakesim_hal.motor import check_gains
 from snakesim_hal.robot import describe
 from snakesim_hal.scenario import RunConfig, config_hash
 
 NAME = "can"
 ANSWER_MARGIN = 1.25  # of the bus time that all answers take
 ANSWER_SLACK_S = 0.002
+MOST_OF_PERIOD = 0.75
+CONFIGURE_LIMIT_S = 0.25  # while the robot is up; an emergency stop waits no longer than that, with motors that are off
 LOCKSTEP_ANSWER_S = 2.0  # twins that are slow are waited for; those that are dead are not waited for again
 FIRST_STATE_SYNCS = 20
 FIRST_STATE_PAUSE_S = 0.02
+LEFT_BEHIND = {"watchdog", "stream"}  # faults of a module whose driver was killed
 
 _log = logging.getLogger("snakesim.can")
+
+
+@dataclass
+class Arming:
+    """The newest arming: the Sync of its beginning, and which joints have followed."""
+
+    sync: int = -1
+    done: set[int] = field(default_factory=set[int])
 
 
 class CanBackend:
@@ -49,7 +62,9 @@ class CanBackend:
     def check(config: RunConfig, settings: Settings) -> tuple[Pace, ...]:
         """Real modules wait for nobody; twins that this backend starts can. Raises ConfigError."""
         check_load(config, settings)
+        check_gains(config.robot)
         check_ratings(config.robot)
+        check_watchdog(config, settings)
         check_twins(config, settings)
         for channel in settings.channels:
             check_interface(channel)
@@ -66,6 +81,8 @@ class CanBackend:
         self._twins: TwinProcess | None = None
         self._wires: list[Wire] = []
         self._open = True
+        self._ours = False  # whether the modules are: before that is known, nothing that disturbs them is sent
+        self._unconfigured = set(range(joints))  # joints whose parameters may not be what the robot file says
         try:
             if pose_listen := settings.pose_listen or ("" if settings.twins_run == "none" else "127.0.0.1:0"):
                 self._mocap = MocapReceiver(pose_listen)
@@ -84,6 +101,7 @@ class CanBackend:
         self._set_points = commands.SetPointWriter(joints)
         self._lifecycle: LifecycleState = "disarmed"
         self._unsent: list[str] = []
+        self._arming = Arming()
         self._answer_limit_s = LOCKSTEP_ANSWER_S if self._lockstep else _answer_time_s(self._buses, self._reports)
         self._tick = 0
 
@@ -104,12 +122,14 @@ class CanBackend:
             return
         if lifecycle == self._lifecycle:
             self._remind(lifecycle)
-        for frame in commands.on_change(self._lifecycle, lifecycle):
-            self._broadcast(frame)
+        elif lifecycle == "armed":
+            self._arming = Arming(self._reading.sync)
         if self._lifecycle in commands.LATCHED and lifecycle not in commands.LATCHED:
-            self._cleared()
+            self._cleared()  # before they are told to arm: parameters are written to motors that are off
+        for frame in commands.on_change(self._lifecycle, lifecycle):
+            if not (self._unconfigured and commands.is_arming(frame)):
+                self._broadcast(frame)
         self._lifecycle = lifecycle
-        self._unsent = []
         if lifecycle != "armed":
             return
         for i, frame in enumerate(self._set_points.frames(set_points)):
@@ -121,6 +141,8 @@ class CanBackend:
     def advance(self) -> None:
         """The world goes on by itself: take in what has come meanwhile. Raises BackendError when it is closed."""
         self._must_be_open()
+        if self._twins is not None and (how := self._twins.how_it_ended()) is not None:
+            raise BackendError(how)
         self._receive()
 
     def faults(self) -> list[Fault]:
@@ -129,6 +151,13 @@ class CanBackend:
             return []
         troubles: list[Trouble] = [trouble for wire in self._wires for trouble in wire.troubles()]
         names = self._description.joints
+        found = self._watch.look(self._reading, self._lifecycle, troubles, self._unsent, self._unconfigured)
+        if found and self._lifecycle not in commands.LATCHED:
+            # Stopped here and now. From now on only a clear leads out, also one that comes before the next period.
+            for frame in commands.on_change(self._lifecycle, "fault"):
+                self._broadcast(frame)
+            self._lifecycle = "fault"
+        self._unconfigured |= self._watch.take_changed()
         return [
             Fault(
                 tick=self._tick,
@@ -136,7 +165,7 @@ class CanBackend:
                 cause=finding.cause[:500],
                 joint=None if finding.joint is None else names[finding.joint].name,
             )
-            for finding in self._watch.look(self._reading, self._lifecycle, troubles, self._unsent)
+            for finding in found
         ]
 
     def close(self) -> None:
@@ -146,10 +175,11 @@ class CanBackend:
         self._open = False
         for wire in self._wires:
             try:
-                wire.send(commands.command(Action.DISARM))
+                if self._ours:
+                    wire.send(commands.command(Action.DISARM))
+                wire.idle()
             except BackendError as error:
                 _log.warning("closing: %s", error)
-            wire.idle()
             wire.close()
         if self._twins is not None:
             self._twins.stop()
@@ -198,27 +228,39 @@ class CanBackend:
     def _bring_up(self, names: list[str]) -> None:
         limit_s = self._settings.bring_up_limit_s
         found = find(self._buses, limit_s, self._reading.take)
+        if self._reading.from_other_host:
+            raise BackendError("another program commands the modules on this bus; end it first. Nothing was sent")
         wrong = objections(self._buses, found, names, lockstep=self._lockstep)
         if wrong:
             raise BackendError("the robot is not whole; nothing was enabled:\n  " + "\n  ".join(wrong))
+        self._ours = True
         self._broadcast(commands.command(Action.DISARM))
-        self._configure(range(1, len(names) + 1))
+        self._configure(limit_s)
         self._await_first_states(names)
         self._forgive_old_faults()
 
     def _forgive_old_faults(self) -> None:
         """What a driver that was killed has left behind is cleared; heat, leaks and emergencies are not."""
+        for _ in range(FIRST_STATE_SYNCS):  # their heartbeats say why they stopped
+            if all(module.faults or module.state != ModuleState.FAULT for module in self._reading.modules):
+                break
+            time.sleep(FIRST_STATE_PAUSE_S)
+            self._sync(0 if self._lockstep else time.monotonic_ns() // 1000)
         for module, wire in zip(self._reading.modules, self._wire_of, strict=True):
-            if module.state == ModuleState.FAULT and module.last_stop in (LastStop.WATCHDOG, LastStop.STREAM):
-                _log.warning("node %d: clearing a %s fault of before", module.node, module.last_stop.name.lower())
+            faults = module.fault_names()
+            if module.state == ModuleState.FAULT and faults and set(faults) <= LEFT_BEHIND:
+                _log.warning("node %d: clearing a fault of before: %s", module.node, ", ".join(faults))
                 wire.send(commands.command(Action.CLEAR, module.node))
 
-    def _configure(self, nodes: range | set[int]) -> None:
+    def _configure(self, limit_s: float) -> None:
+        """Give every module that needs them its parameters. Raises BackendError."""
         wanted = parameters_of(self._config.robot, self._settings, self._reports)
-        in_force = configure(
-            self._buses, {node: wanted[node] for node in nodes}, self._settings.bring_up_limit_s, self._reading.take
-        )
-        check_ratings(self._config.robot, in_force)
+        due = {joint + 1: wanted[joint + 1] for joint in self._unconfigured}
+        try:
+            check_ratings(self._config.robot, configure(self._buses, due, limit_s, self._reading.take))
+        finally:
+            self._reading.forget_frames()  # they came over more than one period
+        self._unconfigured.clear()
 
     def _await_first_states(self, names: list[str]) -> None:
         for _ in range(FIRST_STATE_SYNCS):
@@ -234,7 +276,8 @@ class CanBackend:
         reading = self._reading
         self._receive()
         reading.begin(reading.sync + 1, contacts=contacts_due(self._reports, reading.sync + 1), tail=self._reports.tail)
-        self._broadcast(commands.sync(reading.sync, time_us))
+        frame = commands.sync(reading.sync, time_us)
+        self._unsent = [wire.channel for wire in self._wires if not wire.send(frame)]
         end = time.monotonic() + self._answer_limit_s
         while not reading.complete and (left_s := end - time.monotonic()) > 0:
             if not wait(self._wires, left_s):
@@ -248,29 +291,42 @@ class CanBackend:
                 take(frame)
 
     def _broadcast(self, frame: Frame) -> None:
+        """To everybody: a bus that fails must not keep the others from hearing it."""
+        failed: BackendError | None = None
         for wire in self._wires:
-            wire.send(frame)
+            try:
+                wire.send(frame)
+            except BackendError as error:
+                failed = error
+        if failed is not None:
+            raise failed
 
     def _remind(self, lifecycle: LifecycleState) -> None:
-        for module, wire in zip(self._reading.modules, self._wire_of, strict=True):
+        """Tell those again who missed a frame. Who was armed already, and is not now, was stopped by something."""
+        arming = self._arming
+        in_time = self._reading.sync - arming.sync <= ARM_GRACE and not self._unconfigured
+        for i, module in enumerate(self._reading.modules):
+            if lifecycle == "armed" and module.state == ModuleState.ARMED:
+                arming.done.add(i)
             frame = commands.reminder(lifecycle, module.state, module.node)
-            if frame is not None:
-                wire.send(frame)
+            if frame is not None and (lifecycle != "armed" or (in_time and i not in arming.done)):
+                self._wire_of[i].send(frame)
 
     def _cleared(self) -> None:
-        """Somebody cleared the fault. Modules that restarted have lost their parameters, and get them again."""
+        """Somebody cleared the fault. Modules that may have other parameters get their own again, in a moment or never.
+
+        What is not configured then is told as a fault, and nothing is armed.
+        """
         self._watch.forget(self._reading.sync)
-        restarted, self._watch.restarted = self._watch.restarted, set()
-        if restarted:
+        if self._unconfigured:
             try:
-                self._configure({joint + 1 for joint in restarted})
+                self._configure(CONFIGURE_LIMIT_S)
             except BackendError as error:
-                _log.warning("after a restart: %s", error)
-                self._watch.restarted = restarted
+                _log.warning("after a clear: %s", error)
 
 
 def _answer_time_s(buses: list[Bus], reports: Reports) -> float:
-    """How long all answers to a Sync may take on the fullest bus."""
+    """How long all answers to a Sync may take on the fullest bus; the rest of the period is the controller's."""
     frames = max(len(bus.nodes) for bus in buses) * (1 + (reports.contact_every > 0)) + reports.tail
     bus_s = frames * worst_bits(8) / BIT_RATE
-    return ANSWER_MARGIN * bus_s + ANSWER_SLACK_S
+    return min(ANSWER_MARGIN * bus_s + ANSWER_SLACK_S, MOST_OF_PERIOD / reports.rate_hz)

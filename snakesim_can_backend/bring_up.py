@@ -26,6 +26,7 @@ from snakesim_can_backend.wire import Wire, wait
 from snakesim_hal.errors import BackendError
 
 ASK_EVERY_S = 0.1
+PAUSE_S = 0.001
 LISTEN_ON_S = 0.06  # after the last module is found: a second one with its id may answer later
 
 
@@ -64,7 +65,8 @@ def find(buses: Sequence[Bus], limit_s: float, on_frame: Callable[[Frame], None]
             for wire in wires:
                 wire.send(commands.command(Action.IDENTIFY))
             ask_at = now + ASK_EVERY_S
-        wait(wires, min(0.01, end - now))
+        if not wait(wires, min(0.01, end - now)):
+            time.sleep(PAUSE_S)
         for wire in wires:
             for frame in wire.receive():
                 if opcode_of(frame.id) == Opcode.IDENTITY and len(frame.data) == codec()[Opcode.IDENTITY].length:
@@ -93,6 +95,10 @@ def objections(buses: Sequence[Bus], found: Sequence[Identity], joints: Sequence
         if len(here) > 1:
             serials = " and ".join(f"{i.serial:08X}" for i in here)
             wrong.append(f"{who} is there {len(here)} times, serials {serials}: give each module its own node id")
+        strays = [i for i in by_node[node] if here and i.channel != channel]
+        wrong += [
+            f"{who} has a namesake on {i.channel}, serial {i.serial:08X}: give it another node id" for i in strays
+        ]
         for identity in here:
             if identity.protocol != VERSION:
                 wrong.append(f"{who} speaks protocol version {identity.protocol}, this driver {VERSION}: update one")
@@ -121,7 +127,8 @@ def configure(
     asked_at: dict[int, float] = {}
     wires = [bus.wire for bus in buses]
     end = time.monotonic() + limit_s
-    request, read = codec()[Opcode.PARAMETER_REQUEST], codec()[Opcode.PARAMETER_ANSWER].values
+    request, answers = codec()[Opcode.PARAMETER_REQUEST], codec()[Opcode.PARAMETER_ANSWER]
+    read, answer_length = answers.values, answers.length
     while due:
         now = time.monotonic()
         if now > end:
@@ -133,11 +140,13 @@ def configure(
                 frame = request.frame(node, index=left[0], operation=operation, value=value or 0.0)
                 if wire_of[node].send(frame):
                     asked_at[node] = now
-        wait(wires, 0.01)
+        if not wait(wires, 0.01):
+            time.sleep(PAUSE_S)
         for wire in wires:
             for frame in wire.receive():
                 node = node_of(frame.id)
-                if opcode_of(frame.id) != Opcode.PARAMETER_ANSWER or node not in due:
+                known = opcode_of(frame.id) == Opcode.PARAMETER_ANSWER and len(frame.data) == answer_length
+                if not known or not due.get(node):
                     if on_frame is not None:
                         on_frame(frame)
                     continue
@@ -146,19 +155,20 @@ def configure(
                     continue
                 parameter = due[node].pop(0)
                 asked_at.pop(node, None)
-                _check(node, parameter, wanted[node].get(parameter), Result(int(answer["result"])))
+                _check(node, parameter, wanted[node].get(parameter), int(answer["result"]))
                 in_force[node][parameter] = answer["value"]
         due = {node: left for node, left in due.items() if left}
     return in_force
 
 
-def _check(node: int, parameter: Parameter, asked: float | None, result: Result) -> None:
+def _check(node: int, parameter: Parameter, asked: float | None, result: int) -> None:
     if result == Result.DONE:
         return
     allowed = PARAMETERS[parameter]
+    why = Result(result).name.lower().replace("_", " ") if result < len(Result) else f"result {result}"
     raise BackendError(
         f"node {node} refuses parameter {parameter.name.lower()} = {asked} {allowed.unit}: "
-        f"{result.name.lower().replace('_', ' ')} (allowed: {allowed.low:g} to {allowed.high:g})"
+        f"{why} (allowed: {allowed.low:g} to {allowed.high:g})"
     )
 
 

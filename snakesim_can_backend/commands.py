@@ -4,6 +4,7 @@ Pure: frames come out, and the caller sends them. A set-point that the bus did n
 nothing is ever queued.
 """
 
+import math
 from functools import cache
 
 import numpy as np
@@ -36,7 +37,7 @@ class SetPointWriter:
         self._write = layout.writer("mode", "count", "position", "torque_limit")  # the targets share their bits
         self._count = [0] * joints
         scale = {
-            Mode.PASSIVE: 1.0,
+            Mode.PASSIVE: math.inf,  # its bits are 0
             Mode.POSITION: layout.signals["position"].scale,
             Mode.VELOCITY: layout.signals["velocity"].scale,
             Mode.TORQUE: layout.signals["torque"].scale,
@@ -84,6 +85,11 @@ def reminder(lifecycle: LifecycleState, state: ModuleState, node: int) -> Frame 
         case (("disarmed" | "fault"), ModuleState.ARMED):
             return command(Action.STOP, node)
     return None
+
+
+def is_arming(frame: Frame) -> bool:
+    """Whether a frame would switch motors on."""
+    return frame == command(Action.ARM)
 
 
 def command(action: Action, node: int = BROADCAST) -> Frame:

@@ -1,5 +1,7 @@
 """Everything that goes over the wires, in candump's format: `(1700000000.000000) can0 105#00112233`."""
 
+import contextlib
+import logging
 import time
 from pathlib import Path
 from typing import TextIO
@@ -9,6 +11,8 @@ from snakesim_can_backend.wire import Trouble, Wire
 from snakesim_hal.errors import ConfigError
 
 FLUSH_BYTES = 1 << 16
+
+_log = logging.getLogger("snakesim.can")
 
 
 def open_log(path: Path) -> TextIO:
@@ -25,6 +29,7 @@ class LoggedWire:
     def __init__(self, wire: Wire, log: TextIO) -> None:
         self._wire, self._log = wire, log
         self.channel = wire.channel
+        self._full = False
 
     def send(self, frame: Frame) -> bool:
         """Send, and log what was taken."""
@@ -55,7 +60,14 @@ class LoggedWire:
     def close(self) -> None:
         """Close the wire; the log is complete."""
         self._wire.close()
-        self._log.flush()
+        with contextlib.suppress(OSError):
+            self._log.flush()
 
     def _write(self, frame: Frame) -> None:
-        self._log.write(f"({time.time():.6f}) {self.channel} {frame.id:03X}#{frame.data.hex().upper()}\n")
+        if self._full:
+            return
+        try:
+            self._log.write(f"({time.time():.6f}) {self.channel} {frame.id:03X}#{frame.data.hex().upper()}\n")
+        except OSError as error:  # a full disk ends the log, and nothing else
+            self._full = True
+            _log.warning("the bus log ends here: %s", error.strerror)

@@ -71,6 +71,11 @@ class TwinProcess:
             )
         self._await_ready()
 
+    def how_it_ended(self) -> str | None:
+        """In words; None while it runs."""
+        code = self._process.poll()
+        return None if code is None else f"the module twins have ended, with exit code {code}"
+
     def stop(self) -> None:
         """Ask it to end, then insist. What it said goes to this process's stderr."""
         if self._process.poll() is None:

@@ -8,7 +8,9 @@ from snakesim_can_backend.protocol import Opcode, Parameter, SafeMotion
 from snakesim_can_backend.settings import Settings
 from snakesim_hal.errors import BackendError, ConfigError
 from snakesim_hal.robot import RobotFile
+from snakesim_hal.scenario import RunConfig
 
+LEAST_PERIODS = 2.2  # in a watchdog's time: one set-point may be lost, and the next be a little late
 SPEED_ROOM = 1.2  # a joint may be pushed faster than its motor turns, and must still be told
 
 
@@ -67,3 +69,14 @@ def check_ratings(robot: RobotFile, in_force: Mapping[int, Mapping[Parameter, fl
                     f"joint_{node} is rated for {values[parameter]:.3g} {unit}, robot {robot.name!r} asks for "
                     f"{asked:g}: lower the limit in the robot file"
                 )
+
+
+def check_watchdog(config: RunConfig, settings: Settings) -> None:
+    """Raise ConfigError for modules that one lost set-point would stop."""
+    least_s = LEAST_PERIODS / config.rate_hz
+    if settings.watchdog_s < least_s:
+        least_hz = LEAST_PERIODS / settings.watchdog_s
+        raise ConfigError(
+            f"`backends.can.watchdog_s` = {settings.watchdog_s:g} s at `rate_hz` = {config.rate_hz:g}: one lost "
+            f"set-point would stop the modules; give them {least_s:.3g} s or more, or a rate from {least_hz:.0f} Hz on"
+        )

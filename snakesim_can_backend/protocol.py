@@ -16,6 +16,7 @@ NODE_BITS = 6
 NODE_MASK = (1 << NODE_BITS) - 1
 COMMAND_KEY = 0x5AAE
 COUNTS = 16  # set-point and state counters go round in four bits
+MOST_LOST = 2  # set-points that may be missing before one; a count further ahead, or one of before, is a wrong one
 WRONG_COUNTS = 5  # in a row, and a module stops: its command stream is not one
 HEARTBEAT_PERIOD_S = 0.1
 HEALTH_PERIOD_S = 0.5

@@ -16,6 +16,7 @@ from snakesim_can_backend.codec import codec
 from snakesim_can_backend.protocol import (
     COUNTS,
     FROM_HOST,
+    Action,
     Frame,
     LastStop,
     ModuleFault,
@@ -28,6 +29,7 @@ from snakesim_can_backend.protocol import (
 
 Floats = NDArray[np.float64]
 TOLD_WITHIN = 3  # Syncs from a module's fault to its heartbeat, at most
+ONE_CLOCK_MS = 350  # two heartbeats no further apart are of one and the same module
 LATE_SYNCS = 3  # a state this many Syncs late is still taken, with its age; older counts are wrong ones
 COUNT_AT, STATE_AT = 3, 4  # in what `_read_state` gives
 UNTOUCHED = b""
@@ -49,8 +51,10 @@ class Module:
     twice: int = 0  # Syncs in a row that were answered more than once, up to `twice_at`
     twice_at: int = -1
     frames: int = 0  # in this tick
+    awaited: bool = True  # whether it answered of late
     uptime_ms: int = -1
-    restarts: int = 0
+    went_back: bool = False  # its uptime, in the newest heartbeat
+    restarts: int = 0  # uptimes that went back, and went on from there
     faults: int = 0  # bits, from the newest heartbeat
     last_stop: LastStop = LastStop.NONE
     heartbeat_sync: int = -1
@@ -59,7 +63,7 @@ class Module:
     @property
     def needs_clearing(self) -> bool:
         """Whether it is in a latched state, and its heartbeat had the time to say why."""
-        return bool(self.faults) or self.stopped_syncs >= TOLD_WITHIN
+        return self.state in LATCHED and (bool(self.faults) or self.stopped_syncs >= TOLD_WITHIN)
 
     def answered_twice(self, sync: int) -> int:
         """Syncs in a row, up to now, that were answered more than once."""
@@ -88,9 +92,7 @@ class Reading:
         self._acceleration: list[list[int] | None] = [None] * joints
         self._health: list[list[int] | None] = [None] * joints
         self.shaft_raw: list[int | None] = [None] * joints
-        self._read_state = layouts[Opcode.JOINT_STATE].reader(
-            "angle", "velocity", "torque", "count", "state", "derated"
-        )
+        self._read_state = layouts[Opcode.JOINT_STATE].reader("angle", "velocity", "torque", "count", "state")
         signals = layouts[Opcode.JOINT_STATE].signals
         self._state_scale = np.array([[signals[name].scale] for name in ("angle", "velocity", "torque")])
         contact = layouts[Opcode.CONTACT]
@@ -126,13 +128,13 @@ class Reading:
         contacts, tail: whether it asks for force reports, and whether the tail link sends one of its own.
         """
         self.sync = sync
-        expected = [module.sync >= sync - 1 - LATE_SYNCS or module.sync < 0 for module in self.modules]
-        self.states_missing = sum(expected)
-        self.contacts_missing = (self.states_missing + (tail and expected[0])) if contacts else 0
+        for module in self.modules:
+            module.awaited = module.sync >= sync - 1 - LATE_SYNCS or module.sync < 0
+        self.states_missing = sum(module.awaited for module in self.modules)
+        self.contacts_missing = (self.states_missing + (tail and self.modules[0].awaited)) if contacts else 0
         if contacts:
             self._contact = [None] * len(self._contact)
-        for module in self.modules:
-            module.frames = 0
+        self.forget_frames()
 
     @property
     def complete(self) -> bool:
@@ -155,11 +157,24 @@ class Reading:
     def _take_other(self, frame: Frame) -> None:
         opcode, node = opcode_of(frame.id), node_of(frame.id)
         if opcode in FROM_HOST:
-            self.from_other_host[Opcode(opcode)] += 1
+            if not self._only_asks(frame):
+                self.from_other_host[Opcode(opcode)] += 1
         elif not 1 <= node <= len(self.modules):
             self.strangers[node] += 1
         else:
             self.modules[node - 1].frames += 1
+
+    def _only_asks(self, frame: Frame) -> bool:
+        """Whether somebody merely wants to know who is there."""
+        command = codec()[Opcode.COMMAND]
+        if opcode_of(frame.id) != Opcode.COMMAND or len(frame.data) != command.length:
+            return False
+        return command.reader("action")(frame.data) == [Action.IDENTIFY]
+
+    def forget_frames(self) -> None:
+        """Frames counted so far do not belong to one period."""
+        for module in self.modules:
+            module.frames = 0
 
     # --- what the joints are, in SI units ---------------------------------------------------------------------
 
@@ -175,7 +190,7 @@ class Reading:
         """(link, raw rates, raw accelerations) of every link whose IMU has reported since the last call."""
         found = []
         for i, (gyro, acceleration) in enumerate(zip(self._gyro, self._acceleration, strict=True)):
-            if gyro is not None and acceleration is not None:
+            if gyro is not None and acceleration is not None and gyro[3] == acceleration[3]:  # of one Sync
                 found.append((i + 1, gyro[:3], acceleration[:3]))
                 self._gyro[i] = self._acceleration[i] = None
         return found
@@ -210,7 +225,7 @@ class Reading:
         module.stopped_syncs = module.stopped_syncs + 1 if module.state in LATCHED else 0
         self._joint[module.node - 1] = numbers
         if late == 0:
-            self.states_missing -= 1
+            self.states_missing -= module.awaited
 
     def _answered_twice(self, module: Module) -> None:
         if module.twice_at < self.sync:
@@ -218,21 +233,22 @@ class Reading:
             module.twice_at = self.sync
 
     def _take_contact(self, module: Module, frame: Frame) -> None:
-        self._take_link(module.node, frame.data)
+        self._take_link(module, module.node, frame.data)
 
     def _take_tail_contact(self, module: Module, frame: Frame) -> None:
-        self._take_link(module.node - 1, frame.data)
+        self._take_link(module, module.node - 1, frame.data)
 
-    def _take_link(self, link: int, data: bytes) -> None:
+    def _take_link(self, module: Module, link: int, data: bytes) -> None:
         count, touched = self._read_touch(data)
         if (self.sync - count) % COUNTS == 0 and self._contact[link] is None:
             self._contact[link] = data if touched else UNTOUCHED
-            self.contacts_missing -= 1
+            self.contacts_missing -= module.awaited
 
     def _take_heartbeat(self, module: Module, frame: Frame) -> None:
         state, last_stop, uptime_ms, *bits = self._read_heartbeat(frame.data)
-        if uptime_ms < module.uptime_ms:
+        if module.went_back and 0 <= uptime_ms - module.uptime_ms < ONE_CLOCK_MS:
             module.restarts += 1
+        module.went_back = uptime_ms < module.uptime_ms
         module.uptime_ms = uptime_ms
         module.heartbeat_sync = self.sync
         module.faults = sum(bit << i for i, bit in enumerate(bits))

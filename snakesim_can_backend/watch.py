@@ -16,7 +16,7 @@ SILENT_AFTER = 3  # Syncs without an answer
 IN_A_ROW = 3  # bad frames of one kind before they are a fault and not a glitch
 CLEAR_GRACE = 5  # Syncs that a module may take to follow a clearing
 ARM_GRACE = 5  # Syncs that a module may take to follow an arming
-STRANGER_FRAMES = 3  # of a node that should not be there, within a tick or two
+STRANGER_FRAMES = 3  # of a node that should not be there, in ticks one after the other
 MOST_FRAMES = 16  # of one module in a tick; a healthy one sends 8 at most
 
 BUS_FAULTS = {
@@ -52,12 +52,18 @@ class Watch:
         self._quiet_until = -1  # Sync until which modules may take to follow a clearing
         self._armed_sync: int | None = None
         self._unsent: dict[str, int] = {}  # ticks in a row in which a bus did not take everything
-        self.restarted: set[int] = set()  # joints that have lost their parameters
+        self._unasked: dict[str, int] = {}  # the newest Sync at which it did not
+        self._down: set[str] = set()  # buses whose interface is
+        self._strangers: dict[int, int] = {}  # frames of nodes that should not be there, in ticks in a row
+        self._restarted: set[int] = set()  # joints, until somebody clears
+        self._changed: set[int] = set()  # joints whose parameters may have changed
+        self._was_armed: set[int] = set()  # joints, in this arming
         self.seen: dict[str, int] = {}  # troubles that are no faults, counted
 
     def forget(self, sync: int) -> None:
         """Somebody has cleared the fault: tell again what is still there once the modules have followed."""
         self._told.clear()
+        self._restarted.clear()
         self._quiet_until = sync + CLEAR_GRACE
 
     def look(
@@ -66,18 +72,31 @@ class Watch:
         lifecycle: LifecycleState,
         troubles: Iterable[Trouble] = (),
         unsent: Iterable[str] = (),
+        unconfigured: Iterable[int] = (),
     ) -> list[Finding]:
-        """What is newly wrong. unsent: buses that did not take every frame of this tick."""
+        """What is newly wrong.
+
+        unsent: buses that did not take every frame of this tick; unconfigured: joints that must not be armed so.
+        """
         if lifecycle != "armed":
             self._armed_sync = None
+            self._was_armed.clear()
         elif self._armed_sync is None:
             self._armed_sync = reading.sync
-        found = [*self._of_bus(troubles, list(unsent)), *self._of_strangers(reading)]
+        self._unasked |= dict.fromkeys(unsent := set(unsent), reading.sync)
+        found = [*self._of_bus(troubles, unsent), *self._of_strangers(reading)]
         for i, module in enumerate(reading.modules):
             found += self._of_module(i, module, reading, lifecycle)
+        if lifecycle == "armed":
+            found += [self._bare(i) for i in unconfigured]
         fresh = [f for f in found if (f.what, f.joint if f.joint is not None else f.cause) not in self._told]
         self._told.update((f.what, f.joint if f.joint is not None else f.cause) for f in fresh)
         return fresh
+
+    def take_changed(self) -> set[int]:
+        """Joints whose parameters may not be ours any more, since the last call."""
+        changed, self._changed = self._changed, set()
+        return changed
 
     # --- one module -------------------------------------------------------------------------------------------
 
@@ -90,8 +109,14 @@ class Watch:
 
         missed = reading.sync - module.sync
         if self._has_restarted(i, module, reading):
-            self.restarted.add(i)
-            tell("module_restarted", f"has restarted: its uptime went back to {module.uptime_ms / 1000:.2f} s")
+            self._restarted.add(i)
+            self._changed.add(i)
+        if i in self._restarted:
+            up_s = module.uptime_ms / 1000
+            tell(
+                "module_restarted",
+                f"has restarted, its uptime is {up_s:.2f} s: clear, and it gets its parameters again",
+            )
         if module.repeats >= IN_A_ROW:
             tell("module_frozen", f"is frozen: it repeats its answer number {module.last_count} to every Sync")
         elif module.wrong_counts >= IN_A_ROW:
@@ -102,10 +127,12 @@ class Watch:
             tell("duplicate_node", "is there twice: every Sync is answered two times; give each module its own node id")
         if module.frames > MOST_FRAMES:
             tell("module_babbling", f"floods the bus: {module.frames} frames within one period")
-        if missed >= SILENT_AFTER and not found and not module.corrupt and not module.wrong_counts:
+        unanswered = missed - module.corrupt - max(module.repeats, module.wrong_counts)
+        unanswered = min(unanswered, reading.sync - self._unasked.get(self._channels[i], -1))
+        if unanswered >= SILENT_AFTER and not found:
             tell(
                 "module_silent",
-                f"is silent: no state for {missed * self._period_s * 1000:.0f} ms{_alive(module, reading)}",
+                f"is silent: no state for {unanswered * self._period_s * 1000:.0f} ms{_alive(module, reading)}",
             )
         as_told = lifecycle == "estop" and module.state == ModuleState.EMERGENCY
         if module.needs_clearing and not as_told and reading.sync >= self._quiet_until:
@@ -129,26 +156,40 @@ class Watch:
         return True
 
     def _refuses_to_arm(self, i: int, module: Module, reading: Reading, missed: int) -> bool:
-        late = self._armed_sync is not None and reading.sync - self._armed_sync > ARM_GRACE
+        if self._armed_sync is None:
+            return False
+        if module.state == ModuleState.ARMED:
+            self._was_armed.add(i)
+        late = reading.sync - self._armed_sync > ARM_GRACE or i in self._was_armed
         apart = late and missed == 0 and module.state != ModuleState.ARMED and not module.answered_twice(reading.sync)
         self._unarmed[i] = self._unarmed[i] + 1 if apart else 0
         return self._unarmed[i] >= IN_A_ROW
 
+    def _bare(self, i: int) -> Finding:
+        cause = (
+            f"{self._names[i]} has not taken its parameters, and is not armed; clear, or switch its power off and on"
+        )
+        return Finding("module_not_configured", cause, i)
+
     # --- the bus ----------------------------------------------------------------------------------------------
 
-    def _of_bus(self, troubles: Iterable[Trouble], unsent: list[str]) -> list[Finding]:
+    def _of_bus(self, troubles: Iterable[Trouble], unsent: set[str]) -> list[Finding]:
         found: list[Finding] = []
         for trouble in troubles:
+            if trouble.kind == "interface_down":
+                self._down.add(trouble.channel)
+            elif trouble.kind == "interface_up":
+                self._down.discard(trouble.channel)
             advice = BUS_FAULTS.get(trouble.kind)
             if advice is not None:
                 found.append(Finding(trouble.kind, f"{trouble.channel}: {trouble.detail}; {advice}"))
             else:
                 self.seen[trouble.kind] = self.seen.get(trouble.kind, 0) + 1
-        self._unsent = {channel: self._unsent.get(channel, 0) + 1 for channel in set(unsent)}
+        self._unsent = {channel: self._unsent.get(channel, 0) + 1 for channel in unsent - self._down}
         for channel, ticks in self._unsent.items():
             if ticks * self._period_s >= self._lease_s:
                 cause = (
-                    f"{channel}: set-points do not get out for {self._lease_s * 1000:.0f} ms, its transmit queue stays "
+                    f"{channel}: frames do not get out for {self._lease_s * 1000:.0f} ms, its transmit queue stays "
                     f"full: nobody acknowledges (power, cable, terminator, bit rate), or txqueuelen is below 64"
                 )
                 found.append(Finding("bus_stuck", cause))
@@ -156,15 +197,17 @@ class Watch:
 
     def _of_strangers(self, reading: Reading) -> list[Finding]:
         found: list[Finding] = []
-        for node, frames in reading.strangers.items():
+        self._strangers = {node: self._strangers.get(node, 0) + n for node, n in reading.strangers.items()}
+        for node, frames in self._strangers.items():
             if frames >= STRANGER_FRAMES:
                 found.append(Finding("unknown_node", f"node {node} is on the bus, and this robot has no such joint"))
         reading.strangers.clear()
         others = reading.from_other_host
         if others[Opcode.EMERGENCY]:
             found.append(Finding("emergency", "somebody on the bus called an emergency"))
-        if others[Opcode.SYNC] or others[Opcode.SET_POINT] or others[Opcode.COMMAND]:
+        if others.keys() - {Opcode.EMERGENCY}:
             found.append(Finding("second_host", "another program commands the modules on this bus; end one of the two"))
+            self._changed |= set(range(len(reading.modules)))
         others.clear()
         return found
 

@@ -103,13 +103,14 @@ class SocketCanWire:
         self.channel = channel
         self._bus = SocketcanBus(channel=channel, ignore_rx_error_frames=False)
         self._socket = self._bus.socket
-        self._set_filters(only)
+        self._only = None if only is None else list(only)
+        self._set_filters()
         self._socket.setblocking(False)
         with contextlib.suppress(OSError):
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
         self._buffer = bytearray(_wire_format.size)
         self._found: list[Trouble] = []
-        self._down = False
+        self._down = self._gone = False
         self._dropped = 0
 
     def send(self, frame: Frame) -> bool:
@@ -156,10 +157,9 @@ class SocketCanWire:
         """Close the socket."""
         self._bus.shutdown()
 
-    def _set_filters(self, only: Iterable[Opcode] | None) -> None:
-        wanted = (
-            [(0, 0)] if only is None else [(opcode << NODE_BITS, 0x7FF & ~((1 << NODE_BITS) - 1)) for opcode in only]
-        )
+    def _set_filters(self) -> None:
+        all_nodes = 0x7FF & ~((1 << NODE_BITS) - 1)
+        wanted = [(0, 0)] if self._only is None else [(opcode << NODE_BITS, all_nodes) for opcode in self._only]
         data = b"".join(struct.pack("=II", id_, mask | EXTENDED | REMOTE) for id_, mask in wanted)
         self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, data)
 
@@ -167,18 +167,25 @@ class SocketCanWire:
         self._found.extend(troubles_of(identifier, data, self.channel))
 
     def _note_failure(self, error: OSError) -> None:
-        if error.errno == errno.ENOBUFS:
+        if error.errno in (errno.ENOBUFS, errno.EAGAIN):  # the interface's queue, or this socket's share of it
             self._found.append(Trouble("queue_full", self.channel, "the transmit queue is full"))
         elif error.errno in (errno.ENETDOWN, errno.ENODEV, errno.ENXIO):
+            self._gone |= error.errno != errno.ENETDOWN
             if not self._down:
-                gone = "is down" if error.errno == errno.ENETDOWN else "is gone"
-                self._found.append(Trouble("interface_down", self.channel, f"the interface {gone}"))
+                what = "gone" if self._gone else "down"
+                self._found.append(Trouble("interface_down", self.channel, f"the interface is {what}"))
             self._down = True
         else:
             raise BackendError(f"{self.channel}: {error.strerror}") from error
 
     def _note_up(self) -> None:
-        self._down = False
+        if self._gone:  # an adapter that was plugged in again is another interface of the same name
+            try:
+                self._socket.bind((self.channel,))
+                self._set_filters()  # the kernel forgot them with the interface
+            except OSError:
+                return
+        self._down = self._gone = False
         self._found.append(Trouble("interface_up", self.channel, "the interface is up again"))
 
     def _count_drops(self) -> int:

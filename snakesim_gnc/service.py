@@ -14,6 +14,7 @@ from snakesim_hal.serve import arguments, duty
 from snakesim_hal.session import open_session
 
 SILENCE_S = 1.0
+START_LIMIT_S = 120.0  # until a HAL host answers, which may start MuJoCo on a slow machine
 
 
 class Service(Protocol):
@@ -44,11 +45,11 @@ def serve(service_type: type[Service], argv: Sequence[str] | None = None) -> int
     try:
         if service_type.urgent and given.config.pace == "realtime":
             take_priority()
-        with open_session(given.link, connect_timeout_s=20.0) as session:
+        with open_session(given.link, connect_timeout_s=START_LIMIT_S) as session:
             schedule = given.config.services.get(name, Schedule())
             client = Client(session, name, every_ticks=schedule.every_ticks)
             service = service_type(client, given.config)
-            service.meet(client.description(timeout_s=20.0))
+            service.meet(client.description(timeout_s=START_LIMIT_S))
             client.announce()
             settle_for_timing()
             loop(client, service)

@@ -44,7 +44,7 @@ from snakesim_hal.telling import applied_message, status_message
 INBOX_LIMIT = 4096
 STATUS_PERIOD_NS = 200_000_000
 STANDBY_PERIOD_NS = 20_000_000
-REANCHOR_PERIODS = 10
+REANCHOR_PERIODS = 1  # later than that, time is moved: ticks that catch up in a burst would break limits of rate
 
 
 @dataclass
@@ -202,10 +202,10 @@ class Host:
         for fault in self._backend.faults():
             self.authority.fault(fault)
         self._tick += 1
-        if self._pace == "realtime":
-            self._wait_for_deadline()
         self._watch_fault()
         self._show_status()
+        if self._pace == "realtime":
+            self._wait_for_deadline()
 
     def _wait_for_answers(self, samples: Samples) -> None:
         if self._pace == "lockstep":

@@ -31,7 +31,7 @@ from snakesim_operator.progress import Progress
 from snakesim_operator.record import CONFIG, REPORT, SUMMARY, TELEMETRY, RunRecord
 from snakesim_operator.summary import RunSummary, summarise
 
-START_LIMIT_S = 60.0
+START_LIMIT_S = 120.0  # MuJoCo on a slow machine
 AFTER_FAULT_S = 1.5
 POLL_S = 0.05
 CONNECT_S = 0.5

@@ -6,9 +6,10 @@ import numpy as np
 from snakesim_hal.backend import Samples, SetPoints
 from snakesim_hal.errors import BackendError
 from snakesim_hal.messages import Description, Fault, LifecycleState, Pace
+from snakesim_hal.motor import check_gains
 from snakesim_hal.robot import describe
 from snakesim_hal.scenario import RunConfig, config_hash
-from snakesim_sim_backend.actuators import Motors, check_gains
+from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.contacts import TouchReader
 from snakesim_sim_backend.divergence import DivergenceWatch, log_warnings
 from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS, SimModel, build

@@ -12,9 +12,10 @@ import numpy as np
 
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.messages import Axis
+from snakesim_hal.motor import check_gains
 from snakesim_hal.robot import RobotFile
 from snakesim_hal.scenario import RunConfig, place_all
-from snakesim_sim_backend.actuators import add_motor, check_gains
+from snakesim_sim_backend.actuators import add_motor
 from snakesim_sim_backend.ground import GROUND, add_ground
 from snakesim_sim_backend.imu import add_imus
 from snakesim_sim_backend.obstacles import OBSTACLE, add_obstacle

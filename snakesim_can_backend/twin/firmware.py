@@ -16,6 +16,7 @@ from snakesim_can_backend.protocol import (
     COUNTS,
     HEALTH_PERIOD_S,
     HEARTBEAT_PERIOD_S,
+    MOST_LOST,
     VERSION,
     WRONG_COUNTS,
     Action,
@@ -124,7 +125,7 @@ class Module:
             return
         mode, count, number, limit = read_set_point(frame.data)
         expected, self._expected = self._expected, (count + 1) % COUNTS
-        if expected is not None and count != expected:
+        if expected is not None and (count - expected) % COUNTS > MOST_LOST:
             self.refused += 1
             self._wrong_counts += 1
             if self._wrong_counts >= WRONG_COUNTS:
@@ -134,7 +135,8 @@ class Module:
         if mode > Mode.TORQUE:
             self.refused += 1
             return
-        self._fed_us = now_us
+        if self._synced:  # a host that sends no Sync any more would keep an old demand alive for ever
+            self._fed_us, self._synced = now_us, False
         target = number * STEPS[mode]  # position, velocity and torque stand in the same place
         if mode == Mode.POSITION:
             target = self._within(target)
@@ -160,6 +162,7 @@ class Module:
         if self.imu_is_due():
             self._report_imu(count, sight)
         self._syncs += 1
+        self._synced = True
         if self._pending is not None:
             self.demand, self._pending = self._pending, None
 
@@ -218,6 +221,7 @@ class Module:
         self._wrong_counts = 0
         self._booted_us = self._fed_us = self._stopping_us = self._heartbeat_us = self._health_us = now_us
         self._syncs = 0
+        self._synced = True  # since the set-point that last fed the watchdog
 
     def _enter(self, state: ModuleState, now_us: float, why: LastStop | None = None, demand: Demand = PASSIVE) -> None:
         """Change state, and drop what was demanded; why: said of a module that was ARMED."""
@@ -230,7 +234,7 @@ class Module:
 
     def _arm(self, now_us: float) -> None:
         if self.state == ModuleState.DISARMED and not self._conditions():
-            self._fed_us = now_us
+            self._fed_us, self._synced = now_us, True
             self._enter(ModuleState.ARMED, now_us)
 
     def _disarm(self, now_us: float) -> None:

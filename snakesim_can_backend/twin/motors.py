@@ -17,23 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.messages import Mode
+from snakesim_hal.motor import roll_off
 from snakesim_hal.robot import RobotFile
 
 Floats = NDArray[np.float64]
-
-STEEPEST_ROLL_OFF = 10.0  # full torque is there up to 1 - 1/10 of the limit of speed, and fades to 0 at it
-
-
-def fading_nm_s(robot: RobotFile, step_s: float) -> float:
-    """N·m less a rad/s nearer to the limit of speed: less steep where steps would not resolve it.
-
-    The fading acts on the rotor as a damper behind the motor's lag, which explicit steps only bear up to a strength.
-    """
-    motor, module, limits = robot.motor, robot.module, robot.limits
-    inertia_kg_m2 = motor.armature_kg_m2 + module.mass_kg * module.length_m**2 / 12
-    strongest = inertia_kg_m2 / step_s * max(min(motor.response_time_s / step_s, 1e3), 0.5)
-    flattest = limits.torque_nm / limits.speed_rad_s
-    return float(np.clip(strongest, flattest, STEEPEST_ROLL_OFF * flattest))
 
 
 class Motors:
@@ -44,7 +31,8 @@ class Motors:
         response = robot.motor.response_time_s
         self.rated_nm = robot.limits.torque_nm
         self._decay = math.exp(-step_s / response) if response > 0 else 0.0
-        self._fading = fading_nm_s(robot, step_s)
+        limits = robot.limits
+        self._fading = roll_off(robot, step_s) * limits.torque_nm / limits.speed_rad_s  # N·m less a rad/s
         self.torque_nm: Floats = np.zeros(count)
         self.heat: Floats = np.zeros(count)  # sum of torque squared over the steps since `take_heat`
         self._steps = 0

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.vcan.link import ip, listener, must
+
 CHANNEL = "vcan0"
 HERE = Path(__file__).parent
 RUN = "python deploy/vm/with_vcan.py -- .venv/bin/python -m pytest tests/vcan"
@@ -51,7 +53,17 @@ def channel() -> str:
 @pytest.fixture
 def raw_socket(channel: str) -> Iterator[socket.socket]:
     """A raw CAN socket on the bus, which gives up waiting after two seconds."""
-    with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as opened:
-        opened.settimeout(2.0)
-        opened.bind((channel,))
+    with listener(channel) as opened:
         yield opened
+
+
+@pytest.fixture
+def spare_channel() -> Iterator[str]:
+    """An interface of the test's own, which it may take down."""
+    name = f"vcan{os.getpid() % 100_000}"
+    added = ip("link", "add", name, "type", "vcan")
+    if added.returncode:
+        pytest.skip(f"may not add an interface here: {added.stderr.strip()}")
+    must(ip("link", "set", name, "up"))
+    yield name
+    ip("link", "delete", name)

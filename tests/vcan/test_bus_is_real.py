@@ -1,48 +1,12 @@
 """The kernel's SocketCAN is there and does what our driver relies on; nothing of ours is in these tests."""
 
 import errno
-import os
-import shutil
 import socket
 import struct
-import subprocess
-from collections.abc import Iterator
 
 import pytest
 
-FRAME = struct.Struct("=IB3x8s")  # can_id, length, data: linux/can.h
-# From linux/can/raw.h, linux/can/error.h and asm-generic/socket.h; Python's socket module lacks these names.
-CAN_RAW_ERR_FILTER = 2
-CAN_ERR_MASK = 0x1FFFFFFF
-SO_RXQ_OVFL = 40
-
-
-def frame(can_id: int, data: bytes = b"") -> bytes:
-    return FRAME.pack(can_id, len(data), data)
-
-
-def listener(channel: str) -> socket.socket:
-    opened = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
-    opened.settimeout(2.0)
-    opened.bind((channel,))
-    return opened
-
-
-@pytest.fixture
-def spare_channel() -> Iterator[str]:
-    """An interface of the test's own, which it may take down."""
-    name = f"vcan{os.getpid() % 100_000}"
-    added = ip("link", "add", name, "type", "vcan")
-    if added.returncode:
-        pytest.skip(f"may not add an interface here: {added.stderr.strip()}")
-    assert ip("link", "set", name, "up").returncode == 0
-    yield name
-    ip("link", "delete", name)
-
-
-def ip(*arguments: str) -> subprocess.CompletedProcess[str]:
-    tool = shutil.which("ip") or "/usr/sbin/ip"
-    return subprocess.run([tool, *arguments], capture_output=True, text=True, timeout=60, check=False)
+from tests.vcan.link import CAN_ERR_MASK, CAN_RAW_ERR_FILTER, FRAME, SO_RXQ_OVFL, frame, ip, listener, tc
 
 
 def test_a_frame_goes_from_one_socket_to_another(raw_socket: socket.socket, channel: str) -> None:
@@ -83,10 +47,8 @@ def test_sending_on_an_interface_that_is_down_raises(spare_channel: str) -> None
 def test_a_full_queue_raises_enobufs(spare_channel: str) -> None:
     # vcan is never slow; a traffic limit of one kilobit a second stands in for a bus that nobody acknowledges.
     assert ip("link", "set", spare_channel, "txqueuelen", "10").returncode == 0
-    tc = shutil.which("tc") or "/usr/sbin/tc"
-    slow = ["root", "tbf", "rate", "1kbit", "burst", "16", "limit", "64"]
-    limited = subprocess.run(
-        [tc, "qdisc", "add", "dev", spare_channel, *slow], capture_output=True, text=True, timeout=60, check=False
+    limited = tc(
+        *("qdisc", "add", "dev", spare_channel, "root", "tbf", "rate", "1kbit", "burst", "16", "limit", "64"),
     )
     if limited.returncode:
         pytest.skip(f"no traffic limit here: {limited.stderr.strip()}")

@@ -126,13 +126,32 @@ def test_the_first_count_may_be_anything_the_next_is_one_more():
     assert module.demand.target == pytest.approx(2.0) and module.refused == 1
 
 
-def test_a_lost_set_point_costs_one_more_and_no_fault():
+@pytest.mark.parametrize("lost", [1, 2])
+def test_lost_set_points_cost_nothing_but_themselves(lost: int):
     module = armed()
     drive(module, 0, BOOTED, target=1.0)
-    drive(module, 2, BOOTED, target=2.0)
-    assert module.demand.target == pytest.approx(1.0)
-    drive(module, 3, BOOTED, target=3.0)
+    drive(module, 1 + lost, BOOTED, target=2.0)
+    assert module.demand.target == pytest.approx(2.0) and module.refused == 0
+
+
+@pytest.mark.parametrize("count", [0, 15, 8, 4])  # repeated, of before, and too far ahead
+def test_a_set_point_that_is_no_next_one_is_dropped_and_counting_goes_on_from_it(count: int):
+    module = armed()
+    drive(module, 0, BOOTED, target=1.0)
+    drive(module, count, BOOTED, target=2.0)
+    assert module.demand.target == pytest.approx(1.0) and module.refused == 1
+    drive(module, count + 1, BOOTED, target=3.0)
     assert module.demand.target == pytest.approx(3.0) and module.state == ModuleState.ARMED
+
+
+def test_set_points_without_syncs_do_not_keep_a_module_alive():
+    module = armed()
+    drive(module, 0, BOOTED)
+    for k in range(1, 30):
+        module.hear_set_point(set_point(k, Mode.PASSIVE), BOOTED + k * 10 * MS)
+        module.poll(BOOTED + k * 10 * MS)
+    assert module.state == ModuleState.FAULT and module.last_stop == LastStop.WATCHDOG
+    assert module.demand.mode == Mode.PASSIVE
 
 
 def test_five_wrong_counts_in_a_row_are_no_stream():

@@ -1,0 +1,59 @@
+"""Frames as modules send them, and modules that answer Syncs with them."""
+
+from collections.abc import Iterable
+from typing import Any
+
+from snakesim_can_backend.codec import codec
+from snakesim_can_backend.protocol import Frame, ModuleState, Opcode
+from snakesim_can_backend.reading import Reading
+
+
+def joint_state(node: int, count: int, angle: float = 0.1, **other: float) -> Frame:
+    values: dict[str, float] = {"state": ModuleState.DISARMED, **other}
+    return codec()[Opcode.JOINT_STATE].frame(node, angle=angle, count=count % 16, **values)
+
+
+def heartbeat(node: int, uptime_s: float, state: ModuleState = ModuleState.DISARMED, **other: float) -> Frame:
+    return codec()[Opcode.HEARTBEAT].frame(node, uptime=uptime_s, state=state, **other)
+
+
+def contact(node: int, count: int, *, tail: bool = False, touched: bool = True, **other: float) -> Frame:
+    layout = codec()[Opcode.TAIL_CONTACT if tail else Opcode.CONTACT]
+    return layout.frame(node, count=count % 16, touched=touched, **other)
+
+
+def gyro(node: int, count: int, rate_x: float) -> Frame:
+    return codec()[Opcode.GYRO].frame(node, rate_x=rate_x, count=count % 256)
+
+
+def accelerometer(node: int, count: int, acceleration_z: float) -> Frame:
+    return codec()[Opcode.ACCELEROMETER].frame(node, acceleration_z=acceleration_z, count=count % 256)
+
+
+def health(node: int, **values: float) -> Frame:
+    return codec()[Opcode.HEALTH].frame(node, **values)
+
+
+def spoilt(frame: Frame) -> Frame:
+    """With a wrong checksum."""
+    return Frame(frame.id, frame.data[:-1] + bytes((frame.data[-1] ^ 0x5A,)))
+
+
+def begin(reading: Reading, *, contacts: bool = False, tail: bool = False) -> int:
+    """The next Sync goes out; its number."""
+    reading.begin(reading.sync + 1, contacts=contacts, tail=tail)
+    return reading.sync
+
+
+def answer(reading: Reading, nodes: Iterable[int] | None = None, **values: Any) -> None:
+    """Modules answer the newest Sync; all of them unless told otherwise."""
+    for node in range(1, len(reading.modules) + 1) if nodes is None else nodes:
+        reading.take(joint_state(node, reading.sync, **values))
+
+
+def syncs(reading: Reading, count: int, nodes: Iterable[int] | None = None, **values: Any) -> None:
+    """So many Syncs, answered by these nodes."""
+    nodes = None if nodes is None else list(nodes)
+    for _ in range(count):
+        begin(reading)
+        answer(reading, nodes, **values)

@@ -1,0 +1,312 @@
+"""Every module is found, checked and given its parameters, and nothing is enabled meanwhile."""
+
+import re
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import pytest
+
+from snakesim_can_backend.bring_up import ASK_EVERY_S, LISTEN_ON_S, Bus, Identity, configure, find, objections
+from snakesim_can_backend.bus_load import reports_of
+from snakesim_can_backend.codec import codec
+from snakesim_can_backend.parameters import parameters_of
+from snakesim_can_backend.protocol import (
+    PARAMETERS,
+    Action,
+    Frame,
+    Opcode,
+    Operation,
+    Parameter,
+    Result,
+    node_of,
+    opcode_of,
+)
+from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.twin.chain import ModuleChain
+from snakesim_can_backend.wire import VirtualWire
+from snakesim_hal.errors import BackendError
+from tests.unit.can_backend.frames import heartbeat
+from tests.unit.can_backend.loop import config
+from tests.unit.can_backend.twin import rig
+
+NAMES = [f"joint_{i}" for i in range(1, 5)]
+Spoil = Callable[[Frame], list[Frame]]
+
+
+def as_it_is(frame: Frame) -> list[Frame]:
+    return [frame]
+
+
+class Modules:
+    """Four stepped twins at the other end of a bus. to_modules, to_host: what becomes of each frame."""
+
+    def __init__(self, chain: ModuleChain | None = None) -> None:
+        self.chain = chain or rig.chain()
+        self.channel = f"bring-up-{uuid.uuid4().hex[:8]}"
+        self.far = VirtualWire(self.channel)
+        self.near = VirtualWire(self.channel, self)
+        self.to_modules: Spoil = as_it_is
+        self.to_host: Spoil = as_it_is
+        self.beside: Callable[[], None] = lambda: None
+        self.heard: list[Frame] = []
+        self.bus = Bus(self.near, range(1, 5))
+
+    def __call__(self) -> float | None:
+        for frame in self.far.receive():
+            self.heard.append(frame)
+            for passed in self.to_modules(frame):
+                self.chain.hear(0, passed)
+        for frame in self.chain.take(0):
+            for passed in self.to_host(frame):
+                self.far.send(passed)
+        self.beside()
+        return 0.001
+
+    def close(self) -> None:
+        self.far.close()
+
+
+@pytest.fixture
+def modules() -> Iterator[Modules]:
+    made = Modules()
+    yield made
+    made.near.close()
+
+
+def actions(frames: list[Frame]) -> list[float]:
+    return [rig.read(f)["action"] for f in frames if opcode_of(f.id) == Opcode.COMMAND]
+
+
+# --- who is there ------------------------------------------------------------------------------------------
+
+
+def test_everybody_is_found_and_only_asked_who_they_are(modules: Modules) -> None:
+    found = find([modules.bus], 5.0)
+    assert [i.node for i in found] == [1, 2, 3, 4] and {i.channel for i in found} == {modules.channel}
+    assert [i.serial for i in found] == [seat.module.serial for seat in modules.chain.seats]
+    assert {(i.firmware, i.protocol, i.emulated, i.stepped) for i in found} == {("1.0", 1, True, True)}
+    assert set(actions(modules.heard)) == {Action.IDENTIFY}
+    assert {opcode_of(frame.id) for frame in modules.heard} == {Opcode.COMMAND}
+    assert objections([modules.bus], found, NAMES, lockstep=True) == []
+
+
+def test_it_listens_on_for_a_second_module_with_the_same_id(modules: Modules) -> None:
+    answered_at: list[float] = []
+
+    def watch_the_last(frame: Frame) -> list[Frame]:
+        if opcode_of(frame.id) == Opcode.IDENTITY and node_of(frame.id) == 4:
+            answered_at.append(time.monotonic())
+        return [frame]
+
+    def later() -> None:
+        if answered_at and time.monotonic() > answered_at[0] + LISTEN_ON_S / 2:
+            modules.far.send(codec()[Opcode.IDENTITY].frame(2, serial=0xBAD, protocol=1))
+
+    modules.to_host, modules.beside = watch_the_last, later
+    found = find([modules.bus], 5.0)
+    assert 0xBAD in [i.serial for i in found if i.node == 2] and len(found) == 5
+
+
+def test_it_ends_soon_when_all_are_found_and_at_the_limit_when_not(modules: Modules) -> None:
+    began = time.monotonic()
+    find([modules.bus], 5.0)
+    assert time.monotonic() - began < 2.0
+    began = time.monotonic()
+    found = find([Bus(modules.near, range(1, 6))], 0.25)
+    assert 0.2 < time.monotonic() - began < 2.0 and len(found) == 4
+    assert 2 <= len(actions(modules.heard)) <= 6, "asks again, but not all the time"
+
+
+def test_an_answer_that_is_lost_is_asked_for_again(modules: Modules) -> None:
+    lost: list[Frame] = []
+
+    def lose_first(frame: Frame) -> list[Frame]:
+        if opcode_of(frame.id) == Opcode.IDENTITY and node_of(frame.id) == 3 and not lost:
+            lost.append(frame)
+            return []
+        return [frame]
+
+    modules.to_host = lose_first
+    assert [i.node for i in find([modules.bus], 5.0)] == [1, 2, 3, 4] and lost
+
+
+def test_other_frames_are_handed_on_and_cut_ones_do_no_harm(modules: Modules) -> None:
+    beat = heartbeat(3, 1.0)
+    cut = Frame(codec()[Opcode.IDENTITY].frame(9).id, b"\x01\x02")
+    for frame in (beat, cut):
+        modules.far.send(frame)
+    handed_on: list[Frame] = []
+    assert [i.node for i in find([modules.bus], 5.0, handed_on.append)] == [1, 2, 3, 4]
+    assert [frame for frame in handed_on if opcode_of(frame.id) != Opcode.HEARTBEAT] == [cut] and beat in handed_on
+
+
+# --- what is wrong with them -------------------------------------------------------------------------------
+
+A, B = "can_a", "can_b"
+GOOD = [Identity(n, A if n < 3 else B, 0x1000 + n, "1.0", 1, False, False) for n in (1, 2, 3, 4)]
+
+
+class Named(VirtualWire):
+    """A wire that has a name, and is on no bus."""
+
+    def __init__(self, channel: str) -> None:
+        self.channel = channel
+
+
+def two_buses() -> list[Bus]:
+    wires = {name: Named(name) for name in (A, B)}
+    return [Bus(wires[A], range(1, 3)), Bus(wires[B], range(3, 5))]
+
+
+def wrong_with(found: list[Identity], *, lockstep: bool = False) -> list[str]:
+    return objections(two_buses(), found, NAMES, lockstep=lockstep)
+
+
+def test_a_whole_robot_is_not_objected_to() -> None:
+    assert wrong_with(GOOD) == []
+    assert wrong_with([replace(i, stepped=True) for i in GOOD], lockstep=True) == []
+
+
+@pytest.mark.parametrize(
+    ("found", "words"),
+    [
+        (GOOD[:2] + GOOD[3:], "joint_3 (node 3 on can_b) does not answer"),
+        (
+            [*GOOD, replace(GOOD[1], serial=0xBEEF)],
+            "joint_2 (node 2 on can_a) is there 2 times, serials 00001002 and 0000BEEF: give each module its own",
+        ),
+        ([*GOOD, replace(GOOD[0], node=9)], "node 9 with serial 00001001 on can_a is none of this robot's joints"),
+        (
+            [*GOOD[:2], replace(GOOD[2], channel=A), GOOD[3]],
+            "joint_3 (node 3 on can_b) does not answer; a node 3 answers on can_a",
+        ),
+        ([*GOOD, replace(GOOD[2], channel=A, serial=0xF)], "joint_3 (node 3 on can_b) has a namesake on can_a, serial"),
+        (
+            [replace(GOOD[0], protocol=2), *GOOD[1:]],
+            "joint_1 (node 1 on can_a) speaks protocol version 2, this driver 1",
+        ),
+        ([replace(GOOD[0], stepped=True), *GOOD[1:]], "joint_1 (node 1 on can_a) is a twin whose time stands still"),
+    ],
+)
+def test_what_is_wrong_is_told_with_joint_node_and_bus(found: list[Identity], words: str) -> None:
+    (told,) = wrong_with(found)
+    assert told.startswith(words)
+
+
+def test_modules_that_cannot_wait_are_no_good_for_lockstep() -> None:
+    told = wrong_with([replace(i, stepped=i.node > 1) for i in GOOD], lockstep=True)
+    assert told == ["joint_1 (node 1 on can_a) cannot wait for lockstep: use --pace realtime"]
+
+
+def test_everything_is_told_at_once() -> None:
+    found = [
+        replace(GOOD[0], protocol=3),
+        replace(GOOD[0], protocol=3, serial=5),
+        replace(GOOD[2], channel=A),
+        replace(GOOD[3], stepped=True),
+        replace(GOOD[3], node=62),
+    ]
+    told = wrong_with(found)
+    assert len(told) == 7
+    for words in ("is there 2 times", "version 3", "joint_2 .*does not answer$", "answers on can_a", "--stepped", "62"):
+        assert any(re.search(words, line) for line in told), words
+
+
+# --- parameters --------------------------------------------------------------------------------------------
+
+
+def wanted(**changed: float) -> dict[int, dict[Parameter, float]]:
+    run = config()
+    given = parameters_of(run.robot, Settings(), reports_of(run, Settings()))
+    given[2] |= {Parameter[name.upper()]: value for name, value in changed.items()}
+    return given
+
+
+def test_every_parameter_is_written_and_the_others_are_read(modules: Modules) -> None:
+    in_force = configure([modules.bus], wanted(stiffness=12.5), 5.0)
+    assert set(in_force) == {1, 2, 3, 4}
+    for node, values in in_force.items():
+        assert set(values) == set(Parameter)
+        assert values == pytest.approx(modules.chain.seats[node - 1].module.parameters.values)
+    assert in_force[2][Parameter.STIFFNESS] == 12.5 and in_force[1][Parameter.STIFFNESS] == 40.0
+    assert [in_force[node][Parameter.TAIL] for node in (1, 2, 3, 4)] == [1, 0, 0, 0]
+    assert in_force[1][Parameter.RATED_TORQUE] == pytest.approx(4.0)
+    requests = [rig.read(f) for f in modules.heard]
+    assert {opcode_of(f.id) for f in modules.heard} == {Opcode.PARAMETER_REQUEST}
+    read_only = [r["index"] for r in requests if r["operation"] == Operation.READ]
+    assert set(read_only) == {Parameter.RATED_TORQUE, Parameter.RATED_SPEED} and len(requests) == 4 * len(Parameter)
+
+
+def test_only_the_nodes_asked_for_are_written(modules: Modules) -> None:
+    assert set(configure([modules.bus], {3: wanted()[3]}, 5.0)) == {3}
+    assert {node_of(frame.id) for frame in modules.heard} == {3}
+
+
+@pytest.mark.parametrize("way", ["to_modules", "to_host"])
+def test_what_is_lost_is_asked_again(modules: Modules, way: str) -> None:
+    passed: list[Frame] = []
+
+    def lose_the_fifth(frame: Frame) -> list[Frame]:
+        passed.append(frame)
+        return [] if len(passed) == 5 else [frame]
+
+    setattr(modules, way, lose_the_fifth)
+    began = time.monotonic()
+    in_force = configure([modules.bus], wanted(), 5.0)
+    assert all(set(values) == set(Parameter) for values in in_force.values())
+    assert len(modules.heard) == 4 * len(Parameter) + 1
+    assert time.monotonic() - began > ASK_EVERY_S
+
+
+def test_answers_that_come_twice_or_cut_or_for_another_index_are_no_answers(modules: Modules) -> None:
+    def noisily(frame: Frame) -> list[Frame]:
+        other = codec()[Opcode.PARAMETER_ANSWER].frame(node_of(frame.id), index=200, result=Result.UNKNOWN_INDEX)
+        return [Frame(frame.id, frame.data[:3]), other, frame, frame]
+
+    modules.to_host = noisily
+    in_force = configure([modules.bus], wanted(damping=0.5), 5.0)
+    assert in_force[2][Parameter.DAMPING] == 0.5 and in_force[2][Parameter.STIFFNESS] == 40.0
+    assert in_force[1][Parameter.DAMPING] == 1.0
+
+
+def test_other_frames_are_not_lost_while_it_waits(modules: Modules) -> None:
+    beat = heartbeat(3, 9.0)
+    modules.far.send(beat)
+    handed_on: list[Frame] = []
+    configure([modules.bus], wanted(), 5.0, handed_on.append)
+    assert beat in handed_on
+
+
+def test_a_value_out_of_range_is_told_with_node_name_value_and_range(modules: Modules) -> None:
+    high = PARAMETERS[Parameter.STIFFNESS].high
+    words = f"node 2 refuses parameter stiffness = 200000.0 N·m/rad: out of range (allowed: 0 to {high:g})"
+    with pytest.raises(BackendError, match=re.escape(words)):
+        configure([modules.bus], wanted(stiffness=2e5), 5.0)
+
+
+def test_an_armed_module_refuses(modules: Modules) -> None:
+    modules.chain.hear(0, rig.command(Action.ARM))
+    modules.chain.take(0)
+    with pytest.raises(BackendError, match="not while armed"):
+        configure([modules.bus], wanted(), 5.0)
+
+
+def test_a_result_that_this_version_does_not_know_is_a_refusal(modules: Modules) -> None:
+    def oddly(frame: Frame) -> list[Frame]:
+        if opcode_of(frame.id) != Opcode.PARAMETER_ANSWER:
+            return [frame]
+        return [Frame(frame.id, frame.data[:1] + bytes((frame.data[1] | 0xF0,)) + frame.data[2:])]
+
+    modules.to_host = oddly
+    with pytest.raises(BackendError, match=r"refuses parameter stiffness .*: result 15 "):
+        configure([modules.bus], wanted(), 5.0)
+
+
+def test_who_does_not_answer_is_told_in_the_end(modules: Modules) -> None:
+    modules.to_host = lambda frame: [] if node_of(frame.id) in (2, 4) else [frame]
+    with pytest.raises(BackendError, match=r"no answer about parameters from node 2, 4 within 0\.3 s"):
+        configure([modules.bus], wanted(), 0.3)
+    asked = sum(node_of(frame.id) == 2 for frame in modules.heard)
+    assert 2 <= asked <= 5

@@ -1,0 +1,162 @@
+"""The twins that a driver starts for itself: what is refused, and a child process from its start to its end."""
+
+import json
+import os
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from snakesim_can_backend import own_twins
+from snakesim_can_backend.own_twins import TwinProcess, check_twins, twins_here
+from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.twin.server import Here
+from snakesim_hal.errors import BackendError, ConfigError
+from tests.unit.can_backend.loop import config
+
+RUN = config()
+VCAN = ["vcan0"]
+
+# --- what is refused ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (Settings(twins="here", channels=VCAN), r'"here" is a virtual bus .* leave `channels` empty, or .*"process"'),
+        (Settings(twins="none"), r'"none" needs a bus: name it in `backends\.can\.channels`'),
+        (Settings(twins="process"), r'"process" needs a bus'),
+        (Settings(channels=VCAN, faults=["mute:joint_1@1"]), r"`backends\.can\.faults` are for twins"),
+        (Settings(faults=["mute:joint_5@1"]), "joint_5"),
+        (Settings(faults=["melt:joint_1@1"]), "melt"),
+        (Settings(channels=VCAN, twins="process", faults=["mute:joint_9@1"]), "joint_9"),
+    ],
+)
+def test_twins_that_cannot_be_are_refused(settings: Settings, words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        check_twins(RUN, settings)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        Settings(),
+        Settings(faults=["mute:joint_4@1"]),
+        Settings(channels=VCAN),
+        Settings(channels=VCAN, twins="process", faults=["mute:joint_4@1"]),
+    ],
+)
+def test_those_that_can_are_not(settings: Settings) -> None:
+    check_twins(RUN, settings)
+
+
+def test_twins_here_are_at_the_other_end_of_the_named_bus() -> None:
+    end = twins_here(RUN, Settings(plant="inertia"), "own-twins-test", None, stepped=True)
+    try:
+        assert isinstance(end, Here) and end.server.wires[0].channel == "own-twins-test"
+        assert end.server.chain.stepped and end.server.chain.count == 4
+    finally:
+        end.close()
+
+
+# --- the child ---------------------------------------------------------------------------------------------
+
+
+def child(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, body: str) -> Path:
+    """Instead of `snakesim modules` runs a program that notes its arguments and does as told; where it notes them."""
+    noted = tmp_path / "noted.json"
+    program = tmp_path / "python"
+    program.write_text(
+        f"#!{sys.executable}\n"
+        "import json, os, pathlib, signal, sys, time\n"
+        "config = pathlib.Path(sys.argv[3])\n"
+        f"noted = pathlib.Path({str(noted)!r})\n"
+        "noted.write_text(json.dumps({'arguments': sys.argv[1:], 'pid': os.getpid(), 'session': os.getsid(0),"
+        " 'config': json.loads(config.read_text())}))\n" + body
+    )
+    program.chmod(0o755)
+    monkeypatch.setattr(own_twins.sys, "executable", str(program))
+    return noted
+
+
+def gone(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return True
+    return False
+
+
+SERVE = "print('modules ready: 4 on vcan0', flush=True)\ntime.sleep(60)\n"
+
+
+def test_a_child_is_told_everything_and_ends_when_asked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    end = "signal.signal(signal.SIGTERM, lambda *_: (print('last words', flush=True), sys.exit(0)))\n"
+    noted = child(tmp_path, monkeypatch, end + "print('a warning')\n" + SERVE)
+    settings = Settings(channels=["vcan0", "vcan1"], twins="process", plant="inertia", faults=["mute:joint_1@2"])
+    twins = TwinProcess(RUN, settings, "127.0.0.1:5000", stepped=True)
+    told = json.loads(noted.read_text())
+    arguments = told["arguments"]
+    assert arguments[:2] == ["-m", "snakesim_can_backend.twin.command"] and "--stepped" in arguments
+    assert [arguments[i + 1] for i, word in enumerate(arguments) if word == "--channel"] == ["vcan0", "vcan1"]
+    assert arguments[arguments.index("--pose") + 1] == "127.0.0.1:5000"
+    assert arguments[arguments.index("--parent") + 1] == str(os.getpid())
+    assert told["session"] == told["pid"], "Ctrl-C is not for it"
+    assert told["config"]["backends"]["can"]["plant"] == "inertia"
+    assert told["config"]["backends"]["can"]["faults"] == ["mute:joint_1@2"]
+    twins.stop()
+    assert gone(told["pid"]) and not Path(arguments[2]).exists()
+    said = capsys.readouterr().err
+    assert "a warning" in said and "last words" in said
+
+
+def test_without_a_camera_and_in_real_time_it_is_told_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    noted = child(tmp_path, monkeypatch, SERVE)
+    twins = TwinProcess(RUN, Settings(channels=VCAN, twins="process"), None, stepped=False)
+    twins.stop()
+    arguments = json.loads(noted.read_text())["arguments"]
+    assert arguments[arguments.index("--pose") + 1] == "none" and "--stepped" not in arguments
+
+
+def test_a_child_that_will_not_end_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(own_twins, "STOP_LIMIT_S", 0.2)
+    noted = child(tmp_path, monkeypatch, "signal.signal(signal.SIGTERM, signal.SIG_IGN)\n" + SERVE)
+    twins = TwinProcess(RUN, Settings(channels=VCAN, twins="process"), None, stepped=False)
+    began = time.monotonic()
+    twins.stop()
+    assert gone(json.loads(noted.read_text())["pid"]) and time.monotonic() - began < 5.0
+
+
+@pytest.mark.parametrize("ending", ["sys.exit(2)\n", "time.sleep(60)\n"])
+def test_a_child_that_does_not_get_ready_is_told_and_leaves_nothing(
+    ending: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(own_twins, "START_LIMIT_S", 1.0)
+    noted = child(tmp_path, monkeypatch, "print('no such plant', flush=True)\n" + ending)
+    with pytest.raises(BackendError, match="the module twins did not start"):
+        TwinProcess(RUN, Settings(channels=VCAN, twins="process"), None, stepped=False)
+    told = json.loads(noted.read_text())
+    assert gone(told["pid"]) and not Path(told["arguments"][2]).exists()
+    assert "no such plant" in capsys.readouterr().err
+
+
+def test_the_real_command_says_why_it_does_not_start(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(BackendError, match="did not start"):
+        TwinProcess(RUN, Settings(channels=["vcan77"], twins="process", plant="inertia"), None, stepped=False)
+    assert "vcan77" in capsys.readouterr().err
+
+
+def test_a_child_that_ends_by_itself_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    child(
+        tmp_path, monkeypatch, "print('modules ready: 4', flush=True)\nsys.stdin.read()\ntime.sleep(0.3)\nsys.exit(3)\n"
+    )
+    twins = TwinProcess(RUN, Settings(channels=VCAN, twins="process"), None, stepped=False)
+    assert twins.how_it_ended() is None
+    end = time.monotonic() + 5.0
+    while twins.how_it_ended() is None and time.monotonic() < end:
+        time.sleep(0.01)
+    assert twins.how_it_ended() == "the module twins have ended, with exit code 3"
+    twins.stop()

@@ -1,0 +1,265 @@
+"""What the HAL publishes of the modules' frames, and what the twins make of a touch, there and back."""
+
+import math
+import socket
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from snakesim_can_backend.bus_load import Reports, reports_of
+from snakesim_can_backend.codec import codec
+from snakesim_can_backend.mocap import MocapReceiver
+from snakesim_can_backend.protocol import Opcode
+from snakesim_can_backend.reading import Reading
+from snakesim_can_backend.sensors import LONG_AGO_NS, Sensors, contacts_due, described, on_surface
+from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.twin.frames import write_contact, write_tail_contact
+from snakesim_can_backend.twin.reports import touch
+from snakesim_hal import keys
+from snakesim_hal.backend import Samples
+from snakesim_hal.messages import Contacts, Imu, Pose, Power
+from snakesim_hal.plant import LinkLoad
+from snakesim_hal.quantities import Vector
+from snakesim_hal.scenario import RunConfig
+from tests.unit.can_backend.frames import accelerometer, answer, begin, contact, gyro, health, syncs
+from tests.unit.can_backend.loop import config
+
+JOINTS = 4
+PERIOD_NS = 10_000_000
+EVERYTHING: dict[str, Any] = {
+    "robot__sensors__contacts__rate_hz": 100.0,
+    "robot__sensors__imu__rate_hz": 50.0,
+    "robot__sensors__pose__rate_hz": 100.0,
+}
+
+
+def sensors_of(
+    run: RunConfig, reports: Reports | None = None, mocap: MocapReceiver | None = None
+) -> tuple[Reading, Sensors]:
+    reading = Reading(run.robot.chain.modules)
+    return reading, Sensors(run, reports or reports_of(run, Settings()), reading, mocap)
+
+
+def contacts_of(samples: Samples) -> Contacts:
+    found = samples.others[keys.CONTACTS]
+    assert isinstance(found, Contacts)
+    return found
+
+
+# --- joints ------------------------------------------------------------------------------------------------
+
+
+def test_every_state_has_its_age_and_is_valid_for_the_lease() -> None:
+    reading, sensors = sensors_of(config())
+    syncs(reading, 1, angle=0.5, velocity=-1.0, torque=2.0)
+    fresh = sensors.sample(7, 70 * 10**6).joints
+    assert (fresh.tick, fresh.stamp_ns) == (7, 70 * 10**6)
+    assert fresh.angle_rad == pytest.approx([0.5] * JOINTS)
+    assert fresh.velocity_rad_s == pytest.approx([-1.0] * JOINTS)
+    assert fresh.torque_nm == pytest.approx([2.0] * JOINTS)
+    assert fresh.age_ns == [0] * JOINTS and fresh.valid == [True] * JOINTS
+    for missed in range(1, 9):
+        syncs(reading, 1, [1, 2, 4], angle=0.6)
+        joints = sensors.sample(7 + missed, 0).joints
+        assert joints.age_ns == [0, 0, missed * PERIOD_NS, 0]
+        assert joints.valid == [True, True, missed <= 5, True], "the lease is five periods"
+        assert joints.angle_rad == pytest.approx([0.6, 0.6, 0.5, 0.6])
+
+
+def test_what_was_never_heard_is_not_valid() -> None:
+    reading, sensors = sensors_of(config())
+    syncs(reading, 1, [1, 2, 4])
+    joints = sensors.sample(0, 0).joints
+    assert joints.valid == [True, True, False, True] and joints.age_ns[2] == LONG_AGO_NS
+
+
+# --- forces ------------------------------------------------------------------------------------------------
+
+
+def test_forces_are_told_at_the_syncs_that_ask_for_them() -> None:
+    run = config(**EVERYTHING)
+    reports = Reports(100.0, contact_every=3)
+    reading, sensors = sensors_of(run, reports)
+    for tick in range(300):
+        sync = begin(reading, contacts=contacts_due(reports, reading.sync + 1))
+        answer(reading)
+        assert contacts_due(reports, sync) is (sync % 256 % 3 == 0)
+        assert (keys.CONTACTS in sensors.sample(tick, 0).others) is contacts_due(reports, sync)
+    assert not any(contacts_due(Reports(100.0, contact_every=0), sync) for sync in range(300))
+
+
+def test_nothing_touched_is_an_empty_list() -> None:
+    reading, sensors = sensors_of(config(**EVERYTHING))
+    begin(reading, contacts=True)
+    reading.take(contact(2, reading.sync, touched=False, force_x=9.0))
+    assert contacts_of(sensors.sample(3, 30)) == Contacts(tick=3, stamp_ns=30, contacts=[])
+
+
+def test_a_touch_is_told_in_the_frame_of_its_link() -> None:
+    run = config(**EVERYTHING)
+    reading, sensors = sensors_of(run)
+    begin(reading, contacts=True)
+    reading.take(contact(2, reading.sync, force_x=1.0, force_y=-3.0, along=0.04, bearing=math.pi / 2))
+    (found,) = contacts_of(sensors.sample(3, 30)).contacts
+    radius_m = run.robot.module.radius_m
+    assert found.link == 2 and found.obstacle is None and found.torque_l == (0.0, 0.0, 0.0)
+    assert found.position_l == pytest.approx((0.04, 0.0, radius_m))
+    assert found.normal_l == pytest.approx((0.0, 0.0, -1.0)), "from the obstacle into the body"
+    assert found.force_l == pytest.approx((1.0, -3.0, 0.0))
+    frame = np.array((found.normal_l, found.tangent_1_l, found.tangent_2_l))
+    assert np.allclose(frame @ frame.T, np.eye(3)) and found.tangent_1_l[0] > 0
+
+
+def test_what_is_weaker_than_the_robots_threshold_is_left_out() -> None:
+    reading, sensors = sensors_of(config(**EVERYTHING, robot__sensors__contacts__threshold_n=1.0))
+    begin(reading, contacts=True)
+    for node, force in ((1, 0.9), (2, 1.0), (3, -1.05)):
+        reading.take(contact(node, reading.sync, force_z=force))
+    assert [found.link for found in contacts_of(sensors.sample(0, 0)).contacts] == [2, 3]
+
+
+# The place of a touch, from the plant through twin and bus to the HAL.
+
+
+def capsule_point(along_m: float, polar: float, bearing: float, length_m: float, radius_m: float) -> Vector:
+    """A point of a capsule: on the cylinder for polar 0, on the ball at the nearer end otherwise."""
+    base_m = along_m if polar == 0 else (length_m if polar > 0 else 0.0)
+    across = radius_m * math.cos(polar)
+    return (base_m + radius_m * math.sin(polar), across * math.cos(bearing), across * math.sin(bearing))
+
+
+@given(
+    link=st.integers(0, JOINTS),
+    share=st.floats(0, 1),
+    polar=st.just(0.0) | st.floats(-1.4, 1.4),
+    bearing=st.floats(-math.pi, math.pi),
+)
+def test_a_touch_anywhere_on_a_capsule_comes_back_within_the_steps_of_the_bus(
+    link: int, share: float, polar: float, bearing: float
+) -> None:
+    run = config(**EVERYTHING)
+    length_m, radius_m = run.robot.link_lengths_m[link], run.robot.module.radius_m
+    point = capsule_point(share * length_m, polar, bearing, length_m, radius_m)
+    reading, sensors = sensors_of(run)
+    sync = begin(reading, contacts=True)
+    numbers = (*touch(LinkLoad(link, point, (1.0, 2.0, 3.0))), sync)
+    reading.take(write_tail_contact(1, numbers) if link == 0 else write_contact(link, numbers))
+    (found,) = contacts_of(sensors.sample(0, 0)).contacts
+    assert found.link == link
+    base = (min(max(point[0], 0.0), length_m), 0.0, 0.0)
+    outward = [(p - b) / radius_m for p, b in zip(point, base, strict=True)]
+    cosine = -float(np.dot(outward, found.normal_l))
+    # a step along the link turns the normal most where the ball ends: by step / (radius x cos(polar))
+    turned = codec()[Opcode.CONTACT].signals["bearing"].scale / 2
+    leaned = codec()[Opcode.CONTACT].signals["along"].scale / 2 / (radius_m * math.cos(polar))
+    allowed = 1.5 * (turned * math.cos(polar) + leaned) + 1e-9
+    assert math.acos(min(cosine, 1.0)) <= allowed
+    assert math.dist(point, found.position_l) <= radius_m * allowed + 0.00025
+
+
+@given(st.floats(-0.3, 0.3), st.floats(-4, 4), st.floats(0.01, 0.2), st.floats(0.005, 0.1))
+def test_whatever_is_told_is_a_place_on_the_capsule(
+    along_m: float, bearing: float, length_m: float, radius_m: float
+) -> None:
+    outward, point = on_surface(along_m, bearing, length_m, radius_m)
+    assert math.hypot(*outward) == pytest.approx(1.0)
+    axis_m = min(max(point[0], 0.0), length_m)
+    assert math.dist(point, (axis_m, 0.0, 0.0)) == pytest.approx(radius_m)
+    if -radius_m <= along_m <= length_m + radius_m:
+        assert point[0] == pytest.approx(along_m, abs=1e-12)
+
+
+# --- IMUs, power, pose -------------------------------------------------------------------------------------
+
+
+def test_an_imu_message_holds_only_what_is_new() -> None:
+    reading, sensors = sensors_of(config(**EVERYTHING))
+    syncs(reading, 1)
+    assert keys.IMU not in sensors.sample(0, 0).others
+    reading.take(gyro(3, 0, 0.5))
+    reading.take(accelerometer(3, 0, 9.81))
+    reading.take(gyro(1, 0, 0.5))
+    found = sensors.sample(1, 10).others[keys.IMU]
+    assert isinstance(found, Imu) and (found.tick, found.stamp_ns, found.link) == (1, 10, [3])
+    assert found.angular_velocity_rad_s[0] == pytest.approx((0.5, 0.0, 0.0))
+    assert found.acceleration_m_s2[0] == pytest.approx((0.0, 0.0, 9.81))
+    assert keys.IMU not in sensors.sample(2, 0).others
+
+
+def test_power_comes_twice_a_second_and_what_is_unknown_is_not_valid() -> None:
+    reading, sensors = sensors_of(config())
+    syncs(reading, 1)
+    reading.take(health(2, voltage=23.5, current=-1.5, motor_temperature=-10, board_temperature=40, leak=1))
+    reading.take(health(4, voltage=24.0))
+    due = [tick for tick in range(101) if keys.POWER in sensors.sample(tick, 0).others]
+    assert due == [0, 50, 100]
+    found = sensors.sample(50, 7).others[keys.POWER]
+    assert isinstance(found, Power) and (found.tick, found.stamp_ns) == (50, 7)
+    assert found.valid == [False, True, False, True] and found.leak == [False, True, False, False]
+    assert found.voltage_v[1] == pytest.approx(23.5) and found.current_a[1] == pytest.approx(-1.5)
+    assert (found.motor_c[1], found.board_c[1]) == (-10.0, 40.0)
+    assert all(len(column) == JOINTS for column in (found.voltage_v, found.current_a, found.motor_c, found.board_c))
+
+
+def test_a_pose_is_told_once() -> None:
+    mocap = MocapReceiver("127.0.0.1:0")
+    try:
+        reading, sensors = sensors_of(config(), mocap=mocap)
+        syncs(reading, 1)
+        assert keys.POSE not in sensors.sample(0, 0).others
+        host, _, port = mocap.address.rpartition(":")
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as camera:
+            camera.sendto(b'{"position_w":[1,2,3],"orientation_wxyz":[1,0,0,0]}', (host, int(port)))
+        found = sensors.sample(1, 10).others[keys.POSE]
+        assert isinstance(found, Pose) and (found.tick, found.position_w) == (1, (1.0, 2.0, 3.0))
+        assert keys.POSE not in sensors.sample(2, 0).others
+    finally:
+        mocap.close()
+
+
+# --- what is described -------------------------------------------------------------------------------------
+
+
+def test_sensors_are_described_with_their_rates() -> None:
+    run = config(**EVERYTHING)
+    found = {s.key: s.rate_hz for s in described(run, Reports(100.0, 4, 20), pose=True)}
+    assert found == {keys.JOINTS: 100.0, keys.CONTACTS: 25.0, keys.IMU: 5.0, keys.POWER: 2.0, keys.POSE: 100.0}
+    bare = {s.key for s in described(run, Reports(100.0, 0, 0), pose=False)}
+    assert bare == {keys.JOINTS, keys.POWER}
+
+
+@pytest.mark.parametrize(("contact_every", "imu_every", "pose"), [(1, 20, True), (3, 0, False), (0, 5, False)])
+def test_what_is_described_is_what_is_delivered(contact_every: int, imu_every: int, pose: bool) -> None:
+    run = config(**EVERYTHING)
+    reports = Reports(100.0, contact_every, imu_every)
+    mocap = MocapReceiver("127.0.0.1:0") if pose else None
+    reading, sensors = sensors_of(run, reports, mocap)
+    delivered: dict[str, int] = {}
+    ticks = 200
+    camera = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        for tick in range(ticks):
+            begin(reading, contacts=contacts_due(reports, tick))
+            answer(reading)
+            if imu_every and tick % imu_every == 0:
+                reading.take(gyro(1, tick, 0.0))
+                reading.take(accelerometer(1, tick, 0.0))
+            if mocap is not None:
+                host, _, port = mocap.address.rpartition(":")
+                camera.sendto(b'{"position_w":[1,2,3],"orientation_wxyz":[1,0,0,0]}', (host, int(port)))
+            samples = sensors.sample(tick, tick * PERIOD_NS)
+            for key, message in {keys.JOINTS: samples.joints, **samples.others}.items():
+                delivered[key] = delivered.get(key, 0) + 1
+                assert msgspec.msgpack.decode(msgspec.msgpack.encode(message), type=type(message)) == message
+    finally:
+        camera.close()
+        if mocap is not None:
+            mocap.close()
+    rates = {s.key: s.rate_hz for s in described(run, reports, pose=pose)}
+    assert set(delivered) == set(rates)
+    for key, count in delivered.items():
+        assert count == pytest.approx(rates[key] * ticks / 100.0, abs=1), key

@@ -1,0 +1,436 @@
+"""Each finding: its word, its joint, where it sends a person; told once, and again when it is still there."""
+
+from collections.abc import Callable
+
+import pytest
+
+from snakesim_can_backend.codec import codec
+from snakesim_can_backend.commands import command
+from snakesim_can_backend.protocol import Action, Frame, LastStop, ModuleState, Opcode, frame_id
+from snakesim_can_backend.reading import Reading
+from snakesim_can_backend.watch import ARM_GRACE, CLEAR_GRACE, MOST_FRAMES, Finding, Watch
+from snakesim_can_backend.wire import Kind, Trouble
+from snakesim_hal.messages import LifecycleState
+from tests.unit.can_backend.frames import answer, begin, heartbeat, joint_state, spoilt
+
+JOINTS = 3
+EVERYBODY = (1, 2, 3)
+PERIOD_S, LEASE_S = 0.01, 0.05
+WHO = "joint_2 (node 2 on can0) "
+Speak = Callable[[Reading], None]
+
+
+def quiet(_reading: Reading) -> None:
+    """Nothing comes of node 2."""
+
+
+class Bench:
+    """Ticks of a robot whose joint_2 does what a test wants; the others are well."""
+
+    def __init__(self, lifecycle: LifecycleState = "disarmed") -> None:
+        self.reading = Reading(JOINTS)
+        self.watch = Watch(["joint_1", "joint_2", "joint_3"], ["can0", "can0", "can1"], PERIOD_S, LEASE_S)
+        self.lifecycle: LifecycleState = lifecycle
+        self.state = ModuleState.DISARMED
+        self.ticks(3)
+
+    def tick(
+        self, speak: Speak | None = None, troubles: list[Trouble] | None = None, unsent: str = ""
+    ) -> list[Finding]:
+        """One Sync and its look. speak: what comes of node 2, instead of an answer."""
+        begin(self.reading)
+        answer(self.reading, EVERYBODY if speak is None else (1, 3), state=self.state)
+        if speak is not None:
+            speak(self.reading)
+        return self.watch.look(self.reading, self.lifecycle, troubles or (), [unsent] if unsent else [])
+
+    def ticks(self, count: int, speak: Speak | None = None) -> list[Finding]:
+        return [found for _ in range(count) for found in self.tick(speak)]
+
+    def clear(self) -> None:
+        self.watch.forget(self.reading.sync)
+
+
+def said(found: list[Finding]) -> list[tuple[str, int | None]]:
+    return [(finding.what, finding.joint) for finding in found]
+
+
+# --- what one module can do wrong --------------------------------------------------------------------------
+
+
+def frozen() -> Speak:
+    return lambda reading: reading.take(joint_state(2, 2))
+
+
+def miscounting(reading: Reading) -> None:
+    reading.take(joint_state(2, reading.sync + 7))
+
+
+def corrupt(reading: Reading) -> None:
+    reading.take(spoilt(joint_state(2, reading.sync)))
+
+
+def doubled(reading: Reading) -> None:
+    reading.take(joint_state(2, reading.sync))
+    reading.take(joint_state(2, reading.sync))
+
+
+def babbling(reading: Reading) -> None:
+    reading.take(joint_state(2, reading.sync))
+    for _ in range(MOST_FRAMES):
+        reading.take(heartbeat(2, 1.0))
+
+
+WRONGS = [
+    (quiet, 3, "module_silent", "is silent: no state for 30 ms"),
+    (frozen(), 3, "module_frozen", "is frozen: it repeats its answer number 2 to every Sync"),
+    (miscounting, 3, "wrong_counter", "answers Syncs that were not sent: 3 wrong counters in a row"),
+    (corrupt, 3, "bad_checksum", "sends corrupt states: 3 wrong checksums in a row"),
+    (
+        doubled,
+        3,
+        "duplicate_node",
+        "is there twice: every Sync is answered two times; give each module its own node id",
+    ),
+    (babbling, 1, "module_babbling", f"floods the bus: {MOST_FRAMES + 1} frames within one period"),
+]
+each_wrong = pytest.mark.parametrize(("speak", "after", "what", "cause"), WRONGS, ids=[row[2] for row in WRONGS])
+
+
+@each_wrong
+def test_it_is_named_in_time_with_joint_and_cause(speak: Speak, after: int, what: str, cause: str) -> None:
+    bench = Bench()
+    assert bench.ticks(after - 1, speak) == [], "a glitch is nothing to stop for"
+    assert bench.tick(speak) == [Finding(what, WHO + cause, 1)]
+
+
+@each_wrong
+def test_it_is_told_once_and_again_after_a_clearing(speak: Speak, after: int, what: str, cause: str) -> None:
+    bench = Bench()
+    bench.ticks(after, speak)
+    assert bench.ticks(40, speak) == []
+    bench.clear()
+    assert (what, 1) in said(bench.ticks(CLEAR_GRACE + 1, speak))
+    assert bench.ticks(40, speak) == []
+
+
+@each_wrong
+def test_what_is_over_is_not_told_again(speak: Speak, after: int, what: str, cause: str) -> None:
+    bench = Bench()
+    bench.ticks(after, speak)
+    bench.ticks(5)
+    bench.clear()
+    assert bench.ticks(20) == []
+
+
+@pytest.mark.parametrize("speak", [quiet, frozen(), miscounting, corrupt, doubled])
+@pytest.mark.parametrize("length", [1, 2])
+def test_glitches_tell_nothing_however_often(speak: Speak, length: int) -> None:
+    bench = Bench()
+    for _ in range(20):
+        assert bench.ticks(length, speak) == []
+        assert bench.ticks(2) == []
+
+
+@pytest.mark.parametrize("last_words", [corrupt, miscounting])
+def test_a_module_that_dies_with_a_bad_frame_is_silent_all_the_same(last_words: Speak) -> None:
+    bench = Bench()
+    bench.tick(last_words)
+    assert said(bench.ticks(4, quiet)) == [("module_silent", 1)]
+
+
+@pytest.mark.parametrize("bad", [corrupt, miscounting])
+def test_a_module_that_talks_nonsense_is_not_silent(bad: Speak) -> None:
+    bench = Bench()
+    assert bench.ticks(2, bad) == [] and bench.tick(quiet) == []
+    assert bench.ticks(1) == []
+
+
+def test_a_module_that_was_never_heard_is_silent_and_no_more_is_claimed() -> None:
+    reading, watch = Reading(1), Watch(["joint_1"], ["can0"], PERIOD_S, LEASE_S)
+    found = [f for _ in range(4) for f in (begin(reading), watch.look(reading, "disarmed"))[1]]
+    assert said(found) == [("module_silent", 0)] and found[0].cause.endswith("ms")
+
+
+def test_a_silent_module_whose_heart_beats_is_told_from_a_dead_one() -> None:
+    bench = Bench()
+    bench.tick(lambda reading: reading.take(heartbeat(2, 1.0)))
+    (found,) = bench.ticks(2, quiet)
+    assert "its heart still beats" in found.cause
+    bench = Bench()
+    bench.tick(lambda reading: (answer(reading, [2]), reading.take(heartbeat(2, 1.0)))[0])
+    (found,) = bench.ticks(3, quiet)
+    assert "no heartbeat either: power, cable or reset" in found.cause
+
+
+# --- restarts ----------------------------------------------------------------------------------------------
+
+
+def restarting(bench: Bench) -> list[Finding]:
+    found: list[Finding] = []
+    for uptime_s in (50.0, 0.1, 0.2):
+        found += bench.tick(lambda r, up=uptime_s: (answer(r, [2]), r.take(heartbeat(2, up)))[0])
+    return found
+
+
+def test_a_restart_is_told_once_with_its_joint_and_what_it_lost() -> None:
+    bench = Bench()
+    found = restarting(bench) + bench.ticks(10)
+    assert said(found) == [("module_restarted", 1)]
+    assert found[0].cause.startswith(WHO + "has restarted") and "0.20 s" in found[0].cause
+    assert bench.watch.take_changed() == {1} and bench.watch.take_changed() == set()
+    bench.clear()
+    assert bench.ticks(10) == []
+    assert said(restarting(bench) + bench.ticks(10)) == [("module_restarted", 1)], "the next one is another"
+
+
+def test_who_has_not_its_parameters_is_told_when_the_robot_is_armed() -> None:
+    bench = Bench()
+    steps: list[tuple[LifecycleState, list[tuple[str, int]]]] = [
+        ("disarmed", []),
+        ("armed", [("module_not_configured", 1)]),
+        ("armed", []),
+    ]
+    for lifecycle, told in steps:
+        bench.lifecycle = lifecycle
+        begin(bench.reading)
+        answer(bench.reading)
+        assert said(bench.watch.look(bench.reading, bench.lifecycle, unconfigured={1})) == told
+
+
+def test_two_modules_with_one_id_are_not_called_a_restart() -> None:
+    def two_hearts(reading: Reading) -> None:
+        doubled(reading)
+        reading.take(heartbeat(2, 50.0 + 0.01 * reading.sync))
+        reading.take(heartbeat(2, 0.01 * reading.sync))
+
+    bench = Bench()
+    assert said(bench.ticks(30, two_hearts)) == [("duplicate_node", 1)]
+    assert bench.watch.take_changed() == set()
+
+
+def test_nor_when_the_second_heart_beats_twice_in_a_row() -> None:
+    bench = Bench()
+    found: list[Finding] = []
+    for uptime_s in (50.0, 0.1, 0.2, 50.2, 0.3, 0.4, 50.4):
+        found += bench.ticks(3, doubled)
+        found += bench.tick(lambda r, up=uptime_s: (doubled(r), r.take(heartbeat(2, up)))[0])
+    assert bench.reading.modules[1].restarts > 0
+    assert said(found) == [("duplicate_node", 1)] and bench.watch.take_changed() == set()
+
+
+def test_after_one_doubled_frame_a_restart_is_still_seen() -> None:
+    bench = Bench()
+    bench.tick(doubled)
+    bench.ticks(5)
+    assert said(restarting(bench) + bench.ticks(10)) == [("module_restarted", 1)]
+
+
+# --- faults of modules -------------------------------------------------------------------------------------
+
+
+def faulty(reading: Reading) -> None:
+    answer(reading, [2], state=ModuleState.FAULT)
+    reading.take(heartbeat(2, 1.0, ModuleState.FAULT, last_stop=LastStop.OVERHEAT, fault_overheat=1, fault_leak=1))
+
+
+def test_a_modules_fault_is_told_with_all_reasons() -> None:
+    bench = Bench()
+    reason = "reports overheat, leak; it stopped because of overheat"
+    assert bench.ticks(9, faulty) == [Finding("module_overheat", WHO + reason, 1)]
+
+
+def test_a_fault_whose_heartbeat_is_lost_is_told_by_its_state() -> None:
+    bench = Bench()
+    found = bench.ticks(9, lambda reading: answer(reading, [2], state=ModuleState.FAULT))
+    assert said(found) == [("module_fault", 1)]
+
+
+def test_a_modules_fault_has_time_to_go_after_a_clearing() -> None:
+    bench = Bench()
+    bench.tick(faulty)
+    bench.clear()
+    assert bench.ticks(CLEAR_GRACE - 1, faulty) == []
+    bench.tick(lambda reading: (answer(reading, [2]), reading.take(heartbeat(2, 1.0)))[0])
+    assert bench.ticks(10) == []
+    bench.clear()
+    assert bench.ticks(CLEAR_GRACE - 1, faulty) == []
+    assert said(bench.tick(faulty)) == [("module_overheat", 1)], "and is told again when it stays"
+
+
+@pytest.mark.parametrize(("lifecycle", "told"), [("estop", []), ("disarmed", [("module_emergency", 1)])])
+def test_an_emergency_is_as_it_should_be_only_in_one(lifecycle: LifecycleState, told: list[tuple[str, int]]) -> None:
+    bench = Bench()
+    bench.lifecycle = lifecycle
+    assert said(bench.ticks(9, lambda reading: answer(reading, [2], state=ModuleState.EMERGENCY))) == told
+
+
+def test_a_module_that_does_not_arm_is_told_after_its_grace() -> None:
+    def refuses(reading: Reading) -> None:
+        answer(reading, [2], state=ModuleState.DISARMED)
+
+    bench = Bench()
+    bench.lifecycle, bench.state = "armed", ModuleState.ARMED
+    found = [bench.tick(refuses) for _ in range(20)]
+    first = next(i for i, told in enumerate(found) if told)
+    assert ARM_GRACE < first <= ARM_GRACE + 3
+    assert [f for told in found for f in told] == [
+        Finding("module_not_armed", WHO + "does not arm: it is disarmed", 1),
+    ]
+
+
+def test_who_arms_within_the_grace_or_misses_a_moment_is_let_be() -> None:
+    bench = Bench()
+    bench.lifecycle = "armed"
+    assert bench.ticks(ARM_GRACE) == []
+    bench.state = ModuleState.ARMED
+    assert bench.ticks(10) == []
+    assert bench.ticks(2, lambda reading: answer(reading, [2], state=ModuleState.STOPPING)) == []
+    assert bench.ticks(10) == []
+
+
+def test_the_grace_begins_with_every_arming() -> None:
+    bench = Bench()
+    bench.lifecycle, bench.state = "armed", ModuleState.ARMED
+    bench.ticks(20)
+    bench.lifecycle, bench.state = "disarmed", ModuleState.DISARMED
+    assert bench.ticks(20) == [], "disarmed modules of a disarmed robot"
+    bench.lifecycle = "armed"
+    assert bench.ticks(ARM_GRACE) == []
+
+
+# --- the bus -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "advice"),
+    [
+        ("bus_off", "look for a short, a wrong bit rate, a missing terminator"),
+        ("error_passive", "look at cables, terminators and bit rate"),
+        ("interface_down", "bring it up again, then clear and arm"),
+        ("restarted", "clear and arm when the bus is sound"),
+        ("receive_overflow", "states may be missing"),
+    ],
+)
+def test_a_bus_that_fails_is_a_fault_of_no_joint(kind: Kind, advice: str) -> None:
+    bench = Bench()
+    trouble = Trouble(kind, "can0", "transmit errors 200, receive errors 3")
+    (found,) = bench.tick(troubles=[trouble, trouble][:1])
+    assert (found.what, found.joint) == (kind, None)
+    assert found.cause.startswith("can0: transmit errors 200, receive errors 3; ") and advice in found.cause
+    assert bench.tick(troubles=[trouble]) == []
+    assert [f.cause[:5] for f in bench.tick(troubles=[Trouble(kind, "can1", "")])] == ["can1:"], "the other bus is new"
+    bench.clear()
+    assert said(bench.tick(troubles=[trouble])) == [(kind, None)]
+
+
+@pytest.mark.parametrize("kind", ["error_warning", "not_acknowledged", "queue_full", "error_frames", "interface_up"])
+def test_lesser_troubles_are_only_counted(kind: Kind) -> None:
+    bench = Bench()
+    for _ in range(2):
+        assert bench.tick(troubles=[Trouble(kind, "can0", "")]) == []
+    assert bench.watch.seen == {kind: 2}
+
+
+def test_a_bus_that_takes_nothing_for_the_time_of_the_lease_is_stuck() -> None:
+    bench = Bench()
+    for _ in range(4):
+        assert bench.tick(unsent="can1") == []
+    (found,) = bench.tick(unsent="can1")
+    assert (found.what, found.joint) == ("bus_stuck", None)
+    for words in ("can1: ", "do not get out for 50 ms", "nobody acknowledges", "txqueuelen is below 64"):
+        assert words in found.cause
+    assert bench.tick(unsent="can1") == []
+
+
+def test_a_bus_that_takes_something_again_is_not_stuck() -> None:
+    bench = Bench()
+    for _ in range(5):
+        for _ in range(4):
+            assert bench.tick(unsent="can1") == []
+        assert bench.tick() == []
+
+
+# --- who should not be there -------------------------------------------------------------------------------
+
+
+def stranger(reading: Reading) -> None:
+    answer(reading, [2])
+    reading.take(joint_state(9, reading.sync))
+
+
+def test_a_stranger_that_answers_every_sync_is_found() -> None:
+    bench = Bench()
+    assert bench.ticks(2, stranger) == []
+    (found,) = bench.tick(stranger)
+    assert found == Finding("unknown_node", "node 9 is on the bus, and this robot has no such joint")
+    assert bench.ticks(5, stranger) == []
+
+
+def test_a_stray_frame_now_and_then_is_none() -> None:
+    bench = Bench()
+    for _ in range(10):
+        assert bench.ticks(2, stranger) == [] and bench.tick() == []
+
+
+@pytest.mark.parametrize(
+    ("frame", "what", "words"),
+    [
+        (codec()[Opcode.SYNC].frame(0), "second_host", "another program commands the modules"),
+        (codec()[Opcode.SET_POINT].frame(2), "second_host", "end one of the two"),
+        (codec()[Opcode.COMMAND].frame(2, action=Action.STOP), "second_host", "another program"),
+        (Frame(frame_id(Opcode.EMERGENCY, 0), b"\x01"), "emergency", "somebody on the bus called an emergency"),
+    ],
+)
+def test_another_host_is_told(frame: Frame, what: str, words: str) -> None:
+    def speak(reading: Reading) -> None:
+        answer(reading, [2])
+        reading.take(frame)
+
+    bench = Bench()
+    (found,) = bench.tick(speak)
+    assert (found.what, found.joint) == (what, None) and words in found.cause
+    assert bench.tick(speak) == []
+    bench.clear()
+    assert bench.tick() == [], "it was there once and is no more"
+    assert said(bench.tick(speak)) == [(what, None)]
+
+
+def test_what_another_host_may_have_changed_is_written_anew() -> None:
+    bench = Bench()
+    bench.reading.take(codec()[Opcode.PARAMETER_REQUEST].frame(2, index=1, operation=1))
+    assert said(bench.tick()) == [("second_host", None)]
+    assert bench.watch.take_changed() == {0, 1, 2}
+
+
+def test_who_asks_who_is_there_is_no_second_host() -> None:
+    bench = Bench()
+    bench.reading.take(command(Action.IDENTIFY))
+    assert bench.tick() == [] and bench.watch.take_changed() == set()
+
+
+def test_a_module_is_not_silent_that_was_not_asked() -> None:
+    bench = Bench()
+    for i in range(10):
+        assert said(bench.tick(quiet, unsent="can0")) == ([("bus_stuck", None)] if i == 4 else [])
+    assert bench.ticks(2, quiet) == []
+    assert said(bench.tick(quiet)) == [("module_silent", 1)]
+
+
+def test_a_bus_whose_interface_is_down_is_not_called_stuck_too() -> None:
+    bench = Bench()
+    down, up = (Trouble(kind, "can1", "") for kind in ("interface_down", "interface_up"))
+    assert said(bench.tick(troubles=[down], unsent="can1")) == [("interface_down", None)]
+    for _ in range(10):
+        assert bench.tick(unsent="can1") == []
+    bench.tick(troubles=[up], unsent="can1")
+    found = [f for _ in range(5) for f in bench.tick(unsent="can1")]
+    assert said(found) == [("bus_stuck", None)]
+
+
+def test_a_module_that_was_armed_and_is_not_any_more_is_told_at_once() -> None:
+    bench = Bench()
+    bench.lifecycle, bench.state = "armed", ModuleState.ARMED
+    bench.ticks(2)
+    found = bench.ticks(3, lambda reading: answer(reading, [2], state=ModuleState.DISARMED))
+    assert said(found) == [("module_not_armed", 1)]

@@ -1,0 +1,420 @@
+"""One bus from one end: raw CAN frames and errors as Linux has them, on sockets that every machine has."""
+
+import contextlib
+import errno
+import math
+import socket
+import struct
+import time
+import uuid
+from collections.abc import Iterator
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from snakesim_can_backend import wire as wire_module
+from snakesim_can_backend.protocol import FROM_HOST, Frame, Opcode
+from snakesim_can_backend.wire import (
+    MOST_AT_ONCE,
+    Kind,
+    SocketCanWire,
+    Trouble,
+    VirtualWire,
+    check_interface,
+    drain,
+    is_up,
+    troubles_of,
+    wait,
+)
+from snakesim_hal.errors import BackendError, ConfigError
+
+CAN_ERR_FLAG = 0x20000000  # linux/can.h, linux/can/error.h
+CAN_ERR_TX_TIMEOUT, CAN_ERR_LOSTARB, CAN_ERR_CRTL, CAN_ERR_PROT = 0x001, 0x002, 0x004, 0x008
+CAN_ERR_TRX, CAN_ERR_ACK, CAN_ERR_BUSOFF, CAN_ERR_BUSERROR = 0x010, 0x020, 0x040, 0x080
+CAN_ERR_RESTARTED, CAN_ERR_CNT = 0x100, 0x200
+RX_OVERFLOW, TX_OVERFLOW, RX_WARNING, TX_WARNING = 0x01, 0x02, 0x04, 0x08
+RX_PASSIVE, TX_PASSIVE, ACTIVE = 0x10, 0x20, 0x40
+
+
+def can_frame(identifier: int, data: bytes) -> bytes:
+    """struct can_frame of linux/can.h: id, length, three bytes of padding, eight bytes of data."""
+    return struct.pack("=IB3x8s", identifier, len(data), data)
+
+
+# --- error frames ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("classes", "controller", "kinds"),
+    [
+        (CAN_ERR_BUSOFF, 0, ["bus_off"]),
+        (CAN_ERR_ACK, 0, ["not_acknowledged"]),
+        (CAN_ERR_RESTARTED, 0, ["restarted"]),
+        (CAN_ERR_CRTL, RX_PASSIVE, ["error_passive"]),
+        (CAN_ERR_CRTL, TX_PASSIVE, ["error_passive"]),
+        (CAN_ERR_CRTL, RX_WARNING, ["error_warning"]),
+        (CAN_ERR_CRTL, TX_WARNING, ["error_warning"]),
+        (CAN_ERR_CRTL, RX_OVERFLOW, ["receive_overflow"]),
+        (CAN_ERR_CRTL, TX_OVERFLOW, ["error_frames"]),
+        (CAN_ERR_CRTL, ACTIVE, ["error_frames"]),
+        (CAN_ERR_CRTL | CAN_ERR_BUSOFF, TX_PASSIVE | RX_OVERFLOW, ["bus_off", "error_passive", "receive_overflow"]),
+        (CAN_ERR_PROT, RX_PASSIVE, ["error_frames"]),  # without the class, the byte means nothing
+        (CAN_ERR_TX_TIMEOUT, 0, ["error_frames"]),
+        (CAN_ERR_LOSTARB, 0, ["error_frames"]),
+        (CAN_ERR_TRX | CAN_ERR_BUSERROR | CAN_ERR_CNT, 0, ["error_frames"]),
+    ],
+)
+def test_an_error_frame_in_words(classes: int, controller: int, kinds: list[Kind]) -> None:
+    data = bytes((0, controller, 0, 0, 0, 0, 130, 7))
+    expected = [Trouble(kind, "can0", "transmit errors 130, receive errors 7") for kind in kinds]
+    assert troubles_of(CAN_ERR_FLAG | classes, data, "can0") == expected
+
+
+@given(st.integers(0, 0x1FFFFFFF), st.binary(min_size=8, max_size=8))
+def test_every_error_frame_says_something(classes: int, data: bytes) -> None:
+    found = troubles_of(CAN_ERR_FLAG | classes, data, "can0")
+    assert found and len({trouble.kind for trouble in found}) == len(found)
+
+
+# --- frames through a socket -------------------------------------------------------------------------------
+
+
+class CanLike(socket.socket):
+    """A socket of another family that keeps what only CAN sockets take, and whose errors a test may choose."""
+
+    filters = b""
+    fails: OSError | None = None
+    bound_to: tuple[str] | None = None
+
+    def setsockopt(self, level: int, option: int, value: object, *_more: object) -> None:  # pyright: ignore
+        if level == socket.SOL_CAN_RAW:
+            assert option == socket.CAN_RAW_FILTER and isinstance(value, bytes)
+            self.filters = value
+
+    def bind(self, address: tuple[str]) -> None:  # pyright: ignore
+        self.bound_to = address
+
+    def send(self, data: bytes, *_flags: int) -> int:  # pyright: ignore
+        if self.fails is not None:
+            raise self.fails
+        return super().send(data)
+
+    def recv_into(self, buffer: bytearray, *_more: int) -> int:  # pyright: ignore
+        if self.fails is not None:
+            raise self.fails
+        return super().recv_into(buffer)
+
+
+class FakeBus:
+    """Instead of python-can's."""
+
+    def __init__(self, opened: CanLike) -> None:
+        self.socket = opened
+        self.closed = False
+
+    def shutdown(self) -> None:
+        self.socket.close()
+        self.closed = True
+
+
+class Rig:
+    """A SocketCanWire whose kernel is the other end of a pair of sockets."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, only: frozenset[Opcode] | None = None) -> None:
+        near, self.kernel = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.kernel.settimeout(2.0)
+        self.socket = CanLike(fileno=near.detach())
+        self.bus = FakeBus(self.socket)
+        self.up = True
+        self.opened_with: dict[str, object] = {}
+
+        def opened(**how: object) -> FakeBus:
+            self.opened_with = how
+            return self.bus
+
+        monkeypatch.setattr(wire_module, "SocketcanBus", opened)
+        monkeypatch.setattr(wire_module, "check_interface", lambda _channel: None)
+        monkeypatch.setattr(wire_module, "is_up", lambda _channel: self.up)
+        self.wire = SocketCanWire("can7", only)
+
+    def kinds(self) -> list[Kind]:
+        return [trouble.kind for trouble in self.wire.troubles()]
+
+
+@pytest.fixture
+def rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
+    made = Rig(monkeypatch)
+    yield made
+    made.wire.close()
+    made.kernel.close()
+
+
+@given(st.lists(st.tuples(st.integers(0, 0x7FF), st.binary(max_size=8)), max_size=20))
+def test_drain_takes_everything_in_its_order(frames: list[tuple[int, bytes]]) -> None:
+    near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with near, far:
+        near.setblocking(False)
+        errors: list[tuple[int, bytes]] = []
+        taken: list[Frame] = []
+        for identifier, data in frames:
+            far.send(can_frame(identifier, data))
+        far.send(can_frame(CAN_ERR_FLAG | CAN_ERR_BUSOFF, bytes(range(8))))
+        drain(near, bytearray(16), taken, lambda identifier, data: errors.append((identifier, data)))
+        assert taken == [Frame(*frame) for frame in frames] and all(type(frame) is Frame for frame in taken)
+        assert errors == [(CAN_ERR_FLAG | CAN_ERR_BUSOFF, bytes(range(8)))]
+        drain(near, bytearray(16), taken, lambda *_: None)
+        assert len(taken) == len(frames)
+
+
+def test_a_bus_that_babbles_does_not_keep_its_reader() -> None:
+    class Babbling:
+        def recv_into(self, buffer: bytearray) -> int:
+            buffer[:] = can_frame(0x101, bytes(8))
+            return 16
+
+    taken: list[Frame] = []
+    drain(Babbling(), bytearray(16), taken, lambda *_: None)  # pyright: ignore[reportArgumentType]
+    assert len(taken) == MOST_AT_ONCE
+
+
+def test_a_frame_goes_out_as_the_kernel_wants_it(rig: Rig) -> None:
+    assert rig.wire.send(Frame(0x0C5, bytes.fromhex("3178EC581BF4")))
+    assert rig.kernel.recv(64) == bytes.fromhex("C5000000 06000000 3178EC581BF40000")
+    assert rig.wire.fileno() == rig.socket.fileno() and rig.wire.idle() == math.inf
+    assert rig.opened_with == {"channel": "can7", "ignore_rx_error_frames": False}
+
+
+def test_frames_and_errors_come_in(rig: Rig) -> None:
+    rig.kernel.send(can_frame(0x105, b"\x01\x02"))
+    rig.kernel.send(can_frame(CAN_ERR_FLAG | CAN_ERR_BUSOFF, bytes(8)))
+    rig.kernel.send(can_frame(0x080, bytes(5)))
+    assert rig.wire.receive() == [Frame(0x105, b"\x01\x02"), Frame(0x080, bytes(5))]
+    assert rig.kinds() == ["bus_off"] and rig.kinds() == []
+    assert rig.wire.receive() == []
+
+
+def test_a_full_queue_is_told_and_nothing_is_kept_for_later(rig: Rig) -> None:
+    sent = 0
+    while rig.wire.send(Frame(0x101, bytes(8))):
+        sent += 1
+    assert rig.kinds() == ["queue_full"]
+    for _ in range(sent):
+        rig.kernel.recv(64)
+    rig.kernel.settimeout(0.01)
+    with pytest.raises(TimeoutError):
+        rig.kernel.recv(64)
+    assert rig.wire.send(Frame(0x102, b"")) and rig.kinds() == []
+
+
+@pytest.mark.parametrize("number", [errno.ENOBUFS, errno.EAGAIN])
+def test_the_kernels_ways_to_say_full(rig: Rig, number: int) -> None:
+    rig.socket.fails = OSError(number, "full")
+    assert not rig.wire.send(Frame(0x101, b""))
+    assert rig.wire.troubles() == [Trouble("queue_full", "can7", "the transmit queue is full")]
+
+
+@pytest.mark.parametrize(("number", "word"), [(errno.ENETDOWN, "down"), (errno.ENODEV, "gone"), (errno.ENXIO, "gone")])
+def test_an_interface_that_goes_is_told_once_and_again_when_it_is_back(rig: Rig, number: int, word: str) -> None:
+    rig.socket.fails, rig.up = OSError(number, ""), False
+    for _ in range(3):
+        assert not rig.wire.send(Frame(0x101, b"")) and rig.wire.receive() == []
+    assert rig.wire.troubles() == [Trouble("interface_down", "can7", f"the interface is {word}")]
+    assert rig.kinds() == []
+    rig.socket.fails, rig.up = None, True
+    assert rig.wire.troubles() == [Trouble("interface_up", "can7", "the interface is up again")]
+    assert rig.socket.bound_to == (("can7",) if word == "gone" else None)
+    assert rig.kinds() == [] and rig.wire.send(Frame(0x101, b""))
+
+
+def test_a_frame_that_gets_out_says_that_the_interface_is_back(rig: Rig) -> None:
+    rig.socket.fails, rig.up = OSError(errno.ENETDOWN, ""), False
+    rig.wire.receive()
+    rig.socket.fails = None
+    assert rig.wire.send(Frame(0x101, b""))
+    assert rig.kinds() == ["interface_down", "interface_up"]
+
+
+def test_what_came_before_an_error_is_not_lost(rig: Rig) -> None:
+    rig.kernel.send(can_frame(0x105, b"\x01"))
+    left = [1, 0]
+    receive = rig.socket.recv_into
+
+    def then_down(buffer: bytearray, *_more: int) -> int:
+        if not left.pop(0):
+            raise OSError(errno.ENETDOWN, "down")
+        return receive(buffer)
+
+    rig.socket.recv_into, rig.up = then_down, False
+    assert rig.wire.receive() == [Frame(0x105, b"\x01")] and rig.kinds() == ["interface_down"]
+
+
+def test_anything_else_ends_the_run(rig: Rig) -> None:
+    rig.kernel.close()
+    with pytest.raises(BackendError, match="can7: Broken pipe"):
+        rig.wire.send(Frame(0x101, b""))
+
+
+@pytest.mark.parametrize("only", [None, FROM_HOST])
+def test_the_kernel_filters(monkeypatch: pytest.MonkeyPatch, only: frozenset[Opcode] | None) -> None:
+    rig = Rig(monkeypatch, only)
+    pairs = list(struct.iter_unpack("=II", rig.socket.filters))
+    rig.wire.close()
+    rig.kernel.close()
+
+    def passes(identifier: int) -> bool:
+        return any(identifier & mask == wanted & mask for wanted, mask in pairs)
+
+    for identifier in range(0x800):
+        assert passes(identifier) is (only is None or identifier >> 6 in only)
+        assert not passes(0x80000000 | identifier) and not passes(0x40000000 | identifier), "extended, remote"
+    assert rig.bus.closed
+
+
+def test_dropped_frames_are_told_with_their_number(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    drops = iter([3, 3, 10])
+
+    def meminfo(_level: int, option: int, length: int) -> bytes:
+        assert (option, length) == (55, 36)  # SO_MEMINFO, nine numbers of which the last is the drops
+        return struct.pack("=9I", *range(8), next(drops))
+
+    monkeypatch.setattr(rig.socket, "getsockopt", meminfo)
+    told = [rig.wire.troubles() for _ in range(3)]
+    assert [[t.kind for t in found] for found in told] == [["receive_overflow"], [], ["receive_overflow"]]
+    assert "dropped 3 frames" in told[0][0].detail and "dropped 7 frames" in told[2][0].detail
+
+
+# --- interfaces --------------------------------------------------------------------------------------------
+
+
+def test_an_interface_must_be_there_and_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(wire_module, "_kernel_has_can", lambda: False)
+    with pytest.raises(ConfigError, match=r"'lo': this kernel has no CAN.*`backends\.can\.channels` empty.*docs/hil"):
+        check_interface("lo")
+    monkeypatch.setattr(wire_module, "_kernel_has_can", lambda: True)
+    with pytest.raises(ConfigError, match=r"'nocan7': there is no such interface; `deploy/can/up.sh nocan7` makes it"):
+        check_interface("nocan7")
+    monkeypatch.setattr(wire_module, "is_up", lambda _channel: False)
+    with pytest.raises(ConfigError, match=r"'lo': the interface is down; `deploy/can/up.sh lo` brings it up"):
+        check_interface("lo")
+    monkeypatch.setattr(wire_module, "is_up", lambda _channel: True)
+    check_interface("lo")
+
+
+def test_what_is_not_there_is_not_up() -> None:
+    assert not is_up("nocan7")
+
+
+def test_a_socketcan_wire_looks_at_its_interface_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(wire_module, "_kernel_has_can", lambda: True)
+    with pytest.raises(ConfigError, match="nocan7"):
+        SocketCanWire("nocan7")
+
+
+# --- virtual buses, and waiting ----------------------------------------------------------------------------
+
+
+class End:
+    """Another end that says when it wants to run again."""
+
+    def __init__(self, pause_s: float | None, then_send: VirtualWire | None = None) -> None:
+        self.pause_s, self.then_send = pause_s, then_send
+        self.ran = 0
+        self.closed = False
+
+    def __call__(self) -> float | None:
+        self.ran += 1
+        if self.then_send is not None:
+            self.then_send.send(Frame(0x101, b"\x01"))
+        return self.pause_s
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class Readable:
+    """A wire whose file may be ready."""
+
+    def __init__(self, file: socket.socket) -> None:
+        self.file = file
+
+    def fileno(self) -> int | None:
+        return self.file.fileno()
+
+    def idle(self) -> float | None:
+        return math.inf
+
+
+@pytest.fixture
+def pair() -> Iterator[tuple[VirtualWire, VirtualWire]]:
+    name = f"wire-{uuid.uuid4().hex[:8]}"
+    made = VirtualWire(name), VirtualWire(name)
+    yield made
+    for wire in made:
+        wire.close()
+
+
+def took_s(began: float) -> float:
+    return time.monotonic() - began
+
+
+def test_two_ends_of_a_virtual_bus_hear_each_other_and_not_themselves(pair: tuple[VirtualWire, VirtualWire]) -> None:
+    near, far = pair
+    frames = [Frame(0x105, b"\x01\x02"), Frame(0x7FF, b""), Frame(0, bytes(8))]
+    assert all(near.send(frame) for frame in frames)
+    assert far.receive() == frames and far.receive() == [] and near.receive() == []
+    assert near.fileno() is None and near.troubles() == []
+
+
+def test_a_virtual_bus_says_when_something_may_come(pair: tuple[VirtualWire, VirtualWire]) -> None:
+    near, far = pair
+    assert near.idle() == math.inf
+    near.other_end = End(0.25)
+    assert near.idle() == 0.25
+    near.other_end = End(None)
+    assert near.idle() is None
+    far.send(Frame(1, b""))
+    assert near.idle() == 0.0
+
+
+def test_closing_one_end_closes_what_lives_on_the_other() -> None:
+    end = End(None)
+    VirtualWire(f"wire-{uuid.uuid4().hex[:8]}", end).close()
+    assert end.closed
+
+
+def test_wait_does_not_sleep_when_a_frame_is_there(pair: tuple[VirtualWire, VirtualWire]) -> None:
+    near, far = pair
+    near.other_end = End(5.0, then_send=far)
+    began = time.monotonic()
+    assert wait([near], 5.0) and took_s(began) < 1.0
+    assert near.other_end.ran == 1
+
+
+def test_wait_sleeps_as_long_as_nobody_wants_to_run(pair: tuple[VirtualWire, VirtualWire]) -> None:
+    near, other = pair
+    near.other_end = End(0.05)
+    began = time.monotonic()
+    assert wait([near, other], 5.0) and 0.045 < took_s(began) < 1.0
+    near.other_end = End(5.0)
+    began = time.monotonic()
+    assert wait([near], 0.05) and 0.045 < took_s(began) < 1.0, "and no longer than asked for"
+    assert wait([near], -1.0), "time that is over is no error"
+
+
+def test_wait_says_when_nothing_can_come(pair: tuple[VirtualWire, VirtualWire]) -> None:
+    near, _ = pair
+    near.other_end = End(None)
+    began = time.monotonic()
+    assert not wait([near], 5.0) and took_s(began) < 1.0
+
+
+def test_wait_wakes_up_for_a_socket() -> None:
+    near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with near, far, contextlib.ExitStack():
+        wires: list[wire_module.Wire] = [Readable(near)]  # pyright: ignore[reportAssignmentType]
+        began = time.monotonic()
+        assert wait(wires, 0.05) and took_s(began) > 0.045
+        far.send(can_frame(1, b""))
+        began = time.monotonic()
+        assert wait(wires, 5.0) and took_s(began) < 1.0

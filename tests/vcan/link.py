@@ -1,0 +1,41 @@
+"""CAN interfaces, as a person would treat them with `ip` and `tc`; and a raw socket beside our own."""
+
+import shutil
+import socket
+import struct
+import subprocess
+
+FRAME = struct.Struct("=IB3x8s")  # can_id, length, data: linux/can.h
+# From linux/can/raw.h, linux/can/error.h and asm-generic/socket.h; Python's socket module lacks these names.
+CAN_RAW_ERR_FILTER = 2
+CAN_ERR_MASK = 0x1FFFFFFF
+SO_RXQ_OVFL = 40
+
+
+def ip(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return _run("ip", arguments)
+
+
+def tc(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return _run("tc", arguments)
+
+
+def must(done: subprocess.CompletedProcess[str]) -> None:
+    assert done.returncode == 0, done.stderr
+
+
+def frame(can_id: int, data: bytes = b"") -> bytes:
+    return FRAME.pack(can_id, len(data), data)
+
+
+def listener(channel: str) -> socket.socket:
+    """A raw CAN socket on a bus, which gives up waiting after two seconds."""
+    opened = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+    opened.settimeout(2.0)
+    opened.bind((channel,))
+    return opened
+
+
+def _run(tool: str, arguments: tuple[str, ...]) -> subprocess.CompletedProcess[str]:
+    command = [shutil.which(tool) or f"/usr/sbin/{tool}", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)

@@ -1,0 +1,108 @@
+"""Driver and modules on one kernel interface and in one process, on a clock that passes while the driver waits.
+
+Every frame goes through the kernel. Time is the modules': while the driver waits within a period, their clock goes on
+to the period's end, and then it stands still. So it does not matter how slow this machine is, or how long `ip` takes.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from math import inf
+
+import pytest
+
+from snakesim_can_backend import backend as driver
+from snakesim_can_backend.backend import CanBackend
+from snakesim_can_backend.protocol import FROM_HOST, Frame, ModuleState
+from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.twin.chain import ModuleChain
+from snakesim_can_backend.twin.server import TwinServer, make_plant
+from snakesim_can_backend.wire import SocketCanWire
+from snakesim_hal.backend import SetPoints
+from snakesim_hal.plant import Plant
+from tests.unit.can_backend.loop import Loop, config
+
+ANSWER_LIMIT_S = 2.0  # of this machine's time; the modules' ends the wait before
+
+
+class SharedWire(SocketCanWire):
+    """The driver's end. Whenever it waits, the modules at the other end live on."""
+
+    def __init__(self, channel: str, server: TwinServer) -> None:
+        super().__init__(channel)
+        self.server = server
+        self.now_ns = 0
+        self.until_ns = inf  # the modules' clock stops here
+        self.sent: list[Frame] = []
+        self.refused: list[Frame] = []
+
+    def send(self, frame: Frame) -> bool:
+        taken = super().send(frame)
+        (self.sent if taken else self.refused).append(frame)
+        return taken
+
+    def idle(self) -> float | None:
+        if self.now_ns >= self.until_ns:
+            return None
+        pause_s = self.server.run_due(self.now_ns)
+        assert pause_s is not None
+        self.now_ns = int(min(self.now_ns + pause_s * 1e9, self.until_ns))
+        return 0.0
+
+
+@dataclass
+class SharedBus(Loop):
+    """A loop whose modules have time until the end of each period."""
+
+    true_state_at: dict[int, set[ModuleState]] = field(default_factory=dict[int, set[ModuleState]])  # at ends of ticks
+
+    def run(self, ticks: int, wish: Callable[[int], SetPoints] | None = None) -> None:
+        """So many periods, each as long for the modules as for the driver."""
+        for _ in range(ticks):
+            self.wire.until_ns = self.wire.now_ns + self.config.period_ns
+            super().run(1, wish)
+            while self.wire.idle() is not None:
+                pass
+            self.true_state_at[self.tick] = set(self.true_states())
+
+    def watch_seen(self, kind: str) -> int:
+        """How often a trouble that is no fault was counted."""
+        return self.backend._watch.seen.get(kind, 0)
+
+    @property
+    def wire(self) -> SharedWire:
+        (wire,) = self.backend._wires
+        assert isinstance(wire, SharedWire)
+        return wire
+
+    @property
+    def plant(self) -> Plant:
+        return self.wire.server.chain.plant
+
+    def true_states(self) -> list[ModuleState]:
+        """What the modules are, whether or not they can tell."""
+        return [seat.module.state for seat in self.wire.server.chain.seats]
+
+    def at_rest(self) -> bool:
+        return bool((abs(self.plant.velocity_rad_s) < 0.05).all())
+
+
+@contextmanager
+def shared_bus(channel: str, **dotted: object) -> Iterator[SharedBus]:
+    """Open, and close at the end."""
+    run = config(pace="realtime", **dotted)
+    settings = Settings(channels=[channel], plant="inertia")
+    modules_end = SocketCanWire(channel, FROM_HOST)
+    server = TwinServer([modules_end], ModuleChain(run, settings, make_plant(run, settings), stepped=False))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(driver, "SocketCanWire", lambda name: SharedWire(name, server))
+        patch.setattr(driver, "_answer_time_s", lambda *_: ANSWER_LIMIT_S)
+        patch.setattr(driver, "FIRST_STATE_PAUSE_S", ANSWER_LIMIT_S)
+        try:
+            backend = CanBackend(run, settings)
+            try:
+                yield SharedBus(backend, run)
+            finally:
+                backend.close()
+        finally:
+            modules_end.close()

@@ -1,0 +1,294 @@
+"""What goes wrong with a bus, as the driver sees it on a kernel interface: what it says, and what the modules do.
+
+Times are the modules' and the driver's periods of 10 ms, not this machine's: see `shared_bus`.
+`pytest -rP tests/vcan/test_bus_faults.py` prints a row for each.
+"""
+
+import socket
+
+import pytest
+
+from snakesim_can_backend import commands
+from snakesim_can_backend.protocol import ModuleState, Opcode, frame_id, opcode_of
+from tests.vcan.link import frame, ip, must, tc
+from tests.vcan.shared_bus import SharedBus, shared_bus
+
+NODES = [1, 2, 3, 4]
+PERIOD_MS, WATCHDOG_MS, LEASE_MS = 10, 100, 50
+CAN_ERR_FLAG, CAN_EFF_FLAG, CAN_RTR_FLAG = 0x20000000, 0x80000000, 0x40000000
+# From linux/can/error.h: classes, and bits of data[1] of the class `CRTL`.
+CRTL, ACK, BUSOFF, RESTARTED, PROT = 0x04, 0x20, 0x40, 0x100, 0x08
+RX_OVERFLOW, RX_WARNING, TX_PASSIVE = 0x01, 0x04, 0x20
+
+
+def armed(run: SharedBus) -> SharedBus:
+    run.arm()
+    run.run(12, run.waving)
+    assert not run.faults
+    return run
+
+
+def cleared_and_armed_again(run: SharedBus) -> None:
+    """A person clears the fault and arms; nothing is left of it."""
+    told = len(run.faults)
+    run.lifecycle = "disarmed"
+    run.run(10)
+    assert run.states() == [ModuleState.DISARMED] * 4
+    run.wanted = None
+    run.arm()
+    run.run(10, run.waving)
+    assert len(run.faults) == told, run.faults[told:]
+
+
+def moved_again(run: SharedBus) -> bool:
+    return max(run.true_speed_rad_s[-10:]) > 0.1
+
+
+def set_points_out(run: SharedBus) -> int:
+    return sum(opcode_of(sent.id) == Opcode.SET_POINT for sent in run.wire.sent)
+
+
+def row(what: str, *columns: object) -> None:
+    print(f"| {what} | {' | '.join(map(str, columns))} |")
+
+
+# --- the interface -----------------------------------------------------------------------------------------
+
+
+def test_an_interface_that_goes_down_stops_the_joints_and_comes_back(spare_channel: str) -> None:
+    with shared_bus(spare_channel) as run:
+        armed(run)
+        must(ip("link", "set", spare_channel, "down"))
+        start = run.tick
+        run.run(WATCHDOG_MS // PERIOD_MS + 3, run.waving)
+        (fault,) = run.faults
+        assert fault.what == "interface_down" and fault.cause.startswith(f"{spare_channel}: the interface is down")
+        assert run.lifecycle == "fault" and fault.tick - start <= 1
+        assert run.true_states() == [ModuleState.FAULT] * 4, "the modules' own watchdogs"
+        stopped_ms = PERIOD_MS * next(n for n in range(1, 20) if run.true_state_at[start + n] == {ModuleState.FAULT})
+        assert stopped_ms <= WATCHDOG_MS + PERIOD_MS
+        run.run(40)
+        assert run.at_rest() and len(run.faults) == 1
+        must(ip("link", "set", spare_channel, "up"))
+        run.run(10)
+        assert run.states() == [ModuleState.FAULT] * 4 and run.watch_seen("interface_up") == 1
+        told = {f.what for f in run.faults[1:]}
+        assert "module_watchdog" in told and told <= {"module_watchdog", "module_fault"}, "now they can tell"
+        cleared_and_armed_again(run)
+        assert moved_again(run)
+        row("`ip link set down`", fault.what, f"{PERIOD_MS * (fault.tick - start + 1)} ms", stopped_ms, fault.cause)
+
+
+def test_an_adapter_that_is_pulled_and_plugged_in_again_is_taken_up_again(spare_channel: str) -> None:
+    with shared_bus(spare_channel) as run:
+        armed(run)
+        must(ip("link", "delete", spare_channel))
+        start = run.tick
+        run.run(20, run.waving)
+        (fault,) = run.faults
+        assert fault.what == "interface_down"
+        must(ip("link", "add", spare_channel, "type", "vcan"))
+        must(ip("link", "set", spare_channel, "up"))
+        run.wire.server.wires[0].troubles()  # the modules were never unplugged; only on this bus do they need this
+        run.run(10)
+        assert run.watch_seen("interface_up") == 1
+        cleared_and_armed_again(run)
+        assert moved_again(run)
+        row("`ip link delete`, add", fault.what, f"{PERIOD_MS * (fault.tick - start + 1)} ms", "-", fault.cause)
+
+
+# --- a transmit queue that stays full ------------------------------------------------------------------------
+
+
+@pytest.fixture
+def slow_channel(spare_channel: str) -> str:
+    """An interface that can be told to let next to nothing out: a traffic limit stands in for nobody acknowledging."""
+    clog(spare_channel)
+    unclog(spare_channel)
+    return spare_channel
+
+
+def clog(channel: str, frames: int = 2) -> None:
+    queue = ("rate", "8bit", "burst", "16", "limit", str(16 * frames))
+    limited = tc("qdisc", "add", "dev", channel, "root", "tbf", *queue)
+    if limited.returncode:
+        pytest.skip(f"no traffic limit here: {limited.stderr.strip()}")
+
+
+def unclog(channel: str) -> None:
+    must(tc("qdisc", "del", "dev", channel, "root"))
+
+
+def test_a_queue_that_stays_full_is_a_fault_after_the_lease_and_nothing_is_sent_late(slow_channel: str) -> None:
+    with shared_bus(slow_channel) as run:
+        armed(run)
+        clog(slow_channel)
+        start = run.tick
+        run.run(LEASE_MS // PERIOD_MS + 3, run.waving)
+        (fault,) = run.faults
+        assert fault.what == "bus_stuck" and "its transmit queue stays full" in fault.cause
+        run.run(20)
+        assert run.true_states() == [ModuleState.FAULT] * 4 and len(run.faults) == 1
+        refused = [sent for sent in run.wire.refused if opcode_of(sent.id) == Opcode.SET_POINT]
+        full = run.watch_seen("queue_full")
+        unclog(slow_channel)
+        before = set_points_out(run)
+        run.run(5)
+        assert set_points_out(run) == before, "no set-point of before goes out"
+        cleared_and_armed_again(run)
+        assert moved_again(run)
+        row(
+            "queue stays full",
+            fault.what,
+            f"{PERIOD_MS * (fault.tick - start + 1)} ms",
+            f"{full} frames refused (ENOBUFS), {len(refused)} set-points among them, none sent later",
+            fault.cause,
+        )
+
+
+def test_a_queue_that_is_full_for_a_moment_is_counted_and_the_latest_set_point_goes_on(slow_channel: str) -> None:
+    with shared_bus(slow_channel) as run:
+        armed(run)
+        clog(slow_channel)
+        run.run(LEASE_MS // PERIOD_MS - 2, run.waving)
+        unclog(slow_channel)
+        full, out = run.watch_seen("queue_full"), set_points_out(run)
+        run.run(1, run.waving)
+        assert set_points_out(run) == out + 4, "one for each joint: the latest"
+        run.run(30, run.waving)
+        assert not run.faults and full > 0 and run.states() == [ModuleState.ARMED] * 4
+        row("queue full for 30 ms", "no fault", "-", f"{full} frames refused, counted; none sent later", "-")
+
+
+def test_a_long_queue_that_fills_this_sockets_share_of_it_is_a_full_queue_too(slow_channel: str) -> None:
+    must(ip("link", "set", slow_channel, "txqueuelen", "1000"))
+    with shared_bus(slow_channel) as run:
+        armed(run)
+        run.wire._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1)  # the kernel makes it its minimum
+        limited = tc(
+            "qdisc", "add", "dev", slow_channel, "root", "tbf", "rate", "8bit", "burst", "16", "limit", "16000"
+        )
+        must(limited)
+        run.run(LEASE_MS // PERIOD_MS + 3, run.waving)
+        assert "bus_stuck" in [fault.what for fault in run.faults]
+        row("queue of 1000 frames", run.faults[0].what, "-", f"{run.watch_seen('queue_full')} refused (EAGAIN)", "-")
+
+
+# --- error frames --------------------------------------------------------------------------------------------
+
+
+def error_frame(kind: int, controller: int = 0) -> bytes:
+    return frame(CAN_ERR_FLAG | kind, bytes([0, controller, 0, 0, 0, 0, 130, 7]))
+
+
+@pytest.mark.parametrize(
+    ("what", "sent", "is_fault"),
+    [
+        ("error_warning", error_frame(CRTL, RX_WARNING), False),
+        ("not_acknowledged", error_frame(ACK), False),
+        ("error_frames", error_frame(PROT), False),
+        ("error_passive", error_frame(CRTL, TX_PASSIVE), True),
+        ("receive_overflow", error_frame(CRTL, RX_OVERFLOW), True),
+        ("restarted", error_frame(RESTARTED), True),
+        ("bus_off", error_frame(BUSOFF), True),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_error_frames_of_the_controller_are_faults_or_counted(
+    what: str, sent: bytes, is_fault: bool, channel: str, raw_socket: socket.socket
+) -> None:
+    with shared_bus(channel) as run:
+        armed(run)
+        raw_socket.send(sent)
+        start = run.tick
+        run.run(2, run.waving)
+        if not is_fault:
+            assert run.watch_seen(what) == 1 and not run.faults
+            run.run(3, run.waving)
+            assert run.states() == [ModuleState.ARMED] * 4
+            row(what, "counted", "-", "-", "-")
+            return
+        (fault,) = run.faults
+        assert fault.what == what and fault.cause.startswith(f"{channel}: transmit errors 130, receive errors 7; ")
+        out = set_points_out(run)
+        run.run(30, run.waving)
+        assert run.lifecycle == "fault" and set_points_out(run) == out, "not one set-point more"
+        assert run.true_states() == [ModuleState.DISARMED] * 4 and run.at_rest() and len(run.faults) == 1
+        cleared_and_armed_again(run)
+        row(what, "fault", f"{PERIOD_MS * (fault.tick - start + 1)} ms", "no set-point more until clear", fault.cause)
+
+
+# --- a reader that is too slow -------------------------------------------------------------------------------
+
+
+def test_frames_that_the_kernel_dropped_are_counted(channel: str, raw_socket: socket.socket) -> None:
+    with shared_bus(channel) as run:
+        armed(run)
+        ours = run.wire._socket
+        ours.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1)  # the kernel makes it its minimum
+        for _ in range(50):
+            raw_socket.send(frame(frame_id(Opcode.HEALTH, 1)))
+        ours.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 18)
+        run.run(2, run.waving)
+        (fault,) = run.faults
+        assert fault.what == "receive_overflow"
+        dropped = int(fault.cause.partition("dropped ")[2].partition(" ")[0])
+        kept = run.backend._reading.malformed
+        assert dropped > 0 and kept > 0 and dropped + kept == 50
+        cleared_and_armed_again(run)
+        row("50 frames, not read", fault.what, "-", f"{dropped} dropped, {kept} kept", fault.cause)
+
+
+# --- who else is there ---------------------------------------------------------------------------------------
+
+
+def test_a_second_host_is_named(channel: str, raw_socket: socket.socket) -> None:
+    with shared_bus(channel) as run:
+        armed(run)
+        foreign = commands.sync(run.backend._reading.sync + 7, 0)
+        raw_socket.send(frame(*foreign))
+        run.run(3, run.waving)
+        assert [fault.what for fault in run.faults] == ["second_host"]
+        run.run(20)
+        assert run.true_states() == [ModuleState.DISARMED] * 4 and run.at_rest()
+        cleared_and_armed_again(run)
+        row("a Sync of somebody else", run.faults[0].what, "-", "-", run.faults[0].cause)
+
+
+def test_an_emergency_from_the_bus_stops_and_is_latched(channel: str, raw_socket: socket.socket) -> None:
+    with shared_bus(channel) as run:
+        armed(run)
+        raw_socket.send(frame(frame_id(Opcode.EMERGENCY, 0), b"\x01"))
+        run.run(1, run.waving)
+        assert run.true_states() == [ModuleState.EMERGENCY] * 4, "one frame"
+        run.run(20)
+        assert run.faults[0].what == "emergency" and run.lifecycle == "fault" and run.at_rest()
+        assert run.true_states() == [ModuleState.EMERGENCY] * 4
+        cleared_and_armed_again(run)
+        row("Emergency of a person", run.faults[0].what, "-", "EMERGENCY within one period", run.faults[0].cause)
+
+
+def test_a_node_that_is_no_joint_is_named(channel: str, raw_socket: socket.socket) -> None:
+    with shared_bus(channel) as run:
+        armed(run)
+        for _ in range(3):
+            raw_socket.send(frame(frame_id(Opcode.HEARTBEAT, 40), bytes(8)))
+        run.run(2, run.waving)
+        (fault,) = run.faults
+        assert fault.what == "unknown_node" and "node 40 " in fault.cause
+        cleared_and_armed_again(run)
+        row("3 frames of node 40", fault.what, "-", "-", fault.cause)
+
+
+def test_extended_and_remote_frames_stay_in_the_kernel(channel: str, raw_socket: socket.socket) -> None:
+    with shared_bus(channel) as run:
+        armed(run)
+        for number in (frame_id(Opcode.HEARTBEAT, 40), frame_id(Opcode.SYNC, 0), frame_id(Opcode.JOINT_STATE, 1)):
+            for _ in range(5):
+                raw_socket.send(frame(CAN_EFF_FLAG | number, bytes(8)))
+                raw_socket.send(frame(CAN_EFF_FLAG | 0x12340000 | number, bytes(8)))
+                raw_socket.send(frame(CAN_RTR_FLAG | number))
+        assert run.wire.receive() == []
+        run.run(5, run.waving)
+        assert not run.faults and run.states() == [ModuleState.ARMED] * 4
+        row("45 extended and remote frames", "no fault", "-", "0 received", "-")
