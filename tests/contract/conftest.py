@@ -9,8 +9,7 @@ from snakesim_can_backend.protocol import Frame, node_of
 from snakesim_hal.conformance.bench import Bench
 
 VCAN = "SNAKESIM_VCAN"  # set by deploy/vm/with_vcan.py: the kernel here has vcan0, and it is up
-# Twins with MuJoCo stand on the virtual bus; here it is the bus that counts, and their start that takes time.
-ON_VCAN = ('backend.channels=["vcan0"]', 'backend.twins="process"', 'backend.plant="inertia"')
+ON_VCAN = ('backend.channels=["vcan0"]', 'backend.twins="process"')
 
 
 @pytest.hookimpl(optionalhook=True)
