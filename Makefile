@@ -19,7 +19,7 @@ packages := $(wildcard snakesim_*)
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test test-here test-vcan check bench schemas docs lock clean FORCE
+.PHONY: help setup demo test test-here test-vcan mutation check bench schemas docs lock clean FORCE
 
 help: ## List these targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' Makefile
@@ -39,6 +39,9 @@ test-vcan: $(stamp) ## Run the CAN tests on real SocketCAN, in a small VM where 
 
 # An emulated machine stumbles when its host is busy: what failed there is tried once more.
 on_vcan = $(bin)/python -m pytest tests/vcan tests/contract -m "not slow" $(ARGS)
+
+mutation: $(stamp) ## Break the safety core one change at a time; every break must be noticed
+	$(bin)/python -m tests.mutation --workers $(WORKERS) $(ARGS)
 
 check: $(stamp) ## Lint, format, types and import rules, without changing anything
 	$(bin)/ruff check

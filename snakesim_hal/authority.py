@@ -62,6 +62,8 @@ class Authority:
         self._measured = Measured(np.zeros(count), np.zeros(count), np.zeros(count))
         self._state_trouble: str | None = "no joint state yet"
         self._command: JointCommand | None = None
+        self._command_ns = 0  # when it came
+        self._counting: JointCommand | None = None  # what the last decision since arming was made from
         self._recent: deque[JointCommand] = deque(maxlen=COMMANDS_KEPT)  # good ones since arming, oldest first
         self._last_sequence = -1
         self._hold_at = np.zeros(count)
@@ -71,7 +73,12 @@ class Authority:
 
     def observe(self, joints: JointState) -> None:
         """Take the newest joint state. What is not finite is no measurement: the last good one stays."""
-        columns = np.array([joints.angle_rad, joints.velocity_rad_s, joints.torque_nm])
+        count = len(self.description.joints)
+        lists = (joints.angle_rad, joints.velocity_rad_s, joints.torque_nm, joints.valid, joints.age_ns)
+        if {len(values) for values in lists} != {count}:
+            self._state_trouble = f"no joint state of {count} joints"
+            return
+        columns = np.array(lists[:3])
         finite = bool(np.isfinite(columns).all())
         if finite:
             self._measured = Measured(*columns)
@@ -81,7 +88,7 @@ class Authority:
         fresh = np.array(joints.age_ns) <= self.description.lease_ns
         good = np.isfinite(columns).all(axis=0) & fresh & np.array(joints.valid)
         bad = [self.description.joints[i].name for i in np.flatnonzero(~good)]
-        self._state_trouble = f"no valid and fresh state of {', '.join(bad)}"[:400] if bad else None
+        self._state_trouble = f"no valid and fresh state of {', '.join(bad)}"[:400]
 
     def offer(self, command: JointCommand, *, now_ns: int, tick: int, age_ns: int) -> str | None:
         """Take a command, or return why not. `age_ns`: time since the state that it answers was published."""
@@ -98,11 +105,11 @@ class Authority:
             self.rejected[refusal] += 1
             return refusal
         self._last_sequence = command.sequence
-        self.lease = renewed(self.lease, now_ns, self.description.lease_ns)
-        if not self.answers_arming(command):
+        if not self.answers_arming(command):  # nor does it keep the lease: what moves the robot must be commanded now
             self.standby += 1
             return "before_arming"
-        self._command = command
+        self.lease = renewed(self.lease, now_ns, self.description.lease_ns)
+        self._command, self._command_ns = command, now_ns
         if self.state == "armed":
             self.accepted += 1
             self._recent.append(command)
@@ -135,9 +142,9 @@ class Authority:
         match request.action:
             case "arm":
                 against = self.against_arming(now_ns)
-                if request.robot is None or request.robot != self.description.robot:
+                if request.robot != self.description.robot:
                     against.append(f"this robot is {self.description.robot!r}, the request names {request.robot!r}")
-                if request.backend is None or request.backend != self.description.backend:
+                if request.backend != self.description.backend:
                     against.append(
                         f"this backend is {self.description.backend!r}, the request names {request.backend!r}"
                     )
@@ -145,20 +152,17 @@ class Authority:
                     return self._answer("; ".join(against))
                 self._go("arm", f"armed, commanded by {self.lease.holder}")
                 self.arming += 1
-                self._command = None
+                self._command = self._counting = None
                 self._recent.clear()
-                self._hold_at = self._measured.angle_rad
                 self.lease = renewed(self.lease, now_ns, self.description.lease_ns)
             case "disarm":
-                if lifecycle.after(self.state, "disarm") is None:
+                if not self._go("disarm", "disarmed on request"):
                     return self._answer(f"cannot disarm in state {self.state}; clear it first")
-                self._go("disarm", "disarmed on request")
             case "clear":
-                if lifecycle.after(self.state, "clear") is None:
+                if not self._go("clear", "cleared; arm to move again"):
                     return self._answer(f"nothing to clear in state {self.state}")
-                self._go("clear", "cleared; arm to move again")
                 self.faults.clear()
-            case "finish":
+            case _:  # finish
                 if self.state == "armed":
                     self._go("disarm", "run finished")
         return self._answer(None)
@@ -173,7 +177,7 @@ class Authority:
         """Latch a fault: the joints go to the safe action until someone clears it."""
         self.note(fault)
         if self.state != "estop":
-            self._go("fault", fault.cause)
+            self._go("fault", fault.cause[:500] or fault.what)
         self._drop_lease()
 
     def note(self, fault: Fault) -> None:
@@ -203,6 +207,8 @@ class Authority:
             against.append("nobody holds the lease")
         elif self._command is None:
             against.append(f"no commands from {self.lease.holder} yet")
+        elif now_ns - self._command_ns > self.description.lease_ns:  # the lease may be kept by asking, too
+            against.append(f"no commands from {self.lease.holder} any more")
         else:
             against.extend(self._far_targets(self._command))
         return against
@@ -214,7 +220,7 @@ class Authority:
         """
         if self.state == "armed" and self._state_trouble is not None:
             self.fault(Fault(tick=tick, what="state_invalid", cause=self._state_trouble))
-        if self.lease.holder is None or self.lease.live(now_ns):
+        if self.lease.live(now_ns):
             return
         holder, term_ms = self.lease.holder, self.description.lease_ns / 1e6
         if self.state == "armed":
@@ -230,7 +236,7 @@ class Authority:
         """
         command = self._command
         if up_to is not None:
-            command = next((c for c in reversed(self._recent) if c.tick <= up_to), None)
+            command = next((c for c in reversed(self._recent) if c.tick <= up_to), self._counting)
         if self.state != "armed":
             applied = self._safe()
             self._applied = applied
@@ -240,7 +246,7 @@ class Authority:
             self._applied = applied
             return Decision(gate.as_set_points(applied), None, {})
         applied, asked = gate.limit(command, measured=self._measured, last=self._applied, limits=self.limits)
-        self._applied = applied
+        self._applied, self._counting = applied, command
         limited: dict[int, str] = {}
         if (applied.target != asked).any():
             limited = gate.why_limited(applied, asked, self.limits)
@@ -276,17 +282,19 @@ class Authority:
                 )
         return far
 
-    def _go(self, event: lifecycle.Event, why: str) -> None:
+    def _go(self, event: lifecycle.Event, why: str) -> bool:
+        """Follow an event; False when it is not allowed in this state."""
         following = lifecycle.after(self.state, event)
         if following is None:
-            return
+            return False
         if following != self.state:
             self._hold_at = self._measured.angle_rad
             self._was_armed = self.state == "armed"
-        if following != "armed" and self.state == "armed":
+        if self.state == "armed":
             self._command = None
         self.state = following
         self.why = why
+        return True
 
     def _drop_lease(self) -> None:
         self.lease = freed(self.lease)

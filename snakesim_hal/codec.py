@@ -14,6 +14,7 @@ MessageT = TypeVar("MessageT", bound=Message)
 
 ENCODING_PREFIX = "application/msgpack;snakesim."
 MAX_PAYLOAD_BYTES = 4 * 1024 * 1024
+MAX_WHY = 300  # characters of the reason why a payload is malformed
 
 _encoder = msgspec.msgpack.Encoder()
 encode = _encoder.encode
@@ -41,7 +42,8 @@ class Decoder(Generic[MessageT]):
         try:
             return self._decoder.decode(payload)
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError, OverflowError, ValueError) as error:
-            raise WireError("malformed", f"{self.message.__name__}: {error}") from error
+            why = str(error)[:MAX_WHY]  # it may quote what the sender wrote
+            raise WireError("malformed", f"{self.message.__name__}: {why}") from None
 
 
 def _why_foreign(got: str, want: str) -> str:

@@ -38,9 +38,7 @@ class JointLimits:
     angle_min_rad: Floats
     angle_max_rad: Floats
     speed_rad_s: Floats
-    acceleration_rad_s2: Floats
     torque_nm: Floats
-    torque_rate_nm_s: Floats
     max_step_rad: float
     period_s: float
     lease_ns: int
@@ -59,9 +57,7 @@ class JointLimits:
             angle_min_rad=column("angle_min_rad"),
             angle_max_rad=column("angle_max_rad"),
             speed_rad_s=column("speed_limit_rad_s"),
-            acceleration_rad_s2=column("acceleration_limit_rad_s2"),
             torque_nm=column("torque_limit_nm"),
-            torque_rate_nm_s=column("torque_rate_limit_nm_s"),
             max_step_rad=description.max_step_rad,
             period_s=description.period_ns * 1e-9,
             lease_ns=description.lease_ns,

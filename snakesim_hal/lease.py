@@ -46,7 +46,7 @@ def rule(lease: Lease, request: LeaseRequest, now_ns: int, term_ns: int) -> Ruli
             if not mine:
                 return Ruling(lease, f"{request.holder} does not hold epoch {request.epoch}; acquire the lease first")
             return Ruling(renewed(lease, now_ns, term_ns))
-        case "release":
+        case _:  # release
             if not mine:
                 return Ruling(lease, f"{request.holder} does not hold epoch {request.epoch}; nothing to release")
             return Ruling(freed(lease), changed_hands=True)

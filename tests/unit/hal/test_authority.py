@@ -1,14 +1,12 @@
-"""Who may move the robot: whatever comes in, in whatever order, nothing moves that may not."""
+"""Who may move the robot, case by case; test_authority_machine.py tries every order of everything."""
 
+import dataclasses
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import settings
-from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from snakesim_hal.authority import MAX_FAULTS_KEPT, Authority, Decision
+from snakesim_hal.authority import COMMANDS_KEPT, MAX_FAULTS_KEPT, Authority, Decision
 from snakesim_hal.messages import (
     Answer,
     EstopRequest,
@@ -141,6 +139,41 @@ def test_a_robot_that_does_not_know_its_joints_is_not_armed_and_does_not_stay_ar
     assert np.isfinite(decision.set_points.target).all()
 
 
+@pytest.mark.parametrize("column", ["angle", "velocity", "torque", "valid", "age_ns"])
+@pytest.mark.parametrize("length", [0, JOINTS - 1, JOINTS + 1])
+def test_a_state_of_another_number_of_joints_is_no_state(column: str, length: int) -> None:
+    rig = armed()
+    values = [True] * length if column == "valid" else [0] * length
+    rig.authority.observe(state(rig.robot, **{column: values}))
+    decision = rig.pass_tick()
+    assert rig.authority.state == "fault" and rig.authority.why == "no joint state of 3 joints"
+    assert decision.set_points.target == [0.0] * JOINTS
+
+
+def test_only_the_joints_that_are_not_known_are_named() -> None:
+    rig = Rig()
+    rig.observe(0.1, age_ns=[LEASE_NS, LEASE_NS + 1, 0])
+    assert rig.authority.against_arming(0)[0] == "no valid and fresh state of joint_2"
+
+
+def test_what_is_told_of_a_long_robot_fits_into_a_message() -> None:
+    rig = Rig(chain__modules=100)
+    rig.observe(0.1, valid=[False] * 100)
+    assert len(rig.authority.against_arming(0)[0]) == 400
+    rig.observe(0.1)
+    rig.acquire()
+    rig.send(9.0)
+    assert len(rig.arm().reason) == 500
+
+
+def test_a_state_at_the_end_of_its_time_is_still_good() -> None:
+    rig = armed()
+    rig.observe(0.1, age_ns=[LEASE_NS] * JOINTS)
+    rig.send(0.1)
+    rig.pass_tick()
+    assert rig.authority.state == "armed"
+
+
 def test_arming_is_refused_while_a_target_is_far_and_names_the_joint() -> None:
     rig = Rig()
     rig.observe(0.1)
@@ -152,6 +185,21 @@ def test_arming_is_refused_while_a_target_is_far_and_names_the_joint() -> None:
     assert rig.arm().ok
 
 
+def test_a_first_command_may_use_the_whole_torque() -> None:
+    rig = armed()
+    rig.send(0.1)
+    assert rig.pass_tick().set_points.torque_limit_nm == [4.0] * JOINTS
+
+
+def test_the_very_first_decision_is_passive() -> None:
+    assert modes(Authority(ROBOT).decide()) == {Mode.PASSIVE}
+
+
+def test_a_decision_stays_as_it_is() -> None:
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        Rig().pass_tick().sequence = 1  # pyright: ignore[reportAttributeAccessIssue]
+
+
 def test_right_after_arming_the_pose_is_held_until_a_new_command_comes() -> None:
     rig = armed()
     decision = rig.pass_tick()
@@ -159,6 +207,122 @@ def test_right_after_arming_the_pose_is_held_until_a_new_command_comes() -> None
     assert modes(decision) == {Mode.POSITION} and decision.set_points.target == [0.1] * JOINTS
     rig.send(0.11)
     assert rig.pass_tick().set_points.target == pytest.approx([0.11] * JOINTS)
+
+
+def test_arming_needs_commands_that_still_come() -> None:
+    """Asking keeps the lease while disarmed, but whoever only asks does not command."""
+    rig = Rig()
+    rig.observe(0.1)
+    rig.acquire()
+    rig.send(0.1)
+    for _ in range(2):
+        rig.pass_tick(5)
+        assert rig.authority.on_lease(LeaseRequest(action="renew", holder="control", epoch=1), rig.now_ns).ok
+    answer = rig.arm()
+    assert not answer.ok and answer.reason == "no commands from control any more"
+    rig.send(0.1)
+    rig.now_ns += LEASE_NS
+    assert rig.arm().ok
+
+
+@pytest.mark.parametrize("mode", [Mode.VELOCITY, Mode.TORQUE])
+def test_arming_is_refused_to_a_stream_that_moves(mode: Mode) -> None:
+    rig = Rig()
+    rig.observe(0.1)
+    rig.acquire()
+    rig.send([0.1, 0.0, 0.1], [Mode.POSITION, mode, Mode.PASSIVE])
+    reason = f"joint_2 is asked for {mode.name.lower()}; only staying is allowed at arming"
+    assert rig.arm().reason == reason and rig.authority.state == "disarmed"
+
+
+def test_a_passive_stream_may_be_armed_whatever_its_targets() -> None:
+    rig = Rig()
+    rig.observe(0.1)
+    rig.acquire()
+    rig.send(99.0, Mode.PASSIVE)
+    assert rig.arm().ok
+
+
+def test_what_is_sent_for_another_arming_neither_moves_the_robot_nor_keeps_the_lease() -> None:
+    rig = armed()
+    rig.send(0.1, arming=1)
+    rig.pass_tick()
+    for other in (0, 2, 0, 2):
+        assert rig.send(0.2, arming=other) == "before_arming"
+        assert rig.pass_tick().set_points.target == pytest.approx([0.1] * JOINTS)
+    rig.send(0.2, arming=0)
+    rig.pass_tick()
+    assert rig.authority.state == "fault" and rig.authority.faults[0].what == "lease_expired"
+    assert (rig.authority.accepted, rig.authority.standby) == (1, 6)  # one before arming
+
+
+def test_while_disarmed_it_does_not_matter_which_arming_a_command_names() -> None:
+    rig = armed()
+    rig.authority.on_lifecycle(DISARM, rig.now_ns)
+    for arming in (0, 1, 2):
+        assert rig.send(0.1, arming=arming) is None
+
+
+def test_arming_begins_a_new_term_of_the_lease() -> None:
+    rig = Rig()
+    rig.observe(0.1)
+    rig.acquire()
+    rig.send(0.1)
+    rig.now_ns += LEASE_NS - 1
+    assert rig.arm().ok and rig.authority.lease.expires_ns == 2 * LEASE_NS - 1
+
+
+def test_a_lease_that_ran_out_is_free_before_a_tick_has_noticed() -> None:
+    rig = armed()
+    rig.now_ns += LEASE_NS
+    assert not rig.acquire("teleop").ok
+    rig.now_ns += 1
+    answer = rig.acquire("teleop")
+    assert answer.ok and answer.lifecycle == "disarmed" and rig.authority.why == "lease passed to teleop"
+
+
+def test_commands_without_an_arming_count_in_any() -> None:
+    rig = armed()
+    assert rig.send(0.11, arming=None) is None
+    assert rig.pass_tick().sequence == rig.sequence
+
+
+def test_what_counted_in_an_earlier_arming_does_not_count_in_the_next() -> None:
+    rig = armed()
+    rig.send(0.2)
+    assert rig.authority.decide(rig.tick).sequence == rig.sequence
+    rig.authority.on_lifecycle(DISARM, rig.now_ns)
+    rig.send(0.1)
+    assert rig.arm().ok and rig.authority.arming == 2
+    assert rig.authority.decide(rig.tick).sequence is None
+    assert rig.authority.decide().sequence is None
+
+
+# --- lockstep: what counts is told by ticks --------------------------------------------------------------------
+
+
+def test_in_lockstep_a_command_waits_for_its_tick() -> None:
+    rig = armed()
+    rig.send(0.11, tick=0)
+    rig.tick = 1
+    rig.send(0.12, tick=1)
+    assert rig.authority.decide(0).set_points.target == pytest.approx([0.11] * JOINTS)
+    assert rig.authority.decide(1).set_points.target == pytest.approx([0.12] * JOINTS)
+
+
+def test_in_lockstep_the_last_command_goes_on_when_a_flood_has_pushed_it_out() -> None:
+    """Falling back to the pose at arming would be a jump that no gate has limited."""
+    rig = armed()
+    before = rig.authority.decide(0)
+    for tick in range(5):
+        rig.tick = tick
+        rig.send(0.3)
+        before = rig.authority.decide(tick)
+    rig.tick = 5
+    for _ in range(COMMANDS_KEPT + 1):
+        rig.send(0.1)
+    decision = rig.authority.decide(4)
+    assert decision.sequence == before.sequence and decision.set_points.target == pytest.approx([0.3] * JOINTS)
 
 
 # --- the lease -------------------------------------------------------------------------------------------------
@@ -329,7 +493,16 @@ def test_faults_are_kept_up_to_a_limit_the_first_ones_first() -> None:
     rig = Rig()
     for i in range(100):
         rig.authority.fault(Fault(tick=i, what="hot", cause="hot"))
-    assert [fault.tick for fault in rig.authority.faults] == list(range(MAX_FAULTS_KEPT))
+    assert [fault.tick for fault in rig.authority.faults] == list(range(32))
+    assert (MAX_FAULTS_KEPT, COMMANDS_KEPT) == (32, 1024)  # a status holds 64 faults
+
+
+def test_a_fault_is_explained_in_as_many_words_as_a_message_holds() -> None:
+    rig = armed()
+    rig.authority.fault(Fault(tick=1, what="hot", cause="x" * 501))
+    assert rig.authority.why == rig.authority.faults[0].cause == "x" * 500
+    rig.authority.fault(Fault(tick=1, what="hot", cause=""))
+    assert rig.authority.why == "hot"
 
 
 def test_a_note_stops_nothing() -> None:
@@ -367,195 +540,6 @@ def test_what_the_gate_changes_is_counted_by_limit() -> None:
     decision = rig.pass_tick()
     assert decision.limited == {1: "angle_rate", 2: "angle"}
     assert rig.authority.limited == {"angle_rate": 1, "angle": 1}
-
-
-# --- any order of everything -----------------------------------------------------------------------------------
-
-HOLDERS = st.sampled_from(["control", "teleop"])
-
-
-class AnythingMayHappen(RuleBasedStateMachine):
-    """Requests, commands, states and time in any order; a plain model says what may never happen."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.authority = Authority(ROBOT)
-        self.now_ns = 0
-        self.tick = 0
-        self.sequence = 0
-        self.state_good = False
-        self.angles = [0.0] * JOINTS
-        self.last_good_command_ns: int | None = None  # while armed; None: not commanded since arming
-        self.armed_at_ns = 0
-        self.cleared = True  # since the last fault or estop
-        self.last: Decision | None = None
-        self.before: LifecycleState = "disarmed"
-
-    def moved_to(self) -> None:
-        """Check a change of the lifecycle that just happened."""
-        now = self.authority.state
-        if now == "armed":
-            assert self.before == "armed", "only the rule `arm` may arm"
-        if self.before in ("fault", "estop"):
-            assert now in ("fault", "estop"), "only the rule `clear` may lead out"
-        if now in ("fault", "estop"):
-            self.cleared = False
-        self.before = now
-
-    @rule(
-        angle=st.lists(st.floats(-1.6, 1.6), min_size=JOINTS, max_size=JOINTS),
-        torque=st.floats(-5, 5),
-        trouble=st.sampled_from([None, None, None, None, "valid", "age", "nan"]),
-    )
-    def observe(self, angle: list[float], torque: float, trouble: str | None) -> None:
-        seen = state(
-            ROBOT,
-            [float("nan"), *angle[1:]] if trouble == "nan" else angle,
-            torque=torque,
-            valid=[trouble != "valid"] * JOINTS,
-            age_ns=[LEASE_NS + 1 if trouble == "age" else 0] * JOINTS,
-        )
-        self.authority.observe(seen)
-        self.state_good = trouble is None
-        if trouble != "nan":
-            self.angles = angle
-        self.moved_to()
-
-    @rule(
-        who=HOLDERS, action=st.sampled_from(["acquire", "renew", "release"]), priority=st.sampled_from([50, 100, 200])
-    )
-    def lease(self, who: str, action: Any, priority: int) -> None:
-        held = self.authority.lease
-        live = held.live(self.now_ns)
-        answer = self.authority.on_lease(
-            LeaseRequest(action=action, holder=who, epoch=held.epoch, priority=priority), self.now_ns
-        )
-        if live and action == "acquire":
-            assert answer.ok == (priority > held.priority)
-        if answer.ok and action in ("acquire", "release"):
-            assert self.authority.state != "armed", "the robot stops when the lease changes hands"
-        self.moved_to()
-
-    @rule(
-        wanted=st.lists(
-            st.floats(-1e5, 1e5) | st.floats(-2, 2) | st.just(float("nan")), min_size=JOINTS, max_size=JOINTS
-        ),
-        mode=st.lists(st.sampled_from(list(Mode)), min_size=JOINTS, max_size=JOINTS),
-        epoch=st.sampled_from([0, 0, 0, 0, 0, -1, 1]),
-        replay=st.sampled_from([False, False, False, True]),
-        age_ns=st.sampled_from([0, 0, 0, LEASE_NS, LEASE_NS + 1]),
-        near=st.booleans(),
-    )
-    def command(self, wanted: list[float], mode: list[Mode], epoch: int, replay: bool, age_ns: int, near: bool) -> None:
-        self.sequence += not replay
-        if near:
-            wanted, mode = list(self.angles), [Mode.POSITION] * JOINTS
-        lease, state_before = self.authority.lease, self.authority.state
-        asked = command(
-            ROBOT, wanted, mode, sequence=self.sequence, tick=self.tick, lease_epoch=max(lease.epoch + epoch, 0)
-        )
-        refusal = self.authority.offer(asked, now_ns=self.now_ns, tick=self.tick, age_ns=age_ns)
-        if refusal is None:
-            assert lease.live(self.now_ns) and epoch == 0 and age_ns <= LEASE_NS
-            assert np.isfinite(wanted).all()
-            if state_before == "armed":
-                self.last_good_command_ns = self.now_ns
-        else:
-            assert self.authority.lease == lease, "a refused command renews nothing"
-        self.moved_to()
-
-    @rule(robot=st.sampled_from(["worm", "worm", "worm", "other", None]))
-    def arm(self, robot: str | None) -> None:
-        before, lease = self.authority.state, self.authority.lease
-        answer = self.authority.on_lifecycle(LifecycleRequest(action="arm", robot=robot, backend="lag"), self.now_ns)
-        if answer.ok:
-            assert before == "disarmed" and self.cleared and self.state_good and robot == "worm"
-            assert lease.live(self.now_ns)
-            self.last_good_command_ns, self.armed_at_ns = None, self.now_ns
-        self.before = self.authority.state
-
-    @rule(action=st.sampled_from(["disarm", "finish"]))
-    def disarm(self, action: Any) -> None:
-        self.authority.on_lifecycle(LifecycleRequest(action=action), self.now_ns)
-        assert self.authority.state != "armed"
-        self.moved_to()
-
-    @precondition(lambda self: self.authority.state != "armed")
-    @rule()
-    def clear(self) -> None:
-        assert self.authority.on_lifecycle(CLEAR, self.now_ns).ok
-        assert self.authority.state == "disarmed"
-        self.cleared, self.before = True, "disarmed"
-
-    @rule()
-    def estop(self) -> None:
-        self.authority.on_estop(ESTOP, self.tick)
-        assert self.authority.state == "estop"
-        self.moved_to()
-
-    @rule()
-    def backend_fault(self) -> None:
-        self.authority.fault(Fault(tick=self.tick, what="hot", cause="hot"))
-        assert self.authority.state in ("fault", "estop") and self.authority.lease.holder is None
-        self.moved_to()
-
-    @rule(who=HOLDERS)
-    def gone(self, who: str) -> None:
-        if self.authority.lease.holder == who:
-            self.authority.holder_gone(f"{who} is gone")
-        self.moved_to()
-
-    @rule(periods=st.sampled_from([1, 1, 1, 1, 4, 7]))
-    def pass_time(self, periods: int) -> None:
-        """A tick of the host."""
-        self.now_ns += periods * PERIOD_NS
-        self.tick += periods
-        self.authority.expire(self.now_ns, self.tick)
-        decision = self.authority.decide()
-        self.moved_to()
-        if self.authority.state == "armed":
-            assert self.state_good and self.authority.lease.live(self.now_ns)
-            assert self.now_ns - (self.last_good_command_ns or self.armed_at_ns) <= LEASE_NS
-        if decision.sequence is not None:
-            assert self.authority.state == "armed" and self.last_good_command_ns is not None
-        self.check_limits(decision)
-        self.last = decision
-
-    def check_limits(self, decision: Decision) -> None:
-        points = decision.set_points
-        match self.authority.state:
-            case "disarmed" | "estop":
-                assert set(points.mode) == {Mode.PASSIVE} and decision.sequence is None
-            case "fault" if set(points.mode) != {Mode.PASSIVE}:  # this robot damps what was moving
-                assert set(points.mode) == {Mode.VELOCITY} and points.target == [0.0] * JOINTS
-        for i, (mode, target, torque_limit) in enumerate(
-            zip(points.mode, points.target, points.torque_limit_nm, strict=True)
-        ):
-            assert 0.0 <= torque_limit <= 4.0
-            if mode == Mode.POSITION:
-                assert -1.5 <= target <= 1.5
-                if decision.sequence is not None:  # a held pose stays where it was when the robot was armed
-                    assert abs(target - self.angles[i]) <= 0.3 + 1e-9
-            elif mode == Mode.VELOCITY:
-                assert abs(target) <= 5.0
-            elif mode == Mode.TORQUE:
-                assert abs(target) <= torque_limit
-            else:
-                assert target == 0.0
-            if self.last is not None and self.last.set_points.mode[i] == mode:
-                step = abs(target - self.last.set_points.target[i])
-                if mode == Mode.VELOCITY and decision.sequence is not None:
-                    assert step <= 1.0 + 1e-9
-                elif mode == Mode.TORQUE:
-                    assert step <= 0.8 + 1e-9
-
-    @invariant()
-    def never_armed_with_an_uncleared_stop(self) -> None:
-        assert self.authority.state != "armed" or self.cleared
-
-
-AnythingMayHappen.TestCase.settings = settings(max_examples=150, stateful_step_count=40, deadline=None)
-TestAnythingMayHappen = AnythingMayHappen.TestCase
 
 
 def test_a_lease_epoch_is_never_accepted_twice() -> None:

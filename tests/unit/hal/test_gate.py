@@ -1,5 +1,6 @@
 """The gate: what is refused and why, and that nothing beyond a limit ever comes out of it."""
 
+import dataclasses
 from typing import Any, get_args
 
 import msgspec
@@ -251,6 +252,16 @@ def test_with_no_torque_allowed_there_is_none() -> None:
     assert (applied_for(command(ROBOT, 1.0, Mode.TORQUE, torque_limit_nm=none), torque=3.0).target == 0).all()
 
 
+def test_a_negative_torque_limit_is_none_at_all() -> None:
+    assert applied_for(command(ROBOT, 0.0, torque_limit_nm=[-0.5] * JOINTS)).torque_limit_nm.tolist() == [0.0] * JOINTS
+
+
+@pytest.mark.parametrize("held", [LIMITS, Measured(*np.zeros((3, 1))), Applied(*np.zeros((3, 1)))])  # pyright: ignore[reportArgumentType]
+def test_what_was_decided_stays(held: Any) -> None:
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        held.torque_nm = 1.0
+
+
 def test_a_torque_limit_never_raises_the_robots_own() -> None:
     applied = applied_for(command(ROBOT, 0.0, torque_limit_nm=[1e5, 4.0, 1.0]))
     assert applied.torque_limit_nm.tolist() == [4.0, 4.0, 1.0]
@@ -322,7 +333,15 @@ def test_a_switch_asked_to_stay_changes_nothing_at_all() -> None:
     assert bumpless([Mode.TORQUE] * JOINTS, measured) == measured.torque_nm.tolist()
 
 
+def test_a_switch_to_velocity_mode_reckons_with_the_gain() -> None:
+    joint = msgspec.structs.replace(ROBOT.joints[0], velocity_gain_nm_s_per_rad=2.0)
+    assert bumpless_target(joint, Mode.VELOCITY, 0.3, 1.0, 3.0) == 2.5
+    assert bumpless_target(joint, Mode.PASSIVE, 0.3, 1.0, 3.0) == 0.0
+
+
 def test_a_joint_without_stiffness_gives_a_finite_target() -> None:
+    limp = msgspec.structs.replace(ROBOT.joints[0], stiffness_nm_per_rad=0.0)
+    assert bumpless_target(limp, Mode.POSITION, 0.0, 0.0, 1.0) == pytest.approx(1e9)
     joints = [msgspec.structs.replace(joint, stiffness_nm_per_rad=0.0) for joint in ROBOT.joints]
     soft = JointLimits.of(msgspec.structs.replace(ROBOT, joints=joints))
     measured = Measured(np.zeros(JOINTS), np.zeros(JOINTS), np.full(JOINTS, 4.0))
@@ -340,9 +359,13 @@ def test_a_joint_without_stiffness_gives_a_finite_target() -> None:
         (Mode.POSITION, 2.0, "angle"),
         (Mode.POSITION, -2.0, "angle"),
         (Mode.POSITION, 1.0, "angle_rate"),
+        (Mode.POSITION, 1.5, "angle_rate"),
+        (Mode.POSITION, -1.5, "angle_rate"),
         (Mode.VELOCITY, 6.0, "speed"),
         (Mode.VELOCITY, -4.0, "acceleration"),
+        (Mode.VELOCITY, 5.0, "acceleration"),
         (Mode.TORQUE, 5.0, "torque"),
+        (Mode.TORQUE, 4.0, "torque_rate"),
         (Mode.TORQUE, -3.0, "torque_rate"),
         (Mode.POSITION, 0.01, None),
         (Mode.VELOCITY, 0.5, None),

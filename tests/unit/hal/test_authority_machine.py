@@ -1,0 +1,482 @@
+"""The authority under everything that can happen to it, in any order, against a plain model of what may be.
+
+200 sequences a run; as many as one likes with
+`SNAKESIM_SEQUENCES=10000 python -m pytest -n 2 tests/unit/hal/test_authority_machine.py`.
+"""
+
+import math
+import os
+from typing import Any
+
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
+
+from snakesim_hal import authority as under_test
+from snakesim_hal.authority import Authority, Decision
+from snakesim_hal.lease import Lease
+from snakesim_hal.messages import (
+    Answer,
+    EstopRequest,
+    Fault,
+    JointCommand,
+    LeaseRequest,
+    LifecycleRequest,
+    LifecycleState,
+    Mode,
+)
+from tests.unit.hal.rig import LEASE_NS, PERIOD_NS, command, description, state
+
+SEQUENCES = int(os.environ.get("SNAKESIM_SEQUENCES", "200"))
+PER_TEST = 200
+STEPS = 50
+KEPT = 4  # commands: fewer than in earnest, so that a few are a flood
+JOINTS = 3
+PERIOD_S = PERIOD_NS * 1e-9
+ANGLE, SPEED, ACCELERATION, TORQUE, TORQUE_RATE, FAR = 1.5, 5.0, 100.0, 4.0, 80.0, 0.3  # of the test robot
+STIFFNESS, DAMPING, VELOCITY_GAIN = 40.0, 1.0, 1.0
+TINY = 1e-9
+NAN, INF = float("nan"), float("inf")
+
+HOLDERS = st.sampled_from(["control", "teleop", "mission"])
+NUMBERS = st.floats(-2, 2) | st.floats(-6, 6) | st.sampled_from([0.0, 1e5, -1e5, 5e-324, 1.5, -1.5])
+DEFECTS = ("epoch", "replayed", "future", "stale", "layout", "length", "finite")  # in the order of the gate's checks
+REASONS = {
+    "epoch": "wrong_epoch",
+    "replayed": "replayed",
+    "future": "from_the_future",
+    "stale": "stale",
+    "layout": "wrong_layout",
+    "length": "wrong_length",
+    "finite": "not_finite",
+}
+TIMES_NS = st.sampled_from([0, 1, PERIOD_NS, LEASE_NS - 1, LEASE_NS, LEASE_NS + 1]) | st.integers(0, 3 * LEASE_NS)
+
+
+def per_joint(values: st.SearchStrategy[Any]) -> st.SearchStrategy[list[Any]]:
+    return st.lists(values, min_size=JOINTS, max_size=JOINTS)
+
+
+def often(usual: Any, *others: Any) -> st.SearchStrategy[Any]:
+    return st.sampled_from([usual] * (3 * len(others)) + list(others))
+
+
+def within(value: float, low: float, high: float) -> float:
+    return min(max(value, low), high)
+
+
+class Everything(RuleBasedStateMachine):
+    """Every input of the authority as a rule. What the rules know of it by themselves is the model."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.now_ns = 0
+        self.tick = 0
+        self.sequence = 0
+        self.state: LifecycleState = "disarmed"
+        self.arming = 0
+        self.holder: str | None = None
+        self.epoch = 0
+        self.priority = 0
+        self.expires_ns = 0
+        self.heard: tuple[int, JointCommand] | None = None  # the newest good command of this holder, and when it came
+        self.since_arming: list[JointCommand] = []
+        self.counting: JointCommand | None = None  # of those, what the last tick was decided by
+        self.last_sequence = -1
+        self.measured: tuple[list[float], list[float], list[float]] = ([0.0] * JOINTS, [0.0] * JOINTS, [0.0] * JOINTS)
+        self.known = False  # the joint state is fresh and valid
+        self.offered = 0
+        self.rejected = 0
+        self.faults = 0  # kept since the last clear
+        self.was_armed = False
+        self.hold_at = [0.0] * JOINTS
+        self.last: Decision | None = None
+
+    @initialize(
+        action=st.sampled_from(["passive", "damp", "hold"]),
+        first_epoch=st.sampled_from([0, 1_800_000_000_000]),
+        lag=st.sampled_from([None, None, 0, 1, 2]),
+        at_once=often(True, False),
+    )
+    def begin(self, action: str, first_epoch: int, lag: int | None, at_once: bool) -> None:
+        self.robot = description(safety__action=action)
+        self.action = action
+        self.lag = lag  # in lockstep; None: the newest command counts
+        kept, under_test.COMMANDS_KEPT = under_test.COMMANDS_KEPT, KEPT
+        self.authority = Authority(self.robot, first_epoch=first_epoch)
+        under_test.COMMANDS_KEPT = kept
+        self.epoch = first_epoch
+        if at_once:
+            self.set_up_and_arm(0.1)
+
+    # --- the model ---------------------------------------------------------------------------------------------
+
+    @property
+    def live(self) -> bool:
+        return self.holder is not None and self.now_ns <= self.expires_ns
+
+    def leave_for(self, following: LifecycleState) -> None:
+        if following != self.state:
+            self.was_armed = self.state == "armed"
+            self.hold_at = self.measured[0]
+        if self.state == "armed":
+            self.heard = None
+        self.state = following
+
+    def drop_lease(self) -> None:
+        self.holder = self.heard = None
+        self.last_sequence = -1
+
+    def fail(self) -> None:
+        if self.state != "estop":
+            self.leave_for("fault")
+        self.drop_lease()
+        self.faults = min(self.faults + 1, under_test.MAX_FAULTS_KEPT)
+
+    def check(self, answer: Answer, ok: bool) -> None:
+        assert answer.ok == ok, answer
+        assert answer.reason and answer.epoch == self.epoch and answer.lifecycle == self.state
+
+    # --- what comes in -----------------------------------------------------------------------------------------
+
+    @rule(
+        angle=per_joint(st.floats(-1.7, 1.7)),
+        velocity=per_joint(st.floats(-6, 6)),
+        torque=per_joint(st.floats(-5, 5)),
+        trouble=often(None, "valid", "age", "nan", "inf", "short", "no_valid", "no_age"),
+        joint=st.integers(0, JOINTS - 1),
+    )
+    def observe(
+        self, angle: list[float], velocity: list[float], torque: list[float], trouble: str | None, joint: int
+    ) -> None:
+        valid, age_ns = [True] * JOINTS, [LEASE_NS] * JOINTS
+        shown = list(angle)
+        match trouble:
+            case "valid":
+                valid[joint] = False
+            case "age":
+                age_ns[joint] += 1
+            case "nan" | "inf":
+                shown[joint] = float(trouble)
+            case "short":
+                shown.pop()
+            case "no_valid":
+                valid = []
+            case "no_age":
+                age_ns = []
+            case _:
+                pass
+        self.authority.observe(state(self.robot, shown, velocity, torque, valid=valid, age_ns=age_ns))
+        self.known = trouble is None
+        if trouble in (None, "valid", "age"):  # not good enough to be armed, but the last that is known
+            self.measured = (angle, velocity, torque)
+
+    @rule(
+        who=HOLDERS,
+        action=st.sampled_from(["acquire", "acquire", "renew", "release"]),
+        priority=st.sampled_from([0, 100, 101, 255]),
+        epoch=often(0, -1, 1),
+    )
+    def ask_for_the_lease(self, who: str, action: Any, priority: int, epoch: int) -> None:
+        epoch = max(self.epoch + epoch, 0)
+        mine = self.live and who == self.holder and epoch == self.epoch
+        ok = mine if action != "acquire" else not self.live or priority > self.priority
+        request = LeaseRequest(action=action, holder=who, priority=priority, epoch=epoch)
+        answer = self.authority.on_lease(request, self.now_ns)
+        if ok and action == "renew" and self.state != "armed":
+            self.expires_ns = self.now_ns + LEASE_NS
+        elif ok and action != "renew":
+            self.drop_lease()
+            if self.state == "armed":
+                self.leave_for("disarmed")
+            if action == "acquire":
+                self.holder, self.priority, self.expires_ns = who, priority, self.now_ns + LEASE_NS
+                self.epoch += 1
+        self.check(answer, ok)
+
+    @rule(
+        wanted=per_joint(NUMBERS),
+        mode=per_joint(st.sampled_from(list(Mode))),
+        torque_limit=st.none() | per_joint(st.sampled_from([0.0, 1.0, 3.9, 4.0, 1e5])),
+        near=st.booleans(),
+        defects=st.sets(st.sampled_from(DEFECTS), max_size=2),
+        broken=st.booleans(),
+        arming=often(0, None, -1, 1),
+        back=often(0, 1, 2),
+        times=often(1, 6),
+    )
+    def send_commands(
+        self,
+        wanted: list[float],
+        mode: list[Mode],
+        torque_limit: list[float] | None,
+        near: bool,
+        defects: set[str],
+        broken: bool,
+        arming: int | None,
+        back: int,
+        times: int,
+    ) -> None:
+        """One command, or a flood of them; `back`: ticks between the state that it answers and now."""
+        defects = defects if broken else set()
+        if near:
+            wanted, mode = list(self.measured[0]), [Mode.POSITION] * JOINTS
+        if "length" in defects:
+            wanted = wanted[1:]
+        if "finite" in defects:
+            wanted = [[NAN, INF, -INF][self.sequence % 3], *wanted[1:]]
+        meant = None if arming is None else max(self.arming + arming, 0)
+        for _ in range(times):
+            self.sequence += 1
+            asked = command(
+                self.robot,
+                wanted,
+                mode,
+                tick=self.tick + 1 if "future" in defects else max(self.tick - back, 0),
+                sequence=max(self.last_sequence, 0) if "replayed" in defects else self.sequence,
+                lease_epoch=self.epoch + 1 if "epoch" in defects else self.epoch,
+                layout="of another robot" if "layout" in defects else self.robot.layout,
+                torque_limit_nm=torque_limit,
+                arming=meant,
+            )
+            self.offer(asked, LEASE_NS + 1 if "stale" in defects else LEASE_NS, defects)
+
+    def offer(self, asked: JointCommand, age_ns: int, defects: set[str]) -> None:
+        if "replayed" in defects and self.last_sequence < 0:  # nothing yet that could be replayed
+            defects = defects - {"replayed"}
+        expected = next((REASONS[defect] for defect in DEFECTS if defect in defects), None)
+        if not self.live:
+            expected = "no_lease"
+        counted = self.authority.rejected[expected] if expected else 0
+        refusal = self.authority.offer(asked, now_ns=self.now_ns, tick=self.tick, age_ns=age_ns)
+        self.offered += 1
+        if expected is not None:
+            assert refusal == expected and self.authority.rejected[expected] == counted + 1
+            self.rejected += 1
+            return
+        self.last_sequence = asked.sequence
+        if self.state == "armed" and asked.arming not in (None, self.arming):
+            assert refusal == "before_arming"
+            return
+        assert refusal is None
+        self.expires_ns = self.now_ns + LEASE_NS
+        self.heard = self.now_ns, asked
+        if self.state == "armed":
+            self.since_arming.append(asked)
+
+    @rule(reason=st.sampled_from(["malformed", "unknown_version"]))
+    def send_what_is_no_command(self, reason: str) -> None:
+        counted = self.authority.rejected[reason]
+        self.authority.reject(reason)
+        assert self.authority.rejected[reason] == counted + 1
+        self.offered += 1
+        self.rejected += 1
+
+    @rule(robot=often("worm", "other", None), backend=often("lag", "can", None))
+    def arm(self, robot: str | None, backend: str | None) -> None:
+        ready = self.state == "disarmed" and self.known and self.live and self.heard is not None
+        if ready and self.heard is not None:
+            heard_ns, asked = self.heard
+            ready = self.now_ns - heard_ns <= LEASE_NS and all(
+                mode == Mode.PASSIVE or (mode == Mode.POSITION and abs(target - angle) <= FAR)
+                for mode, target, angle in zip(asked.mode, asked.target, self.measured[0], strict=True)
+            )
+        assert (not self.authority.against_arming(self.now_ns)) == ready
+        ready = ready and robot == "worm" and backend == "lag"
+        request = LifecycleRequest(action="arm", robot=robot, backend=backend)
+        answer = self.authority.on_lifecycle(request, self.now_ns)
+        if ready:
+            self.leave_for("armed")
+            self.arming += 1
+            self.heard = None
+            self.since_arming, self.counting = [], None
+            self.expires_ns = self.now_ns + LEASE_NS
+        self.check(answer, ready)
+
+    @rule(action=st.sampled_from(["disarm", "finish", "clear"]))
+    def ask_for_less(self, action: Any) -> None:
+        ok = action == "finish" or self.state in (("armed", "disarmed") if action == "disarm" else ("fault", "estop"))
+        if action == "clear" and self.state == "disarmed":
+            ok = True
+        answer = self.authority.on_lifecycle(LifecycleRequest(action=action), self.now_ns)
+        if ok and (action != "finish" or self.state == "armed"):
+            self.leave_for("disarmed")
+        if ok and action == "clear":
+            self.faults = 0
+        self.check(answer, ok)
+
+    @rule(who=st.text(min_size=1, max_size=64))
+    def estop(self, who: str) -> None:
+        answer = self.authority.on_estop(EstopRequest(who=who), self.tick)
+        self.leave_for("estop")
+        self.faults = min(self.faults + 1, under_test.MAX_FAULTS_KEPT)
+        self.check(answer, True)
+
+    @rule(cause=st.sampled_from(["joint_2 is hot", "", "x" * 10_000]))
+    def backend_fault(self, cause: str) -> None:
+        self.authority.fault(Fault(tick=self.tick, what="hot", cause=cause))
+        self.fail()
+
+    @rule()
+    def holder_gone(self) -> None:
+        self.authority.holder_gone("the holder is gone")
+        if self.state != "armed":
+            self.drop_lease()
+
+    # --- what a run does when all is well: chance alone would hardly ever arm -----------------------------------
+
+    def stay(self) -> None:
+        """A good command to stay where the joints are."""
+        near, still = [within(angle, -ANGLE, ANGLE) for angle in self.measured[0]], [Mode.POSITION] * JOINTS
+        self.send_commands(near, still, None, False, set(), False, 0, 0, 1)
+
+    @precondition(lambda self: self.state != "armed")
+    @rule(angle=st.floats(-1.6, 1.6))
+    def set_up_and_arm(self, angle: float) -> None:
+        self.observe([angle] * JOINTS, [0.0] * JOINTS, [0.0] * JOINTS, None, 0)
+        if self.state in ("fault", "estop"):
+            self.ask_for_less("clear")
+        if not self.live:
+            self.ask_for_the_lease("control", "acquire", 100, 0)
+        self.stay()
+        self.arm("worm", "lag")
+
+    @precondition(lambda self: self.state == "armed")
+    @rule(
+        wanted=per_joint(NUMBERS),
+        mode=per_joint(st.sampled_from(list(Mode))),
+        torque_limit=st.none() | per_joint(st.sampled_from([0.0, 1.0, 3.9, 4.0, 1e5])),
+        moves=per_joint(st.floats(-0.1, 0.1) | st.floats(-1, 1)),
+        torque=per_joint(st.floats(-5, 5)),
+        ticks=st.integers(1, 6),
+    )
+    def go_on_for_some_ticks(
+        self,
+        wanted: list[float],
+        mode: list[Mode],
+        torque_limit: list[float] | None,
+        moves: list[float],
+        torque: list[float],
+        ticks: int,
+    ) -> None:
+        for _ in range(ticks):
+            angle = [before + moved for before, moved in zip(self.measured[0], moves, strict=True)]
+            self.observe(angle, [moved / PERIOD_S for moved in moves], torque, None, 0)
+            self.send_commands(wanted, mode, torque_limit, False, set(), False, 0, 0, 1)
+            self.end_a_tick(PERIOD_NS)
+
+    # --- time, and what goes out -------------------------------------------------------------------------------
+
+    @rule(passes_ns=TIMES_NS)
+    def time_passes(self, passes_ns: int) -> None:
+        """Between two ticks: requests and commands meet a lease that may be over already."""
+        self.now_ns += passes_ns
+
+    @rule(late_ns=often(PERIOD_NS, LEASE_NS, 0, LEASE_NS + 1) | TIMES_NS)
+    def end_a_tick(self, late_ns: int) -> None:
+        """What a host does at the end of a tick."""
+        self.now_ns += late_ns
+        self.tick += 1
+        if self.state == "armed" and not self.known:
+            self.fail()
+        if self.holder is not None and not self.live:
+            if self.state == "armed":
+                self.fail()
+            else:
+                self.drop_lease()
+        self.authority.expire(self.now_ns, self.tick)
+        up_to = None if self.lag is None else self.tick - self.lag
+        limited = self.authority.limited.total()
+        decision = self.authority.decide(up_to)
+        assert self.authority.limited.total() == limited + len(decision.limited)
+        if self.state != "armed":
+            self.check_safe(decision)
+        else:
+            assert self.live and self.known
+            for sent in self.since_arming[-KEPT:]:
+                self.counting = sent if up_to is None or sent.tick <= up_to else self.counting
+            assert decision.sequence == (None if self.counting is None else self.counting.sequence)
+            if self.counting is None:  # nothing was commanded since the robot was armed
+                self.check_held(decision, self.hold_at)
+            else:
+                self.check_commanded(decision, self.counting)
+        self.last = decision
+
+    def check_safe(self, decision: Decision) -> None:
+        assert decision.sequence is None and not decision.limited
+        action = self.action if self.state == "fault" and self.was_armed else "passive"
+        if action == "hold":
+            self.check_held(decision, self.hold_at)
+            return
+        assert set(decision.set_points.mode) == {Mode.VELOCITY if action == "damp" else Mode.PASSIVE}
+        assert decision.set_points.target == [0.0] * JOINTS
+
+    def check_held(self, decision: Decision, angle_rad: list[float]) -> None:
+        assert set(decision.set_points.mode) == {Mode.POSITION} and not decision.limited
+        assert decision.set_points.target == [within(angle, -ANGLE, ANGLE) for angle in angle_rad]
+        assert decision.set_points.torque_limit_nm == [TORQUE] * JOINTS
+
+    def check_commanded(self, decision: Decision, sent: JointCommand) -> None:
+        assert decision.set_points.mode == sent.mode
+        for i in range(JOINTS):
+            applied = decision.set_points.torque_limit_nm[i]
+            before = TORQUE if self.last is None else self.last.set_points.torque_limit_nm[i]
+            allowed = TORQUE if sent.torque_limit_nm is None else sent.torque_limit_nm[i]
+            assert 0.0 <= applied <= min(TORQUE, allowed) and applied <= before + TORQUE_RATE * PERIOD_S + TINY
+            if sent.mode[i] is not Mode.PASSIVE:
+                self.check_target(i, decision, sent.mode[i], sent.target[i])
+            else:
+                assert decision.set_points.target[i] == 0.0 and i not in decision.limited
+
+    def check_target(self, i: int, decision: Decision, mode: Mode, wanted: float) -> None:
+        """Inside the limits, no faster than allowed, as near to what is wanted as that permits; else named."""
+        angle, velocity, torque = (column[i] for column in self.measured)
+        target = decision.set_points.target[i]
+        if mode is Mode.POSITION:
+            low, high = (within(angle + side * FAR, -ANGLE, ANGLE) for side in (-1, 1))
+            step, start = SPEED * PERIOD_S, angle + (torque + DAMPING * velocity) / STIFFNESS
+        elif mode is Mode.VELOCITY:
+            low, high = -SPEED, SPEED
+            step, start = ACCELERATION * PERIOD_S, velocity + torque / VELOCITY_GAIN
+        else:
+            high = decision.set_points.torque_limit_nm[i]
+            low = -high
+            step, start = TORQUE_RATE * PERIOD_S, torque
+        if self.last is not None and self.last.set_points.mode[i] is mode:
+            start = self.last.set_points.target[i]
+        assert math.isfinite(target) and low <= target <= high
+        assert abs(target - start) <= step + TINY or target in (low, high)  # the limits themselves outrank the rate
+        assert abs(target - within(within(wanted, start - step, start + step), low, high)) <= TINY
+        assert (i in decision.limited) == (target != wanted)
+
+    @invariant()
+    def it_is_as_the_model_says(self) -> None:
+        if not hasattr(self, "authority"):
+            return
+        found = self.authority
+        assert found.state == self.state, f"{found.state}, not {self.state}: {found.why}"
+        assert found.arming == self.arming
+        expected = Lease(self.holder, self.epoch, self.priority, self.expires_ns) if self.holder else Lease()
+        assert found.lease.epoch == self.epoch  # the model's only ever grows
+        assert (found.lease.holder, found.lease.live(self.now_ns)) == (self.holder, self.live)
+        assert not self.holder or found.lease == expected
+        assert found.why and len(found.why) <= 500
+        assert len(found.faults) == self.faults and all(len(fault.cause) <= 500 for fault in found.faults)
+        assert found.rejected.total() == self.rejected
+        assert found.accepted == len(self.since_arming) or found.arming > 1
+        assert found.accepted + found.standby + found.rejected.total() == self.offered
+
+
+@pytest.mark.parametrize("batch", range(-(-SEQUENCES // PER_TEST)))
+def test_whatever_happens_the_robot_does_only_what_it_may(batch: int) -> None:
+    """In batches, because hypothesis keeps every sequence of a test in memory."""
+    tried = settings(max_examples=min(SEQUENCES, PER_TEST), stateful_step_count=STEPS)
+    run_state_machine_as_test(Everything, settings=tried)
