@@ -38,7 +38,7 @@ test-vcan: $(stamp) ## Run the CAN tests on real SocketCAN, in a small VM where 
 	SNAKESIM_NEED_VCAN=1 $(bin)/python deploy/vm/with_vcan.py -- sh -c '$(on_vcan) || exec $(on_vcan) --last-failed'
 
 # An emulated machine stumbles when its host is busy: what failed there is tried once more.
-on_vcan = $(bin)/python -m pytest tests/vcan tests/contract -m "not slow" $(ARGS)
+on_vcan = $(bin)/python -m pytest tests/vcan tests/contract -m "not slow" --timeout 600 $(ARGS)
 
 mutation: $(stamp) ## Break the safety core one change at a time; every break must be noticed
 	$(bin)/python -m tests.mutation --workers $(WORKERS) $(ARGS)
