@@ -113,7 +113,7 @@ class CanBackend:
         """Send Sync, and take what the modules sampled at it. Who is late is waited for only so long."""
         self._must_be_open()
         self._tick = tick
-        self._sync(stamp_ns // 1000 if self._lockstep else time.monotonic_ns() // 1000)
+        self._sync(stamp_ns)
         return self._sensors.sample(tick, stamp_ns)
 
     def enact(self, set_points: SetPoints, lifecycle: LifecycleState) -> None:
@@ -245,7 +245,7 @@ class CanBackend:
             if all(module.faults or module.state != ModuleState.FAULT for module in self._reading.modules):
                 break
             time.sleep(FIRST_STATE_PAUSE_S)
-            self._sync(0 if self._lockstep else time.monotonic_ns() // 1000)
+            self._sync(stamp_ns=0)
         for module, wire in zip(self._reading.modules, self._wire_of, strict=True):
             faults = module.fault_names()
             if module.state == ModuleState.FAULT and faults and set(faults) <= LEFT_BEHIND:
@@ -263,17 +263,18 @@ class CanBackend:
         self._unconfigured.clear()
 
     def _await_first_states(self, names: list[str]) -> None:
+        self._answer_limit_s = LOCKSTEP_ANSWER_S if self._lockstep else FIRST_STATE_PAUSE_S
         for _ in range(FIRST_STATE_SYNCS):
-            self._answer_limit_s = FIRST_STATE_PAUSE_S if not self._lockstep else LOCKSTEP_ANSWER_S
-            self._sync(0 if self._lockstep else time.monotonic_ns() // 1000)
+            self._sync(stamp_ns=0)
             if all(module.sync >= 0 for module in self._reading.modules):
                 self._reading.strangers.clear()
                 return
         silent = [name for name, module in zip(names, self._reading.modules, strict=True) if module.sync < 0]
         raise BackendError(f"{', '.join(silent)} did not answer {FIRST_STATE_SYNCS} Syncs; nothing was enabled")
 
-    def _sync(self, time_us: int) -> None:
+    def _sync(self, stamp_ns: int) -> None:
         reading = self._reading
+        time_us = (stamp_ns if self._lockstep else time.monotonic_ns()) // 1000
         self._receive()
         reading.begin(reading.sync + 1, contacts=contacts_due(self._reports, reading.sync + 1), tail=self._reports.tail)
         frame = commands.sync(reading.sync, time_us)

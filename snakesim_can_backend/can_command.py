@@ -9,8 +9,10 @@ from snakesim_can_backend.bring_up import Bus, Identity, find
 from snakesim_can_backend.bus_load import (
     LEAST_RATE_HZ,
     MOST_LOAD,
+    Reports,
     arithmetic,
     busiest_s,
+    fits,
     load,
     on_bus,
     reports_at,
@@ -76,9 +78,9 @@ def _load(arguments: argparse.Namespace) -> int:
     loaded = load_scenario(arguments.scenario, overrides)
     settings = settings_of(loaded)
     if arguments.joints is None and arguments.rates is None:
-        lines, fits = one(loaded.config, settings)
+        lines, all_fit = one(loaded.config, settings)
         print("\n".join(lines))
-        return OK if fits else FAILED
+        return OK if all_fit else FAILED
     config = loaded.config
     print("\n".join(table(config, settings, arguments.joints or [config.robot.chain.modules], arguments.rates)))
     return OK
@@ -101,8 +103,8 @@ def one(config: RunConfig, settings: Settings) -> tuple[list[str], bool]:
         busiest_ms = 1e3 * busiest_s(count, on_bus(i, reports))
         lines += [f"{name}: {count} joints at {config.rate_hz:g} Hz", arithmetic(count, on_bus(i, reports))]
         lines.append(f"  Sync, answers, forces and set-points of one period: {busiest_ms:.2f} of {period_ms:.2f} ms")
-    fits = all(load(count, on_bus(i, reports)) <= MOST_LOAD for i, count in enumerate(joints))
-    return (lines if fits else [*lines, f"Refused. {what_fits(joints, config, settings)}"]), fits
+    all_fit = all(fits(count, on_bus(i, reports)) for i, count in enumerate(joints))
+    return (lines if all_fit else [*lines, f"Refused. {what_fits(joints, config, settings)}"]), all_fit
 
 
 def table(
@@ -113,14 +115,14 @@ def table(
     rates = rates_hz or [config.rate_hz]
     yield "joints" + "".join(f"{f'{rate:g} Hz':>16}" for rate in rates)
     for count in joints:
-        loads = [load(ceil(count / buses), reports_at(rate, config, settings)) for rate in rates]
-        yield f"{count:6}" + "".join(f"{_cell(share):>16}" for share in loads)
+        cells = [_cell(ceil(count / buses), reports_at(rate, config, settings)) for rate in rates]
+        yield f"{count:6}" + "".join(f"{cell:>16}" for cell in cells)
     on = "one bus" if buses == 1 else f"the fullest of {buses} buses"
-    yield f"Worst-case load of {on}, 1 Mbit/s; above {MOST_LOAD:.0%} it is refused."
+    yield f"Worst-case load of {on}, 1 Mbit/s; above {MOST_LOAD:.0%}, or with a period that is too full, it is refused."
 
 
-def _cell(share: float) -> str:
-    return f"{100 * share:.1f} %" + ("" if share <= MOST_LOAD else " refused")
+def _cell(joints: int, reports: Reports) -> str:
+    return f"{100 * load(joints, reports):.1f} %" + ("" if fits(joints, reports) else " refused")
 
 
 # --- scan --------------------------------------------------------------------------------------------------

@@ -34,7 +34,7 @@ LATE_SYNCS = 3  # a state this many Syncs late is still taken, with its age; old
 COUNT_AT, STATE_AT = 3, 4  # in what `_read_state` gives
 UNTOUCHED = b""
 STATES = [ModuleState(i) if i < len(ModuleState) else ModuleState.FAULT for i in range(16)]  # what is unknown is bad
-LATCHED = (ModuleState.FAULT, ModuleState.EMERGENCY)
+STOPPED = (ModuleState.FAULT, ModuleState.EMERGENCY)  # until a Clear
 
 
 @dataclass
@@ -63,7 +63,7 @@ class Module:
     @property
     def needs_clearing(self) -> bool:
         """Whether it is in a latched state, and its heartbeat had the time to say why."""
-        return self.state in LATCHED and (bool(self.faults) or self.stopped_syncs >= TOLD_WITHIN)
+        return self.state in STOPPED and (bool(self.faults) or self.stopped_syncs >= TOLD_WITHIN)
 
     def answered_twice(self, sync: int) -> int:
         """Syncs in a row, up to now, that were answered more than once."""
@@ -104,6 +104,8 @@ class Reading:
         names = ("voltage", "current", "motor_temperature", "board_temperature", "leak")
         self._read_health = layouts[Opcode.HEALTH].reader(*names)
         self._read_shaft = layouts[Opcode.SHAFT_LOAD].reader("torque")
+        command = layouts[Opcode.COMMAND]
+        self._read_action, self._command_length = command.reader("action"), command.length
         faults = [f"fault_{fault.name.lower()}" for fault in ModuleFault]
         self._read_heartbeat = layouts[Opcode.HEARTBEAT].reader("state", "last_stop", "uptime", *faults)
         takers = {
@@ -166,10 +168,8 @@ class Reading:
 
     def _only_asks(self, frame: Frame) -> bool:
         """Whether somebody merely wants to know who is there."""
-        command = codec()[Opcode.COMMAND]
-        if opcode_of(frame.id) != Opcode.COMMAND or len(frame.data) != command.length:
-            return False
-        return command.reader("action")(frame.data) == [Action.IDENTIFY]
+        is_command = opcode_of(frame.id) == Opcode.COMMAND and len(frame.data) == self._command_length
+        return is_command and self._read_action(frame.data) == [Action.IDENTIFY]
 
     def forget_frames(self) -> None:
         """Frames counted so far do not belong to one period."""
@@ -222,7 +222,7 @@ class Reading:
         module.corrupt = module.wrong_counts = 0
         module.sync = sync
         module.state = STATES[numbers[STATE_AT]]
-        module.stopped_syncs = module.stopped_syncs + 1 if module.state in LATCHED else 0
+        module.stopped_syncs = module.stopped_syncs + 1 if module.state in STOPPED else 0
         self._joint[module.node - 1] = numbers
         if late == 0:
             self.states_missing -= module.awaited

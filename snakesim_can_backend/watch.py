@@ -37,6 +37,11 @@ class Finding:
     cause: str
     joint: int | None = None  # index, tail to head
 
+    @property
+    def subject(self) -> tuple[str, int | str]:
+        """Two findings with the same are told once."""
+        return self.what, self.cause if self.joint is None else self.joint
+
 
 class Watch:
     """Remembers what has been told."""
@@ -45,7 +50,7 @@ class Watch:
         """joints, channel_of: name and bus of every joint, tail to head."""
         self._names, self._channels = joints, channel_of
         self._period_s, self._lease_s = period_s, lease_s
-        self._told: set[tuple[str, int | str | None]] = set()
+        self._told: set[tuple[str, int | str]] = set()
         self._restarts = [0] * len(joints)
         self._unarmed = [0] * len(joints)  # Syncs in a row that found a module not armed, while the robot was
         self._restart_at: dict[int, int] = {}  # joint -> Sync at which its uptime went back
@@ -89,8 +94,8 @@ class Watch:
             found += self._of_module(i, module, reading, lifecycle)
         if lifecycle == "armed":
             found += [self._bare(i) for i in unconfigured]
-        fresh = [f for f in found if (f.what, f.joint if f.joint is not None else f.cause) not in self._told]
-        self._told.update((f.what, f.joint if f.joint is not None else f.cause) for f in fresh)
+        fresh = [finding for finding in found if finding.subject not in self._told]
+        self._told.update(finding.subject for finding in fresh)
         return fresh
 
     def take_changed(self) -> set[int]:

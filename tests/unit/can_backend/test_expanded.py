@@ -5,7 +5,7 @@ import subprocess
 import sys
 
 import cantools
-from cantools.database.can import Database
+from cantools.database.can import Database, Message
 
 from snakesim_can_backend import commands
 from snakesim_can_backend.codec import codec, dbc_path, load_database
@@ -61,37 +61,18 @@ def test_signals_are_the_same_for_every_node() -> None:
     for message in published().messages:
         original = source[message.name.partition("_")[0]]
         assert message.length == original.length and message.senders == original.senders
-        assert {
-            s.name: (
-                s.start,
-                s.length,
-                s.is_signed,
-                s.conversion.scale,
-                s.conversion.offset,
-                s.conversion.is_float,
-                s.unit,
-                s.minimum,
-                s.maximum,
-                s.choices,
-                s.multiplexer_ids,
-            )
-            for s in message.signals
-        } == {
-            s.name: (
-                s.start,
-                s.length,
-                s.is_signed,
-                s.conversion.scale,
-                s.conversion.offset,
-                s.conversion.is_float,
-                s.unit,
-                s.minimum,
-                s.maximum,
-                s.choices,
-                s.multiplexer_ids,
-            )
-            for s in original.signals
-        }
+        assert layout_of(message) == layout_of(original)
+
+
+def layout_of(message: Message) -> dict[str, tuple[object, ...]]:
+    """Everything that a decoder needs of each signal."""
+    return {
+        s.name: (
+            *(s.start, s.length, s.is_signed, s.conversion.scale, s.conversion.offset, s.conversion.is_float),
+            *(s.unit, s.minimum, s.maximum, s.choices, s.multiplexer_ids),
+        )
+        for s in message.signals
+    }
 
 
 def sent() -> list[tuple[Frame, str]]:
