@@ -234,6 +234,8 @@ class CanBackend:
         if wrong:
             raise BackendError("the robot is not whole; nothing was enabled:\n  " + "\n  ".join(wrong))
         self._ours = True
+        emulated = all(identity.emulated for identity in found)
+        self._description = msgspec.structs.replace(self._description, emulated=emulated)
         self._broadcast(commands.command(Action.DISARM))
         self._configure(limit_s)
         self._await_first_states(names)

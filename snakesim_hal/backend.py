@@ -6,13 +6,14 @@ when to let a period pass. It never sees Zenoh or leases: the host does those, f
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import msgspec
 
 from snakesim_hal.messages import Description, Fault, JointState, LifecycleState, Message, Mode, Pace
 
 if TYPE_CHECKING:
+    from snakesim_hal.injection import Injection
     from snakesim_hal.scenario import RunConfig
 
 
@@ -62,6 +63,15 @@ class Backend(Protocol):
 
     def close(self) -> None:
         """Make the joints safe and let go of everything. Called once, also after an error."""
+        ...
+
+
+@runtime_checkable
+class Injectable(Protocol):
+    """A backend that can let things go wrong by itself, more truly than the host could for it."""
+
+    def inject(self, injection: "Injection", *, begins: bool) -> bool:
+        """Begin or end a fault on request; False when this backend knows no such fault. Raises ConfigError."""
         ...
 
 

@@ -17,6 +17,7 @@ APPLIED = "hal/applied"
 LEASE = "hal/lease"
 LIFECYCLE = "hal/lifecycle"
 ESTOP = "hal/estop"
+FAULT_ALL = "fault/*"
 DONE_ALL = "hal/done/*"
 WORLD = "guidance/world"
 TRAJECTORY = "navigation/trajectory"
@@ -50,6 +51,7 @@ SPACE: tuple[Row, ...] = (
     Row(LEASE, m.LeaseRequest, "any", "query", "acquire, renew, release the right to command; replies Answer"),
     Row(LIFECYCLE, m.LifecycleRequest, "any", "query", "arm, disarm, clear, finish; replies Answer"),
     Row(ESTOP, m.EstopRequest, "any", "query", "stop now, needs no lease, latched; replies Answer"),
+    Row(FAULT_ALL, m.FaultRequest, "any", "query", "let something go wrong, where that is allowed; replies Answer"),
     Row(DONE_ALL, m.Done, "each service", "stream", "lockstep: all that is owed for a tick is published"),
     Row(WORLD, m.World, "guidance", "stream", "body pose, contacts and obstacles in the world"),
     Row(TRAJECTORY, m.Trajectory, "navigation", "stream", "path, speed, push-points ahead"),
@@ -64,6 +66,11 @@ MESSAGE_AT: dict[str, type[m.Message]] = {row.key: row.message for row in SPACE 
 def done(service: str) -> str:
     """Key on which `service` reports a lockstep tick as done."""
     return f"hal/done/{service}"
+
+
+def fault(part: str) -> str:
+    """Key on which a part of a run takes requests for faults."""
+    return f"fault/{part}"
 
 
 def alive(service: str) -> str:
@@ -82,6 +89,8 @@ def message_at(key: str) -> type[m.Message] | None:
         return MESSAGE_AT[key]
     if key.startswith("hal/done/") and key.count("/") == 2:
         return m.Done
+    if key.startswith("fault/") and key.count("/") == 1:
+        return m.FaultRequest
     return None
 
 

@@ -201,6 +201,7 @@ class Description(Message, frozen=True, kw_only=True):
     lease_ns: q.Nanoseconds
     max_step_rad: Annotated[float, Meta(gt=0, le=10)]  # a position target further from the measured is limited
     safe_action: SafeAction
+    emulated: bool = False  # nothing real moves: a simulator, or emulated modules; faults on request are allowed
     joints: Annotated[list[JointDescription], Meta(min_length=1, max_length=q.MAX_JOINTS)]
     links: Annotated[list[LinkDescription], Meta(min_length=2, max_length=q.MAX_JOINTS + 1)]
     sensors: Annotated[list[SensorDescription], Meta(max_length=32)]
@@ -237,6 +238,9 @@ class Status(Message, frozen=True, kw_only=True):
     waiting_for: Annotated[list[q.Name], Meta(max_length=64)]
     overruns: q.Tick
     ready_to_arm: bool
+    injected: Annotated[list[q.Reason], Meta(max_length=64)] = []  # faults on request that are on now
+    hygiene: Annotated[list[q.Reason], Meta(max_length=16)] = []  # real-time measures that the system refused
+    derated: Annotated[dict[q.Name, q.Fraction], Meta(max_length=q.MAX_JOINTS)] = {}  # joint -> torque it has left
 
 
 class LeaseRequest(Message, frozen=True, kw_only=True):
@@ -254,6 +258,7 @@ class LifecycleRequest(Message, frozen=True, kw_only=True):
     action: Literal["arm", "disarm", "clear", "finish"]
     robot: q.Name | None = None
     backend: q.Name | None = None
+    config_hash: q.Name | None = None  # of the description that whoever arms has read
 
 
 class EstopRequest(Message, frozen=True, kw_only=True):
@@ -262,11 +267,22 @@ class EstopRequest(Message, frozen=True, kw_only=True):
     who: q.Name
 
 
+class FaultRequest(Message, frozen=True, kw_only=True):
+    """Query payload on `fault/<part>`: let something go wrong now, or end it. Only runs that allow faults do it."""
+
+    kind: q.Name
+    target: q.Name
+    for_s: Annotated[float, Meta(gt=0, le=86400)] | None = None  # None: until it is ended
+    amount: q.Scalar | None = None
+    end: bool = False
+
+
 class Answer(Message, frozen=True, kw_only=True):
     """Reply to every query: whether it was done, and if not, why not."""
 
     ok: bool
     reason: q.Reason
+    refusal: q.Name | None = None  # a short word to decide by: lease_held, not_ready, wrong_state, not_allowed, ...
     epoch: q.Tick = 0
     lifecycle: LifecycleState = "disarmed"
 
@@ -376,6 +392,7 @@ VERSIONS: dict[type[Message], int] = dict.fromkeys(
         LeaseRequest,
         LifecycleRequest,
         EstopRequest,
+        FaultRequest,
         Answer,
         Done,
         World,

@@ -150,8 +150,10 @@ class RobotFile(FileStruct, frozen=True, kw_only=True):
         return [0.5] + [1.0] * (self.chain.modules - 1) + [0.5]
 
 
-def describe(robot: RobotFile, *, backend: str, period_ns: int, lease_ns: int, config_hash: str) -> Description:
-    """The description that the HAL publishes, from a robot file."""
+def describe(
+    robot: RobotFile, *, backend: str, period_ns: int, lease_ns: int, config_hash: str, emulated: bool = False
+) -> Description:
+    """The description that the HAL publishes, from a robot file. emulated: nothing real moves."""
     axes = robot.axes
     joints = [
         JointDescription(
@@ -191,6 +193,7 @@ def describe(robot: RobotFile, *, backend: str, period_ns: int, lease_ns: int, c
         lease_ns=lease_ns,
         max_step_rad=robot.safety.max_step_rad,
         safe_action=robot.safety.action,
+        emulated=emulated,
         joints=joints,
         links=links,
         sensors=sensors,

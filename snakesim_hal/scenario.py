@@ -76,6 +76,8 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
     rate_hz: Annotated[float, Meta(ge=20, le=5000, extra_json_schema={"unit": "Hz"})] = 100.0
     duration_s: Annotated[float, Meta(gt=0, le=86400, extra_json_schema={"unit": "s"})] = 10.0
     seed: Annotated[int, Meta(ge=0, le=2**31)] = 1
+    faults: list[str] = []  # what goes wrong on request, at times since the first arming: see snakesim_hal.injection
+    faults_allowed: bool = False  # also where something real moves
     stall_limit_s: Annotated[float, Meta(gt=0, le=600, extra_json_schema={"unit": "s"})] = 10.0
     start: Start = Start()
     mission: Mission = Mission()

@@ -42,6 +42,7 @@ class SimBackend:
             period_ns=config.period_ns,
             lease_ns=config.lease_ns,
             config_hash=config_hash(config),
+            emulated=True,
         )
         log_warnings()
         self._sim = build(config, settings)
