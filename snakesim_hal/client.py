@@ -77,6 +77,7 @@ class Client:
         self._publishers: dict[str, Publisher[Any]] = {}
         self._done: Publisher[Done] | None = None
         self._clock: Clock | None = None
+        self._ahead: Clock | None = None  # taken from the queue, and not due yet
         self.commanded_tick = -1
         session.on_arrival(keys.CLOCK, self._take_clock)
         self._descriptions = session.latched_reader(keys.DESCRIPTION, Description)
@@ -105,9 +106,7 @@ class Client:
         """Every due tick in lockstep; the newest one otherwise. None after each `silence_s` without any clock."""
         while True:
             try:
-                clock = self._clocks.get(timeout=silence_s)
-                while clock.pace != "lockstep" and not self._clocks.empty():
-                    clock = self._clocks.get()
+                clock = self._next_clock(silence_s)
             except Empty:
                 if silence_s is None or time.monotonic() - self._heard_at >= silence_s:
                     yield None
@@ -115,10 +114,22 @@ class Client:
             if self._clock is not None and clock.tick < self._clock.tick:
                 for feed in self._feeds.values():
                     feed.clear()
-            self._clock = clock
+            self._clock, self.commanded_tick = clock, -1
             for feed in self._feeds.values():
                 feed.take_in()
             yield clock
+
+    def _next_clock(self, timeout_s: float | None) -> Clock:
+        """The next due clock; in lockstep the newest of its tick, which is shown again while time stands still."""
+        clock = self._ahead or self._clocks.get(timeout=timeout_s)
+        self._ahead = None
+        while not self._clocks.empty():
+            following = self._clocks.get()
+            if clock.pace == "lockstep" and following.tick != clock.tick:
+                self._ahead = following
+                break
+            clock = following
+        return clock
 
     def _take_clock(self, arrival: Arrival) -> None:
         """Runs in Zenoh's thread: wakes the service only for ticks that are its own."""

@@ -1,0 +1,81 @@
+"""What a service sees of the clock."""
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+
+import pytest
+
+from snakesim_hal import keys
+from snakesim_hal.client import Client
+from snakesim_hal.messages import Clock, Done, Pace
+from snakesim_hal.session import Link, Session, open_session
+from tests.e2e.command import free_endpoint, wait_until
+
+
+def clock(tick: int, *, arming: int = 0, pace: Pace = "lockstep") -> Clock:
+    return Clock(
+        tick=tick,
+        stamp_ns=tick * 10**7,
+        period_ns=10**7,
+        pace=pace,
+        lifecycle="armed" if arming else "disarmed",
+        arming=arming,
+        lease_epoch=1,
+        newest={},
+    )
+
+
+@pytest.fixture
+def sessions() -> Iterator[tuple[Session, Session]]:
+    with ExitStack() as stack:
+        endpoint = free_endpoint()
+        host = stack.enter_context(open_session(Link(endpoint, "robot", listen=True)))
+        yield host, stack.enter_context(open_session(Link(endpoint, "robot")))
+
+
+def shown(sessions: tuple[Session, Session], clocks: list[Clock]) -> Iterator[Clock | None]:
+    """The ticks of a service that was busy while all these clocks came."""
+    host, service = sessions
+    client = Client(service, "control")
+    publisher = host.publisher(keys.CLOCK, Clock, lossless=True)
+    wait_until(publisher.heard, "the service listens", 5.0)
+    for each in clocks:
+        publisher.put(each)
+    wait_until(lambda: client._clocks.qsize() == len(clocks), "all clocks there", 5.0)
+    return client.ticks(0.05)
+
+
+def test_in_lockstep_a_tick_that_was_shown_many_times_is_answered_once_as_it_is_now(
+    sessions: tuple[Session, Session],
+) -> None:
+    ticks = shown(sessions, [clock(0)] * 50 + [clock(0, arming=1), clock(1, arming=1), clock(2, arming=1)])
+    assert [(c.tick, c.arming) if c is not None else None for c in (next(ticks) for _ in range(4))] == [
+        *((0, 1), (1, 1), (2, 1)),
+        None,
+    ]
+
+
+def test_in_real_time_only_the_newest_counts(sessions: tuple[Session, Session]) -> None:
+    ticks = shown(sessions, [clock(tick, pace="realtime") for tick in range(5)])
+    newest, nothing = next(ticks), next(ticks)
+    assert newest is not None and newest.tick == 4 and nothing is None
+
+
+def test_a_tick_that_was_commanded_before_is_reported_done_when_it_is_shown_again(
+    sessions: tuple[Session, Session],
+) -> None:
+    host, service = sessions
+    client = Client(service, "control")
+    reports = host.reader(keys.done("control"), Done)
+    publisher = host.publisher(keys.CLOCK, Clock, lossless=True)
+    wait_until(publisher.heard, "the service listens", 5.0)
+    ticks = client.ticks(5.0)
+    for arming in (0, 1):
+        publisher.put(clock(0, arming=arming))
+        assert next(ticks) is not None
+        if arming == 0:
+            client.commanded_tick = 0
+        client.done(0)
+    told: list[Done] = []
+    wait_until(lambda: told.extend(reports.drain()) is None and bool(told), "the tick reported done", 5.0)
+    assert told == [Done(tick=0)]
