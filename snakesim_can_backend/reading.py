@@ -53,8 +53,9 @@ class Module:
     frames: int = 0  # in this tick
     awaited: bool = True  # whether it answered of late
     uptime_ms: int = -1
+    uptime_before_ms: int = -1
     went_back: bool = False  # its uptime, in the newest heartbeat
-    restarts: int = 0  # uptimes that went back, and went on from there
+    restarts: int = 0  # uptimes that went back, and went on from there; one that came late goes on from before
     faults: int = 0  # bits, from the newest heartbeat
     last_stop: LastStop = LastStop.NONE
     heartbeat_sync: int = -1
@@ -246,10 +247,11 @@ class Reading:
 
     def _take_heartbeat(self, module: Module, frame: Frame) -> None:
         state, last_stop, uptime_ms, *bits = self._read_heartbeat(frame.data)
-        if module.went_back and 0 <= uptime_ms - module.uptime_ms < ONE_CLOCK_MS:
+        goes_on = 0 <= uptime_ms - module.uptime_ms < ONE_CLOCK_MS
+        if module.went_back and goes_on and uptime_ms < module.uptime_before_ms:
             module.restarts += 1
         module.went_back = uptime_ms < module.uptime_ms
-        module.uptime_ms = uptime_ms
+        module.uptime_before_ms, module.uptime_ms = module.uptime_ms, uptime_ms
         module.heartbeat_sync = self.sync
         module.faults = sum(bit << i for i, bit in enumerate(bits))
         module.last_stop = LastStop(last_stop) if last_stop < len(LastStop) else LastStop.NONE

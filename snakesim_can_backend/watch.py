@@ -147,7 +147,8 @@ class Watch:
                 f"reports {words}; it stopped because of {module.last_stop.name.lower()}",
             )
         elif self._refuses_to_arm(i, module, reading, missed):
-            tell("module_not_armed", f"does not arm: it is {module.state.name.lower()}")
+            how = "is not armed any more" if i in self._was_armed else "does not arm"
+            tell("module_not_armed", f"{how}: it is {module.state.name.lower()}")
         return found
 
     def _has_restarted(self, i: int, module: Module, reading: Reading) -> bool:
@@ -168,7 +169,8 @@ class Watch:
         late = reading.sync - self._armed_sync > ARM_GRACE or i in self._was_armed
         apart = late and missed == 0 and module.state != ModuleState.ARMED and not module.answered_twice(reading.sync)
         self._unarmed[i] = self._unarmed[i] + 1 if apart else 0
-        return self._unarmed[i] >= IN_A_ROW
+        fell_back = i in self._was_armed and module.state in (ModuleState.BOOT, ModuleState.DISARMED)
+        return self._unarmed[i] >= (1 if fell_back else IN_A_ROW)
 
     def _bare(self, i: int) -> Finding:
         cause = (

@@ -337,6 +337,13 @@ def test_two_clocks_in_turn_are_two_modules_and_no_restart() -> None:
     assert made.modules[1].restarts == 0
 
 
+def test_a_heartbeat_that_comes_late_is_no_restart() -> None:
+    made = reading()
+    for uptime_s in (5.0, 5.2, 5.1, 5.3, 5.4):
+        made.take(heartbeat(2, uptime_s))
+    assert made.modules[1].restarts == 0
+
+
 def test_a_heartbeat_tells_state_faults_and_reason() -> None:
     made = reading()
     made.take(heartbeat(2, 1.0, ModuleState.FAULT, last_stop=LastStop.LEAK, fault_leak=1, fault_voltage=1))

@@ -289,6 +289,14 @@ def test_who_arms_within_the_grace_or_misses_a_moment_is_let_be() -> None:
     assert bench.ticks(10) == []
 
 
+def test_who_was_armed_and_says_that_it_is_not_is_told_at_once() -> None:
+    bench = Bench()
+    bench.lifecycle, bench.state = "armed", ModuleState.ARMED
+    assert bench.ticks(20) == []
+    found = bench.tick(lambda reading: answer(reading, [2], state=ModuleState.DISARMED))
+    assert found == [Finding("module_not_armed", WHO + "is not armed any more: it is disarmed", 1)]
+
+
 def test_the_grace_begins_with_every_arming() -> None:
     bench = Bench()
     bench.lifecycle, bench.state = "armed", ModuleState.ARMED
