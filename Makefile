@@ -8,6 +8,8 @@ PYTHON ?=
 ARGS ?=
 UPGRADE ?=
 WORKERS ?= 2
+PAYLOADS ?= 1000000
+MINUTES ?= 30
 
 # A sourced ROS workspace sets these; its packages and pytest plugins must not leak into ours.
 unexport PYTHONPATH PYTHONHOME PYTHONSTARTUP PYTEST_ADDOPTS VIRTUAL_ENV
@@ -19,7 +21,7 @@ packages := $(wildcard snakesim_*)
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test test-here test-vcan mutation check bench schemas docs lock clean FORCE
+.PHONY: help setup demo test test-here test-vcan faults mutation fuzz soak check bench schemas docs lock clean FORCE
 
 help: ## List these targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' Makefile
@@ -40,8 +42,18 @@ test-vcan: $(stamp) ## Run the CAN tests on real SocketCAN, in a small VM where 
 # An emulated machine stumbles when its host is busy: what failed there is tried once more.
 on_vcan = $(bin)/python -m pytest tests/vcan tests/contract -m "not slow" --timeout 600 $(ARGS)
 
+faults: $(stamp) ## Measure the fault table and write docs/faults.md (ARGS="--rows NAME --trials 3")
+	$(bin)/python -m tests.faults --write $(ARGS)
+
 mutation: $(stamp) ## Break the safety core one change at a time; every break must be noticed
 	$(bin)/python -m tests.mutation --workers $(WORKERS) $(ARGS)
+
+fuzz: $(stamp) ## Bad payloads into every decoder, then over the network of a robot that runs (PAYLOADS=1000000)
+	$(bin)/python -m tests.fuzz --payloads $(PAYLOADS) $(ARGS)
+	$(bin)/python -m tests.fuzz --payloads $(PAYLOADS) --network $(ARGS)
+
+soak: $(stamp) ## A long run with faults at random, and an operator who mends (MINUTES=30, ARGS="--backend can --seed 2")
+	$(bin)/python -m tests.soak --minutes $(MINUTES) $(ARGS)
 
 check: $(stamp) ## Lint, format, types and import rules, without changing anything
 	$(bin)/ruff check

@@ -17,16 +17,18 @@ from snakesim_can_backend.bring_up import Bus, configure, find, objections
 from snakesim_can_backend.bus_load import BIT_RATE, Reports, check_load, reports_of, shares, worst_bits
 from snakesim_can_backend.log import LoggedWire, open_log
 from snakesim_can_backend.mocap import MocapReceiver
-from snakesim_can_backend.own_twins import TwinProcess, check_twins, twins_here
+from snakesim_can_backend.own_twins import TwinProcess, check_faults, check_twins, modules_know, twins_here
 from snakesim_can_backend.parameters import check_ratings, check_watchdog, parameters_of
 from snakesim_can_backend.protocol import Action, Frame, ModuleState
 from snakesim_can_backend.reading import Reading
 from snakesim_can_backend.sensors import Sensors, contacts_due, described
 from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.trouble import Trouble
 from snakesim_can_backend.watch import ARM_GRACE, Watch
-from snakesim_can_backend.wire import SocketCanWire, Trouble, VirtualWire, Wire, check_interface, wait
+from snakesim_can_backend.wire import OtherEnd, SocketCanWire, VirtualWire, Wire, check_interface, wait
 from snakesim_hal.backend import Samples, SetPoints
-from snakesim_hal.errors import BackendError
+from snakesim_hal.errors import BackendError, ConfigError
+from snakesim_hal.injection import Injection
 from snakesim_hal.messages import Description, Fault, LifecycleState, Pace
 from snakesim_hal.motor import check_gains
 from snakesim_hal.robot import describe
@@ -66,6 +68,7 @@ class CanBackend:
         check_ratings(config.robot)
         check_watchdog(config, settings)
         check_twins(config, settings)
+        check_faults(config, settings)
         for channel in settings.channels:
             check_interface(channel)
         return ("realtime",) if settings.twins_run == "none" else ("lockstep", "realtime")
@@ -79,6 +82,7 @@ class CanBackend:
         joints = config.robot.chain.modules
         self._mocap: MocapReceiver | None = None
         self._twins: TwinProcess | None = None
+        self._here: OtherEnd | None = None
         self._wires: list[Wire] = []
         self._open = True
         self._ours = False  # whether the modules are: before that is known, nothing that disturbs them is sent
@@ -168,6 +172,19 @@ class CanBackend:
             for finding in found
         ]
 
+    def inject(self, injection: Injection, *, begins: bool) -> bool:
+        """Own twins and buses can be let go wrong; False for what else there is. Raises ConfigError."""
+        if injection.target_type == "bus":
+            if injection.number >= len(self._wires):
+                raise ConfigError(f"there is no {injection.target}; this robot has bus_1 to bus_{len(self._wires)}")
+            self._wires[injection.number].inject(injection.kind, begins=begins)
+            return True
+        twins = self._twins or self._here
+        if twins is None or not modules_know(injection, len(self._wire_of)):
+            return False
+        twins.inject(injection, begins=begins)
+        return True
+
     def close(self) -> None:
         """Motors off, buses closed, own twins ended."""
         if not self._open:
@@ -214,8 +231,8 @@ class CanBackend:
             if settings.channels:
                 self._wires.append(SocketCanWire(name))
             else:
-                other_end = twins_here(self._config, settings, name, pose, stepped=self._lockstep)
-                self._wires.append(VirtualWire(name, other_end))
+                self._here = twins_here(self._config, settings, name, pose, stepped=self._lockstep)
+                self._wires.append(VirtualWire(name, self._here))
         if settings.log:
             log = open_log(Path(settings.log))
             self._wires = [LoggedWire(wire, log) for wire in self._wires]
@@ -281,6 +298,8 @@ class CanBackend:
         reading.begin(reading.sync + 1, contacts=contacts_due(self._reports, reading.sync + 1), tail=self._reports.tail)
         frame = commands.sync(reading.sync, time_us)
         self._unsent = [wire.channel for wire in self._wires if not wire.send(frame)]
+        if reading.complete:  # nobody is expected to answer; but twins in this process live only while they are awaited
+            wait(self._wires, 0.0)
         end = time.monotonic() + self._answer_limit_s
         while not reading.complete and (left_s := end - time.monotonic()) > 0:
             if not wait(self._wires, left_s):

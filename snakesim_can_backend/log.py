@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import TextIO
 
 from snakesim_can_backend.protocol import Frame
-from snakesim_can_backend.wire import Trouble, Wire
+from snakesim_can_backend.trouble import Trouble
+from snakesim_can_backend.wire import Wire
 from snakesim_hal.errors import ConfigError
 
 FLUSH_BYTES = 1 << 16
@@ -56,6 +57,10 @@ class LoggedWire:
     def idle(self) -> float | None:
         """As the wire does."""
         return self._wire.idle()
+
+    def inject(self, kind: str, *, begins: bool) -> None:
+        """As the wire does; what does not go over it is not logged."""
+        self._wire.inject(kind, begins=begins)
 
     def close(self) -> None:
         """Close the wire; the log is complete."""

@@ -1,5 +1,6 @@
 """The module twins that a driver starts for itself: in its own process on a virtual bus, or as a child on vcan."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -13,6 +14,8 @@ import msgspec
 from snakesim_can_backend.settings import Settings
 from snakesim_can_backend.wire import OtherEnd
 from snakesim_hal.errors import BackendError, ConfigError
+from snakesim_hal.injection import KINDS, Injection
+from snakesim_hal.planned import check_backend_can
 from snakesim_hal.scenario import RunConfig, write
 
 READY = "modules ready"
@@ -41,6 +44,27 @@ def check_twins(config: RunConfig, settings: Settings) -> None:
         parse(text, config.robot.chain.modules)
 
 
+def check_faults(config: RunConfig, settings: Settings) -> None:
+    """Whether what the run has planned for joints and buses can be done. Raises ConfigError."""
+    from snakesim_can_backend.twin.faults import ABOUT
+
+    own, virtual = settings.twins_run != "none", not settings.channels
+    does = {*KINDS["bus"]} - (set() if virtual else {"full"}) | ({*ABOUT} if own else set())
+    because = f"its modules know {', '.join(ABOUT)}" if own else "its modules are not the driver's own"
+    because += "" if virtual else "; and no program can fill the queue of a kernel interface"
+    check_backend_can(config, does=does, buses=max(len(settings.channels), 1), because=because)
+
+
+def modules_know(injection: Injection, joints: int) -> bool:
+    """Whether module twins can have a fault. Raises ConfigError when its joint is not there."""
+    from snakesim_can_backend.twin.faults import ABOUT, checked
+
+    if injection.target_type != "joint" or injection.kind not in ABOUT:
+        return False
+    checked(injection, joints)
+    return True
+
+
 def twins_here(config: RunConfig, settings: Settings, channel: str, pose: str | None, *, stepped: bool) -> OtherEnd:
     """Twins at the other end of a virtual bus; the returned function lets them run."""
     from snakesim_can_backend.twin.server import here
@@ -62,8 +86,8 @@ class TwinProcess:
         arguments += ["--stepped"] if stepped else []
         with self._said.open("wb") as output:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "snakesim_can_backend.twin.command", *arguments],
-                stdin=subprocess.DEVNULL,
+                [sys.executable, "-m", "snakesim_can_backend.twin.command", *arguments, "--interactive"],
+                stdin=subprocess.PIPE,
                 stdout=output,
                 stderr=subprocess.STDOUT,
                 env={**os.environ, "PYTHONUNBUFFERED": "1"},
@@ -76,6 +100,17 @@ class TwinProcess:
         code = self._process.poll()
         return None if code is None else f"the module twins have ended, with exit code {code}"
 
+    def inject(self, fault: Injection, *, begins: bool) -> None:
+        """Let something go wrong with a module, or end. Raises BackendError when the child is gone."""
+        from snakesim_can_backend.twin.faults import typed
+
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(f"{typed(fault, begins=begins)}\n".encode())
+            self._process.stdin.flush()
+        except (OSError, ValueError) as error:  # the latter when it was stopped
+            raise BackendError(f"the module twins do not take {fault}: {error}") from error
+
     def stop(self) -> None:
         """Ask it to end, then insist. What it said goes to this process's stderr."""
         if self._process.poll() is None:
@@ -85,6 +120,9 @@ class TwinProcess:
             except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.wait()
+        if self._process.stdin is not None:
+            with contextlib.suppress(OSError):
+                self._process.stdin.close()
         sys.stderr.write(self._said.read_text(encoding="utf-8", errors="replace"))
         self._folder.cleanup()
 

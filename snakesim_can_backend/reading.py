@@ -59,6 +59,7 @@ class Module:
     faults: int = 0  # bits, from the newest heartbeat
     last_stop: LastStop = LastStop.NONE
     heartbeat_sync: int = -1
+    health_sync: int = -1  # when it last told its health
     stopped_syncs: int = 0  # in a row, in which its state was fault or emergency
 
     @property
@@ -268,3 +269,4 @@ class Reading:
 
     def _take_health(self, module: Module, frame: Frame) -> None:
         self._health[module.node - 1] = self._read_health(frame.data)
+        module.health_sync = self.sync

@@ -19,6 +19,7 @@ from snakesim_hal.quantities import Vector
 from snakesim_hal.scenario import RunConfig
 
 LONG_AGO_NS = 3600 * 10**9
+HEALTH_LASTS_S = 2.5 * HEALTH_PERIOD_S  # one report may be lost
 NO_TORQUE = (0.0, 0.0, 0.0)
 
 
@@ -38,6 +39,7 @@ class Sensors:
         health = layouts[Opcode.HEALTH].signals
         self._health = [health[name] for name in ("voltage", "current", "motor_temperature", "board_temperature")]
         self._health_every = max(round(HEALTH_PERIOD_S * config.rate_hz), 1)
+        self._health_lasts = round(HEALTH_LASTS_S * config.rate_hz)  # Syncs
 
     def sample(self, tick: int, stamp_ns: int) -> Samples:
         """Everything that is new at `tick`."""
@@ -117,7 +119,10 @@ class Sensors:
             motor_c=columns[2],
             board_c=columns[3],
             leak=[row is not None and bool(row[4]) for row in rows],
-            valid=[row is not None for row in rows],
+            valid=[
+                row is not None and self._reading.sync - module.health_sync <= self._health_lasts
+                for row, module in zip(rows, self._reading.modules, strict=True)
+            ],
         )
 
 

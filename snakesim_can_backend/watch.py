@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from snakesim_can_backend.protocol import ModuleState, Opcode
 from snakesim_can_backend.reading import Module, Reading
-from snakesim_can_backend.wire import Trouble
+from snakesim_can_backend.trouble import Trouble
 from snakesim_hal.messages import LifecycleState
 
 SILENT_AFTER = 3  # Syncs without an answer

@@ -2,8 +2,8 @@
 
 `SocketCanWire` is a kernel interface (can0, vcan0). python-can opens and filters it; frames go through its socket
 directly, which costs a third of a `can.Message` each. `VirtualWire` is python-can's virtual bus between two ends in one
-process, for machines whose kernel has no CAN. It does *not* simulate: errors, arbitration, bit rate, a full queue,
-an interface that goes down.
+process, for machines whose kernel has no CAN. It does *not* simulate arbitration and bit rate; errors, a full queue and
+an interface that goes down only on request: see `wire_faults`.
 """
 
 import contextlib
@@ -14,51 +14,24 @@ import socket
 import struct
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Protocol
 
 import can
 from can.interfaces.socketcan.socketcan import SocketcanBus
 from can.interfaces.virtual import VirtualBus
 
 from snakesim_can_backend.protocol import NODE_BITS, Frame, Opcode
+from snakesim_can_backend.trouble import Trouble, troubles_of
+from snakesim_can_backend.wire_faults import VirtualFaults, inject_into_interface
 from snakesim_hal.errors import BackendError, ConfigError
-
-Kind = Literal[
-    "bus_off",
-    "error_passive",
-    "error_warning",
-    "not_acknowledged",
-    "restarted",
-    "interface_down",
-    "interface_up",
-    "queue_full",
-    "receive_overflow",
-    "error_frames",
-]
+from snakesim_hal.injection import Injection
 
 EXTENDED, REMOTE, ERROR = 0x80000000, 0x40000000, 0x20000000
 RECEIVE_BUFFER_BYTES = 1 << 20
 MOST_AT_ONCE = 4096  # a bus that babbles must not keep its reader for ever
 SO_MEMINFO, MEMINFO_DROPS, MEMINFO_BYTES = 55, 8, 36  # linux/sock_diag.h
-NOTHING_KNOWN: list[Kind] = ["error_frames"]
-ERROR_CLASSES: tuple[tuple[int, Kind], ...] = ((0x40, "bus_off"), (0x20, "not_acknowledged"), (0x100, "restarted"))
-CONTROLLER_STATES: tuple[tuple[int, Kind], ...] = (
-    (0x30, "error_passive"),
-    (0x0C, "error_warning"),
-    (0x01, "receive_overflow"),
-)
 _wire_format = struct.Struct("<IB3x8s")
-
-
-@dataclass(frozen=True)
-class Trouble:
-    """Something that is wrong with a bus, not with a module on it."""
-
-    kind: Kind
-    channel: str
-    detail: str
 
 
 class Wire(Protocol):
@@ -87,6 +60,10 @@ class Wire(Protocol):
 
         Seconds until a frame may be there, 0 for one that is; None: not before this end sends something.
         """
+        ...
+
+    def inject(self, kind: str, *, begins: bool) -> None:
+        """Begin or end a fault of a bus on request: see `snakesim_hal.injection`. Raises ConfigError."""
         ...
 
     def close(self) -> None:
@@ -153,6 +130,10 @@ class SocketCanWire:
         """The other end runs by itself."""
         return math.inf
 
+    def inject(self, kind: str, *, begins: bool) -> None:
+        """Begin or end a fault: the interface goes down, or an error frame says that something is wrong."""
+        inject_into_interface(self.channel, kind, begins=begins)
+
     def close(self) -> None:
         """Close the socket."""
         self._bus.shutdown()
@@ -203,6 +184,10 @@ class OtherEnd(Protocol):
         """Run for a moment; seconds until it wants to run again, None: not before it hears something."""
         ...
 
+    def inject(self, injection: Injection, *, begins: bool) -> None:
+        """Let something go wrong with a module there, or end."""
+        ...
+
     def close(self) -> None:
         """Leave the bus."""
         ...
@@ -216,9 +201,12 @@ class VirtualWire:
         self.channel = channel
         self.other_end = other_end
         self._bus = VirtualBus(channel=channel)
+        self._faults = VirtualFaults(channel)
 
     def send(self, frame: Frame) -> bool:
-        """Hand over a frame; a virtual bus takes everything."""
+        """Hand over a frame; a virtual bus takes everything, unless a fault is on."""
+        if self._faults.on and (taken := self._faults.stops_sending()) is not None:
+            return taken
         self._bus.send(can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False))
         return True
 
@@ -227,11 +215,11 @@ class VirtualWire:
         frames: list[Frame] = []
         while (message := self._bus.recv(0)) is not None:
             frames.append(Frame(message.arbitration_id, bytes(message.data)))
-        return frames
+        return self._faults.leaves(frames) if self._faults.on else frames
 
     def troubles(self) -> list[Trouble]:
-        """A virtual bus has none."""
-        return []
+        """A virtual bus has only those that were asked for."""
+        return self._faults.take_troubles()
 
     def fileno(self) -> int | None:
         """There is nothing to wait on."""
@@ -241,6 +229,10 @@ class VirtualWire:
         """Let the other end run."""
         pause_s = math.inf if self.other_end is None else self.other_end()
         return pause_s if self._bus.queue.empty() else 0.0
+
+    def inject(self, kind: str, *, begins: bool) -> None:
+        """Begin or end a fault, as this end would see it on a kernel interface; the other end hears nothing of it."""
+        self._faults.inject(kind, begins=begins)
 
     def close(self) -> None:
         """Leave the bus; the other end, if it lives on this one, leaves too."""
@@ -280,16 +272,6 @@ def wait(wires: Sequence[Wire], timeout_s: float) -> bool:
     elif timeout_s > 0:
         time.sleep(timeout_s)
     return True
-
-
-def troubles_of(identifier: int, data: bytes, channel: str) -> list[Trouble]:
-    """What an error frame of the kernel says."""
-    kinds: list[Kind] = [kind for bit, kind in ERROR_CLASSES if identifier & bit]
-    if identifier & 0x04:
-        states: list[Kind] = [kind for bits, kind in CONTROLLER_STATES if data[1] & bits]
-        kinds.extend(states)
-    counters = f"transmit errors {data[6]}, receive errors {data[7]}"
-    return [Trouble(kind, channel, counters) for kind in kinds or NOTHING_KNOWN]
 
 
 def check_interface(channel: str) -> None:

@@ -6,8 +6,9 @@ from typing import Protocol
 
 from snakesim_hal.client import Client
 from snakesim_hal.errors import SnakesimError
+from snakesim_hal.injector import Injector
 from snakesim_hal.messages import Clock, Description, Message
-from snakesim_hal.process import settle_for_timing, take_priority
+from snakesim_hal.process import hurry, settle_for_timing
 from snakesim_hal.scenario import RunConfig
 from snakesim_hal.scenario import Service as Schedule
 from snakesim_hal.serve import arguments, duty
@@ -26,7 +27,7 @@ class Service(Protocol):
     def __init__(self, client: Client, config: RunConfig) -> None: ...
 
     def meet(self, robot: Description) -> None:
-        """Learn what robot is there; called once, before the first tick."""
+        """Learn what robot is there; called before the first tick, and again when the HAL has started over."""
         ...
 
     def outputs(self, clock: Clock) -> list[tuple[str, Message]] | None:
@@ -44,15 +45,21 @@ def serve(service_type: type[Service], argv: Sequence[str] | None = None) -> int
     given = duty(arguments(f"Run the {name} service of a robot."), argv)
     try:
         if service_type.urgent and given.config.pace == "realtime":
-            take_priority()
+            hurry()
         with open_session(given.link, connect_timeout_s=START_LIMIT_S) as session:
             schedule = given.config.services.get(name, Schedule())
             client = Client(session, name, every_ticks=schedule.every_ticks)
             service = service_type(client, given.config)
-            service.meet(client.description(timeout_s=START_LIMIT_S))
+            robot = client.description(timeout_s=START_LIMIT_S)
+            service.meet(robot)
+            injector = Injector(name, given.config, session, newest=lambda: client.heard)
+            injector.allow(emulated=robot.emulated, faults_allowed=given.config.faults_allowed)
             client.announce()
             settle_for_timing()
-            loop(client, service)
+            try:
+                loop(client, service, injector)
+            finally:
+                injector.close()
     except SnakesimError as error:
         print(f"snakesim {name}: {error}", file=sys.stderr)
         return 1
@@ -61,13 +68,18 @@ def serve(service_type: type[Service], argv: Sequence[str] | None = None) -> int
     return 0
 
 
-def loop(client: Client, service: Service) -> None:
+def loop(client: Client, service: Service, injector: Injector) -> None:
     """Act on every tick that is due. A tick that is shown again, because time stands still, is answered again."""
     for clock in client.ticks(SILENCE_S):
         if clock is None:
+            injector.idle()
             for key, message in service.silence():
                 client.put(key, message)
             continue
+        injector.turn(clock.stamp_ns, clock.arming, clock.lifecycle)
+        robot = client.met_anew()
+        if robot is not None:
+            service.meet(robot)
         outputs = service.outputs(clock)
         if outputs is None:
             continue

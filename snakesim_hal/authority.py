@@ -10,9 +10,11 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from snakesim_hal import gate, lifecycle
+from snakesim_hal import arming, gate, lifecycle
 from snakesim_hal.backend import SetPoints
-from snakesim_hal.gate import Applied, JointLimits, Measured
+from snakesim_hal.derating import Derating
+from snakesim_hal.gate import Applied, JointLimits
+from snakesim_hal.halting import Halt
 from snakesim_hal.lease import Lease, freed, renewed, rule
 from snakesim_hal.messages import (
     Answer,
@@ -25,7 +27,9 @@ from snakesim_hal.messages import (
     LifecycleRequest,
     LifecycleState,
     Mode,
+    Power,
 )
+from snakesim_hal.plausible import JointWatch
 
 MAX_FAULTS_KEPT = 32
 COMMANDS_KEPT = 1024
@@ -59,36 +63,39 @@ class Authority:
         self.limited: Counter[str] = Counter()
         count = len(description.joints)
         self._applied = Applied(np.zeros(count, dtype=np.int64), np.zeros(count), self.limits.torque_nm)
-        self._measured = Measured(np.zeros(count), np.zeros(count), np.zeros(count))
-        self._state_trouble: str | None = "no joint state yet"
+        self._watch = JointWatch(self.limits)
+        self._measured = self._watch.measured
+        self._state_trouble: Fault | None = Fault(tick=0, what="state_invalid", cause="no joint state yet")
+        self._derating = Derating(description)
         self._command: JointCommand | None = None
         self._command_ns = 0  # when it came
         self._counting: JointCommand | None = None  # what the last decision since arming was made from
         self._recent: deque[JointCommand] = deque(maxlen=COMMANDS_KEPT)  # good ones since arming, oldest first
         self._last_sequence = -1
         self._hold_at = np.zeros(count)
-        self._was_armed = False  # when the present fault came: only then is there a motion to stop
+        self._halt: Halt | None = None  # of a robot that was armed when the present fault came
+        self._told = True  # whether the motors were told that the robot is disarmed, since it is
 
     # --- what comes in -------------------------------------------------------------------------------------
 
-    def observe(self, joints: JointState) -> None:
-        """Take the newest joint state. What is not finite is no measurement: the last good one stays."""
-        count = len(self.description.joints)
-        lists = (joints.angle_rad, joints.velocity_rad_s, joints.torque_nm, joints.valid, joints.age_ns)
-        if {len(values) for values in lists} != {count}:
-            self._state_trouble = f"no joint state of {count} joints"
-            return
-        columns = np.array(lists[:3])
-        finite = bool(np.isfinite(columns).all())
-        if finite:
-            self._measured = Measured(*columns)
-        if finite and all(joints.valid) and max(joints.age_ns) <= self.description.lease_ns:
-            self._state_trouble = None
-            return
-        fresh = np.array(joints.age_ns) <= self.description.lease_ns
-        good = np.isfinite(columns).all(axis=0) & fresh & np.array(joints.valid)
-        bad = [self.description.joints[i].name for i in np.flatnonzero(~good)]
-        self._state_trouble = f"no valid and fresh state of {', '.join(bad)}"[:400]
+    def observe(self, joints: JointState, now_ns: int | None = None) -> None:
+        """Take the newest joint state. What cannot be is no measurement: the last good one stays.
+
+        now_ns: safety time; None: that of the state's stamp.
+        """
+        applied = self._applied if self.state == "armed" else None
+        now_ns = joints.stamp_ns if now_ns is None else now_ns
+        self._state_trouble = self._watch.take(joints, now_ns=now_ns, applied=applied)
+        self._measured = self._watch.measured
+
+    def observe_power(self, power: Power, now_ns: int) -> None:
+        """Take the newest that the modules say of supply, heat and leaks; `expire` draws the conclusions."""
+        self._derating.take(power, now_ns)
+
+    @property
+    def derated(self) -> dict[str, float]:
+        """Joints that heat leaves less than their whole torque, and the share that is left."""
+        return self._derating.derated()
 
     def offer(self, command: JointCommand, *, now_ns: int, tick: int, age_ns: int) -> str | None:
         """Take a command, or return why not. `age_ns`: time since the state that it answers was published."""
@@ -129,27 +136,24 @@ class Authority:
         """Decide a lease request; when the lease changes hands the robot stops in between."""
         ruling = rule(self.lease, request, now_ns, self.description.lease_ns)
         if self.state == "armed" and request.action == "renew":
-            return self._answer(ruling.refusal)  # armed, only a good command renews: asking is not commanding
+            return self._answer(
+                ruling.refusal, ruling.word
+            )  # armed, only a good command renews: asking is not commanding
         self.lease = ruling.lease
         if ruling.changed_hands:
             self._forget_commands()
             if self.state == "armed":
                 self._go("disarm", f"lease passed to {ruling.lease.holder or 'nobody'}")
-        return self._answer(ruling.refusal)
+        return self._answer(ruling.refusal, ruling.word)
 
     def on_lifecycle(self, request: LifecycleRequest, now_ns: int) -> Answer:
         """Arm, disarm or clear. Arming says no with every condition that is not met."""
         match request.action:
             case "arm":
-                against = self.against_arming(now_ns)
-                if request.robot != self.description.robot:
-                    against.append(f"this robot is {self.description.robot!r}, the request names {request.robot!r}")
-                if request.backend != self.description.backend:
-                    against.append(
-                        f"this backend is {self.description.backend!r}, the request names {request.backend!r}"
-                    )
+                against = self._refusals(now_ns) + arming.mistaken(request, self.description)
                 if against:
-                    return self._answer("; ".join(against))
+                    words = {word for word, _ in against}
+                    return self._answer("; ".join(why for _, why in against), min(words, key=arming.ORDER.index))
                 self._go("arm", f"armed, commanded by {self.lease.holder}")
                 self.arming += 1
                 self._command = self._counting = None
@@ -157,10 +161,10 @@ class Authority:
                 self.lease = renewed(self.lease, now_ns, self.description.lease_ns)
             case "disarm":
                 if not self._go("disarm", "disarmed on request"):
-                    return self._answer(f"cannot disarm in state {self.state}; clear it first")
+                    return self._answer(f"cannot disarm in state {self.state}; clear it first", "wrong_state")
             case "clear":
                 if not self._go("clear", "cleared; arm to move again"):
-                    return self._answer(f"nothing to clear in state {self.state}")
+                    return self._answer(f"nothing to clear in state {self.state}", "wrong_state")
                 self.faults.clear()
             case _:  # finish
                 if self.state == "armed":
@@ -176,7 +180,7 @@ class Authority:
     def fault(self, fault: Fault) -> None:
         """Latch a fault: the joints go to the safe action until someone clears it."""
         self.note(fault)
-        if self.state != "estop":
+        if self.state not in ("fault", "estop"):  # what comes after the first is its consequence, as a rule
             self._go("fault", fault.cause[:500] or fault.what)
         self._drop_lease()
 
@@ -198,28 +202,21 @@ class Authority:
 
     def against_arming(self, now_ns: int) -> list[str]:
         """Every condition for arming that is not met; empty when ready."""
-        against: list[str] = []
-        if self.state != "disarmed":
-            against.append(f"state is {self.state}, must be disarmed")
-        if self._state_trouble is not None:
-            against.append(self._state_trouble)
-        if not self.lease.live(now_ns):
-            against.append("nobody holds the lease")
-        elif self._command is None:
-            against.append(f"no commands from {self.lease.holder} yet")
-        elif now_ns - self._command_ns > self.description.lease_ns:  # the lease may be kept by asking, too
-            against.append(f"no commands from {self.lease.holder} any more")
-        else:
-            against.extend(self._far_targets(self._command))
-        return against
+        return [why for _, why in self._refusals(now_ns)]
 
     def expire(self, now_ns: int, tick: int) -> None:
         """Let the lease run out: armed, that is a fault; disarmed, the lease is simply free again.
 
-        A robot that is armed and does not know its joints any more is at fault too.
+        A robot that is armed and does not know its joints any more is at fault too, and so is one, armed or not, whose
+        modules are too hot, leak or lack voltage.
         """
         if self.state == "armed" and self._state_trouble is not None:
-            self.fault(Fault(tick=tick, what="state_invalid", cause=self._state_trouble))
+            self.fault(msgspec.structs.replace(self._state_trouble, tick=tick))
+        wrong, silent = self._derating.look(now_ns, tick)
+        for fault in wrong:
+            self.fault(fault)
+        if silent is not None:
+            self.note(silent)
         if self.lease.live(now_ns):
             return
         holder, term_ms = self.lease.holder, self.description.lease_ns / 1e6
@@ -237,50 +234,57 @@ class Authority:
         command = self._command
         if up_to is not None:
             command = next((c for c in reversed(self._recent) if c.tick <= up_to), self._counting)
+        sequence: int | None = None
+        limited: dict[int, str] = {}
         if self.state != "armed":
             applied = self._safe()
-            self._applied = applied
-            return Decision(gate.as_set_points(applied), None, {})
-        if command is None:  # armed a moment ago: hold the pose until the first command
-            applied = self._holding(self._hold_at)
-            self._applied = applied
-            return Decision(gate.as_set_points(applied), None, {})
-        applied, asked = gate.limit(command, measured=self._measured, last=self._applied, limits=self.limits)
-        self._applied, self._counting = applied, command
-        limited: dict[int, str] = {}
-        if (applied.target != asked).any():
-            limited = gate.why_limited(applied, asked, self.limits)
-            self.limited.update(limited.values())
-        return Decision(gate.as_set_points(applied), command.sequence, limited)
+            self._told = True
+        elif command is None:  # armed a moment ago: hold the pose until the first command
+            applied = self._uniform(Mode.POSITION, self.limits.inside(self._hold_at))
+        else:
+            measured, share = self._measured, self._derating.share
+            applied, asked = gate.limit(command, measured=measured, last=self._applied, limits=self.limits, share=share)
+            sequence, self._counting = command.sequence, command
+            if (applied.target != asked).any() or (share < 1.0).any():
+                limited = gate.why_limited(command, applied, measured=measured, limits=self.limits, share=share)
+                self.limited.update(limited.values())
+        self._applied = applied
+        return Decision(gate.as_set_points(applied), sequence, limited)
 
     # --- inside --------------------------------------------------------------------------------------------
 
-    def _safe(self) -> Applied:
-        if self.state != "fault" or not self._was_armed or self.description.safe_action == "passive":
-            return self._uniform(Mode.PASSIVE, np.zeros_like(self._measured.angle_rad))
-        if self.description.safe_action == "damp":
-            return self._uniform(Mode.VELOCITY, np.zeros_like(self._measured.angle_rad))
-        return self._holding(self._hold_at)
+    def _refusals(self, now_ns: int) -> list[tuple[str, str]]:
+        found: list[tuple[str, str]] = []
+        if self.state != "disarmed":
+            found.append(("wrong_state", f"state is {self.state}, must be disarmed"))
+        return found + [("not_ready", why) for why in self._unready(now_ns)]
 
-    def _holding(self, angle_rad: gate.Floats) -> Applied:
-        return self._uniform(Mode.POSITION, np.clip(angle_rad, self.limits.angle_min_rad, self.limits.angle_max_rad))
+    def _unready(self, now_ns: int) -> list[str]:
+        against = [fault.cause for fault in (self._state_trouble, *self._derating.wrong) if fault is not None]
+        if self.arming and not self._told:
+            against.append("the motors have not been told yet that the robot was stopped; ask again in a period")
+        if not self.lease.live(now_ns):
+            against.append("nobody holds the lease")
+        elif self._command is None:
+            against.append(f"no commands from {self.lease.holder} yet")
+        elif now_ns - self._command_ns > self.description.lease_ns:  # the lease may be kept by asking, too
+            against.append(f"no commands from {self.lease.holder} any more")
+        else:
+            against.extend(arming.far_targets(self._command, self._measured.angle_rad, self.description))
+        return against
+
+    def _safe(self) -> Applied:
+        zeros = np.zeros_like(self._measured.angle_rad)
+        if self.state != "fault" or self._halt is None or self.description.safe_action == "passive":
+            return self._uniform(Mode.PASSIVE, zeros)
+        if self.description.safe_action == "damp":
+            return self._uniform(Mode.VELOCITY, zeros)
+        self._halt = self._halt.after_a_period(self.limits)
+        return self._uniform(Mode.POSITION, self._halt.target_rad)
 
     def _uniform(self, mode: Mode, target: gate.Floats) -> Applied:
-        return Applied(np.full(len(target), int(mode), dtype=np.int64), target, self.limits.torque_nm)
-
-    def _far_targets(self, command: JointCommand) -> list[str]:
-        far: list[str] = []
-        for i, joint in enumerate(self.description.joints):
-            gap = command.target[i] - self._measured.angle_rad[i]
-            if command.mode[i] not in (Mode.POSITION, Mode.PASSIVE):
-                asked = command.mode[i].name.lower()
-                far.append(f"{joint.name} is asked for {asked}; only staying is allowed at arming")
-            if command.mode[i] == Mode.POSITION and abs(gap) > self.limits.max_step_rad:
-                far.append(
-                    f"{joint.name} is asked to go {gap:+.2f} rad from where it is; at most "
-                    f"{self.limits.max_step_rad} rad at arming"
-                )
-        return far
+        most_nm = self.limits.torque_nm * self._derating.share
+        return Applied(np.full(len(target), int(mode), dtype=np.int64), target, most_nm)
 
     def _go(self, event: lifecycle.Event, why: str) -> bool:
         """Follow an event; False when it is not allowed in this state."""
@@ -289,7 +293,9 @@ class Authority:
             return False
         if following != self.state:
             self._hold_at = self._measured.angle_rad
-            self._was_armed = self.state == "armed"
+            was_armed = self.state == "armed"
+            self._halt = Halt.begin(self._measured, self._applied, self.limits) if was_armed else None
+            self._told &= following != "disarmed"
         if self.state == "armed":
             self._command = None
         self.state = following
@@ -304,10 +310,11 @@ class Authority:
         self._command = None
         self._last_sequence = -1
 
-    def _answer(self, refusal: str | None) -> Answer:
+    def _answer(self, reason: str | None, refusal: str | None = None) -> Answer:
         return Answer(
-            ok=refusal is None,
-            reason=(refusal or self.why)[:500],
+            ok=reason is None,
+            reason=(reason or self.why)[:500],
+            refusal=refusal,
             epoch=self.lease.epoch,
             lifecycle=self.state,
         )

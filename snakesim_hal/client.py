@@ -6,14 +6,16 @@ gives every service the same inputs however the processes happened to be schedul
 
 import time
 from collections import OrderedDict
-from collections.abc import Iterator
-from queue import Empty, SimpleQueue
+from collections.abc import Callable, Iterator
+from queue import Empty
 from typing import Any, Generic
 
 from snakesim_hal import keys
 from snakesim_hal.backend import SetPoints
 from snakesim_hal.codec import Decoder, MessageT
 from snakesim_hal.errors import NotConnectedError, StalledError, WireError
+from snakesim_hal.fit import misfit
+from snakesim_hal.mailbox import Mailbox
 from snakesim_hal.messages import (
     Answer,
     Clock,
@@ -28,6 +30,7 @@ from snakesim_hal.messages import (
 from snakesim_hal.session import Arrival, Publisher, Reader, Session
 
 KEPT_PER_KEY = 32
+NO_TICK = -1  # of messages that are of no tick, such as an intent: only the newest is kept
 MISSING_LIMIT_S = 2.0
 LEASE_RETRY_S = 0.25
 
@@ -35,15 +38,24 @@ LEASE_RETRY_S = 0.25
 class Feed(Generic[MessageT]):
     """The samples of one key, found by the tick that they are of."""
 
-    def __init__(self, reader: Reader[MessageT], key: str) -> None:
+    def __init__(
+        self, reader: Reader[MessageT], key: str, fits: Callable[[Message], bool] = lambda _message: True
+    ) -> None:
+        """fits: whether a message is about the robot that is there; what is not is left out."""
         self._reader = reader
+        self._fits = fits
         self._kept: OrderedDict[int, MessageT] = OrderedDict()
         self.key = key
 
-    def take_in(self) -> None:
+    def take_in(self, *, newest_only: bool = False) -> None:
         """Move what arrived into the shelf."""
-        for message in self._reader.drain():
-            tick: int = message.tick  # pyright: ignore[reportAttributeAccessIssue]
+        if newest_only:
+            newest = self._reader.newest(self._fits)
+            fitting = [] if newest is None else [newest]
+        else:
+            fitting = [message for message in self._reader.drain() if self._fits(message)]
+        for message in fitting:
+            tick: int = getattr(message, "tick", NO_TICK)
             self._kept[tick] = message
             self._kept.move_to_end(tick)
         while len(self._kept) > KEPT_PER_KEY:
@@ -70,14 +82,17 @@ class Client:
         self.service = service
         self.session = session
         self._every_ticks = every_ticks
-        self._clocks: SimpleQueue[Clock] = SimpleQueue()
+        self._clocks: Mailbox[Clock] = Mailbox()
         self._heard_at = time.monotonic()
+        self.heard: Clock | None = None  # the newest clock, due or not
         self._clock_decoder = Decoder(Clock)
         self._feeds: dict[str, Feed[Any]] = {}
         self._publishers: dict[str, Publisher[Any]] = {}
         self._done: Publisher[Done] | None = None
+        self._robot: Description | None = None
         self._clock: Clock | None = None
         self._ahead: Clock | None = None  # taken from the queue, and not due yet
+        self._started_over = False
         self.commanded_tick = -1
         session.on_arrival(keys.CLOCK, self._take_clock)
         self._descriptions = session.latched_reader(keys.DESCRIPTION, Description)
@@ -85,18 +100,28 @@ class Client:
     def description(self, timeout_s: float = 10.0) -> Description:
         """The robot. Raises NotConnectedError when no HAL shows one in time."""
         deadline = time.monotonic() + timeout_s
-        while time.monotonic() < deadline:
+        while self._robot is None and time.monotonic() < deadline:
             found = self._descriptions.drain()
             if found:
-                return found[-1]
+                self._robot = found[-1]
+                self.session.stop_reading(self._descriptions)
             time.sleep(0.01)
+        if self._robot is not None:
+            return self._robot
         raise NotConnectedError(f"no robot description within {timeout_s} s; is the robot's HAL host running?")
 
     def subscribe(self, key: str, message: type[MessageT]) -> Feed[MessageT]:
         """Start listening to a key; do this for everything before `announce`."""
-        feed = Feed(self.session.reader(key, message), key)
+        feed = Feed(self.session.reader(key, message), key, self._fits)
         self._feeds[key] = feed
         return feed
+
+    def _fits(self, message: Message) -> bool:
+        """Whether a message is about our robot, as far as it is known; what is not is counted."""
+        reason = None if self._robot is None else misfit(message, self._robot)
+        if reason is not None:
+            self.session.rejected[reason] += 1
+        return reason is None
 
     def announce(self) -> None:
         """Show that the service is here. A lockstep run waits for it from now on."""
@@ -112,11 +137,12 @@ class Client:
                     yield None
                 continue
             if self._clock is not None and clock.tick < self._clock.tick:
+                self._started_over, self.commanded_tick = True, -1
                 for feed in self._feeds.values():
                     feed.clear()
             self._clock, self.commanded_tick = clock, -1
             for feed in self._feeds.values():
-                feed.take_in()
+                feed.take_in(newest_only=clock.pace != "lockstep")
             yield clock
 
     def _next_clock(self, timeout_s: float | None) -> Clock:
@@ -131,6 +157,14 @@ class Client:
             clock = following
         return clock
 
+    def met_anew(self) -> Description | None:
+        """The robot, when its HAL has started over since the last call; else None."""
+        if not self._started_over:
+            return None
+        self._started_over = False
+        self._robot = self.session.latest(keys.DESCRIPTION, Description, MISSING_LIMIT_S) or self._robot
+        return self._robot
+
     def _take_clock(self, arrival: Arrival) -> None:
         """Runs in Zenoh's thread: wakes the service only for ticks that are its own."""
         self._heard_at = arrival.monotonic_ns * 1e-9
@@ -139,6 +173,7 @@ class Client:
         except WireError as error:
             self.session.rejected[error.reason] += 1
             return
+        self.heard = clock
         if clock.tick % self._every_ticks == 0:
             self._clocks.put(clock)
 

@@ -13,7 +13,7 @@ from snakesim_hal.messages import VERSIONS, Message
 MessageT = TypeVar("MessageT", bound=Message)
 
 ENCODING_PREFIX = "application/msgpack;snakesim."
-MAX_PAYLOAD_BYTES = 4 * 1024 * 1024
+MAX_PAYLOAD_BYTES = 1024 * 1024  # a world of 4096 obstacles fits; longer ones are dropped by the session unread
 MAX_WHY = 300  # characters of the reason why a payload is malformed
 
 _encoder = msgspec.msgpack.Encoder()

@@ -10,10 +10,11 @@ import numpy as np
 
 from snakesim_hal.backend import BackendFactory
 from snakesim_hal.errors import SnakesimError
-from snakesim_hal.host import Host
+from snakesim_hal.host import Ending, Host
+from snakesim_hal.latch import EstopLatch
 from snakesim_hal.messages import Fault
 from snakesim_hal.plugins import BACKENDS, find_plugin, plugin_settings
-from snakesim_hal.process import on_stop_signal, settle_for_timing, take_priority
+from snakesim_hal.process import hurry, on_stop_signal, settle_for_timing
 from snakesim_hal.scenario import RunConfig
 from snakesim_hal.serve import arguments, duty
 from snakesim_hal.session import open_session
@@ -38,6 +39,8 @@ class HostRecord(msgspec.Struct, frozen=True, kw_only=True):
     faults: list[Fault]
     lifecycle: str
     why: str
+    ended: Ending = "complete"
+    injected: list[str] = []  # faults on request, as they began and ended
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -46,14 +49,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--router", action="store_true", help="connect to a router instead of listening")
     parser.add_argument("--max-ticks", type=int, help="end this many ticks after the first arming")
     parser.add_argument("--end-after-fault", type=float, help="end so many seconds after a fault")
+    parser.add_argument("--stay", action="store_true", help="count only armed ticks, record only what follows them")
     parsed_listen = "--router" not in (sys.argv[1:] if argv is None else argv)
     given = duty(parser, argv, listen=parsed_listen)
     try:
         factory = find_plugin(BACKENDS, given.config.backend)
         backend = factory(given.config, backend_settings(given.config, factory))
         try:
-            if given.config.pace == "realtime":
-                take_priority()
+            hygiene = hurry() if given.config.pace == "realtime" else []
             with open_session(given.link) as session:
                 host = Host(
                     given.config,
@@ -61,6 +64,9 @@ def main(argv: Sequence[str] | None = None) -> int:
                     session,
                     max_ticks=given.arguments.max_ticks,
                     end_after_fault_s=given.arguments.end_after_fault,
+                    stay=given.arguments.stay,
+                    latch=EstopLatch(given.out),
+                    hygiene=hygiene,
                 )
                 on_stop_signal(host.stop)
                 settle_for_timing()
@@ -99,6 +105,8 @@ def leave_record(host: Host, out: Path) -> None:
         faults=host.authority.fault_log,
         lifecycle=host.authority.state,
         why=host.authority.why,
+        ended=host.ended,
+        injected=host.faults.noted,
     )
     host.black_box.save(out / BLACK_BOX)
     (out / DESCRIPTION).write_bytes(msgspec.json.encode(host.description))

@@ -18,6 +18,7 @@ from snakesim_hal.errors import ConfigError
 
 TargetType = Literal["process", "key", "joint", "bus", "simulator", "clock"]
 RUN, HAL, CONTROL = "run", "hal", "control"
+ROUTER = "router"  # that of a run with --with-router
 SUPERVISED = ("kill", "stop", "freeze")  # of a process; what is left of its faults it does to itself
 FORM = "KIND:TARGET@START, KIND:TARGET@START-END, or either with =AMOUNT; in seconds, such as mute:joint_3@2-3.5"
 _text = re.compile(
@@ -212,7 +213,7 @@ def checked(injection: Injection, said: str | None = None) -> Injection:
 
 def check_targets(injections: Iterable[Injection], *, services: Iterable[str], joints: int, buses: int) -> None:
     """Whether a run has everything that is to go wrong. Raises ConfigError."""
-    processes = [*services, "host"]
+    processes = [*services, "host", ROUTER]
     for injection in injections:
         sort = injection.target_type
         if sort in ("joint", "bus"):
@@ -224,6 +225,10 @@ def check_targets(injections: Iterable[Injection], *, services: Iterable[str], j
             raise ConfigError(
                 f"fault {str(injection)!r}: there is no process {injection.target!r}; this run has "
                 f"{', '.join(processes)}"
+            )
+        elif injection.target == ROUTER and injection.kind not in SUPERVISED:
+            raise ConfigError(
+                f"fault {str(injection)!r}: a router cannot {injection.kind}, only {', '.join(SUPERVISED)}"
             )
 
 
@@ -269,7 +274,10 @@ def explain() -> str:
         lines.append(f"{sort}:")
         for name, kind in kinds.items():
             amount = kind.amount
-            much = "" if amount is None else f"; amount: {amount.about}, {amount.default:g} {amount.unit} if not given"
+            much = ""
+            if amount is not None:
+                unit = "" if amount.unit == "1" else f" {amount.unit}"
+                much = f"; amount: {amount.about}, {amount.default:g}{unit} if not given"
             lines.append(f"  {name:<14} {kind.about}{much}")
     return "\n".join(lines)
 

@@ -26,6 +26,7 @@ class Ruling:
     lease: Lease
     refusal: str | None = None
     changed_hands: bool = False
+    word: str | None = None  # the refusal in short
 
 
 def rule(lease: Lease, request: LeaseRequest, now_ns: int, term_ns: int) -> Ruling:
@@ -39,17 +40,22 @@ def rule(lease: Lease, request: LeaseRequest, now_ns: int, term_ns: int) -> Ruli
                     lease,
                     f"held by {lease.holder} (epoch {lease.epoch}, priority {lease.priority}) for another "
                     f"{left_ms:.0f} ms; stop it, or ask with a priority above {lease.priority}",
+                    word="lease_held",
                 )
             taken = Lease(request.holder, lease.epoch + 1, request.priority, now_ns + term_ns)
             return Ruling(taken, changed_hands=True)
         case "renew":
             if not mine:
-                return Ruling(lease, f"{request.holder} does not hold epoch {request.epoch}; acquire the lease first")
+                return _not_holder(lease, request, "acquire the lease first")
             return Ruling(renewed(lease, now_ns, term_ns))
         case _:  # release
             if not mine:
-                return Ruling(lease, f"{request.holder} does not hold epoch {request.epoch}; nothing to release")
+                return _not_holder(lease, request, "nothing to release")
             return Ruling(freed(lease), changed_hands=True)
+
+
+def _not_holder(lease: Lease, request: LeaseRequest, then: str) -> Ruling:
+    return Ruling(lease, f"{request.holder} does not hold epoch {request.epoch}; {then}", word="not_holder")
 
 
 def renewed(lease: Lease, now_ns: int, term_ns: int) -> Lease:

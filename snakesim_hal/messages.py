@@ -171,6 +171,9 @@ class JointDescription(Message, frozen=True, kw_only=True):
     stiffness_nm_per_rad: Annotated[float, Meta(ge=0, le=1e6)]  # of position mode
     damping_nm_s_per_rad: Annotated[float, Meta(ge=0, le=1e6)]
     velocity_gain_nm_s_per_rad: Annotated[float, Meta(gt=0, le=1e6)]  # of velocity mode
+    derate_from_c: q.Temperature = 80.0  # of the winding: from here on torque is taken away
+    stop_at_c: q.Temperature = 105.0  # there the robot is stopped
+    least_voltage_v: q.Voltage = 18.0  # below it, too
 
 
 class LinkDescription(Message, frozen=True, kw_only=True):
@@ -278,7 +281,12 @@ class FaultRequest(Message, frozen=True, kw_only=True):
 
 
 class Answer(Message, frozen=True, kw_only=True):
-    """Reply to every query: whether it was done, and if not, why not."""
+    """Reply to every query: whether it was done, and if not, why not, for people and in one stable word.
+
+    lease       lease_held (by someone of no lower priority), not_holder (of that epoch)
+    lifecycle   not_ready (a condition for arming is not met), wrong_state, wrong_robot, wrong_backend, wrong_config
+    any key     malformed, unknown_version and the like: what was asked could not be read; the decoder's own words
+    """
 
     ok: bool
     reason: q.Reason

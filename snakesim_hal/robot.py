@@ -45,6 +45,17 @@ class Limits(FileStruct, frozen=True, kw_only=True):
     acceleration_rad_s2: Annotated[float, above(1e5, "rad/s²")]
     torque_nm: Annotated[float, above(1000, "N·m")]
     torque_rate_nm_s: Annotated[float, above(1e5, "N·m/s")]
+    derate_from_c: Annotated[float, above(300, "°C")] = 80.0  # of the winding: from here on torque is taken away
+    stop_at_c: Annotated[float, above(300, "°C")] = 105.0  # a fifth of the torque is left, and the robot stops
+    least_voltage_v: Annotated[float, from_zero(1000, "V")] = 18.0  # below it the robot stops
+
+    def __post_init__(self) -> None:
+        """Torque must fade before the robot stops. Raises ValueError, which a reader of files explains."""
+        if self.stop_at_c <= self.derate_from_c:
+            raise ValueError(
+                f"`stop_at_c` = {self.stop_at_c:g} °C must be above `derate_from_c` = {self.derate_from_c:g} °C, "
+                f"so that torque fades before the robot stops"
+            )
 
 
 class Motor(FileStruct, frozen=True, kw_only=True):
@@ -103,6 +114,13 @@ class PoseSensor(FileStruct, frozen=True, kw_only=True):
     angle_noise_rad: Annotated[float, from_zero(1, "rad")] = 0.0
 
 
+class PowerSensor(FileStruct, frozen=True, kw_only=True):
+    """Supply, temperatures and leaks of every joint module. Modules on a bus tell them at a rate of their own."""
+
+    rate_hz: Annotated[float, above(1e4, "Hz")] = 2.0
+    delay_s: Annotated[float, from_zero(1, "s")] = 0.0
+
+
 class Sensors(FileStruct, frozen=True, kw_only=True):
     """The sensors that the robot has; a section that is left out is a sensor that it lacks."""
 
@@ -110,6 +128,7 @@ class Sensors(FileStruct, frozen=True, kw_only=True):
     contacts: ContactSensor | None = None
     imu: ImuSensor | None = None
     pose: PoseSensor | None = None
+    power: PowerSensor | None = None
 
 
 class RobotFile(FileStruct, frozen=True, kw_only=True):
@@ -168,6 +187,9 @@ def describe(
             stiffness_nm_per_rad=robot.motor.stiffness_nm_per_rad,
             damping_nm_s_per_rad=robot.motor.damping_nm_s_per_rad,
             velocity_gain_nm_s_per_rad=robot.motor.velocity_gain_nm_s_per_rad,
+            derate_from_c=robot.limits.derate_from_c,
+            stop_at_c=robot.limits.stop_at_c,
+            least_voltage_v=robot.limits.least_voltage_v,
         )
         for i, axis in enumerate(axes)
     ]
@@ -181,6 +203,7 @@ def describe(
         (keys.CONTACTS, robot.sensors.contacts),
         (keys.IMU, robot.sensors.imu),
         (keys.POSE, robot.sensors.pose),
+        (keys.POWER, robot.sensors.power),
     ):
         if sensor is not None:
             sensors.append(SensorDescription(key=key, rate_hz=min(sensor.rate_hz, rate_hz), delay_s=sensor.delay_s))

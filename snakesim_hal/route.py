@@ -12,6 +12,11 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 
+def is_line(points_w: Floats) -> bool:
+    """Whether (n, 2) points make a line: two at least, and a way to go from each to the next."""
+    return len(points_w) >= 2 and bool((points_w[1:] != points_w[:-1]).any(axis=1).all())
+
+
 class Route:
     """A planar curve given by dense points, parametrised by arc length; straight beyond both ends.
 
@@ -20,10 +25,10 @@ class Route:
 
     def __init__(self, points_w: Floats | Sequence[tuple[float, float]]) -> None:
         self.points_w = np.ascontiguousarray(points_w, dtype=np.float64)
+        if not is_line(self.points_w):
+            raise ValueError("a route needs at least two points, and no two neighbours may coincide")
         steps = np.diff(self.points_w, axis=0)
         lengths = np.hypot(steps[:, 0], steps[:, 1])
-        if len(self.points_w) < 2 or not np.all(lengths > 0):
-            raise ValueError("a route needs at least two points, and no two neighbours may coincide")
         self._s = np.concatenate(([0.0], np.cumsum(lengths)))
         self._first_direction = steps[0] / lengths[0]
         self._last_direction = steps[-1] / lengths[-1]

@@ -56,6 +56,7 @@ class Service(FileStruct, frozen=True, kw_only=True):
 
     every_ticks: Annotated[int, Meta(ge=1, le=1000)] = 1
     lag_ticks: Annotated[int, Meta(ge=1, le=1000)] = 1
+    restart: bool = True  # with `snakesim run --stay`, when its process ends; false: the run ends with it
 
     def counting_at(self, tick: int) -> int:
         """The newest tick whose output counts at `tick`. That of tick 0 counts from the start."""

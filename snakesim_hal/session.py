@@ -18,12 +18,13 @@ import zenoh
 from zenoh import ext, handlers  # pyright: ignore[reportMissingModuleSource]
 
 from snakesim_hal import keys
-from snakesim_hal.codec import Decoder, MessageT, encode, encoding_of
+from snakesim_hal.codec import MAX_PAYLOAD_BYTES, Decoder, MessageT, encode, encoding_of
 from snakesim_hal.errors import ConfigError, NotConnectedError, RefusedError, WireError
 from snakesim_hal.messages import Answer, Message
 
 DEFAULT_PORT = 7447
 DEFAULT_ENDPOINT = f"tcp/127.0.0.1:{DEFAULT_PORT}"
+MAX_MESSAGE_BYTES = MAX_PAYLOAD_BYTES + 4096  # with key and encoding; what is longer costs neither memory nor time
 READER_DEPTH = 256  # deep enough that a burst of noise on a key does not push out the sample that counts
 
 
@@ -50,14 +51,21 @@ class Publisher(Generic[MessageT]):
     """Puts one message type on one key."""
 
     def __init__(self, publisher: Any, message: type[MessageT]) -> None:
-        self._put = publisher.put
         self.message = message
-
         self._publisher = publisher
+        self._put: Callable[[bytes], None] = publisher.put
 
     def put(self, message: MessageT) -> None:
         """Send it; may wait for a slow reader only when the publisher was declared lossless."""
         self._put(encode(message))
+
+    def send(self, payload: bytes) -> None:
+        """Send bytes as they are, past whoever stands in the way."""
+        self._publisher.put(payload)
+
+    def reroute(self, put: Callable[[bytes], None] | None) -> None:
+        """Hand what is put to somebody who may `send` it; None: straight out again."""
+        self._put = self._publisher.put if put is None else put
 
     def heard(self) -> bool:
         """Whether anybody subscribes to it now."""
@@ -68,19 +76,37 @@ class Reader(Generic[MessageT]):
     """The newest samples of one key, decoded when they are asked for, in the asking thread."""
 
     def __init__(self, subscriber: Any, message: type[MessageT], rejected: Counter[str]) -> None:
-        self._subscriber = subscriber
+        self.subscriber = subscriber
         self._decoder = Decoder(message)
         self._rejected = rejected
 
     def drain(self) -> list[MessageT]:
         """Everything that arrived since the last call, oldest first. What cannot be decoded is counted and left out."""
-        taken: list[MessageT] = []
-        while (sample := self._subscriber.try_recv()) is not None:
-            try:
-                taken.append(self._decoder.decode(sample.payload.to_bytes(), str(sample.encoding)))
-            except WireError as error:
-                self._rejected[error.reason] += 1
-        return taken
+        return [message for sample in self._arrived() if (message := self._decoded(sample)) is not None]
+
+    def newest(self, wanted: Callable[[MessageT], bool]) -> MessageT | None:
+        """The newest that is wanted of what arrived since the last call.
+
+        What came before it is dropped unread, so that a flood costs its reader little.
+        """
+        for sample in reversed(self._arrived()):
+            message = self._decoded(sample)
+            if message is not None and wanted(message):
+                return message
+        return None
+
+    def _arrived(self) -> list[Any]:
+        arrived: list[Any] = []
+        while (sample := self.subscriber.try_recv()) is not None:
+            arrived.append(sample)
+        return arrived
+
+    def _decoded(self, sample: Any) -> MessageT | None:
+        try:
+            return self._decoder.decode(sample.payload.to_bytes(), str(sample.encoding))
+        except WireError as error:
+            self._rejected[error.reason] += 1
+            return None
 
 
 @dataclass(frozen=True)
@@ -104,6 +130,8 @@ class Session:
     def __init__(self, zenoh_session: zenoh.Session) -> None:
         self._zenoh = zenoh_session
         self._declared: list[Any] = []
+        self._publishers: dict[str, Publisher[Any]] = {}
+        self._reroutes: dict[str, Callable[[bytes], None]] = {}
         self.rejected: Counter[str] = Counter()  # samples that readers could not take, by reason
 
     def publisher(self, key: str, message: type[MessageT], *, lossless: bool = False) -> Publisher[MessageT]:
@@ -118,8 +146,7 @@ class Session:
             priority=zenoh.Priority.REAL_TIME if command else zenoh.Priority.DATA_HIGH,
             express=ends_a_tick,
         )
-        self._declared.append(publisher)
-        return Publisher(publisher, message)
+        return self._published(key, publisher, message)
 
     def latched_publisher(self, key: str, message: type[MessageT]) -> Publisher[MessageT]:
         """A publisher whose last value is given to readers that come later."""
@@ -130,8 +157,26 @@ class Session:
             cache=ext.CacheConfig(1),
             publisher_detection=True,
         )
+        return self._published(key, publisher, message)
+
+    def _published(self, key: str, publisher: Any, message: type[MessageT]) -> Publisher[MessageT]:
         self._declared.append(publisher)
-        return Publisher(publisher, message)
+        made = self._publishers[key] = Publisher(publisher, message)
+        made.reroute(self._reroutes.get(key))
+        return made
+
+    def reroute(self, key: str, put: Callable[[bytes], None] | None) -> None:
+        """Hand what is published on a key, now or later, to somebody who may `send` it; None: straight out again."""
+        if put is None:
+            self._reroutes.pop(key, None)
+        else:
+            self._reroutes[key] = put
+        if key in self._publishers:
+            self._publishers[key].reroute(put)
+
+    def send(self, key: str, payload: bytes) -> None:
+        """Send bytes on a key that this session publishes on."""
+        self._publishers[key].send(payload)
 
     def reader(self, key: str, message: type[MessageT], *, depth: int = READER_DEPTH) -> Reader[MessageT]:
         """The newest `depth` samples of a stream; older ones are dropped, nothing ever blocks."""
@@ -149,6 +194,21 @@ class Session:
         )
         self._declared.append(subscriber)
         return Reader(subscriber, message, self.rejected)
+
+    def stop_reading(self, reader: Reader[Any]) -> None:
+        """Close a reader: what nobody asks it for any more need not be kept."""
+        self._declared.remove(reader.subscriber)
+        reader.subscriber.undeclare()
+
+    def latest(self, key: str, message: type[MessageT], timeout_s: float) -> MessageT | None:
+        """The value latched on a key; None when there is none in time."""
+        reader, deadline = self.latched_reader(key, message), time.monotonic() + timeout_s
+        found: list[MessageT] = []
+        while not found and time.monotonic() < deadline:
+            time.sleep(0.01)
+            found = reader.drain()
+        self.stop_reading(reader)
+        return found[-1] if found else None
 
     def on_arrival(self, key: str, take: Callable[[Arrival], None]) -> None:
         """Call `take` for every sample, in Zenoh's thread: it must only store, never compute."""
@@ -179,10 +239,45 @@ class Session:
         """Like `ask`, but a no is returned, not raised."""
         decoder = Decoder(Answer)
         replies = self._zenoh.get(key, payload=encode(request), encoding=encoding_of(type(request)), timeout=timeout_s)
+        unreadable: WireError | None = None
         for reply in replies:
-            if reply.ok is not None:
+            if reply.ok is None:
+                continue
+            try:
                 return decoder.decode(reply.ok.payload.to_bytes(), str(reply.ok.encoding))
+            except WireError as error:
+                self.rejected[error.reason] += 1
+                unreadable = error
+        if unreadable is not None:
+            raise NotConnectedError(f"what answers on {key} cannot be read: {unreadable}")
         raise NotConnectedError(f"nobody answers on {key} within {timeout_s} s; is the robot's HAL host running?")
+
+    def ask_all(self, pattern: str, request: Message, timeout_s: float = 2.0) -> Iterator[tuple[str, Answer]]:
+        """Ask every robot whose key matches, at once: (key, answer) as they come, until all answered or time is up."""
+        replies = self._zenoh.get(
+            pattern,
+            payload=encode(request),
+            encoding=encoding_of(type(request)),
+            timeout=timeout_s,
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+        )
+        return self._answers(replies)
+
+    def _answers(self, replies: Any) -> Iterator[tuple[str, Answer]]:
+        decoder = Decoder(Answer)
+        for reply in replies:
+            if reply.ok is None:
+                continue
+            try:
+                yield str(reply.ok.key_expr), decoder.decode(reply.ok.payload.to_bytes(), str(reply.ok.encoding))
+            except WireError as error:
+                self.rejected[error.reason] += 1
+
+    def present(self, pattern: str, timeout_s: float = 1.0) -> list[str]:
+        """The liveliness keys that match now."""
+        replies = self._zenoh.liveliness().get(pattern, timeout=timeout_s)
+        return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})
 
     def declare_alive(self, service: str) -> None:
         """Show the liveliness token of a service for as long as the session lives."""
@@ -232,7 +327,10 @@ def _settings(link: Link, connect_timeout_s: float) -> dict[str, Any]:
         "mode": "router" if link.listen else "client",
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "timestamping": {"enabled": {"router": True, "peer": True, "client": True}},
-        "transport": {"link": {"tx": {"lease": 2000}}, "shared_memory": {"enabled": False}},
+        "transport": {
+            "link": {"tx": {"lease": 2000}, "rx": {"max_message_size": MAX_MESSAGE_BYTES}},
+            "shared_memory": {"enabled": False},
+        },
         "listen": {"endpoints": [link.endpoint] if link.listen else [], "exit_on_failure": True},
         "connect": {
             "endpoints": [] if link.listen else [link.endpoint],

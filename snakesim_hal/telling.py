@@ -28,6 +28,8 @@ def status_message(
     safety_now_ns: int,
     missing: list[str],
     overruns: int,
+    hygiene: list[str],
+    injected: list[str],
 ) -> Status:
     """How the robot is now, and why. missing: the services that arming waits for."""
     description = authority.description
@@ -54,5 +56,8 @@ def status_message(
         alive=participants.present(),
         waiting_for=missing,
         overruns=overruns,
+        hygiene=hygiene,
+        injected=injected,
         ready_to_arm=not against and not missing,
+        derated=authority.derated,
     )

@@ -38,13 +38,13 @@ class Child:
         return "\n".join(lines[-15:])
 
 
-def start(name: str, arguments: Sequence[str], log: Path) -> Child:
-    """Start a Python module as a child that dies with this process.
+def start(name: str, arguments: Sequence[str], log: Path, *, again: bool = False) -> Child:
+    """Start a Python module as a child that dies with this process. again: its log goes on.
 
     It gets a session of its own, so that Ctrl-C reaches only the supervisor, which then ends its children in order.
     """
     environment = {**os.environ, **ONE_THREAD, "PYTHONUNBUFFERED": "1", "PYTHONHASHSEED": "0"}
-    with log.open("wb") as output:
+    with log.open("ab" if again else "wb") as output:
         process = subprocess.Popen(
             [sys.executable, "-m", *arguments, "--parent", str(os.getpid())],
             stdin=subprocess.DEVNULL,
@@ -56,11 +56,17 @@ def start(name: str, arguments: Sequence[str], log: Path) -> Child:
     return Child(name, process, log)
 
 
+def ask_to_end(child: Child) -> None:
+    """Have a child end in order; one that is frozen must first be thawed."""
+    if child.process.poll() is None:
+        child.process.send_signal(signal.SIGTERM)
+        child.process.send_signal(signal.SIGCONT)
+
+
 def stop_all(children: Sequence[Child]) -> None:
     """Ask every child to end, wait, then insist. Returns when all are gone."""
     for child in children:
-        if child.process.poll() is None:
-            child.process.send_signal(signal.SIGTERM)
+        ask_to_end(child)
     deadline = time.monotonic() + STOP_LIMIT_S
     for child in children:
         try:

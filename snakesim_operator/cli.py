@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from snakesim_hal.errors import ConfigError, SnakesimError
+from snakesim_hal.injection import explain
 from snakesim_hal.plugins import COMMANDS, find_plugin, installed
 from snakesim_hal.scenario import Loaded, Override, load, parse_set
 
@@ -46,6 +47,14 @@ def _parser() -> argparse.ArgumentParser:
 
     run = commands.add_parser("run", help="run a scenario: backend, guidance, navigation and control")
     _add_scenario(run)
+    run.add_argument(
+        "--fault",
+        action="append",
+        metavar="KIND:TARGET@START[-END][=AMOUNT]",
+        help="what goes wrong, at seconds after arming, instead of what the scenario plans; may be repeated",
+    )
+    run.add_argument("--stay", action="store_true", help="a fault ends nothing: processes restart, you clear and arm")
+    run.add_argument("--with-router", action="store_true", help="meet at a router of the run's own, as in a lab")
     run.add_argument("--out", type=Path, help="folder for what the run leaves (default: runs/NAME-TIME)")
     _add_network(run)
     run.set_defaults(act=_run)
@@ -80,6 +89,34 @@ def _parser() -> argparse.ArgumentParser:
     status = commands.add_parser("status", help="say how the robots on the network are, and why")
     _add_network(status)
     status.set_defaults(act=_status)
+
+    arm = commands.add_parser("arm", help="let a robot move; it and its backend are named, so that none is mixed up")
+    arm.add_argument("robot", metavar="ROBOT", help="name of the robot, as `snakesim status` shows it")
+    arm.add_argument("backend", metavar="BACKEND", help="sim, can, ...: what stands behind its keys")
+    for name, act, about in (
+        ("disarm", _disarm, "let a robot's joints go passive"),
+        ("clear", _clear, "forget a fault or an emergency stop; the robot is disarmed then"),
+        ("estop", _estop, "stop a robot now, or all on the network when no --namespace is given"),
+    ):
+        told = commands.add_parser(name, help=about)
+        _add_network(told)
+        told.set_defaults(act=act)
+    _add_network(arm)
+    arm.set_defaults(act=_arm)
+
+    fault = commands.add_parser(
+        "fault",
+        help="let something go wrong in a run that allows it",
+        epilog=f"kinds, by what they happen to:\n{explain()}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    fault.add_argument("kind", metavar="KIND", help="such as mute; `list` prints all of them")
+    fault.add_argument("target", nargs="?", metavar="TARGET", help="such as joint_3, bus_1, control, actuator/joints")
+    fault.add_argument("--for", dest="for_s", type=float, metavar="S", help="seconds of robot time until it ends")
+    fault.add_argument("--amount", type=float, metavar="X", help="how much of it, for kinds that have an amount")
+    fault.add_argument("--end", action="store_true", help="end it")
+    _add_network(fault)
+    fault.set_defaults(act=_fault)
 
     router = commands.add_parser("router", help="run a Zenoh router from a JSON5 file")
     router.add_argument("config", type=Path, nargs="?", help="JSON5 file (default: deploy/router.json5's settings)")
@@ -130,6 +167,8 @@ def _load(arguments: argparse.Namespace) -> Loaded:
         if value is not None:
             flag = f"--{key.removesuffix('_s')} {value}"
             overrides.append(Override(key, value, flag))
+    if faults := getattr(arguments, "fault", None):
+        overrides.append(Override("faults", faults, " ".join(f"--fault {text}" for text in faults)))
     return load(arguments.scenario, overrides)
 
 
@@ -138,7 +177,17 @@ def _run(arguments: argparse.Namespace) -> int:
 
     loaded = _load(arguments)
     config = check_plugins(loaded.config, loaded.table)  # here, because only the table knows which flag set what
-    return run(RunRequest(config, arguments.out, arguments.endpoint, arguments.router, arguments.namespace))
+    return run(
+        RunRequest(
+            config,
+            out=arguments.out,
+            endpoint=arguments.endpoint,
+            router=arguments.router,
+            namespace=arguments.namespace,
+            stay=arguments.stay,
+            with_router=arguments.with_router,
+        )
+    )
 
 
 def _compare(arguments: argparse.Namespace) -> int:
@@ -186,6 +235,37 @@ def _status(arguments: argparse.Namespace) -> int:
     from snakesim_operator.watch import show_status
 
     return show_status(_link(arguments))
+
+
+def _arm(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.command import arm
+
+    return arm(arguments.robot, arguments.backend, _link(arguments))
+
+
+def _disarm(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.command import disarm
+
+    return disarm(_link(arguments))
+
+
+def _clear(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.command import clear
+
+    return clear(_link(arguments))
+
+
+def _estop(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.command import estop
+
+    return estop(_link(arguments))
+
+
+def _fault(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.fault import FaultOrder, fault
+
+    order = FaultOrder(arguments.kind, arguments.target, arguments.for_s, arguments.amount, arguments.end)
+    return fault(order, _link(arguments))
 
 
 def _link(arguments: argparse.Namespace):

@@ -35,6 +35,10 @@ class Progress:
             sys.stdout.write("\n")
             sys.stdout.flush()
 
+    def start_over(self) -> None:
+        """Robot time begins at 0 again, with a new host."""
+        self._origin = None
+
     def show(self, status: Status | None, control: ControlState | None, *, armed: bool) -> None:
         """Update the line, if it is time to."""
         now = time.monotonic()

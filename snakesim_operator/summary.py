@@ -1,5 +1,6 @@
 """The numbers of a run, in one file that scripts can read: `summary.json`."""
 
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import msgspec
@@ -8,6 +9,7 @@ from msgspec import Meta
 
 from snakesim_hal.messages import Fault, Pace
 from snakesim_operator.record import RunRecord
+from snakesim_operator.supervisor import Restart
 
 SATURATED_FROM = 0.99  # of a joint's torque limit
 
@@ -50,11 +52,13 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     rejected_commands: Annotated[dict[str, int], Meta(description="by reason")]
     limited_commands: Annotated[dict[str, int], Meta(description="joint set-points changed by the gate, by limit")]
     faults: list[Fault]
+    hosts: Annotated[int, Meta(description="how many HAL hosts the run had; all numbers here are of the last one")] = 1
+    restarts: Annotated[list[Restart], Meta(description="processes that ended and were started again")] = []
     ended: Annotated[str, Meta(description="complete, interrupted, or what failed")]
     config: Annotated[dict[str, Any], Meta(description="the effective configuration; repeats the run")]
 
 
-def summarise(record: RunRecord, ended: str) -> RunSummary:
+def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), hosts: int = 1) -> RunSummary:
     """Work out the numbers of a run."""
     config, host = record.config, record.host
     count = len(record.time_s)
@@ -99,6 +103,8 @@ def summarise(record: RunRecord, ended: str) -> RunSummary:
         rejected_commands=host.rejected_commands,
         limited_commands=host.limited_commands,
         faults=host.faults,
+        hosts=hosts,
+        restarts=list(restarts),
         ended=ended,
         config=msgspec.to_builtins(config),
     )

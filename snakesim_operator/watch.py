@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from queue import Empty, SimpleQueue
+from queue import Empty
 
 import msgspec
 
@@ -14,8 +14,9 @@ from snakesim_hal import keys
 from snakesim_hal.codec import Decoder
 from snakesim_hal.errors import ConfigError, NotConnectedError, WireError
 from snakesim_hal.files import SHIPPED
+from snakesim_hal.mailbox import Mailbox
 from snakesim_hal.messages import Message, Status
-from snakesim_hal.session import Arrival, Link, open_session
+from snakesim_hal.session import DEFAULT_ENDPOINT, Arrival, Link, open_session
 from snakesim_operator import lastrun
 
 STATUS_WAIT_S = 1.0
@@ -31,7 +32,7 @@ def echo(key: str, link: Link, *, rate_only: bool, count: int | None, say: Calla
         known = "\n  ".join(f"{row.key:<24}{row.about}" for row in keys.SPACE if row.kind in ("stream", "latched"))
         raise ConfigError(f"there is no key {key!r}; what can be echoed:\n  {known}")
     everywhere = relative if link.namespace is not None else f"**/{relative}"
-    arrivals: SimpleQueue[Arrival] = SimpleQueue()
+    arrivals: Mailbox[Arrival] = Mailbox()
     with open_session(link, CONNECT_S) as session:
         if relative in (keys.STATUS, keys.DESCRIPTION):
             session.on_latched_arrival(everywhere, arrivals.put)
@@ -45,7 +46,7 @@ def echo(key: str, link: Link, *, rate_only: bool, count: int | None, say: Calla
 
 
 def _print_messages(
-    arrivals: SimpleQueue[Arrival], message: type[Message], count: int | None, say: Callable[[str], None]
+    arrivals: Mailbox[Arrival], message: type[Message], count: int | None, say: Callable[[str], None]
 ) -> None:
     decoder, printed = Decoder(message), 0
     while count is None or printed < count:
@@ -58,7 +59,7 @@ def _print_messages(
         printed += 1
 
 
-def _print_rates(arrivals: SimpleQueue[Arrival], count: int | None, say: Callable[[str], None]) -> None:
+def _print_rates(arrivals: Mailbox[Arrival], count: int | None, say: Callable[[str], None]) -> None:
     printed = 0
     while count is None or printed < count:
         stamps: dict[str, list[int]] = {}
@@ -98,12 +99,14 @@ def show_status(link: Link, say: Callable[[str], None] = print) -> int:
         return 1
     for namespace, status in sorted(found.items()):
         say(_in_words(namespace, status))
+        for line in _what_to_type(namespace, status, link):
+            say(line)
     return 0 if all(status.lifecycle in ("armed", "disarmed") for status in found.values()) else 1
 
 
 def _statuses(link: Link) -> dict[str, Status]:
     """The newest status of each robot, by namespace."""
-    arrivals: SimpleQueue[Arrival] = SimpleQueue()
+    arrivals: Mailbox[Arrival] = Mailbox()
     decoder = Decoder(Status)
     found: dict[str, Status] = {}
     with open_session(link, CONNECT_S) as session:
@@ -137,12 +140,28 @@ def _in_words(namespace: str, status: Status) -> str:
         f"  commands: {status.commands_accepted} accepted, {status.commands_standby} in standby, rejected: "
         f"{counts(status.commands_rejected)}; joint targets limited: {counts(status.commands_limited)}",
     ]
+    for joint, share in sorted(status.derated.items()):
+        lines.append(f"  derated: {joint} has {100 * share:.0f} % of its torque left")
+    for what in status.hygiene:
+        lines.append(f"  real time: {what}")
+    for what in status.injected:
+        lines.append(f"  fault on request: {what}")
     if status.waiting_for:
         lines.append(f"  waiting for: {', '.join(status.waiting_for)}")
     for fault in status.faults:
         where = f" at {fault.joint}" if fault.joint else ""
         lines.append(f"  fault {fault.what}{where} at tick {fault.tick}: {fault.cause}")
     return "\n".join(lines)
+
+
+def _what_to_type(namespace: str, status: Status, link: Link) -> list[str]:
+    """What a person does next; nothing while the robot moves, or cannot be armed yet."""
+    where = f" --endpoint {link.endpoint}" if link.endpoint != DEFAULT_ENDPOINT else ""
+    where += f" --namespace {namespace}" if namespace != status.robot else ""
+    arm = f"`snakesim arm {status.robot} {status.backend}{where}`"
+    if status.lifecycle in ("fault", "estop"):
+        return [f"  next: `snakesim clear{where}`, then {arm}"]
+    return [f"  next: {arm}"] if status.ready_to_arm else []
 
 
 def run_router(config: Path | None) -> int:

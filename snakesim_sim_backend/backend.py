@@ -1,17 +1,22 @@
 """The simulated robot behind the HAL. Thin: every job has its own module."""
 
+import math
+
 import mujoco
 import numpy as np
 
 from snakesim_hal.backend import Samples, SetPoints
 from snakesim_hal.errors import BackendError
+from snakesim_hal.injection import Injection
 from snakesim_hal.messages import Description, Fault, LifecycleState, Pace
 from snakesim_hal.motor import check_gains
+from snakesim_hal.planned import check_backend_can
 from snakesim_hal.robot import describe
 from snakesim_hal.scenario import RunConfig, config_hash
+from snakesim_hal.thermal import Thermal
 from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.contacts import TouchReader
-from snakesim_sim_backend.divergence import DivergenceWatch, log_warnings
+from snakesim_sim_backend.divergence import MOST_SPEED, DivergenceWatch, log_warnings
 from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS, SimModel, build
 from snakesim_sim_backend.sensors import Sensors, rotate
 from snakesim_sim_backend.settings import Settings
@@ -32,6 +37,12 @@ class SimBackend:
     def check(config: RunConfig, _settings: Settings) -> tuple[Pace, ...]:
         """Simulated time goes as one likes. Raises ConfigError."""
         check_gains(config.robot)
+        does, because = ["diverge"], "the simulator has neither modules nor buses"
+        if config.robot.sensors.power is not None:
+            does.append("overheat")
+        else:
+            because += ", and without [sensors.power] in the robot file nobody would feel heat"
+        check_backend_can(config, does=does, buses=0, because=because)
         return ("lockstep", "realtime", "free")
 
     def __init__(self, config: RunConfig, settings: Settings) -> None:
@@ -53,7 +64,9 @@ class SimBackend:
         if settings.tether is not None:
             self._rope = Rope(self._sim.model, self._data, settings.tether)
             self._rope.tighten()
-        self._sensors = Sensors(self._sim, self._data, config, self._motors)
+        self._windings = Thermal(self._motors.count, config.robot.limits.torque_nm)
+        self._heats, self._period_s = config.robot.sensors.power is not None, config.period_ns * 1e-9
+        self._sensors = Sensors(self._sim, self._data, config, self._motors, self._windings)
         self._watch = DivergenceWatch(self._sim.model, self._data, self._sim.steps_per_tick)
         self._model, self._option = self._sim.model, self._sim.model.opt
         self._with_sensors = int(self._option.disableflags)
@@ -91,10 +104,24 @@ class SimBackend:
         mujoco.mj_step(model, data, self._read_steps)
         self._tick += 1
         self._watch.check(self._tick)
+        if self._heats:  # by the torque of the last step: windings are slow
+            self._windings.pass_time(self._period_s, np.square(self._motors.applied_nm()))
 
     def faults(self) -> list[Fault]:
         """A simulated robot has no faults of its own: a divergence is raised by `advance`."""
         return []
+
+    def inject(self, injection: Injection, *, begins: bool) -> bool:
+        """`diverge`: the base becomes impossibly fast, as if the simulation blew up. `overheat`: a winding is hot."""
+        if injection.target_type == "joint" and injection.kind == "overheat" and self._heats:
+            hold = begins and injection.end_s != math.inf
+            self._windings.inject(injection.number, heat=begins, hold=hold)
+            return True
+        if injection.target_type != "simulator" or injection.kind != "diverge":
+            return False
+        if begins:
+            self._data.qvel[0] = 10.0 * MOST_SPEED
+        return True
 
     def close(self) -> None:
         """Switch the motors off; nothing moves any more. `true_state` stays readable."""

@@ -5,9 +5,9 @@ from typing import Generic, TypeVar
 
 import msgspec
 
-from snakesim_hal.messages import Contacts, Imu, Pose
+from snakesim_hal.messages import Contacts, Imu, Pose, Power
 
-SampleT = TypeVar("SampleT", bound=Contacts | Imu | Pose)
+SampleT = TypeVar("SampleT", bound=Contacts | Imu | Pose | Power)
 
 
 class Due:

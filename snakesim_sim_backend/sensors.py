@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from snakesim_hal import keys
 from snakesim_hal.backend import Samples
 from snakesim_hal.kinematics import tangents
-from snakesim_hal.messages import Contact, Contacts, Imu, JointState, Message, Pose
+from snakesim_hal.messages import Contact, Contacts, Imu, JointState, Message, Pose, Power
 from snakesim_hal.quantities import MAX_CONTACTS, Quaternion, Vector
-from snakesim_hal.robot import ContactSensor, ImuSensor, JointSensor, PoseSensor
+from snakesim_hal.robot import ContactSensor, ImuSensor, JointSensor, PoseSensor, PowerSensor
 from snakesim_hal.scenario import RunConfig
+from snakesim_hal.thermal import SUPPLY_V, Thermal, board_c, current_a
 from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.contacts import Touch, TouchReader
 from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS, SimModel
@@ -33,7 +34,9 @@ NO_TORQUE = (0.0, 0.0, 0.0)  # a point contact carries no moment about its own p
 class Sensors:
     """All sensors of the robot, on one source of noise: the same seed and commands give the same bytes."""
 
-    def __init__(self, sim: SimModel, data: mujoco.MjData, config: RunConfig, motors: Motors) -> None:
+    def __init__(
+        self, sim: SimModel, data: mujoco.MjData, config: RunConfig, motors: Motors, windings: Thermal
+    ) -> None:
         noise = np.random.default_rng(config.seed).standard_normal
         has = config.robot.sensors
         self._joints = JointReader(data, has.joints, motors, noise, config.period_ns)
@@ -47,6 +50,9 @@ class Sensors:
         if has.pose is not None:
             reader = PoseReader(data, has.pose, noise)
             self._others.append((keys.POSE, Channel(reader.read, has.pose, config)))
+        if has.power is not None:
+            reader = PowerReader(data, motors, windings, config.robot.limits.torque_nm)
+            self._others.append((keys.POWER, Channel(reader.read, has.power, config)))
 
     def sample(self, tick: int, stamp_ns: int) -> Samples:
         """Every sensor that is due. Ticks must come in order, each once."""
@@ -63,13 +69,13 @@ class Channel:
 
     def __init__(
         self,
-        read: Callable[[int, int], Contacts] | Callable[[int, int], Imu] | Callable[[int, int], Pose],
-        sensor: ContactSensor | ImuSensor | PoseSensor,
+        read: Callable[[int, int], Contacts | Imu | Pose | Power],
+        sensor: ContactSensor | ImuSensor | PoseSensor | PowerSensor,
         config: RunConfig,
     ) -> None:
         self._read = read
         self._due = Due(sensor.rate_hz, config.rate_hz, config.period_ns)
-        self._line: DelayLine[Contacts | Imu | Pose] = DelayLine(ticks_of(sensor.delay_s, config.period_ns))
+        self._line: DelayLine[Contacts | Imu | Pose | Power] = DelayLine(ticks_of(sensor.delay_s, config.period_ns))
 
     def arriving(self, tick: int, stamp_ns: int) -> Message | None:
         """Take a sample if due, and hand over what arrives at this tick."""
@@ -214,6 +220,29 @@ class PoseReader:
             orientation_wxyz=(w, x, y, z),
             velocity_w=(vx, vy, vz),
             angular_velocity_w=spin_w,
+        )
+
+
+class PowerReader:
+    """Supply, current and temperatures of the modules that the joints would be in. No noise, and never a leak."""
+
+    def __init__(self, data: mujoco.MjData, motors: Motors, windings: Thermal, rated_nm: float) -> None:
+        self._velocities, self._torques = data.qvel[FREE_DOFS:], motors.applied_nm()
+        self._windings, self._rated_nm = windings, rated_nm
+        self._count = motors.count
+
+    def read(self, tick: int, stamp_ns: int) -> Power:
+        """What the modules would say now."""
+        winding_c = self._windings.winding_c
+        return Power(
+            tick=tick,
+            stamp_ns=stamp_ns,
+            voltage_v=[SUPPLY_V] * self._count,
+            current_a=current_a(self._torques, self._velocities, self._rated_nm, SUPPLY_V).tolist(),
+            motor_c=winding_c.tolist(),
+            board_c=board_c(winding_c).tolist(),
+            leak=[False] * self._count,
+            valid=[True] * self._count,
         )
 
 

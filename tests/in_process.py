@@ -209,7 +209,9 @@ class _Runner:
         assert answer.ok, answer.reason
         stay = SetPoints([Mode.POSITION] * len(self.robot.joints), list(joints.angle_rad), [])
         assert self.authority.offer(self._command(-1, stay), now_ns=0, tick=0, age_ns=0) is None
-        request = LifecycleRequest(action="arm", robot=self.robot.robot, backend=self.robot.backend)
+        request = LifecycleRequest(
+            action="arm", robot=self.robot.robot, backend=self.robot.backend, config_hash=self.robot.config_hash
+        )
         answer = self.authority.on_lifecycle(request, 0)
         assert answer.ok, answer.reason
 

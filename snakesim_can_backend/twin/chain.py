@@ -16,15 +16,16 @@ import msgspec
 from snakesim_can_backend.bus_load import shares
 from snakesim_can_backend.protocol import BROADCAST, FROM_HOST, Frame, Opcode, Parameter, node_of, opcode_of
 from snakesim_can_backend.settings import Settings
-from snakesim_can_backend.twin import thermal
 from snakesim_can_backend.twin.bus_time import FRAME_US, BusTime, Traffic
-from snakesim_can_backend.twin.faults import Change, Fault, Plan, parse
+from snakesim_can_backend.twin.faults import parse
 from snakesim_can_backend.twin.firmware import BOOT_US, Module
 from snakesim_can_backend.twin.frames import LENGTHS, read_sync
 from snakesim_can_backend.twin.motors import Motors
 from snakesim_can_backend.twin.parameters import Parameters, from_factory
 from snakesim_can_backend.twin.seat import Seat
 from snakesim_can_backend.twin.senses import PoseCamera, Senses
+from snakesim_hal import thermal
+from snakesim_hal.injection import Change, Injection, Plan
 from snakesim_hal.messages import Mode
 from snakesim_hal.plant import Plant
 from snakesim_hal.scenario import RunConfig
@@ -129,14 +130,14 @@ class ModuleChain:
 
     def _poll(self, now_us: float) -> None:
         """Everything that time brings, but the physics."""
-        for change in self._plan.until(now_us):
+        for change in self._plan.until(now_us / 1e6):
             self._go_wrong(change, now_us)
         speeds, torques = self.plant.velocity_rad_s.tolist(), self.motors.torque_nm.tolist()
         windings, rated = self.thermal.winding_c.tolist(), self.motors.rated_nm
-        due_us = self._plan.next_us()
+        due_us = self._plan.next_s() * 1e6
         for seat in self.seats:
             j = seat.joint
-            seat.feel(speeds[j], torques[j], rated, windings[j], thermal.AMBIENT_C)
+            seat.feel(speeds[j], torques[j], rated, windings[j])
             due_us = min(due_us, seat.module.poll(now_us))
             self._follow_up(seat)
         for seat, since_us in self._babblers.items():
@@ -254,26 +255,25 @@ class ModuleChain:
 
     # --- faults on request ---------------------------------------------------------------------------------
 
-    def inject(self, fault: Fault, *, begins: bool = True) -> None:
+    def inject(self, fault: Injection, *, begins: bool = True) -> None:
         """Let something go wrong now, or end."""
-        self._go_wrong(Change(self.now_us, fault, begins), self.now_us)
+        self._go_wrong(Change(self.now_us / 1e6, fault, begins), self.now_us)
         self._poll(self.now_us)
 
     def _go_wrong(self, change: Change, now_us: float) -> None:
-        fault, seat = change.fault, self.seats[change.fault.joint]
+        fault, joint = change.injection, change.injection.number
+        seat = self.seats[joint]
         self.happened.append(f"{now_us * 1e-6:.2f} s {fault} {'begins' if change.begins else 'ends'}")
         match fault.kind:
             case "overheat":
-                self.thermal.inject(fault.joint, heat=change.begins, hold=change.begins and fault.end_s != inf)
+                self.thermal.inject(joint, heat=change.begins, hold=change.begins and fault.end_s != inf)
                 self.motors.derate(self.thermal.share_left())
                 self._derated = True
             case "duplicate":
                 if change.begins:
-                    self._seat(
-                        fault.joint, seat.channel, seat.module.serial ^ OTHER_SERIAL, now_us - BOOT_US, drives=False
-                    )
+                    self._seat(joint, seat.channel, seat.module.serial ^ OTHER_SERIAL, now_us - BOOT_US, drives=False)
                 else:
-                    self.seats[self.count :] = [s for s in self.seats[self.count :] if s.joint != fault.joint]
+                    self.seats[self.count :] = [s for s in self.seats[self.count :] if s.joint != joint]
             case "babble" if self.stepped:
                 self._babblers.pop(seat, None)
                 if change.begins:

@@ -47,14 +47,13 @@ from snakesim_can_backend.twin.frames import (
 )
 from snakesim_can_backend.twin.parameters import Parameters
 from snakesim_can_backend.twin.reports import Inside, Sight, health
-from snakesim_can_backend.twin.thermal import COOLED_C, OVERHEAT_C
 from snakesim_hal.messages import Mode
+from snakesim_hal.thermal import COOLED_C, LEAST_VOLTAGE_V, OVERHEAT_C
 
 BOOT_US = 100_000
 HEARTBEAT_US = round(HEARTBEAT_PERIOD_S * 1e6)
 HEALTH_US = round(HEALTH_PERIOD_S * 1e6)
 AT_REST_RAD_S = 0.05
-LEAST_VOLTAGE_V = 18.0
 FIRMWARE = (1, 0)
 MODES = tuple(Mode)
 STOP_OF_FAULT = {fault: LastStop[fault.name] for fault in ModuleFault}

@@ -3,13 +3,10 @@
 from dataclasses import dataclass
 
 from snakesim_can_backend.protocol import Frame, Opcode, checksum, opcode_of
-from snakesim_can_backend.twin.faults import Kind
-from snakesim_can_backend.twin.firmware import LEAST_VOLTAGE_V, Demand, Module
-from snakesim_can_backend.twin.thermal import LOSS_AT_RATED_W
+from snakesim_can_backend.twin.firmware import Demand, Module
+from snakesim_hal.thermal import LEAST_VOLTAGE_V, SUPPLY_V, board_c, current_a
 
-SUPPLY_V, SAGGED_V = 24.0, LEAST_VOLTAGE_V - 6.0
-IDLE_A = 0.05
-BOARD_OVER_AMBIENT = 0.3  # of what the winding is warmer than the water, a guess
+SAGGED_V = LEAST_VOLTAGE_V - 6.0
 
 
 @dataclass(slots=True, eq=False)
@@ -26,17 +23,17 @@ class Seat:
     wrong_count: bool = False
     wrong_checksum: bool = False
 
-    def begin(self, kind: Kind, now_us: float) -> None:
+    def begin(self, kind: str, now_us: float) -> None:
         """Something goes wrong with this module alone."""
         self._set(kind, True)
         if kind == "reboot":
             self.module.reboot(now_us)
 
-    def end(self, kind: Kind) -> None:
+    def end(self, kind: str) -> None:
         """It is over."""
         self._set(kind, False)
 
-    def _set(self, kind: Kind, wrong: bool) -> None:
+    def _set(self, kind: str, wrong: bool) -> None:
         match kind:
             case "mute":
                 self.mute = wrong
@@ -53,13 +50,12 @@ class Seat:
             case _:
                 pass
 
-    def feel(self, speed_rad_s: float, torque_nm: float, rated_nm: float, winding_c: float, ambient_c: float) -> None:
+    def feel(self, speed_rad_s: float, torque_nm: float, rated_nm: float, winding_c: float) -> None:
         """Bring what it measures inside itself up to date."""
         inside = self.module.inside
         inside.speed_rad_s, inside.winding_c = speed_rad_s, winding_c
-        inside.board_c = ambient_c + BOARD_OVER_AMBIENT * (winding_c - ambient_c)
-        watts = torque_nm * speed_rad_s + LOSS_AT_RATED_W * (torque_nm / rated_nm) ** 2
-        inside.current_a = IDLE_A + watts / inside.voltage_v
+        inside.board_c = board_c(winding_c)
+        inside.current_a = current_a(torque_nm, speed_rad_s, rated_nm, inside.voltage_v)
 
     def outgoing(self) -> list[Frame]:
         """What the module has to send, as it goes out; each frame once."""

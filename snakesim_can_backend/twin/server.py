@@ -17,6 +17,7 @@ from snakesim_can_backend.settings import Settings
 from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_can_backend.wire import VirtualWire, Wire
 from snakesim_hal.errors import ConfigError
+from snakesim_hal.injection import Injection
 from snakesim_hal.plant import Plant
 from snakesim_hal.plugins import PLANTS, find_plugin, plugin_settings
 from snakesim_hal.scenario import RunConfig
@@ -122,6 +123,10 @@ class Here:
     def __call__(self) -> float | None:
         """Handle what is there and send what is due; seconds until it wants to run again, None for never."""
         return self.server.run_due(self._clock_ns())
+
+    def inject(self, injection: Injection, *, begins: bool) -> None:
+        """Let something go wrong with a module, or end."""
+        self.server.chain.inject(injection, begins=begins)
 
     def close(self) -> None:
         """Leave the bus."""

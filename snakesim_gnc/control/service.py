@@ -45,6 +45,8 @@ class Control(Service):
         """Get ready to command this robot."""
         self._robot = robot
         self._commander = Commander(self._client, robot)
+        self._controller = None
+        self._last_told = ()
 
     def outputs(self, clock: Clock) -> list[tuple[str, Message]] | None:
         """Command the robot; armed, as the controller says, otherwise to stay as it is."""

@@ -169,8 +169,11 @@ class Hosted:
         return self.backend.seen[-1].tick if self.backend.seen else -1
 
     def lifecycle(self, action: Any) -> Answer:
-        """Arm (naming robot and backend), disarm or clear."""
-        request = LifecycleRequest(action=action, robot=self.robot.robot, backend=self.robot.backend)
+        """Arm (naming robot, backend and configuration), disarm or clear."""
+        robot = self.robot
+        request = LifecycleRequest(
+            action=action, robot=robot.robot, backend=robot.backend, config_hash=robot.config_hash
+        )
         return self.session.ask_politely(keys.LIFECYCLE, request, timeout_s=10.0)
 
     def arm(self, plan: Plan) -> None:

@@ -52,16 +52,16 @@ def push(rig: Rig) -> Pushing:
     near = both(Mode.POSITION, t.NEAR_STOP * upper.angle_max_rad, t.NEAR_STOP * lower.angle_min_rad)
     rig.drive(near, rig.periods(t.SETTLE_S))
     asked_nm = t.PUSH_SHARE * upper.torque_limit_nm
-    rig.drive(both(Mode.TORQUE, asked_nm, -asked_nm), rig.periods(t.PUSH_S))
-    torque_mode = rig.drive(both(Mode.TORQUE, asked_nm, -asked_nm), t.TRANSPORT_PERIODS)
+    rig.press(both(Mode.TORQUE, asked_nm, -asked_nm), rig.periods(t.PUSH_S))
+    torque_mode = rig.press(both(Mode.TORQUE, asked_nm, -asked_nm), t.TRANSPORT_PERIODS)
     limit_nm = t.LIMIT_SHARE * upper.torque_limit_nm
     speed = min(
         t.DEMAND_SHARE * upper.torque_limit_nm / upper.velocity_gain_nm_s_per_rad, 0.5 * upper.speed_limit_rad_s
     )
     limits = [limit_nm] * rig.count
     fast = both(Mode.VELOCITY, speed, -speed)
-    rig.drive(fast, rig.periods(t.PUSH_S), torque_limit_nm=limits)
-    limited = rig.drive(fast, t.TRANSPORT_PERIODS, torque_limit_nm=limits)
+    rig.press(fast, rig.periods(t.PUSH_S), torque_limit_nm=limits)
+    limited = rig.press(fast, t.TRANSPORT_PERIODS, torque_limit_nm=limits)
     rig.must_be_armed()
     return Pushing(torque_mode, asked_nm, limited, limit_nm, rig.since(began))
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesim_hal import keys
 from snakesim_hal.authority import Authority
 from snakesim_hal.backend import Backend, Samples, SetPoints
 from snakesim_hal.conformance import tolerances as t
@@ -20,6 +21,7 @@ from snakesim_hal.messages import (
     LifecycleState,
     Mode,
     Pace,
+    Power,
 )
 
 Floats = NDArray[np.float64]
@@ -144,6 +146,16 @@ class Rig:
             self.idle()
         return self.since(began)
 
+    def press(self, asked: Asked, periods: int = 1, *, torque_limit_nm: list[float] | None = None) -> Record:
+        """The same past the gate, which lets nothing drive a joint against its stop; the lifecycle goes on."""
+        began = self.tick
+        for _ in range(periods):
+            self._offer(self.points({i: (Mode.PASSIVE, 0.0) for i in asked}))
+            self.authority.expire(self._now_ns, self.tick)
+            self.authority.decide()
+            self.hand(self.points(asked, torque_limit_nm), self.authority.state)
+        return self.since(began)
+
     def points(self, asked: Asked, torque_limit_nm: list[float] | None = None) -> SetPoints:
         """Set-points of all joints; those that nothing is asked of stay at home."""
         mode, target = [Mode.POSITION] * self.count, list(self.home_rad)
@@ -162,7 +174,9 @@ class Rig:
             self.idle(t.TRANSPORT_PERIODS)
         here = {i: (Mode.POSITION, angle) for i, angle in enumerate(self.now.angle_rad)}
         self._offer(self.points(here))
-        request = LifecycleRequest(action="arm", robot=self.robot.robot, backend=self.robot.backend)
+        request = LifecycleRequest(
+            action="arm", robot=self.robot.robot, backend=self.robot.backend, config_hash=self.robot.config_hash
+        )
         answer = self.authority.on_lifecycle(request, self._now_ns)
         assert answer.ok, f"the robot cannot be armed: {answer.reason}"
         self.drive(here, t.ARMING_PERIODS)
@@ -240,7 +254,10 @@ class Rig:
 
     def _sample(self) -> Samples:
         samples = self.backend.sample(self.tick, self._now_ns)
-        self.authority.observe(samples.joints)
+        self.authority.observe(samples.joints, self._now_ns)
+        power = samples.others.get(keys.POWER)
+        if isinstance(power, Power):
+            self.authority.observe_power(power, self._now_ns)
         self._samples.append(samples)
         return samples
 

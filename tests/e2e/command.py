@@ -73,7 +73,8 @@ class Running:
 
     def part(self, name: str) -> int:
         """Process id of one of its parts: `host`, `control`, ..."""
-        wanted = "snakesim_hal.host_process" if name == "host" else f"snakesim_hal.serve\0{name}\0"
+        own = {"host": "snakesim_hal.host_process", "router": "snakesim_hal.router_process"}
+        wanted = own.get(name, f"snakesim_hal.serve\0{name}\0")
         return next(pid for pid, line in processes_of(self.out) if wanted in line)
 
     def wait_for(self, what: str, limit_s: float = LIMIT_S) -> None:

@@ -1,20 +1,49 @@
-"""`python -m tests.fuzz --payloads 1000000`: run, and print what became of every kind of payload."""
+"""`python -m tests.fuzz --payloads 1000000 [--network]`: run, and print what became of every kind of payload.
+
+Without `--network` the decoders are fed in this process. With it, a run of its own is armed, and a stranger on its
+network sends to every key and asks every query.
+"""
 
 import argparse
+import tempfile
 import time
 from collections import Counter
+from pathlib import Path
 
+from tests.fuzz import network
 from tests.fuzz.run import run
 
 GROWTH_MB = 16.0  # more than what an allocator keeps back
+RATE = 4000.0  # a second: two cores bear the robot and this beside it
 
 
 def main() -> int:
-    """0 when no decoder raised anything but a WireError and memory stayed flat."""
+    """0 when nothing raised anything but a WireError, memory stayed flat, and a running robot took no harm."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--payloads", type=int, default=1_000_000)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--network", action="store_true", help="against a robot that runs, over its network")
+    parser.add_argument("--rate", type=float, default=RATE, help="payloads a second over the network (%(default)g)")
+    parser.add_argument("--backend", default="sim", help="of the robot that runs: sim or can")
+    parser.add_argument("--robot-hz", type=float, default=100.0, help="the robot's own rate (%(default)g)")
+    parser.add_argument("--out", type=Path, help="folder of the run over the network (default: a temporary one)")
     asked = parser.parse_args()
+    return over_network(asked) if asked.network else in_process(asked)
+
+
+def over_network(asked: argparse.Namespace) -> int:
+    """A robot of its own, and a stranger."""
+    with tempfile.TemporaryDirectory(prefix="snakesim-fuzz-") as temporary:
+        out = (asked.out or Path(temporary) / "run").resolve()
+        out.parent.mkdir(parents=True, exist_ok=True)
+        request = network.Request(asked.payloads, asked.rate, asked.seed, asked.backend, robot_hz=asked.robot_hz)
+        verdict = network.fuzz(out, request)
+    print(network.table(verdict))
+    return 1 if verdict.violations else 0
+
+
+def in_process(asked: argparse.Namespace) -> int:
+    """Every decoder, and a HAL without a network."""
     started = time.monotonic()
     report = run(asked.payloads, asked.seed)
     total: Counter[str] = Counter()

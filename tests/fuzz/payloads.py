@@ -2,7 +2,7 @@
 
 import datetime
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +22,8 @@ REAL: dict[type[Message], list[Message]] = {
         LeaseRequest(action=action, holder="control", epoch=1) for action in ("acquire", "renew", "release")
     ],
     LifecycleRequest: [
-        LifecycleRequest(action=action, robot="worm", backend="lag") for action in ("arm", "disarm", "clear", "finish")
+        LifecycleRequest(action=action, robot="worm", backend="lag", config_hash=ROBOT.config_hash)
+        for action in ("arm", "disarm", "clear", "finish")
     ],
 }
 LONG = 100_000
@@ -109,9 +110,10 @@ def seeds() -> list[Seed]:
 class Maker:
     """Makes one sample after the other; the same ones for the same random numbers."""
 
-    def __init__(self, rng: random.Random) -> None:
+    def __init__(self, rng: random.Random, start_from: Sequence[Seed] | None = None) -> None:
+        """start_from: valid messages to make others of; None: `seeds()`."""
         self._rng = rng
-        self._seeds = seeds()
+        self._seeds = list(start_from or seeds())
         self._kinds: dict[str, Callable[[Seed], bytes]] = {
             "valid": lambda seed: seed.payload,
             "random": lambda seed: rng.randbytes(rng.randrange(200)),

@@ -57,7 +57,7 @@ class Robot:
         for request in (
             LeaseRequest(action="acquire", holder="control"),
             command(ROBOT, 0.1),
-            LifecycleRequest(action="arm", robot=ROBOT.robot, backend=ROBOT.backend),
+            LifecycleRequest(action="arm", robot=ROBOT.robot, backend=ROBOT.backend, config_hash=ROBOT.config_hash),
         ):
             word = self.take(request)
             assert word in ("yes", "accepted"), word

@@ -7,6 +7,7 @@ _A_SUM = "renewed() adds the two: their order does not matter"
 _ROUNDED = "one part in a million, in a text that is rounded to whole milliseconds"
 _SET_BEFORE_USE = "whatever reads it is preceded by a change of lifecycle or lease that sets it; here it is declared"
 _ONLY_COMPARED = "zeros as whole or as real numbers: the first modes are only ever compared"
+_IN_ANY_ORDER = "the greater of two, or the middle of three with a low below a high, does not depend on the order"
 
 EQUIVALENT: dict[tuple[str, str, str], str] = {
     (
@@ -71,4 +72,24 @@ EQUIVALENT: dict[tuple[str, str, str], str] = {
         "Authority.on_lifecycle",
         "renewed(self.lease, now_ns, self.description.lease_ns) -> renewed(self.lease, self.description.lease_ns, now_ns) in `self.lease = renewed(self.lease, now_ns, self.description.lease_ns)`",
     ): _A_SUM,
+    (
+        "halting.py",
+        "Halt.begin",
+        "True -> False in `states = zip(limits.joints, angle.tolist(), velocity.tolist(), measured.torque_nm.tolist(), strict=True)`",
+    ): _SAME_LENGTHS,
+    (
+        "halting.py",
+        "Halt.begin",
+        "np.clip(target, angle - limits.max_step_rad, angle + limits.max_step_rad) -> np.clip(angle - limits.max_step_rad, target, angle + limits.max_step_rad) in `near = np.clip(target, angle - limits.max_step_rad, angle + limits.max_step_rad)`",
+    ): _IN_ANY_ORDER,
+    (
+        "halting.py",
+        "Halt.begin",
+        "np.clip(velocity, -limits.speed_rad_s, limits.speed_rad_s) -> np.clip(-limits.speed_rad_s, velocity, limits.speed_rad_s) in `slowed = np.clip(velocity, -limits.speed_rad_s, limits.speed_rad_s)`",
+    ): _IN_ANY_ORDER,
+    (
+        "halting.py",
+        "Halt.after_a_period",
+        "np.maximum(np.abs(self.velocity_rad_s) - limits.acceleration_rad_s2 * period_s, 0.0) -> np.maximum(0.0, np.abs(self.velocity_rad_s) - limits.acceleration_rad_s2 * period_s) in `slower = np.maximum(np.abs(self.velocity_rad_s) - limits.acceleration_rad_s2 * period_s, 0.0)`",
+    ): _IN_ANY_ORDER,
 }

@@ -19,6 +19,11 @@ TRIED_BY = {
     "lease.py": ("test_lease.py", "test_authority.py", "test_authority_machine.py"),
     "lifecycle.py": ("test_lifecycle.py", "test_authority.py", "test_authority_machine.py"),
     "authority.py": ("test_authority.py", "test_authority_machine.py"),
+    "arming.py": ("test_authority.py", "test_authority_machine.py"),
+    "plausible.py": ("test_plausible.py", "test_authority_machine.py"),
+    "halting.py": ("test_halting.py", "test_authority_machine.py"),
+    "derating.py": ("test_derating.py", "test_authority_machine.py"),
+    "thermal.py": ("test_thermal.py",),
 }
 SURVIVED, KILLED = int(pytest.ExitCode.OK), int(pytest.ExitCode.TESTS_FAILED)
 BROKEN_AT_IMPORT = int(pytest.ExitCode.INTERRUPTED)

@@ -22,7 +22,7 @@ from snakesim_can_backend.can_command import COLUMNS
 from snakesim_can_backend.codec import codec
 from snakesim_can_backend.protocol import Action, Frame, LastStop, ModuleState, Opcode, node_of, opcode_of
 from snakesim_hal import keys
-from snakesim_hal.messages import LifecycleRequest, Status
+from snakesim_hal.messages import Description, LifecycleRequest, Status
 from snakesim_hal.scenario import Override, RunConfig, load, write
 from snakesim_hal.session import Link, Session, open_session
 from tests.e2e.command import environment, free_endpoint, snakesim, wait_until
@@ -195,6 +195,8 @@ class Operator:
     def __init__(self, bench: Bench) -> None:
         self._bench, self._session = bench, bench.joined()
         self._statuses = self._session.latched_reader(keys.STATUS, Status)
+        self._descriptions = self._session.latched_reader(keys.DESCRIPTION, Description)
+        self._robot: Description | None = None
         self._status: Status | None = None
 
     def status(self) -> Status | None:
@@ -207,15 +209,18 @@ class Operator:
             self._session.ask_politely(keys.LIFECYCLE, LifecycleRequest(action="clear"), timeout_s=10.0)
             print(f"cleared: {status.why}")
             self._status = None
-        return status is not None and status.ready_to_arm
+        self._robot = (self._descriptions.drain() or [self._robot])[-1]
+        return status is not None and status.ready_to_arm and self._robot is not None
 
     def arm(self) -> None:
         """Clear what there is, arm, and wait until every module is armed."""
         bench = self._bench
         bench.until(self._ready, "ready to arm")
-        status = self._status
-        assert status is not None
-        request = LifecycleRequest(action="arm", robot=status.robot, backend=status.backend)
+        robot = self._robot
+        assert robot is not None
+        request = LifecycleRequest(
+            action="arm", robot=robot.robot, backend=robot.backend, config_hash=robot.config_hash
+        )
         bench.listener.forget()
         self._session.ask(keys.LIFECYCLE, request, timeout_s=10.0)
         armed = [ModuleState.ARMED] * JOINTS

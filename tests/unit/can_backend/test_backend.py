@@ -35,6 +35,7 @@ from snakesim_can_backend.twin.server import Here, TwinServer, here
 from snakesim_can_backend.wire import OtherEnd, VirtualWire
 from snakesim_hal.backend import SetPoints
 from snakesim_hal.errors import BackendError, ConfigError
+from snakesim_hal.injection import Injection
 from snakesim_hal.messages import LifecycleState, Mode
 from snakesim_hal.scenario import RunConfig
 from tests.unit.can_backend.loop import JOINTS, Loop, config, loop
@@ -489,6 +490,9 @@ class OneChain:
 
     def __call__(self) -> float | None:
         return None if self.closed else self.server.run_due(0)
+
+    def inject(self, injection: Injection, *, begins: bool) -> None:
+        raise NotImplementedError
 
     def close(self) -> None:
         if not self.closed:

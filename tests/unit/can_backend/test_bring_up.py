@@ -27,6 +27,7 @@ from snakesim_can_backend.settings import Settings
 from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_can_backend.wire import VirtualWire
 from snakesim_hal.errors import BackendError
+from snakesim_hal.injection import Injection
 from tests.unit.can_backend.frames import heartbeat
 from tests.unit.can_backend.loop import config
 from tests.unit.can_backend.twin import rig
@@ -63,6 +64,9 @@ class Modules:
                 self.far.send(passed)
         self.beside()
         return 0.001
+
+    def inject(self, injection: Injection, *, begins: bool) -> None:
+        raise NotImplementedError
 
     def close(self) -> None:
         self.far.close()

@@ -14,6 +14,7 @@ from snakesim_can_backend.protocol import Action, Frame, ModuleState, Opcode, op
 from snakesim_can_backend.settings import Settings
 from snakesim_can_backend.wire import VirtualWire
 from snakesim_hal.errors import ConfigError
+from snakesim_hal.injection import Injection
 from snakesim_hal.scenario import load as load_scenario
 from snakesim_hal.scenario import parse_set
 
@@ -106,6 +107,9 @@ class Bystanders:
         for frame in self.chatter:
             self.wire.send(frame)
         self.chatter = []
+
+    def inject(self, injection: Injection, *, begins: bool) -> None:
+        raise NotImplementedError
 
     def close(self) -> None:
         self.wire.close()

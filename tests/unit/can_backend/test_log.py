@@ -9,7 +9,7 @@ from cantools.logreader import Parser
 
 from snakesim_can_backend.log import LoggedWire, open_log
 from snakesim_can_backend.protocol import Frame
-from snakesim_can_backend.wire import Trouble
+from snakesim_can_backend.trouble import Trouble
 from snakesim_hal.errors import ConfigError
 
 LINE = re.compile(r"\((\d+\.\d{6})\) (\S+) ([0-9A-F]{3})#([0-9A-F]*)\n")
@@ -39,6 +39,9 @@ class FakeWire:
 
     def idle(self) -> float | None:
         return 0.25
+
+    def inject(self, kind: str, *, begins: bool) -> None:
+        raise NotImplementedError
 
     def close(self) -> None:
         self.closed = True

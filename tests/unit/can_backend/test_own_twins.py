@@ -13,6 +13,7 @@ from snakesim_can_backend.own_twins import TwinProcess, check_twins, twins_here
 from snakesim_can_backend.settings import Settings
 from snakesim_can_backend.twin.server import Here
 from snakesim_hal.errors import BackendError, ConfigError
+from snakesim_hal.injection import Injection
 from tests.unit.can_backend.loop import config
 
 RUN = config()
@@ -150,9 +151,7 @@ def test_the_real_command_says_why_it_does_not_start(capsys: pytest.CaptureFixtu
 
 
 def test_a_child_that_ends_by_itself_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    child(
-        tmp_path, monkeypatch, "print('modules ready: 4', flush=True)\nsys.stdin.read()\ntime.sleep(0.3)\nsys.exit(3)\n"
-    )
+    child(tmp_path, monkeypatch, "print('modules ready: 4', flush=True)\ntime.sleep(0.3)\nsys.exit(3)\n")
     twins = TwinProcess(RUN, Settings(channels=VCAN, twins="process"), None, stepped=False)
     assert twins.how_it_ended() is None
     end = time.monotonic() + 5.0
@@ -160,3 +159,21 @@ def test_a_child_that_ends_by_itself_is_noticed(tmp_path: Path, monkeypatch: pyt
         time.sleep(0.01)
     assert twins.how_it_ended() == "the module twins have ended, with exit code 3"
     twins.stop()
+
+
+def test_a_child_is_told_what_goes_wrong_as_in_a_terminal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    heard = tmp_path / "heard"
+    listen = "print('modules ready: 4', flush=True)\nfor line in sys.stdin:\n    "
+    noted = child(tmp_path, monkeypatch, f"{listen}pathlib.Path({str(heard)!r}).open('a').write(line)\n")
+    twins = TwinProcess(RUN, Settings(channels=VCAN, twins="process"), None, stepped=False)
+    assert "--interactive" in json.loads(noted.read_text())["arguments"]
+    twins.inject(Injection("mute", "joint_3", 1.0, 2.0), begins=True)
+    twins.inject(Injection("mute", "joint_3", 1.0, 2.0), begins=False)
+    end = time.monotonic() + 5.0
+    while not (heard.exists() and heard.read_text().endswith("off\n")) and time.monotonic() < end:
+        time.sleep(0.01)
+    assert heard.read_text() == "mute joint_3\nmute joint_3 off\n"
+    twins.stop()
+    with pytest.raises(BackendError, match=r"do not take leak:joint_1@0"):
+        for _ in range(100):  # until the pipe is known to be broken
+            twins.inject(Injection("leak", "joint_1"), begins=True)

@@ -205,6 +205,24 @@ def test_power_comes_twice_a_second_and_what_is_unknown_is_not_valid() -> None:
     assert all(len(column) == JOINTS for column in (found.voltage_v, found.current_a, found.motor_c, found.board_c))
 
 
+def test_what_a_module_said_of_its_health_is_not_valid_for_ever() -> None:
+    reading, sensors = sensors_of(config())
+    syncs(reading, 1)
+    reading.take(health(2, voltage=23.5))
+
+    def valid(tick: int) -> list[bool]:
+        power = sensors.sample(tick, 0).others[keys.POWER]
+        assert isinstance(power, Power)
+        return power.valid
+
+    syncs(reading, 125)  # of 100 Hz: two reports and a half
+    assert valid(50) == [False, True, False, False]
+    syncs(reading, 1)
+    assert valid(100) == [False] * JOINTS
+    reading.take(health(2, voltage=23.5))
+    assert valid(150) == [False, True, False, False]
+
+
 def test_a_pose_is_told_once() -> None:
     mocap = MocapReceiver("127.0.0.1:0")
     try:

@@ -8,8 +8,8 @@ from snakesim_can_backend.codec import codec
 from snakesim_can_backend.commands import command
 from snakesim_can_backend.protocol import Action, Frame, LastStop, ModuleState, Opcode, frame_id
 from snakesim_can_backend.reading import Reading
+from snakesim_can_backend.trouble import Kind, Trouble
 from snakesim_can_backend.watch import ARM_GRACE, CLEAR_GRACE, MOST_FRAMES, Finding, Watch
-from snakesim_can_backend.wire import Kind, Trouble
 from snakesim_hal.messages import LifecycleState
 from tests.unit.can_backend.frames import answer, begin, heartbeat, joint_state, spoilt
 

@@ -15,19 +15,18 @@ from hypothesis import strategies as st
 
 from snakesim_can_backend import wire as wire_module
 from snakesim_can_backend.protocol import FROM_HOST, Frame, Opcode
+from snakesim_can_backend.trouble import Kind, Trouble, troubles_of
 from snakesim_can_backend.wire import (
     MOST_AT_ONCE,
-    Kind,
     SocketCanWire,
-    Trouble,
     VirtualWire,
     check_interface,
     drain,
     is_up,
-    troubles_of,
     wait,
 )
 from snakesim_hal.errors import BackendError, ConfigError
+from snakesim_hal.injection import Injection
 
 CAN_ERR_FLAG = 0x20000000  # linux/can.h, linux/can/error.h
 CAN_ERR_TX_TIMEOUT, CAN_ERR_LOSTARB, CAN_ERR_CRTL, CAN_ERR_PROT = 0x001, 0x002, 0x004, 0x008
@@ -327,6 +326,9 @@ class End:
         if self.then_send is not None:
             self.then_send.send(Frame(0x101, b"\x01"))
         return self.pause_s
+
+    def inject(self, injection: Injection, *, begins: bool) -> None:
+        raise AssertionError(f"nobody asked for {injection}")
 
     def close(self) -> None:
         self.closed = True

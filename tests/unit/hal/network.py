@@ -206,7 +206,9 @@ class Running:
 
     def lifecycle(self, action: Any) -> Answer:
         """Arm (naming the robot rightly), disarm, clear or finish."""
-        return self.ask(keys.LIFECYCLE, LifecycleRequest(action=action, robot="worm", backend="lag"))
+        config_hash = self.host.description.config_hash
+        request = LifecycleRequest(action=action, robot="worm", backend="lag", config_hash=config_hash)
+        return self.ask(keys.LIFECYCLE, request)
 
     def arm(self) -> None:
         """As soon as the host is ready."""

@@ -3,6 +3,7 @@
 import dataclasses
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -16,12 +17,13 @@ from snakesim_hal.messages import (
     LifecycleRequest,
     LifecycleState,
     Mode,
+    Power,
 )
 from tests.unit.hal.rig import LEASE_NS, PERIOD_NS, command, description, state
 
 ROBOT = description()
 JOINTS = len(ROBOT.joints)
-ARM = LifecycleRequest(action="arm", robot="worm", backend="lag")
+ARM = LifecycleRequest(action="arm", robot="worm", backend="lag", config_hash=ROBOT.config_hash)
 DISARM, CLEAR, FINISH = (LifecycleRequest(action=action) for action in ("disarm", "clear", "finish"))
 ESTOP = EstopRequest(who="a person")
 
@@ -35,9 +37,12 @@ class Rig:
         self.now_ns = 0
         self.tick = 0
         self.sequence = 0
+        self.stamp_ns = 0
 
     def observe(self, *values: Any, **other: Any) -> None:
-        self.authority.observe(state(self.robot, *values, **other))
+        """A state so much later than the one before that the joints may have come from anywhere."""
+        self.stamp_ns += 10**9
+        self.authority.observe(state(self.robot, *values, stamp_ns=self.stamp_ns, **other))
 
     def acquire(self, holder: str = "control", priority: int = 100) -> Answer:
         return self.authority.on_lease(LeaseRequest(action="acquire", holder=holder, priority=priority), self.now_ns)
@@ -98,9 +103,11 @@ def test_the_way_to_armed() -> None:
         (LifecycleRequest(action="arm", robot="worm"), ["this backend is 'lag', the request names None"]),
         (LifecycleRequest(action="arm", robot="other", backend="lag"), ["this robot is 'worm'", "'other'"]),
         (LifecycleRequest(action="arm", robot="worm", backend="can"), ["this backend is 'lag'", "'can'"]),
+        (msgspec.structs.replace(ARM, config_hash=None), ["the request names none", "arm with its config_hash"]),
+        (msgspec.structs.replace(ARM, config_hash="1" * 16), [f"{'0' * 16!r}, the request names {'1' * 16!r}"]),
     ],
 )
-def test_arming_names_the_robot_and_the_backend(request_: LifecycleRequest, words: list[str]) -> None:
+def test_arming_names_robot_backend_and_configuration(request_: LifecycleRequest, words: list[str]) -> None:
     rig = Rig()
     rig.observe()
     rig.acquire()
@@ -125,12 +132,12 @@ def test_a_robot_that_does_not_know_its_joints_is_not_armed_and_does_not_stay_ar
     rig.observe()
     rig.acquire()
     rig.send()
-    rig.authority.observe(state(rig.robot, **bad))
+    rig.observe(**bad)
     answer = rig.arm()
     assert not answer.ok and answer.reason == f"no valid and fresh state of {joint}"
     rig.observe()
     assert rig.arm().ok
-    rig.authority.observe(state(rig.robot, **bad))
+    rig.observe(**bad)
     rig.send(0.2)
     decision = rig.pass_tick()
     assert rig.authority.state == "fault" and decision.sequence is None
@@ -144,7 +151,7 @@ def test_a_robot_that_does_not_know_its_joints_is_not_armed_and_does_not_stay_ar
 def test_a_state_of_another_number_of_joints_is_no_state(column: str, length: int) -> None:
     rig = armed()
     values = [True] * length if column == "valid" else [0] * length
-    rig.authority.observe(state(rig.robot, **{column: values}))
+    rig.observe(**{column: values})
     decision = rig.pass_tick()
     assert rig.authority.state == "fault" and rig.authority.why == "no joint state of 3 joints"
     assert decision.set_points.target == [0.0] * JOINTS
@@ -292,6 +299,7 @@ def test_what_counted_in_an_earlier_arming_does_not_count_in_the_next() -> None:
     rig.send(0.2)
     assert rig.authority.decide(rig.tick).sequence == rig.sequence
     rig.authority.on_lifecycle(DISARM, rig.now_ns)
+    rig.pass_tick()
     rig.send(0.1)
     assert rig.arm().ok and rig.authority.arming == 2
     assert rig.authority.decide(rig.tick).sequence is None
@@ -501,8 +509,20 @@ def test_a_fault_is_explained_in_as_many_words_as_a_message_holds() -> None:
     rig = armed()
     rig.authority.fault(Fault(tick=1, what="hot", cause="x" * 501))
     assert rig.authority.why == rig.authority.faults[0].cause == "x" * 500
+    rig = armed()
+    rig = armed()
     rig.authority.fault(Fault(tick=1, what="hot", cause=""))
     assert rig.authority.why == "hot"
+    rig.authority.fault(Fault(tick=2, what="cold", cause="what follows from it explains nothing"))
+    assert rig.authority.why == "hot" and len(rig.authority.faults) == 2
+
+
+def test_the_first_fault_is_why_and_what_it_brings_about_is_listed() -> None:
+    rig = armed()
+    for what in ("bus_off", *["watchdog"] * 40):
+        rig.authority.fault(Fault(tick=1, what=what, cause=f"because of {what}"))
+    assert rig.authority.why == rig.authority.faults[0].cause == "because of bus_off"
+    assert rig.authority.faults[1].cause == "because of watchdog"
 
 
 def test_a_note_stops_nothing() -> None:
@@ -553,3 +573,181 @@ def test_a_lease_epoch_is_never_accepted_twice() -> None:
         assert all(rig.authority.offer(c, now_ns=rig.now_ns, tick=rig.tick, age_ns=0) == "wrong_epoch" for c in old)
         old.append(command(rig.robot, sequence=10**6, lease_epoch=epoch))
         rig.pass_tick(10)
+
+
+# --- what is not believed --------------------------------------------------------------------------------------
+
+
+def test_a_glitch_of_an_encoder_moves_no_motor_and_stops_the_robot() -> None:
+    rig = armed(safety__action="hold")
+    rig.observe(0.1)
+    rig.send(0.1)
+    rig.pass_tick()
+    rig.stamp_ns += PERIOD_NS - 10**9
+    rig.observe([0.1, 0.9, 0.1])
+    rig.send([0.1, 0.9, 0.1])
+    decision = rig.pass_tick()
+    (fault,) = rig.authority.faults
+    assert (fault.what, fault.joint, fault.tick) == ("state_invalid", "joint_2", rig.tick)
+    assert "joint_2 by +0.80 rad" in fault.cause
+    assert decision.set_points.target == pytest.approx([0.1] * JOINTS)
+
+
+def test_a_glitch_stands_against_arming() -> None:
+    rig = Rig()
+    rig.observe(0.1)
+    rig.acquire()
+    rig.send(0.1)
+    rig.stamp_ns += PERIOD_NS - 10**9
+    rig.observe([0.1, 0.9, 0.1])
+    assert "joint_2 by +0.80 rad" in rig.arm().reason
+    rig.observe(0.1)
+    assert rig.arm().ok
+
+
+def test_time_that_the_host_knows_of_counts() -> None:
+    rig = armed()
+    rig.authority.observe(state(rig.robot, 0.9, stamp_ns=rig.stamp_ns), rig.stamp_ns + 10**9)
+    rig.pass_tick()
+    assert rig.authority.state == "armed"
+
+
+def test_a_frozen_joint_stops_an_armed_robot() -> None:
+    rig = armed()
+    for k in range(12):
+        rig.stamp_ns += PERIOD_NS - 10**9
+        rig.observe(0.1, 0.0, [0.1, 0.5, 0.1 * k])
+        rig.send([0.1, 0.1 + 0.02 * k, 0.1 + 0.02 * k])
+        rig.pass_tick()
+    assert [(fault.what, fault.joint) for fault in rig.authority.faults] == [("joint_frozen", "joint_2")]
+
+
+# --- heat, supply and leaks ------------------------------------------------------------------------------------
+
+
+def hear(rig: Rig, motor_c: list[float], volts: float = 24.0) -> None:
+    power = Power(
+        tick=rig.tick,
+        stamp_ns=0,
+        voltage_v=[volts] * JOINTS,
+        current_a=[0.0] * JOINTS,
+        motor_c=motor_c,
+        board_c=[20.0] * JOINTS,
+        leak=[False] * JOINTS,
+        valid=[True] * JOINTS,
+    )
+    rig.authority.observe_power(power, rig.now_ns)
+
+
+def test_heat_derates_then_stops_and_must_be_gone_before_the_next_arming() -> None:
+    rig = armed()
+    hear(rig, [20.0, 92.5, 20.0])
+    rig.send(0.1)
+    decision = rig.pass_tick()
+    assert decision.set_points.torque_limit_nm == pytest.approx([4.0, 2.4, 4.0])
+    assert decision.limited == {1: "thermal"} and rig.authority.limited == {"thermal": 1}
+    assert rig.authority.derated == {"joint_2": pytest.approx(0.6)}
+    hear(rig, [20.0, 110.0, 20.0])
+    decision = rig.pass_tick()
+    assert [(fault.what, fault.joint) for fault in rig.authority.faults] == [("overheated", "joint_2")]
+    assert decision.set_points.torque_limit_nm == pytest.approx([4.0, 0.8, 4.0])  # also of the safe action
+    rig.authority.on_lifecycle(CLEAR, rig.now_ns)
+    rig.acquire()
+    rig.send(0.1)
+    rig.pass_tick()
+    answer = rig.arm()
+    assert rig.authority.state == "disarmed" and answer.refusal == "not_ready" and "joint_2 is at 110" in answer.reason
+    hear(rig, [20.0, 70.0, 20.0])
+    rig.pass_tick()
+    rig.send(0.1)
+    assert rig.arm().ok and rig.authority.derated == {}
+
+
+def test_who_tells_nothing_of_its_health_is_noted() -> None:
+    rig = Rig()
+    hear(rig, [20.0] * JOINTS)
+    rig.pass_tick(301)
+    assert [fault.what for fault in rig.authority.faults] == ["power_unknown"] and rig.authority.state == "disarmed"
+
+
+def test_a_weak_supply_stops_an_armed_robot_within_50_ms() -> None:
+    rig = armed()
+    hear(rig, [20.0] * JOINTS, volts=12.0)
+    for _ in range(5):
+        assert rig.authority.state == "armed"
+        rig.send(0.1)
+        rig.pass_tick()
+    assert {fault.what for fault in rig.authority.faults} == {"undervoltage"}
+
+
+# --- stops that nobody has seen --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("stop", ["estop", "fault", "disarm"])
+def test_no_arming_before_the_motors_were_told_of_a_stop(stop: str) -> None:
+    """Cleared and armed again within one period, the backend would never have heard of it."""
+    rig = armed()
+    rig.send(0.1)
+    rig.pass_tick()
+    if stop == "estop":
+        rig.authority.on_estop(ESTOP, rig.tick)
+    elif stop == "fault":
+        rig.authority.fault(Fault(tick=1, what="hot", cause="hot"))
+    else:
+        rig.authority.on_lifecycle(DISARM, rig.now_ns)
+    if stop != "disarm":
+        rig.pass_tick()  # told of the stop, but not that it was cleared
+        rig.authority.on_lifecycle(CLEAR, rig.now_ns)
+    rig.acquire()
+    rig.send(0.1)
+    answer = rig.arm()
+    assert (answer.ok, answer.refusal) == (False, "not_ready") and "have not been told" in answer.reason
+    assert rig.authority.decide().set_points.mode == [Mode.PASSIVE] * JOINTS
+    assert rig.arm().ok
+
+
+def test_before_the_first_arming_nobody_needs_to_be_told() -> None:
+    """In lockstep there are no decisions before it."""
+    rig = Rig()
+    rig.authority.on_estop(ESTOP, 0)
+    rig.authority.on_lifecycle(CLEAR, 0)
+    rig.observe()
+    rig.acquire()
+    rig.send()
+    assert rig.arm().ok
+
+
+# --- a no in one word ------------------------------------------------------------------------------------------
+
+
+def test_every_no_has_a_word() -> None:
+    rig = armed()
+    ask, authority = LeaseRequest, rig.authority
+    answers = {
+        "lease_held": authority.on_lease(ask(action="acquire", holder="teleop"), 0),
+        "not_holder": authority.on_lease(ask(action="release", holder="teleop", epoch=1), 0),
+        "wrong_state": rig.arm(),
+    }
+    assert authority.on_lease(ask(action="renew", holder="teleop", epoch=1), 0).refusal == "not_holder"
+    assert authority.on_lifecycle(CLEAR, 0).refusal == "wrong_state"
+    authority.on_estop(ESTOP, 0)
+    assert authority.on_lifecycle(DISARM, 0).refusal == "wrong_state"
+    rig = Rig()
+    for word, change in (("robot", {"robot": "x"}), ("backend", {"backend": "x"}), ("config", {"config_hash": "x"})):
+        asked = msgspec.structs.replace(ARM, **change)
+        answers[f"wrong_{word}"] = rig.authority.on_lifecycle(asked, 0)
+    answers["not_ready"] = rig.arm()
+    assert {word: answer.refusal for word, answer in answers.items()} == {word: word for word in answers}
+    assert not any(answer.ok for answer in answers.values())
+    assert rig.acquire().refusal is None
+
+
+def test_what_matters_most_is_the_word() -> None:
+    rig = armed()
+    for change, word in (
+        ({"config_hash": None, "backend": None, "robot": None}, "wrong_robot"),
+        ({"config_hash": None, "backend": None}, "wrong_backend"),
+        ({"config_hash": None}, "wrong_config"),
+        ({}, "wrong_state"),
+    ):
+        assert rig.authority.on_lifecycle(msgspec.structs.replace(ARM, **change), 0).refusal == word

@@ -32,6 +32,7 @@ from snakesim_hal.messages import (
     LifecycleRequest,
     LifecycleState,
     Mode,
+    Power,
 )
 from tests.unit.hal.rig import LEASE_NS, PERIOD_NS, command, description, state
 
@@ -43,6 +44,11 @@ JOINTS = 3
 PERIOD_S = PERIOD_NS * 1e-9
 ANGLE, SPEED, ACCELERATION, TORQUE, TORQUE_RATE, FAR = 1.5, 5.0, 100.0, 4.0, 80.0, 0.3  # of the test robot
 STIFFNESS, DAMPING, VELOCITY_GAIN = 40.0, 1.0, 1.0
+REACH, SLACK = 2 * SPEED, 0.05  # rad/s and rad: what is believed of a joint
+REACTION_S = 4 * PERIOD_S
+DERATE_FROM, STOP_AT, LEAST_V, LEAST_SHARE = 80.0, 105.0, 18.0, 0.2
+KNOWN_FOR_NS, LOW_FOR_NS = 3_000_000_000, 50_000_000
+LONG_NS = 1_000_000_000  # a joint may be anywhere after that
 TINY = 1e-9
 NAN, INF = float("nan"), float("inf")
 
@@ -58,7 +64,9 @@ REASONS = {
     "length": "wrong_length",
     "finite": "not_finite",
 }
-TIMES_NS = st.sampled_from([0, 1, PERIOD_NS, LEASE_NS - 1, LEASE_NS, LEASE_NS + 1]) | st.integers(0, 3 * LEASE_NS)
+TIMES_NS = st.sampled_from([0, 1, PERIOD_NS, LEASE_NS - 1, LEASE_NS, LEASE_NS + 1, KNOWN_FOR_NS + 1]) | st.integers(
+    0, 3 * LEASE_NS
+)
 
 
 def per_joint(values: st.SearchStrategy[Any]) -> st.SearchStrategy[list[Any]]:
@@ -71,6 +79,33 @@ def often(usual: Any, *others: Any) -> st.SearchStrategy[Any]:
 
 def within(value: float, low: float, high: float) -> float:
     return min(max(value, low), high)
+
+
+def stoppable(distance: float) -> float:
+    """The speed from which a joint stops within a distance, after it went on for the reaction time."""
+    return ACCELERATION * (math.sqrt(REACTION_S**2 + 2 * distance / ACCELERATION) - REACTION_S) if distance > 0 else 0.0
+
+
+class Health:
+    """What one module said last, and what follows from it."""
+
+    def __init__(self) -> None:
+        self.heard_ns: int | None = None
+        self.celsius, self.volts, self.leak = 20.0, 24.0, False
+        self.hot = False
+        self.low_since_ns: int | None = None
+
+    def known(self, now_ns: int) -> bool:
+        return self.heard_ns is not None and now_ns - self.heard_ns <= KNOWN_FOR_NS
+
+    def wrong(self, now_ns: int) -> set[str]:
+        low = self.low_since_ns is not None and now_ns - self.low_since_ns >= LOW_FOR_NS
+        told = {"leak": self.leak, "undervoltage": low} if self.known(now_ns) else {}
+        return {word for word, there in {"overheated": self.hot, **told}.items() if there}
+
+    def share(self, now_ns: int) -> float:
+        over = (self.celsius - DERATE_FROM) / (STOP_AT - DERATE_FROM)
+        return 1.0 - (1.0 - LEAST_SHARE) * within(over, 0.0, 1.0) if self.known(now_ns) else 1.0
 
 
 class Everything(RuleBasedStateMachine):
@@ -96,8 +131,17 @@ class Everything(RuleBasedStateMachine):
         self.offered = 0
         self.rejected = 0
         self.faults = 0  # kept since the last clear
-        self.was_armed = False
         self.hold_at = [0.0] * JOINTS
+        self.halt: list[list[float]] | None = None  # wanted angle, its velocity, target: of every joint
+        self.stamp_ns = 0
+        self.good: list[tuple[float, float] | None] = [None] * JOINTS  # angle and when it was taken
+        self.strays: list[list[tuple[float, float]]] = [[] for _ in range(JOINTS)]
+        self.same: list[list[tuple[Any, float, float]]] = [[] for _ in range(JOINTS)]  # state, time, target
+        self.healths = [Health() for _ in range(JOINTS)]
+        self.wrong: set[tuple[str, int]] = set()  # at the last tick
+        self.silent: set[int] = set()
+        self.shares = [1.0] * JOINTS
+        self.told = True  # the motors were told of the last stop
         self.last: Decision | None = None
 
     @initialize(
@@ -125,11 +169,64 @@ class Everything(RuleBasedStateMachine):
 
     def leave_for(self, following: LifecycleState) -> None:
         if following != self.state:
-            self.was_armed = self.state == "armed"
             self.hold_at = self.measured[0]
+            self.halt = [self.beginning_of_halt(i) for i in range(JOINTS)] if self.state == "armed" else None
+            self.told = self.told and following != "disarmed"
         if self.state == "armed":
             self.heard = None
         self.state = following
+
+    def mode_before(self, i: int) -> Mode:
+        return Mode.PASSIVE if self.last is None else self.last.set_points.mode[i]
+
+    def target_before(self, i: int) -> float:
+        return 0.0 if self.last is None else self.last.set_points.target[i]
+
+    def beginning_of_halt(self, i: int) -> list[float]:
+        angle, velocity, torque = (column[i] for column in self.measured)
+        target = angle + (torque + DAMPING * velocity) / STIFFNESS
+        if self.mode_before(i) is Mode.POSITION:
+            target = self.target_before(i)
+        target = within(within(target, angle - FAR, angle + FAR), -ANGLE, ANGLE)
+        return [within(angle, -ANGLE, ANGLE), within(velocity, -SPEED, SPEED), target]
+
+    def halt_for_a_period(self, i: int) -> float:
+        assert self.halt is not None
+        wanted, velocity, target = self.halt[i]
+        slower = math.copysign(max(abs(velocity) - ACCELERATION * PERIOD_S, 0.0), velocity)
+        wanted = within(wanted + (velocity + slower) / 2 * PERIOD_S, -ANGLE, ANGLE)
+        target = within(wanted, target - SPEED * PERIOD_S, target + SPEED * PERIOD_S)
+        self.halt[i] = [wanted, slower, target]
+        return target
+
+    def believe(self, i: int, angle: float, taken_s: float) -> bool:
+        """Whether an angle that is otherwise sound is believed; keeps those that are not."""
+
+        def reachable(before: tuple[float, float]) -> bool:
+            return abs(angle - before[0]) <= SLACK + REACH * max(taken_s - before[1], 0.0)
+
+        good, strays = self.good[i], self.strays[i]
+        if good is None or reachable(good):
+            return True
+        if strays and not reachable(strays[-1]):
+            strays.clear()
+        repeated = bool(strays) and taken_s <= strays[-1][1]
+        strays.append((angle, taken_s))
+        if repeated:
+            strays.pop(0)
+        return len(strays) >= 5 and self.state != "armed"
+
+    def is_frozen(self, i: int, state_: Any, taken_s: float) -> bool:
+        if self.state != "armed" or self.mode_before(i) is not Mode.POSITION:
+            self.same[i] = []
+            return False
+        if self.same[i] and self.same[i][-1][0] != state_:
+            self.same[i] = []
+        self.same[i].append((state_, taken_s, self.target_before(i)))
+        targets = [target for _, _, target in self.same[i]]
+        limit = self.last.set_points.torque_limit_nm[i] if self.last else TORQUE
+        long = taken_s - self.same[i][0][1] > LEASE_NS * 1e-9
+        return long and max(targets) - min(targets) > FAR / 4 and abs(state_[2]) < 0.95 * limit
 
     def drop_lease(self) -> None:
         self.holder = self.heard = None
@@ -142,7 +239,7 @@ class Everything(RuleBasedStateMachine):
         self.faults = min(self.faults + 1, under_test.MAX_FAULTS_KEPT)
 
     def check(self, answer: Answer, ok: bool) -> None:
-        assert answer.ok == ok, answer
+        assert answer.ok == ok and (answer.refusal is None) == ok, answer
         assert answer.reason and answer.epoch == self.epoch and answer.lifecycle == self.state
 
     # --- what comes in -----------------------------------------------------------------------------------------
@@ -153,12 +250,20 @@ class Everything(RuleBasedStateMachine):
         torque=per_joint(st.floats(-5, 5)),
         trouble=often(None, "valid", "age", "nan", "inf", "short", "no_valid", "no_age"),
         joint=st.integers(0, JOINTS - 1),
+        later_ns=often(LONG_NS, PERIOD_NS, 0),
     )
     def observe(
-        self, angle: list[float], velocity: list[float], torque: list[float], trouble: str | None, joint: int
+        self,
+        angle: list[float],
+        velocity: list[float],
+        torque: list[float],
+        trouble: str | None,
+        joint: int,
+        later_ns: int,
     ) -> None:
         valid, age_ns = [True] * JOINTS, [LEASE_NS] * JOINTS
         shown = list(angle)
+        self.stamp_ns += later_ns
         match trouble:
             case "valid":
                 valid[joint] = False
@@ -174,10 +279,74 @@ class Everything(RuleBasedStateMachine):
                 age_ns = []
             case _:
                 pass
-        self.authority.observe(state(self.robot, shown, velocity, torque, valid=valid, age_ns=age_ns))
+        seen = state(self.robot, shown, velocity, torque, valid=valid, age_ns=age_ns, stamp_ns=self.stamp_ns)
+        self.authority.observe(seen)
         self.known = trouble is None
-        if trouble in (None, "valid", "age"):  # not good enough to be armed, but the last that is known
-            self.measured = (angle, velocity, torque)
+        if trouble in ("short", "no_valid", "no_age"):
+            return
+        measured = (list(self.measured[0]), list(self.measured[1]), list(self.measured[2]))
+        strange = False
+        for i in range(JOINTS):
+            taken_s = (self.stamp_ns - age_ns[i]) * 1e-9
+            frozen = self.is_frozen(i, (shown[i], velocity[i], torque[i]), taken_s)
+            sound = trouble is None or i != joint
+            believed = sound and self.believe(i, angle[i], taken_s)
+            if believed or not sound:
+                self.strays[i] = []
+            if believed:
+                self.good[i] = angle[i], taken_s
+                measured[0][i], measured[1][i], measured[2][i] = angle[i], velocity[i], torque[i]
+            strange |= frozen or not believed
+        self.measured = measured
+        self.known = not strange
+
+    @rule(
+        celsius=per_joint(often(20.0, 80.0, 81.0, 104.9, 105.0, 300.0)),
+        volts=per_joint(often(24.0, 18.0, 17.9)),
+        leak=st.none() | st.integers(0, 3 * JOINTS),
+        silent=st.none() | st.integers(0, JOINTS - 1),
+        trouble=often(None, "nan", "short"),
+    )
+    def hear_of_power(
+        self, celsius: list[float], volts: list[float], leak: int | None, silent: int | None, trouble: str | None
+    ) -> None:
+        leaks, valid = [i == leak for i in range(JOINTS)], [i != silent for i in range(JOINTS)]
+        told = [NAN, *celsius[1:]] if trouble == "nan" else celsius[1:] if trouble == "short" else celsius
+        power = Power(
+            tick=self.tick,
+            stamp_ns=0,
+            voltage_v=volts,
+            current_a=[0.0] * JOINTS,
+            motor_c=told,
+            board_c=[20.0] * JOINTS,
+            leak=leaks,
+            valid=valid,
+        )
+        self.authority.observe_power(power, self.now_ns)
+        for i, health in enumerate(self.healths if trouble != "short" else ()):
+            if i == silent or not math.isfinite(told[i]):
+                continue
+            health.heard_ns, health.celsius, health.volts, health.leak = self.now_ns, celsius[i], volts[i], leaks[i]
+            health.hot = celsius[i] >= (DERATE_FROM if health.hot else STOP_AT)
+            if volts[i] >= LEAST_V:
+                health.low_since_ns = None
+            elif health.low_since_ns is None:
+                health.low_since_ns = self.now_ns
+
+    def draw_conclusions(self) -> None:
+        """At the end of a tick: what the modules said, and what they have not said for long."""
+        before, self.wrong = self.wrong, set()
+        for i, health in enumerate(self.healths):
+            self.wrong |= {(word, i) for word in health.wrong(self.now_ns)}
+        for _ in self.wrong - before:
+            self.fail()
+        quiet_before, self.silent = self.silent, set()
+        for i, health in enumerate(self.healths):
+            if health.heard_ns is not None and not health.known(self.now_ns):
+                self.silent.add(i)
+        if self.silent - quiet_before:
+            self.faults = min(self.faults + 1, under_test.MAX_FAULTS_KEPT)
+        self.shares = [health.share(self.now_ns) for health in self.healths]
 
     @rule(
         who=HOLDERS,
@@ -280,9 +449,14 @@ class Everything(RuleBasedStateMachine):
         self.offered += 1
         self.rejected += 1
 
-    @rule(robot=often("worm", "other", None), backend=often("lag", "can", None))
-    def arm(self, robot: str | None, backend: str | None) -> None:
+    @rule(
+        robot=often("worm", "other", None),
+        backend=often("lag", "can", None),
+        config_hash=often("0" * 16, "1" * 16, None),
+    )
+    def arm(self, robot: str | None, backend: str | None, config_hash: str | None) -> None:
         ready = self.state == "disarmed" and self.known and self.live and self.heard is not None
+        ready = ready and not self.wrong and (self.told or self.arming == 0)
         if ready and self.heard is not None:
             heard_ns, asked = self.heard
             ready = self.now_ns - heard_ns <= LEASE_NS and all(
@@ -290,8 +464,14 @@ class Everything(RuleBasedStateMachine):
                 for mode, target, angle in zip(asked.mode, asked.target, self.measured[0], strict=True)
             )
         assert (not self.authority.against_arming(self.now_ns)) == ready
-        ready = ready and robot == "worm" and backend == "lag"
-        request = LifecycleRequest(action="arm", robot=robot, backend=backend)
+        told = {
+            "wrong_robot": robot == "worm",
+            "wrong_backend": backend == "lag",
+            "wrong_config": config_hash == "0" * 16,
+        }
+        told |= {"wrong_state": self.state == "disarmed", "not_ready": ready}
+        ready = all(told.values())
+        request = LifecycleRequest(action="arm", robot=robot, backend=backend, config_hash=config_hash)
         answer = self.authority.on_lifecycle(request, self.now_ns)
         if ready:
             self.leave_for("armed")
@@ -300,6 +480,7 @@ class Everything(RuleBasedStateMachine):
             self.since_arming, self.counting = [], None
             self.expires_ns = self.now_ns + LEASE_NS
         self.check(answer, ready)
+        assert answer.refusal == next((word for word, right in told.items() if not right), None)
 
     @rule(action=st.sampled_from(["disarm", "finish", "clear"]))
     def ask_for_less(self, action: Any) -> None:
@@ -341,13 +522,14 @@ class Everything(RuleBasedStateMachine):
     @precondition(lambda self: self.state != "armed")
     @rule(angle=st.floats(-1.6, 1.6))
     def set_up_and_arm(self, angle: float) -> None:
-        self.observe([angle] * JOINTS, [0.0] * JOINTS, [0.0] * JOINTS, None, 0)
+        self.observe([angle] * JOINTS, [0.0] * JOINTS, [0.0] * JOINTS, None, 0, LONG_NS)
         if self.state in ("fault", "estop"):
             self.ask_for_less("clear")
         if not self.live:
             self.ask_for_the_lease("control", "acquire", 100, 0)
+        self.end_a_tick(0)
         self.stay()
-        self.arm("worm", "lag")
+        self.arm("worm", "lag", "0" * 16)
 
     @precondition(lambda self: self.state == "armed")
     @rule(
@@ -356,7 +538,8 @@ class Everything(RuleBasedStateMachine):
         torque_limit=st.none() | per_joint(st.sampled_from([0.0, 1.0, 3.9, 4.0, 1e5])),
         moves=per_joint(st.floats(-0.1, 0.1) | st.floats(-1, 1)),
         torque=per_joint(st.floats(-5, 5)),
-        ticks=st.integers(1, 6),
+        ticks=st.integers(1, 8),
+        later_ns=often(PERIOD_NS, LONG_NS),
     )
     def go_on_for_some_ticks(
         self,
@@ -366,10 +549,11 @@ class Everything(RuleBasedStateMachine):
         moves: list[float],
         torque: list[float],
         ticks: int,
+        later_ns: int,
     ) -> None:
         for _ in range(ticks):
             angle = [before + moved for before, moved in zip(self.measured[0], moves, strict=True)]
-            self.observe(angle, [moved / PERIOD_S for moved in moves], torque, None, 0)
+            self.observe(angle, [moved / PERIOD_S for moved in moves], torque, None, 0, later_ns)
             self.send_commands(wanted, mode, torque_limit, False, set(), False, 0, 0, 1)
             self.end_a_tick(PERIOD_NS)
 
@@ -387,6 +571,7 @@ class Everything(RuleBasedStateMachine):
         self.tick += 1
         if self.state == "armed" and not self.known:
             self.fail()
+        self.draw_conclusions()
         if self.holder is not None and not self.live:
             if self.state == "armed":
                 self.fail()
@@ -398,6 +583,7 @@ class Everything(RuleBasedStateMachine):
         decision = self.authority.decide(up_to)
         assert self.authority.limited.total() == limited + len(decision.limited)
         if self.state != "armed":
+            self.told = True
             self.check_safe(decision)
         else:
             assert self.live and self.known
@@ -412,9 +598,13 @@ class Everything(RuleBasedStateMachine):
 
     def check_safe(self, decision: Decision) -> None:
         assert decision.sequence is None and not decision.limited
-        action = self.action if self.state == "fault" and self.was_armed else "passive"
+        action = self.action if self.state == "fault" and self.halt is not None else "passive"
+        assert decision.set_points.torque_limit_nm == pytest.approx([TORQUE * share for share in self.shares])
         if action == "hold":
-            self.check_held(decision, self.hold_at)
+            assert set(decision.set_points.mode) == {Mode.POSITION}
+            held = [self.halt_for_a_period(i) for i in range(JOINTS)]
+            assert decision.set_points.target == pytest.approx(held)
+            assert all(abs(target) <= ANGLE for target in decision.set_points.target)
             return
         assert set(decision.set_points.mode) == {Mode.VELOCITY if action == "damp" else Mode.PASSIVE}
         assert decision.set_points.target == [0.0] * JOINTS
@@ -422,7 +612,7 @@ class Everything(RuleBasedStateMachine):
     def check_held(self, decision: Decision, angle_rad: list[float]) -> None:
         assert set(decision.set_points.mode) == {Mode.POSITION} and not decision.limited
         assert decision.set_points.target == [within(angle, -ANGLE, ANGLE) for angle in angle_rad]
-        assert decision.set_points.torque_limit_nm == [TORQUE] * JOINTS
+        assert decision.set_points.torque_limit_nm == pytest.approx([TORQUE * share for share in self.shares])
 
     def check_commanded(self, decision: Decision, sent: JointCommand) -> None:
         assert decision.set_points.mode == sent.mode
@@ -430,13 +620,14 @@ class Everything(RuleBasedStateMachine):
             applied = decision.set_points.torque_limit_nm[i]
             before = TORQUE if self.last is None else self.last.set_points.torque_limit_nm[i]
             allowed = TORQUE if sent.torque_limit_nm is None else sent.torque_limit_nm[i]
-            assert 0.0 <= applied <= min(TORQUE, allowed) and applied <= before + TORQUE_RATE * PERIOD_S + TINY
+            cool = TORQUE * self.shares[i] + TINY
+            assert 0.0 <= applied <= min(cool, allowed) and applied <= before + TORQUE_RATE * PERIOD_S + TINY
             if sent.mode[i] is not Mode.PASSIVE:
-                self.check_target(i, decision, sent.mode[i], sent.target[i])
+                self.check_target(i, decision, sent.mode[i], sent.target[i], bound_by_heat=min(TORQUE, allowed) > cool)
             else:
                 assert decision.set_points.target[i] == 0.0 and i not in decision.limited
 
-    def check_target(self, i: int, decision: Decision, mode: Mode, wanted: float) -> None:
+    def check_target(self, i: int, decision: Decision, mode: Mode, wanted: float, *, bound_by_heat: bool) -> None:
         """Inside the limits, no faster than allowed, as near to what is wanted as that permits; else named."""
         angle, velocity, torque = (column[i] for column in self.measured)
         target = decision.set_points.target[i]
@@ -444,18 +635,23 @@ class Everything(RuleBasedStateMachine):
             low, high = (within(angle + side * FAR, -ANGLE, ANGLE) for side in (-1, 1))
             step, start = SPEED * PERIOD_S, angle + (torque + DAMPING * velocity) / STIFFNESS
         elif mode is Mode.VELOCITY:
-            low, high = -SPEED, SPEED
+            low, high = max(-SPEED, -stoppable(ANGLE + angle)), min(SPEED, stoppable(ANGLE - angle))
             step, start = ACCELERATION * PERIOD_S, velocity + torque / VELOCITY_GAIN
         else:
-            high = decision.set_points.torque_limit_nm[i]
-            low = -high
+            most = decision.set_points.torque_limit_nm[i]
+            low, high = -stoppable(ANGLE + angle) - velocity, stoppable(ANGLE - angle) - velocity  # gain 1 N·m·s/rad
+            if angle >= ANGLE:
+                low, high = min(low, min(high, 0.0)), min(high, 0.0)
+            if angle <= -ANGLE:
+                low, high = max(low, 0.0), max(high, max(low, 0.0))
+            low, high = within(low, -most, most), within(high, -most, most)
             step, start = TORQUE_RATE * PERIOD_S, torque
         if self.last is not None and self.last.set_points.mode[i] is mode:
             start = self.last.set_points.target[i]
         assert math.isfinite(target) and low <= target <= high
         assert abs(target - start) <= step + TINY or target in (low, high)  # the limits themselves outrank the rate
         assert abs(target - within(within(wanted, start - step, start + step), low, high)) <= TINY
-        assert (i in decision.limited) == (target != wanted)
+        assert (i in decision.limited) == (target != wanted or bound_by_heat)
 
     @invariant()
     def it_is_as_the_model_says(self) -> None:

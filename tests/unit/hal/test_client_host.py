@@ -16,7 +16,8 @@ from snakesim_hal.backend import SetPoints
 from snakesim_hal.client import Client, Commander, Feed
 from snakesim_hal.codec import ENCODING_PREFIX, Decoder, encode, encoding_of
 from snakesim_hal.errors import RefusedError, StalledError
-from snakesim_hal.host import INBOX_LIMIT, Host
+from snakesim_hal.host import Host
+from snakesim_hal.inbox import INBOX_LIMIT
 from snakesim_hal.messages import (
     Answer,
     AppliedCommand,
@@ -266,7 +267,7 @@ def test_a_strangers_command_neither_moves_the_robot_nor_passes_for_the_holders_
         for epoch, done_tick in ((0, -1), (own + 6, -1), (own, 0)):
             sent = command(host.description, 0.1, lease_epoch=epoch)
             arrival = Arrival(keys.JOINT_COMMAND, encode(sent), encoding_of(JointCommand), time.monotonic_ns())
-            host._handle(arrival)
+            host._inbox.handle(arrival)
             assert host.participants["control"].done_tick == done_tick
         assert host.authority.rejected["wrong_epoch"] == 2
 
@@ -282,12 +283,12 @@ def test_a_flood_of_commands_does_not_keep_an_estop_out() -> None:
         publisher = stranger.publisher(keys.JOINT_COMMAND, JointCommand, lossless=True)
         for sequence in range(INBOX_LIMIT + 500):
             publisher.put(command(host.description, sequence=sequence))
-        wait_until(lambda: host.tally.inbox_dropped >= 400, "a full inbox")
+        wait_until(lambda: host._inbox.dropped >= 400, "a full inbox")
         answers: list[Any] = []
         request = EstopRequest(who="a person")
         asking = threading.Thread(target=lambda: answers.append(stranger.ask_politely(keys.ESTOP, request, 10.0)))
         asking.start()
-        wait_until(lambda: host._inbox.qsize() > INBOX_LIMIT, "the estop in the inbox")
+        wait_until(lambda: host._inbox.waiting() > INBOX_LIMIT, "the estop in the inbox")
         thread = threading.Thread(target=host.run)
         thread.start()
         asking.join(15.0)

@@ -15,9 +15,11 @@ from snakesim_hal.gate import (
     Measured,
     Refusal,
     as_set_points,
+    bounds_at_ends,
     bumpless_target,
     limit,
     refuse,
+    stoppable_speed,
     why_limited,
 )
 from snakesim_hal.lease import Lease
@@ -27,6 +29,7 @@ from tests.unit.hal.rig import LEASE_NS, command, description
 ROBOT = description()
 LIMITS = JointLimits.of(ROBOT)
 JOINTS = len(ROBOT.joints)
+COOL = np.ones(JOINTS)
 LEASE = Lease("control", 1, 100, 1000)
 ANGLE_STEP = 5.0 * 0.01  # rad a period
 SPEED_STEP = 100.0 * 0.01  # rad/s a period
@@ -118,6 +121,16 @@ def bumpless(modes: list[Mode], measured: Measured) -> list[float]:
     return [bumpless_target(joint, mode, *state) for joint, mode, state in zip(ROBOT.joints, modes, now, strict=True)]
 
 
+def ends(mode: Mode, measured: Measured, i: int) -> tuple[float, float]:
+    angle, velocity = float(measured.angle_rad[i]), float(measured.velocity_rad_s[i])
+    return bounds_at_ends(ROBOT.joints[i], mode, angle, velocity, LIMITS.period_s)
+
+
+def at_a_bound(target: float, most: float, low: float, high: float) -> bool:
+    """The speed, torque and angle limits outrank the rate."""
+    return abs(target) == most or target in (low, high)
+
+
 HUGE = st.floats(-1e5, 1e5)
 ANY_ANGLE = st.floats(-3, 3) | st.floats(-1e4, 1e4)
 
@@ -150,7 +163,7 @@ def situations(draw: st.DrawFn) -> tuple[JointCommand, Measured, Applied]:
 @settings(max_examples=300)
 def test_whatever_is_asked_what_is_applied_is_inside_every_limit(case: tuple[JointCommand, Measured, Applied]) -> None:
     asked, measured, last = case
-    applied, _ = limit(asked, measured=measured, last=last, limits=LIMITS)
+    applied, _ = limit(asked, measured=measured, last=last, limits=LIMITS, share=COOL)
     assert np.isfinite(applied.target).all() and np.isfinite(applied.torque_limit_nm).all()
     assert (applied.torque_limit_nm >= 0).all() and (applied.torque_limit_nm <= LIMITS.torque_nm).all()
     if asked.torque_limit_nm is not None:
@@ -173,11 +186,14 @@ def test_whatever_is_asked_what_is_applied_is_inside_every_limit(case: tuple[Joi
                 edges = np.clip(measured.angle_rad[i] + np.array([-0.3, 0.3]), -1.5, 1.5)
                 assert moved <= ANGLE_STEP + TINY * abs(start[i]) + TINY or np.abs(edges - target).min() < TINY
             case Mode.VELOCITY:
-                assert abs(target) <= 5.0
-                assert moved <= SPEED_STEP + TINY * abs(start[i]) + TINY or abs(target) == 5.0
+                low, high = ends(asked.mode[i], measured, i)
+                assert abs(target) <= 5.0 and low - TINY <= target <= high + TINY
+                assert moved <= SPEED_STEP + TINY * abs(start[i]) + TINY or at_a_bound(target, 5.0, low, high)
             case Mode.TORQUE:
-                assert abs(target) <= applied.torque_limit_nm[i]
-                assert moved <= TORQUE_STEP + TINY * abs(start[i]) + TINY or abs(target) == applied.torque_limit_nm[i]
+                low, high = ends(asked.mode[i], measured, i)
+                most = applied.torque_limit_nm[i]
+                assert abs(target) <= most and target <= max(high, -most) and target >= min(low, most)
+                assert moved <= TORQUE_STEP + TINY * abs(start[i]) + TINY or at_a_bound(target, most, low, high)
 
 
 @given(situations())
@@ -185,13 +201,17 @@ def test_what_needs_no_change_is_not_changed_and_what_was_changed_is_named(
     case: tuple[JointCommand, Measured, Applied],
 ) -> None:
     asked, measured, last = case
-    applied, wanted = limit(asked, measured=measured, last=last, limits=LIMITS)
+    applied, wanted = limit(asked, measured=measured, last=last, limits=LIMITS, share=COOL)
     assert wanted.tolist() == list(asked.target)
-    words = why_limited(applied, wanted, LIMITS)
+    words = why_limited(asked, applied, measured=measured, limits=LIMITS, share=COOL)
     changed = {i for i in range(JOINTS) if asked.mode[i] != Mode.PASSIVE and applied.target[i] != asked.target[i]}
     assert set(words) == changed
     again, _ = limit(
-        msgspec.structs.replace(asked, target=applied.target.tolist()), measured=measured, last=applied, limits=LIMITS
+        msgspec.structs.replace(asked, target=applied.target.tolist()),
+        measured=measured,
+        last=applied,
+        limits=LIMITS,
+        share=COOL,
     )
     assert (again.target == applied.target).all()  # what came out once passes unchanged
 
@@ -203,7 +223,7 @@ def test_a_stream_of_wild_targets_never_moves_faster_than_the_limit(stream: list
     last = Applied(np.full(JOINTS, int(Mode.POSITION)), zero, LIMITS.torque_nm)
     for target in stream:
         measured = Measured(last.target, zero, zero)
-        applied, _ = limit(command(ROBOT, target), measured=measured, last=last, limits=LIMITS)
+        applied, _ = limit(command(ROBOT, target), measured=measured, last=last, limits=LIMITS, share=COOL)
         assert np.abs(applied.target - last.target).max() <= ANGLE_STEP + TINY
         last = applied
 
@@ -219,7 +239,7 @@ def test_a_target_that_waits_is_reached() -> None:
         measured = Measured(zero, zero, zero)
         steps = int(np.ceil(wanted / step - 1e-9))
         for k in range(1, steps + 1):
-            last, _ = limit(command(ROBOT, wanted, mode), measured=measured, last=last, limits=LIMITS)
+            last, _ = limit(command(ROBOT, wanted, mode), measured=measured, last=last, limits=LIMITS, share=COOL)
             assert last.target[0] == pytest.approx(min(k * step, wanted))
 
 
@@ -232,7 +252,7 @@ def applied_for(
     """What is applied when every joint is in the same situation; the target before was 1."""
     measured = Measured(np.full(JOINTS, angle), np.full(JOINTS, velocity), np.full(JOINTS, torque))
     last = Applied(np.full(JOINTS, int(before)), np.ones(JOINTS), LIMITS.torque_nm)
-    return limit(asked, measured=measured, last=last, limits=LIMITS)[0]
+    return limit(asked, measured=measured, last=last, limits=LIMITS, share=COOL)[0]
 
 
 @pytest.mark.parametrize("angle", [1.6, 1.8, 2.5, 1e4])
@@ -321,7 +341,7 @@ def test_a_switch_to_velocity_mode_goes_on_with_the_torque_that_is_there(velocit
 def test_a_torque_limit_rises_no_faster_than_a_torque() -> None:
     before = Applied(np.zeros(JOINTS, dtype=np.int64), np.zeros(JOINTS), np.zeros(JOINTS))
     measured = Measured(np.zeros(JOINTS), np.zeros(JOINTS), np.zeros(JOINTS))
-    applied, _ = limit(command(ROBOT, 0.3, Mode.POSITION), measured=measured, last=before, limits=LIMITS)
+    applied, _ = limit(command(ROBOT, 0.3, Mode.POSITION), measured=measured, last=before, limits=LIMITS, share=COOL)
     assert applied.torque_limit_nm == pytest.approx(np.full(JOINTS, TORQUE_STEP))
 
 
@@ -346,8 +366,102 @@ def test_a_joint_without_stiffness_gives_a_finite_target() -> None:
     soft = JointLimits.of(msgspec.structs.replace(ROBOT, joints=joints))
     measured = Measured(np.zeros(JOINTS), np.zeros(JOINTS), np.full(JOINTS, 4.0))
     last = Applied(np.zeros(JOINTS, dtype=np.int64), np.zeros(JOINTS), LIMITS.torque_nm)
-    applied, _ = limit(command(ROBOT, 0.0), measured=measured, last=last, limits=soft)
+    applied, _ = limit(command(ROBOT, 0.0), measured=measured, last=last, limits=soft, share=COOL)
     assert np.abs(applied.target).max() <= 0.3
+
+
+# --- near the ends ---------------------------------------------------------------------------------------------
+
+
+def test_a_joint_can_stop_before_its_end() -> None:
+    """Four periods on at that speed, then braked by the acceleration limit, it comes to rest at the very end."""
+    for distance in (1e-6, 0.01, 0.3, 3.0):
+        speed = stoppable_speed(distance, 100.0, 0.01)
+        assert speed * 0.04 + speed**2 / 200.0 == pytest.approx(distance)
+        assert speed < np.sqrt(2 * 100.0 * distance)
+    assert stoppable_speed(0.0, 100.0, 0.01) == stoppable_speed(-1.0, 100.0, 0.01) == 0.0
+
+
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize("delay", [1, 2])
+def test_a_joint_that_is_driven_at_its_end_by_velocity_stops_before_it(side: int, delay: int) -> None:
+    """A joint that turns as it is told, one or two periods later."""
+    angle, told = 0.0, [0.0] * delay
+    last = Applied(np.full(JOINTS, int(Mode.VELOCITY)), np.zeros(JOINTS), LIMITS.torque_nm)
+    speeds: list[float] = []
+    for _ in range(400):
+        measured = Measured(np.full(JOINTS, angle), np.full(JOINTS, told[0]), np.zeros(JOINTS))
+        last, _ = limit(
+            command(ROBOT, side * 5.0, Mode.VELOCITY), measured=measured, last=last, limits=LIMITS, share=COOL
+        )
+        told = [*told[1:], float(last.target[0])]
+        angle += told[0] * 0.01
+        speeds.append(abs(told[0]))
+        assert abs(angle) <= 1.5
+    assert max(speeds) == 5.0 and abs(angle) > 1.49
+    assert max(np.abs(np.diff(speeds))) <= SPEED_STEP + TINY  # what outranks the rate limit hardly needs to
+
+
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize("mode", [Mode.VELOCITY, Mode.TORQUE])
+@pytest.mark.parametrize("beyond", [0.0, 0.2])
+def test_at_the_end_nothing_drives_outwards(side: int, mode: Mode, beyond: float) -> None:
+    for velocity in (-50.0, -1.0, 0.0, 1.0, 50.0):
+        for before in (mode, Mode.POSITION):
+            last = Applied(np.full(JOINTS, int(before)), np.full(JOINTS, side * 3.0), LIMITS.torque_nm)
+            measured = Measured(np.full(JOINTS, side * (1.5 + beyond)), np.full(JOINTS, velocity), np.zeros(JOINTS))
+            for wanted in (-9.0, 9.0):
+                asked = command(ROBOT, wanted, mode)
+                applied, _ = limit(asked, measured=measured, last=last, limits=LIMITS, share=COOL)
+                assert (side * applied.target <= 0.0).all()
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_joint_that_comes_too_fast_is_braked_in_torque_mode(side: int) -> None:
+    last = Applied(np.full(JOINTS, int(Mode.TORQUE)), np.full(JOINTS, side * 4.0), LIMITS.torque_nm)
+    measured = Measured(np.full(JOINTS, side * 1.4), np.full(JOINTS, side * 5.0), np.zeros(JOINTS))
+    asked = command(ROBOT, side * 4.0, Mode.TORQUE)
+    applied, _ = limit(asked, measured=measured, last=last, limits=LIMITS, share=COOL)
+    allowed = stoppable_speed(0.1, 100.0, 0.01)
+    assert applied.target == pytest.approx(np.full(JOINTS, side * (allowed - 5.0)))  # gain 1 N·m·s/rad
+    assert why_limited(asked, applied, measured=measured, limits=LIMITS, share=COOL) == dict.fromkeys(
+        range(JOINTS), "angle"
+    )
+
+
+def test_a_weak_velocity_mode_leaves_torque_mode_its_torque() -> None:
+    weak = msgspec.structs.replace(ROBOT.joints[0], velocity_gain_nm_s_per_rad=1e-3)
+    low, high = bounds_at_ends(weak, Mode.TORQUE, 0.0, 0.0, 0.01)
+    assert high == -low == pytest.approx(4.0 / 5.0 * stoppable_speed(1.5, 100.0, 0.01)) and high > 4.0
+
+
+def test_a_range_without_width_leaves_no_torque() -> None:
+    stuck = msgspec.structs.replace(ROBOT.joints[0], angle_min_rad=0.0, angle_max_rad=0.0)
+    for velocity in (-3.0, 0.0, 3.0):
+        low, high = bounds_at_ends(stuck, Mode.TORQUE, 0.0, velocity, 0.01)
+        assert low <= 0.0 >= high and low <= high
+
+
+# --- heat ------------------------------------------------------------------------------------------------------
+
+
+def test_heat_bounds_the_torque_limit_and_is_named() -> None:
+    share = np.array([1.0, 0.5, 0.25])
+    last = Applied(np.full(JOINTS, int(Mode.TORQUE)), np.full(JOINTS, 2.0), LIMITS.torque_nm)
+    still = Measured(*np.zeros((3, JOINTS)))
+
+    def words(asked: JointCommand) -> tuple[list[float], dict[int, str]]:
+        applied, _ = limit(asked, measured=still, last=last, limits=LIMITS, share=share)
+        named = why_limited(asked, applied, measured=still, limits=LIMITS, share=share)
+        return applied.torque_limit_nm.tolist(), named
+
+    assert words(command(ROBOT, 2.0, Mode.TORQUE)) == ([4.0, 2.0, 1.0], {1: "thermal", 2: "thermal"})
+    assert words(command(ROBOT, 9.0, Mode.TORQUE)) == ([4.0, 2.0, 1.0], {0: "torque", 1: "thermal", 2: "thermal"})
+    assert words(command(ROBOT, 2.0, Mode.TORQUE, torque_limit_nm=[2.0] * 3)) == ([2.0, 2.0, 1.0], {2: "thermal"})
+    assert words(command(ROBOT, 2.0, Mode.TORQUE, torque_limit_nm=[1.0] * 3))[1] == dict.fromkeys(range(3), "torque")
+    far = words(command(ROBOT, 9.0, Mode.POSITION))[1]
+    assert far == dict.fromkeys(range(3), "angle")  # a target that was changed is named by what changed it
+    assert words(command(ROBOT, 9.0, Mode.PASSIVE))[1] == {}
 
 
 # --- words -----------------------------------------------------------------------------------------------------
@@ -377,8 +491,10 @@ def test_a_changed_target_is_named_by_its_limit(mode: Mode, wanted: float, word:
     zero = np.zeros(JOINTS)
     asked = command(ROBOT, [0.0, wanted, 0.0], mode)
     last = Applied(np.full(JOINTS, int(mode)), zero, LIMITS.torque_nm)
-    applied, wanted_all = limit(asked, measured=Measured(zero, zero, zero), last=last, limits=LIMITS)
-    assert why_limited(applied, wanted_all, LIMITS) == ({} if word is None else {1: word})
+    measured = Measured(zero, zero, zero)
+    applied, _ = limit(asked, measured=measured, last=last, limits=LIMITS, share=COOL)
+    words = why_limited(asked, applied, measured=measured, limits=LIMITS, share=COOL)
+    assert words == ({} if word is None else {1: word})
 
 
 def test_set_points_for_the_backend_are_plain_python() -> None:

@@ -61,6 +61,7 @@ def test_refused_and_nothing_changed(case: str) -> None:
     ruling = rule(lease, asked, now, TERM)
     assert ruling.lease == lease and not ruling.changed_hands
     assert ruling.refusal is not None and words in ruling.refusal
+    assert ruling.word == ("lease_held" if asked.action == "acquire" else "not_holder")
 
 
 def test_the_refusal_says_how_long_it_may_take() -> None:

@@ -3,8 +3,9 @@
 import pytest
 
 from snakesim_can_backend.protocol import Action, LastStop, ModuleState, Opcode, intact, node_of, opcode_of
-from snakesim_can_backend.twin.faults import ABOUT, Fault, explain, parse, parse_typed
+from snakesim_can_backend.twin.faults import ABOUT, explain, parse, parse_typed, typed
 from snakesim_hal.errors import ConfigError
+from snakesim_hal.injection import KINDS, Injection
 from tests.unit.can_backend.twin.rig import Host, chain, command, only
 
 
@@ -19,23 +20,32 @@ def of_node_2(frames, opcode=Opcode.JOINT_STATE):
 
 
 def test_texts_go_both_ways():
-    assert parse("mute:joint_3@2.0", 4) == Fault("mute", 2, 2.0)
+    assert parse("mute:joint_3@2.0", 4) == Injection("mute", "joint_3", 2.0)
     for text in ("leak:joint_1@1-4", "babble:joint_4@0.5"):
         assert str(parse(text, 4)) == text
-    assert parse_typed("mute joint_2\n", 4, 7.0) == (Fault("mute", 1, 7.0), True)
-    assert parse_typed("mute joint_2 off", 4, 7.0) == (Fault("mute", 1, 7.0), False)
+    assert parse_typed("mute joint_2\n", 4, 7.0) == (Injection("mute", "joint_2", 7.0), True)
+    assert parse_typed("mute joint_2 off", 4, 7.0) == (Injection("mute", "joint_2", 7.0), False)
+    for begins in (True, False):
+        fault = Injection("leak", "joint_4", 3.0)
+        assert parse_typed(typed(fault, begins=begins), 4, 3.0) == (fault, begins)
     assert all(kind in explain() for kind in ABOUT)
+
+
+def test_every_fault_of_a_joint_is_known_but_those_that_a_module_cannot_have():
+    assert KINDS["joint"].keys() - ABOUT.keys() == {"wrong", "nan"}
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("mute", "KIND:JOINT@START"),
-        ("mute:joint_3", "KIND:JOINT@START"),
-        ("mote:joint_3@2", "no kind 'mote'; allowed are mute, freeze"),
-        ("mute:joint_5@2", "no joint_5; this robot has joint_1 to joint_4"),
+        ("mute", "KIND:TARGET@START"),
+        ("mute:joint_3", "KIND:TARGET@START"),
+        ("mote:joint_3@2", "knows no 'mote', only mute, freeze"),
+        ("mute:joint_5@2", "no joint_5; this run has joint_1 to joint_4"),
         ("mute:joint_1@2-1", "must be later than its start"),
-        ("mute:joint_1@1.2.3", "are seconds"),
+        ("mute:joint_1@1.2.3", "are numbers"),
+        ("wrong:joint_1@1", "modules know mute, freeze, reboot"),
+        ("kill:control@1", "modules know mute, freeze, reboot"),
     ],
 )
 def test_wrong_texts_are_told_what_is_allowed(text: str, message: str):

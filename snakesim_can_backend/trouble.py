@@ -1,0 +1,44 @@
+"""What can be wrong with a bus, and what the kernel's error frames say of it."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+Kind = Literal[
+    "bus_off",
+    "error_passive",
+    "error_warning",
+    "not_acknowledged",
+    "restarted",
+    "interface_down",
+    "interface_up",
+    "queue_full",
+    "receive_overflow",
+    "error_frames",
+]
+
+NOTHING_KNOWN: list[Kind] = ["error_frames"]
+ERROR_CLASSES: tuple[tuple[int, Kind], ...] = ((0x40, "bus_off"), (0x20, "not_acknowledged"), (0x100, "restarted"))
+CONTROLLER_STATES: tuple[tuple[int, Kind], ...] = (
+    (0x30, "error_passive"),
+    (0x0C, "error_warning"),
+    (0x01, "receive_overflow"),
+)
+
+
+@dataclass(frozen=True)
+class Trouble:
+    """Something that is wrong with a bus, not with a module on it."""
+
+    kind: Kind
+    channel: str
+    detail: str
+
+
+def troubles_of(identifier: int, data: bytes, channel: str) -> list[Trouble]:
+    """What an error frame of the kernel says."""
+    kinds: list[Kind] = [kind for bit, kind in ERROR_CLASSES if identifier & bit]
+    if identifier & 0x04:
+        states: list[Kind] = [kind for bits, kind in CONTROLLER_STATES if data[1] & bits]
+        kinds.extend(states)
+    counters = f"transmit errors {data[6]}, receive errors {data[7]}"
+    return [Trouble(kind, channel, counters) for kind in kinds or NOTHING_KNOWN]

@@ -1,0 +1,47 @@
+"""What stands against arming, in words and in short. Pure."""
+
+from collections.abc import Sequence
+
+from snakesim_hal.gate import Floats
+from snakesim_hal.messages import Description, JointCommand, LifecycleRequest, Mode
+
+ORDER = ("wrong_robot", "wrong_backend", "wrong_config", "wrong_state", "not_ready")  # what matters most first
+
+
+def mistaken(request: LifecycleRequest, description: Description) -> list[tuple[str, str]]:
+    """What a request to arm takes the robot for that it is not: (refusal, reason)."""
+    found: list[tuple[str, str]] = []
+    if request.robot != description.robot:
+        found.append(
+            ("wrong_robot", f"this robot is {description.robot!r}, the request names {request.robot!r}"),
+        )
+    if request.backend != description.backend:
+        found.append(
+            ("wrong_backend", f"this backend is {description.backend!r}, the request names {request.backend!r}"),
+        )
+    if request.config_hash != description.config_hash:
+        asked = "none" if request.config_hash is None else repr(request.config_hash)
+        found.append(
+            (
+                "wrong_config",
+                f"the configuration is {description.config_hash!r}, the request names {asked}: read hal/description, "
+                f"and arm with its config_hash",
+            )
+        )
+    return found
+
+
+def far_targets(command: JointCommand, angle_rad: Floats, description: Description) -> Sequence[str]:
+    """Joints that a command would move at once: only staying is allowed at arming."""
+    far: list[str] = []
+    most = description.max_step_rad
+    for joint, mode, target, angle in zip(
+        description.joints, command.mode, command.target, angle_rad.tolist(), strict=True
+    ):
+        if mode not in (Mode.POSITION, Mode.PASSIVE):
+            far.append(f"{joint.name} is asked for {mode.name.lower()}; only staying is allowed at arming")
+        if mode is Mode.POSITION and abs(target - angle) > most:
+            far.append(
+                f"{joint.name} is asked to go {target - angle:+.2f} rad from where it is; at most {most} rad at arming"
+            )
+    return far

@@ -1,0 +1,28 @@
+"""`python -m snakesim_hal.router_process`: a router for one run, so that its death can be tried."""
+
+import sys
+import threading
+from collections.abc import Sequence
+
+from snakesim_hal.errors import SnakesimError
+from snakesim_hal.process import on_stop_signal
+from snakesim_hal.serve import arguments, duty
+from snakesim_hal.session import Link, open_session
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Forward between all who connect, until told to stop."""
+    given = duty(arguments("Run a Zenoh router on a run's endpoint."), argv)
+    stopped = threading.Event()
+    on_stop_signal(stopped.set)
+    try:
+        with open_session(Link(given.link.endpoint, listen=True)):
+            stopped.wait()
+    except SnakesimError as error:
+        print(f"snakesim router: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

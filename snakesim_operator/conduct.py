@@ -1,0 +1,135 @@
+"""A run while it goes on: arms once, writes telemetry, shows progress, and sees that nothing stays unnoticed."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from snakesim_hal import keys
+from snakesim_hal.errors import RefusedError
+from snakesim_hal.messages import Description, LifecycleRequest, Status
+from snakesim_hal.scenario import RunConfig
+from snakesim_hal.session import Session
+from snakesim_operator.ending import Ending
+from snakesim_operator.process_faults import ProcessFaults
+from snakesim_operator.progress import Progress
+from snakesim_operator.supervisor import Supervisor
+from snakesim_operator.telemetry import Telemetry
+
+START_LIMIT_S = 120.0  # MuJoCo on a slow machine
+AFTER_FAULT_S = 1.5
+POLL_S = 0.05
+ARM_LIMIT_S = 10.0
+
+
+class Conductor:
+    """Watches one run over its network, until it is over."""
+
+    def __init__(
+        self,
+        config: RunConfig,
+        session: Session,
+        supervisor: Supervisor,
+        out: Path,
+        ending: Ending,
+        say: Callable[[str], None],
+        *,
+        stay: bool,
+    ) -> None:
+        """stay: a fault ends nothing; a person clears it and arms again."""
+        self._session, self._supervisor = session, supervisor
+        self._ending, self._say, self._stay = ending, say, stay
+        self._statuses = session.latched_reader(keys.STATUS, Status)
+        self._descriptions = session.latched_reader(keys.DESCRIPTION, Description)
+        self._telemetry = Telemetry(session, out)
+        self._faults = ProcessFaults(config, session, supervisor, say)
+        self._progress = Progress(config)
+        self._status: Status | None = None
+        self._robot: Description | None = None
+        self._armed = False  # once, by this run or by a person
+        self._may_arm = True  # until something went wrong: then a person does
+        self._hosts = supervisor.hosts
+        self._told: str | None = None
+
+    def go(self) -> None:
+        """Until the run is over. Raises SnakesimError when it cannot go on."""
+        give_up = time.monotonic() + START_LIMIT_S
+        with self._telemetry, self._progress:
+            try:
+                while self._supervisor.goes_on() and not self._ending.interrupted:
+                    self._take_in()
+                    self._see_to_faults()
+                    if self._ending.reason is not None and self._over_before_it_began():
+                        break
+                    self._arm_once()
+                    if not self._armed and self._may_arm and time.monotonic() > give_up:
+                        why = self._status.why if self._status else "no status"
+                        self._ending.because(f"not ready to arm within {START_LIMIT_S:.0f} s: {why}")
+                        break
+                    time.sleep(POLL_S)
+                if self._ending.reason is not None and self._armed and not self._ending.interrupted:
+                    self._let_it_settle()
+            finally:
+                self._faults.undo()
+                self._telemetry.take_in()
+
+    def _take_in(self) -> None:
+        """What arrived."""
+        if self._hosts != self._supervisor.hosts:
+            self._hosts = self._supervisor.hosts
+            self._may_arm = False
+            self._telemetry.expect_new_host()
+            self._progress.start_over()
+            self._status = None
+        self._status = (self._statuses.drain() or [self._status])[-1]
+        self._robot = (self._descriptions.drain() or [self._robot])[-1]
+        self._telemetry.take_in()
+        self._progress.show(self._status, self._telemetry.latest, armed=self._armed)
+
+    def _see_to_faults(self) -> None:
+        """Let go wrong what is to go wrong, and notice what did."""
+        status = self._status
+        if self._robot is not None and not self._armed:
+            refusal = self._faults.refusal(self._robot)
+            if refusal is not None:
+                raise RefusedError(refusal)
+        self._faults.carry_out(self._robot, status.lifecycle if status is not None else "disarmed")
+        if status is None:
+            return
+        if status.lifecycle in ("fault", "estop"):
+            self._may_arm = False
+        self._armed |= status.lifecycle == "armed"
+        if self._stay:
+            self._tell(status)
+        elif status.faults:
+            self._ending.because(status.faults[0].cause)
+
+    def _over_before_it_began(self) -> bool:
+        return not self._armed and not self._may_arm
+
+    def _tell(self, status: Status) -> None:
+        """Say once how a person gets on after a fault."""
+        latched = f"{status.lifecycle}: {status.why}" if status.lifecycle in ("fault", "estop") else None
+        if latched is not None and latched != self._told:
+            self._say(f"{latched}\n  go on with `snakesim clear`, then `snakesim arm {status.robot} {status.backend}`")
+        self._told = latched
+
+    def _arm_once(self) -> None:
+        status = self._status
+        if status is None:
+            return
+        if not status.waiting_for:
+            self._supervisor.came_up = True
+        if self._armed or not self._may_arm or not status.ready_to_arm or self._robot is None:
+            return
+        request = LifecycleRequest(
+            action="arm", robot=status.robot, backend=status.backend, config_hash=self._robot.config_hash
+        )
+        self._session.ask(keys.LIFECYCLE, request, timeout_s=ARM_LIMIT_S)
+        self._armed = True
+
+    def _let_it_settle(self) -> None:
+        """After a failure the host goes on for a moment: the safe stop belongs in the record, and in `status`."""
+        deadline = time.monotonic() + 2 * AFTER_FAULT_S
+        while self._supervisor.host_runs() and time.monotonic() < deadline and not self._ending.interrupted:
+            self._take_in()
+            time.sleep(POLL_S)

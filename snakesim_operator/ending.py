@@ -1,0 +1,41 @@
+"""How a run ends: why, and on whose wish."""
+
+import contextlib
+import signal
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from types import FrameType
+
+
+@dataclass
+class Ending:
+    """How the run ended, as it becomes known."""
+
+    causes: list[str] = field(default_factory=list[str])
+    interrupted: bool = False
+
+    @property
+    def reason(self) -> str | None:
+        """Everything that went wrong, in the order in which it was noticed; None when nothing did."""
+        return "; ".join(self.causes) or None
+
+    def because(self, cause: str) -> None:
+        """Note what went wrong."""
+        if cause not in self.causes:
+            self.causes.append(cause)
+
+
+@contextlib.contextmanager
+def interruptible(ending: Ending) -> Iterator[None]:
+    """Ctrl-C and SIGTERM end the run in order; a second one is left to the default."""
+
+    def handle(number: int, _frame: FrameType | None) -> None:
+        ending.interrupted = True
+        signal.signal(number, signal.SIG_DFL)
+
+    old = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in old.items():
+            signal.signal(number, handler)

@@ -1,0 +1,59 @@
+"""The harness of the fault table measures, judges, and writes: two cheap rows, and a row that is not met."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.faults.__main__ import main
+from tests.faults.page import write
+from tests.faults.results import Store
+from tests.faults.row import Result, Row, Trial, judge
+from tests.faults.table import HEADINGS, ROWS
+
+IN_ISSUE = 14
+
+
+def test_no_row_is_missing_and_every_row_stands_on_both_backends_or_says_why_not() -> None:
+    assert len(HEADINGS) == IN_ISSUE and len(ROWS) == sum(len(heading.rows) for heading in HEADINGS)
+    for row in ROWS.values():
+        assert set(row.on) in ({"sim", "can"}, {"both"}), row.name
+        assert any(not isinstance(measure, str) for measure in row.on.values()), row.name
+
+
+@pytest.mark.e2e
+@pytest.mark.slow
+def test_rows_are_measured_merged_and_written(tmp_path: Path) -> None:
+    raw = tmp_path / "faults.json"
+    asked = ["--trials", "2", "--json", str(raw)]
+    assert main(["--rows", "host_silent", *asked]) == 0
+    assert main(["--rows", "bus_duplicate_at_start", *asked]) == 0
+    results = Store(raw).read()
+    assert sorted(results) == [("bus_duplicate_at_start", "can"), ("host_silent", "can")]
+    silent = results["host_silent", "can"]
+    assert [trial.value for trial in silent.trials] == pytest.approx([100.0, 100.0], abs=1.0)
+    page = write(Store(raw), tmp_path / "faults.md").read_text()
+    assert "**2 of " in page and "**not run**" in page and "not applicable: " in page
+    for heading in HEADINGS:
+        assert f"## {heading.fault}\n" in page
+
+
+def test_a_row_is_judged_by_its_worst_trial_and_by_everything_that_went_wrong() -> None:
+    row = Row("r", "fault", "stop", "50 ms", 50.0, "ms", {"sim": lambda _request: iter(())})
+
+    def judged(*trials: Trial, broken: str = "", why_over: str = "") -> tuple[bool, bool, str]:
+        result = Result(
+            row="r", backend="sim", when="2026-01-01 00:00", took_s=1.0, load=0.0, machine="", trials=list(trials),
+            broken=broken,
+        )  # fmt: skip
+        changed = Row(row.name, row.fault, row.expected, row.deadline, row.limit, row.unit, row.on, why_over=why_over)
+        verdict = judge(changed, result)
+        return verdict.met, verdict.explained, verdict.why
+
+    good, late = Trial(value=40.0, recovered=True), Trial(value=50.1)
+    assert judged(good, good) == (True, False, "")
+    assert judged(good, late) == (False, False, "1 of 2 trials over 50 ms")
+    assert judged(late, why_over="it is so") == (False, True, "1 of 1 trials over 50 ms, because it is so")
+    assert judged(late, Trial(value=None), why_over="it is so")[:2] == (False, False)
+    assert "no recovery" in judged(Trial(value=1.0, recovered=False))[2]
+    assert "odd" in judged(good, Trial(value=1.0, trouble="odd"))[2]
+    assert judged(good, broken="it broke")[0] is False and judged()[0] is False

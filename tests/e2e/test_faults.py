@@ -1,0 +1,137 @@
+"""Faults on request in runs of real processes: planned with a flag, asked for with the command, and refused."""
+
+from pathlib import Path
+
+import pytest
+
+from snakesim_hal.host_process import HostRecord
+from snakesim_operator.record import RunRecord
+from tests.e2e.command import Running, nothing_left, run_to_summary, running, snakesim, wait_until
+
+pytestmark = pytest.mark.e2e
+
+
+def host_record(out: Path) -> HostRecord:
+    return RunRecord.load(out).host
+
+
+@pytest.mark.parametrize(
+    ("backend", "fault", "what"),
+    [
+        ("sim", "mute:joint_3@1", "state_invalid"),
+        ("sim", "nan:joint_3@1", "state_invalid"),
+        ("sim", "diverge:simulator@1", "backend_failed"),
+        ("can", "mute:joint_3@1", "module_silent"),
+        ("can", "leak:joint_3@1", "module_leak"),
+        ("can", "cut:bus_1@1-1.3", "interface_down"),
+    ],
+)
+def test_a_planned_fault_happens_at_its_tick_and_ends_the_run_as_it_should(
+    tmp_path: Path, backend: str, fault: str, what: str
+) -> None:
+    ended, summary = run_to_summary(tmp_path / "run", "triplet", "--backend", backend, "--fault", fault)
+    record = host_record(tmp_path / "run")
+    assert ended.code == 1 and summary.faults[0].what == what
+    assert record.injected[0].startswith(f"tick 100: {fault} ") and 100 <= record.faults[0].tick <= 104
+    assert record.lifecycle == "fault"
+    nothing_left(tmp_path / "run")
+
+
+@pytest.mark.parametrize(("backend", "pace"), [("sim", "lockstep"), ("can", "lockstep"), ("sim", "realtime")])
+def test_a_fault_that_is_no_danger_disturbs_nothing(tmp_path: Path, backend: str, pace: str) -> None:
+    """Messages that come twice are what networks do; a simulator that takes its time is no reason to stop."""
+    faults = ["duplicate:actuator/joints@0.5-1.5", "duplicate:sensor/joints@0.5-1.5", "slow:simulator@1-1.2=0.5"]
+    flags = [word for fault in faults for word in ("--fault", fault)]
+    ended, _ = run_to_summary(
+        tmp_path / "run", "triplet", "--backend", backend, "--duration", "2", "--pace", pace, *flags
+    )
+    record = host_record(tmp_path / "run")
+    assert ended.code == 0 and record.armed_ticks == 200
+    replayed = record.rejected_commands["replayed"]
+    assert replayed == 100 if pace == "lockstep" else 90 <= replayed <= 110
+    assert [text.partition(": ")[2] for text in record.injected] == [
+        "duplicate:sensor/joints@0.5-1.5=1 begins",
+        "slow:simulator@1-1.2=0.5 begins",
+        "slow:simulator@1-1.2=0.5 ends",
+        "duplicate:sensor/joints@0.5-1.5=1 ends",
+    ]
+
+
+def ask(run: Running, *words: str):
+    return snakesim("fault", *words, "--endpoint", run.endpoint, cwd=run.out.parent)
+
+
+@pytest.mark.parametrize("backend", ["sim", "can"])
+def test_a_fault_is_asked_for_with_a_command(tmp_path: Path, backend: str) -> None:
+    arguments = ["triplet", "--controller", "hold", "--duration", "600", "--pace", "realtime", "--backend", backend]
+    with running(tmp_path / "run", *arguments) as run:
+        run.wait_for(" s  ")  # the first line of progress: armed
+        told = ask(run, "leak", "joint_3") if backend == "sim" else ask(run, "diverge", "simulator")
+        assert told.code == 1 and f"backend '{backend}' cannot do" in told.err
+        told = ask(run, "mute", "joint_99")
+        assert told.code == 1 and "no joint_99" in told.err
+        told = ask(run, "drop", "guidance/world", "--amount", "0.2", "--for", "0.5")
+        assert told.code == 0 and told.out == "drop of guidance/world has begun\n", told.err
+        told = ask(run, "mute", "joint_3", "--for", "30")
+        assert told.code == 0 and told.out == "mute of joint_3 has begun\n", told.err
+        assert run.end() == 1
+    record = host_record(tmp_path / "run")
+    assert record.faults[0].joint in (None, "joint_3") and "joint_3" in record.faults[0].cause
+    assert "mute:joint_3@" in record.injected[0]
+    said = (tmp_path / "run" / "guidance.log").read_text()
+    assert "drop:guidance/world@" in said and "begins" in said
+    nothing_left(tmp_path / "run")
+
+
+def test_a_busy_interpreter_loses_the_lease_although_it_is_alive(tmp_path: Path) -> None:
+    flags = ["--pace", "realtime", "--controller", "hold", "--fault", "hang:control@1"]
+    ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
+    assert ended.code == 1 and [fault.what for fault in summary.faults] == ["lease_expired"]
+    assert "hang:control@1 begins" in (tmp_path / "run" / "control.log").read_text()
+    nothing_left(tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["run", "triplet", "--fault", "mute:joint_14@1"], "--fault mute:joint_14@1: `faults[0]`: "),
+        (["run", "triplet", "--fault", "mute:joint_1@1", "--fault", "drop:a/b@1"], "`faults[1]`: 'a/b': no part"),
+        (["run", "triplet", "--fault", "leak:joint_1@1"], "backend 'sim' cannot do leak to joint_1"),
+        (["fault", "mute"], "name what it happens to"),
+        (["fault", "mote", "joint_1"], "knows no 'mote'"),
+        (["fault", "reboot", "joint_1", "--for", "2"], "happens once and has no end"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_anything_starts(tmp_path: Path, arguments: list[str], words: str) -> None:
+    ended = snakesim(*arguments, cwd=tmp_path)
+    assert ended.code == 2 and words in ended.err
+    assert not list(tmp_path.iterdir())
+
+
+def test_without_a_robot_there_is_nothing_to_ask_and_the_list_is_there_anyway(tmp_path: Path) -> None:
+    ended = snakesim("fault", "mute", "joint_1", "--endpoint", "tcp/127.0.0.1:9", cwd=tmp_path)
+    assert ended.code == 1 and ended.err.startswith("snakesim: ")
+    ended = snakesim("fault", "list", cwd=tmp_path)
+    assert ended.code == 0 and "undervoltage" in ended.out
+
+
+def test_where_something_real_moves_faults_are_not_allowed(tmp_path: Path) -> None:
+    """A backend that does not say that it is emulated counts as real."""
+    (tmp_path / "bench.py").write_text(
+        "import msgspec\n"
+        "from snakesim_sim_backend.backend import SimBackend\n\n"
+        "class Bench(SimBackend):\n"
+        "    def describe(self):\n"
+        "        return msgspec.structs.replace(super().describe(), emulated=False)\n"
+    )
+    arguments = ["triplet", "--backend", "./bench.py:Bench", "--controller", "hold", "--pace", "realtime"]
+    with running(tmp_path / "run", *arguments, "--duration", "600") as run:
+        run.wait_for(" s  ")
+        for words in (("mute", "joint_3"), ("hang", "control")):
+            told = ask(run, *words)
+            assert told.code == 1 and "faults on request are not allowed: something real moves here" in told.err
+        run.process.terminate()
+        run.end()
+    ended = snakesim("run", *arguments, "--fault", "mute:joint_3@1", "--out", str(tmp_path / "other"), cwd=tmp_path)
+    assert ended.code == 1 and "`faults` are planned, and something real moves here" in ended.out
+    wait_until(lambda: not list((tmp_path / "other").glob("host.json")), "no record of it")

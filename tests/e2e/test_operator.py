@@ -1,0 +1,102 @@
+"""What a person tells a robot: arm, disarm, clear, estop; and that a stop outlives the host."""
+
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from snakesim_hal.latch import ESTOP
+from tests.e2e.command import Ended, Running, nothing_left, running, snakesim, wait_until
+
+pytestmark = pytest.mark.e2e
+
+ARGUMENTS = [
+    "triplet",
+    "--controller",
+    "hold",
+    "--duration",
+    "600",
+    "--pace",
+    "realtime",
+    "--set",
+    "rate_hz=50",
+    "--stay",
+]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
+    out = tmp_path_factory.mktemp("operator") / "run"
+    with running(out, *ARGUMENTS) as started:
+        started.wait_for(" s  ")
+        yield started
+        os.kill(started.process.pid, signal.SIGINT)
+        assert started.end() == 130, started.said()
+    nothing_left(out)
+
+
+def tell(run: Running, *arguments: str) -> Ended:
+    return snakesim(*arguments, "--endpoint", run.endpoint, cwd=run.out.parent)
+
+
+def until_armed(run: Running) -> None:
+    """As a person does it: until the answer is yes."""
+    wait_until(lambda: tell(run, "arm", "planar13", "sim").code == 0, "armed", 30.0)
+
+
+def test_arming_is_for_what_is_named(run: Running) -> None:
+    assert tell(run, "disarm").code == 0
+    for robot, backend, word in (("mamba", "sim", "'planar13', not 'mamba'"), ("planar13", "can", "'sim', not 'can'")):
+        ended = tell(run, "arm", robot, backend)
+        assert ended.code == 1 and word in ended.err and "snakesim arm planar13 sim" in ended.err
+    until_armed(run)
+    assert "planar13: armed" in tell(run, "status").out
+    again = tell(run, "arm", "planar13", "sim")
+    assert again.code == 1 and "must be disarmed" in again.err
+    assert tell(run, "clear").code == 1
+
+
+def test_a_stop_is_latched_and_outlives_the_host(run: Running) -> None:
+    until_armed(run) if "planar13: armed" not in tell(run, "status").out else None
+    stopped = tell(run, "estop")
+    assert stopped.code == 0 and "planar13: stopped" in stopped.out
+    assert (run.out / ESTOP).is_file()
+    first = run.part("host")
+    os.kill(first, signal.SIGKILL)
+    wait_until(lambda: "planar13: estop" in tell(run, "status").out, "a new host in estop", 30.0)
+    assert run.part("host") != first
+    status = tell(run, "status").out
+    assert "before this host" in status and "`snakesim clear" in status and "then `snakesim arm planar13 sim" in status
+    refused = tell(run, "arm", "planar13", "sim")
+    assert refused.code == 1 and "state is estop" in refused.err
+    assert tell(run, "clear").code == 0
+    assert not (run.out / ESTOP).exists()
+    until_armed(run)
+    assert run.said().count("is started again") == 1
+
+
+def test_nobody_there(tmp_path: Path) -> None:
+    for arguments in (["estop"], ["clear"], ["arm", "planar13", "sim"]):
+        ended = snakesim(*arguments, "--endpoint", "tcp/127.0.0.1:9", cwd=tmp_path)
+        assert ended.code == 1 and "nobody listens" in ended.err
+
+
+def test_several_robots_on_one_network(tmp_path: Path) -> None:
+    with (
+        running(tmp_path / "one", *ARGUMENTS, "--with-router") as one,
+        running(tmp_path / "two", *ARGUMENTS, "--router", one.endpoint, "--namespace", "lab/second") as two,
+    ):
+        one.wait_for(" s  ")
+        two.wait_for(" s  ")
+        for arguments in (["disarm"], ["clear"], ["arm", "planar13", "sim"]):
+            ended = tell(one, *arguments)
+            assert ended.code == 1 and "lab/second, planar13" in ended.err and "--namespace" in ended.err, ended
+        assert tell(one, "disarm", "--namespace", "lab/second").code == 0
+        status = tell(one, "status").out
+        assert "lab/second: disarmed" in status and "planar13: armed" in status
+        assert "snakesim arm planar13 sim" in status and "--namespace lab/second" in status
+        stopped = tell(one, "estop")
+        assert stopped.code == 0, stopped.out + stopped.err
+        assert "lab/second: stopped" in stopped.out and "planar13: stopped" in stopped.out

@@ -1,0 +1,220 @@
+"""What `snakesim run --stay` does when processes end: it starts them again, and arms nothing. And faults on request."""
+
+import os
+import re
+import signal
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from snakesim_hal import keys
+from snakesim_hal.messages import Answer, Description, FaultRequest, LifecycleRequest, Status
+from snakesim_hal.session import Link, Reader, Session, open_session
+from snakesim_operator.record import SUMMARY
+from snakesim_operator.summary import RunSummary
+from tests.e2e.command import Running, nothing_left, processes_of, run_to_summary, running, snakesim, wait_until
+
+pytestmark = pytest.mark.e2e
+
+SERVICES = ("guidance", "navigation", "control")
+# 50 Hz has the longest lease, 100 ms: a busy test machine may well forget a process for 50 ms.
+LONG = ["triplet", "--controller", "hold", "--duration", "600", "--set", "rate_hz=50"]
+BACK_S = 20.0  # 5 s on a machine that has nothing else to do
+
+
+class Robot:
+    """A run as somebody on its network sees it."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._statuses: Reader[Status] = session.latched_reader(keys.STATUS, Status)
+        self._status: Status | None = None
+
+    def status(self) -> Status:
+        for status in self._statuses.drain():
+            self._status = status
+        wait_until(lambda: self._status is not None or bool(self._take()), "a status")
+        assert self._status is not None
+        return self._status
+
+    def _take(self) -> list[Status]:
+        found = self._statuses.drain()
+        self._status = found[-1] if found else self._status
+        return found
+
+    def reaches(self, lifecycle: str) -> Status:
+        wait_until(lambda: self.status().lifecycle == lifecycle, f"lifecycle {lifecycle}", BACK_S)
+        return self.status()
+
+    def is_ready(self) -> None:
+        wait_until(lambda: self.status().ready_to_arm, "ready to arm", BACK_S)
+
+    def tell(self, action: str) -> Answer:
+        robot = self._session.latest(keys.DESCRIPTION, Description, BACK_S)
+        assert robot is not None
+        request = LifecycleRequest(
+            action=action,  # pyright: ignore[reportArgumentType]
+            robot=robot.robot,
+            backend=robot.backend,
+            config_hash=robot.config_hash,
+        )
+        return self._session.ask_politely(keys.LIFECYCLE, request)
+
+    def arm(self) -> None:
+        wait_until(lambda: self.tell("arm").ok, "armed", BACK_S)
+
+    def fault(self, kind: str, target: str, **more: object) -> Answer:
+        request = FaultRequest(kind=kind, target=target, **more)  # pyright: ignore[reportArgumentType]
+        return self._session.ask_politely(keys.fault("run"), request, 5.0)
+
+
+def pids(run: Running, *names: str) -> dict[str, int]:
+    return {name: run.part(name) for name in names}
+
+
+def interrupt(run: Running) -> RunSummary:
+    os.kill(run.process.pid, signal.SIGINT)
+    assert run.end() == 130, run.said()
+    nothing_left(run.out)
+    return msgspec.json.decode((run.out / SUMMARY).read_bytes(), type=RunSummary)
+
+
+@pytest.mark.parametrize("pace", ["lockstep", "realtime"])
+def test_a_killed_host_is_started_again_and_not_armed(tmp_path: Path, pace: str) -> None:
+    with running(tmp_path / "run", *LONG, "--pace", pace, "--stay") as run:
+        run.wait_for(" s  ")
+        with open_session(Link(run.endpoint, "planar13")) as session:
+            robot = Robot(session)
+            first, services = robot.reaches("armed"), pids(run, *SERVICES)
+            os.kill(run.part("host"), signal.SIGKILL)
+            wait_until(lambda: robot.status().lease_epoch > first.lease_epoch + 1, "another host's lease", BACK_S)
+            robot.is_ready()
+            assert robot.status().lifecycle == "disarmed" and robot.status().commands_accepted == 0
+            assert robot.status().tick == 0 or pace == "realtime"
+            assert pids(run, *SERVICES) == services  # they found the new host by themselves
+            robot.arm()
+            robot.reaches("armed")
+            wait_until(lambda: robot.status().commands_accepted > 20, "commands to the new host")
+        summary = interrupt(run)
+    assert summary.hosts == 2 and [restart.name for restart in summary.restarts] == ["host"]
+    assert (tmp_path / "run" / "telemetry-1.jsonl").is_file()
+    assert summary.ticks > 0 and "host was ended by SIGKILL; it is started again in 0.5 s" in run.said()
+
+
+def test_a_killed_controller_is_a_latched_fault_until_a_person_clears_it(tmp_path: Path) -> None:
+    with running(tmp_path / "run", *LONG, "--pace", "realtime", "--stay") as run:
+        run.wait_for(" s  ")
+        with open_session(Link(run.endpoint, "planar13")) as session:
+            robot, before = Robot(session), run.part("control")
+            os.kill(before, signal.SIGKILL)
+            robot.reaches("fault")
+            wait_until(
+                lambda: "control" in robot.status().alive and robot.status().lease_holder == "control", "control"
+            )
+            assert robot.status().lifecycle == "fault" and not robot.tell("arm").ok
+            assert run.part("control") != before
+            assert robot.tell("clear").ok
+            robot.is_ready()
+            robot.arm()
+            robot.reaches("armed")
+        summary = interrupt(run)
+    assert [fault.what for fault in summary.faults] == ["service_lost", "lease_expired"]
+    assert summary.ended == "interrupted" and "go on with `snakesim clear`" in run.said()
+
+
+def test_a_router_that_dies_stops_the_robot_and_nothing_arms_it_again(tmp_path: Path) -> None:
+    with running(tmp_path / "run", *LONG, "--pace", "realtime", "--stay", "--with-router") as run:
+        run.wait_for(" s  ")
+        with open_session(Link(run.endpoint, "planar13")) as session:
+            robot = Robot(session)
+            robot.reaches("armed")
+            before = pids(run, "host", *SERVICES)
+            os.kill(run.part("router"), signal.SIGKILL)
+            robot.reaches("fault")  # told by the host as soon as there is a router again
+            wait_until(lambda: not robot.status().waiting_for, "everybody back", BACK_S)
+            assert robot.status().lifecycle == "fault" and pids(run, "host", *SERVICES) == before
+            assert "lease_expired" in [fault.what for fault in robot.status().faults]
+            for command in (["clear"], ["arm", "planar13", "sim"]):
+                told = snakesim(*command, "--router", run.endpoint, cwd=tmp_path)
+                if command == ["clear"]:
+                    assert told.code == 0, told.err
+                    robot.is_ready()
+            robot.reaches("armed")
+        interrupt(run)
+
+
+def test_a_service_that_may_not_be_restarted_ends_the_run(tmp_path: Path) -> None:
+    with running(tmp_path / "run", *LONG, "--stay", "--set", "services.guidance.restart=false") as run:
+        run.wait_for(" s  ")
+        os.kill(run.part("guidance"), signal.SIGKILL)
+        assert run.end() == 1 and "guidance was ended by SIGKILL" in run.said()
+    nothing_left(tmp_path / "run")
+
+
+def test_processes_go_wrong_on_request(tmp_path: Path) -> None:
+    with running(tmp_path / "run", *LONG, "--pace", "realtime", "--stay") as run:
+        run.wait_for(" s  ")
+        with open_session(Link(run.endpoint, "planar13")) as session:
+            robot = Robot(session)
+            robot.reaches("armed")
+            assert robot.fault("freeze", "control", for_s=0.5).ok
+            robot.reaches("fault")
+            wait_until(lambda: "fault on request ends: freeze:control" in run.said(), "the thaw")
+            before = run.part("navigation")
+            assert robot.fault("stop", "navigation").ok
+            wait_until(lambda: run.said().count("it is started again") == 1, "navigation's end")
+            wait_until(lambda: not robot.status().waiting_for, "navigation again", BACK_S)
+            assert run.part("navigation") != before
+            for kind, target, word in (
+                ("kill", "nobody", "host, guidance, navigation, control"),
+                ("hang", "control", "fault/control"),
+                ("kill", "router", "no process 'router'"),
+                ("freeze", "sensor/imu", "knows no 'freeze'"),
+            ):
+                answer = robot.fault(kind, target)
+                assert not answer.ok and answer.refusal == "unknown_fault" and word in answer.reason, answer
+            assert robot.fault("freeze", "host").ok
+            run.wait_for("fault on request: freeze:host")
+        interrupt(run)  # a frozen host is thawed to end in order
+
+
+def test_a_planned_kill_ends_a_run_that_does_not_stay(tmp_path: Path) -> None:
+    arguments = [*LONG, "--pace", "realtime", "--set", 'faults=["kill:control@0.5"]']
+    ended, summary = run_to_summary(tmp_path / "run", *arguments)
+    assert ended.code == 1 and "fault on request: kill:control" in ended.out
+    assert "control was ended by SIGKILL" in summary.ended
+    expired = next(fault for fault in summary.faults if fault.what == "lease_expired")
+    assert 0.5 <= expired.tick * 0.02 - _armed_at_s(tmp_path / "run") < 1.5
+
+
+def _armed_at_s(out: Path) -> float:
+    from snakesim_operator.record import RunRecord
+
+    return float(RunRecord.load(out).time_s[0])
+
+
+def test_a_killed_supervisor_leaves_no_frozen_child(tmp_path: Path) -> None:
+    arguments = [
+        *LONG,
+        "--pace",
+        "realtime",
+        "--with-router",
+        "--set",
+        'faults=["freeze:control@0.2","freeze:host@0.2"]',
+    ]
+    with running(tmp_path / "run", *arguments) as run:
+        run.wait_for("fault on request: freeze:host")
+        frozen = [Path(f"/proc/{run.part(name)}/stat").read_text() for name in ("control", "host")]
+        assert [re.sub(r".*\) ", "", line)[0] for line in frozen] == ["T", "T"]
+        assert len(processes_of(tmp_path / "run")) == 5
+        os.kill(run.process.pid, signal.SIGKILL)
+        run.end()
+        nothing_left(tmp_path / "run")
+
+
+def test_a_router_that_the_run_does_not_have_cannot_fail(tmp_path: Path) -> None:
+    ended = snakesim("run", "triplet", "--set", 'faults=["kill:router@1"]', "--out", "run", cwd=tmp_path)
+    assert ended.code == 2 and "--with-router" in ended.err and not (tmp_path / "run").exists()
+    ended = snakesim("run", "triplet", "--with-router", "--router", "tcp/127.0.0.1:1", "--out", "run", cwd=tmp_path)
+    assert ended.code == 2 and "--with-router" in ended.err

@@ -1,0 +1,51 @@
+"""A consumer of a robot's streams that cannot keep up: `python -m tests.faults.consumer sleep|disk ENDPOINT NAMESPACE`.
+
+sleep: its callback sleeps for half a second at every sample. disk: it writes what it gets to a disk that is full.
+"""
+
+import sys
+import time
+from pathlib import Path
+
+from snakesim_hal import keys
+from snakesim_hal.process import die_with_parent
+from snakesim_hal.session import Arrival, Link, open_session
+
+SLEEP_S = 0.5
+KEYS = (keys.JOINTS, keys.CLOCK, keys.APPLIED, keys.JOINT_COMMAND, keys.CONTACTS, keys.POSE)
+READY = "subscribed"
+STUCK = "stuck"
+
+
+def main() -> None:
+    """Until killed."""
+    kind, endpoint, namespace, disk = sys.argv[1:5]
+    die_with_parent()
+    said: list[bool] = []
+
+    def sleeps(_arrival: Arrival) -> None:
+        if not said:
+            said.append(True)
+            print(STUCK, flush=True)
+        time.sleep(SLEEP_S)
+
+    def writes(arrival: Arrival) -> None:
+        try:
+            with Path(disk, "recording").open("ab") as file:
+                file.write(arrival.payload)
+        except OSError as error:
+            if not said:
+                said.append(True)
+                print(f"{STUCK}: {error.strerror}", flush=True)
+            raise
+
+    with open_session(Link(endpoint, namespace)) as session:
+        for key in KEYS:
+            session.on_arrival(key, sleeps if kind == "sleep" else writes)
+        print(READY, flush=True)
+        while True:
+            time.sleep(1.0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,160 @@
+"""One robot's processes, started as `snakesim run` starts them, and an observer beside them."""
+
+import contextlib
+import os
+import random
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from snakesim_hal.errors import NotConnectedError
+from snakesim_hal.scenario import Override, RunConfig, load, write
+from snakesim_hal.session import Link, open_session
+from snakesim_operator import children
+from snakesim_operator.children import Child
+from tests.e2e.command import free_endpoint
+from tests.faults.observer import Observer, TrialError
+from tests.faults.row import Request, Trial
+
+START_LIMIT_S = 240.0 if os.environ.get("SNAKESIM_VCAN") == "guest" else 60.0  # an emulated machine is slow
+MOVING_S = 0.25  # from arming to the injection
+SETTLED_S = 0.3  # how long steps are watched after a recovery
+PERIOD_S = 0.01
+OBSERVER_PRIORITY = 30  # of 99; host and control have 20
+
+
+def configuration(backend: str, **dotted: Any) -> RunConfig:
+    """The triplet in real time at 100 Hz, for as long as anybody likes; `__` in a name stands for the dot."""
+    values = {"backend": backend, "pace": "realtime", "duration_s": 3600.0, **dotted}
+    overrides = [Override(name.replace("__", "."), value, f"--{name}") for name, value in values.items()]
+    return load("triplet", overrides).config
+
+
+class Robot:
+    """Host, guidance, navigation and control, each a process of its own; any can be killed, frozen, started again."""
+
+    def __init__(self, folder: Path, config: RunConfig, *, endpoint: str | None = None, router: bool = False) -> None:
+        """router: somebody else listens at the endpoint."""
+        self.folder, self.config, self.router = folder, config, router
+        self.endpoint = endpoint or free_endpoint()
+        self.running: dict[str, Child] = {}
+        self._stack = ExitStack()
+        self.random = random.Random(config.seed)
+        write(config, folder / "config.json")
+
+    def __enter__(self) -> "Robot":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+        for child in self.running.values():
+            with contextlib.suppress(ProcessLookupError):
+                child.process.send_signal(signal.SIGCONT)
+        children.stop_all(list(self.running.values()))
+
+    def start(self, name: str) -> Child:
+        """Start one of its processes."""
+        common = ["--config", str(self.folder / "config.json"), "--endpoint", self.endpoint]
+        if name == "host":
+            module = ["snakesim_hal.host_process", *common, "--out", str(self.folder)]
+            module += ["--router"] if self.router else []
+        elif name == "router":
+            module = ["snakesim_hal.router_process", *common]
+        else:
+            module = ["snakesim_hal.serve", name, *common]
+        self.running[name] = children.start(name, module, self.folder / f"{name}.log")
+        return self.running[name]
+
+    def start_all(self) -> None:
+        """All of them."""
+        for name in ("host", *self.config.services):
+            self.start(name)
+
+    def observe(self) -> Observer:
+        """Join the network as soon as there is one."""
+        deadline = time.monotonic() + START_LIMIT_S
+        link = Link(self.endpoint, self.config.robot.name)
+        while True:
+            try:
+                with _urgently():
+                    session = self._stack.enter_context(open_session(link, connect_timeout_s=0.5))
+                return Observer(session)
+            except NotConnectedError:
+                if time.monotonic() > deadline or self.ended():
+                    raise TrialError(f"no network: {'; '.join(self.ended())}; {self.last_words()}") from None
+
+    def ended(self) -> list[str]:
+        """Which of its processes are gone, and how."""
+        return [how for child in self.running.values() if (how := child.how_it_ended()) is not None]
+
+    def last_words(self) -> str:
+        """Of those that are gone."""
+        return " | ".join(child.last_words() for child in self.running.values() if child.how_it_ended())
+
+    def signal(self, name: str, number: signal.Signals) -> int:
+        """Send a signal to one of its processes; when, by the monotonic clock."""
+        pid = self.running[name].process.pid
+        now_ns = time.monotonic_ns()
+        os.kill(pid, number)
+        if number is signal.SIGKILL:
+            self.running[name].process.wait()
+        return now_ns
+
+    def set_in_motion(self, observer: Observer) -> None:
+        """Armed, and moving for a moment; what follows happens at any phase of a period."""
+        if observer.state() != "armed":
+            observer.arm()
+        observer.watch(MOVING_S + self.random.random() * PERIOD_S)
+        observer.forget()
+        if observer.state() != "armed":
+            raise TrialError(f"the robot stopped before the injection: {observer.in_words()}")
+
+
+@contextlib.contextmanager
+def _urgently() -> Iterator[None]:
+    """Have this thread, and those that start meanwhile, outrank the robot's own where the system lets them.
+
+    So an observer is not kept waiting by a controller that is busy, and has priority. Processes do not inherit it.
+    """
+    priority = os.sched_param(OBSERVER_PRIORITY)
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, priority)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, priority)
+
+
+@contextlib.contextmanager
+def robot(request: Request, **dotted: Any) -> Iterator[tuple[Robot, Observer]]:
+    """A robot with all its processes, and who watches it."""
+    with Robot(request.folder, configuration(request.backend, **dotted)) as made:
+        made.start_all()
+        observer = made.observe()
+        observer.arm(START_LIMIT_S)
+        yield made, observer
+        tell_stumbles(request, observer)
+
+
+def tell_stumbles(request: Request, observer: Observer) -> None:
+    """So that what was tried again is not kept quiet."""
+    if observer.stumbles:
+        request.note(f"on {request.backend}, {observer.stumbles} armings did not last, and were made again")
+
+
+def recovered(observer: Observer, value: float | None, trouble: str = "", limit_s: float = START_LIMIT_S) -> Trial:
+    """Bring the robot back by an operator's commands, and look at how its targets step."""
+    try:
+        observer.arm(limit_s)
+    except TrialError as error:
+        return Trial(value=value, trouble="; ".join(filter(None, (trouble, str(error)))), recovered=False)
+    observer.watch(SETTLED_S)
+    steps = observer.steps()
+    bound = observer.description().max_step_rad
+    if max(steps.within_rad, steps.first_rad) > bound + 1e-9:
+        trouble = "; ".join(filter(None, (trouble, f"a target jumped by more than {bound} rad at recovery")))
+    return Trial(value=value, trouble=trouble, recovered=True, step_rad=steps.within_rad, first_rad=steps.first_rad)

@@ -1,0 +1,110 @@
+"""What a row of the fault table is, and what its trials leave."""
+
+import statistics
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+
+Backend = Literal["sim", "can", "both"]
+Place = Literal["here", "namespaces", "guest"]
+TRIALS = 20  # of each row and backend in a whole table
+
+
+class Trial(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """One injection."""
+
+    value: float | None  # in the row's unit; None: what should have happened did not
+    trouble: str = ""  # what else was wrong
+    recovered: bool | None = None  # by an operator's command; None: there was nothing to recover from
+    step_rad: float | None = None  # largest change of an applied angle target in a tick, after the recovery
+    first_rad: float | None = None  # largest distance of the first angle targets from the measured angles
+
+
+class Result(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """A row on a backend, as it was measured."""
+
+    row: str
+    backend: str
+    when: str
+    took_s: float
+    load: float  # the machine's, when it began
+    machine: str
+    trials: list[Trial]
+    notes: list[str] = []
+    broken: str = ""  # why it ended early
+
+
+@dataclass(frozen=True)
+class Request:
+    """What a measurement is asked for."""
+
+    backend: str
+    trials: int
+    folder: Path  # its own, empty
+    notes: list[str]  # what should stand beside the row
+
+    def note(self, text: str) -> None:
+        """Once, however often it is said."""
+        if text not in self.notes:
+            self.notes.append(text)
+
+
+Measure = Callable[[Request], Iterator[Trial]]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table."""
+
+    name: str
+    fault: str
+    expected: str
+    deadline: str  # in words, with how it is counted
+    limit: float | None  # the worst value allowed; None: the row says nothing of time
+    unit: str
+    on: Mapping[Backend, Measure | str]  # how it is measured, or why it does not apply
+    place: Place = "here"
+    why_over: str = ""  # why a limit cannot be met, where that is known
+    least: int = 0  # trials in a whole table of 20; fewer where fewer are asked for
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether a row is met."""
+
+    met: bool
+    why: str
+    median: float | None = None
+    worst: float | None = None
+    explained: bool = False  # all that is against it is a limit of which the row says why
+
+
+def judge(row: Row, result: Result) -> Verdict:
+    """By the worst trial."""
+    values = [trial.value for trial in result.trials if trial.value is not None]
+    median = statistics.median(values) if values else None
+    worst = max(values) if values else None
+    against: list[str] = []
+    over = [value for value in values if row.limit is not None and value > row.limit]
+    if over:
+        why = f", because {row.why_over}" if row.why_over else ""
+        against.append(f"{len(over)} of {len(values)} trials over {row.limit:g} {row.unit}{why}")
+    only_over = len(against)
+    if result.broken:
+        against.append(result.broken)
+    missing = sum(trial.value is None for trial in result.trials)
+    if missing:
+        against.append(f"nothing measured in {missing} of {len(result.trials)} trials")
+    troubles = [trial.trouble for trial in result.trials if trial.trouble]
+    if troubles:
+        against.append(f"{len(troubles)} of {len(result.trials)} trials: {troubles[0]}")
+    stuck = sum(trial.recovered is False for trial in result.trials)
+    if stuck:
+        against.append(f"no recovery in {stuck} trials")
+    if not result.trials and not result.broken:
+        against.append("no trial")
+    explained = bool(row.why_over) and len(against) == only_over == 1
+    return Verdict(not against, "; ".join(against), median, worst, explained)

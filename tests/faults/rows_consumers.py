@@ -1,0 +1,78 @@
+"""Somebody else listens, and cannot keep up: only he may suffer."""
+
+import itertools
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from tests.faults.consumer import STUCK
+from tests.faults.observer import Observer, TrialError
+from tests.faults.robot import robot
+from tests.faults.row import Measure, Request, Trial
+
+WINDOW_S = 0.5
+DISK_BYTES = 64 * 1024
+
+
+def cannot_keep_up(kind: str) -> Measure:
+    """kind: `sleep` in the callback, or `disk` that is full.
+
+    A cycle is missed when the set-points of a tick are those of the tick before: no command had come for it. The value:
+    how many more are missed in half a second than in the worst such window before the consumer came.
+    """
+
+    def measure(request: Request) -> Iterator[Trial]:
+        with robot(request) as (made, observer):
+            before, with_it = [_missed(observer) for _ in range(request.trials)], list[int]()
+            with _consumer(kind, made.endpoint, made.config.robot.name, request.folder) as process:
+                for _ in range(request.trials):
+                    with_it.append(_missed(observer))
+                    trouble = ""
+                    if observer.state() != "armed":
+                        trouble = f"the robot stopped: {observer.in_words()}"
+                        observer.arm()
+                    elif process.poll() is not None:
+                        trouble = "the consumer has ended"
+                    yield Trial(value=float(max(with_it[-1] - max(before), 0)), trouble=trouble)
+            request.note(
+                f"in {request.trials} windows of {WINDOW_S:g} s: {sum(before)} cycles missed without the consumer, "
+                f"worst {max(before)}; {sum(with_it)} with it, worst {max(with_it)}"
+            )
+
+    return measure
+
+
+def _missed(observer: Observer) -> int:
+    observer.forget()
+    observer.watch(WINDOW_S)
+    rows = [heard.message for heard in observer.applied]
+    return sum(a.sequence == b.sequence for a, b in itertools.pairwise(rows) if b.sequence is not None)
+
+
+@contextmanager
+def _consumer(kind: str, endpoint: str, namespace: str, folder: Path) -> Iterator[subprocess.Popen[str]]:
+    """In a mount namespace of its own, with a small disk; once it is stuck."""
+    disk = folder / "disk"
+    disk.mkdir()
+    mount = f'mount -t tmpfs -o size={DISK_BYTES} none {disk} && exec "$@"'
+    command = [sys.executable, "-m", "tests.faults.consumer", kind, endpoint, namespace, str(disk)]
+    log = folder / "consumer.log"
+    with log.open("w") as said:
+        process = subprocess.Popen(
+            ["unshare", "--mount", "sh", "-c", mount, "sh", *command], stdout=said, stderr=subprocess.STDOUT, text=True
+        )
+    try:
+        waited = 0
+        while STUCK not in log.read_text():
+            try:
+                process.wait(0.1)
+            except subprocess.TimeoutExpired:
+                waited += 1
+            if process.returncode is not None or waited > 200:
+                raise TrialError(f"the consumer did not get stuck: {log.read_text()[-500:]}")
+        yield process
+    finally:
+        process.kill()
+        process.wait()

@@ -1,0 +1,119 @@
+"""The controller's process is killed, frozen, or busy with something else; the host restarts."""
+
+import signal
+import time
+from collections.abc import Callable, Iterator
+
+from snakesim_hal.messages import Mode
+from tests.faults.observer import Observer, TrialError
+from tests.faults.robot import START_LIMIT_S, Robot, recovered, robot
+from tests.faults.row import Request, Trial
+from tests.faults.stranger import send_raw
+
+HANG_S = 0.5
+REPLAYED = 10
+REFUSED_S = 1.5  # until the status must have counted them
+UNDER_WAY_S = 0.1  # until what a dead host has sent has come
+LATCHED_S = 0.15  # how long a fault must be seen to stay, with a controller that commands again
+
+
+def _trial(made: Robot, observer: Observer, fail: Callable[[], int], mend: Callable[[], None]) -> Trial:
+    made.set_in_motion(observer)
+    failed_ns = fail()
+    value = observer.safe_after_ms(failed_ns)
+    status = observer.first_fault(failed_ns)
+    troubles: list[str] = []
+    if not any(fault.what == "lease_expired" for fault in status.faults):
+        troubles.append(f"not because of the lease: {status.why}")
+    if status.lease_holder is not None:
+        troubles.append(f"the lease is still {status.lease_holder}'s")
+    mend()
+    observer.until(lambda: observer.status is not None and observer.status.lease_holder == "control", "control is back")
+    observer.forget()
+    observer.watch(LATCHED_S)
+    if observer.state() != "fault" or any(h.message.sequence is not None for h in observer.applied):
+        troubles.append(f"not latched: {observer.in_words()}")
+    return recovered(observer, value, "; ".join(troubles))
+
+
+def killed(request: Request) -> Iterator[Trial]:
+    """SIGKILL; the operator clears when another one has been started."""
+    with robot(request) as (made, observer):
+        for _ in range(request.trials):
+            yield _trial(
+                made, observer, lambda: made.signal("control", signal.SIGKILL), lambda: void(made.start("control"))
+            )
+
+
+def frozen(request: Request) -> Iterator[Trial]:
+    """SIGSTOP; later SIGCONT."""
+    with robot(request) as (made, observer):
+        for _ in range(request.trials):
+            yield _trial(
+                made,
+                observer,
+                lambda: made.signal("control", signal.SIGSTOP),
+                lambda: void(made.signal("control", signal.SIGCONT)),
+            )
+
+
+def hung(request: Request) -> Iterator[Trial]:
+    """Its interpreter is busy, by the injector."""
+    with robot(request) as (made, observer):
+
+        def hang() -> int:
+            now_ns = time.monotonic_ns()
+            observer.inject("control", "hang", "control", for_s=HANG_S)
+            return now_ns
+
+        for _ in range(request.trials):
+            yield _trial(made, observer, hang, lambda: None)
+
+
+def host_restarts(request: Request) -> Iterator[Trial]:
+    """The host is killed while moving and started again; what was streamed before is sent to the new one.
+
+    The value: set-points of the new host that were not passive, before somebody armed it.
+    """
+    with robot(request) as (made, observer):
+        for _ in range(request.trials):
+            made.set_in_motion(observer)
+            observer.watch(0.1)
+            streamed = [arrival.payload for arrival in observer.commands][-REPLAYED:]
+            epoch = observer.status.lease_epoch if observer.status else 0
+            made.signal("host", signal.SIGKILL)
+            observer.watch(UNDER_WAY_S)
+            observer.forget()
+            made.start("host")
+            observer.until(lambda: observer.statuses, "a status of the new host", START_LIMIT_S)
+            observer.until(lambda: observer.applied, "the new host's set-points")
+            troubles = _objections(observer, streamed)
+            if observer.status is None or 0 < observer.status.lease_epoch <= epoch:
+                troubles.append(f"the lease's epoch did not grow from {epoch}: {observer.in_words()}")
+            moved = sum(set(h.message.mode) != {Mode.PASSIVE} for h in observer.applied)
+            yield recovered(observer, float(moved), "; ".join(troubles))
+        request.note(f"in each trial {REPLAYED} commands of before were sent to the new host")
+
+
+def _objections(observer: Observer, streamed: list[bytes]) -> list[str]:
+    """What is not as it must be with a new host that is sent what its predecessor was."""
+
+    def refused() -> int:
+        return 0 if observer.status is None else sum(observer.status.commands_rejected.values())
+
+    before = refused()
+    for payload in streamed:
+        send_raw(observer.session, payload)
+    troubles: list[str] = []
+    try:
+        observer.until(lambda: refused() >= before + len(streamed), "old commands refused", REFUSED_S)
+    except TrialError:
+        troubles.append(f"{refused() - before} of {len(streamed)} old commands were refused")
+    observer.watch(LATCHED_S)
+    if {h.message.lifecycle for h in observer.statuses} != {"disarmed"}:
+        troubles.append(f"did not boot disarmed, and stay so: {observer.in_words()}")
+    return troubles
+
+
+def void(_: object) -> None:
+    """Let a result go."""

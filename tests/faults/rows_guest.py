@@ -1,0 +1,215 @@
+"""What needs a machine of its own: modules on a kernel's CAN bus outlive the host, and the wall clock is set.
+
+The modules are twins in a process that lives through all trials, at 25 Hz; the listener has the kernel's time of every
+frame. The driver is forked from this process, which has everything imported: an emulated machine is slow to start one.
+"""
+
+import contextlib
+import os
+import random
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from snakesim_can_backend.protocol import LastStop, ModuleState, Opcode, node_of
+from snakesim_hal.scenario import Override, load
+from tests.faults.observer import Observer, TrialError
+from tests.faults.robot import START_LIMIT_S, Robot
+from tests.faults.row import Measure, Request, Trial
+from tests.unit.can_backend.twin.rig import BOOTED, MS, QUIET, Module, armed, set_point
+from tests.unit.hal.rig import write_files
+from tests.vcan import driver
+from tests.vcan.test_killed import (
+    JOINTS,
+    NODES,
+    RATE_HZ,
+    SCENARIO,
+    Bench,
+    Heard,
+    bench,
+    first_in,
+    passed_for_module_ms,
+    stop_commands,
+)
+
+CHANNEL = "vcan0"
+ARM_LIMIT_S = 120.0
+LIVE_S = 0.3
+LEFT_S = 0.8
+MOST_STUMBLES = 20
+LOOK_S = 0.4
+WATCHDOG_MS = 100.0
+STEP_S = 3600.0
+AFTER_STEP_S = 1.0
+ATTEMPTS = 3
+
+
+def host_gone(number: signal.Signals) -> Measure:
+    """SIGKILL or SIGSTOP for the driver. The value: from the last set-point to the fault, in the module's own time."""
+
+    def measure(request: Request) -> Iterator[Trial]:
+        rng, by_kernel_ms, stumbles, done = random.Random(7), list[float](), 0, 0
+        with bench(request.folder, CHANNEL) as robot:
+            robot.modules()
+            while done < request.trials:
+                with _driver(robot) as pid:
+                    robot.listener.forget()
+                    time.sleep(LIVE_S + rng.random() / RATE_HZ)
+                    trial = _left_alone(robot, pid, number, by_kernel_ms)
+                if trial is not None:
+                    done += 1
+                    yield trial
+                else:
+                    stumbles += 1
+                    if stumbles > MOST_STUMBLES:
+                        raise TrialError(f"this machine is too busy: {stumbles} times not armed any more at the signal")
+        request.note(
+            f"{JOINTS} modules at {RATE_HZ:g} Hz on {CHANNEL}, in a process of their own; from the signal to the last "
+            f"module's fault by the kernel's clock: at most {max(by_kernel_ms, default=0):.0f} ms. Each trial begins "
+            f"with a new driver that clears and arms all modules; {stumbles} times the emulated machine had stumbled, "
+            f"and the robot had stopped before the signal: those were tried again"
+        )
+
+    return measure
+
+
+def _left_alone(robot: Bench, pid: int, number: signal.Signals, by_kernel_ms: list[float]) -> Trial | None:
+    """None: the robot had stopped already when the signal came."""
+    listener, fault = robot.listener, {ModuleState.FAULT}
+    now_ns = time.time_ns()
+    os.kill(pid, number)
+    time.sleep(LEFT_S)  # also for the heartbeats after it, by which the modules' own time is told
+    heard = listener.listen()
+    if not _went_well_until(heard, now_ns):
+        return None
+    stopped = first_in(heard, fault, now_ns)
+    if len(stopped) < JOINTS:
+        return Trial(value=None, trouble=f"not all in fault {LEFT_S:g} s after the signal: {listener.states()}")
+    by_kernel_ms.append(max(h.at_ns for h in stopped.values()) / 1e6 - now_ns / 1e6)
+    troubles: list[str] = []
+    causes = {h.says()["last_stop"] for h in stopped.values() if h.opcode == Opcode.HEARTBEAT}
+    if causes - {LastStop.WATCHDOG}:
+        troubles.append(f"stopped by {causes}")
+    own_ms: list[float] = []
+    for node in NODES:
+        points = [h.at_ns for h in heard if h.opcode == Opcode.SET_POINT and node_of(h.frame.id) == node]
+        own_ms.append(passed_for_module_ms(heard, node, max(points), stopped[node].at_ns))
+    return Trial(value=max(own_ms), trouble="; ".join(troubles), recovered=True)
+
+
+def _went_well_until(heard: Sequence[Heard], now_ns: int) -> bool:
+    """Whether every module had a set-point within the last three periods, and nobody had been told to stop."""
+    recent_ns = now_ns - round(3e9 / RATE_HZ)
+    driven = {node_of(h.frame.id) for h in heard if h.opcode == Opcode.SET_POINT and recent_ns < h.at_ns}
+    return driven == set(NODES) and not stop_commands([h for h in heard if h.at_ns > recent_ns])
+
+
+@contextlib.contextmanager
+def _driver(robot: Bench) -> Iterator[int]:
+    """The driver alone, in a process of its own, once it has armed every module."""
+    config, log, parent = robot.folder / "config.json", robot.folder / "driver.log", os.getpid()
+    pid = os.fork()
+    if pid == 0:
+        _become_driver(config, log, parent)
+    try:
+        _await_armed(robot)
+        yield pid
+    finally:
+        os.kill(pid, signal.SIGKILL)
+        os.waitpid(pid, 0)
+
+
+def _await_armed(robot: Bench) -> None:
+    """Looks rarely, and only at what is new: this machine is slow, and modules and driver need it."""
+    deadline = time.monotonic() + ARM_LIMIT_S
+    while robot.listener.states() != [ModuleState.ARMED] * JOINTS:
+        if time.monotonic() > deadline:
+            raise TrialError(f"not armed within {ARM_LIMIT_S:g} s: {robot.said('driver')[-300:]}")
+        robot.listener.forget()
+        time.sleep(LOOK_S)
+
+
+def _become_driver(config: Path, log: Path, parent: int) -> None:
+    """Never returns."""
+    try:
+        output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+        os.dup2(output, 1)
+        os.dup2(output, 2)
+        sys.argv = ["driver", str(config), "--parent", str(parent)]
+        driver.main()
+    except Exception:  # noqa: BLE001 - the outermost of this process; what it says is in the log
+        traceback.print_exc()
+        sys.stderr.flush()
+    finally:
+        os._exit(1)
+
+
+def watchdog(request: Request) -> Iterator[Trial]:
+    """A module whose host is silent from some instant on. The value: until it is passive, in its own exact time."""
+    rng = random.Random(8)
+    for _ in range(request.trials):
+        module: Module = armed()
+        now_us = BOOTED
+        for count in range(rng.randrange(5, 40)):
+            now_us += 10 * MS
+            module.sync(count, QUIET)
+            module.poll(now_us)
+            module.hear_set_point(set_point(count), now_us)
+        assert module.state == ModuleState.ARMED, module.state
+        last_us = now_us
+        while module.state == ModuleState.ARMED and now_us - last_us < 1000 * MS:
+            now_us += MS / 10
+            module.poll(now_us)
+        trouble = "" if module.state == ModuleState.FAULT else f"it is {module.state.name}"
+        yield Trial(value=(now_us - last_us) / MS, trouble=trouble)
+
+
+def clock_step(request: Request) -> Iterator[Trial]:
+    """An hour ahead, then an hour back, while a robot moves at 25 Hz. The value: faults and stops."""
+    scenario = write_files(request.folder, scenario=SCENARIO.replace('channels = ["CHANNEL"]\n', ""))
+    settings = {"robot.chain.modules": JOINTS, "backend": request.backend, "duration_s": 3600.0}
+    config = load(scenario, [Override(key, value, "the fault table") for key, value in settings.items()]).config
+    with Robot(request.folder, config) as made:
+        made.start_all()
+        observer = made.observe()
+        observer.arm(START_LIMIT_S)
+        stumbles = 0
+        for number in range(request.trials):
+            trial = Trial(value=None)
+            for _ in range(ATTEMPTS):
+                trial = _stepped(made, observer, STEP_S if number % 2 == 0 else -STEP_S)
+                if trial.value == 0:
+                    break
+                stumbles += 1
+                _step_clock(STEP_S if number % 2 else -STEP_S)
+                observer.arm(START_LIMIT_S)
+            yield trial
+        if request.trials % 2:
+            _step_clock(-STEP_S)
+    request.note(
+        f"{JOINTS} joints at {RATE_HZ:g} Hz, holding; the clock goes {STEP_S:g} s ahead and back by turns. On "
+        f"{request.backend} {stumbles} steps met a stop, as an emulated machine brings about by itself; those were "
+        f"tried again, at most {ATTEMPTS} times each"
+    )
+
+
+def _stepped(made: Robot, observer: Observer, by_s: float) -> Trial:
+    while observer.state() != "armed":
+        observer.arm(START_LIMIT_S)
+    observer.watch(LIVE_S + made.random.random() / RATE_HZ)
+    observer.forget()
+    _step_clock(by_s)
+    observer.watch(AFTER_STEP_S)
+    faults = len(observer.status.faults) if observer.status is not None else 1
+    stops = sum(h.message.sequence is None for h in observer.applied)
+    trouble = "" if observer.state() == "armed" else f"stopped: {observer.in_words()}"
+    if len(observer.applied) < AFTER_STEP_S * RATE_HZ / 2:
+        trouble = trouble or f"only {len(observer.applied)} set-points heard of in {AFTER_STEP_S:g} s"
+    return Trial(value=float(faults + stops), trouble=trouble)
+
+
+def _step_clock(by_s: float) -> None:
+    time.clock_settime(time.CLOCK_REALTIME, time.clock_gettime(time.CLOCK_REALTIME) + by_s)

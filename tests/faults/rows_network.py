@@ -1,0 +1,170 @@
+"""The network fails: its router dies, its cable is cut."""
+
+import contextlib
+import ctypes
+import fcntl
+import signal
+import socket
+import struct
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from tests.faults.observer import Observer, TrialError
+from tests.faults.robot import START_LIMIT_S, Robot, configuration, recovered, tell_stumbles
+from tests.faults.row import Request, Trial
+
+DOWN_S = 0.4  # how long there is no router
+RECONNECT_S = 5.0
+STEADY_S = 0.2
+OURS, THEIRS = "10.99.7.1", "10.99.7.2"
+PORT = 7447
+CLONE_NEWNET = 0x40000000
+INTERFACE = struct.Struct("16sH22x")  # struct ifreq of netdevice(7)
+SIOCGIFFLAGS, SIOCSIFFLAGS, IFF_UP = 0x8913, 0x8914, 1
+CUTS_S = (0.3, 0.5, 1.0, 3.0)  # the longest outlives Zenoh's own lease of a link
+
+
+def router_restarts(request: Request) -> Iterator[Trial]:
+    """The router is killed and started again. The value: from the kill to the safe stop, by the host's own ticks."""
+    with Robot(request.folder, configuration(request.backend), router=True) as made:
+        made.start("router")
+        made.observe().session.close()  # it is there
+        made.start_all()
+        observer = made.observe()
+        observer.arm(START_LIMIT_S)
+        slowest_s = 0.0
+        for _ in range(request.trials):
+            made.set_in_motion(observer)
+            observer.watch(0.05)
+            dead_ns = made.signal("router", signal.SIGKILL)
+            observer.watch(DOWN_S)
+            tick = observer.tick_at(dead_ns)
+            observer.forget()
+            made.start("router")
+            started = time.monotonic()
+            observer.until(lambda: observer.statuses and observer.clocks, "reconnected", START_LIMIT_S)
+            observer.until(lambda: _all_back(observer), "every service reconnected", START_LIMIT_S)
+            took_s = time.monotonic() - started
+            slowest_s = max(slowest_s, took_s)
+            yield _after(observer, tick, [f"reconnected only after {took_s:.1f} s"] if took_s > RECONNECT_S else [])
+        tell_stumbles(request, observer)
+        request.note(
+            f"everything connected again at most {slowest_s:.1f} s after the router's process was started again "
+            f"(deadline {RECONNECT_S:g} s); the safe stop is told by the tick that the host gives its fault"
+        )
+
+
+def _all_back(observer: Observer) -> bool:
+    status = observer.status
+    return status is not None and not status.waiting_for and status.lease_holder == "control"
+
+
+def _after(observer: Observer, tick: float, troubles: list[str]) -> Trial:
+    """Still stopped; when that was, by the host's ticks; and back by an operator's commands."""
+    observer.forget()
+    observer.watch(STEADY_S)
+    status = observer.status
+    if status is None or status.lifecycle != "fault":
+        return recovered(observer, None, "; ".join([*troubles, f"not stopped: {observer.in_words()}"]))
+    if any(h.message.sequence is not None for h in observer.applied):
+        troubles.append("commands were applied without an arming")
+    expired = [fault for fault in status.faults if fault.what == "lease_expired"]
+    if not expired:
+        return recovered(observer, None, "; ".join([*troubles, f"not because of the lease: {status.why}"]))
+    value = (expired[0].tick + 1 - tick) * observer.description().period_ns * 1e-6
+    return recovered(observer, value, "; ".join(troubles))
+
+
+# --- a cable ---------------------------------------------------------------------------------------------------
+
+
+def network_cut(request: Request) -> Iterator[Trial]:
+    """Host and observer on one side of a veth pair, the services on the other; the link goes down, and up again."""
+    with _far_side() as far:
+        made = Robot(request.folder, configuration(request.backend), endpoint=f"tcp/{OURS}:{PORT}")
+        with made:
+            made.start("host")
+            observer = made.observe()
+            with _inside(far):
+                for service in made.config.services:
+                    made.start(service)
+            observer.arm(START_LIMIT_S)
+            slowest_s = 0.0
+            for number in range(request.trials):
+                made.set_in_motion(observer)
+                cut_ns = time.monotonic_ns()
+                _set_link("ours", up=False)
+                value = observer.safe_after_ms(cut_ns)
+                status = observer.first_fault(cut_ns)
+                troubles = [] if status.lease_holder is None else [f"the lease is still {status.lease_holder}'s"]
+                observer.watch(CUTS_S[number % len(CUTS_S)])
+                observer.forget()
+                _set_link("ours", up=True)
+                started = time.monotonic()
+                observer.until(lambda: _all_back(observer), "every service reconnected", START_LIMIT_S)
+                slowest_s = max(slowest_s, time.monotonic() - started)
+                if observer.state() != "fault" or any(h.message.sequence is not None for h in observer.applied):
+                    troubles.append(f"not latched: {observer.in_words()}")
+                yield recovered(observer, value, "; ".join(troubles))
+            tell_stumbles(request, observer)
+            request.note(
+                f"two network namespaces with a veth pair, one end down for {CUTS_S[0]:g} to {CUTS_S[-1]:g} s; "
+                f"everything connected again at most {slowest_s:.1f} s after the link was up"
+            )
+
+
+@contextlib.contextmanager
+def _far_side() -> Iterator[Path]:
+    """A network namespace behind a veth pair; this process must be in one of its own."""
+    holder = subprocess.Popen(["unshare", "--net", "sleep", "infinity"])
+    far = Path(f"/proc/{holder.pid}/ns/net")
+    try:
+        _until_another(far)
+        _ip("link", "set", "lo", "up")
+        _ip("link", "add", "ours", "type", "veth", "peer", "name", "theirs", "netns", str(holder.pid))
+        _ip("address", "add", f"{OURS}/24", "dev", "ours")
+        _ip("link", "set", "ours", "up")
+        with _inside(far):
+            _ip("link", "set", "lo", "up")
+            _ip("address", "add", f"{THEIRS}/24", "dev", "theirs")
+            _ip("link", "set", "theirs", "up")
+        yield far
+    finally:
+        holder.kill()
+        holder.wait()
+
+
+def _until_another(far: Path) -> None:
+    deadline = time.monotonic() + 5.0
+    while far.readlink() == Path("/proc/self/ns/net").readlink():
+        if time.monotonic() > deadline:
+            raise TrialError("no network namespace could be made; it needs root")
+        time.sleep(0.01)
+
+
+@contextlib.contextmanager
+def _inside(namespace: Path) -> Iterator[None]:
+    """What this thread starts meanwhile is in that network namespace."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    with open("/proc/thread-self/ns/net") as own, namespace.open() as other:  # noqa: PTH123 - both are held open
+        if libc.setns(other.fileno(), CLONE_NEWNET):
+            raise OSError(ctypes.get_errno(), "setns")
+        try:
+            yield
+        finally:
+            libc.setns(own.fileno(), CLONE_NEWNET)
+
+
+def _ip(*arguments: str) -> None:
+    subprocess.run(["ip", *arguments], check=True, capture_output=True, text=True, timeout=10)
+
+
+def _set_link(name: str, *, up: bool) -> None:
+    """What `ip link set` does, without the time that a process takes to start."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
+        asked = INTERFACE.pack(name.encode(), 0)
+        _, flags = INTERFACE.unpack(fcntl.ioctl(any_socket, SIOCGIFFLAGS, asked))
+        flags = flags | IFF_UP if up else flags & ~IFF_UP
+        fcntl.ioctl(any_socket, SIOCSIFFLAGS, INTERFACE.pack(name.encode(), flags))

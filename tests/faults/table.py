@@ -1,0 +1,350 @@
+"""Every row of the fault table, in its order. The fault, what is expected, the deadline, and how it is measured."""
+
+import signal
+from dataclasses import dataclass
+
+from snakesim_hal.injection import KINDS
+from tests.faults import (
+    rows_commands,
+    rows_consumers,
+    rows_controller,
+    rows_guest,
+    rows_modules,
+    rows_network,
+    rows_simulator,
+)
+from tests.faults.row import Backend, Measure, Place, Row
+
+LEASE_MS, PERIOD_MS = 50.0, 10.0
+WITHIN_LEASE = "lease, 50 ms after the last good command, and acted on within the period (10 ms)"
+ROUTERS = 50  # times that it dies
+NO_BUS = "a simulator has no bus"
+NO_MODULES = "a simulator has no modules; what its sensors can do is in the rows by a whole robot"
+QUEUE_FULL = (
+    "a queue that is full for less than the lease is no fault: the newest set-point takes the place of one that did "
+    "not get out, and no module acts on an old one; at the lease (50 ms) it is, "
+    "and the modules' watchdogs stand behind it"
+)
+NO_MODULES_LEFT = "the simulator is in the host's process: without a host nothing is there that could move"
+IN_GUEST_MS = 100.0 + 1000.0 / rows_guest.RATE_HZ  # where heartbeats tell the module's time
+PASSED = "messages got through"
+
+
+@dataclass(frozen=True)
+class Heading:
+    """A row as the table asks for it; it may need several measurements."""
+
+    fault: str
+    expected: str
+    deadline: str
+    rows: tuple[Row, ...]
+
+
+def both(measure: Measure) -> dict[Backend, Measure | str]:
+    """Measured in the same way on both."""
+    return {"sim": measure, "can": measure}
+
+
+def lease_row(
+    name: str, fault: str, measure: Measure, least: int = 0, place: Place = "here", more_ms: float = 0.0
+) -> Row:
+    """A row of a stream that stops."""
+    return Row(
+        name,
+        fault,
+        "safe stop by the lease, lease freed, fault latched",
+        WITHIN_LEASE,
+        LEASE_MS + PERIOD_MS + more_ms,
+        "ms",
+        both(measure),
+        place,
+        least=least,
+    )
+
+
+def watchdog_row(name: str, fault: str, measure: Measure, limit_ms: float, place: Place = "here") -> Row:
+    """Modules that are left alone. Where a listener tells their time from their heartbeats, it may be a little off."""
+    told = f", which a listener can tell to {limit_ms - 100:.0f} ms" if limit_ms > 100 else ""
+    return Row(
+        name,
+        fault,
+        "every module stops by itself, motor off, latched",
+        f"100 ms after the last set-point, in the module's own time{told}",
+        limit_ms,
+        "ms",
+        {"sim": NO_MODULES_LEFT, "can": measure},
+        place,
+    )
+
+
+def joint_row(name: str, kind: str, what: str) -> Row:
+    """A joint module on CAN."""
+    about = KINDS["joint"][kind].about
+    return Row(
+        name,
+        f"a joint module: {about}",
+        "fault names the joint, group to safe stop, latched",
+        "50 ms from right after the module's last good answer to the safe action on the bus",
+        50.0,
+        "ms",
+        {"sim": NO_MODULES, "can": rows_modules.at_driver(kind, what)},
+    )
+
+
+def sensor_row(name: str, fault: str, kind: str) -> Row:
+    """What any backend's sensors can do."""
+    expected = "fault names the joint, group to safe stop, latched"
+    deadline = "50 ms; and the injector takes the request at the host's next tick (10 ms)"
+    return Row(name, fault, expected, deadline, 60.0, "ms", both(rows_modules.through_robot(kind)))
+
+
+def bus_row(
+    name: str,
+    fault: str,
+    kind: str,
+    what: str,
+    limit_ms: float = 3 * PERIOD_MS,
+    *,
+    paced: bool = False,
+    why_over: str = "",
+) -> Row:
+    """A bus on CAN."""
+    return Row(
+        name,
+        fault,
+        "fault, group to safe stop, recovers only to disarmed",
+        f"{limit_ms:.0f} ms to the safe action on the bus",
+        limit_ms,
+        "ms",
+        {"sim": NO_BUS, "can": rows_modules.at_driver(kind, what, paced=paced)},
+        why_over=why_over,
+    )
+
+
+def consumer_row(name: str, fault: str, kind: str) -> Row:
+    """Somebody who listens."""
+    expected = "no control cycle is missed, the robot goes on"
+    return Row(name, fault, expected, "-", 0.0, "more missed cycles", both(rows_consumers.cannot_keep_up(kind)))
+
+
+HEADINGS: tuple[Heading, ...] = (
+    Heading(
+        "controller killed; controller frozen (SIGSTOP; busy interpreter)",
+        "safe stop, lease freed, latched",
+        "lease",
+        (
+            lease_row("controller_killed", "control: SIGKILL", rows_controller.killed),
+            lease_row("controller_frozen", "control: SIGSTOP", rows_controller.frozen),
+            lease_row(
+                "controller_hung",
+                "control: interpreter busy, by the injector (which takes the request at the controller's next tick)",
+                rows_controller.hung,
+                more_ms=PERIOD_MS,
+            ),
+        ),
+    ),
+    Heading(
+        "HAL host killed or frozen",
+        "modules' own watchdog",
+        "100 ms",
+        (
+            watchdog_row("host_silent", "the host says nothing any more, at one module", rows_guest.watchdog, 100.0),
+            watchdog_row("host_killed", "driver: SIGKILL", rows_guest.host_gone(signal.SIGKILL), IN_GUEST_MS, "guest"),
+            watchdog_row("host_frozen", "driver: SIGSTOP", rows_guest.host_gone(signal.SIGSTOP), IN_GUEST_MS, "guest"),
+        ),
+    ),
+    Heading(
+        "router dies, restarts, 50 times",
+        "safe stop if the stream stops; reconnects; no re-arm",
+        "lease; 5 s to reconnect",
+        (
+            lease_row(
+                "router_restarts", "router: SIGKILL, 0.4 s later a new one", rows_network.router_restarts, ROUTERS
+            ),
+        ),
+    ),
+    Heading(
+        "network cut between controller and robot (namespaces with a veth pair, link down)",
+        "safe stop on the robot side",
+        "lease",
+        (
+            lease_row(
+                "network_cut", "link down between host and services", rows_network.network_cut, place="namespaces"
+            ),
+        ),
+    ),
+    Heading(
+        "two controllers",
+        "first wins, typed refusal, zero frames from the second in 100,000 interleavings",
+        "at once",
+        (
+            Row(
+                "two_controllers",
+                "two writers at one gate, interleaved by chance",
+                "no set-point and no right for the second",
+                "at once: with the call",
+                0.0,
+                "frames from the second",
+                {"both": rows_commands.interleaved},
+            ),
+            Row(
+                "second_controller",
+                "a second controller on the network asks for the lease, and commands with other epochs",
+                "typed refusal (lease_held), commands refused as wrong_epoch, the first goes on",
+                "at once: none applied",
+                0.0,
+                "frames from the second",
+                both(rows_commands.second_controller),
+            ),
+        ),
+    ),
+    Heading(
+        "stale, replayed, reordered, duplicated, future command",
+        "refused",
+        "one message",
+        (
+            Row(
+                "out_of_time",
+                "commands out of their time, with the right lease epoch",
+                "each refused and counted by its reason, the controller's own go on",
+                "one message: none applied",
+                0.0,
+                PASSED,
+                both(rows_commands.out_of_time),
+            ),
+        ),
+    ),
+    Heading(
+        "NaN, infinity, out of range, wrong length, wrong joint order, malformed or huge bytes, unknown version",
+        "refused, counted; never an exception out of a callback",
+        "one message",
+        (
+            Row(
+                "wrong_in_itself",
+                "commands that are wrong in themselves, with the right epoch, sequence and tick",
+                "each refused and counted by its reason, the controller's own go on, no process ends",
+                "one message: none applied",
+                0.0,
+                PASSED,
+                both(rows_commands.wrong_in_itself),
+            ),
+        ),
+    ),
+    Heading(
+        "joint module silent, restarted, frozen value, wrong counter",
+        "fault names the joint; group to safe stop",
+        "50 ms; restart: one frame",
+        (
+            joint_row("joint_silent", "mute", "module_silent"),
+            joint_row("joint_frozen", "freeze", "module_frozen"),
+            joint_row("joint_restarted", "reboot", "module_restarted"),
+            joint_row("joint_wrong_counter", "counter", "wrong_counter"),
+            joint_row("joint_bad_checksum", "checksum", "bad_checksum"),
+            sensor_row("robot_joint_silent", "a joint says nothing, by a whole robot", "mute"),
+            sensor_row("robot_joint_frozen", "a joint repeats its last value, by a whole robot", "freeze"),
+            sensor_row("robot_joint_wrong", "a joint's angle is suddenly off by 0.5 rad, by a whole robot", "wrong"),
+            sensor_row("robot_joint_nan", "a joint's angle is no number, by a whole robot", "nan"),
+        ),
+    ),
+    Heading(
+        "bus-off, error-passive, transmit queue full, interface down, receive overflow, babbling node, duplicate id",
+        "fault; recovers only to disarmed; duplicate refused at arming",
+        "2-3 T; flood 100 ms",
+        (
+            bus_row("bus_off", "the controller leaves the bus", "bus_off", "bus_off", paced=True),
+            bus_row("bus_error_passive", "more than 127 errors", "error_passive", "error_passive"),
+            bus_row(
+                "bus_queue_full", "the transmit queue stays full", "full", "bus_stuck", paced=True, why_over=QUEUE_FULL
+            ),
+            bus_row("bus_interface_down", "the interface goes down", "cut", "interface_down", paced=True),
+            bus_row("bus_receive_overflow", "received frames get lost", "overflow", "receive_overflow"),
+            bus_row("bus_babbling", "a node floods the bus", "babble", "module_babbling", 100.0),
+            bus_row("bus_duplicate", "a second node with the same id appears", "duplicate", "duplicate_node", 100.0),
+            Row(
+                "bus_duplicate_at_start",
+                "two nodes with the same id are there when the driver opens",
+                "refused, with the joint and both serials; nothing is enabled",
+                "before anything is enabled",
+                0.0,
+                "modules enabled",
+                {"sim": NO_BUS, "can": rows_modules.twice_at_start},
+            ),
+        ),
+    ),
+    Heading(
+        "wall clock steps by an hour either way",
+        "nothing",
+        "-",
+        (
+            Row(
+                "clock_step",
+                "the wall clock goes an hour ahead, and back",
+                "nothing: no fault, no lease missed",
+                "-",
+                0.0,
+                "faults and stops",
+                both(rows_guest.clock_step),
+                "guest",
+            ),
+        ),
+    ),
+    Heading(
+        "simulator slower than real time in lockstep (0.1x)",
+        "no false stop",
+        "-",
+        (
+            Row(
+                "slow_simulator",
+                "the simulator runs at a tenth of real time, in lockstep",
+                "no stop, no fault: leases count in simulated time",
+                "-",
+                0.0,
+                "stops and faults",
+                both(rows_simulator.slow),
+            ),
+        ),
+    ),
+    Heading(
+        "simulation diverges",
+        "stop, fault, last good state kept",
+        "one step",
+        (
+            Row(
+                "simulation_diverges",
+                "the simulator's state becomes impossible",
+                "stop and fault in the same step; nothing that is no number is published or recorded",
+                "one step",
+                1.0,
+                "steps",
+                {"sim": rows_simulator.diverges, "can": "modules on a bus are no simulation that could diverge"},
+            ),
+        ),
+    ),
+    Heading(
+        "slow subscriber (sleeping callback, full disk at a consumer)",
+        "only that consumer suffers; zero missed control cycles",
+        "-",
+        (
+            consumer_row("consumer_sleeps", "a consumer's callback sleeps for 0.5 s at every sample", "sleep"),
+            consumer_row("consumer_disk_full", "a consumer writes to a disk that is full", "disk"),
+        ),
+    ),
+    Heading(
+        "HAL restarts while moving",
+        "boots disarmed; old commands void; no jump",
+        "before first frame",
+        (
+            Row(
+                "host_restarts",
+                "host: SIGKILL while moving, started again",
+                "boots disarmed, refuses what was streamed before, moves nothing until armed",
+                "before the first set-points: none but passive ones until armed",
+                0.0,
+                "set-points not passive",
+                both(rows_controller.host_restarts),
+            ),
+        ),
+    ),
+)
+
+ROWS: dict[str, Row] = {row.name: row for heading in HEADINGS for row in heading.rows}

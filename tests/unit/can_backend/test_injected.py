@@ -1,0 +1,239 @@
+"""Faults on request through the driver: its own twins get theirs, and a virtual bus fails as a kernel interface does.
+
+What real interfaces do stands in tests/vcan/test_bus_faults.py; the rows here are the same.
+"""
+
+from typing import Any
+
+import pytest
+
+from snakesim_can_backend.backend import CanBackend
+from snakesim_can_backend.protocol import Frame, ModuleState
+from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.trouble import Trouble
+from snakesim_can_backend.twin.faults import ABOUT
+from snakesim_can_backend.wire import VirtualWire
+from snakesim_can_backend.wire_faults import inject_into_interface
+from snakesim_hal.backend import Injectable
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.faulty_backend import FaultyBackend
+from snakesim_hal.injection import parse
+from tests.unit.can_backend.loop import Loop, config, loop
+from tests.unit.can_backend.test_faults_seen import MODULE_FAULTS
+
+PERIOD_MS, LEASE_MS = 10, 50
+
+
+def armed(run: Loop) -> Loop:
+    run.arm()
+    run.run(12, run.waving)
+    assert not run.faults
+    return run
+
+
+def inject(run: Loop, text: str, *, begins: bool = True) -> None:
+    FaultyBackend(run.backend).inject(parse(f"{text}@0"), begins)
+
+
+def cleared_and_armed_again(run: Loop) -> None:
+    """A person clears the fault and arms; nothing is left of it."""
+    told = len(run.faults)
+    run.lifecycle = "disarmed"
+    run.run(10)
+    assert run.states() == [ModuleState.DISARMED] * 4
+    run.wanted = None
+    run.arm()
+    run.run(10, run.waving)
+    assert len(run.faults) == told, run.faults[told:]
+
+
+# --- modules -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("kind", "what", "within"), MODULE_FAULTS, ids=[row[0] for row in MODULE_FAULTS])
+def test_a_fault_of_a_module_is_injected_while_it_runs(kind: str, what: str, within: int) -> None:
+    with loop() as run:
+        assert isinstance(run.backend, Injectable)
+        armed(run).run(40, run.waving)
+        inject(run, f"{kind}:joint_3")
+        run.run(within + 1, run.waving)
+        assert run.faults and run.faults[0].joint == "joint_3", f"{kind} was not seen within {within + 1} periods"
+        run.run(20)
+        assert what in [fault.what for fault in run.faults]
+
+
+def test_a_module_that_is_no_longer_mute_can_be_cleared() -> None:
+    with loop() as run:
+        armed(run)
+        inject(run, "mute:joint_2")
+        run.run(5, run.waving)
+        assert run.faults[0].what == "module_silent"
+        inject(run, "mute:joint_2", begins=False)
+        cleared_and_armed_again(run)
+
+
+def test_every_module_may_fall_silent_and_come_back() -> None:
+    with loop() as run:
+        armed(run)
+        for joint in range(1, 5):
+            inject(run, f"mute:joint_{joint}")
+        run.run(10, run.waving)
+        assert {fault.what for fault in run.faults} == {"module_silent"}
+        for joint in range(1, 5):
+            inject(run, f"mute:joint_{joint}", begins=False)
+        run.run(5)
+        cleared_and_armed_again(run)
+
+
+def test_what_a_module_cannot_know_the_host_makes() -> None:
+    with loop() as run:
+        run.run(3)
+        faulty = FaultyBackend(run.backend)
+        faulty.inject(parse("wrong:joint_2@0=0.4"), True)
+        told = faulty.sample(3, 3 * run.config.period_ns).joints.angle_rad
+        assert told == pytest.approx([0.0, 0.4, 0.0, 0.0], abs=0.02)
+        with pytest.raises(ConfigError, match="cannot do diverge to simulator"):
+            faulty.inject(parse("diverge:simulator@0"), True)
+        with pytest.raises(ConfigError, match="no joint_9"):
+            faulty.inject(parse("leak:joint_9@0"), True)
+        with pytest.raises(ConfigError, match="there is no bus_2; this robot has bus_1 to bus_1"):
+            faulty.inject(parse("cut:bus_2@0"), True)
+
+
+@pytest.mark.parametrize(
+    ("settings", "text", "words"),
+    [
+        (Settings(), "diverge:simulator@1", "its modules know mute, freeze"),
+        (Settings(), "cut:bus_2@1", "this run has bus_1 to bus_1"),
+        (Settings(channels=["vcan0"]), "leak:joint_1@1", "its modules are not the driver's own"),
+        (Settings(channels=["vcan0"], twins="process"), "full:bus_1@1", "fill the queue of a kernel interface"),
+    ],
+)
+def test_what_cannot_be_had_is_refused_before_anything_is_opened(settings: Settings, text: str, words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        CanBackend.check(config(faults=[text]), settings)
+
+
+def test_everything_that_own_twins_and_a_virtual_bus_can_do_is_allowed() -> None:
+    texts = [f"{kind}:joint_1@1" for kind in (*ABOUT, "wrong", "nan")]
+    texts += [f"{kind}:bus_1@1" for kind in ("cut", "bus_off", "error_passive", "overflow", "full")]
+    assert CanBackend.check(config(faults=texts), Settings()) == ("lockstep", "realtime")
+
+
+# --- the bus -------------------------------------------------------------------------------------------------
+
+
+def test_an_interface_that_goes_down_stops_the_joints_and_comes_back() -> None:
+    with loop() as run:
+        armed(run)
+        inject(run, "cut:bus_1")
+        start = run.tick
+        run.run(13, run.waving)
+        (fault,) = run.faults
+        assert fault.what == "interface_down" and fault.tick - start <= 1 and run.lifecycle == "fault"
+        inject(run, "cut:bus_1", begins=False)
+        run.run(10)
+        assert run.states() == [ModuleState.FAULT] * 4 and run.backend._watch.seen["interface_up"] == 1
+        told = {f.what for f in run.faults[1:]}
+        assert told and told <= {"module_watchdog", "module_fault"}, "now they can tell"
+        cleared_and_armed_again(run)
+
+
+def test_a_controller_that_leaves_the_bus_is_a_fault_and_restarts_at_the_end() -> None:
+    with loop() as run:
+        armed(run)
+        inject(run, "bus_off:bus_1")
+        start = run.tick
+        run.run(13, run.waving)
+        assert run.faults[0].what == "bus_off" and run.faults[0].tick - start <= 1
+        assert {fault.what for fault in run.faults} <= {"bus_off", "module_silent"}
+        inject(run, "bus_off:bus_1", begins=False)
+        run.run(10)
+        assert "restarted" in [fault.what for fault in run.faults]
+        cleared_and_armed_again(run)
+
+
+def test_a_queue_that_stays_full_is_a_fault_after_the_lease() -> None:
+    with loop() as run:
+        armed(run)
+        inject(run, "full:bus_1")
+        start = run.tick
+        run.run(LEASE_MS // PERIOD_MS + 3, run.waving)
+        (fault,) = run.faults
+        assert fault.what == "bus_stuck" and LEASE_MS // PERIOD_MS - 1 <= fault.tick - start <= LEASE_MS // PERIOD_MS
+        assert run.backend._watch.seen["queue_full"] > 0
+        inject(run, "full:bus_1", begins=False)
+        run.run(5)
+        cleared_and_armed_again(run)
+
+
+def test_a_queue_that_is_full_for_a_moment_is_counted() -> None:
+    with loop() as run:
+        armed(run)
+        inject(run, "full:bus_1")
+        run.run(LEASE_MS // PERIOD_MS - 2, run.waving)
+        inject(run, "full:bus_1", begins=False)
+        run.run(30, run.waving)
+        assert not run.faults and run.states() == [ModuleState.ARMED] * 4
+        assert run.backend._watch.seen["queue_full"] > 0
+
+
+@pytest.mark.parametrize(("kind", "what"), [("error_passive", "error_passive"), ("overflow", "receive_overflow")])
+def test_what_the_controller_tells_once_is_a_fault(kind: str, what: str) -> None:
+    with loop() as run:
+        armed(run)
+        inject(run, f"{kind}:bus_1")
+        run.run(2, run.waving)
+        assert [fault.what for fault in run.faults] == [what]
+        run.run(20)
+        assert run.lifecycle == "fault"
+        cleared_and_armed_again(run)
+
+
+def test_one_end_of_a_virtual_bus() -> None:
+    here, there = VirtualWire("wire-faults"), VirtualWire("wire-faults")
+    try:
+        frame = Frame(0x105, b"1")
+        assert here.send(frame) and there.receive() == [frame] and here.troubles() == []
+        for kind, taken in (("cut", False), ("bus_off", True), ("full", False)):
+            here.inject(kind, begins=True)
+            assert here.send(frame) is taken and there.receive() == []
+            there.send(frame)
+            assert here.receive() == ([frame] if kind == "full" else [])
+            here.inject(kind, begins=False)
+            assert here.send(frame) and there.receive() == [frame]
+        here.inject("overflow", begins=True)
+        there.send(frame)
+        there.send(frame)
+        assert here.receive() == []
+        there.send(frame)
+        assert here.receive() == [frame]
+        said = [(trouble.kind, trouble.detail) for trouble in here.troubles()]
+        assert said == [
+            ("interface_down", "the interface is down"),
+            ("interface_up", "the interface is up again"),
+            ("bus_off", "transmit errors 255, receive errors 0"),
+            ("restarted", "transmit errors 0, receive errors 0"),
+            ("queue_full", "the transmit queue is full"),
+            ("receive_overflow", "the kernel dropped 2 frames: this process reads too slowly"),
+        ]
+        here.inject("cut", begins=True)
+        here.inject("cut", begins=True)
+        assert here.troubles() == [Trouble("interface_down", "wire-faults", "the interface is down")]
+    finally:
+        here.close()
+        there.close()
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (("lo0", "full"), "tc qdisc add dev lo0"),
+        (("nothere0", "cut"), "`ip link set nothere0 down`"),
+        (("can7", "bus_off"), "error frames can only be had on virtual interfaces"),
+    ],
+)
+def test_what_cannot_be_done_to_an_interface_is_told(given: Any, words: str) -> None:
+    channel, kind = given
+    with pytest.raises(ConfigError, match=words):
+        inject_into_interface(channel, kind, begins=True)

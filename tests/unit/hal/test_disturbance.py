@@ -1,0 +1,163 @@
+"""Messages that go wrong on their way out: what may come of them, whatever happens."""
+
+import random
+from math import inf
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from snakesim_hal.codec import Decoder, encode, encoding_of
+from snakesim_hal.disturbance import MOST_AT_ONCE, Disturbance, spoilt
+from snakesim_hal.errors import WireError
+from snakesim_hal.injection import Injection, checked
+from snakesim_hal.messages import JointCommand
+from tests.unit.hal.rig import command, description
+
+KEY = "sensor/joints"
+MESSAGES = [b"%05d" % i for i in range(400)]
+STEP_S = 0.01
+
+
+def on(kind: str, amount: float | None = None) -> Injection:
+    return checked(Injection(kind, KEY, amount=amount))
+
+
+def disturbed(*faults: Injection, seed: str = "1") -> Disturbance:
+    made = Disturbance(seed)
+    for fault in faults:
+        made.begin(fault, 0.0)
+    return made
+
+
+def sent(way: Disturbance, messages: list[bytes] = MESSAGES, step_s: float = STEP_S) -> list[tuple[float, bytes]]:
+    """(when, what) of everything that goes out, to the last that is late."""
+    out: list[tuple[float, bytes]] = []
+    for i, message in enumerate(messages):
+        now_s = i * step_s
+        out += [(now_s, payload) for payload in way.due(now_s) + way.put(message, now_s)]
+    while (now_s := way.next_s()) < inf:
+        out += [(now_s, payload) for payload in way.due(now_s)]
+    return out
+
+
+faults = st.lists(
+    st.one_of(
+        st.builds(on, st.sampled_from(["drop", "duplicate", "reorder"]), st.floats(0.0, 1.0)),
+        st.builds(on, st.just("delay"), st.floats(0.0, 0.2)),
+    ),
+    max_size=4,
+)
+
+
+@given(faults, st.text(max_size=5))
+def test_nothing_is_invented_and_nothing_comes_before_its_time(chosen: list[Injection], seed: str) -> None:
+    way = disturbed(*chosen, seed=seed)
+    out = sent(way, MESSAGES[:40])
+    assert {payload for _, payload in out} <= set(MESSAGES[:40])
+    assert all(when >= int(payload) * STEP_S for when, payload in out)
+    assert [when for when, _ in out] == sorted(when for when, _ in out)
+    kinds = {fault.kind for fault in chosen}
+    payloads = [payload for _, payload in out]
+    if "duplicate" not in kinds:
+        assert len(set(payloads)) == len(payloads)
+    if "reorder" not in kinds:
+        assert payloads == sorted(payloads), "late, but in order"
+    if not kinds & {"drop", "reorder"}:
+        assert set(payloads) == set(MESSAGES[:40])
+
+
+@given(faults, st.integers(0, 39))
+def test_when_all_is_over_everything_is_as_before(chosen: list[Injection], at: int) -> None:
+    way = disturbed(*chosen)
+    for message in MESSAGES[:at]:
+        way.put(message, 0.0)
+    for fault in chosen:
+        way.end(fault.kind, 0.0)
+    while way.next_s() < inf:
+        way.due(way.next_s())
+    assert way.over
+    assert way.put(b"new", 9.0) == [b"new"] and way.over
+
+
+def test_the_seed_decides() -> None:
+    first, again, other = (sent(disturbed(on("drop", 0.5), seed=seed)) for seed in ("1", "1", "2"))
+    assert first == again != other
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 1.0])
+def test_so_many_are_dropped(share: float) -> None:
+    lost = len(MESSAGES) - len(sent(disturbed(on("drop", share))))
+    assert lost == pytest.approx(share * len(MESSAGES), abs=4 * (share * (1 - share) * len(MESSAGES)) ** 0.5)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_so_many_come_twice_one_right_after_the_other(share: float) -> None:
+    payloads = [payload for _, payload in sent(disturbed(on("duplicate", share)))]
+    more = len(payloads) - len(MESSAGES)
+    assert more == pytest.approx(share * len(MESSAGES), abs=4 * (share * (1 - share) * len(MESSAGES)) ** 0.5)
+    assert payloads == sorted(payloads)
+
+
+def test_a_reordered_message_comes_right_after_the_one_that_follows_it() -> None:
+    payloads = [payload for _, payload in sent(disturbed(on("reorder")))]
+    assert payloads == [payload for i in range(0, 400, 2) for payload in (MESSAGES[i + 1], MESSAGES[i])]
+
+
+def test_a_held_message_goes_out_when_the_reordering_ends() -> None:
+    way = disturbed(on("reorder"))
+    assert way.put(b"1", 0.0) == []
+    assert way.end("reorder", 0.0) == [b"1"] and way.over
+
+
+def test_a_delay_is_as_long_as_it_says_and_what_follows_it_does_not_overtake() -> None:
+    way = disturbed(on("delay", 0.05))
+    out = sent(way)
+    late_s = [when - int(payload) * STEP_S for when, payload in out]
+    assert len(late_s) == len(MESSAGES) and min(late_s) > 0.0499 and max(late_s) < 0.0501 + STEP_S
+    way.put(b"late", 10.0)
+    assert way.end("delay", 10.01) == [] and not way.over
+    assert way.put(b"prompt", 10.02) == []
+    assert way.due(10.049) == [] and way.due(10.05) == [b"late", b"prompt"] and way.over
+
+
+def test_a_flood_repeats_the_newest_message_at_its_rate() -> None:
+    way = disturbed(on("flood", 1000.0))
+    assert way.next_s() == inf, "there is nothing to repeat yet"
+    assert way.put(b"1", 1.0) == [b"1"]
+    repeated = [way.due(1.0 + i / 1000) for i in range(100)]
+    assert 100 <= sum(map(len, repeated)) <= 101
+    way.put(b"2", 1.2)
+    assert set(way.due(1.3)) == {b"2"} and len(way.due(99.0)) == MOST_AT_ONCE, "a hiccup is not made up for"
+    assert way.due(99.0) == []
+    way.end("flood", 99.0)
+    assert way.over and way.due(100.0) == []
+
+
+# --- bytes ---------------------------------------------------------------------------------------------------
+
+
+@given(st.binary(max_size=200), st.integers(0, 2**32))
+def test_corrupt_bytes_are_other_bytes(payload: bytes, seed: int) -> None:
+    assert spoilt(payload, random.Random(seed)) != payload
+
+
+def test_decoders_get_noise_cuts_and_numbers_that_are_none_and_refuse_them_in_order() -> None:
+    payload, decoder, rng = encode(command(description(), 0.1)), Decoder(JointCommand), random.Random(5)
+    lengths, refused, taken = set(), 0, 0
+    for _ in range(20_000):
+        wrong = spoilt(payload, rng)
+        lengths.add(len(wrong))
+        try:
+            decoder.decode(wrong, encoding_of(JointCommand))
+            taken += 1
+        except WireError:
+            refused += 1
+    assert min(lengths) == 0 and max(lengths) > len(payload) and len(lengths) > 100
+    assert refused > 5_000 and taken > 1_000, "some still make sense: what those ask for is the gate's to judge"
+
+
+def test_corruption_strikes_as_often_as_it_says() -> None:
+    payloads = [payload for _, payload in sent(disturbed(on("corrupt", 0.5)))]
+    kept = sum(payload == message for payload, message in zip(payloads, MESSAGES, strict=True))
+    assert kept == pytest.approx(200, abs=40)

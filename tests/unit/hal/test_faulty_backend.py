@@ -1,0 +1,123 @@
+"""What the host makes of samples where the backend itself knows no faults, and what it passes on or refuses."""
+
+import math
+import time
+from typing import Any
+
+import msgspec
+import pytest
+
+from snakesim_hal.backend import Backend, SetPoints
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.faulty_backend import FaultyBackend
+from snakesim_hal.injection import Injection, parse
+from snakesim_hal.messages import Description, JointState, Mode
+from tests.unit.hal.network import LagBackend
+from tests.unit.hal.rig import PERIOD_NS, run_config
+
+
+class Emulated(LagBackend):
+    """Says that nothing real moves."""
+
+    def describe(self) -> Description:
+        return msgspec.structs.replace(super().describe(), emulated=True)
+
+
+class Leaky(Emulated):
+    """Knows one fault by itself."""
+
+    def __init__(self, config: Any) -> None:
+        super().__init__(config)
+        self.injected: list[tuple[str, bool]] = []
+
+    def inject(self, injection: Injection, *, begins: bool) -> bool:
+        if injection.kind != "leak":
+            return False
+        self.injected.append((str(injection), begins))
+        return True
+
+
+class Bench:
+    """A backend whose joints all move, tick by tick."""
+
+    def __init__(self, inner: Backend) -> None:
+        self.backend = FaultyBackend(inner)
+        self.tick = 0
+
+    def sample(self) -> JointState:
+        self.backend.enact(SetPoints([Mode.VELOCITY] * 3, [1.0] * 3, [4.0] * 3), "armed")
+        self.backend.advance()
+        self.tick += 1
+        return self.backend.sample(self.tick, self.tick * PERIOD_NS).joints
+
+    def inject(self, text: str, *, begins: bool = True) -> None:
+        self.backend.inject(parse(f"{text}@0"), begins)
+
+
+@pytest.fixture
+def bench() -> Bench:
+    made = Bench(Emulated(run_config(rate_hz=100)))
+    made.sample()
+    return made
+
+
+def test_without_a_fault_everything_is_the_backends(bench: Bench) -> None:
+    assert bench.sample().angle_rad == [0.02] * 3
+    assert bench.backend.describe().backend == "lag" and bench.backend.faults() == []
+
+
+def test_a_mute_joint_says_nothing_and_its_age_grows(bench: Bench) -> None:
+    bench.inject("mute:joint_2")
+    told = [bench.sample() for _ in range(3)]
+    assert [joints.angle_rad[1] for joints in told] == [0.01] * 3
+    assert [joints.valid for joints in told] == [[True, False, True]] * 3
+    assert [joints.age_ns[1] for joints in told] == [PERIOD_NS, 2 * PERIOD_NS, 3 * PERIOD_NS]
+    assert told[-1].angle_rad[0] == pytest.approx(0.04) and told[-1].age_ns[0] == 0
+    bench.inject("mute:joint_2", begins=False)
+    back = bench.sample()
+    assert back.valid == [True] * 3 and back.age_ns == [0] * 3 and back.angle_rad[1] == pytest.approx(0.05)
+
+
+def test_a_frozen_joint_repeats_itself_and_grows_old(bench: Bench) -> None:
+    bench.inject("freeze:joint_1")
+    told = [bench.sample() for _ in range(3)]
+    assert [joints.angle_rad[0] for joints in told] == [0.01] * 3 and all(joints.valid[0] for joints in told)
+    assert told[-1].age_ns == [3 * PERIOD_NS, 0, 0]
+
+
+def test_an_angle_can_be_off_and_can_be_no_number(bench: Bench) -> None:
+    bench.inject("wrong:joint_3")
+    bench.inject("nan:joint_1")
+    told = bench.sample()
+    assert math.isnan(told.angle_rad[0]) and told.angle_rad[1:] == [pytest.approx(0.02), pytest.approx(0.52)]
+    bench.inject("wrong:joint_3", begins=False)
+    bench.inject("nan:joint_1", begins=False)
+    assert bench.sample().angle_rad == [pytest.approx(0.03)] * 3
+
+
+def test_a_slow_simulator_takes_its_time(bench: Bench) -> None:
+    bench.backend.inject(parse("slow:simulator@0=0.2"), True)
+    began = time.monotonic()
+    bench.sample()
+    assert 0.05 <= time.monotonic() - began < 1.0
+    bench.inject("slow:simulator", begins=False)
+    began = time.monotonic()
+    bench.sample()
+    assert time.monotonic() - began < 0.05
+
+
+def test_the_backend_is_asked_first_and_what_nobody_can_do_is_refused(bench: Bench) -> None:
+    leaky = Leaky(run_config())
+    able = Bench(leaky)
+    able.inject("leak:joint_1")
+    able.inject("leak:joint_1", begins=False)
+    assert leaky.injected == [("leak:joint_1@0", True), ("leak:joint_1@0", False)]
+    able.inject("mute:joint_1")
+    assert able.sample().valid == [False, True, True]
+    for backend in (able, bench):
+        with pytest.raises(ConfigError, match="backend 'lag' cannot do reboot to joint_1"):
+            backend.inject("reboot:joint_1")
+    with pytest.raises(ConfigError, match="there is no joint_4; this robot has joint_1 to joint_3"):
+        bench.inject("mute:joint_4")
+    with pytest.raises(ConfigError, match="simulates nothing that could be slow"):
+        Bench(LagBackend(run_config())).inject("slow:simulator")

@@ -1,0 +1,167 @@
+"""The vocabulary of faults on request: texts, who carries what out, and the order of time."""
+
+from math import inf
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from snakesim_hal import keys
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.injection import (
+    KINDS,
+    Injection,
+    Plan,
+    check_targets,
+    checked,
+    explain,
+    kinds_in_short,
+    parse,
+    writer_of,
+)
+from snakesim_hal.planned import check_backend_can, check_planned, planned
+from tests.unit.hal.rig import run_config
+
+TARGETS = {
+    "process": ["control", "host"],
+    "key": [keys.JOINT_COMMAND, keys.JOINTS, keys.done("guidance")],
+    "joint": ["joint_1", "joint_13"],
+    "bus": ["bus_1"],
+    "simulator": ["simulator"],
+    "clock": ["clock"],
+}
+seconds = st.floats(0.0, 1e4).map(lambda s: round(s, 2))
+
+
+@st.composite
+def injections(draw: st.DrawFn) -> Injection:
+    sort = draw(st.sampled_from(sorted(KINDS)))
+    name = draw(st.sampled_from(sorted(KINDS[sort])))
+    start_s = draw(seconds)
+    end_s = draw(st.one_of(st.just(inf), seconds.map(lambda s: round(start_s + s + 0.01, 2))))
+    amount = KINDS[sort][name].amount
+    drawn = None if amount is None else draw(st.sampled_from([amount.low, amount.default, amount.high]))
+    return Injection(name, draw(st.sampled_from(TARGETS[sort])), start_s, end_s, drawn)
+
+
+@given(injections())
+def test_texts_go_both_ways(injection: Injection) -> None:
+    there = parse(str(injection))
+    assert str(there) == str(injection)
+    assert (there.kind, there.target, there.part) == (injection.kind, injection.target, injection.part)
+    assert there.about is KINDS[there.target_type][there.kind]
+
+
+def test_an_amount_that_is_left_out_is_the_usual_one() -> None:
+    assert parse("drop:sensor/joints@1").amount == 1.0 and parse("delay:sensor/joints@1").amount == 0.05
+    assert parse("mute:joint_2@1").amount is None
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ("kill:control@1", "run"),
+        ("freeze:host@1", "run"),
+        ("hang:control@1", "control"),
+        ("hang:host@1", "hal"),
+        ("step:clock@1", "run"),
+        ("mute:joint_1@1", "hal"),
+        ("cut:bus_1@1", "hal"),
+        ("slow:simulator@1", "hal"),
+        ("drop:actuator/joints@1", "control"),
+        ("drop:sensor/joints@1", "hal"),
+        ("delay:hal/status@1", "hal"),
+        ("drop:guidance/world@1", "guidance"),
+        ("drop:hal/done/navigation@1", "navigation"),
+    ],
+)
+def test_everything_has_a_part_that_carries_it_out(text: str, part: str) -> None:
+    assert parse(text).part == part
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("mute", "KIND:TARGET@START"),
+        ("mute:joint_0@1", "knows no 'mute'"),
+        ("mote:joint_1@1", "a joint such as joint_1 knows no 'mote', only mute, freeze"),
+        ("mute:control@1", "mute is for joints"),
+        ("freeze:bus_1@1", "freeze is for processs? and joints"),
+        ("mute:joint_1@2-2", "must be later than its start, 2 s"),
+        ("mute:joint_1@1.2.3", "are numbers"),
+        ("mute:joint_1@1=2", "mute takes no amount; leave out =2"),
+        ("drop:sensor/joints@1=1.5", r"share of the messages = 1.5 must be from 0 to 1"),
+        ("delay:sensor/joints@1=1e999", "must be from 0 to 10 s"),
+        ("drop:operator/intent@1", "no part of a run writes this key"),
+        ("drop:hal/lease@1", "no part of a run writes this key; those with a writer are sensor/joints"),
+    ],
+)
+def test_wrong_texts_are_told_what_is_allowed(text: str, words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        parse(text)
+
+
+def test_the_writers_are_those_of_the_key_space() -> None:
+    assert writer_of(keys.JOINT_COMMAND) == "control" and writer_of(keys.CLOCK) == "hal"
+    assert writer_of(keys.WORLD) == "guidance"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("mute:joint_14@1", "no joint_14; this run has joint_1 to joint_13"),
+        ("cut:bus_1@1", "no bus_1; this run has no bus"),
+        ("kill:contrl@1", "no process 'contrl'; this run has control, host"),
+    ],
+)
+def test_what_is_not_there_cannot_go_wrong(text: str, words: str) -> None:
+    check_targets([parse("mute:joint_13@1"), parse("kill:host@1")], services=["control"], joints=13, buses=0)
+    with pytest.raises(ConfigError, match=words):
+        check_targets([parse(text)], services=["control"], joints=13, buses=0)
+
+
+def test_a_request_is_checked_like_a_text() -> None:
+    assert checked(Injection("drop", keys.JOINTS)).amount == 1.0
+    with pytest.raises(ConfigError, match="'mute control': a process"):
+        checked(Injection("mute", "control"), "mute control")
+
+
+@given(st.lists(injections(), max_size=8), st.lists(seconds, max_size=8))
+def test_a_plan_gives_every_change_once_in_the_order_of_time(given_: list[Injection], looks: list[float]) -> None:
+    plan, seen = Plan(given_), []
+    for now_s in [*sorted(looks), inf]:
+        due = plan.until(now_s)
+        assert (all(change.at_s <= now_s for change in due) and plan.next_s() > now_s) or now_s == inf
+        seen += due
+    assert [change.at_s for change in seen] == sorted(change.at_s for change in seen)
+    ends = [i for i in given_ if i.end_s != inf and not i.about.once]
+    assert sorted(str(c.injection) for c in seen if c.begins) == sorted(map(str, given_))
+    assert sorted(str(c.injection) for c in seen if not c.begins) == sorted(map(str, ends))
+    assert plan.next_s() == inf
+
+
+def test_help_explains_every_kind() -> None:
+    for kinds in KINDS.values():
+        for name, kind in kinds.items():
+            assert name in kinds_in_short() and name in explain() and kind.about in explain()
+
+
+# --- of a run ------------------------------------------------------------------------------------------------
+
+
+def test_a_runs_plan_names_the_entry_that_is_wrong() -> None:
+    assert [str(i) for i in planned(run_config(faults=["mute:joint_1@1"]))] == ["mute:joint_1@1"]
+    with pytest.raises(ConfigError, match=r"scenario 'crawl': `faults\[1\]`: fault 'mute': give KIND:TARGET"):
+        planned(run_config(faults=["mute:joint_1@1", "mute"]))
+    with pytest.raises(ConfigError, match=r"`faults\[0\]`: .*no joint_4; this run has joint_1 to joint_3"):
+        check_planned(run_config(faults=["mute:joint_4@1"]))
+    check_planned(run_config(faults=["cut:bus_8@1", "hang:control@1", "leak:joint_3@1"]))
+
+
+def test_a_backend_is_not_asked_for_what_it_cannot_do() -> None:
+    does = {"does": ("leak",), "buses": 1, "because": "it is a toy"}
+    check_backend_can(run_config(faults=["leak:joint_1@1", "mute:joint_1@1", "slow:simulator@1"]), **does)
+    with pytest.raises(ConfigError, match=r"`faults\[1\]`: backend 'lag' cannot do reboot to joint_1: it is a toy"):
+        check_backend_can(run_config(faults=["leak:joint_1@1", "reboot:joint_1@1"]), **does)
+    with pytest.raises(ConfigError, match="no bus_2; this run has bus_1 to bus_1"):
+        check_backend_can(run_config(faults=["cut:bus_2@1"]), **does)

@@ -1,0 +1,221 @@
+"""Faults on request in a running host, over real Zenoh: planned, asked for, refused, and on the wire."""
+
+import threading
+import time
+from typing import Any
+
+import pytest
+
+from snakesim_hal import keys
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.host import Host
+from snakesim_hal.injection import parse
+from snakesim_hal.injector import Injector
+from snakesim_hal.message_faults import MessageFaults
+from snakesim_hal.messages import Answer, Clock, FaultRequest, JointState
+from snakesim_hal.session import Link, open_session
+from tests.unit.hal.network import (
+    Follower,
+    LagBackend,
+    Running,
+    following,
+    free_endpoint,
+    running,
+    wait_until,
+)
+from tests.unit.hal.rig import description, run_config, state
+
+ALLOWED: dict[str, Any] = {"pace": "realtime", "rate_hz": 100, "faults_allowed": True}
+
+
+def ask(run: Running, kind: str, target: str, **more: Any) -> Answer:
+    return run.ask(keys.fault("hal"), FaultRequest(kind=kind, target=target, **more))
+
+
+def test_a_fault_that_is_asked_for_is_on_until_it_is_ended_and_the_status_shows_it() -> None:
+    with running(run_config(**ALLOWED)) as run, following(run.link, Follower()):
+        run.arm()
+        answer = ask(run, "mute", "joint_2")
+        assert answer.ok and answer.reason == "mute of joint_2 has begun" and answer.lifecycle == "armed"
+        run.reaches("fault")
+        assert "joint_2" in run.status.why
+        (on,) = run.status.injected
+        assert on.startswith("mute:joint_2@")
+        assert ask(run, "mute", "joint_2", end=True).ok
+        wait_until(lambda: run.status.injected == [], "an end of it")
+        assert run.lifecycle("clear").ok
+        run.arm()
+        assert [text.split()[-1] for text in run.host.faults.noted] == ["begins", "ends"]
+        assert all(text.startswith("tick ") for text in run.host.faults.noted)
+
+
+def test_a_fault_ends_by_itself_after_its_time() -> None:
+    with running(run_config(**ALLOWED)) as run:
+        assert ask(run, "mute", "joint_1", for_s=0.1).ok
+        wait_until(lambda: len(run.host.faults.noted) == 2, "begin and end")
+        begin, end = (int(text.split()[1].rstrip(":")) for text in run.host.faults.noted)
+        assert end - begin == 10
+
+
+def test_what_was_planned_comes_at_its_tick_after_the_first_arming_in_every_run() -> None:
+    config = run_config(faults=["mute:joint_1@0.1-0.12"], faults_allowed=True)
+    for _ in range(2):
+        with running(config) as run, following(run.link, Follower()):
+            run.arm()
+            run.reaches("fault")
+            wait_until(lambda run=run: len(run.host.faults.noted) == 2, "begin and end")
+            assert run.host.faults.noted == [
+                "tick 10: mute:joint_1@0.1-0.12 begins",
+                "tick 12: mute:joint_1@0.1-0.12 ends",
+            ]
+            assert run.host.authority.fault_log[0].tick == 10
+
+
+@pytest.mark.parametrize(
+    ("request_", "refusal", "words"),
+    [
+        (("mote", "joint_1", {}), "cannot", "knows no 'mote'"),
+        (("mute", "joint_9", {}), "cannot", "no joint_9; this robot has joint_1 to joint_3"),
+        (("leak", "joint_1", {}), "cannot", "backend 'lag' cannot do leak to joint_1"),
+        (("kill", "control", {}), "wrong_part", "is for run to do"),
+        (("drop", "actuator/joints", {}), "wrong_part", "is for control to do"),
+        (("mute", "joint_1", {"end": True}), "wrong_state", "is not on; on is nothing"),
+    ],
+)
+def test_what_cannot_be_is_refused_with_the_reason(request_: Any, refusal: str, words: str) -> None:
+    kind, target, more = request_
+    with running(run_config(**ALLOWED)) as run:
+        answer = ask(run, kind, target, **more)
+        assert not answer.ok and answer.refusal == refusal and words in answer.reason
+        assert run.host.faults.noted == []
+
+
+def test_where_something_real_moves_nothing_goes_wrong_on_request() -> None:
+    with running(run_config(pace="realtime")) as run:
+        answer = ask(run, "mute", "joint_1")
+        assert not answer.ok and answer.refusal == "not_allowed" and "faults_allowed = true" in answer.reason
+    config = run_config(faults=["mute:joint_1@1"])
+    with (
+        open_session(Link(free_endpoint(), "worm", listen=True)) as own,
+        pytest.raises(ConfigError, match="something real moves here"),
+    ):
+        Host(config, LagBackend(config), own)
+
+
+def test_what_was_planned_and_cannot_be_done_is_told_as_a_fault_of_the_run() -> None:
+    with running(run_config(faults=["leak:joint_1@0.1"], **ALLOWED)) as run, following(run.link, Follower()):
+        run.arm()
+        wait_until(lambda: run.host.authority.fault_log, "a word about it")
+        assert run.host.authority.fault_log[0].what == "injection_refused"
+        assert "is refused: backend 'lag' cannot do leak" in run.host.faults.noted[0]
+
+
+def test_a_hanging_host_does_nothing_and_goes_on_afterwards() -> None:
+    with running(run_config(**ALLOWED)) as run:
+        assert ask(run, "hang", "host", for_s=0.5).ok
+        before = run.backend.advanced
+        time.sleep(0.3)
+        assert run.backend.advanced - before <= 2
+        wait_until(lambda: run.backend.advanced > before + 5, "the host going on")
+        assert ask(run, "hang", "host").ok
+        assert ask(run, "hang", "host", end=True).ok, "that is heard"
+
+
+def test_sensors_that_are_dropped_do_not_arrive_and_come_back() -> None:
+    with running(run_config(**ALLOWED)) as run:
+        reader = run.session.reader(keys.JOINTS, JointState)
+        wait_until(reader.drain, "sensor samples")
+        assert ask(run, "drop", keys.JOINTS, for_s=0.2).ok
+        wait_until(lambda: run.host.faults.noted, "its begin")
+        reader.drain()
+        wait_until(lambda: len(run.host.faults.noted) == 2, "its end")
+        begin, end = (int(text.split()[1].rstrip(":")) for text in run.host.faults.noted)
+        ticks: list[int] = []
+        wait_until(lambda: ticks.extend(j.tick for j in reader.drain()) or (ticks and ticks[-1] > end), "new samples")
+        assert not set(ticks) & set(range(begin, end))
+
+
+# --- a part's own rules --------------------------------------------------------------------------------------
+
+
+def turn(injector: Injector, tick: int, arming: int) -> None:
+    injector.turn(tick * 10_000_000, arming, "armed" if arming else "disarmed")
+
+
+def test_a_service_that_is_started_anew_does_not_repeat_what_was_planned() -> None:
+    config = run_config(faults=["drop:actuator/joints@0.1"], faults_allowed=True)
+    with open_session(Link(free_endpoint(), "worm", listen=True)) as session:
+        for first_arming, expected in ((0, ["drop:actuator/joints@0.1=1"]), (1, [])):
+            injector = Injector("control", config, session, note=lambda _text, _now_s: None)
+            injector.allow(emulated=False, faults_allowed=True)
+            turn(injector, 0, first_arming)
+            for tick in range(1, 15):
+                turn(injector, tick, 1)
+            assert injector.on == expected
+            injector.close()
+
+
+def test_a_newer_fault_of_a_kind_takes_the_place_of_the_one_before() -> None:
+    config = run_config(faults=["drop:actuator/joints@0.1-0.3=0.5", "drop:actuator/joints@0.2-0.4"])
+    notes: list[str] = []
+    with open_session(Link(free_endpoint(), "worm", listen=True)) as session:
+        injector = Injector("control", config, session, note=lambda text, now_s: notes.append(f"{now_s:g} {text}"))
+        injector.allow(emulated=True, faults_allowed=False)
+        for tick in range(50):
+            turn(injector, tick, int(tick > 0))
+        injector.close()
+    assert notes == [
+        "0.11 drop:actuator/joints@0.1-0.3=0.5 begins",
+        "0.21 drop:actuator/joints@0.2-0.4=1 begins",
+        "0.41 drop:actuator/joints@0.2-0.4=1 ends",
+    ]
+
+
+# --- on the wire ---------------------------------------------------------------------------------------------
+
+
+def test_messages_are_late_and_the_thread_that_sends_them_goes_when_it_is_not_needed() -> None:
+    endpoint = free_endpoint()
+    with open_session(Link(endpoint, listen=True)) as here, open_session(Link(endpoint)) as there:
+        arrived: list[float] = []
+        there.on_arrival(keys.CLOCK, lambda arrival: arrived.append(arrival.monotonic_ns * 1e-9))
+        publisher = here.publisher(keys.CLOCK, Clock)
+        wait_until(publisher.heard, "a subscriber")
+        straight = publisher._put
+        faults, delay = MessageFaults(here, 1), parse("delay:hal/clock@0=0.1")
+        faults.begin(delay)
+        sent_at = []
+        clock = Clock(
+            tick=1, stamp_ns=1, period_ns=1, pace="free", lifecycle="armed", arming=1, lease_epoch=0, newest={}
+        )
+        for _ in range(5):
+            sent_at.append(time.monotonic())
+            publisher.put(clock)
+            time.sleep(0.02)
+        assert any(thread.name == "late messages" for thread in threading.enumerate())
+        faults.end(delay)
+        wait_until(lambda: len(arrived) == 5, "all of them")
+        assert all(0.1 <= there_s - here_s < 1.0 for here_s, there_s in zip(sent_at, arrived, strict=True))
+        wait_until(lambda: publisher._put == straight, "the straight way again")
+        wait_until(lambda: all(t.name != "late messages" for t in threading.enumerate()), "the thread gone")
+        faults.close()
+
+
+def test_a_publisher_that_is_declared_later_is_disturbed_too_and_a_flood_ends_with_the_faults() -> None:
+    endpoint = free_endpoint()
+    with open_session(Link(endpoint, listen=True)) as here, open_session(Link(endpoint)) as there:
+        arrived: list[bytes] = []
+        there.on_arrival(keys.JOINTS, lambda arrival: arrived.append(arrival.payload))
+        faults = MessageFaults(here, 1)
+        faults.begin(parse("flood:sensor/joints@0=2000"))
+        faults.begin(parse("corrupt:sensor/joints@0=0.5"))
+        publisher = here.publisher(keys.JOINTS, JointState)
+        wait_until(publisher.heard, "a subscriber")
+        publisher.put(state(description()))
+        wait_until(lambda: len(arrived) > 500, "a flood")
+        assert 100 < len(set(arrived)) < len(arrived)
+        faults.close()
+        time.sleep(0.05)
+        count = len(arrived)
+        time.sleep(0.1)
+        assert len(arrived) == count

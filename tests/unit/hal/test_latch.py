@@ -1,0 +1,66 @@
+"""An emergency stop on disk: written before it is answered, found again, and latched when in doubt."""
+
+from pathlib import Path
+from queue import SimpleQueue
+
+import pytest
+
+from snakesim_hal import keys
+from snakesim_hal.latch import ESTOP, EstopLatch
+from snakesim_hal.messages import EstopRequest
+from tests.unit.hal.network import running
+from tests.unit.hal.test_client_host import run_config
+
+
+def asked(latch: EstopLatch, what: str) -> str | None:
+    answers: SimpleQueue[str | None] = SimpleQueue()
+    if what == "engage":
+        latch.engage("anna", 7, answers.put)
+    else:
+        latch.release(answers.put)
+    return answers.get(timeout=5)
+
+
+def test_kept_found_and_released(tmp_path: Path) -> None:
+    first = EstopLatch(tmp_path)
+    assert first.found is None and asked(first, "engage") is None
+    assert (tmp_path / ESTOP).is_file() and [path.name for path in tmp_path.iterdir()] == [ESTOP]
+    second = EstopLatch(tmp_path)
+    assert second.found is not None and (second.found.who, second.found.tick) == ("anna", 7)
+    assert asked(second, "engage") is None and asked(second, "release") is None
+    assert EstopLatch(tmp_path).found is None
+    assert asked(second, "release") is None
+    assert asked(second, "engage") is None and EstopLatch(tmp_path).found is not None
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b'{"who":1}', b"\xff" * 100])
+def test_what_cannot_be_read_counts_as_latched(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / ESTOP).write_bytes(content)
+    latch = EstopLatch(tmp_path)
+    assert latch.found is not None and "cannot be read" in latch.found.who
+    assert asked(latch, "engage") is None
+    again = EstopLatch(tmp_path)
+    assert again.found is not None and again.found.who == "anna"  # a good file in its place
+    assert asked(latch, "release") is None and EstopLatch(tmp_path).found is None
+
+
+def test_a_stop_that_cannot_be_kept_says_so(tmp_path: Path) -> None:
+    latch = EstopLatch(tmp_path / "gone")
+    trouble = asked(latch, "engage")
+    assert trouble is not None and "will not outlive this host" in trouble
+
+
+def test_without_a_folder_nothing_is_kept() -> None:
+    latch = EstopLatch(None)
+    assert latch.found is None and asked(latch, "engage") is None and asked(latch, "release") is None
+
+
+def test_a_host_that_finds_one_begins_in_estop(tmp_path: Path) -> None:
+    with running(run_config(), latch=EstopLatch(tmp_path)) as run:
+        answer = run.ask(keys.ESTOP, EstopRequest(who="anna"))
+        assert answer.ok and (tmp_path / ESTOP).is_file()
+    with running(run_config(), latch=EstopLatch(tmp_path)) as run:
+        assert run.status.lifecycle == "estop" and "anna, before this host" in run.status.why
+        assert not run.lifecycle("arm").ok
+        assert run.lifecycle("clear").ok and not (tmp_path / ESTOP).exists()
+        run.reaches("disarmed")

@@ -1,0 +1,43 @@
+"""Measures for real time: taken where the system allows them, and otherwise named."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+LOCK = "import resource; resource.setrlimit(resource.RLIMIT_MEMLOCK, ({0}, {0})); "
+PRINT = "from snakesim_hal.process import {0}; print({0}({1}))"
+
+
+def said(code: str, *, drop: str = "") -> str:
+    """What a process of its own prints; drop: a capability that it must not have (an ordinary user's has none)."""
+    bounded = ["setpriv", f"--bounding-set=-{drop}", f"--inh-caps=-{drop}"] if drop and os.geteuid() == 0 else []
+    done = subprocess.run(
+        [*bounded, sys.executable, "-c", code], capture_output=True, text=True, timeout=30, check=False
+    )
+    return (done.stdout + done.stderr).strip()
+
+
+def test_memory_is_not_locked_under_a_limit() -> None:
+    words = said(LOCK.format(1 << 20) + PRINT.format("lock_memory", ""), drop="ipc_lock")
+    assert "the limit is 1024 KiB" in words and "ulimit -l" in words
+
+
+def test_memory_is_locked_where_that_is_allowed() -> None:
+    code = PRINT.format("lock_memory", "") + "; print(open('/proc/self/status').read().split('VmLck:')[1].split()[0])"
+    verdict, *locked = said(code).splitlines()
+    if verdict != "None":
+        pytest.skip(verdict)
+    assert int(locked[0]) > 1000
+
+
+def test_what_is_refused_is_returned_and_printed() -> None:
+    code = "from snakesim_hal.process import hurry; r = hurry(); print(len(r), r)"
+    words = said(LOCK.format(1 << 20) + code, drop="ipc_lock,-sys_nice")
+    assert words.startswith("2 [") and words.count("no real-time priority") == 2, words
+
+
+def test_the_clock_is_not_stepped_without_permission() -> None:
+    words = said(PRINT.format("step_wall_clock", "0.0"), drop="sys_time")
+    assert "CAP_SYS_TIME" in words and "RefusedError" in words

@@ -1,0 +1,235 @@
+"""What a stranger on the network sends must end no service: each of these once did."""
+
+import time
+from typing import Any
+
+import msgspec
+import pytest
+import zenoh
+
+from snakesim_hal import keys
+from snakesim_hal.client import Client, Commander
+from snakesim_hal.codec import MAX_PAYLOAD_BYTES
+from snakesim_hal.errors import NotConnectedError
+from snakesim_hal.fit import misfit
+from snakesim_hal.host import Host
+from snakesim_hal.messages import (
+    Answer,
+    Clock,
+    Contact,
+    Contacts,
+    Description,
+    Imu,
+    Intent,
+    JointState,
+    LeaseRequest,
+    Message,
+    Pose,
+    Power,
+    Trajectory,
+    World,
+    WorldContact,
+)
+from snakesim_hal.route import Route
+from snakesim_hal.session import Link, Session, open_session
+from tests.unit.hal.network import LagBackend, free_endpoint, wait_until
+from tests.unit.hal.rig import description, run_config, state
+
+ROBOT = description()  # three joints, four links
+X, UPRIGHT = (1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
+CLOCK = Clock(
+    tick=3,
+    stamp_ns=0,
+    period_ns=10_000_000,
+    pace="realtime",
+    lifecycle="disarmed",
+    arming=0,
+    lease_epoch=0,
+    newest={},
+)
+
+
+def contacts(link: int) -> Contacts:
+    touch = Contact(
+        link=link, obstacle=None, position_l=X, normal_l=X, tangent_1_l=X, tangent_2_l=X, force_l=X, torque_l=X
+    )
+    return Contacts(tick=0, stamp_ns=0, contacts=[touch])
+
+
+def world(link: int = 0, orientation: tuple[float, float, float, float] = UPRIGHT) -> World:
+    touch = WorldContact(link=link, obstacle=None, body_s_m=0.0, position_w=X, normal_w=X, tangent_w=X, force_w=X)
+    return World(
+        tick=0,
+        stamp_ns=0,
+        base_position_w=X,
+        base_orientation_wxyz=orientation,
+        base_confidence=1.0,
+        contacts=[touch],
+        obstacles=[],
+    )
+
+
+def pose(*orientation: float) -> Pose:
+    wxyz: Any = orientation
+    return Pose(tick=0, stamp_ns=0, position_w=X, orientation_wxyz=wxyz, velocity_w=X, angular_velocity_w=X)
+
+
+def imu(link: list[int], rates: int) -> Imu:
+    return Imu(tick=0, stamp_ns=0, link=link, angular_velocity_rad_s=[X] * rates, acceleration_m_s2=[X] * len(link))
+
+
+def power(joints: int) -> Power:
+    numbers, flags = [1.0] * joints, [True] * joints
+    return Power(
+        tick=0,
+        stamp_ns=0,
+        voltage_v=numbers,
+        current_a=numbers,
+        motor_c=numbers,
+        board_c=numbers,
+        leak=flags,
+        valid=flags,
+    )
+
+
+def trajectory(*path: tuple[float, float]) -> Trajectory:
+    return Trajectory(tick=0, stamp_ns=0, path_id=1, path_w=list(path), speed_m_s=0.1, push_points=[], finished=False)
+
+
+@pytest.mark.parametrize(
+    ("message", "why"),
+    [
+        (state(ROBOT, 0.1), None),
+        (msgspec.structs.replace(state(ROBOT, 0.1), angle_rad=[0.0] * 13), "wrong_length"),
+        (msgspec.structs.replace(state(ROBOT, 0.1), valid=[]), "wrong_length"),
+        (power(3), None),
+        (power(4), "wrong_length"),
+        (imu([0, 3], 2), None),
+        (imu([], 0), None),
+        (imu([0, 4], 2), "wrong_length"),
+        (imu([0, 3], 1), "wrong_length"),
+        (contacts(3), None),
+        (contacts(4), "wrong_length"),
+        (world(3), None),
+        (world(4), "wrong_length"),
+        (world(0, (0.0, 0.0, 0.0, 0.0)), "no_rotation"),
+        (pose(0.6, 0.0, 0.0, 0.8), None),
+        (pose(0.0, 0.0, 0.0, 0.0), "no_rotation"),
+        (pose(1.0, 1.0, 1.0, 1.0), "no_rotation"),
+        (trajectory((0.0, 0.0), (1.0, 0.0)), None),
+        (trajectory((0.0, 0.0), (1.0, 0.0), (1.0, 0.0)), "no_path"),
+        (Intent(stamp_ns=0, who="operator"), None),
+    ],
+)
+def test_a_message_that_cannot_be_of_this_robot(message: Message, why: str | None) -> None:
+    assert misfit(message, ROBOT) == why
+
+
+def test_what_passes_as_a_path_makes_a_route() -> None:
+    tiny = 5e-324  # the shortest step there is: its length is no number to divide by
+    for path in ([(0.0, 0.0), (tiny, 0.0)], [(1e6, 0.0), (-1e6, 0.0)]):
+        if misfit(trajectory(*path), ROBOT) is None:
+            assert Route(path).length_m > 0
+
+
+def served(hal: Session) -> None:
+    """A HAL that shows its robot and nothing else."""
+    hal.latched_publisher(keys.DESCRIPTION, Description).put(ROBOT)
+
+
+def test_an_intent_is_of_no_tick_and_what_does_not_fit_is_counted_and_left_out() -> None:
+    endpoint = free_endpoint()
+    with open_session(Link(endpoint, "worm", listen=True)) as hal, open_session(Link(endpoint, "worm")) as session:
+        served(hal)
+        client = Client(session, "navigation")
+        intents, joints = client.subscribe(keys.INTENT, Intent), client.subscribe(keys.JOINTS, JointState)
+        assert client.description() == client.description() == ROBOT  # asked again, it is remembered
+        clocks = hal.publisher(keys.CLOCK, Clock)
+        asked, felt = hal.publisher(keys.INTENT, Intent), hal.publisher(keys.JOINTS, JointState)
+        wait_until(lambda: clocks.heard() and asked.heard() and felt.heard(), "everybody heard")
+        for speed in (0.1, 0.2):
+            asked.put(Intent(stamp_ns=5, who="operator", speed_m_s=speed))
+        felt.put(state(ROBOT, 0.1, tick=3))
+        felt.put(msgspec.structs.replace(state(ROBOT, 0.1, tick=4), angle_rad=[0.0] * 13))
+        ticks = client.ticks()
+
+        def all_there() -> bool:
+            clocks.put(CLOCK)
+            next(ticks)
+            return session.rejected == {"wrong_length": 1} and intents.newest() is not None
+
+        wait_until(all_there, "the wrong state counted, and an intent")
+        intent, newest = intents.newest(), joints.newest()
+        assert intent is not None and intent.speed_m_s == 0.2
+        assert newest is not None and newest.tick == 3
+
+
+def test_an_answer_that_cannot_be_read_is_no_answer() -> None:
+    endpoint = free_endpoint()
+    with open_session(Link(endpoint, "worm", listen=True)) as rogue, open_session(Link(endpoint, "worm")) as session:
+        served(rogue)
+        network: Any = rogue._zenoh  # pyright: ignore[reportPrivateUsage] - a rogue does not keep to our session
+        stranger = network.declare_queryable(
+            keys.LEASE, lambda query: query.reply(keys.LEASE, b"\xc1", encoding="zenoh/bytes")
+        )
+        with pytest.raises(NotConnectedError, match="hal/lease cannot be read: unknown_message"):
+            session.ask_politely(keys.LEASE, LeaseRequest(action="acquire", holder="control"))
+        commander = Commander(Client(session, "control"), ROBOT)
+        time.sleep(0.3)  # it asks at most so often
+        assert not commander.holds(CLOCK)
+        assert commander.refusal is not None and "cannot be read" in commander.refusal
+        assert session.rejected == {"unknown_message": 2}
+        stranger.undeclare()
+
+
+def test_what_is_longer_than_any_message_never_arrives_and_the_link_stays() -> None:
+    endpoint = free_endpoint()
+    with (
+        open_session(Link(endpoint, "worm", listen=True)) as hal,
+        open_session(Link(endpoint, "worm")) as session,
+        open_session(Link(endpoint, "worm")) as stranger,
+    ):
+        heard: list[int] = []
+        for listener in (hal, session):
+            listener.on_arrival(keys.JOINTS, lambda arrival: heard.append(len(arrival.payload)))
+        publisher = stranger.publisher(keys.JOINTS, JointState, lossless=True)
+        wait_until(publisher.heard, "somebody listening")
+        put: Any = stranger._zenoh.put  # pyright: ignore[reportPrivateUsage] - a stranger does not keep to our session
+        for length in (MAX_PAYLOAD_BYTES, 10 * MAX_PAYLOAD_BYTES, 1):
+            put(keys.JOINTS, bytes(length), congestion_control=zenoh.CongestionControl.BLOCK)
+        wait_until(lambda: heard.count(1) >= 2, "the last one everywhere")
+        assert sorted(heard) == [1, 1, MAX_PAYLOAD_BYTES, MAX_PAYLOAD_BYTES]
+
+
+def test_a_lease_that_has_run_out_is_a_fault_even_when_somebody_asks_for_it_at_that_moment() -> None:
+    config, answers = run_config(pace="realtime", services={}), list[Answer]()
+    with open_session(Link(free_endpoint(), "worm", listen=True)) as session:
+        host = Host(config, LagBackend(config), session)  # between two ticks
+        host.answer(LeaseRequest(action="acquire", holder="control"), answers.append)
+        host.authority.observe(state(ROBOT))
+        host.authority.state = "armed"
+        time.sleep(1.5e-9 * host.description.lease_ns)
+        host.answer(LeaseRequest(action="acquire", holder="stranger"), answers.append)
+    assert [answer.ok for answer in answers] == [True, True]
+    assert host.authority.state == "fault" and host.authority.faults[-1].what == "lease_expired"
+
+
+def test_a_flood_is_dropped_unread_but_for_the_newest_that_is_wanted() -> None:
+    endpoint = free_endpoint()
+    with open_session(Link(endpoint, "worm", listen=True)) as hal, open_session(Link(endpoint, "worm")) as session:
+        reader, asked = session.reader(keys.JOINTS, JointState), list[int]()
+        joints, after = hal.publisher(keys.JOINTS, JointState, lossless=True), session.reader(keys.CLOCK, Clock)
+        clocks = hal.publisher(keys.CLOCK, Clock, lossless=True)
+        wait_until(lambda: joints.heard() and clocks.heard(), "both readers")
+        for tick in range(101):
+            joints.put(state(ROBOT, tick=tick))
+        clocks.put(CLOCK)
+        wait_until(after.drain, "what was sent last")
+
+        def wanted(message: JointState) -> bool:
+            asked.append(message.tick)
+            return message.tick < 100
+
+        newest = reader.newest(wanted)
+        assert newest is not None and newest.tick == 99 and asked == [100, 99]
+        assert reader.newest(wanted) is None and reader.drain() == []
