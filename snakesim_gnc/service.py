@@ -8,7 +8,7 @@ from snakesim_hal.client import Client
 from snakesim_hal.errors import SnakesimError
 from snakesim_hal.injector import Injector
 from snakesim_hal.messages import Clock, Description, Message
-from snakesim_hal.process import hurry, settle_for_timing
+from snakesim_hal.process import SERVICE_PRIORITY, hurry, settle_for_timing
 from snakesim_hal.scenario import RunConfig
 from snakesim_hal.scenario import Service as Schedule
 from snakesim_hal.serve import arguments, duty
@@ -45,7 +45,7 @@ def serve(service_type: type[Service], argv: Sequence[str] | None = None) -> int
     given = duty(arguments(f"Run the {name} service of a robot."), argv)
     try:
         if service_type.urgent and given.config.pace == "realtime":
-            hurry()
+            hurry(SERVICE_PRIORITY)
         with open_session(given.link, connect_timeout_s=START_LIMIT_S) as session:
             schedule = given.config.services.get(name, Schedule())
             client = Client(session, name, every_ticks=schedule.every_ticks)

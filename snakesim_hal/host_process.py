@@ -14,7 +14,7 @@ from snakesim_hal.host import Ending, Host
 from snakesim_hal.latch import EstopLatch
 from snakesim_hal.messages import Fault
 from snakesim_hal.plugins import BACKENDS, find_plugin, plugin_settings
-from snakesim_hal.process import hurry, on_stop_signal, settle_for_timing
+from snakesim_hal.process import HOST_PRIORITY, hurry, on_stop_signal, settle_for_timing
 from snakesim_hal.scenario import RunConfig
 from snakesim_hal.serve import arguments, duty
 from snakesim_hal.session import open_session
@@ -56,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         factory = find_plugin(BACKENDS, given.config.backend)
         backend = factory(given.config, backend_settings(given.config, factory))
         try:
-            hygiene = hurry() if given.config.pace == "realtime" else []
+            hygiene = hurry(HOST_PRIORITY) if given.config.pace == "realtime" else []
             with open_session(given.link) as session:
                 host = Host(
                     given.config,

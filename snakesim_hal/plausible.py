@@ -5,7 +5,7 @@ Three nets, joint by joint. What one of the first two catches is not believed, a
 unknown   not valid, not finite, or older than a lease
 jumped    further from the last good angle than twice the speed limit allows in the time between, and a little more.
           What stays at the new place is believed again after a few samples, but never while the robot is armed
-frozen    angle, velocity and torque repeat to the bit in new samples for more than a lease, while the position target
+frozen    angle, velocity and torque go on repeating to the bit for more than a lease after the position target has
           moved so far that the torque must have changed, and the torque is not at its limit
 """
 
@@ -125,7 +125,8 @@ class _Stillness:
         count = len(limits.joints)
         self._columns = np.full((3, count), np.nan)
         self._followed: Mask = np.zeros(count, dtype=np.bool_)  # whether the joint had a position target before
-        self._since_s, self._low_rad, self._high_rad = np.zeros(count), np.zeros(count), np.zeros(count)
+        self._low_rad, self._high_rad = np.zeros(count), np.zeros(count)
+        self._far_since_s = np.full(count, np.inf)  # since when a target has been far from where it was at the start
 
     def look(self, columns: Floats, taken_s: Floats, applied: Applied | None) -> Mask:
         """Take the newest states, (3, n_joints), and what was applied; returns which joints are frozen."""
@@ -135,9 +136,10 @@ class _Stillness:
         if applied is None:
             return same
         target = applied.target
-        self._since_s = np.where(same, self._since_s, taken_s)
         self._low_rad = np.where(same, np.minimum(self._low_rad, target), target)
         self._high_rad = np.where(same, np.maximum(self._high_rad, target), target)
-        long = taken_s - self._since_s > self._lease_s
+        far = same & (self._high_rad - self._low_rad > self._far_rad)
+        self._far_since_s = np.where(far, np.minimum(self._far_since_s, taken_s), np.inf)
+        long = taken_s - self._far_since_s > self._lease_s
         free = np.abs(columns[2]) < AT_LIMIT * applied.torque_limit_nm
-        return same & long & free & (self._high_rad - self._low_rad > self._far_rad)
+        return far & long & free

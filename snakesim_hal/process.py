@@ -17,7 +17,8 @@ PR_SET_PDEATHSIG = 1
 CAP_IPC_LOCK = 14
 MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT = 1, 2, 4
 SWITCH_INTERVAL_S = 0.0005  # of the interpreter, 5 ms by default: as long as half a control period
-REALTIME_PRIORITY = 20  # of 99; above every ordinary process, below the kernel's own threads
+# Of 99: above every ordinary process, below the kernel's own threads. A controller that hangs holds up no host.
+HOST_PRIORITY, SERVICE_PRIORITY = 20, 19
 
 
 def die_with_parent(parent_pid: int | None = None) -> None:
@@ -49,25 +50,25 @@ def settle_for_timing() -> None:
     gc.set_threshold(50_000, 50, 1000)
 
 
-def hurry() -> list[str]:
+def hurry(priority: int) -> list[str]:
     """Take every measure for a process that the robot waits for in real time. Call it before a session is opened.
 
     Best effort: what the system refuses is printed to stderr, and returned as short reasons.
     """
     sys.setswitchinterval(SWITCH_INTERVAL_S)
-    refused = [reason for reason in (take_priority(), lock_memory()) if reason is not None]
+    refused = [reason for reason in (take_priority(priority), lock_memory()) if reason is not None]
     for reason in refused:
         print(f"real time: {reason}", file=sys.stderr)
     return refused
 
 
-def take_priority() -> str | None:
+def take_priority(priority: int) -> str | None:
     """Ask the kernel to run this process, and the threads that it will start, before ordinary ones.
 
     Returns why it was refused, or None.
     """
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(REALTIME_PRIORITY))
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     except OSError as error:
         return f"no real-time priority: {error.strerror}; see `ulimit -r`"
     return None

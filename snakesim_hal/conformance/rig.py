@@ -150,7 +150,7 @@ class Rig:
         """The same past the gate, which lets nothing drive a joint against its stop; the lifecycle goes on."""
         began = self.tick
         for _ in range(periods):
-            self._offer(self.points({i: (Mode.PASSIVE, 0.0) for i in asked}))
+            self._offer(self.points(dict.fromkeys(asked, (Mode.PASSIVE, 0.0))))
             self.authority.expire(self._now_ns, self.tick)
             self.authority.decide()
             self.hand(self.points(asked, torque_limit_nm), self.authority.state)

@@ -33,7 +33,7 @@ def test_memory_is_locked_where_that_is_allowed() -> None:
 
 
 def test_what_is_refused_is_returned_and_printed() -> None:
-    code = "from snakesim_hal.process import hurry; r = hurry(); print(len(r), r)"
+    code = "from snakesim_hal.process import hurry; r = hurry(20); print(len(r), r)"
     words = said(LOCK.format(1 << 20) + code, drop="ipc_lock,-sys_nice")
     assert words.startswith("2 [") and words.count("no real-time priority") == 2, words
 
