@@ -96,7 +96,7 @@ class CanBackend:
             names = [joint.name for joint in self._description.joints]
             self._wire_of = [bus.wire for bus in self._buses for _ in bus.nodes]
             channels = [wire.channel for wire in self._wire_of]
-            self._watch = Watch(names, channels, config.period_ns * 1e-9, config.lease_ns * 1e-9)
+            self._watch = Watch(names, channels, config.period_ns * 1e-9)
             self._bring_up(names)
         except BaseException:
             self.close()

@@ -13,7 +13,7 @@ from snakesim_can_backend.trouble import Trouble
 from snakesim_hal.messages import LifecycleState
 
 SILENT_AFTER = 3  # Syncs without an answer
-IN_A_ROW = 3  # bad frames of one kind before they are a fault and not a glitch
+IN_A_ROW = 3  # bad frames of one kind, or periods that a bus is full, before they are a fault and not a glitch
 CLEAR_GRACE = 5  # Syncs that a module may take to follow a clearing
 ARM_GRACE = 5  # Syncs that a module may take to follow an arming
 STRANGER_FRAMES = 3  # of a node that should not be there, in ticks one after the other
@@ -46,10 +46,10 @@ class Finding:
 class Watch:
     """Remembers what has been told."""
 
-    def __init__(self, joints: Sequence[str], channel_of: Sequence[str], period_s: float, lease_s: float) -> None:
+    def __init__(self, joints: Sequence[str], channel_of: Sequence[str], period_s: float) -> None:
         """joints, channel_of: name and bus of every joint, tail to head."""
         self._names, self._channels = joints, channel_of
-        self._period_s, self._lease_s = period_s, lease_s
+        self._period_s = period_s
         self._told: set[tuple[str, int | str]] = set()
         self._restarts = [0] * len(joints)
         self._unarmed = [0] * len(joints)  # Syncs in a row that found a module not armed, while the robot was
@@ -194,9 +194,10 @@ class Watch:
                 self.seen[trouble.kind] = self.seen.get(trouble.kind, 0) + 1
         self._unsent = {channel: self._unsent.get(channel, 0) + 1 for channel in unsent - self._down}
         for channel, ticks in self._unsent.items():
-            if ticks * self._period_s >= self._lease_s:
+            if ticks >= IN_A_ROW:
+                took_ms = 1000 * IN_A_ROW * self._period_s
                 cause = (
-                    f"{channel}: frames do not get out for {self._lease_s * 1000:.0f} ms, its transmit queue stays "
+                    f"{channel}: frames do not get out for {took_ms:.0f} ms, its transmit queue stays "
                     f"full: nobody acknowledges (power, cable, terminator, bit rate), or txqueuelen is below 64"
                 )
                 found.append(Finding("bus_stuck", cause))

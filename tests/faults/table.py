@@ -20,11 +20,6 @@ WITHIN_LEASE = "lease, 50 ms after the last good command, and acted on within th
 ROUTERS = 50  # times that it dies
 NO_BUS = "a simulator has no bus"
 NO_MODULES = "a simulator has no modules; what its sensors can do is in the rows by a whole robot"
-QUEUE_FULL = (
-    "a queue that is full for less than the lease is no fault: the newest set-point takes the place of one that did "
-    "not get out, and no module acts on an old one; at the lease (50 ms) it is, "
-    "and the modules' watchdogs stand behind it"
-)
 NO_MODULES_LEFT = "the simulator is in the host's process: without a host nothing is there that could move"
 IN_GUEST_MS = 100.0 + 1000.0 / rows_guest.RATE_HZ  # where heartbeats tell the module's time
 PASSED = "messages got through"
@@ -106,7 +101,6 @@ def bus_row(
     limit_ms: float = 3 * PERIOD_MS,
     *,
     paced: bool = False,
-    why_over: str = "",
 ) -> Row:
     """A bus on CAN."""
     return Row(
@@ -117,7 +111,6 @@ def bus_row(
         limit_ms,
         "ms",
         {"sim": NO_BUS, "can": rows_modules.at_driver(kind, what, paced=paced)},
-        why_over=why_over,
     )
 
 
@@ -253,9 +246,7 @@ HEADINGS: tuple[Heading, ...] = (
         (
             bus_row("bus_off", "the controller leaves the bus", "bus_off", "bus_off", paced=True),
             bus_row("bus_error_passive", "more than 127 errors", "error_passive", "error_passive"),
-            bus_row(
-                "bus_queue_full", "the transmit queue stays full", "full", "bus_stuck", paced=True, why_over=QUEUE_FULL
-            ),
+            bus_row("bus_queue_full", "the transmit queue stays full", "full", "bus_stuck", paced=True),
             bus_row("bus_interface_down", "the interface goes down", "cut", "interface_down", paced=True),
             bus_row("bus_receive_overflow", "received frames get lost", "overflow", "receive_overflow"),
             bus_row("bus_babbling", "a node floods the bus", "babble", "module_babbling", 100.0),

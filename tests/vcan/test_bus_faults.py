@@ -10,6 +10,7 @@ import pytest
 
 from snakesim_can_backend import commands
 from snakesim_can_backend.protocol import ModuleState, Opcode, frame_id, opcode_of
+from snakesim_can_backend.watch import IN_A_ROW
 from tests.vcan.link import frame, ip, must, tc
 from tests.vcan.shared_bus import SharedBus, shared_bus
 
@@ -119,7 +120,7 @@ def unclog(channel: str) -> None:
     must(tc("qdisc", "del", "dev", channel, "root"))
 
 
-def test_a_queue_that_stays_full_is_a_fault_after_the_lease_and_nothing_is_sent_late(slow_channel: str) -> None:
+def test_a_queue_that_stays_full_is_a_fault_after_three_periods_and_nothing_is_sent_late(slow_channel: str) -> None:
     with shared_bus(slow_channel) as run:
         armed(run)
         clog(slow_channel)
@@ -150,14 +151,20 @@ def test_a_queue_that_is_full_for_a_moment_is_counted_and_the_latest_set_point_g
     with shared_bus(slow_channel) as run:
         armed(run)
         clog(slow_channel)
-        run.run(LEASE_MS // PERIOD_MS - 2, run.waving)
+        run.run(IN_A_ROW - 1, run.waving)
         unclog(slow_channel)
         full, out = run.watch_seen("queue_full"), set_points_out(run)
         run.run(1, run.waving)
         assert set_points_out(run) == out + 4, "one for each joint: the latest"
         run.run(30, run.waving)
         assert not run.faults and full > 0 and run.states() == [ModuleState.ARMED] * 4
-        row("queue full for 30 ms", "no fault", "-", f"{full} frames refused, counted; none sent later", "-")
+        row(
+            f"queue full for {(IN_A_ROW - 1) * PERIOD_MS} ms",
+            "no fault",
+            "-",
+            f"{full} frames refused, counted; none sent later",
+            "-",
+        )
 
 
 def test_a_long_queue_that_fills_this_sockets_share_of_it_is_a_full_queue_too(slow_channel: str) -> None:
