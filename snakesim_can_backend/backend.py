@@ -292,12 +292,15 @@ class CanBackend:
         raise BackendError(f"{', '.join(silent)} did not answer {FIRST_STATE_SYNCS} Syncs; nothing was enabled")
 
     def _sync(self, stamp_ns: int) -> None:
-        reading = self._reading
+        reading, questions = self._reading, self._questions()
         time_us = (stamp_ns if self._lockstep else time.monotonic_ns()) // 1000
         self._receive()
-        reading.begin(reading.sync + 1, contacts=contacts_due(self._reports, reading.sync + 1), tail=self._reports.tail)
+        due = contacts_due(self._reports, reading.sync + 1)
+        reading.begin(reading.sync + 1, contacts=due, tail=self._reports.tail, questions=len(questions))
         frame = commands.sync(reading.sync, time_us)
         self._unsent = [wire.channel for wire in self._wires if not wire.send(frame)]
+        for wire, question in questions:
+            wire.send(question)
         if reading.complete:  # nobody is expected to answer; but twins in this process live only while they are awaited
             wait(self._wires, 0.0)
         end = time.monotonic() + self._answer_limit_s
@@ -305,6 +308,19 @@ class CanBackend:
             if not wait(self._wires, left_s):
                 break
             self._receive()
+
+    def _questions(self) -> list[tuple[Wire, Frame]]:
+        """In lockstep, what is asked of twins behind a Sync: once it is answered, everything that they said is here.
+
+        Some reports answer only some Syncs, and nobody could tell whether one is still on its way.
+        """
+        if self._twins is None or not self._lockstep:
+            return []
+        asked: dict[str, tuple[Wire, Frame]] = {}
+        for module, wire in zip(self._reading.modules, self._wire_of, strict=True):
+            if module.sync >= 0 and module.sync == self._reading.sync:
+                asked.setdefault(wire.channel, (wire, commands.question(module.node)))
+        return list(asked.values())
 
     def _receive(self) -> None:
         take = self._reading.take

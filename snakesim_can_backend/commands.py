@@ -20,6 +20,8 @@ from snakesim_can_backend.protocol import (
     Frame,
     ModuleState,
     Opcode,
+    Operation,
+    Parameter,
 )
 from snakesim_hal.backend import SetPoints
 from snakesim_hal.messages import LifecycleState, Mode
@@ -95,6 +97,11 @@ def is_arming(frame: Frame) -> bool:
 def command(action: Action, node: int = BROADCAST) -> Frame:
     """A Command to one module, or to all."""
     return codec()[Opcode.COMMAND].frame(node, action=action, key=COMMAND_KEY)
+
+
+def question(node: int) -> Frame:
+    """Asks a module for something that never changes: its answer comes after all that it had to say before."""
+    return codec()[Opcode.PARAMETER_REQUEST].frame(node, index=Parameter.TAIL, operation=Operation.READ, value=0.0)
 
 
 def emergency() -> Frame:

@@ -84,6 +84,7 @@ class Reading:
         self.sync = -1  # the newest one sent
         self.states_missing = joints
         self.contacts_missing = 0
+        self.answers_missing = 0  # to questions about parameters
         self.strangers: Counter[int] = Counter()  # frames of nodes that should not be there, since the last tick
         self.from_other_host: Counter[Opcode] = Counter()
         self.malformed = 0
@@ -126,16 +127,18 @@ class Reading:
             for module in self.modules
         }
 
-    def begin(self, sync: int, *, contacts: bool, tail: bool) -> None:
+    def begin(self, sync: int, *, contacts: bool, tail: bool, questions: int = 0) -> None:
         """A Sync goes out. Only modules that answered of late are waited for.
 
         contacts, tail: whether it asks for force reports, and whether the tail link sends one of its own.
+        questions: about parameters, that go out with it.
         """
         self.sync = sync
         for module in self.modules:
             module.awaited = module.sync >= sync - 1 - LATE_SYNCS or module.sync < 0
         self.states_missing = sum(module.awaited for module in self.modules)
         self.contacts_missing = (self.states_missing + (tail and self.modules[0].awaited)) if contacts else 0
+        self.answers_missing = questions
         if contacts:
             self._contact = [None] * len(self._contact)
         self.forget_frames()
@@ -143,7 +146,7 @@ class Reading:
     @property
     def complete(self) -> bool:
         """Whether everybody has answered who can be expected to."""
-        return self.states_missing <= 0 and self.contacts_missing <= 0
+        return self.states_missing <= 0 and self.contacts_missing <= 0 and self.answers_missing <= 0
 
     def take(self, frame: Frame) -> None:
         """Take in one frame."""
@@ -167,6 +170,7 @@ class Reading:
             self.strangers[node] += 1
         else:
             self.modules[node - 1].frames += 1
+            self.answers_missing -= opcode == Opcode.PARAMETER_ANSWER
 
     def _only_asks(self, frame: Frame) -> bool:
         """Whether somebody merely wants to know who is there."""

@@ -13,6 +13,7 @@ from snakesim_can_backend import backend as backend_module
 from snakesim_can_backend.backend import CanBackend, _answer_time_s
 from snakesim_can_backend.bring_up import Bus
 from snakesim_can_backend.bus_load import Reports
+from snakesim_can_backend.commands import question
 from snakesim_can_backend.log import LoggedWire
 from snakesim_can_backend.protocol import (
     BROADCAST,
@@ -570,6 +571,21 @@ def test_every_module_is_spoken_to_on_its_own_bus(two_buses: Callable[..., Loop]
     run.backend.close()
     assert [words(wire.sent)[-1] for wire in WIRES] == ["disarm", "disarm"]
     assert NoProcess.stopped == stopped + 1 and [wire.closed for wire in WIRES] == [1, 1]
+
+
+def test_in_lockstep_nothing_that_twins_said_is_still_on_its_way_when_a_tick_goes_on(
+    two_buses: Callable[..., Loop],
+) -> None:
+    run = two_buses([3, 1])
+    run.run(2)
+    for wire in WIRES:
+        wire.sent.clear()
+    run.run(20)
+    for wire, node in zip(WIRES, (1, 4), strict=True):
+        asked = [opcode_of(f.id) for f in wire.sent if f == question(node) or opcode_of(f.id) == Opcode.SYNC]
+        assert asked == [Opcode.SYNC, Opcode.PARAMETER_REQUEST] * 20
+    assert run.backend._reading.answers_missing == 0
+    run.backend.close()
 
 
 def test_a_module_on_the_wrong_bus_is_found_before_anything_is_enabled(two_buses: Callable[..., Loop]) -> None:
