@@ -8,7 +8,7 @@ from snakesim_hal.client import Client
 from snakesim_hal.errors import SnakesimError
 from snakesim_hal.injector import Injector
 from snakesim_hal.messages import Clock, Description, Message
-from snakesim_hal.process import SERVICE_PRIORITY, hurry, settle_for_timing
+from snakesim_hal.process import SERVICE_PRIORITY, calm_down_after, hurry, settle_for_timing
 from snakesim_hal.scenario import RunConfig
 from snakesim_hal.scenario import Service as Schedule
 from snakesim_hal.serve import arguments, duty
@@ -46,6 +46,7 @@ def serve(service_type: type[Service], argv: Sequence[str] | None = None) -> int
     try:
         if service_type.urgent and given.config.pace == "realtime":
             hurry(SERVICE_PRIORITY)
+            calm_down_after(given.config.lease_ns * 1e-9)
         with open_session(given.link, connect_timeout_s=START_LIMIT_S) as session:
             schedule = given.config.services.get(name, Schedule())
             client = Client(session, name, every_ticks=schedule.every_ticks)

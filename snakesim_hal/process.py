@@ -74,6 +74,22 @@ def take_priority(priority: int) -> str | None:
     return None
 
 
+def calm_down_after(longest_s: float) -> None:
+    """Have this process give up its priority once it has computed for so long without a pause: it hangs.
+
+    A busy thread with real-time priority lets ordinary processes starve, until the kernel sets real time aside for
+    some 50 ms, for everybody.
+    """
+
+    def calm_down(_number: int, _frame: FrameType | None) -> None:
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        print(f"real time: given up, after computing for {longest_s * 1e3:.0f} ms without a pause", file=sys.stderr)
+
+    signal.signal(signal.SIGXCPU, calm_down)
+    _, most = resource.getrlimit(resource.RLIMIT_RTTIME)
+    resource.setrlimit(resource.RLIMIT_RTTIME, (round(longest_s * 1e6), most))
+
+
 def lock_memory() -> str | None:
     """Keep every page that this process has or will have in memory. Returns why it was refused, or None.
 

@@ -41,3 +41,28 @@ def test_what_is_refused_is_returned_and_printed() -> None:
 def test_the_clock_is_not_stepped_without_permission() -> None:
     words = said(PRINT.format("step_wall_clock", "0.0"), drop="sys_time")
     assert "CAP_SYS_TIME" in words and "RefusedError" in words
+
+
+def test_a_thread_that_never_pauses_gives_up_its_priority() -> None:
+    code = """
+import os, time
+from snakesim_hal.process import calm_down_after, take_priority
+if take_priority(5) is not None:
+    raise SystemExit("refused")
+calm_down_after(0.05)
+def compute(seconds):
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        pass
+for _ in range(20):
+    compute(0.01)
+    time.sleep(0.001)
+print(os.sched_getscheduler(0) == os.SCHED_FIFO)
+compute(0.5)
+print(os.sched_getscheduler(0) == os.SCHED_OTHER)
+"""
+    words = said(code)
+    if "refused" in words:
+        pytest.skip("real-time priority is refused here")
+    assert words.startswith("True\nTrue\n"), words
+    assert "given up, after computing for 50 ms without a pause" in words
