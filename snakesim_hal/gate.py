@@ -21,6 +21,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesim_hal import keys
 from snakesim_hal.backend import SetPoints
 from snakesim_hal.lease import Lease
 from snakesim_hal.messages import Description, JointCommand, JointDescription, Mode
@@ -28,6 +29,7 @@ from snakesim_hal.messages import Description, JointCommand, JointDescription, M
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
+FRESH_PERIODS, FRESH_NS = 3, 30_000_000  # how old a joint state may be, the longer of the two, besides its delay
 REACTION_PERIODS = 4  # the least that lets no joint swing past its end, with a latency of two as a bus has
 
 
@@ -55,6 +57,7 @@ class JointLimits:
     max_step_rad: float
     period_s: float
     lease_ns: int
+    oldest_state_ns: int  # a joint state that is older is not believed any more
     layout: str
     joints: tuple[JointDescription, ...]  # the same, joint by joint
 
@@ -75,6 +78,7 @@ class JointLimits:
             max_step_rad=description.max_step_rad,
             period_s=description.period_ns * 1e-9,
             lease_ns=description.lease_ns,
+            oldest_state_ns=_oldest_state_ns(description),
             layout=description.layout,
             joints=tuple(joints),
         )
@@ -82,6 +86,13 @@ class JointLimits:
     def inside(self, angle_rad: Floats) -> Floats:
         """Angles brought inside the angle limits, (n_joints,)."""
         return np.clip(angle_rad, self.angle_min_rad, self.angle_max_rad)
+
+
+def _oldest_state_ns(description: Description) -> int:
+    """Sooner than the lease, so that a joint that says nothing new is at fault within the lease."""
+    delay_s = next((sensor.delay_s for sensor in description.sensors if sensor.key == keys.JOINTS), 0.0)
+    fresh_ns = max(FRESH_PERIODS * description.period_ns, FRESH_NS)
+    return min(fresh_ns + round(delay_s * 1e9), description.lease_ns)
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 Three nets, joint by joint. What one of the first two catches is not believed, and the last good value stays:
 
-unknown   not valid, not finite, or older than a lease
+unknown   not valid, not finite, or older than three periods (and 30 ms, and its delay; at most a lease)
 jumped    further from the last good angle than twice the speed limit allows in the time between, and a little more.
           What stays at the new place is believed again after a few samples, but never while the robot is armed
 frozen    angle, velocity and torque go on repeating to the bit for more than a lease after the position target has
@@ -55,7 +55,8 @@ class JointWatch:
         ages_ns = np.array(joints.age_ns, dtype=np.float64)
         taken_s = (np.array([[joints.stamp_ns], [now_ns]], dtype=np.float64) - ages_ns) * 1e-9
         columns = np.array(lists[:3])
-        sound: Mask = np.isfinite(columns).all(axis=0) & (ages_ns <= self._limits.lease_ns) & np.array(joints.valid)
+        fresh = ages_ns <= self._limits.oldest_state_ns
+        sound: Mask = np.isfinite(columns).all(axis=0) & fresh & np.array(joints.valid)
         elapsed_s = (taken_s - self._good_s).max(axis=0)
         jump_rad = np.where(sound, columns[0], 0.0) - self._columns[0]
         jumped = sound & self._known & (np.abs(jump_rad) > self._strays.reach_rad(elapsed_s))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from snakesim_hal.authority import COMMANDS_KEPT, MAX_FAULTS_KEPT, Authority, Decision
+from snakesim_hal.gate import FRESH_NS
 from snakesim_hal.messages import (
     Answer,
     EstopRequest,
@@ -159,7 +160,7 @@ def test_a_state_of_another_number_of_joints_is_no_state(column: str, length: in
 
 def test_only_the_joints_that_are_not_known_are_named() -> None:
     rig = Rig()
-    rig.observe(0.1, age_ns=[LEASE_NS, LEASE_NS + 1, 0])
+    rig.observe(0.1, age_ns=[FRESH_NS, FRESH_NS + 1, 0])
     assert rig.authority.against_arming(0)[0] == "no valid and fresh state of joint_2"
 
 
@@ -175,7 +176,7 @@ def test_what_is_told_of_a_long_robot_fits_into_a_message() -> None:
 
 def test_a_state_at_the_end_of_its_time_is_still_good() -> None:
     rig = armed()
-    rig.observe(0.1, age_ns=[LEASE_NS] * JOINTS)
+    rig.observe(0.1, age_ns=[FRESH_NS] * JOINTS)
     rig.send(0.1)
     rig.pass_tick()
     assert rig.authority.state == "armed"

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from snakesim_hal import keys
 from snakesim_hal.gate import (
     Applied,
     JointLimits,
@@ -23,7 +24,7 @@ from snakesim_hal.gate import (
     why_limited,
 )
 from snakesim_hal.lease import Lease
-from snakesim_hal.messages import JointCommand, Mode
+from snakesim_hal.messages import JointCommand, Mode, SensorDescription
 from tests.unit.hal.rig import LEASE_NS, command, description
 
 ROBOT = description()
@@ -502,3 +503,16 @@ def test_set_points_for_the_backend_are_plain_python() -> None:
     points = as_set_points(applied)
     assert points.mode == [Mode.POSITION] * JOINTS and all(type(m) is Mode for m in points.mode)
     assert all(type(value) is float for value in points.target + points.torque_limit_nm)
+
+
+@pytest.mark.parametrize(
+    ("period_ms", "delay_ms", "oldest_ms"),
+    [(10, 0, 30), (1, 0, 30), (20, 0, 60), (40, 0, 100), (10, 5, 35), (10, 40, 50)],
+)
+def test_how_old_a_joint_state_may_be(period_ms: int, delay_ms: int, oldest_ms: int) -> None:
+    """Three periods, or 30 ms, and its delay; never longer than the lease."""
+    period_ns = period_ms * 1_000_000
+    sensor = SensorDescription(key=keys.JOINTS, rate_hz=100.0, delay_s=delay_ms * 1e-3)
+    lease_ns = min(max(5 * period_ns, 50_000_000), 100_000_000)
+    robot = msgspec.structs.replace(ROBOT, period_ns=period_ns, lease_ns=lease_ns, sensors=[sensor])
+    assert JointLimits.of(robot).oldest_state_ns == oldest_ms * 1_000_000

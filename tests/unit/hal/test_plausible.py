@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from snakesim_hal.gate import Applied, JointLimits
+from snakesim_hal.gate import FRESH_PERIODS, Applied, JointLimits
 from snakesim_hal.messages import Fault, Mode
 from snakesim_hal.plausible import JointWatch
 from tests.unit.hal.rig import LEASE_NS, PERIOD_NS, description, state
@@ -86,8 +86,8 @@ def test_age_counts_as_time() -> None:
     bench = Bench()
     assert bench.see(0.1, age_ns=[PERIOD_NS] * JOINTS) is not None
     assert bench.see(0.04, age_ns=[2 * PERIOD_NS] * JOINTS) is None
-    bench = Bench(age_ns=[4 * PERIOD_NS] * JOINTS)
-    assert bench.see(0.5, age_ns=[0] * JOINTS) is None
+    bench = Bench(age_ns=[3 * PERIOD_NS] * JOINTS)
+    assert bench.see(0.4, age_ns=[0] * JOINTS) is None
 
 
 def test_a_host_that_was_held_up_knows_that_more_time_has_passed() -> None:
@@ -229,5 +229,5 @@ def test_whatever_still_changes_is_alive(column: int) -> None:
 def test_a_sample_that_is_only_old_is_not_frozen() -> None:
     """It was taken once: what is lost is judged by its age."""
     bench = Bench(torque=0.5)
-    for k in range(1, LEASE_PERIODS + 1):
+    for k in range(1, FRESH_PERIODS + 1):
         assert bench.see(0.0, 0.0, 0.5, applied=told(0.1 * k), age_ns=[k * PERIOD_NS] * JOINTS) is None
