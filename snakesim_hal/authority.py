@@ -136,9 +136,7 @@ class Authority:
         """Decide a lease request; when the lease changes hands the robot stops in between."""
         ruling = rule(self.lease, request, now_ns, self.description.lease_ns)
         if self.state == "armed" and request.action == "renew":
-            return self._answer(
-                ruling.refusal, ruling.word
-            )  # armed, only a good command renews: asking is not commanding
+            return self._answer(ruling.refusal, ruling.word)  # only a good command renews: asking is not commanding
         self.lease = ruling.lease
         if ruling.changed_hands:
             self._forget_commands()
