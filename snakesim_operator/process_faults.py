@@ -21,6 +21,7 @@ from snakesim_hal.scenario import RunConfig
 from snakesim_hal.session import Question, Session
 from snakesim_operator.supervisor import Supervisor
 
+MEETING_POINTS = ("host", "router")
 SIGNALS = {"kill": signal.SIGKILL, "stop": signal.SIGTERM, "freeze": signal.SIGSTOP}
 
 
@@ -98,10 +99,10 @@ class ProcessFaults:
         try:
             request = self._decoder.decode(question.payload, question.encoding)
             injection = checked(Injection(request.kind, request.target, 0.0, request.for_s or inf, request.amount))
-            self._check(injection)
             if request.end:
                 self._end(injection)
                 return Answer(ok=True, reason=f"ended: {injection.kind}:{injection.target}", lifecycle=lifecycle)
+            self._check(injection)
             if injection.kind in SUPERVISED:
                 self._asked.append(injection)  # when the answer is on its way: it may pass through that process
             else:
@@ -128,6 +129,11 @@ class ProcessFaults:
         if injection.target_type == "process" and injection.target not in self._supervisor.names:
             raise ConfigError(
                 f"there is no process {injection.target!r}; this run has {', '.join(self._supervisor.names)}"
+            )
+        if injection.kind == "freeze" and injection.target in MEETING_POINTS and injection.end_s == inf:
+            raise ConfigError(
+                f"freeze:{injection.target} on request needs an end, because nobody could ask for it through a frozen "
+                f"{injection.target}: give --for SECONDS"
             )
 
     def _begin(self, injection: Injection) -> None:

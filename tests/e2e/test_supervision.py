@@ -171,10 +171,11 @@ def test_processes_go_wrong_on_request(tmp_path: Path) -> None:
                 ("hang", "control", "fault/control"),
                 ("kill", "router", "no process 'router'"),
                 ("freeze", "sensor/imu", "knows no 'freeze'"),
+                ("freeze", "host", "give --for SECONDS"),
             ):
                 answer = robot.fault(kind, target)
                 assert not answer.ok and answer.refusal == "unknown_fault" and word in answer.reason, answer
-            assert robot.fault("freeze", "host").ok
+            assert robot.fault("freeze", "host", for_s=60.0).ok
             run.wait_for("fault on request: freeze:host")
         interrupt(run)  # a frozen host is thawed to end in order
 

@@ -98,6 +98,7 @@ class Dice:
                 continue
             injection = checked(Injection(kind, target, 0.0, lasts_s, amount))
             once = injection.about.once
+            by_itself |= (kind, target) == ("freeze", "host")  # nobody can ask for its end
             request = FaultRequest(
                 kind=kind, target=target, amount=amount, for_s=lasts_s if by_itself and not once else None
             )
