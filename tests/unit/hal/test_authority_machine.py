@@ -22,6 +22,7 @@ from hypothesis.stateful import (
 
 from snakesim_hal import authority as under_test
 from snakesim_hal.authority import Authority, Decision
+from snakesim_hal.gate import FRESH_NS
 from snakesim_hal.lease import Lease
 from snakesim_hal.messages import (
     Answer,
@@ -223,10 +224,11 @@ class Everything(RuleBasedStateMachine):
         if self.same[i] and self.same[i][-1][0] != state_:
             self.same[i] = []
         self.same[i].append((state_, taken_s, self.target_before(i)))
-        targets = [target for _, _, target in self.same[i]]
         limit = self.last.set_points.torque_limit_nm[i] if self.last else TORQUE
-        long = taken_s - self.same[i][0][1] > LEASE_NS * 1e-9
-        return long and max(targets) - min(targets) > FAR / 4 and abs(state_[2]) < 0.95 * limit
+        targets = [target for _, _, target in self.same[i]]
+        ways = [max(targets[: k + 1]) - min(targets[: k + 1]) for k in range(len(targets))]
+        far = [taken for (_, taken, _), way in zip(self.same[i], ways, strict=True) if way > FAR / 4]
+        return bool(far) and taken_s - min(far) > LEASE_NS * 1e-9 and abs(state_[2]) < 0.95 * limit
 
     def drop_lease(self) -> None:
         self.holder = self.heard = None
@@ -261,7 +263,7 @@ class Everything(RuleBasedStateMachine):
         joint: int,
         later_ns: int,
     ) -> None:
-        valid, age_ns = [True] * JOINTS, [LEASE_NS] * JOINTS
+        valid, age_ns = [True] * JOINTS, [FRESH_NS] * JOINTS
         shown = list(angle)
         self.stamp_ns += later_ns
         match trouble:
