@@ -34,7 +34,7 @@ demo: $(stamp) ## Run the simulated snake through a triplet of obstacles, into r
 test: test-here test-vcan ## Run all tests
 
 test-here: $(stamp) ## Run the tests that need no CAN bus (ARGS="-k gate")
-	$(bin)/python -m pytest -n $(WORKERS) --ignore tests/vcan $(ARGS)
+	$(bin)/python -m pytest -n $(WORKERS) --dist worksteal --ignore tests/vcan $(ARGS)
 
 test-vcan: $(stamp) ## Run the CAN tests on real SocketCAN, in a small VM where the kernel has none (ARGS="-m slow": kills, triplet)
 	SNAKESIM_NEED_VCAN=1 $(bin)/python deploy/vm/with_vcan.py -- sh -c '$(on_vcan) || exec $(on_vcan) --last-failed'
