@@ -11,6 +11,11 @@ _IN_ANY_ORDER = "the greater of two, or the middle of three with a low below a h
 
 EQUIVALENT: dict[tuple[str, str, str], str] = {
     (
+        "arming.py",
+        "far_targets",
+        "True -> False in `for joint, mode, target, angle in zip(description.joints, command.mode, command.target, angle_rad.tolist(), strict=True):`",
+    ): _SAME_LENGTHS,
+    (
         "gate.py",
         "limit",
         "True -> False in `for asked, joint, held in zip(asked_limits, limits.joints, last.torque_limit_nm.tolist(), strict=True):`",
@@ -92,4 +97,14 @@ EQUIVALENT: dict[tuple[str, str, str], str] = {
         "Halt.after_a_period",
         "np.maximum(np.abs(self.velocity_rad_s) - limits.acceleration_rad_s2 * period_s, 0.0) -> np.maximum(0.0, np.abs(self.velocity_rad_s) - limits.acceleration_rad_s2 * period_s) in `slower = np.maximum(np.abs(self.velocity_rad_s) - limits.acceleration_rad_s2 * period_s, 0.0)`",
     ): _IN_ANY_ORDER,
+    (
+        "halting.py",
+        "Halt.after_a_period",
+        "np.clip(wanted, self.target_rad - step, self.target_rad + step) -> np.clip(self.target_rad - step, wanted, self.target_rad + step) in `target = np.clip(wanted, self.target_rad - step, self.target_rad + step)`",
+    ): _IN_ANY_ORDER,
+    (
+        "halting.py",
+        "Halt",
+        "True -> False in `@dataclass(frozen=True)`",
+    ): "nobody assigns to it; that nobody may is for the reader",
 }

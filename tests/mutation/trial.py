@@ -19,7 +19,7 @@ TRIED_BY = {
     "lease.py": ("test_lease.py", "test_authority.py", "test_authority_machine.py"),
     "lifecycle.py": ("test_lifecycle.py", "test_authority.py", "test_authority_machine.py"),
     "authority.py": ("test_authority.py", "test_authority_machine.py"),
-    "arming.py": ("test_authority.py", "test_authority_machine.py"),
+    "arming.py": ("test_arming.py", "test_authority.py", "test_authority_machine.py"),
     "plausible.py": ("test_plausible.py", "test_authority_machine.py"),
     "halting.py": ("test_halting.py", "test_authority_machine.py"),
     "derating.py": ("test_derating.py", "test_authority_machine.py"),

@@ -1,0 +1,44 @@
+"""What a request for arming must name, and where targets may be."""
+
+import numpy as np
+import pytest
+
+from snakesim_hal.arming import far_targets, mistaken
+from snakesim_hal.messages import LifecycleRequest, Mode
+from tests.unit.hal.rig import command, description
+
+ROBOT = description()
+MOST = ROBOT.max_step_rad
+GOOD = LifecycleRequest(action="arm", robot=ROBOT.robot, backend=ROBOT.backend, config_hash=ROBOT.config_hash)
+
+
+def test_a_request_that_names_everything_is_not_mistaken() -> None:
+    assert mistaken(GOOD, ROBOT) == []
+
+
+@pytest.mark.parametrize(("given", "named"), [(None, "none"), ("abc", "'abc'")])
+def test_a_request_without_the_configuration_says_what_to_do(given: str | None, named: str) -> None:
+    request = LifecycleRequest(action="arm", robot=ROBOT.robot, backend=ROBOT.backend, config_hash=given)
+    assert mistaken(request, ROBOT) == [
+        (
+            "wrong_config",
+            f"the configuration is {ROBOT.config_hash!r}, the request names {named}: read hal/description, and arm "
+            f"with its config_hash",
+        )
+    ]
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_target_may_be_a_whole_step_away_and_no_further(side: float) -> None:
+    here = np.zeros(len(ROBOT.joints))
+    assert far_targets(command(ROBOT, side * MOST), here, ROBOT) == []
+    further = np.nextafter(MOST, np.inf)
+    assert len(far_targets(command(ROBOT, side * further), here, ROBOT)) == len(ROBOT.joints)
+
+
+def test_only_staying_is_allowed() -> None:
+    here = np.zeros(len(ROBOT.joints))
+    assert far_targets(command(ROBOT, 9.0, Mode.PASSIVE), here, ROBOT) == []
+    for mode in (Mode.VELOCITY, Mode.TORQUE):
+        (first, *_) = far_targets(command(ROBOT, 0.0, mode), here, ROBOT)
+        assert first == f"joint_1 is asked for {mode.name.lower()}; only staying is allowed at arming"
