@@ -129,14 +129,15 @@ def _joined(link: Link, supervisor: Supervisor, ending: Ending) -> Iterator[Sess
     with contextlib.ExitStack() as stack:
         while True:
             try:
-                yield stack.enter_context(open_session(link, connect_timeout_s=CONNECT_S))
-                return
+                session = stack.enter_context(open_session(link, connect_timeout_s=CONNECT_S))
+                break
             except NotConnectedError:
                 ended = supervisor.first_ended()
                 if ended is not None:
                     raise NotConnectedError(ended) from None
                 if time.monotonic() > give_up or ending.interrupted:
                     raise
+        yield session
 
 
 def _folder(request: RunRequest) -> Path:
