@@ -95,20 +95,13 @@ class Client:
         self._started_over = False
         self.commanded_tick = -1
         session.on_arrival(keys.CLOCK, self._take_clock)
-        self._descriptions = session.latched_reader(keys.DESCRIPTION, Description)
 
     def description(self, timeout_s: float = 10.0) -> Description:
         """The robot. Raises NotConnectedError when no HAL shows one in time."""
-        deadline = time.monotonic() + timeout_s
-        while self._robot is None and time.monotonic() < deadline:
-            found = self._descriptions.drain()
-            if found:
-                self._robot = found[-1]
-                self.session.stop_reading(self._descriptions)
-            time.sleep(0.01)
-        if self._robot is not None:
-            return self._robot
-        raise NotConnectedError(f"no robot description within {timeout_s} s; is the robot's HAL host running?")
+        self._robot = self._robot or self.session.latest(keys.DESCRIPTION, Description, timeout_s)
+        if self._robot is None:
+            raise NotConnectedError(f"no robot description within {timeout_s} s; is the robot's HAL host running?")
+        return self._robot
 
     def subscribe(self, key: str, message: type[MessageT]) -> Feed[MessageT]:
         """Start listening to a key; do this for everything before `announce`."""
@@ -137,7 +130,7 @@ class Client:
                     yield None
                 continue
             if self._clock is not None and clock.tick < self._clock.tick:
-                self._started_over, self.commanded_tick = True, -1
+                self._started_over = True
                 for feed in self._feeds.values():
                     feed.clear()
             self._clock, self.commanded_tick = clock, -1

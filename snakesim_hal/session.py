@@ -237,17 +237,12 @@ class Session:
 
     def ask_politely(self, key: str, request: Message, timeout_s: float = 2.0) -> Answer:
         """Like `ask`, but a no is returned, not raised."""
-        decoder = Decoder(Answer)
         replies = self._zenoh.get(key, payload=encode(request), encoding=encoding_of(type(request)), timeout=timeout_s)
         unreadable: WireError | None = None
-        for reply in replies:
-            if reply.ok is None:
-                continue
-            try:
-                return decoder.decode(reply.ok.payload.to_bytes(), str(reply.ok.encoding))
-            except WireError as error:
-                self.rejected[error.reason] += 1
-                unreadable = error
+        for _, answer in self._answers(replies):
+            if isinstance(answer, Answer):
+                return answer
+            unreadable = answer
         if unreadable is not None:
             raise NotConnectedError(f"what answers on {key} cannot be read: {unreadable}")
         raise NotConnectedError(f"nobody answers on {key} within {timeout_s} s; is the robot's HAL host running?")
@@ -262,9 +257,10 @@ class Session:
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
         )
-        return self._answers(replies)
+        return ((at, answer) for at, answer in self._answers(replies) if isinstance(answer, Answer))
 
-    def _answers(self, replies: Any) -> Iterator[tuple[str, Answer]]:
+    def _answers(self, replies: Any) -> Iterator[tuple[str, Answer | WireError]]:
+        """What came back from which key; what cannot be read is counted."""
         decoder = Decoder(Answer)
         for reply in replies:
             if reply.ok is None:
@@ -273,6 +269,7 @@ class Session:
                 yield str(reply.ok.key_expr), decoder.decode(reply.ok.payload.to_bytes(), str(reply.ok.encoding))
             except WireError as error:
                 self.rejected[error.reason] += 1
+                yield str(reply.ok.key_expr), error
 
     def present(self, pattern: str, timeout_s: float = 1.0) -> list[str]:
         """The liveliness keys that match now."""

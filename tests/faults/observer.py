@@ -94,19 +94,27 @@ class Observer:
                 continue
             try:
                 message = self._decoders[arrival.key].decode(arrival.payload, arrival.encoding)
-            except WireError:  # a joint state with no number in it, say
-                self.unreadable += 1
-                continue
-            match message:
-                case Status():
-                    self.status = message
-                    self.statuses.append(Heard(arrival.monotonic_ns, message))
-                case AppliedCommand():
-                    self.applied.append(Heard(arrival.monotonic_ns, message))
-                case Clock():
-                    self.clocks.append(Heard(arrival.monotonic_ns, message))
-                case _:
-                    self.joints[message.tick] = message
+            except WireError as error:  # a joint state with no number in it, say
+                self.could_not_read(arrival, error)
+            else:
+                self.hear(arrival.monotonic_ns, message)
+
+    def could_not_read(self, arrival: Arrival, error: WireError) -> None:
+        """Something came that is no message."""
+        self.unreadable += 1
+
+    def hear(self, at_ns: int, message: Any) -> None:
+        """A message came."""
+        match message:
+            case Status():
+                self.status = message
+                self.statuses.append(Heard(at_ns, message))
+            case AppliedCommand():
+                self.applied.append(Heard(at_ns, message))
+            case Clock():
+                self.clocks.append(Heard(at_ns, message))
+            case _:
+                self.joints[message.tick] = message
 
     def forget(self) -> None:
         """Start afresh; the newest status stays known."""

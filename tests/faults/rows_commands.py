@@ -87,7 +87,11 @@ def _bombarded(observer: Observer, stranger: Stranger, kinds: Kinds) -> Trial:
     def uncounted() -> Counter[str]:
         return expected - (_counts(observer) - before)
 
-    troubles: list[str] = []
+    return _judged(observer, uncounted, [])
+
+
+def _judged(observer: Observer, uncounted: Callable[[], Counter[str]], troubles: list[str]) -> Trial:
+    """How many set-points got through; trouble besides `troubles` when not all are counted, or the robot stopped."""
     try:
         observer.until(lambda: not uncounted(), "all counted", COUNTED_S)
     except TrialError:
@@ -137,14 +141,8 @@ def _second(observer: Observer, stranger: Stranger, answered_ms: list[float]) ->
     for guess in guesses:
         stranger.send(stranger.forged(lease_epoch=guess))
         time.sleep(stranger.random.random() * PERIOD_NS * 1e-9)
-    try:
-        observer.until(lambda: (_counts(observer) - before)["wrong_epoch"] >= len(guesses), "counted", COUNTED_S)
-    except TrialError:
-        troubles.append(f"not counted: {dict(_counts(observer) - before)}")
-    observer.watch(0.05)
-    if observer.state() != "armed":
-        troubles.append(f"the robot stopped: {observer.in_words()}")
-    return Trial(value=float(applied_of_others(observer)), trouble="; ".join(troubles))
+    expected = Counter(wrong_epoch=len(guesses))
+    return _judged(observer, lambda: expected - (_counts(observer) - before), troubles)
 
 
 def interleaved(request: Request) -> Iterator[Trial]:

@@ -2,13 +2,13 @@
 
 import math
 from collections import Counter
-from queue import Empty
+from typing import Any
 
 from snakesim_hal import keys
 from snakesim_hal.errors import WireError
-from snakesim_hal.messages import AppliedCommand, Clock, Description, JointState, Mode, Status
-from snakesim_hal.session import Session
-from tests.faults.observer import Heard, Observer
+from snakesim_hal.messages import AppliedCommand, Clock, Description, Mode, Status
+from snakesim_hal.session import Arrival, Session
+from tests.faults.observer import Observer
 
 ROUNDING_RAD = 1e-6
 KEPT = 200  # joint states
@@ -28,38 +28,32 @@ class Watch(Observer):
         self._pending: list[AppliedCommand] = []
 
     def listen(self) -> None:
-        """Take in what has come; what cannot be read is counted."""
-        while True:
-            try:
-                arrival = self._inbox.get_nowait()
-            except Empty:
-                return
-            if arrival.key == keys.JOINT_COMMAND:
-                continue
-            try:
-                message = self._decoders[arrival.key].decode(arrival.payload, arrival.encoding)
-            except WireError as error:
-                self.counts[f"{arrival.key}: {error.reason}"] += 1
-                continue
-            match message:
-                case Status():
-                    self.status = message
-                    self.statuses = [*self.statuses[-20:], Heard(arrival.monotonic_ns, message)]
-                    self._explained(message)
-                case AppliedCommand():
-                    self.applied = [*self.applied[-5:], Heard(arrival.monotonic_ns, message)]
-                    self.sequences += message.sequence is not None
-                    self._pending.append(message)
-                case Clock():
-                    self.clocks = [*self.clocks[-5:], Heard(arrival.monotonic_ns, message)]
-                case JointState():
-                    self.joints[message.tick] = message
-                    while len(self.joints) > KEPT:
-                        del self.joints[next(iter(self.joints))]
-                case _:
-                    pass
-            while len(self._pending) > 1:  # its joint state has come, if it ever will
-                self.judge(self._pending.pop(0))
+        """Take in what has come; commands are not kept."""
+        super().listen()
+        self.commands.clear()
+
+    def could_not_read(self, arrival: Arrival, error: WireError) -> None:
+        """It is counted, by key and reason."""
+        self.counts[f"{arrival.key}: {error.reason}"] += 1
+
+    def hear(self, at_ns: int, message: Any) -> None:
+        """Judge it at once, and keep little."""
+        super().hear(at_ns, message)
+        match message:
+            case Status():
+                del self.statuses[:-21]
+                self._explained(message)
+            case AppliedCommand():
+                del self.applied[:-6]
+                self.sequences += message.sequence is not None
+                self._pending.append(message)
+            case Clock():
+                del self.clocks[:-6]
+            case _:
+                while len(self.joints) > KEPT:
+                    del self.joints[next(iter(self.joints))]
+        while len(self._pending) > 1:  # its joint state has come, if it ever will
+            self.judge(self._pending.pop(0))
 
     def start_over(self) -> None:
         """Another host: its ticks count from zero."""

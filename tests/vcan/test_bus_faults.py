@@ -11,6 +11,7 @@ import pytest
 from snakesim_can_backend import commands
 from snakesim_can_backend.protocol import ModuleState, Opcode, frame_id, opcode_of
 from snakesim_can_backend.watch import IN_A_ROW
+from tests.unit.can_backend.loop import armed, cleared_and_armed_again
 from tests.vcan.link import frame, ip, must, tc
 from tests.vcan.shared_bus import SharedBus, shared_bus
 
@@ -20,25 +21,6 @@ CAN_ERR_FLAG, CAN_EFF_FLAG, CAN_RTR_FLAG = 0x20000000, 0x80000000, 0x40000000
 # From linux/can/error.h: classes, and bits of data[1] of the class `CRTL`.
 CRTL, ACK, BUSOFF, RESTARTED, PROT = 0x04, 0x20, 0x40, 0x100, 0x08
 RX_OVERFLOW, RX_WARNING, TX_PASSIVE = 0x01, 0x04, 0x20
-
-
-def armed(run: SharedBus) -> SharedBus:
-    run.arm()
-    run.run(12, run.waving)
-    assert not run.faults
-    return run
-
-
-def cleared_and_armed_again(run: SharedBus) -> None:
-    """A person clears the fault and arms; nothing is left of it."""
-    told = len(run.faults)
-    run.lifecycle = "disarmed"
-    run.run(10)
-    assert run.states() == [ModuleState.DISARMED] * 4
-    run.wanted = None
-    run.arm()
-    run.run(10, run.waving)
-    assert len(run.faults) == told, run.faults[told:]
 
 
 def moved_again(run: SharedBus) -> bool:

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -93,3 +93,26 @@ def loop(run: RunConfig | None = None, **settings: Any) -> Iterator[Loop]:
         yield Loop(backend, run)
     finally:
         backend.close()
+
+
+LoopT = TypeVar("LoopT", bound=Loop)
+
+
+def armed(run: LoopT) -> LoopT:
+    """All joints swing, and nothing is wrong."""
+    run.arm()
+    run.run(12, run.waving)
+    assert not run.faults
+    return run
+
+
+def cleared_and_armed_again(run: Loop) -> None:
+    """A person clears the fault and arms; nothing is left of it."""
+    told = len(run.faults)
+    run.lifecycle = "disarmed"
+    run.run(10)
+    assert run.states() == [ModuleState.DISARMED] * 4
+    run.wanted = None
+    run.arm()
+    run.run(10, run.waving)
+    assert len(run.faults) == told, run.faults[told:]

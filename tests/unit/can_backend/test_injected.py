@@ -18,33 +18,14 @@ from snakesim_hal.backend import Injectable
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.faulty_backend import FaultyBackend
 from snakesim_hal.injection import parse
-from tests.unit.can_backend.loop import Loop, config, loop
+from tests.unit.can_backend.loop import Loop, armed, cleared_and_armed_again, config, loop
 from tests.unit.can_backend.test_faults_seen import MODULE_FAULTS
 
 PERIOD_MS, LEASE_MS = 10, 50
 
 
-def armed(run: Loop) -> Loop:
-    run.arm()
-    run.run(12, run.waving)
-    assert not run.faults
-    return run
-
-
 def inject(run: Loop, text: str, *, begins: bool = True) -> None:
     FaultyBackend(run.backend).inject(parse(f"{text}@0"), begins)
-
-
-def cleared_and_armed_again(run: Loop) -> None:
-    """A person clears the fault and arms; nothing is left of it."""
-    told = len(run.faults)
-    run.lifecycle = "disarmed"
-    run.run(10)
-    assert run.states() == [ModuleState.DISARMED] * 4
-    run.wanted = None
-    run.arm()
-    run.run(10, run.waving)
-    assert len(run.faults) == told, run.faults[told:]
 
 
 # --- modules -------------------------------------------------------------------------------------------------
