@@ -104,6 +104,7 @@ class CanBackend:
         self._sensors = Sensors(config, self._reports, self._reading, self._mocap)
         self._set_points = commands.SetPointWriter(joints)
         self._lifecycle: LifecycleState = "disarmed"
+        self._isolated: frozenset[int] = frozenset()  # joints that are set aside: motors off, and no set-points
         self._unsent: list[str] = []
         self._arming = Arming()
         self._answer_limit_s = LOCKSTEP_ANSWER_S if self._lockstep else _answer_time_s(self._buses, self._reports)
@@ -128,15 +129,20 @@ class CanBackend:
             self._remind(lifecycle)
         elif lifecycle == "armed":
             self._arming = Arming(self._reading.sync)
-        if self._lifecycle in commands.LATCHED and lifecycle not in commands.LATCHED:
-            self._cleared()  # before they are told to arm: parameters are written to motors that are off
+        back = self._isolate(set_points.isolated)
+        if back or (self._lifecycle in commands.LATCHED and lifecycle not in commands.LATCHED):
+            self._cleared(back)  # before they are told to arm: parameters are written to motors that are off
         for frame in commands.on_change(self._lifecycle, lifecycle):
-            if not (self._unconfigured and commands.is_arming(frame)):
+            if not commands.is_arming(frame):
                 self._broadcast(frame)
+            elif not self._unconfigured - self._isolated:
+                self._arm(frame)
         self._lifecycle = lifecycle
         if lifecycle != "armed":
             return
         for i, frame in enumerate(self._set_points.frames(set_points)):
+            if i in self._isolated:
+                continue
             if self._wire_of[i].send(frame):
                 self._set_points.sent(i)
             else:  # the queue is full or the interface down: the next set-point takes its place
@@ -155,8 +161,11 @@ class CanBackend:
             return []
         troubles: list[Trouble] = [trouble for wire in self._wires for trouble in wire.troubles()]
         names = self._description.joints
-        found = self._watch.look(self._reading, self._lifecycle, troubles, self._unsent, self._unconfigured)
-        if found and self._lifecycle not in commands.LATCHED:
+        found = self._watch.look(
+            self._reading, self._lifecycle, troubles, self._unsent, self._unconfigured, self._isolated
+        )
+        may_go_on = self._description.may_lose_joints > 0 and all(finding.alone for finding in found)
+        if found and not may_go_on and self._lifecycle not in commands.LATCHED:
             # Stopped here and now. From now on only a clear leads out, also one that comes before the next period.
             for frame in commands.on_change(self._lifecycle, "fault"):
                 self._broadcast(frame)
@@ -168,6 +177,7 @@ class CanBackend:
                 what=finding.what,
                 cause=finding.cause[:500],
                 joint=None if finding.joint is None else names[finding.joint].name,
+                reach="joint" if finding.alone else "robot",
             )
             for finding in found
         ]
@@ -342,20 +352,40 @@ class CanBackend:
     def _remind(self, lifecycle: LifecycleState) -> None:
         """Tell those again who missed a frame. Who was armed already, and is not now, was stopped by something."""
         arming = self._arming
-        in_time = self._reading.sync - arming.sync <= ARM_GRACE and not self._unconfigured
+        in_time = self._reading.sync - arming.sync <= ARM_GRACE and not self._unconfigured - self._isolated
         for i, module in enumerate(self._reading.modules):
-            if lifecycle == "armed" and module.state == ModuleState.ARMED:
+            wanted = "fault" if lifecycle == "armed" and i in self._isolated else lifecycle
+            if wanted == "armed" and module.state == ModuleState.ARMED:
                 arming.done.add(i)
-            frame = commands.reminder(lifecycle, module.state, module.node)
-            if frame is not None and (lifecycle != "armed" or (in_time and i not in arming.done)):
+            frame = commands.reminder(wanted, module.state, module.node)
+            if frame is not None and (wanted != "armed" or (in_time and i not in arming.done)):
                 self._wire_of[i].send(frame)
 
-    def _cleared(self) -> None:
+    def _isolate(self, isolated: frozenset[int]) -> frozenset[int]:
+        """Stop the modules that are newly set aside; returns the joints that count again."""
+        fresh, back = isolated - self._isolated, self._isolated - isolated
+        self._isolated = isolated
+        for i in sorted(fresh):
+            self._wire_of[i].send(commands.command(Action.STOP, i + 1))
+        return back
+
+    def _arm(self, to_all: Frame) -> None:
+        """Tell the modules to arm, but not those that are set aside."""
+        if not self._isolated:
+            self._broadcast(to_all)
+            return
+        for i, wire in enumerate(self._wire_of):
+            if i not in self._isolated:
+                wire.send(commands.command(Action.ARM, i + 1))
+
+    def _cleared(self, back: frozenset[int]) -> None:
         """Somebody cleared the fault. Modules that may have other parameters get their own again, in a moment or never.
 
-        What is not configured then is told as a fault, and nothing is armed.
+        What is not configured then is told as a fault, and nothing is armed. back: joints that were set aside.
         """
         self._watch.forget(self._reading.sync)
+        for i in sorted(back):
+            self._wire_of[i].send(commands.command(Action.CLEAR, i + 1))
         if self._unconfigured:
             try:
                 self._configure(CONFIGURE_LIMIT_S)

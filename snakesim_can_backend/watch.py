@@ -4,7 +4,7 @@ Pure: looks at a `Reading` and at the troubles of the wires once a tick. Each fi
 clears the robot's fault; what persists is then told again.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Sequence, Set
 from dataclasses import dataclass
 
 from snakesim_can_backend.protocol import ModuleState, Opcode
@@ -18,6 +18,10 @@ CLEAR_GRACE = 5  # Syncs that a module may take to follow a clearing
 ARM_GRACE = 5  # Syncs that a module may take to follow an arming
 STRANGER_FRAMES = 3  # of a node that should not be there, in ticks one after the other
 MOST_FRAMES = 16  # of one module in a tick; a healthy one sends 8 at most
+
+# Of one module, and yet nothing that the others could go on beside: two modules with one id, a bus that is full, water,
+# a supply that all share, an emergency.
+CONCERNS_ALL = {"duplicate_node", "module_babbling", "module_leak", "module_voltage", "module_emergency"}
 
 BUS_FAULTS = {
     "bus_off": "the controller has left the bus after too many errors: look for a short, a wrong bit rate, a missing "
@@ -36,11 +40,12 @@ class Finding:
     what: str
     cause: str
     joint: int | None = None  # index, tail to head
+    alone: bool = False  # whether it leaves the other joints as they were
 
     @property
-    def subject(self) -> tuple[str, int | str]:
+    def subject(self) -> tuple[str, int | str, bool]:
         """Two findings with the same are told once."""
-        return self.what, self.cause if self.joint is None else self.joint
+        return self.what, self.cause if self.joint is None else self.joint, self.alone
 
 
 class Watch:
@@ -50,7 +55,7 @@ class Watch:
         """joints, channel_of: name and bus of every joint, tail to head."""
         self._names, self._channels = joints, channel_of
         self._period_s = period_s
-        self._told: set[tuple[str, int | str]] = set()
+        self._told: set[tuple[str, int | str, bool]] = set()
         self._restarts = [0] * len(joints)
         self._unarmed = [0] * len(joints)  # Syncs in a row that found a module not armed, while the robot was
         self._restart_at: dict[int, int] = {}  # joint -> Sync at which its uptime went back
@@ -78,10 +83,12 @@ class Watch:
         troubles: Iterable[Trouble] = (),
         unsent: Iterable[str] = (),
         unconfigured: Iterable[int] = (),
+        isolated: Set[int] = frozenset(),
     ) -> list[Finding]:
         """What is newly wrong.
 
-        unsent: buses that did not take every frame of this tick; unconfigured: joints that must not be armed so.
+        unsent: buses that did not take every frame of this tick; unconfigured: joints that must not be armed so;
+        isolated: joints that are set aside, of which nothing is news that concerns nobody else.
         """
         if lifecycle != "armed":
             self._armed_sync = None
@@ -94,6 +101,7 @@ class Watch:
             found += self._of_module(i, module, reading, lifecycle)
         if lifecycle == "armed":
             found += [self._bare(i) for i in unconfigured]
+        found = [finding for finding in found if not (finding.alone and finding.joint in isolated)]
         fresh = [finding for finding in found if finding.subject not in self._told]
         self._told.update(finding.subject for finding in fresh)
         return fresh
@@ -109,8 +117,9 @@ class Watch:
         who = f"{self._names[i]} (node {module.node} on {self._channels[i]})"
         found: list[Finding] = []
 
-        def tell(what: str, cause: str) -> None:
-            found.append(Finding(what, f"{who} {cause}", i))
+        def tell(what: str, cause: str, *also: str) -> None:
+            """also: what else would have been reason enough."""
+            found.append(Finding(what, f"{who} {cause}", i, alone=CONCERNS_ALL.isdisjoint((what, *also))))
 
         missed = reading.sync - module.sync
         if self._has_restarted(i, module, reading):
@@ -141,11 +150,9 @@ class Watch:
             )
         as_told = lifecycle == "estop" and module.state == ModuleState.EMERGENCY
         if module.needs_clearing and not as_told and reading.sync >= self._quiet_until:
-            words = ", ".join(module.fault_names()) or module.state.name.lower()
-            tell(
-                f"module_{words.split(', ')[0]}",
-                f"reports {words}; it stopped because of {module.last_stop.name.lower()}",
-            )
+            words = module.fault_names() or [module.state.name.lower()]
+            kinds = [f"module_{word}" for word in words]
+            tell(kinds[0], f"reports {', '.join(words)}; it stopped because of {module.last_stop.name.lower()}", *kinds)
         elif self._refuses_to_arm(i, module, reading, missed):
             how = "is not armed any more" if i in self._was_armed else "does not arm"
             tell("module_not_armed", f"{how}: it is {module.state.name.lower()}")
@@ -176,7 +183,7 @@ class Watch:
         cause = (
             f"{self._names[i]} has not taken its parameters, and is not armed; clear, or switch its power off and on"
         )
-        return Finding("module_not_configured", cause, i)
+        return Finding("module_not_configured", cause, i, alone=True)
 
     # --- the bus ----------------------------------------------------------------------------------------------
 

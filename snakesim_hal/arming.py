@@ -2,6 +2,9 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+from numpy.typing import NDArray
+
 from snakesim_hal.gate import Floats
 from snakesim_hal.messages import Description, JointCommand, LifecycleRequest, Mode
 
@@ -31,13 +34,17 @@ def mistaken(request: LifecycleRequest, description: Description) -> list[tuple[
     return found
 
 
-def far_targets(command: JointCommand, angle_rad: Floats, description: Description) -> Sequence[str]:
-    """Joints that a command would move at once: only staying is allowed at arming."""
+def far_targets(
+    command: JointCommand, angle_rad: Floats, description: Description, aside: NDArray[np.bool_]
+) -> Sequence[str]:
+    """Joints that a command would move at once: only staying is allowed at arming. aside: joints that stay passive."""
     far: list[str] = []
     most = description.max_step_rad
-    for joint, mode, target, angle in zip(
-        description.joints, command.mode, command.target, angle_rad.tolist(), strict=True
+    for joint, mode, target, angle, passive in zip(
+        description.joints, command.mode, command.target, angle_rad.tolist(), aside.tolist(), strict=True
     ):
+        if passive:
+            continue
         if mode not in (Mode.POSITION, Mode.PASSIVE):
             far.append(f"{joint.name} is asked for {mode.name.lower()}; only staying is allowed at arming")
         if mode is Mode.POSITION and abs(target - angle) > most:

@@ -15,6 +15,7 @@ from snakesim_hal.backend import SetPoints
 from snakesim_hal.derating import Derating
 from snakesim_hal.gate import Applied, JointLimits
 from snakesim_hal.halting import Halt
+from snakesim_hal.isolation import Isolation, Mask
 from snakesim_hal.lease import Lease, freed, renewed, rule
 from snakesim_hal.messages import (
     Answer,
@@ -29,7 +30,7 @@ from snakesim_hal.messages import (
     Mode,
     Power,
 )
-from snakesim_hal.plausible import JointWatch
+from snakesim_hal.plausible import Doubt, JointWatch, readable
 
 MAX_FAULTS_KEPT = 32
 COMMANDS_KEPT = 1024
@@ -65,7 +66,8 @@ class Authority:
         self._applied = Applied(np.zeros(count, dtype=np.int64), np.zeros(count), self.limits.torque_nm)
         self._watch = JointWatch(self.limits)
         self._measured = self._watch.measured
-        self._state_trouble: Fault | None = Fault(tick=0, what="state_invalid", cause="no joint state yet")
+        self._isolation = Isolation(description)
+        self._doubt: Doubt | None = self._unknown("no joint state yet")
         self._derating = Derating(description)
         self._command: JointCommand | None = None
         self._command_ns = 0  # when it came
@@ -85,17 +87,26 @@ class Authority:
         """
         applied = self._applied if self.state == "armed" else None
         now_ns = joints.stamp_ns if now_ns is None else now_ns
-        self._state_trouble = self._watch.take(joints, now_ns=now_ns, applied=applied)
+        self._doubt = self._watch.take(joints, now_ns=now_ns, applied=applied, aside=self._isolation.joints)
         self._measured = self._watch.measured
 
     def observe_power(self, power: Power, now_ns: int) -> None:
         """Take the newest that the modules say of supply, heat and leaks; `expire` draws the conclusions."""
         self._derating.take(power, now_ns)
 
+    def readable(self, joints: JointState) -> JointState:
+        """A joint state as everybody may have it: all numbers are numbers."""
+        return readable(joints, self._measured)
+
     @property
     def derated(self) -> dict[str, float]:
         """Joints that heat leaves less than their whole torque, and the share that is left."""
         return self._derating.derated()
+
+    @property
+    def isolated(self) -> list[str]:
+        """Joints that failed, and are passive until a clear."""
+        return self._isolation.names
 
     def offer(self, command: JointCommand, *, now_ns: int, tick: int, age_ns: int) -> str | None:
         """Take a command, or return why not. `age_ns`: time since the state that it answers was published."""
@@ -163,6 +174,7 @@ class Authority:
             case "clear":
                 if not self._go("clear", "cleared; arm to move again"):
                     return self._answer(f"nothing to clear in state {self.state}", "wrong_state")
+                self._take_back()
                 self.faults.clear()
             case _:  # finish
                 if self.state == "armed":
@@ -175,8 +187,16 @@ class Authority:
         self._go("estop", f"emergency stop by {request.who}; clear it to go on")
         return self._answer(None)
 
-    def fault(self, fault: Fault) -> None:
-        """Latch a fault: the joints go to the safe action until someone clears it."""
+    def fault(self, fault: Fault, joints: Mask | None = None) -> None:
+        """Latch a fault: the joints go to the safe action until someone clears it.
+
+        What reaches no further than some joints sets them aside instead, if the robot file allows that. joints: which;
+        None: the one that the fault names.
+        """
+        joints = self._isolation.mask(fault.joint) if joints is None else joints
+        if fault.reach == "joint" and self._set_aside(fault, joints):
+            return
+        fault = msgspec.structs.replace(fault, reach="robot")
         self.note(fault)
         if self.state not in ("fault", "estop"):  # what comes after the first is its consequence, as a rule
             self._go("fault", fault.cause[:500] or fault.what)
@@ -208,8 +228,8 @@ class Authority:
         A robot that is armed and does not know its joints any more is at fault too, and so is one, armed or not, whose
         modules are too hot, leak or lack voltage.
         """
-        if self.state == "armed" and self._state_trouble is not None:
-            self.fault(msgspec.structs.replace(self._state_trouble, tick=tick))
+        if self.state == "armed" and self._doubt is not None:
+            self.fault(msgspec.structs.replace(self._doubt.fault, tick=tick), self._doubt.joints)
         wrong, silent = self._derating.look(now_ns, tick)
         for fault in wrong:
             self.fault(fault)
@@ -245,9 +265,10 @@ class Authority:
             sequence, self._counting = command.sequence, command
             if (applied.target != asked).any() or (share < 1.0).any():
                 limited = gate.why_limited(command, applied, measured=measured, limits=self.limits, share=share)
-                self.limited.update(limited.values())
-        self._applied = applied
-        return Decision(gate.as_set_points(applied), sequence, limited)
+            limited |= self._isolation.overruled(command)
+            self.limited.update(limited.values())
+        self._applied = applied = self._isolation.without(applied)
+        return Decision(gate.as_set_points(applied, self._isolation.indices), sequence, limited)
 
     # --- inside --------------------------------------------------------------------------------------------
 
@@ -258,7 +279,8 @@ class Authority:
         return found + [("not_ready", why) for why in self._unready(now_ns)]
 
     def _unready(self, now_ns: int) -> list[str]:
-        against = [fault.cause for fault in (self._state_trouble, *self._derating.wrong) if fault is not None]
+        against = [] if self._doubt is None else [self._doubt.fault.cause]
+        against += [fault.cause for fault in self._derating.wrong if not self._is_aside(fault)]
         if self.arming and not self._told:
             against.append("the motors have not been told yet that the robot was stopped; ask again in a period")
         if not self.lease.live(now_ns):
@@ -268,8 +290,32 @@ class Authority:
         elif now_ns - self._command_ns > self.description.lease_ns:  # the lease may be kept by asking, too
             against.append(f"no commands from {self.lease.holder} any more")
         else:
-            against.extend(arming.far_targets(self._command, self._measured.angle_rad, self.description))
+            at, aside = self._measured.angle_rad, self._isolation.joints
+            against.extend(arming.far_targets(self._command, at, self.description, aside))
         return against
+
+    def _unknown(self, cause: str) -> Doubt:
+        fault = Fault(tick=0, what="state_invalid", cause=cause)
+        return Doubt(fault, np.ones(len(self.description.joints), dtype=np.bool_))
+
+    def _is_aside(self, fault: Fault) -> bool:
+        return fault.reach == "joint" and self._isolation.covers(self._isolation.mask(fault.joint))
+
+    def _set_aside(self, fault: Fault, joints: Mask) -> bool:
+        """Go on without joints that have failed, if that may be; what they complain of afterwards is no news."""
+        if self._isolation.covers(joints):
+            return True
+        if self.state != "armed" or not self._isolation.add(joints):
+            return False
+        self.note(fault)
+        self.why = f"armed, without {', '.join(self.isolated)}: {fault.cause}"[:500]
+        return True
+
+    def _take_back(self) -> None:
+        """Joints that were set aside count again; first they must be heard of."""
+        if self.isolated:
+            self._isolation.clear()
+            self._doubt = self._unknown("no joint state since the clear")
 
     def _safe(self) -> Applied:
         zeros = np.zeros_like(self._measured.angle_rad)

@@ -24,6 +24,7 @@ class SetPoints:
     mode: list[Mode]
     target: list[float]  # rad, rad/s or N·m, as the mode says
     torque_limit_nm: list[float]
+    isolated: frozenset[int] = frozenset()  # joints that are set aside: passive here, and to be switched off
 
 
 @dataclass(frozen=True)

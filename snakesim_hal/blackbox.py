@@ -1,6 +1,9 @@
 """The black box: every tick of a run as the host saw it, kept in memory and written once at the end.
 
 `command_digest` is a hash over every set-point as applied, so two runs with one digest drove the motors alike.
+
+Rows come in blocks that are never moved: to copy a longer and longer table took 60 ms of a tick after three minutes at
+100 Hz, and cost the controller its lease.
 """
 
 import hashlib
@@ -17,7 +20,7 @@ from snakesim_hal.backend import Samples
 from snakesim_hal.messages import Contacts, Description, Pose
 
 Floats = NDArray[np.float64]
-_GROW = 4096
+BLOCK_ROWS = 1024
 
 
 class BlackBox:
@@ -26,8 +29,8 @@ class BlackBox:
     def __init__(self, description: Description) -> None:
         self._joints = len(description.joints)
         self._rows = 0
-        self._numbers = np.empty((_GROW, self._width()))
-        self._modes = np.empty((_GROW, self._joints), dtype=np.int8)
+        self._numbers: list[Floats] = []  # block by block
+        self._modes: list[NDArray[np.int8]] = []
         self._digest = hashlib.sha256()
         self._pack = struct.Struct(f"<q{self._joints}b{2 * self._joints}d").pack
         self._pose = [np.nan] * 7
@@ -39,9 +42,10 @@ class BlackBox:
 
     def record(self, tick: int, stamp_ns: int, samples: Samples, decision: Decision) -> None:
         """Keep one tick."""
-        if self._rows == len(self._numbers):
-            self._numbers = np.concatenate([self._numbers, np.empty_like(self._numbers)])
-            self._modes = np.concatenate([self._modes, np.empty_like(self._modes)])
+        row = self._rows % BLOCK_ROWS
+        if row == 0:
+            self._numbers.append(np.empty((BLOCK_ROWS, self._width())))
+            self._modes.append(np.empty((BLOCK_ROWS, self._joints), dtype=np.int8))
         pose = samples.others.get(keys.POSE)
         if isinstance(pose, Pose):
             self._pose = [*pose.position_w, *pose.orientation_wxyz]
@@ -51,7 +55,7 @@ class BlackBox:
             self._contact_peak_n = max(squares, default=0.0) ** 0.5
             self._contact_count = len({c.obstacle for c in contacts.contacts})
         joints, points = samples.joints, decision.set_points
-        self._numbers[self._rows] = [
+        self._numbers[-1][row] = [
             stamp_ns * 1e-9,
             *joints.angle_rad,
             *joints.velocity_rad_s,
@@ -62,7 +66,7 @@ class BlackBox:
             self._contact_peak_n,
             self._contact_count,
         ]
-        self._modes[self._rows] = points.mode
+        self._modes[-1][row] = points.mode
         self._rows += 1
         self._digest.update(self._pack(tick, *points.mode, *points.target, *points.torque_limit_nm))
 
@@ -78,9 +82,11 @@ class BlackBox:
 
     def arrays(self) -> dict[str, Any]:
         """The columns: time_s (n,), angle_rad (n, joints), ..., position_w (n, 3), orientation_wxyz (n, 4)."""
-        rows, j = self._numbers[: self._rows], self._joints
+        j = self._joints
+        rows = np.concatenate([np.empty((0, self._width())), *self._numbers])[: self._rows]
+        modes = np.concatenate([np.empty((0, j), dtype=np.int8), *self._modes])[: self._rows]
         names = ["angle_rad", "velocity_rad_s", "torque_nm", "target", "torque_limit_nm"]
-        columns: dict[str, Any] = {"time_s": rows[:, 0], "mode": self._modes[: self._rows]}
+        columns: dict[str, Any] = {"time_s": rows[:, 0], "mode": modes}
         for k, name in enumerate(names):
             columns[name] = rows[:, 1 + k * j : 1 + (k + 1) * j]
         rest = rows[:, 1 + 5 * j :]

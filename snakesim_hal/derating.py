@@ -2,7 +2,8 @@
 
 From `derate_from_c` on a winding loses torque, linearly, down to a fifth at `stop_at_c`. There, with water inside, or
 with a supply that is below `least_voltage_v` for 50 ms, the robot is stopped, and is not armed again before the winding
-has cooled below `derate_from_c`. What no module has told for some seconds is not known: it is said, and does not count.
+has cooled below `derate_from_c`. Heat concerns the one joint; a leak or a weak supply is taken for the whole robot's.
+What no module has told for some seconds is not known: it is said, and does not count.
 """
 
 import math
@@ -51,7 +52,13 @@ class Derating:
         self._due_ns = min(min(health.due_ns(now_ns, began_ns) for health in self._healths), now_ns + KNOWN_FOR_NS)
         self.share = np.array([health.share(now_ns) for health in self._healths])
         self.wrong = [
-            Fault(tick=tick, what=what, cause=cause, joint=health.joint.name)
+            Fault(
+                tick=tick,
+                what=what,
+                cause=cause,
+                joint=health.joint.name,
+                reach="joint" if what == "overheated" else "robot",
+            )
             for health in self._healths
             for what, cause in health.troubles(now_ns)
         ]
@@ -72,7 +79,8 @@ class Derating:
         if not fresh:
             return None
         cause = f"supply and heat are unknown, and do not count, for {', '.join(fresh)}"[:LONGEST_CAUSE]
-        return Fault(tick=tick, what="power_unknown", cause=cause, joint=fresh[0] if len(fresh) == 1 else None)
+        joint = fresh[0] if len(fresh) == 1 else None
+        return Fault(tick=tick, what="power_unknown", cause=cause, joint=joint, reach="joint")
 
 
 @dataclass

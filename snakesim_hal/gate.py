@@ -278,10 +278,10 @@ def _why(
     return "acceleration" if fast else "torque_rate"
 
 
-def as_set_points(applied: Applied) -> SetPoints:
-    """For the backend."""
+def as_set_points(applied: Applied, isolated: frozenset[int]) -> SetPoints:
+    """For the backend. isolated: joints that are set aside."""
     modes = [_MODES[code] for code in applied.mode.tolist()]
-    return SetPoints(modes, applied.target.tolist(), applied.torque_limit_nm.tolist())
+    return SetPoints(modes, applied.target.tolist(), applied.torque_limit_nm.tolist(), isolated)
 
 
 _MODES = {int(mode): mode for mode in Mode}

@@ -163,7 +163,7 @@ class Host:
 
     def _publish(self, samples: Samples) -> None:
         tick = self._tick
-        self._outbox.put(keys.JOINTS, samples.joints)
+        self._outbox.put(keys.JOINTS, self.authority.readable(samples.joints))
         self._newest[keys.JOINTS] = tick
         for key, message in samples.others.items():
             self._outbox.put(key, message)

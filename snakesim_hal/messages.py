@@ -17,6 +17,7 @@ Pace = Literal["realtime", "lockstep", "free"]
 LifecycleState = Literal["disarmed", "armed", "fault", "estop"]
 LocomotionState = Literal["PowerOff", "Idle", "NotLocomoting", "Locomoting"]
 SafeAction = Literal["passive", "damp", "hold"]
+Reach = Literal["robot", "joint"]
 Axis = Literal["yaw", "pitch"]
 
 
@@ -204,6 +205,7 @@ class Description(Message, frozen=True, kw_only=True):
     lease_ns: q.Nanoseconds
     max_step_rad: Annotated[float, Meta(gt=0, le=10)]  # a position target further from the measured is limited
     safe_action: SafeAction
+    may_lose_joints: Annotated[int, Meta(ge=0, le=q.MAX_JOINTS)] = 0  # that fail, before the robot stops
     emulated: bool = False  # nothing real moves: a simulator, or emulated modules; faults on request are allowed
     joints: Annotated[list[JointDescription], Meta(min_length=1, max_length=q.MAX_JOINTS)]
     links: Annotated[list[LinkDescription], Meta(min_length=2, max_length=q.MAX_JOINTS + 1)]
@@ -211,12 +213,17 @@ class Description(Message, frozen=True, kw_only=True):
 
 
 class Fault(Message, frozen=True, kw_only=True):
-    """One thing that went wrong, and where."""
+    """One thing that went wrong, and where.
+
+    reach says how far it goes. A backend says "joint" of what leaves the other joints as they were, so that the robot
+    may go on without this one if its file says so; what stopped the robot is told with "robot".
+    """
 
     tick: q.Tick
     what: q.Name  # a short word to count by: lease_expired, service_lost, diverged, ...
     cause: q.Reason
     joint: q.Name | None = None
+    reach: Reach = "robot"
 
 
 class Status(Message, frozen=True, kw_only=True):
@@ -244,6 +251,7 @@ class Status(Message, frozen=True, kw_only=True):
     injected: Annotated[list[q.Reason], Meta(max_length=64)] = []  # faults on request that are on now
     hygiene: Annotated[list[q.Reason], Meta(max_length=16)] = []  # real-time measures that the system refused
     derated: Annotated[dict[q.Name, q.Fraction], Meta(max_length=q.MAX_JOINTS)] = {}  # joint -> torque it has left
+    isolated: Annotated[list[q.Name], Meta(max_length=q.MAX_JOINTS)] = []  # joints that failed, and are passive
 
 
 class LeaseRequest(Message, frozen=True, kw_only=True):

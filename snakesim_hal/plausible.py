@@ -1,6 +1,7 @@
 """Which joint states are believed. An angle that no joint could have reached is no measurement. Pure.
 
-Three nets, joint by joint. What one of the first two catches is not believed, and the last good value stays:
+Three nets, joint by joint. What one of the first two catches is not believed, and the last good value stays; joints
+that are set aside are not looked at:
 
 unknown   not valid, not finite, or older than three periods (and 30 ms, and its delay; at most a lease)
 jumped    further from the last good angle than twice the speed limit allows in the time between, and a little more.
@@ -9,6 +10,10 @@ frozen    angle, velocity and torque go on repeating to the bit for more than a 
           moved so far that the torque must have changed, and the torque is not at its limit
 """
 
+import math
+from dataclasses import dataclass
+
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,6 +28,14 @@ AGREEING = 5  # samples in a row at a new place, until it is believed
 FROZEN_SHARE = 0.25  # of max_step_rad: a target that moves so far changes the torque of a joint that does not follow
 AT_LIMIT = 0.95  # of the torque limit
 LONGEST_CAUSE = 400
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """What is wrong with a joint state, and of which joints."""
+
+    fault: Fault
+    joints: Mask
 
 
 class JointWatch:
@@ -42,16 +55,18 @@ class JointWatch:
         """The last good state of every joint; zeros for one that never had any."""
         return Measured(*self._columns)
 
-    def take(self, joints: JointState, *, now_ns: int, applied: Applied | None) -> Fault | None:
+    def take(self, joints: JointState, *, now_ns: int, applied: Applied | None, aside: Mask) -> Doubt | None:
         """Take a joint state; returns what is wrong with it, if anything.
 
         now_ns: safety time. A host that was held up knows by it that more time has passed than its ticks say.
         applied: what the motors of an armed robot were told last; None: the robot is not armed.
+        aside: joints that nobody relies on.
         """
         count = len(self._known)
         lists = (joints.angle_rad, joints.velocity_rad_s, joints.torque_nm, joints.valid, joints.age_ns)
         if {len(values) for values in lists} != {count}:
-            return Fault(tick=joints.tick, what="state_invalid", cause=f"no joint state of {count} joints")
+            cause = f"no joint state of {count} joints"
+            return Doubt(Fault(tick=joints.tick, what="state_invalid", cause=cause), np.ones_like(self._known))
         ages_ns = np.array(joints.age_ns, dtype=np.float64)
         taken_s = (np.array([[joints.stamp_ns], [now_ns]], dtype=np.float64) - ages_ns) * 1e-9
         columns = np.array(lists[:3])
@@ -68,25 +83,50 @@ class JointWatch:
         self._good_s = np.where(good, taken_s, self._good_s)
         self._known |= good
         frozen = self._stillness.look(columns, taken_s[0], applied)
-        if not sound.all():
-            return self._fault(joints.tick, "state_invalid", "no valid and fresh state of ", ~sound)
+        unknown, jumped, frozen = ~sound & ~aside, jumped & ~aside, frozen & ~aside
+        if unknown.any():
+            return self._doubt(joints.tick, "state_invalid", "no valid and fresh state of ", unknown)
         if jumped.any():
             tails = [
                 f" by {by:+.2f} rad in {within * 1e3:.0f} ms" for by, within in zip(jump_rad, elapsed_s, strict=True)
             ]
-            return self._fault(joints.tick, "state_invalid", "faster than any joint turns: a jump of ", jumped, tails)
+            return self._doubt(joints.tick, "state_invalid", "faster than any joint turns: a jump of ", jumped, tails)
         if frozen.any():
-            return self._fault(
+            return self._doubt(
                 joints.tick, "joint_frozen", "the same state over and over while its target moves: ", frozen
             )
         return None
 
-    def _fault(self, tick: int, what: str, words: str, which: Mask, tails: list[str] | None = None) -> Fault:
+    def _doubt(self, tick: int, what: str, words: str, which: Mask, tails: list[str] | None = None) -> Doubt:
         found = np.flatnonzero(which).tolist()
         names = [self._limits.joints[i].name for i in found]
         told = names if tails is None else [name + tails[i] for name, i in zip(names, found, strict=True)]
         cause = (words + ", ".join(told))[:LONGEST_CAUSE]
-        return Fault(tick=tick, what=what, cause=cause, joint=names[0] if len(names) == 1 else None)
+        joint = names[0] if len(names) == 1 else None
+        return Doubt(Fault(tick=tick, what=what, cause=cause, joint=joint, reach="joint"), which)
+
+
+def readable(joints: JointState, good: Measured) -> JointState:
+    """What may be published: a number that is none would make a reader refuse the states of all joints.
+
+    The last good one takes its place, and is not valid.
+    """
+    columns = (joints.angle_rad, joints.velocity_rad_s, joints.torque_nm)
+    if all(math.isfinite(value) for column in columns for value in column):
+        return joints
+    kept = (good.angle_rad.tolist(), good.velocity_rad_s.tolist(), good.torque_nm.tolist())
+    sound = [all(map(math.isfinite, values)) for values in zip(*columns, strict=False)]
+    mended = [
+        [value if fine else last for value, fine, last in zip(column, sound, before, strict=False)]
+        for column, before in zip(columns, kept, strict=True)
+    ]
+    return msgspec.structs.replace(
+        joints,
+        angle_rad=mended[0],
+        velocity_rad_s=mended[1],
+        torque_nm=mended[2],
+        valid=[valid and fine for valid, fine in zip(joints.valid, sound, strict=False)],
+    )
 
 
 class _Strays:

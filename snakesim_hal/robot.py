@@ -75,6 +75,7 @@ class Safety(FileStruct, frozen=True, kw_only=True):
 
     action: SafeAction = "damp"
     max_step_rad: Annotated[float, above(3.2, "rad")] = 0.35  # furthest a position target may be from the measured
+    may_lose_joints: Annotated[int, Meta(ge=0, le=MAX_JOINTS)] = 0  # that fail and are left passive, before all stop
 
 
 class JointSensor(FileStruct, frozen=True, kw_only=True):
@@ -216,6 +217,7 @@ def describe(
         lease_ns=lease_ns,
         max_step_rad=robot.safety.max_step_rad,
         safe_action=robot.safety.action,
+        may_lose_joints=robot.safety.may_lose_joints,
         emulated=emulated,
         joints=joints,
         links=links,

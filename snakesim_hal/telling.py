@@ -60,4 +60,5 @@ def status_message(
         injected=injected,
         ready_to_arm=not against and not missing,
         derated=authority.derated,
+        isolated=authority.isolated,
     )

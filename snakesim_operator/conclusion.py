@@ -23,7 +23,8 @@ def conclude(out: Path, ending: Ending, restarts: Sequence[Restart], hosts: int,
     """
     record = RunRecord.load(out)
     for fault in () if stay else record.host.faults:
-        ending.because(fault.cause)
+        if fault.reach == "robot":
+            ending.because(fault.cause)
     ended = "interrupted" if ending.interrupted else ending.reason or "complete"
     summary = summarise(record, ended, restarts, hosts)
     (out / SUMMARY).write_bytes(msgspec.json.format(msgspec.json.encode(summary), indent=2))

@@ -100,8 +100,8 @@ class Conductor:
         self._armed |= status.lifecycle == "armed"
         if self._stay:
             self._tell(status)
-        elif status.faults:
-            self._ending.because(status.faults[0].cause)
+        elif stopping := [fault for fault in status.faults if fault.reach == "robot"]:
+            self._ending.because(stopping[0].cause)
 
     def _over_before_it_began(self) -> bool:
         return not self._armed and not self._may_arm

@@ -142,6 +142,8 @@ def _in_words(namespace: str, status: Status) -> str:
     ]
     for joint, share in sorted(status.derated.items()):
         lines.append(f"  derated: {joint} has {100 * share:.0f} % of its torque left")
+    if status.isolated:
+        lines.append(f"  isolated: {', '.join(status.isolated)}; passive until a clear")
     for what in status.hygiene:
         lines.append(f"  real time: {what}")
     for what in status.injected:
@@ -161,7 +163,9 @@ def _what_to_type(namespace: str, status: Status, link: Link) -> list[str]:
     arm = f"`snakesim arm {status.robot} {status.backend}{where}`"
     if status.lifecycle in ("fault", "estop"):
         return [f"  next: `snakesim clear{where}`, then {arm}"]
-    return [f"  next: {arm}"] if status.ready_to_arm else []
+    back = f"  or: `snakesim clear{where}` first, to take back {', '.join(status.isolated)}"
+    told = [f"  next: {arm}"] if status.ready_to_arm else []
+    return [*told, back] if status.isolated and status.lifecycle == "disarmed" else told
 
 
 def run_router(config: Path | None) -> int:

@@ -4,6 +4,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -188,8 +189,14 @@ class Rig:
 
     def disarm(self) -> None:
         """Disarm, or clear a stop."""
-        action = "disarm" if self.authority.state == "armed" else "clear"
-        self.authority.on_lifecycle(LifecycleRequest(action=action), self._now_ns)
+        if self.authority.state == "armed":
+            self.authority.on_lifecycle(LifecycleRequest(action="disarm"), self._now_ns)
+        else:
+            self.clear()
+
+    def clear(self) -> None:
+        """Clear a stop, and take back what was set aside."""
+        self.authority.on_lifecycle(LifecycleRequest(action="clear"), self._now_ns)
 
     def estop(self) -> None:
         """Emergency stop."""
@@ -198,6 +205,18 @@ class Rig:
     def fault(self) -> None:
         """A fault that somebody else found."""
         self.authority.fault(Fault(tick=self.tick, what="bench", cause="the contract tests say so"))
+
+    def may_lose_a_joint(self) -> None:
+        """From now on one joint that fails is set aside, whatever the robot's file says. Call it while disarmed."""
+        self.spoiled = True
+        self.authority = Authority(msgspec.structs.replace(self.robot, may_lose_joints=1))
+        self.idle()
+
+    def lose(self, joint: int) -> None:
+        """Somebody found that a joint has failed."""
+        name = self.robot.joints[joint].name
+        cause = f"the contract tests set {name} aside"
+        self.authority.fault(Fault(tick=self.tick, what="bench", cause=cause, joint=name, reach="joint"))
 
     def cruise(self, joint: int = 0) -> Record:
         """Arm, and set one joint going."""

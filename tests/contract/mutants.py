@@ -234,6 +234,34 @@ class OneModeForAll(Mistold):
         return SetPoints([points.mode[1]] * len(points.mode), points.target, points.torque_limit_nm)
 
 
+@breaks("a_joint_that_is_set_aside_is_let_go_and_the_others_go_on")
+class HoldsWhatIsLost(Mistold):
+    def heard(self, points, lifecycle):
+        held = [Mode.POSITION if i in points.isolated else mode for i, mode in enumerate(points.mode)]
+        target = [0.3 if i in points.isolated else target for i, target in enumerate(points.target)]
+        return SetPoints(held, target, [limit or 4.0 for limit in points.torque_limit_nm])
+
+
+@breaks("a_joint_that_is_set_aside_is_let_go_and_the_others_go_on")
+class OneForAll(Mistold):
+    def heard(self, points, lifecycle):
+        passive = SetPoints([Mode.PASSIVE] * len(points.mode), [0.0] * len(points.mode), points.torque_limit_nm)
+        return passive if points.isolated else points
+
+
+@breaks("a_joint_that_is_set_aside_is_let_go_and_the_others_go_on")
+class TakesNothingBack(Mistold):
+    lost: frozenset[int] = frozenset()
+
+    def heard(self, points, lifecycle):
+        self.lost |= points.isolated
+        return SetPoints(
+            [Mode.PASSIVE if i in self.lost else mode for i, mode in enumerate(points.mode)],
+            points.target,
+            points.torque_limit_nm,
+        )
+
+
 @breaks("the_reported_velocity_is_the_change_of_the_reported_angle", "velocity_mode_turns_at_the_speed_that_is_asked")
 class NoSpeedometer(Misread):
     def misread(self, joints):

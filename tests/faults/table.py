@@ -9,6 +9,7 @@ from tests.faults import (
     rows_consumers,
     rows_controller,
     rows_guest,
+    rows_isolation,
     rows_modules,
     rows_network,
     rows_simulator,
@@ -91,6 +92,13 @@ def sensor_row(name: str, fault: str, kind: str) -> Row:
     expected = "fault names the joint, group to safe stop, latched"
     deadline = "50 ms; and the injector takes the request at the host's next tick (10 ms)"
     return Row(name, fault, expected, deadline, 60.0, "ms", both(rows_modules.through_robot(kind)))
+
+
+def isolated_row(name: str, fault: str, kind: str) -> Row:
+    """One joint fails, and the robot may lose one."""
+    expected = "fault names the joint, it alone is let go; the others go on; a clear takes it back"
+    deadline = "50 ms; and the injector takes the request at the host's next tick (10 ms)"
+    return Row(name, fault, expected, deadline, 60.0, "ms", both(rows_isolation.set_aside(kind)))
 
 
 def bus_row(
@@ -237,6 +245,17 @@ HEADINGS: tuple[Heading, ...] = (
             sensor_row("robot_joint_frozen", "a joint repeats its last value, by a whole robot", "freeze"),
             sensor_row("robot_joint_wrong", "a joint's angle is suddenly off by 0.5 rad, by a whole robot", "wrong"),
             sensor_row("robot_joint_nan", "a joint's angle is no number, by a whole robot", "nan"),
+        ),
+    ),
+    Heading(
+        "one joint fails, and the robot file allows for it (`may_lose_joints = 1`)",
+        "that joint is let go, the others go on",
+        "50 ms",
+        (
+            isolated_row("isolated_silent", "a joint says nothing", "mute"),
+            isolated_row("isolated_frozen", "a joint repeats its last value", "freeze"),
+            isolated_row("isolated_wrong", "a joint's angle is suddenly off by 0.5 rad", "wrong"),
+            isolated_row("isolated_nan", "a joint's angle is no number", "nan"),
         ),
     ),
     Heading(

@@ -9,7 +9,7 @@ from snakesim_can_backend.commands import command
 from snakesim_can_backend.protocol import Action, Frame, LastStop, ModuleState, Opcode, frame_id
 from snakesim_can_backend.reading import Reading
 from snakesim_can_backend.trouble import Kind, Trouble
-from snakesim_can_backend.watch import ARM_GRACE, CLEAR_GRACE, MOST_FRAMES, Finding, Watch
+from snakesim_can_backend.watch import ARM_GRACE, CLEAR_GRACE, CONCERNS_ALL, MOST_FRAMES, Finding, Watch
 from snakesim_hal.messages import LifecycleState
 from tests.unit.can_backend.frames import answer, begin, heartbeat, joint_state, spoilt
 
@@ -32,6 +32,7 @@ class Bench:
         self.watch = Watch(["joint_1", "joint_2", "joint_3"], ["can0", "can0", "can1"], PERIOD_S)
         self.lifecycle: LifecycleState = lifecycle
         self.state = ModuleState.DISARMED
+        self.isolated: set[int] = set()
         self.ticks(3)
 
     def tick(
@@ -42,7 +43,8 @@ class Bench:
         answer(self.reading, EVERYBODY if speak is None else (1, 3), state=self.state)
         if speak is not None:
             speak(self.reading)
-        return self.watch.look(self.reading, self.lifecycle, troubles or (), [unsent] if unsent else [])
+        unsent_on = [unsent] if unsent else []
+        return self.watch.look(self.reading, self.lifecycle, troubles or (), unsent_on, isolated=self.isolated)
 
     def ticks(self, count: int, speak: Speak | None = None) -> list[Finding]:
         return [found for _ in range(count) for found in self.tick(speak)]
@@ -101,7 +103,7 @@ each_wrong = pytest.mark.parametrize(("speak", "after", "what", "cause"), WRONGS
 def test_it_is_named_in_time_with_joint_and_cause(speak: Speak, after: int, what: str, cause: str) -> None:
     bench = Bench()
     assert bench.ticks(after - 1, speak) == [], "a glitch is nothing to stop for"
-    assert bench.tick(speak) == [Finding(what, WHO + cause, 1)]
+    assert bench.tick(speak) == [Finding(what, WHO + cause, 1, alone=what not in CONCERNS_ALL)]
 
 
 @each_wrong
@@ -240,6 +242,26 @@ def test_a_modules_fault_is_told_with_all_reasons() -> None:
     assert bench.ticks(9, faulty) == [Finding("module_overheat", WHO + reason, 1)]
 
 
+def test_of_a_joint_that_is_set_aside_only_what_concerns_all_is_told() -> None:
+    bench = Bench()
+    bench.isolated = {1}
+    assert bench.ticks(9, lambda reading: answer(reading, [2], state=ModuleState.FAULT)) == []
+    (found,) = bench.ticks(9, faulty)  # it leaks, too
+    assert found.what == "module_overheat" and found.joint == 1 and not found.alone
+
+
+def test_water_after_heat_is_told_again() -> None:
+    def hot(reading: Reading) -> None:
+        answer(reading, [2], state=ModuleState.FAULT)
+        reading.take(heartbeat(2, 1.0, ModuleState.FAULT, last_stop=LastStop.OVERHEAT, fault_overheat=1))
+
+    bench = Bench()
+    (found,) = bench.ticks(9, hot)
+    assert found.alone
+    (found,) = bench.ticks(9, faulty)
+    assert not found.alone and "overheat, leak" in found.cause
+
+
 def test_a_fault_whose_heartbeat_is_lost_is_told_by_its_state() -> None:
     bench = Bench()
     found = bench.ticks(9, lambda reading: answer(reading, [2], state=ModuleState.FAULT))
@@ -275,7 +297,7 @@ def test_a_module_that_does_not_arm_is_told_after_its_grace() -> None:
     first = next(i for i, told in enumerate(found) if told)
     assert ARM_GRACE < first <= ARM_GRACE + 3
     assert [f for told in found for f in told] == [
-        Finding("module_not_armed", WHO + "does not arm: it is disarmed", 1),
+        Finding("module_not_armed", WHO + "does not arm: it is disarmed", 1, alone=True),
     ]
 
 
@@ -294,7 +316,7 @@ def test_who_was_armed_and_says_that_it_is_not_is_told_at_once() -> None:
     bench.lifecycle, bench.state = "armed", ModuleState.ARMED
     assert bench.ticks(20) == []
     found = bench.tick(lambda reading: answer(reading, [2], state=ModuleState.DISARMED))
-    assert found == [Finding("module_not_armed", WHO + "is not armed any more: it is disarmed", 1)]
+    assert found == [Finding("module_not_armed", WHO + "is not armed any more: it is disarmed", 1, alone=True)]
 
 
 def test_the_grace_begins_with_every_arming() -> None:

@@ -42,6 +42,8 @@ PER_TEST = 200
 STEPS = 50
 KEPT = 4  # commands: fewer than in earnest, so that a few are a flood
 JOINTS = 3
+ALL = list(range(JOINTS))
+WORDS = ("overheated", "leak", "undervoltage")  # in the order in which they are told of a joint
 PERIOD_S = PERIOD_NS * 1e-9
 ANGLE, SPEED, ACCELERATION, TORQUE, TORQUE_RATE, FAR = 1.5, 5.0, 100.0, 4.0, 80.0, 0.3  # of the test robot
 STIFFNESS, DAMPING, VELOCITY_GAIN = 40.0, 1.0, 1.0
@@ -128,7 +130,8 @@ class Everything(RuleBasedStateMachine):
         self.counting: JointCommand | None = None  # of those, what the last tick was decided by
         self.last_sequence = -1
         self.measured: tuple[list[float], list[float], list[float]] = ([0.0] * JOINTS, [0.0] * JOINTS, [0.0] * JOINTS)
-        self.known = False  # the joint state is fresh and valid
+        self.doubt: set[int] | None = set(ALL)  # joints whose newest state is not believed; None: whatever their number
+        self.aside: set[int] = set()  # joints that have failed
         self.offered = 0
         self.rejected = 0
         self.faults = 0  # kept since the last clear
@@ -149,10 +152,12 @@ class Everything(RuleBasedStateMachine):
         action=st.sampled_from(["passive", "damp", "hold"]),
         first_epoch=st.sampled_from([0, 1_800_000_000_000]),
         lag=st.sampled_from([None, None, 0, 1, 2]),
+        may_lose=st.sampled_from([0, 0, 1, 2]),
         at_once=often(True, False),
     )
-    def begin(self, action: str, first_epoch: int, lag: int | None, at_once: bool) -> None:
-        self.robot = description(safety__action=action)
+    def begin(self, action: str, first_epoch: int, lag: int | None, may_lose: int, at_once: bool) -> None:
+        self.robot = description(safety__action=action, safety__may_lose_joints=may_lose)
+        self.may_lose = may_lose
         self.action = action
         self.lag = lag  # in lockstep; None: the newest command counts
         kept, under_test.COMMANDS_KEPT = under_test.COMMANDS_KEPT, KEPT
@@ -240,6 +245,25 @@ class Everything(RuleBasedStateMachine):
         self.drop_lease()
         self.faults = min(self.faults + 1, under_test.MAX_FAULTS_KEPT)
 
+    def lose(self, joints: set[int]) -> bool:
+        """Whether the robot goes on without these joints, too."""
+        if joints <= self.aside:
+            return True
+        if self.state != "armed" or len(self.aside | joints) > self.may_lose:
+            return False
+        self.aside |= joints
+        self.faults = min(self.faults + 1, under_test.MAX_FAULTS_KEPT)
+        return True
+
+    def lose_or_fail(self, joints: set[int] | None) -> None:
+        if joints is None or not self.lose(joints):
+            self.fail()
+
+    @property
+    def known(self) -> bool:
+        """The joint state is fresh and valid."""
+        return self.doubt == set()
+
     def check(self, answer: Answer, ok: bool) -> None:
         assert answer.ok == ok and (answer.refusal is None) == ok, answer
         assert answer.reason and answer.epoch == self.epoch and answer.lifecycle == self.state
@@ -283,11 +307,11 @@ class Everything(RuleBasedStateMachine):
                 pass
         seen = state(self.robot, shown, velocity, torque, valid=valid, age_ns=age_ns, stamp_ns=self.stamp_ns)
         self.authority.observe(seen)
-        self.known = trouble is None
         if trouble in ("short", "no_valid", "no_age"):
+            self.doubt = None
             return
         measured = (list(self.measured[0]), list(self.measured[1]), list(self.measured[2]))
-        strange = False
+        unknown, strayed, stuck = set[int](), set[int](), set[int]()
         for i in range(JOINTS):
             taken_s = (self.stamp_ns - age_ns[i]) * 1e-9
             frozen = self.is_frozen(i, (shown[i], velocity[i], torque[i]), taken_s)
@@ -298,9 +322,13 @@ class Everything(RuleBasedStateMachine):
             if believed:
                 self.good[i] = angle[i], taken_s
                 measured[0][i], measured[1][i], measured[2][i] = angle[i], velocity[i], torque[i]
-            strange |= frozen or not believed
+            if i in self.aside:
+                continue
+            unknown |= {i} if not sound else set()
+            strayed |= {i} if sound and not believed else set()
+            stuck |= {i} if frozen else set()
         self.measured = measured
-        self.known = not strange
+        self.doubt = unknown or strayed or stuck
 
     @rule(
         celsius=per_joint(often(20.0, 80.0, 81.0, 104.9, 105.0, 300.0)),
@@ -340,8 +368,8 @@ class Everything(RuleBasedStateMachine):
         before, self.wrong = self.wrong, set()
         for i, health in enumerate(self.healths):
             self.wrong |= {(word, i) for word in health.wrong(self.now_ns)}
-        for _ in self.wrong - before:
-            self.fail()
+        for word, i in sorted(self.wrong - before, key=lambda found: (found[1], WORDS.index(found[0]))):
+            self.lose_or_fail({i} if word == "overheated" else None)
         quiet_before, self.silent = self.silent, set()
         for i, health in enumerate(self.healths):
             if health.heard_ns is not None and not health.known(self.now_ns):
@@ -458,12 +486,13 @@ class Everything(RuleBasedStateMachine):
     )
     def arm(self, robot: str | None, backend: str | None, config_hash: str | None) -> None:
         ready = self.state == "disarmed" and self.known and self.live and self.heard is not None
-        ready = ready and not self.wrong and (self.told or self.arming == 0)
+        wrong = self.wrong - {("overheated", i) for i in self.aside}
+        ready = ready and not wrong and (self.told or self.arming == 0)
         if ready and self.heard is not None:
             heard_ns, asked = self.heard
             ready = self.now_ns - heard_ns <= LEASE_NS and all(
-                mode == Mode.PASSIVE or (mode == Mode.POSITION and abs(target - angle) <= FAR)
-                for mode, target, angle in zip(asked.mode, asked.target, self.measured[0], strict=True)
+                i in self.aside or mode == Mode.PASSIVE or (mode == Mode.POSITION and abs(target - angle) <= FAR)
+                for i, mode, target, angle in zip(ALL, asked.mode, asked.target, self.measured[0], strict=True)
             )
         assert (not self.authority.against_arming(self.now_ns)) == ready
         told = {
@@ -494,6 +523,8 @@ class Everything(RuleBasedStateMachine):
             self.leave_for("disarmed")
         if ok and action == "clear":
             self.faults = 0
+            if self.aside:
+                self.aside, self.doubt = set(), None
         self.check(answer, ok)
 
     @rule(who=st.text(min_size=1, max_size=64))
@@ -503,10 +534,15 @@ class Everything(RuleBasedStateMachine):
         self.faults = min(self.faults + 1, under_test.MAX_FAULTS_KEPT)
         self.check(answer, True)
 
-    @rule(cause=st.sampled_from(["joint_2 is hot", "", "x" * 10_000]))
-    def backend_fault(self, cause: str) -> None:
-        self.authority.fault(Fault(tick=self.tick, what="hot", cause=cause))
-        self.fail()
+    @rule(
+        cause=st.sampled_from(["joint_2 is hot", "", "x" * 10_000]),
+        reach=st.sampled_from(["robot", "joint"]),
+        joint=st.none() | st.integers(0, JOINTS),
+    )
+    def backend_fault(self, cause: str, reach: Any, joint: int | None) -> None:
+        name = None if joint is None else f"joint_{joint + 1}"
+        self.authority.fault(Fault(tick=self.tick, what="hot", cause=cause, joint=name, reach=reach))
+        self.lose_or_fail({joint} if reach == "joint" and joint in ALL else None)
 
     @rule()
     def holder_gone(self) -> None:
@@ -572,7 +608,7 @@ class Everything(RuleBasedStateMachine):
         self.now_ns += late_ns
         self.tick += 1
         if self.state == "armed" and not self.known:
-            self.fail()
+            self.lose_or_fail(self.doubt)
         self.draw_conclusions()
         if self.holder is not None and not self.live:
             if self.state == "armed":
@@ -583,12 +619,13 @@ class Everything(RuleBasedStateMachine):
         up_to = None if self.lag is None else self.tick - self.lag
         limited = self.authority.limited.total()
         decision = self.authority.decide(up_to)
+        self.check_aside(decision)
         assert self.authority.limited.total() == limited + len(decision.limited)
         if self.state != "armed":
             self.told = True
             self.check_safe(decision)
         else:
-            assert self.live and self.known
+            assert self.live and self.doubt is not None and self.doubt <= self.aside
             for sent in self.since_arming[-KEPT:]:
                 self.counting = sent if up_to is None or sent.tick <= up_to else self.counting
             assert decision.sequence == (None if self.counting is None else self.counting.sequence)
@@ -598,27 +635,45 @@ class Everything(RuleBasedStateMachine):
                 self.check_commanded(decision, self.counting)
         self.last = decision
 
+    def check_aside(self, decision: Decision) -> None:
+        points = decision.set_points
+        assert points.isolated == self.aside and len(self.aside) <= self.may_lose
+        assert self.authority.isolated == [f"joint_{i + 1}" for i in sorted(self.aside)]
+        for i in self.aside:
+            assert (points.mode[i], points.target[i], points.torque_limit_nm[i]) == (Mode.PASSIVE, 0.0, 0.0)
+
+    def of_the_rest(self, values: list[Any]) -> list[Any]:
+        """What concerns the joints that are not set aside."""
+        return [value for i, value in enumerate(values) if i not in self.aside]
+
+    def torques(self) -> Any:
+        return pytest.approx(self.of_the_rest([TORQUE * share for share in self.shares]))
+
     def check_safe(self, decision: Decision) -> None:
         assert decision.sequence is None and not decision.limited
         action = self.action if self.state == "fault" and self.halt is not None else "passive"
-        assert decision.set_points.torque_limit_nm == pytest.approx([TORQUE * share for share in self.shares])
+        assert self.of_the_rest(decision.set_points.torque_limit_nm) == self.torques()
         if action == "hold":
-            assert set(decision.set_points.mode) == {Mode.POSITION}
+            assert set(self.of_the_rest(decision.set_points.mode)) <= {Mode.POSITION}
             held = [self.halt_for_a_period(i) for i in range(JOINTS)]
-            assert decision.set_points.target == pytest.approx(held)
+            assert self.of_the_rest(decision.set_points.target) == pytest.approx(self.of_the_rest(held))
             assert all(abs(target) <= ANGLE for target in decision.set_points.target)
             return
-        assert set(decision.set_points.mode) == {Mode.VELOCITY if action == "damp" else Mode.PASSIVE}
+        mode = Mode.VELOCITY if action == "damp" else Mode.PASSIVE
+        assert set(self.of_the_rest(decision.set_points.mode)) <= {mode}
         assert decision.set_points.target == [0.0] * JOINTS
 
     def check_held(self, decision: Decision, angle_rad: list[float]) -> None:
-        assert set(decision.set_points.mode) == {Mode.POSITION} and not decision.limited
-        assert decision.set_points.target == [within(angle, -ANGLE, ANGLE) for angle in angle_rad]
-        assert decision.set_points.torque_limit_nm == pytest.approx([TORQUE * share for share in self.shares])
+        assert set(self.of_the_rest(decision.set_points.mode)) <= {Mode.POSITION} and not decision.limited
+        held = [within(angle, -ANGLE, ANGLE) for angle in angle_rad]
+        assert self.of_the_rest(decision.set_points.target) == self.of_the_rest(held)
+        assert self.of_the_rest(decision.set_points.torque_limit_nm) == self.torques()
 
     def check_commanded(self, decision: Decision, sent: JointCommand) -> None:
-        assert decision.set_points.mode == sent.mode
-        for i in range(JOINTS):
+        for i in self.aside:
+            assert decision.limited.get(i) == (None if sent.mode[i] is Mode.PASSIVE else "isolated")
+        assert self.of_the_rest(decision.set_points.mode) == self.of_the_rest(sent.mode)
+        for i in self.of_the_rest(ALL):
             applied = decision.set_points.torque_limit_nm[i]
             before = TORQUE if self.last is None else self.last.set_points.torque_limit_nm[i]
             allowed = TORQUE if sent.torque_limit_nm is None else sent.torque_limit_nm[i]

@@ -1,5 +1,6 @@
 """The black box: keeps every tick, and its digest stands for what the motors were told."""
 
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import pytest
 from snakesim_hal import keys
 from snakesim_hal.authority import Decision
 from snakesim_hal.backend import Samples, SetPoints
-from snakesim_hal.blackbox import BlackBox
+from snakesim_hal.blackbox import BLOCK_ROWS, BlackBox
 from snakesim_hal.messages import Contact, Contacts, Mode, Pose
 from tests.unit.hal.rig import description, state
 
@@ -37,7 +38,8 @@ def contact(obstacle: str | None, force: tuple[float, float, float]) -> Contact:
 
 def test_columns_hold_what_was_recorded_however_long_the_run() -> None:
     box = BlackBox(ROBOT)
-    count = 9000  # past two enlargements
+    count = 9000  # several blocks
+    assert count > 3 * BLOCK_ROWS
     for tick in range(count):
         others: dict[str, Any] = {}
         if tick == 2:
@@ -92,3 +94,27 @@ def test_a_box_of_a_run_that_never_armed_is_empty(tmp_path: Path) -> None:
     box = BlackBox(ROBOT)
     box.save(tmp_path / "box.npz")
     assert box.ticks == 0 and box.arrays()["angle_rad"].shape == (0, 3)
+
+
+@pytest.mark.parametrize("count", [0, 1, BLOCK_ROWS, BLOCK_ROWS + 1])
+def test_a_block_more_or_less_makes_no_difference(count: int) -> None:
+    box = BlackBox(ROBOT)
+    for tick in range(count):
+        box.record(tick, tick, Samples(state(ROBOT, 0.001 * tick)), decision())
+    columns = box.arrays()
+    assert columns["angle_rad"][:, 1].tolist() == pytest.approx([0.001 * tick for tick in range(count)])
+    assert columns["mode"].shape == (count, 3)
+
+
+def test_no_tick_pays_for_those_before_it() -> None:
+    """A row costs the same after an hour, also the one that needs new space: what is there is never copied."""
+    robot = description(chain__modules=100)
+    box, row = BlackBox(robot), Samples(state(robot, 0.1))
+    told = Decision(SetPoints([Mode.POSITION] * 100, [0.1] * 100, [4.0] * 100), 1, {})
+    allocated: list[int] = []
+    for tick in range(4 * BLOCK_ROWS + 1):
+        tracemalloc.start()
+        box.record(tick, tick, row, told)
+        allocated.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert max(allocated[BLOCK_ROWS + 1 :]) <= 1.01 * max(allocated[: BLOCK_ROWS + 1])

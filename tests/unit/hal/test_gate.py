@@ -500,7 +500,8 @@ def test_a_changed_target_is_named_by_its_limit(mode: Mode, wanted: float, word:
 
 def test_set_points_for_the_backend_are_plain_python() -> None:
     applied = applied_for(command(ROBOT, 0.01))
-    points = as_set_points(applied)
+    points = as_set_points(applied, frozenset({1}))
+    assert points.isolated == {1}
     assert points.mode == [Mode.POSITION] * JOINTS and all(type(m) is Mode for m in points.mode)
     assert all(type(value) is float for value in points.target + points.torque_limit_nm)
 

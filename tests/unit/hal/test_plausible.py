@@ -2,12 +2,13 @@
 
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
 from snakesim_hal.gate import FRESH_PERIODS, Applied, JointLimits
 from snakesim_hal.messages import Fault, Mode
-from snakesim_hal.plausible import JointWatch
+from snakesim_hal.plausible import JointWatch, Mask, readable
 from tests.unit.hal.rig import LEASE_NS, PERIOD_NS, description, state
 
 ROBOT = description()
@@ -15,6 +16,7 @@ LIMITS = JointLimits.of(ROBOT)
 JOINTS = len(ROBOT.joints)
 REACH = 0.05 + 2 * 5.0 * 0.01  # rad in a period
 WORD = "state_invalid"
+NOBODY: Mask = np.zeros(JOINTS, dtype=np.bool_)
 
 
 def told(target: Any = 0.0, mode: Mode = Mode.POSITION, torque_limit: float = 4.0) -> Applied:
@@ -36,11 +38,14 @@ class Bench:
         applied: Applied | None = None,
         periods: float = 1,
         late_ns: int = 0,
+        aside: Mask = NOBODY,
         **other: Any,
     ) -> Fault | None:
         self.stamp_ns += round(periods * PERIOD_NS)
         seen = state(ROBOT, angle, *values, stamp_ns=self.stamp_ns, tick=7, **other)
-        return self.watch.take(seen, now_ns=self.stamp_ns + late_ns, applied=applied)
+        doubt = self.watch.take(seen, now_ns=self.stamp_ns + late_ns, applied=applied, aside=aside)
+        self.doubted = [] if doubt is None else np.flatnonzero(doubt.joints).tolist()
+        return None if doubt is None else doubt.fault
 
     @property
     def angles(self) -> list[float]:
@@ -147,9 +152,43 @@ def test_what_is_not_known_changes_nothing_else(bad: dict[str, Any]) -> None:
 def test_a_long_story_fits_into_a_message() -> None:
     robot = description(chain__modules=100)
     watch = JointWatch(JointLimits.of(robot))
-    watch.take(state(robot), now_ns=0, applied=None)
-    fault = watch.take(state(robot, 1.0), now_ns=0, applied=None)
-    assert fault is not None and len(fault.cause) == 400
+    nobody = np.zeros(100, dtype=np.bool_)
+    watch.take(state(robot), now_ns=0, applied=None, aside=nobody)
+    doubt = watch.take(state(robot, 1.0), now_ns=0, applied=None, aside=nobody)
+    assert doubt is not None and len(doubt.fault.cause) == 400 and doubt.joints.all()
+
+
+@pytest.mark.parametrize("at", [1, 2])
+def test_who_is_set_aside_is_not_looked_at(at: int) -> None:
+    bench, aside = Bench(), NOBODY.copy()
+    aside[1] = True
+    valid = [i != at for i in range(JOINTS)]
+    found = bench.see(valid=valid, aside=aside)
+    assert (found is None) == (at == 1) and bench.doubted == [2] * (at == 2)
+    jumped = [0.0, 0.0, 0.0]
+    jumped[at] = 1.0
+    assert (bench.see(jumped, aside=aside) is None) == (at == 1) and bench.doubted == [2] * (at == 2)
+
+
+def test_what_is_wrong_concerns_joints_and_a_state_of_no_joints_the_robot() -> None:
+    bench = Bench()
+    fault = bench.see(valid=[True, False, False])
+    assert fault is not None and fault.reach == "joint" and bench.doubted == [1, 2]
+    fault = bench.see(valid=[])
+    assert fault is not None and fault.reach == "robot" and bench.doubted == [0, 1, 2]
+
+
+@pytest.mark.parametrize("column", ["angle_rad", "velocity_rad_s", "torque_nm"])
+def test_what_is_published_has_numbers_only(column: str) -> None:
+    bench = Bench(angle=0.1)
+    sound = state(ROBOT, 0.12, 0.2, 0.3)
+    assert readable(sound, bench.watch.measured) is sound
+    spoilt = msgspec.structs.replace(sound, **{column: [0.5, float("nan"), 0.7]})
+    told = readable(spoilt, bench.watch.measured)
+    assert told.valid == [True, False, True]
+    assert told.angle_rad[1] == 0.1 and told.velocity_rad_s[1] == told.torque_nm[1] == 0.0
+    assert getattr(told, column)[::2] == [0.5, 0.7] and told.age_ns == sound.age_ns
+    assert [told.angle_rad[0], told.velocity_rad_s[2], told.torque_nm[2]] != [0.1, 0.0, 0.0]
 
 
 # --- stuck sensors ---------------------------------------------------------------------------------------------

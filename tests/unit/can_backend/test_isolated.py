@@ -1,0 +1,140 @@
+"""A robot that may lose a joint, through the driver: the module that fails is switched off, and the others go on.
+
+Driver, twins and the HAL's authority are the real ones, stepped.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from snakesim_can_backend.backend import CanBackend
+from snakesim_can_backend.protocol import ModuleState
+from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.watch import CONCERNS_ALL
+from snakesim_hal.conformance.rig import Rig
+from snakesim_hal.injection import parse
+from snakesim_hal.messages import LifecycleRequest, Mode
+from tests.unit.can_backend.loop import JOINTS, config
+from tests.unit.can_backend.test_faults_seen import MODULE_FAULTS
+
+FAILS = 2  # joint_3
+OTHERS = [i for i in range(JOINTS) if i != FAILS]
+DEADLINE = 5  # periods: 50 ms
+
+
+class Lame(Rig):
+    """What the contract's tests drive, and what there is to see of its modules."""
+
+    @property
+    def can(self) -> CanBackend:
+        assert isinstance(self.backend, CanBackend)
+        return self.backend
+
+    def states(self) -> list[ModuleState]:
+        return [module.state for module in self.can._reading.modules]
+
+    def inject(self, text: str, *, begins: bool = True) -> None:
+        assert self.can.inject(parse(f"{text}@0"), begins=begins)
+
+    def wave(self, periods: int) -> None:
+        """The others turn at a steady speed, and back."""
+        for _ in range(periods):
+            there = 0.5 if self.tick // 50 % 2 else -0.5
+            self.drive(dict.fromkeys(OTHERS, (Mode.VELOCITY, there)))
+
+    def turning(self) -> list[bool]:
+        return [abs(self.now.velocity_rad_s[i]) > 0.2 for i in OTHERS]
+
+
+@contextmanager
+def lame_robot(may_lose: int = 1) -> Iterator[Lame]:
+    run = config(robot__safety__may_lose_joints=may_lose)
+    backend = CanBackend(run, Settings(plant="inertia"))
+    try:
+        yield Lame(backend, "lockstep", run.period_ns)
+    finally:
+        backend.close()
+
+
+@pytest.mark.parametrize(("kind", "what", "within"), MODULE_FAULTS, ids=[row[0] for row in MODULE_FAULTS])
+def test_a_module_that_fails_stops_alone_if_it_can(kind: str, what: str, within: int) -> None:
+    with lame_robot() as robot:
+        robot.arm()
+        robot.wave(30)
+        assert robot.states() == [ModuleState.ARMED] * JOINTS and all(robot.turning())
+        robot.inject(f"{kind}:joint_{FAILS + 1}")
+        robot.wave(within + 1)
+        if what in CONCERNS_ALL:
+            assert robot.authority.state == "fault" and robot.authority.isolated == []
+            return
+        assert robot.authority.isolated == [f"joint_{FAILS + 1}"], robot.authority.why
+        robot.wave(30)
+        robot.must_be_armed()
+        assert all(robot.turning()) and {fault.joint for fault in robot.faults} == {f"joint_{FAILS + 1}"}
+        assert [robot.states()[i] for i in OTHERS] == [ModuleState.ARMED] * (JOINTS - 1)
+
+
+@pytest.mark.parametrize("kind", ["mute", "freeze", "reboot", "counter", "checksum"])
+def test_the_joint_is_taken_back_by_a_clear(kind: str) -> None:
+    with lame_robot() as robot:
+        robot.arm()
+        robot.wave(30)
+        robot.inject(f"{kind}:joint_{FAILS + 1}")
+        robot.wave(30)
+        assert robot.authority.isolated == [f"joint_{FAILS + 1}"], robot.authority.why
+        robot.inject(f"{kind}:joint_{FAILS + 1}", begins=False)
+        robot.wave(40)
+        robot.must_be_armed()
+        assert robot.states()[FAILS] != ModuleState.ARMED, "its motor is on"
+        told = len(robot.faults)
+        robot.disarm()
+        robot.idle(5)
+        assert robot.authority.on_lifecycle(LifecycleRequest(action="clear"), 0).ok
+        robot.idle(20)
+        robot.arm()
+        robot.wave(30)
+        robot.must_be_armed()
+        assert robot.states() == [ModuleState.ARMED] * JOINTS and robot.authority.isolated == []
+        assert len(robot.faults) == told, robot.faults[told:]
+
+
+def test_it_may_be_armed_again_without_the_joint() -> None:
+    with lame_robot() as robot:
+        robot.arm()
+        robot.wave(30)
+        robot.inject(f"reboot:joint_{FAILS + 1}")
+        robot.wave(60)
+        robot.disarm()
+        robot.idle(10)
+        robot.arm()
+        robot.wave(30)
+        robot.must_be_armed()
+        assert all(robot.turning()) and robot.states()[FAILS] == ModuleState.DISARMED
+        assert [robot.states()[i] for i in OTHERS] == [ModuleState.ARMED] * (JOINTS - 1)
+
+
+def test_one_joint_too_many_stops_all() -> None:
+    with lame_robot() as robot:
+        robot.arm()
+        robot.wave(30)
+        robot.inject(f"mute:joint_{FAILS + 1}")
+        robot.wave(30)
+        robot.must_be_armed()
+        robot.inject("mute:joint_1")
+        robot.wave(DEADLINE)
+        assert robot.authority.state == "fault"
+        robot.idle(30)
+        assert robot.states()[1] == robot.states()[3] == ModuleState.DISARMED
+
+
+def test_what_the_host_alone_finds_switches_the_module_off_too() -> None:
+    """A joint that is too hot for the HAL is healthy for its module."""
+    with lame_robot() as robot:
+        robot.arm()
+        robot.wave(10)
+        joints = robot.authority._isolation.mask(f"joint_{FAILS + 1}")
+        assert robot.authority._isolation.add(joints)
+        robot.wave(10)
+        robot.must_be_armed()
+        assert robot.states()[FAILS] != ModuleState.ARMED and all(robot.turning())

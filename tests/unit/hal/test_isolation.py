@@ -1,0 +1,177 @@
+"""One joint fails: what the robot file says then, case by case."""
+
+from typing import Any
+
+import pytest
+
+from snakesim_hal.messages import Fault, Mode
+from tests.unit.hal.test_authority import CLEAR, DISARM, ESTOP, JOINTS, Rig, armed, hear
+
+SAYS_NO = [True, False, True]  # joint_2 has no valid state
+
+
+def lame(**robot: Any) -> Rig:
+    """An armed robot that has lost joint_2."""
+    rig = armed(safety__may_lose_joints=1, **robot)
+    rig.observe(0.1, valid=SAYS_NO)
+    rig.send(0.1)
+    rig.pass_tick()
+    assert rig.authority.state == "armed" and rig.authority.isolated == ["joint_2"]
+    return rig
+
+
+def broken(joint: str | None = "joint_2", reach: Any = "joint") -> Fault:
+    return Fault(tick=3, what="module_frozen", cause=f"{joint} repeats itself", joint=joint, reach=reach)
+
+
+def test_by_default_one_joint_stops_the_robot() -> None:
+    rig = armed()
+    rig.observe(0.1, valid=SAYS_NO)
+    rig.pass_tick()
+    assert rig.authority.state == "fault" and rig.authority.isolated == []
+    (fault,) = rig.authority.faults
+    assert fault.joint == "joint_2" and fault.reach == "robot"
+
+
+def test_a_joint_that_fails_is_passive_and_the_others_go_on() -> None:
+    rig = lame()
+    (fault,) = rig.authority.faults
+    assert (fault.what, fault.joint, fault.reach) == ("state_invalid", "joint_2", "joint")
+    assert rig.authority.why == "armed, without joint_2: no valid and fresh state of joint_2"
+    for _ in range(20):
+        rig.observe(0.1, valid=SAYS_NO)
+        assert rig.send(0.12, torque_limit_nm=[3.0] * JOINTS) is None
+        decision = rig.pass_tick()
+        points = decision.set_points
+        assert points.mode == [Mode.POSITION, Mode.PASSIVE, Mode.POSITION]
+        assert points.target == [0.12, 0.0, 0.12] and points.torque_limit_nm == [3.0, 0.0, 3.0]
+        assert points.isolated == {1} and decision.limited == {1: "isolated"}
+    assert rig.authority.state == "armed" and len(rig.authority.faults) == 1
+    assert rig.authority.limited["isolated"] == 21
+
+
+def test_nothing_is_limited_where_nothing_is_asked() -> None:
+    rig = lame()
+    rig.send([0.1, 0.0, 0.1], [Mode.POSITION, Mode.PASSIVE, Mode.POSITION])
+    assert rig.pass_tick().limited == {}
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_one_joint_too_many_stops_the_robot(known: bool) -> None:
+    rig = lame()
+    if known:
+        rig.authority.fault(broken("joint_3"))
+    else:
+        rig.observe(0.1, valid=[True, False, False])
+        rig.pass_tick()
+    assert rig.authority.state == "fault"
+    assert [(fault.joint, fault.reach) for fault in rig.authority.faults] == [
+        ("joint_2", "joint"),
+        ("joint_3", "robot"),
+    ]
+
+
+def test_two_that_fail_at_once_are_two() -> None:
+    rig = armed(safety__may_lose_joints=1)
+    rig.observe(0.1, valid=[True, False, False])
+    rig.pass_tick()
+    assert rig.authority.state == "fault" and rig.authority.isolated == []
+    rig = armed(safety__may_lose_joints=2)
+    rig.observe(0.1, valid=[True, False, False])
+    rig.pass_tick()
+    assert rig.authority.state == "armed" and rig.authority.isolated == ["joint_2", "joint_3"]
+
+
+@pytest.mark.parametrize(
+    "fault", [broken(reach="robot"), broken(joint=None), broken(joint="joint_9")], ids=["robot", "nobody", "unknown"]
+)
+def test_what_concerns_more_than_a_joint_stops_the_robot(fault: Fault) -> None:
+    rig = armed(safety__may_lose_joints=3)
+    rig.authority.fault(fault)
+    assert rig.authority.state == "fault" and rig.authority.isolated == []
+
+
+def test_a_state_of_no_joints_at_all_stops_the_robot() -> None:
+    rig = armed(safety__may_lose_joints=3)
+    rig.observe(0.1, valid=[])
+    rig.pass_tick()
+    assert rig.authority.state == "fault"
+
+
+def test_what_a_lost_joint_complains_of_is_no_news() -> None:
+    rig = lame()
+    rig.authority.fault(broken())
+    rig.authority.on_lifecycle(DISARM, rig.now_ns)
+    rig.authority.fault(broken())
+    assert rig.authority.state == "disarmed" and len(rig.authority.faults) == 1
+
+
+def test_while_disarmed_no_joint_is_set_aside() -> None:
+    rig = Rig(safety__may_lose_joints=1)
+    rig.observe(0.1, valid=SAYS_NO)
+    rig.acquire()
+    rig.send(0.1)
+    answer = rig.arm()
+    assert answer.refusal == "not_ready" and "joint_2" in answer.reason
+    rig.authority.fault(broken())
+    assert rig.authority.state == "fault" and rig.authority.isolated == []
+
+
+def test_it_may_be_armed_again_without_the_joint() -> None:
+    rig = lame()
+    rig.authority.on_lifecycle(DISARM, rig.now_ns)
+    rig.pass_tick()
+    rig.observe(0.1, valid=SAYS_NO)
+    rig.send([0.1, 1.4, 0.1])  # where nobody knows the joint to be
+    assert rig.arm().ok
+    rig.send(0.1)
+    assert rig.pass_tick().set_points.isolated == {1}
+
+
+def test_a_clear_takes_the_joint_back_once_it_is_heard_of() -> None:
+    rig = lame()
+    assert rig.authority.on_lifecycle(CLEAR, rig.now_ns).refusal == "wrong_state"  # not while it moves
+    rig.authority.on_lifecycle(DISARM, rig.now_ns)
+    rig.pass_tick()
+    assert rig.authority.on_lifecycle(CLEAR, rig.now_ns).ok
+    assert rig.authority.isolated == [] and rig.authority.faults == []
+    rig.send(0.1)
+    assert "no joint state since the clear" in rig.arm().reason
+    rig.observe(0.1)
+    rig.send(0.1)
+    assert rig.arm().ok
+    rig.send(0.1)
+    assert rig.pass_tick().set_points.mode == [Mode.POSITION] * JOINTS
+
+
+@pytest.mark.parametrize("action", ["passive", "damp", "hold"])
+def test_no_safe_action_moves_a_lost_joint(action: str) -> None:
+    rig = lame(safety__action=action)
+    rig.pass_tick(6)
+    assert rig.authority.state == "fault"
+    points = rig.pass_tick().set_points
+    assert points.isolated == {1} and points.mode[1] is Mode.PASSIVE and points.torque_limit_nm[1] == 0.0
+    assert rig.authority.on_lifecycle(CLEAR, rig.now_ns).ok and rig.authority.isolated == []
+
+
+def test_an_emergency_stop_keeps_the_joint_aside_until_the_clear() -> None:
+    rig = lame()
+    rig.authority.on_estop(ESTOP, rig.tick)
+    assert rig.authority.isolated == ["joint_2"]
+    assert rig.authority.on_lifecycle(CLEAR, rig.now_ns).ok and rig.authority.isolated == []
+
+
+def test_a_joint_that_is_too_hot_is_set_aside_and_water_is_not() -> None:
+    rig = armed(safety__may_lose_joints=1)
+    hear(rig, [20.0, 110.0, 20.0])
+    rig.send(0.1)
+    assert rig.pass_tick().set_points.isolated == {1} and rig.authority.state == "armed"
+    rig.authority.on_lifecycle(DISARM, rig.now_ns)
+    rig.pass_tick()
+    rig.send(0.1)
+    assert rig.arm().ok  # it stays hot, and is not asked
+    hear(rig, [20.0, 110.0, 20.0], volts=12.0)
+    for _ in range(7):
+        rig.send(0.1)
+        rig.pass_tick()
+    assert rig.authority.state == "fault" and rig.authority.faults[-1].what == "undervoltage"
