@@ -233,7 +233,7 @@ class Authority:
         wrong, silent = self._derating.look(now_ns, tick)
         for fault in wrong:
             self.fault(fault)
-        if silent is not None:
+        if silent is not None and not self._is_aside(silent):
             self.note(silent)
         if self.lease.live(now_ns):
             return

@@ -41,6 +41,7 @@ class HostRecord(msgspec.Struct, frozen=True, kw_only=True):
     why: str
     ended: Ending = "complete"
     injected: list[str] = []  # faults on request, as they began and ended
+    isolated: list[str] = []  # joints that were set aside at the end
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -78,7 +79,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SnakesimError as error:
         print(f"snakesim host: {error}", file=sys.stderr)
         return 1
-    return 1 if host.authority.fault_log else 0
+    return 1 if any(fault.reach == "robot" for fault in host.authority.fault_log) else 0
 
 
 def backend_settings(config: RunConfig, factory: BackendFactory) -> Any:
@@ -107,6 +108,7 @@ def leave_record(host: Host, out: Path) -> None:
         why=host.authority.why,
         ended=host.ended,
         injected=host.faults.noted,
+        isolated=host.authority.isolated,
     )
     host.black_box.save(out / BLACK_BOX)
     (out / DESCRIPTION).write_bytes(msgspec.json.encode(host.description))

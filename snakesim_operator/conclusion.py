@@ -62,6 +62,8 @@ def _print_summary(summary: RunSummary) -> None:
     ]
     if summary.faults:
         rows.append(("faults", f"{len(summary.faults)}, the first: {summary.faults[0].cause}"))
+    if summary.isolated:
+        rows.append(("isolated", f"{', '.join(summary.isolated)}: failed, and passive since"))
     if summary.restarts:
         rows.append(("restarts", ", ".join(restart.name for restart in summary.restarts)))
     if summary.hosts > 1:

@@ -52,6 +52,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     rejected_commands: Annotated[dict[str, int], Meta(description="by reason")]
     limited_commands: Annotated[dict[str, int], Meta(description="joint set-points changed by the gate, by limit")]
     faults: list[Fault]
+    isolated: Annotated[list[str], Meta(description="joints that failed, and were passive at the end")] = []
     hosts: Annotated[int, Meta(description="how many HAL hosts the run had; all numbers here are of the last one")] = 1
     restarts: Annotated[list[Restart], Meta(description="processes that ended and were started again")] = []
     ended: Annotated[str, Meta(description="complete, interrupted, or what failed")]
@@ -103,6 +104,7 @@ def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), h
         rejected_commands=host.rejected_commands,
         limited_commands=host.limited_commands,
         faults=host.faults,
+        isolated=host.isolated,
         hosts=hosts,
         restarts=list(restarts),
         ended=ended,

@@ -1,10 +1,14 @@
 """Faults on request in runs of real processes: planned with a flag, asked for with the command, and refused."""
 
+import os
+import signal
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from snakesim_hal.host_process import HostRecord
+from snakesim_hal.messages import Mode
 from snakesim_operator.record import RunRecord
 from tests.e2e.command import Running, nothing_left, run_to_summary, running, snakesim, wait_until
 
@@ -80,6 +84,52 @@ def test_a_fault_is_asked_for_with_a_command(tmp_path: Path, backend: str) -> No
     assert "mute:joint_3@" in record.injected[0]
     said = (tmp_path / "run" / "guidance.log").read_text()
     assert "drop:guidance/world@" in said and "begins" in said
+    nothing_left(tmp_path / "run")
+
+
+MAY_LOSE_ONE = ("--set", "robot.safety.may_lose_joints=1")
+
+
+@pytest.mark.parametrize("backend", ["sim", "can"])
+def test_a_joint_that_may_be_lost_is_passive_and_the_run_goes_on(tmp_path: Path, backend: str) -> None:
+    flags = ["--backend", backend, *MAY_LOSE_ONE, "--fault", "mute:joint_5@1", "--duration", "3"]
+    ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
+    assert ended.code == 0 and summary.ended == "complete" and summary.duration_s == 3.0, ended.out
+    assert summary.isolated == ["joint_5"] and summary.faults[0].joint == "joint_5"
+    assert "isolated              joint_5: failed, and passive since" in ended.out
+    with np.load(tmp_path / "run" / "blackbox.npz") as box:
+        modes, limits = box["mode"], box["torque_limit_nm"]
+    before, after = slice(50, 95), slice(106, 300)
+    assert (modes[before, 4] == Mode.POSITION).all() and (modes[after, 4] == Mode.PASSIVE).all()
+    assert (limits[after, 4] == 0.0).all() and (np.delete(modes, 4, axis=1)[after] != Mode.PASSIVE).all()
+    nothing_left(tmp_path / "run")
+
+
+def test_an_operator_takes_back_a_joint_that_was_lost(tmp_path: Path) -> None:
+    def operator(*words: str):
+        return snakesim(*words, "--endpoint", run.endpoint, cwd=tmp_path)
+
+    def told(what: str) -> None:
+        wait_until(lambda: what in operator("status").out, f"{what!r} in the status")
+
+    arguments = ["triplet", "--controller", "hold", "--duration", "3600", "--stay", *MAY_LOSE_ONE]
+    with running(tmp_path / "run", *arguments) as run:
+        run.wait_for(" s  ")
+        assert ask(run, "mute", "joint_3", "--for", "1").code == 0
+        told("isolated: joint_3; passive until a clear")
+        assert "armed, without joint_3: no valid and fresh state of joint_3" in operator("status").out
+        refused = operator("clear")
+        assert refused.code == 1 and "nothing to clear in state armed" in refused.err + refused.out
+        assert operator("disarm").code == 0
+        told("or: `snakesim clear")
+        assert operator("arm", "planar13", "sim").code == 0
+        assert "isolated: joint_3" in operator("status").out
+        assert operator("disarm").code == 0 and operator("clear").code == 0
+        assert operator("arm", "planar13", "sim").code == 0
+        status = operator("status").out
+        assert "planar13: armed" in status and "isolated:" not in status, status
+        os.kill(run.process.pid, signal.SIGINT)
+        assert run.end() == 130
     nothing_left(tmp_path / "run")
 
 

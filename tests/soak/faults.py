@@ -128,6 +128,6 @@ def _follows(injection: Injection) -> tuple[Follows, tuple[str, ...]]:
             sure = kind in ("mute", "nan") and lasts_s >= LONG_FREEZE_S
             return ("stop" if sure else "perhaps"), (target, "control")
         case "bus":
-            return "perhaps", (target, "bus", "joint", "control", "can")
+            return "perhaps", (target, "virtual-", "joint", "control", "can")
         case _:
             return "perhaps", ("simulat", "diverge", "control", "joint")

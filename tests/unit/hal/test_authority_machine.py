@@ -374,7 +374,8 @@ class Everything(RuleBasedStateMachine):
         for i, health in enumerate(self.healths):
             if health.heard_ns is not None and not health.known(self.now_ns):
                 self.silent.add(i)
-        if self.silent - quiet_before:
+        fresh = self.silent - quiet_before
+        if fresh and not (len(fresh) == 1 and fresh <= self.aside):
             self.faults = min(self.faults + 1, under_test.MAX_FAULTS_KEPT)
         self.shares = [health.share(self.now_ns) for health in self.healths]
 
