@@ -29,7 +29,7 @@ class Derating:
         self._expected = any(sensor.key == keys.POWER for sensor in description.sensors)
         self._began_ns: int | None = None
         self._due_ns = -math.inf  # before that nothing changes unless a sample comes
-        self._told: set[tuple[str, str]] = set()
+        self._told: set[tuple[str, str | None]] = set()
         self._silent: set[str] = set()
         self.share: Floats = np.ones(len(self._healths))  # of its torque limit that each joint may use
         self.wrong: list[Fault] = []  # what is wrong now
@@ -62,8 +62,8 @@ class Derating:
             for health in self._healths
             for what, cause in health.troubles(now_ns)
         ]
-        before, self._told = self._told, {(fault.what, fault.joint or "") for fault in self.wrong}
-        fresh = [fault for fault in self.wrong if (fault.what, fault.joint or "") not in before]
+        before, self._told = self._told, {(fault.what, fault.joint) for fault in self.wrong}
+        fresh = [fault for fault in self.wrong if (fault.what, fault.joint) not in before]
         return fresh, self._newly_silent(now_ns, tick)
 
     def derated(self) -> dict[str, float]:

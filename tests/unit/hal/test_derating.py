@@ -55,6 +55,7 @@ class Bench:
 
 def test_nothing_is_derated_before_anything_is_known() -> None:
     bench = Bench()
+    assert bench.shares == [1.0] * JOINTS
     assert bench.look(0) == [] and bench.shares == [1.0] * JOINTS and bench.derating.derated() == {}
 
 
@@ -169,4 +170,21 @@ def test_one_silent_module_is_named() -> None:
     bench = Bench()
     bench.hear(valid=[True, False, False])
     bench.look(4 * S)
-    assert bench.notes[0].joint == "joint_1"
+    assert (bench.notes[0].joint, bench.notes[0].reach) == ("joint_1", "joint")
+
+
+def test_a_long_list_of_silent_modules_fits_into_a_message() -> None:
+    bench = Bench(expected=True, chain__modules=100)
+    bench.look(0)
+    bench.look(4 * S)
+    assert len(bench.notes[0].cause) == 400
+
+
+@pytest.mark.parametrize(
+    ("told", "reach"), [({"motor_c": 110.0}, "joint"), ({"leak": True}, "robot"), ({"voltage_v": 12.0}, "robot")]
+)
+def test_heat_concerns_a_joint_and_water_and_voltage_the_robot(told: dict[str, Any], reach: str) -> None:
+    bench = Bench()
+    bench.hear(**told)
+    bench.look(50 * MS)
+    assert [fault.reach for fault in bench.derating.wrong] == [reach] * JOINTS
