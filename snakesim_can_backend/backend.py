@@ -105,6 +105,7 @@ class CanBackend:
         self._set_points = commands.SetPointWriter(joints)
         self._lifecycle: LifecycleState = "disarmed"
         self._isolated: frozenset[int] = frozenset()  # joints that are set aside: motors off, and no set-points
+        self._owed: frozenset[int] = frozenset()  # joints that were just told to have failed, and nothing was stopped
         self._unsent: list[str] = []
         self._arming = Arming()
         self._answer_limit_s = LOCKSTEP_ANSWER_S if self._lockstep else _answer_time_s(self._buses, self._reports)
@@ -129,14 +130,15 @@ class CanBackend:
             self._remind(lifecycle)
         elif lifecycle == "armed":
             self._arming = Arming(self._reading.sync)
-        back = self._isolate(set_points.isolated)
-        if back or (self._lifecycle in commands.LATCHED and lifecycle not in commands.LATCHED):
-            self._cleared(back)  # before they are told to arm: parameters are written to motors that are off
-        for frame in commands.on_change(self._lifecycle, lifecycle):
+        told = commands.on_change(self._lifecycle, lifecycle)
+        for frame in told:
             if not commands.is_arming(frame):
-                self._broadcast(frame)
-            elif not self._unconfigured - self._isolated:
-                self._arm(frame)
+                self._broadcast(frame)  # what stops or ends goes first: what follows may take a while
+        back = self._isolate(set_points.isolated)
+        if lifecycle not in commands.LATCHED and (back or self._lifecycle in commands.LATCHED):
+            self._cleared(back)  # before they are told to arm: parameters are written to motors that are off
+        if any(map(commands.is_arming, told)) and not self._unconfigured - self._isolated:
+            self._arm()
         self._lifecycle = lifecycle
         if lifecycle != "armed":
             return
@@ -164,8 +166,11 @@ class CanBackend:
         found = self._watch.look(
             self._reading, self._lifecycle, troubles, self._unsent, self._unconfigured, self._isolated
         )
-        may_go_on = self._description.may_lose_joints > 0 and all(finding.alone for finding in found)
-        if found and not may_go_on and self._lifecycle not in commands.LATCHED:
+        failed = frozenset(finding.joint for finding in found if finding.joint is not None)
+        few = len(self._isolated | failed) <= self._description.may_lose_joints
+        if self._lifecycle == "armed" and few and all(finding.alone for finding in found):
+            self._owed |= failed  # the HAL sets them aside
+        elif found and self._lifecycle not in commands.LATCHED:
             # Stopped here and now. From now on only a clear leads out, also one that comes before the next period.
             for frame in commands.on_change(self._lifecycle, "fault"):
                 self._broadcast(frame)
@@ -354,25 +359,31 @@ class CanBackend:
         arming = self._arming
         in_time = self._reading.sync - arming.sync <= ARM_GRACE and not self._unconfigured - self._isolated
         for i, module in enumerate(self._reading.modules):
-            wanted = "fault" if lifecycle == "armed" and i in self._isolated else lifecycle
-            if wanted == "armed" and module.state == ModuleState.ARMED:
+            if lifecycle == "armed" and i in self._isolated:
+                if module.state in (ModuleState.ARMED, ModuleState.STOPPING):
+                    self._wire_of[i].send(commands.command(Action.DISARM, module.node))
+                continue
+            if lifecycle == "armed" and module.state == ModuleState.ARMED:
                 arming.done.add(i)
-            frame = commands.reminder(wanted, module.state, module.node)
-            if frame is not None and (wanted != "armed" or (in_time and i not in arming.done)):
+            frame = commands.reminder(lifecycle, module.state, module.node)
+            if frame is not None and (lifecycle != "armed" or (in_time and i not in arming.done)):
                 self._wire_of[i].send(frame)
 
     def _isolate(self, isolated: frozenset[int]) -> frozenset[int]:
-        """Stop the modules that are newly set aside; returns the joints that count again."""
-        fresh, back = isolated - self._isolated, self._isolated - isolated
-        self._isolated = isolated
+        """Switch off the modules that are newly set aside; returns the joints that count again.
+
+        Those are also joints that were told to have failed, if somebody has cleared that before it was seen here.
+        """
+        fresh, back = isolated - self._isolated, (self._isolated | self._owed) - isolated
+        self._isolated, self._owed = isolated, frozenset()
         for i in sorted(fresh):
-            self._wire_of[i].send(commands.command(Action.STOP, i + 1))
+            self._wire_of[i].send(commands.command(Action.DISARM, i + 1))
         return back
 
-    def _arm(self, to_all: Frame) -> None:
+    def _arm(self) -> None:
         """Tell the modules to arm, but not those that are set aside."""
         if not self._isolated:
-            self._broadcast(to_all)
+            self._broadcast(commands.command(Action.ARM))
             return
         for i, wire in enumerate(self._wire_of):
             if i not in self._isolated:
@@ -381,7 +392,7 @@ class CanBackend:
     def _cleared(self, back: frozenset[int]) -> None:
         """Somebody cleared the fault. Modules that may have other parameters get their own again, in a moment or never.
 
-        What is not configured then is told as a fault, and nothing is armed. back: joints that were set aside.
+        What is not configured then is told as a fault, and nothing is armed. back: joints that count again.
         """
         self._watch.forget(self._reading.sync)
         for i in sorted(back):

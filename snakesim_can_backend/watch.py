@@ -20,8 +20,11 @@ STRANGER_FRAMES = 3  # of a node that should not be there, in ticks one after th
 MOST_FRAMES = 16  # of one module in a tick; a healthy one sends 8 at most
 
 # Of one module, and yet nothing that the others could go on beside: two modules with one id, a bus that is full, water,
-# a supply that all share, an emergency.
-CONCERNS_ALL = {"duplicate_node", "module_babbling", "module_leak", "module_voltage", "module_emergency"}
+# a supply that all share, an emergency; nor does a robot set out that is not whole.
+NEVER_ARMED = "module_never_armed"
+CONCERNS_ALL = {
+    "duplicate_node", "module_babbling", "module_leak", "module_voltage", "module_emergency", NEVER_ARMED
+}  # fmt: skip
 
 BUS_FAULTS = {
     "bus_off": "the controller has left the bus after too many errors: look for a short, a wrong bit rate, a missing "
@@ -98,9 +101,10 @@ class Watch:
         self._unasked |= dict.fromkeys(unsent := set(unsent), reading.sync)
         found = [*self._of_bus(troubles, unsent), *self._of_strangers(reading)]
         for i, module in enumerate(reading.modules):
-            found += self._of_module(i, module, reading, lifecycle)
+            found += self._of_answers(i, module, reading)
+            found += self._of_state(i, module, reading, lifecycle, aside=i in isolated)
         if lifecycle == "armed":
-            found += [self._bare(i) for i in unconfigured]
+            found += [self._bare(i) for i in unconfigured if i not in isolated]
         found = [finding for finding in found if not (finding.alone and finding.joint in isolated)]
         fresh = [finding for finding in found if finding.subject not in self._told]
         self._told.update(finding.subject for finding in fresh)
@@ -113,15 +117,18 @@ class Watch:
 
     # --- one module -------------------------------------------------------------------------------------------
 
-    def _of_module(self, i: int, module: Module, reading: Reading, lifecycle: LifecycleState) -> list[Finding]:
+    def _finding(self, i: int, module: Module, what: str, cause: str, *also: str) -> Finding:
+        """also: what else would have been reason enough."""
         who = f"{self._names[i]} (node {module.node} on {self._channels[i]})"
+        return Finding(what, f"{who} {cause}", i, alone=CONCERNS_ALL.isdisjoint((what, *also)))
+
+    def _of_answers(self, i: int, module: Module, reading: Reading) -> list[Finding]:
+        """What is wrong with its frames, or that there are none."""
         found: list[Finding] = []
 
-        def tell(what: str, cause: str, *also: str) -> None:
-            """also: what else would have been reason enough."""
-            found.append(Finding(what, f"{who} {cause}", i, alone=CONCERNS_ALL.isdisjoint((what, *also))))
+        def tell(what: str, cause: str) -> None:
+            found.append(self._finding(i, module, what, cause))
 
-        missed = reading.sync - module.sync
         if self._has_restarted(i, module, reading):
             self._restarted.add(i)
             self._changed.add(i)
@@ -141,22 +148,31 @@ class Watch:
             tell("duplicate_node", "is there twice: every Sync is answered two times; give each module its own node id")
         if module.frames > MOST_FRAMES:
             tell("module_babbling", f"floods the bus: {module.frames} frames within one period")
-        unanswered = missed - module.corrupt - max(module.repeats, module.wrong_counts)
+        unanswered = reading.sync - module.sync - module.corrupt - max(module.repeats, module.wrong_counts)
         unanswered = min(unanswered, reading.sync - self._unasked.get(self._channels[i], -1))
         if unanswered >= SILENT_AFTER and not found:
             tell(
                 "module_silent",
                 f"is silent: no state for {unanswered * self._period_s * 1000:.0f} ms{_alive(module, reading)}",
             )
+        return found
+
+    def _of_state(
+        self, i: int, module: Module, reading: Reading, lifecycle: LifecycleState, *, aside: bool
+    ) -> list[Finding]:
+        """What it says that is wrong with it, or that it does not follow."""
+        state = module.state.name.lower()
         as_told = lifecycle == "estop" and module.state == ModuleState.EMERGENCY
         if module.needs_clearing and not as_told and reading.sync >= self._quiet_until:
-            words = module.fault_names() or [module.state.name.lower()]
-            kinds = [f"module_{word}" for word in words]
-            tell(kinds[0], f"reports {', '.join(words)}; it stopped because of {module.last_stop.name.lower()}", *kinds)
-        elif self._refuses_to_arm(i, module, reading, missed):
-            how = "is not armed any more" if i in self._was_armed else "does not arm"
-            tell("module_not_armed", f"{how}: it is {module.state.name.lower()}")
-        return found
+            faults = module.fault_names()
+            kinds = [f"module_{word}" for word in (*faults, state)]
+            why = f"it stopped because of {module.last_stop.name.lower()}"
+            return [self._finding(i, module, kinds[0], f"reports {', '.join(faults) or state}; {why}", *kinds)]
+        if aside or not self._refuses_to_arm(i, module, reading):
+            return []
+        if i in self._was_armed:
+            return [self._finding(i, module, "module_not_armed", f"is not armed any more: it is {state}")]
+        return [self._finding(i, module, "module_not_armed", f"does not arm: it is {state}", NEVER_ARMED)]
 
     def _has_restarted(self, i: int, module: Module, reading: Reading) -> bool:
         """A second module with the same id lets the uptime go back too, and then every Sync is answered twice."""
@@ -168,13 +184,18 @@ class Watch:
         del self._restart_at[i]
         return True
 
-    def _refuses_to_arm(self, i: int, module: Module, reading: Reading, missed: int) -> bool:
+    def _refuses_to_arm(self, i: int, module: Module, reading: Reading) -> bool:
         if self._armed_sync is None:
             return False
         if module.state == ModuleState.ARMED:
             self._was_armed.add(i)
         late = reading.sync - self._armed_sync > ARM_GRACE or i in self._was_armed
-        apart = late and missed == 0 and module.state != ModuleState.ARMED and not module.answered_twice(reading.sync)
+        apart = (
+            late
+            and reading.sync == module.sync
+            and module.state != ModuleState.ARMED
+            and not module.answered_twice(reading.sync)
+        )
         self._unarmed[i] = self._unarmed[i] + 1 if apart else 0
         fell_back = i in self._was_armed and module.state in (ModuleState.BOOT, ModuleState.DISARMED)
         return self._unarmed[i] >= (1 if fell_back else IN_A_ROW)
@@ -183,7 +204,7 @@ class Watch:
         cause = (
             f"{self._names[i]} has not taken its parameters, and is not armed; clear, or switch its power off and on"
         )
-        return Finding("module_not_configured", cause, i, alone=True)
+        return Finding("module_not_configured", cause, i)
 
     # --- the bus ----------------------------------------------------------------------------------------------
 

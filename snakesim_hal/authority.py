@@ -173,7 +173,9 @@ class Authority:
                     return self._answer(f"cannot disarm in state {self.state}; clear it first", "wrong_state")
             case "clear":
                 if not self._go("clear", "cleared; arm to move again"):
-                    return self._answer(f"nothing to clear in state {self.state}", "wrong_state")
+                    lost = ", ".join(self.isolated)
+                    hint = f"; disarm first, then a clear takes back {lost}" if lost else ""
+                    return self._answer(f"nothing to clear in state {self.state}{hint}", "wrong_state")
                 self._take_back()
                 self.faults.clear()
             case _:  # finish
@@ -206,6 +208,9 @@ class Authority:
         """Keep a fault that people should know of but that stops nothing by itself."""
         fault = msgspec.structs.replace(fault, cause=fault.cause[:500])
         for kept in (self.faults, self.fault_log):
+            less = [i for i, other in enumerate(kept) if other.reach == "joint"]
+            if len(kept) == MAX_FAULTS_KEPT and less and fault.reach == "robot":  # why it stopped is never left out
+                del kept[less[-1]]
             if len(kept) < MAX_FAULTS_KEPT:
                 kept.append(fault)
 
@@ -233,7 +238,7 @@ class Authority:
         wrong, silent = self._derating.look(now_ns, tick)
         for fault in wrong:
             self.fault(fault)
-        if silent is not None and not self._is_aside(silent):
+        if silent is not None and not self._isolation.covers(self._isolation.mask(silent.joint)):
             self.note(silent)
         if self.lease.live(now_ns):
             return

@@ -80,7 +80,7 @@ class Derating:
             return None
         cause = f"supply and heat are unknown, and do not count, for {', '.join(fresh)}"[:LONGEST_CAUSE]
         joint = fresh[0] if len(fresh) == 1 else None
-        return Fault(tick=tick, what="power_unknown", cause=cause, joint=joint, reach="joint")
+        return Fault(tick=tick, what="power_unknown", cause=cause, joint=joint)
 
 
 @dataclass

@@ -163,9 +163,10 @@ def _what_to_type(namespace: str, status: Status, link: Link) -> list[str]:
     arm = f"`snakesim arm {status.robot} {status.backend}{where}`"
     if status.lifecycle in ("fault", "estop"):
         return [f"  next: `snakesim clear{where}`, then {arm}"]
-    back = f"  or: `snakesim clear{where}` first, to take back {', '.join(status.isolated)}"
-    told = [f"  next: {arm}"] if status.ready_to_arm else []
-    return [*told, back] if status.isolated and status.lifecycle == "disarmed" else told
+    if status.isolated and status.lifecycle == "disarmed":
+        back = f"`snakesim clear{where}`, to take back {', '.join(status.isolated)}"
+        return [f"  next: {back}", *([f"  or, without: {arm}"] if status.ready_to_arm else [])]
+    return [f"  next: {arm}"] if status.ready_to_arm else []
 
 
 def run_router(config: Path | None) -> int:

@@ -36,28 +36,30 @@ def verdict(record: RunRecord, summary: RunSummary) -> Verdict:
     if summary.ticks == 0 and len(record.time_s) == 0 and not summary.faults:
         return Verdict("bad", f"Nothing was recorded: the robot was never armed ({summary.ended}).")
     moved = _moved(summary)
-    if summary.faults:
-        fault = summary.faults[0]
+    stopping = [fault for fault in summary.faults if fault.reach == "robot"]
+    if stopping:
+        fault = stopping[0]
         at_s = fault.tick / summary.rate_hz - (float(record.time_s[0]) if len(record.time_s) else 0.0)
         joint = f" at {fault.joint}" if fault.joint else ""
         what = f"Stopped by a fault after {max(at_s, 0.0):.1f} s{joint}: {_sentence(fault.cause)}"
         return Verdict("bad", f"{what} Before that: {moved[0].lower()}{moved[1:]}.")
+    harm = _harm(summary)
     ending = "" if summary.ended == "complete" else f" The run ended early: {_sentence(summary.ended)}"
     distance = _distance_m(summary)
     if distance is None:
-        return Verdict("poor", f"{moved}; {_handed_over(record, summary)}no fault.{ending}")
+        return Verdict("poor", f"{moved}; {_handed_over(record, summary)}{harm}.{ending}")
     if abs(distance) < MOVED_M or summary.locomoting_fraction == 0:
         why = summary.last_reason or "the controller gave no reason"
         if summary.last_state == "Locomoting":
             why = "the snake stayed where it was, although its controller reported Locomoting"
         kind = "Jammed" if summary.jammed else "Did not locomote"
-        return Verdict("poor", f"{kind}: {_sentence(why)} {moved}; no fault.{ending}")
+        return Verdict("poor", f"{kind}: {_sentence(why)} {moved}; {harm}.{ending}")
     stopped = _stopped(record)
     if summary.jammed and stopped:
-        return Verdict("poor", f"Jammed. {moved}; {_handed_over(record, summary)}no fault.{stopped}{ending}")
+        return Verdict("poor", f"Jammed. {moved}; {_handed_over(record, summary)}{harm}.{stopped}{ending}")
     jam = "it jammed on the way; " if summary.jammed else ""
     good: Kind = "poor" if ending or distance < 0 else "good"
-    return Verdict(good, f"{moved}; {_handed_over(record, summary)}{jam}no fault.{stopped}{ending}")
+    return Verdict(good, f"{moved}; {_handed_over(record, summary)}{jam}{harm}.{stopped}{ending}")
 
 
 def tiles(record: RunRecord, summary: RunSummary) -> list[Tile]:
@@ -79,6 +81,12 @@ def tiles(record: RunRecord, summary: RunSummary) -> list[Tile]:
         Tile("commands refused", str(rejected)),
         Tile("faults", str(len(summary.faults)), "", bool(summary.faults)),
     ]
+
+
+def _harm(summary: RunSummary) -> str:
+    """What went wrong, and stopped nothing."""
+    lost = list(dict.fromkeys(fault.joint for fault in summary.faults if fault.joint is not None))
+    return f"went on without {', '.join(lost)}" if lost else "no fault"
 
 
 def _distance_m(summary: RunSummary) -> float | None:

@@ -119,9 +119,9 @@ def test_an_operator_takes_back_a_joint_that_was_lost(tmp_path: Path) -> None:
         told("isolated: joint_3; passive until a clear")
         assert "armed, without joint_3: no valid and fresh state of joint_3" in operator("status").out
         refused = operator("clear")
-        assert refused.code == 1 and "nothing to clear in state armed" in refused.err + refused.out
+        assert refused.code == 1 and "disarm first, then a clear takes back joint_3" in refused.err + refused.out
         assert operator("disarm").code == 0
-        told("or: `snakesim clear")
+        told("or, without: `snakesim arm planar13 sim")
         assert operator("arm", "planar13", "sim").code == 0
         assert "isolated: joint_3" in operator("status").out
         assert operator("disarm").code == 0 and operator("clear").code == 0

@@ -5,13 +5,19 @@ Driver, twins and the HAL's authority are the real ones, stepped.
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Literal
 
 import pytest
 
 from snakesim_can_backend.backend import CanBackend
-from snakesim_can_backend.protocol import ModuleState
+from snakesim_can_backend.commands import command, emergency
+from snakesim_can_backend.protocol import Action, Frame, ModuleFault, ModuleState
 from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.twin.chain import ModuleChain
+from snakesim_can_backend.twin.firmware import PASSIVE
+from snakesim_can_backend.twin.server import Here
 from snakesim_can_backend.watch import CONCERNS_ALL
+from snakesim_can_backend.wire import VirtualWire
 from snakesim_hal.conformance.rig import Rig
 from snakesim_hal.injection import parse
 from snakesim_hal.messages import LifecycleRequest, Mode
@@ -36,6 +42,16 @@ class Lame(Rig):
 
     def inject(self, text: str, *, begins: bool = True) -> None:
         assert self.can.inject(parse(f"{text}@0"), begins=begins)
+
+    @property
+    def chain(self) -> ModuleChain:
+        (wire,) = self.can._wires
+        assert isinstance(wire, VirtualWire) and isinstance(wire.other_end, Here)
+        return wire.other_end.server.chain
+
+    def ask(self, action: Literal["disarm", "clear"]) -> None:
+        answer = self.authority.on_lifecycle(LifecycleRequest(action=action), self._now_ns)
+        assert answer.ok, answer.reason
 
     def wave(self, periods: int) -> None:
         """The others turn at a steady speed, and back."""
@@ -88,9 +104,9 @@ def test_the_joint_is_taken_back_by_a_clear(kind: str) -> None:
         robot.must_be_armed()
         assert robot.states()[FAILS] != ModuleState.ARMED, "its motor is on"
         told = len(robot.faults)
-        robot.disarm()
+        robot.ask("disarm")
         robot.idle(5)
-        assert robot.authority.on_lifecycle(LifecycleRequest(action="clear"), 0).ok
+        robot.ask("clear")
         robot.idle(20)
         robot.arm()
         robot.wave(30)
@@ -126,6 +142,83 @@ def test_one_joint_too_many_stops_all() -> None:
         assert robot.authority.state == "fault"
         robot.idle(30)
         assert robot.states()[1] == robot.states()[3] == ModuleState.DISARMED
+
+
+def swallowed(robot: Lame, *joints: int) -> None:
+    """Modules fail with a fault that lasts until they are cleared, and a person clears before a period has passed."""
+    chain = robot.chain
+    for joint in joints:
+        chain.seats[joint].module._fail(ModuleFault.SENSOR, chain.now_us)
+    for _ in range(20):
+        if robot.authority.isolated or robot.authority.state == "fault":
+            break
+        (robot.wave if robot.authority.state == "armed" else robot.idle)(1)
+    if robot.authority.state == "armed":
+        robot.ask("disarm")
+    robot.ask("clear")
+    robot.idle(20)
+
+
+@pytest.mark.parametrize("may_lose", [0, 1, 2])
+@pytest.mark.parametrize(("driven", "joints"), [(True, [2]), (True, [2, 3]), (False, [2])])
+def test_who_clears_before_a_period_has_passed_clears_all_the_same(
+    driven: bool, joints: list[int], may_lose: int
+) -> None:
+    with lame_robot(may_lose) as robot:
+        robot.arm()
+        robot.wave(30)
+        if not driven:
+            robot.ask("disarm")
+            robot.idle(20)
+        swallowed(robot, *joints)
+        assert robot.authority.state == "disarmed" and robot.states() == [ModuleState.DISARMED] * JOINTS
+        robot.arm()
+        robot.wave(30)
+        robot.must_be_armed()
+        assert robot.states() == [ModuleState.ARMED] * JOINTS and robot.authority.isolated == []
+
+
+@pytest.mark.parametrize("then", ["clear", "estop", "fault"])
+def test_what_stops_the_motors_waits_for_nothing(monkeypatch: pytest.MonkeyPatch, then: str) -> None:
+    """A module that is lost needs its parameters again and does not take them: that takes a second."""
+    sent: list[Frame] = []
+    send = VirtualWire.send
+
+    def overheard(wire: VirtualWire, frame: Frame) -> bool:
+        sent.append(frame)
+        return send(wire, frame)
+
+    with lame_robot() as robot:
+        robot.arm()
+        robot.wave(30)
+        robot.inject(f"reboot:joint_{FAILS + 1}")
+        robot.wave(60)
+        robot.inject(f"mute:joint_{FAILS + 1}")
+        robot.wave(10)
+        robot.must_be_armed()
+        if then == "fault":
+            robot.lose(0)
+        else:
+            robot.ask("disarm")
+        robot.ask("clear")
+        if then == "estop":
+            robot.estop()
+        monkeypatch.setattr(VirtualWire, "send", overheard)
+        robot.idle()
+    stops = [command(Action.DISARM), command(Action.STOP), emergency()]
+    assert sent[0] == (emergency() if then == "estop" else stops[0]) and sent[0] in stops
+
+
+def test_a_lost_module_is_switched_off_at_once() -> None:
+    """Not braked: its own sensor may be what is wrong."""
+    with lame_robot() as robot:
+        robot.arm()
+        robot.drive({FAILS: (Mode.VELOCITY, 0.5)}, 30)
+        robot.lose(FAILS)
+        robot.wave(3)
+        robot.must_be_armed()
+        assert robot.states()[FAILS] == ModuleState.DISARMED
+        assert robot.chain.seats[FAILS].module.demand == PASSIVE
 
 
 def test_what_the_host_alone_finds_switches_the_module_off_too() -> None:

@@ -250,6 +250,25 @@ def test_of_a_joint_that_is_set_aside_only_what_concerns_all_is_told() -> None:
     assert found.what == "module_overheat" and found.joint == 1 and not found.alone
 
 
+def test_an_emergency_concerns_all_whatever_else_is_wrong() -> None:
+    def emergency(reading: Reading) -> None:
+        answer(reading, [2], state=ModuleState.EMERGENCY)
+        reading.take(heartbeat(2, 1.0, ModuleState.EMERGENCY, last_stop=LastStop.EMERGENCY, fault_overheat=1))
+
+    bench = Bench()
+    bench.isolated = {1}
+    (found,) = bench.ticks(9, emergency)
+    assert found.what == "module_overheat" and not found.alone
+
+
+def test_a_joint_without_its_parameters_that_is_set_aside_is_no_news() -> None:
+    bench = Bench("armed")
+    told = bench.watch.look(bench.reading, "armed", unconfigured={1}, isolated={1})
+    assert told == []
+    (found,) = bench.watch.look(bench.reading, "armed", unconfigured={1})
+    assert found.what == "module_not_configured" and not found.alone
+
+
 def test_water_after_heat_is_told_again() -> None:
     def hot(reading: Reading) -> None:
         answer(reading, [2], state=ModuleState.FAULT)
@@ -297,7 +316,7 @@ def test_a_module_that_does_not_arm_is_told_after_its_grace() -> None:
     first = next(i for i, told in enumerate(found) if told)
     assert ARM_GRACE < first <= ARM_GRACE + 3
     assert [f for told in found for f in told] == [
-        Finding("module_not_armed", WHO + "does not arm: it is disarmed", 1, alone=True),
+        Finding("module_not_armed", WHO + "does not arm: it is disarmed", 1),
     ]
 
 

@@ -626,7 +626,7 @@ def test_a_frozen_joint_stops_an_armed_robot() -> None:
 # --- heat, supply and leaks ------------------------------------------------------------------------------------
 
 
-def hear(rig: Rig, motor_c: list[float], volts: float = 24.0) -> None:
+def hear(rig: Rig, motor_c: list[float], volts: float = 24.0, valid: list[bool] | None = None) -> None:
     power = Power(
         tick=rig.tick,
         stamp_ns=0,
@@ -635,7 +635,7 @@ def hear(rig: Rig, motor_c: list[float], volts: float = 24.0) -> None:
         motor_c=motor_c,
         board_c=[20.0] * JOINTS,
         leak=[False] * JOINTS,
-        valid=[True] * JOINTS,
+        valid=valid or [True] * JOINTS,
     )
     rig.authority.observe_power(power, rig.now_ns)
 

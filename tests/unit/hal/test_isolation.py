@@ -4,6 +4,7 @@ from typing import Any
 
 import pytest
 
+from snakesim_hal.authority import MAX_FAULTS_KEPT
 from snakesim_hal.messages import Fault, Mode
 from tests.unit.hal.test_authority import CLEAR, DISARM, ESTOP, JOINTS, Rig, armed, hear
 
@@ -130,7 +131,9 @@ def test_it_may_be_armed_again_without_the_joint() -> None:
 
 def test_a_clear_takes_the_joint_back_once_it_is_heard_of() -> None:
     rig = lame()
-    assert rig.authority.on_lifecycle(CLEAR, rig.now_ns).refusal == "wrong_state"  # not while it moves
+    answer = rig.authority.on_lifecycle(CLEAR, rig.now_ns)  # not while it moves
+    assert answer.refusal == "wrong_state"
+    assert answer.reason == "nothing to clear in state armed; disarm first, then a clear takes back joint_2"
     rig.authority.on_lifecycle(DISARM, rig.now_ns)
     rig.pass_tick()
     assert rig.authority.on_lifecycle(CLEAR, rig.now_ns).ok
@@ -175,3 +178,26 @@ def test_a_joint_that_is_too_hot_is_set_aside_and_water_is_not() -> None:
         rig.send(0.1)
         rig.pass_tick()
     assert rig.authority.state == "fault" and rig.authority.faults[-1].what == "undervoltage"
+
+
+def test_that_a_lost_joint_tells_nothing_of_its_health_is_no_news() -> None:
+    rig = lame()
+    hear(rig, [20.0] * JOINTS)
+    rig.authority.on_lifecycle(DISARM, rig.now_ns)
+    rig.pass_tick(250)
+    hear(rig, [20.0] * JOINTS, valid=[True, False, True])
+    rig.pass_tick(100)
+    assert [fault.what for fault in rig.authority.faults] == ["state_invalid"]
+    rig.pass_tick(250)
+    assert [fault.what for fault in rig.authority.faults] == ["state_invalid", "power_unknown"]
+
+
+@pytest.mark.parametrize("kept", ["faults", "fault_log"])
+def test_why_the_robot_stopped_is_never_left_out(kept: str) -> None:
+    rig = armed(safety__may_lose_joints=1)
+    for tick in range(MAX_FAULTS_KEPT):
+        rig.authority.note(Fault(tick=tick, what="noted", cause="", reach="joint" if tick in (3, 9) else "robot"))
+    rig.authority.note(Fault(tick=50, what="noted", cause="", reach="joint"))
+    rig.authority.fault(Fault(tick=51, what="leak", cause="water"))
+    ticks = [fault.tick for fault in getattr(rig.authority, kept)]
+    assert ticks == [*range(9), *range(10, MAX_FAULTS_KEPT), 51]

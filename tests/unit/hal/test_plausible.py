@@ -176,6 +176,12 @@ def test_what_is_wrong_concerns_joints_and_a_state_of_no_joints_the_robot() -> N
     assert fault is not None and fault.reach == "joint" and bench.doubted == [1, 2]
     fault = bench.see(valid=[])
     assert fault is not None and fault.reach == "robot" and bench.doubted == [0, 1, 2]
+    assert (fault.tick, fault.what, fault.cause, fault.joint) == (7, WORD, "no joint state of 3 joints", None)
+
+
+def test_as_far_as_a_joint_may_turn_is_not_too_far() -> None:
+    assert Bench(angle=0.0).see(0.05, periods=0) is None
+    assert Bench(angle=0.0).see(float(np.nextafter(0.05, 1.0)), periods=0) is not None
 
 
 @pytest.mark.parametrize("column", ["angle_rad", "velocity_rad_s", "torque_nm"])
