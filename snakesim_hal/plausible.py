@@ -109,24 +109,21 @@ class JointWatch:
 def readable(joints: JointState, good: Measured) -> JointState:
     """What may be published: a number that is none would make a reader refuse the states of all joints.
 
-    The last good one takes its place, and is not valid.
+    The last good one takes its place, and is not valid. A state of another number of joints stays as it is.
     """
     columns = (joints.angle_rad, joints.velocity_rad_s, joints.torque_nm)
     if all(math.isfinite(value) for column in columns for value in column):
         return joints
+    if {len(values) for values in (*columns, joints.valid)} != {len(good.angle_rad)}:
+        return joints
     kept = (good.angle_rad.tolist(), good.velocity_rad_s.tolist(), good.torque_nm.tolist())
-    sound = [all(map(math.isfinite, values)) for values in zip(*columns, strict=False)]
-    mended = [
-        [value if fine else last for value, fine, last in zip(column, sound, before, strict=False)]
+    sound = [all(map(math.isfinite, values)) for values in zip(*columns, strict=True)]
+    angle, velocity, torque = (
+        [value if fine else last for value, fine, last in zip(column, sound, before, strict=True)]
         for column, before in zip(columns, kept, strict=True)
-    ]
-    return msgspec.structs.replace(
-        joints,
-        angle_rad=mended[0],
-        velocity_rad_s=mended[1],
-        torque_nm=mended[2],
-        valid=[valid and fine for valid, fine in zip(joints.valid, sound, strict=False)],
     )
+    valid = [valid and fine for valid, fine in zip(joints.valid, sound, strict=True)]
+    return msgspec.structs.replace(joints, angle_rad=angle, velocity_rad_s=velocity, torque_nm=torque, valid=valid)
 
 
 class _Strays:

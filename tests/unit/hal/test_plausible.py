@@ -130,6 +130,26 @@ def test_a_sample_that_is_repeated_does_not_count_again() -> None:
     assert bench.see(1.4) is None
 
 
+def test_a_sample_that_comes_again_and_again_does_not_count_however_late() -> None:
+    bench = Bench()
+    for k in range(12):
+        assert bench.see(1.4, periods=0.0 if k else 1.0, late_ns=k) is not None
+
+
+def test_a_stamp_that_goes_back_leaves_no_less_room_than_none() -> None:
+    assert Bench().see(0.04, periods=-0.5) is None
+
+
+def test_who_strays_first_does_not_help_who_strays_later() -> None:
+    """All must be at a new place for as many samples, also one that goes to zero."""
+    bench = Bench(angle=[0.0, 1.0, 0.0])
+    assert bench.see([3.0, 1.0, 0.0]) is not None
+    for k in range(4):
+        assert bench.see([3.0, 0.0, 0.0]) is not None, k
+    assert bench.angles[:2] == [3.0, 1.0]
+    assert bench.see([3.0, 0.0, 0.0]) is None
+
+
 def test_joints_are_judged_each_by_itself() -> None:
     bench = Bench()
     for _ in range(4):
@@ -195,6 +215,17 @@ def test_what_is_published_has_numbers_only(column: str) -> None:
     assert told.angle_rad[1] == 0.1 and told.velocity_rad_s[1] == told.torque_nm[1] == 0.0
     assert getattr(told, column)[::2] == [0.5, 0.7] and told.age_ns == sound.age_ns
     assert [told.angle_rad[0], told.velocity_rad_s[2], told.torque_nm[2]] != [0.1, 0.0, 0.0]
+    assert readable(msgspec.structs.replace(spoilt, valid=[False, True, True]), bench.watch.measured).valid == [
+        False,
+        False,
+        True,
+    ]
+
+
+@pytest.mark.parametrize("column", ["angle_rad", "velocity_rad_s", "torque_nm", "valid"])
+def test_a_state_of_another_number_of_joints_is_published_as_it_is(column: str) -> None:
+    odd = msgspec.structs.replace(state(ROBOT, float("nan")), **{column: [float("nan")]})
+    assert readable(odd, Bench().watch.measured) is odd
 
 
 # --- stuck sensors ---------------------------------------------------------------------------------------------
@@ -269,6 +300,19 @@ def test_whatever_still_changes_is_alive(column: int) -> None:
     for k in range(50):
         row = np.array([0.0, 0.0, 0.5]) + 1e-9 * (k % 2) * (np.arange(3) == column)
         assert bench.see(float(row[0]), float(row[1]), float(row[2]), applied=told(0.02 * k)) is None
+
+
+def test_a_target_that_moved_just_so_far_proves_nothing() -> None:
+    bench = Bench(torque=0.5)
+    assert bench.see(0.0, 0.0, 0.5, applied=told(0.0)) is None
+    for _ in range(3 * LEASE_PERIODS):
+        assert bench.see(0.0, 0.0, 0.5, applied=told(0.075)) is None
+
+
+def test_that_the_host_was_held_up_makes_no_joint_frozen() -> None:
+    bench = Bench(torque=0.5)
+    for k in range(FAR_PERIODS + 4):
+        assert bench.see(0.0, 0.0, 0.5, applied=told(0.02 * k), late_ns=k * LEASE_NS) is None
 
 
 def test_a_sample_that_is_only_old_is_not_frozen() -> None:
