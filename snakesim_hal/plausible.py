@@ -146,7 +146,6 @@ class _Strays:
             return strayed
         elapsed_s = taken_s - self._taken_s
         follows = np.abs(np.where(strayed, angle_rad, 0.0) - self._angle_rad) <= self.reach_rad(elapsed_s.max(axis=0))
-        follows &= self._in_a_row > 0
         repeated = follows & (elapsed_s[0] <= 0)  # the same sample once more says nothing new
         counted = np.where(follows, self._in_a_row + ~repeated, 1)
         self._in_a_row = np.where(strayed, counted, 0)

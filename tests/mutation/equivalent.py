@@ -8,18 +8,19 @@ _ROUNDED = "one part in a million, in a text that is rounded to whole millisecon
 _BELOW_A_NANOSECOND = "a delay that counts is below a lease, and this changes it by less than a nanosecond"
 _SET_BEFORE_USE = "whatever reads it is preceded by a change of lifecycle or lease that sets it; here it is declared"
 _ONLY_COMPARED = "zeros as whole or as real numbers: the first modes are only ever compared"
+_A_SHORTCUT = "a shortcut: the long way comes to the same, only later"
+_THE_ONLY_ONE = "of a list with one entry the first is the last"
+_NOT_READ_YET = "nothing reads it before a good state, or a sample, has replaced it"
+_FOR_THE_READER = "nobody assigns to it; that nobody may is for the reader"
+_MASKED = "it stands where a mask leaves it out, or never comes to five in a row"
+_ROUGH = "the bound is a rough one, and no sum of floating-point numbers comes to rest exactly on it"
 _IN_ANY_ORDER = "the greater of two, or the middle of three with a low below a high, does not depend on the order"
 
 EQUIVALENT: dict[tuple[str, str, str], str] = {
     (
         "arming.py",
         "far_targets",
-        "True -> False in `for joint, mode, target, angle in zip(description.joints, command.mode, command.target, angle_rad.tolist(), strict=True):`",
-    ): _SAME_LENGTHS,
-    (
-        "gate.py",
-        "limit",
-        "True -> False in `for asked, joint, held in zip(asked_limits, limits.joints, last.torque_limit_nm.tolist(), strict=True):`",
+        "True -> False in `for joint, mode, target, angle, passive in zip(description.joints, command.mode, command.target, angle_rad.tolist(), aside.tolist(), strict=True):`",
     ): _SAME_LENGTHS,
     (
         "gate.py",
@@ -66,8 +67,6 @@ EQUIVALENT: dict[tuple[str, str, str], str] = {
     ("authority.py", "Authority.__init__", "1 -> 2 in `self._last_sequence = -1`"): _SET_BEFORE_USE,
     ("authority.py", "Authority.__init__", "1 -> 0 in `self._last_sequence = -1`"): _SET_BEFORE_USE,
     ("authority.py", "Authority.__init__", "self._hold_at = np.zeros(count) -> (removed)"): _SET_BEFORE_USE,
-    ("authority.py", "Authority.__init__", "self._was_armed = False -> (removed)"): _SET_BEFORE_USE,
-    ("authority.py", "Authority.__init__", "False -> True in `self._was_armed = False`"): _SET_BEFORE_USE,
     (
         "authority.py",
         "Authority.offer",
@@ -107,7 +106,7 @@ EQUIVALENT: dict[tuple[str, str, str], str] = {
         "halting.py",
         "Halt",
         "True -> False in `@dataclass(frozen=True)`",
-    ): "nobody assigns to it; that nobody may is for the reader",
+    ): _FOR_THE_READER,
     (
         "gate.py",
         "JointLimits.inside",
@@ -123,4 +122,133 @@ EQUIVALENT: dict[tuple[str, str, str], str] = {
         "_oldest_state_ns",
         "1000000000.0 -> 999999999.0 in `return min(fresh_ns + round(delay_s * 1000000000.0), description.lease_ns)`",
     ): _BELOW_A_NANOSECOND,
+    ("isolation.py", "Isolation.without", "if not self.indices: -> (removed)"): _A_SHORTCUT,
+    ("isolation.py", "Isolation.without", "return applied -> (removed)"): _A_SHORTCUT,
+    ("derating.py", "Derating.look", "if now_ns < self._due_ns: -> (removed)"): _A_SHORTCUT,
+    ("derating.py", "Derating.look", "return ([], None) -> (removed)"): _A_SHORTCUT,
+    (
+        "derating.py",
+        "Derating.look",
+        "self._due_ns = min(min((health.due_ns(now_ns, began_ns) for health in self._healths)), now_ns + KNOWN_FOR_NS) -> (removed)",
+    ): _A_SHORTCUT,
+    (
+        "derating.py",
+        "Derating.look",
+        "now_ns + KNOWN_FOR_NS -> now_ns - KNOWN_FOR_NS in `self._due_ns = min(min((health.due_ns(now_ns, began_ns) for health in self._healths)), now_ns + KNOWN_FOR_NS)`",
+    ): _A_SHORTCUT,
+    (
+        "derating.py",
+        "_Health.due_ns",
+        "at_ns > now_ns -> at_ns >= now_ns in `return min((at_ns for at_ns in (silent_ns, low_ns) if at_ns > now_ns), default=math.inf)`",
+    ): _A_SHORTCUT,
+    ("plausible.py", "_Strays.settled", "if not strayed.any(): -> (removed)"): _A_SHORTCUT,
+    ("plausible.py", "_Strays.settled", "0 -> -1 in `self._in_a_row[:] = 0`"): _A_SHORTCUT,
+    ("plausible.py", "_Strays.settled", "return strayed -> (removed)"): _A_SHORTCUT,
+    (
+        "derating.py",
+        "Derating.take",
+        "True -> False in `for health, volts, winding_c, leak, valid in zip(self._healths, *lists, strict=True):`",
+    ): _SAME_LENGTHS,
+    (
+        "derating.py",
+        "Derating.derated",
+        "True -> False in `shares = zip(self._healths, self.share.tolist(), strict=True)`",
+    ): _SAME_LENGTHS,
+    (
+        "plausible.py",
+        "JointWatch.take",
+        "True -> False in `tails = [f' by {by:+.2f} rad in {within * 1000.0:.0f} ms' for by, within in zip(jump_rad, elapsed_s, strict=True)]`",
+    ): _SAME_LENGTHS,
+    (
+        "plausible.py",
+        "JointWatch._doubt",
+        "True -> False in `told = names if tails is None else [name + tails[i] for name, i in zip(names, found, strict=True)]`",
+    ): _SAME_LENGTHS,
+    (
+        "gate.py",
+        "limit",
+        "True -> False in `for asked, joint, cool, held in zip(asked_limits, limits.joints, most, last.torque_limit_nm.tolist(), strict=True):`",
+    ): _SAME_LENGTHS,
+    (
+        "derating.py",
+        "Derating._newly_silent",
+        "0 -> -1 in `joint = fresh[0] if len(fresh) == 1 else None`",
+    ): _THE_ONLY_ONE,
+    ("plausible.py", "JointWatch._doubt", "0 -> -1 in `joint = names[0] if len(names) == 1 else None`"): _THE_ONLY_ONE,
+    ("derating.py", "_Health", "0.0 -> 1.0 in `winding_c: float = 0.0`"): _NOT_READ_YET,
+    ("derating.py", "_Health", "0.0 -> -1.0 in `winding_c: float = 0.0`"): _NOT_READ_YET,
+    ("derating.py", "_Health", "voltage_v: float = 0.0 -> (removed)"): _NOT_READ_YET,
+    ("derating.py", "_Health", "0.0 -> 1.0 in `voltage_v: float = 0.0`"): _NOT_READ_YET,
+    ("derating.py", "_Health", "0.0 -> -1.0 in `voltage_v: float = 0.0`"): _NOT_READ_YET,
+    ("derating.py", "_Health", "leak: bool = False -> (removed)"): _NOT_READ_YET,
+    ("derating.py", "_Health", "False -> True in `leak: bool = False`"): _NOT_READ_YET,
+    ("plausible.py", "JointWatch.__init__", "2 -> 1 in `self._good_s = np.zeros((2, count))`"): _NOT_READ_YET,
+    ("plausible.py", "_Strays.__init__", "2 -> 1 in `self._taken_s = np.zeros((2, count))`"): _NOT_READ_YET,
+    (
+        "derating.py",
+        "_Health.share",
+        "self.winding_c <= self.joint.derate_from_c -> self.winding_c < self.joint.derate_from_c in `if self.winding_c <= self.joint.derate_from_c or not self.known(now_ns):`",
+    ): _AT_THE_BOUND,
+    ("plausible.py", "Doubt", "True -> False in `@dataclass(frozen=True)`"): _FOR_THE_READER,
+    (
+        "plausible.py",
+        "JointWatch.take",
+        "0.0 -> 1.0 in `jump_rad = np.where(sound, columns[0], 0.0) - self._columns[0]`",
+    ): _MASKED,
+    (
+        "plausible.py",
+        "JointWatch.take",
+        "0.0 -> -1.0 in `jump_rad = np.where(sound, columns[0], 0.0) - self._columns[0]`",
+    ): _MASKED,
+    (
+        "plausible.py",
+        "_Strays.settled",
+        "0.0 -> 1.0 in `follows = np.abs(np.where(strayed, angle_rad, 0.0) - self._angle_rad) <= self.reach_rad(elapsed_s.max(axis=0))`",
+    ): _MASKED,
+    (
+        "plausible.py",
+        "_Strays.settled",
+        "0.0 -> -1.0 in `follows = np.abs(np.where(strayed, angle_rad, 0.0) - self._angle_rad) <= self.reach_rad(elapsed_s.max(axis=0))`",
+    ): _MASKED,
+    ("plausible.py", "_Strays.settled", "0 -> -1 in `self._in_a_row = np.where(strayed, counted, 0)`"): _MASKED,
+    (
+        "plausible.py",
+        "_Strays.settled",
+        "0.0 -> 1.0 in `self._angle_rad, self._taken_s = (np.where(strayed, angle_rad, 0.0), taken_s)`",
+    ): _MASKED,
+    (
+        "plausible.py",
+        "_Strays.settled",
+        "0.0 -> -1.0 in `self._angle_rad, self._taken_s = (np.where(strayed, angle_rad, 0.0), taken_s)`",
+    ): _MASKED,
+    (
+        "plausible.py",
+        "_Strays.reach_rad",
+        "np.maximum(elapsed_s, 0.0) -> np.maximum(0.0, elapsed_s) in `return SLACK_RAD + self._speed_rad_s * np.maximum(elapsed_s, 0.0)`",
+    ): _IN_ANY_ORDER,
+    (
+        "plausible.py",
+        "_Stillness.look",
+        "np.minimum(self._low_rad, target) -> np.minimum(target, self._low_rad) in `self._low_rad = np.where(same, np.minimum(self._low_rad, target), target)`",
+    ): _IN_ANY_ORDER,
+    (
+        "plausible.py",
+        "_Stillness.look",
+        "np.maximum(self._high_rad, target) -> np.maximum(target, self._high_rad) in `self._high_rad = np.where(same, np.maximum(self._high_rad, target), target)`",
+    ): _IN_ANY_ORDER,
+    (
+        "plausible.py",
+        "_Stillness.look",
+        "np.minimum(self._far_since_s, taken_s) -> np.minimum(taken_s, self._far_since_s) in `self._far_since_s = np.where(far, np.minimum(self._far_since_s, taken_s), np.inf)`",
+    ): _IN_ANY_ORDER,
+    (
+        "plausible.py",
+        "_Strays.settled",
+        "np.abs(np.where(strayed, angle_rad, 0.0) - self._angle_rad) <= self.reach_rad(elapsed_s.max(axis=0)) -> np.abs(np.where(strayed, angle_rad, 0.0) - self._angle_rad) < self.reach_rad(elapsed_s.max(axis=0)) in `follows = np.abs(np.where(strayed, angle_rad, 0.0) - self._angle_rad) <= self.reach_rad(elapsed_s.max(axis=0))`",
+    ): _ROUGH,
+    (
+        "plausible.py",
+        "_Stillness.look",
+        "taken_s - self._far_since_s > self._lease_s -> taken_s - self._far_since_s >= self._lease_s in `long = taken_s - self._far_since_s > self._lease_s`",
+    ): _ROUGH,
 }

@@ -434,6 +434,12 @@ def test_a_weak_velocity_mode_leaves_torque_mode_its_torque() -> None:
     weak = msgspec.structs.replace(ROBOT.joints[0], velocity_gain_nm_s_per_rad=1e-3)
     low, high = bounds_at_ends(weak, Mode.TORQUE, 0.0, 0.0, 0.01)
     assert high == -low == pytest.approx(4.0 / 5.0 * stoppable_speed(1.5, 100.0, 0.01)) and high > 4.0
+    slow = msgspec.structs.replace(weak, speed_limit_rad_s=0.5)
+    low, high = bounds_at_ends(slow, Mode.TORQUE, 0.0, 0.0, 0.01)
+    assert high == -low == pytest.approx(4.0 / 0.5 * stoppable_speed(1.5, 100.0, 0.01))
+    still = msgspec.structs.replace(weak, speed_limit_rad_s=0.0)
+    low, high = bounds_at_ends(still, Mode.TORQUE, 0.0, 0.0, 0.01)
+    assert high == -low > 4.0
 
 
 def test_a_range_without_width_leaves_no_torque() -> None:
