@@ -109,7 +109,7 @@ class Bench:
         self._rig = self._hosted = None
         if hosted is not None:
             hosted.close()
-        if rig is not None and not rig.spoiled:
+        if rig is not None and not rig.closed:
             rig.close()
 
     def keep(self, name: str, make: Callable[[], Any]) -> Any:

@@ -68,6 +68,7 @@ class Rig:
     pace: Pace
     period_ns: int
     spoiled: bool = False  # of no use for further tests: closed, or a joint is silent
+    closed: bool = False
     tick: int = 0
     late_periods: float = 0.0  # how far this machine fell behind real time at worst
     _found: list[tuple[int, Fault]] = field(default_factory=list[tuple[int, Fault]])
@@ -241,7 +242,7 @@ class Rig:
 
     def close(self) -> None:
         """Close the backend; safe to call again."""
-        self.spoiled = True
+        self.spoiled = self.closed = True
         self.backend.close()
 
     # --- inside --------------------------------------------------------------------------------------------
