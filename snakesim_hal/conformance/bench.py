@@ -42,6 +42,7 @@ class Bench:
         self._backend = backend
         self._scenario, self._sets = scenario, sets
         self._rig: Rig | None = None
+        self.was_opened = False  # at any time
         self._hosted: Hosted | None = None
         self._kept: dict[str, Any] = {}
 
@@ -76,6 +77,7 @@ class Bench:
     def open(self) -> Backend:
         """A fresh backend; whatever was open is closed before."""
         self.close()
+        self.was_opened = True
         return self.factory(self.config, self._settings(self.config))
 
     def fresh_rig(self) -> Rig:

@@ -1,7 +1,8 @@
 """An open backend on the bench, driven tick by tick as the host does it, through the real authority and its gate."""
 
+import contextlib
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 import msgspec
@@ -207,10 +208,16 @@ class Rig:
         """A fault that somebody else found."""
         self.authority.fault(Fault(tick=self.tick, what="bench", cause="the contract tests say so"))
 
-    def may_lose_a_joint(self) -> None:
-        """From now on one joint that fails is set aside, whatever the robot's file says. Call it while disarmed."""
-        self.spoiled = True
+    @contextlib.contextmanager
+    def may_lose_a_joint(self) -> Iterator[None]:
+        """Meanwhile one joint that fails is set aside, whatever the robot file says. It begins and ends disarmed."""
+        usual = self.authority
         self.authority = Authority(msgspec.structs.replace(self.robot, may_lose_joints=1))
+        self.idle()
+        yield
+        self.disarm()
+        self.idle()
+        self.authority = usual
         self.idle()
 
     def lose(self, joint: int) -> None:

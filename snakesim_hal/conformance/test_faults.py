@@ -21,6 +21,30 @@ def test_a_healthy_robot_reports_no_fault(rig: Rig, healthy: Record) -> None:
     assert healthy.samples and not healthy.faults, healthy.faults
 
 
+def test_a_joint_that_is_set_aside_is_let_go_and_the_others_go_on(rig: Rig) -> None:
+    """While it is in `isolated`, a joint has no torque, whatever is asked of it; a clear takes it back."""
+    with rig.may_lose_a_joint():
+        began = rig.tick
+        rig.cruise()
+        rig.lose(LOST)
+        asked = {0: (Mode.VELOCITY, t.CRUISE_RAD_S), LOST: (Mode.POSITION, rig.home_rad[LOST] + t.STEP_RAD)}
+        record = rig.drive(asked, rig.periods(t.CRUISE_S))
+        rig.must_be_armed()
+        assert abs(record.torque_nm[-1, LOST]) < t.TORQUE_NM, f"{record.torque_nm[-1, LOST]:.3f} N·m"
+        moved = np.ptp(record.angle_rad[t.TRANSPORT_PERIODS :, LOST])
+        assert moved < t.REACHED_RAD, f"it was moved by {moved:.3f} rad"
+        assert record.velocity_rad_s[-1, 0] > (1 - t.SPEED_SHARE) * t.CRUISE_RAD_S, "the others stop, too"
+        rig.disarm()
+        rig.idle(t.TRANSPORT_PERIODS)
+        rig.clear()
+        rig.idle(t.ARMING_PERIODS)
+        rig.arm()
+        record = rig.drive({LOST: asked[LOST]}, rig.periods(t.SETTLE_S))
+        away = record.angle_rad[-1, LOST] - asked[LOST][1]
+        assert abs(away) < t.REACHED_RAD, f"taken back, it stops {away:.3f} rad from its target"
+        assert not rig.since(began).faults, rig.since(began).faults
+
+
 def test_a_silent_joint_grows_old_and_the_robot_stops(bench: Bench, rig: Rig) -> None:
     """No news is never good news: the joint is invalid, or its age grows with time, until the robot is at fault.
 
@@ -47,29 +71,6 @@ def test_a_silent_joint_grows_old_and_the_robot_stops(bench: Bench, rig: Rig) ->
     rig.idle(t.TRANSPORT_PERIODS)
     assert len(rig.faults) == told, f"reported again: {rig.faults[told:]}"
     rig.close()
-
-
-def test_a_joint_that_is_set_aside_is_let_go_and_the_others_go_on(rig: Rig) -> None:
-    """While it is in `isolated`, a joint has no torque, whatever is asked of it; a clear takes it back."""
-    rig.may_lose_a_joint()
-    rig.cruise()
-    rig.lose(LOST)
-    asked = {0: (Mode.VELOCITY, t.CRUISE_RAD_S), LOST: (Mode.POSITION, rig.home_rad[LOST] + t.STEP_RAD)}
-    record = rig.drive(asked, rig.periods(t.CRUISE_S))
-    rig.must_be_armed()
-    assert abs(record.torque_nm[-1, LOST]) < t.TORQUE_NM, f"{record.torque_nm[-1, LOST]:.3f} N·m"
-    moved = np.ptp(record.angle_rad[t.TRANSPORT_PERIODS :, LOST])
-    assert moved < t.REACHED_RAD, f"it was moved by {moved:.3f} rad"
-    assert record.velocity_rad_s[-1, 0] > (1 - t.SPEED_SHARE) * t.CRUISE_RAD_S, "the others stop, too"
-    rig.disarm()
-    rig.idle(t.TRANSPORT_PERIODS)
-    rig.clear()
-    rig.idle(t.ARMING_PERIODS)
-    rig.arm()
-    record = rig.drive({LOST: asked[LOST]}, rig.periods(t.SETTLE_S))
-    away = record.angle_rad[-1, LOST] - asked[LOST][1]
-    assert abs(away) < t.REACHED_RAD, f"taken back, it stops {away:.3f} rad from its target"
-    assert not rig.faults, rig.faults
 
 
 def must_rest_but_the_muted(rig: Rig) -> None:

@@ -14,6 +14,7 @@ _NOT_READ_YET = "nothing reads it before a good state, or a sample, has replaced
 _FOR_THE_READER = "nobody assigns to it; that nobody may is for the reader"
 _MASKED = "it stands where a mask leaves it out, or never comes to five in a row"
 _ROUGH = "the bound is a rough one, and no sum of floating-point numbers comes to rest exactly on it"
+_BOTH = "both must hold, in whatever order they stand"
 _IN_ANY_ORDER = "the greater of two, or the middle of three with a low below a high, does not depend on the order"
 
 EQUIVALENT: dict[tuple[str, str, str], str] = {
@@ -142,7 +143,6 @@ EQUIVALENT: dict[tuple[str, str, str], str] = {
         "at_ns > now_ns -> at_ns >= now_ns in `return min((at_ns for at_ns in (silent_ns, low_ns) if at_ns > now_ns), default=math.inf)`",
     ): _A_SHORTCUT,
     ("plausible.py", "_Strays.settled", "if not strayed.any(): -> (removed)"): _A_SHORTCUT,
-    ("plausible.py", "_Strays.settled", "0 -> -1 in `self._in_a_row[:] = 0`"): _A_SHORTCUT,
     ("plausible.py", "_Strays.settled", "return strayed -> (removed)"): _A_SHORTCUT,
     (
         "derating.py",
@@ -210,7 +210,6 @@ EQUIVALENT: dict[tuple[str, str, str], str] = {
         "_Strays.settled",
         "0.0 -> -1.0 in `follows = np.abs(np.where(strayed, angle_rad, 0.0) - self._angle_rad) <= self.reach_rad(elapsed_s.max(axis=0))`",
     ): _MASKED,
-    ("plausible.py", "_Strays.settled", "0 -> -1 in `self._in_a_row = np.where(strayed, counted, 0)`"): _MASKED,
     (
         "plausible.py",
         "_Strays.settled",
@@ -251,4 +250,24 @@ EQUIVALENT: dict[tuple[str, str, str], str] = {
         "_Stillness.look",
         "taken_s - self._far_since_s > self._lease_s -> taken_s - self._far_since_s >= self._lease_s in `long = taken_s - self._far_since_s > self._lease_s`",
     ): _ROUGH,
+    (
+        "plausible.py",
+        "readable",
+        "True -> False in `sound = [all(map(math.isfinite, values)) for values in zip(*columns, strict=True)]`",
+    ): _SAME_LENGTHS,
+    (
+        "plausible.py",
+        "readable",
+        "True -> False in `angle, velocity, torque = ([value if fine else last for value, fine, last in zip(column, sound, before, strict=True)] for column, before in zip(columns, kept, strict=True))`",
+    ): _SAME_LENGTHS,
+    (
+        "plausible.py",
+        "readable",
+        "zip(joints.valid, sound, strict=True) -> zip(sound, joints.valid, strict=True) in `valid = [valid and fine for valid, fine in zip(joints.valid, sound, strict=True)]`",
+    ): _BOTH,
+    (
+        "plausible.py",
+        "readable",
+        "True -> False in `valid = [valid and fine for valid, fine in zip(joints.valid, sound, strict=True)]`",
+    ): _SAME_LENGTHS,
 }
