@@ -752,3 +752,18 @@ def test_what_matters_most_is_the_word() -> None:
         ({}, "wrong_state"),
     ):
         assert rig.authority.on_lifecycle(msgspec.structs.replace(ARM, **change), 0).refusal == word
+
+
+# --- what is told ----------------------------------------------------------------------------------------------
+
+
+def test_what_never_became_a_command_is_counted_by_reason() -> None:
+    rig = armed()
+    rig.authority.reject("malformed")
+    assert rig.authority.rejected == {"malformed": 1} and rig.authority.state == "armed"
+
+
+def test_what_is_published_of_a_joint_without_a_number_is_its_last_good_state() -> None:
+    rig = armed()
+    told = rig.authority.readable(state(rig.robot, [0.2, float("nan"), 0.2]))
+    assert told.angle_rad == [0.2, 0.1, 0.2] and told.valid == [True, False, True]
