@@ -442,6 +442,16 @@ def test_a_weak_velocity_mode_leaves_torque_mode_its_torque() -> None:
     assert high == -low > 4.0
 
 
+@pytest.mark.parametrize("velocity", [-3.0, 0.0, 3.0])
+def test_at_its_end_a_joint_needs_no_torque_to_stay_or_to_leave(velocity: float) -> None:
+    """Outwards nothing, and inwards only what brakes a joint that still goes outwards."""
+    joint = ROBOT.joints[0]
+    _, most = bounds_at_ends(joint, Mode.TORQUE, joint.angle_max_rad, velocity, 0.01)
+    least, _ = bounds_at_ends(joint, Mode.TORQUE, joint.angle_min_rad, velocity, 0.01)
+    assert most == (0.0 if velocity <= 0.0 else -velocity)  # gain 1 N·m·s/rad
+    assert least == (0.0 if velocity >= 0.0 else -velocity)
+
+
 def test_a_range_without_width_leaves_no_torque() -> None:
     stuck = msgspec.structs.replace(ROBOT.joints[0], angle_min_rad=0.0, angle_max_rad=0.0)
     for velocity in (-3.0, 0.0, 3.0):
