@@ -157,6 +157,7 @@ class Hosted:
             self.robot = self.host.description
             self.session: Session = self._open.enter_context(open_session(self._link))
             self._commands = self.session.publisher(keys.JOINT_COMMAND, JointCommand)
+            wait_until(self._commands.heard, "the host hears our commands")  # what is put before that is lost
             self._start("host", self.host.run, self.host.stop)
             self._start("controller", lambda: self.controller.run(self._link), self.controller.stopped.set)
         except BaseException:
