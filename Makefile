@@ -36,7 +36,7 @@ test: test-here test-vcan ## Run all tests
 test-here: $(stamp) ## Run the tests that need no CAN bus (ARGS="-k gate")
 	$(here) -n $(WORKERS) --dist worksteal || $(here) $(again)
 
-test-vcan: $(stamp) ## Run the CAN tests on real SocketCAN, in a small VM where the kernel has none (ARGS="-m slow": kills, triplet)
+test-vcan: $(stamp) ## Run the CAN tests on real SocketCAN, in a small VM where the kernel has none (ARGS="-m slow": kills, triplet, openings)
 	SNAKESIM_NEED_VCAN=1 $(bin)/python deploy/vm/with_vcan.py -- sh -c '$(on_vcan) || exec $(on_vcan) $(again)'
 
 # Robots in real time stumble on a busy machine, an emulated one most of all. What failed is tried once more: here, alone.

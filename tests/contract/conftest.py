@@ -9,6 +9,7 @@ from snakesim_can_backend.protocol import Frame, node_of
 from snakesim_hal.conformance.bench import Bench
 
 VCAN = "SNAKESIM_VCAN"  # set by deploy/vm/with_vcan.py: the kernel here has vcan0, and it is up
+ABOUT_OPENINGS = ("same_seed", "closing_twice", "opens_again")
 ON_VCAN = ('backend.channels=["vcan0"]', 'backend.twins="process"')
 
 
@@ -21,12 +22,12 @@ def pytest_snakesim_benches() -> list[Bench]:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """In an emulated machine an opening takes half a minute: the clause with most of them is left to `-m slow`.
+    """In an emulated machine an opening takes half a minute: clauses that are about openings are left to `-m slow`.
 
-    That runs repeat themselves to the bit over the kernel's bus is shown there by tests/vcan/test_triplet.py, too.
+    The other clauses open and close the bus several times anyway.
     """
     for item in items:
-        if os.environ.get(VCAN) == "guest" and "same_seed" in item.name:
+        if os.environ.get(VCAN) == "guest" and any(words in item.name for words in ABOUT_OPENINGS):
             item.add_marker(pytest.mark.slow)
 
 
