@@ -270,5 +270,14 @@ EQUIVALENT: dict[tuple[str, str, str], str] = {
         "readable",
         "True -> False in `valid = [valid and fine for valid, fine in zip(joints.valid, sound, strict=True)]`",
     ): _SAME_LENGTHS,
-    ("gate.py", "stoppable_speed", "distance_rad <= 0.0 -> distance_rad < 0.0 in `if distance_rad <= 0.0:`"): _AT_THE_BOUND,
+    (
+        "gate.py",
+        "stoppable_speed",
+        "distance_rad <= 0.0 -> distance_rad < 0.0 in `if distance_rad <= 0.0:`",
+    ): _AT_THE_BOUND,
+    (
+        "gate.py",
+        "why_limited",
+        "True -> False in `for i, (mode, want) in enumerate(zip(command.mode, command.target, strict=True)):`",
+    ): _SAME_LENGTHS,
 }
