@@ -280,4 +280,9 @@ EQUIVALENT: dict[tuple[str, str, str], str] = {
         "why_limited",
         "True -> False in `for i, (mode, want) in enumerate(zip(command.mode, command.target, strict=True)):`",
     ): _SAME_LENGTHS,
+    (
+        "gate.py",
+        "bound_by_heat",
+        "np.minimum(command.torque_limit_nm, limits.torque_nm) -> np.minimum(limits.torque_nm, command.torque_limit_nm) in `asked = limits.torque_nm if command.torque_limit_nm is None else np.minimum(command.torque_limit_nm, limits.torque_nm)`",
+    ): _IN_ANY_ORDER,
 }

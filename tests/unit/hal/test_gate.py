@@ -442,6 +442,18 @@ def test_a_weak_velocity_mode_leaves_torque_mode_its_torque() -> None:
     assert high == -low > 4.0
 
 
+def test_a_joint_near_its_end_is_said_to_be_bound_by_its_angle() -> None:
+    asked = command(ROBOT, 5.0, Mode.VELOCITY)
+    measured = Measured(np.full(JOINTS, 1.45), np.zeros(JOINTS), np.zeros(JOINTS))
+    last = Applied(np.full(JOINTS, int(Mode.VELOCITY)), np.full(JOINTS, 5.0), np.full(JOINTS, 4.0))
+    applied, _ = limit(asked, measured=measured, last=last, limits=LIMITS, share=COOL)
+    words = why_limited(asked, applied, measured=measured, limits=LIMITS, share=COOL)
+    assert words == dict.fromkeys(range(JOINTS), "angle")
+    elsewhere = Measured(np.zeros(JOINTS), np.full(JOINTS, 1.45), np.zeros(JOINTS))
+    words = why_limited(asked, applied, measured=elsewhere, limits=LIMITS, share=COOL)
+    assert words == dict.fromkeys(range(JOINTS), "acceleration")
+
+
 @pytest.mark.parametrize("velocity", [-3.0, 0.0, 3.0])
 def test_at_its_end_a_joint_needs_no_torque_to_stay_or_to_leave(velocity: float) -> None:
     """Outwards nothing, and inwards only what brakes a joint that still goes outwards."""
