@@ -238,7 +238,7 @@ class Authority:
         wrong, silent = self._derating.look(now_ns, tick)
         for fault in wrong:
             self.fault(fault)
-        if silent is not None and not self._isolation.covers(self._isolation.mask(silent.joint)):
+        if silent is not None and not self._isolation.has(silent.joint):
             self.note(silent)
         if self.lease.live(now_ns):
             return
@@ -304,7 +304,7 @@ class Authority:
         return Doubt(fault, np.ones(len(self.description.joints), dtype=np.bool_))
 
     def _is_aside(self, fault: Fault) -> bool:
-        return fault.reach == "joint" and self._isolation.covers(self._isolation.mask(fault.joint))
+        return fault.reach == "joint" and self._isolation.has(fault.joint)
 
     def _set_aside(self, fault: Fault, joints: Mask) -> bool:
         """Go on without joints that have failed, if that may be; what they complain of afterwards is no news."""

@@ -33,6 +33,10 @@ class Isolation:
         """The joint of that name; no joint for a name that is none."""
         return np.array([name == own for own in self._names])
 
+    def has(self, name: str | None) -> bool:
+        """Whether the joint of that name is set aside."""
+        return name in self.names
+
     def covers(self, joints: Mask) -> bool:
         """Whether these are joints that are set aside already."""
         return bool(joints.any() and (self.joints | ~joints).all())

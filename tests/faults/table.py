@@ -87,18 +87,22 @@ def joint_row(name: str, kind: str, what: str) -> Row:
     )
 
 
+def asked_row(name: str, fault: str, expected: str, measure: Measure) -> Row:
+    """What a joint of any backend can do, asked of the injector of a whole robot."""
+    deadline = "50 ms; and the injector takes the request at the host's next tick (10 ms)"
+    return Row(name, fault, expected, deadline, 60.0, "ms", both(measure))
+
+
 def sensor_row(name: str, fault: str, kind: str) -> Row:
     """What any backend's sensors can do."""
     expected = "fault names the joint, group to safe stop, latched"
-    deadline = "50 ms; and the injector takes the request at the host's next tick (10 ms)"
-    return Row(name, fault, expected, deadline, 60.0, "ms", both(rows_modules.through_robot(kind)))
+    return asked_row(name, fault, expected, rows_modules.through_robot(kind))
 
 
 def isolated_row(name: str, fault: str, kind: str) -> Row:
     """One joint fails, and the robot may lose one."""
     expected = "fault names the joint, it alone is let go; the others go on; a clear takes it back"
-    deadline = "50 ms; and the injector takes the request at the host's next tick (10 ms)"
-    return Row(name, fault, expected, deadline, 60.0, "ms", both(rows_isolation.set_aside(kind)))
+    return asked_row(name, fault, expected, rows_isolation.set_aside(kind))
 
 
 def bus_row(

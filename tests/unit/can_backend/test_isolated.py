@@ -65,10 +65,14 @@ class Lame(Rig):
 
 @contextmanager
 def lame_robot(may_lose: int = 1) -> Iterator[Lame]:
+    """Armed, and its other joints swing."""
     run = config(robot__safety__may_lose_joints=may_lose)
     backend = CanBackend(run, Settings(plant="inertia"))
     try:
-        yield Lame(backend, "lockstep", run.period_ns)
+        robot = Lame(backend, "lockstep", run.period_ns)
+        robot.arm()
+        robot.wave(30)
+        yield robot
     finally:
         backend.close()
 
@@ -76,8 +80,6 @@ def lame_robot(may_lose: int = 1) -> Iterator[Lame]:
 @pytest.mark.parametrize(("kind", "what", "within"), MODULE_FAULTS, ids=[row[0] for row in MODULE_FAULTS])
 def test_a_module_that_fails_stops_alone_if_it_can(kind: str, what: str, within: int) -> None:
     with lame_robot() as robot:
-        robot.arm()
-        robot.wave(30)
         assert robot.states() == [ModuleState.ARMED] * JOINTS and all(robot.turning())
         robot.inject(f"{kind}:joint_{FAILS + 1}")
         robot.wave(within + 1)
@@ -94,8 +96,6 @@ def test_a_module_that_fails_stops_alone_if_it_can(kind: str, what: str, within:
 @pytest.mark.parametrize("kind", ["mute", "freeze", "reboot", "counter", "checksum"])
 def test_the_joint_is_taken_back_by_a_clear(kind: str) -> None:
     with lame_robot() as robot:
-        robot.arm()
-        robot.wave(30)
         robot.inject(f"{kind}:joint_{FAILS + 1}")
         robot.wave(30)
         assert robot.authority.isolated == [f"joint_{FAILS + 1}"], robot.authority.why
@@ -117,8 +117,6 @@ def test_the_joint_is_taken_back_by_a_clear(kind: str) -> None:
 
 def test_it_may_be_armed_again_without_the_joint() -> None:
     with lame_robot() as robot:
-        robot.arm()
-        robot.wave(30)
         robot.inject(f"reboot:joint_{FAILS + 1}")
         robot.wave(60)
         robot.disarm()
@@ -132,8 +130,6 @@ def test_it_may_be_armed_again_without_the_joint() -> None:
 
 def test_one_joint_too_many_stops_all() -> None:
     with lame_robot() as robot:
-        robot.arm()
-        robot.wave(30)
         robot.inject(f"mute:joint_{FAILS + 1}")
         robot.wave(30)
         robot.must_be_armed()
@@ -165,8 +161,6 @@ def test_who_clears_before_a_period_has_passed_clears_all_the_same(
     driven: bool, joints: list[int], may_lose: int
 ) -> None:
     with lame_robot(may_lose) as robot:
-        robot.arm()
-        robot.wave(30)
         if not driven:
             robot.ask("disarm")
             robot.idle(20)
@@ -189,8 +183,6 @@ def test_what_stops_the_motors_waits_for_nothing(monkeypatch: pytest.MonkeyPatch
         return send(wire, frame)
 
     with lame_robot() as robot:
-        robot.arm()
-        robot.wave(30)
         robot.inject(f"reboot:joint_{FAILS + 1}")
         robot.wave(60)
         robot.inject(f"mute:joint_{FAILS + 1}")
@@ -224,8 +216,6 @@ def test_a_lost_module_is_switched_off_at_once() -> None:
 def test_what_the_host_alone_finds_switches_the_module_off_too() -> None:
     """A joint that is too hot for the HAL is healthy for its module."""
     with lame_robot() as robot:
-        robot.arm()
-        robot.wave(10)
         joints = robot.authority._isolation.mask(f"joint_{FAILS + 1}")
         assert robot.authority._isolation.add(joints)
         robot.wave(10)
