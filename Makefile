@@ -10,6 +10,7 @@ UPGRADE ?=
 WORKERS ?= 2
 PAYLOADS ?= 1000000
 MINUTES ?= 30
+TRIALS ?= 300
 
 # A sourced ROS workspace sets these; its packages and pytest plugins must not leak into ours.
 unexport PYTHONPATH PYTHONHOME PYTHONSTARTUP PYTEST_ADDOPTS VIRTUAL_ENV
@@ -21,7 +22,7 @@ packages := $(wildcard snakesim_*)
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test test-here test-vcan faults mutation fuzz soak check bench schemas docs lock clean FORCE
+.PHONY: help setup demo test test-here test-vcan attack faults mutation fuzz soak kills check bench schemas docs lock clean FORCE
 
 help: ## List these targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' Makefile
@@ -53,6 +54,12 @@ mutation: $(stamp) ## Break the safety core one change at a time; every break mu
 fuzz: $(stamp) ## Bad payloads into every decoder, then over the network of a robot that runs (PAYLOADS=1000000)
 	$(bin)/python -m tests.fuzz --payloads $(PAYLOADS) $(ARGS)
 	$(bin)/python -m tests.fuzz --payloads $(PAYLOADS) --network $(ARGS)
+
+attack: $(stamp) ## Every attack of a stranger on the network, in full (ARGS="-k a4"); make test has the quick form
+	SNAKESIM_ATTACK=full $(bin)/python -m pytest tests/attack --timeout 900 $(ARGS)
+
+kills: $(stamp) ## Random kills and freezes of runs that start, arm, stop, clear and end (TRIALS=300, ARGS="--seed 2")
+	$(bin)/python -m tests.soak.kills --trials $(TRIALS) $(ARGS)
 
 soak: $(stamp) ## A long run with faults at random, and an operator who mends (MINUTES=30, ARGS="--backend can --seed 2")
 	$(bin)/python -m tests.soak --minutes $(MINUTES) $(ARGS)

@@ -18,7 +18,7 @@ def run(*arguments: str) -> RunSummary:
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
         subprocess.run(
-            [sys.executable, "-m", "snakesim_operator.cli", "run", "triplet", "--out", str(out), *arguments],
+            [sys.executable, "-m", "snakesim_operator", "run", "triplet", "--out", str(out), *arguments],
             check=True,
             stdout=subprocess.DEVNULL,
             timeout=300,

@@ -16,7 +16,7 @@ from snakesim_can_backend import commands
 from snakesim_can_backend.bring_up import Bus, configure, find, objections
 from snakesim_can_backend.bus_load import BIT_RATE, Reports, check_load, reports_of, shares, worst_bits
 from snakesim_can_backend.log import LoggedWire, open_log
-from snakesim_can_backend.mocap import MocapReceiver
+from snakesim_can_backend.mocap import MocapReceiver, check_pose, pose_address
 from snakesim_can_backend.own_twins import TwinProcess, check_faults, check_twins, modules_know, twins_here
 from snakesim_can_backend.parameters import check_ratings, check_watchdog, parameters_of
 from snakesim_can_backend.protocol import Action, Frame, ModuleState
@@ -24,7 +24,7 @@ from snakesim_can_backend.reading import Reading
 from snakesim_can_backend.sensors import Sensors, contacts_due, described
 from snakesim_can_backend.settings import Settings
 from snakesim_can_backend.trouble import Trouble
-from snakesim_can_backend.watch import ARM_GRACE, Watch
+from snakesim_can_backend.watch import ARM_GRACE, Finding, Watch
 from snakesim_can_backend.wire import OtherEnd, SocketCanWire, VirtualWire, Wire, check_interface, wait
 from snakesim_hal.backend import Samples, SetPoints
 from snakesim_hal.errors import BackendError, ConfigError
@@ -67,6 +67,7 @@ class CanBackend:
         check_gains(config.robot)
         check_ratings(config.robot)
         check_watchdog(config, settings)
+        check_pose(config, settings)
         check_twins(config, settings)
         check_faults(config, settings)
         for channel in settings.channels:
@@ -88,8 +89,9 @@ class CanBackend:
         self._ours = False  # whether the modules are: before that is known, nothing that disturbs them is sent
         self._unconfigured = set(range(joints))  # joints whose parameters may not be what the robot file says
         try:
-            if pose_listen := settings.pose_listen or ("" if settings.twins_run == "none" else "127.0.0.1:0"):
-                self._mocap = MocapReceiver(pose_listen)
+            camera = config.robot.sensors.pose
+            if camera is not None and (pose_listen := pose_address(settings)):
+                self._mocap = MocapReceiver(pose_listen, camera.delay_s, self._now_ns)
             self._buses = self._open_buses(shares(config, settings))
             self._reading = Reading(joints)
             self._description = self._describe()
@@ -172,8 +174,11 @@ class CanBackend:
             self._owed |= failed  # the HAL sets them aside
         elif found and self._lifecycle not in commands.LATCHED:
             # Stopped here and now. From now on only a clear leads out, also one that comes before the next period.
-            for frame in commands.on_change(self._lifecycle, "fault"):
-                self._broadcast(frame)
+            try:
+                for frame in commands.on_change(self._lifecycle, "fault"):
+                    self._broadcast(frame)
+            except BackendError as error:  # what was found is told all the same; the bus that fails raises again
+                found.append(Finding("stop_not_sent", str(error)))
             self._lifecycle = "fault"
         self._unconfigured |= self._watch.take_changed()
         return [
@@ -206,19 +211,26 @@ class CanBackend:
             return
         self._open = False
         for wire in self._wires:
-            try:
-                if self._ours:
-                    wire.send(commands.command(Action.DISARM))
-                wire.idle()
-            except BackendError as error:
-                _log.warning("closing: %s", error)
-            wire.close()
+            self._let_go(wire)
         if self._twins is not None:
             self._twins.stop()
         if self._mocap is not None:
             self._mocap.close()
 
     # --- inside -----------------------------------------------------------------------------------------------
+
+    def _let_go(self, wire: Wire) -> None:
+        """Motors off, and the bus closed, as far as it still works; the other buses have their turn in any case."""
+        try:
+            if self._ours:
+                wire.send(commands.command(Action.DISARM))
+            wire.idle()
+        except BackendError as error:
+            _log.warning("closing: %s", error)
+        try:
+            wire.close()
+        except BackendError as error:
+            _log.warning("closing: %s", error)
 
     def _must_be_open(self) -> None:
         if not self._open:
@@ -233,8 +245,10 @@ class CanBackend:
             lease_ns=config.lease_ns,
             config_hash=config_hash(config),
         )
-        sensors = described(config, self._reports, pose=self._mocap is not None)
-        return msgspec.structs.replace(plain, sensors=sensors)
+        camera = config.robot.sensors.pose
+        delay_s = camera.delay_s if camera is not None and self._mocap is not None else None
+        sensors = described(config, self._reports, pose_delay_s=delay_s)
+        return msgspec.structs.replace(plain, sensors=sensors, hardware="+".join(self._settings.channels))
 
     def _open_buses(self, joints_of: list[int]) -> list[Bus]:
         settings = self._settings
@@ -264,7 +278,7 @@ class CanBackend:
             raise BackendError("another program commands the modules on this bus; end it first. Nothing was sent")
         wrong = objections(self._buses, found, names, lockstep=self._lockstep)
         if wrong:
-            raise BackendError("the robot is not whole; nothing was enabled:\n  " + "\n  ".join(wrong))
+            raise BackendError("the robot is not whole; nothing was enabled:", *(f"  {what}" for what in wrong))
         self._ours = True
         emulated = all(identity.emulated for identity in found)
         self._description = msgspec.structs.replace(self._description, emulated=emulated)
@@ -308,7 +322,7 @@ class CanBackend:
 
     def _sync(self, stamp_ns: int) -> None:
         reading, questions = self._reading, self._questions()
-        time_us = (stamp_ns if self._lockstep else time.monotonic_ns()) // 1000
+        time_us = self._now_ns(stamp_ns) // 1000
         self._receive()
         due = contacts_due(self._reports, reading.sync + 1)
         reading.begin(reading.sync + 1, contacts=due, tail=self._reports.tail, questions=len(questions))
@@ -323,6 +337,10 @@ class CanBackend:
             if not wait(self._wires, left_s):
                 break
             self._receive()
+
+    def _now_ns(self, stamp_ns: int) -> int:
+        """The time by this driver's clock: in lockstep the robot's own, which is that of the tick's stamp."""
+        return stamp_ns if self._lockstep else time.monotonic_ns()
 
     def _questions(self) -> list[tuple[Wire, Frame]]:
         """In lockstep, what is asked of twins behind a Sync: once it is answered, everything that they said is here.

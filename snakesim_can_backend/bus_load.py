@@ -138,16 +138,17 @@ def check_load(config: RunConfig, settings: Settings) -> list[float]:
     worst = max(range(len(loads)), key=lambda i: loads[i])
     if loads[worst] > MOST_LOAD:
         raise ConfigError(
-            f"{joints[worst]} joints at {config.rate_hz:g} Hz do not fit on {_name(settings, worst)}:\n"
-            f"{arithmetic(joints[worst], on_bus(worst, reports))}\n{what_fits(joints, config, settings)}"
+            f"{joints[worst]} joints at {config.rate_hz:g} Hz do not fit on {_name(settings, worst)}:",
+            *arithmetic(joints[worst], on_bus(worst, reports)),
+            what_fits(joints, config, settings),
         )
     longest = max(range(len(joints)), key=lambda i: busiest_s(joints[i], on_bus(i, reports)))
     needed_s = busiest_s(joints[longest], on_bus(longest, reports))
     if needed_s * config.rate_hz > 1:
         raise ConfigError(
             f"{joints[longest]} joints at {config.rate_hz:g} Hz do not fit on {_name(settings, longest)}: a period "
-            f"with force reports takes {needed_s * 1000:.2f} ms of bus time and lasts {1000 / config.rate_hz:.2f} ms.\n"
-            f"{what_fits(joints, config, settings)}"
+            f"with force reports takes {needed_s * 1000:.2f} ms of bus time and lasts {1000 / config.rate_hz:.2f} ms.",
+            what_fits(joints, config, settings),
         )
     return loads
 
@@ -156,9 +157,9 @@ def _name(settings: Settings, bus: int) -> str:
     return settings.channels[bus] if settings.channels else "the virtual bus"
 
 
-def arithmetic(joints: int, reports: Reports) -> str:
+def arithmetic(joints: int, reports: Reports) -> list[str]:
     """The sum, line by line."""
-    lines = []
+    lines: list[str] = []
     for stream in streams(joints, reports):
         if stream.frames_per_s:
             layout = codec()[stream.opcode]
@@ -168,7 +169,7 @@ def arithmetic(joints: int, reports: Reports) -> str:
                 f" = {100 * stream.bits_per_s / BIT_RATE:5.1f} %"
             )
     total = 100 * load(joints, reports)
-    return "\n".join([*lines, f"  together {total:.1f} % of 1 Mbit/s at worst-case stuffing; at most {MOST_LOAD:.0%}"])
+    return [*lines, f"  together {total:.1f} % of 1 Mbit/s at worst-case stuffing; at most {MOST_LOAD:.0%}"]
 
 
 def what_fits(joints: Sequence[int], config: RunConfig, settings: Settings) -> str:

@@ -26,10 +26,11 @@ from snakesim_can_backend.protocol import FIRST_NODE, LAST_NODE, Opcode
 from snakesim_can_backend.reading import Module, Reading
 from snakesim_can_backend.settings import Settings
 from snakesim_can_backend.wire import SocketCanWire, Wire
-from snakesim_hal.errors import ConfigError
 from snakesim_hal.files import Table, decode
 from snakesim_hal.scenario import Loaded, Override, RunConfig, parse_set
 from snakesim_hal.scenario import load as load_scenario
+from snakesim_hal.terminal import say
+from snakesim_hal.textfiles import write_text
 
 OK, FAILED = 0, 1
 MOST_RATE_HZ = 5000  # of a scenario
@@ -42,11 +43,12 @@ UNKNOWN = "-"
 
 def main(argv: Sequence[str]) -> int:
     """Exit code: 0 done, 1 does not fit or nobody answers. Raises SnakesimError."""
-    arguments = _parser().parse_args(list(argv))
+    arguments = parser().parse_args(list(argv))
     return arguments.act(arguments)
 
 
-def _parser() -> argparse.ArgumentParser:
+def parser() -> argparse.ArgumentParser:
+    """What the command takes."""
     parser = argparse.ArgumentParser(prog="snakesim can", description="Joint modules and their buses.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
@@ -79,10 +81,12 @@ def _load(arguments: argparse.Namespace) -> int:
     settings = settings_of(loaded)
     if arguments.joints is None and arguments.rates is None:
         lines, all_fit = one(loaded.config, settings)
-        print("\n".join(lines))
+        for line in lines:
+            say(line)
         return OK if all_fit else FAILED
     config = loaded.config
-    print("\n".join(table(config, settings, arguments.joints or [config.robot.chain.modules], arguments.rates)))
+    for line in table(config, settings, arguments.joints or [config.robot.chain.modules], arguments.rates):
+        say(line)
     return OK
 
 
@@ -101,7 +105,7 @@ def one(config: RunConfig, settings: Settings) -> tuple[list[str], bool]:
     for i, count in enumerate(joints):
         name = settings.channels[i] if settings.channels else "one bus"
         busiest_ms = 1e3 * busiest_s(count, on_bus(i, reports))
-        lines += [f"{name}: {count} joints at {config.rate_hz:g} Hz", arithmetic(count, on_bus(i, reports))]
+        lines += [f"{name}: {count} joints at {config.rate_hz:g} Hz", *arithmetic(count, on_bus(i, reports))]
         lines.append(f"  Sync, answers, forces and set-points of one period: {busiest_ms:.2f} of {period_ms:.2f} ms")
     all_fit = all(fits(count, on_bus(i, reports)) for i, count in enumerate(joints))
     return (lines if all_fit else [*lines, f"Refused. {what_fits(joints, config, settings)}"]), all_fit
@@ -136,7 +140,8 @@ def _scan(arguments: argparse.Namespace) -> int:
             rows = scan(wire, arguments.seconds)
         finally:
             wire.close()
-        print("\n".join(aligned(rows)) if rows else f"{channel}: nobody answers")
+        for line in aligned(rows) if rows else [f"{channel}: nobody answers"]:
+            say(line)
         found += len(rows)
     return OK if found else FAILED
 
@@ -204,11 +209,8 @@ def _shaft(raw: int | None) -> str:
 
 def _expand(arguments: argparse.Namespace) -> int:
     path = arguments.write / EXPANDED
-    try:
-        path.write_text(expanded_dbc(), encoding="cp1252", newline="\n")
-    except OSError as error:
-        raise ConfigError(f"--write {arguments.write}: {error.strerror}; give a folder that is there") from error
-    print(path)
+    write_text(path, expanded_dbc(), encoding="cp1252")
+    say(str(path))
     return OK
 
 

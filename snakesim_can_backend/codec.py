@@ -4,7 +4,6 @@ cantools reads the file once; what runs at every frame is made from it here and 
 once a tick for all joints together. Bus units end in this module.
 """
 
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -16,7 +15,8 @@ import cantools
 from cantools.database.can import Database
 
 from snakesim_can_backend.protocol import NODE_BITS, WITH_CHECKSUM, Frame, Opcode, checksum, frame_id
-from snakesim_hal.errors import ConfigError, SnakesimError
+from snakesim_hal.errors import SnakesimError
+from snakesim_hal.files import SCHEMAS
 
 DBC = "snakesim.dbc"
 OPCODE_MASK = 0x7FF & ~((1 << NODE_BITS) - 1)
@@ -142,12 +142,8 @@ def load_database() -> Database:
 
 
 def dbc_path() -> Path:
-    """Where the DBC file is: in the repository's `schemas/can`, or where an installed package has put it."""
-    folders = (Path(__file__).parents[1] / "schemas" / "can", Path(sys.prefix) / "share" / "snakesim" / "can")
-    for folder in folders:
-        if (folder / DBC).is_file():
-            return folder / DBC
-    raise ConfigError(f"{DBC} is neither in {folders[0]} nor in {folders[1]}; install SnakeSIM anew")
+    """Where the DBC file is: it comes with the HAL, as the other schemas do."""
+    return SCHEMAS / "can" / DBC
 
 
 def _expression(signal: Signal) -> str:

@@ -19,7 +19,7 @@ _log = logging.getLogger("snakesim.can")
 def open_log(path: Path) -> TextIO:
     """Begin a log. Raises ConfigError."""
     try:
-        return path.open("w", encoding="ascii", buffering=FLUSH_BYTES)
+        return path.open("w", encoding="utf-8", errors="backslashreplace", buffering=FLUSH_BYTES)
     except OSError as error:
         raise ConfigError(f"`backends.can.log` = {str(path)!r}: {error.strerror}; choose another file") from error
 
@@ -64,9 +64,9 @@ class LoggedWire:
 
     def close(self) -> None:
         """Close the wire; the log is complete."""
-        self._wire.close()
         with contextlib.suppress(OSError):
             self._log.flush()
+        self._wire.close()
 
     def _write(self, frame: Frame) -> None:
         if self._full:

@@ -17,9 +17,10 @@ from snakesim_hal.errors import BackendError, ConfigError
 from snakesim_hal.injection import KINDS, Injection
 from snakesim_hal.planned import check_backend_can
 from snakesim_hal.scenario import RunConfig, write
+from snakesim_hal.serve import START_LIMIT_S
+from snakesim_hal.terminal import complain
 
 READY = "modules ready"
-START_LIMIT_S = 120.0  # MuJoCo on a slow machine
 STOP_LIMIT_S = 5.0
 POLL_S = 0.02
 
@@ -77,23 +78,31 @@ class TwinProcess:
 
     def __init__(self, config: RunConfig, settings: Settings, pose: str | None, *, stepped: bool) -> None:
         """Start it, and wait until its modules are on the bus. Raises BackendError."""
-        self._folder = tempfile.TemporaryDirectory(prefix="snakesim-twins-")
-        run, self._said = Path(self._folder.name, "config.json"), Path(self._folder.name, "modules.log")
-        write(msgspec.structs.replace(config, backends={**config.backends, "can": msgspec.to_builtins(settings)}), run)
-        arguments = [str(run), "--parent", str(os.getpid()), "--pose", pose or "none"]
+        changed = msgspec.structs.replace(config, backends={**config.backends, "can": msgspec.to_builtins(settings)})
+        arguments = ["--parent", str(os.getpid()), "--pose", pose or "none"]
         for channel in settings.channels:
             arguments += ["--channel", channel]
         arguments += ["--stepped"] if stepped else []
+        try:
+            self._folder = tempfile.TemporaryDirectory(prefix="snakesim-twins-", ignore_cleanup_errors=True)
+            self._said = Path(self._folder.name, "modules.log")
+            self._process = self._started(changed, arguments)
+        except OSError as error:
+            raise BackendError(f"the module twins cannot be started: {error}") from error
+        self._await_ready()
+
+    def _started(self, config: RunConfig, arguments: list[str]) -> subprocess.Popen[bytes]:
+        run = Path(self._folder.name, "config.json")
+        write(config, run)
         with self._said.open("wb") as output:
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", "snakesim_can_backend.twin.command", *arguments, "--interactive"],
+            return subprocess.Popen(
+                [sys.executable, "-m", "snakesim_can_backend.twin.command", str(run), *arguments, "--interactive"],
                 stdin=subprocess.PIPE,
                 stdout=output,
                 stderr=subprocess.STDOUT,
                 env={**os.environ, "PYTHONUNBUFFERED": "1"},
                 start_new_session=True,
             )
-        self._await_ready()
 
     def how_it_ended(self) -> str | None:
         """In words; None while it runs."""
@@ -123,15 +132,17 @@ class TwinProcess:
         if self._process.stdin is not None:
             with contextlib.suppress(OSError):
                 self._process.stdin.close()
-        sys.stderr.write(self._said.read_text(encoding="utf-8", errors="replace"))
+        with contextlib.suppress(OSError):  # a log that cannot be read or passed on keeps nothing from ending
+            for line in self._said.read_text(encoding="utf-8", errors="replace").splitlines():
+                complain(line)
         self._folder.cleanup()
 
     def _await_ready(self) -> None:
         end = time.monotonic() + START_LIMIT_S
         while time.monotonic() < end:
-            said = self._said.read_text(encoding="utf-8", errors="replace")
-            if READY in said:
-                return
+            with contextlib.suppress(OSError):
+                if READY in self._said.read_text(encoding="utf-8", errors="replace"):
+                    return
             if self._process.poll() is not None:
                 break
             time.sleep(POLL_S)

@@ -41,6 +41,7 @@ def check_ratings(robot: RobotFile, in_force: Mapping[int, Mapping[Parameter, fl
         ("limits.angle_rad", robot.limits.angle_rad, signals["angle"].high, "rad"),
         ("limits.speed_rad_s", robot.limits.speed_rad_s, signals["velocity"].high / SPEED_ROOM, "rad/s"),
         ("limits.torque_nm", robot.limits.torque_nm, signals["torque"].high, "N·m"),
+        ("limits.stop_at_c", robot.limits.stop_at_c, codec()[Opcode.HEALTH].signals["motor_temperature"].high, "°C"),
     ):
         if value > most:
             raise ConfigError(
@@ -64,7 +65,7 @@ def check_ratings(robot: RobotFile, in_force: Mapping[int, Mapping[Parameter, fl
             (Parameter.RATED_TORQUE, robot.limits.torque_nm, "N·m"),
             (Parameter.RATED_SPEED, robot.limits.speed_rad_s, "rad/s"),
         ):
-            if values[parameter] < asked * 0.999:
+            if not values[parameter] >= asked * 0.999:  # a rating of NaN, which the bus can carry, is none
                 raise BackendError(
                     f"joint_{node} is rated for {values[parameter]:.3g} {unit}, robot {robot.name!r} asks for "
                     f"{asked:g}: lower the limit in the robot file"

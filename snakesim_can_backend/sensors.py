@@ -131,8 +131,8 @@ def contacts_due(reports: Reports, sync: int) -> bool:
     return reports.contact_every > 0 and (sync & 0xFF) % reports.contact_every == 0
 
 
-def described(config: RunConfig, reports: Reports, *, pose: bool) -> list[SensorDescription]:
-    """What this robot's modules deliver, and how often."""
+def described(config: RunConfig, reports: Reports, *, pose_delay_s: float | None) -> list[SensorDescription]:
+    """What this robot's modules deliver, and how often; pose_delay_s: of motion capture, None without any."""
     rate = config.rate_hz
     sensors = [SensorDescription(key=keys.JOINTS, rate_hz=rate, delay_s=0.0)]
     if reports.contact_every:
@@ -140,8 +140,8 @@ def described(config: RunConfig, reports: Reports, *, pose: bool) -> list[Sensor
     if reports.imu_every:
         sensors.append(SensorDescription(key=keys.IMU, rate_hz=rate / reports.imu_every, delay_s=0.0))
     sensors.append(SensorDescription(key=keys.POWER, rate_hz=1 / HEALTH_PERIOD_S, delay_s=0.0))
-    if pose:
-        sensors.append(SensorDescription(key=keys.POSE, rate_hz=rate, delay_s=0.0))
+    if pose_delay_s is not None:
+        sensors.append(SensorDescription(key=keys.POSE, rate_hz=rate, delay_s=pose_delay_s))
     return sensors
 
 

@@ -31,11 +31,12 @@ EXTENDED, REMOTE, ERROR = 0x80000000, 0x40000000, 0x20000000
 RECEIVE_BUFFER_BYTES = 1 << 20
 MOST_AT_ONCE = 4096  # a bus that babbles must not keep its reader for ever
 SO_MEMINFO, MEMINFO_DROPS, MEMINFO_BYTES = 55, 8, 36  # linux/sock_diag.h
+IO_ERRORS = (OSError, ValueError, can.CanError)  # of sockets, of `select` and of python-can
 _wire_format = struct.Struct("<IB3x8s")
 
 
 class Wire(Protocol):
-    """One end of a bus."""
+    """One end of a bus. Whatever is wrong with it is a trouble or a BackendError, never another exception."""
 
     channel: str
 
@@ -75,14 +76,20 @@ class SocketCanWire:
     """A SocketCAN interface."""
 
     def __init__(self, channel: str, only: Iterable[Opcode] | None = None) -> None:
-        """only: messages to receive, filtered in the kernel; None: all with 11-bit ids. Raises ConfigError."""
+        """only: messages to receive, filtered in the kernel; None: all with 11-bit ids.
+
+        Raises ConfigError for an interface that is not there, BackendError for one that cannot be opened.
+        """
         check_interface(channel)
         self.channel = channel
-        self._bus = SocketcanBus(channel=channel, ignore_rx_error_frames=False)
-        self._socket = self._bus.socket
         self._only = None if only is None else list(only)
-        self._set_filters()
-        self._socket.setblocking(False)
+        try:
+            self._bus = SocketcanBus(channel=channel, ignore_rx_error_frames=False)
+            self._socket = self._bus.socket
+            self._set_filters()
+            self._socket.setblocking(False)
+        except IO_ERRORS as error:
+            raise BackendError(f"{channel}: cannot be opened: {error}") from error
         with contextlib.suppress(OSError):
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
         self._buffer = bytearray(_wire_format.size)
@@ -136,7 +143,10 @@ class SocketCanWire:
 
     def close(self) -> None:
         """Close the socket."""
-        self._bus.shutdown()
+        try:
+            self._bus.shutdown()
+        except IO_ERRORS as error:
+            raise BackendError(f"{self.channel}: cannot be closed: {error}") from error
 
     def _set_filters(self) -> None:
         all_nodes = 0x7FF & ~((1 << NODE_BITS) - 1)
@@ -207,14 +217,20 @@ class VirtualWire:
         """Hand over a frame; a virtual bus takes everything, unless a fault is on."""
         if self._faults.on and (taken := self._faults.stops_sending()) is not None:
             return taken
-        self._bus.send(can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False))
+        try:
+            self._bus.send(can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False))
+        except IO_ERRORS as error:
+            raise BackendError(f"{self.channel}: cannot send: {error}") from error
         return True
 
     def receive(self) -> list[Frame]:
         """Every frame that is there now."""
         frames: list[Frame] = []
-        while (message := self._bus.recv(0)) is not None:
-            frames.append(Frame(message.arbitration_id, bytes(message.data)))
+        try:
+            while (message := self._bus.recv(0)) is not None:
+                frames.append(Frame(message.arbitration_id, bytes(message.data)))
+        except IO_ERRORS as error:
+            raise BackendError(f"{self.channel}: cannot receive: {error}") from error
         return self._faults.leaves(frames) if self._faults.on else frames
 
     def troubles(self) -> list[Trouble]:
@@ -238,7 +254,10 @@ class VirtualWire:
         """Leave the bus; the other end, if it lives on this one, leaves too."""
         if self.other_end is not None:
             self.other_end.close()
-        self._bus.shutdown()
+        try:
+            self._bus.shutdown()
+        except IO_ERRORS as error:
+            raise BackendError(f"{self.channel}: cannot be closed: {error}") from error
 
 
 def drain(
@@ -260,7 +279,7 @@ def drain(
 def wait(wires: Sequence[Wire], timeout_s: float) -> bool:
     """Until a frame may be there on any of them, or the time is over. Other ends in this process run meanwhile.
 
-    False when nothing can come any more before this end sends something.
+    False when nothing can come any more before this end sends something. Raises BackendError.
     """
     pauses = [pause for wire in wires if (pause := wire.idle()) is not None]
     if not pauses:
@@ -268,7 +287,11 @@ def wait(wires: Sequence[Wire], timeout_s: float) -> bool:
     files = [number for wire in wires if (number := wire.fileno()) is not None]
     timeout_s = max(min([timeout_s, *pauses]), 0.0)
     if files:
-        select.select(files, [], [], timeout_s)
+        try:
+            select.select(files, [], [], timeout_s)
+        except IO_ERRORS as error:
+            channels = ", ".join(wire.channel for wire in wires)
+            raise BackendError(f"{channels}: cannot be waited for: {error}") from error
     elif timeout_s > 0:
         time.sleep(timeout_s)
     return True
@@ -292,7 +315,7 @@ def is_up(channel: str) -> bool:
     """Whether an interface is there and administratively up."""
     try:
         return bool(int(Path("/sys/class/net", channel, "flags").read_text(encoding="ascii"), 16) & 1)
-    except OSError:
+    except (OSError, ValueError):  # the latter: the file of an interface that is going away is empty
         return False
 
 

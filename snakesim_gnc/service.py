@@ -1,6 +1,5 @@
 """The thin shell around a pure core: join, wait for ticks, publish what the core says, report it done."""
 
-import sys
 from collections.abc import Sequence
 from typing import Protocol
 
@@ -11,11 +10,11 @@ from snakesim_hal.messages import Clock, Description, Message
 from snakesim_hal.process import SERVICE_PRIORITY, calm_down_after, hurry, settle_for_timing
 from snakesim_hal.scenario import RunConfig
 from snakesim_hal.scenario import Service as Schedule
-from snakesim_hal.serve import arguments, duty
+from snakesim_hal.serve import START_LIMIT_S, arguments, duty
 from snakesim_hal.session import open_session
+from snakesim_hal.terminal import complain_of
 
 SILENCE_S = 1.0
-START_LIMIT_S = 120.0  # until a HAL host answers, which may start MuJoCo on a slow machine
 
 
 class Service(Protocol):
@@ -49,24 +48,32 @@ def serve(service_type: type[Service], argv: Sequence[str] | None = None) -> int
             calm_down_after(given.config.lease_ns * 1e-9)
         with open_session(given.link, connect_timeout_s=START_LIMIT_S) as session:
             schedule = given.config.services.get(name, Schedule())
-            client = Client(session, name, every_ticks=schedule.every_ticks)
+            client = Client(session, name, every_ticks=schedule.every_ticks, pace=given.config.pace)
             service = service_type(client, given.config)
             robot = client.description(timeout_s=START_LIMIT_S)
             service.meet(robot)
             injector = Injector(name, given.config, session, newest=lambda: client.heard)
             injector.allow(emulated=robot.emulated, faults_allowed=given.config.faults_allowed)
-            client.announce()
+            be_there(client, injector)
             settle_for_timing()
             try:
                 loop(client, service, injector)
             finally:
                 injector.close()
     except SnakesimError as error:
-        print(f"snakesim {name}: {error}", file=sys.stderr)
+        complain_of(error, f"snakesim {name}")
         return 1
     except KeyboardInterrupt:
         return 0
     return 0
+
+
+def be_there(client: Client, injector: Injector) -> None:
+    """Show that the service is here; from now on the robot may be armed, perhaps before the service's first tick."""
+    clock = client.hear(SILENCE_S)
+    if clock is not None:
+        injector.turn(clock.stamp_ns, clock.arming, clock.lifecycle)
+    client.announce()
 
 
 def loop(client: Client, service: Service, injector: Injector) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from snakesim_hal import arming, gate, lifecycle
 from snakesim_hal.backend import SetPoints
 from snakesim_hal.derating import Derating
+from snakesim_hal.fault_log import FaultLog
 from snakesim_hal.gate import Applied, JointLimits
 from snakesim_hal.halting import Halt
 from snakesim_hal.isolation import Isolation, Mask
@@ -32,7 +33,6 @@ from snakesim_hal.messages import (
 )
 from snakesim_hal.plausible import Doubt, JointWatch, readable
 
-MAX_FAULTS_KEPT = 32
 COMMANDS_KEPT = 1024
 
 
@@ -56,8 +56,8 @@ class Authority:
         self.why = "not armed yet"
         self.arming = 0
         self.lease = Lease(epoch=first_epoch)
-        self.faults: list[Fault] = []  # since the last clear
-        self.fault_log: list[Fault] = []  # since the start
+        self.since_clear = FaultLog()
+        self.since_start = FaultLog()
         self.accepted = 0
         self.standby = 0
         self.rejected: Counter[str] = Counter()
@@ -66,6 +66,8 @@ class Authority:
         self._applied = Applied(np.zeros(count, dtype=np.int64), np.zeros(count), self.limits.torque_nm)
         self._watch = JointWatch(self.limits)
         self._measured = self._watch.measured
+        self._state_tick = 0  # of the newest joint state
+        self._armed_tick = -1  # of the state that was the newest at the last arming
         self._isolation = Isolation(description)
         self._doubt: Doubt | None = self._unknown("no joint state yet")
         self._derating = Derating(description)
@@ -87,6 +89,7 @@ class Authority:
         """
         applied = self._applied if self.state == "armed" else None
         now_ns = joints.stamp_ns if now_ns is None else now_ns
+        self._state_tick = joints.tick
         self._doubt = self._watch.take(joints, now_ns=now_ns, applied=applied, aside=self._isolation.joints)
         self._measured = self._watch.measured
 
@@ -102,6 +105,11 @@ class Authority:
     def derated(self) -> dict[str, float]:
         """Joints that heat leaves less than their whole torque, and the share that is left."""
         return self._derating.derated()
+
+    @property
+    def faults(self) -> list[Fault]:
+        """What went wrong since the last clear, as far as it is kept."""
+        return self.since_clear.kept
 
     @property
     def isolated(self) -> list[str]:
@@ -122,10 +130,13 @@ class Authority:
         if refusal is not None:
             self.rejected[refusal] += 1
             return refusal
-        self._last_sequence = command.sequence
         if not self.answers_arming(command):  # nor does it keep the lease: what moves the robot must be commanded now
-            self.standby += 1
+            if command.tick <= self._armed_tick:  # under way when the robot was armed: nobody's mistake
+                self.standby += 1
+            else:
+                self.rejected["before_arming"] += 1
             return "before_arming"
+        self._last_sequence = command.sequence  # only now: what is refused must not make the next good one a replay
         self.lease = renewed(self.lease, now_ns, self.description.lease_ns)
         self._command, self._command_ns = command, now_ns
         if self.state == "armed":
@@ -137,7 +148,7 @@ class Authority:
 
     def answers_arming(self, command: JointCommand) -> bool:
         """Whether a command was sent in the knowledge that the robot is armed, if it is."""
-        return self.state != "armed" or command.arming is None or command.arming == self.arming
+        return self.state != "armed" or command.arming == self.arming
 
     def reject(self, reason: str) -> None:
         """Count a sample that never became a command."""
@@ -163,29 +174,31 @@ class Authority:
                 if against:
                     words = {word for word, _ in against}
                     return self._answer("; ".join(why for _, why in against), min(words, key=arming.ORDER.index))
-                self._go("arm", f"armed, commanded by {self.lease.holder}")
+                self._go("arm", f"armed by {request.who}, commanded by {self.lease.holder}")
                 self.arming += 1
+                self._armed_tick = self._state_tick
                 self._command = self._counting = None
                 self._recent.clear()
                 self.lease = renewed(self.lease, now_ns, self.description.lease_ns)
             case "disarm":
-                if not self._go("disarm", "disarmed on request"):
+                if not self._go("disarm", f"disarmed by {request.who}"):
                     return self._answer(f"cannot disarm in state {self.state}; clear it first", "wrong_state")
             case "clear":
-                if not self._go("clear", "cleared; arm to move again"):
+                if not self._go("clear", f"cleared by {request.who}; arm to move again"):
                     lost = ", ".join(self.isolated)
                     hint = f"; disarm first, then a clear takes back {lost}" if lost else ""
                     return self._answer(f"nothing to clear in state {self.state}{hint}", "wrong_state")
                 self._take_back()
-                self.faults.clear()
+                self.since_clear = FaultLog()
             case _:  # finish
                 if self.state == "armed":
-                    self._go("disarm", "run finished")
+                    self._go("disarm", f"finished by {request.who}")
         return self._answer(None)
 
     def on_estop(self, request: EstopRequest, tick: int) -> Answer:
         """Stop now, whoever asks."""
-        self.note(Fault(tick=tick, what="estop", cause=f"emergency stop by {request.who}"))
+        stopping = Fault(tick=tick, what="estop", cause=f"emergency stop by {request.who}")
+        self.note(stopping, stops=self.state != "estop")
         self._go("estop", f"emergency stop by {request.who}; clear it to go on")
         return self._answer(None)
 
@@ -199,20 +212,17 @@ class Authority:
         if fault.reach == "joint" and self._set_aside(fault, joints):
             return
         fault = msgspec.structs.replace(fault, reach="robot")
-        self.note(fault)
-        if self.state not in ("fault", "estop"):  # what comes after the first is its consequence, as a rule
+        stops = self.state not in ("fault", "estop")  # what comes after the first is its consequence, as a rule
+        self.note(fault, stops=stops)
+        if stops:
             self._go("fault", fault.cause[:500] or fault.what)
         self._drop_lease()
 
-    def note(self, fault: Fault) -> None:
-        """Keep a fault that people should know of but that stops nothing by itself."""
+    def note(self, fault: Fault, *, stops: bool = False) -> None:
+        """Keep a fault that people should know of but that stops nothing by itself. stops: it does."""
         fault = msgspec.structs.replace(fault, cause=fault.cause[:500])
-        for kept in (self.faults, self.fault_log):
-            less = [i for i, other in enumerate(kept) if other.reach == "joint"]
-            if len(kept) == MAX_FAULTS_KEPT and less and fault.reach == "robot":  # why it stopped is never left out
-                del kept[less[-1]]
-            if len(kept) < MAX_FAULTS_KEPT:
-                kept.append(fault)
+        for log in (self.since_clear, self.since_start):
+            log.add(fault, stops=stops)
 
     def holder_gone(self, cause: str) -> None:
         """The lease holder's process is known to be gone while disarmed: free the lease at once."""

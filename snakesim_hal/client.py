@@ -26,7 +26,9 @@ from snakesim_hal.messages import (
     LeaseRequest,
     Message,
     Mode,
+    Pace,
 )
+from snakesim_hal.run_key import is_proven, own_run_key
 from snakesim_hal.session import Arrival, Publisher, Reader, Session
 
 KEPT_PER_KEY = 32
@@ -77,11 +79,14 @@ class Feed(Generic[MessageT]):
 class Client:
     """A service's connection to one robot's HAL."""
 
-    def __init__(self, session: Session, service: str, *, every_ticks: int = 1) -> None:
-        """every_ticks: the service acts on ticks that are multiples of this, and sleeps through the others."""
+    def __init__(self, session: Session, service: str, *, every_ticks: int = 1, pace: Pace = "lockstep") -> None:
+        """every_ticks: the service acts on ticks that are multiples of this, and sleeps through the others.
+
+        pace: of the run. A robot in real time has no clock in lockstep, for which a service would wait.
+        """
         self.service = service
         self.session = session
-        self._every_ticks = every_ticks
+        self._every_ticks, self._pace = every_ticks, pace
         self._clocks: Mailbox[Clock] = Mailbox()
         self._heard_at = time.monotonic()
         self.heard: Clock | None = None  # the newest clock, due or not
@@ -98,7 +103,7 @@ class Client:
 
     def description(self, timeout_s: float = 10.0) -> Description:
         """The robot. Raises NotConnectedError when no HAL shows one in time."""
-        self._robot = self._robot or self.session.latest(keys.DESCRIPTION, Description, timeout_s)
+        self._robot = self._robot or self._own_description(timeout_s)
         if self._robot is None:
             raise NotConnectedError(f"no robot description within {timeout_s} s; is the robot's HAL host running?")
         return self._robot
@@ -150,13 +155,25 @@ class Client:
             clock = following
         return clock
 
+    def hear(self, timeout_s: float) -> Clock | None:
+        """The newest clock, due or not; waits for the first one. None when there is none in time."""
+        deadline = time.monotonic() + timeout_s
+        while self.heard is None and time.monotonic() < deadline:
+            time.sleep(0.001)
+        return self.heard
+
     def met_anew(self) -> Description | None:
         """The robot, when its HAL has started over since the last call; else None."""
         if not self._started_over:
             return None
         self._started_over = False
-        self._robot = self.session.latest(keys.DESCRIPTION, Description, MISSING_LIMIT_S) or self._robot
+        self._robot = self._own_description(MISSING_LIMIT_S) or self._robot
         return self._robot
+
+    def _own_description(self, timeout_s: float) -> Description | None:
+        """What our own run's host shows; a forged one is not looked at."""
+        key = own_run_key()
+        return self.session.latest(keys.DESCRIPTION, Description, timeout_s, lambda found: is_proven(found, key))
 
     def _take_clock(self, arrival: Arrival) -> None:
         """Runs in Zenoh's thread: wakes the service only for ticks that are its own."""
@@ -165,6 +182,9 @@ class Client:
             clock = self._clock_decoder.decode(arrival.payload, arrival.encoding)
         except WireError as error:
             self.session.rejected[error.reason] += 1
+            return
+        if clock.pace == "lockstep" != self._pace:
+            self.session.rejected["other_pace"] += 1
             return
         self.heard = clock
         if clock.tick % self._every_ticks == 0:
@@ -195,13 +215,6 @@ class Client:
                 return found
         raise StalledError(f"{feed.key} of tick {wanted} was promised at tick {clock.tick} and never came")
 
-    def age_s(self, message: Message) -> float | None:
-        """How old a reading is by the robot's clock; None before the first tick."""
-        stamp_ns: int | None = getattr(message, "stamp_ns", None)
-        if self._clock is None or stamp_ns is None:
-            return None
-        return (self._clock.stamp_ns - stamp_ns) * 1e-9
-
     def put(self, key: str, message: Message) -> None:
         """Publish an output of this service."""
         publisher = self._publishers.get(key)
@@ -216,7 +229,8 @@ class Client:
         if self.commanded_tick == tick:
             return
         if self._done is None:
-            self._done = self.session.publisher(keys.done(self.service), Done, lossless=True)
+            lossless = self._clock is not None and self._clock.pace == "lockstep"
+            self._done = self.session.publisher(keys.done(self.service), Done, lossless=lossless)
         self._done.put(Done(tick=tick))
 
 
@@ -242,7 +256,7 @@ class Commander:
         self._asked_at = now
         request = LeaseRequest(action="acquire", holder=self._client.service, priority=self._priority)
         try:
-            answer: Answer = self._client.session.ask_politely(keys.LEASE, request)
+            answer: Answer = self._client.session.ask(keys.LEASE, request, host=self._description.host)
         except NotConnectedError as error:
             self.refusal = str(error)
             return False
@@ -250,11 +264,11 @@ class Commander:
         self._epoch = answer.epoch if answer.ok else 0
         return answer.ok
 
-    def send(self, clock: Clock, set_points: SetPoints) -> None:
-        """Publish set-points that answer the state at `clock`; they are good for one lease term."""
+    def send(self, clock: Clock, joints: JointState, set_points: SetPoints) -> None:
+        """Publish set-points that answer a joint state; they are good for one lease term from when it was published."""
         self._sequence += 1
         command = JointCommand(
-            tick=clock.tick,
+            tick=joints.tick,
             arming=clock.arming,
             sequence=self._sequence,
             lease_epoch=self._epoch,
@@ -265,7 +279,7 @@ class Commander:
             torque_limit_nm=set_points.torque_limit_nm,
         )
         self._client.put(keys.JOINT_COMMAND, command)
-        self._client.commanded_tick = clock.tick
+        self._client.commanded_tick = joints.tick
 
     def stay(self, joints: JointState) -> SetPoints:
         """Set-points that keep every joint where it is: what is streamed while the robot is not armed."""

@@ -15,6 +15,8 @@ MessageT = TypeVar("MessageT", bound=Message)
 ENCODING_PREFIX = "application/msgpack;snakesim."
 MAX_PAYLOAD_BYTES = 1024 * 1024  # a world of 4096 obstacles fits; longer ones are dropped by the session unread
 MAX_WHY = 300  # characters of the reason why a payload is malformed
+# Everything that a msgspec decoder raises for bytes of a stranger: a payload may be nested too deeply, or be no text.
+UNDECODABLE = (msgspec.DecodeError, UnicodeDecodeError, RecursionError, OverflowError, ValueError)
 
 _encoder = msgspec.msgpack.Encoder()
 encode = _encoder.encode
@@ -41,7 +43,7 @@ class Decoder(Generic[MessageT]):
             raise WireError("malformed", f"{len(payload)} bytes, at most {MAX_PAYLOAD_BYTES}")
         try:
             return self._decoder.decode(payload)
-        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError, OverflowError, ValueError) as error:
+        except UNDECODABLE as error:
             why = str(error)[:MAX_WHY]  # it may quote what the sender wrote
             raise WireError("malformed", f"{self.message.__name__}: {why}") from None
 

@@ -1,9 +1,10 @@
 """Heat, supply and leaks: torque is derated before the robot is stopped. Pure; time is passed in.
 
-From `derate_from_c` on a winding loses torque, linearly, down to a fifth at `stop_at_c`. There, with water inside, or
-with a supply that is below `least_voltage_v` for 50 ms, the robot is stopped, and is not armed again before the winding
-has cooled below `derate_from_c`. Heat concerns the one joint; a leak or a weak supply is taken for the whole robot's.
-What no module has told for some seconds is not known: it is said, and does not count.
+From `derate_from_c` on a winding loses torque, linearly, down to a fifth at `stop_at_c`: by `thermal.HeatLimits`, which
+the motors hold by themselves as well. There, with water inside, or with a supply that is below `least_voltage_v` for
+50 ms, the robot is stopped, and is not armed again before the winding has cooled below `derate_from_c`. Heat concerns
+the one joint; a leak or a weak supply is taken for the whole robot's. What no module has told for some seconds is not
+known: it is said, and does not count.
 """
 
 import math
@@ -14,8 +15,8 @@ import numpy as np
 from snakesim_hal import keys
 from snakesim_hal.gate import Floats
 from snakesim_hal.messages import Description, Fault, JointDescription, Power
+from snakesim_hal.thermal import HeatLimits
 
-LEAST_SHARE = 0.2
 LOW_FOR_NS = 50_000_000
 KNOWN_FOR_NS = 3_000_000_000
 LONGEST_CAUSE = 400
@@ -119,10 +120,9 @@ class _Health:
 
     def share(self, now_ns: int) -> float:
         """The share of the torque limit that heat leaves."""
-        if self.winding_c <= self.joint.derate_from_c or not self.known(now_ns):
+        if not self.known(now_ns):
             return 1.0
-        over = (self.winding_c - self.joint.derate_from_c) / (self.joint.stop_at_c - self.joint.derate_from_c)
-        return 1.0 - (1.0 - LEAST_SHARE) * min(over, 1.0)
+        return HeatLimits(self.joint.derate_from_c, self.joint.stop_at_c).share_left(self.winding_c)
 
     def troubles(self, now_ns: int) -> list[tuple[str, str]]:
         """What stops the robot: a word, and the whole story."""

@@ -2,7 +2,14 @@
 
 
 class SnakesimError(Exception):
-    """Anything that SnakeSIM refuses or fails at; the message says what, and what to do next."""
+    """Anything that SnakeSIM refuses or fails at; the message says what, and what to do next.
+
+    lines: one, as a rule. Each is printed as one line, whatever it quotes from a file or from the network.
+    """
+
+    def __init__(self, *lines: str) -> None:
+        super().__init__("\n".join(lines))
+        self.lines = lines
 
 
 class ConfigError(SnakesimError, ValueError):
@@ -26,6 +33,10 @@ class NotConnectedError(SnakesimError, ConnectionError):
 
 class StalledError(SnakesimError, TimeoutError):
     """Something that had to arrive did not arrive in its time."""
+
+
+class ControllerError(SnakesimError, RuntimeError):
+    """A controller raised, or gave what cannot be sent: names the controller, the field, the value, what is allowed."""
 
 
 class BackendError(SnakesimError, RuntimeError):

@@ -5,9 +5,7 @@ value, the file or flag that it came from.
 """
 
 import difflib
-import json
 import re
-import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,10 +15,14 @@ import msgspec
 from msgspec import inspect
 
 from snakesim_hal.errors import ConfigError
+from snakesim_hal.textfiles import MOST_DEPTH, parse_json, parse_toml, read_text
+from snakesim_hal.wanted import fields_at, in_words, options, type_at, unit_of, value_at
 
 StructT = TypeVar("StructT", bound=msgspec.Struct)
 _AT = re.compile(r"^(?P<what>.*?)(?: - at `(?P<where>[^`]*)`)?$", re.DOTALL)
 SHIPPED = Path(__file__).parent / "shipped"
+ROUTER = SHIPPED / "router.json5"
+SCHEMAS = Path(__file__).parent / "schemas"  # in the repository a link to the folder beside the packages
 
 
 class FileStruct(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
@@ -38,6 +40,8 @@ class Table:
     def put(self, dotted: str, value: Any, origin: str) -> None:
         """Set a value, making the tables on the way."""
         *parents, last = dotted.split(".")
+        if len(parents) >= MOST_DEPTH:
+            raise ConfigError(f"{origin}: the key has {len(parents) + 1} parts, at most {MOST_DEPTH} are allowed")
         place: Any = self.values
         for i, name in enumerate(parents):
             if isinstance(place, list):
@@ -46,7 +50,7 @@ class Table:
             place = place.setdefault(name, {})
             if not isinstance(place, dict | list):
                 raise ConfigError(
-                    f"{origin}: `{'.'.join(parents[: i + 1])}` is the value {place!r}, not a section; "
+                    f"{origin}: `{'.'.join(parents[: i + 1])}` is the value {short(repr(place))}, not a section; "
                     f"`{dotted}` cannot be set inside it"
                 )
         if isinstance(place, list):
@@ -84,7 +88,7 @@ def _origins(value: Any, origin: str, prefix: str = "") -> dict[str, str]:
 
 
 def _list_entry(place: list[Any], name: str, dotted: str, origin: str) -> Any:
-    if not name.isdigit() or int(name) >= len(place):
+    if not name.isdecimal() or len(name) > 9 or int(name) >= len(place):
         has = f"has entries 0 to {len(place) - 1}; name one by its number" if place else "is empty"
         raise ConfigError(f"{origin}: `{dotted}`: the list {has}")
     return place[int(name)]
@@ -103,18 +107,14 @@ def leaves(value: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
         yield prefix, value
 
 
-def read_table(path: Path) -> Table:
-    """Read a TOML or JSON file. Raises ConfigError when it is absent or no such file."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read as text: {error}") from error
-    try:
-        values = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, json.JSONDecodeError, RecursionError) as error:
-        raise ConfigError(f"{path}: not valid {path.suffix[1:].upper() or 'TOML'}: {error}") from error
+def read_table(path: Path, suffix: str | None = None) -> Table:
+    """Read a TOML or JSON file. Raises ConfigError when it is absent or no such file.
+
+    suffix: says which; None: that of the path.
+    """
+    text = read_text(path)
+    is_json = (path.suffix if suffix is None else suffix) == ".json"
+    values = parse_json(text, str(path)) if is_json else parse_toml(text, str(path))
     if not isinstance(values, dict):
         raise ConfigError(f"{path}: holds a {type(values).__name__}, not a table of settings")
     return Table(values, str(path), _origins(values, str(path)))
@@ -126,15 +126,22 @@ def find(name: str, kind: str, beside: Path | None = None) -> Path:
     kind: `robots`, `scenes` or `scenarios`.
     """
     if name.endswith((".toml", ".json")) or "/" in name:
-        path = Path(name).expanduser()
+        path = expanded(name)
         return path if path.is_absolute() or beside is None else beside / path
-    path = SHIPPED / kind / f"{name}.toml"
-    if not path.is_file():
+    if name not in shipped(kind):
         raise ConfigError(
-            f"no {kind[:-1]} called {name!r}; shipped are {', '.join(shipped(kind))}. "
-            f"For a file of your own give its path, such as ./{name}.toml"
+            f"no {kind[:-1]} called {short(name)!r}; shipped are {', '.join(shipped(kind))}. "
+            f"For a file of your own give its path, such as ./{short(name)}.toml"
         )
-    return path
+    return SHIPPED / kind / f"{name}.toml"
+
+
+def expanded(name: str) -> Path:
+    """A path, with `~` for the home folder. Raises ConfigError when there is no such home."""
+    try:
+        return Path(name).expanduser()
+    except RuntimeError as error:
+        raise ConfigError(f"{short(name)}: {error}") from None
 
 
 def shipped(kind: str) -> list[str]:
@@ -148,6 +155,11 @@ def decode(table: Table, struct: type[StructT], under: str = "") -> StructT:
         return msgspec.convert(table.values, struct)
     except msgspec.ValidationError as error:
         raise ConfigError(_explain(error, table, struct, under)) from None
+    except UnicodeEncodeError as error:  # JSON may escape, and a command line may hold, half of a character
+        odd = ascii(error.object[error.start : error.end])[:40]
+        raise ConfigError(
+            f"{table.source}: a key or a text holds {odd}, which is no character; write it anew"
+        ) from None
 
 
 def _explain(error: msgspec.ValidationError, table: Table, struct: type[msgspec.Struct], under: str) -> str:
@@ -156,11 +168,11 @@ def _explain(error: msgspec.ValidationError, table: Table, struct: type[msgspec.
     what, where = match["what"], (match["where"] or "$").removeprefix("$").lstrip(".")
     steps = _steps(where, table.values, struct)
     dotted = ".".join(filter(None, [under, *steps]))
-    unknown = re.match(r"Object contains unknown field `(.*)`", what)
+    unknown = re.match(r"Object contains unknown field `(.*)`", what, re.DOTALL)
     missing = re.match(r"Object missing required field `(.*)`", what)
-    fields = _fields_at(struct, steps)
+    fields = fields_at(struct, steps, table.values)
     if unknown:
-        name = unknown[1]
+        name = short(unknown[1])
         close = difflib.get_close_matches(name, fields, 1, 0.6)
         full = f"{dotted}.{name}" if dotted else name
         hint = f"did you mean `{close[0]}`?" if close else f"known here: {', '.join(sorted(fields))}."
@@ -169,17 +181,27 @@ def _explain(error: msgspec.ValidationError, table: Table, struct: type[msgspec.
     if missing:
         name = missing[1]
         full = f"{dotted}.{name}" if dotted else name
-        return f"{table.file_of(full)}: field `{full}` is missing; add it ({_wanted(fields.get(name))})."
-    value: Any = table.values
-    for step in steps:
-        if isinstance(value, list | dict):
-            value = value[int(step)] if isinstance(value, list) else value.get(step)
-    info = fields_type(struct, steps)
-    unit = _unit_of(info)
+        return f"{table.file_of(full)}: field `{full}` is missing; add it ({in_words(fields.get(name))})."
+    value = value_at(table.values, steps)
+    info = type_at(struct, steps, table.values)
+    unit = unit_of(info)
     origin = table.origin_of(dotted)
     origin = table.file_of(dotted) if origin == "default" else origin
-    shown = f"{value!r}{' ' + unit if unit and isinstance(value, int | float) else ''}"
-    return f"{origin}: `{dotted}` = {shown} is not allowed: {what[:1].lower() + what[1:]}; wanted is {_wanted(info)}."
+    shown = f"{short(_repr(value))}{' ' + unit if unit and isinstance(value, int | float) else ''}"
+    why = short(what[:1].lower() + what[1:])
+    return f"{origin}: `{short(dotted)}` = {shown} is not allowed: {why}; wanted is {in_words(info)}."
+
+
+def short(text: str, most: int = 120) -> str:
+    """A text that a person wrote, for quoting: its beginning, when it is long."""
+    return text if len(text) <= most else text[: most - 3] + "..."
+
+
+def _repr(value: Any) -> str:
+    try:
+        return repr(value)
+    except ValueError:  # Python writes no whole number of more than 4300 digits
+        return "a very large number"
 
 
 def _steps(where: str, values: dict[str, Any], struct: type[msgspec.Struct]) -> list[str]:
@@ -189,18 +211,15 @@ def _steps(where: str, values: dict[str, Any], struct: type[msgspec.Struct]) -> 
     for match in re.finditer(r"\[(\.\.\.|\d+)\]|[^.\[\]]+", where):
         step = match[1] or match[0]
         if step == "...":
-            step = _wrong_entry(value, fields_type(struct, steps)) if isinstance(value, dict) else step
+            step = _wrong_entry(value, type_at(struct, steps, values)) if isinstance(value, dict) else step
         steps.append(step)
-        if isinstance(value, dict):
-            value = value.get(step)
-        elif isinstance(value, list) and step.isdigit() and int(step) < len(value):
-            value = value[int(step)]
+        value = value_at(value, [step])
     return steps
 
 
 def _wrong_entry(section: dict[str, Any], info: inspect.Type | None) -> str:
     wanted: Any = dict
-    for option in _options(info):
+    for option in options(info):
         if isinstance(option, inspect.DictType) and isinstance(option.value_type, inspect.StructType):
             wanted = option.value_type.cls
     for key, value in section.items():
@@ -209,77 +228,3 @@ def _wrong_entry(section: dict[str, Any], info: inspect.Type | None) -> str:
         except msgspec.ValidationError:
             return key
     return "..."
-
-
-def _fields_at(struct: type[msgspec.Struct], steps: list[str]) -> dict[str, inspect.Type]:
-    info = fields_type(struct, steps)
-    for option in _options(info):
-        if isinstance(option, inspect.StructType):
-            return {f.encode_name: f.type for f in option.fields}
-    return {}
-
-
-def fields_type(struct: type[msgspec.Struct], steps: list[str]) -> inspect.Type | None:
-    """The declared type at a path inside a Struct, as msgspec describes it."""
-    info: inspect.Type | None = inspect.type_info(struct)
-    for step in steps:
-        following: inspect.Type | None = None
-        for option in _options(info):
-            if isinstance(option, inspect.StructType):
-                following = next((f.type for f in option.fields if f.encode_name == step), None)
-            elif isinstance(option, inspect.ListType):
-                following = option.item_type
-            elif isinstance(option, inspect.TupleType) and step.isdigit():
-                following = option.item_types[int(step)] if int(step) < len(option.item_types) else None
-            elif isinstance(option, inspect.DictType):
-                following = option.value_type
-            if following is not None:
-                break
-        info = following
-    return info
-
-
-def _options(info: inspect.Type | None) -> list[inspect.Type]:
-    if info is None:
-        return []
-    if isinstance(info, inspect.Metadata):
-        return _options(info.type)
-    if isinstance(info, inspect.UnionType):
-        return [leaf for option in info.types for leaf in _options(option)]
-    return [info]
-
-
-def _unit_of(info: inspect.Type | None) -> str:
-    if isinstance(info, inspect.Metadata):
-        return str((info.extra_json_schema or {}).get("unit", ""))
-    return ""
-
-
-def _wanted(info: inspect.Type | None) -> str:
-    """What a field takes, in words."""
-    unit = _unit_of(info)
-    said: list[str] = []
-    for option in _options(info):
-        if isinstance(option, inspect.FloatType | inspect.IntType):
-            word = "a number" if isinstance(option, inspect.FloatType) else "a whole number"
-            bounds = [
-                f"{sign} {bound:g}"
-                for sign, bound in ((">=", option.ge), (">", option.gt), ("<=", option.le), ("<", option.lt))
-                if bound is not None
-            ]
-            said.append(" ".join(filter(None, [word, " and ".join(bounds), f"in {unit}" if unit else ""])))
-        elif isinstance(option, inspect.LiteralType):
-            said.append("one of " + ", ".join(repr(v) for v in option.values))
-        elif isinstance(option, inspect.StrType):
-            said.append("a text")
-        elif isinstance(option, inspect.BoolType):
-            said.append("true or false")
-        elif isinstance(option, inspect.StructType):
-            said.append("a section with " + ", ".join(f.encode_name for f in option.fields))
-        elif isinstance(option, inspect.ListType):
-            said.append(f"a list, each {_wanted(option.item_type)}")
-        elif isinstance(option, inspect.TupleType):
-            said.append(f"{len(option.item_types)} values, each {_wanted(option.item_types[0])}")
-        elif isinstance(option, inspect.DictType):
-            said.append("a section")
-    return " or ".join(said) or "another value"

@@ -7,10 +7,12 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from snakesim_hal.messages import Contacts, Description, Imu, JointState, Message, Pose, Power, Trajectory, World
 from snakesim_hal.route import is_line
 
+MAX_PATH_M = 1e5
 UNIT_NORM_ERROR = 0.1  # of a rotation; rounding makes far less
 
 
@@ -36,10 +38,19 @@ def misfit(message: Message, robot: Description) -> str | None:
         case Pose():
             return _no_rotation(message.orientation_wxyz)
         case Trajectory():
-            return None if is_line(np.array(message.path_w)) else "no_path"
+            return None if _is_path(np.array(message.path_w)) else "no_path"
         case _:
             fits = True
     return None if fits else "wrong_length"
+
+
+def _is_path(points_w: NDArray[np.float64]) -> bool:
+    """Whether a snake could go along it; lengths beyond that could not be told in `control/state`."""
+    return (
+        is_line(points_w)
+        and float(np.hypot(*np.diff(points_w, axis=0).T).sum()) <= MAX_PATH_M
+        and bool((np.abs(points_w) <= MAX_PATH_M).all())
+    )
 
 
 def _no_rotation(wxyz: Sequence[float]) -> str | None:

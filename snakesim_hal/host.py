@@ -9,9 +9,13 @@ free      not at all
 """
 
 import contextlib
+import secrets
 import time
 from collections.abc import Callable, Sequence
+from math import inf
 from typing import Any, Literal
+
+import msgspec
 
 from snakesim_hal import keys
 from snakesim_hal.authority import Authority
@@ -19,12 +23,12 @@ from snakesim_hal.backend import Backend, Samples
 from snakesim_hal.blackbox import BlackBox
 from snakesim_hal.deadlines import Deadlines
 from snakesim_hal.errors import BackendError, WireError
+from snakesim_hal.guarded_backend import GuardedBackend
 from snakesim_hal.host_faults import HostFaults
 from snakesim_hal.inbox import Inbox, Request
 from snakesim_hal.latch import EstopLatch, replying
 from snakesim_hal.messages import (
     Answer,
-    AppliedCommand,
     Clock,
     Description,
     EstopRequest,
@@ -38,15 +42,21 @@ from snakesim_hal.messages import (
 )
 from snakesim_hal.outbox import Outbox
 from snakesim_hal.participants import Participant, Participants
+from snakesim_hal.private_channel import HostEnd, ToStarter
 from snakesim_hal.publish_times import PublishTimes
+from snakesim_hal.run_key import own_run_key, proven
 from snakesim_hal.scenario import RunConfig
 from snakesim_hal.session import Session
 from snakesim_hal.tally import Tally
 from snakesim_hal.telling import applied_message, status_message
 
-Ending = Literal["complete", "stopped", "failed"]  # all ticks done or `finish`; told to stop; the backend cannot go on
+# Not yet; as many armed ticks as were asked for; on request (`finish`); by a signal; a fault, or too little armed time.
+Ending = Literal["running", "complete", "finished", "stopped", "failed"]
 STATUS_PERIOD_NS = 200_000_000
 STANDBY_PERIOD_NS = 20_000_000
+STATUS_GAP_NS = 10_000_000  # of what changes again and again, such as a lease that people fight for
+TAKEN_SHARE = 0.25  # of a period, for what came in late: a flood must not take the whole
+MAX_REQUESTS_KEPT = 256
 RECORDED_AFTER_NS = 2_000_000_000  # what follows the last armed tick, in a host that stays
 
 
@@ -63,27 +73,32 @@ class Host:
         end_after_fault_s: float | None = None,
         stay: bool = False,
         latch: EstopLatch | None = None,
+        starter: HostEnd | None = None,
         hygiene: Sequence[str] = (),
     ) -> None:
         """max_ticks: end this many ticks after the first arming; None: go on until asked to finish.
 
         end_after_fault_s: end so long after a fault; None: stay, so that a person can clear it.
-        stay: only armed ticks count for `max_ticks`, and of what follows them a moment is recorded.
+        stay: also when others come between, of which a moment is recorded; else so many ticks after the first arming.
         latch: keeps an emergency stop for the host that comes after this one.
+        starter: the private channel to whoever started this host.
         hygiene: real-time measures that the system refused.
         """
-        self.description: Description = backend.describe()
+        described = msgspec.structs.replace(backend.describe(), host=secrets.token_hex(8))
+        self.description: Description = proven(described, own_run_key())
         self.authority = Authority(self.description, first_epoch=time.time_ns() // 1_000_000)
         self.black_box = BlackBox(self.description)
         self.tally = Tally()
+        self.requests: list[str] = []  # who asked to arm, disarm, clear, finish or stop, and what became of it
         self.participants = Participants(config.services)
         self._config = config
-        self.faults = HostFaults(config, backend, session, self.authority)
+        self.faults = HostFaults(config, GuardedBackend(backend), session, self.authority)
         self._backend = self.faults.backend
         self._max_ticks = max_ticks
         self._end_after_fault_s = end_after_fault_s
         self._stay = stay
         self._latch = latch or EstopLatch(None)
+        self._starter = starter or HostEnd(None)
         self._hygiene = list(hygiene)
         self._pace: Pace = config.pace
         self._period_ns = config.period_ns
@@ -93,24 +108,39 @@ class Host:
         self._published_arming = 0
         self._newest: dict[str, int] = {}
         self._last_armed_tick = 0
+        self._other_hosts: set[str] = set()
+        self._network_faults: set[str] = set()
         self._answered = -1  # newest tick that a good command answered
         self._advance_ns = 0.0  # how long a period takes the backend, smoothed
         self._stopping = False
-        self.ended: Ending = "stopped"
+        self.ended: Ending = "running"
+        self.ended_why = ""
         self._armed_at_ns: int | None = None
         self._ended_ns = 0
         self._faulted_at_ns: int | None = None
         self._status_due_ns = 0
         self._status_shown: Any = None
-        self._applied_heard = False
         if (found := self._latch.found) is not None:
             self.authority.on_estop(EstopRequest(who=f"{found.who[:40]}, before this host"), max(found.tick, 0))
-        self._inbox = Inbox(session, self)
-        self._outbox = Outbox(session, self.description, lossless=config.pace == "lockstep")
+        self._outbox = Outbox(session, self.description, lockstep=config.pace == "lockstep")
+        self._inbox = Inbox(session, self, config.services, self._outbox.answer)
+        session.on_alive(self._another_host, keys.HOST_ALL)
+        self._starter.say(ToStarter(description=self.description))
+        self._starter.serve(self._inbox.ask)
 
     def stop(self) -> None:
         """End the run in order; may be called from a signal handler."""
+        self._end("stopped", "by a signal")
+
+    def _end(self, ended: Ending, why: str = "") -> None:
+        """End the run in order. What came first is why."""
+        if self.ended == "running":
+            self.ended, self.ended_why = ended, why
         self._stopping = True
+
+    def take_stop(self, who: str, reply: Callable[[str], None]) -> None:
+        """An emergency stop that came past the network; from any thread."""
+        self._inbox.ask(EstopRequest(who=who[:64] or "somebody"), lambda answer: reply(answer.reason))
 
     def run(self) -> None:
         """Tick until the run is over. The joints are safe when this returns."""
@@ -130,18 +160,22 @@ class Host:
                 self._wait_for_answers(last)
                 self._finish_tick(last)
         finally:
+            self._end("failed", "by an error of its own; host.log has it")
             self._ended_ns = time.monotonic_ns()
-            self.authority.on_lifecycle(LifecycleRequest(action="finish"), self._safety_now())
+            self.authority.on_lifecycle(LifecycleRequest(action="finish", who="the host"), self._safety_now())
             with contextlib.suppress(BackendError):
                 self._backend.enact(self.authority.decide().set_points, self.authority.state)
             self._show_status(force=True)
             self.faults.close()
             self._latch.close()
+            self._outbox.close()
 
     @property
     def wall_s(self) -> float:
-        """Wall-clock time from the first arming to the end of the run."""
-        return 0.0 if self._armed_at_ns is None else (self._ended_ns - self._armed_at_ns) * 1e-9
+        """Wall-clock time from the first arming to the end of the run, or until now."""
+        if self._armed_at_ns is None:
+            return 0.0
+        return ((self._ended_ns or time.monotonic_ns()) - self._armed_at_ns) * 1e-9
 
     # --- one tick ------------------------------------------------------------------------------------------
 
@@ -196,18 +230,19 @@ class Host:
             self._last_armed_tick = self._tick
             self.tally.ticks += 1
             self.tally.answered_ticks += self._answered >= (self._tick if counting is None else counting)
-        if self._applied_heard:
-            self._outbox.put(keys.APPLIED, applied_message(self.description, self._tick, decision))
         started = time.monotonic_ns()
         try:
             self._backend.enact(decision.set_points, self.authority.state)
+            if self._outbox.applied_heard:
+                self._outbox.put(keys.APPLIED, applied_message(self.description, self._tick, decision))
             self._backend.advance()
+            for fault in self._backend.faults():
+                self.authority.fault(fault)
         except BackendError as error:
             self._backend_failed(error)
         self._advance_ns += 0.1 * (time.monotonic_ns() - started - self._advance_ns)
-        for fault in self._backend.faults():
-            self.authority.fault(fault)
         self._tick += 1
+        self._watch_network()
         self._watch_fault()
         self._show_status()
         if self._pace == "realtime":
@@ -230,7 +265,7 @@ class Host:
                 left_ns = self._deadlines.of(self._tick + 1) - spare_ns - time.monotonic_ns()
                 if left_ns <= 0 or not self._inbox.take(left_ns * 1e-9):
                     break
-        self._inbox.take_all()
+        self._inbox.take_all(inf if self._pace == "lockstep" else TAKEN_SHARE * self._period_ns)
 
     def _wait_for_participants(self, samples: Samples) -> None:
         give_up_ns = time.monotonic_ns() + round(self._config.stall_limit_s * 1e9)
@@ -260,7 +295,7 @@ class Host:
         if refusal is None and command.tick > self._answered:
             self._answered = command.tick
             if self.authority.state == "armed":
-                self.tally.state_to_command_us.append((monotonic_ns - published_ns) / 1000)
+                self.tally.state_to_command.add((monotonic_ns - published_ns) / 1000)
 
     def take_done(self, service: str, tick: int) -> None:
         """A service owes nothing more for a tick."""
@@ -273,7 +308,13 @@ class Host:
     def refuse(self, error: WireError) -> Answer:
         """Something cannot be decoded."""
         self.authority.reject(error.reason)
-        return Answer(ok=False, reason=str(error)[:500], refusal=error.reason, lifecycle=self.authority.state)
+        return Answer(
+            ok=False,
+            reason=str(error)[:500],
+            refusal=error.reason,
+            lifecycle=self.authority.state,
+            host=self.description.host,
+        )
 
     def answer(self, request: Request, reply: Callable[[Answer], None]) -> None:
         """Somebody asks for the lease, for another state, or for a stop."""
@@ -283,6 +324,9 @@ class Host:
             answer = self.authority.on_lease(request, now_ns)
         elif isinstance(request, EstopRequest):
             answer = self.authority.on_estop(request, self._tick)
+        elif request.host not in (None, self.description.host):
+            meant = f"this is host {self.description.host}, the request is for {request.host}: two have one name"
+            answer = Answer(ok=False, reason=meant, refusal="wrong_host", lifecycle=self.authority.state)
         elif request.action == "arm" and (missing := self._missing()):
             waiting = f"waiting for {', '.join(missing)}"
             answer = Answer(ok=False, reason=waiting, refusal="not_ready", lifecycle=self.authority.state)
@@ -291,14 +335,27 @@ class Host:
             if request.action == "arm" and answer.ok:
                 self._expect_first_command()
             if request.action == "finish":
-                self._stopping, self.ended = True, "complete"
-        self._show_status(force=True)
+                by = f" by {request.who}" if request.who else ""
+                self._end("finished", f"on request{by}")
+        answer = msgspec.structs.replace(answer, host=self.description.host)
+        if not isinstance(request, LeaseRequest):
+            self._keep(request, answer)
+        self._show_status()
         if isinstance(request, EstopRequest):
             self._latch.engage(request.who, self._tick, replying(reply, answer))
         elif isinstance(request, LifecycleRequest) and request.action == "clear" and answer.ok:
             self._latch.release(replying(reply, answer))
         else:
             reply(answer)
+
+    def _keep(self, request: LifecycleRequest | EstopRequest, answer: Answer) -> None:
+        """Who asked for what, for the record and the log."""
+        action = "estop" if isinstance(request, EstopRequest) else request.action
+        outcome = "done" if answer.ok else f"refused: {answer.reason}"
+        asked = f"tick {self._tick}: {action} by {request.who!r}, {outcome}"
+        if len(self.requests) < MAX_REQUESTS_KEPT:
+            self.requests.append(asked)
+            self._outbox.log(asked)
 
     def _holder(self) -> Participant | None:
         return self.participants.get(self.authority.lease.holder or "")
@@ -329,6 +386,25 @@ class Host:
         if self.authority.lease.holder == service:
             self.authority.holder_gone(f"{service} is gone")
 
+    def _another_host(self, key: str, present: bool) -> None:
+        """In Zenoh's thread: a host process came or went. One beside this one answers to this robot's name."""
+        host = keys.service_of(key)
+        if host != self.description.host:
+            (self._other_hosts.add if present else self._other_hosts.discard)(host)
+
+    def _watch_network(self) -> None:
+        """Note what is wrong with the network around the robot, once as it begins."""
+        # In lockstep a lease lasts by simulated time: a slow computer is not a network that is held up.
+        held_up_s = 0.0 if self._pace == "lockstep" else self._outbox.held_up_s()
+        wrong = {
+            f"another HAL host answers to this robot's name: {host}": "second_host" for host in set(self._other_hosts)
+        }
+        if held_up_s * 1e9 > self._config.lease_ns:
+            wrong["the network takes no message: it is congested, or somebody attacks it"] = "network_held_up"
+        for cause in wrong.keys() - self._network_faults:
+            self.authority.note(Fault(tick=self._tick, what=wrong[cause], cause=cause))
+        self._network_faults = set(wrong)
+
     # --- what goes out -------------------------------------------------------------------------------------
 
     def status(self) -> Status:
@@ -347,14 +423,16 @@ class Host:
 
     def _show_status(self, *, force: bool = False) -> None:
         """Publish the status when it matters: at once when the lifecycle changed, else a few times a second."""
-        now_ns = time.monotonic_ns()
+        now_ns, was = time.monotonic_ns(), self._status_shown
         mark = (self.authority.state, self.authority.lease.epoch, len(self.authority.faults))
-        if not force and mark == self._status_shown and now_ns < self._status_due_ns:
+        due_ns = self._status_due_ns if mark == was else self._status_due_ns - STATUS_PERIOD_NS + STATUS_GAP_NS
+        if not force and now_ns < due_ns and was is not None and mark[0] == was[0]:
             return
         self._status_shown = mark
         self._status_due_ns = now_ns + STATUS_PERIOD_NS
-        self._outbox.put(keys.STATUS, self.status())
-        self._applied_heard = self._outbox.heard(keys.APPLIED, AppliedCommand)
+        status = self.status()
+        self._outbox.put_status(status)
+        self._starter.say(ToStarter(status=status))
 
     # --- time and endings ----------------------------------------------------------------------------------
 
@@ -371,7 +449,7 @@ class Host:
     def _backend_failed(self, error: BackendError) -> None:
         self.authority.fault(Fault(tick=self._tick, what="backend_failed", cause=str(error)[:500]))
         self._show_status(force=True)
-        self._stopping, self.ended = True, "failed"
+        self._end("failed", str(error)[:500])
 
     def _watch_fault(self) -> None:
         """After a fault nobody is waited for: what follows is shown in real time, and may end the run."""
@@ -388,10 +466,15 @@ class Host:
     def _over(self) -> bool:
         if self._stopping:
             return True
-        ticks = self.tally.ticks if self._stay else self.black_box.ticks
-        if self._max_ticks is not None and ticks >= self._max_ticks:
-            self.ended = "complete"
-            return True
+        if self._max_ticks is not None and self.tally.ticks >= self._max_ticks:
+            self._end("complete")
+        elif self._max_ticks is not None and not self._stay and self.black_box.ticks >= self._max_ticks:
+            self._end("failed", "the time was over before that much of it was armed")
+        elif self._settled_after_fault():
+            self._end("failed", self.authority.why)
+        return self._stopping
+
+    def _settled_after_fault(self) -> bool:
         if self._faulted_at_ns is None or self._end_after_fault_s is None:
             return False
         return time.monotonic_ns() - self._faulted_at_ns > self._end_after_fault_s * 1e9

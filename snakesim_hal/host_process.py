@@ -1,33 +1,41 @@
 """`python -m snakesim_hal.host_process`: opens a backend and runs the host until the run is over."""
 
+import contextlib
+import os
+import socket
 import sys
+import time
 from collections.abc import Sequence
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import msgspec
-import numpy as np
 
+from snakesim_hal import keys
 from snakesim_hal.backend import BackendFactory
-from snakesim_hal.errors import SnakesimError
+from snakesim_hal.errors import BackendError, RefusedError, SnakesimError
+from snakesim_hal.guarded_backend import GuardedBackend
 from snakesim_hal.host import Ending, Host
 from snakesim_hal.latch import EstopLatch
+from snakesim_hal.local_registry import LocalRobot, registered, robot_folder
 from snakesim_hal.messages import Fault
 from snakesim_hal.plugins import BACKENDS, find_plugin, plugin_settings
+from snakesim_hal.private_channel import HostEnd
 from snakesim_hal.process import HOST_PRIORITY, hurry, on_stop_signal, settle_for_timing
+from snakesim_hal.recorder import Recorder
 from snakesim_hal.scenario import RunConfig
-from snakesim_hal.serve import arguments, duty
-from snakesim_hal.session import open_session
+from snakesim_hal.serve import Duty, arguments, duty
+from snakesim_hal.session import Link, Session, open_session
+from snakesim_hal.stop_port import open_stop_port, serve_stops, stop_address
+from snakesim_hal.terminal import complain_of
 
-HOST_RECORD = "host.json"
-BLACK_BOX = "blackbox.npz"
-DESCRIPTION = "description.json"
+GONE_LIMIT_S = 3.0  # until a host that died is not seen any more: longer than the lease of its connection
 
 
 class HostRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """What the host leaves behind: its own numbers of the run."""
+    """What the host leaves behind: its own numbers of the run. They are written twice a second, while it runs too."""
 
-    ticks: int
+    ticks: int  # recorded: from the first arming on
     wall_s: float
     overruns: int
     answered_ticks: int
@@ -40,46 +48,105 @@ class HostRecord(msgspec.Struct, frozen=True, kw_only=True):
     lifecycle: str
     why: str
     ended: Ending = "complete"
+    ended_why: str = ""  # unless complete
+    lost_ticks: int = 0  # that the black box on disk lacks
+    trouble: str = ""  # what could not be written, and why
+    faults_left_out: int = 0  # of `faults`, in the middle
     injected: list[str] = []  # faults on request, as they began and ended
+    requests: list[str] = []  # to arm, disarm, clear, finish or stop: by whom, and what became of it
     isolated: list[str] = []  # joints that were set aside at the end
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Exit code 0 when the run ended without a fault, 1 otherwise."""
+    """Exit code 0 when all ticks were done without a fault, 1 otherwise."""
     parser = arguments("Run a robot's HAL host.")
     parser.add_argument("--router", action="store_true", help="connect to a router instead of listening")
     parser.add_argument("--max-ticks", type=int, help="end this many ticks after the first arming")
     parser.add_argument("--end-after-fault", type=float, help="end so many seconds after a fault")
-    parser.add_argument("--stay", action="store_true", help="count only armed ticks, record only what follows them")
-    parsed_listen = "--router" not in (sys.argv[1:] if argv is None else argv)
-    given = duty(parser, argv, listen=parsed_listen)
+    parser.add_argument("--stay", action="store_true", help="go on until that many ticks were armed")
+    parser.add_argument("--memory", metavar="PATH", help="file without a disk that gets the host's own numbers")
+    parser.add_argument("--channel", type=int, metavar="FD", help="inherited socket to whoever starts this host")
+    parser.add_argument("--stop-port", type=int, metavar="FD", help="inherited UDP socket for emergency stops")
+    listen = "--router" not in (sys.argv[1:] if argv is None else argv)
+    given = duty(parser, argv, listen=listen)
     try:
-        factory = find_plugin(BACKENDS, given.config.backend)
-        backend = factory(given.config, backend_settings(given.config, factory))
-        try:
-            hygiene = hurry(HOST_PRIORITY) if given.config.pace == "realtime" else []
-            with open_session(given.link) as session:
-                host = Host(
-                    given.config,
-                    backend,
-                    session,
-                    max_ticks=given.arguments.max_ticks,
-                    end_after_fault_s=given.arguments.end_after_fault,
-                    stay=given.arguments.stay,
-                    latch=EstopLatch(given.out),
-                    hygiene=hygiene,
-                )
-                on_stop_signal(host.stop)
-                settle_for_timing()
-                host.run()
-                if given.out is not None:
-                    leave_record(host, given.out)
-        finally:
-            backend.close()
+        host = _run(given)
     except SnakesimError as error:
-        print(f"snakesim host: {error}", file=sys.stderr)
+        complain_of(error, "snakesim host")
         return 1
-    return 1 if any(fault.reach == "robot" for fault in host.authority.fault_log) else 0
+    stopped = any(fault.reach == "robot" for fault in host.authority.since_start.kept)
+    return 1 if stopped or host.ended != "complete" else 0
+
+
+def _run(given: Duty) -> Host:
+    """Open everything, run the host to its end, close everything."""
+    config, wanted = given.config, given.arguments
+    with contextlib.ExitStack() as opened:
+        if wanted.stop_port is not None:
+            stop_port = socket.socket(fileno=wanted.stop_port)
+        else:
+            stop_port = open_stop_port(*stop_address(given.link.endpoint, listens=given.link.listen))
+            opened.enter_context(registered(_entry(given, stop_port)))
+        opened.callback(stop_port.close)
+        backend = open_backend(find_plugin(BACKENDS, config.backend), config)
+        opened.callback(backend.close)
+        hygiene = hurry(HOST_PRIORITY) if config.pace == "realtime" else []
+        session = opened.enter_context(open_session(given.link))
+        refuse_second_host(session, given.link)
+        described = backend.describe()
+        host = Host(
+            config,
+            backend,
+            session,
+            max_ticks=wanted.max_ticks,
+            end_after_fault_s=wanted.end_after_fault,
+            stay=wanted.stay,
+            latch=EstopLatch(robot_folder(described.robot, described.backend, described.hardware)),
+            starter=HostEnd.of(wanted.channel),
+            hygiene=hygiene,
+        )
+        serve_stops(stop_port, given.link.namespace or described.robot, host.take_stop)
+        on_stop_signal(host.stop)
+        settle_for_timing()
+        memory = wanted.memory and os.open(wanted.memory, os.O_WRONLY)
+        with Recorder(host.black_box, host.description, partial(record_of, host), given.out, memory):
+            host.run()
+    return host
+
+
+def refuse_second_host(session: Session, link: Link) -> None:
+    """Raise RefusedError when another HAL host answers to the robot's name; one that has just died may take a while."""
+    deadline = time.monotonic() + GONE_LIMIT_S
+    while others := session.present(keys.HOST_ALL):
+        if time.monotonic() > deadline:
+            raise RefusedError(
+                f"another HAL host is on {link.endpoint} as {link.namespace}: {keys.service_of(others[0])}. End it, or "
+                f"give this robot another --namespace"
+            )
+
+
+def _entry(given: Duty, stop_port: socket.socket) -> LocalRobot:
+    stop_host, port = stop_port.getsockname()[:2]
+    return LocalRobot(
+        namespace=given.link.namespace or given.config.robot.name,
+        robot=given.config.robot.name,
+        backend=given.config.backend,
+        endpoint=given.link.endpoint,
+        stop_host=stop_host,
+        stop_port=port,
+        pid=os.getpid(),
+    )
+
+
+def open_backend(factory: BackendFactory, config: RunConfig) -> GuardedBackend:
+    """Open the run's backend. Raises BackendError for whatever goes wrong in it."""
+    settings = backend_settings(config, factory)
+    try:
+        return GuardedBackend(factory(config, settings))
+    except SnakesimError:
+        raise
+    except Exception as error:  # a backend is somebody else's code
+        raise BackendError(f"backend {config.backend!r} does not open: {type(error).__name__}: {error}") from error
 
 
 def backend_settings(config: RunConfig, factory: BackendFactory) -> Any:
@@ -87,34 +154,31 @@ def backend_settings(config: RunConfig, factory: BackendFactory) -> Any:
     return plugin_settings(factory, config.backend_settings, f"scenario {config.name!r}", config.backend_section)
 
 
-def leave_record(host: Host, out: Path) -> None:
-    """Write the black box and the host's own numbers."""
-    latencies = np.array(host.tally.state_to_command_us)
-    record = HostRecord(
+def record_of(host: Host, *, lost_ticks: int = 0, trouble: str = "") -> HostRecord:
+    """The host's numbers as they are now; called beside its loop, which replaces or copies nothing half."""
+    tally, authority = host.tally, host.authority
+    return HostRecord(
         ticks=host.black_box.ticks,
         wall_s=host.wall_s,
-        overruns=host.tally.overruns,
-        answered_ticks=host.tally.answered_ticks,
-        armed_ticks=host.tally.ticks,
+        overruns=tally.overruns,
+        answered_ticks=tally.answered_ticks,
+        armed_ticks=tally.ticks,
         command_digest=host.black_box.command_digest,
-        state_to_command_us={
-            "p50": float(np.percentile(latencies, 50)) if len(latencies) else None,
-            "p99": float(np.percentile(latencies, 99)) if len(latencies) else None,
-        },
-        rejected_commands=dict(host.authority.rejected),
-        limited_commands=dict(host.authority.limited),
-        faults=host.authority.fault_log,
-        lifecycle=host.authority.state,
-        why=host.authority.why,
+        state_to_command_us={f"p{p}": tally.state_to_command.percentile_us(p) for p in (50, 99)},
+        rejected_commands=dict(authority.rejected),
+        limited_commands=dict(authority.limited),
+        faults=list(authority.since_start.kept),
+        faults_left_out=authority.since_start.left_out,
+        lifecycle=authority.state,
+        why=authority.why,
         ended=host.ended,
-        injected=host.faults.noted,
-        isolated=host.authority.isolated,
+        ended_why=host.ended_why,
+        lost_ticks=lost_ticks,
+        trouble=trouble,
+        injected=list(host.faults.noted),
+        requests=list(host.requests),
+        isolated=authority.isolated,
     )
-    host.black_box.save(out / BLACK_BOX)
-    (out / DESCRIPTION).write_bytes(msgspec.json.encode(host.description))
-    partial = out / f"{HOST_RECORD}.partial"
-    partial.write_bytes(msgspec.json.format(msgspec.json.encode(record)))
-    partial.rename(out / HOST_RECORD)
 
 
 if __name__ == "__main__":

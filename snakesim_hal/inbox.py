@@ -1,7 +1,12 @@
-"""What comes in to the HAL host: queued by Zenoh's threads, decoded and handed over in the host's own, in order."""
+"""What comes in to the HAL host: queued by other threads, decoded and handed over in the host's own.
+
+There are lanes, and what stands in a lower one goes first: an emergency stop waits for nothing, and no number of lease
+requests keeps a command waiting. Each lane is bounded, so a flood costs neither memory nor other people's turn.
+"""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
 from queue import Empty
 from typing import Any, Protocol
 
@@ -12,9 +17,19 @@ from snakesim_hal.mailbox import Mailbox
 from snakesim_hal.messages import Answer, Done, EstopRequest, JointCommand, LeaseRequest, LifecycleRequest
 from snakesim_hal.session import Arrival, Question, Session
 
-INBOX_LIMIT = 4096
+STOPS, PRESENCE, SAMPLES, REQUESTS = range(4)  # lanes
+LIMITS = (64, None, 4096, 64)  # only known services have a presence, so that lane needs no bound
 
 Request = LeaseRequest | LifecycleRequest | EstopRequest
+Reply = Callable[[Answer], None]
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A request that came another way than over Zenoh."""
+
+    request: Request
+    reply: Reply
 
 
 class Receiver(Protocol):
@@ -32,7 +47,7 @@ class Receiver(Protocol):
         """A service's token is there, or is not any more."""
         ...
 
-    def answer(self, request: Request, reply: Callable[[Answer], None]) -> None:
+    def answer(self, request: Request, reply: Reply) -> None:
         """Somebody asks; reply once, from any thread."""
         ...
 
@@ -42,12 +57,18 @@ class Receiver(Protocol):
 
 
 class Inbox:
-    """A queue that Zenoh fills and the host empties."""
+    """What other threads fill and the host empties."""
 
-    def __init__(self, session: Session, receiver: Receiver) -> None:
-        """Declares everything that the host listens to."""
-        self._receiver = receiver
-        self._queue: Mailbox[Any] = Mailbox()
+    def __init__(
+        self,
+        session: Session,
+        receiver: Receiver,
+        services: Collection[str],
+        reply: Callable[[Question, Answer], None],
+    ) -> None:
+        """Declares everything that the host listens to. services: whose presence counts; reply: answers a query."""
+        self._receiver, self._reply = receiver, reply
+        self._queue: Mailbox[Any] = Mailbox(LIMITS)
         self._command_decoder = Decoder(JointCommand)
         self._done_decoder = Decoder(Done)
         self._request_decoders: dict[str, Decoder[Any]] = {
@@ -55,16 +76,22 @@ class Inbox:
             keys.LIFECYCLE: Decoder(LifecycleRequest),
             keys.ESTOP: Decoder(EstopRequest),
         }
+        self._services = frozenset(services)
         self.dropped = 0
-        session.on_arrival(keys.JOINT_COMMAND, self._put)
-        session.on_arrival(keys.DONE_ALL, self._put)
-        for key in self._request_decoders:
-            session.on_question(key, self._put)
-        session.on_alive(lambda key, present: self._put((keys.service_of(key), present)))
+        session.on_arrival(keys.JOINT_COMMAND, self._put_sample)
+        session.on_arrival(keys.DONE_ALL, self._put_sample)
+        session.on_question(keys.ESTOP, self._put_stop)
+        for key in (keys.LEASE, keys.LIFECYCLE):
+            session.on_question(key, self._put_request)
+        session.on_alive(self._put_presence)
 
     def waiting(self) -> int:
         """How much has not been taken yet."""
         return self._queue.qsize()
+
+    def ask(self, request: Request, reply: Reply) -> None:
+        """Put a request that came another way than over Zenoh; from any thread."""
+        self._queue.put(Asked(request, reply), STOPS)
 
     def take(self, timeout_s: float) -> bool:
         """Handle the next thing that comes in; False when nothing came in time."""
@@ -80,16 +107,20 @@ class Inbox:
         while (left_ns := monotonic_ns - time.monotonic_ns()) > 0 and self.take(left_ns * 1e-9):
             pass
 
-    def take_all(self) -> None:
-        """Handle everything that is there."""
+    def take_all(self, limit_ns: float) -> None:
+        """Handle what is there, for at most so long: what floods in may wait for the next tick."""
+        stop_ns = time.monotonic_ns() + limit_ns
         for _ in range(self._queue.qsize()):
-            self.handle(self._queue.get())
+            if not self.take(0.0) or time.monotonic_ns() > stop_ns:
+                return
 
     def handle(self, item: Any) -> None:
         """Decode one thing, and hand it over."""
         receiver = self._receiver
-        if isinstance(item, Question):
-            self._ask(item)
+        if isinstance(item, Asked):
+            receiver.answer(item.request, item.reply)
+        elif isinstance(item, Question):
+            self._answer(item)
         elif not isinstance(item, Arrival):
             receiver.came_or_went(*item)
         else:
@@ -103,17 +134,28 @@ class Inbox:
             except WireError as error:
                 receiver.refuse(error)
 
-    def _ask(self, question: Question) -> None:
+    def _answer(self, question: Question) -> None:
         try:
             request = self._request_decoders[question.key].decode(question.payload, question.encoding)
         except WireError as error:
-            question.reply(self._receiver.refuse(error))
+            self._reply(question, self._receiver.refuse(error))
         else:
-            self._receiver.answer(request, question.reply)
+            self._receiver.answer(request, lambda answer: self._reply(question, answer))
 
-    def _put(self, item: Any) -> None:
-        """In Zenoh's thread. Only samples may be dropped: a flood of commands must not keep an emergency stop out."""
-        if not isinstance(item, Arrival) or self._queue.qsize() < INBOX_LIMIT:
-            self._queue.put(item)
-        else:
-            self.dropped += 1
+    # --- in Zenoh's threads ----------------------------------------------------------------------------------
+
+    def _put_stop(self, question: Question) -> None:
+        self._queue.put(question, STOPS)
+
+    def _put_request(self, question: Question) -> None:
+        self.dropped += self._queue.full(REQUESTS)  # whoever asked is not answered, and may ask again
+        self._queue.put(question, REQUESTS)
+
+    def _put_sample(self, arrival: Arrival) -> None:
+        self.dropped += self._queue.full(SAMPLES)
+        self._queue.put(arrival, SAMPLES)
+
+    def _put_presence(self, key: str, present: bool) -> None:
+        service = keys.service_of(key)
+        if service in self._services:
+            self._queue.put((service, present), PRESENCE)

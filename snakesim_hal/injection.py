@@ -21,6 +21,7 @@ RUN, HAL, CONTROL = "run", "hal", "control"
 ROUTER = "router"  # that of a run with --with-router
 SUPERVISED = ("kill", "stop", "freeze")  # of a process; what is left of its faults it does to itself
 FORM = "KIND:TARGET@START, KIND:TARGET@START-END, or either with =AMOUNT; in seconds, such as mute:joint_3@2-3.5"
+LONGEST_TEXT = 200  # characters of one, as people write it
 _text = re.compile(
     r"(?P<kind>[a-z_]+):(?P<target>[a-z0-9_/]+)@(?P<start>[0-9.]+)(-(?P<end>[0-9.]+))?(=(?P<amount>[-+0-9.e]+))?"
 )
@@ -73,7 +74,7 @@ KINDS: Mapping[TargetType, Mapping[str, Kind]] = {
         "counter": Kind("joint states with a wrong count"),
         "checksum": Kind("joint states with a wrong checksum"),
         "duplicate": Kind("a second module with the same node id is on the bus"),
-        "overheat": Kind("its winding is heated to 110 °C; kept there until the end, if one is given"),
+        "overheat": Kind("its winding is heated to 5 °C above `stop_at_c`; kept there until the end, if one is given"),
         "leak": Kind("finds water inside"),
         "babble": Kind("sends its heartbeat over and over, as often as the bus lets it"),
         "undervoltage": Kind("its supply falls to 12 V"),
@@ -170,6 +171,8 @@ def writer_of(key: str) -> str:
 
 def parse(text: str) -> Injection:
     """An injection from its text in a file. Raises ConfigError."""
+    if len(text) > LONGEST_TEXT:
+        raise ConfigError(f"fault {text[:40]!r}...: {len(text)} characters, at most {LONGEST_TEXT}: give {FORM}")
     match = _text.fullmatch(text.strip())
     if match is None:
         raise ConfigError(f"fault {text!r}: give {FORM}. Kinds: {kinds_in_short()}")
@@ -225,6 +228,10 @@ def check_targets(injections: Iterable[Injection], *, services: Iterable[str], j
             raise ConfigError(
                 f"fault {str(injection)!r}: there is no process {injection.target!r}; this run has "
                 f"{', '.join(processes)}"
+            )
+        elif sort == "key" and injection.part not in processes and injection.part != HAL:
+            raise ConfigError(
+                f"fault {str(injection)!r}: {injection.part} writes {injection.target}, and this run does not start it"
             )
         elif injection.target == ROUTER and injection.kind not in SUPERVISED:
             raise ConfigError(

@@ -4,7 +4,6 @@ Every part of a run has one: the host, and each service. Times are robot time, s
 planned counts from the first arming. A part that was started anew while the robot was armed has no plan any more.
 """
 
-import sys
 import time
 from collections.abc import Callable
 from math import inf
@@ -21,6 +20,7 @@ from snakesim_hal.messages import Answer, Clock, FaultRequest, LifecycleState
 from snakesim_hal.planned import planned
 from snakesim_hal.scenario import RunConfig
 from snakesim_hal.session import Question, Session
+from snakesim_hal.terminal import complain
 
 HALF_A_NANOSECOND = 0.5e-9
 HOW_TO_ALLOW = "something real moves here; set `faults_allowed = true` in the scenario if that is what you want"
@@ -35,7 +35,7 @@ def nothing_more(injection: Injection, _begins: bool) -> None:
 
 def print_note(text: str, now_s: float) -> None:
     """For a part whose words go to a log."""
-    print(f"{now_s:.3f} s: on request, {text}", file=sys.stderr, flush=True)
+    complain(f"{now_s:.3f} s: on request, {text}")
 
 
 class Injector:
@@ -162,7 +162,9 @@ class Injector:
             self._begin(injection, now_s)
             if for_s != inf and not injection.about.once:
                 self._ends.append((now_s + for_s, injection))
-            return Answer(ok=True, reason=f"{injection.kind} of {injection.target} has begun")
+            return Answer(
+                ok=True, reason=f"{injection.kind} of {injection.target} has begun, at {now_s:.3f} s of robot time"
+            )
         was = self._on.get((injection.kind, injection.target))
         if was is None:
             on = ", ".join(self.on) or "nothing"

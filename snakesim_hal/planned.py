@@ -48,7 +48,7 @@ def _check(config: RunConfig, table: Table | None, buses: int) -> list[Injection
     found = planned(config, table)
     for i, injection in enumerate(found):
         try:
-            check_targets([injection], services=config.services, joints=config.robot.chain.modules, buses=buses)
+            check_targets([injection], services=config.own_services, joints=config.robot.chain.modules, buses=buses)
         except ConfigError as error:
             raise ConfigError(f"{_place(config, i, table)}: {error}") from None
     return found

@@ -12,6 +12,7 @@ from pathlib import Path
 from types import FrameType
 
 from snakesim_hal.errors import RefusedError
+from snakesim_hal.terminal import complain
 
 PR_SET_PDEATHSIG = 1
 CAP_IPC_LOCK = 14
@@ -58,7 +59,7 @@ def hurry(priority: int) -> list[str]:
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     refused = [reason for reason in (take_priority(priority), lock_memory()) if reason is not None]
     for reason in refused:
-        print(f"real time: {reason}", file=sys.stderr)
+        complain(f"real time: {reason}")
     return refused
 
 
@@ -83,7 +84,7 @@ def calm_down_after(longest_s: float) -> None:
 
     def calm_down(_number: int, _frame: FrameType | None) -> None:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-        print(f"real time: given up, after computing for {longest_s * 1e3:.0f} ms without a pause", file=sys.stderr)
+        complain(f"real time: given up, after computing for {longest_s * 1e3:.0f} ms without a pause")
 
     signal.signal(signal.SIGXCPU, calm_down)
     _, most = resource.getrlimit(resource.RLIMIT_RTTIME)
@@ -103,6 +104,14 @@ def lock_memory() -> str | None:
     if libc.mlockall(MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT) != 0:
         return f"memory not locked: {os.strerror(ctypes.get_errno())}"
     return None
+
+
+def raise_open_files(most: int) -> None:
+    """Let this process have more files and connections open than by default, as far as the system allows."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    allowed = most if hard == resource.RLIM_INFINITY else min(most, hard)
+    if soft != resource.RLIM_INFINITY and soft < allowed:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (allowed, hard))
 
 
 def step_wall_clock(by_s: float) -> None:

@@ -8,6 +8,7 @@ from snakesim_hal.errors import SnakesimError
 from snakesim_hal.process import on_stop_signal
 from snakesim_hal.serve import arguments, duty
 from snakesim_hal.session import Link, open_session
+from snakesim_hal.terminal import complain_of
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -19,7 +20,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         with open_session(Link(given.link.endpoint, listen=True)):
             stopped.wait()
     except SnakesimError as error:
-        print(f"snakesim router: {error}", file=sys.stderr)
+        complain_of(error, "snakesim router")
         return 1
     return 0
 

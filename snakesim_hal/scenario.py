@@ -6,7 +6,6 @@ and checks everything at once; the result is what every process of the run is gi
 
 import hashlib
 import json
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,12 +17,16 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.files import FileStruct, Table, decode, find, leaves, read_table
+from snakesim_hal.files import FileStruct, Table, decode, find, leaves, read_table, short
+from snakesim_hal.injection import CONTROL
 from snakesim_hal.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
 from snakesim_hal.messages import Pace
+from snakesim_hal.quantities import above
 from snakesim_hal.robot import RobotFile
 from snakesim_hal.route import chain_angles, lay_chain, yaw_segments_m
 from snakesim_hal.scene import Capsule, Heading, Placed, Point, SceneFile, check_clear, place, route_of
+from snakesim_hal.textfiles import parse_toml
+from snakesim_hal.whole_file import write_whole
 
 CHOSEN = (
     "control.",
@@ -57,11 +60,29 @@ class Service(FileStruct, frozen=True, kw_only=True):
     every_ticks: Annotated[int, Meta(ge=1, le=1000)] = 1
     lag_ticks: Annotated[int, Meta(ge=1, le=1000)] = 1
     restart: bool = True  # with `snakesim run --stay`, when its process ends; false: the run ends with it
+    external: bool = False  # somebody else's process: the run waits for it, and does not start it
 
     def counting_at(self, tick: int) -> int:
         """The newest tick whose output counts at `tick`. That of tick 0 counts from the start."""
         due = max(tick - self.lag_ticks, 0)
         return due - due % self.every_ticks
+
+
+Seconds = Annotated[float, above(60, "s")]
+
+
+class MaxAge(FileStruct, frozen=True, kw_only=True):
+    """How old what control acts on may be, in robot time; what is left out follows from rates, delays and schedules.
+
+    With joints older than this control sends no command, so that the lease ends and the robot stops. With an older
+    pose, contacts, world or trajectory the controller holds, and goes on when the stream is back.
+    """
+
+    joints_s: Seconds | None = None
+    pose_s: Seconds | None = None
+    contacts_s: Seconds | None = None
+    world_s: Seconds | None = None
+    trajectory_s: Seconds | None = None
 
 
 class RunConfig(FileStruct, frozen=True, kw_only=True):
@@ -83,6 +104,7 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
     start: Start = Start()
     mission: Mission = Mission()
     services: dict[str, Service]
+    max_age: MaxAge = MaxAge()
     controllers: dict[str, dict[str, Any]] = {}  # settings of each controller, checked by the controller
     backends: dict[str, dict[str, Any]] = {}  # settings of each backend, checked by the backend
 
@@ -105,6 +127,21 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
     def backend_settings(self) -> dict[str, Any]:
         """The settings of the chosen backend."""
         return self.backends.get(self.backend.rpartition(":")[2], {})
+
+    @property
+    def own_services(self) -> dict[str, Service]:
+        """The services whose processes belong to the run."""
+        return {name: service for name, service in self.services.items() if not service.external}
+
+    @property
+    def has_own_control(self) -> bool:
+        """Whether the run commands the robot itself; otherwise whoever does also arms it."""
+        return CONTROL in self.own_services
+
+    @property
+    def commander(self) -> str:
+        """The controller, or `external` when the run starts none."""
+        return self.controller if self.has_own_control else "external"
 
     @property
     def period_ns(self) -> int:
@@ -144,12 +181,12 @@ def parse_set(text: str) -> Override:
     key, equals, value = text.partition("=")
     key = key.strip()
     if not equals or not key:
-        raise ConfigError(f"--set {text}: give section.key=value, such as --set control.propulsion_n=35")
+        raise ConfigError(f"--set {short(text)}: give section.key=value, such as --set control.propulsion_n=35")
     try:
-        parsed = tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:
+        parsed = parse_toml(f"value = {value}", "--set")["value"]
+    except ConfigError:
         parsed = value.strip()
-    return Override(key, parsed, f"--set {text}")
+    return Override(key, parsed, f"--set {short(text)}")
 
 
 def load(scenario: str, overrides: Sequence[Override] = ()) -> Loaded:
@@ -250,11 +287,16 @@ def config_hash(config: RunConfig) -> str:
     return hashlib.sha256(plain.encode()).hexdigest()[:16]
 
 
+def written(config: RunConfig) -> bytes:
+    """The effective configuration as a file holds it; `snakesim run` takes it like a scenario file."""
+    return msgspec.json.format(msgspec.json.encode(config), indent=2)
+
+
 def write(config: RunConfig, path: Path) -> None:
-    """Save the effective configuration; `snakesim run` takes it like a scenario file."""
-    path.write_bytes(msgspec.json.format(msgspec.json.encode(config), indent=2))
+    """Save the effective configuration."""
+    write_whole(path, written(config))
 
 
 def read(path: Path) -> RunConfig:
-    """Read back what `write` saved."""
-    return decode(read_table(path), RunConfig)
+    """Read back what `write` saved, whatever the file is called."""
+    return decode(read_table(path, ".json"), RunConfig)

@@ -5,6 +5,7 @@ fields into plain obstacles; `check_clear` refuses a scene in which one of them 
 """
 
 import math
+from collections import Counter
 from typing import Annotated
 
 import numpy as np
@@ -146,6 +147,7 @@ class RandomField(FileStruct, frozen=True, kw_only=True):
 
 
 MOST_STREWN = 1000
+MOST_OBSTACLES = 4096  # that the message World holds
 
 
 class SceneFile(FileStruct, frozen=True, kw_only=True):
@@ -191,6 +193,7 @@ def place(scene: SceneFile, keep_clear: "list[Capsule] | None" = None) -> list[P
 
     keep_clear: capsules (the snake at its start) that random fields stay away from.
     """
+    _check_count(scene)
     placed: list[Placed] = []
     for i, c in enumerate(scene.cylinder):
         placed.append(_peg(c.name or f"cylinder_{i}", c.position_m, c.radius_m, c.height_m, c.friction))
@@ -221,11 +224,24 @@ def place(scene: SceneFile, keep_clear: "list[Capsule] | None" = None) -> list[P
         placed.extend(_pegs_along(scene, i, row, route))
     for i, field in enumerate(scene.random_field):
         placed.extend(_strewn(scene, i, field, route, placed, keep_clear or []))
-    names = [p.obstacle.name for p in placed]
-    twice = {name for name in names if names.count(name) > 1}
+    names = Counter(p.obstacle.name for p in placed)
+    twice = sorted(name for name, count in names.items() if count > 1)
     if twice:
-        raise ConfigError(f"scene {scene.name!r}: two obstacles are called {sorted(twice)[0]!r}; rename one")
+        raise ConfigError(f"scene {scene.name!r}: two obstacles are called {twice[0]!r}; rename one")
     return placed
+
+
+def _check_count(scene: SceneFile) -> None:
+    given = (scene.cylinder, scene.box, scene.sphere, scene.wall, scene.step)
+    count = sum(len(kind) for kind in given) + sum(row.count for row in scene.pegs_along_route)
+    count += sum(min(_wanted(field), MOST_STREWN) for field in scene.random_field)
+    if count > MOST_OBSTACLES:
+        raise ConfigError(f"scene {scene.name!r}: has {count} obstacles; at most {MOST_OBSTACLES} are allowed")
+
+
+def _wanted(field: RandomField) -> int:
+    """How many pegs a random field asks for."""
+    return round(field.density_per_m2 * math.prod(np.subtract(field.high_m, field.low_m).tolist()))
 
 
 def _peg(name: str, position: Point, radius: float, height: float, friction: float) -> Placed:
@@ -293,7 +309,7 @@ def _strewn(
         raise ConfigError(f"{where}: `radius_m` = {field.radius_m}: smallest first, then largest")
     if field.route_clearance_m is not None and route is None:
         raise ConfigError(f"{where}: `route_clearance_m` is set but the scene has no route; add a [route] section")
-    wanted = round(field.density_per_m2 * float(np.prod(high - low)))
+    wanted = _wanted(field)
     if wanted > MOST_STREWN:
         raise ConfigError(
             f"{where}: `density_per_m2` = {field.density_per_m2} asks for {wanted} pegs on this area; at most "

@@ -11,6 +11,9 @@ from snakesim_hal.plugins import SERVICES, find_plugin
 from snakesim_hal.process import die_with_parent
 from snakesim_hal.scenario import RunConfig, read
 from snakesim_hal.session import DEFAULT_ENDPOINT, Link
+from snakesim_hal.terminal import complain, complain_of
+
+START_LIMIT_S = 600.0  # until a part of a run is there: MuJoCo starts slowly in an emulated machine on a busy one
 
 
 @dataclass(frozen=True)
@@ -50,13 +53,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     """`python -m snakesim_hal.serve NAME ...`: run the service that an installed package offers under a name."""
     given = list(sys.argv[1:] if argv is None else argv)
     if not given or given[0].startswith("-"):
-        print("usage: python -m snakesim_hal.serve NAME [--help]", file=sys.stderr)
+        complain("usage: python -m snakesim_hal.serve NAME [--help]")
         return 2
     try:
         service_main = find_plugin(SERVICES, given[0])
         return service_main(given[1:])
     except ConfigError as error:
-        print(f"snakesim {given[0]}: {error}", file=sys.stderr)
+        complain_of(error, f"snakesim {given[0]}")
         return 2
 
 

@@ -6,6 +6,7 @@ tells them of each other, and gossip is off here. With `--router` the host too i
 """
 
 import json
+import os
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -19,12 +20,24 @@ from zenoh import ext, handlers  # pyright: ignore[reportMissingModuleSource]
 
 from snakesim_hal import keys
 from snakesim_hal.codec import MAX_PAYLOAD_BYTES, Decoder, MessageT, encode, encoding_of
-from snakesim_hal.errors import ConfigError, NotConnectedError, RefusedError, WireError
+from snakesim_hal.errors import ConfigError, NotConnectedError, WireError
+from snakesim_hal.files import short
 from snakesim_hal.messages import Answer, Message
+from snakesim_hal.process import raise_open_files
+from snakesim_hal.textfiles import check_brackets, read_text
 
 DEFAULT_PORT = 7447
 DEFAULT_ENDPOINT = f"tcp/127.0.0.1:{DEFAULT_PORT}"
 MAX_MESSAGE_BYTES = MAX_PAYLOAD_BYTES + 4096  # with key and encoding; what is longer costs neither memory nor time
+# Who connects and says nothing is let go after a second, and there is room for many who do.
+UNICAST = {"accept_timeout": 1000, "accept_pending": 1000, "max_sessions": 4000}
+# A reader that does not read loses samples after 0.1 ms (Zenoh's default is 1 ms), so that ten of them cost a writer
+# little. With less, bursts to good readers are lost: at 0 ms, two thirds of six express messages in a row.
+TX = {"lease": 2000, "queue": {"congestion_control": {"drop": {"wait_before_drop": 100}}}}
+# Letting go of a frozen reader holds up a receiving thread of Zenoh, and it has two: three readers that freeze together
+# kept the controller's commands out for long enough to end its lease.
+RUNTIME = ("ZENOH_RUNTIME", "(rx: (worker_threads: 16))")
+MAX_OPEN_FILES = 16384  # a connection takes one, and a process has 1024 unless it asks for more
 READER_DEPTH = 256  # deep enough that a burst of noise on a key does not push out the sample that counts
 
 
@@ -200,15 +213,21 @@ class Session:
         self._declared.remove(reader.subscriber)
         reader.subscriber.undeclare()
 
-    def latest(self, key: str, message: type[MessageT], timeout_s: float) -> MessageT | None:
-        """The value latched on a key; None when there is none in time."""
+    def latest(
+        self,
+        key: str,
+        message: type[MessageT],
+        timeout_s: float,
+        wanted: Callable[[MessageT], bool] = lambda _message: True,
+    ) -> MessageT | None:
+        """The value latched on a key; None when there is none (that is wanted) in time."""
         reader, deadline = self.latched_reader(key, message), time.monotonic() + timeout_s
-        found: list[MessageT] = []
-        while not found and time.monotonic() < deadline:
+        found: MessageT | None = None
+        while found is None and time.monotonic() < deadline:
             time.sleep(0.01)
-            found = reader.drain()
+            found = reader.newest(wanted)
         self.stop_reading(reader)
-        return found[-1] if found else None
+        return found
 
     def on_arrival(self, key: str, take: Callable[[Arrival], None]) -> None:
         """Call `take` for every sample, in Zenoh's thread: it must only store, never compute."""
@@ -228,27 +247,28 @@ class Session:
 
         self._declared.append(self._zenoh.declare_queryable(key, handle))
 
-    def ask(self, key: str, request: Message, timeout_s: float = 2.0) -> Answer:
-        """Ask the HAL and wait. Raises NotConnectedError when nobody answers, RefusedError on no."""
-        answer = self.ask_politely(key, request, timeout_s)
-        if not answer.ok:
-            raise RefusedError(answer.reason)
-        return answer
+    def ask(self, key: str, request: Message, timeout_s: float = 2.0, *, host: str | None = None) -> Answer:
+        """Ask the HAL, and wait for the answer, which may be no. Raises NotConnectedError when there is none.
 
-    def ask_politely(self, key: str, request: Message, timeout_s: float = 2.0) -> Answer:
-        """Like `ask`, but a no is returned, not raised."""
-        replies = self._zenoh.get(key, payload=encode(request), encoding=encoding_of(type(request)), timeout=timeout_s)
+        host: the host process that is meant; what others answer does not count. None: the first answer does.
+        """
         unreadable: WireError | None = None
-        for _, answer in self._answers(replies):
-            if isinstance(answer, Answer):
+        for _, answer in self._answers(key, request, timeout_s):
+            if isinstance(answer, WireError):
+                unreadable = answer
+            elif host is None or answer.host == host:
                 return answer
-            unreadable = answer
         if unreadable is not None:
             raise NotConnectedError(f"what answers on {key} cannot be read: {unreadable}")
         raise NotConnectedError(f"nobody answers on {key} within {timeout_s} s; is the robot's HAL host running?")
 
     def ask_all(self, pattern: str, request: Message, timeout_s: float = 2.0) -> Iterator[tuple[str, Answer]]:
-        """Ask every robot whose key matches, at once: (key, answer) as they come, until all answered or time is up."""
+        """Ask everybody whose key matches, at once: (key, answer) as they come, until all answered or time is up."""
+        answers = self._answers(pattern, request, timeout_s)
+        return ((at, answer) for at, answer in answers if isinstance(answer, Answer))
+
+    def _answers(self, pattern: str, request: Message, timeout_s: float) -> Iterator[tuple[str, Answer | WireError]]:
+        """What comes back from which key; what cannot be read is counted. No answer takes the place of another."""
         replies = self._zenoh.get(
             pattern,
             payload=encode(request),
@@ -257,10 +277,6 @@ class Session:
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
         )
-        return ((at, answer) for at, answer in self._answers(replies) if isinstance(answer, Answer))
-
-    def _answers(self, replies: Any) -> Iterator[tuple[str, Answer | WireError]]:
-        """What came back from which key; what cannot be read is counted."""
         decoder = Decoder(Answer)
         for reply in replies:
             if reply.ok is None:
@@ -278,7 +294,11 @@ class Session:
 
     def declare_alive(self, service: str) -> None:
         """Show the liveliness token of a service for as long as the session lives."""
-        self._declared.append(self._zenoh.liveliness().declare_token(keys.alive(service)))
+        self.declare_token(keys.alive(service))
+
+    def declare_token(self, key: str) -> None:
+        """Show a liveliness token for as long as the session lives."""
+        self._declared.append(self._zenoh.liveliness().declare_token(key))
 
     def on_alive(self, take: Callable[[str, bool], None], key: str = keys.ALIVE_ALL) -> None:
         """Call `take(key, present)` when a service comes or goes, in Zenoh's thread."""
@@ -309,9 +329,27 @@ def _storing(take: Callable[[Arrival], None]) -> Callable[[zenoh.Sample], None]:
     return handle
 
 
+def key_expression(text: str) -> str:
+    """A key that may have wildcards, in Zenoh's canonical form. Raises ConfigError."""
+    try:
+        return str(zenoh.KeyExpr.autocanonize(text))
+    except zenoh.ZError as error:
+        raise ConfigError(
+            f"{text!r} is not a key: {str(error).split(' at /')[0]}; valid are such as sensor/joints, sensor/* and **"
+        ) from None
+
+
+def intersects(pattern: str, key: str) -> bool:
+    """Whether two key expressions have a key in common."""
+    return zenoh.KeyExpr(pattern).intersects(zenoh.KeyExpr(key))
+
+
 @contextmanager
 def open_session(link: Link, connect_timeout_s: float = 5.0) -> Iterator[Session]:
     """Join the network. Raises NotConnectedError when the endpoint does not answer or cannot be listened on."""
+    if link.listen:
+        raise_open_files(MAX_OPEN_FILES)
+        os.environ.setdefault(*RUNTIME)
     session = Session(_open(_settings(link, connect_timeout_s), link))
     try:
         yield session
@@ -325,7 +363,8 @@ def _settings(link: Link, connect_timeout_s: float) -> dict[str, Any]:
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "timestamping": {"enabled": {"router": True, "peer": True, "client": True}},
         "transport": {
-            "link": {"tx": {"lease": 2000}, "rx": {"max_message_size": MAX_MESSAGE_BYTES}},
+            "unicast": UNICAST,
+            "link": {"tx": TX, "rx": {"max_message_size": MAX_MESSAGE_BYTES}},
             "shared_memory": {"enabled": False},
         },
         "listen": {"endpoints": [link.endpoint] if link.listen else [], "exit_on_failure": True},
@@ -354,17 +393,32 @@ def _open(settings: dict[str, Any], link: Link) -> zenoh.Session:
         raise NotConnectedError(f"nobody listens on {link.endpoint}; start a run or a router there first") from error
 
 
+def router_settings(config: Path) -> zenoh.Config:
+    """What a router's JSON5 file says; opens nothing. Raises ConfigError."""
+    text = read_text(config)
+    check_brackets(text, str(config))
+    try:
+        settings = zenoh.Config.from_json5(text)
+    except zenoh.ZError as error:
+        raise _refused_by_zenoh(config, error) from error
+    if json.loads(settings.get_json("mode")) != "router":
+        raise ConfigError(f'{config}: `mode` must be "router"')
+    return settings
+
+
+def _refused_by_zenoh(config: Path, error: zenoh.ZError) -> ConfigError:
+    return ConfigError(f"{config}: Zenoh refuses it: {short(' '.join(str(error).split()), 500)}")  # it quotes the file
+
+
 @contextmanager
 def open_router(config: Path) -> Iterator[None]:
     """Run a Zenoh router from a JSON5 file for as long as the context lives. Raises ConfigError."""
     zenoh.init_log_from_env_or("error")
+    settings = router_settings(config)
     try:
-        settings = zenoh.Config.from_file(str(config))
-        if json.loads(settings.get_json("mode")) != "router":
-            raise ConfigError(f'{config}: `mode` must be "router"')
         session = zenoh.open(settings)
     except zenoh.ZError as error:
-        raise ConfigError(f"{config}: Zenoh refuses it: {error}") from error
+        raise _refused_by_zenoh(config, error) from error
     try:
         yield
     finally:

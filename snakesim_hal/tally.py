@@ -1,6 +1,32 @@
 """The numbers that the HAL host leaves behind."""
 
+import math
 from dataclasses import dataclass, field
+
+STEP = math.log(1.01)  # a bin is 1 % wide
+BINS = 1 + math.ceil(math.log(1e7) / STEP)  # 1 us to 10 s
+
+
+class Latencies:
+    """How long something took, each time, to 1 %: in memory of fixed size, however long the run."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._bins = [0] * BINS
+
+    def add(self, took_us: float) -> None:
+        """Count one."""
+        self._bins[min(max(round(math.log(max(took_us, 1.0)) / STEP), 0), BINS - 1)] += 1
+        self.count += 1
+
+    def percentile_us(self, percent: float) -> float | None:
+        """None when nothing was counted."""
+        left = percent / 100 * self.count
+        for place, count in enumerate(self._bins if self.count else ()):
+            left -= count
+            if left <= 0:
+                return math.exp(place * STEP)
+        return None
 
 
 @dataclass
@@ -10,4 +36,4 @@ class Tally:
     ticks: int = 0
     overruns: int = 0
     answered_ticks: int = 0  # commands that came within their own tick
-    state_to_command_us: list[float] = field(default_factory=list[float])
+    state_to_command: Latencies = field(default_factory=Latencies)

@@ -53,6 +53,7 @@ def status_message(
         commands_rejected=dict(authority.rejected),
         commands_limited=dict(authority.limited),
         faults=authority.faults,
+        faults_left_out=authority.since_clear.left_out,
         alive=participants.present(),
         waiting_for=missing,
         overruns=overruns,
@@ -61,4 +62,5 @@ def status_message(
         ready_to_arm=not against and not missing,
         derated=authority.derated,
         isolated=authority.isolated,
+        host=description.host,
     )

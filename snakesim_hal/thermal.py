@@ -6,8 +6,12 @@ First order: copper losses go with torque squared, and the housing takes them aw
 
 No module was measured. The numbers stand for a small geared servo: rated torque is what it has at stall for seconds,
 half of it is what it holds for ever (80 °C at 20 °C ambient, so 240 K at rated torque), and it takes a minute to warm.
+
+`HeatLimits` is the one curve by which heat takes torque away: the host derates by it, and so do the simulator's motors
+and emulated modules by themselves. Both bound the torque from above, so the lower one holds; they never multiply.
 """
 
+from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
@@ -20,38 +24,58 @@ AMBIENT_C = 20.0
 RISE_AT_RATED_K = 240.0
 TIME_CONSTANT_S = 60.0
 LOSS_AT_RATED_W = 48.0  # 5 K/W from winding to water, a guess of the right order for a housing of 100 mm
-FADES_FROM_C, FADED_C, LEAST_SHARE = 80.0, 100.0, 0.2  # of a module's own firmware
-INJECTED_C = 110.0  # by a fault on request
-OVERHEAT_C, COOLED_C = 105.0, 70.0  # a fault from the one up, gone below the other
+LEAST_SHARE = 0.2  # of its torque, that the hottest winding may still use
+INJECTED_ABOVE_STOP_K = 5.0  # by a fault on request
 SUPPLY_V, LEAST_VOLTAGE_V = 24.0, 18.0
 IDLE_A = 0.05
 BOARD_OVER_AMBIENT = 0.3  # of what the winding is warmer than the water, a guess
 
 
+@dataclass(frozen=True)
+class HeatLimits:
+    """Where a winding begins to lose torque, and where it stops: the robot file's `derate_from_c` and `stop_at_c`."""
+
+    derate_from_c: float
+    stop_at_c: float
+
+    def share_left(self, winding_c: float) -> float:
+        """Which share of its rated torque a winding leaves its motor: 1 up to the one, a fifth from the other on."""
+        over = (winding_c - self.derate_from_c) / (self.stop_at_c - self.derate_from_c)
+        return 1.0 - (1.0 - LEAST_SHARE) * min(max(over, 0.0), 1.0)
+
+
 class Thermal:
     """Winding temperatures of all motors."""
 
-    def __init__(self, count: int, rated_nm: float) -> None:
+    def __init__(self, count: int, rated_nm: float, limits: HeatLimits) -> None:
+        self.limits = limits
         self.winding_c: Floats = np.full(count, AMBIENT_C)
         self._held = np.zeros(count, dtype=np.bool_)
+        self._derates = False
         self._rise = RISE_AT_RATED_K / rated_nm**2
 
     def pass_time(self, seconds: float, torque_squared: Floats) -> None:
         """Heat and cool, under a mean square of torque, N²·m², (n_joints,). Exact for a constant torque."""
         settles_at = AMBIENT_C + self._rise * torque_squared
         self.winding_c += (settles_at - self.winding_c) * -np.expm1(-seconds / TIME_CONSTANT_S)
-        np.copyto(self.winding_c, INJECTED_C, where=self._held)
+        np.copyto(self.winding_c, self._injected_c, where=self._held)
 
     def inject(self, motor: int, *, heat: bool, hold: bool) -> None:
         """Heat one winding by hand; hold: it stays as hot until told otherwise."""
         if heat:
-            self.winding_c[motor] = INJECTED_C
+            self.winding_c[motor] = self._injected_c
         self._held[motor] = hold
 
-    def share_left(self) -> Floats:
-        """Which share of its torque limit each motor may still use, (n_joints,)."""
-        over = (self.winding_c - FADES_FROM_C) / (FADED_C - FADES_FROM_C)
-        return 1.0 - (1.0 - LEAST_SHARE) * np.clip(over, 0.0, 1.0)
+    def share_left(self) -> Floats | None:
+        """Which share of its rated torque each motor may use, (n_joints,); None while all are cool, as before."""
+        derated, self._derates = self._derates, bool(self.winding_c.max() > self.limits.derate_from_c)
+        if not (self._derates or derated):
+            return None
+        return np.array([self.limits.share_left(celsius) for celsius in self.winding_c.tolist()])
+
+    @property
+    def _injected_c(self) -> float:
+        return self.limits.stop_at_c + INJECTED_ABOVE_STOP_K
 
 
 def board_c(winding_c: Number) -> Number:

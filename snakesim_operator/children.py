@@ -1,25 +1,53 @@
 """The processes of a run: started together, watched, ended by id, and never left behind."""
 
+import contextlib
+import fcntl
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from types import MappingProxyType
 
 STOP_LIMIT_S = 5.0
+LINES_SHOWN, LAST_BYTES = 15, 16384
+PIPE_BYTES = 2**20  # what a child may say while this process is frozen
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+
+class Words:
+    """What a process says: taken from a pipe at once, so that it never waits for a disk, and handed on."""
+
+    def __init__(self, pipe: int, keep: Callable[[bytes], object]) -> None:
+        self._pipe, self._keep = pipe, keep
+        self._last = b""
+        self._thread = threading.Thread(target=self._listen, name="words", daemon=True)
+        self._thread.start()
+
+    def last(self) -> list[str]:
+        """The end of it, in lines, once the process has ended."""
+        self._thread.join(1.0)
+        return self._last.decode(errors="replace").strip().splitlines()[-LINES_SHOWN:]
+
+    def _listen(self) -> None:
+        with contextlib.suppress(OSError):  # a pipe may be larger than it is by default
+            fcntl.fcntl(self._pipe, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
+        while words := os.read(self._pipe, 65536):
+            self._last = (self._last + words)[-LAST_BYTES:]
+            self._keep(words)
+        os.close(self._pipe)
 
 
 @dataclass(frozen=True)
 class Child:
-    """One process, and where what it says goes."""
+    """One process, and what it says."""
 
     name: str
     process: subprocess.Popen[bytes]
-    log: Path
+    words: Words
 
     def how_it_ended(self) -> str | None:
         """In words; None while it runs."""
@@ -28,32 +56,48 @@ class Child:
             return None
         if code < 0:
             return f"{self.name} was ended by {signal.Signals(-code).name}"
-        return f"{self.name} ended with exit code {code}"
+        why = (self.last_words() or [""])[-1]
+        said = f"snakesim {self.name}: "
+        return f"{self.name} ended with exit code {code}" + (f": {why[len(said) :]}" if why.startswith(said) else "")
 
-    def last_words(self) -> str:
-        """The end of what it wrote to stderr."""
-        if not self.log.is_file():
-            return ""
-        lines = self.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-        return "\n".join(lines[-15:])
+    def last_words(self) -> list[str]:
+        """The last lines of what it wrote to stdout and stderr, once it has ended."""
+        return self.words.last()
 
 
-def start(name: str, arguments: Sequence[str], log: Path, *, again: bool = False) -> Child:
-    """Start a Python module as a child that dies with this process. again: its log goes on.
+def start(
+    name: str,
+    arguments: Sequence[str],
+    keep: Callable[[bytes], object],
+    *,
+    inherits: Sequence[int] = (),
+    more: Mapping[str, str] = MappingProxyType({}),
+) -> Child:
+    """Start a Python module as a child that dies with this process.
+
+    keep: gets what it says, from another thread; inherits: file descriptors that stay open in it; more: environment
+    variables.
 
     It gets a session of its own, so that Ctrl-C reaches only the supervisor, which then ends its children in order.
     """
-    environment = {**os.environ, **ONE_THREAD, "PYTHONUNBUFFERED": "1", "PYTHONHASHSEED": "0"}
-    with log.open("ab" if again else "wb") as output:
+    environment = {**os.environ, **ONE_THREAD, "PYTHONUNBUFFERED": "1", "PYTHONHASHSEED": "0", **more}
+    ours, theirs = os.pipe()
+    try:
         process = subprocess.Popen(
             [sys.executable, "-m", *arguments, "--parent", str(os.getpid())],
             stdin=subprocess.DEVNULL,
-            stdout=output,
+            stdout=theirs,
             stderr=subprocess.STDOUT,
             env=environment,
             start_new_session=True,
+            pass_fds=inherits,
         )
-    return Child(name, process, log)
+    except OSError:
+        os.close(ours)
+        raise
+    finally:
+        os.close(theirs)
+    return Child(name, process, Words(ours, keep))
 
 
 def ask_to_end(child: Child) -> None:
@@ -73,4 +117,5 @@ def stop_all(children: Sequence[Child]) -> None:
             child.process.wait(max(deadline - time.monotonic(), 0.05))
         except subprocess.TimeoutExpired:
             child.process.kill()
-            child.process.wait()
+            with contextlib.suppress(subprocess.TimeoutExpired):  # in the hands of a disk that hangs
+                child.process.wait(STOP_LIMIT_S)

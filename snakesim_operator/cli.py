@@ -4,48 +4,60 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
+from importlib.metadata import version
 from pathlib import Path
 
+from snakesim_hal.endpoint import check_endpoint, check_namespace
 from snakesim_hal.errors import ConfigError, SnakesimError
+from snakesim_hal.files import ROUTER, find, read_table, shipped, short
 from snakesim_hal.injection import explain
-from snakesim_hal.plugins import COMMANDS, find_plugin, installed
+from snakesim_hal.plugins import COMMANDS, find_plugin, in_file, installed
 from snakesim_hal.scenario import Loaded, Override, load, parse_set
+from snakesim_hal.terminal import complain, complain_of, say
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Exit code: 0 done, 1 a fault, 2 wrong input and nothing started, 130 interrupted."""
+    """Exit code: 0 done, 1 a fault, 2 wrong input and nothing started, 3 an incomplete record, 130 interrupted."""
     given = list(sys.argv[1:] if argv is None else argv)
     try:
         if given and given[0] in installed(COMMANDS):
             return find_plugin(COMMANDS, given[0])(given[1:])
-        arguments = _parser().parse_args(given)
+        arguments = parser().parse_args(given)
         return arguments.act(arguments)
     except ConfigError as error:
-        print(f"snakesim: {error}", file=sys.stderr)
+        complain_of(error, "snakesim")
         return BAD_INPUT
     except SnakesimError as error:
-        print(f"snakesim: {error}", file=sys.stderr)
+        complain_of(error, "snakesim")
         return FAILED
-    except BrokenPipeError:
+    except OSError as error:  # such as a full disk under what is printed
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return OK
-    except KeyboardInterrupt:
-        return 130
+        if isinstance(error, BrokenPipeError):  # somebody has seen enough
+            return OK
+        complain(f"snakesim: {error}")
+        return FAILED
 
 
-def _parser() -> argparse.ArgumentParser:
+def parser() -> argparse.ArgumentParser:
+    """What the command takes, without the commands of installed packages."""
     parser = argparse.ArgumentParser(
         prog="snakesim",
         description="Snake robots that push themselves off obstacles: one controller, simulator or robot.",
     )
+    parser.add_argument("--version", action="version", version=f"snakesim {version('snakesim')}")
     more = installed(COMMANDS)
     if more:
         parser.epilog = f"From installed backends: {', '.join(more)}; each explains itself with --help."
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    run = commands.add_parser("run", help="run a scenario: backend, guidance, navigation and control")
+    run = commands.add_parser(
+        "run",
+        help="run a scenario: backend, guidance, navigation and control",
+        epilog="Exit code: 0 complete, all of the time was armed time; 1 a fault, or ended before that; 2 wrong input, "
+        "nothing was started; 3 complete, but the record lacks something; 130 interrupted. 1 and 130 outrank 3.",
+    )
     _add_scenario(run)
     run.add_argument(
         "--fault",
@@ -79,8 +91,8 @@ def _parser() -> argparse.ArgumentParser:
     scenarios = commands.add_parser("scenarios", help="list the scenarios, robots and scenes that are shipped")
     scenarios.set_defaults(act=_scenarios)
 
-    echo = commands.add_parser("echo", help="print what is published on a key")
-    echo.add_argument("key", help="such as sensor/joints; `snakesim echo --help` lists none, schemas/keys.md all")
+    echo = commands.add_parser("echo", help="print what is published on a key, one JSON object a line")
+    echo.add_argument("key", nargs="?", help="such as sensor/joints or sensor/*; without it, the keys are listed")
     echo.add_argument("--hz", action="store_true", help="print only how often, and how regularly")
     echo.add_argument("--count", type=int, help="end after so many messages")
     _add_network(echo)
@@ -119,12 +131,16 @@ def _parser() -> argparse.ArgumentParser:
     fault.set_defaults(act=_fault)
 
     router = commands.add_parser("router", help="run a Zenoh router from a JSON5 file")
-    router.add_argument("config", type=Path, nargs="?", help="JSON5 file (default: deploy/router.json5's settings)")
+    router.add_argument("config", type=Path, nargs="?", help=f"JSON5 file (default: {str(ROUTER).replace('%', '%%')})")
     router.set_defaults(act=_router)
 
-    schemas = commands.add_parser("schemas", help="write the JSON Schemas and the key space")
-    schemas.add_argument("--write", type=Path, required=True, metavar="FOLDER")
+    schemas = commands.add_parser("schemas", help="say where the JSON Schemas, the key space and the DBC file are")
+    schemas.add_argument("--write", type=Path, metavar="FOLDER", help="write schemas and key space anew, from the code")
     schemas.set_defaults(act=_schemas)
+
+    completion = commands.add_parser("completion", help="print a script for tab completion: source <(snakesim ...)")
+    completion.add_argument("shell", choices=["bash", "zsh"])
+    completion.set_defaults(act=_completion)
     return parser
 
 
@@ -154,6 +170,14 @@ def _add_network(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--namespace", help="namespace of the robot (default: the robot's name)")
 
 
+def _check_network(arguments: argparse.Namespace) -> None:
+    for flag, given in (("--endpoint", arguments.endpoint), ("--router", arguments.router)):
+        if given is not None:
+            check_endpoint(given, flag)
+    if arguments.namespace is not None:
+        check_namespace(arguments.namespace, "--namespace")
+
+
 def _load(arguments: argparse.Namespace) -> Loaded:
     flags = {
         "backend": arguments.backend,
@@ -165,7 +189,7 @@ def _load(arguments: argparse.Namespace) -> Loaded:
     overrides = [parse_set(text) for text in arguments.set]
     for key, value in flags.items():
         if value is not None:
-            flag = f"--{key.removesuffix('_s')} {value}"
+            flag = f"--{key.removesuffix('_s')} {short(str(value))}"
             overrides.append(Override(key, value, flag))
     if faults := getattr(arguments, "fault", None):
         overrides.append(Override("faults", faults, " ".join(f"--fault {text}" for text in faults)))
@@ -175,6 +199,7 @@ def _load(arguments: argparse.Namespace) -> Loaded:
 def _run(arguments: argparse.Namespace) -> int:
     from snakesim_operator.run import RunRequest, check_plugins, run
 
+    _check_network(arguments)
     loaded = _load(arguments)
     config = check_plugins(loaded.config, loaded.table)  # here, because only the table knows which flag set what
     return run(
@@ -200,12 +225,18 @@ def _config(arguments: argparse.Namespace) -> int:
     from snakesim_operator.run import check_plugins
 
     loaded = _load(arguments)
-    check_plugins(loaded.config, loaded.table)
+    check_plugins(loaded.config, loaded.table, run_files=False)
     rows = [(key, _shown(value), origin) for key, value, origin in loaded.explain()]
     key_width = max(len(key) for key, _, _ in rows)
     value_width = min(max(len(value) for _, value, _ in rows), 48)
     for key, value, origin in rows:
-        print(f"{key:<{key_width}}  {value:<{value_width}}  {origin}")
+        say(f"{key:<{key_width}}  {value:<{value_width}}  {origin}")
+    for section, name in (
+        (loaded.config.control_section, loaded.config.controller),
+        (loaded.config.backend_section, loaded.config.backend),
+    ):
+        if in_file(name):
+            say(f"{section}: not checked, because that would run {name}; `snakesim run` checks it")
     return OK
 
 
@@ -215,63 +246,62 @@ def _shown(value: object) -> str:
 
 
 def _scenarios(_arguments: argparse.Namespace) -> int:
-    from snakesim_hal.files import find, read_table, shipped
-
     for kind, about in (("scenarios", "title"), ("robots", "about"), ("scenes", "about")):
-        print(f"{kind}:")
+        say(f"{kind}:")
         for name in shipped(kind):
             table = read_table(find(name, kind))
-            print(f"  {name:<18}{table.values.get(about, '')}")
+            say(f"  {name:<18}{table.values.get(about, '')}")
     return OK
 
 
 def _echo(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.watch import echo
+    from snakesim_operator.echo import EchoRequest, echo
 
-    return echo(arguments.key, _link(arguments), rate_only=arguments.hz, count=arguments.count)
+    return echo(EchoRequest(arguments.key, arguments.hz, arguments.count), _where(arguments))
 
 
 def _status(arguments: argparse.Namespace) -> int:
     from snakesim_operator.watch import show_status
 
-    return show_status(_link(arguments))
+    return show_status(_where(arguments))
 
 
 def _arm(arguments: argparse.Namespace) -> int:
     from snakesim_operator.command import arm
 
-    return arm(arguments.robot, arguments.backend, _link(arguments))
+    return arm(arguments.robot, arguments.backend, _where(arguments))
 
 
 def _disarm(arguments: argparse.Namespace) -> int:
     from snakesim_operator.command import disarm
 
-    return disarm(_link(arguments))
+    return disarm(_where(arguments))
 
 
 def _clear(arguments: argparse.Namespace) -> int:
     from snakesim_operator.command import clear
 
-    return clear(_link(arguments))
+    return clear(_where(arguments))
 
 
 def _estop(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.command import estop
+    from snakesim_operator.stop import estop
 
-    return estop(_link(arguments))
+    return estop(_where(arguments))
 
 
 def _fault(arguments: argparse.Namespace) -> int:
     from snakesim_operator.fault import FaultOrder, fault
 
     order = FaultOrder(arguments.kind, arguments.target, arguments.for_s, arguments.amount, arguments.end)
-    return fault(order, _link(arguments))
+    return fault(order, _where(arguments))
 
 
-def _link(arguments: argparse.Namespace):
-    from snakesim_hal.session import DEFAULT_ENDPOINT, Link
+def _where(arguments: argparse.Namespace):
+    from snakesim_operator.targets import Where
 
-    return Link(arguments.router or arguments.endpoint or DEFAULT_ENDPOINT, arguments.namespace)
+    _check_network(arguments)
+    return Where(arguments.router or arguments.endpoint, arguments.namespace)
 
 
 def _router(arguments: argparse.Namespace) -> int:
@@ -281,12 +311,16 @@ def _router(arguments: argparse.Namespace) -> int:
 
 
 def _schemas(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.schemas import write_schemas
+    from snakesim_operator.schemas import published, write_schemas
 
-    for path in write_schemas(arguments.write):
-        print(path)
+    for path in published() if arguments.write is None else write_schemas(arguments.write):
+        say(str(path))
     return OK
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+def _completion(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.completion import completion
+
+    for line in completion(parser(), arguments.shell):
+        say(line)
+    return OK

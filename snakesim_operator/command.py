@@ -1,25 +1,29 @@
-"""What a person tells a robot: `snakesim arm`, `disarm`, `clear`, `estop`."""
+"""What a person tells a robot: `snakesim arm`, `disarm`, `clear`.
+
+Names are no identity: anybody on the network can answer in a robot's name. So everybody is asked, two answers are one
+too many, and an answer counts once the robot's host shows the new state itself.
+"""
 
 import getpass
-from collections.abc import Callable
-from dataclasses import replace
+import time
+from collections.abc import Sequence
 
 from snakesim_hal import keys
 from snakesim_hal.errors import NotConnectedError, RefusedError
-from snakesim_hal.messages import Answer, Description, EstopRequest, LifecycleRequest
-from snakesim_hal.session import Link, Session, open_session
+from snakesim_hal.latch import forget_stop, stops_kept
+from snakesim_hal.messages import Answer, Description, LifecycleRequest, Status
+from snakesim_hal.session import Link, Reader, Session, open_session
+from snakesim_hal.terminal import Say, say
+from snakesim_operator.targets import CONNECT_S, Where, the_one
 
-CONNECT_S = 1.0
 ANSWER_S = 5.0
 DESCRIPTION_S = 3.0
-HAL_EVERYWHERE = f"**/{keys.alive('hal')}"
-
-Say = Callable[[str], None]
+SHOWN_S = 1.5  # until the host's status must show what its answer says
 
 
-def arm(robot: str, backend: str, link: Link, say: Say = print) -> int:
+def arm(robot: str, backend: str, where: Where, say: Say = say) -> int:
     """Arm a robot, when it is the one that is meant. Raises RefusedError with the reason."""
-    link = of_one(link, f"arm {robot} {backend}")
+    link = the_one(where, f"arm {robot} {backend}")
     with open_session(link, CONNECT_S) as session:
         description = _description(session, link)
         wrong = [
@@ -35,91 +39,102 @@ def arm(robot: str, backend: str, link: Link, say: Say = print) -> int:
                 f"not armed: {'; '.join(wrong)}. Armed is only what is named: "
                 f"`snakesim arm {description.robot} {description.backend}`"
             )
-        request = LifecycleRequest(action="arm", robot=robot, backend=backend, config_hash=description.config_hash)
-        answer = session.ask_politely(keys.LIFECYCLE, request, ANSWER_S)
-    return _tell("armed", link, answer, say)
-
-
-def disarm(link: Link, say: Say = print) -> int:
-    """Let the joints go passive; also what is streamed then does not move them."""
-    return _lifecycle(LifecycleRequest(action="disarm"), "disarmed", link, say)
-
-
-def clear(link: Link, say: Say = print) -> int:
-    """Forget a fault or an emergency stop. The robot is disarmed then."""
-    return _lifecycle(LifecycleRequest(action="clear"), "cleared", link, say)
-
-
-def estop(link: Link, say: Say = print) -> int:
-    """Stop a robot now; every robot on the network when none is named."""
-    key = keys.ESTOP if link.namespace is not None else f"**/{keys.ESTOP}"
-    stopped: set[str] = set()
-    refused = 0
-    with open_session(link, CONNECT_S) as session:
-        answers = session.ask_all(key, EstopRequest(who=_who()), ANSWER_S)
-        here = [link.namespace] if link.namespace is not None else _robots(session)
-        for at, answer in answers:
-            name = link.namespace or _namespace(at)
-            refused += not answer.ok
-            stopped.add(name)
-            say(f"{name}: {'stopped' if answer.ok else 'NOT STOPPED'}: {answer.reason}")
-    silent = [name for name in here if name not in stopped]
-    for name in silent:
-        say(f"{name}: NO ANSWER: use its own emergency stop")
-    if not here and not stopped:
-        say(f"no robot on {link.endpoint}")
-    return 1 if silent or refused or not stopped else 0
-
-
-def _lifecycle(request: LifecycleRequest, done: str, link: Link, say: Say) -> int:
-    link = of_one(link, request.action)
-    with open_session(link, CONNECT_S) as session:
-        answer = session.ask_politely(keys.LIFECYCLE, request, ANSWER_S)
-    return _tell(done, link, answer, say)
-
-
-def _tell(done: str, link: Link, answer: Answer, say: Say) -> int:
-    if not answer.ok:
-        raise RefusedError(f"{link.namespace}: not {done}: {answer.reason}")
-    say(f"{link.namespace}: {done}: {answer.reason}")
-    return 0
-
-
-def of_one(link: Link, command: str) -> Link:
-    """The link to the one robot that is meant: the one that is named, or the only one there is."""
-    if link.namespace is not None:
-        return link
-    with open_session(link, CONNECT_S) as session:
-        robots = _robots(session)
-    if not robots:
-        raise NotConnectedError(f"no robot on {link.endpoint}; start a run there, or say where with --endpoint")
-    if len(robots) > 1:
-        raise RefusedError(
-            f"several robots are on {link.endpoint}: {', '.join(robots)}; say which one is meant, such as "
-            f"`snakesim {command} --namespace {robots[0]}`"
+        request = LifecycleRequest(
+            action="arm",
+            who=who(),
+            host=description.host,
+            robot=robot,
+            backend=backend,
+            config_hash=description.config_hash,
         )
-    return replace(link, namespace=robots[0])
+        return _ask(session, request, "armed", link, say)
 
 
-def _robots(session: Session) -> list[str]:
-    """The namespaces of all robots whose HAL is alive."""
-    return [_namespace(key) for key in session.present(HAL_EVERYWHERE)]
+def disarm(where: Where, say: Say = say) -> int:
+    """Let the joints go passive; also what is streamed then does not move them."""
+    link = the_one(where, "disarm")
+    with open_session(link, CONNECT_S) as session:
+        return _ask(session, LifecycleRequest(action="disarm", who=who()), "disarmed", link, say)
 
 
-def _namespace(key: str) -> str:
-    split = keys.split_namespace(key)
-    return key if split is None else split[0]
+def clear(where: Where, say: Say = say) -> int:
+    """Forget a fault or an emergency stop. The robot is disarmed then.
+
+    Where no robot runs, an emergency stop that the last run left is forgotten.
+    """
+    try:
+        link = the_one(where, "clear")
+    except NotConnectedError:
+        kept = [path for path in stops_kept() if where.namespace in (None, path.parent.name)]
+        if not kept or where.endpoint is not None:
+            raise
+        for path in kept:
+            say(f"{path.parent.name}: {forget_stop(path)}; cleared by {who()}. No robot of that name runs here")
+        return 0
+    with open_session(link, CONNECT_S) as session:
+        return _ask(session, LifecycleRequest(action="clear", who=who()), "cleared", link, say)
 
 
-def _description(session: Session, link: Link) -> Description:
-    found = session.latest(keys.DESCRIPTION, Description, DESCRIPTION_S)
-    if found is None:
-        raise NotConnectedError(f"{link.namespace} shows no description on {link.endpoint}; is its HAL host running?")
-    return found
-
-
-def _who() -> str:
+def who() -> str:
+    """Who types this."""
     try:
         return getpass.getuser()[:64]
     except (KeyError, OSError):
         return "operator"
+
+
+def _ask(session: Session, request: LifecycleRequest, done: str, link: Link, say: Say) -> int:
+    statuses = session.latched_reader(keys.STATUS, Status)
+    answers = [answer for _, answer in session.ask_all(keys.LIFECYCLE, request, ANSWER_S)]
+    doubt, shown = judge(answers, statuses)
+    name = link.namespace
+    if not answers:
+        raise NotConnectedError(f"{name}: NO ANSWER on {link.endpoint}; if the robot moves, `snakesim estop`")
+    if doubt is not None:
+        now = "unknown" if shown is None else f"{shown.lifecycle} - {shown.why}"
+        raise RefusedError(f"{name}: NOT CONFIRMED that it is {done}: {doubt}. Its status: {now}")
+    if not answers[0].ok:
+        raise RefusedError(f"{name}: not {done}: {answers[0].reason}")
+    say(f"{name}: {done}: {answers[0].reason}")
+    return 0
+
+
+def judge(answers: Sequence[Answer], statuses: Reader[Status]) -> tuple[str | None, Status | None]:
+    """Whether answers can be believed: (why not, the newest status). None: one host answered, and shows it."""
+    if len(answers) > 1:
+        return f"{len(answers)} answered in its name; at least one is an impostor", _newest(statuses, None)
+    wanted = answers[0].lifecycle if answers else None
+    shown = _newest(statuses, wanted)
+    hosts = {status.host for status in (shown,) if status is not None} | {answer.host for answer in answers}
+    if len(hosts) > 1:
+        return "who answered is not who publishes its status; one of them is an impostor", shown
+    if shown is None or shown.lifecycle != wanted:
+        return "its status does not show it; the host may hang, and who answered be an impostor", shown
+    return None, shown
+
+
+def _newest(statuses: Reader[Status], lifecycle: str | None) -> Status | None:
+    """The newest status, once it shows a state, or when it does not in time."""
+    shown: Status | None = None
+    deadline = time.monotonic() + SHOWN_S
+    while time.monotonic() < deadline:
+        shown = (statuses.drain() or [shown])[-1]
+        if shown is not None and lifecycle in (None, shown.lifecycle):
+            break
+        time.sleep(0.01)
+    return shown
+
+
+def _description(session: Session, link: Link) -> Description:
+    """What the robot's host shows. Raises RefusedError when two hosts show something."""
+    reader = session.latched_reader(keys.DESCRIPTION, Description)
+    deadline = time.monotonic() + DESCRIPTION_S
+    found: list[Description] = []
+    while not found and time.monotonic() < deadline:
+        time.sleep(0.05)
+        found = reader.drain()
+    if not found:
+        raise NotConnectedError(f"{link.namespace} shows no description on {link.endpoint}; is its HAL host running?")
+    if len({description.host for description in found}) > 1:
+        raise RefusedError(f"{link.namespace}: {len(found)} hosts describe it; at least one is an impostor. Not armed")
+    return found[-1]

@@ -2,23 +2,23 @@
 
 import time
 from collections.abc import Callable
-from pathlib import Path
 
-from snakesim_hal import keys
-from snakesim_hal.errors import RefusedError
+from snakesim_hal.errors import NotConnectedError, RefusedError
 from snakesim_hal.messages import Description, LifecycleRequest, Status
 from snakesim_hal.scenario import RunConfig
+from snakesim_hal.serve import START_LIMIT_S
 from snakesim_hal.session import Session
 from snakesim_operator.ending import Ending
 from snakesim_operator.process_faults import ProcessFaults
 from snakesim_operator.progress import Progress
+from snakesim_operator.run_files import RunFiles
 from snakesim_operator.supervisor import Supervisor
 from snakesim_operator.telemetry import Telemetry
 
-START_LIMIT_S = 120.0  # MuJoCo on a slow machine
 AFTER_FAULT_S = 1.5
 POLL_S = 0.05
 ARM_LIMIT_S = 10.0
+WHO = "snakesim run"
 
 
 class Conductor:
@@ -29,7 +29,7 @@ class Conductor:
         config: RunConfig,
         session: Session,
         supervisor: Supervisor,
-        out: Path,
+        files: RunFiles,
         ending: Ending,
         say: Callable[[str], None],
         *,
@@ -38,22 +38,22 @@ class Conductor:
         """stay: a fault ends nothing; a person clears it and arms again."""
         self._session, self._supervisor = session, supervisor
         self._ending, self._say, self._stay = ending, say, stay
-        self._statuses = session.latched_reader(keys.STATUS, Status)
-        self._descriptions = session.latched_reader(keys.DESCRIPTION, Description)
-        self._telemetry = Telemetry(session, out)
+        self._telemetry = Telemetry(session, files)
         self._faults = ProcessFaults(config, session, supervisor, say)
         self._progress = Progress(config)
         self._status: Status | None = None
         self._robot: Description | None = None
         self._armed = False  # once, by this run or by a person
-        self._may_arm = True  # until something went wrong: then a person does
+        self._may_arm = config.has_own_control  # until something went wrong: then a person does
+        self._own_services = frozenset(config.own_services)
         self._hosts = supervisor.hosts
+        self._asked_at: float | None = None
         self._told: str | None = None
 
     def go(self) -> None:
         """Until the run is over. Raises SnakesimError when it cannot go on."""
         give_up = time.monotonic() + START_LIMIT_S
-        with self._telemetry, self._progress:
+        with self._progress:
             try:
                 while self._supervisor.goes_on() and not self._ending.interrupted:
                     self._take_in()
@@ -79,9 +79,11 @@ class Conductor:
             self._may_arm = False
             self._telemetry.expect_new_host()
             self._progress.start_over()
-            self._status = None
-        self._status = (self._statuses.drain() or [self._status])[-1]
-        self._robot = (self._descriptions.drain() or [self._robot])[-1]
+            self._asked_at = None
+        host = self._supervisor.host
+        if host is not None:
+            host.take_in()
+        self._status, self._robot = (None, None) if host is None else (host.status, host.description)
         self._telemetry.take_in()
         self._progress.show(self._status, self._telemetry.latest, armed=self._armed)
 
@@ -110,22 +112,43 @@ class Conductor:
         """Say once how a person gets on after a fault."""
         latched = f"{status.lifecycle}: {status.why}" if status.lifecycle in ("fault", "estop") else None
         if latched is not None and latched != self._told:
-            self._say(f"{latched}\n  go on with `snakesim clear`, then `snakesim arm {status.robot} {status.backend}`")
+            self._say(latched)
+            self._say(f"  go on with `snakesim clear`, then `snakesim arm {status.robot} {status.backend}`")
         self._told = latched
 
     def _arm_once(self) -> None:
         status = self._status
         if status is None:
             return
-        if not status.waiting_for:
+        if self._own_services.isdisjoint(status.waiting_for):
             self._supervisor.came_up = True
         if self._armed or not self._may_arm or not status.ready_to_arm or self._robot is None:
             return
-        request = LifecycleRequest(
-            action="arm", robot=status.robot, backend=status.backend, config_hash=self._robot.config_hash
-        )
-        self._session.ask(keys.LIFECYCLE, request, timeout_s=ARM_LIMIT_S)
-        self._armed = True
+        self._ask_to_arm(status, self._robot)
+
+    def _ask_to_arm(self, status: Status, robot: Description) -> None:
+        """Over the private channel: only the host that this run has started can be meant, and can answer."""
+        host = self._supervisor.host
+        assert host is not None
+        if self._asked_at is None:
+            host.ask(
+                LifecycleRequest(
+                    action="arm",
+                    who=WHO,
+                    host=robot.host,
+                    robot=status.robot,
+                    backend=status.backend,
+                    config_hash=robot.config_hash,
+                )
+            )
+            self._asked_at = time.monotonic()
+        elif host.answers:
+            answer, self._asked_at = host.answers.pop(0), None
+            if not answer.ok and answer.refusal != "not_ready":
+                raise RefusedError(answer.reason)
+            self._armed = answer.ok
+        elif time.monotonic() - self._asked_at > ARM_LIMIT_S:
+            raise NotConnectedError(f"the host does not answer within {ARM_LIMIT_S:.0f} s; see host.log")
 
     def _let_it_settle(self) -> None:
         """After a failure the host goes on for a moment: the safe stop belongs in the record, and in `status`."""

@@ -16,13 +16,13 @@ class Ending:
 
     @property
     def reason(self) -> str | None:
-        """Everything that went wrong, in the order in which it was noticed; None when nothing did."""
+        """Everything that went wrong, causes before consequences; None when nothing did."""
         return "; ".join(self.causes) or None
 
-    def because(self, cause: str) -> None:
-        """Note what went wrong."""
+    def because(self, cause: str, *, first: bool = False) -> None:
+        """Note what went wrong. first: what was noted before is a consequence of it."""
         if cause not in self.causes:
-            self.causes.append(cause)
+            self.causes.insert(0 if first else len(self.causes), cause)
 
 
 @contextlib.contextmanager

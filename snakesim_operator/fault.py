@@ -7,8 +7,10 @@ from snakesim_hal import keys
 from snakesim_hal.errors import ConfigError, NotConnectedError, RefusedError
 from snakesim_hal.injection import Injection, checked, explain
 from snakesim_hal.messages import FaultRequest
-from snakesim_hal.session import Link, open_session
-from snakesim_operator.command import ANSWER_S, CONNECT_S, Say, of_one
+from snakesim_hal.session import open_session
+from snakesim_hal.terminal import Say, say
+from snakesim_operator.command import ANSWER_S
+from snakesim_operator.targets import CONNECT_S, Where, the_one
 
 LIST = "list"
 
@@ -24,10 +26,11 @@ class FaultOrder:
     end: bool = False
 
 
-def fault(order: FaultOrder, link: Link, say: Say = print) -> int:
+def fault(order: FaultOrder, where: Where, say: Say = say) -> int:
     """Ask the part that can do it. Raises RefusedError when it says no, NotConnectedError when nobody answers."""
     if order.kind == LIST and order.target is None:
-        say(explain())
+        for line in explain().splitlines():
+            say(line)
         return 0
     if order.target is None:
         raise ConfigError(f"fault {order.kind}: name what it happens to, such as joint_3; `snakesim fault list` helps")
@@ -37,9 +40,9 @@ def fault(order: FaultOrder, link: Link, say: Say = print) -> int:
     if injection.about.once and (order.end or order.for_s is not None):
         raise ConfigError(f"{order.kind} happens once and has no end; leave out --for and --end")
     request = FaultRequest(kind=order.kind, target=order.target, for_s=order.for_s, amount=order.amount, end=order.end)
-    with open_session(of_one(link, f"fault {order.kind} {order.target}"), CONNECT_S) as session:
+    with open_session(the_one(where, f"fault {order.kind} {order.target}"), CONNECT_S) as session:
         try:
-            answer = session.ask_politely(keys.fault(injection.part), request, ANSWER_S)
+            answer = session.ask(keys.fault(injection.part), request, ANSWER_S)
         except NotConnectedError:
             raise NotConnectedError(
                 f"{injection.part} does not answer, and only it can {order.kind} {order.target}; `snakesim status` "

@@ -7,6 +7,7 @@ from typing import Self
 
 from snakesim_hal.messages import ControlState, Status
 from snakesim_hal.scenario import RunConfig
+from snakesim_hal.terminal import say, say_again
 
 TERMINAL_PERIOD_S = 0.1
 PLAIN_PERIOD_S = 5.0
@@ -22,6 +23,8 @@ class Progress:
         self._next = 0.0
         self._shown = 0
         self._origin: tuple[float, float] | None = None  # wall and robot time at arming
+        self._armed_s = 0.0  # robot time so far in which the robot was armed: what a run's duration counts
+        self._before: Status | None = None
         self._last = ""
         self._armed = False
 
@@ -32,38 +35,43 @@ class Progress:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._terminal and self._shown:
-            sys.stdout.write("\n")
-            sys.stdout.flush()
+            say("")
 
     def start_over(self) -> None:
         """Robot time begins at 0 again, with a new host."""
-        self._origin = None
+        self._origin = self._before = None
+        self._armed_s = 0.0
 
     def show(self, status: Status | None, control: ControlState | None, *, armed: bool) -> None:
         """Update the line, if it is time to."""
         now = time.monotonic()
-        if status is None or (now < self._next and armed == self._armed):
+        if status is None:
+            return
+        self._count(status)
+        if now < self._next and armed == self._armed:
             return
         self._armed = armed
         self._next = now + (TERMINAL_PERIOD_S if self._terminal else PLAIN_PERIOD_S)
         text = self._running(status, control, now) if armed else f"starting: {status.why}"
         if self._terminal:
-            line = text[:118]
-            sys.stdout.write("\r" + line.ljust(self._shown))
-            self._shown = len(line)
+            self._shown = say_again(text, 118, self._shown)
         elif text != self._last:
-            print(text)
+            say(text)
         self._last = text
-        sys.stdout.flush()
+
+    def _count(self, status: Status) -> None:
+        before, self._before = self._before, status
+        if before is not None and before.lifecycle == "armed":
+            self._armed_s += max(status.tick - before.tick, 0) / self._rate_hz
 
     def _running(self, status: Status, control: ControlState | None, now: float) -> str:
         time_s = status.tick / self._rate_hz
         if self._origin is None:
             self._origin = (now, time_s)
-        done_s, wall_s = time_s - self._origin[1], now - self._origin[0]
-        parts = [f"{done_s:6.2f} of {self._duration_s:g} s"]
+        passed_s, wall_s = time_s - self._origin[1], now - self._origin[0]
+        parts = [f"{min(self._armed_s, self._duration_s):6.2f} of {self._duration_s:g} s"]
         if wall_s > 0.3:
-            parts.append(f"{done_s / wall_s:.1f}x real time")
+            parts.append(f"{passed_s / wall_s:.1f}x real time")
         if status.lifecycle != "armed":
             parts.append(f"{status.lifecycle}: {status.why}")
         elif control is not None:

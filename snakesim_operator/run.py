@@ -5,29 +5,35 @@ somebody presses Ctrl-C, a part fails, this process is killed) no process stays 
 """
 
 import contextlib
-import socket
+import os
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from datetime import datetime
 from pathlib import Path
 
 import msgspec
 
 from snakesim_hal.errors import ConfigError, NotConnectedError, SnakesimError
 from snakesim_hal.files import Table
-from snakesim_hal.host_process import HOST_RECORD
 from snakesim_hal.injection import ROUTER
+from snakesim_hal.local_registry import registered
 from snakesim_hal.planned import check_planned, planned
-from snakesim_hal.plugins import BACKENDS, CONTROLLERS, SERVICES, find_plugin, plugin_settings
-from snakesim_hal.scenario import RunConfig, write
-from snakesim_hal.session import DEFAULT_PORT, Link, Session, open_session
-from snakesim_operator.conduct import AFTER_FAULT_S, START_LIMIT_S, Conductor
+from snakesim_hal.plugins import BACKENDS, CONTROLLERS, SERVICES, find_installed, find_plugin, plugin_settings
+from snakesim_hal.scenario import RunConfig, written
+from snakesim_hal.serve import START_LIMIT_S
+from snakesim_hal.session import Link, Session, open_session
+from snakesim_hal.terminal import say
+from snakesim_hal.whole_file import write_whole
+from snakesim_operator.conduct import AFTER_FAULT_S, Conductor
 from snakesim_operator.ending import Ending, interruptible
-from snakesim_operator.record import CONFIG, REPORT, SUMMARY, TELEMETRY
+from snakesim_operator.folder import claimed, named_after
+from snakesim_operator.meeting import local_robot, meeting_point, refuse_second_robot
+from snakesim_operator.record import CONFIG
+from snakesim_operator.run_files import RunFiles
 from snakesim_operator.supervisor import HOST, Supervisor
 
 CONNECT_S = 0.5
+TELL_S = 20.0  # between two signs of life while nothing is heard
 
 
 @dataclass(frozen=True)
@@ -42,20 +48,30 @@ class RunRequest:
     stay: bool = False  # a fault ends nothing: processes are started again, a person clears and arms
     with_router: bool = False  # the run's parts meet at a router of its own
 
+    @property
+    def network_name(self) -> str:
+        """The robot's namespace."""
+        return self.namespace or self.config.robot.name
 
-def check_plugins(config: RunConfig, table: Table | None = None) -> RunConfig:
+
+def check_plugins(config: RunConfig, table: Table | None = None, *, run_files: bool = True) -> RunConfig:
     """Everything that a run needs is installed and agrees with its settings. Raises ConfigError.
 
     Returns the configuration, with a pace that the backend can keep: a scenario is written for any backend.
+    run_files: False runs no code of a `./file.py:Class`, so that its settings and its pace are not checked.
     """
     source = table.source if table is not None else f"scenario {config.name!r}"
     origin = table.origin if table is not None else None
-    backend, controller = find_plugin(BACKENDS, config.backend), find_plugin(CONTROLLERS, config.controller)
-    settings = plugin_settings(backend, config.backend_settings, source, config.backend_section, origin)
-    plugin_settings(controller, config.control_settings, source, config.control_section, origin)
-    for service in config.services:
-        find_plugin(SERVICES, service)
+    find = find_plugin if run_files else find_installed
+    backend, controller = find(BACKENDS, config.backend), find(CONTROLLERS, config.controller)
+    if controller is not None:
+        plugin_settings(controller, config.control_settings, source, config.control_section, origin)
+    for service in config.own_services:
+        find(SERVICES, service)
     check_planned(config, table)
+    if backend is None:
+        return config
+    settings = plugin_settings(backend, config.backend_settings, source, config.backend_section, origin)
     paces = backend.check(config, settings)
     if config.pace in paces:
         return config
@@ -66,21 +82,51 @@ def check_plugins(config: RunConfig, table: Table | None = None) -> RunConfig:
 
 
 def run(request: RunRequest) -> int:
-    """Run it. Returns 0, 1 on a fault, 130 when interrupted."""
+    """Run it. Returns 0, 1 on a fault or an early end, 3 when the record lacks something, 130 when interrupted."""
     request = replace(request, config=check_plugins(request.config))
     _check_router(request)
-    out = _folder(request)
-    write(request.config, out / CONFIG)
+    refuse_second_robot(request.endpoint, request.router, request.network_name)
+    endpoint, stop_port = meeting_point(request.endpoint, request.router)
     ending = Ending()
-    supervisor = Supervisor(out, ending, _say, stay=request.stay)
-    with interruptible(ending):
-        _conduct(request, supervisor, out, ending)
-    if not (out / HOST_RECORD).is_file():
-        print(f"the run left no record: {ending.reason or 'the host ended early'}; what its parts said is in {out}")
-        return 130 if ending.interrupted else 1
-    from snakesim_operator.conclusion import conclude
+    with contextlib.closing(stop_port), _files(request) as (files, config_file):
+        supervisor = Supervisor(files, ending, say, stop_port, stay=request.stay)
+        with (
+            interruptible(ending),
+            registered(local_robot(request.config, request.network_name, endpoint, stop_port)) as trouble,
+        ):
+            if trouble is not None:
+                say(trouble)
+            _conduct(request, supervisor, endpoint, files, config_file, ending)
+        from snakesim_operator.conclusion import conclude
 
-    return conclude(out, ending, supervisor.restarts, supervisor.hosts, stay=request.stay)
+        return conclude(request.config, files, ending, supervisor, stay=request.stay)
+
+
+@contextlib.contextmanager
+def _files(request: RunRequest) -> Iterator[tuple[RunFiles, Path]]:
+    """The run's folder, held, and where its configuration is.
+
+    A folder that cannot be written to is no reason not to run: then nothing is kept.
+    """
+    out = request.out or named_after(request.config.name)
+    content = written(request.config)
+    with contextlib.ExitStack() as held:
+        try:
+            folder = held.enter_context(claimed(out, say))
+            write_whole(folder / CONFIG, content)
+        except OSError as error:
+            held.close()
+            say(f"warning: --out {out}: {error.strerror}; the run goes on, but nothing of it is recorded")
+            memory = os.memfd_create("snakesim-config")
+            held.callback(os.close, memory)
+            os.write(memory, content)
+            yield RunFiles(None, _warn), Path(f"/proc/{os.getpid()}/fd/{memory}")
+        else:
+            yield RunFiles(folder, _warn), folder / CONFIG
+
+
+def _warn(trouble: str) -> None:
+    say(f"warning: {trouble}; the run goes on, its record may lack something")
 
 
 def _check_router(request: RunRequest) -> None:
@@ -95,14 +141,15 @@ def _check_router(request: RunRequest) -> None:
         raise ConfigError(f"fault {str(wanted[0])!r}: this run has no router of its own; add --with-router")
 
 
-def _conduct(request: RunRequest, supervisor: Supervisor, out: Path, ending: Ending) -> None:
-    config = request.config
-    endpoint = request.router or request.endpoint or _free_endpoint()
-    namespace = request.namespace or config.robot.name
-    common = ["--config", str(out / CONFIG), "--endpoint", endpoint, "--namespace", namespace]
+def _conduct(
+    request: RunRequest, supervisor: Supervisor, endpoint: str, files: RunFiles, config_file: Path, ending: Ending
+) -> None:
+    config, namespace = request.config, request.network_name
+    common = ["--config", str(config_file), "--endpoint", endpoint, "--namespace", namespace]
     ticks = round(config.duration_s * config.rate_hz)
     host_arguments = [
-        *("snakesim_hal.host_process", *common, "--out", str(out), "--max-ticks", str(ticks)),
+        *("snakesim_hal.host_process", *common, "--max-ticks", str(ticks), "--memory", supervisor.memory),
+        *(["--out", str(files.folder)] if files.folder else []),
         *(["--stay"] if request.stay else ["--end-after-fault", str(AFTER_FAULT_S)]),
         *(["--router"] if request.router or request.with_router else []),
     ]
@@ -110,12 +157,14 @@ def _conduct(request: RunRequest, supervisor: Supervisor, out: Path, ending: End
         if request.with_router:
             supervisor.start(ROUTER, ["snakesim_hal.router_process", *common])
         supervisor.start(HOST, host_arguments)
-        for name, service in config.services.items():
+        for name, service in config.own_services.items():
             supervisor.start(name, ["snakesim_hal.serve", name, *common], may_restart=service.restart)
         with _joined(Link(endpoint, namespace), supervisor, ending) as session:
-            _say(f"{config.name}: {config.robot.name} in {config.scene.name}, {config.controller}, {config.pace}")
-            _say(f"network: {endpoint}, namespace {namespace}")
-            Conductor(config, session, supervisor, out, ending, _say, stay=request.stay).go()
+            say(f"{config.name}: {config.robot.name} in {config.scene.name}, {config.commander}, {config.pace}")
+            say(f"network: {endpoint}, namespace {namespace}")
+            if not config.has_own_control:
+                say("whoever takes the lease commands the robot, and arms it")
+            Conductor(config, session, supervisor, files, ending, say, stay=request.stay).go()
     except SnakesimError as error:
         ending.because(str(error))
     finally:
@@ -125,7 +174,7 @@ def _conduct(request: RunRequest, supervisor: Supervisor, out: Path, ending: End
 @contextlib.contextmanager
 def _joined(link: Link, supervisor: Supervisor, ending: Ending) -> Iterator[Session]:
     """A session on the run's network, as soon as there is one. Raises NotConnectedError when a part has ended."""
-    give_up = time.monotonic() + START_LIMIT_S
+    began = told = time.monotonic()
     with contextlib.ExitStack() as stack:
         while True:
             try:
@@ -135,35 +184,10 @@ def _joined(link: Link, supervisor: Supervisor, ending: Ending) -> Iterator[Sess
                 ended = supervisor.first_ended()
                 if ended is not None:
                     raise NotConnectedError(ended) from None
-                if time.monotonic() > give_up or ending.interrupted:
+                now = time.monotonic()
+                if now > began + START_LIMIT_S or ending.interrupted:
                     raise
+                if now > told + TELL_S:
+                    say(f"starting: the host has not opened its network yet, after {now - began:.0f} s")
+                    told = now
         yield session
-
-
-def _folder(request: RunRequest) -> Path:
-    stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
-    out = request.out or Path("runs") / f"{request.config.name}-{stamp}"
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        for old in (HOST_RECORD, SUMMARY, REPORT, TELEMETRY):
-            (out / old).unlink(missing_ok=True)
-        for old in out.glob(TELEMETRY.replace(".", "-*.")):
-            old.unlink()
-    except OSError as error:
-        raise ConfigError(f"--out {out}: {error.strerror}; choose another folder") from error
-    return out.resolve()
-
-
-def _free_endpoint() -> str:
-    """The default port, or any free one when another run has it."""
-    for port in (DEFAULT_PORT, 0):
-        with socket.socket() as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            with contextlib.suppress(OSError):
-                probe.bind(("127.0.0.1", port))
-                return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-    raise NotConnectedError("no free port on the loopback interface")
-
-
-def _say(text: str) -> None:
-    print(text, flush=True)

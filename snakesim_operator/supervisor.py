@@ -4,18 +4,25 @@ Nothing here arms anything: a host that is started again boots disarmed, and a p
 """
 
 import contextlib
+import os
+import socket
 import subprocess
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
+from functools import partial
 
 import msgspec
 
-from snakesim_hal.host_process import HOST_RECORD, HostRecord
+from snakesim_hal.codec import UNDECODABLE
+from snakesim_hal.host_process import HostRecord
+from snakesim_hal.messages import Description
+from snakesim_hal.private_channel import StarterEnd, socket_pair
+from snakesim_hal.run_key import RUN_KEY, new_run_key
 from snakesim_operator import children
 from snakesim_operator.children import Child
 from snakesim_operator.ending import Ending
+from snakesim_operator.run_files import RunFiles
 
 HOST = "host"
 FIRST_DELAY_S, LAST_DELAY_S = 0.5, 10.0
@@ -56,33 +63,72 @@ class Part:
         self.delay_s = min(2 * delay_s, LAST_DELAY_S)
         return delay_s
 
-    def start_if_due(self) -> bool:
-        """Start it again when it is time to."""
-        if self.again_s is None or time.monotonic() < self.again_s:
-            return False
-        self.child = children.start(self.name, self.arguments, self.child.log, again=True)
-        self.again_s, self.started_s = None, time.monotonic()
-        return True
+    def is_due(self) -> bool:
+        """Whether it is time to start it again."""
+        return self.again_s is not None and time.monotonic() >= self.again_s
 
 
 class Supervisor:
     """Watches over all processes of a run."""
 
-    def __init__(self, out: Path, ending: Ending, say: Callable[[str], None], *, stay: bool = False) -> None:
-        """stay: processes that end are started again, once the run has come up."""
+    def __init__(
+        self,
+        files: RunFiles,
+        ending: Ending,
+        say: Callable[[str], None],
+        stop_port: socket.socket,
+        *,
+        stay: bool = False,
+    ) -> None:
+        """stop_port: for every host of the run, one after the other; what comes while there is none waits in it.
+
+        stay: processes that end are started again, once the run has come up.
+        """
         self.restarts: list[Restart] = []
         self.came_up = False  # until then a process that ends has a reason that a restart would not mend
-        self._out = out
+        self._files = files
+        self._memory = os.memfd_create("snakesim-host")
         self._ending = ending
         self._say = say
         self._stay = stay
+        self._stop_port = stop_port
+        self._secret = {RUN_KEY: new_run_key()}
         self._parts: dict[str, Part] = {}
+        self.host: StarterEnd | None = None  # the private channel to the host that was started last
         self._begun_s = time.monotonic()
 
     def start(self, name: str, arguments: Sequence[str], *, may_restart: bool = True) -> None:
         """Start a Python module as a part of the run."""
-        child = children.start(name, arguments, self._out / f"{name}.log")
-        self._parts[name] = Part(name, arguments, may_restart, child)
+        self._parts[name] = Part(name, arguments, may_restart, self._launch(name, arguments))
+
+    def _launch(self, name: str, arguments: Sequence[str]) -> Child:
+        keep = partial(self._files.append, f"{name}.log")
+        if name != HOST:
+            return children.start(name, arguments, keep, more=self._secret)
+        ours, its = socket_pair()
+        with its:
+            private = ["--channel", str(its.fileno()), "--stop-port", str(self._stop_port.fileno())]
+            inherits = (its.fileno(), self._stop_port.fileno())
+            child = children.start(name, [*arguments, *private], keep, inherits=inherits, more=self._secret)
+        if self.host is not None:
+            self.host.close()
+        self.host = StarterEnd(ours)
+        return child
+
+    @property
+    def memory(self) -> str:
+        """Path of a file without a disk, where the host keeps its numbers for this process."""
+        return f"/proc/{os.getpid()}/fd/{self._memory}"
+
+    def host_record(self) -> HostRecord | None:
+        """The host's own numbers, half a second old while it runs; None while nothing is known."""
+        with contextlib.suppress(OSError, *UNDECODABLE):
+            return msgspec.json.decode(os.pread(self._memory, 2**20, 0), type=HostRecord)
+        return None
+
+    def robot(self) -> Description | None:
+        """What the host said that it is; None while nothing is known."""
+        return self.host.description if self.host is not None else None
 
     @property
     def names(self) -> list[str]:
@@ -111,33 +157,33 @@ class Supervisor:
         for part in self._parts.values():
             how = part.ended()
             if how is None:
-                part.start_if_due()
+                if part.is_due():
+                    part.child = self._launch(part.name, part.arguments)
+                    part.again_s, part.started_s = None, time.monotonic()
             elif part.name == HOST and self._host_is_done():
                 return False
             elif self._stay and self.came_up and part.may_restart:
                 self._put_off(part, how)
             else:
-                self._ending.because(how)
+                self._ending.because(how, first=True)
                 return False
         return True
 
     def _put_off(self, part: Part, how: str) -> None:
         delay_s = part.put_off()
+        if part.name == HOST and self.host is not None:
+            self.host.close()
+            self.host = None
         at_s = time.monotonic() - self._begun_s
         self.restarts.append(Restart(name=part.name, how=how, at_s=round(at_s, 3), after_s=delay_s))
         self._say(f"{how}; it is started again in {delay_s:g} s")
 
     def _host_is_done(self) -> bool:
         """Whether a host that ended has left its record, and nothing more is to be done."""
-        if self._parts[HOST].child.process.returncode not in (0, 1):
+        record = self.host_record()
+        if record is None or self._parts[HOST].child.process.returncode not in (0, 1):
             return False
-        return not self._stay or self._last_record_says() == "complete"
-
-    def _last_record_says(self) -> str | None:
-        path = self._out / HOST_RECORD
-        with contextlib.suppress(OSError, msgspec.MsgspecError):
-            return msgspec.json.decode(path.read_bytes(), type=HostRecord).ended
-        return None
+        return not self._stay or record.ended in ("complete", "finished")
 
     def end(self) -> None:
         """End everything, the host first and in order, so that its record is written. Nothing is left after this."""
@@ -153,7 +199,7 @@ class Supervisor:
         for part in self._parts.values():
             how = part.ended()
             if part.name != HOST and how is not None:
-                self._ending.because(how)
+                self._ending.because(how, first=True)  # whatever fault the host has noted since
         children.stop_all(running)
         self._print_last_words()
 
@@ -163,4 +209,6 @@ class Supervisor:
         for part in self._parts.values():
             words = part.child.last_words()
             if words:
-                self._say(f"--- {part.name} said:\n{words}")
+                self._say(f"--- {part.name} said:")
+                for line in words:
+                    self._say(line)

@@ -1,8 +1,6 @@
 """What control and guidance tell during a run, written as it comes."""
 
-from pathlib import Path
-from types import TracebackType
-from typing import Self
+from pathlib import PurePath
 
 import msgspec
 
@@ -10,6 +8,7 @@ from snakesim_hal import keys
 from snakesim_hal.messages import ControlState, Message, World
 from snakesim_hal.session import Session
 from snakesim_operator.record import TELEMETRY
+from snakesim_operator.run_files import RunFiles
 
 DEPTH = 8192
 WORLDS_PER_S = 20.0  # as often as control tells its state
@@ -18,23 +17,14 @@ WORLDS_PER_S = 20.0  # as often as control tells its state
 class Telemetry:
     """Writes control states and worlds, decoded once."""
 
-    def __init__(self, session: Session, out: Path) -> None:
+    def __init__(self, session: Session, files: RunFiles) -> None:
         self.latest: ControlState | None = None
         self._control = session.reader(keys.CONTROL_STATE, ControlState, depth=DEPTH)
         self._world = session.reader(keys.WORLD, World, depth=DEPTH)
-        self._path = out / TELEMETRY
-        self._file = self._path.open("wb")
+        self._files = files
         self._next_world_ns = 0
         self._hosts = 0
         self._new_host = False
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._file.close()
 
     def expect_new_host(self) -> None:
         """The host has ended; what control says of the old one's time still belongs to it."""
@@ -42,11 +32,10 @@ class Telemetry:
 
     def _start_over(self) -> None:
         """Time begins at 0 again, with a new host: what was told under the old one goes to a file of its own."""
-        self._file.close()
         self._new_host = False
         self._hosts += 1
-        self._path.rename(self._path.with_stem(f"{self._path.stem}-{self._hosts}"))
-        self._file = self._path.open("wb")
+        path = PurePath(TELEMETRY)
+        self._files.rename(TELEMETRY, path.with_stem(f"{path.stem}-{self._hosts}").name)
         self._next_world_ns = 0
 
     def take_in(self) -> None:
@@ -62,4 +51,4 @@ class Telemetry:
                 self._write(keys.WORLD, world)
 
     def _write(self, key: str, message: Message) -> None:
-        self._file.write(msgspec.json.encode({"key": key, "message": message}) + b"\n")
+        self._files.append(TELEMETRY, msgspec.json.encode({"key": key, "message": message}) + b"\n")

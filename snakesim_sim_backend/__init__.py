@@ -10,3 +10,9 @@
 
 Imports the HAL and MuJoCo, never guidance, navigation, control or Zenoh. Nothing heavy is imported here.
 """
+
+import os
+
+# Nothing is drawn here. Otherwise MuJoCo would start a Python of its own, to look for a window library: 0.1 s of every
+# start, and a traceback when Ctrl-C meets it.
+os.environ.setdefault("MUJOCO_GL", "off")

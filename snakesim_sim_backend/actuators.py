@@ -5,7 +5,7 @@ Each joint has a `dcmotor` with motor constant 1, so that its current is its tor
     demand = kp (position - angle) + kd (velocity - speed) + feed-forward       the mode chooses the gains
     demand is held below the line that falls from `roll_off` times full torque at rest to 0 at the limit of speed
     torque follows the demand as a first-order lag of `response_time_s`, integrated exactly
-    torque is clipped to the joint's limit and the command's
+    torque is clipped to the command's limit and the joint's, less what heat takes from the latter
 
 The torque is the motor's state; a change of mode changes the demand alone. So torque never jumps on a change of mode:
 it goes to the new demand as the motor's response lets it, also to zero in passive mode.
@@ -58,6 +58,7 @@ class Motors:
         self._applied = data.actuator_force[: self.count]
         self._inputs = data.ctrl[: INPUTS * self.count]
         self._full_limit = np.full(self.count, robot.limits.torque_nm)
+        self._own_limit = self._full_limit  # what heat leaves of it
         self._limit = self._full_limit.copy()
         self._limit_asked: list[float] = self._limit.tolist()
         self._fading = False
@@ -84,8 +85,12 @@ class Motors:
             self._inputs[self._passive] = 0.0
         if set_points.torque_limit_nm != self._limit_asked:
             self._limit_asked = list(set_points.torque_limit_nm)
-            self._limit = np.minimum(self._limit_asked, self._full_limit)
-            self._fading = True
+            self._bound()
+
+    def derate(self, share_left: Floats) -> None:
+        """Heat leaves this share of each joint's own limit, (n_joints,), whatever a command allows."""
+        self._own_limit = self._full_limit * share_left
+        self._bound()
 
     def switch_off(self) -> None:
         """All joints passive."""
@@ -109,6 +114,10 @@ class Motors:
     def applied_nm(self) -> Floats:
         """Torque of every motor over the last physics step, (n_joints,) float64."""
         return self._applied
+
+    def _bound(self) -> None:
+        self._limit = np.minimum(self._limit_asked, self._own_limit)
+        self._fading = True
 
     def _set_range(self, limit_nm: Floats) -> None:
         self._most[:] = limit_nm

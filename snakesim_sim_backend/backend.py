@@ -13,7 +13,7 @@ from snakesim_hal.motor import check_gains
 from snakesim_hal.planned import check_backend_can
 from snakesim_hal.robot import describe
 from snakesim_hal.scenario import RunConfig, config_hash
-from snakesim_hal.thermal import Thermal
+from snakesim_hal.thermal import HeatLimits, Thermal
 from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.contacts import TouchReader
 from snakesim_sim_backend.divergence import MOST_SPEED, DivergenceWatch, log_warnings
@@ -64,7 +64,10 @@ class SimBackend:
         if settings.tether is not None:
             self._rope = Rope(self._sim.model, self._data, settings.tether)
             self._rope.tighten()
-        self._windings = Thermal(self._motors.count, config.robot.limits.torque_nm)
+        limits = config.robot.limits
+        self._windings = Thermal(
+            self._motors.count, limits.torque_nm, HeatLimits(limits.derate_from_c, limits.stop_at_c)
+        )
         self._heats, self._period_s = config.robot.sensors.power is not None, config.period_ns * 1e-9
         self._sensors = Sensors(self._sim, self._data, config, self._motors, self._windings)
         self._watch = DivergenceWatch(self._sim.model, self._data, self._sim.steps_per_tick)
@@ -95,17 +98,25 @@ class SimBackend:
         """Step the physics through one control period. Raises BackendError when it has diverged."""
         if not self._open:
             raise BackendError("the simulation is closed; open a new backend")
-        model, data, option = self._model, self._data, self._option
         self._motors.before_steps()
+        self._tick += 1
+        try:
+            self._step()
+            self._watch.check(self._tick)
+        except mujoco.FatalError as error:
+            raise BackendError(f"MuJoCo cannot go on at tick {self._tick}: {error}") from error
+        if self._heats:  # by the torque of the last step: windings are slow
+            self._windings.pass_time(self._period_s, np.square(self._motors.applied_nm()))
+            if (share_left := self._windings.share_left()) is not None:
+                self._motors.derate(share_left)
+
+    def _step(self) -> None:
+        model, data, option = self._model, self._data, self._option
         if self._unread_steps:  # IMUs cost time, and only their values in the last step are read
             option.disableflags = self._without_sensors
             mujoco.mj_step(model, data, self._unread_steps)
             option.disableflags = self._with_sensors
         mujoco.mj_step(model, data, self._read_steps)
-        self._tick += 1
-        self._watch.check(self._tick)
-        if self._heats:  # by the torque of the last step: windings are slow
-            self._windings.pass_time(self._period_s, np.square(self._motors.applied_nm()))
 
     def faults(self) -> list[Fault]:
         """A simulated robot has no faults of its own: a divergence is raised by `advance`."""

@@ -62,7 +62,10 @@ def build(config: RunConfig, settings: Settings, *, motors: bool = True) -> SimM
         add_imus(spec, config.robot.link_lengths_m)
     if settings.tether is not None:
         add_tether(spec, settings.tether, config.robot, settings.contact_time_s)
-    model = spec.compile()
+    try:
+        model = spec.compile()
+    except ValueError as error:
+        raise ConfigError(f"MuJoCo cannot build robot {config.robot.name!r} in this scene: {error}") from error
     names = [model.geom(i).name for i in range(model.ngeom)]
     obstacles = [name.removeprefix(OBSTACLE) if name.startswith(OBSTACLE) else None for name in names]
     return SimModel(

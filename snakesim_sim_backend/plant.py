@@ -77,8 +77,11 @@ class MujocoPlant:
             self._watch.check(self._steps)  # raises again
         self._torques[:] = torque_nm
         self._speeds_before[:] = self._speeds
-        mujoco.mj_step(self._model, self._data)
         self._steps += 1
+        try:
+            mujoco.mj_step(self._model, self._data)
+        except mujoco.FatalError as error:
+            raise BackendError(f"MuJoCo cannot go on at step {self._steps}: {error}") from error
         self._unchecked += 1
         # What blows up does so here first; it is caught in its very step, or firmware would read what is no number.
         if self._unchecked == STEPS_PER_CHECK or not self._qacc.dot(self._qacc) < MOST_SQUARED:

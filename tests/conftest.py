@@ -4,6 +4,8 @@ import os
 
 from hypothesis import HealthCheck, Phase, settings
 
+import tests  # noqa: F401 - before anything else: it sets a state folder apart
+
 settings.register_profile("snakesim", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 # For tests/mutation: always the same examples, nothing remembered, and the first failure is enough.
 settings.register_profile(

@@ -6,7 +6,7 @@ and the authority decides what the motors get.
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesim_gnc.control.advance import Advance
 from snakesim_gnc.control.controller import Controller, Report, View
 from snakesim_gnc.control.hold import Hold
 from snakesim_gnc.control.obstacle_triplet import ObstacleTriplet
@@ -124,15 +125,20 @@ def run(
     controller: Controller | None = None,
     intercept: Callable[[int, SetPoints], SetPoints] | None = None,
     each_tick: Callable[[int, SimBackend], None] | None = None,
+    blind: Collection[int] = (),
+    lost: Collection[int] = (),
 ) -> Run:
     """Run a configuration for its duration.
 
     intercept: changes the controller's set-points; each_tick: called before every period with the backend.
+    blind, lost: ticks at which the controller gets no world model, and no trajectory.
     """
     settings = msgspec.convert(config.backends.get("sim", {}), SimBackend.Settings)
     backend = SimBackend(config, settings)
     try:
-        return _Runner(config, backend, controller).go(duration_s or config.duration_s, intercept, each_tick)
+        runner = _Runner(config, backend, controller)
+        runner.blind, runner.lost = blind, lost
+        return runner.go(duration_s or config.duration_s, intercept, each_tick)
     finally:
         backend.close()
 
@@ -150,6 +156,8 @@ class _Runner:
         self.controller = controller or _make_controller(config, self.robot)
         self.contacts: Contacts | None = None
         self.pose: Pose | None = None
+        self.blind: Collection[int] = ()
+        self.lost: Collection[int] = ()
 
     def go(
         self,
@@ -169,8 +177,8 @@ class _Runner:
                 time_s=stamp_ns * 1e-9,
                 period_s=period_ns * 1e-9,
                 joints=joints,
-                world=self.world.at(tick),
-                trajectory=self.trajectory.at(tick),
+                world=None if tick in self.blind else self.world.at(tick),
+                trajectory=None if tick in self.lost else self.trajectory.at(tick),
             )
             started = time.perf_counter_ns()
             action = self.controller.update(view)
@@ -220,6 +228,7 @@ class _Runner:
             tick=max(tick, 0),
             sequence=tick + 1,
             lease_epoch=self.authority.lease.epoch,
+            arming=self.authority.arming,
             layout=self.robot.layout,
             valid_for_ns=self.robot.lease_ns,
             mode=set_points.mode,
@@ -233,17 +242,19 @@ class _Runner:
 
     def _as_run(self, rows: Sequence[tuple[Any, ...]]) -> Run:
         views, reports, decisions, took_us, base, strongest = zip(*rows, strict=True)
-        wants = [view.trajectory is not None and view.trajectory.speed_m_s != 0.0 for view in views]
-        told = [
-            locomotion_state(
-                hal_answers=True,
-                armed=True,
-                wants_to_move=want,
-                usable_push_points=report.usable_push_points,
-                obstacle=report.why,
+        advance, told = Advance(), list[tuple[str, str]]()
+        for view, report in zip(views, reports, strict=True):
+            if view.world is not None:
+                advance.put(view.world.stamp_ns * 1e-9, view.world.centre_w)
+            moves = view.trajectory is not None and view.trajectory.speed_m_s != 0.0
+            told.append(
+                locomotion_state(
+                    rests="" if moves else "no speed",
+                    usable_push_points=report.usable_push_points,
+                    obstacle=report.why,
+                    advanced_m=advance.metres,
+                )
             )
-            for want, report in zip(wants, reports, strict=True)
-        ]
         return Run(
             config=self.config,
             backend=self.backend,

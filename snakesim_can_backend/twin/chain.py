@@ -24,15 +24,16 @@ from snakesim_can_backend.twin.motors import Motors
 from snakesim_can_backend.twin.parameters import Parameters, from_factory
 from snakesim_can_backend.twin.seat import Seat
 from snakesim_can_backend.twin.senses import PoseCamera, Senses
-from snakesim_hal import thermal
 from snakesim_hal.injection import Change, Injection, Plan
 from snakesim_hal.messages import Mode
 from snakesim_hal.plant import Plant
 from snakesim_hal.scenario import RunConfig
+from snakesim_hal.thermal import HeatLimits, Thermal
 
 MOST_AT_ONCE_US = 200_000.0  # after a longer hiccup of this process, the modules have missed the rest of it
 HEAT_EVERY = 10  # steps
-ROUND_US = 1 << 32  # Sync times go round: what is less than half a round ahead is later
+ROUND_US = 1 << 32  # Sync times go round
+LONGEST_STEP_US = 60_000_000  # a Sync that is later by more is of another clock; no bus is cut for so long in lockstep
 NEW_HOST_US = 1_000_000  # a Sync that is so much earlier is no latecomer on another bus, but a host that began anew
 OTHER_SERIAL = 0x0D0B1E00
 
@@ -53,7 +54,9 @@ class ModuleChain:
         robot, self.stepped, self.plant = config.robot, stepped, plant
         self.count = robot.chain.modules
         self.counts = shares(config, settings)  # modules on each bus
-        self.motors, self.thermal = Motors(robot, plant.step_s), thermal.Thermal(self.count, robot.limits.torque_nm)
+        self._heat_limits = HeatLimits(robot.limits.derate_from_c, robot.limits.stop_at_c)
+        self.motors = Motors(robot, plant.step_s)
+        self.thermal = Thermal(self.count, robot.limits.torque_nm, self._heat_limits)
         self.buses = [BusTime() for _ in self.counts]
         self.now_us = 0.0  # module time: since the twins were started
         self.skipped_us = 0.0  # what this process slept through
@@ -62,7 +65,6 @@ class ModuleChain:
         self._plan = Plan(parse(text, self.count) for text in settings.faults)
         self._flash = from_factory(robot.limits.torque_nm, robot.limits.speed_rad_s)
         self._step_us, self._steps, self._due_us = plant.step_s * 1e6, 0, 0.0
-        self._derated = False
         self._sync_time: int | None = None
         self._pose_time: int | None = None
         self._seed = config.seed
@@ -78,7 +80,7 @@ class ModuleChain:
         self._send_pose = send_pose
         self._camera: PoseCamera | None = None
         if send_pose is not None and robot.sensors.pose is not None:
-            self._camera = PoseCamera(robot.sensors.pose, plant, (config.seed, len(self.counts)))
+            self._camera = PoseCamera(robot.sensors.pose, plant, (config.seed, len(self.counts)), config.period_ns)
         self._encode = msgspec.json.Encoder().encode
         self._out: list[list[Frame]] = [[] for _ in self.counts]
         self._babblers: dict[Seat, float] = {}  # in stepped time: until when they have spoken
@@ -118,15 +120,13 @@ class ModuleChain:
 
     def _warm(self) -> None:
         self.thermal.pass_time(HEAT_EVERY * self.plant.step_s, self.motors.take_heat())
-        hottest = self.thermal.winding_c.max()
-        if hottest > thermal.FADES_FROM_C:
-            self.motors.derate(self.thermal.share_left())
-            if hottest >= thermal.OVERHEAT_C:
-                self._due_us = -inf
-            self._derated = True
-        elif self._derated:
-            self.motors.derate(self.thermal.share_left())
-            self._derated = False
+        self._derate()
+        if self.thermal.winding_c.max() >= self._heat_limits.stop_at_c:
+            self._due_us = -inf
+
+    def _derate(self) -> None:
+        if (share_left := self.thermal.share_left()) is not None:
+            self.motors.derate(share_left)
 
     def _poll(self, now_us: float) -> None:
         """Everything that time brings, but the physics."""
@@ -195,7 +195,7 @@ class ModuleChain:
             self._step_to(time)
         if self._camera is not None and self._send_pose is not None and time != self._pose_time:
             self._pose_time = time
-            sample = self._camera.look()
+            sample = self._camera.look(round(self.now_us * 1000))
             if sample is not None:
                 self._send_pose(self._encode(sample))
         first = sum(self.counts[:channel])
@@ -213,9 +213,9 @@ class ModuleChain:
         out[sent:] = sorted(out[sent:], key=lambda frame: frame.id)  # as they would win the bus
 
     def _step_to(self, sync_time: int) -> None:
-        """Let the time from the latest Sync to this one pass. The first sets zero, as does one of a new host."""
+        """Let the time from the latest Sync to this one pass. The first sets zero, as does one of another clock."""
         later_us = 0 if self._sync_time is None else (sync_time - self._sync_time) % ROUND_US
-        if 0 < later_us < ROUND_US // 2:
+        if 0 < later_us <= LONGEST_STEP_US:
             until_us = self.now_us + later_us
             self._pass(until_us, round(until_us / self._step_us) - self._steps)
         elif 0 < ROUND_US - later_us < NEW_HOST_US:
@@ -267,8 +267,7 @@ class ModuleChain:
         match fault.kind:
             case "overheat":
                 self.thermal.inject(joint, heat=change.begins, hold=change.begins and fault.end_s != inf)
-                self.motors.derate(self.thermal.share_left())
-                self._derated = True
+                self._derate()
             case "duplicate":
                 if change.begins:
                     self._seat(joint, seat.channel, seat.module.serial ^ OTHER_SERIAL, now_us - BOOT_US, drives=False)
@@ -287,7 +286,9 @@ class ModuleChain:
                 seat.end(kind)
 
     def _seat(self, joint: int, channel: int, serial: int, now_us: float, *, drives: bool = True) -> None:
-        module = Module(joint + 1, serial, Parameters(self._flash), stepped=self.stepped, now_us=now_us)
+        module = Module(
+            joint + 1, serial, Parameters(self._flash), self._heat_limits, stepped=self.stepped, now_us=now_us
+        )
         self.seats.append(Seat(len(self.seats), channel, joint, module, drives))
 
     def _serial(self, joint: int) -> int:

@@ -21,6 +21,7 @@ from snakesim_hal.errors import ConfigError, SnakesimError
 from snakesim_hal.files import Table, decode
 from snakesim_hal.process import die_with_parent, on_stop_signal, settle_for_timing
 from snakesim_hal.scenario import Loaded, Override, load, parse_set
+from snakesim_hal.terminal import complain_of, say
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
 DEFAULT_CHANNEL = "vcan0"
@@ -32,21 +33,22 @@ LONGEST_PAUSE_S = 0.5  # until a stop signal is looked at
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Exit code: 0 when stopped or done, 1 a fault, 2 wrong input and nothing started."""
-    arguments = _parser().parse_args(argv)
+    arguments = parser().parse_args(argv)
     if arguments.parent is not None:
         die_with_parent(arguments.parent)
     try:
         with ExitStack() as open_things:
             return _serve(arguments, open_things)
     except ConfigError as error:
-        print(f"snakesim modules: {error}", file=sys.stderr)
+        complain_of(error, "snakesim modules")
         return BAD_INPUT
     except SnakesimError as error:
-        print(f"snakesim modules: {error}", file=sys.stderr)
+        complain_of(error, "snakesim modules")
         return FAILED
 
 
-def _parser() -> argparse.ArgumentParser:
+def parser() -> argparse.ArgumentParser:
+    """What the command takes."""
     parser = argparse.ArgumentParser(
         prog="snakesim modules",
         description=__doc__,
@@ -96,9 +98,10 @@ def _serve(arguments: argparse.Namespace, open_things: ExitStack) -> int:
     on_stop_signal(loop.stop)
     settle_for_timing()
     count = loaded.config.robot.chain.modules
-    print(f"modules ready: {count} on {', '.join(settings.channels)}", flush=True)
+    say(f"modules ready: {count} on {', '.join(settings.channels)}")
     loop.run()
-    print("\n".join(loop.summary()), flush=True)
+    for line in loop.summary():
+        say(line)
     return OK
 
 
@@ -188,7 +191,7 @@ class Loop:
             f"{wire.channel} {b.load_since(a):.1%}"
             for wire, a, b in zip(self._server.wires, before, after, strict=True)
         ]
-        print(f"{now_s - self._start_s:7.1f} s  load {', '.join(loads)}", flush=True)
+        say(f"{now_s - self._start_s:7.1f} s  load {', '.join(loads)}")
         return after
 
     def _read_terminal(self) -> None:
@@ -200,7 +203,7 @@ class Loop:
                 try:
                     fault, begins = parse_typed(line, self._chain.count, self._chain.now_us * 1e-6)
                 except ConfigError as error:
-                    print(error, flush=True)
+                    say(str(error))
                 else:
                     self._chain.inject(fault, begins=begins)
 

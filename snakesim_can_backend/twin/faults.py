@@ -29,6 +29,8 @@ def parse(text: str, joints: int) -> Injection:
 
 def parse_typed(text: str, joints: int, now_s: float) -> tuple[Injection, bool]:
     """A fault as typed in a terminal, `mute joint_3 off`, and whether it begins. Raises ConfigError."""
+    if len(text) > injection.LONGEST_TEXT:
+        raise ConfigError(f"{text[:40]!r}...: {len(text)} characters, at most {injection.LONGEST_TEXT}")
     match = _typed.fullmatch(text.strip())
     if match is None:
         raise ConfigError(f"{text.strip()!r}: type KIND joint_N, and later KIND joint_N off. Kinds: {', '.join(ABOUT)}")

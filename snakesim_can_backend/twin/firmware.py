@@ -48,7 +48,7 @@ from snakesim_can_backend.twin.frames import (
 from snakesim_can_backend.twin.parameters import Parameters
 from snakesim_can_backend.twin.reports import Inside, Sight, health
 from snakesim_hal.messages import Mode
-from snakesim_hal.thermal import COOLED_C, LEAST_VOLTAGE_V, OVERHEAT_C
+from snakesim_hal.thermal import LEAST_VOLTAGE_V, HeatLimits
 
 BOOT_US = 100_000
 HEARTBEAT_US = round(HEARTBEAT_PERIOD_S * 1e6)
@@ -74,9 +74,17 @@ class Module:
     """One module on the bus."""
 
     def __init__(
-        self, node: int, serial: int, parameters: Parameters, *, stepped: bool = False, now_us: float = 0.0
+        self,
+        node: int,
+        serial: int,
+        parameters: Parameters,
+        heat: HeatLimits,
+        *,
+        stepped: bool = False,
+        now_us: float = 0.0,
     ) -> None:
-        self.node, self.serial, self.parameters = node, serial, parameters
+        """heat: where its winding stops it, and below which it must have cooled before a clear helps."""
+        self.node, self.serial, self.parameters, self.heat = node, serial, parameters, heat
         self.frames: list[Frame] = []
         self.inside = Inside()
         self.hangs = False  # its main loop stands still; only hardware still works
@@ -269,7 +277,7 @@ class Module:
     def _conditions(self) -> int:
         """Bits of the faults whose cause is there now. A winding that overheated must cool well below that."""
         inside = self.inside
-        hot = COOLED_C if self.faults >> ModuleFault.OVERHEAT & 1 else OVERHEAT_C
+        hot = self.heat.derate_from_c if self.faults >> ModuleFault.OVERHEAT & 1 else self.heat.stop_at_c
         return (
             (inside.winding_c >= hot) << ModuleFault.OVERHEAT
             | inside.leak << ModuleFault.LEAK

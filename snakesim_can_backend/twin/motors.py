@@ -5,7 +5,7 @@ At every step of the plant
     demand = kp (position - angle) + kd (velocity - speed) + feed-forward       the mode chooses the gains
     demand is held below the line that falls from some times full torque at rest to 0 at the limit of speed
     torque follows the demand as a first-order lag of `response_time_s`, integrated exactly
-    torque is clipped to the least of rated, parameter's and set-point's limit, less what heat takes from it
+    torque is clipped to the least of the set-point's limit, the parameter's, and what heat leaves of rated torque
 
 The torque is the motor's state, and a change of mode or limit moves the demand alone, so torque never jumps. Torque is
 brought up to date before the joint moves under it, which keeps explicit steps stable far beyond 1 ms.
@@ -40,7 +40,7 @@ class Motors:
         self._position, self._velocity, self._feed = np.zeros(count), np.zeros(count), np.zeros(count)
         self._slope, self._top = np.zeros(count), np.full(count, np.inf)
         self._asked_limit = np.full(count, self.rated_nm)
-        self._share_left = np.ones(count)
+        self._own_limit = np.full(count, self.rated_nm)
         self._limit = self._asked_limit.copy()
         self._demand, self._cap, self._spare = np.zeros(count), np.zeros(count), np.zeros(count)
 
@@ -60,12 +60,12 @@ class Motors:
         self._slope[i] = self._fading if on else 0.0
         self._top[i] = self._fading * speed if on else math.inf
         self._asked_limit[i] = min(limit_nm, self.rated_nm)
-        self._limit[i] = self._asked_limit[i] * self._share_left[i]
+        self._limit[i] = min(self._asked_limit[i], self._own_limit[i])
 
     def derate(self, share_left: Floats) -> None:
-        """Heat leaves this share of each limit, (n_joints,), from 0 to 1."""
-        self._share_left = share_left
-        np.multiply(self._asked_limit, share_left, out=self._limit)
+        """Heat leaves this share of rated torque, (n_joints,), from 0 to 1; what is asked for below that is given."""
+        np.multiply(self.rated_nm, share_left, out=self._own_limit)
+        np.minimum(self._asked_limit, self._own_limit, out=self._limit)
 
     def derated(self) -> NDArray[np.bool_]:
         """Whether heat holds a torque below what is asked for, (n_joints,)."""

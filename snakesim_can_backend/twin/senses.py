@@ -1,9 +1,11 @@
 """What the sensors of modules give at a Sync: the plant as it is, with the noise and threshold of the robot file.
 
-Rates are what the host asks of the modules, and the bus is the delay: those of the robot file mean nothing here.
+Rates are what the host asks of the modules, and the bus is the delay: those of the robot file mean nothing here, but
+for the delay of motion capture.
 """
 
 import math
+from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
@@ -97,15 +99,19 @@ class Senses:
 
 
 class PoseCamera:
-    """Motion capture of the base."""
+    """Motion capture of the base, at every Sync, with the delay of the robot file."""
 
-    def __init__(self, sensor: PoseSensor, plant: Plant, seed: Sequence[int]) -> None:
+    def __init__(self, sensor: PoseSensor, plant: Plant, seed: Sequence[int], period_ns: int) -> None:
         self._plant = plant
+        self._under_way: deque[MocapSample] = deque(maxlen=1 + round(sensor.delay_s * 1e9 / period_ns))
         self._noise = np.random.default_rng(seed).standard_normal
         self._sigma = np.repeat([sensor.position_noise_m, 0.5 * sensor.angle_noise_rad], 3)  # quaternions halve angles
 
-    def look(self) -> MocapSample | None:
-        """The base now; None in a plant without a world. Velocities carry no noise of their own."""
+    def look(self, stamp_ns: int) -> MocapSample | None:
+        """What arrives at this Sync: the base as it was before the delay; None before that, or without a world.
+
+        Velocities carry no noise of their own.
+        """
         pose = self._plant.pose()
         if pose is None:
             return None
@@ -121,9 +127,12 @@ class PoseCamera:
             )
         )
         w, x, y, z = (turned / np.linalg.norm(turned)).tolist()
-        return MocapSample(
+        sample = MocapSample(
+            stamp_ns=stamp_ns,
             position_w=(px + ex, py + ey, pz + ez),
             orientation_wxyz=(w, x, y, z),
             velocity_w=pose.velocity_w,
             angular_velocity_w=pose.angular_velocity_w,
         )
+        self._under_way.append(sample)
+        return self._under_way[0] if len(self._under_way) == self._under_way.maxlen else None

@@ -1,7 +1,8 @@
 """What a controller is: settings in, then a view of the world each tick, set-points out. No clock, no I/O.
 
 A controller is a class with a `Settings` Struct, a constructor that takes the robot and the settings, and `update`.
-It is made anew at every arming, and called once a tick while the robot is armed.
+It is made anew at every arming, and called once a tick while the robot is armed. Any view may lack the world or the
+trajectory, also in the middle of a run: then it must not push, but hold, and go on without a jump when they are back.
 """
 
 from collections.abc import Sequence
@@ -22,7 +23,7 @@ class View:
     time_s: float  # since arming, by the robot's clock
     period_s: float
     joints: JointState
-    world: World | None  # None: guidance has said nothing yet
+    world: World | None  # None: there is none yet, or it is too old to act on; the same goes for the trajectory
     trajectory: Trajectory | None
 
 

@@ -30,15 +30,12 @@ class PathFollowing:
         look_ahead_m: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "m"})] = 0.03
         blend_s: Annotated[float, Meta(gt=0, le=10, extra_json_schema={"unit": "s"})] = 0.3
         speed_filter_s: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "s"})] = 0.03
-        world_age_s: Annotated[float, Meta(gt=0, le=10, extra_json_schema={"unit": "s"})] = 0.25
 
     def __init__(self, robot: Description, settings: Settings) -> None:
         self._robot = robot
         self._set = settings
         self._body = PlanarBody(robot)
-        self._progress = Progress(
-            self._body, speed_filter_s=settings.speed_filter_s, oldest_world_s=settings.world_age_s
-        )
+        self._progress = Progress(self._body, speed_filter_s=settings.speed_filter_s)
         self._hand_over = HandOver(robot)
         self._reference: Floats | None = None
         self._ahead_s_m = 0.0
@@ -47,22 +44,28 @@ class PathFollowing:
         """Angles of the body a little further on."""
         located = self._progress.update(view)
         if isinstance(located, str):
-            if self._reference is None:
-                return Action(positions(self._robot, view.joints.angle_rad), Report(why=located))
-            return Action(self._towards(), Report(why=located, reference_rad=self._reference.tolist()))
+            return self._wait(view, located)
         tail_s_m = located.tail_s_m
-        if located.new_path:
+        if located.anew:
             self._ahead_s_m = tail_s_m
         advanced = self._ahead_s_m + located.trajectory.speed_m_s * view.period_s
         self._ahead_s_m = min(max(advanced, tail_s_m), tail_s_m + self._set.look_ahead_m)
         reference = self._body.all_angles(located.on_path.at(self._ahead_s_m))
         if self._reference is None:
             self._hand_over.start(view.joints, reference)
-        elif located.new_path:
+        elif located.anew:
             self._hand_over.shift(reference - self._reference)
         self._reference = reference
         self._hand_over.fade(view.period_s / self._set.blend_s)
         return Action(self._towards(), Report(path_s_m=tail_s_m, reference_rad=reference.tolist()))
+
+    def _wait(self, view: View, why: str) -> Action:
+        """Without knowing where the body is: every joint stays where it was meant to be."""
+        if self._reference is None:
+            self._reference = np.array(view.joints.angle_rad)
+            self._hand_over.start(view.joints, self._reference)
+        self._hand_over.fade(view.period_s / self._set.blend_s)
+        return Action(self._towards(), Report(why=why, reference_rad=self._reference.tolist()))
 
     def _towards(self) -> SetPoints:
         assert self._reference is not None

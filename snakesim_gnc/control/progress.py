@@ -15,6 +15,7 @@ from snakesim_hal.route import Route
 Floats = NDArray[np.float64]
 
 TICKS_KEPT = 128
+AGAIN_STEPS = 8  # to find a body again that may have slid meanwhile
 
 
 @dataclass(frozen=True)
@@ -24,72 +25,78 @@ class Located:
     on_path: BodyOnPath
     tail_s_m: float  # arc length of the tail end
     speed_m_s: float
-    nodes_w: Floats  # (2, n_nodes), as measured at the newest world model's tick
+    nodes_w: Floats  # (2, n_nodes), as measured last
     fresh: bool  # a new world model has come
-    new_path: bool
+    anew: bool  # on a new path, or found again after it was unknown: the place may have jumped
     world: World
     trajectory: Trajectory
 
 
 class Progress:
-    """Follows the body along the path with an alpha-beta filter over world models, each matched with its own joints.
+    """Follows the body along the path with an alpha-beta filter over poses, each with the joints of its instant.
 
-    The joints that bend are the yaw joints; all others count as straight. Between world models the tail goes on at
-    the speed last seen, so what is returned is always the present.
+    The joints that bend are the yaw joints; all others count as straight. Between poses the tail goes on at the speed
+    last seen, so what is returned is always the present. A world model that repeats a pose is no new measurement: taken
+    for one, it would look like a body that stands still.
     """
 
-    def __init__(self, body: PlanarBody, *, speed_filter_s: float, oldest_world_s: float) -> None:
+    def __init__(self, body: PlanarBody, *, speed_filter_s: float) -> None:
         self._planar = body
         self._speed_filter_s = speed_filter_s
-        self._oldest_s = oldest_world_s
-        self._angles: deque[tuple[int, list[float]]] = deque(maxlen=TICKS_KEPT)
+        self._angles: deque[tuple[int, list[float]]] = deque(maxlen=TICKS_KEPT)  # stamp of the joint state, angles
         self._body: BodyOnPath | None = None
         self._path_id: int | None = None
-        self._world: World | None = None
+        self._world_tick: int | None = None
+        self._measured_ns: int | None = None  # the pose's instant; None: where the body is, is unknown
         self._nodes = np.empty((2, 0))
-        self._s_m = 0.0  # at the tick of the newest world model
+        self._s_m = 0.0  # at that instant
         self._speed_m_s = 0.0
 
     def update(self, view: View) -> Located | str:
         """Where the body is at this tick, or why that is unknown."""
-        self._angles.append((view.tick, view.joints.angle_rad))
+        self._angles.append((view.joints.stamp_ns, view.joints.angle_rad))
         world, trajectory = view.world, view.trajectory
-        if world is None:
-            return "no world model yet"
-        if trajectory is None:
-            return "no trajectory yet"
-        age_s = (view.tick - world.tick) * view.period_s
-        if age_s > self._oldest_s:
-            return f"the world model is {age_s:.2f} s old; at most {self._oldest_s} s"
+        if world is None or trajectory is None:
+            self._measured_ns = None
+            return "no world model" if world is None else "no trajectory"
         new_path = self._body is None or trajectory.path_id != self._path_id
         if new_path:
             self._body = BodyOnPath(Route(trajectory.path_w), self._planar.segments_m)
             self._path_id = trajectory.path_id
         body = self._body
         assert body is not None
-        fresh = self._world is None or world.tick != self._world.tick
-        if fresh:
-            self._measure(world)
+        pose_ns = world.stamp_ns if world.pose_stamp_ns is None else world.pose_stamp_ns
+        before_ns = self._measured_ns
+        if before_ns is None or pose_ns > before_ns:
+            self._measure(world, pose_ns)
         if new_path:
             self._s_m, self._speed_m_s = body.find(self._nodes), 0.0
-        elif fresh:
-            self._filter(body, world, view.period_s)
-        self._world = world
-        s = self._s_m + self._speed_m_s * age_s
-        return Located(body, s, self._speed_m_s, self._nodes, fresh, new_path, world, trajectory)
+        elif before_ns is None:
+            self._s_m, self._speed_m_s = body.fit(self._nodes, self._s_m, steps=AGAIN_STEPS), 0.0
+        elif pose_ns > before_ns:
+            self._filter(body, max(_seconds(pose_ns - before_ns, view), view.period_s))
+        assert self._measured_ns is not None
+        s = self._s_m + self._speed_m_s * _seconds(view.joints.stamp_ns - self._measured_ns, view)
+        anew = new_path or before_ns is None
+        fresh, self._world_tick = world.tick != self._world_tick, world.tick
+        return Located(body, s, self._speed_m_s, self._nodes, fresh, anew, world, trajectory)
 
-    def _measure(self, world: World) -> None:
-        angles = next((a for tick, a in reversed(self._angles) if tick <= world.tick), self._angles[0][1])
+    def _measure(self, world: World, pose_ns: int) -> None:
+        angles = next((a for stamp_ns, a in reversed(self._angles) if stamp_ns <= pose_ns), self._angles[0][1])
         bending = [angles[i] for i in self._planar.bends]
         heading = heading_of(world.base_orientation_wxyz)
         self._nodes = chain_nodes(world.base_position_w[:2], heading, bending, self._planar.segments_m)
+        self._measured_ns = pose_ns
 
-    def _filter(self, body: BodyOnPath, world: World, period_s: float) -> None:
+    def _filter(self, body: BodyOnPath, passed_s: float) -> None:
         """Critically damped alpha-beta filter with the time constant `speed_filter_s`."""
-        assert self._world is not None
-        passed_s = max((world.tick - self._world.tick) * period_s, period_s)
         expected = self._s_m + self._speed_m_s * passed_s
         off = body.fit(self._nodes, expected, steps=1) - expected
         keep = float(np.exp(-passed_s / self._speed_filter_s)) if self._speed_filter_s > 0 else 0.0
         self._s_m = expected + (1 - keep * keep) * off
         self._speed_m_s += (1 - keep) ** 2 * off / passed_s
+
+
+def _seconds(elapsed_ns: int, view: View) -> float:
+    """In whole periods as a rule: those come out alike on every machine."""
+    return elapsed_ns / round(view.period_s * 1e9) * view.period_s

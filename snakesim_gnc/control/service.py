@@ -1,18 +1,24 @@
-"""The control process: runs one controller, holds the lease, sends the commands, and says what it is doing."""
+"""The control process: runs one controller, holds the lease, sends the commands, and says what it is doing.
+
+A controller is given only what is fresh enough (`freshness`). With stale joints no command is sent: the lease ends, and
+the robot is stopped. What it answers is checked (`guarded`): a controller that cannot go on ends this process at once.
+"""
 
 import sys
 from collections.abc import Sequence
 
-from snakesim_gnc.control.controller import Controller, Report, View
-from snakesim_gnc.control.states import locomotion_state
+from snakesim_gnc.control.controller import Controller, View
+from snakesim_gnc.control.freshness import Limits
+from snakesim_gnc.control.guarded import Guarded
+from snakesim_gnc.control.telling import Telling
 from snakesim_gnc.service import Service, serve
 from snakesim_hal import keys
 from snakesim_hal.client import Client, Commander
+from snakesim_hal.errors import ControllerError
 from snakesim_hal.messages import Clock, ControlState, Description, JointState, Message, Trajectory, World
 from snakesim_hal.plugins import CONTROLLERS, find_plugin, plugin_settings
 from snakesim_hal.scenario import RunConfig
-
-TELEMETRY_S = 0.05
+from snakesim_hal.terminal import complain
 
 
 class Control(Service):
@@ -23,7 +29,7 @@ class Control(Service):
 
     def __init__(self, client: Client, config: RunConfig) -> None:
         """Finds the controller and checks its settings."""
-        self._controller_name = config.controller
+        self._config = config
         self._plugin: type[Controller] = find_plugin(CONTROLLERS, config.controller)
         self._settings = plugin_settings(
             self._plugin, config.control_settings, f"scenario {config.name!r}", config.control_section
@@ -33,96 +39,113 @@ class Control(Service):
         self._world = client.subscribe(keys.WORLD, World)
         self._trajectory = client.subscribe(keys.TRAJECTORY, Trajectory)
         self._robot: Description | None = None
-        self._commander: Commander | None = None
-        self._controller: Controller | None = None
         self._arming = -1
         self._armed_at_ns = 0
-        self._last_told: tuple[object, ...] = ()
-        self._tell_at_ns = 0
+        self._noted: set[str] = set()  # streams that are too old, as the log has it
         self._last_clock: Clock | None = None
 
     def meet(self, robot: Description) -> None:
         """Get ready to command this robot."""
         self._robot = robot
         self._commander = Commander(self._client, robot)
-        self._controller = None
-        self._last_told = ()
+        self._limits = Limits.of(self._config, robot)
+        self._telling = Telling(self._config.controller, robot)
+        self._controller: Guarded | None = None
 
     def outputs(self, clock: Clock) -> list[tuple[str, Message]] | None:
         """Command the robot; armed, as the controller says, otherwise to stay as it is."""
-        assert self._robot is not None and self._commander is not None
         self._last_clock = clock
         joints = self._client.read(self._joints)
         if joints is None:
             return None
-        if not self._commander.holds(clock):
+        armed = clock.lifecycle == "armed"
+        mine = self._commander.holds(clock)
+        if not (armed and mine):
             self._controller = None
+        if not mine:
             why = f"no right to command: {self._commander.refusal or 'the lease is not ours'}"
-            return self._tell(clock, Report(why=why[:400]), armed=False, wants=False)
-        if clock.lifecycle != "armed":
-            self._controller = None
-            self._commander.send(clock, self._commander.stay(joints))
-            return self._tell(clock, Report(), armed=False, wants=False)
-        if self._controller is None or clock.arming != self._arming:
-            self._controller = self._plugin(self._robot, self._settings)
-            self._arming, self._armed_at_ns = clock.arming, clock.stamp_ns
-        trajectory = self._client.read(self._trajectory)
-        view = View(
-            tick=clock.tick,
-            time_s=(clock.stamp_ns - self._armed_at_ns) * 1e-9,
-            period_s=clock.period_ns * 1e-9,
-            joints=joints,
-            world=self._client.read(self._world),
-            trajectory=trajectory,
-        )
-        action = self._controller.update(view)
-        self._commander.send(clock, action.set_points)
-        wants = trajectory is not None and trajectory.speed_m_s != 0.0
-        return self._tell(clock, action.report, armed=True, wants=wants)
+            return _told(self._telling.state(clock, armed=armed, missing=why))
+        late = self._limits.against_joints(joints, clock.stamp_ns)
+        if late:
+            self._note(clock, [late], "no commands")
+            return _told(self._telling.state(clock, armed=armed, missing=late))
+        if not armed:
+            self._note(clock)
+            self._commander.send(clock, joints, self._commander.stay(joints))
+            return _told(self._telling.state(clock))
+        return self._act(clock, joints)
 
     def silence(self) -> list[tuple[str, Message]]:
-        """The HAL is gone: PowerOff."""
+        """The HAL is gone, or a slow computer holds it up: PowerOff. The next tick decides about the controller."""
         if self._last_clock is None:
             return []
-        self._controller = None
-        return self._tell(self._last_clock, Report(), armed=False, wants=False, answers=False)
+        return _told(self._telling.state(self._last_clock, answers=False))
 
-    def _tell(
-        self, clock: Clock, report: Report, *, armed: bool, wants: bool, answers: bool = True
-    ) -> list[tuple[str, Message]]:
-        """The telemetry, at a few hertz, and at once when something worth knowing changed."""
-        state, reason = locomotion_state(
-            hal_answers=answers,
-            armed=armed,
-            wants_to_move=wants,
-            usable_push_points=report.usable_push_points,
-            obstacle=report.why,
-        )
-        mark = (state, report.propulsion_joint, report.jammed, clock.lifecycle, clock.arming)
-        if mark == self._last_told and clock.stamp_ns < self._tell_at_ns:
-            return []
-        self._last_told, self._tell_at_ns = mark, clock.stamp_ns + round(TELEMETRY_S * 1e9)
-        joints = self._robot.joints if self._robot is not None else []
-        told = ControlState(
-            tick=clock.tick,
-            stamp_ns=clock.stamp_ns,
-            controller=self._controller_name[-64:],
-            state=state,
-            reason=reason[:500],
-            path_s_m=report.path_s_m,
-            propulsion_joint=None if report.propulsion_joint is None else joints[report.propulsion_joint].name,
-            propulsion_n=report.propulsion_n,
-            push_points=list(report.push_points),
-            solved_force_n=list(report.solved_force_n),
-            propulsion_torque_nm=report.propulsion_torque_nm,
-            bending_torque_nm=list(report.bending_torque_nm),
-            reference_rad=list(report.reference_rad),
-            condition=report.condition,
-            torque_headroom_nm=report.torque_headroom_nm,
-            saturated=report.saturated,
-            jammed=report.jammed,
-        )
-        return [(keys.CONTROL_STATE, told)]
+    def _act(self, clock: Clock, joints: JointState) -> list[tuple[str, Message]]:
+        """Let the controller answer, with what is fresh of the world and the trajectory."""
+        world, trajectory, missing = self._outlook(clock)
+        try:
+            controller = self._made_for(clock)
+            view = View(
+                tick=clock.tick,
+                time_s=(clock.stamp_ns - self._armed_at_ns) * 1e-9,
+                period_s=clock.period_ns * 1e-9,
+                joints=joints,
+                world=world,
+                trajectory=trajectory,
+            )
+            action = controller.update(view)
+            self._commander.send(clock, joints, action.set_points)
+            rests = _why_it_rests(trajectory)
+            try:
+                told = self._telling.state(clock, action.report, armed=True, missing=missing, rests=rests)
+            except ValueError as error:
+                raise controller.wrong(str(error)) from None
+        except ControllerError as error:
+            self._client.put(keys.CONTROL_STATE, self._telling.failure(clock, str(error)))
+            raise
+        return _told(told)
+
+    def _outlook(self, clock: Clock) -> tuple[World | None, Trajectory | None, str]:
+        """World and trajectory, as far as they are there and fresh, and why they are not."""
+        world, trajectory = self._client.read(self._world), self._client.read(self._trajectory)
+        late: list[str] = []
+        if world is not None and (why := self._limits.against_world(world, clock.stamp_ns)):
+            world, late = None, [why]
+        if trajectory is not None and (why := self._limits.against_trajectory(trajectory, clock.stamp_ns)):
+            trajectory, late = None, [*late, why]
+        self._note(clock, late, "the controller holds")
+        if world is not None:
+            self._telling.follow(world)
+        return world, trajectory, "; ".join(late)
+
+    def _made_for(self, clock: Clock) -> Guarded:
+        """The controller of this arming."""
+        assert self._robot is not None
+        if self._controller is None or clock.arming != self._arming:
+            self._controller = Guarded(self._config.controller, self._plugin, self._robot, self._settings)
+            self._arming, self._armed_at_ns = clock.arming, clock.stamp_ns
+        return self._controller
+
+    def _note(self, clock: Clock, late: Sequence[str] = (), so: str = "") -> None:
+        """Write into the log when other streams are too old than before, and when all is fresh again."""
+        streams = {why.partition(" ")[0] for why in late}
+        if streams != self._noted:
+            text = f"{'; '.join(late)}: {so}" if late else "all that control acts on is fresh again"
+            complain(f"{clock.stamp_ns * 1e-9:.3f} s: {text}")
+        self._noted = streams
+
+
+def _why_it_rests(trajectory: Trajectory | None) -> str:
+    if trajectory is None:
+        return "there is no trajectory yet"
+    if trajectory.speed_m_s != 0.0:
+        return ""
+    return trajectory.reason or "the speed is zero"
+
+
+def _told(state: ControlState | None) -> list[tuple[str, Message]]:
+    return [] if state is None else [(keys.CONTROL_STATE, state)]
 
 
 def main(argv: Sequence[str] | None = None) -> int:

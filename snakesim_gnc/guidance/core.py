@@ -22,7 +22,7 @@ POSE_MEMORY_S = 0.5  # confidence in a pose falls to 1/e after this long without
 
 
 class WorldModel:
-    """Turns the sensors of one instant into a World."""
+    """Turns the newest sample of each sensor into a World."""
 
     def __init__(self, robot: Description, known: Sequence[Obstacle], *, reach_m: float = 0.5) -> None:
         """known: the surveyed obstacles; only those within `reach_m` of the body are passed on."""
@@ -33,21 +33,29 @@ class WorldModel:
         self._centres = np.array([o.position_w[:2] for o in known]).reshape(-1, 2)
         self._sizes = np.array([_outer_radius_m(o) for o in known])
         self._reach_m = reach_m
+        masses = np.array([link.mass_kg for link in robot.links])
+        self._shares = masses / masses.sum()
+        self._half_m = 0.5 * np.array(self._lengths)
 
-    def update(self, tick: int, stamp_ns: int, joints: JointState, contacts: Contacts | None, pose: Pose) -> World:
-        """The world as it stands at `tick`."""
+    def update(self, tick: int, now_ns: int, joints: JointState, contacts: Contacts | None, pose: Pose) -> World:
+        """The world from the newest samples, whose own stamps it carries. tick, now_ns: of the clock."""
         rotation = rotation_from_quaternion(pose.orientation_wxyz)
         origins, rotations = link_frames(pose.position_w, rotation, joints.angle_rad, self._axes, self._lengths)
         felt = [] if contacts is None else contacts.contacts
-        age_s = max(stamp_ns - pose.stamp_ns, 0) * 1e-9
+        age_s = max(now_ns - pose.stamp_ns, 0) * 1e-9
+        middles = origins + self._half_m[:, None] * rotations[:, :, 0]
+        x, y, z = (self._shares @ middles).tolist()
         return World(
             tick=tick,
-            stamp_ns=stamp_ns,
+            stamp_ns=joints.stamp_ns,
             base_position_w=pose.position_w,
             base_orientation_wxyz=pose.orientation_wxyz,
             base_confidence=math.exp(-age_s / POSE_MEMORY_S),
             contacts=[self._in_world(c, origins, rotations) for c in felt if c.link < len(origins)],
             obstacles=self._near(origins),
+            pose_stamp_ns=pose.stamp_ns,
+            contacts_stamp_ns=None if contacts is None else contacts.stamp_ns,
+            centre_w=(x, y, z),
         )
 
     def _in_world(self, contact: Contact, origins: np.ndarray, rotations: np.ndarray) -> WorldContact:

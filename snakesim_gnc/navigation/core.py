@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from snakesim_gnc.navigation.intents import Intents
 from snakesim_hal.messages import Intent, Obstacle, Trajectory, World
 from snakesim_hal.route import Route
 from snakesim_hal.scene import outline_distance_m
@@ -18,7 +19,7 @@ class KnownPath:
     def __init__(self, route: Route, obstacles: Sequence[Obstacle], *, speed_m_s: float) -> None:
         self._route = route
         self._path = [(float(x), float(y)) for x, y in route.points_w]
-        self._speed_m_s = speed_m_s
+        self._intents = Intents(speed_m_s)
         found: list[tuple[float, str]] = []
         for obstacle in obstacles:
             s = route.project(np.array(obstacle.position_w[:2]))
@@ -27,23 +28,34 @@ class KnownPath:
         self._push_points = sorted(found)
         self._tail_s_m: float | None = None
 
-    def update(self, tick: int, stamp_ns: int, world: World | None, intent: Intent | None) -> Trajectory:
-        """The trajectory from where the body is now."""
+    def start_over(self) -> None:
+        """Another robot, or another start: the body may be anywhere, and robot time begins anew."""
+        self._tail_s_m = None
+        self._intents.start_over()
+
+    def update(self, tick: int, now_ns: int, world: World | None, intent: Intent | None) -> Trajectory:
+        """The trajectory from where the body was by this world model; its stamp is the world model's.
+
+        tick, now_ns: of the clock. intent: the one that came last, if any ever did.
+        """
         if world is not None:
             tail = np.array(world.base_position_w[:2])
             self._tail_s_m = self._route.project(tail, self._tail_s_m)
-        tail_s_m = self._tail_s_m or 0.0
-        finished = tail_s_m >= self._route.length_m
-        speed = self._speed_m_s if intent is None or intent.speed_m_s is None else intent.speed_m_s
-        if finished or (intent is not None and not intent.go):
-            speed = 0.0
-        ahead = [name for s, name in self._push_points if tail_s_m <= s <= tail_s_m + PUSH_POINTS_AHEAD_M]
+        finished = self._tail_s_m is not None and self._tail_s_m >= self._route.length_m
+        wish = self._intents.wish(intent, now_ns)
         return Trajectory(
             tick=tick,
-            stamp_ns=stamp_ns,
+            stamp_ns=None if world is None else world.stamp_ns,
             path_id=0,
             path_w=self._path,
-            speed_m_s=speed,
-            push_points=ahead,
+            speed_m_s=0.0 if finished else wish.speed_m_s,
+            push_points=self._ahead(),
             finished=finished,
+            reason="the path is finished" if finished else wish.why[:500],
         )
+
+    def _ahead(self) -> list[str]:
+        tail_s_m = self._tail_s_m
+        if tail_s_m is None:
+            return []
+        return [name for s, name in self._push_points if tail_s_m <= s <= tail_s_m + PUSH_POINTS_AHEAD_M]

@@ -36,7 +36,8 @@ class Navigation(Service):
         self._client = client
 
     def meet(self, robot: Description) -> None:
-        """Any robot will do."""
+        """Any robot will do; where it is, is not known any more."""
+        self._planner.start_over()
 
     def outputs(self, clock: Clock) -> list[tuple[str, Message]]:
         """The trajectory at this tick. An operator's intent counts as soon as it arrives."""

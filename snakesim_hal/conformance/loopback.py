@@ -89,6 +89,7 @@ class Controller:
     plan: Plan = stay
     last_sent_tick: int = -1
     epoch: int = 0
+    arming: int = 0
     stopped: threading.Event = field(default_factory=threading.Event)
 
     def run(self, link: Link) -> None:
@@ -114,18 +115,20 @@ class Controller:
                     held = commander.stay(measured)
                 elif clock.arming != arming:
                     arming, armed_at = clock.arming, clock.tick
-                self._send(clock, client, commander, held, clock.tick - armed_at)
+                asked = self._asked(clock, held, clock.tick - armed_at)
+                if asked is not None:
+                    commander.send(clock, measured, asked)
+                    self.last_sent_tick, self.epoch, self.arming = clock.tick, clock.lease_epoch, clock.arming
+                    client.done(clock.tick)
 
-    def _send(self, clock: Clock, client: Client, commander: Commander, held: SetPoints, ticks: int) -> None:
+    def _asked(self, clock: Clock, held: SetPoints, ticks: int) -> SetPoints | None:
         asked = self.plan(ticks) if clock.lifecycle == "armed" else {}
         if asked is None:
-            return
+            return None
         mode, target = list(held.mode), list(held.target)
         for joint, (wanted_mode, wanted) in asked.items():
             mode[joint], target[joint] = wanted_mode, wanted
-        commander.send(clock, SetPoints(mode, target, held.torque_limit_nm))
-        self.last_sent_tick, self.epoch = clock.tick, clock.lease_epoch
-        client.done(clock.tick)
+        return SetPoints(mode, target, held.torque_limit_nm)
 
 
 class Hosted:
@@ -175,7 +178,7 @@ class Hosted:
         request = LifecycleRequest(
             action=action, robot=robot.robot, backend=robot.backend, config_hash=robot.config_hash
         )
-        return self.session.ask_politely(keys.LIFECYCLE, request, timeout_s=10.0)
+        return self.session.ask(keys.LIFECYCLE, request, timeout_s=10.0)
 
     def arm(self, plan: Plan) -> None:
         """Arm from any state; the controller acts by the plan from then on."""
@@ -212,6 +215,7 @@ class Hosted:
             "tick": self.tick,
             "sequence": 2**40,
             "lease_epoch": self.controller.epoch,
+            "arming": self.controller.arming,
             "layout": self.robot.layout,
             "valid_for_ns": self.robot.lease_ns,
             "mode": [Mode.VELOCITY] * count,

@@ -271,6 +271,7 @@ class Rig:
             tick=self.tick,
             sequence=self._sequence,
             lease_epoch=self.authority.lease.epoch,
+            arming=self.authority.arming,
             layout=self.robot.layout,
             valid_for_ns=self.robot.lease_ns,
             mode=points.mode,

@@ -23,6 +23,8 @@ def what_is_still_seen(rig: Rig) -> list[JointState]:
         with contextlib.suppress(BackendError):
             rig.backend.advance()
         with contextlib.suppress(BackendError):
+            rig.backend.faults()
+        with contextlib.suppress(BackendError):
             seen.append(rig.backend.sample(tick, tick * rig.period_ns).joints)
     return seen
 

@@ -1,11 +1,10 @@
 """`snakesim compare RUN_A RUN_B`: read two run folders, print the table, write the page."""
 
 from pathlib import Path
-from zipfile import BadZipFile
-
-import msgspec
 
 from snakesim_hal.errors import ConfigError
+from snakesim_hal.terminal import say
+from snakesim_hal.textfiles import write_text
 from snakesim_operator.compare.difference import differ
 from snakesim_operator.compare.page import page
 from snakesim_operator.compare.table import table
@@ -28,15 +27,15 @@ def compare(run_a: Path, run_b: Path, out: Path | None = None, within_percent: f
         )
     path = out or run_b / PAGE
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(page(difference, asked), encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}; name another file with --out FILE.html") from error
-    print(table(difference))
-    print(f"page: {path}")
+        write_text(path, page(difference, asked))
+    except ConfigError as error:
+        raise ConfigError(f"{error}; name another file with --out FILE.html") from None
+    for line in table(difference):
+        say(line)
+    say(f"page: {path}")
     if asked is None:
         return 0
-    print(asked.words)
+    say(asked.words)
     return 0 if asked.holds else 1
 
 
@@ -44,12 +43,4 @@ def _load(folder: Path) -> RunRecord:
     if not folder.is_dir():
         what = "not a folder" if folder.exists() else "no such folder"
         raise ConfigError(f"{folder}: {what}; give the folder that `snakesim run --out FOLDER` left")
-    try:
-        return RunRecord.load(folder.resolve())
-    except ConfigError:
-        raise
-    except (OSError, ValueError, TypeError, EOFError, BadZipFile, msgspec.MsgspecError) as error:
-        raise ConfigError(
-            f"{folder} holds a record that cannot be read: {error}; repeat the run with "
-            f"`snakesim run {folder / 'config.json'}`"
-        ) from error
+    return RunRecord.load(folder.resolve())

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.host_process import BLACK_BOX
 from snakesim_hal.messages import Mode
+from snakesim_hal.recorder import BLACK_BOX
 from snakesim_operator.compare.alignment import SAME_INSTANT_S, Aligned, Joints, align
 from snakesim_operator.compare.settings import Setting, differences, identity
 from snakesim_operator.record import RunRecord
@@ -52,6 +52,12 @@ class Gap:
     rms: float | None  # over all joints
     worst: Worst | None
     correlation: float | None  # over all joints and instants; None when one of them never changes
+    untold: float  # share of what is compared that is not a number in one of the runs, or in both
+
+    @property
+    def same(self) -> bool:
+        """Whether every value is known in both runs, and is the same."""
+        return self.untold == 0 and self.worst is not None and not self.worst.difference
 
 
 @dataclass(frozen=True)
@@ -148,8 +154,7 @@ class Difference:
             return False
         if self.advance is not None and abs(self.advance.difference_m) >= STOOD_M:
             return False
-        gaps = (self.angle, self.speed, self.torque, *self.targets)
-        return self.other_mode == 0 and not any(np.nan_to_num(gap.difference).any() for gap in gaps)
+        return self.other_mode == 0 and all(gap.same for gap in self.gaps)
 
     @property
     def gaps(self) -> list[Gap]:
@@ -168,8 +173,8 @@ def differ(a: RunRecord, b: RunRecord, apart_rad: float = APART_RAD) -> Differen
     for mode, what, unit in TARGETS:
         both = same_mode & (on_a.mode == mode)
         if both.any():
-            told = (np.where(both, joints.target, np.nan) for joints in (on_a, on_b))
-            targets.append(_gap(what, unit, time_s, *told))
+            told = [np.where(both, joints.target, np.nan) for joints in (on_a, on_b)]
+            targets.append(_gap(what, unit, time_s, told[0], told[1], both))
     angle = _gap("angle", "rad", time_s, on_a.angle_rad, on_b.angle_rad)
     return Difference(
         a=a,
@@ -204,11 +209,33 @@ def _check(a: RunRecord, b: RunRecord) -> None:
             f"{told[0]}, {told[1]}: their names, order or axes are not the same, so there is no joint to compare with "
             "which. Compare runs of one robot file"
         )
+    for record in (a, b):
+        _check_shapes(record)
 
 
-def _gap(what: str, unit: str, time_s: Floats, a: Floats, b: Floats) -> Gap:
-    difference = b - a
+def _check_shapes(record: RunRecord) -> None:
+    """A black box from anywhere may hold any arrays."""
+    ticks, joints = len(record.time_s), len(record.description.joints)
+    shapes = {"time_s": (ticks,), "position_w": (ticks, 3), "orientation_wxyz": (ticks, 4)}
+    for name in ("angle_rad", "velocity_rad_s", "torque_nm", "mode", "target"):
+        shapes[name] = (ticks, joints)
+    for name, shape in shapes.items():
+        array: NDArray[np.generic] = getattr(record, name)
+        if array.shape != shape or array.dtype.kind not in "fiu":
+            raise ConfigError(
+                f"{record.folder / BLACK_BOX}: `{name}` holds {array.dtype} {array.shape}, wanted are numbers {shape}: "
+                f"{ticks} ticks, {joints} joints. It is damaged, or not of this run; repeat the run"
+            )
+    if not np.isfinite(record.time_s).all() or (np.diff(record.time_s) <= 0).any():
+        raise ConfigError(f"{record.folder / BLACK_BOX}: `time_s` does not grow from tick to tick; repeat the run")
+
+
+def _gap(what: str, unit: str, time_s: Floats, a: Floats, b: Floats, compared: NDArray[np.bool_] | None = None) -> Gap:
+    with np.errstate(invalid="ignore"):  # infinity less infinity is unknown too
+        difference = b - a
     known = np.isfinite(difference)
+    wanted = known.size if compared is None else int(compared.sum())
+    untold = 1 - known.sum() / wanted if wanted else 0.0
     squares = np.where(known, difference, 0.0) ** 2
     count = known.sum(axis=0)
     joint_rms = np.sqrt(np.where(count > 0, squares.sum(axis=0) / np.maximum(count, 1), np.nan))
@@ -219,7 +246,8 @@ def _gap(what: str, unit: str, time_s: Floats, a: Floats, b: Floats) -> Gap:
         joint_worst.append(told if count[joint] else None)
     worst = max((one for one in joint_worst if one is not None), key=lambda one: abs(one.difference), default=None)
     rms = float(np.sqrt(squares.sum() / known.sum())) if known.any() else None
-    return Gap(what, unit, difference, joint_rms, joint_worst, rms, worst, _correlation(a[known], b[known]))
+    correlation = _correlation(a[known], b[known])
+    return Gap(what, unit, difference, joint_rms, joint_worst, rms, worst, correlation, float(untold))
 
 
 def _correlation(a: Floats, b: Floats) -> float | None:

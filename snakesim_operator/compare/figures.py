@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from snakesim_operator.compare.difference import Advance, Difference, Gap
 from snakesim_operator.report import charts
 from snakesim_operator.report.charts import Frame
-from snakesim_operator.report.svg import element, line, text
+from snakesim_operator.report.svg import element, line, text, title
 from snakesim_operator.report.timeline import propulsion_intervals
 from snakesim_operator.report.torque_map import joint_map
 
@@ -93,9 +93,9 @@ def hand_overs(difference: Difference, width: float) -> str:
                 if one.joint != joint:
                     continue
                 left, right = frame.x(one.start_s), frame.x(one.end_s)
-                title = element("title", f"{name.upper()}, {one.start_s:.2f} to {one.end_s:.2f} s")
+                told = title(f"{name.upper()}, {one.start_s:.2f} to {one.end_s:.2f} s")
                 bar = {"x": left, "y": top + below, "width": max(right - left, 1.0), "height": ROW / 2 - 3.5}
-                parts.append(element("rect", title, class_=f"turn run-{name}", **bar))
+                parts.append(element("rect", told, class_=f"turn run-{name}", **bar))
     return charts.chart(
         frame, "Propulsion joints of both runs over time", *parts, _parted(frame, difference), charts.time_axis(frame)
     )

@@ -83,6 +83,7 @@ def _compared(difference: Difference) -> str:
     rows = folders + [[one.key, one.a, one.b, "differs" if one.a != one.b else ""] for one in difference.compared]
     hosts = (difference.a.host, difference.b.host)
     rows.append(["faults", *("; ".join(f.cause for f in host.faults) or "none" for host in hosts), ""])
+    rows.append(["not known", *("; ".join(record.lacks) or UNKNOWN for record in (difference.a, difference.b)), ""])
     digests = [host.command_digest[:16] for host in hosts]
     rows.append(["command digest", *digests, "the same" if digests[0] == digests[1] else ""])
     parts = [table(["", "A", "B", ""], rows, "compared"), "<h3>Settings that differ</h3>"]
@@ -122,8 +123,10 @@ def _map(difference: Difference, anchor: str, title: str, gap: Gap) -> str:
     worst = gap.worst
     if worst is None:
         return section(anchor, title, absent(f"No {gap.what} is known in both runs."))
-    if not worst.difference:
+    if gap.same:
         return section(anchor, title, absent(f"No difference: every {gap.what} is the same at every instant."))
+    if not worst.difference:
+        return section(anchor, title, absent(f"No difference where the {gap.what} is known in both runs."))
     lead = (
         f"B − A, a row a joint, head on top. Orange: B is greater; blue: A is. Full colour is the worst, "
         f"{shown(abs(worst.difference), 3)} {gap.unit}, of {difference.joints[worst.joint]} at {worst.time_s:.2f} s."
@@ -141,7 +144,7 @@ def _worst(difference: Difference) -> str:
             chosen.setdefault(gap.worst.joint, []).append(f"worst {gap.what}, {_worst_words(gap.worst, gap.unit)}")
     title = "The joints that differ most"
     if not chosen:
-        return section("worst", title, absent("No joint: all angles and torques are the same."))
+        return section("worst", title, absent("No joint: all angles and torques that are known are the same."))
     a, b = difference.aligned.a, difference.aligned.b
     blocks: list[str] = []
     for joint, why in chosen.items():

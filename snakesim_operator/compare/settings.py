@@ -9,7 +9,8 @@ from snakesim_hal.files import leaves
 from snakesim_operator.record import RunRecord
 
 UNSET = "not set"
-FOLLOWS = ("config_hash", "robot", "backend", "period_ns", "lease_ns")  # of the description; the configuration tells it
+# Of the description: what the configuration tells already, and what is another in every run.
+FOLLOWS = ("config_hash", "robot", "backend", "period_ns", "lease_ns", "host", "proof")
 
 
 @dataclass(frozen=True)

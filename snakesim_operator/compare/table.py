@@ -9,7 +9,7 @@ SETTINGS_SHOWN = 16
 HAND_OVERS_SHOWN = 8
 
 
-def table(difference: Difference) -> str:
+def table(difference: Difference) -> list[str]:
     """Everything that the page tells in numbers, in lines."""
     lines = [
         _row("", "A", "B"),
@@ -27,7 +27,7 @@ def table(difference: Difference) -> str:
         "",
         *sentences(difference),
     ]
-    return "\n".join(line.rstrip() for line in lines)
+    return [line.rstrip() for line in lines]
 
 
 def _row(name: str, a: str, b: str, note: str = "") -> str:
@@ -41,6 +41,8 @@ def _compared(difference: Difference) -> list[str]:
     hosts = (difference.a.host, difference.b.host)
     faults, digests = [str(len(host.faults)) for host in hosts], [host.command_digest[:16] for host in hosts]
     lines.append(_row("faults", faults[0], faults[1]))
+    for name, record in (("A", difference.a), ("B", difference.b)):
+        lines += [f"  not known of {name}: {lack}" for lack in record.lacks]
     lines.append(_row("command digest", digests[0], digests[1], "the same" if digests[0] == digests[1] else ""))
     return lines
 
@@ -86,8 +88,10 @@ def _gap(gap: Gap, joints: list[str]) -> str:
     if gap.rms is None or gap.worst is None:
         return f"  {gap.what:<{NAME}}unknown"
     worst = gap.worst
-    if not worst.difference:
+    if gap.same:
         return f"  {gap.what:<{NAME}}the same for every joint at every instant"
+    if not worst.difference:
+        return f"  {gap.what:<{NAME}}the same where it is known"
     where = f"{joints[worst.joint]} at {worst.time_s:.2f} s, A {worst.a:+.3f}, B {worst.b:+.3f}"
     rms, most = f"{gap.rms:.4f} {gap.unit}", f"{worst.difference:+.4f} {gap.unit}"
     return f"  {gap.what:<{NAME}}{rms:<{VALUE}}{most:<{VALUE}}{where}"

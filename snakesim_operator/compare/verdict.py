@@ -34,7 +34,8 @@ def sentences(difference: Difference) -> list[str]:
     if difference.identical:
         return [f"The runs are the same, joint by joint, for all of their {_common(difference)}."]
     advance = difference.advance
-    said = [
+    said = [*_untold(difference)]
+    said += [
         "How far they moved cannot be compared: there is no measure of it that both runs have."
         if advance is None
         else f"{_capital(how_far(advance))}."
@@ -52,6 +53,13 @@ def sentences(difference: Difference) -> list[str]:
     if hand_overs.a or hand_overs.b:
         said.append(f"{_capital(who_propelled(difference))}.")
     return said
+
+
+def _untold(difference: Difference) -> list[str]:
+    untold = [f"{gap.what} {100 * gap.untold:.2g} %" for gap in difference.gaps if gap.untold]
+    if not untold:
+        return []
+    return [f"Not a number in one run or in both, so that nobody can tell whether it is the same: {', '.join(untold)}."]
 
 
 def how_far(advance: Advance) -> str:

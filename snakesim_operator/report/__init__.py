@@ -1,6 +1,6 @@
 """The report on a run: one page that needs no network, no program and no other file, `report.html`.
 
-`write_report`   the page, into the run's folder
+`page`           the page
 `write_picture`  the best instant alone, as an SVG for a README
 
 `timeline`, `instants`, `verdict` work out what to say; `charts`, `top_view`, `polygon`, `torque_map` draw it;
@@ -8,7 +8,7 @@
 Like the rest of this package it imports the HAL only.
 """
 
-from snakesim_operator.report.page import write_report
+from snakesim_operator.report.page import page
 from snakesim_operator.report.picture import write_picture
 
-__all__ = ["write_picture", "write_report"]
+__all__ = ["page", "write_picture"]

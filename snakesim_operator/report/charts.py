@@ -19,6 +19,7 @@ from snakesim_operator.report.svg import (
     text_width,
     tick_text,
     ticks,
+    title,
 )
 from snakesim_operator.report.timeline import Band, Propulsion, thinned
 
@@ -153,7 +154,7 @@ def strip(frame: Frame, bands: list[Band], top: float, height: float, *, named: 
         left, right = frame.x(band.start_s), frame.x(band.end_s)
         box = element(
             "rect",
-            element("title", f"{band.what}, {band.start_s:.2f} to {band.end_s:.2f} s"),
+            title(f"{band.what}, {band.start_s:.2f} to {band.end_s:.2f} s"),
             x=left,
             y=top,
             width=max(right - left, 0.8),

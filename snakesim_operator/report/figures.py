@@ -7,7 +7,7 @@ from snakesim_operator.record import RunRecord
 from snakesim_operator.report import charts
 from snakesim_operator.report.charts import Frame
 from snakesim_operator.report.palette import joint_class
-from snakesim_operator.report.svg import element, line, text, text_width
+from snakesim_operator.report.svg import element, line, text, text_width, title
 from snakesim_operator.report.timeline import (
     Propulsion,
     Series,
@@ -18,6 +18,7 @@ from snakesim_operator.report.timeline import (
     state_bands,
     zero_s,
 )
+from snakesim_operator.summary import largest
 
 Floats = NDArray[np.float64]
 LOWERED = 0.995  # of the joint's limit: a controller's own limit below that is drawn
@@ -69,9 +70,9 @@ def _staircase(record: RunRecord, frame: Frame, joints: list[int], intervals: li
             if one.joint != joint:
                 continue
             left, right = frame.x(one.start_s), frame.x(one.end_s)
-            title = element("title", f"{name}, {one.start_s:.2f} to {one.end_s:.2f} s")
+            told = title(f"{name}, {one.start_s:.2f} to {one.end_s:.2f} s")
             bar = {"x": left, "y": y + 3, "width": max(right - left, 1.0), "height": STEP - 6}
-            parts.append(element("rect", title, class_=f"stair {joint_class(joint)}", **bar))
+            parts.append(element("rect", told, class_=f"stair {joint_class(joint)}", **bar))
             words = f"{one.length_s:.1f} s"
             if right - left > text_width(words, 11) + 6:
                 parts.append(text((left + right) / 2, y + STEP / 2 + 4, words, "tiny on-colour", anchor="middle"))
@@ -125,8 +126,8 @@ def torque_use(record: RunRecord, width: float) -> str:
     """The hardest-worked joint's torque as a share of its limit; at the limit it is marked."""
     time_s = record.time_s - zero_s(record)
     limits = np.array([joint.torque_limit_nm for joint in record.description.joints])
-    share = 100 * (np.abs(record.torque_nm) / limits).max(axis=1)
-    frame = Frame(width, 170, end_s(record), 0.0, max(float(share.max()), 100.0) * 1.12)
+    share = 100 * np.fmax.reduce(np.abs(record.torque_nm) / limits, axis=1)
+    frame = Frame(width, 170, end_s(record), 0.0, max(largest(share) or 0.0, 100.0) * 1.12)
     return charts.chart(
         frame,
         "Largest torque of any joint as a share of its limit",
@@ -155,7 +156,7 @@ def contact_force(record: RunRecord, width: float) -> str:
 def contact_count(record: RunRecord, width: float) -> str:
     """How many obstacles are touched over time; three make a triplet."""
     time_s = record.time_s - zero_s(record)
-    frame = Frame(width, 130, end_s(record), 0.0, max(float(np.nanmax(record.contact_count)), 3.0) + 0.7)
+    frame = Frame(width, 130, end_s(record), 0.0, max(largest(record.contact_count) or 0.0, 3.0) + 0.7)
     return charts.chart(
         frame,
         "Obstacles touched over time",

@@ -3,12 +3,15 @@
 from collections.abc import Callable, Sequence
 from html import escape
 
+from snakesim_hal.terminal import printable
+
+KEPT = "\n\u202f\u00a0"  # line breaks of a configuration, and the blanks in large numbers
 MINUS_SAFE = str.maketrans({"-": "−"})
 
 
 def words(value: object) -> str:
-    """Text, escaped."""
-    return escape(str(value))
+    """Text, escaped; what would turn the text around it, or end it, is shown as `\\u202e`."""
+    return escape(printable(str(value), KEPT))
 
 
 def paragraph(value: str, class_: str = "") -> str:

@@ -5,7 +5,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from snakesim_operator.record import CONFIG, REPORT, RunRecord
+from snakesim_operator.record import CONFIG, RunRecord
 from snakesim_operator.report import figures, tables
 from snakesim_operator.report.cards import instants_section
 from snakesim_operator.report.html import absent, document, paragraph, responsive, section, shown, tile, words
@@ -27,13 +27,6 @@ from snakesim_operator.summary import RunSummary
 HERE = Path(__file__).parent
 HALF_WIDTH = 500.0
 NO_TICKS = "The run has no ticks: the robot was never armed, so nothing was recorded."
-
-
-def write_report(record: RunRecord, summary: RunSummary) -> Path:
-    """Write report.html into the run's folder."""
-    path = record.folder / REPORT
-    path.write_text(page(record, summary), encoding="utf-8")
-    return path
 
 
 def page(record: RunRecord, summary: RunSummary) -> str:
@@ -76,12 +69,14 @@ def _header(record: RunRecord, summary: RunSummary) -> str:
         f"{summary.pace}, {summary.rate_hz:g} Hz",
         f"seed {summary.seed}",
     ]
+    lacks = paragraph(f"The record lacks something. {'. '.join(summary.lacks)}.", "lacks") if summary.lacks else ""
     shown_tiles = "".join(tile(one.name, one.value, one.unit, alarming=one.alarming) for one in tiles(record, summary))
     return (
         f'<header id="header"><p class="kicker">SnakeSIM run report <span>{words(summary.scenario)}</span></p>'
         f"<h1>{words(record.config.title or summary.scenario)}</h1>"
         f'<p class="facts">{" · ".join(f"<span>{words(fact)}</span>" for fact in facts)}</p>'
-        f'<p class="verdict {judged.kind}">{words(judged.words)}</p><div class="tiles">{shown_tiles}</div></header>'
+        f'<p class="verdict {judged.kind}">{words(judged.words)}</p>{lacks}'
+        f'<div class="tiles">{shown_tiles}</div></header>'
     )
 
 

@@ -6,6 +6,8 @@ What it looks like stands in figure.css and palette.py; a figure only names clas
 import math
 from html import escape
 
+from snakesim_hal.terminal import printable
+
 Point = tuple[float, float]
 Attribute = str | float | int | None
 
@@ -24,7 +26,7 @@ def element(name: str, *children: str, **attributes: Attribute) -> str:
     for key, value in attributes.items():
         if value is None:
             continue
-        shown = escape(value) if isinstance(value, str) else number(value)
+        shown = escape(printable(value)) if isinstance(value, str) else number(value)
         parts.append(f'{key.rstrip("_").replace("_", "-")}="{shown}"')
     opening = " ".join(parts)
     return f"<{opening}>{''.join(children)}</{name}>" if children else f"<{opening}/>"
@@ -34,13 +36,18 @@ def text(x: float, y: float, words: str, class_: str = "", *, anchor: str = "sta
     """A line of text. anchor: start, middle or end; turn: degrees."""
     return element(
         "text",
-        escape(words, quote=False),
+        escape(printable(words), quote=False),
         x=x,
         y=y,
         class_=class_ or None,
         text_anchor=None if anchor == "start" else anchor,
         transform=f"rotate({number(turn)} {number(x)} {number(y)})" if turn else None,
     )
+
+
+def title(words: str) -> str:
+    """What a browser shows when the pointer rests on the element around it."""
+    return element("title", escape(printable(words), quote=False))
 
 
 def line(a: Point, b: Point, class_: str) -> str:

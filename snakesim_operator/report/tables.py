@@ -5,6 +5,7 @@ from typing import Any, get_type_hints
 import msgspec
 from msgspec import Meta
 
+from snakesim_hal.fault_log import FIRST_KEPT
 from snakesim_operator.report.html import absent, shown, table, words
 from snakesim_operator.summary import RunSummary
 
@@ -50,6 +51,9 @@ def faults(summary: RunSummary, zero_s: float) -> str:
         [f"{fault.tick / summary.rate_hz - zero_s:.2f} s", fault.what, fault.joint or "–", fault.cause]
         for fault in summary.faults
     ]
+    if summary.faults_left_out:
+        told = f"{summary.faults_left_out} more, between the first and the newest, are left out"
+        rows.insert(FIRST_KEPT, ["…", "", "–", told])
     return table(["when", "what", "joint", "cause"], rows)
 
 

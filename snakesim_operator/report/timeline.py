@@ -122,7 +122,7 @@ def distance(record: RunRecord) -> Series | None:
     """Advance since the first tick: along the route, else of the tail as the controller knew it, else as it flies."""
     count = len(record.time_s)
     rows = np.unique(np.linspace(0, count - 1, min(count, POSE_SAMPLES)).astype(int)) if count else np.array([], int)
-    rows = np.array([row for row in rows if not np.isnan(record.position_w[row]).any()], dtype=int)
+    rows = rows[record.posed[rows]]
     if len(rows) > 1:
         time_s = record.time_s[rows] - zero_s(record)
         arc = [arc_position_m(record, int(row)) for row in rows]
@@ -132,6 +132,15 @@ def distance(record: RunRecord) -> Series | None:
         moved = record.position_w[rows, :2] - record.position_w[rows[0], :2]
         return Series(time_s, np.hypot(*moved.T), "distance of the tail end from where it was")
     return told_distance(record)
+
+
+def came_to_rest_s(record: RunRecord, within_m: float) -> float | None:
+    """Since when the body has stayed where it was at the end, on the time axis; None when nobody measured where."""
+    moved = distance(record)
+    if moved is None or not len(moved.value):
+        return None
+    away = np.flatnonzero(np.abs(moved.value - moved.value[-1]) > within_m)
+    return float(moved.time_s[away[-1] + 1]) if len(away) else 0.0
 
 
 def told_distance(record: RunRecord) -> Series | None:

@@ -23,6 +23,7 @@ from snakesim_operator.report.svg import (
     round_below,
     text,
     text_width,
+    title,
 )
 from snakesim_operator.report.view import EDGE, FELT_SHARE, FOOT, View, nodes_xy_w
 
@@ -74,15 +75,15 @@ def _obstacle(item: Placed, view: View, labels: Labels) -> str:
     if not (-reach < x < view.width + reach and -reach < y < view.height - FOOT + reach):
         return ""
     labels.keep_off((x - reach, y - reach, x + reach, y + reach), 0.15)
-    title = element("title", obstacle.name.replace("&", "&amp;").replace("<", "&lt;"))
+    told = title(obstacle.name)
     if obstacle.shape != "box":
-        return element("circle", title, cx=x, cy=y, r=obstacle.radius_m * view.scale, class_=class_)
+        return element("circle", told, cx=x, cy=y, r=obstacle.radius_m * view.scale, class_=class_)
     c, s = math.cos(obstacle.yaw_rad), math.sin(obstacle.yaw_rad)
     a, b = obstacle.half_size_m[:2]
     centre = np.array(obstacle.position_w[:2])
     around = [(a, b), (-a, b), (-a, -b), (a, -b)]
     corners = [view.at(centre + np.array([c * u - s * v, s * u + c * v])) for u, v in around]
-    return element("polygon", title, points=points_text(corners), class_=class_)
+    return element("polygon", told, points=points_text(corners), class_=class_)
 
 
 def _body(record: RunRecord, instant: Instant, view: View, nodes: Floats, labels: Labels) -> str:

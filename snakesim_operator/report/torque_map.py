@@ -13,6 +13,7 @@ from snakesim_operator.report.charts import Frame, chart, time_axis
 from snakesim_operator.report.palette import LIGHT
 from snakesim_operator.report.svg import element, line, text
 from snakesim_operator.report.timeline import Propulsion, end_s
+from snakesim_operator.summary import largest
 
 Floats = NDArray[np.float64]
 COLUMNS = 480
@@ -80,7 +81,7 @@ def joint_map(
 def full_colour_nm(record: RunRecord) -> float:
     """The torque that is drawn in full colour: the run's largest, unless that is next to nothing."""
     least = 0.05 * max(joint.torque_limit_nm for joint in record.description.joints)
-    return max(float(np.nanmax(np.abs(record.torque_nm))), least, 1e-9)
+    return max(largest(np.abs(record.torque_nm)) or 0.0, least, 1e-9)
 
 
 def strongest(values: Floats, columns: int) -> Floats:

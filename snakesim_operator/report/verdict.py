@@ -4,11 +4,14 @@ from dataclasses import dataclass
 from typing import Literal
 
 from snakesim_operator.record import RunRecord
-from snakesim_operator.report.timeline import end_s, propulsion_intervals, state_bands, told_at_s
+from snakesim_operator.report.timeline import came_to_rest_s, end_s, propulsion_intervals, state_bands, told_at_s
 from snakesim_operator.summary import RunSummary
 
 MOVED_M = 0.02  # less than this is no locomotion
-STOPPED_S = 0.5  # a shorter stop at the end is not worth a word
+LEAST_STOP_S = 0.5  # a shorter stop at the end is not worth a word
+RESTING_SHARE = 0.02  # of all its way: what is so near to the end of it has arrived, but for who moves to the last,
+REST_SHARE, REST_S = 0.1, 5.0  # which is told from a rest by how long it takes: a tenth of the run, or so many seconds
+POOR_SHARE = 0.5  # a run that stood still for more of its time than this, up to its end, is no good one
 SHOWN_HANDOVERS = 8
 Kind = Literal["good", "poor", "bad"]
 
@@ -42,7 +45,8 @@ def verdict(record: RunRecord, summary: RunSummary) -> Verdict:
         at_s = fault.tick / summary.rate_hz - (float(record.time_s[0]) if len(record.time_s) else 0.0)
         joint = f" at {fault.joint}" if fault.joint else ""
         what = f"Stopped by a fault after {max(at_s, 0.0):.1f} s{joint}: {_sentence(fault.cause)}"
-        return Verdict("bad", f"{what} Before that: {moved[0].lower()}{moved[1:]}.")
+        said = _control_said(record, at_s)
+        return Verdict("bad", f"{what}{said} Before that: {moved[0].lower()}{moved[1:]}.")
     harm = _harm(summary)
     ending = "" if summary.ended == "complete" else f" The run ended early: {_sentence(summary.ended)}"
     distance = _distance_m(summary)
@@ -54,9 +58,12 @@ def verdict(record: RunRecord, summary: RunSummary) -> Verdict:
             why = "the snake stayed where it was, although its controller reported Locomoting"
         kind = "Jammed" if summary.jammed else "Did not locomote"
         return Verdict("poor", f"{kind}: {_sentence(why)} {moved}; {harm}.{ending}")
-    stopped = _stopped(record)
-    if summary.jammed and stopped:
-        return Verdict("poor", f"Jammed. {moved}; {_handed_over(record, summary)}{harm}.{stopped}{ending}")
+    stop = _stop(record, abs(distance))
+    stopped = "" if stop is None else f" Locomotion ended at {stop.at_s:.1f} s of {end_s(record):.1f} s: {stop.why}"
+    if stop is not None and not stop.on_purpose and (summary.jammed or stop.share > POOR_SHARE):
+        kind = "Jammed" if summary.jammed else "Stopped"
+        said = f"{kind} at {stop.at_s:.1f} s of {end_s(record):.1f} s: {stop.why.removeprefix('jammed: ')}"
+        return Verdict("poor", f"{said} {moved}; {_handed_over(record, summary)}{harm}.{ending}")
     jam = "it jammed on the way; " if summary.jammed else ""
     good: Kind = "poor" if ending or distance < 0 else "good"
     return Verdict(good, f"{moved}; {_handed_over(record, summary)}{jam}{harm}.{stopped}{ending}")
@@ -116,14 +123,34 @@ def _handed_over(record: RunRecord, summary: RunSummary) -> str:
     return f"propulsion handed over {len(names) - 1} times among {distinct} joints ({shown}); "
 
 
-def _stopped(record: RunRecord) -> str:
-    """When and why locomotion came to its end before the run did."""
-    bands = state_bands(record)
-    if len(bands) < 2 or bands[-1].what == "Locomoting" or end_s(record) - bands[-1].start_s < STOPPED_S:
-        return ""
-    at_s = bands[-1].start_s
-    reason = next(state.reason for state in record.control if told_at_s(record, state) >= at_s)
-    return f" Locomotion ended at {at_s:.1f} s: {_sentence(reason)}"
+def _control_said(record: RunRecord, at_s: float) -> str:
+    """What control lacked when the robot was stopped: a fault of the lease only tells that no command came."""
+    told = [state for state in record.control if told_at_s(record, state) <= at_s]
+    return f" Control said: {_sentence(told[-1].reason)}" if told and told[-1].state == "NotLocomoting" else ""
+
+
+@dataclass(frozen=True)
+class _Stop:
+    """The end of locomotion, before that of the run."""
+
+    at_s: float
+    share: float  # of the run that it stood still for then
+    why: str
+    on_purpose: bool
+
+
+def _stop(record: RunRecord, moved_m: float) -> _Stop | None:
+    """When and why it came to rest, by what control told and by what was measured; None when it did not."""
+    bands, end = state_bands(record), end_s(record)
+    at_s = bands[-1].start_s if len(bands) > 1 and bands[-1].what != "Locomoting" else end
+    rest_s = came_to_rest_s(record, min(MOVED_M, RESTING_SHARE * moved_m))
+    if rest_s is not None and at_s - rest_s > max(LEAST_STOP_S, min(REST_SHARE * end, REST_S)):
+        at_s = rest_s
+    if end - at_s < LEAST_STOP_S:
+        return None
+    after = [state for state in record.control if told_at_s(record, state) >= at_s and state.state != "Locomoting"]
+    why = after[0].reason if after else "its controller reported Locomoting all the same"
+    return _Stop(at_s, (end - at_s) / end, _sentence(why), bool(after) and after[-1].state == "Idle")
 
 
 def _sentence(words: str) -> str:

@@ -16,7 +16,7 @@ import msgspec
 from snakesim_operator.record import SUMMARY
 from snakesim_operator.summary import RunSummary
 
-SNAKESIM = [sys.executable, "-m", "snakesim_operator.cli"]
+SNAKESIM = [sys.executable, "-m", "snakesim_operator"]
 LIMIT_S = 90.0
 
 

@@ -1,5 +1,6 @@
 """Wrong files and flags: one clear error, exit code 2, nothing started, nothing left."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -22,7 +23,7 @@ WRONG = {
     "overlap": (["triplet", "--set", "scene.pegs_along_route.0.corridor_m=0.02"], ["overlaps", "link_", "mm"]),
     "controller setting": (["triplet", "--set", "control.propulsion_n=-1"], ["propulsion_n", "-1"]),
     "unknown controller": (["triplet", "--controller", "wiggle"], ["'wiggle'", "hold", "obstacle_triplet"]),
-    "controller file": (["triplet", "--controller", "./no.py:No"], ["no file"]),
+    "controller file": (["triplet", "--controller", "./no.py:No"], ["no.py: no such file"]),
     "unknown backend": (["triplet", "--backend", "gazebo"], ["'gazebo'", "can, sim"]),
     "too much for the bus": (
         ["triplet", "--backend", "can", "--set", "robot.chain.modules=18", "--set", "rate_hz=200"],
@@ -37,6 +38,26 @@ WRONG = {
     "missing field": (["./missing.toml"], ["missing.toml", "`controller` is missing"]),
     "robot file": (["./bad_robot.toml"], ["my_robot.toml", "mass_kg", "heavy"]),
     "scene file": (["./bad_scene.toml"], ["my_scene.toml", "friction"]),
+    "route kind": (["triplet", "--set", 'scene.route.kind="spiral"'], ["'spiral'", "one of 'sine', 'waypoints'"]),
+    "controller without a class": (
+        ["triplet", "--controller", "./wave.py"],
+        ["wave.py:Wave", "classes in it are Wave"],
+    ),
+    "controller file that is a pipe": (["triplet", "--controller", "./pipe.py:X"], ["pipe.py: is a pipe"]),
+    "endpoint": (["triplet", "--endpoint", "banana"], ["--endpoint banana", "such as tcp/127.0.0.1:7447"]),
+    "port 0": (["triplet", "--endpoint", "tcp/127.0.0.1:0"], ["from 1 to 65535", "such as tcp/127.0.0.1:7447"]),
+    "port 70000": (["triplet", "--router", "tcp/127.0.0.1:70000"], ["--router", "from 1 to 65535"]),
+    "no locator": (["triplet", "--endpoint", "127.0.0.1:7447"], ["such as tcp/127.0.0.1:7447"]),
+    "namespace": (["triplet", "--namespace", "a/*"], ["--namespace 'a/*'", "such as planar13"]),
+    "scenario that is a pipe": (["./pipe.toml"], ["pipe.toml: is a pipe"]),
+    "scenario without an end": (["./endless.toml"], ["endless.toml: is a device"]),
+    "robot that is a pipe": (["triplet", "--set", "robot=./pipe.toml"], ["pipe.toml: is a pipe"]),
+    "scene without an end": (["triplet", "--set", "scene=/dev/zero"], ["/dev/zero: is a device"]),
+    "deep JSON": (["./deep.json"], ["deep.json: ", "nested deeper"]),
+    "50,000 parts": (["triplet", "--set", ".".join("a" * 50_000) + "=1"], ["at most 16 are allowed"]),
+    "UTF-16": (["./utf16.toml"], ["utf16.toml: is UTF-16"]),
+    "steering": (["./steering.toml"], ["unknown field `\\u001b[2J\\u202e`"]),
+    "too many pegs": (["./crowded.toml"], ["20000 obstacles; at most 4096"]),
 }
 
 
@@ -49,6 +70,18 @@ def folder(tmp_path: Path) -> Path:
     (tmp_path / "bad_robot.toml").write_text(scenario.replace('"planar13"', '"my_robot.toml"'))
     (tmp_path / "my_scene.toml").write_text(SCENE.read_text().replace("friction = 0.1", "friction = 99.0"))
     (tmp_path / "bad_scene.toml").write_text(scenario.replace('scene = "triplet"', 'scene = "my_scene.toml"'))
+    (tmp_path / "wave.py").write_text("class Wave: ...\n")
+    for name in ("pipe.py", "pipe.toml"):
+        os.mkfifo(tmp_path / name)
+    (tmp_path / "endless.toml").symlink_to("/dev/zero")
+    (tmp_path / "deep.json").write_text('{"a":' * 100_000)
+    (tmp_path / "utf16.toml").write_text(scenario, encoding="utf-16")
+    (tmp_path / "steering.toml").write_text(f'"\\u001b[2J\\u202e" = 1\n{scenario}')
+    pegs = "".join(f"[[cylinder]]\nposition_m = [{9 + i % 900}, 9]\nradius_m = 0.1\n" for i in range(20_000))
+    (tmp_path / "crowd.toml").write_text(f"name = 'crowd'\n[ground]\nfriction = 0.1\n{pegs}")
+    (tmp_path / "crowded.toml").write_text(
+        scenario.replace('scene = "triplet"', 'scene = "crowd.toml"').replace("tail_s_m = 0.0", "on_route = false")
+    )
     return tmp_path
 
 

@@ -11,7 +11,7 @@ import pytest
 from snakesim_hal.messages import Mode
 from snakesim_operator.record import SUMMARY, RunRecord
 from snakesim_operator.summary import RunSummary
-from tests.e2e.command import nothing_left, running, snakesim
+from tests.e2e.command import nothing_left, run_to_summary, running, snakesim
 
 pytestmark = pytest.mark.e2e
 
@@ -74,17 +74,38 @@ def test_killed_supervisor_leaves_nothing_running(tmp_path: Path) -> None:
         nothing_left(tmp_path / "run")
 
 
-def test_a_controller_that_raises_is_named(tmp_path: Path) -> None:
-    (tmp_path / "broken.py").write_text(
-        "from snakesim_gnc.control.hold import Hold\n\n\n"
-        "class Broken(Hold):\n"
+WRONG_ANSWERS = {
+    "length": ("angles[:-1]", "SetPoints.mode has 12 values, must have 13: one a joint, joint_1 to joint_13"),
+    "nan": (
+        "[*angles[:3], float('nan'), *angles[4:]]",
+        "SetPoints.target[3] (joint_4) is nan, must be a finite number",
+    ),
+    "raises": ("1 / 0", "update() raised ZeroDivisionError: division by zero (wave.py line 11)"),
+}
+
+
+@pytest.mark.parametrize("pace", ["lockstep", "realtime"])
+@pytest.mark.parametrize("wrong", WRONG_ANSWERS)
+def test_a_controller_that_answers_wrongly_is_named_at_once(tmp_path: Path, wrong: str, pace: str) -> None:
+    answer, words = WRONG_ANSWERS[wrong]
+    (tmp_path / "wave.py").write_text(
+        "from snakesim_gnc.control.controller import Action, SetPoints\n"
+        "from snakesim_gnc.control.hold import Hold\n"
+        "from snakesim_hal.messages import Mode\n\n\n"
+        "class Wave(Hold):\n"
         "    def update(self, view):\n"
-        "        if view.tick > 20:\n"
-        "            raise ZeroDivisionError('as planned')\n"
-        "        return super().update(view)\n"
+        "        if view.time_s < 0.5:\n"
+        "            return super().update(view)\n"
+        "        angles = list(view.joints.angle_rad)\n"
+        f"        angles = {answer}\n"
+        "        return Action(SetPoints([Mode.POSITION] * len(angles), angles, [7.0] * 13))\n"
     )
-    ended = snakesim("run", "triplet", "--controller", "./broken.py:Broken", "--out", "run", cwd=tmp_path)
-    assert ended.code == 1
-    assert "ZeroDivisionError: as planned" in ended.out
-    assert "control ended with exit code 1" in ended.out
+    flags = ["--controller", "./wave.py:Wave", "--pace", pace, "--duration", "60"]
+    ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
+    said = f"controller ./wave.py:Wave (class Wave): {words}"
+    assert ended.code == 1 and summary.duration_s < 5.0  # not after the time that a stalled service is given
+    assert summary.ended.startswith(f"control ended with exit code 1: {said}")
+    assert f"fault: control ended with exit code 1: {said}" in ended.out
+    assert summary.last_reason is not None and summary.last_reason.startswith(said)
+    assert (tmp_path / "run" / "control.log").read_text().splitlines()[-1].startswith(f"snakesim control: {said}")
     nothing_left(tmp_path / "run")

@@ -122,3 +122,12 @@ def test_run_from_a_file_of_ones_own_in_another_folder(tmp_path: Path) -> None:
     ended = snakesim("run", "./mine.toml", "--out", "out", cwd=tmp_path)
     assert ended.code == 0, ended.out + ended.err
     assert (tmp_path / "out" / "report.html").is_file()
+
+
+def test_a_host_that_is_held_up_costs_no_determinism(tmp_path: Path) -> None:
+    """Control hears nothing for more than a second of wall-clock time; in lockstep no robot time passes meanwhile."""
+    arguments = ["triplet", "--duration", "2", "--pace", "lockstep"]
+    _, plain = run_to_summary(tmp_path / "plain", *arguments)
+    ended, held_up = run_to_summary(tmp_path / "held-up", *arguments, "--fault", "freeze:host@1-2.4")
+    assert ended.code == 0, ended.out + ended.err
+    assert held_up.command_digest == plain.command_digest

@@ -1,21 +1,31 @@
 """The other commands: config, scenarios, echo, status, router, and controllers from outside."""
 
+import json
 import os
 import re
 import signal
 import subprocess
+import time
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from snakesim_hal import keys
+from snakesim_hal.files import find
+from snakesim_hal.messages import EstopRequest
+from snakesim_hal.session import Link, open_session
 from tests.e2e.command import (
     SNAKESIM,
+    Running,
     environment,
     free_endpoint,
     nothing_left,
     run_to_summary,
     running,
     snakesim,
+    wait_until,
 )
 
 pytestmark = pytest.mark.e2e
@@ -42,6 +52,129 @@ def test_scenarios_lists_what_is_shipped(tmp_path: Path) -> None:
         assert name in ended.out
 
 
+def echoed(run: Running, folder: Path, key: str, count: int, *more: str) -> list[dict[str, Any]]:
+    """What `snakesim echo` prints, each line read as JSON."""
+    ended = snakesim("echo", key, "--count", str(count), "--endpoint", run.endpoint, *more, cwd=folder)
+    assert ended.code == 0 and ended.err == "", ended.err
+    lines = [json.loads(line) for line in ended.out.splitlines()]
+    assert len(lines) == count and all(set(line) in ({"key", "message"}, {"key", "error"}) for line in lines)
+    return lines
+
+
+def test_echo_without_a_key_lists_the_keys(tmp_path: Path) -> None:
+    ended = snakesim("echo", cwd=tmp_path)
+    assert ended.code == 0, ended.err
+    listed = [line.split()[0] for line in ended.out.splitlines()]
+    assert listed == [row.key for row in keys.SPACE if row.kind in ("stream", "latched")]
+
+
+NASTY = "\x1b[2J\x9b31mroot\u202e\r\nplanar13: disarmed\x07"
+
+
+def test_nothing_from_the_network_steers_the_terminal(tmp_path: Path) -> None:
+    """A stranger's name is part of what `status`, `echo` and the run itself print."""
+    arguments = ["triplet", "--controller", "hold", "--duration", "600", "--pace", "realtime", "--stay"]
+    with running(tmp_path / "run", *arguments) as run:
+        run.wait_for(" s  ")
+        with open_session(Link(run.endpoint, "planar13")) as session:
+            session.ask(keys.ESTOP, EstopRequest(who=NASTY[:64]))
+        run.wait_for("estop")
+        status = snakesim("status", "--endpoint", run.endpoint, cwd=tmp_path)
+        assert "root" in status.out and "planar13: estop" in status.out
+        echo = snakesim("echo", "hal/status", "--count", "1", "--endpoint", run.endpoint, cwd=tmp_path)
+        assert "\x9b31mroot\u202e\r\n" in json.loads(echo.out)["message"]["why"]
+        os.kill(run.process.pid, signal.SIGINT)
+        assert run.end() == 130
+        for text in (status.out, echo.out, run.said()):
+            steering = [char for char in text if not char.isprintable() and char not in "\n"]
+            assert steering == [] and "\nplanar13: disarmed" not in text, text
+    nothing_left(tmp_path / "run")
+
+
+def test_version(tmp_path: Path) -> None:
+    ended = snakesim("--version", cwd=tmp_path)
+    assert ended.code == 0 and ended.out == f"snakesim {version('snakesim')}\n"
+
+
+def test_config_runs_no_code_of_a_file(tmp_path: Path) -> None:
+    (tmp_path / "wave.py").write_text("open('mark', 'w')\nclass Wave: ...\n")
+    for flags in (["--controller", "./wave.py:Wave"], ["--backend", "./wave.py:Wave"]):
+        ended = snakesim("config", "triplet", *flags, "--set", "controllers.Wave.gain=1", cwd=tmp_path)
+        assert ended.code == 0, ended.err
+        assert "ers.Wave: not checked" in ended.out or "ends.Wave: not checked" in ended.out
+    ended = snakesim("config", "triplet", "--controller", "./wave.py", cwd=tmp_path)
+    assert ended.code == 2 and "the classes in it are Wave" in ended.err
+    assert not (tmp_path / "mark").exists()
+
+
+def test_a_scenario_with_a_byte_order_mark(tmp_path: Path) -> None:
+    text = find("triplet", "scenarios").read_text(encoding="utf-8")
+    (tmp_path / "mine.toml").write_text(text, encoding="utf-8-sig")
+    ended = snakesim("config", "./mine.toml", cwd=tmp_path)
+    assert ended.code == 0 and "'mine'" in ended.out, ended.err
+
+
+def test_output_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [*SNAKESIM, "scenarios"], cwd=tmp_path, stdout=full, stderr=subprocess.PIPE, text=True, check=False
+        )
+    assert done.returncode == 1 and done.stderr.startswith("snakesim: ") and done.stderr.count("\n") == 1
+    seen = subprocess.run(
+        ["sh", "-c", f"{' '.join(SNAKESIM)} config triplet | head -1"],
+        cwd=tmp_path,
+        capture_output=True,
+        check=False,
+    )
+    assert seen.stderr == b"" and seen.stdout.count(b"\n") == 1
+
+
+INTERRUPTED = (
+    ["config", "triplet"],
+    ["scenarios"],
+    ["can", "load", "triplet"],
+    ["schemas", "--write", "schemas"],
+    ["echo", "hal/clock"],
+    ["status"],
+    ["arm", "planar13", "sim"],
+    ["modules", "triplet"],
+    ["run", "triplet", "--pace", "realtime", "--out", "run"],
+)
+
+
+@pytest.mark.parametrize("command", INTERRUPTED, ids=lambda command: command[0])
+def test_ctrl_c_at_any_moment_leaves_no_traceback(command: list[str], tmp_path: Path) -> None:
+    """From the first line of ours on; what comes before is the interpreter's own start."""
+    on_network = command[0] in ("echo", "status", "arm", "run")
+    endpoint = ["--endpoint", free_endpoint()] if on_network else []
+    for moment in range(14):
+        process = subprocess.Popen(
+            [*SNAKESIM, *command, *endpoint],
+            cwd=tmp_path,
+            env=environment(tmp_path),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=True,
+        )
+        wait_until(lambda pid=process.pid: first_line_ran(pid), "our first line")
+        time.sleep(0.06 * moment)
+        os.killpg(process.pid, signal.SIGINT)  # a terminal tells all that it has started
+        said, _ = process.communicate(timeout=60)
+        assert "Traceback" not in said and "KeyboardInterrupt" not in said, said
+        assert "Exception ignored" not in said, said
+    nothing_left(tmp_path / "run")
+
+
+def first_line_ran(pid: int) -> bool:
+    """Whether the interpreter's own handler of SIGINT is gone again, and the command's modules are being loaded."""
+    fields = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
+    maps = Path(f"/proc/{pid}/maps").read_text()
+    caught = int(fields.get("SigCgt", "0"), 16) >> (signal.SIGINT - 1) & 1
+    ended = fields["State"].strip().startswith("Z")
+    return ended or (not caught and ("lib-dynload" in maps or "site-packages" in maps))
+
+
 def test_echo_and_status_of_a_running_robot(tmp_path: Path) -> None:
     arguments = ["triplet", "--controller", "hold", "--duration", "600", "--pace", "realtime"]
     with running(tmp_path / "run", *arguments) as run:
@@ -50,9 +183,19 @@ def test_echo_and_status_of_a_running_robot(tmp_path: Path) -> None:
         found = re.findall(r"planar13/sensor/joints: ([\d.]+) Hz", rate.out)
         assert found and float(found[-1]) == pytest.approx(100, rel=0.1), rate.out + rate.err
         one = snakesim("echo", "hal/description", "--count", "1", "--endpoint", run.endpoint, cwd=tmp_path)
-        assert '"name":"joint_13"' in one.out
+        told = json.loads(one.out)
+        assert told["key"] == "planar13/hal/description" and told["message"]["joints"][12]["name"] == "joint_13"
+        found = echoed(run, tmp_path, "sensor/**", 40)
+        assert {"planar13/sensor/joints", "planar13/sensor/imu"} <= {line["key"] for line in found}
+        assert all("tick" in line["message"] for line in found)
+        everything = {line["key"] for line in echoed(run, tmp_path, "**", 200)}
+        assert {"planar13/hal/description", "planar13/hal/clock", "planar13/hal/done/guidance"} <= everything
+        named = echoed(run, tmp_path, "*/joints", 3, "--namespace", "planar13")
+        assert {line["key"] for line in named} <= {"sensor/joints", "actuator/joints"}
         unknown = snakesim("echo", "sensor/smell", "--endpoint", run.endpoint, cwd=tmp_path)
         assert unknown.code == 2 and "sensor/contacts" in unknown.err
+        wrong = snakesim("echo", "sensor/***", "--endpoint", run.endpoint, cwd=tmp_path)
+        assert wrong.code == 2 and "is not a key" in wrong.err and wrong.err.count("\n") == 1
         status = snakesim("status", "--endpoint", run.endpoint, cwd=tmp_path)
         assert status.code == 0 and "planar13: armed" in status.out and "control, guidance, navigation" in status.out
         os.kill(run.process.pid, signal.SIGINT)
@@ -84,7 +227,7 @@ def test_run_over_a_router_of_ones_own(tmp_path: Path) -> None:
         assert summary.ticks == 100 and summary.answered_fraction == 1.0
     finally:
         router.send_signal(signal.SIGINT)
-        assert router.wait(10) == 130
+        assert router.wait(10) == -signal.SIGINT  # which a shell shows as 130
 
 
 def test_a_router_file_that_zenoh_refuses(tmp_path: Path) -> None:
@@ -94,7 +237,7 @@ def test_a_router_file_that_zenoh_refuses(tmp_path: Path) -> None:
 
 
 def test_the_controller_of_the_tutorial(tmp_path: Path) -> None:
-    blocks = re.findall(r"```python\n(.*?)```", TUTORIAL.read_text(encoding="utf-8"), re.DOTALL)
+    blocks = re.findall(r"```python wave\.py\n(.*?)```", TUTORIAL.read_text(encoding="utf-8"), re.DOTALL)
     example = next(block for block in blocks if "class Wave" in block)
     assert len([line for line in example.splitlines() if line.strip()]) <= 24
     (tmp_path / "wave.py").write_text(example, encoding="utf-8")

@@ -63,12 +63,12 @@ def _measured(row: Row, backend: Backend, trials: int) -> Result:
     measure = row.on[backend]
     assert not isinstance(measure, str)
     started, load, done, broken = time.monotonic(), round(os.getloadavg()[0], 2), list[Trial](), ""
-    notes: list[str] = []
     wanted = max(trials, row.least) if trials >= TRIALS else trials
     print(f"{datetime.now():%H:%M:%S} {row.name} on {backend} ...", flush=True)
     with tempfile.TemporaryDirectory(prefix=f"snakesim-{row.name}-") as folder:
+        request = Request(backend, wanted, Path(folder), [])
         try:
-            for trial in measure(Request(backend, wanted, Path(folder), notes)):
+            for trial in measure(request):
                 done.append(trial)
                 if trial.trouble:
                     print(f"    {trial.trouble}", flush=True)
@@ -79,7 +79,8 @@ def _measured(row: Row, backend: Backend, trials: int) -> Result:
             print("\n".join(logs), file=sys.stderr, flush=True)
             broken = f"{type(error).__name__}: {error}"[:500]
     took_s = round(time.monotonic() - started, 1)
-    return _result(row, backend, took_s=took_s, load=load, trials=done, notes=notes, broken=broken)
+    told = {"trials": done, "retried": request.retried, "notes": request.notes, "broken": broken}
+    return _result(row, backend, took_s=took_s, load=load, **told)
 
 
 def _elsewhere(place: str, wanted: Sequence[Job], given: argparse.Namespace, store: Store) -> None:
@@ -114,7 +115,9 @@ def _told(row: Row, backend: str, store: Store) -> list[str]:
     verdict = judge(row, result)
     figures = "" if verdict.median is None else f"median {verdict.median:.1f}, worst {verdict.worst:.1f} {row.unit}, "
     outcome = "met" if verdict.met else f"NOT MET: {verdict.why}"
-    print(f"    {row.name} on {backend}: {figures}{len(result.trials)} trials in {result.took_s:.0f} s: {outcome}")
+    retried = f", {result.retried} retried" if result.retried else ""
+    trials = f"{len(result.trials)} trials{retried} in {result.took_s:.0f} s"
+    print(f"    {row.name} on {backend}: {figures}{trials}: {outcome}")
     sys.stdout.flush()
     return [] if verdict.met or verdict.explained else [f"{row.name} on {backend}"]
 

@@ -194,7 +194,7 @@ class Observer:
     def ask(self, key: str, request: Message) -> Answer:
         """Ask, and be answered; a no is an answer too. Raises TrialError when nobody answers."""
         try:
-            return self.session.ask_politely(key, request, timeout_s=5.0)
+            return self.session.ask(key, request, timeout_s=5.0)
         except NotConnectedError as error:
             raise TrialError(str(error)) from error
 
@@ -209,8 +209,14 @@ class Observer:
         """Clear what is latched, if anything is."""
         self.until(lambda: self.status is not None, "a status")
         if self.state() in ("fault", "estop"):
+            asked_ns = time.monotonic_ns()
             self.ask(keys.LIFECYCLE, LifecycleRequest(action="clear"))
-            self.until(lambda: self.state() == "disarmed", "disarmed after clear", 5.0)
+
+            def cleared() -> bool:  # if only for a moment: what goes wrong next is another fault
+                since = [h.message.lifecycle for h in self.statuses if h.at_ns > asked_ns]
+                return self.state() == "disarmed" or "disarmed" in since
+
+            self.until(cleared, "disarmed after clear", 5.0)
 
     def arm(self, limit_s: float = LIMIT_S) -> None:
         """Clear, arm as soon as the robot is ready, and wait until the controller's commands are applied.
@@ -224,8 +230,7 @@ class Observer:
                 raise TrialError(f"could not be armed within {limit_s:g} s: {self.in_words()}")
 
     def _armed(self, limit_s: float) -> bool:
-        self.clear()
-        self.until(lambda: self.status is not None and self.status.ready_to_arm, "ready to arm", limit_s)
+        self._make_ready(limit_s)
         robot = self.description()
         self.forget()
         request = LifecycleRequest(
@@ -235,6 +240,18 @@ class Observer:
             return False
         self.until(lambda: self._commanded() or self.state() == "fault", "commands applied after arming", 5.0)
         return self.state() != "fault"
+
+    def _make_ready(self, limit_s: float) -> None:
+        """Clear, as often as something more is told: what went wrong in the meantime is told after the clear."""
+        deadline = time.monotonic() + limit_s
+        while self.status is None or not self.status.ready_to_arm:
+            self.clear()
+            left_s = max(deadline - time.monotonic(), 0.1)
+            self.until(
+                lambda: self.status is not None and (self.status.ready_to_arm or self.state() == "fault"),
+                "ready to arm",
+                left_s,
+            )
 
     def _commanded(self) -> bool:
         return any(h.message.sequence is not None for h in self.applied)

@@ -9,7 +9,7 @@ from tests.faults.row import TRIALS, Result, Row, judge
 from tests.faults.table import HEADINGS, LEASE_MS, PERIOD_MS
 
 PAGE = ROOT / "docs" / "faults.md"
-COLUMNS = ("fault", "backend", "expected", "deadline", "median", "worst", "trials", "result", "recovery")
+COLUMNS = ("fault", "backend", "expected", "deadline", "median", "worst", "trials", "retried", "result", "recovery")
 
 INTRODUCTION = """\
 # The fault table
@@ -20,12 +20,16 @@ Made by `make faults`{when}; do not edit. Raw results of every trial: [`faults.j
 **How.** Each row injects a fault, measures, and asserts, at least 20 times on each backend. The robot is the 13-joint
 snake of the shipped scenario `triplet` at 100 Hz in real time (T = {period:.0f} ms, lease {lease:.0f} ms), with host,
 guidance, navigation and control as processes of their own; `can` is the CAN driver with module twins on a virtual bus,
-if nothing else is said. Rows that are about a bus or a module alone are measured at the driver.
+if nothing else is said. The host is the product's own process in every row but those that say so.
 
 **What the times are.** Upper bounds: from just before the injection until an observer has received the first set-points
 that are the host's own safe action (`hal/applied` without a sequence). The observer is a process of its own, with
 real-time priority where the system allows it. The lease counts from the last good command, and is looked at once a
 period; so what must be done within the lease is done at most one period after its end.
+
+**Retried.** How often a trial, or the arming that begins it, was made again because the robot had stopped by itself
+before anything was injected: a machine that is busy, or emulated, misses leases. A dash: measured before this was
+counted.
 
 **Recovery.** After each trial an operator's `clear` and `arm` bring the robot back; a trial counts as recovered when
 the controller's commands are applied again. *Step*: the largest change of an applied angle target from one tick to the
@@ -64,7 +68,7 @@ def _lines(results: dict[tuple[str, str], Result]) -> Iterator[str]:
         for row in heading.rows:
             for backend, measure in row.on.items():
                 if isinstance(measure, str):
-                    yield _line(row, backend, "-", "-", "-", f"not applicable: {measure}", "-")
+                    yield _line(row, backend, "-", "-", "-", "-", f"not applicable: {measure}", "-")
                 else:
                     yield _measured(row, backend, results.get((row.name, backend)))
         yield ""
@@ -84,14 +88,15 @@ def _summary(results: dict[tuple[str, str], Result]) -> Iterator[str]:
 
 def _measured(row: Row, backend: str, result: Result | None) -> str:
     if result is None:
-        return _line(row, backend, "-", "-", "0", "**not run**", "-")
+        return _line(row, backend, "-", "-", "0", "-", "**not run**", "-")
     verdict = judge(row, result)
     median = "-" if verdict.median is None else f"{verdict.median:.3g} {row.unit}"
     worst = "-" if verdict.worst is None else f"{verdict.worst:.3g} {row.unit}"
     outcome = "met" if verdict.met else f"**not met**: {_escaped(verdict.why[:300])}"
     trials = str(len(result.trials))
     trials += "" if len(result.trials) >= max(TRIALS, row.least) else f" of {max(TRIALS, row.least)}"
-    return _line(row, backend, median, worst, trials, outcome, _recovery(result))
+    retried = "-" if result.retried is None else str(result.retried)
+    return _line(row, backend, median, worst, trials, retried, outcome, _recovery(result))
 
 
 def _notes(row: Row, results: dict[tuple[str, str], Result]) -> Iterator[str]:

@@ -49,11 +49,11 @@ class Robot:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._stack.close()
         for child in self.running.values():
             with contextlib.suppress(ProcessLookupError):
                 child.process.send_signal(signal.SIGCONT)
         children.stop_all(list(self.running.values()))
+        self._stack.close()
 
     def start(self, name: str) -> Child:
         """Start one of its processes."""
@@ -65,7 +65,9 @@ class Robot:
             module = ["snakesim_hal.router_process", *common]
         else:
             module = ["snakesim_hal.serve", name, *common]
-        self.running[name] = children.start(name, module, self.folder / f"{name}.log")
+        log = self._stack.enter_context((self.folder / f"{name}.log").open("ab", buffering=0))
+        state = {"XDG_STATE_HOME": str(self.folder)}  # what outlives a run must not outlive this one
+        self.running[name] = children.start(name, module, log.write, more=state)
         return self.running[name]
 
     def start_all(self) -> None:
@@ -92,7 +94,8 @@ class Robot:
 
     def last_words(self) -> str:
         """Of those that are gone."""
-        return " | ".join(child.last_words() for child in self.running.values() if child.how_it_ended())
+        ended = [child for child in self.running.values() if child.how_it_ended()]
+        return " | ".join(line for child in ended for line in child.last_words())
 
     def signal(self, name: str, number: signal.Signals) -> int:
         """Send a signal to one of its processes; when, by the monotonic clock."""
@@ -137,13 +140,7 @@ def robot(request: Request, **dotted: Any) -> Iterator[tuple[Robot, Observer]]:
         observer = made.observe()
         observer.arm(START_LIMIT_S)
         yield made, observer
-        tell_stumbles(request, observer)
-
-
-def tell_stumbles(request: Request, observer: Observer) -> None:
-    """So that what was tried again is not kept quiet."""
-    if observer.stumbles:
-        request.note(f"on {request.backend}, {observer.stumbles} armings did not last, and were made again")
+        request.retry(observer.stumbles)
 
 
 def recovered(observer: Observer, value: float | None, trouble: str = "", limit_s: float = START_LIMIT_S) -> Trial:

@@ -33,18 +33,24 @@ class Result(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     load: float  # the machine's, when it began
     machine: str
     trials: list[Trial]
+    retried: int | None = None  # trials that were made again, see `Request.retry`; None: it was not counted then
     notes: list[str] = []
     broken: str = ""  # why it ended early
 
 
-@dataclass(frozen=True)
+@dataclass
 class Request:
-    """What a measurement is asked for."""
+    """What a measurement is asked for, and what it tells besides its trials."""
 
     backend: str
     trials: int
     folder: Path  # its own, empty
     notes: list[str]  # what should stand beside the row
+    retried: int = 0
+
+    def retry(self, times: int = 1) -> None:
+        """A trial is made again: its arming did not last, or the robot had stopped before anything was injected."""
+        self.retried += times
 
     def note(self, text: str) -> None:
         """Once, however often it is said."""

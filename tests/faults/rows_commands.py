@@ -35,6 +35,7 @@ def out_of_time(request: Request) -> Iterator[Trial]:
             "reordered": (stranger.reordered, "replayed"),
             "duplicated": (stranger.duplicated, "replayed"),
             "future": (stranger.future, "from_the_future"),
+            "without an arming": (stranger.without_arming, "before_arming"),
         }
 
     yield from _among_good_ones(request, kinds)
@@ -217,7 +218,7 @@ class TwoWriters:
 
     def _offer(self, given: JointCommand, sequence: int, epoch: int) -> str | None:
         made = msgspec.structs.replace(
-            given, sequence=sequence, tick=self.tick, lease_epoch=epoch, arming=self.authority.arming or None
+            given, sequence=sequence, tick=self.tick, lease_epoch=epoch, arming=self.authority.arming
         )
         age_ns = self.rng.randrange(LEASE_NS)
         return self.authority.offer(made, now_ns=self.now_ns, tick=self.tick, age_ns=age_ns)

@@ -1,176 +1,115 @@
-"""Joint modules and buses that fail, through the product's own injector.
+"""Joint modules and buses that fail, through the product's own injector, in a robot with all its processes.
 
-Those of CAN alone are measured at the driver, with module twins on a virtual bus, in periods of robot time: stepped, so
-that the machine's load does not count. What sensors of any backend can do is measured through a whole robot.
+Those of CAN alone are told in periods of robot time, from the host's ticks: a machine that is late by some milliseconds
+does not count, one that misses a period does. What sensors of any backend can do is measured from outside.
 """
 
 import random
+import re
 import time
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Iterator
 
-import numpy as np
-
-from snakesim_can_backend.protocol import ModuleState
-from snakesim_hal.backend import SetPoints
-from snakesim_hal.errors import BackendError
+from snakesim_can_backend.protocol import Action
 from snakesim_hal.injection import Injection, checked
-from tests.faults.observer import TrialError
-from tests.faults.robot import recovered, robot
+from snakesim_hal.messages import Answer, Status
+from tests.faults import bus_log
+from tests.faults.observer import Observer, TrialError
+from tests.faults.robot import START_LIMIT_S, Robot, configuration, recovered, robot
 from tests.faults.row import Measure, Request, Trial
-from tests.unit.can_backend.loop import JOINTS, Loop, config, loop
 
 PERIOD_MS = 10.0
-BOOT_TICKS = 15  # of the twins, before their first Sync counts
-MOST_TICKS = 40  # until a fault must have been found
-REST_TICKS = 40  # until all joints must be at rest
-CLEAR_TICKS = 12
-AT_REST_RAD_S = 0.05
 ASKED_FOR_S = 0.3
-HARMLESS = 5  # periods after an arming in which nothing new may be wrong
+REST_S = 0.4  # until all motors must be off
+OFF_NM = 0.1  # what noise makes of none
+CUT_OFF = ("cut", "bus_off", "full")  # of a bus that takes no frame any more: modules stop by themselves
+BUS_KINDS = (*CUT_OFF, "error_passive", "overflow")
+BUS_LOG = "bus.log"
+SAID_AT = re.compile(r"at ([0-9.]+) s of robot time")
 
 
-class PacedLoop(Loop):
-    """In real time: stepped twins live from Sync to Sync, and stand still on a bus that is cut."""
+def at_host(kind: str, what: str) -> Measure:
+    """A fault of joint_N or bus_1 on CAN, asked of the host. what: the name that the driver gives it.
 
-    due_s = 0.0
-
-    def run(self, ticks: int, wish: Callable[[int], SetPoints] | None = None) -> None:
-        """So many periods of wall time."""
-        for _ in range(ticks):
-            super().run(1, wish)
-            now_s = time.monotonic()
-            self.due_s = max(self.due_s + PERIOD_MS / 1000, now_s)
-            time.sleep(self.due_s - now_s)
-
-
-@contextmanager
-def paced_loop() -> Iterator[Loop]:
-    """Open, and close at the end."""
-    with loop(config(pace="realtime")) as opened:
-        yield PacedLoop(opened.backend, opened.config)
-
-
-def at_driver(kind: str, what: str, *, paced: bool = False) -> Measure:
-    """A fault of joint_N or bus_1 on CAN. what: the name that the driver gives it.
-
-    The value: from the moment right after the module answered, the worst, to the safe action on the bus.
+    The value: from its beginning, which is just before a Sync, to the safe action, which goes out where the set-points
+    of that period would have; for a module from its last good answer, a period earlier.
     """
 
     def measure(request: Request) -> Iterator[Trial]:
-        rng = random.Random(5)
-        opened: AbstractContextManager[Loop] = paced_loop() if paced else loop()
-        request.note(
-            "measured at the driver in periods of robot time, "
-            + ("which go with the wall clock" if paced else "stepped, whatever the machine's load")
-        )
-        with opened as run:
-            run.run(BOOT_TICKS)
+        rng, log = random.Random(5), request.folder / BUS_LOG
+        with robot(request, backend__log=str(log)) as (made, observer):
             for _ in range(request.trials):
-                joint = rng.randrange(JOINTS)
-                target = "bus_1" if kind in BUS_KINDS else f"joint_{joint + 1}"
-                yield _trial(run, checked(Injection(kind, target)), what, rng, request)
+                made.set_in_motion(observer)
+                number = rng.randrange(len(observer.description().joints)) + 1
+                yield _trial(observer, Injection(kind, "bus_1" if kind in BUS_KINDS else f"joint_{number}"), what)
+        stops = bus_log.commands(bus_log.read(log), Action.STOP)
+        if kind not in CUT_OFF and stops < request.trials:
+            raise TrialError(f"{stops} Stops on the bus in {request.trials} trials")
+        request.note("the real host process, in real time; counted in its periods")
 
     return measure
 
 
-BUS_KINDS = ("cut", "bus_off", "error_passive", "overflow", "full")
+def _trial(observer: Observer, injection: Injection, what: str) -> Trial:
+    injection, asked_ns = checked(injection), time.monotonic_ns()
+    begun = _begun_tick(observer.inject("hal", injection.kind, injection.target, for_s=ASKED_FOR_S))
+    status = observer.first_fault(asked_ns)
+    found = min((fault for fault in status.faults if fault.tick >= begun), key=lambda fault: fault.tick, default=None)
+    if found is None:
+        return Trial(value=None, trouble=f"nothing found after tick {begun}: {status.faults}")
+    observer.watch(REST_S)
+    troubles = _objections(observer, injection, what, asked_ns)
+    if injection.target_type == "joint" and found.joint != injection.target:
+        troubles.append(f"{found.joint} was named, not {injection.target}: {found.cause}")
+    observer.watch(ASKED_FOR_S)
+    periods = found.tick - begun + (2 if injection.target_type == "joint" else 1)
+    return recovered(observer, PERIOD_MS * periods, "; ".join(troubles))
 
 
-def _trial(run: Loop, injection: Injection, what: str, rng: random.Random, request: Request) -> Trial:
-    run.wanted, run.faults = None, []
-    run.arm()
-    run.run(rng.randrange(20, 50), run.waving)
-    if run.faults or run.lifecycle != "armed":
-        raise TrialError(f"a fault before the injection: {run.faults}")
-    start = run.tick
-    first_frame: int | None = None
-    restarts = [module.restarts for module in run.backend._reading.modules]
-
-    def inject_then_wave(tick: int) -> SetPoints:
-        if tick == start:
-            run.backend.inject(injection, begins=True)
-        return run.waving(tick)
-
-    while not run.faults and run.tick - start < MOST_TICKS:
-        run.run(1, inject_then_wave)
-    if not run.faults:
-        return Trial(value=None, trouble=f"not found within {MOST_TICKS} periods")
-    value = PERIOD_MS * (run.tick - start)  # the safe action goes out where the set-points of this tick would have
-    stopped_tick = run.tick
-    for _ in range(REST_TICKS):
-        run.run(1)
-        now = [module.restarts for module in run.backend._reading.modules]
-        first_frame = run.tick if first_frame is None and now != restarts else first_frame
-    troubles = _objections(run, injection, what)
-    if first_frame is not None:
-        named = next((f.tick for f in run.faults if f.what == "module_restarted"), None)
-        if first_frame < stopped_tick:
-            troubles.append("the restarted module was heard before the group was stopped")
-        if named is not None:
-            request.note(
-                f"the group is stopped before the restarted module's first frame; it is named as restarted "
-                f"{PERIOD_MS * max(named - first_frame + 1, 0):.0f} ms after that frame, when it cannot be a second "
-                f"module with the same id any more"
-            )
-    back = _back(run, injection, troubles)
-    return Trial(value=value, trouble="; ".join(troubles), recovered=back)
+def _begun_tick(answer: Answer) -> int:
+    """The first tick that a fault concerns: it begins before the Sync."""
+    said = SAID_AT.search(answer.reason)
+    if said is None:
+        raise TrialError(f"the injector does not say when: {answer.reason}")
+    return round(float(said[1]) * 1000 / PERIOD_MS)
 
 
-def _objections(run: Loop, injection: Injection, what: str) -> list[str]:
+def _objections(observer: Observer, injection: Injection, what: str, asked_ns: int) -> list[str]:
     """What is not as it must be after the safe action."""
     troubles: list[str] = []
-    if what not in [fault.what for fault in run.faults]:
-        troubles.append(f"found as {[fault.what for fault in run.faults]}, not {what}")
-    if injection.target_type == "joint" and run.faults[0].joint != injection.target:
-        troubles.append(f"{run.faults[0].joint} was named, not {injection.target}: {run.faults[0].cause}")
-    if run.true_speed_rad_s[-1] > AT_REST_RAD_S:
-        troubles.append(f"still moving at {run.true_speed_rad_s[-1]:.2f} rad/s after {REST_TICKS} periods")
-    if run.lifecycle != "fault":
-        troubles.append(f"not latched: {run.lifecycle}")
+    told: list[Status] = [heard.message for heard in observer.statuses if heard.at_ns >= asked_ns]
+    words = {fault.what for status in told for fault in status.faults}
+    if what not in words:
+        troubles.append(f"found as {sorted(words)}, not {what}")
+    if observer.state() != "fault":
+        troubles.append(f"not latched: {observer.in_words()}")
+    joints = observer.joints[max(observer.joints)]
+    aside = {injection.number} if injection.target_type == "joint" else set[int]()
+    torques = [
+        abs(torque)
+        for i, (torque, valid) in enumerate(zip(joints.torque_nm, joints.valid, strict=True))
+        if valid and i not in aside
+    ]
+    if max(torques, default=0.0) > OFF_NM:
+        troubles.append(f"a motor still gives {max(torques):.2f} N·m after {REST_S:g} s")
     return troubles
 
 
-def _back(run: Loop, injection: Injection, troubles: list[str]) -> bool:
-    """It ends; somebody clears and arms; the robot moves as before."""
-    if not injection.about.once:
-        run.backend.inject(injection, begins=False)
-    run.run(CLEAR_TICKS)
-    run.lifecycle, told = "disarmed", len(run.faults)
-    run.run(CLEAR_TICKS)
-    if run.lifecycle != "disarmed":  # what had gone wrong meanwhile is told once more after the first clear
-        run.lifecycle, told = "disarmed", len(run.faults)
-        run.run(CLEAR_TICKS)
-    run.wanted = None
-    before = np.array(run.samples[-1].joints.angle_rad)
-    run.lifecycle = "armed"
-    run.run(8)
-    if set(run.states()) != {ModuleState.ARMED}:
-        troubles.append(f"not armed again: {run.states()}, {run.faults[told:]}")
-        return False
-    jump = float(np.abs(np.array(run.samples[-1].joints.angle_rad) - before).max())
-    if jump > AT_REST_RAD_S:
-        troubles.append(f"a joint jumped by {jump:.3f} rad at arming")
-    run.run(HARMLESS + 25, run.waving)
-    if len(run.faults) > told:
-        troubles.append(f"something is wrong again: {run.faults[told:][0]}")
-        return False
-    moved = max(run.true_speed_rad_s[-20:]) > AT_REST_RAD_S
-    run.lifecycle = "disarmed"
-    run.run(HARMLESS)
-    return moved
-
-
 def twice_at_start(request: Request) -> Iterator[Trial]:
-    """A node id that is there twice when the driver opens. The value: modules that it enabled all the same."""
+    """A node id that is there twice when the host opens its bus. The value: modules that it enabled all the same."""
+    joints = configuration("can").robot.chain.modules
     for number in range(request.trials):
-        joint = f"joint_{number % JOINTS + 1}"
-        try:
-            with loop(faults=[f"duplicate:{joint}@0"]) as run:
-                yield Trial(value=float(run.states().count(ModuleState.ARMED)), trouble="it was opened")
-        except BackendError as error:
-            trouble = "" if joint in str(error) and "2 times" in str(error) else f"in other words: {error}"
-            yield Trial(value=0.0, trouble=trouble)
+        joint, folder = f"joint_{number % joints + 1}", request.folder / str(number)
+        folder.mkdir()
+        log = folder / BUS_LOG
+        config = configuration("can", backend__log=str(log), backend__faults=[f"duplicate:{joint}@0"])
+        with Robot(folder, config) as made:
+            host = made.start("host")
+            host.process.wait(START_LIMIT_S)
+            words = "\n".join(host.last_words())
+        trouble = "" if joint in words and "2 times" in words else f"in other words: {words}"
+        frames = bus_log.read(log)
+        yield Trial(value=float(bus_log.commands(frames, Action.ARM) + bus_log.set_points(frames)), trouble=trouble)
+    request.note("the real host process, which says why it refuses; enabled is what its bus log shows")
 
 
 def through_robot(kind: str, *words: str) -> Measure:

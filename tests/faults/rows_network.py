@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from tests.faults.observer import Observer, TrialError
-from tests.faults.robot import START_LIMIT_S, Robot, configuration, recovered, tell_stumbles
+from tests.faults.robot import START_LIMIT_S, Robot, configuration, recovered
 from tests.faults.row import Request, Trial
 
 DOWN_S = 0.4  # how long there is no router
@@ -49,7 +49,7 @@ def router_restarts(request: Request) -> Iterator[Trial]:
             took_s = time.monotonic() - started
             slowest_s = max(slowest_s, took_s)
             yield _after(observer, tick, [f"reconnected only after {took_s:.1f} s"] if took_s > RECONNECT_S else [])
-        tell_stumbles(request, observer)
+        request.retry(observer.stumbles)
         request.note(
             f"everything connected again at most {slowest_s:.1f} s after the router's process was started again "
             f"(deadline {RECONNECT_S:g} s); the safe stop is told by the tick that the host gives its fault"
@@ -108,7 +108,7 @@ def network_cut(request: Request) -> Iterator[Trial]:
                 if observer.state() != "fault" or any(h.message.sequence is not None for h in observer.applied):
                     troubles.append(f"not latched: {observer.in_words()}")
                 yield recovered(observer, value, "; ".join(troubles))
-            tell_stumbles(request, observer)
+            request.retry(observer.stumbles)
             request.note(
                 f"two network namespaces with a veth pair, one end down for {CUTS_S[0]:g} to {CUTS_S[-1]:g} s; "
                 f"everything connected again at most {slowest_s:.1f} s after the link was up"

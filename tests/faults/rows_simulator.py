@@ -6,7 +6,9 @@ from collections.abc import Iterator
 import msgspec
 import numpy as np
 
-from snakesim_hal.host_process import BLACK_BOX, HOST_RECORD, HostRecord
+from snakesim_hal.blackbox import read_black_box
+from snakesim_hal.host_process import HostRecord
+from snakesim_hal.recorder import BLACK_BOX, HOST_RECORD
 from tests.faults.observer import TrialError
 from tests.faults.robot import START_LIMIT_S, recovered, robot
 from tests.faults.row import Request, Trial
@@ -49,7 +51,7 @@ def diverges(request: Request) -> Iterator[Trial]:
             made.running["host"].process.wait(START_LIMIT_S)
             observer.listen()
             left = msgspec.json.decode(record.read_bytes(), type=HostRecord)
-            box = np.load(request.folder / BLACK_BOX)
+            _, box = read_black_box(request.folder / BLACK_BOX)
             troubles: list[str] = []
             fault = next((f for f in left.faults if "diverged" in f.cause), None)
             if fault is None:

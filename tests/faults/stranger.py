@@ -75,6 +75,10 @@ class Stranger:
         forged = self.forged()
         self.send(msgspec.structs.replace(forged, tick=forged.tick + 50))
 
+    def without_arming(self) -> None:
+        """An answer to the newest state that names no arming."""
+        self.send(self.forged(arming=0))
+
     def replayed(self) -> None:
         """The bytes of a command of a while ago."""
         self._resend(20)

@@ -3,6 +3,7 @@
 import signal
 from dataclasses import dataclass
 
+from snakesim_hal import keys
 from snakesim_hal.injection import KINDS
 from tests.faults import (
     rows_commands,
@@ -13,6 +14,7 @@ from tests.faults import (
     rows_modules,
     rows_network,
     rows_simulator,
+    rows_streams,
 )
 from tests.faults.row import Backend, Measure, Place, Row
 
@@ -83,7 +85,7 @@ def joint_row(name: str, kind: str, what: str) -> Row:
         "50 ms from right after the module's last good answer to the safe action on the bus",
         50.0,
         "ms",
-        {"sim": NO_MODULES, "can": rows_modules.at_driver(kind, what)},
+        {"sim": NO_MODULES, "can": rows_modules.at_host(kind, what)},
     )
 
 
@@ -105,15 +107,7 @@ def isolated_row(name: str, fault: str, kind: str) -> Row:
     return asked_row(name, fault, expected, rows_isolation.set_aside(kind))
 
 
-def bus_row(
-    name: str,
-    fault: str,
-    kind: str,
-    what: str,
-    limit_ms: float = 3 * PERIOD_MS,
-    *,
-    paced: bool = False,
-) -> Row:
+def bus_row(name: str, fault: str, kind: str, what: str, limit_ms: float = 3 * PERIOD_MS) -> Row:
     """A bus on CAN."""
     return Row(
         name,
@@ -122,7 +116,7 @@ def bus_row(
         f"{limit_ms:.0f} ms to the safe action on the bus",
         limit_ms,
         "ms",
-        {"sim": NO_BUS, "can": rows_modules.at_driver(kind, what, paced=paced)},
+        {"sim": NO_BUS, "can": rows_modules.at_host(kind, what)},
     )
 
 
@@ -130,6 +124,19 @@ def consumer_row(name: str, fault: str, kind: str) -> Row:
     """Somebody who listens."""
     expected = "no control cycle is missed, the robot goes on"
     return Row(name, fault, expected, "-", 0.0, "more missed cycles", both(rows_consumers.cannot_keep_up(kind)))
+
+
+def stream_row(name: str, key: str, oldest_ms: float) -> Row:
+    """A stream without which the controller holds. oldest_ms: what the scenario's `max_age` comes to."""
+    return Row(
+        name,
+        f"{key}: all of it is lost",
+        "the push ends, every joint holds its position, control/state names the stream; goes on when it is back",
+        f"{oldest_ms:.0f} ms, which is how old it may be, and a tick (10 ms) of injector, control and host",
+        oldest_ms + 3 * PERIOD_MS,
+        "ms",
+        both(rows_streams.withheld(key)),
+    )
 
 
 HEADINGS: tuple[Heading, ...] = (
@@ -154,8 +161,8 @@ HEADINGS: tuple[Heading, ...] = (
         "100 ms",
         (
             watchdog_row("host_silent", "the host says nothing any more, at one module", rows_guest.watchdog, 100.0),
-            watchdog_row("host_killed", "driver: SIGKILL", rows_guest.host_gone(signal.SIGKILL), IN_GUEST_MS, "guest"),
-            watchdog_row("host_frozen", "driver: SIGSTOP", rows_guest.host_gone(signal.SIGSTOP), IN_GUEST_MS, "guest"),
+            watchdog_row("host_killed", "host: SIGKILL", rows_guest.host_gone(signal.SIGKILL), IN_GUEST_MS, "guest"),
+            watchdog_row("host_frozen", "host: SIGSTOP", rows_guest.host_gone(signal.SIGSTOP), IN_GUEST_MS, "guest"),
         ),
     ),
     Heading(
@@ -252,6 +259,26 @@ HEADINGS: tuple[Heading, ...] = (
         ),
     ),
     Heading(
+        "a stream that control acts on stops: of a sensor, of guidance, of navigation",
+        "without joint states: safe stop; without another: the controller holds, and goes on when it is back",
+        "joints: 30 ms and the lease; others: their `max_age`",
+        (
+            Row(
+                "stream_joints",
+                "sensor/joints: all of it is lost",
+                "no command on a state that is too old: safe stop by the lease, lease freed, fault latched",
+                "30 ms that a state may be old, the lease (50 ms), and a tick (10 ms) of injector, control and host",
+                30.0 + LEASE_MS + 3 * PERIOD_MS,
+                "ms",
+                both(rows_streams.no_joints),
+            ),
+            stream_row("stream_pose", keys.POSE, 240.0),
+            stream_row("stream_contacts", keys.CONTACTS, 240.0),
+            stream_row("stream_world", keys.WORLD, 220.0),
+            stream_row("stream_trajectory", keys.TRAJECTORY, 840.0),
+        ),
+    ),
+    Heading(
         "one joint fails, and the robot file allows for it (`may_lose_joints = 1`)",
         "that joint is let go, the others go on",
         "50 ms",
@@ -267,16 +294,16 @@ HEADINGS: tuple[Heading, ...] = (
         "fault; recovers only to disarmed; duplicate refused at arming",
         "2-3 T; flood 100 ms",
         (
-            bus_row("bus_off", "the controller leaves the bus", "bus_off", "bus_off", paced=True),
+            bus_row("bus_off", "the controller leaves the bus", "bus_off", "bus_off"),
             bus_row("bus_error_passive", "more than 127 errors", "error_passive", "error_passive"),
-            bus_row("bus_queue_full", "the transmit queue stays full", "full", "bus_stuck", paced=True),
-            bus_row("bus_interface_down", "the interface goes down", "cut", "interface_down", paced=True),
+            bus_row("bus_queue_full", "the transmit queue stays full", "full", "bus_stuck"),
+            bus_row("bus_interface_down", "the interface goes down", "cut", "interface_down"),
             bus_row("bus_receive_overflow", "received frames get lost", "overflow", "receive_overflow"),
             bus_row("bus_babbling", "a node floods the bus", "babble", "module_babbling", 100.0),
             bus_row("bus_duplicate", "a second node with the same id appears", "duplicate", "duplicate_node", 100.0),
             Row(
                 "bus_duplicate_at_start",
-                "two nodes with the same id are there when the driver opens",
+                "two nodes with the same id are there when the host opens the bus",
                 "refused, with the joint and both serials; nothing is enabled",
                 "before anything is enabled",
                 0.0,

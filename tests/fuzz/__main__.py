@@ -10,7 +10,7 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from tests.fuzz import network
+from tests.fuzz import bus, inputs, network
 from tests.fuzz.run import run
 
 GROWTH_MB = 16.0  # more than what an allocator keeps back
@@ -43,7 +43,8 @@ def over_network(asked: argparse.Namespace) -> int:
 
 
 def in_process(asked: argparse.Namespace) -> int:
-    """Every decoder, and a HAL without a network."""
+    """Every decoder, and a HAL without a network; of the payloads a tenth more goes to files, and a tenth to a bus."""
+    beside_the_wire(asked.payloads // 10, asked.seed)
     started = time.monotonic()
     report = run(asked.payloads, asked.seed)
     total: Counter[str] = Counter()
@@ -58,6 +59,16 @@ def in_process(asked: argparse.Namespace) -> int:
         f"{report.resident_mb[-1]:.0f} MB at the end, {report.peak_mb:.0f} MB at most"
     )
     return 0 if report.growth_mb <= GROWTH_MB else 1
+
+
+def beside_the_wire(payloads: int, seed: int) -> None:
+    """Datagrams, files, flags; and frames on a CAN bus."""
+    with tempfile.TemporaryDirectory(prefix="snakesim-fuzz-") as folder, inputs.all_inputs(Path(folder)) as found:
+        for name, outcome in inputs.run(found, max(payloads // len(found), 1), seed).items():
+            words = ", ".join(f"{count} {word}" for word, count in outcome.words.most_common())
+            print(f"{name:24} {words}; {1e3 * outcome.longest_s:.0f} ms at most")
+    words = bus.run(payloads, seed)
+    print("frames on a CAN bus      " + ", ".join(f"{count} {word}" for word, count in words.most_common()))
 
 
 if __name__ == "__main__":

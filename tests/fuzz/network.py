@@ -18,8 +18,10 @@ import msgspec
 import numpy as np
 
 from snakesim_hal import keys
-from snakesim_hal.host_process import BLACK_BOX, HOST_RECORD, HostRecord
+from snakesim_hal.blackbox import read_black_box
+from snakesim_hal.host_process import HostRecord
 from snakesim_hal.messages import Mode, Status
+from snakesim_hal.recorder import BLACK_BOX, HOST_RECORD
 from snakesim_hal.session import Link, Session, open_session
 from tests.e2e.command import LIMIT_S, Running, processes_of, running, wait_until
 from tests.fuzz.vitals import Vitals, complaints, parts, vitals
@@ -199,8 +201,8 @@ def _complaints(out: Path) -> list[str]:
 def _foreign(out: Path, record: HostRecord) -> list[str]:
     """Set-points that the holding controller did not ask for."""
     found = [f"fault {fault.what}: {fault.cause}" for fault in record.faults]
-    with np.load(out / BLACK_BOX) as box:
-        modes, targets = box["mode"], box["target"]
+    _, box = read_black_box(out / BLACK_BOX)
+    modes, targets = box["mode"], box["target"]
     if (modes != Mode.POSITION).any():
         found.append(f"{int((modes != Mode.POSITION).any(axis=1).sum())} ticks in another mode than position")
     elif len(targets) and (targets != targets[-1]).any():

@@ -13,7 +13,6 @@ WARM_UP_S = 20.0  # of a process: until then, anything may grow
 LONG_ENOUGH_S = 300.0  # of a process that a slope is told of
 GROWTH_MB_MIN = 4.0  # a minute
 GROWTH_MB = 24.0  # in all
-BLACK_BOX_MB_S = 75 * 8 * 100 / 2**20 + 0.01  # the host keeps every tick of planar13 at 100 Hz, and latencies
 MORE_THREADS, MORE_FILES = 8, 16
 ORPHANED_S = 10.0
 
@@ -62,12 +61,11 @@ class Health:
             if len(rows) < 3:
                 continue
             lasted_s = rows[-1].at_s - rows[0].at_s
-            kept_mb = BLACK_BOX_MB_S * lasted_s if name == "host" else 0.0
-            grown_mb = rows[-1].vitals.resident_mb - rows[0].vitals.resident_mb - kept_mb
+            grown_mb = rows[-1].vitals.resident_mb - rows[0].vitals.resident_mb
             if grown_mb > GROWTH_MB:
                 found.append(f"{name} (process {pid}) grew by {grown_mb:.1f} MB in {lasted_s:.0f} s")
             if lasted_s > LONG_ENOUGH_S and grown_mb > GROWTH_MB / 4:
-                slope = self._slope_mb_min(rows) - (60 * BLACK_BOX_MB_S if name == "host" else 0.0)
+                slope = self._slope_mb_min(rows)
                 if slope > GROWTH_MB_MIN:
                     found.append(f"{name} (process {pid}) grows by {slope:.1f} MB a minute")
             for what, first, last, more in (

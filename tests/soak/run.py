@@ -182,7 +182,7 @@ class Operator:
 
     def _try(self, request: LifecycleRequest) -> str:
         try:
-            answer = self._watch.session.ask_politely(keys.LIFECYCLE, request, timeout_s=5.0)
+            answer = self._watch.session.ask(keys.LIFECYCLE, request, timeout_s=5.0)
         except NotConnectedError as error:
             return str(error)
         self._spend(0.1)
@@ -196,7 +196,7 @@ class Operator:
         give_up = time.monotonic() + RECOVERY_S
         while True:
             try:
-                return self._watch.session.ask_politely(keys.fault(part), request, timeout_s=5.0)
+                return self._watch.session.ask(keys.fault(part), request, timeout_s=5.0)
             except NotConnectedError as error:
                 if time.monotonic() > give_up:
                     return Answer(ok=False, reason=str(error), refusal="no_answer")

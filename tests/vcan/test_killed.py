@@ -1,7 +1,7 @@
 """Processes that are killed with SIGKILL while the robot is armed, as a listener on the bus sees it.
 
-Host, control and modules are the processes of `snakesim run` and `snakesim modules`, the driver is one of its own; the
-listener has the kernel's time of every frame. `pytest -rP tests/vcan/test_killed.py` prints a row for each.
+Host, control and modules are the processes of `snakesim run` and `snakesim modules`; the listener has the kernel's time
+of every frame. `pytest -rP tests/vcan/test_killed.py` prints a row for each.
 """
 
 import os
@@ -145,10 +145,14 @@ class Bench:
         return started
 
     def host(self) -> subprocess.Popen[str]:
-        return self.start("host", "snakesim_hal.host_process", *self._network, "--out", str(self.folder))
+        return self.start("host", "snakesim_hal.host_process", *self.host_arguments)
 
     def control(self) -> subprocess.Popen[str]:
         return self.start("control", "snakesim_hal.serve", "control", *self._network)
+
+    @property
+    def host_arguments(self) -> Sequence[str]:
+        return (*self._network, "--out", str(self.folder))
 
     @property
     def _saved(self) -> str:
@@ -206,7 +210,7 @@ class Operator:
     def _ready(self) -> bool:
         status = self.status()
         if status is not None and status.lifecycle == "fault":
-            self._session.ask_politely(keys.LIFECYCLE, LifecycleRequest(action="clear"), timeout_s=10.0)
+            self._session.ask(keys.LIFECYCLE, LifecycleRequest(action="clear"), timeout_s=10.0)
             print(f"cleared: {status.why}")
             self._status = None
         self._robot = (self._descriptions.drain() or [self._robot])[-1]
@@ -308,15 +312,12 @@ def test_a_killed_controller_makes_the_driver_stop_the_modules(tmp_path: Path, c
         )
 
 
-def test_a_killed_driver_leaves_every_module_to_its_own_watchdog(tmp_path: Path, channel: str) -> None:
+def test_a_killed_host_leaves_every_module_to_its_own_watchdog(tmp_path: Path, channel: str) -> None:
     with bench(tmp_path, channel) as robot:
-        robot.modules()
-        driver = robot.start("driver", "tests.vcan.driver", str(robot.folder / "config.json"))
+        host, _, operator = all_armed(robot)
         armed = [ModuleState.ARMED] * JOINTS
-        robot.until(lambda: robot.listener.states() == armed, "every module armed")
-        robot.until(lambda: len(robot.listener.of(Opcode.SET_POINT)) > 10 * JOINTS, "set-points")
-        assert robot.listener.states() == armed, robot.said("driver")
-        killed_ns = killed(driver)
+        assert robot.listener.states() == armed, f"{operator.status()}, {robot.said('host')}"
+        killed_ns = killed(host)
         period_ms = robot.config.period_ns / 1e6
         fault = {ModuleState.FAULT}
         robot.until(lambda: len(first_in(robot.listener.listen(), fault, killed_ns)) == JOINTS, "modules in fault")
@@ -343,7 +344,7 @@ def test_a_killed_driver_leaves_every_module_to_its_own_watchdog(tmp_path: Path,
         assert max(own_ms) <= 100 + period_ms and min(own_ms) > 100 - period_ms
         assert robot.listener.states() == [ModuleState.FAULT] * JOINTS
         print(
-            f"| driver, SIGKILL | last frame {last_ms:.1f} ms after it | all modules FAULT (watchdog), "
+            f"| host, SIGKILL | last frame {last_ms:.1f} ms after it | all modules FAULT (watchdog), "
             f"motor off, {max(took_ms):.0f} ms after their last set-point by the kernel's clock, "
             f"{min(own_ms):.0f} to {max(own_ms):.0f} ms by their own | watchdog 100 ms |"
         )

@@ -62,9 +62,7 @@ class ObstacleTriplet:
         self._robot = robot
         self._set = settings
         self._body = PlanarBody(robot)
-        self._progress = Progress(
-            self._body, speed_filter_s=settings.speed_filter_s, oldest_world_s=settings.world_age_s
-        )
+        self._progress = Progress(self._body, speed_filter_s=settings.speed_filter_s)
         self._hand_over = HandOver(robot)
         self._triplets = Triplets(
             condition_max=settings.condition_max,
@@ -95,7 +93,7 @@ class ObstacleTriplet:
         if located.trajectory.speed_m_s <= 0:
             self._choice = None
             self._stall_watch.forget()
-        if located.fresh or located.new_path:
+        if located.fresh or located.anew:
             self._look(located, lie)
             self._choose(view, located, lie)
         self._guard(view, lie)
@@ -115,18 +113,18 @@ class ObstacleTriplet:
         return Action(SetPoints(mode, targets, limits_nm), self._report_push(located, lie, choice, push))
 
     def _follow(self, view: View, located: Located) -> Lie:
-        """Where the joints in position mode want the body; starts, and goes on to a new path, without a jump."""
+        """Where the joints in position mode want the body; starts, and goes on from another place, without a jump."""
         set_, s, before = self._set, located.tail_s_m, self._lie
-        if before is None or located.new_path:
+        if before is None or located.anew:
             lie = located.on_path.at(s)
         else:
             most_m = max(located.trajectory.speed_m_s, 0.0) * set_.overspeed_share * view.period_s
             followed = min(max(before.tail_s_m, s - set_.slack_m), s + set_.slack_m, before.tail_s_m + most_m)
             lie = located.on_path.at(max(followed, s - set_.brake_m))
         reference = self._body.all_angles(lie)
-        if before is None:
+        if not len(self._reference):
             self._hand_over.start(view.joints, reference)
-        elif located.new_path:
+        elif located.anew:
             self._hand_over.shift(reference - self._reference)
         self._lie, self._reference = lie, reference
         return lie
@@ -152,7 +150,7 @@ class ObstacleTriplet:
     def _look(self, located: Located, lie: Lie) -> None:
         """Plan the contacts with the obstacles near the body, and see which of them it is at."""
         world = located.world
-        if located.new_path:
+        if located.anew:
             self._planned.clear()
         near = {obstacle.name: obstacle for obstacle in world.obstacles}
         for name in [name for name in self._planned if name not in near]:
@@ -239,11 +237,14 @@ class ObstacleTriplet:
     # --- what it tells ---------------------------------------------------------------------------------------
 
     def _wait(self, view: View, why: str) -> Action:
-        """Without knowing where the body is: every joint stays where it was meant to be."""
-        self._choice = None
-        if self._lie is None:
-            return Action(positions(self._robot, view.joints.angle_rad), Report(why=why))
+        """Without knowing where the body is, nothing pushes: every joint goes where it was meant to be, and stays."""
+        self._choice, self._asked_n = None, 0.0
+        self._stall_watch.forget()
+        if not len(self._reference):
+            self._reference = np.array(view.joints.angle_rad)
+            self._hand_over.start(view.joints, self._reference)
         self._hand_over.pass_to(None, view.joints, self._reference)
+        self._hand_over.fade(view.period_s / self._set.blend_s)  # what the joint pushed with, too
         targets = self._hand_over.positions_rad(self._reference).tolist()
         return Action(positions(self._robot, targets), Report(why=why, reference_rad=self._reference.tolist()))
 

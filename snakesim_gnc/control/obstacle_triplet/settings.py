@@ -59,6 +59,5 @@ class Settings(FileStruct, frozen=True, kw_only=True):
     overspeed_share: Annotated[float, Meta(ge=1, le=100, extra_json_schema={"unit": "1"})] = 1.2
     brake_m: Annotated[float, from_zero(1, "m")] = 0.02
 
-    # Filter of the speed along the path, and the oldest world model that is still acted on.
+    # Filter of the speed along the path.
     speed_filter_s: Annotated[float, from_zero(1, "s")] = 0.03
-    world_age_s: Annotated[float, above(10, "s")] = 0.25

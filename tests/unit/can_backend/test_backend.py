@@ -6,6 +6,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import can
 import numpy as np
 import pytest
 
@@ -34,12 +35,13 @@ from snakesim_can_backend.twin.firmware import Module
 from snakesim_can_backend.twin.inertia import InertiaPlant, InertiaSettings
 from snakesim_can_backend.twin.server import Here, TwinServer, here
 from snakesim_can_backend.wire import OtherEnd, VirtualWire
+from snakesim_hal import keys
 from snakesim_hal.backend import SetPoints
 from snakesim_hal.errors import BackendError, ConfigError
 from snakesim_hal.injection import Injection
-from snakesim_hal.messages import LifecycleState, Mode
+from snakesim_hal.messages import LifecycleState, Mode, Pose
 from snakesim_hal.scenario import RunConfig
-from tests.unit.can_backend.loop import JOINTS, Loop, config, loop
+from tests.unit.can_backend.loop import JOINTS, Loop, armed, config, loop
 from tests.unit.can_backend.twin import rig
 
 ARMED, DISARMED, EMERGENCY = ModuleState.ARMED, ModuleState.DISARMED, ModuleState.EMERGENCY
@@ -522,7 +524,7 @@ class NoProcess:
 @pytest.fixture
 def two_buses(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[list[int]], Loop]]:
     """Opens a driver for two buses with so many joints each, on twins with three and one."""
-    run, channels = config(), ["bus_a", "bus_b"]
+    run, channels = config(robot__sensors__pose__rate_hz=100.0), ["bus_a", "bus_b"]
     real = Settings(channels=channels, joints_per_channel=[3, 1], twins="process", plant="inertia")
     chain = ModuleChain(run, real, InertiaPlant(run, InertiaSettings()), stepped=True)
     end = OneChain(TwinServer([VirtualWire(name) for name in channels], chain))
@@ -640,7 +642,7 @@ def test_closing_disarms_and_twice_is_harmless() -> None:
 
 
 def test_closing_goes_on_when_a_bus_is_broken(monkeypatch: pytest.MonkeyPatch) -> None:
-    with loop(pose_listen="127.0.0.1:0") as run:
+    with loop(config(robot__sensors__pose__rate_hz=100.0), pose_listen="127.0.0.1:0") as run:
         mocap = run.backend._mocap
         assert mocap is not None
         host, _, port = mocap.address.rpartition(":")
@@ -648,11 +650,67 @@ def test_closing_goes_on_when_a_bus_is_broken(monkeypatch: pytest.MonkeyPatch) -
         def broken(_frame: Frame) -> bool:
             raise BackendError("the bus is broken")
 
+        def gone() -> None:
+            raise can.CanOperationError("the bus is gone")
+
         WIRES[0].refuses = broken
-        run.backend.close()
+        with monkeypatch.context() as patched:
+            patched.setattr(WIRES[0]._bus, "shutdown", gone)
+            run.backend.close()
         assert WIRES[0].closed == 1
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
             free.bind((host, int(port)))
+
+
+def test_a_datagram_that_cannot_be_decoded_does_no_harm() -> None:
+    with loop(config(robot__sensors__pose__rate_hz=100.0), pose_listen="127.0.0.1:0") as run:
+        mocap = run.backend._mocap
+        assert mocap is not None
+        host, _, port = mocap.address.rpartition(":")
+        run.arm()
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+            stranger.sendto(b'{"a":' + b"[" * 2000, (host, int(port)))
+            run.run(5, run.waving)
+        assert run.faults == [] and run.lifecycle == "armed"
+
+
+def test_poses_need_a_delay_that_somebody_has_stated() -> None:
+    with pytest.raises(ConfigError, match=r"pose_listen.*\[sensors\.pose\].*delay_s"):
+        CanBackend.check(config(), Settings(pose_listen="127.0.0.1:0"))
+    CanBackend.check(config(robot__sensors__pose__delay_s=0.02), Settings(pose_listen="127.0.0.1:0"))
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.03])
+def test_a_pose_of_twins_is_as_old_as_the_robot_file_says(delay_s: float) -> None:
+    """To the bit, in lockstep; and the description says so."""
+    with loop(config(robot__sensors__pose__delay_s=delay_s), plant="mujoco") as run:
+        (sensor,) = [s for s in run.backend.describe().sensors if s.key == keys.POSE]
+        assert sensor.delay_s == delay_s
+        run.run(20)
+        late = [
+            (s.joints.stamp_ns, pose.stamp_ns) for s in run.samples if isinstance(pose := s.others.get(keys.POSE), Pose)
+        ]
+        assert {now_ns - captured_ns for now_ns, captured_ns in late} == {round(delay_s * 1e9)}
+        assert len(late) == 20 - round(delay_s / 0.01)
+
+
+def test_what_is_wrong_is_told_even_when_the_bus_no_longer_takes_the_stop() -> None:
+    """The cause is not lost to the error of the bus."""
+    with loop() as run:
+        armed(run)
+        module_of(run, 2).inside.leak = True
+        wire = WIRES[0]
+
+        def breaks(frame: Frame) -> bool:
+            if is_action(frame, Action.STOP):
+                raise BackendError("the bus is broken")
+            return False
+
+        wire.refuses = breaks
+        with pytest.raises(BackendError, match="the bus is broken"):  # by the next tick, which tries again
+            run.run(3, run.waving)
+        told = {fault.what: fault.cause for fault in run.faults}
+        assert "leak" in told["module_leak"] and told["stop_not_sent"] == "the bus is broken"
 
 
 def test_the_log_holds_everything_that_went_over_the_bus(tmp_path: Path) -> None:

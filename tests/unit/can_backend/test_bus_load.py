@@ -239,7 +239,7 @@ def test_18_joints_at_200_hz_are_refused_with_the_sum_and_ways_out() -> None:
     config, settings = run_of(18, 200.0), Settings(channels=["can7"])
     text = refusal(config, settings)
     assert text is not None and text.startswith("18 joints at 200 Hz do not fit on can7:\n")
-    assert arithmetic(18, Reports(200.0, 2, 40)) in text
+    assert "\n".join(arithmetic(18, Reports(200.0, 2, 40))) in text
     for words in ("SetPoint         3600 frames/s x 115 bits (6 bytes) =  41.4 %", "together 123.6 % of 1 Mbit/s"):
         assert words in text
     ways = ways_out(text, config, settings)

@@ -82,8 +82,9 @@ def test_expand_writes_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 
 def test_expand_needs_a_folder(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="give a folder that is there"):
-        main(["expand", "--write", str(tmp_path / "nowhere")])
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match=r"file/snakesim-expanded\.dbc: cannot be written: its folder is a file"):
+        main(["expand", "--write", str(tmp_path / "file")])
 
 
 # --- scan --------------------------------------------------------------------------------------------------

@@ -27,6 +27,7 @@ from snakesim_can_backend.settings import Settings
 from snakesim_can_backend.twin.firmware import BOOT_US, Module
 from snakesim_can_backend.twin.parameters import Parameters, from_factory
 from snakesim_hal.scenario import load as load_scenario
+from snakesim_hal.thermal import HeatLimits
 
 TEXT = (Path(__file__).parents[3] / "docs" / "can-protocol.md").read_text(encoding="utf-8")
 NODE = 5
@@ -147,7 +148,7 @@ def test_the_table_of_loads() -> None:
 
 def module_in(state: ModuleState) -> Module:
     """A module that has just come to be in a state, at 1 s."""
-    module = Module(NODE, 1, Parameters(from_factory(7.0, 7.5)))
+    module = Module(NODE, 1, Parameters(from_factory(7.0, 7.5)), HeatLimits(80.0, 105.0))
     if state == ModuleState.BOOT:
         module.poll(BOOT_US / 2)
         return module

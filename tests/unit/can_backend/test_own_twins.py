@@ -177,3 +177,19 @@ def test_a_child_is_told_what_goes_wrong_as_in_a_terminal(tmp_path: Path, monkey
     with pytest.raises(BackendError, match=r"do not take leak:joint_1@0"):
         for _ in range(100):  # until the pipe is known to be broken
             twins.inject(Injection("leak", "joint_1"), begins=True)
+
+
+def test_a_child_that_cannot_be_started_is_an_error_of_the_backend(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(own_twins.sys, "executable", str(tmp_path / "no python"))
+    with pytest.raises(BackendError, match=r"the module twins cannot be started: .*No such file"):
+        TwinProcess(RUN, Settings(channels=VCAN), None, stepped=True)
+
+
+def test_a_log_that_is_gone_keeps_no_child_from_ending(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    child(tmp_path, monkeypatch, "print('modules ready', flush=True)\ntime.sleep(60)\n")
+    twins = TwinProcess(RUN, Settings(channels=VCAN), None, stepped=True)
+    twins._said.unlink()
+    twins.stop()
+    assert twins.how_it_ended() is not None

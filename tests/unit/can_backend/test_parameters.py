@@ -76,15 +76,16 @@ def test_stiff_holding_is_nothing_a_module_does_by_itself() -> None:
 
 
 @pytest.mark.parametrize(
-    ("field", "signal", "room", "unit"),
+    ("field", "opcode", "signal", "room", "unit"),
     [
-        ("angle_rad", "angle", 1.0, "rad"),
-        ("speed_rad_s", "velocity", SPEED_ROOM, "rad/s"),
-        ("torque_nm", "torque", 1.0, "N·m"),
+        ("angle_rad", Opcode.JOINT_STATE, "angle", 1.0, "rad"),
+        ("speed_rad_s", Opcode.JOINT_STATE, "velocity", SPEED_ROOM, "rad/s"),
+        ("torque_nm", Opcode.JOINT_STATE, "torque", 1.0, "N·m"),
+        ("stop_at_c", Opcode.HEALTH, "motor_temperature", 1.0, "°C"),
     ],
 )
-def test_limits_end_where_the_bus_ends(field: str, signal: str, room: float, unit: str) -> None:
-    most = codec()[Opcode.JOINT_STATE].signals[signal].high / room
+def test_limits_end_where_the_bus_ends(field: str, opcode: Opcode, signal: str, room: float, unit: str) -> None:
+    most = codec()[opcode].signals[signal].high / room
     if field != "angle_rad" or most <= 3.1:
         check_ratings(changed("limits", **{field: most * 0.999}))
     with pytest.raises(ConfigError, match=rf"planar13.*limits\.{field}` = .* {unit} does not go through the bus"):
@@ -98,7 +99,11 @@ def test_modules_that_can_do_what_the_robot_asks_for_are_taken() -> None:
 
 @pytest.mark.parametrize(
     ("torque_nm", "speed_rad_s", "words"),
-    [(6.9, 7.5, "rated for 6.9 N·m.*asks for 7"), (7.0, 7.0, "rated for 7 rad/s.*asks for 7.5")],
+    [
+        (6.9, 7.5, "rated for 6.9 N·m.*asks for 7"),
+        (7.0, 7.0, "rated for 7 rad/s.*asks for 7.5"),
+        (float("nan"), 7.5, "rated for nan N·m.*asks for 7"),
+    ],
 )
 def test_a_weaker_module_is_named_with_what_to_do(torque_nm: float, speed_rad_s: float, words: str) -> None:
     with pytest.raises(BackendError, match=f"joint_4 is {words}: lower the limit in the robot file"):

@@ -223,15 +223,20 @@ def test_what_a_module_said_of_its_health_is_not_valid_for_ever() -> None:
     assert valid(150) == [False, True, False, False]
 
 
+def pose_at(stamp_ns: int) -> bytes:
+    still = b'"velocity_w":[0,0,0],"angular_velocity_w":[0,0,0]'
+    return b'{"stamp_ns":%d,"position_w":[1,2,3],"orientation_wxyz":[1,0,0,0],%s}' % (stamp_ns, still)
+
+
 def test_a_pose_is_told_once() -> None:
-    mocap = MocapReceiver("127.0.0.1:0")
+    mocap = MocapReceiver("127.0.0.1:0", 0.0, clock=lambda stamp_ns: stamp_ns)
     try:
         reading, sensors = sensors_of(config(), mocap=mocap)
         syncs(reading, 1)
         assert keys.POSE not in sensors.sample(0, 0).others
         host, _, port = mocap.address.rpartition(":")
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as camera:
-            camera.sendto(b'{"position_w":[1,2,3],"orientation_wxyz":[1,0,0,0]}', (host, int(port)))
+            camera.sendto(pose_at(20), (host, int(port)))
         found = sensors.sample(1, 10).others[keys.POSE]
         assert isinstance(found, Pose) and (found.tick, found.position_w) == (1, (1.0, 2.0, 3.0))
         assert keys.POSE not in sensors.sample(2, 0).others
@@ -244,9 +249,11 @@ def test_a_pose_is_told_once() -> None:
 
 def test_sensors_are_described_with_their_rates() -> None:
     run = config(**EVERYTHING)
-    found = {s.key: s.rate_hz for s in described(run, Reports(100.0, 4, 20), pose=True)}
+    sensors = described(run, Reports(100.0, 4, 20), pose_delay_s=0.02)
+    found = {s.key: s.rate_hz for s in sensors}
     assert found == {keys.JOINTS: 100.0, keys.CONTACTS: 25.0, keys.IMU: 5.0, keys.POWER: 2.0, keys.POSE: 100.0}
-    bare = {s.key for s in described(run, Reports(100.0, 0, 0), pose=False)}
+    assert {s.key: s.delay_s for s in sensors if s.delay_s} == {keys.POSE: 0.02}
+    bare = {s.key for s in described(run, Reports(100.0, 0, 0), pose_delay_s=None)}
     assert bare == {keys.JOINTS, keys.POWER}
 
 
@@ -254,7 +261,7 @@ def test_sensors_are_described_with_their_rates() -> None:
 def test_what_is_described_is_what_is_delivered(contact_every: int, imu_every: int, pose: bool) -> None:
     run = config(**EVERYTHING)
     reports = Reports(100.0, contact_every, imu_every)
-    mocap = MocapReceiver("127.0.0.1:0") if pose else None
+    mocap = MocapReceiver("127.0.0.1:0", 0.0, clock=lambda stamp_ns: stamp_ns) if pose else None
     reading, sensors = sensors_of(run, reports, mocap)
     delivered: dict[str, int] = {}
     ticks = 200
@@ -268,7 +275,7 @@ def test_what_is_described_is_what_is_delivered(contact_every: int, imu_every: i
                 reading.take(accelerometer(1, tick, 0.0))
             if mocap is not None:
                 host, _, port = mocap.address.rpartition(":")
-                camera.sendto(b'{"position_w":[1,2,3],"orientation_wxyz":[1,0,0,0]}', (host, int(port)))
+                camera.sendto(pose_at(tick * PERIOD_NS), (host, int(port)))
             samples = sensors.sample(tick, tick * PERIOD_NS)
             for key, message in {keys.JOINTS: samples.joints, **samples.others}.items():
                 delivered[key] = delivered.get(key, 0) + 1
@@ -277,7 +284,7 @@ def test_what_is_described_is_what_is_delivered(contact_every: int, imu_every: i
         camera.close()
         if mocap is not None:
             mocap.close()
-    rates = {s.key: s.rate_hz for s in described(run, reports, pose=pose)}
+    rates = {s.key: s.rate_hz for s in described(run, reports, pose_delay_s=0.0 if pose else None)}
     assert set(delivered) == set(rates)
     for key, count in delivered.items():
         assert count == pytest.approx(rates[key] * ticks / 100.0, abs=1), key

@@ -8,6 +8,7 @@ import struct
 import time
 import uuid
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -420,3 +421,43 @@ def test_wait_wakes_up_for_a_socket() -> None:
         far.send(can_frame(1, b""))
         began = time.monotonic()
         assert wait(wires, 5.0) and took_s(began) < 1.0
+
+
+# --- what breaks -------------------------------------------------------------------------------------------
+
+
+def test_a_virtual_bus_that_is_gone_is_an_error_of_the_backend() -> None:
+    wire = VirtualWire(f"gone-{uuid.uuid4().hex}")
+    wire._bus.shutdown()
+    with pytest.raises(BackendError, match=r"gone-\w+: cannot send: "):
+        wire.send(Frame(0x80, b"12345"))
+    with pytest.raises(BackendError, match=r"gone-\w+: cannot receive: "):
+        wire.receive()
+
+
+class OnSocket(VirtualWire):
+    """A bus that is waited for by a socket, as a kernel interface is."""
+
+    def __init__(self, source: socket.socket) -> None:
+        super().__init__(f"waits-{uuid.uuid4().hex}")
+        self.source = source
+
+    def fileno(self) -> int | None:
+        return self.source.fileno()
+
+
+def test_a_socket_that_cannot_be_waited_for_is_an_error_of_the_backend() -> None:
+    ours, other = socket.socketpair()
+    with other:
+        wire = OnSocket(ours)
+        assert wait([wire], 0.0)
+        ours.close()
+        with pytest.raises(BackendError, match=r"waits-\w+: cannot be waited for: "):
+            wait([wire], 0.0)
+        wire.close()
+
+
+def test_an_interface_that_is_going_away_is_not_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "flags").write_text("")
+    monkeypatch.setattr(wire_module, "Path", lambda *parts: tmp_path / parts[-1])
+    assert not is_up("can0")

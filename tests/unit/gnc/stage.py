@@ -19,6 +19,11 @@ AMPLITUDE_M, WAVELENGTH_M, LENGTH_M = 0.045, 0.6, 6.0
 BODY_RADIUS_M, PEG_RADIUS_M, CLEARANCE_M = 0.04, 0.05, 0.005
 
 
+def stamp_of(tick: int) -> int:
+    """Robot time of a tick."""
+    return tick * round(PERIOD_S * 1e9)
+
+
 def known(value: T | None) -> T:
     """A value that must be there."""
     assert value is not None
@@ -84,8 +89,10 @@ class Stage:
         turned: dict[int, float] | None = None,
         torque_nm: float = 0.0,
         contacts: list[WorldContact] | None = None,
+        pose_age_ticks: int | None = None,
+        without: str = "",
     ) -> View:
-        """turned: joint -> how far it is from where the route has it."""
+        """turned: joint -> how far it is from where the route has it. without: `world` or `trajectory`, perhaps."""
         axes = [joint.axis for joint in self.robot.joints]
         segments = yaw_segments_m(axes, [link.length_m for link in self.robot.links])
         lay = lay_chain(self.route, tail_s_m, segments)
@@ -95,7 +102,8 @@ class Stage:
         seen = lay if world_tail_s_m is None else lay_chain(self.route, world_tail_s_m, segments)
         world = World(
             tick=tick - world_age_ticks,
-            stamp_ns=0,
+            stamp_ns=stamp_of(tick - world_age_ticks),
+            pose_stamp_ns=stamp_of(tick - (world_age_ticks if pose_age_ticks is None else pose_age_ticks)),
             base_position_w=(*seen.tail_w, BODY_RADIUS_M),
             base_orientation_wxyz=quaternion_from_yaw(seen.heading_rad),
             base_confidence=1.0,
@@ -105,7 +113,7 @@ class Stage:
         count = len(axes)
         joints = JointState(
             tick=tick,
-            stamp_ns=0,
+            stamp_ns=stamp_of(tick),
             angle_rad=angles.tolist(),
             velocity_rad_s=[0.0] * count,
             torque_nm=[torque_nm] * count,
@@ -122,7 +130,12 @@ class Stage:
             finished=False,
         )
         return View(
-            tick=tick, time_s=tick * PERIOD_S, period_s=PERIOD_S, joints=joints, world=world, trajectory=trajectory
+            tick=tick,
+            time_s=tick * PERIOD_S,
+            period_s=PERIOD_S,
+            joints=joints,
+            world=None if without == "world" else world,
+            trajectory=None if without == "trajectory" else trajectory,
         )
 
 

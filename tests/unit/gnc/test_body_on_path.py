@@ -66,7 +66,7 @@ def test_pitch_joints_count_as_straight():
 
 
 def make_progress(**more) -> Progress:
-    settings = {"speed_filter_s": 0.03, "oldest_world_s": 0.25}
+    settings = {"speed_filter_s": 0.03}
     return Progress(PlanarBody(make_robot()), **{**settings, **more})
 
 
@@ -94,10 +94,32 @@ def test_progress_gives_the_present_from_an_old_world_model(speed_m_s):
 
 
 def test_progress_says_what_it_lacks():
-    stage = make_stage()
-    view = stage.view(40, 0.3, world_age_ticks=30)
-    progress = make_progress()
-    assert "0.30 s old" in str(progress.update(view))
+    stage, progress = make_stage(), make_progress()
+    assert progress.update(stage.view(0, 0.3, without="world")) == "no world model"
+    assert progress.update(stage.view(1, 0.3, without="trajectory")) == "no trajectory"
+
+
+def test_a_pose_that_is_repeated_is_no_body_that_stands_still():
+    """Guidance goes on making world models when the motion capture has stopped."""
+    stage, progress = make_stage(), make_progress()
+    follow(progress, stage, 0.2, 61)
+    for tick in range(61, 71):  # new world models, all with the pose of tick 58
+        located = progress.update(
+            stage.view(tick, 0.3 + 0.2 * tick * PERIOD_S, world_tail_s_m=0.3 + 0.2 * 0.58, pose_age_ticks=tick - 58)
+        )
+        assert isinstance(located, Located) and located.fresh
+        assert located.speed_m_s == pytest.approx(0.2, abs=0.01)
+        assert located.tail_s_m == pytest.approx(0.3 + 0.2 * tick * PERIOD_S, abs=2e-3)
+
+
+def test_a_body_that_was_lost_is_found_again_where_it_is():
+    stage, progress = make_stage(), make_progress()
+    follow(progress, stage, 0.2, 61)
+    for tick in range(61, 161):
+        progress.update(stage.view(tick, 0.5, without="world"))
+    found = progress.update(stage.view(161, 0.55))
+    assert isinstance(found, Located) and found.anew
+    assert found.tail_s_m == pytest.approx(0.55, abs=2e-3) and found.speed_m_s == 0.0
 
 
 def test_a_new_path_is_noticed():
@@ -109,4 +131,4 @@ def test_a_new_path_is_noticed():
     assert isinstance(first, Located)
     assert isinstance(again, Located)
     assert isinstance(other, Located)
-    assert (first.new_path, again.new_path, other.new_path) == (True, False, True)
+    assert (first.anew, again.anew, other.anew) == (True, False, True)

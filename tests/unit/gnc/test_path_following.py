@@ -53,15 +53,11 @@ def test_it_starts_without_a_jump():
 
 def test_it_holds_while_it_knows_nothing():
     stage = make_stage()
-    view = stage.view(0, TAIL_S_M)
     controller = make_controller(stage)
-    blind = type(view)(**{**vars(view), "trajectory": None})
-    assert controller.update(blind).report.why == "no trajectory yet"
-    assert controller.update(blind).set_points.target == view.joints.angle_rad
-    controller.update(view)
-    later = controller.update(stage.view(100, TAIL_S_M, world_age_ticks=60))
-    assert "old" in later.report.why
-    assert later.set_points.target == pytest.approx(view.joints.angle_rad, abs=0.02)
+    first = controller.update(stage.view(0, TAIL_S_M, without="trajectory"))
+    assert first.report.why == "no trajectory"
+    slid = controller.update(stage.view(1, TAIL_S_M, without="trajectory", turned={3: 0.2}))
+    assert slid.set_points.target == first.set_points.target  # held, not followed
 
 
 def test_a_stopped_mission_stops_the_reference():

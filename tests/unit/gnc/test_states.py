@@ -1,10 +1,12 @@
-"""The four states of the paper's Figure 6."""
+"""The four states of the paper's Figure 6, and what counts as moving."""
 
+import numpy as np
 import pytest
 
+from snakesim_gnc.control.advance import Advance
 from snakesim_gnc.control.states import locomotion_state
 
-READY = {"hal_answers": True, "armed": True, "wants_to_move": True, "usable_push_points": 3}
+READY = {"usable_push_points": 3, "advanced_m": 0.1}
 
 
 @pytest.mark.parametrize(
@@ -15,8 +17,13 @@ READY = {"hal_answers": True, "armed": True, "wants_to_move": True, "usable_push
         ({"usable_push_points": 2}, "NotLocomoting", "2 usable push-points, 3 are needed"),
         ({"usable_push_points": 0, "obstacle": "lost"}, "NotLocomoting", "lost"),
         ({"obstacle": "jammed: x"}, "NotLocomoting", "jammed: x"),
-        ({"wants_to_move": False}, "Idle", "wants"),
-        ({"armed": False}, "Idle", "not armed"),
+        ({"advanced_m": 0.004}, "NotLocomoting", "standing still: less than 5 mm in 1 s"),
+        ({"advanced_m": 0.004, "usable_push_points": None}, "NotLocomoting", "standing still"),
+        ({"advanced_m": None}, "NotLocomoting", "nobody measures"),
+        ({"missing": "sensor/pose is 1 s old"}, "NotLocomoting", "sensor/pose is 1 s old"),
+        ({"rests": "speed zero"}, "Idle", "nobody wants to move: speed zero"),
+        ({"armed": False}, "Idle", "the robot is not armed"),
+        ({"armed": False, "missing": "sensor/joints is old"}, "Idle", "not armed; sensor/joints is old"),
         ({"hal_answers": False}, "PowerOff", "no clock"),
     ],
 )
@@ -24,3 +31,44 @@ def test_state_and_reason(change, state, word):
     found, reason = locomotion_state(**{**READY, **change})
     assert found == state
     assert word in reason
+
+
+def advanced(speed_m_s, seconds, noise_m=0.0, every_s=0.02):
+    rng, advance, far = np.random.default_rng(1), Advance(), []
+    for tick in range(round(seconds / every_s)):
+        x, y, z = (rng.standard_normal(3) * noise_m).tolist()
+        advance.put(tick * every_s, (x + speed_m_s * tick * every_s, y, z))
+        far.append(advance.metres)
+    return far
+
+
+def test_nothing_is_known_before_the_first_measurement():
+    assert Advance().metres is None
+
+
+def test_the_advance_is_that_of_the_last_second():
+    far = advanced(0.1, 5.0)
+    assert far[0] == 0.0
+    assert far[-1] == pytest.approx(0.1, rel=0.03)
+    assert next(i for i, metres in enumerate(far) if metres >= 0.005) * 0.02 < 0.3  # soon after the start
+
+
+def test_noise_is_no_advance():
+    assert max(advanced(0.0, 100.0, noise_m=0.001)) < 0.005
+
+
+def test_a_body_that_stops_stands_still_a_second_later():
+    advance = Advance()
+    for tick in range(300):
+        advance.put(tick * 0.02, (0.1 * min(tick * 0.02, 2.0), 0.0, 0.0))
+        if tick * 0.02 > 3.4:
+            assert advance.metres is not None and advance.metres < 0.005
+
+
+def test_after_a_time_without_any_measurement_it_begins_anew():
+    advance = Advance()
+    advance.put(0.0, (0.0, 0.0, 0.0))
+    advance.put(5.0, (1.0, 0.0, 0.0))
+    assert advance.metres == 0.0
+    advance.put(4.0, (9.0, 0.0, 0.0))  # comes too late to say anything
+    assert advance.metres == 0.0

@@ -170,7 +170,7 @@ class Follower:
                 self.armed_ticks.append(clock.tick)
                 wave = self.amplitude_rad * math.sin(2 * math.pi * clock.stamp_ns * 1e-9)
                 points = SetPoints(points.mode, [wave] * len(robot.joints), points.torque_limit_nm)
-            commander.send(clock, points)
+            commander.send(clock, joints, points)
         client.done(clock.tick)
 
 
@@ -202,7 +202,7 @@ class Running:
 
     def ask(self, key: str, request: Message) -> Answer:
         """Ask the host; a no is an answer too."""
-        return self.session.ask_politely(key, request)
+        return self.session.ask(key, request)
 
     def lifecycle(self, action: Any) -> Answer:
         """Arm (naming the robot rightly), disarm, clear or finish."""

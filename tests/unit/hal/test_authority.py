@@ -7,7 +7,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from snakesim_hal.authority import COMMANDS_KEPT, MAX_FAULTS_KEPT, Authority, Decision
+from snakesim_hal.authority import COMMANDS_KEPT, Authority, Decision
+from snakesim_hal.fault_log import MAX_FAULTS_KEPT
 from snakesim_hal.gate import FRESH_NS
 from snakesim_hal.messages import (
     Answer,
@@ -50,7 +51,9 @@ class Rig:
 
     def send(self, target: Any = 0.0, mode: Any = Mode.POSITION, **other: Any) -> str | None:
         self.sequence += 1
-        values = {"sequence": self.sequence, "lease_epoch": self.authority.lease.epoch, "tick": self.tick, **other}
+        authority = self.authority
+        values = {"sequence": self.sequence, "lease_epoch": authority.lease.epoch, "arming": authority.arming, **other}
+        values = {"tick": self.tick, **values}
         asked = command(self.robot, target, mode, **values)
         return self.authority.offer(asked, now_ns=self.now_ns, tick=self.tick, age_ns=0)
 
@@ -261,7 +264,8 @@ def test_what_is_sent_for_another_arming_neither_moves_the_robot_nor_keeps_the_l
     rig.send(0.2, arming=0)
     rig.pass_tick()
     assert rig.authority.state == "fault" and rig.authority.faults[0].what == "lease_expired"
-    assert (rig.authority.accepted, rig.authority.standby) == (1, 6)  # one before arming
+    assert rig.authority.rejected == {"before_arming": 5}
+    assert (rig.authority.accepted, rig.authority.standby) == (1, 1)
 
 
 def test_while_disarmed_it_does_not_matter_which_arming_a_command_names() -> None:
@@ -289,9 +293,43 @@ def test_a_lease_that_ran_out_is_free_before_a_tick_has_noticed() -> None:
     assert answer.ok and answer.lifecycle == "disarmed" and rig.authority.why == "lease passed to teleop"
 
 
-def test_commands_without_an_arming_count_in_any() -> None:
+def test_a_command_that_names_no_arming_never_moves_an_armed_robot() -> None:
     rig = armed()
-    assert rig.send(0.11, arming=None) is None
+    rig.pass_tick()
+    bare = JointCommand(
+        tick=rig.tick,
+        sequence=50,
+        lease_epoch=rig.authority.lease.epoch,
+        layout=ROBOT.layout,
+        valid_for_ns=LEASE_NS,
+        mode=[Mode.POSITION] * JOINTS,
+        target=[0.2] * JOINTS,
+    )
+    assert rig.authority.offer(bare, now_ns=rig.now_ns, tick=rig.tick, age_ns=0) == "before_arming"
+    assert rig.authority.rejected == {"before_arming": 1}
+    assert rig.pass_tick().set_points.target == pytest.approx([0.1] * JOINTS)
+
+
+def test_a_command_that_was_under_way_when_the_robot_was_armed_is_nobodys_mistake() -> None:
+    rig = Rig()
+    rig.tick = 7
+    rig.observe(0.1, tick=7)
+    rig.acquire()
+    rig.send(0.1)
+    assert rig.arm().ok
+    assert rig.send(0.1, arming=0) == "before_arming"
+    assert rig.authority.standby == 2 and not rig.authority.rejected
+    rig.tick = 8
+    assert rig.send(0.1, arming=0) == "before_arming"
+    assert rig.authority.standby == 2 and rig.authority.rejected == {"before_arming": 1}
+
+
+@pytest.mark.parametrize("wrong", [{"arming": 0}, {"arming": 2}, {"layout": "other"}, {"tick": 10**6}])
+def test_a_refused_command_does_not_make_the_next_good_one_a_replay(wrong: dict[str, Any]) -> None:
+    rig = armed()
+    rig.pass_tick()
+    assert rig.send(0.2, sequence=2**60, **wrong) is not None
+    assert rig.send(0.11) is None
     assert rig.pass_tick().sequence == rig.sequence
 
 
@@ -498,12 +536,16 @@ def test_a_fault_does_not_turn_an_estop_into_something_milder() -> None:
     assert [fault.what for fault in rig.authority.faults] == ["estop", "hot"]
 
 
-def test_faults_are_kept_up_to_a_limit_the_first_ones_first() -> None:
+def test_faults_are_kept_up_to_a_limit_the_first_and_the_newest() -> None:
     rig = Rig()
     for i in range(100):
         rig.authority.fault(Fault(tick=i, what="hot", cause="hot"))
-    assert [fault.tick for fault in rig.authority.faults] == list(range(32))
+    assert [fault.tick for fault in rig.authority.faults] == [*range(16), *range(84, 100)]
+    assert rig.authority.since_clear.left_out == rig.authority.since_start.left_out == 68
     assert (MAX_FAULTS_KEPT, COMMANDS_KEPT) == (32, 1024)  # a status holds 64 faults
+    rig.authority.on_lifecycle(CLEAR, 0)
+    assert rig.authority.faults == [] and rig.authority.since_clear.left_out == 0
+    assert len(rig.authority.since_start.kept) == MAX_FAULTS_KEPT and rig.authority.since_start.left_out == 68
 
 
 def test_a_fault_is_explained_in_as_many_words_as_a_message_holds() -> None:

@@ -22,6 +22,7 @@ from hypothesis.stateful import (
 
 from snakesim_hal import authority as under_test
 from snakesim_hal.authority import Authority, Decision
+from snakesim_hal.fault_log import MAX_FAULTS_KEPT
 from snakesim_hal.gate import FRESH_NS
 from snakesim_hal.lease import Lease
 from snakesim_hal.messages import (
@@ -121,6 +122,8 @@ class Everything(RuleBasedStateMachine):
         self.sequence = 0
         self.state: LifecycleState = "disarmed"
         self.arming = 0
+        self.seen_tick = 0  # of the newest joint state
+        self.armed_tick = -1  # of the state that was the newest at the last arming
         self.holder: str | None = None
         self.epoch = 0
         self.priority = 0
@@ -243,7 +246,7 @@ class Everything(RuleBasedStateMachine):
         if self.state != "estop":
             self.leave_for("fault")
         self.drop_lease()
-        self.faults = min(self.faults + 1, under_test.MAX_FAULTS_KEPT)
+        self.faults = min(self.faults + 1, MAX_FAULTS_KEPT)
 
     def lose(self, joints: set[int]) -> bool:
         """Whether the robot goes on without these joints, too."""
@@ -252,7 +255,7 @@ class Everything(RuleBasedStateMachine):
         if self.state != "armed" or len(self.aside | joints) > self.may_lose:
             return False
         self.aside |= joints
-        self.faults = min(self.faults + 1, under_test.MAX_FAULTS_KEPT)
+        self.faults = min(self.faults + 1, MAX_FAULTS_KEPT)
         return True
 
     def lose_or_fail(self, joints: set[int] | None) -> None:
@@ -305,8 +308,10 @@ class Everything(RuleBasedStateMachine):
                 age_ns = []
             case _:
                 pass
-        seen = state(self.robot, shown, velocity, torque, valid=valid, age_ns=age_ns, stamp_ns=self.stamp_ns)
+        when = {"tick": self.tick, "stamp_ns": self.stamp_ns}
+        seen = state(self.robot, shown, velocity, torque, valid=valid, age_ns=age_ns, **when)
         self.authority.observe(seen)
+        self.seen_tick = self.tick
         if trouble in ("short", "no_valid", "no_age"):
             self.doubt = None
             return
@@ -376,7 +381,7 @@ class Everything(RuleBasedStateMachine):
                 self.silent.add(i)
         fresh = self.silent - quiet_before
         if fresh and not (len(fresh) == 1 and fresh <= self.aside):
-            self.faults = min(self.faults + 1, under_test.MAX_FAULTS_KEPT)
+            self.faults = min(self.faults + 1, MAX_FAULTS_KEPT)
         self.shares = [health.share(self.now_ns) for health in self.healths]
 
     @rule(
@@ -409,7 +414,7 @@ class Everything(RuleBasedStateMachine):
         near=st.booleans(),
         defects=st.sets(st.sampled_from(DEFECTS), max_size=2),
         broken=st.booleans(),
-        arming=often(0, None, -1, 1),
+        arming=often(0, None, -1, 1),  # None: the command names none
         back=often(0, 1, 2),
         times=often(1, 6),
     )
@@ -433,7 +438,7 @@ class Everything(RuleBasedStateMachine):
             wanted = wanted[1:]
         if "finite" in defects:
             wanted = [[NAN, INF, -INF][self.sequence % 3], *wanted[1:]]
-        meant = None if arming is None else max(self.arming + arming, 0)
+        meant = 0 if arming is None else max(self.arming + arming, 0)
         for _ in range(times):
             self.sequence += 1
             asked = command(
@@ -462,10 +467,11 @@ class Everything(RuleBasedStateMachine):
             assert refusal == expected and self.authority.rejected[expected] == counted + 1
             self.rejected += 1
             return
-        self.last_sequence = asked.sequence
-        if self.state == "armed" and asked.arming not in (None, self.arming):
+        if self.state == "armed" and asked.arming != self.arming:
             assert refusal == "before_arming"
+            self.rejected += asked.tick > self.armed_tick
             return
+        self.last_sequence = asked.sequence
         assert refusal is None
         self.expires_ns = self.now_ns + LEASE_NS
         self.heard = self.now_ns, asked
@@ -508,6 +514,7 @@ class Everything(RuleBasedStateMachine):
         if ready:
             self.leave_for("armed")
             self.arming += 1
+            self.armed_tick = self.seen_tick
             self.heard = None
             self.since_arming, self.counting = [], None
             self.expires_ns = self.now_ns + LEASE_NS
@@ -532,7 +539,7 @@ class Everything(RuleBasedStateMachine):
     def estop(self, who: str) -> None:
         answer = self.authority.on_estop(EstopRequest(who=who), self.tick)
         self.leave_for("estop")
-        self.faults = min(self.faults + 1, under_test.MAX_FAULTS_KEPT)
+        self.faults = min(self.faults + 1, MAX_FAULTS_KEPT)
         self.check(answer, True)
 
     @rule(

@@ -155,6 +155,16 @@ def test_who_falls_silent_is_told_once_and_is_not_derated() -> None:
     assert len(bench.notes) == 2 and bench.notes[1].cause.endswith("for joint_1, joint_2")
 
 
+@pytest.mark.parametrize("told", [{"leak": True}, {"voltage_v": 12.0}])
+def test_water_and_voltage_do_not_count_when_nothing_is_heard_any_more(told: dict[str, Any]) -> None:
+    bench = Bench()
+    bench.hear(**told)
+    bench.look(50 * MS)
+    assert len(bench.derating.wrong) == JOINTS
+    bench.look(3 * S)
+    assert bench.derating.wrong == []
+
+
 def test_a_sensor_that_never_says_anything_is_told_where_there_should_be_one() -> None:
     silent, absent = Bench(expected=True), Bench()
     for bench in (silent, absent):

@@ -1,7 +1,8 @@
 """Reading files: whatever is wrong ends in one ConfigError that says where, what, and what is allowed instead."""
 
+from enum import Enum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import pytest
 from hypothesis import given
@@ -102,6 +103,81 @@ def test_the_error_names_the_file_in_which_the_field_should_stand() -> None:
         decode(table, Whole)
 
 
+class Round(FileStruct, frozen=True, tag="round", tag_field="kind"):
+    """One of two shapes."""
+
+    radius_m: float
+
+
+class Square(FileStruct, frozen=True, tag="square", tag_field="kind"):
+    """The other."""
+
+    edge_m: float
+    colour: Literal["red", "blue"] = "red"
+
+
+class Grip(Enum):
+    """How it holds."""
+
+    FIRM = "firm"
+    LOOSE = "loose"
+
+
+class Thing(FileStruct, frozen=True):
+    """Has a shape."""
+
+    shape: Round | Square | None = None
+    shapes: list[Round | Square] = []
+    grip: Grip = Grip.FIRM
+
+
+UNION: dict[str, tuple[dict[str, Any], list[str]]] = {
+    "unknown kind": ({"shape": {"kind": "spiral"}}, ["`shape.kind` = 'spiral'", "one of 'round', 'square'"]),
+    "unknown kind in a list": (
+        {"shapes": [{"kind": "round", "radius_m": 1}, {"kind": "x"}]},
+        ["`shapes.1.kind` = 'x'", "one of 'round', 'square'"],
+    ),
+    "kind of another type": ({"shape": {"kind": 3}}, ["`shape.kind` = 3", "one of 'round', 'square'"]),
+    "no kind": ({"shape": {"radius_m": 1}}, ["`shape.kind` is missing", "one of 'round', 'square'"]),
+    "no section": ({"shape": 3}, ["`shape` = 3", "kind = 'round', radius_m", "kind = 'square', edge_m, colour"]),
+    "field of the other kind": (
+        {"shape": {"kind": "square", "edge_m": 1, "radius_m": 1}},
+        ["unknown field `shape.radius_m`", "known here: colour, edge_m, kind"],
+    ),
+    "field missing": ({"shape": {"kind": "square"}}, ["`shape.edge_m` is missing", "a number"]),
+    "wrong in the second kind": (
+        {"shape": {"kind": "square", "edge_m": 1, "colour": "green"}},
+        ["`shape.colour` = 'green'", "one of 'blue', 'red'"],
+    ),
+    "enumeration": ({"grip": "soft"}, ["`grip` = 'soft'", "one of 'firm', 'loose'"]),
+}
+
+
+@pytest.mark.parametrize("wrong", UNION)
+def test_a_wrong_kind_says_what_is_allowed(wrong: str) -> None:
+    values, words = UNION[wrong]
+    with pytest.raises(ConfigError) as caught:
+        decode(Table(values, "my.toml"), Thing)
+    for word in words:
+        assert word in str(caught.value), caught.value
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"part": {"size_m": "x" * 100_000}},
+        {"part": {"size_m": 1}, "x" * 100_000: 1},
+        {"part": {"size_m": 1, "many": 1 << 60_000}},
+        {"part": {"size_m": 1}, "a` - at `$.parts[7].size_m": 1},
+        {"part": {"size_m": 1}, "a\nb": 1},
+    ],
+)
+def test_what_is_quoted_is_short(values: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError) as caught:
+        decode(Table(values, "my.toml"), Whole)
+    assert len(str(caught.value)) < 600
+
+
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers(-20, 20) | st.floats() | st.text(max_size=3),
     lambda inner: (
@@ -128,7 +204,7 @@ def test_any_values_decode_or_end_in_a_config_error(values: dict[str, Any]) -> N
     [
         ("a.toml", b"robot = \n", ["not valid TOML", "line 1"]),
         ("a.toml", b"a = 1\na = 2\n", ["not valid TOML"]),
-        ("a.toml", b"\xff\xfe\x00", ["cannot be read as text"]),
+        ("a.toml", b"\xff\xfe\x00", ["UTF-16", "UTF-8"]),
         ("a.json", b"", ["not valid JSON"]),
         ("a.json", b"[1, 2]", ["holds a list"]),
         ("a.json", b"{", ["not valid JSON"]),
@@ -148,7 +224,7 @@ def test_a_file_that_is_none_is_refused(tmp_path: Path, name: str, content: byte
 def test_absent_files_and_folders_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"a\.toml: no such file"):
         read_table(tmp_path / "a.toml")
-    with pytest.raises(ConfigError, match="cannot be read"):
+    with pytest.raises(ConfigError, match="is a folder, not a file"):
         read_table(tmp_path)
 
 

@@ -112,6 +112,7 @@ def test_the_writers_are_those_of_the_key_space() -> None:
         ("mute:joint_14@1", "no joint_14; this run has joint_1 to joint_13"),
         ("cut:bus_1@1", "no bus_1; this run has no bus"),
         ("kill:contrl@1", "no process 'contrl'; this run has control, host"),
+        ("drop:guidance/world@1", "guidance writes guidance/world, and this run does not start it"),
     ],
 )
 def test_what_is_not_there_cannot_go_wrong(text: str, words: str) -> None:

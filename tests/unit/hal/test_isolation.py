@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from snakesim_hal.authority import MAX_FAULTS_KEPT
+from snakesim_hal.fault_log import MAX_FAULTS_KEPT
 from snakesim_hal.messages import Fault, Mode
 from tests.unit.hal.test_authority import CLEAR, DISARM, ESTOP, JOINTS, Rig, armed, hear
 
@@ -192,12 +192,16 @@ def test_that_a_lost_joint_tells_nothing_of_its_health_is_no_news() -> None:
     assert [fault.what for fault in rig.authority.faults] == ["state_invalid", "power_unknown"]
 
 
-@pytest.mark.parametrize("kept", ["faults", "fault_log"])
-def test_why_the_robot_stopped_is_never_left_out(kept: str) -> None:
+@pytest.mark.parametrize("kept", ["since_clear", "since_start"])
+@pytest.mark.parametrize("before", [0, 3, 20, 50])
+def test_why_the_robot_stopped_is_never_left_out(kept: str, before: int) -> None:
     rig = armed(safety__may_lose_joints=1)
-    for tick in range(MAX_FAULTS_KEPT):
-        rig.authority.note(Fault(tick=tick, what="noted", cause="", reach="joint" if tick in (3, 9) else "robot"))
-    rig.authority.note(Fault(tick=50, what="noted", cause="", reach="joint"))
-    rig.authority.fault(Fault(tick=51, what="leak", cause="water"))
-    ticks = [fault.tick for fault in getattr(rig.authority, kept)]
-    assert ticks == [*range(9), *range(10, MAX_FAULTS_KEPT), 51]
+    for tick in range(before):
+        rig.authority.note(Fault(tick=tick, what="noted", cause=""))
+    rig.authority.fault(Fault(tick=1000, what="leak", cause="water"))
+    log = getattr(rig.authority, kept)
+    for tick in range(2000, 2100):
+        rig.authority.fault(Fault(tick=tick, what="follows", cause=""))
+        assert 1000 in [fault.tick for fault in log.kept] and log.kept[-1].tick == tick
+        assert len(log.kept) <= MAX_FAULTS_KEPT and len(log.kept) + log.left_out == before + 1 + tick - 1999
+    assert [fault.tick for fault in log.kept] == sorted(fault.tick for fault in log.kept)

@@ -32,7 +32,7 @@ def test_no_key_stands_twice_and_none_begins_or_ends_with_a_slash() -> None:
 
 
 def test_every_key_constant_is_in_the_space() -> None:
-    constants = {value for name, value in vars(keys).items() if name.isupper() and isinstance(value, str)}
+    constants = {value for name, value in vars(keys).items() if name[0].isupper() and isinstance(value, str)}
     assert constants == {row.key for row in keys.SPACE}
 
 

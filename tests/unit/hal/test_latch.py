@@ -1,14 +1,19 @@
 """An emergency stop on disk: written before it is answered, found again, and latched when in doubt."""
 
+import threading
+import time
+from collections.abc import Iterator
 from pathlib import Path
 from queue import SimpleQueue
+from threading import Event
 
 import pytest
 
 from snakesim_hal import keys
+from snakesim_hal import latch as under_test
 from snakesim_hal.latch import ESTOP, EstopLatch
 from snakesim_hal.messages import EstopRequest
-from tests.unit.hal.network import running
+from tests.unit.hal.network import running, wait_until
 from tests.unit.hal.test_client_host import run_config
 
 
@@ -45,7 +50,8 @@ def test_what_cannot_be_read_counts_as_latched(tmp_path: Path, content: bytes) -
 
 
 def test_a_stop_that_cannot_be_kept_says_so(tmp_path: Path) -> None:
-    latch = EstopLatch(tmp_path / "gone")
+    (tmp_path / "in the way").write_text("a file where the folder belongs")
+    latch = EstopLatch(tmp_path / "in the way")
     trouble = asked(latch, "engage")
     assert trouble is not None and "will not outlive this host" in trouble
 
@@ -64,3 +70,43 @@ def test_a_host_that_finds_one_begins_in_estop(tmp_path: Path) -> None:
         assert not run.lifecycle("arm").ok
         assert run.lifecycle("clear").ok and not (tmp_path / ESTOP).exists()
         run.reaches("disarmed")
+
+
+@pytest.fixture
+def hanging(monkeypatch: pytest.MonkeyPatch) -> Iterator[Event]:
+    """A disk that hangs until the event is set."""
+    goes_on, write = Event(), under_test.write_whole
+
+    def slow(path: Path, content: bytes, *, durable: bool = False) -> None:
+        goes_on.wait(30)
+        write(path, content, durable=durable)
+
+    monkeypatch.setattr(under_test, "write_whole", slow)
+    monkeypatch.setattr(under_test, "ANSWER_LIMIT_S", 0.3)
+    yield goes_on
+    goes_on.set()
+
+
+def test_a_stop_is_answered_although_the_disk_hangs(tmp_path: Path, hanging: Event) -> None:
+    answers: SimpleQueue[str | None] = SimpleQueue()
+    latch, began = EstopLatch(tmp_path), time.monotonic()
+    for _ in range(1000):  # a flood, too
+        latch.engage("anna", 7, answers.put)
+    for _ in range(1000):
+        said = answers.get(timeout=5)
+        assert said is not None and "not kept yet" in said and str(tmp_path / ESTOP) in said
+    assert time.monotonic() - began < 2.0 and threading.active_count() < 50
+    latch.close()
+    assert time.monotonic() - began < 2.0
+    hanging.set()
+    wait_until(lambda: EstopLatch(tmp_path).found is not None, "the stop kept after all")
+    assert answers.empty()  # once each
+
+
+def test_a_host_on_a_disk_that_hangs_stops_at_once_answers_and_ends(tmp_path: Path, hanging: Event) -> None:
+    with running(run_config(pace="realtime"), latch=EstopLatch(tmp_path)) as run:
+        began = time.monotonic()
+        answer = run.ask(keys.ESTOP, EstopRequest(who="anna"))
+        assert answer.ok and answer.lifecycle == "estop" and "not kept yet" in answer.reason
+        assert time.monotonic() - began < 2.0
+        run.reaches("estop")

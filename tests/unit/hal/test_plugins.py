@@ -11,7 +11,15 @@ import pytest
 
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.files import FileStruct
-from snakesim_hal.plugins import BACKENDS, CONTROLLERS, SERVICES, find_plugin, installed, plugin_settings
+from snakesim_hal.plugins import (
+    BACKENDS,
+    CONTROLLERS,
+    SERVICES,
+    find_installed,
+    find_plugin,
+    installed,
+    plugin_settings,
+)
 
 REPOSITORY = Path(__file__).parents[3]
 WAVE = """\
@@ -50,11 +58,47 @@ def test_a_class_of_a_file_is_a_plugin(tmp_path: Path) -> None:
     assert wave.__name__ == "Wave" and plugin_settings(wave, {"gain": 2.0}, "a.toml", "c").gain == 2.0
 
 
+TRAP = """\
+from pathlib import Path
+Path({mark!r}).write_text("executed")
+
+class Wave:
+    class Settings: ...
+
+class Other: ...
+
+def make(): ...
+"""
+NAMELESS = {"no class": "", "empty class": ":", "unknown class": ":Wove"}
+
+
+@pytest.mark.parametrize("nameless", NAMELESS)
+@pytest.mark.parametrize("find", [find_plugin, find_installed])
+def test_a_file_without_its_class_lists_the_classes(find: Any, nameless: str, tmp_path: Path) -> None:
+    (tmp_path / "wave.py").write_text(TRAP.format(mark=str(tmp_path / "mark")))
+    with pytest.raises(ConfigError) as caught:
+        find(CONTROLLERS, f"{tmp_path}/wave.py{NAMELESS[nameless]}")
+    assert f"as in {tmp_path}/wave.py:Wave; the classes in it are Wave, Other" in str(caught.value)
+    assert (tmp_path / "mark").exists() == (find is find_plugin and nameless == "unknown class")
+
+
+def test_looking_at_a_file_runs_none_of_it(tmp_path: Path) -> None:
+    (tmp_path / "wave.py").write_text(TRAP.format(mark=str(tmp_path / "mark")))
+    for name in ("Wave", "make", "Path"):
+        assert find_installed(CONTROLLERS, f"{tmp_path}/wave.py:{name}") is None
+    assert not (tmp_path / "mark").exists()
+    assert find_installed(CONTROLLERS, "hold") is find_plugin(CONTROLLERS, "hold")
+
+
 BROKEN = {
-    "no such class": (WAVE, "Wove", "AttributeError"),
+    "no such class": (WAVE, "Wove", "the file has no 'Wove', as in .*wave.py:Wave; the classes in it are Wave$"),
     "not Python": ("class Wave(:\n", "Wave", "SyntaxError"),
     "import that fails": ("import no_such_module_anywhere\n", "Wave", "no_such_module_anywhere"),
     "name that is not there": ("x = undefined_thing\n", "Wave", "undefined_thing"),
+    "exception of its own": ("x = 1 / 0\n", "Wave", "ZeroDivisionError: division by zero"),
+    "exit": ("raise SystemExit(0)\n", "Wave", "SystemExit"),
+    "deep": ("x = " + "(" * 100_000, "Wave", "too many nested parentheses"),
+    "NUL": ("x = 1\0", "Wave", "null bytes"),
 }
 
 
@@ -68,7 +112,7 @@ def test_a_file_that_cannot_be_loaded_is_one_error(broken: str, tmp_path: Path) 
 
 
 def test_an_absent_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"there is no file .*none\.py"):
+    with pytest.raises(ConfigError, match=r"none\.py: no such file"):
         find_plugin(BACKENDS, f"{tmp_path}/none.py:None")
 
 

@@ -13,6 +13,8 @@ from hypothesis import strategies as st
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.files import shipped
 from snakesim_hal.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
+from snakesim_hal.participants import Participants
+from snakesim_hal.planned import check_planned
 from snakesim_hal.scenario import (
     Loaded,
     Override,
@@ -84,6 +86,18 @@ def test_an_effective_configuration_keeps_flags_and_takes_new_ones(tmp_path: Pat
 def test_the_hash_follows_everything_that_matters(change: dict[str, Any], same: bool) -> None:
     assert (config_hash(run_config(**change)) == config_hash(run_config())) == same
     assert 1 <= len(config_hash(run_config())) <= 64
+
+
+def test_an_external_service_is_waited_for_and_not_started() -> None:
+    own, external = (with_flags("triplet", *flags).config for flags in ([], ["services.control.external=true"]))
+    assert own.has_own_control and own.commander == "obstacle_triplet" and "control" in own.own_services
+    assert not external.has_own_control and external.commander == "external"
+    assert set(external.services) - set(external.own_services) == {"control"}
+    assert list(Participants(external.services)) == list(own.services)
+    for text in ("kill:control@1", "hang:control@1", "drop:actuator/joints@1"):
+        check_planned(with_flags("triplet", f'faults=["{text}"]').config)
+        with pytest.raises(ConfigError, match=r"`faults\[0\]`: .*control"):
+            check_planned(with_flags("triplet", f'faults=["{text}"]', "services.control.external=true").config)
 
 
 @given(rate_hz=st.floats(20, 5000))

@@ -173,7 +173,7 @@ def test_an_answer_that_cannot_be_read_is_no_answer() -> None:
             keys.LEASE, lambda query: query.reply(keys.LEASE, b"\xc1", encoding="zenoh/bytes")
         )
         with pytest.raises(NotConnectedError, match="hal/lease cannot be read: unknown_message"):
-            session.ask_politely(keys.LEASE, LeaseRequest(action="acquire", holder="control"))
+            session.ask(keys.LEASE, LeaseRequest(action="acquire", holder="control"))
         commander = Commander(Client(session, "control"), ROBOT)
         time.sleep(0.3)  # it asks at most so often
         assert not commander.holds(CLOCK)

@@ -1,21 +1,23 @@
-"""Heat: how fast it comes, what it takes from the torque, and that torque fades before the module gives up."""
+"""Heat: how fast it comes, what it takes from the torque, and that torque fades before the robot stops."""
 
 import numpy as np
 import pytest
 
 from snakesim_hal import thermal
-from snakesim_hal.thermal import Thermal
+from snakesim_hal.thermal import HeatLimits, Thermal
+
+LIMITS = HeatLimits(derate_from_c=80.0, stop_at_c=105.0)
 
 
 def test_half_of_rated_torque_is_held_for_ever_at_80_degrees() -> None:
-    heat = Thermal(1, 4.0)
+    heat = Thermal(1, 4.0, LIMITS)
     heat.pass_time(3600.0, np.array([2.0**2]))
     assert heat.winding_c[0] == pytest.approx(80.0)
-    assert heat.share_left()[0] == pytest.approx(1.0)
+    assert heat.share_left() is None
 
 
 def test_it_is_exact_whatever_the_step() -> None:
-    fine, coarse = Thermal(1, 4.0), Thermal(1, 4.0)
+    fine, coarse = Thermal(1, 4.0, LIMITS), Thermal(1, 4.0, LIMITS)
     for _ in range(1000):
         fine.pass_time(0.01, np.array([9.0]))
     coarse.pass_time(10.0, np.array([9.0]))
@@ -23,30 +25,40 @@ def test_it_is_exact_whatever_the_step() -> None:
     assert coarse.winding_c[0] == pytest.approx(20 + 240 * 9 / 16 * (1 - np.exp(-10 / 60)))
 
 
-@pytest.mark.parametrize(("celsius", "share"), [(20, 1.0), (80, 1.0), (90, 0.6), (100, 0.2), (120, 0.2)])
+@pytest.mark.parametrize(("celsius", "share"), [(20, 1.0), (80, 1.0), (85, 0.84), (92.5, 0.6), (105, 0.2), (120, 0.2)])
 def test_derating_is_linear(celsius: float, share: float) -> None:
-    heat = Thermal(1, 4.0)
-    heat.winding_c[:] = celsius
-    assert heat.share_left()[0] == pytest.approx(share)
+    assert LIMITS.share_left(celsius) == pytest.approx(share)
+    assert HeatLimits(celsius, celsius + 10.0).share_left(celsius + 5.0) == pytest.approx(0.6)
+
+
+def test_a_share_is_told_while_one_winding_is_hot_and_once_more_when_it_has_cooled() -> None:
+    heat = Thermal(2, 4.0, LIMITS)
+    for celsius, told in ((80.0, False), (80.1, True), (100.0, True), (79.0, True), (79.0, False)):
+        heat.winding_c[1] = celsius
+        share = heat.share_left()
+        assert (share is not None) is told
+        assert share is None or share.tolist() == pytest.approx([1.0, LIMITS.share_left(celsius)])
 
 
 def test_a_motor_at_stall_fades_and_never_overheats() -> None:
-    heat = Thermal(1, 4.0)
+    heat = Thermal(1, 4.0, LIMITS)
     shares: list[float] = []
     for _ in range(60_000):
-        shares.append(heat.share_left()[0])
+        shares.append(LIMITS.share_left(float(heat.winding_c[0])))
         heat.pass_time(0.01, np.array([(4.0 * shares[-1]) ** 2]))
     assert np.abs(np.diff(shares)).max() < 0.01
-    assert heat.winding_c[0] < thermal.OVERHEAT_C - 5 and shares[-1] < 0.8
+    assert heat.winding_c[0] < LIMITS.stop_at_c - 5 and shares[-1] < 0.8
 
 
 def test_injected_heat_stays_only_while_it_is_held() -> None:
-    heat = Thermal(2, 4.0)
+    heat = Thermal(2, 4.0, LIMITS)
     heat.inject(0, heat=True, hold=False)
     heat.inject(1, heat=True, hold=True)
+    assert heat.winding_c.tolist() == [110.0, 110.0], "5 K above where the robot stops"
     heat.pass_time(30.0, np.zeros(2))
-    assert heat.winding_c[0] < 80 and heat.winding_c[1] == thermal.INJECTED_C
+    assert heat.winding_c[0] < 80 and heat.winding_c[1] == 110.0
     heat.inject(1, heat=False, hold=False)
+    assert heat.winding_c[1] == 110.0, "it cools from there"
     heat.pass_time(30.0, np.zeros(2))
     assert heat.winding_c[1] < 80
 

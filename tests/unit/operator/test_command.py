@@ -1,23 +1,55 @@
-"""`snakesim estop` where a robot is there and does not answer."""
+"""`snakesim estop`, `disarm`: who is asked, who is believed, and what is said when nobody is."""
 
-from dataclasses import replace
+import pytest
 
-from snakesim_hal.session import Link, open_session
-from snakesim_operator import command
-from tests.unit.hal.network import running
+from snakesim_hal import keys
+from snakesim_hal.errors import RefusedError
+from snakesim_hal.messages import Answer
+from snakesim_hal.session import Link, Question, open_session
+from snakesim_operator import command, stop
+from snakesim_operator.targets import Where
+from tests.unit.hal.network import Follower, following, running
 from tests.unit.hal.test_client_host import run_config
 
 
 def test_a_robot_that_does_not_answer_a_stop_is_named() -> None:
     with running(run_config()) as run:
-        everywhere, said = replace(run.link, namespace=None), list[str]()
-        assert command.estop(everywhere, said.append) == 0
-        assert said == [f"lab/worm: stopped: {run.status.why}"] and run.status.lifecycle == "estop"
-        with open_session(Link(run.link.endpoint, "lab/deaf")) as deaf:
+        at, said = run.link.endpoint, list[str]()
+        assert stop.estop(Where(at), said.append) == 0
+        assert said == [f"lab/worm: stopped: {run.status.why} ({at})"] and run.status.lifecycle == "estop"
+        with open_session(Link(at, "lab/deaf")) as deaf:
             deaf.declare_alive("hal")
             said.clear()
-            assert command.estop(everywhere, said.append) == 1
-            assert said[0].startswith("lab/worm: stopped") and said[1].startswith("lab/deaf: NO ANSWER")
+            assert stop.estop(Where(at), said.append) == 1
+            assert {line.split(": ")[1] for line in said if line.startswith("lab/worm")} == {"stopped"}
+            assert any(line.startswith("lab/deaf: NOT STOPPED: NO ANSWER") for line in said)
             said.clear()
-            assert command.estop(Link(run.link.endpoint, "lab/nobody"), said.append) == 1
-            assert said == ["lab/nobody: NO ANSWER: use its own emergency stop"]
+            assert stop.estop(Where(at, "lab/nobody"), said.append) == 1
+            assert said[0].startswith("lab/nobody: NOT STOPPED: NO ANSWER")
+
+
+def test_an_impostor_that_answers_too_is_told() -> None:
+    with running(run_config(pace="realtime")) as run, following(run.link, Follower()):
+        run.arm()
+        with open_session(run.link) as impostor:
+
+            def lie(question: Question) -> None:
+                question.reply(Answer(ok=True, reason="done", lifecycle="disarmed", host=run.host.description.host))
+
+            impostor.on_question(keys.LIFECYCLE, lie)
+            with pytest.raises(RefusedError, match="2 answered in its name"):
+                command.disarm(Where(run.link.endpoint))
+        assert run.status.lifecycle == "disarmed"
+
+
+def test_an_answer_that_the_status_does_not_show_is_not_believed() -> None:
+    with running(run_config(pace="realtime")) as run, following(run.link, Follower()):
+        run.arm()
+        with open_session(Link(run.link.endpoint, "lab/other")) as impostor:
+            impostor.declare_alive("hal")
+            impostor.on_question(
+                keys.LIFECYCLE, lambda question: question.reply(Answer(ok=True, reason="done", lifecycle="disarmed"))
+            )
+            with pytest.raises(RefusedError, match="NOT CONFIRMED"):
+                command.disarm(Where(run.link.endpoint, "lab/other"))
+        assert run.status.lifecycle == "armed"

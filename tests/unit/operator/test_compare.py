@@ -14,7 +14,7 @@ from snakesim_hal.errors import ConfigError
 from snakesim_hal.host_process import HostRecord
 from snakesim_hal.messages import ControlState, Mode
 from snakesim_hal.robot import Chain, describe
-from snakesim_hal.scenario import RunConfig, load, parse_set
+from snakesim_hal.scenario import RunConfig, load, parse_set, write
 from snakesim_operator.compare.command import compare
 from snakesim_operator.compare.difference import Difference, differ
 from snakesim_operator.compare.page import page
@@ -24,6 +24,7 @@ from snakesim_operator.record import RunRecord
 
 JOINTS = 13
 SPEED_M_S = 0.1
+BY_JOINT = ("angle_rad", "velocity_rad_s", "torque_nm", "mode", "target")
 
 
 def configured(**changes: Any) -> RunConfig:
@@ -96,7 +97,7 @@ def describe_of(run: RunConfig):
 
 def shown(difference: Difference) -> tuple[str, str]:
     """Table and page; neither may show what is not a number."""
-    told = table(difference), page(difference, within(difference, 5))
+    told = "\n".join(table(difference)), page(difference, within(difference, 5))
     for text in told:
         assert not re.search(
             r"\b(nan|inf|None)\b", re.sub(r"<(style|script)>.*?</\1>|base64,[^\"]*", "", text, flags=re.S)
@@ -114,6 +115,44 @@ def test_the_same_run_twice_differs_in_nothing() -> None:
     text, html = shown(difference)
     assert "The runs are the same, joint by joint, for all of their 200 common ticks." in text
     assert "No difference: every angle is the same at every instant." in html
+
+
+@pytest.mark.parametrize("name", ["angle_rad", "velocity_rad_s", "torque_nm", "target"])
+@pytest.mark.parametrize("where", [np.s_[:], np.s_[50:60, 3]])
+def test_what_is_not_a_number_in_both_runs_is_not_called_the_same(name: str, where: Any) -> None:
+    record = made_up()
+    hurt = getattr(record, name).copy()
+    hurt[where] = np.nan
+    hurt = dataclasses.replace(record, **{name: hurt})
+    for difference in (differ(hurt, hurt), differ(record, hurt), differ(hurt, record)):
+        text, html = shown(difference)
+        assert not difference.identical and "The runs are the same" not in text + html
+        assert "Not a number in one run or in both, so that nobody can tell whether it is the same: " in text
+
+
+def test_infinity_in_both_runs_is_not_called_the_same() -> None:
+    record = made_up()
+    hurt = dataclasses.replace(record, torque_nm=np.full_like(record.torque_nm, np.inf))
+    assert not differ(hurt, hurt).identical
+
+
+ODD: dict[str, dict[str, Any]] = {
+    "too few joints": {"angle_rad": np.zeros((200, 5))},
+    "too few ticks": {"torque_nm": np.zeros((5, JOINTS))},
+    "texts": {"target": np.full((200, JOINTS), "x")},
+    "complex": {"velocity_rad_s": np.zeros((200, JOINTS), dtype=complex)},
+    "a number": {"mode": np.zeros(())},
+    "positions in a plane": {"position_w": np.zeros((200, 2))},
+    "time that stands": {"time_s": np.zeros(200)},
+    "time that is not a number": {"time_s": np.full(200, np.nan)},
+}
+
+
+@pytest.mark.parametrize("odd", ODD)
+def test_a_black_box_with_odd_arrays_is_one_error(odd: str) -> None:
+    with pytest.raises(ConfigError, match="blackbox") as caught:
+        differ(made_up(), dataclasses.replace(made_up(), **ODD[odd]))
+    assert f"`{next(iter(ODD[odd]))}`" in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_one_joint_that_is_off_is_named_with_its_time() -> None:
@@ -189,7 +228,7 @@ def test_a_set_point_holds_until_the_next_one() -> None:
 def test_ticks_that_are_missing_are_told() -> None:
     a = made_up()
     keep = np.arange(200) != 50
-    columns = ("time_s", "angle_rad", "velocity_rad_s", "torque_nm", "mode", "target")
+    columns = [name for name, value in vars(a).items() if isinstance(value, np.ndarray)]
     difference = differ(a, dataclasses.replace(a, **{name: getattr(a, name)[keep] for name in columns}))
     assert difference.aligned.how.startswith("both at 100 Hz, but some ticks are missing")
     assert difference.identical
@@ -280,7 +319,7 @@ def test_robots_with_other_joints_are_not_compared() -> None:
 def test_a_run_that_never_armed_is_not_compared() -> None:
     a = made_up()
     empty = dataclasses.replace(a, folder=Path("idle"), time_s=np.zeros(0))
-    with pytest.raises(ConfigError, match=r"idle/blackbox.npz.*never armed"):
+    with pytest.raises(ConfigError, match=r"idle/blackbox.rows.*never armed"):
         differ(a, empty)
 
 
@@ -293,9 +332,15 @@ def test_folders_that_hold_no_run_are_named(tmp_path: Path) -> None:
         compare(tmp_path / "nowhere", tmp_path)
     with pytest.raises(ConfigError, match=r"not the folder of a run: config\.json is missing"):
         compare(tmp_path, tmp_path)
-    for name in ("config.json", "blackbox.npz", "host.json", "description.json"):
+    for name in ("config.json", "blackbox.rows", "host.json", "description.json"):
         (tmp_path / name).write_text("{")
-    with pytest.raises(ConfigError, match="holds a record that cannot be read"):
+    with pytest.raises(ConfigError, match=r"config\.json: not valid JSON"):
+        compare(tmp_path, tmp_path)
+    write(configured(), tmp_path / "config.json")
+    with pytest.raises(ConfigError, match="the record of this run is damaged"):
+        compare(tmp_path, tmp_path)
+    (tmp_path / "description.json").write_bytes(msgspec.json.encode(describe_of(configured())))
+    with pytest.raises(ConfigError, match=r"blackbox\.rows cannot be read as the black box of a run"):
         compare(tmp_path, tmp_path)
     with pytest.raises(ConfigError, match="--within -1: give a percentage"):
         compare(tmp_path, tmp_path, within_percent=-1)

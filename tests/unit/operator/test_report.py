@@ -21,7 +21,8 @@ from snakesim_hal.route import Route, lay_chain, sine_points
 from snakesim_hal.scenario import RunConfig, Service, Start
 from snakesim_hal.scene import Cylinder, Ground, SceneFile, SineRoute, place, route_of
 from snakesim_operator.record import RunRecord
-from snakesim_operator.report import write_picture, write_report
+from snakesim_operator.report import page as report_page
+from snakesim_operator.report import write_picture
 from snakesim_operator.report.figures import joint_angle, joint_torque
 from snakesim_operator.report.instants import best_instant, pushing_instants
 from snakesim_operator.report.labels import Labels
@@ -36,6 +37,7 @@ from snakesim_operator.report.timeline import (
     thinned,
 )
 from snakesim_operator.report.torque_map import coloured, strongest
+from snakesim_operator.report.verdict import Verdict, verdict
 from snakesim_operator.summary import RunSummary, summarise
 
 SECTIONS = ["instants", "overview", "joints", "loads", "numbers", "again"]
@@ -299,9 +301,7 @@ class Reader(HTMLParser):
 
 
 def read(record: RunRecord, ended: str = "complete") -> Reader:
-    path = write_report(record, summarise(record, ended))
-    assert path == record.folder / "report.html"
-    page = path.read_text(encoding="utf-8")
+    page = report_page(record, summarise(record, ended))
     reader = Reader(page)
     assert [i for i in reader.ids if i in SECTIONS] == SECTIONS
     assert len(page.encode()) < 1_500_000
@@ -334,7 +334,7 @@ def test_the_verdict_tells_distance_and_hand_over(page: Reader) -> None:
         "Moved 0.43 m along the path in 10.0 s; propulsion handed over joint_7 → joint_6 → joint_5 → joint_4; no fault."
     )
     assert said in page.text
-    assert "Locomotion ended at 9.2 s: 2 usable push-points, 3 are needed." in page.text
+    assert "Locomotion ended at 9.2 s of 10.0 s: 2 usable push-points, 3 are needed." in page.text
 
 
 def test_every_joint_that_propelled_has_its_angle_and_its_torque(page: Reader) -> None:
@@ -400,7 +400,7 @@ def test_the_drawn_polygon_is_closed_and_in_proportion(record: RunRecord) -> Non
 
 
 def test_no_text_of_a_figure_covers_another(record: RunRecord) -> None:
-    page = write_report(record, summarise(record, "complete")).read_text(encoding="utf-8")
+    page = report_page(record, summarise(record, "complete"))
     figures = [ET.fromstring(found) for found in re.findall(r'<svg viewBox="[^"]*" class="figure" role.*?</svg>', page)]
     assert len(figures) >= 20
     for figure in figures:
@@ -450,7 +450,7 @@ def test_every_number_of_the_summary_stands_in_the_table_with_its_unit(record: R
 
 
 def test_the_page_says_how_to_repeat_the_run(record: RunRecord) -> None:
-    page = write_report(record, summarise(record, "complete")).read_text(encoding="utf-8")
+    page = report_page(record, summarise(record, "complete"))
     assert f"snakesim run {record.folder}/config.json --backend sim --seed 1" in page
     assert "&quot;amplitude_m&quot;: 0.05" in page
 
@@ -543,8 +543,54 @@ def test_a_run_that_moved_and_then_jammed_is_called_jammed(record: RunRecord) ->
         for state in record.control
     ]
     page = read(changed(record, control=stuck))
-    assert "Jammed. Moved 0.43 m along the path" in page.text
-    assert "Locomotion ended at 9.2 s: jammed: wedged." in page.text
+    assert "Jammed at 9.2 s of 10.0 s: wedged. Moved 0.43 m along the path" in page.text
+
+
+def stopped_at(record: RunRecord, at_s: float, **state: Any) -> RunRecord:
+    """The same run, in which nothing moves any more from a time on, and control tells this."""
+    row = record.row_at(float(record.time_s[0]) + at_s)
+    held = {name: getattr(record, name).copy() for name in MOVING}
+    for column in held.values():
+        column[row:] = column[row]
+    since_ns = (float(record.time_s[0]) + at_s) * 1e9
+    control = [msgspec.structs.replace(one, **state) if one.stamp_ns > since_ns else one for one in record.control]
+    return changed(record, control=control, **held)
+
+
+def judged(record: RunRecord) -> Verdict:
+    return verdict(record, summarise(record, "complete"))
+
+
+def test_a_run_that_stood_still_for_most_of_its_time_is_no_good_one(record: RunRecord) -> None:
+    assert judged(record).kind == "good"
+    lost = judged(stopped_at(record, 4.0, state="NotLocomoting", reason="2 usable push-points, 3 are needed"))
+    assert lost.kind == "poor"
+    assert lost.words.startswith("Stopped at 4.0 s of 10.0 s: 2 usable push-points, 3 are needed. Moved 0.")
+    late = judged(stopped_at(record, 6.5, state="NotLocomoting", reason="2 usable push-points, 3 are needed"))
+    assert late.kind == "good" and "Locomotion ended at 6.6 s of 10.0 s: 2 usable push-points" in late.words
+
+
+def test_a_jam_is_one_whatever_control_told_at_the_very_end(record: RunRecord) -> None:
+    """A controller that tries again and again, and each time says for a moment that it moves."""
+    stuck = stopped_at(record, 6.0, state="NotLocomoting", reason="jammed: wedged", jammed=True)
+    trying = [*stuck.control[:-1], msgspec.structs.replace(stuck.control[-1], state="Locomoting", reason="pushing")]
+    found = judged(changed(stuck, control=trying))
+    assert found.kind == "poor" and found.words.startswith("Jammed at 5.9 s of 10.0 s: wedged. Moved")
+    claims = judged(stopped_at(record, 4.0, state="Locomoting", reason="pushing"))
+    assert claims.kind == "poor" and "its controller reported Locomoting all the same" in claims.words
+
+
+def test_a_run_that_rests_at_the_end_of_its_path_has_not_failed(record: RunRecord) -> None:
+    rests = judged(stopped_at(record, 4.0, state="Idle", reason="nobody wants to move: the path is finished"))
+    assert rests.kind == "good" and "Locomotion ended at 4.0 s" in rests.words
+
+
+def test_who_says_nothing_more_is_not_known_to_move(record: RunRecord) -> None:
+    silent = [state for state in record.control if state.stamp_ns < 4.37e9]
+    assert silent[-1].state == "Locomoting"
+    told = summarise(changed(record, control=silent), "complete").locomoting_fraction
+    whole = summarise(record, "complete").locomoting_fraction
+    assert told == pytest.approx((4.0 - 0.8 + 0.5) / 10.0, abs=0.06) and whole == pytest.approx(0.84, abs=0.06)
 
 
 def test_a_controller_that_says_it_moves_and_does_not(record: RunRecord) -> None:
@@ -560,10 +606,35 @@ def test_text_from_outside_is_escaped(record: RunRecord) -> None:
     told = [msgspec.structs.replace(state, reason=nasty, state="NotLocomoting") for state in record.control]
     host = msgspec.structs.replace(record.host, faults=[Fault(tick=90, what=nasty, cause=nasty)])
     hurt = changed(record, config=config_, control=told, host=host)
-    page = write_report(hurt, summarise(hurt, nasty)).read_text(encoding="utf-8")
+    page = report_page(hurt, summarise(hurt, nasty))
     assert "<script>alert" not in page
     assert page.count("&lt;script&gt;alert") >= 5
     assert nasty in Reader(page).text
+
+
+def test_names_from_outside_are_escaped_and_turn_no_text_around(record: RunRecord) -> None:
+    nasty = "</title><script>alert(1)\u202e\x9b31m\x1b[31m\u2028"
+    joints = [msgspec.structs.replace(joint, name=f"{nasty}{i}") for i, joint in enumerate(record.description.joints)]
+    old = [joint.name for joint in record.description.joints]
+    told = [
+        msgspec.structs.replace(
+            state, propulsion_joint=None if (one := state.propulsion_joint) is None else joints[old.index(one)].name
+        )
+        for state in record.control
+    ]
+    pegs_ = [
+        msgspec.structs.replace(peg, name=f"{nasty}{i}"[:64]) for i, peg in enumerate(record.config.scene.cylinder)
+    ]
+    scene = msgspec.structs.replace(record.config.scene, cylinder=pegs_)
+    hurt = changed(
+        record,
+        description=msgspec.structs.replace(record.description, joints=joints),
+        control=told,
+        config=msgspec.structs.replace(record.config, scene=scene),
+    )
+    page = report_page(hurt, summarise(hurt, "complete"))
+    assert propulsion_intervals(hurt) and "<script>alert" not in page and "&lt;script&gt;alert" in page
+    assert not {"\u202e", "\x9b", "\x1b", "\u2028"} & set(page) and "\\u202e\\u009b31m" in page
 
 
 def test_a_snake_that_lies_upwards_is_turned(record: RunRecord) -> None:

@@ -21,6 +21,7 @@ from snakesim_hal.robot import RobotFile
 from snakesim_hal.scenario import RunConfig, load
 from snakesim_hal.scene import SceneFile
 from snakesim_operator.schemas import contract, write_schemas
+from snakesim_operator.schemas import schema_of as published_schema
 from tests.unit.hal.strategies import messages_of, places, plain_example, poisons, replaced
 
 REPOSITORY = Path(__file__).parents[3]
@@ -37,14 +38,15 @@ def test_the_published_files_are_what_the_code_says() -> None:
     published = {
         name: text for name, text in published.items() if not name.startswith("can/")
     }  # tests/unit/can_backend
-    published.pop("README.md", None)  # written by hand
+    for by_hand in ("README.md", "protocol.md"):
+        del published[by_hand]
     assert sorted(published) == sorted(generated), "run `make schemas` and commit what it changes"
     for name, text in generated.items():
         assert published[name] == text, f"schemas/{name} is out of date; run `make schemas` and commit what it changes"
 
 
 def test_writing_removes_what_is_not_part_of_the_contract_any_more(tmp_path: Path) -> None:
-    (tmp_path / "messages").mkdir()
+    write_schemas(tmp_path)
     (tmp_path / "messages" / "Gone.json").write_text("{}")
     (tmp_path / "README.md").write_text("by hand")
     written = write_schemas(tmp_path)
@@ -52,6 +54,13 @@ def test_writing_removes_what_is_not_part_of_the_contract_any_more(tmp_path: Pat
     assert found.pop("README.md") == "by hand"
     assert found == dict(contract())
     assert {str(path.relative_to(tmp_path)) for path in written} == set(found)
+
+
+def test_writing_into_a_folder_of_somebody_else_removes_nothing_of_it(tmp_path: Path) -> None:
+    (tmp_path / "files").mkdir()
+    (tmp_path / "files" / "thesis.json").write_text("{}")
+    write_schemas(tmp_path)
+    assert (tmp_path / "files" / "thesis.json").is_file()
 
 
 def test_the_key_table_lists_every_key_with_its_message_and_version() -> None:
@@ -143,12 +152,12 @@ def schema_of(name: str) -> dict[str, Any]:
 
 
 def message_schema(message: type[Message]) -> dict[str, Any]:
-    return {"encoding": encoding_of(message), **msgspec.json.schema(message)}
+    return {"encoding": encoding_of(message), **published_schema(message)}
 
 
 SCHEMAS = {f"messages/{message.__name__}.json": json.dumps(message_schema(message)) for message in VERSIONS}
 SCHEMAS |= {
-    f"files/{name}.json": json.dumps(msgspec.json.schema(struct))
+    f"files/{name}.json": json.dumps(published_schema(struct))
     for name, struct in (("robot", RobotFile), ("scene", SceneFile), ("run", RunConfig))
 }
 

@@ -1,10 +1,11 @@
 """A simulation that blows up is reported once and for all, and its last good state stays readable."""
 
+import mujoco
 import numpy as np
 import pytest
 
 from snakesim_hal.codec import Decoder, encode, encoding_of
-from snakesim_hal.errors import BackendError
+from snakesim_hal.errors import BackendError, ConfigError
 from snakesim_hal.messages import Mode
 from tests.unit.sim_backend.rig import Run, make_config
 
@@ -53,3 +54,21 @@ def test_nothing_moves_after_closing():
     with pytest.raises(BackendError, match="closed"):
         run.go()
     assert run.sim.faults() == []
+
+
+def test_what_mujoco_cannot_do_is_an_error_of_the_backend():
+    run = Run(make_config())
+    run.go(0.1)
+    run.sim.sim.model.opt.integrator = 99
+    for tick in (11, 12):
+        with pytest.raises(BackendError, match=f"MuJoCo cannot go on at tick {tick}: mj_step: invalid integrator"):
+            run.go()
+
+
+def test_a_robot_that_mujoco_cannot_build_is_named(monkeypatch):
+    def fails(_spec):
+        raise ValueError("mass and inertia of moving bodies must be larger than mjMINVAL")
+
+    monkeypatch.setattr(mujoco.MjSpec, "compile", fails)
+    with pytest.raises(ConfigError, match=r"MuJoCo cannot build robot 'planar13' in this scene: mass and inertia"):
+        Run(make_config())

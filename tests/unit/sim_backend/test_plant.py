@@ -384,3 +384,11 @@ def test_a_firmware_that_swings_up_is_found_out_and_the_joint_named():
         for _ in range(5000):
             plant.advance(-20.0 * plant.velocity_rad_s + 1e-3)
             assert np.isfinite(plant.angle_rad).all()
+
+
+def test_what_mujoco_cannot_do_is_an_error_of_the_backend():
+    plant = make_plant(make_config())
+    pass_time(plant, seconds=0.01)
+    plant.sim.model.opt.integrator = 99
+    with pytest.raises(BackendError, match="MuJoCo cannot go on at step 11: mj_step: invalid integrator"):
+        plant.advance(np.zeros(13))

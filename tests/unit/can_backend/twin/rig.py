@@ -24,12 +24,14 @@ from snakesim_can_backend.twin.parameters import Parameters, from_factory
 from snakesim_can_backend.twin.reports import Sight
 from snakesim_hal.messages import Mode
 from snakesim_hal.scenario import RunConfig
+from snakesim_hal.thermal import HeatLimits
 from tests.unit.hal.rig import run_config
 
 NODE = 3
 SERIAL = 0xC0FFEE
 MS = 1000.0
 BOOTED = 100 * MS
+HEAT = HeatLimits(derate_from_c=80.0, stop_at_c=105.0)
 QUIET = Sight(0, 0, 0)
 
 
@@ -70,7 +72,7 @@ def only(frames: Sequence[Frame], opcode: Opcode, node: int | None = None) -> li
 
 def new_module(**flash: float) -> Module:
     values = from_factory(5.0, 6.0) | {Parameter[name.upper()]: value for name, value in flash.items()}
-    return Module(NODE, SERIAL, Parameters(values))
+    return Module(NODE, SERIAL, Parameters(values), HEAT)
 
 
 def booted(**flash: float) -> Module:

@@ -87,10 +87,10 @@ def test_a_condition_is_a_fault_until_it_is_gone_and_cleared(sensed: str, fault:
     module.poll(BOOTED + MS)
     [beat] = only(module.frames, Opcode.HEARTBEAT)
     assert beat[f"fault_{fault.name.lower()}"] == 1 and beat["last_stop"] == LastStop[fault.name]
-    module.inside.winding_c = 71.0 if sensed == "hot" else 20.0
+    module.inside.winding_c = 80.0 if sensed == "hot" else 20.0
     module.hear(command(Action.CLEAR), BOOTED + 2 * MS)
     assert module.state == ModuleState.FAULT
-    module.inside.leak, module.inside.winding_c = False, 69.0
+    module.inside.leak, module.inside.winding_c = False, 79.0
     module.poll(BOOTED + 3 * MS)
     assert module.state == ModuleState.FAULT, "latched"
     module.hear(command(Action.CLEAR), BOOTED + 3 * MS)

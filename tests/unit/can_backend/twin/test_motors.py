@@ -96,7 +96,7 @@ def test_position_mode_of_the_shipped_robot_is_stable_at_1_ms_and_arrives():
     assert np.abs(plant.velocity_rad_s).max() < 1e-3
 
 
-def test_heat_takes_its_share_of_the_limit_and_says_so():
+def test_heat_bounds_the_torque_and_says_so():
     motors, _ = motor()
     drive(motors, Mode.TORQUE, 3.0)
     motors.step(REST, REST)
@@ -108,6 +108,10 @@ def test_heat_takes_its_share_of_the_limit_and_says_so():
     drive(motors, Mode.TORQUE, 1.0)
     motors.step(REST, REST)
     assert not motors.derated()[0]
+    drive(motors, Mode.TORQUE, 3.0, limit=RATED_NM / 4)
+    for _ in range(100):
+        motors.step(REST, REST)
+    assert motors.torque_nm[0] == RATED_NM / 4, "what is asked for is not reduced once more"
 
 
 def test_the_simulator_s_motors_do_the_same():

@@ -1,0 +1,42 @@
+"""How far the body has come of late, by what guidance measured. Pure but for its own memory."""
+
+import math
+from collections import deque
+
+from snakesim_hal.quantities import Vector
+
+WINDOW_S = 1.0
+MOVING_M = 0.005  # in a whole window: what is less counts as standing still
+SMOOTHED_S = 0.1  # time constant: a pose's noise is no movement
+
+
+class Advance:
+    """Follows the body's centre of mass: a body that only wriggles moves its tail and its head, but hardly that."""
+
+    def __init__(self) -> None:
+        self._smooth: Vector | None = None
+        self._recent: deque[tuple[float, Vector]] = deque()  # time, smoothed centre; a window long
+
+    def put(self, time_s: float, centre_w: Vector) -> None:
+        """The centre at a time; times must grow."""
+        smooth, recent = self._smooth, self._recent
+        if recent and time_s <= recent[-1][0]:
+            return
+        if smooth is None or not recent or time_s - recent[-1][0] > WINDOW_S:
+            recent.clear()
+            smooth = centre_w
+        else:
+            keep = math.exp(-(time_s - recent[-1][0]) / SMOOTHED_S)
+            (a, b, c), (x, y, z) = smooth, centre_w
+            smooth = (x + keep * (a - x), y + keep * (b - y), z + keep * (c - z))
+        self._smooth = smooth
+        recent.append((time_s, smooth))
+        while time_s - recent[0][0] > WINDOW_S:
+            recent.popleft()
+
+    @property
+    def metres(self) -> float | None:
+        """How far the centre is from where it was a window ago, or at the first time; None: it was never known."""
+        if not self._recent:
+            return None
+        return math.dist(self._recent[0][1], self._recent[-1][1])

@@ -1,0 +1,89 @@
+"""Whether what control is about to act on is fresh enough, by the stamps that it carries. Pure.
+
+Ages count in robot time, from the instant that a sample is of. The limits are the scenario's `[max_age]`; what it
+leaves out follows from how often a stream comes when all is well:
+
+joints      what the gate allows: three periods or 30 ms, and the sensor's delay; at most a lease
+world       guidance's lag, and three of its turns missed, or 0.2 s
+pose,       the sensor's delay, guidance's turn and lag, and three samples missed, or 0.2 s
+contacts
+trajectory  guidance's turn and lag, navigation's lag, and three of its turns missed, or 0.2 s
+
+A stamp that is further ahead of the clock than its limit is refused as well: it is of another host, or forged.
+"""
+
+from dataclasses import dataclass
+
+from snakesim_hal import keys
+from snakesim_hal.gate import JointLimits
+from snakesim_hal.messages import Description, JointState, Trajectory, World
+from snakesim_hal.scenario import RunConfig, Service
+
+MISSED = 3
+LEAST_MARGIN_S = 0.2  # guidance and navigation have no real-time priority: a busy computer holds them up
+
+
+@dataclass(frozen=True)
+class Limits:
+    """The greatest ages, in s; a sensor that the robot lacks has none."""
+
+    joints_s: float
+    world_s: float
+    trajectory_s: float
+    sensors_s: dict[str, float]  # by key: what a world model was made of
+
+    @staticmethod
+    def of(config: RunConfig, robot: Description) -> "Limits":
+        """Those of a run, as its scenario says or as they follow from it."""
+        period_s, own = robot.period_ns * 1e-9, config.max_age
+        guidance = config.services.get("guidance", Service())
+        navigation = config.services.get("navigation", Service())
+        turn_s, lag_s = guidance.every_ticks * period_s, guidance.lag_ticks * period_s
+        plan_s = navigation.every_ticks * period_s
+        planned_s = turn_s + lag_s + navigation.lag_ticks * period_s
+        said = {keys.POSE: own.pose_s, keys.CONTACTS: own.contacts_s}
+        sensors_s = {
+            sensor.key: said[sensor.key] or sensor.delay_s + turn_s + lag_s + _margin_s(1.0 / sensor.rate_hz)
+            for sensor in robot.sensors
+            if sensor.key in said
+        }
+        return Limits(
+            joints_s=own.joints_s or JointLimits.of(robot).oldest_state_ns * 1e-9,
+            world_s=own.world_s or lag_s + _margin_s(turn_s),
+            trajectory_s=own.trajectory_s or planned_s + _margin_s(plan_s),
+            sensors_s=sensors_s,
+        )
+
+    def against_joints(self, joints: JointState, now_ns: int) -> str:
+        """Why a joint state is not acted on; empty when it is. now_ns: robot time."""
+        return _off(keys.JOINTS, joints.stamp_ns, now_ns, self.joints_s)
+
+    def against_world(self, world: World, now_ns: int) -> str:
+        """Why a world model is not acted on; empty when it is."""
+        off = _off(keys.WORLD, world.stamp_ns, now_ns, self.world_s)
+        if off:
+            return off
+        stamps = {keys.POSE: world.pose_stamp_ns, keys.CONTACTS: world.contacts_stamp_ns}
+        found = [_off(key, stamps[key], now_ns, limit_s) for key, limit_s in self.sensors_s.items()]
+        return "; ".join(filter(None, found))
+
+    def against_trajectory(self, trajectory: Trajectory, now_ns: int) -> str:
+        """Why a trajectory is not acted on; empty when it is."""
+        if trajectory.stamp_ns is None:
+            return f"{keys.TRAJECTORY} was planned without a world model"
+        return _off(keys.TRAJECTORY, trajectory.stamp_ns, now_ns, self.trajectory_s)
+
+
+def _margin_s(turn_s: float) -> float:
+    return max(MISSED * turn_s, LEAST_MARGIN_S)
+
+
+def _off(key: str, stamp_ns: int | None, now_ns: int, limit_s: float) -> str:
+    if stamp_ns is None:
+        return f"{keys.WORLD} was made without {key}"
+    age_s = (now_ns - stamp_ns) * 1e-9
+    if age_s > limit_s:
+        return f"{key} is {age_s:.3g} s old, at most {limit_s:.3g} s"
+    if age_s < -limit_s:
+        return f"{key} is stamped {-age_s:.3g} s ahead of the robot's clock"
+    return ""

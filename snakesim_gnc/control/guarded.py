@@ -1,0 +1,114 @@
+"""A controller, and a check of all that it gives. A controller is somebody else's code: what is wrong with it is named.
+
+What a controller must give is what the wire takes: a list of modes, targets and torque limits with one entry a joint,
+of `Mode` and plain Python numbers that are finite.
+"""
+
+import contextlib
+import math
+import traceback
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from snakesim_gnc.control.controller import Action, Controller, Report, View
+from snakesim_hal.backend import SetPoints
+from snakesim_hal.errors import ControllerError
+from snakesim_hal.messages import Description, Mode
+from snakesim_hal.quantities import MOST_TARGET
+
+NUMBERS = {float, int}  # exactly: a NumPy number or a bool is none that can be sent
+MODES = ", ".join(f"Mode.{mode.name}" for mode in Mode)
+
+
+class Guarded:
+    """Stands for a controller, made for one arming. Every call may raise ControllerError."""
+
+    def __init__(self, name: str, plugin: type[Controller], robot: Description, settings: Any) -> None:
+        """name: as it was asked for: an entry point, or `./file.py:Class`."""
+        self._who = f"controller {name} (class {getattr(plugin, '__name__', plugin)})"
+        self._joints = [joint.name for joint in robot.joints]
+        with self._named("__init__"):
+            self._controller = plugin(robot, settings)
+
+    def update(self, view: View) -> Action:
+        """The controller's answer, which can be sent."""
+        with self._named("update"):
+            action = self._controller.update(view)
+        try:
+            check(action, self._joints)
+        except ValueError as error:
+            raise self.wrong(str(error)) from None
+        return action
+
+    def wrong(self, what: str) -> ControllerError:
+        """An error that names the controller. what: the field, its value, and what is allowed."""
+        return ControllerError(f"{self._who}: {what}")
+
+    @contextlib.contextmanager
+    def _named(self, method: str) -> Iterator[None]:
+        """Name what a method raises; its traceback goes to the log."""
+        try:
+            yield
+        except (Exception, SystemExit) as error:
+            traceback.print_exc()
+            last = traceback.extract_tb(error.__traceback__)[-1]
+            raised = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+            where = f"{last.filename.rpartition('/')[2]} line {last.lineno}"
+            raise self.wrong(f"{method}() raised {raised} ({where})") from error
+
+
+def check(action: Action, joints: Sequence[str]) -> None:
+    """Raises ValueError with the field, its value and what is allowed. joints: names, tail to head."""
+    if not isinstance(action, Action):
+        raise ValueError(f"update() returned {_shown(action)}, must return an Action")
+    points, report = action.set_points, action.report
+    if not isinstance(points, SetPoints):
+        raise ValueError(f"Action.set_points is {_shown(points)}, must be SetPoints")
+    if not isinstance(report, Report):
+        raise ValueError(f"Action.report is {_shown(report)}, must be a Report")
+    _check_length("mode", points.mode, joints)
+    for i, mode in enumerate(points.mode):
+        if type(mode) is not Mode:
+            raise ValueError(f"SetPoints.mode[{i}] ({joints[i]}) is {_shown(mode)}, must be one of {MODES}")
+    _check_numbers("target", points.target, joints, least=-MOST_TARGET)
+    _check_numbers("torque_limit_nm", points.torque_limit_nm, joints, least=0.0)
+    _check_report(report, joints)
+
+
+def _check_length(field: str, values: Any, joints: Sequence[str]) -> None:
+    if type(values) is not list:
+        hint = "; use .tolist()" if hasattr(values, "tolist") else ""
+        raise ValueError(f"SetPoints.{field} is {_shown(values)}, must be a list{hint}")
+    if len(values) != len(joints):
+        wanted = f"{len(joints)}: one a joint, {joints[0]} to {joints[-1]}"
+        raise ValueError(f"SetPoints.{field} has {len(values)} values, must have {wanted}")
+
+
+def _check_numbers(field: str, values: Any, joints: Sequence[str], *, least: float) -> None:
+    _check_length(field, values, joints)
+    for i, value in enumerate(values):
+        if type(value) in NUMBERS and least <= value <= MOST_TARGET:  # which no NaN is
+            continue
+        where = f"SetPoints.{field}[{i}] ({joints[i]}) is {_shown(value)}"
+        if type(value) not in NUMBERS:
+            raise ValueError(f"{where}, must be a plain float: use float(), or .tolist() of an array")
+        unit = "N·m" if field == "torque_limit_nm" else "rad, rad/s or N·m"
+        raise ValueError(f"{where}, must be a finite number of {unit} from {least:g} to {MOST_TARGET:g}")
+
+
+def _check_report(report: Report, joints: Sequence[str]) -> None:
+    """What decides about the state; the rest is checked when it is told."""
+    if not isinstance(report.why, str):
+        raise ValueError(f"Report.why is {_shown(report.why)}, must be a str")
+    for field, most in (("usable_push_points", math.inf), ("propulsion_joint", len(joints) - 1)):
+        value = getattr(report, field)
+        if value is not None and not (type(value) is int and 0 <= value <= most):
+            allowed = "None or an int from 0" + ("" if most == math.inf else f" to {most}")
+            raise ValueError(f"Report.{field} is {_shown(value)}, must be {allowed}")
+
+
+def _shown(value: Any) -> str:
+    """A value as an error shows it: its type too where that is not plain."""
+    text = repr(value)
+    text = text if len(text) <= 60 else f"{text[:57]}..."
+    return text if value is None or type(value) in (int, float, str) else f"{text} ({type(value).__name__})"

@@ -1,0 +1,101 @@
+"""What control tells of itself: `control/state` a few times a second, and at once when it changes."""
+
+import msgspec
+
+from snakesim_gnc.control.advance import Advance
+from snakesim_gnc.control.controller import Report
+from snakesim_gnc.control.states import locomotion_state
+from snakesim_hal.messages import Clock, ControlState, Description, LocomotionState, World
+
+TELEMETRY_S = 0.05
+LONGEST = 500  # characters of a reason
+
+
+class Telling:
+    """Makes the state's message when it is time for one."""
+
+    def __init__(self, controller: str, robot: Description) -> None:
+        self._controller = controller[-64:]
+        self._joints = [joint.name for joint in robot.joints]
+        self._advance = Advance()
+        self._decoder = msgspec.msgpack.Decoder(ControlState)
+        self._last: tuple[object, ...] = ()
+        self._next_ns = 0
+
+    def follow(self, world: World) -> None:
+        """Take where the body is from a world model that is fresh."""
+        if world.centre_w is not None:
+            self._advance.put(world.stamp_ns * 1e-9, world.centre_w)
+
+    def state(
+        self,
+        clock: Clock,
+        report: Report | None = None,
+        *,
+        answers: bool = True,
+        armed: bool = False,
+        missing: str = "",
+        rests: str = "",
+    ) -> ControlState | None:
+        """The message, or None when there is no news and the last one is recent. See `locomotion_state`.
+
+        Raises ValueError when the report holds what cannot be told.
+        """
+        report = report or Report()
+        state, reason = locomotion_state(
+            hal_answers=answers,
+            armed=armed,
+            missing=missing,
+            rests=rests,
+            usable_push_points=report.usable_push_points,
+            obstacle=report.why,
+            advanced_m=self._advance.metres,
+        )
+        mark = (state, bool(missing), rests, report.propulsion_joint, report.jammed, clock.lifecycle, clock.arming)
+        if mark == self._last and clock.stamp_ns < self._next_ns:
+            return None
+        self._last, self._next_ns = mark, clock.stamp_ns + round(TELEMETRY_S * 1e9)
+        return self._message(clock, state, reason, report)
+
+    def failure(self, clock: Clock, why: str) -> ControlState:
+        """The last message of a controller that cannot go on."""
+        return self._message(clock, "NotLocomoting", why, Report())
+
+    def _message(self, clock: Clock, state: LocomotionState, reason: str, report: Report) -> ControlState:
+        joint = report.propulsion_joint
+        told = ControlState(
+            tick=clock.tick,
+            stamp_ns=clock.stamp_ns,
+            controller=self._controller,
+            state=state,
+            reason=reason[:LONGEST],
+            path_s_m=report.path_s_m,
+            propulsion_joint=None if joint is None else self._joints[joint],
+            propulsion_n=report.propulsion_n,
+            push_points=report.push_points,  # pyright: ignore[reportArgumentType] - any sequence can be sent
+            solved_force_n=report.solved_force_n,  # pyright: ignore[reportArgumentType]
+            propulsion_torque_nm=report.propulsion_torque_nm,
+            bending_torque_nm=report.bending_torque_nm,  # pyright: ignore[reportArgumentType]
+            reference_rad=report.reference_rad,  # pyright: ignore[reportArgumentType]
+            condition=report.condition,
+            torque_headroom_nm=report.torque_headroom_nm,
+            saturated=report.saturated,
+            jammed=report.jammed,
+        )
+        try:
+            return self._decoder.decode(msgspec.msgpack.encode(told))
+        except (TypeError, msgspec.ValidationError) as error:
+            raise ValueError(_what_is_wrong(told) or str(error)) from None
+
+
+def _what_is_wrong(told: ControlState) -> str:
+    """The field of the report that cannot be sent, with its value."""
+    for field in msgspec.structs.fields(ControlState):
+        value = getattr(told, field.name)
+        try:
+            msgspec.msgpack.decode(msgspec.msgpack.encode(value), type=field.type)
+        except msgspec.ValidationError as error:
+            return f"Report.{field.name} is {value!r:.100}: {error}"
+        except TypeError:
+            return f"Report.{field.name} is {value!r:.100}, must be plain Python numbers: use float() or .tolist()"
+    return ""

@@ -1,0 +1,67 @@
+"""Whether anybody's intent counts now, and what speed it asks for. Pure but for its own memory."""
+
+from dataclasses import dataclass
+
+from snakesim_hal.messages import Intent
+
+LONGEST_NS = 5_000_000_000  # an intent that asks for more counts no longer than this
+FASTEST_M_S = 10.0  # as a scenario's mission
+AHEAD_NS = 100_000_000  # its sender may have heard a newer clock than navigation, which acts a few times a second
+
+
+@dataclass(frozen=True)
+class Wish:
+    """How fast to go, and why that is not the mission's speed; empty when it is."""
+
+    speed_m_s: float
+    why: str = ""
+
+
+class Intents:
+    """Follows the newest good intent until it expires, and then stops.
+
+    Whoever takes over from the mission keeps it: an operator whose connection breaks must not set the robot in motion.
+    """
+
+    def __init__(self, mission_m_s: float) -> None:
+        self._mission_m_s = mission_m_s
+        self._followed: Intent | None = None
+        self._stopped = ""  # why it stands still, after an intent that was followed; empty before any was
+
+    def start_over(self) -> None:
+        """Robot time begins anew: what was stamped before says nothing any more."""
+        if self._followed is not None:
+            self._stop(f"the intent of {self._followed.who} was for another start of the robot")
+
+    def wish(self, newest: Intent | None, now_ns: int) -> Wish:
+        """What counts now. newest: the intent that came last; now_ns: robot time."""
+        refused = ""
+        if newest is not None and newest != self._followed:
+            refused = _against(newest, now_ns)
+            if not refused:
+                self._followed, self._stopped = newest, ""
+        if self._followed is not None and (why := _against(self._followed, now_ns)):
+            self._stop(why)
+        followed = self._followed
+        if followed is None:
+            return Wish(0.0 if self._stopped else self._mission_m_s, refused or self._stopped)
+        if not followed.go:
+            return Wish(0.0, f"{followed.who} wants it to stop")
+        asked = followed.speed_m_s
+        return Wish(self._mission_m_s if asked is None else asked, f"as {followed.who} wants it")
+
+    def _stop(self, why: str) -> None:
+        self._followed, self._stopped = None, f"{why}; send a new one to go on"
+
+
+def _against(intent: Intent, now_ns: int) -> str:
+    """Why an intent does not count; empty when it does."""
+    age_ns, valid_ns = now_ns - intent.stamp_ns, min(intent.valid_for_ns, LONGEST_NS)
+    if age_ns < -AHEAD_NS:
+        return f"the intent of {intent.who} is stamped {-age_ns * 1e-9:.3g} s ahead of the robot's clock"
+    if age_ns > valid_ns:
+        age = f"it is {age_ns * 1e-9:.3g} s old, valid for {valid_ns * 1e-9:.3g} s"
+        return f"the intent of {intent.who} has expired: {age}"
+    if intent.speed_m_s is not None and abs(intent.speed_m_s) > FASTEST_M_S:
+        return f"the intent of {intent.who} asks for {intent.speed_m_s:g} m/s, at most {FASTEST_M_S:g} m/s"
+    return ""

@@ -1,0 +1,150 @@
+"""The stop port: a UDP socket beside the robot's endpoint, through which an emergency stop comes past everything else.
+
+It shares nothing with Zenoh: no session, no connection, no queue. Whatever shuts people out there (half-open
+connections, idle sessions, floods) leaves this path open. A datagram is
+
+    request  b"SNAKSTOP", 16 bytes made up by the sender, who asks in UTF-8 (at most 64 bytes)
+    answer   b"SNAKDONE", the same 16 bytes, in UTF-8: the robot's namespace, a line feed, what was done
+
+The kernel drops what is no request before it is queued, so a flood of anything else takes no room from a stop; and a
+flood of requests is a stop. Who may reach the port is the network's to decide: stopping a robot needs no right.
+"""
+
+import ctypes
+import secrets
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from snakesim_hal.errors import NotConnectedError
+
+REQUEST, ANSWER = b"SNAKSTOP", b"SNAKDONE"
+NONCE_BYTES, MAX_WHO_BYTES, MAX_ANSWER_BYTES = 16, 64, 1024
+UDP_HEADER = 8
+SO_ATTACH_FILTER = 26
+PAUSE_S = 0.001  # between two requests: a flood of them must not take the interpreter for itself
+MAX_REFUSED = 10  # answers of the kernel that nobody has the port
+REPEAT_S = 0.02  # a sender repeats a request that is not answered
+
+Reply = Callable[[str], None]
+
+
+def stop_address(endpoint: str, *, listens: bool) -> tuple[str, int]:
+    """Where the stop port of a robot belongs: beside the endpoint that its host listens on, else on loopback."""
+    protocol, _, address = endpoint.partition("/")
+    host, _, port = address.partition("?")[0].partition("#")[0].rpartition(":")
+    if listens and protocol in ("tcp", "tls", "ws") and port.isdigit():
+        return host.strip("[]"), int(port)
+    return "127.0.0.1", 0
+
+
+def open_stop_port(host: str, port: int) -> socket.socket:
+    """Bind the port. port 0: any. Raises NotConnectedError when somebody else has it."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    opened = socket.socket(family, socket.SOCK_DGRAM)
+    try:
+        opened.bind((host, port))
+        _accept_requests_only(opened)
+    except OSError as error:
+        opened.close()
+        raise NotConnectedError(
+            f"cannot listen for emergency stops on udp/{host}:{port}: {error.strerror}. Another run may hold the port; "
+            f"choose one with --endpoint tcp/{host}:PORT"
+        ) from error
+    return opened
+
+
+def serve_stops(opened: socket.socket, robot: str, take: Callable[[str, Reply], None]) -> None:
+    """Call `take(who, reply)` for every request, from a thread of its own. robot: its namespace, for the answers."""
+
+    def serve() -> None:
+        while True:
+            try:
+                datagram, sender = opened.recvfrom(UDP_HEADER + len(REQUEST) + NONCE_BYTES + MAX_WHO_BYTES)
+            except OSError:
+                return
+            if not datagram.startswith(REQUEST) or len(datagram) < len(REQUEST) + NONCE_BYTES:
+                continue
+            nonce, who = datagram[len(REQUEST) :][:NONCE_BYTES], datagram[len(REQUEST) + NONCE_BYTES :]
+            take(who.decode(errors="replace") or "somebody", _replying(opened, nonce + robot.encode() + b"\n", sender))
+            time.sleep(PAUSE_S)
+
+    threading.Thread(target=serve, name="stop port", daemon=True).start()
+
+
+@dataclass(frozen=True)
+class Stopped:
+    """What a stop port answers."""
+
+    robot: str  # its namespace
+    text: str
+
+
+def ask_to_stop(host: str, port: int, who: str, timeout_s: float) -> Stopped | None:
+    """Ask until it is answered; None when no answer came in time.
+
+    Raises NotConnectedError when nobody has that port.
+    """
+    nonce = secrets.token_bytes(NONCE_BYTES)
+    request = REQUEST + nonce + who.encode()[:MAX_WHO_BYTES]
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    deadline, refused = time.monotonic() + timeout_s, 0
+    with socket.socket(family, socket.SOCK_DGRAM) as asking:
+        asking.settimeout(REPEAT_S)
+        while time.monotonic() < deadline:
+            try:
+                asking.connect((host, port))  # so that the kernel takes answers from there alone
+                asking.send(request)
+                until = time.monotonic() + REPEAT_S
+                while time.monotonic() < until:
+                    answer = asking.recv(MAX_ANSWER_BYTES)
+                    if answer.startswith(ANSWER + nonce):
+                        robot, _, text = answer[len(ANSWER) + NONCE_BYTES :].decode(errors="replace").partition("\n")
+                        return Stopped(robot, text)
+            except TimeoutError:
+                continue
+            except ConnectionRefusedError:
+                refused += 1
+                if refused > MAX_REFUSED:
+                    raise NotConnectedError(f"nobody takes emergency stops on udp/{host}:{port}") from None
+                time.sleep(REPEAT_S)
+            except OSError:  # the way there is closed for now
+                time.sleep(REPEAT_S)
+    return None
+
+
+def _replying(opened: socket.socket, head: bytes, sender: object) -> Reply:
+    def reply(text: str) -> None:
+        try:
+            opened.sendto(ANSWER + head + text.encode()[: MAX_ANSWER_BYTES - 64], sender)  # pyright: ignore
+        except OSError:  # whoever asked is gone; the robot is stopped all the same
+            return
+
+    return reply
+
+
+def _accept_requests_only(opened: socket.socket) -> None:
+    """Have the kernel drop what does not begin like a request, and cut off what is too long.
+
+    Classic BPF; offsets count from the UDP header. Where the kernel refuses, `serve_stops` still looks at each.
+    """
+    first, second = struct.unpack(">II", REQUEST)
+    most = UDP_HEADER + len(REQUEST) + NONCE_BYTES + MAX_WHO_BYTES
+    program = [  # (code, jump if true, jump if false, constant)
+        (0x20, 0, 0, UDP_HEADER),  # load the word there
+        (0x15, 0, 3, first),  # go on if it is equal
+        (0x20, 0, 0, UDP_HEADER + 4),
+        (0x15, 0, 1, second),
+        (0x06, 0, 0, most),  # take so many bytes
+        (0x06, 0, 0, 0),  # take none
+    ]
+    code = b"".join(struct.pack("HBBI", *line) for line in program)
+    kept = ctypes.create_string_buffer(code)
+    with_pointer = struct.pack("HL", len(program), ctypes.addressof(kept))
+    try:
+        opened.setsockopt(socket.SOL_SOCKET, SO_ATTACH_FILTER, with_pointer)
+    except OSError:
+        return

@@ -1,0 +1,87 @@
+"""A3: faults on request are refused where something real moves, whatever a stranger says of the robot."""
+
+import os
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.attack import wire
+from tests.attack.command import STANDING, running
+from tests.attack.robot import Robot, joined
+from tests.attack.stranger import Stranger
+
+BENCH = Path(__file__).parent / "data" / "bench.py"
+EVERY_S = 0.05
+ASKED = (
+    ("fault/run", {"kind": "kill", "target": "control"}),
+    ("fault/run", {"kind": "freeze", "target": "navigation", "for_s": 5.0}),
+    ("fault/run", {"kind": "stop", "target": "guidance"}),
+    ("fault/control", {"kind": "hang", "target": "control", "for_s": 1.0}),
+    ("fault/control", {"kind": "drop", "target": "sensor/joints", "for_s": 1.0, "amount": 1.0}),
+    ("fault/hal", {"kind": "drop", "target": "actuator/joints", "for_s": 1.0, "amount": 1.0}),
+    ("fault/hal", {"kind": "overheat", "target": "joint_3", "for_s": 1.0}),
+)
+
+
+@pytest.fixture(scope="module")
+def real(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Robot, Stranger]]:
+    """A robot that really moves, and a stranger who says from its first moment on that it does not."""
+    home = tmp_path_factory.mktemp("real")
+    with running(home, *STANDING, "--backend", f"{BENCH}:Bench") as run, joined(run) as operator:
+        about = operator.newest("hal/description")
+        assert about["emulated"] is False
+        with Stranger(run.endpoint) as stranger, forging(stranger, {**about, "emulated": True}):
+            operator.recover()
+            # A service that is started again learns what robot it has from what the stranger says.
+            os.kill(run.part("control"), signal.SIGKILL)
+            operator.until(lambda: "control" not in run.parts(), "control gone")
+            operator.until(lambda: "control" in run.parts(), "control again")
+            operator.recover(40.0)
+            yield Robot(run, operator), stranger
+
+
+@contextmanager
+def forging(stranger: Stranger, about: dict[str, Any]) -> Iterator[None]:
+    publisher, over = stranger.latch("hal/description", about), threading.Event()
+
+    def repeat() -> None:
+        while not over.wait(EVERY_S):
+            stranger.put("hal/description", about)
+            publisher.put(wire.encode(about))
+
+    thread = threading.Thread(target=repeat, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+@pytest.mark.parametrize(("key", "request_"), ASKED, ids=[f"{key}-{asked['kind']}" for key, asked in ASKED])
+def test_a3_a_forged_description_lets_nothing_go_wrong_on_a_real_robot(
+    real: tuple[Robot, Stranger], key: str, request_: dict[str, Any]
+) -> None:
+    robot, stranger = real
+    robot.operator.recover(40.0)  # whom an earlier request has killed is started again
+    before = robot.health()
+    answers = stranger.ask(key, request_)
+    assert all(not answer["ok"] for answer in answers), f"{request_}: {answers}"
+    assert answers, f"nobody answers at {key}"
+    robot.stays("armed", 0.5)
+    robot.unharmed(before)
+    assert not robot.operator.status()["injected"]
+
+
+def test_a3_faults_are_for_runs_on_a_simulator_only_by_who_may_ask(robot: Robot) -> None:
+    """What remains: on a simulator anybody may let anything go wrong, which ends in a stop, or a restart."""
+    with Stranger(robot.endpoint) as stranger:
+        assert stranger.ask("fault/run", {"kind": "kill", "target": "guidance"})[0]["ok"]
+        assert not stranger.ask("fault/run", {"kind": "kill", "target": "no such process"})[0]["ok"]
+    robot.run.says("guidance was ended by SIGKILL")
+    robot.operator.recover()

@@ -1,0 +1,226 @@
+"""A8, A9: what services hear from a stranger. It may lead the robot astray, but not beyond its limits."""
+
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.attack import wire
+from tests.attack.effort import FULL, effort
+from tests.attack.limits import beyond_limits
+from tests.attack.robot import Robot, standing
+from tests.attack.stranger import Stranger
+
+FORGED_S = effort(3, 100) / 10
+NS = 10**9
+ABSURD_M_S = 77.0
+
+
+@pytest.fixture(scope="module")
+def moving(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
+    """A robot that goes where navigation says."""
+    home = tmp_path_factory.mktemp("moving")
+    arguments = ("triplet", "--pace", "realtime", "--set", "rate_hz=50", "--duration", "3600", "--stay")
+    with standing(home, *arguments) as robot:
+        robot.operator.hear("sensor/joints", "guidance/world", "navigation/trajectory", "actuator/joints")
+        yield robot
+
+
+@contextmanager
+def repeating(
+    stranger: Stranger,
+    messages: Callable[[], list[tuple[str, Any]]],
+) -> Iterator[None]:
+    """Say something again and again, faster than who should say it."""
+    over = threading.Event()
+
+    def repeat() -> None:
+        while not over.wait(0.005):
+            for key, message in messages():
+                stranger.put(key, message)
+
+    thread = threading.Thread(target=repeat, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+def holds(robot: Robot, key: str, variants: dict[str, dict[str, Any]], each_s: float = FORGED_S) -> None:
+    """Under each forgery nothing leaves its limits and nobody dies; afterwards the robot can be used as before.
+
+    What is forged is the newest honest message with these changes, and the clock's tick and time unless they change.
+    """
+    operator = robot.operator
+    operator.recover()
+    before, about, honest = robot.health(), operator.newest("hal/description"), operator.next(key)
+    with Stranger(robot.endpoint) as stranger:
+        for name, changes in variants.items():
+            operator.forget()
+            clock = operator.next("hal/clock")
+            offset = {"tick": 0, "stamp_ns": 0} if key != "hal/clock" else {}
+
+            def forged(
+                clock: dict[str, Any] = clock, changes: dict[str, Any] = changes, offset: dict[str, int] = offset
+            ) -> dict[str, Any]:
+                now = operator.newest("hal/clock") if offset else clock
+                return {**honest, **{field: now[field] for field in offset}, **changes}
+
+            with repeating(stranger, lambda forged=forged: [(key, forged())]):
+                time.sleep(each_s)
+            rows = [heard.message for heard in operator.heard("hal/applied")]
+            assert beyond_limits(about, rows) == [], name
+            robot.unharmed(before, f"after {key}, {name}")
+            operator.recover()
+    robot.unharmed(before)
+
+
+# --- intents ----------------------------------------------------------------------------------------------------------
+
+
+def intent(operator: Stranger, stamp_ns: int, speed_m_s: float, valid_s: float | None = None) -> dict[str, Any]:
+    said: dict[str, Any] = {"stamp_ns": stamp_ns, "who": "stranger", "speed_m_s": speed_m_s, "go": True}
+    if valid_s is not None:
+        said[how_long()] = round(valid_s * NS)
+    return said
+
+
+def how_long() -> str:
+    """The field of an intent that says for how long it holds."""
+    found = [name for name in wire.fields("Intent") if name.startswith(("valid_for", "expires"))]
+    assert found, "schemas/messages/Intent.json has no field that says how long an intent holds"
+    return found[0]
+
+
+def speeds(operator: Stranger, seconds: float) -> set[float]:
+    began = time.monotonic()
+    time.sleep(seconds)
+    return {heard.message["speed_m_s"] for heard in operator.heard("navigation/trajectory") if heard.at_s > began}
+
+
+@pytest.mark.parametrize("age_s", [60.0, -60.0], ids=["old", "future"])
+def test_a9_an_intent_of_another_time_is_not_followed(moving: Robot, age_s: float) -> None:
+    operator = moving.operator
+    operator.recover()
+    while (now_ns := operator.next("hal/clock")["stamp_ns"]) < 3 * NS:  # what is as old as the robot must be old
+        time.sleep(0.1)
+    operator.put("operator/intent", intent(operator, max(now_ns - round(age_s * NS), 0), 0.0123))
+    assert 0.0123 not in speeds(operator, 1.0), f"an intent that is {age_s:g} s old is followed"
+
+
+def test_a9_an_intent_ends_when_it_says(moving: Robot) -> None:
+    operator = moving.operator
+    operator.recover()
+    now_ns = operator.next("hal/clock")["stamp_ns"]
+    operator.put("operator/intent", intent(operator, now_ns, 0.0321, valid_s=1.0))
+    assert 0.0321 in speeds(operator, 0.8)
+    time.sleep(0.7)
+    assert speeds(operator, 1.0) == {0.0}, "it does not go back to its mission by itself"
+
+
+# --- what remains: a stranger leads the robot astray, within its limits -----------------------------------------------
+
+
+CIRCLE = [[10.0 * math.cos(i / 10), 10.0 * math.sin(i / 10)] for i in range(200)]
+
+
+def test_a8_a_forged_trajectory_is_followed_within_the_limits(moving: Robot) -> None:
+    variants = {
+        "elsewhere": {"path_id": 7, "path_w": CIRCLE, "speed_m_s": ABSURD_M_S},
+        "far": {"path_id": 8, "path_w": [[1e6, -1e6], [-1e6, 1e6]], "speed_m_s": 1e5},
+        "long": {"path_id": 9, "path_w": [[i / 1e3, 0.0] for i in range(20_000)], "speed_m_s": -1e5},
+        "nan": {"path_w": [[float("nan"), 0.0], [0.0, 0.0]]},
+        "one point": {"path_id": 10, "path_w": [[0.0, 0.0]] * 20_000},
+        "hardly any length": {"path_id": 11, "path_w": [[0.0, 0.0], [1e-300, 0.0]]},
+        "unknown obstacles": {"push_points": ["nobody"] * 512, "path_id": 2**62},
+        "future": {"tick": 2**62, "stamp_ns": 2**62},
+        "past": {"tick": 0, "stamp_ns": 0},
+    }
+    holds(moving, "navigation/trajectory", variants)
+
+
+def test_a8_a_forged_world_ends_nobody_and_breaks_no_limit(moving: Robot) -> None:
+    variants = {
+        "elsewhere": {"base_position_w": [1e6, 1e6, 0.0]},
+        "no rotation": {"base_orientation_wxyz": [0.0, 0.0, 0.0, 0.0]},
+        "no contacts": {"base_confidence": 0.0, "contacts": []},
+        "no obstacles": {"obstacles": []},
+        "past": {"tick": 0, "stamp_ns": 0},
+    }
+    holds(moving, "guidance/world", variants)
+
+
+def test_a8_a_world_of_the_future_ends_nobody(moving: Robot) -> None:
+    holds(moving, "guidance/world", {"future": {"tick": 2**62, "stamp_ns": 2**62}})
+
+
+def test_a8_forged_joints_break_no_limit(moving: Robot) -> None:
+    variants = {
+        "elsewhere": {"angle_rad": [1e4] * 13},
+        "fast": {"angle_rad": [0.0] * 13, "velocity_rad_s": [1e5] * 13},
+        "nan": {"angle_rad": [float("nan")] * 13},
+        "one joint": {"angle_rad": [0.0]},
+        "invalid": {"valid": [False] * 13},
+        "old": {"age_ns": [2**62] * 13},
+        "future": {"tick": 2**62, "stamp_ns": 2**62},
+    }
+    holds(moving, "sensor/joints", variants)
+
+
+def test_a8_a_forged_clock_stops_the_robot_at_most(moving: Robot) -> None:
+    variants = {
+        "future": {"tick": 2**62, "stamp_ns": 2**62},
+        "past": {"tick": 0, "stamp_ns": 0},
+        "armed often": {"lifecycle": "armed", "arming": 2**62},
+        "disarmed": {"lifecycle": "disarmed"},
+        "another lease": {"lease_epoch": 2**62},
+        "no lease": {"lease_epoch": 0},
+        "no period": {"period_ns": 0},
+        "promises": {"newest": {"sensor/joints": 2**62, "guidance": 2**62, "navigation": 2**62}},
+    }
+    holds(moving, "hal/clock", variants)
+
+
+def test_a8_a_clock_of_another_pace_ends_nobody(moving: Robot) -> None:
+    """Services know from their own configuration whether they run in lockstep."""
+    # A service waits two seconds for what it was promised.
+    holds(moving, "hal/clock", {"lockstep": {"pace": "lockstep"}}, each_s=max(FORGED_S, 3.0))
+
+
+@pytest.mark.parametrize("lifecycle", ["armed", "fault", "estop", "disarmed"] if FULL else ["estop"])
+def test_a8_a_forged_status_moves_nothing(robot: Robot, lifecycle: str) -> None:
+    operator = robot.operator
+    operator.stand_by()
+    armings = operator.next("hal/clock")["arming"]
+    forged = {**operator.status(), "lifecycle": lifecycle, "ready_to_arm": True, "why": "forged"}
+    with Stranger(robot.endpoint) as stranger, repeating(stranger, lambda: [("hal/status", forged)]):
+        time.sleep(FORGED_S)
+        assert operator.next("hal/clock")["arming"] == armings
+        stopped = robot.run.tell("estop")
+    operator.forget()
+    assert operator.next("hal/clock")["lifecycle"] == "estop", stopped.said
+
+
+def test_a8_forged_answers_of_services_stop_a_lockstep_run_at_most(tmp_path: Path) -> None:
+    arguments = ("triplet", "--controller", "hold", "--pace", "lockstep", "--duration", "3600", "--stay")
+    with standing(tmp_path, *arguments) as robot:
+        before, operator = robot.health(), robot.operator
+
+        def messages() -> list[tuple[str, Any]]:
+            tick = operator.newest("hal/clock")["tick"] + 2
+            return [(f"hal/done/{name}", {"tick": tick}) for name in ("control", "guidance", "navigation")]
+
+        with Stranger(robot.endpoint) as stranger:
+            for name in ("control", "guidance", "navigation", "nobody"):
+                stranger.put(f"hal/done/{name}", {"tick": 2**62})
+            with repeating(stranger, messages):
+                time.sleep(FORGED_S)
+        operator.recover()
+        robot.unharmed(before)

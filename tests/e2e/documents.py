@@ -1,0 +1,112 @@
+"""What a document asks its reader to type: its fenced blocks, section by section, as one shell script.
+
+    ```sh               commands, one after the other
+    ```sh background    a command in a terminal of its own; the next one, or the section's end, ends it with Ctrl-C
+    ```python wave.py   a file that the reader is asked to save
+
+`# ... (exit code 1)` behind a command says how it ends when not with 0.
+"""
+
+import re
+import shutil
+import subprocess
+import sys
+import sysconfig
+from dataclasses import dataclass, field
+from pathlib import Path
+
+REPOSITORY = Path(__file__).parents[2]
+LEFT_OUT = shutil.ignore_patterns(".venv", ".tools", ".git", "runs", "build", "*.egg-info", "__pycache__", ".*_cache")
+PROLOGUE = """\
+set -eum
+ip link set lo up 2>/dev/null || true
+running=
+end_background() {
+    [ -z "$running" ] || { kill -INT -- "-$running" 2>/dev/null || true; wait "$running" || true; }
+    running=
+}
+await_running() {
+    for _ in $(seq 600); do
+        grep -q ' s  ' "$1" && return
+        kill -0 "$running" || break
+        sleep 0.2
+    done
+    echo "did not start:"; cat "$1"; exit 90
+}
+trap 'code=$?; end_background; cat background-*.log 2>/dev/null || true; exit $code' EXIT
+"""
+
+
+@dataclass
+class Section:
+    """A heading, and what is to be typed below it."""
+
+    title: str
+    blocks: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])  # (words behind the fence, content)
+    files: dict[str, str] = field(default_factory=dict[str, str])  # to be saved: here, or in a section before
+
+    @property
+    def has_commands(self) -> bool:
+        """Whether anything is to be typed at all."""
+        return any(info.startswith("sh") for info, _ in self.blocks)
+
+
+def sections(path: Path) -> list[Section]:
+    """Every section of a document that has blocks."""
+    found = [Section("")]
+    fence: list[str] | None = None
+    info = ""
+    for line in path.read_text(encoding="utf-8").splitlines():
+        if fence is None and (heading := re.match(r"#+ (.*)", line)):
+            found.append(Section(heading[1], files=dict(found[-1].files)))
+        elif line.startswith("```") and fence is None:
+            fence, info = [], line.removeprefix("```").strip()
+        elif line.startswith("```") and fence is not None:
+            _, _, name = info.partition(" ")
+            if "." in name:
+                found[-1].files[name] = "\n".join(fence) + "\n"
+            found[-1].blocks.append((info, "\n".join(fence) + "\n"))
+            fence = None
+        elif fence is not None:
+            fence.append(line)
+    return [section for section in found if section.blocks]
+
+
+def script(section: Section) -> str:
+    """All commands of a section, for bash."""
+    parts = [PROLOGUE]
+    for number, (info, content) in enumerate(section.blocks):
+        if info == "sh background":
+            log = f"background-{number}.log"
+            parts.append(f"end_background\n( {content.rstrip()} ) >{log} 2>&1 &\nrunning=$!\nawait_running {log}\n")
+        elif info == "sh":
+            parts += [_expecting(command) for command in re.split(r"(?<!\\)\n", content) if command.strip()]
+    return "\n".join(parts)
+
+
+def _expecting(command: str) -> str:
+    code = re.search(r"#.*\(exit code (\d+)\)", command)
+    told = f"echo '$' {_quoted(command)}"
+    if code is None:
+        return f"{told}\n{command}"
+    return f"{told}\ncode=0; {command.partition('#')[0].strip()} || code=$?; [ $code = {code[1]} ]"
+
+
+def _quoted(text: str) -> str:
+    return "'" + text.replace("'", "'\\''") + "'"
+
+
+def clone(folder: Path) -> None:
+    """The repository's files, and an environment that `make` takes for its own: it lends what is installed here."""
+    shutil.copytree(REPOSITORY, folder, ignore=LEFT_OUT, symlinks=True)
+    (folder / ".tools").symlink_to(REPOSITORY / ".tools")
+    uv, venv = REPOSITORY / ".tools" / "bin" / "uv", folder / ".venv"
+    subprocess.run([uv, "venv", "--quiet", "--offline", "--python", sys.executable, venv], check=True)
+    library = next((venv / "lib").glob("python*/site-packages"))
+    lent = sysconfig.get_path("purelib")
+    (library / "lent.pth").write_text(f"import site; site.addsitedir({lent!r})\n")
+    command = venv / "bin" / "snakesim"
+    entry = "import sys\nfrom snakesim_operator.__main__ import main\nsys.exit(main())\n"
+    command.write_text(f"#!{venv}/bin/python\n{entry}")
+    command.chmod(0o755)
+    (venv / ".setup").write_text(f"{folder}\n\n")

@@ -1,0 +1,85 @@
+"""The clients that docs/client.md shows: few lines, nothing of ours in them, and a robot that does what they ask."""
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from snakesim_hal import keys
+from snakesim_hal.messages import JointState, Status
+from snakesim_hal.process import SERVICE_PRIORITY, take_priority
+from snakesim_hal.session import Link, Session, open_session
+from tests.e2e.command import Ended, Running, running, wait_until
+
+pytestmark = pytest.mark.e2e
+
+DOCS = Path(__file__).parents[2] / "docs"
+CLIENT, STOP = DOCS / "client.py", DOCS / "stop.py"
+EXTERNAL = ("triplet", "--set", "services.control.external=true", "--set", "rate_hz=50", "--duration", "600", "--stay")
+DEPTH = 8192
+
+
+@pytest.fixture(params=["realtime", "lockstep"])
+def run(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Running]:
+    with running(tmp_path / "run", *EXTERNAL, "--pace", request.param) as started:
+        started.wait_for("whoever takes the lease")
+        yield started
+
+
+def call(script: Path, *arguments: str) -> Ended:
+    """Run it, as urgent as a run's own control where that is allowed: a busy machine holds it up otherwise."""
+    with subprocess.Popen(
+        [sys.executable, str(script), *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: take_priority(SERVICE_PRIORITY),
+    ) as process:
+        out, err = process.communicate(timeout=30)
+    return Ended(process.returncode, out, err)
+
+
+def status(session: Session) -> Status:
+    found = session.latest(keys.STATUS, Status, 10.0)
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize(("script", "known"), [(CLIENT, {"msgpack", "zenoh"}), (STOP, set[str]())])
+def test_a_client_needs_nothing_of_ours(script: Path, known: set[str]) -> None:
+    tree = ast.parse(script.read_text(encoding="utf-8"))
+    assert not [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+    imported = {name.name for node in ast.walk(tree) if isinstance(node, ast.Import) for name in node.names}
+    assert imported - sys.stdlib_module_names == known
+
+
+def test_the_clients_are_as_short_as_they_are_said_to_be() -> None:
+    assert len(CLIENT.read_text(encoding="utf-8").splitlines()) <= 60
+    lines = STOP.read_text(encoding="utf-8").split("import sys\n")[1].split("\n")
+    assert len([line for line in lines if line]) == 8
+
+
+def test_a_client_leases_arms_moves_and_disarms(run: Running) -> None:
+    with open_session(Link(run.endpoint, "planar13")) as session:
+        wait_until(lambda: status(session).waiting_for == ["control"], "a run that waits for control alone")
+        joints = session.reader(keys.JOINTS, JointState, depth=DEPTH)
+        ended = call(CLIENT, run.endpoint, "planar13")
+        assert ended.code == 0, ended.out + ended.err
+        angles = [state.angle_rad for state in joints.drain()]
+        furthest = [max(abs(angle - joint[0]) for angle in joint) for joint in zip(*angles, strict=True)]
+        assert 0.09 < furthest[2] < 0.11, furthest
+        assert max(furthest[:2] + furthest[3:]) < 0.03, furthest
+        now = status(session)
+        assert now.lifecycle == "disarmed" and now.commands_rejected == {}
+        assert now.commands_accepted > 50 and {fault.what for fault in now.faults} <= {"service_lost"}
+
+
+def test_a_stop_by_udp_stops_the_robot(run: Running) -> None:
+    host, _, port = run.endpoint.removeprefix("tcp/").partition(":")
+    ended = call(STOP, host, port)
+    assert ended.code == 0 and ended.out.startswith("planar13\n") and "anna" in ended.out, ended.out + ended.err
+    with open_session(Link(run.endpoint, "planar13")) as session:
+        assert status(session).lifecycle == "estop"

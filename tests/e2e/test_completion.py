@@ -1,0 +1,67 @@
+"""Tab completion: the printed scripts, asked by a real bash and a real zsh."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from snakesim_hal.files import shipped
+from tests.e2e.command import snakesim
+
+pytestmark = pytest.mark.e2e
+
+# What a shell does when TAB is pressed behind these words; zsh counts them from 1 where bash counts from 0.
+ASKED = 'COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); _snakesim; printf "%s\\n" "${COMPREPLY[@]}"'
+ASK = {"bash": f'source "$1"; shift; {ASKED}', "zsh": f'source "$1"; shift; setopt ksharrays; {ASKED}'}
+TYPED: dict[str, tuple[list[str], set[str]]] = {
+    "command": (["ru"], {"run"}),
+    "all commands": ([""], {"run", "echo", "fault", "can", "modules", "completion"}),
+    "scenario": (["run", ""], set(shipped("scenarios"))),
+    "flag": (["run", "triplet", "--pa"], {"--pace"}),
+    "value of a flag": (["run", "triplet", "--pace", "l"], {"lockstep"}),
+    "controller": (["run", "--controller", ""], {"hold", "obstacle_triplet", "path_following"}),
+    "free value": (["run", "--duration", ""], set()),
+    "after a free value": (["run", "--duration", "3", "pe"], {"peg_row"}),
+    "of an installed package": (["can", ""], {"load", "scan", "expand"}),
+    "its argument": (["can", "load", "pe"], {"peg_row"}),
+    "its flag": (["can", "load", "peg_row", "--j"], {"--joints"}),
+    "key": (["echo", "sensor/j"], {"sensor/joints"}),
+    "kind of a fault": (["fault", "overh"], {"overheat"}),
+    "robot": (["arm", "pl"], {"planar13"}),
+    "shell": (["completion", "z"], {"zsh"}),
+    "file": (["router", "./"], set()),  # nothing of ours: the shell completes file names
+}
+
+
+@pytest.fixture(scope="module", params=sorted(ASK))
+def script(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
+    shell = request.param
+    if shutil.which(shell) is None:
+        pytest.skip(f"{shell} is not installed")
+    folder = tmp_path_factory.mktemp("completion")
+    ended = snakesim("completion", shell, cwd=folder)
+    assert ended.code == 0 and ended.err == "", ended.err
+    (folder / shell).write_text(ended.out)
+    return shell, folder / shell
+
+
+@pytest.mark.parametrize("typed", TYPED)
+def test_what_can_follow(script: tuple[str, Path], typed: str) -> None:
+    shell, path = script
+    words, wanted = TYPED[typed]
+    plain = ["--norc", "--noprofile"] if shell == "bash" else ["-f"]
+    done = subprocess.run(
+        [shell, *plain, "-c", ASK[shell], shell, str(path), "snakesim", *words],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+    )
+    found = {word for word in done.stdout.split() if word.startswith(words[-1])}  # which zsh leaves to its matcher
+    assert done.stderr == "" and (found >= wanted if typed == "all commands" else found == wanted), done.stdout
+
+
+def test_an_unknown_shell_is_refused(tmp_path: Path) -> None:
+    ended = snakesim("completion", "fish", cwd=tmp_path)
+    assert ended.code == 2 and "bash" in ended.err and "zsh" in ended.err

@@ -1,0 +1,92 @@
+"""Everything that the tutorial and the README ask a reader to type is typed here, as printed.
+
+Of docs/hil.md only what needs no CAN; `make test-vcan` runs the rest of it with commands of its own.
+"""
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from tests.e2e import documents
+from tests.e2e.command import environment
+from tests.e2e.documents import REPOSITORY, Section, sections
+
+pytestmark = [pytest.mark.e2e, pytest.mark.timeout(600)]
+
+TUTORIAL = [section for section in sections(REPOSITORY / "docs" / "tutorial.md") if section.has_commands]
+HIL = [section for section in sections(REPOSITORY / "docs" / "hil.md") if section.title == "1. Anywhere"]  # no CAN
+README = [section for section in sections(REPOSITORY / "README.md") if section.has_commands]
+UV = REPOSITORY / ".tools" / "bin" / "uv"
+LIMIT_S = 500.0
+needs_uv = pytest.mark.skipif(not UV.is_file(), reason="`make setup` has put no uv into .tools")
+
+
+def apart() -> list[str]:
+    """A network of the script's own, in which the default port is free; nothing where the kernel grants none."""
+    command = ["unshare", "--net"] if os.geteuid() == 0 else ["unshare", "--net", "--map-root-user"]
+    granted = shutil.which("unshare") and subprocess.run([*command, "true"], capture_output=True, check=False)
+    return command if granted and granted.returncode == 0 else []
+
+
+def typed(script: str, cwd: Path, prefix: list[str]) -> str:
+    """Run a script; what it says. Nothing that it has started is left."""
+    (cwd / "typed.sh").write_text(script)
+    path = os.pathsep.join([str(cwd / ".venv" / "bin"), os.environ["PATH"]])
+    process = subprocess.Popen(
+        [*prefix, "bash", "typed.sh"],
+        cwd=cwd,
+        env=environment(cwd / "state", PATH=path),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+    try:
+        said, _ = process.communicate(timeout=LIMIT_S)
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGTERM)
+        said, _ = process.communicate(timeout=30)
+        raise AssertionError(f"not done within {LIMIT_S:.0f} s:\n{said}") from None
+    assert process.returncode == 0, said
+    assert "Traceback" not in said, said
+    return said
+
+
+@needs_uv
+@pytest.mark.slow
+@pytest.mark.parametrize("section", [*TUTORIAL, *HIL], ids=lambda section: re.sub(r"\W+", "-", section.title).lower())
+def test_a_section_as_printed(section: Section, tmp_path: Path) -> None:
+    folder = tmp_path / "snakesim"
+    documents.clone(folder)
+    for name, content in section.files.items():
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_text(content, encoding="utf-8")
+    typed(documents.script(section), folder, apart())
+
+
+@needs_uv
+@pytest.mark.slow
+@pytest.mark.parametrize("section", README, ids=lambda section: re.sub(r"\W+", "-", section.title).lower())
+def test_the_readme_as_printed(section: Section, tmp_path: Path) -> None:
+    """A clone, and an environment of its own from the lock; what is downloaded for it is in uv's cache, as a rule."""
+    git = ["git", "-C", str(tmp_path / "origin"), "-c", "user.name=x", "-c", "user.email=x@example.org"]
+    shutil.copytree(REPOSITORY, tmp_path / "origin", ignore=documents.LEFT_OUT, symlinks=True)
+    for arguments in (["init", "-q"], ["add", "-A"], ["commit", "-qm", "As it is"]):
+        subprocess.run([*git, *arguments], check=True)
+    script = documents.script(section).replace("<this repository>", str(tmp_path / "origin"))
+    said = typed(script, tmp_path, [])
+    assert "report:" in said and (tmp_path / "snakesim" / "runs" / "demo" / "report.html").is_file()
+
+
+def test_the_documents_ask_for_something() -> None:
+    assert len(TUTORIAL) >= 5 and len(README) >= 1 and len(HIL) == 1
+    every = [info for section in [*TUTORIAL, *README] for info, _ in section.blocks]
+    assert {info.split()[0] for info in every if info} <= {"sh", "python", "toml", "text"}
+    commands = "\n".join(content for section in TUTORIAL for info, content in section.blocks if info.startswith("sh"))
+    assert not re.search(r"\bpip\b(?! install --python)|pgrep|kill -9|killall|pkill|step:clock", commands)

@@ -1,0 +1,57 @@
+"""Streams that stop in a run of real processes: joints stop the robot, all others make the controller hold."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from snakesim_hal.messages import Mode
+from snakesim_operator.record import REPORT, RunRecord
+from tests.e2e.command import nothing_left, run_to_summary
+
+pytestmark = pytest.mark.e2e
+
+FROM_S, TO_S = 2.0, 3.4
+FADED_S = 0.9  # after the push has ended: three time constants of the fade
+
+
+def test_without_joints_the_robot_stops_and_the_reason_is_told(tmp_path: Path) -> None:
+    flags = ["--pace", "realtime", "--duration", "6", "--fault", f"drop:sensor/joints@{FROM_S}"]
+    ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
+    assert ended.code == 1 and summary.faults[0].what == "lease_expired"
+    after_s = (summary.faults[0].tick - RunRecord.load(tmp_path / "run").time_s[0] * summary.rate_hz) / summary.rate_hz
+    assert FROM_S < after_s < FROM_S + 0.2  # a state may be 30 ms old, a lease lasts 50 ms
+    assert "sensor/joints is 0.0" in (tmp_path / "run" / "control.log").read_text()
+    assert "at most 0.03 s: no commands" in (tmp_path / "run" / "control.log").read_text()
+    assert "Control said: sensor/joints is 0.0" in (tmp_path / "run" / REPORT).read_text()
+    nothing_left(tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("key", "limit_s"),
+    [
+        ("sensor/pose", 0.24),
+        ("sensor/contacts", 0.24),
+        ("guidance/world", 0.22),
+        ("navigation/trajectory", 0.84),
+    ],
+)
+def test_without_another_stream_it_holds_and_goes_on_when_it_is_back(tmp_path: Path, key: str, limit_s: float) -> None:
+    flags = ["--pace", "realtime", "--duration", "5", "--fault", f"drop:{key}@{FROM_S}-{TO_S}"]
+    ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
+    assert ended.code == 0 and summary.faults == [] and summary.ended == "complete", ended.out
+    record = RunRecord.load(tmp_path / "run")
+    time_s = record.time_s - record.time_s[0]
+    pushes = (record.mode == Mode.TORQUE).any(axis=1)
+    held = (time_s > FROM_S + limit_s + 0.1) & (time_s < TO_S)
+    assert pushes[time_s < FROM_S].any() and not pushes[held].any() and pushes[time_s > TO_S + 0.5].any()
+    assert (record.mode[held] == Mode.POSITION).all()
+    told = [state for state in record.control if state.reason.startswith(f"{key} is 0.")]
+    assert told and all(state.state == "NotLocomoting" for state in told)
+    assert any(f"s old, at most {limit_s:g} s" in state.reason for state in told)
+    assert record.control[-1].state == "Locomoting"
+    late = (time_s > FROM_S + limit_s + FADED_S) & (time_s < TO_S)
+    if late.any():  # nothing moves any more, and no target moves
+        assert np.ptp(record.target[late], axis=0).max() < 0.02
+        assert np.ptp(record.position_w[late][:, 0]) < 0.01
+    nothing_left(tmp_path / "run")

@@ -1,0 +1,106 @@
+"""One winding temperature, one torque limit: in the simulator, in module twins on CAN, and in the status.
+
+Each robot is pushed against a joint's stop, and the torque that the joint gives there is measured.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from snakesim_can_backend.backend import CanBackend
+from snakesim_can_backend.settings import Settings as CanSettings
+from snakesim_can_backend.twin.server import Here
+from snakesim_hal import keys, thermal
+from snakesim_hal.conformance.rig import Rig
+from snakesim_hal.messages import Mode, Power
+from snakesim_hal.thermal import Thermal
+from snakesim_sim_backend.backend import SimBackend
+from snakesim_sim_backend.settings import Settings as SimSettings
+from tests.unit.hal.rig import run_config
+
+RATED_NM = 4.0
+STEP_NM = 0.003  # of the bus, and what a joint at its stop still sways by
+AT_STOP_TICKS = 150
+CURVES = {"usual": (80.0, 105.0), "cool": (50.0, 70.0)}
+
+
+@contextmanager
+def hot_robot(backend: str, curve: str, celsius: float, monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
+    """The winding of joint_1 stays at a temperature, and the robot is armed."""
+    derate_from_c, stop_at_c = CURVES[curve]
+    monkeypatch.setattr(thermal, "TIME_CONSTANT_S", 1e12)
+    config = run_config(
+        backend=backend,
+        rate_hz=100,
+        robot__sensors__power__rate_hz=2.0,
+        robot__limits__derate_from_c=derate_from_c,
+        robot__limits__stop_at_c=stop_at_c,
+    )
+    opened = SimBackend(config, SimSettings()) if backend == "sim" else CanBackend(config, CanSettings())
+    try:
+        windings(opened).winding_c[0] = celsius
+        yield Rig(opened, "lockstep", config.period_ns)
+    finally:
+        opened.close()
+
+
+def windings(backend: SimBackend | CanBackend) -> Thermal:
+    if isinstance(backend, SimBackend):
+        return backend._windings
+    assert isinstance(backend._here, Here)
+    return backend._here.server.chain.thermal
+
+
+def until_told(rig: Rig, celsius: float) -> None:
+    """Until the robot's power samples tell the temperature."""
+    for _ in range(100):
+        rig.idle()
+        power = rig.since(rig.tick - 1).samples[-1].others.get(keys.POWER)
+        if isinstance(power, Power) and power.motor_c[0] == pytest.approx(celsius, abs=0.5):
+            return
+    raise AssertionError(f"{celsius} °C were not told")
+
+
+def pushes_nm(rig: Rig, limit_nm: float) -> float:
+    """What the joint gives at its stop when that much is allowed."""
+    limits = [limit_nm, *[RATED_NM] * (rig.count - 1)]
+    record = rig.press({0: (Mode.TORQUE, 2 * RATED_NM)}, AT_STOP_TICKS, torque_limit_nm=limits)
+    assert np.abs(record.velocity_rad_s[-5:, 0]).max() < 0.05, "it is at its stop"
+    return float(record.torque_nm[-5:, 0].mean())
+
+
+@pytest.mark.parametrize("curve", CURVES)
+@pytest.mark.parametrize("over", [-0.2, 0.0, 0.2, 0.48, 0.8, 0.96])
+@pytest.mark.parametrize("backend", ["sim", "can"])
+def test_heat_derates_once(backend: str, curve: str, over: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """over: how far the winding is from `derate_from_c` to `stop_at_c`."""
+    derate_from_c, stop_at_c = CURVES[curve]
+    celsius = round(derate_from_c + over * (stop_at_c - derate_from_c))
+    share = min(1.0 - 0.8 * (celsius - derate_from_c) / (stop_at_c - derate_from_c), 1.0)
+    with hot_robot(backend, curve, celsius, monkeypatch) as rig:
+        until_told(rig, celsius)
+        rig.arm()
+        assert rig.authority.derated.get("joint_1", 1.0) == pytest.approx(share), "in the status"
+        from_gate_nm = rig.authority.decide().set_points.torque_limit_nm[0]
+        assert from_gate_nm == pytest.approx(share * RATED_NM)
+        assert pushes_nm(rig, from_gate_nm) == pytest.approx(share * RATED_NM, abs=STEP_NM), "at the joint"
+        assert pushes_nm(rig, RATED_NM) == pytest.approx(share * RATED_NM, abs=STEP_NM), "by the motor's own protection"
+        small_nm = 0.1 * RATED_NM
+        assert pushes_nm(rig, small_nm) == pytest.approx(small_nm, abs=STEP_NM), "what is little is not made less"
+
+
+@pytest.mark.parametrize("curve", CURVES)
+@pytest.mark.parametrize("backend", ["sim", "can"])
+def test_a_winding_at_the_stop_temperature_stops_the_robot(
+    backend: str, curve: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stop_at_c = CURVES[curve][1]
+    with hot_robot(backend, curve, stop_at_c - 1.0, monkeypatch) as rig:
+        until_told(rig, stop_at_c - 1.0)
+        rig.arm()
+        windings(rig.backend).winding_c[0] = stop_at_c + 0.1  # pyright: ignore[reportArgumentType]
+        rig.drive({}, 60)
+        assert rig.authority.state == "fault"
+        assert {fault.joint for fault in rig.authority.faults} == {"joint_1"}

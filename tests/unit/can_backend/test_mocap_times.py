@@ -1,0 +1,137 @@
+"""Stamps of another clock: order, lateness, and a clock that jumps."""
+
+import random
+
+import pytest
+
+from snakesim_can_backend.mocap_times import MOST_LATE_NS, READINGS_TO_BELIEVE, CaptureTimes
+
+MS = 1_000_000
+AHEAD_NS = 5_000_000_000_000  # what the other clock shows when ours shows 0
+
+
+class Camera:
+    """A camera with a clock of its own, and a reader that looks every 10 ms."""
+
+    def __init__(self) -> None:
+        self.times = CaptureTimes()
+        self.ahead_ns = AHEAD_NS
+        self.now_ns = 0
+
+    def stamp(self, late_ms: float = 0.0) -> int:
+        return self.now_ns - round(late_ms * MS) + self.ahead_ns
+
+    def read(self, *late_ms: float) -> list[str | None]:
+        """One reading, of samples that are late by so much, in their order."""
+        self.now_ns += 10 * MS
+        return list(self.times.judge([self.stamp(ms) for ms in late_ms], self.now_ns))
+
+    def late_ms(self, stamp_ns: int) -> float:
+        return self.times.late_ns(stamp_ns, self.now_ns) / MS
+
+
+def running(readings: int = 20) -> Camera:
+    camera = Camera()
+    for _ in range(readings):
+        assert camera.read(0.0) == [None]
+    return camera
+
+
+def test_nothing_read_says_nothing() -> None:
+    assert CaptureTimes().judge([], 0) == []
+
+
+@pytest.mark.parametrize("ahead_ns", [AHEAD_NS, -AHEAD_NS, 0])
+def test_stamps_in_their_order_count_whatever_zero_their_clock_has(ahead_ns: int) -> None:
+    camera = Camera()
+    camera.ahead_ns = ahead_ns
+    camera.now_ns = 2 * AHEAD_NS
+    assert [camera.read(6.0, 3.0, 0.0) for _ in range(50)] == [[None] * 3] * 50 and camera.times.jumps == 0
+
+
+def test_a_sample_is_late_by_what_it_took_longer_than_the_fastest() -> None:
+    camera = running()
+    assert camera.late_ms(camera.stamp(0.0)) == 0.0
+    assert camera.read(7.0) == [None] and camera.late_ms(camera.stamp(7.0)) == pytest.approx(7.0)
+
+
+def test_the_first_samples_may_be_the_slowest_of_all() -> None:
+    camera = Camera()
+    assert camera.read(40.0) == [None] and camera.late_ms(camera.stamp(40.0)) == 0.0, "nothing faster is known yet"
+    assert camera.read(0.0) == [None] and camera.late_ms(camera.stamp(40.0)) == pytest.approx(40.0)
+
+
+def test_a_reader_that_slept_takes_what_is_fresh_and_no_jump_is_seen() -> None:
+    camera = running()
+    camera.now_ns += 400 * MS
+    assert camera.read(*range(390, -10, -10)) == ["late"] * 14 + [None] * 26
+    assert camera.times.jumps == 0
+
+
+@pytest.mark.parametrize(("late_ms", "why"), [(10.0, "duplicate"), (9.5, "duplicate"), (12.0, "reordered")])
+def test_what_is_not_newer_is_refused(late_ms: float, why: str) -> None:
+    camera = running()
+    assert camera.read(late_ms) == [why]
+    assert camera.read(0.0) == [None]
+
+
+def test_within_one_reading_order_counts_too() -> None:
+    camera = running()
+    assert camera.read(2.0, 5.0, 2.0, 0.0) == [None, "reordered", "duplicate", None]
+
+
+def test_what_is_too_late_or_from_the_future_is_refused() -> None:
+    camera = running()
+    camera.now_ns += 1000 * MS
+    assert camera.read(MOST_LATE_NS / MS + 1) == ["late"]
+    assert camera.read(MOST_LATE_NS / MS - 1) == [None]
+    assert camera.read(-51.0) == ["future"]
+    assert camera.read(0.0) == [None] and camera.times.jumps == 0
+
+
+@pytest.mark.parametrize("jump_ms", [3_600_000, -3_600_000, 500, -500])
+def test_a_clock_that_jumped_is_believed_after_some_readings(jump_ms: int) -> None:
+    camera = running()
+    camera.ahead_ns += jump_ms * MS
+    verdicts = [camera.read(0.0)[0] for _ in range(READINGS_TO_BELIEVE + 5)]
+    why = "future" if jump_ms > 0 else "reordered"
+    assert verdicts == [why] * (READINGS_TO_BELIEVE - 1) + [None] * 6 and camera.times.jumps == 1
+    assert camera.late_ms(camera.stamp(3.0)) == pytest.approx(3.0), "by the new clock"
+
+
+def test_strange_stamps_among_good_ones_are_never_believed() -> None:
+    camera = running()
+    camera.ahead_ns += 3_600_000 * MS
+    for _ in range(50):
+        camera.now_ns += 10 * MS
+        good = camera.now_ns + AHEAD_NS
+        assert camera.times.judge([camera.stamp(), good], camera.now_ns) == ["future", None]
+    assert camera.times.jumps == 0
+
+
+def test_strange_stamps_that_do_not_agree_are_never_believed() -> None:
+    camera, rng = running(), random.Random(3)
+    for _ in range(200):
+        assert camera.read(-1000.0 * rng.randrange(1, 10**6)) == ["future"]
+    assert camera.times.jumps == 0 and camera.read(0.0) == [None]
+
+
+def test_one_stamp_for_ever_is_a_duplicate_and_no_jump() -> None:
+    camera = running()
+    stamp_ns = camera.stamp(0.0)
+    for _ in range(100):
+        camera.now_ns += 10 * MS
+        assert camera.times.judge([stamp_ns], camera.now_ns) == ["duplicate"]
+    assert camera.times.jumps == 0
+
+
+@pytest.mark.parametrize("share", [1.0002, 0.9998])
+def test_a_clock_that_drifts_stays_known(share: float) -> None:
+    """Ten minutes: by then it is 120 ms off."""
+    times = CaptureTimes()
+    for tick in range(60_000):
+        now_ns = tick * 10 * MS
+        stamp_ns = round(now_ns * share) + AHEAD_NS
+        assert times.judge([stamp_ns], now_ns) == [None]
+        assert times.late_ns(stamp_ns, now_ns) < 5 * MS
+    assert times.jumps == 0

@@ -1,0 +1,46 @@
+"""Every shipped controller without a world model or a trajectory in the middle of a run: it holds, and goes on."""
+
+import numpy as np
+import pytest
+
+from snakesim_gnc.control.hold import Hold
+from snakesim_gnc.control.obstacle_triplet import ObstacleTriplet
+from snakesim_gnc.control.path_following import PathFollowing
+from snakesim_hal.messages import Mode
+from tests.unit.gnc.stage import make_stage
+
+TAIL_S_M = 0.3
+TORQUE_NM = 2.0  # that every joint is said to have: what the propulsion joint pushes with
+STEP_RAD = 0.02  # of a target within a tick, without a jump
+CONTROLLERS = [Hold, PathFollowing, ObstacleTriplet]
+
+
+@pytest.mark.parametrize("without", ["world", "trajectory"])
+@pytest.mark.parametrize("plugin", CONTROLLERS)
+def test_it_holds_without_a_push_and_goes_on_without_a_jump(plugin, without):
+    stage = make_stage()
+    controller = plugin(stage.robot, plugin.Settings())
+
+    def act(ticks, tail_s_m=TAIL_S_M, **more):
+        return [controller.update(stage.view(t, tail_s_m, torque_nm=TORQUE_NM, **more)) for t in ticks]
+
+    before = act(range(100))[-1]
+    pushing = Mode.TORQUE in before.set_points.mode
+    assert pushing == (plugin is ObstacleTriplet)
+    blind = act(range(100, 300), without=without)
+    assert all(set(action.set_points.mode) == {Mode.POSITION} for action in blind)
+    assert all(action.report.propulsion_joint is None for action in blind)
+    targets = np.array([action.set_points.target for action in blind])
+    angles = np.array(stage.view(0, TAIL_S_M).joints.angle_rad)
+    assert np.abs(np.diff(targets, axis=0)).max() < STEP_RAD
+    assert np.abs(targets[-1] - targets[-100]).max() < 2e-3  # it stays
+    if pushing:  # what the joint pushed with has faded, and is not kept up by a position target far away
+        turn = before.set_points.mode.index(Mode.TORQUE)
+        stiffness = stage.robot.joints[turn].stiffness_nm_per_rad
+        assert abs(targets[0, turn] - angles[turn]) * stiffness == pytest.approx(TORQUE_NM, rel=0.2)
+        assert abs(targets[-1, turn] - angles[turn]) * stiffness < 0.05 * TORQUE_NM
+    back = act(range(300, 360), tail_s_m=TAIL_S_M + 0.02)  # it has slid a little meanwhile
+    steps = np.array(back[0].set_points.target) - targets[-1]
+    steady = np.array([mode == Mode.POSITION for mode in back[0].set_points.mode])
+    assert np.abs(steps[steady]).max() < STEP_RAD
+    assert (Mode.TORQUE in back[-1].set_points.mode) == pushing

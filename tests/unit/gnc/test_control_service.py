@@ -1,0 +1,153 @@
+"""The control service on a real host: what it gives its controller when streams stop; what it does without joints."""
+
+import math
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from snakesim_gnc.control.controller import Action, Report, positions
+from snakesim_hal import keys
+from snakesim_hal.errors import ControllerError
+from snakesim_hal.messages import Clock, FaultRequest, Intent, JointCommand, JointState
+from tests.unit.gnc.services import Stage, stage
+from tests.unit.hal.network import wait_until
+
+PERIOD_NS = 20_000_000
+SEEN = 10  # views in a row
+
+
+@pytest.fixture(autouse=True)
+def quick_threads() -> Iterator[None]:
+    """Host and services share one interpreter here; in real life they are processes."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(0.0005)
+    yield
+    sys.setswitchinterval(before)
+
+
+def sighted(made: Stage, since: int = 0) -> bool:
+    views = made.views[since:][-SEEN:]
+    return len(views) == SEEN and all(view.world is not None and view.trajectory is not None for view in views)
+
+
+def blind(made: Stage, what: str) -> bool:
+    views = made.views[-SEEN:]
+    return len(views) == SEEN and all(getattr(view, what) is None for view in views)
+
+
+def speed(made: Stage) -> float | None:
+    trajectory = made.views[-1].trajectory
+    return None if trajectory is None else trajectory.speed_m_s
+
+
+def test_without_joints_it_sends_nothing_and_the_lease_ends(tmp_path: Path) -> None:
+    with stage(tmp_path, faults=["drop:sensor/joints@1"]) as made:
+        commands = made.run.session.reader(keys.JOINT_COMMAND, JointCommand)
+        joints = made.run.session.reader(keys.JOINTS, JointState)
+        made.run.arm()
+        made.run.reaches("fault")
+        assert [fault.what for fault in made.run.status.faults] == ["lease_expired"]
+        told = made.tells("sensor/joints is ")
+        assert told.state == "NotLocomoting" and "at most 0.06 s" in told.reason
+        last_joints, last_command = joints.drain()[-1].tick, commands.drain()[-1].tick
+        assert last_command == last_joints  # no command ever named a state that was not
+        assert len(made.views) < 80
+
+
+def test_a_command_names_the_joint_state_that_it_answers(tmp_path: Path) -> None:
+    """Not the clock, which comes also when its joint state was lost on the way."""
+    with stage(tmp_path, max_age={"joints_s": 0.5}) as made:
+        session = made.run.session
+        clocks, joints = session.reader(keys.CLOCK, Clock), session.reader(keys.JOINTS, JointState)
+        commands = session.reader(keys.JOINT_COMMAND, JointCommand)
+        wait_until(commands.drain, "commands")
+        lose = FaultRequest(kind="drop", target=keys.JOINTS, amount=0.5)
+        assert made.run.ask(keys.fault("hal"), lose).ok
+        for reader in (clocks, joints, commands):
+            reader.drain()
+        named: set[int] = set()
+        wait_until(lambda: named.update(c.tick for c in commands.drain()) or len(named) > 20, "twenty commands")
+        shown, felt = {clock.tick for clock in clocks.drain()}, {state.tick for state in joints.drain()}
+        assert len(shown) > len(felt) + 5
+        assert len(named - felt) <= 2  # at the ends of what was heard
+
+
+@pytest.mark.parametrize(
+    ("key", "what", "words"),
+    [
+        (keys.POSE, "world", "sensor/pose is 0."),
+        (keys.WORLD, "world", "guidance/world is 0."),
+        (keys.TRAJECTORY, "trajectory", "navigation/trajectory is 0."),
+    ],
+)
+def test_a_stream_that_stops_is_withheld_named_and_given_again(tmp_path: Path, key: str, what: str, words: str) -> None:
+    limits = {"pose_s": 0.3, "world_s": 0.2, "trajectory_s": 0.5}
+    with stage(tmp_path, faults=[f"drop:{key}@0.5-2"], max_age=limits) as made:
+        made.run.arm()
+        wait_until(lambda: sighted(made), "views with everything in them")
+        wait_until(lambda: blind(made, what), f"views without a {what}")
+        told = made.tells(words)
+        assert told.state == "NotLocomoting" and f"at most {limits[key.partition('/')[2] + '_s']:.3g} s" in told.reason
+        since = len(made.views)
+        wait_until(lambda: sighted(made, since), "views with everything again")
+        wait_until(lambda: words not in (made.state() or told).reason, "another reason")
+        assert made.run.status.lifecycle == "armed" and not made.run.status.faults
+        for view in made.views:  # nothing too old was ever handed over
+            if view.world is not None:
+                assert view.tick * PERIOD_NS - (view.world.pose_stamp_ns or 0) <= 300_000_000
+
+
+def test_guidance_that_ends_leaves_a_world_and_a_trajectory_that_grow_old(tmp_path: Path) -> None:
+    with stage(tmp_path, max_age={"trajectory_s": 0.5}) as made:
+        made.run.arm()
+        wait_until(lambda: sighted(made), "views with everything in them")
+        made.services["guidance"].stop()
+        made.tells("guidance/world is ")
+        made.tells("navigation/trajectory is ")  # planned from the last world model over and over
+        wait_until(lambda: blind(made, "world") and blind(made, "trajectory"), "views without either")
+        assert made.run.status.lifecycle == "armed"
+
+
+def test_when_an_operators_intent_has_expired_the_robot_rests_and_says_why(tmp_path: Path) -> None:
+    with stage(tmp_path) as made:
+        clocks, operator = made.run.session.reader(keys.CLOCK, Clock), made.run.session
+        intents = operator.publisher(keys.INTENT, Intent)
+        made.run.arm()
+        wait_until(lambda: sighted(made), "views with everything in them")
+        assert speed(made) == 0.2  # the mission's
+        now_ns = clocks.drain()[-1].stamp_ns
+        intents.put(Intent(stamp_ns=now_ns, who="ann", speed_m_s=0.1, valid_for_ns=500_000_000))
+        wait_until(lambda: speed(made) == 0.1, "the operator's speed")
+        wait_until(lambda: speed(made) == 0.0, "no speed")
+        assert (made.views[-1].tick * PERIOD_NS - now_ns) * 1e-9 == pytest.approx(0.6, abs=0.25)
+        told = made.tells("the intent of ann has expired")
+        assert told.state == "Idle" and "send a new one to go on" in told.reason
+        intents.put(Intent(stamp_ns=clocks.drain()[-1].stamp_ns, who="ann"))
+        wait_until(lambda: speed(made) == 0.2, "a new intent")
+
+
+@pytest.mark.parametrize(
+    ("answer", "words"),
+    [
+        (lambda self, view: Action(positions(self._robot, [0.0, 0.0])), "has 2 values, must have 3"),
+        (lambda self, view: Action(positions(self._robot, [0.0, math.nan, 0.0])), "(joint_2) is nan"),
+        (lambda self, view: 1 / 0, "update() raised ZeroDivisionError: division by zero (test_control_service.py"),
+        (
+            lambda self, view: Action(positions(self._robot, [0.0] * 3), Report(path_s_m=math.nan)),
+            "Report.path_s_m is nan",
+        ),
+    ],
+    ids=["length", "nan", "raises", "report"],
+)
+def test_a_controller_that_answers_wrongly_ends_control_with_its_name(tmp_path: Path, answer, words: str) -> None:
+    with stage(tmp_path) as made:
+        made.answer(answer)
+        made.run.arm()
+        control = made.services["control"]
+        wait_until(lambda: not control.thread.is_alive(), "the end of control")
+        assert isinstance(control.error, ControllerError)
+        for text in (str(control.error), made.tells(words).reason):
+            assert "showing.py:Showing (class Showing): " in text and words in text
+        made.run.reaches("fault")

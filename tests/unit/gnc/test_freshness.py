@@ -1,0 +1,112 @@
+"""How old what control acts on may be: the defaults, what a scenario says, and what is refused with which words."""
+
+from typing import Any
+
+import msgspec
+import pytest
+
+from snakesim_gnc.control.freshness import Limits
+from snakesim_hal.messages import Description, SensorDescription, Trajectory, World
+from snakesim_hal.scenario import RunConfig
+from tests.unit.hal.rig import description, run_config, state
+
+SCHEDULE = {
+    "control": {"lag_ticks": 2},
+    "guidance": {"every_ticks": 2, "lag_ticks": 2},
+    "navigation": {"every_ticks": 20, "lag_ticks": 20},
+}
+SECOND = 10**9
+NOW = 100 * SECOND
+
+
+def robot(**rates: float) -> Description:
+    """With sensors of these rates in Hz, each with a delay of 0.05 s."""
+    sensors = [SensorDescription(key=f"sensor/{name}", rate_hz=rate, delay_s=0.05) for name, rate in rates.items()]
+    return msgspec.structs.replace(description(), sensors=sensors)
+
+
+def limits(config: RunConfig | None = None, **rates: float) -> Limits:
+    return Limits.of(config or run_config(services=SCHEDULE), robot(**rates))
+
+
+def world(**changes: Any) -> World:
+    values: dict[str, Any] = {
+        "tick": 9_990,
+        "stamp_ns": NOW,
+        "base_position_w": (0.0, 0.0, 0.0),
+        "base_orientation_wxyz": (1.0, 0.0, 0.0, 0.0),
+        "base_confidence": 1.0,
+        "contacts": [],
+        "obstacles": [],
+        "pose_stamp_ns": NOW,
+        "contacts_stamp_ns": NOW,
+    }
+    return World(**(values | changes))
+
+
+def trajectory(stamp_ns: int | None) -> Trajectory:
+    path = [(0.0, 0.0), (1.0, 0.0)]
+    return Trajectory(tick=0, stamp_ns=stamp_ns, path_id=0, path_w=path, speed_m_s=0.1, push_points=[], finished=False)
+
+
+def test_the_limits_follow_from_rates_delays_and_schedules() -> None:
+    found = limits(joints=100.0, pose=100.0, contacts=10.0)
+    assert found.joints_s == pytest.approx(0.05)  # 30 ms and the delay of 50 ms, but no more than a lease
+    assert found.world_s == pytest.approx(0.02 + 0.2)
+    assert found.sensors_s == pytest.approx({"sensor/pose": 0.05 + 0.04 + 0.2, "sensor/contacts": 0.05 + 0.04 + 0.3})
+    assert found.trajectory_s == pytest.approx(0.04 + 0.2 + 3 * 0.2)
+    assert limits().joints_s == pytest.approx(0.03) and limits().sensors_s == {}
+
+
+def test_a_run_without_guidance_or_navigation_has_limits_too() -> None:
+    found = limits(run_config())
+    assert found.world_s == pytest.approx(0.01 + 0.2) and found.trajectory_s == pytest.approx(0.03 + 0.2)
+
+
+def test_the_scenario_may_say_otherwise() -> None:
+    said = {"joints_s": 0.04, "pose_s": 0.5, "contacts_s": 5.0, "world_s": 0.1, "trajectory_s": 2.0}
+    found = limits(run_config(services=SCHEDULE, max_age=said), pose=100.0, contacts=10.0)
+    assert (found.joints_s, found.world_s, found.trajectory_s) == (0.04, 0.1, 2.0)
+    assert found.sensors_s == {"sensor/pose": 0.5, "sensor/contacts": 5.0}
+
+
+@pytest.mark.parametrize("wrong", [{"pose_s": 0.0}, {"pose_s": -1.0}, {"world_s": 61.0}, {"imu_s": 1.0}])
+def test_what_a_scenario_may_not_say(wrong: dict[str, float]) -> None:
+    with pytest.raises(msgspec.ValidationError):
+        run_config(max_age=wrong)
+
+
+@pytest.mark.parametrize(
+    ("made", "words"),
+    [
+        ({}, ""),
+        ({"pose_stamp_ns": NOW - 310_000_000}, "sensor/pose is 0.31 s old, at most 0.29 s"),
+        ({"pose_stamp_ns": NOW - 290_000_000}, ""),
+        ({"contacts_stamp_ns": NOW - SECOND}, "sensor/contacts is 1 s old, at most 0.29 s"),
+        (
+            {"pose_stamp_ns": 0, "contacts_stamp_ns": NOW - SECOND},
+            "sensor/pose is 100 s old, at most 0.29 s; sensor/contacts is 1 s old, at most 0.29 s",
+        ),
+        ({"contacts_stamp_ns": None}, "guidance/world was made without sensor/contacts"),
+        ({"stamp_ns": NOW - SECOND, "pose_stamp_ns": NOW - SECOND}, "guidance/world is 1 s old, at most 0.22 s"),
+        ({"stamp_ns": NOW + SECOND}, "guidance/world is stamped 1 s ahead of the robot's clock"),
+        ({"pose_stamp_ns": 2**62}, "sensor/pose is stamped 4.61e+09 s ahead of the robot's clock"),
+    ],
+)
+def test_a_world_model_is_as_old_as_what_it_was_made_of(made: dict[str, Any], words: str) -> None:
+    assert limits(pose=100.0, contacts=100.0).against_world(world(**made), NOW) == words
+
+
+def test_a_sensor_that_the_robot_lacks_cannot_be_stale() -> None:
+    bare = world(pose_stamp_ns=None, contacts_stamp_ns=None)
+    assert limits().against_world(bare, NOW) == ""
+
+
+def test_joints_and_trajectory_have_their_own_limits() -> None:
+    found, joints = limits(), state(robot(), stamp_ns=NOW)
+    assert found.against_joints(joints, NOW + 30_000_000) == ""
+    assert found.against_joints(joints, NOW + 31_000_000) == "sensor/joints is 0.031 s old, at most 0.03 s"
+    assert found.against_joints(joints, NOW - 10_000_000) == ""  # it came before its tick's clock
+    assert found.against_trajectory(trajectory(NOW - 800_000_000), NOW) == ""
+    assert "navigation/trajectory is 0.9 s old" in found.against_trajectory(trajectory(NOW - 900_000_000), NOW)
+    assert found.against_trajectory(trajectory(None), NOW) == "navigation/trajectory was planned without a world model"

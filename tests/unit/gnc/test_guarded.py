@@ -1,0 +1,103 @@
+"""A controller that answers wrongly is named, with the field, the value and what is allowed."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from snakesim_gnc.control.controller import Action, Report, View, positions
+from snakesim_gnc.control.guarded import Guarded
+from snakesim_hal.backend import SetPoints
+from snakesim_hal.errors import ControllerError
+from snakesim_hal.messages import Description, Mode
+from tests.unit.gnc.stage import make_stage
+
+STAGE = make_stage(3)
+VIEW = STAGE.view(0, 0.3)
+GOOD = positions(STAGE.robot, VIEW.joints.angle_rad)
+WHO = r"^controller ./wave.py:Wave \(class Wave\): "
+
+
+class Wave:
+    """Answers whatever it is given."""
+
+    class Settings(msgspec.Struct):
+        """None."""
+
+    def __init__(self, robot: Description, settings: Any) -> None:
+        self.answer = settings
+        if isinstance(settings, Exception):
+            raise settings
+
+    def update(self, view: View) -> Any:
+        if isinstance(self.answer, type) and issubclass(self.answer, BaseException):
+            raise self.answer("as planned")
+        return self.answer
+
+
+def update(answer: Any) -> Action:
+    plugin: Any = Wave
+    return Guarded("./wave.py:Wave", plugin, STAGE.robot, answer).update(VIEW)
+
+
+def points(**changes: Any) -> Action:
+    return Action(replace(GOOD, **changes))
+
+
+def told(**report: Any) -> Action:
+    return Action(GOOD, Report(**report))
+
+
+def made_of(set_points: Any, report: Any = None) -> Action:
+    return Action(set_points, report or Report())
+
+
+def test_a_good_answer_passes_as_it_is() -> None:
+    for answer in (Action(GOOD), points(target=[1, 0.5, -2]), points(mode=list(Mode)[:3])):
+        assert update(answer) is answer
+
+
+@pytest.mark.parametrize(
+    ("answer", "words"),
+    [
+        (None, r"update\(\) returned None, must return an Action"),
+        (GOOD, r"update\(\) returned SetPoints\(.*\.\.\. \(SetPoints\), must return an Action"),
+        (made_of([0.0] * 3), r"Action.set_points is \[0.0, 0.0, 0.0\] \(list\), must be SetPoints"),
+        (made_of(GOOD, "moving"), r"Action.report is 'moving', must be a Report"),
+        (points(target=[0.0] * 2), r"SetPoints.target has 2 values, must have 3: one a joint, joint_1 to joint_3"),
+        (points(mode=[Mode.POSITION] * 4), "SetPoints.mode has 4 values, must have 3"),
+        (points(torque_limit_nm=[]), "SetPoints.torque_limit_nm has 0 values"),
+        (points(target=np.zeros(3)), r"SetPoints.target is array\(.*\(ndarray\), must be a list; use .tolist\(\)"),
+        (points(target=[0.0, math.nan, 0.0]), r"SetPoints.target\[1\] \(joint_2\) is nan, must be a finite number"),
+        (points(target=[0.0, 0.0, -math.inf]), r"SetPoints.target\[2\] \(joint_3\) is -inf"),
+        (points(target=[2e5, 0.0, 0.0]), r".* is 200000.0, must be .* of rad, rad/s or N·m from -100000 to 100000"),
+        (points(target=[np.float64(1), 0.0, 0.0]), r".* is .*1.0.* \(float64\), must be a plain float"),
+        (points(target=[True, 0.0, 0.0]), r".* is True \(bool\), must be a plain float"),
+        (points(target=["1", 0.0, 0.0]), ".* is '1', must be a plain float"),
+        (points(torque_limit_nm=[7.0, -1.0, 7.0]), r".*_limit_nm\[1\] \(joint_2\) is -1.0, must be .* N·m from 0"),
+        (points(mode=[1, 1, 1]), r"SetPoints.mode\[0\] \(joint_1\) is 1, must be one of Mode.PASSIVE, Mode.POSITION"),
+        (points(mode=[Mode.POSITION, 7, "x"]), r"SetPoints.mode\[1\] \(joint_2\) is 7"),
+        (told(why=None), "Report.why is None, must be a str"),
+        (told(usable_push_points="3"), "Report.usable_push_points is '3'"),
+        (told(propulsion_joint=3), "Report.propulsion_joint is 3, must be None or an int from 0 to 2"),
+        (ZeroDivisionError, r"update\(\) raised ZeroDivisionError: as planned \(test_guarded.py line \d+\)"),
+        (SystemExit, r"update\(\) raised SystemExit: as planned"),
+        (ValueError("no such robot"), r"__init__\(\) raised ValueError: no such robot"),
+    ],
+)
+def test_a_wrong_one_is_named(answer: Any, words: str) -> None:
+    with pytest.raises(ControllerError, match=WHO + words):
+        update(answer)
+
+
+def test_somebody_who_presses_ctrl_c_is_no_fault_of_the_controller() -> None:
+    with pytest.raises(KeyboardInterrupt):
+        update(KeyboardInterrupt)
+
+
+def test_a_missing_field_of_the_set_points_cannot_even_be_made() -> None:
+    with pytest.raises(TypeError):
+        SetPoints([Mode.POSITION] * 3, [0.0] * 3)  # pyright: ignore[reportCallIssue]

@@ -1,0 +1,116 @@
+"""Navigation: where the snake shall go, how old the plan is, and how long anybody's intent counts."""
+
+from typing import Any
+
+import pytest
+
+from snakesim_gnc.navigation.core import KnownPath
+from snakesim_gnc.navigation.intents import LONGEST_NS, Intents
+from snakesim_hal.messages import Intent, Obstacle, World
+from snakesim_hal.route import Route
+
+MISSION_M_S = 0.2
+SECOND = 10**9
+ROUTE = Route([(0.0, 0.0), (1.0, 0.0), (10.0, 0.0)])
+PEG = Obstacle(name="peg", shape="cylinder", position_w=(2.0, 0.1, 0.1), radius_m=0.05, height_m=0.2)
+
+
+def intent(at_s: float, **more: Any) -> Intent:
+    return Intent(**{"stamp_ns": round(at_s * SECOND), "who": "ann", "speed_m_s": 0.1, **more})
+
+
+def world(tail_x_m: float, stamp_ns: int = 0) -> World:
+    return World(
+        tick=0,
+        stamp_ns=stamp_ns,
+        base_position_w=(tail_x_m, 0.0, 0.0),
+        base_orientation_wxyz=(1.0, 0.0, 0.0, 0.0),
+        base_confidence=1.0,
+        contacts=[],
+        obstacles=[],
+    )
+
+
+def wish(intents: Intents, newest: Intent | None, at_s: float) -> tuple[float, str]:
+    found = intents.wish(newest, round(at_s * SECOND))
+    return found.speed_m_s, found.why
+
+
+def test_the_trajectory_is_as_old_as_the_world_model_that_it_was_planned_from() -> None:
+    planner = KnownPath(ROUTE, [PEG], speed_m_s=MISSION_M_S)
+    blind = planner.update(0, 0, None, None)
+    assert blind.stamp_ns is None and blind.push_points == [] and not blind.finished
+    seen = planner.update(20, 20 * 10**7, world(0.5, stamp_ns=18 * 10**7), None)
+    assert (seen.tick, seen.stamp_ns, seen.push_points) == (20, 18 * 10**7, ["peg"])
+    again = planner.update(40, 40 * 10**7, world(0.5, stamp_ns=18 * 10**7), None)
+    assert again.stamp_ns == 18 * 10**7  # guidance has said nothing new: nor has the plan become new
+
+
+def test_the_path_ends_and_another_start_begins_it_anew() -> None:
+    planner = KnownPath(ROUTE, [], speed_m_s=MISSION_M_S)
+    there = planner.update(0, 0, world(10.0), None)
+    assert there.finished and there.speed_m_s == 0.0 and there.reason == "the path is finished"
+    planner.start_over()
+    back = planner.update(0, 0, world(0.0), None)
+    assert not back.finished and back.speed_m_s == MISSION_M_S and back.reason == ""
+
+
+def test_an_intent_counts_for_as_long_as_it_says_and_then_the_robot_stops() -> None:
+    intents = Intents(MISSION_M_S)
+    assert wish(intents, None, 0.0) == (MISSION_M_S, "")
+    asked = intent(1.0)
+    assert wish(intents, asked, 1.2) == (0.1, "as ann wants it")
+    assert wish(intents, asked, 2.0) == (0.1, "as ann wants it")
+    speed, why = wish(intents, asked, 2.2)
+    assert speed == 0.0 and why.startswith("the intent of ann has expired: it is 1.2 s old, valid for 1 s")
+    speed, why = wish(intents, None, 60.0)  # it does not go back to its mission
+    assert speed == 0.0 and "send a new one to go on" in why
+    assert wish(intents, intent(60.0, who="bob", speed_m_s=None), 60.1) == (MISSION_M_S, "as bob wants it")
+
+
+def test_an_intent_may_ask_for_less_time_and_gets_no_more_than_the_longest() -> None:
+    intents, brief = Intents(MISSION_M_S), intent(0.0, valid_for_ns=SECOND // 2)
+    assert wish(intents, brief, 0.5)[0] == 0.1 and wish(intents, brief, 0.6)[0] == 0.0
+    intents, endless = Intents(MISSION_M_S), intent(0.0, valid_for_ns=2**62)
+    assert wish(intents, endless, LONGEST_NS / SECOND)[0] == 0.1
+    speed, why = wish(intents, endless, LONGEST_NS / SECOND + 0.1)
+    assert speed == 0.0 and "valid for 5 s" in why
+
+
+@pytest.mark.parametrize(
+    ("at_s", "words"), [(20.2, "stamped 10.2 s ahead of the robot's clock"), (8.0, "has expired: it is 2 s old")]
+)
+def test_what_is_stamped_in_the_future_or_long_ago_is_refused(at_s: float, words: str) -> None:
+    intents = Intents(MISSION_M_S)
+    speed, why = wish(intents, intent(at_s), 10.0)
+    assert speed == MISSION_M_S and words in why  # nobody has taken over from the mission
+    good = intent(10.0)
+    assert wish(intents, good, 10.1)[0] == 0.1
+    assert wish(intents, intent(at_s, speed_m_s=5.0), 10.2) == (0.1, "as ann wants it")  # the good one goes on
+    assert wish(intents, intent(at_s, speed_m_s=5.0), 11.5)[0] == 0.0  # and ends when it says
+
+
+def test_a_clock_that_the_sender_heard_first_is_no_future() -> None:
+    assert wish(Intents(MISSION_M_S), intent(1.09), 1.0)[0] == 0.1
+
+
+@pytest.mark.parametrize("speed_m_s", [10.1, -11.0, 1e5])
+def test_nobody_goes_faster_than_a_mission_may(speed_m_s: float) -> None:
+    speed, why = wish(Intents(MISSION_M_S), intent(1.0, speed_m_s=speed_m_s), 1.0)
+    assert speed == MISSION_M_S and f"asks for {speed_m_s:g} m/s, at most 10 m/s" in why
+
+
+def test_stop_is_a_wish_too() -> None:
+    assert wish(Intents(MISSION_M_S), intent(1.0, go=False), 1.1) == (0.0, "ann wants it to stop")
+
+
+def test_after_another_start_of_the_robot_an_intent_of_before_does_not_count_at_the_same_time_again() -> None:
+    intents, asked = Intents(MISSION_M_S), intent(50.0)
+    assert wish(intents, asked, 50.1)[0] == 0.1
+    intents.start_over()
+    speed, why = wish(intents, None, 0.0)
+    assert speed == 0.0 and "the intent of ann was for another start of the robot" in why
+    assert wish(intents, None, 50.1)[0] == 0.0
+    fresh = Intents(MISSION_M_S)
+    fresh.start_over()
+    assert wish(fresh, None, 0.0) == (MISSION_M_S, "")

@@ -1,0 +1,61 @@
+"""Whatever a backend raises stops the robot, with a record of what it was."""
+
+from typing import Any
+
+import pytest
+
+from snakesim_hal.backend import Samples, SetPoints
+from snakesim_hal.errors import BackendError, SnakesimError
+from snakesim_hal.guarded_backend import GuardedBackend
+from snakesim_hal.messages import Fault, LifecycleState
+from tests.unit.hal.network import Follower, LagBackend, following, running, wait_until
+from tests.unit.hal.test_client_host import run_config
+
+
+class Clumsy(LagBackend):
+    """Raises what a backend should not, once it is told to."""
+
+    raises_in: str | None = None
+
+    def _trip(self, where: str) -> None:
+        if self.raises_in == where:
+            raise OSError(19, "No such device")
+
+    def sample(self, tick: int, stamp_ns: int) -> Samples:
+        self._trip("sample")
+        return super().sample(tick, stamp_ns)
+
+    def enact(self, set_points: SetPoints, lifecycle: LifecycleState) -> None:
+        self._trip("enact")
+        super().enact(set_points, lifecycle)
+
+    def advance(self) -> None:
+        self._trip("advance")
+        super().advance()
+
+    def faults(self) -> list[Fault]:
+        self._trip("faults")
+        return super().faults()
+
+
+@pytest.mark.parametrize("where", ["sample", "enact", "advance", "faults"])
+def test_an_error_anywhere_is_a_latched_fault(where: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tests.unit.hal.network.LagBackend", Clumsy)
+    with running(run_config(pace="realtime")) as run, following(run.link, Follower()):
+        run.arm()
+        backend: Any = run.backend
+        backend.raises_in = where
+        wait_until(run.ended, "the end of the host")
+        assert run.host.ended == "failed" and run.host.authority.state == "fault"
+        (fault,) = run.host.authority.since_start.kept
+        assert fault.what == "backend_failed"
+        assert fault.cause == f"Clumsy.{where} failed: OSError: [Errno 19] No such device"
+
+
+def test_our_own_errors_stay_as_they_are() -> None:
+    class Refusing(LagBackend):
+        def advance(self) -> None:
+            raise BackendError("diverged")
+
+    with pytest.raises(SnakesimError, match=r"^diverged$"):
+        GuardedBackend(Refusing(run_config())).advance()

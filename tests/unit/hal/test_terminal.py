@@ -1,0 +1,52 @@
+"""What a tool prints: nothing that came from outside steers the terminal, and JSON stays JSON."""
+
+import ast
+import json
+import sys
+import unicodedata
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.terminal import complain_of, printable, say, say_again
+
+REPOSITORY = Path(__file__).parents[3]
+STEERING = {"Cc", "Cf", "Cs", "Zl", "Zp"}  # control, format (bidirectional overrides too), surrogates, separators
+
+
+def test_every_character_that_could_steer_is_shown_as_an_escape() -> None:
+    for code in range(sys.maxunicode + 1):
+        if unicodedata.category(chr(code)) in STEERING:
+            assert printable(f"a{chr(code)}b").isascii(), hex(code)
+    assert printable("\x1b[2J\x9b31m\r\n\u202eoff") == "\\u001b[2J\\u009b31m\\u000d\\u000a\\u202eoff"
+    assert printable("\U000e0041") == "\\udb40\\udc41"
+    assert printable("3 N·m, ü, 関節, ⟂") == "3 N·m, ü, 関節, ⟂"
+    assert printable("a\nb\tc", keep="\n") == "a\nb\\u0009c"
+
+
+@given(st.text())
+def test_a_json_text_that_is_printed_stays_one(text: str) -> None:
+    value = {text: [text]}
+    shown = printable(json.dumps(value, ensure_ascii=False))
+    assert json.loads(shown) == value and "\n" not in shown
+
+
+def test_what_is_said_is_harmless(capsys: pytest.CaptureFixture[str]) -> None:
+    say("\x1b]0;title\x07")
+    complain_of(ConfigError("a.toml: \x9b2J\n  next: trust me", "second line"), "snakesim")
+    assert say_again("tick 10 \x1b[1A and much more", 24, 3) == 24
+    out, err = capsys.readouterr()
+    assert out == "\\u001b]0;title\\u0007\n\rtick 10 \\u001b[1A and mu"
+    assert err == "snakesim: a.toml: \\u009b2J\\u000a  next: trust me\nsecond line\n"
+
+
+def test_nothing_else_prints() -> None:
+    """`make check` refuses `print`; nor does anything write to the streams directly."""
+    for package in REPOSITORY.glob("snakesim_*"):
+        for path in package.rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_bytes())):
+                if isinstance(node, ast.Attribute) and node.attr in ("write", "writelines"):
+                    assert ast.unparse(node.value) not in ("sys.stdout", "sys.stderr"), path

@@ -1,0 +1,158 @@
+"""Files of settings from anywhere: what is none, or is too much, is one clear line, in bounded time and memory."""
+
+import os
+import socket
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.files import Table, find, read_table
+from snakesim_hal.scenario import load, parse_set
+from snakesim_hal.session import open_router
+from snakesim_hal.textfiles import MOST_DEPTH, MOST_TOML, parse_toml, read_text, write_text
+
+LIMIT_S = 10.0  # on a busy machine; alone each takes less than two
+DEEP = ".".join("a" * 50_000)
+
+
+def endless(path: Path) -> None:
+    path.symlink_to("/dev/zero")
+
+
+def sparse(path: Path) -> None:
+    with path.open("wb") as file:
+        file.truncate(50 * 1024**3)
+
+
+def listening(path: Path) -> None:
+    os.chdir(path.parent)  # a socket's name is short
+    with socket.socket(socket.AF_UNIX) as end:
+        end.bind(path.name)
+
+
+ODD: dict[str, tuple[Callable[[Path], object], str]] = {
+    "pipe": (os.mkfifo, "is a pipe, not a file"),
+    "device that never ends": (endless, "is a device, not a file"),
+    "terminal": (lambda path: path.symlink_to("/dev/tty"), "is a device, not a file"),
+    "socket": (listening, "is a socket, not a file"),
+    "folder": (Path.mkdir, "is a folder, not a file"),
+    "50 GB of nothing": (sparse, "is larger than 8 MB"),
+    "10 MB": (lambda path: path.write_text("a = 1\n" * 1_700_000), "is larger than 8 MB"),
+    "5 MB of TOML": (lambda path: path.write_text("a = 1\n" * 850_000), "is larger than 2 MB"),
+    "link in a circle": (lambda path: path.symlink_to(path), "symbolic links"),
+    "UTF-16": (lambda path: path.write_text("a = 1", encoding="utf-16"), "is UTF-16 text, or none at all; save it as"),
+    "UTF-16 without a mark": (lambda path: path.write_text("a = 1", encoding="utf-16-le"), "is UTF-16 text"),
+    "Latin-1": (lambda path: path.write_bytes(b"a = '\xe4'"), "is not UTF-8 text: byte 0xe4 at 5"),
+    "key of 50,000 parts": (lambda path: path.write_text(f"{DEEP} = 1"), f"has more than {MOST_DEPTH} parts"),
+    "section of 50,000 parts": (lambda path: path.write_text(f"[{DEEP}]"), f"has more than {MOST_DEPTH} parts"),
+    "quoted key of 50,000 parts": (lambda path: path.write_text('"a"."b" . ' * 25_000), "parts"),
+    "key of 50,000 parts inside": (lambda path: path.write_text(f"x = {{ {DEEP} = 1 }}"), "parts"),
+    "deep lists": (lambda path: path.write_text("a = " + "[" * 100_000), "nested deeper"),
+    "deep sections": (lambda path: path.write_text("a = " + "{a=" * 100_000), "nested deeper"),
+    "lists that are closed": (lambda path: path.write_text("a = " + "[" * 200 + "]" * 200), "nested deeper"),
+    "number of 100,000 digits": (lambda path: path.write_text("a = " + "9" * 100_000), "not valid TOML"),
+}
+
+
+@pytest.mark.parametrize("odd", ODD)
+def test_an_odd_file_is_one_clear_line_at_once(odd: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    make, words = ODD[odd]
+    path = tmp_path / "odd.toml"
+    make(path)
+    started = time.monotonic()
+    with pytest.raises(ConfigError) as caught:
+        load(str(path))
+    assert time.monotonic() - started < LIMIT_S
+    assert str(caught.value).startswith(f"{path}: ") and words in str(caught.value), caught.value
+    assert len(caught.value.lines) == 1 and "\n" not in str(caught.value) and len(str(caught.value)) < 500
+
+
+@pytest.mark.parametrize("depth", [MOST_DEPTH + 1, 900, 100_000])
+def test_a_deep_json_file_is_refused(depth: int, tmp_path: Path) -> None:
+    path = tmp_path / "config.json"
+    path.write_text('{"a":' * depth + "1" + "}" * depth)
+    with pytest.raises(ConfigError, match="nested deeper than"):
+        read_table(path)
+
+
+def test_a_large_file_with_as_much_as_is_allowed_takes_bounded_time(tmp_path: Path) -> None:
+    key = ".".join("k" * (MOST_DEPTH - 1))
+    text = "".join(f"a{i}.{key} = 1\n" for i in range(80_000))[: MOST_TOML - 10]
+    (tmp_path / "large.toml").write_text(text[: text.rindex("\n")])
+    started = time.monotonic()
+    with pytest.raises(ConfigError, match="unknown field"):
+        load(str(tmp_path / "large.toml"), [parse_set("robot=planar13"), parse_set("scene=triplet")])
+    assert time.monotonic() - started < 3 * LIMIT_S
+
+
+def test_a_byte_order_mark_is_skipped(tmp_path: Path) -> None:
+    for name, text in (("a.toml", "a = 1"), ("a.json", '{"a": 1}')):
+        (tmp_path / name).write_text(text, encoding="utf-8-sig")
+        assert read_table(tmp_path / name).values == {"a": 1}
+
+
+@pytest.mark.parametrize("text", [f"{DEEP}=1", f"robot={{{DEEP}=1}}", "rate_hz=" + "[" * 50_000, "x" * 200_000])
+def test_a_flag_of_any_length_is_one_short_line(text: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load("triplet", [parse_set(text)])
+    assert len(str(caught.value)) < 1000 and "\n" not in str(caught.value)
+
+
+def test_names_that_no_file_has() -> None:
+    for name in ("a\0b.toml", "x" * 5000 + ".toml", "~nobody-of-this-name/x.toml"):
+        with pytest.raises(ConfigError):
+            read_text(find(name, "scenarios"))
+    with pytest.raises(ConfigError, match="no scenario called"):
+        find("x" * 5000, "scenarios")
+    with pytest.raises(ConfigError, match="the list has entries"):
+        Table({"a": [1]}, "x").put("a.²", 1, "--set")
+
+
+def test_a_router_file_that_would_overflow_zenoh(tmp_path: Path) -> None:
+    for text in ("[" * 100_000, "{plugins:" * 20_000):
+        (tmp_path / "router.json5").write_text(text)
+        with pytest.raises(ConfigError, match="nested deeper"), open_router(tmp_path / "router.json5"):
+            pass
+
+
+def test_a_dotted_text_is_no_dotted_key() -> None:
+    assert parse_toml("about = 'wait ..................................... 1.2.3.4'", "x")["about"].endswith("4")
+
+
+# --- writing ---------------------------------------------------------------------------------------------------
+
+
+def test_a_file_is_written_whole_into_folders_that_are_made(tmp_path: Path) -> None:
+    write_text(tmp_path / "a" / "b.html", "old")
+    write_text(tmp_path / "a" / "b.html", "new")
+    assert [path.name for path in (tmp_path / "a").iterdir()] == ["b.html"]
+    assert (tmp_path / "a" / "b.html").read_text() == "new"
+
+
+TAKEN: dict[str, tuple[Callable[[Path], object], str]] = {
+    "link": (lambda path: path.symlink_to(path.with_name("elsewhere")), "is a symbolic link"),
+    "link to nowhere": (lambda path: path.symlink_to("/nowhere/at/all"), "is a symbolic link"),
+    "pipe": (os.mkfifo, "is a pipe"),
+    "folder": (Path.mkdir, "is a folder"),
+}
+
+
+@pytest.mark.parametrize("taken", TAKEN)
+def test_what_is_no_file_is_not_written_to(taken: str, tmp_path: Path) -> None:
+    make, words = TAKEN[taken]
+    (tmp_path / "elsewhere").write_text("precious")
+    make(tmp_path / "out.html")
+    with pytest.raises(ConfigError, match=words):
+        write_text(tmp_path / "out.html", "page")
+    assert (tmp_path / "elsewhere").read_text() == "precious"
+
+
+def test_a_link_where_the_partial_file_would_be_is_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").write_text("precious")
+    (tmp_path / "out.html.partial").symlink_to(tmp_path / "elsewhere")
+    write_text(tmp_path / "out.html", "page")
+    assert (tmp_path / "elsewhere").read_text() == "precious" and (tmp_path / "out.html").read_text() == "page"

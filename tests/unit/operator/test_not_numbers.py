@@ -1,0 +1,205 @@
+"""NaN, infinity and noise anywhere in the samples of a run: the report is still made, and says what is not known."""
+
+import dataclasses
+import json
+import math
+import re
+import warnings
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from snakesim_hal import keys
+from snakesim_hal.blackbox import Layout
+from snakesim_hal.recorder import BLACK_BOX, DESCRIPTION, HOST_RECORD
+from snakesim_hal.scenario import write
+from snakesim_operator.compare import page as compare_page
+from snakesim_operator.compare.difference import differ
+from snakesim_operator.compare.table import table
+from snakesim_operator.record import CONFIG, TELEMETRY, RunRecord
+from snakesim_operator.report import page
+from snakesim_operator.summary import RunSummary, summarise
+from tests.unit.operator.test_report import Reader, made_up
+
+FIRST, LAST = 240, 330  # rows of the made-up run that are kept: two joints propel in them
+FIRST_TICK = 37 + FIRST
+JOINTS = [f"joint_{i + 1}" for i in range(13)]
+SIGNALS = {
+    "angle_rad": 13,
+    "velocity_rad_s": 13,
+    "torque_nm": 13,
+    "target": 13,
+    "torque_limit_nm": 13,
+    "position_w": 3,
+    "orientation_wxyz": 4,
+    "time_s": 0,
+    "contact_peak_n": 0,
+    "contact_count": 0,
+}
+WRONG = st.sampled_from([math.nan, math.inf, -math.inf, 1e300])
+
+
+def put_down(folder: Path, record: RunRecord) -> None:
+    """A record as a run leaves it."""
+    write(record.config, folder / CONFIG)
+    (folder / DESCRIPTION).write_bytes(msgspec.json.encode(record.description))
+    (folder / HOST_RECORD).write_bytes(msgspec.json.encode(record.host))
+    told = [(keys.CONTROL_STATE, state) for state in record.control] + [(keys.WORLD, world) for world in record.worlds]
+    lines = [msgspec.json.encode({"key": key, "message": message}, enc_hook=float) + b"\n" for key, message in told]
+    (folder / TELEMETRY).write_bytes(b"".join(lines))
+    layout, count = Layout.of(record.description), len(record.time_s)
+    rows = bytearray(count * layout.row_bytes)
+    columns = layout.arrays(rows)  # pyright: ignore[reportArgumentType]
+    columns["tick"][:] = FIRST_TICK + np.arange(count)
+    for column in layout.columns[1:]:
+        columns[column.name][:] = getattr(record, column.name)
+    (folder / BLACK_BOX).write_bytes(layout.header() + rows)
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory: pytest.TempPathFactory) -> RunRecord:
+    folder = tmp_path_factory.mktemp("base")
+    whole = made_up(folder)
+    kept = {name: value[FIRST:LAST] for name, value in vars(whole).items() if isinstance(value, np.ndarray)}
+    begin_ns, end_ns = (round(kept["time_s"][i] * 1e9) for i in (0, -1))
+    record = dataclasses.replace(
+        whole,
+        control=[state for state in whole.control if begin_ns <= state.stamp_ns <= end_ns],
+        worlds=[world for world in whole.worlds if begin_ns <= world.stamp_ns <= end_ns],
+        host=msgspec.structs.replace(whole.host, ticks=LAST - FIRST),
+        **kept,
+    )
+    put_down(folder, record)
+    loaded = RunRecord.load(folder)
+    assert loaded.lacks == [] and "lacks something" not in reported(loaded)[1].text
+    return loaded
+
+
+def reported(record: RunRecord) -> tuple[RunSummary, Reader]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        summary = summarise(record, "complete")
+        reader = Reader(page(record, summary))
+    numbers = [value for value in msgspec.structs.astuple(summary) if isinstance(value, float)]
+    assert len(numbers) > 5 and all(map(math.isfinite, numbers))
+    msgspec.json.decode(msgspec.json.encode(summary), type=RunSummary)
+    assert not [a for a in reader.attributes if a[2] is not None and re.search(r"\b(nan|inf|None)\b", a[2])]
+    assert not re.search(r"\b(None|nan|inf)\b", reader.text)
+    return summary, reader
+
+
+def compared(a: RunRecord, b: RunRecord) -> str:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        difference = differ(a, b)
+        text = "\n".join(table(difference))
+        reader = Reader(compare_page.page(difference))
+    assert not re.search(r"\b(nan|inf)\b", text + reader.text)
+    for record in (a, b):
+        for lack in record.lacks:
+            assert lack in text and lack in reader.text
+    return text
+
+
+@st.composite
+def spoilt_cells(draw: st.DrawFn) -> list[tuple[str, slice, int, float]]:
+    """Single samples, stretches, and whole columns."""
+    found: list[tuple[str, slice, int, float]] = []
+    for _ in range(draw(st.integers(1, 12))):
+        signal = draw(st.sampled_from(sorted(SIGNALS)))
+        first = draw(st.integers(0, LAST - FIRST - 1))
+        rows = draw(st.sampled_from([slice(first, first + 1), slice(first, first + 20), slice(0, None)]))
+        found.append((signal, rows, draw(st.integers(0, max(SIGNALS[signal] - 1, 0))), draw(WRONG)))
+    return found
+
+
+@given(cells=spoilt_cells())
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_black_box_with_numbers_that_are_none(base: RunRecord, tmp_path: Path, cells: Any) -> None:
+    spoilt = {name: np.array(getattr(base, name)) for name in SIGNALS}
+    for signal, rows, column, value in cells:
+        place = spoilt[signal]
+        place[(rows, column) if place.ndim > 1 else rows] = value
+    put_down(tmp_path, dataclasses.replace(base, **spoilt))
+    record = RunRecord.load(tmp_path)
+    assert np.allclose(record.time_s, base.time_s)
+    said = {line.partition(":")[0]: line for line in record.lacks}
+    for name, values in spoilt.items():
+        bad = ~(np.abs(values) < 1e9)
+        if name in ("position_w", "orientation_wxyz") or not bad.any():
+            continue
+        assert f"of {LAST - FIRST} samples are not numbers" in said[name]
+        counts = zip(JOINTS, bad.sum(axis=0), strict=True) if values.ndim > 1 else [("", bad.sum())]
+        assert all(f"{joint} {n}" in said[name] for joint, n in counts if n)
+    summary, reader = reported(record)
+    assert summary.lacks == record.lacks and all(lack in reader.text for lack in record.lacks)
+    compared(base, record)
+    compared(record, record)
+
+
+def leaves(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """Places of all numbers in a message."""
+    if isinstance(value, dict | list):
+        inner = value.items() if isinstance(value, dict) else enumerate(value)
+        return [leaf for key, item in inner for leaf in leaves(item, (*path, key))]
+    return [path] if isinstance(value, int | float) and not isinstance(value, bool) else []
+
+
+@given(data=st.data())
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_telemetry_with_numbers_that_are_none(base: RunRecord, tmp_path: Path, data: st.DataObject) -> None:
+    put_down(tmp_path, base)
+    lines = (tmp_path / TELEMETRY).read_bytes().splitlines(keepends=True)
+    refused = 0
+    for number in data.draw(st.sets(st.integers(0, len(lines) - 1), min_size=1, max_size=8)):
+        line = json.loads(lines[number])
+        place = data.draw(st.sampled_from(leaves(line["message"])))
+        message = line["message"]
+        for key in place[:-1]:
+            message = message[key]
+        message[place[-1]] = "HERE"
+        wrong = data.draw(st.sampled_from(["null", "NaN", "Infinity", "-Infinity", "1e400", "-1e400", '"no"', "{", ""]))
+        lines[number] = json.dumps(line).replace('"HERE"', wrong).encode() + b"\n"
+        may_be_unknown = wrong == "null" and place[-1] in (
+            "path_s_m",
+            "propulsion_n",
+            "propulsion_torque_nm",
+            "torque_headroom_nm",
+            "condition",
+        )
+        refused += not may_be_unknown
+    torn = data.draw(st.integers(0, 20))
+    (tmp_path / TELEMETRY).write_bytes(b"".join(lines) + lines[0][:torn].rstrip(b"\n"))
+    record = RunRecord.load(tmp_path)
+    assert len(record.control) + len(record.worlds) == len(lines) - refused
+    told = [re.match(r"telemetry: (\d+) lines? cannot be read, (control/state|guidance/world|no message)", lack)
+            for lack in record.lacks]  # fmt: skip
+    assert sum(int(found[1]) for found in told if found) == refused and all(told)
+    _, reader = reported(record)
+    assert all(lack in reader.text for lack in record.lacks)
+    compared(record, base)
+
+
+def test_a_pose_that_is_not_known_yet_or_never_is_lacking_only_where_there_is_a_sensor(
+    base: RunRecord, tmp_path: Path
+) -> None:
+    def lacks(sensors: Any, unknown: slice) -> list[str]:
+        position = base.position_w.copy()
+        position[unknown] = np.nan
+        robot = msgspec.structs.replace(base.config.robot, sensors=sensors)
+        config = msgspec.structs.replace(base.config, robot=robot)
+        put_down(tmp_path, dataclasses.replace(base, config=config, position_w=position))
+        record = RunRecord.load(tmp_path)
+        reported(record)
+        return record.lacks
+
+    sensors = base.config.robot.sensors
+    assert lacks(sensors, slice(0, 5)) == []
+    assert lacks(sensors, slice(3, 5)) == ["position_w: 2 of 90 samples are not numbers"]
+    assert lacks(sensors, slice(0, None)) == ["position_w: 90 of 90 samples are not numbers"]
+    assert lacks(msgspec.structs.replace(sensors, pose=None), slice(0, None)) == []

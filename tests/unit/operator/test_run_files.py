@@ -1,0 +1,133 @@
+"""What a supervisor writes: in order, never waited for, kept while the disk is full, and told when it is lost."""
+
+import errno
+import os
+import time
+from pathlib import Path
+from threading import Event
+
+import pytest
+
+from snakesim_operator import run_files as under_test
+from snakesim_operator.run_files import RunFiles
+from tests.unit.hal.network import wait_until
+
+
+class Disk:
+    """A disk that takes so many bytes more, or hangs."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.space, self.hangs, self.goes_on = 2**30, False, Event()
+        self._write, self._whole = os.write, under_test.write_whole
+        monkeypatch.setattr(under_test.os, "write", self.write)
+        monkeypatch.setattr(under_test, "write_whole", self.write_whole)
+        monkeypatch.setattr(under_test, "RETRY_S", 0.02)
+        monkeypatch.setattr(under_test, "LIMIT_S", 0.3)
+
+    def _take(self, size: int) -> int:
+        if self.hangs:
+            self.goes_on.wait(30)
+        if self.space == 0:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        taken = min(size, self.space)
+        self.space -= taken
+        return taken
+
+    def write(self, handle: int, content: bytes) -> int:
+        return self._write(handle, content[: self._take(len(content))])
+
+    def write_whole(self, path: Path, content: bytes) -> None:
+        if self._take(len(content)) < len(content):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        self._whole(path, content)
+
+
+@pytest.fixture
+def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
+    return Disk(monkeypatch)
+
+
+def test_everything_is_there_after_settling_in_the_order_in_which_it_was_asked_for(tmp_path: Path) -> None:
+    warned: list[str] = []
+    files = RunFiles(tmp_path, warned.append)
+    for i in range(1000):
+        files.append("a.log", b"%d\n" % i)
+        files.append("b.log", b"%d\n" % -i)
+    files.rename("a.log", "a-1.log")
+    files.rename("never.log", "never-1.log")  # what nobody appended to has nothing to give
+    files.append("a.log", b"new\n")
+    files.put("whole.json", b"{}")
+    files.settle()
+    assert (tmp_path / "a-1.log").read_bytes() == b"".join(b"%d\n" % i for i in range(1000))
+    assert (tmp_path / "a.log").read_bytes() == b"new\n" and (tmp_path / "whole.json").read_bytes() == b"{}"
+    assert files.close() == "" and warned == []
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a-1.log", "a.log", "b.log", "whole.json"]
+
+
+def test_nothing_is_lost_when_a_full_disk_has_room_again(tmp_path: Path, disk: Disk) -> None:
+    warned: list[str] = []
+    files = RunFiles(tmp_path, warned.append)
+    disk.space = 10
+    files.append("a.log", b"0123456789abcdef")
+    files.put("whole.json", b"{}")
+    wait_until(lambda: warned, "a warning")
+    assert (tmp_path / "a.log").read_bytes() == b"0123456789"
+    began = time.monotonic()
+    files.settle()
+    assert time.monotonic() - began < 0.2  # it knows that it would be in vain
+    disk.space = 2**30
+    wait_until(lambda: (tmp_path / "whole.json").exists(), "the second file")
+    assert (tmp_path / "a.log").read_bytes() == b"0123456789abcdef"
+    assert files.close() == "" and warned == [f"{tmp_path}: No space left on device"]
+
+
+def test_a_disk_that_stays_full_gets_no_empty_file_and_the_loss_is_told(tmp_path: Path, disk: Disk) -> None:
+    warned: list[str] = []
+    files = RunFiles(tmp_path, warned.append)
+    disk.space = 0
+    for i in range(100):
+        files.append("a.log", b"%d\n" % i)
+    files.put("whole.json", b"{}")
+    wait_until(lambda: warned, "a warning")
+    assert files.close() == f"{tmp_path}: No space left on device" and len(warned) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_nobody_waits_for_a_disk_that_hangs_and_memory_is_bounded(
+    tmp_path: Path, disk: Disk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(under_test, "MEMORY_BYTES", 10_000)
+    files = RunFiles(tmp_path, lambda _: None)
+    disk.hangs = True
+    began = time.monotonic()
+    for _ in range(1000):
+        files.append("a.log", b"x" * 100)
+    assert time.monotonic() - began < 0.2
+    assert sum(len(task.content) for task in files._tasks) <= 10_000
+    assert files.close() == f"{tmp_path}: the disk has not answered for 0.3 s"
+    assert time.monotonic() - began < 1.0
+    disk.goes_on.set()
+
+
+def test_what_comes_too_fast_for_a_slow_disk_is_told(
+    tmp_path: Path, disk: Disk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(under_test, "MEMORY_BYTES", 10_000)
+    monkeypatch.setattr(under_test, "LIMIT_S", 5.0)
+    files = RunFiles(tmp_path, lambda _: None)
+    disk.hangs = True
+    for i in range(200):
+        files.append("a.log", b"%099d\n" % i)
+    disk.hangs = False
+    disk.goes_on.set()
+    assert files.close() == f"{tmp_path}: the disk is too slow for what the run tells"
+    kept = (tmp_path / "a.log").read_bytes().splitlines()
+    assert [int(line) for line in kept] == list(range(100))
+
+
+def test_without_a_folder_nothing_is_kept() -> None:
+    files = RunFiles(None, pytest.fail)
+    files.append("a.log", b"x")
+    files.put("whole.json", b"{}")
+    files.settle()
+    assert files.close() == ""
