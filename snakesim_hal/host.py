@@ -402,7 +402,7 @@ class Host:
         if held_up_s * 1e9 > self._config.lease_ns:
             wrong["the network takes no message: it is congested, or somebody attacks it"] = "network_held_up"
         for cause in wrong.keys() - self._network_faults:
-            self.authority.note(Fault(tick=self._tick, what=wrong[cause], cause=cause))
+            self.authority.note(Fault(tick=self._tick, what=wrong[cause], cause=cause, reach="none"))
         self._network_faults = set(wrong)
 
     # --- what goes out -------------------------------------------------------------------------------------

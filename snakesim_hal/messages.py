@@ -20,7 +20,7 @@ Pace = Literal["realtime", "lockstep", "free"]
 LifecycleState = Literal["disarmed", "armed", "fault", "estop"]
 LocomotionState = Literal["PowerOff", "Idle", "NotLocomoting", "Locomoting"]
 SafeAction = Literal["passive", "damp", "hold"]
-Reach = Literal["robot", "joint"]
+Reach = Literal["robot", "joint", "none"]
 Axis = Literal["yaw", "pitch"]
 
 A_JOINT = "one entry a joint"
@@ -267,7 +267,10 @@ class Fault(Message, frozen=True, kw_only=True):
     cause: q.Reason
     joint: Annotated[q.Name | None, about("null: it is not about one joint")] = None
     reach: Annotated[
-        Reach, about("joint: the others are as they were, and the robot may go on if its file says so")
+        Reach,
+        about(
+            "joint: the others are as they were, and the robot may go on if its file says so; none: it stops nothing"
+        ),
     ] = "robot"
 
 
