@@ -26,6 +26,7 @@ class Sender:
 
     def __init__(self, name: str) -> None:
         self._waiting: Mailbox[Callable[[], None] | None] = Mailbox((WAITING_LIMIT,))
+        self._closing = False
         self._since_ns = 0  # when the thing under way began; 0: none is
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
@@ -41,6 +42,7 @@ class Sender:
 
     def close(self) -> None:
         """Do what waits, for a moment, and end."""
+        self._closing = True
         self._waiting.put(None)
         self._thread.join(FLUSH_S)
 
@@ -50,7 +52,8 @@ class Sender:
             try:
                 action()
             except Exception as error:  # noqa: BLE001 - this thread's outermost loop; the network is closed, as a rule
-                complain(f"not sent: {type(error).__name__}: {error}")
+                if not self._closing:
+                    complain(f"not sent: {type(error).__name__}: {error}")
             self._since_ns = 0
 
 

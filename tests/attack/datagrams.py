@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import random
 import socket
 import threading
 import time
@@ -55,6 +56,36 @@ def false_port(endpoint: str, *, knows_nonce: bool = True) -> Iterator[None]:
     thread.start()
     try:
         yield
+    finally:
+        over.set()
+        thread.join()
+        wire.close()
+
+
+@contextmanager
+def flood(endpoint: str) -> Iterator[list[int]]:
+    """Noise, truncated and oversized stops, as fast as one thread can send."""
+    dice, sent, over = random.Random(1), [0], threading.Event()
+    nonce = bytes(16)
+    shots = [
+        *(dice.randbytes(size) for size in (0, 1, 8, 24, 100, 1400, 60_000)),
+        *(stop(nonce=nonce)[:size] for size in (1, 7, 8, 9, 23)),
+        b"snakstop" + nonce + b"x",
+        DONE + nonce + b"done",
+        b"SNAKSTOQ" + nonce,
+    ]
+    wire = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+
+    def send() -> None:
+        while not over.is_set():
+            with contextlib.suppress(OSError):
+                wire.sendto(dice.choice(shots), address(endpoint))
+                sent[0] += 1
+
+    thread = threading.Thread(target=send, daemon=True)
+    thread.start()
+    try:
+        yield sent
     finally:
         over.set()
         thread.join()

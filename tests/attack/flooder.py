@@ -88,7 +88,7 @@ def readers(endpoint: str, amount: int) -> Iterator[str]:
     session = zenoh.open(settings(endpoint))
     kept: list[Any] = []
     for i in range(amount):
-        kept.append(session.declare_subscriber(pattern(i), lambda _: None))
+        kept.append(session.declare_subscriber(pattern(i), handlers.RingChannel(1)))  # unread: no thread each
     time.sleep(1.0)  # until the robot's host knows of them
     yield "ready"
     while True:

@@ -1,7 +1,6 @@
 """A4: an emergency stop cannot be shut out. What floods or occupies the network must not keep it away."""
 
 import contextlib
-import random
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -10,7 +9,7 @@ from contextlib import AbstractContextManager, contextmanager
 import pytest
 
 from tests.attack import datagrams
-from tests.attack.command import CONTROL_CHARACTERS, address, free_endpoint, snakesim
+from tests.attack.command import CONTROL_CHARACTERS, free_endpoint, snakesim
 from tests.attack.effort import FULL, effort
 from tests.attack.floods import Flooder, flood, half_open
 from tests.attack.robot import Robot
@@ -142,41 +141,11 @@ def test_a4_a_datagram_stops_the_robot_under(
     assert answer is not None and took_s < QUERY_S
 
 
-@contextmanager
-def datagram_flood(endpoint: str) -> Iterator[list[int]]:
-    """Noise, truncated and oversized stops, as fast as one thread can send."""
-    dice, sent, over = random.Random(1), [0], threading.Event()
-    nonce = bytes(16)
-    shots = [
-        *(dice.randbytes(size) for size in (0, 1, 8, 24, 100, 1400, 60_000)),
-        *(datagrams.stop(nonce=nonce)[:size] for size in (1, 7, 8, 9, 23)),
-        b"snakstop" + nonce + b"x",
-        datagrams.DONE + nonce + b"done",
-        b"SNAKSTOQ" + nonce,
-    ]
-    wire = datagrams.socket.socket(datagrams.socket.AF_INET, datagrams.socket.SOCK_DGRAM)
-
-    def send() -> None:
-        while not over.is_set():
-            with contextlib.suppress(OSError):
-                wire.sendto(dice.choice(shots), address(endpoint))
-                sent[0] += 1
-
-    thread = threading.Thread(target=send, daemon=True)
-    thread.start()
-    try:
-        yield sent
-    finally:
-        over.set()
-        thread.join()
-        wire.close()
-
-
 def test_a4_a_flood_of_wrong_datagrams_does_nothing_and_keeps_no_right_one_out(
     robot: Robot, record_property: Callable[[str, object], None]
 ) -> None:
     before = robot.health()
-    with datagram_flood(robot.endpoint) as sent:
+    with datagrams.flood(robot.endpoint) as sent:
         time.sleep(float(effort(2, 10)))
         assert not robot.operator.status()["why"].startswith("emergency stop"), robot.operator.status()["why"]
         asked_s = time.monotonic()

@@ -1,6 +1,7 @@
-"""A consumer of a robot's streams that cannot keep up: `python -m tests.faults.consumer sleep|disk ENDPOINT NAMESPACE`.
+"""A consumer of a robot's streams that cannot keep up. `python -m tests.faults.consumer KIND ENDPOINT NAMESPACE DISK`.
 
 sleep: its callback sleeps for half a second at every sample. disk: it writes what it gets to a disk that is full.
+freeze: it reads everything, until somebody stops its process.
 """
 
 import sys
@@ -39,9 +40,15 @@ def main() -> None:
                 print(f"{STUCK}: {error.strerror}", flush=True)
             raise
 
+    def reads(_arrival: Arrival) -> None:
+        if not said:
+            said.append(True)
+            print(STUCK, flush=True)
+
+    act = {"sleep": sleeps, "disk": writes, "freeze": reads}[kind]
     with open_session(Link(endpoint, namespace)) as session:
-        for key in KEYS:
-            session.on_arrival(key, sleeps if kind == "sleep" else writes)
+        for key in ("**",) if kind == "freeze" else KEYS:
+            session.on_arrival(key, act)
         print(READY, flush=True)
         while True:
             time.sleep(1.0)

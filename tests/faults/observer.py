@@ -248,7 +248,7 @@ class Observer:
             self.clear()
             left_s = max(deadline - time.monotonic(), 0.1)
             self.until(
-                lambda: self.status is not None and (self.status.ready_to_arm or self.state() == "fault"),
+                lambda: self.status is not None and (self.status.ready_to_arm or self.state() in ("fault", "estop")),
                 "ready to arm",
                 left_s,
             )

@@ -16,6 +16,7 @@ from snakesim_hal.session import Link, open_session
 from snakesim_operator import children
 from snakesim_operator.children import Child
 from tests.e2e.command import free_endpoint
+from tests.faults.host_watch import HostWatch, urgently
 from tests.faults.observer import Observer, TrialError
 from tests.faults.row import Request, Trial
 
@@ -23,7 +24,6 @@ START_LIMIT_S = 240.0 if os.environ.get("SNAKESIM_VCAN") == "guest" else 60.0  #
 MOVING_S = 0.25  # from arming to the injection
 SETTLED_S = 0.3  # how long steps are watched after a recovery
 PERIOD_S = 0.01
-OBSERVER_PRIORITY = 30  # of 99; host and control have 20
 
 
 def configuration(backend: str, **dotted: Any) -> RunConfig:
@@ -42,6 +42,8 @@ class Robot:
         self.endpoint = endpoint or free_endpoint()
         self.running: dict[str, Child] = {}
         self._stack = ExitStack()
+        self.host = HostWatch()  # of the first host
+        self._stack.callback(self.host.close)
         self.random = random.Random(config.seed)
         write(config, folder / "config.json")
 
@@ -58,16 +60,19 @@ class Robot:
     def start(self, name: str) -> Child:
         """Start one of its processes."""
         common = ["--config", str(self.folder / "config.json"), "--endpoint", self.endpoint]
+        inherits: list[int] = []
         if name == "host":
             module = ["snakesim_hal.host_process", *common, "--out", str(self.folder)]
             module += ["--router"] if self.router else []
+            inherits = [self.host.inherited.fileno()]
+            module += ["--channel", str(inherits[0])]
         elif name == "router":
             module = ["snakesim_hal.router_process", *common]
         else:
             module = ["snakesim_hal.serve", name, *common]
         log = self._stack.enter_context((self.folder / f"{name}.log").open("ab", buffering=0))
         state = {"XDG_STATE_HOME": str(self.folder)}  # what outlives a run must not outlive this one
-        self.running[name] = children.start(name, module, log.write, more=state)
+        self.running[name] = children.start(name, module, log.write, inherits=inherits, more=state)
         return self.running[name]
 
     def start_all(self) -> None:
@@ -81,7 +86,7 @@ class Robot:
         link = Link(self.endpoint, self.config.robot.name)
         while True:
             try:
-                with _urgently():
+                with urgently():
                     session = self._stack.enter_context(open_session(link, connect_timeout_s=0.5))
                 return Observer(session)
             except NotConnectedError:
@@ -114,22 +119,6 @@ class Robot:
         observer.forget()
         if observer.state() != "armed":
             raise TrialError(f"the robot stopped before the injection: {observer.in_words()}")
-
-
-@contextlib.contextmanager
-def _urgently() -> Iterator[None]:
-    """Have this thread, and those that start meanwhile, outrank the robot's own where the system lets them.
-
-    So an observer is not kept waiting by a controller that is busy, and has priority. Processes do not inherit it.
-    """
-    priority = os.sched_param(OBSERVER_PRIORITY)
-    with contextlib.suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_FIFO, priority)
-    try:
-        yield
-    finally:
-        with contextlib.suppress(OSError):
-            os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, priority)
 
 
 @contextlib.contextmanager

@@ -1,10 +1,11 @@
 """Somebody else listens, and cannot keep up: only he may suffer."""
 
 import itertools
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from tests.faults.consumer import STUCK
@@ -14,6 +15,7 @@ from tests.faults.row import Measure, Request, Trial
 
 WINDOW_S = 0.5
 DISK_BYTES = 64 * 1024
+FROZEN, FROZEN_WINDOW_S, FROZEN_HZ = 4, 1.0, 200.0  # 20 such windows outlast every buffer on the way, and Zenoh's lease
 
 
 def cannot_keep_up(kind: str) -> Measure:
@@ -44,9 +46,36 @@ def cannot_keep_up(kind: str) -> Measure:
     return measure
 
 
-def _missed(observer: Observer) -> int:
+def frozen_readers(request: Request) -> Iterator[Trial]:
+    """Readers of everything whose processes are stopped, and stay. The value: as above, in windows of a second.
+
+    What is sent to them fills every buffer on the way, so whoever waits for them stands still within seconds.
+    """
+    with robot(request, rate_hz=FROZEN_HZ, controller="hold") as (made, observer), ExitStack() as stack:
+        before, with_them = [_missed(observer, FROZEN_WINDOW_S) for _ in range(5)], list[int]()
+        for number in range(FROZEN):
+            (folder := request.folder / str(number)).mkdir()
+            reader = stack.enter_context(_consumer("freeze", made.endpoint, made.config.robot.name, folder))
+            stack.callback(reader.send_signal, signal.SIGCONT)
+            reader.send_signal(signal.SIGSTOP)
+        observer.arm()
+        for _ in range(request.trials):
+            with_them.append(_missed(observer, FROZEN_WINDOW_S))
+            trouble = ""
+            if observer.state() != "armed":
+                trouble = f"the robot stopped: {observer.in_words()}"
+                observer.arm()
+            yield Trial(value=float(max(with_them[-1] - max(before), 0)), trouble=trouble)
+        request.note(
+            f"{FROZEN} readers at {FROZEN_HZ:g} Hz for {request.trials * FROZEN_WINDOW_S:g} s: {sum(before)} cycles "
+            f"missed in {len(before)} windows of {FROZEN_WINDOW_S:g} s without them, {sum(with_them)} in "
+            f"{request.trials} with them, worst {max(with_them)}"
+        )
+
+
+def _missed(observer: Observer, window_s: float = WINDOW_S) -> int:
     observer.forget()
-    observer.watch(WINDOW_S)
+    observer.watch(window_s)
     rows = [heard.message for heard in observer.applied]
     return sum(a.sequence == b.sequence for a, b in itertools.pairwise(rows) if b.sequence is not None)
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from snakesim_hal import keys
 from snakesim_hal.injection import KINDS
 from tests.faults import (
+    rows_attacks,
     rows_commands,
     rows_consumers,
     rows_controller,
@@ -25,6 +26,7 @@ NO_BUS = "a simulator has no bus"
 NO_MODULES = "a simulator has no modules; what its sensors can do is in the rows by a whole robot"
 NO_MODULES_LEFT = "the simulator is in the host's process: without a host nothing is there that could move"
 IN_GUEST_MS = 100.0 + 1000.0 / rows_guest.RATE_HZ  # where heartbeats tell the module's time
+STOP_MS = 200.0
 PASSED = "messages got through"
 
 
@@ -120,10 +122,10 @@ def bus_row(name: str, fault: str, kind: str, what: str, limit_ms: float = 3 * P
     )
 
 
-def consumer_row(name: str, fault: str, kind: str) -> Row:
+def consumer_row(name: str, fault: str, measure: Measure) -> Row:
     """Somebody who listens."""
     expected = "no control cycle is missed, the robot goes on"
-    return Row(name, fault, expected, "-", 0.0, "more missed cycles", both(rows_consumers.cannot_keep_up(kind)))
+    return Row(name, fault, expected, "-", 0.0, "more missed cycles", both(measure))
 
 
 def stream_row(name: str, key: str, oldest_ms: float) -> Row:
@@ -137,6 +139,12 @@ def stream_row(name: str, key: str, oldest_ms: float) -> Row:
         "ms",
         both(rows_streams.withheld(key)),
     )
+
+
+def stop_row(name: str, fault: str, measure: Measure) -> Row:
+    """An emergency stop while somebody attacks the network."""
+    expected = "every joint is made safe at once, the stop is latched and confirmed to who asked"
+    return Row(name, fault, expected, f"{STOP_MS:.0f} ms from asking to the set-points", STOP_MS, "ms", both(measure))
 
 
 HEADINGS: tuple[Heading, ...] = (
@@ -362,12 +370,66 @@ HEADINGS: tuple[Heading, ...] = (
         ),
     ),
     Heading(
-        "slow subscriber (sleeping callback, full disk at a consumer)",
+        "slow subscriber (sleeping callback, full disk at a consumer, frozen process)",
         "only that consumer suffers; zero missed control cycles",
         "-",
         (
-            consumer_row("consumer_sleeps", "a consumer's callback sleeps for 0.5 s at every sample", "sleep"),
-            consumer_row("consumer_disk_full", "a consumer writes to a disk that is full", "disk"),
+            consumer_row(
+                "consumer_sleeps",
+                "a consumer's callback sleeps for 0.5 s at every sample",
+                rows_consumers.cannot_keep_up("sleep"),
+            ),
+            consumer_row(
+                "consumer_disk_full", "a consumer writes to a disk that is full", rows_consumers.cannot_keep_up("disk")
+            ),
+            consumer_row(
+                "consumer_frozen", "four readers of everything are frozen (SIGSTOP)", rows_consumers.frozen_readers
+            ),
+        ),
+    ),
+    Heading(
+        "an emergency stop while the network is flooded, occupied or held up",
+        "stopped at once, whatever else goes on",
+        f"{STOP_MS:.0f} ms",
+        (
+            stop_row("stop_half_open", "300 half-open connections", rows_attacks.stopped_under("half_open")),
+            stop_row(
+                "stop_idle", "1000 sessions that do nothing, or as many as get in", rows_attacks.stopped_under("idle")
+            ),
+            stop_row(
+                "stop_lease_flood", "lease queries, as many as two processes can", rows_attacks.stopped_under("lease")
+            ),
+            stop_row(
+                "stop_sample_flood",
+                "10,000 samples of noise a second on every key",
+                rows_attacks.stopped_under("garbage"),
+            ),
+            stop_row(
+                "stop_datagram_flood",
+                "wrong datagrams at the stop port, as many as a thread can",
+                rows_attacks.stopped_under("datagrams"),
+            ),
+            stop_row(
+                "stop_readers_leave",
+                "300 readers of everything leave at once",
+                rows_attacks.stopped_while_readers_leave,
+            ),
+        ),
+    ),
+    Heading(
+        "a second run on a robot's network, or at its endpoint",
+        "refuses to start; the robot stays as it is",
+        "-",
+        (
+            Row(
+                "second_run",
+                "a person disarmed the robot; a second `snakesim run` of its name starts there",
+                "the second ends with an error that names the robot; nothing is armed",
+                "-",
+                0.0,
+                "set-points not passive",
+                both(rows_attacks.second_run),
+            ),
         ),
     ),
     Heading(
