@@ -1,6 +1,7 @@
 # What a contributor does, and what CI does. `make` alone lists it.
 #   PYTHON=python3.12   the interpreter that `make setup` builds on
 #   ARGS="-k gate"      further arguments for demo, test and bench
+#   QUICK=      takes the slow tests in
 #   WORKERS=1           how many tests run side by side (2)
 #   UPGRADE=1           lets `make lock` take the newest versions allowed
 
@@ -11,6 +12,7 @@ WORKERS ?= 2
 PAYLOADS ?= 1000000
 MINUTES ?= 30
 TRIALS ?= 300
+QUICK ?= 1
 
 # A sourced ROS workspace sets these; its packages and pytest plugins must not leak into ours.
 unexport PYTHONPATH PYTHONHOME PYTHONSTARTUP PYTEST_ADDOPTS VIRTUAL_ENV
@@ -22,7 +24,7 @@ packages := $(wildcard snakesim_*)
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test test-here test-vcan attack faults mutation fuzz soak kills check bench schemas docs lock clean FORCE
+.PHONY: help setup demo test test-all test-here test-vcan attack faults mutation fuzz soak kills check bench schemas docs lock clean FORCE
 
 help: ## List these targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' Makefile
@@ -32,7 +34,10 @@ setup: $(stamp) ## Make .venv from the hashed lock (PYTHON=python3.12 to choose)
 demo: $(stamp) ## Run the simulated snake through a triplet of obstacles, into runs/demo
 	$(bin)/snakesim run triplet --out runs/demo $(ARGS)
 
-test: test-here test-vcan ## Run all tests
+test: test-here test-vcan ## Run the tests, but for those that are slow
+
+test-all: ## Run all tests, as before a release
+	$(MAKE) test-here test-vcan QUICK=
 
 test-here: $(stamp) ## Run the tests that need no CAN bus (ARGS="-k gate")
 	$(here) -n $(WORKERS) --dist worksteal || $(here) $(again)
@@ -42,8 +47,8 @@ test-vcan: $(stamp) ## Run the CAN tests on real SocketCAN, in a small VM where 
 
 # Robots in real time stumble on a busy machine, an emulated one most of all. What failed is tried once more: here, alone.
 again = --last-failed --last-failed-no-failures none
-here = $(bin)/python -m pytest --ignore tests/vcan $(ARGS)
-on_vcan = $(bin)/python -m pytest tests/vcan tests/contract -m "not slow" --timeout 600 $(ARGS)
+here = $(bin)/python -m pytest --ignore tests/vcan $(if $(QUICK),-m "not slow") $(ARGS)
+on_vcan = $(bin)/python -m pytest tests/vcan tests/contract $(if $(QUICK),-m "not slow") --timeout 900 $(ARGS)
 
 faults: $(stamp) ## Measure the fault table and write docs/faults.md (ARGS="--rows NAME --trials 3")
 	$(bin)/python -m tests.faults --write $(ARGS)

@@ -29,9 +29,13 @@ class Ended:
     err: str
 
 
+HANDED_DOWN = {"MAKEFLAGS", "MFLAGS", "MAKEOVERRIDES", "MAKELEVEL", "ARGS", "WORKERS", "QUICK"}
+
+
 def environment(home: Path, **more: str) -> dict[str, str]:
-    """The caller's environment, but with a state folder of the test's own."""
-    return {**os.environ, "XDG_STATE_HOME": str(home), "PYTHONUNBUFFERED": "1", **more}
+    """The caller's environment without what `make` hands down, and with a state folder of the test's own."""
+    kept = {name: value for name, value in os.environ.items() if name not in HANDED_DOWN}
+    return {**kept, "XDG_STATE_HOME": str(home), "PYTHONUNBUFFERED": "1", **more}
 
 
 def snakesim(*arguments: str, cwd: Path, limit_s: float = LIMIT_S, more: dict[str, str] | None = None) -> Ended:

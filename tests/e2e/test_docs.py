@@ -71,7 +71,6 @@ def test_a_section_as_printed(section: Section, tmp_path: Path) -> None:
 
 
 @needs_uv
-@pytest.mark.slow
 @pytest.mark.parametrize("section", README, ids=lambda section: re.sub(r"\W+", "-", section.title).lower())
 def test_the_readme_as_printed(section: Section, tmp_path: Path) -> None:
     """A clone, and an environment of its own from the lock; what is downloaded for it is in uv's cache, as a rule."""

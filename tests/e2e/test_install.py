@@ -98,12 +98,13 @@ WAYS: dict[str, Callable[[Path, Path], Installed]] = {
 
 
 @needs_uv
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("way", [way if way == "user" else pytest.param(way, marks=pytest.mark.slow) for way in WAYS])
 def test_a_wheel_has_all_that_it_needs(way: str, wheel: Path, dependencies: Path, tmp_path: Path) -> None:
     check(WAYS[way](wheel, tmp_path), dependencies, tmp_path)
 
 
 @needs_uv
+@pytest.mark.slow
 def test_the_sources_installed_as_they_are(sources: Path, dependencies: Path, tmp_path: Path) -> None:
     """`pip install .`; what builds it is lent by the environment here, too."""
     check(into_a_folder(sources, tmp_path), dependencies, tmp_path)

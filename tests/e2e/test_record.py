@@ -141,6 +141,7 @@ def test_a_second_run_in_the_folder_is_refused_and_the_first_keeps_its_stop(tmp_
     nothing_left(tmp_path / "run")
 
 
+@pytest.mark.slow
 def test_an_earlier_run_is_moved_aside_and_both_can_be_compared(tmp_path: Path) -> None:
     runs = [run_to_summary(tmp_path / "run", *SHORT) for _ in range(3)]
     assert all(ended.code == 0 for ended, _ in runs) and not (tmp_path / "run" / "run.lock").exists()
@@ -284,6 +285,7 @@ def hangs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "hangs"
 
 
+@pytest.mark.slow
 def test_a_slow_disk_delays_no_tick_and_loses_nothing(tmp_path: Path, hangs: Path) -> None:
     ended, summary = run_to_summary(tmp_path / "run", *LONG, "--duration", "4")
     assert ended.code == 0 and "warning:" not in ended.out, ended.out

@@ -31,9 +31,9 @@ def test_without_joints_the_robot_stops_and_the_reason_is_told(tmp_path: Path) -
     ("key", "limit_s"),
     [
         ("sensor/pose", 0.24),
-        ("sensor/contacts", 0.24),
+        pytest.param("sensor/contacts", 0.24, marks=pytest.mark.slow),
         ("guidance/world", 0.22),
-        ("navigation/trajectory", 0.84),
+        pytest.param("navigation/trajectory", 0.84, marks=pytest.mark.slow),
     ],
 )
 def test_without_another_stream_it_holds_and_goes_on_when_it_is_back(tmp_path: Path, key: str, limit_s: float) -> None:

@@ -28,6 +28,7 @@ from snakesim_hal.session import Arrival, Session
 
 LIMIT_S = 30.0
 LOOK_S = 0.002
+ASKED = 5  # times, before nobody seems to be there
 MessageT = TypeVar("MessageT", bound=Message)
 
 
@@ -192,11 +193,17 @@ class Observer:
     # --- the operator -----------------------------------------------------------------------------------------
 
     def ask(self, key: str, request: Message) -> Answer:
-        """Ask, and be answered; a no is an answer too. Raises TrialError when nobody answers."""
-        try:
-            return self.session.ask(key, request, timeout_s=5.0)
-        except NotConnectedError as error:
-            raise TrialError(str(error)) from error
+        """Ask until it is answered; a no is an answer too. Raises TrialError when nobody answers.
+
+        A flood of queries may push an answer out, and then whoever asked asks again.
+        """
+        why = ""
+        for _ in range(ASKED):
+            try:
+                return self.session.ask(key, request, timeout_s=2.0)
+            except NotConnectedError as error:
+                why = str(error)
+        raise TrialError(f"{why}, asked {ASKED} times")
 
     def inject(self, part: str, kind: str, target: str, **more: Any) -> Answer:
         """Let something go wrong by the product's own injector. Raises TrialError when it refuses."""

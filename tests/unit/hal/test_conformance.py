@@ -69,6 +69,7 @@ def test_a_backend_that_breaks_a_clause_fails_it(tmp_path: Path) -> None:
     assert not unnoticed
 
 
+@pytest.mark.slow
 def test_the_example_of_the_docs_passes_from_anywhere(tmp_path) -> None:
     (tmp_path / "workbench.py").write_text(text_of_the_example())
     given = ["--backend", "./workbench.py:Workbench", "--mute", "./workbench.py:mute", "--contract-table", "table.md"]
@@ -79,6 +80,7 @@ def test_the_example_of_the_docs_passes_from_anywhere(tmp_path) -> None:
     assert len(rows) == len(clauses())
 
 
+@pytest.mark.slow
 def test_a_backend_that_is_late_coarse_and_slow_to_wake_passes() -> None:
     ran = run_suite("--backend", f"{BUS}:BusWorkbench", "--mute", f"{BUS}:mute", "-q")
     assert ran.returncode == 0, ran.stdout

@@ -119,7 +119,7 @@ def spoilt_cells(draw: st.DrawFn) -> list[tuple[str, slice, int, float]]:
 
 
 @given(cells=spoilt_cells())
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_a_black_box_with_numbers_that_are_none(base: RunRecord, tmp_path: Path, cells: Any) -> None:
     spoilt = {name: np.array(getattr(base, name)) for name in SIGNALS}
     for signal, rows, column, value in cells:
@@ -151,7 +151,7 @@ def leaves(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 
 
 @given(data=st.data())
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_telemetry_with_numbers_that_are_none(base: RunRecord, tmp_path: Path, data: st.DataObject) -> None:
     put_down(tmp_path, base)
     lines = (tmp_path / TELEMETRY).read_bytes().splitlines(keepends=True)
