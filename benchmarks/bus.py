@@ -14,11 +14,11 @@ from dataclasses import dataclass
 
 import can
 
-from snakesim_can_backend.bus_load import BIT_RATE, FRAME_BITS
-from snakesim_can_backend.codec import codec, load_database
-from snakesim_can_backend.protocol import COUNTS, Opcode
-from snakesim_can_backend.reading import Reading
-from snakesim_can_backend.wire import drain, is_up
+from snakesim_can_backend.bus.bus import drain, is_up
+from snakesim_can_backend.bus.load import BIT_RATE, FRAME_BITS
+from snakesim_can_backend.driver.reports import Reading
+from snakesim_can_backend.protocol.codec import codec, load_database
+from snakesim_can_backend.protocol.definitions import COUNTS, Opcode
 
 JOINTS = 13
 SYNCS = 400

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.whole import run
-from snakesim_can_backend.bus_load import MOST_LOAD, Reports, load
-from snakesim_can_backend.protocol import Opcode, opcode_of
+from snakesim_can_backend.bus.load import MOST_LOAD, Reports, load
+from snakesim_can_backend.protocol.definitions import Opcode, opcode_of
 from tests.unit.can_backend.twin.rig import run_at
 
 WARM_UP = 100  # cycles

@@ -8,12 +8,12 @@ from contextlib import contextmanager
 import mujoco
 
 from snakesim_hal.backend import Samples, SetPoints
-from snakesim_hal.codec import encode
-from snakesim_hal.keys import CLOCK, JOINTS
-from snakesim_hal.messages import Clock, JointCommand, Mode
-from snakesim_hal.plugins import BACKENDS, find_plugin, plugin_settings
-from snakesim_hal.scenario import RunConfig, load, parse_set
-from snakesim_hal.session import Link, Publisher, Session, open_session
+from snakesim_hal.model.plugins import BACKENDS, find_plugin, plugin_settings
+from snakesim_hal.model.scenario import RunConfig, load, parse_set
+from snakesim_hal.network.session import Link, Publisher, Session, open_session
+from snakesim_hal.wire.codec import encode
+from snakesim_hal.wire.keys import CLOCK, JOINTS
+from snakesim_hal.wire.messages import Clock, JointCommand, Mode
 from snakesim_sim_backend.backend import SimBackend
 from tests.in_process import run as run_in_process
 

@@ -4,8 +4,8 @@ import time
 
 from snakesim_gnc.control.controller import Action, View
 from snakesim_gnc.control.hold import Hold
-from snakesim_hal.files import FileStruct
-from snakesim_hal.messages import Description
+from snakesim_hal.model.files import FileStruct
+from snakesim_hal.wire.messages import Description
 
 
 class Stamped:

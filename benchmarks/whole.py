@@ -7,8 +7,8 @@ from pathlib import Path
 
 import msgspec
 
-from snakesim_operator.record import SUMMARY
-from snakesim_operator.summary import RunSummary
+from snakesim_operator.results.record import SUMMARY
+from snakesim_operator.results.summary import RunSummary
 
 RATES_HZ = (200, 300, 400, 500, 600, 700, 800, 900, 1000, 1200, 1500, 2000)
 

@@ -5,8 +5,8 @@ from collections.abc import Iterator, Sequence
 from math import ceil
 from pathlib import Path
 
-from snakesim_can_backend.bring_up import Bus, Identity, find
-from snakesim_can_backend.bus_load import (
+from snakesim_can_backend.bus.bus import SocketCanWire, Wire
+from snakesim_can_backend.bus.load import (
     LEAST_RATE_HZ,
     MOST_LOAD,
     Reports,
@@ -20,17 +20,17 @@ from snakesim_can_backend.bus_load import (
     shares,
     what_fits,
 )
-from snakesim_can_backend.codec import codec
-from snakesim_can_backend.expanded import EXPANDED, expanded_dbc
-from snakesim_can_backend.protocol import FIRST_NODE, LAST_NODE, Opcode
-from snakesim_can_backend.reading import Module, Reading
+from snakesim_can_backend.driver.bring_up import Bus, Identity, find
+from snakesim_can_backend.driver.reports import Module, Reading
+from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.definitions import FIRST_NODE, LAST_NODE, Opcode
+from snakesim_can_backend.protocol.expanded import EXPANDED, expanded_dbc
 from snakesim_can_backend.settings import Settings
-from snakesim_can_backend.wire import SocketCanWire, Wire
-from snakesim_hal.files import Table, decode
-from snakesim_hal.scenario import Loaded, Override, RunConfig, parse_set
-from snakesim_hal.scenario import load as load_scenario
+from snakesim_hal.model.files import Table, decode
+from snakesim_hal.model.scenario import Loaded, Override, RunConfig, parse_set
+from snakesim_hal.model.scenario import load as load_scenario
+from snakesim_hal.model.textfiles import write_text
 from snakesim_hal.terminal import say
-from snakesim_hal.textfiles import write_text
 
 OK, FAILED = 0, 1
 MOST_RATE_HZ = 5000  # of a scenario

@@ -4,9 +4,9 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
-from snakesim_can_backend.protocol import LAST_NODE
-from snakesim_hal.files import FileStruct
-from snakesim_hal.quantities import from_zero
+from snakesim_can_backend.protocol.definitions import LAST_NODE
+from snakesim_hal.model.files import FileStruct
+from snakesim_hal.wire.quantities import from_zero
 
 
 class Settings(FileStruct, frozen=True, kw_only=True):

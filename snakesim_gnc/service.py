@@ -3,16 +3,16 @@
 from collections.abc import Sequence
 from typing import Protocol
 
-from snakesim_hal.client import Client
 from snakesim_hal.errors import SnakesimError
-from snakesim_hal.injector import Injector
-from snakesim_hal.messages import Clock, Description, Message
+from snakesim_hal.faults.injector import Injector
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.model.scenario import Service as Schedule
+from snakesim_hal.network.client import Client
+from snakesim_hal.network.session import open_session
 from snakesim_hal.process import SERVICE_PRIORITY, calm_down_after, hurry, settle_for_timing
-from snakesim_hal.scenario import RunConfig
-from snakesim_hal.scenario import Service as Schedule
 from snakesim_hal.serve import START_LIMIT_S, arguments, duty
-from snakesim_hal.session import open_session
 from snakesim_hal.terminal import complain_of
+from snakesim_hal.wire.messages import Clock, Description, Message
 
 SILENCE_S = 1.0
 

@@ -1,10 +1,15 @@
 """The hardware abstraction: everything that a controller and a robot have to agree on.
 
-`messages`, `keys`, `codec`   what is said, where, and how it looks on the wire
-`robot`, `scene`, `scenario`  the files that people write, checked on reading
-`route`, `kinematics`         geometry of paths and of the chain, shared by all
-`backend`, `host`             what a simulator or a driver implements, and the process that runs it
-`client`                      what guidance, navigation and control use; it never names a backend
+From the ground up:
 
-Zenoh is imported here and nowhere else. This package imports no backend, no GNC, no MuJoCo and no CAN.
+`wire`      what crosses the network: quantities, messages, keys, codec
+`model`     what people write in files (robot, scene, scenario), and its geometry and physics
+`backend`   the one protocol that a simulator or a driver implements
+`safety`    who may move the robot, by how much, and what stops it; pure
+`network`   Zenoh, and nothing else imports it: sessions, the client of controllers, the stop port
+`faults`    carries out faults on request
+`host`      the process that owns a robot: its loop, and what it records
+`conformance`, and the entry points `host_process`, `router_process`, `serve`
+
+Each imports only what stands above it. No backend, no GNC, no MuJoCo and no CAN is imported here.
 """

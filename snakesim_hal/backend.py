@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import msgspec
 
-from snakesim_hal.messages import Description, Fault, JointState, LifecycleState, Message, Mode, Pace
+from snakesim_hal.wire.messages import Description, Fault, JointState, LifecycleState, Message, Mode, Pace
 
 if TYPE_CHECKING:
-    from snakesim_hal.injection import Injection
-    from snakesim_hal.scenario import RunConfig
+    from snakesim_hal.model.injection import Injection
+    from snakesim_hal.model.scenario import RunConfig
 
 
 @dataclass(frozen=True)

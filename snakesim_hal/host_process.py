@@ -11,23 +11,23 @@ from typing import Any
 
 import msgspec
 
-from snakesim_hal import keys
 from snakesim_hal.backend import BackendFactory
 from snakesim_hal.errors import BackendError, RefusedError, SnakesimError
-from snakesim_hal.guarded_backend import GuardedBackend
-from snakesim_hal.host import Ending, Host
-from snakesim_hal.latch import EstopLatch
-from snakesim_hal.local_registry import LocalRobot, registered, robot_folder
-from snakesim_hal.messages import Fault
-from snakesim_hal.plugins import BACKENDS, find_plugin, plugin_settings
-from snakesim_hal.private_channel import HostEnd
+from snakesim_hal.host.guarded_backend import GuardedBackend
+from snakesim_hal.host.host import Ending, Host
+from snakesim_hal.host.latch import EstopLatch
+from snakesim_hal.host.recorder import Recorder
+from snakesim_hal.model.plugins import BACKENDS, find_plugin, plugin_settings
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.network.local_registry import LocalRobot, registered, robot_folder
+from snakesim_hal.network.private_channel import HostEnd
+from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.stop_port import open_stop_port, serve_stops, stop_address
 from snakesim_hal.process import HOST_PRIORITY, hurry, on_stop_signal, settle_for_timing
-from snakesim_hal.recorder import Recorder
-from snakesim_hal.scenario import RunConfig
 from snakesim_hal.serve import Duty, arguments, duty
-from snakesim_hal.session import Link, Session, open_session
-from snakesim_hal.stop_port import open_stop_port, serve_stops, stop_address
 from snakesim_hal.terminal import complain_of
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Fault
 
 GONE_LIMIT_S = 3.0  # until a host that died is not seen any more: longer than the lease of its connection
 

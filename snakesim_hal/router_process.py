@@ -5,9 +5,9 @@ import threading
 from collections.abc import Sequence
 
 from snakesim_hal.errors import SnakesimError
+from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.process import on_stop_signal
 from snakesim_hal.serve import arguments, duty
-from snakesim_hal.session import Link, open_session
 from snakesim_hal.terminal import complain_of
 
 

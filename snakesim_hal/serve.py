@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.plugins import SERVICES, find_plugin
+from snakesim_hal.model.plugins import SERVICES, find_plugin
+from snakesim_hal.model.scenario import RunConfig, read
+from snakesim_hal.network.session import DEFAULT_ENDPOINT, Link
 from snakesim_hal.process import die_with_parent
-from snakesim_hal.scenario import RunConfig, read
-from snakesim_hal.session import DEFAULT_ENDPOINT, Link
 from snakesim_hal.terminal import complain, complain_of
 
 START_LIMIT_S = 600.0  # until a part of a run is there: MuJoCo starts slowly in an emulated machine on a busy one

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 
-from snakesim_hal.endpoint import check_endpoint, check_namespace
 from snakesim_hal.errors import ConfigError, SnakesimError
-from snakesim_hal.files import ROUTER, find, read_table, shipped, short
-from snakesim_hal.injection import explain
-from snakesim_hal.plugins import COMMANDS, find_plugin, in_file, installed
-from snakesim_hal.scenario import Loaded, Override, load, parse_set
+from snakesim_hal.model.files import ROUTER, find, read_table, shipped, short
+from snakesim_hal.model.injection import explain
+from snakesim_hal.model.plugins import COMMANDS, find_plugin, in_file, installed
+from snakesim_hal.model.scenario import Loaded, Override, load, parse_set
+from snakesim_hal.network.endpoint import check_endpoint, check_namespace
 from snakesim_hal.terminal import complain, complain_of, say
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
@@ -197,7 +197,7 @@ def _load(arguments: argparse.Namespace) -> Loaded:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.run import RunRequest, check_plugins, run
+    from snakesim_operator.run.run import RunRequest, check_plugins, run
 
     _check_network(arguments)
     loaded = _load(arguments)
@@ -216,13 +216,13 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _compare(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.compare import compare
+    from snakesim_operator.results.compare import compare
 
     return compare(arguments.run_a, arguments.run_b, arguments.out, arguments.within)
 
 
 def _config(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.run import check_plugins
+    from snakesim_operator.run.run import check_plugins
 
     loaded = _load(arguments)
     check_plugins(loaded.config, loaded.table, run_files=False)
@@ -255,63 +255,63 @@ def _scenarios(_arguments: argparse.Namespace) -> int:
 
 
 def _echo(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.echo import EchoRequest, echo
+    from snakesim_operator.tools.echo import EchoRequest, echo
 
     return echo(EchoRequest(arguments.key, arguments.hz, arguments.count), _where(arguments))
 
 
 def _status(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.watch import show_status
+    from snakesim_operator.tools.status import show_status
 
     return show_status(_where(arguments))
 
 
 def _arm(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.command import arm
+    from snakesim_operator.tools.command import arm
 
     return arm(arguments.robot, arguments.backend, _where(arguments))
 
 
 def _disarm(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.command import disarm
+    from snakesim_operator.tools.command import disarm
 
     return disarm(_where(arguments))
 
 
 def _clear(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.command import clear
+    from snakesim_operator.tools.command import clear
 
     return clear(_where(arguments))
 
 
 def _estop(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.stop import estop
+    from snakesim_operator.tools.stop import estop
 
     return estop(_where(arguments))
 
 
 def _fault(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.fault import FaultOrder, fault
+    from snakesim_operator.tools.fault import FaultOrder, fault
 
     order = FaultOrder(arguments.kind, arguments.target, arguments.for_s, arguments.amount, arguments.end)
     return fault(order, _where(arguments))
 
 
 def _where(arguments: argparse.Namespace):
-    from snakesim_operator.targets import Where
+    from snakesim_operator.tools.targets import Where
 
     _check_network(arguments)
     return Where(arguments.router or arguments.endpoint, arguments.namespace)
 
 
 def _router(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.watch import run_router
+    from snakesim_operator.tools.status import run_router
 
     return run_router(arguments.config)
 
 
 def _schemas(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.schemas import published, write_schemas
+    from snakesim_operator.tools.schemas import published, write_schemas
 
     for path in published() if arguments.write is None else write_schemas(arguments.write):
         say(str(path))
@@ -319,7 +319,7 @@ def _schemas(arguments: argparse.Namespace) -> int:
 
 
 def _completion(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.completion import completion
+    from snakesim_operator.tools.completion import completion
 
     for line in completion(parser(), arguments.shell):
         say(line)

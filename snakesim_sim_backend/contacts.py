@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import mujoco
 
-from snakesim_hal.quantities import Vector
+from snakesim_hal.wire.quantities import Vector
 from snakesim_sim_backend.model import SimModel
 
 

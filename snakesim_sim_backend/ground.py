@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.scene import Ground, Uneven
+from snakesim_hal.model.scene import Ground, Uneven
 
 Floats = NDArray[np.float64]
 

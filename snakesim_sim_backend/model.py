@@ -1,8 +1,8 @@
 """Robot file + scene -> compiled MuJoCo model.
 
 The snake is a chain of capsules, tail to head. The free joint sits on link 0, whose body frame is the base: origin at
-the tail end, x forward. Every other body's frame is the link frame of `snakesim_hal.kinematics`: origin at the rear
-joint. Bodies, hinges and motors therefore stand in the order of the robot description.
+the tail end, x forward. Every other body's frame is the link frame of `model.kinematics`: origin at the rear joint.
+Bodies, hinges and motors therefore stand in the order of the robot description.
 """
 
 from dataclasses import dataclass
@@ -11,10 +11,10 @@ import mujoco
 import numpy as np
 
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.messages import Axis
-from snakesim_hal.motor import check_gains
-from snakesim_hal.robot import RobotFile
-from snakesim_hal.scenario import RunConfig, place_all
+from snakesim_hal.model.motor import check_gains
+from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.scenario import RunConfig, place_all
+from snakesim_hal.wire.messages import Axis
 from snakesim_sim_backend.actuators import add_motor
 from snakesim_sim_backend.ground import GROUND, add_ground
 from snakesim_sim_backend.imu import add_imus

@@ -4,9 +4,9 @@ from typing import TypedDict
 
 import mujoco
 
-from snakesim_hal.kinematics import quaternion_from_yaw
-from snakesim_hal.messages import Obstacle
-from snakesim_hal.scene import Placed
+from snakesim_hal.model.kinematics import quaternion_from_yaw
+from snakesim_hal.model.scene import Placed
+from snakesim_hal.wire.messages import Obstacle
 from snakesim_sim_backend.ground import GROUND_GROUP
 from snakesim_sim_backend.settings import Settings
 from snakesim_sim_backend.surface import frictionless_skin

@@ -5,7 +5,7 @@ from typing import Generic, TypeVar
 
 import msgspec
 
-from snakesim_hal.messages import Contacts, Imu, Pose, Power
+from snakesim_hal.wire.messages import Contacts, Imu, Pose, Power
 
 SampleT = TypeVar("SampleT", bound=Contacts | Imu | Pose | Power)
 

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.errors import BackendError
-from snakesim_hal.messages import Imu, Pose
-from snakesim_hal.plant import LinkLoad
-from snakesim_hal.robot import ImuSensor, PoseSensor
-from snakesim_hal.scenario import RunConfig
+from snakesim_hal.model.plant import LinkLoad
+from snakesim_hal.model.robot import ImuSensor, PoseSensor
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.wire.messages import Imu, Pose
 from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.divergence import MOST_ACCELERATION, DivergenceWatch, log_warnings
 from snakesim_sim_backend.loads import LoadReader
@@ -31,7 +31,7 @@ NO_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 
 
 class MujocoPlant:
-    """A `snakesim_hal.plant.Plant` on MuJoCo. Deterministic: start and torques decide every byte.
+    """A `snakesim_hal.model.plant.Plant` on MuJoCo. Deterministic: start and torques decide every byte.
 
     Angles, velocities and the pose are those of now. Loads, shaft torques and what the IMUs feel are forces and
     accelerations, so they are those that acted over the step just made; before the first one, at the start.

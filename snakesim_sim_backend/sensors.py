@@ -12,14 +12,14 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal import keys
 from snakesim_hal.backend import Samples
-from snakesim_hal.kinematics import tangents
-from snakesim_hal.messages import Contact, Contacts, Imu, JointState, Message, Pose, Power
-from snakesim_hal.quantities import MAX_CONTACTS, Quaternion, Vector
-from snakesim_hal.robot import ContactSensor, ImuSensor, JointSensor, PoseSensor, PowerSensor
-from snakesim_hal.scenario import RunConfig
-from snakesim_hal.thermal import SUPPLY_V, Thermal, board_c, current_a
+from snakesim_hal.model.kinematics import tangents
+from snakesim_hal.model.robot import ContactSensor, ImuSensor, JointSensor, PoseSensor, PowerSensor
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.model.thermal import SUPPLY_V, Thermal, board_c, current_a
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Contact, Contacts, Imu, JointState, Message, Pose, Power
+from snakesim_hal.wire.quantities import MAX_CONTACTS, Quaternion, Vector
 from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.contacts import Touch, TouchReader
 from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS, SimModel

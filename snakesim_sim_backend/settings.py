@@ -4,8 +4,8 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from snakesim_hal.files import FileStruct
-from snakesim_hal.quantities import MAX_JOINTS
+from snakesim_hal.model.files import FileStruct
+from snakesim_hal.wire.quantities import MAX_JOINTS
 
 
 class Tether(FileStruct, frozen=True, kw_only=True):

@@ -4,9 +4,9 @@ import mujoco
 import numpy as np
 
 from snakesim_hal.backend import SetPoints
-from snakesim_hal.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
-from snakesim_hal.messages import Mode
-from snakesim_hal.scenario import RunConfig, StartPose, start_of
+from snakesim_hal.model.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
+from snakesim_hal.model.scenario import RunConfig, StartPose, start_of
+from snakesim_hal.wire.messages import Mode
 from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.ground import GROUND_GROUP
 from snakesim_sim_backend.model import FREE_QPOS, SimModel

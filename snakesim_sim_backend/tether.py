@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.robot import RobotFile
+from snakesim_hal.model.robot import RobotFile
 from snakesim_sim_backend.settings import Tether
 
 ROPE_M = 50.0

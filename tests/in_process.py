@@ -1,6 +1,6 @@
 """A whole run in one process: backend, authority with its gate, guidance, navigation and a controller; no Zenoh.
 
-The order of calls and the age of every message are those of the lockstep host (`snakesim_hal.host`): in a tick the
+The order of calls and the age of every message are those of the lockstep host (`snakesim_hal.host.host`): in a tick the
 backend is sampled, services act on the ticks that are theirs, the controller answers with what counts at that tick,
 and the authority decides what the motors get.
 """
@@ -22,10 +22,15 @@ from snakesim_gnc.control.path_following import PathFollowing
 from snakesim_gnc.control.states import locomotion_state
 from snakesim_gnc.guidance.core import WorldModel
 from snakesim_gnc.navigation.core import KnownPath
-from snakesim_hal import keys
-from snakesim_hal.authority import Authority
 from snakesim_hal.backend import SetPoints
-from snakesim_hal.messages import (
+from snakesim_hal.model.plugins import CONTROLLERS, find_plugin, plugin_settings
+from snakesim_hal.model.route import Route
+from snakesim_hal.model.scenario import Override, RunConfig, load, parse_set, place_all, start_of
+from snakesim_hal.model.scenario import Service as Schedule
+from snakesim_hal.model.scene import route_of
+from snakesim_hal.safety.authority import Authority
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import (
     Contacts,
     Description,
     JointCommand,
@@ -37,11 +42,6 @@ from snakesim_hal.messages import (
     Trajectory,
     World,
 )
-from snakesim_hal.plugins import CONTROLLERS, find_plugin, plugin_settings
-from snakesim_hal.route import Route
-from snakesim_hal.scenario import Override, RunConfig, load, parse_set, place_all, start_of
-from snakesim_hal.scenario import Service as Schedule
-from snakesim_hal.scene import route_of
 from snakesim_sim_backend.backend import SimBackend
 
 Floats = NDArray[np.float64]

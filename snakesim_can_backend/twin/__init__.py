@@ -4,7 +4,7 @@
 `server`      one or more buses, served: what arrives is handled, what is due is sent; also inside another process
 `chain`       all modules of a robot, their motors, and the plant that they move; wall-clock or stepped time
 `firmware`    one module: states, watchdog, set-points, reports; `parameters` is what it keeps in its flash
-`motors`      all motors as vectors; their heat is `snakesim_hal.thermal`
+`motors`      all motors as vectors; their heat is `snakesim_hal.model.thermal`
 `senses`      what the sensors feel, with their noise; `reports` rounds it as the bus does; `frames` are the layouts
 `seat`        a module's place on a bus, and what is wrong there
 `bus_time`    what a bus of 1 Mbit/s would make of the frames: who waits for whom, and how full it is

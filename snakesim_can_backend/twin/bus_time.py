@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from heapq import heappop, heappush
 from math import inf
 
-from snakesim_can_backend.bus_load import BIT_RATE, worst_bits
-from snakesim_can_backend.protocol import NODE_BITS, Frame, Opcode
+from snakesim_can_backend.bus.load import BIT_RATE, worst_bits
+from snakesim_can_backend.protocol.definitions import NODE_BITS, Frame, Opcode
 
 OPCODES = 32
 US_PER_BIT = 1e6 / BIT_RATE

@@ -13,22 +13,22 @@ from zlib import crc32
 
 import msgspec
 
-from snakesim_can_backend.bus_load import shares
-from snakesim_can_backend.protocol import BROADCAST, FROM_HOST, Frame, Opcode, Parameter, node_of, opcode_of
+from snakesim_can_backend.bus.load import shares
+from snakesim_can_backend.protocol.definitions import BROADCAST, FROM_HOST, Frame, Opcode, Parameter, node_of, opcode_of
 from snakesim_can_backend.settings import Settings
 from snakesim_can_backend.twin.bus_time import FRAME_US, BusTime, Traffic
 from snakesim_can_backend.twin.faults import parse
 from snakesim_can_backend.twin.firmware import BOOT_US, Module
 from snakesim_can_backend.twin.frames import LENGTHS, read_sync
+from snakesim_can_backend.twin.module_slot import Seat
 from snakesim_can_backend.twin.motors import Motors
 from snakesim_can_backend.twin.parameters import Parameters, from_factory
-from snakesim_can_backend.twin.seat import Seat
 from snakesim_can_backend.twin.senses import PoseCamera, Senses
-from snakesim_hal.injection import Change, Injection, Plan
-from snakesim_hal.messages import Mode
-from snakesim_hal.plant import Plant
-from snakesim_hal.scenario import RunConfig
-from snakesim_hal.thermal import HeatLimits, Thermal
+from snakesim_hal.model.injection import Change, Injection, Plan
+from snakesim_hal.model.plant import Plant
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.model.thermal import HeatLimits, Thermal
+from snakesim_hal.wire.messages import Mode
 
 MOST_AT_ONCE_US = 200_000.0  # after a longer hiccup of this process, the modules have missed the rest of it
 HEAT_EVERY = 10  # steps

@@ -9,18 +9,18 @@ from contextlib import ExitStack
 
 import msgspec
 
-from snakesim_can_backend.bus_load import shares
-from snakesim_can_backend.protocol import FROM_HOST
+from snakesim_can_backend.bus.bus import SocketCanWire, wait
+from snakesim_can_backend.bus.load import shares
+from snakesim_can_backend.protocol.definitions import FROM_HOST
 from snakesim_can_backend.settings import Settings
 from snakesim_can_backend.twin.bus_time import Traffic, by_opcode
 from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_can_backend.twin.faults import explain, parse, parse_typed
 from snakesim_can_backend.twin.server import PoseSender, TwinServer, make_plant
-from snakesim_can_backend.wire import SocketCanWire, wait
 from snakesim_hal.errors import ConfigError, SnakesimError
-from snakesim_hal.files import Table, decode
+from snakesim_hal.model.files import Table, decode
+from snakesim_hal.model.scenario import Loaded, Override, load, parse_set
 from snakesim_hal.process import die_with_parent, on_stop_signal, settle_for_timing
-from snakesim_hal.scenario import Loaded, Override, load, parse_set
 from snakesim_hal.terminal import complain_of, say
 
 OK, FAILED, BAD_INPUT = 0, 1, 2

@@ -1,15 +1,15 @@
 """What can go wrong with a module twin on request: those faults of a joint that a module can have.
 
-The words are those of `snakesim_hal.injection`, with times since the twins were started: `mute:joint_3@2.0-3.5` is a
-module that says nothing for 1.5 s. In a terminal it is `mute joint_3`, and later `mute joint_3 off`.
+The words are those of `model.injection` in the HAL, with times since the twins were started: `mute:joint_3@2.0-3.5` is
+a module that says nothing for 1.5 s. In a terminal it is `mute joint_3`, and later `mute joint_3 off`.
 """
 
 import re
 from collections.abc import Mapping
 
-from snakesim_hal import injection
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.injection import KINDS, Injection
+from snakesim_hal.model import injection
+from snakesim_hal.model.injection import KINDS, Injection
 
 NOT_A_MODULES = ("wrong", "nan")  # a module cannot know that its angle is off; the host makes these
 ABOUT: Mapping[str, str] = {

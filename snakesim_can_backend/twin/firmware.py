@@ -11,7 +11,7 @@ passed in; nothing here waits. `frames` collects what is to be sent; whoever run
 from collections.abc import Callable
 from typing import NamedTuple
 
-from snakesim_can_backend.protocol import (
+from snakesim_can_backend.protocol.definitions import (
     COMMAND_KEY,
     COUNTS,
     HEALTH_PERIOD_S,
@@ -47,8 +47,8 @@ from snakesim_can_backend.twin.frames import (
 )
 from snakesim_can_backend.twin.parameters import Parameters
 from snakesim_can_backend.twin.reports import Inside, Sight, health
-from snakesim_hal.messages import Mode
-from snakesim_hal.thermal import LEAST_VOLTAGE_V, HeatLimits
+from snakesim_hal.model.thermal import LEAST_VOLTAGE_V, HeatLimits
+from snakesim_hal.wire.messages import Mode
 
 BOOT_US = 100_000
 HEARTBEAT_US = round(HEARTBEAT_PERIOD_S * 1e6)

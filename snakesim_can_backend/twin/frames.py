@@ -1,7 +1,7 @@
 """The frames that a module reads and writes, as functions of raw numbers."""
 
-from snakesim_can_backend.codec import codec
-from snakesim_can_backend.protocol import ModuleFault, Opcode
+from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.definitions import ModuleFault, Opcode
 
 _layouts = codec()
 _set_point = _layouts[Opcode.SET_POINT].signals

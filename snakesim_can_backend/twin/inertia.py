@@ -10,11 +10,11 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from snakesim_hal.errors import BackendError
-from snakesim_hal.files import FileStruct
-from snakesim_hal.messages import Imu, Pose
-from snakesim_hal.plant import LinkLoad
-from snakesim_hal.quantities import from_zero
-from snakesim_hal.scenario import RunConfig, start_of
+from snakesim_hal.model.files import FileStruct
+from snakesim_hal.model.plant import LinkLoad
+from snakesim_hal.model.scenario import RunConfig, start_of
+from snakesim_hal.wire.messages import Imu, Pose
+from snakesim_hal.wire.quantities import from_zero
 
 Floats = NDArray[np.float64]
 
@@ -30,7 +30,7 @@ class InertiaSettings(FileStruct, frozen=True, kw_only=True):
 
 
 class InertiaPlant:
-    """A `snakesim_hal.plant.Plant`: rotor and one link, turned about the link's middle, with friction and end stops."""
+    """A `Plant`: rotor and one link, turned about the link's middle, with friction and end stops."""
 
     Settings = InertiaSettings
 

@@ -16,9 +16,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.messages import Mode
-from snakesim_hal.motor import roll_off
-from snakesim_hal.robot import RobotFile
+from snakesim_hal.model.motor import roll_off
+from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.wire.messages import Mode
 
 Floats = NDArray[np.float64]
 

@@ -3,8 +3,8 @@
 import math
 from struct import Struct
 
-from snakesim_can_backend.codec import codec
-from snakesim_can_backend.protocol import (
+from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.definitions import (
     PARAMETERS,
     Frame,
     Opcode,

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_can_backend.codec import Signal, codec
-from snakesim_can_backend.protocol import Opcode
-from snakesim_hal.plant import LinkLoad
+from snakesim_can_backend.protocol.codec import Signal, codec
+from snakesim_can_backend.protocol.definitions import Opcode
+from snakesim_hal.model.plant import LinkLoad
 
 Floats = NDArray[np.float64]
 UNTOUCHED = (0, 0, 0, 0, 0, 0)

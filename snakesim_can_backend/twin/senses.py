@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_can_backend.mocap import MocapSample
+from snakesim_can_backend.protocol.mocap_sample import MocapSample
 from snakesim_can_backend.twin.reports import (
     ACCELERATION,
     ANGLE,
@@ -23,8 +23,8 @@ from snakesim_can_backend.twin.reports import (
     Sight,
     touch,
 )
-from snakesim_hal.plant import LinkLoad, Plant
-from snakesim_hal.robot import PoseSensor, RobotFile
+from snakesim_hal.model.plant import LinkLoad, Plant
+from snakesim_hal.model.robot import PoseSensor, RobotFile
 
 Floats = NDArray[np.float64]
 

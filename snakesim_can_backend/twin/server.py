@@ -12,15 +12,15 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from snakesim_can_backend.protocol import NODE_BITS, Frame, Opcode
+from snakesim_can_backend.bus.bus import VirtualWire, Wire
+from snakesim_can_backend.protocol.definitions import NODE_BITS, Frame, Opcode
 from snakesim_can_backend.settings import Settings
 from snakesim_can_backend.twin.chain import ModuleChain
-from snakesim_can_backend.wire import VirtualWire, Wire
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.injection import Injection
-from snakesim_hal.plant import Plant
-from snakesim_hal.plugins import PLANTS, find_plugin, plugin_settings
-from snakesim_hal.scenario import RunConfig
+from snakesim_hal.model.injection import Injection
+from snakesim_hal.model.plant import Plant
+from snakesim_hal.model.plugins import PLANTS, find_plugin, plugin_settings
+from snakesim_hal.model.scenario import RunConfig
 
 IN_STEP_US = 2000.0  # the plant is kept this near to now, so that a Sync finds little left to do
 FINEST_US = 200.0  # frames are let through in groups of this length, to wake up less often

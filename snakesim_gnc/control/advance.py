@@ -3,7 +3,7 @@
 import math
 from collections import deque
 
-from snakesim_hal.quantities import Vector
+from snakesim_hal.wire.quantities import Vector
 
 WINDOW_S = 1.0
 MOVING_M = 0.005  # in a whole window: what is less counts as standing still

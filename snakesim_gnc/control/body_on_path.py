@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.route import Route, next_on_route
+from snakesim_hal.model.route import Route, next_on_route
 
 Floats = NDArray[np.float64]
 

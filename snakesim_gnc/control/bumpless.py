@@ -8,7 +8,7 @@ torque that it has, and the propulsion torque fades in. Both fades move by `fade
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.messages import Description, JointState
+from snakesim_hal.wire.messages import Description, JointState
 
 Floats = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import msgspec
 
 from snakesim_hal.backend import SetPoints
-from snakesim_hal.messages import Description, JointState, Mode, Trajectory, World, WorldContact
+from snakesim_hal.wire.messages import Description, JointState, Mode, Trajectory, World, WorldContact
 
 
 @dataclass(frozen=True)

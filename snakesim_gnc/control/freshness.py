@@ -14,10 +14,10 @@ A stamp that is further ahead of the clock than its limit is refused as well: it
 
 from dataclasses import dataclass
 
-from snakesim_hal import keys
-from snakesim_hal.gate import JointLimits
-from snakesim_hal.messages import Description, JointState, Trajectory, World
-from snakesim_hal.scenario import RunConfig, Service
+from snakesim_hal.model.scenario import RunConfig, Service
+from snakesim_hal.safety.gate import JointLimits
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Description, JointState, Trajectory, World
 
 MISSED = 3
 LEAST_MARGIN_S = 0.2  # guidance and navigation have no real-time priority: a busy computer holds them up

@@ -13,8 +13,8 @@ from typing import Any
 from snakesim_gnc.control.controller import Action, Controller, Report, View
 from snakesim_hal.backend import SetPoints
 from snakesim_hal.errors import ControllerError
-from snakesim_hal.messages import Description, Mode
-from snakesim_hal.quantities import MOST_TARGET
+from snakesim_hal.wire.messages import Description, Mode
+from snakesim_hal.wire.quantities import MOST_TARGET
 
 NUMBERS = {float, int}  # exactly: a NumPy number or a bool is none that can be sent
 MODES = ", ".join(f"Mode.{mode.name}" for mode in Mode)

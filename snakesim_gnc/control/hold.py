@@ -1,8 +1,8 @@
 """Hold: every joint stays at the angle that it had at arming. The control experiment, and the safest controller."""
 
 from snakesim_gnc.control.controller import Action, Report, View, positions
-from snakesim_hal.files import FileStruct
-from snakesim_hal.messages import Description
+from snakesim_hal.model.files import FileStruct
+from snakesim_hal.wire.messages import Description
 
 
 class Hold:

@@ -15,8 +15,8 @@ from snakesim_gnc.control.controller import Action, Report, View, positions
 from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_gnc.control.progress import Progress
 from snakesim_hal.backend import SetPoints
-from snakesim_hal.files import FileStruct
-from snakesim_hal.messages import Description
+from snakesim_hal.model.files import FileStruct
+from snakesim_hal.wire.messages import Description
 
 Floats = NDArray[np.float64]
 

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_gnc.control.body_on_path import Lie
-from snakesim_hal.messages import Description
-from snakesim_hal.route import yaw_segments_m
+from snakesim_hal.model.route import yaw_segments_m
+from snakesim_hal.wire.messages import Description
 
 Floats = NDArray[np.float64]
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from snakesim_gnc.control.body_on_path import BodyOnPath, chain_nodes, heading_of
 from snakesim_gnc.control.controller import View
 from snakesim_gnc.control.planar_body import PlanarBody
-from snakesim_hal.messages import Trajectory, World
-from snakesim_hal.route import Route
+from snakesim_hal.model.route import Route
+from snakesim_hal.wire.messages import Trajectory, World
 
 Floats = NDArray[np.float64]
 

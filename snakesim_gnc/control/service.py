@@ -12,13 +12,13 @@ from snakesim_gnc.control.freshness import Limits
 from snakesim_gnc.control.guarded import Guarded
 from snakesim_gnc.control.telling import Telling
 from snakesim_gnc.service import Service, serve
-from snakesim_hal import keys
-from snakesim_hal.client import Client, Commander
 from snakesim_hal.errors import ControllerError
-from snakesim_hal.messages import Clock, ControlState, Description, JointState, Message, Trajectory, World
-from snakesim_hal.plugins import CONTROLLERS, find_plugin, plugin_settings
-from snakesim_hal.scenario import RunConfig
+from snakesim_hal.model.plugins import CONTROLLERS, find_plugin, plugin_settings
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.network.client import Client, Commander
 from snakesim_hal.terminal import complain
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Clock, ControlState, Description, JointState, Message, Trajectory, World
 
 
 class Control(Service):

@@ -1,7 +1,7 @@
 """The four states of the paper's Figure 6, as one pure function."""
 
 from snakesim_gnc.control.advance import MOVING_M, WINDOW_S
-from snakesim_hal.messages import LocomotionState
+from snakesim_hal.wire.messages import LocomotionState
 
 PUSH_POINTS_NEEDED = 3
 

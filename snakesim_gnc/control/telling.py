@@ -5,7 +5,7 @@ import msgspec
 from snakesim_gnc.control.advance import Advance
 from snakesim_gnc.control.controller import Report
 from snakesim_gnc.control.states import locomotion_state
-from snakesim_hal.messages import Clock, ControlState, Description, LocomotionState, World
+from snakesim_hal.wire.messages import Clock, ControlState, Description, LocomotionState, World
 
 TELEMETRY_S = 0.05
 LONGEST = 500  # characters of a reason

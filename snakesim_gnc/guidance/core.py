@@ -5,8 +5,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from snakesim_hal.kinematics import link_frames, rotation_from_quaternion
-from snakesim_hal.messages import (
+from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion
+from snakesim_hal.model.scene import outline_distance_m
+from snakesim_hal.wire.messages import (
     Contact,
     Contacts,
     Description,
@@ -16,7 +17,6 @@ from snakesim_hal.messages import (
     World,
     WorldContact,
 )
-from snakesim_hal.scene import outline_distance_m
 
 POSE_MEMORY_S = 0.5  # confidence in a pose falls to 1/e after this long without a new one
 

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 
 from snakesim_gnc.guidance.core import WorldModel
 from snakesim_gnc.service import Service, serve
-from snakesim_hal import keys
-from snakesim_hal.client import Client
-from snakesim_hal.messages import Clock, Contacts, Description, JointState, Message, Pose
-from snakesim_hal.scenario import RunConfig, place_all
+from snakesim_hal.model.scenario import RunConfig, place_all
+from snakesim_hal.network.client import Client
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Clock, Contacts, Description, JointState, Message, Pose
 
 
 class Guidance(Service):

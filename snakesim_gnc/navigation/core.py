@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from snakesim_gnc.navigation.intents import Intents
-from snakesim_hal.messages import Intent, Obstacle, Trajectory, World
-from snakesim_hal.route import Route
-from snakesim_hal.scene import outline_distance_m
+from snakesim_hal.model.route import Route
+from snakesim_hal.model.scene import outline_distance_m
+from snakesim_hal.wire.messages import Intent, Obstacle, Trajectory, World
 
 PUSH_REACH_M = 0.15  # an obstacle whose outline is nearer to the path than this can be pushed on
 PUSH_POINTS_AHEAD_M = 3.0

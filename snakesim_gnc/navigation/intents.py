@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from snakesim_hal.messages import Intent
+from snakesim_hal.wire.messages import Intent
 
 LONGEST_NS = 5_000_000_000  # an intent that asks for more counts no longer than this
 FASTEST_M_S = 10.0  # as a scenario's mission

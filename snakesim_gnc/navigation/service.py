@@ -7,12 +7,12 @@ import numpy as np
 
 from snakesim_gnc.navigation.core import KnownPath
 from snakesim_gnc.service import Service, serve
-from snakesim_hal import keys
-from snakesim_hal.client import Client
-from snakesim_hal.messages import Clock, Description, Intent, Message, World
-from snakesim_hal.route import Route
-from snakesim_hal.scenario import RunConfig, place_all, start_of
-from snakesim_hal.scene import route_of
+from snakesim_hal.model.route import Route
+from snakesim_hal.model.scenario import RunConfig, place_all, start_of
+from snakesim_hal.model.scene import route_of
+from snakesim_hal.network.client import Client
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Clock, Description, Intent, Message, World
 
 NO_ROUTE_LENGTH_M = 100.0
 

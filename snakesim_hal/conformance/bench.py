@@ -10,9 +10,9 @@ import msgspec
 from snakesim_hal.backend import Backend, BackendFactory
 from snakesim_hal.conformance.loopback import Hosted
 from snakesim_hal.conformance.rig import HOLDER, Rig
-from snakesim_hal.messages import Pace
-from snakesim_hal.plugins import BACKENDS, find_plugin, plugin_settings
-from snakesim_hal.scenario import Override, RunConfig, Service, load, parse_set
+from snakesim_hal.model.plugins import BACKENDS, find_plugin, plugin_settings
+from snakesim_hal.model.scenario import Override, RunConfig, Service, load, parse_set
+from snakesim_hal.wire.messages import Pace
 
 SCENARIO = str(Path(__file__).parent / "scenario.toml")
 Mute = Callable[[Any, int], None]

@@ -9,12 +9,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from snakesim_hal import keys
 from snakesim_hal.backend import Backend, Samples, SetPoints
-from snakesim_hal.client import Client, Commander
 from snakesim_hal.conformance.rig import HOLDER, Asked
-from snakesim_hal.host import Host
-from snakesim_hal.messages import (
+from snakesim_hal.host.host import Host
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.network.client import Client, Commander
+from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import (
     Answer,
     Clock,
     Description,
@@ -25,8 +27,6 @@ from snakesim_hal.messages import (
     LifecycleState,
     Mode,
 )
-from snakesim_hal.scenario import RunConfig
-from snakesim_hal.session import Link, Session, open_session
 
 LIMIT_S = 60.0  # for what takes a tenth of a second; slow machines are no failure
 Plan = Callable[[int], "Asked | None"]  # ticks since arming -> what is asked of joints; None: say nothing

@@ -15,7 +15,7 @@ if TYPE_CHECKING:  # nothing of ours is imported before it is used: every pytest
     from snakesim_hal.conformance.loopback import Hosted
     from snakesim_hal.conformance.recordings import Pushing
     from snakesim_hal.conformance.rig import Floats, Record, Rig
-    from snakesim_hal.messages import Mode
+    from snakesim_hal.wire.messages import Mode
 
 pytest.register_assert_rewrite("snakesim_hal.conformance.loopback", "snakesim_hal.conformance.rig")
 
@@ -108,7 +108,7 @@ def _from_options(config: pytest.Config) -> "list[Bench]":
     if COMMAND_LINE not in known:
         from snakesim_hal.conformance.bench import SCENARIO, Bench
         from snakesim_hal.errors import ConfigError
-        from snakesim_hal.plugins import BACKENDS, find_plugin
+        from snakesim_hal.model.plugins import BACKENDS, find_plugin
 
         sets: list[str] = config.getoption("--set") or []
         try:

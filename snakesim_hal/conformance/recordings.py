@@ -9,7 +9,7 @@ import numpy as np
 
 from snakesim_hal.conformance import tolerances as t
 from snakesim_hal.conformance.rig import Asked, Floats, Record, Rig
-from snakesim_hal.messages import Mode
+from snakesim_hal.wire.messages import Mode
 
 # Every ordered pair of modes once, and back to the first: an Eulerian circuit.
 CIRCUIT = tuple(Mode(int(code)) for code in "1012023031321")

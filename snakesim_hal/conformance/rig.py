@@ -9,11 +9,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal import keys
-from snakesim_hal.authority import Authority
 from snakesim_hal.backend import Backend, Samples, SetPoints
 from snakesim_hal.conformance import tolerances as t
-from snakesim_hal.messages import (
+from snakesim_hal.safety.authority import Authority
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import (
     EstopRequest,
     Fault,
     JointCommand,

@@ -11,7 +11,7 @@ from snakesim_hal.conformance.bench import Bench
 from snakesim_hal.conformance.rig import Rig
 from snakesim_hal.conformance.test_lifecycle import GO
 from snakesim_hal.errors import BackendError
-from snakesim_hal.messages import JointState, Mode
+from snakesim_hal.wire.messages import JointState, Mode
 
 
 def what_is_still_seen(rig: Rig) -> list[JointState]:

@@ -2,14 +2,14 @@
 
 from collections import Counter
 
-from snakesim_hal import keys
-from snakesim_hal.codec import Decoder, encode, encoding_of
 from snakesim_hal.conformance import tolerances as t
 from snakesim_hal.conformance.bench import Bench
 from snakesim_hal.conformance.rig import Record, Rig
-from snakesim_hal.messages import Description, Imu
-from snakesim_hal.robot import describe, layout_hash
-from snakesim_hal.scenario import config_hash
+from snakesim_hal.model.robot import describe, layout_hash
+from snakesim_hal.model.scenario import config_hash
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import Decoder, encode, encoding_of
+from snakesim_hal.wire.messages import Description, Imu
 
 
 def test_the_description_is_what_the_robot_file_says(bench: Bench, rig: Rig) -> None:

@@ -9,7 +9,7 @@ from snakesim_hal.conformance import tolerances as t
 from snakesim_hal.conformance.bench import Bench
 from snakesim_hal.conformance.rig import Record, Rig
 from snakesim_hal.conformance.test_lifecycle import must_rest
-from snakesim_hal.messages import Mode
+from snakesim_hal.wire.messages import Mode
 
 MUTED = 1
 LOST = 1

@@ -10,7 +10,7 @@ from snakesim_hal.conformance import tolerances as t
 from snakesim_hal.conformance.bench import Bench
 from snakesim_hal.conformance.loopback import Hosted, stay, wait_until
 from snakesim_hal.conformance.rig import Asked
-from snakesim_hal.messages import Fault, JointState, Mode
+from snakesim_hal.wire.messages import Fault, JointState, Mode
 
 
 def undisturbed(hosted: Hosted, act: Callable[[], None]) -> None:

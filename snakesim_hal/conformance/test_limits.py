@@ -5,7 +5,7 @@ import numpy as np
 from snakesim_hal.conformance import tolerances as t
 from snakesim_hal.conformance.recordings import Pushing
 from snakesim_hal.conformance.rig import Rig
-from snakesim_hal.messages import Mode
+from snakesim_hal.wire.messages import Mode
 
 
 def test_the_torque_limit_of_the_set_points_is_kept(pushing: Pushing) -> None:

@@ -5,7 +5,7 @@ import numpy as np
 from snakesim_hal.conformance import tolerances as t
 from snakesim_hal.conformance.recordings import Pushing
 from snakesim_hal.conformance.rig import Rig
-from snakesim_hal.messages import Mode
+from snakesim_hal.wire.messages import Mode
 
 
 def test_position_mode_turns_the_joint_that_is_asked_and_no_other(rig: Rig) -> None:

@@ -5,11 +5,11 @@ from itertools import chain, pairwise
 
 import numpy as np
 
-from snakesim_hal import keys
-from snakesim_hal.codec import Decoder, encode, encoding_of
 from snakesim_hal.conformance import tolerances as t
 from snakesim_hal.conformance.rig import Record, Rig
-from snakesim_hal.messages import Message
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import Decoder, encode, encoding_of
+from snakesim_hal.wire.messages import Message
 
 COLUMNS = ("angle_rad", "velocity_rad_s", "torque_nm", "valid", "age_ns")
 

@@ -6,7 +6,7 @@ import pytest
 from snakesim_hal.conformance import tolerances as t
 from snakesim_hal.conformance.recordings import PAIRS
 from snakesim_hal.conformance.rig import Floats, Rig
-from snakesim_hal.messages import Mode
+from snakesim_hal.wire.messages import Mode
 
 NAMES = [f"{before.name}_to_{after.name}".lower() for before, after in PAIRS]
 

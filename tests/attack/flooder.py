@@ -107,8 +107,8 @@ def pattern(i: int) -> str:
 
 
 def everything(endpoint: str, _amount: int) -> Iterator[str]:
-    """One reader of everything, to be frozen."""
-    session = zenoh.open(settings(endpoint))
+    """One reader of everything, to be frozen. With a small buffer, so that it is full at once."""
+    session = zenoh.open(settings(endpoint, receive_buffer=4096))
     heard: list[int] = []
     keep = session.declare_subscriber("**", lambda sample: heard.append(len(sample.payload)))
     while not heard:

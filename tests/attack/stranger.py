@@ -29,8 +29,16 @@ class Heard:
     message: Any
 
 
-def settings(endpoint: str, mode: str = "client", *, listen: str | None = None, timeout_s: float = 3.0) -> zenoh.Config:
-    """No scouting: a stranger finds the robot by its endpoint."""
+def settings(
+    endpoint: str,
+    mode: str = "client",
+    *,
+    listen: str | None = None,
+    timeout_s: float = 3.0,
+    receive_buffer: int | None = None,
+) -> zenoh.Config:
+    """No scouting: a stranger finds the robot by its endpoint. receive_buffer: of its connection, in bytes."""
+    buffers = {} if receive_buffer is None else {"transport": {"link": {"tcp": {"so_rcvbuf": receive_buffer}}}}
     return zenoh.Config.from_json5(
         json.dumps(
             {
@@ -43,6 +51,7 @@ def settings(endpoint: str, mode: str = "client", *, listen: str | None = None, 
                     "timeout_ms": round(timeout_s * 1000),
                     "exit_on_failure": True,
                 },
+                **buffers,
             }
         )
     )

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from snakesim_can_backend.protocol import Frame, node_of
+from snakesim_can_backend.protocol.definitions import Frame, node_of
 from snakesim_hal.conformance.bench import Bench
 
 VCAN = "SNAKESIM_VCAN"  # set by deploy/vm/with_vcan.py: the kernel here has vcan0, and it is up

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from snakesim_hal import keys
 from snakesim_hal.backend import Samples, SetPoints
 from snakesim_hal.conformance.bench import Bench
 from snakesim_hal.errors import BackendError
-from snakesim_hal.messages import Description, Fault, JointState, Mode, Pose, SensorDescription
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Description, Fault, JointState, Mode, Pose, SensorDescription
 from tests.contract.workbench import Workbench, mute
 
 

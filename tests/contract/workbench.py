@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from snakesim_hal.backend import Samples, SetPoints
-from snakesim_hal.messages import LifecycleState, Mode
+from snakesim_hal.wire.messages import LifecycleState, Mode
 
 DOCS = Path(__file__).parents[2] / "docs" / "backends.md"
 

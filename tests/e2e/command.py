@@ -13,8 +13,8 @@ from pathlib import Path
 
 import msgspec
 
-from snakesim_operator.record import SUMMARY
-from snakesim_operator.summary import RunSummary
+from snakesim_operator.results.record import SUMMARY
+from snakesim_operator.results.summary import RunSummary
 
 SNAKESIM = [sys.executable, "-m", "snakesim_operator"]
 LIMIT_S = 90.0

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal import keys
-from snakesim_hal.messages import JointState, Status
+from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.process import SERVICE_PRIORITY, take_priority
-from snakesim_hal.session import Link, Session, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import JointState, Status
 from tests.e2e.command import Ended, Running, running, wait_until
 
 pytestmark = pytest.mark.e2e

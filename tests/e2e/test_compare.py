@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.errors import ConfigError
-from snakesim_operator.compare.command import compare
+from snakesim_operator.results.compare.command import compare
 from tests.e2e.command import run_to_summary, snakesim
 
 pytestmark = pytest.mark.e2e

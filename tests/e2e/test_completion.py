@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal.files import shipped
+from snakesim_hal.model.files import shipped
 from tests.e2e.command import snakesim
 
 pytestmark = pytest.mark.e2e

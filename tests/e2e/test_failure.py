@@ -8,9 +8,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from snakesim_hal.messages import Mode
-from snakesim_operator.record import SUMMARY, RunRecord
-from snakesim_operator.summary import RunSummary
+from snakesim_hal.wire.messages import Mode
+from snakesim_operator.results.record import SUMMARY, RunRecord
+from snakesim_operator.results.summary import RunSummary
 from tests.e2e.command import nothing_left, run_to_summary, running, snakesim
 
 pytestmark = pytest.mark.e2e
@@ -91,7 +91,7 @@ def test_a_controller_that_answers_wrongly_is_named_at_once(tmp_path: Path, wron
     (tmp_path / "wave.py").write_text(
         "from snakesim_gnc.control.controller import Action, SetPoints\n"
         "from snakesim_gnc.control.hold import Hold\n"
-        "from snakesim_hal.messages import Mode\n\n\n"
+        "from snakesim_hal.wire.messages import Mode\n\n\n"
         "class Wave(Hold):\n"
         "    def update(self, view):\n"
         "        if view.time_s < 0.5:\n"

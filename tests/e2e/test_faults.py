@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from snakesim_hal.host_process import HostRecord
-from snakesim_hal.messages import Mode
-from snakesim_operator.record import RunRecord
+from snakesim_hal.wire.messages import Mode
+from snakesim_operator.results.record import RunRecord
 from tests.e2e.command import Running, nothing_left, run_to_summary, running, snakesim, wait_until
 
 pytestmark = pytest.mark.e2e

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal.latch import ESTOP
+from snakesim_hal.host.latch import ESTOP
 from tests.e2e.command import Ended, Running, nothing_left, running, snakesim, wait_until
 
 pytestmark = pytest.mark.e2e

@@ -10,12 +10,12 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from snakesim_hal import keys
-from snakesim_hal.latch import ESTOP
-from snakesim_hal.messages import EstopRequest, LifecycleRequest, Status
-from snakesim_hal.session import Link, Session, open_session
-from snakesim_operator.record import REPORT, SUMMARY, RunRecord
-from snakesim_operator.summary import RunSummary
+from snakesim_hal.host.latch import ESTOP
+from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import EstopRequest, LifecycleRequest, Status
+from snakesim_operator.results.record import REPORT, SUMMARY, RunRecord
+from snakesim_operator.results.summary import RunSummary
 from tests.e2e.command import (
     SNAKESIM,
     Ended,

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_operator.record import REPORT
+from snakesim_operator.results.record import REPORT
 from tests.e2e.command import nothing_left, run_to_summary, snakesim
 
 pytestmark = pytest.mark.e2e

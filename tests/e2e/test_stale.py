@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from snakesim_hal.messages import Mode
-from snakesim_operator.record import REPORT, RunRecord
+from snakesim_hal.wire.messages import Mode
+from snakesim_operator.results.record import REPORT, RunRecord
 from tests.e2e.command import nothing_left, run_to_summary
 
 pytestmark = pytest.mark.e2e

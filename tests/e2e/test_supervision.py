@@ -8,11 +8,11 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from snakesim_hal import keys
-from snakesim_hal.messages import Answer, Description, FaultRequest, LifecycleRequest, Status
-from snakesim_hal.session import Link, Reader, Session, open_session
-from snakesim_operator.record import SUMMARY
-from snakesim_operator.summary import RunSummary
+from snakesim_hal.network.session import Link, Reader, Session, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Answer, Description, FaultRequest, LifecycleRequest, Status
+from snakesim_operator.results.record import SUMMARY
+from snakesim_operator.results.summary import RunSummary
 from tests.e2e.command import Running, nothing_left, processes_of, run_to_summary, running, snakesim, wait_until
 
 pytestmark = pytest.mark.e2e
@@ -190,7 +190,7 @@ def test_a_planned_kill_ends_a_run_that_does_not_stay(tmp_path: Path) -> None:
 
 
 def _armed_at_s(out: Path) -> float:
-    from snakesim_operator.record import RunRecord
+    from snakesim_operator.results.record import RunRecord
 
     return float(RunRecord.load(out).time_s[0])
 

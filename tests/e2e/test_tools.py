@@ -12,10 +12,10 @@ from typing import Any
 
 import pytest
 
-from snakesim_hal import keys
-from snakesim_hal.files import find
-from snakesim_hal.messages import EstopRequest
-from snakesim_hal.session import Link, open_session
+from snakesim_hal.model.files import find
+from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import EstopRequest
 from tests.e2e.command import (
     SNAKESIM,
     Running,

@@ -5,9 +5,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from snakesim_hal import keys
-from snakesim_operator.record import REPORT, TELEMETRY, RunRecord
-from snakesim_operator.summary import summarise
+from snakesim_hal.wire import keys
+from snakesim_operator.results.record import REPORT, TELEMETRY, RunRecord
+from snakesim_operator.results.summary import summarise
 from tests.e2e.command import nothing_left, run_to_summary
 
 pytestmark = pytest.mark.e2e

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from snakesim_can_backend.codec import codec
-from snakesim_can_backend.protocol import Action, Frame, Opcode, opcode_of
+from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.definitions import Action, Frame, Opcode, opcode_of
 
 
 def read(path: Path) -> list[Frame]:

@@ -1,16 +1,15 @@
 """A consumer of a robot's streams that cannot keep up. `python -m tests.faults.consumer KIND ENDPOINT NAMESPACE DISK`.
 
 sleep: its callback sleeps for half a second at every sample. disk: it writes what it gets to a disk that is full.
-freeze: it reads everything, until somebody stops its process.
 """
 
 import sys
 import time
 from pathlib import Path
 
-from snakesim_hal import keys
+from snakesim_hal.network.session import Arrival, Link, open_session
 from snakesim_hal.process import die_with_parent
-from snakesim_hal.session import Arrival, Link, open_session
+from snakesim_hal.wire import keys
 
 SLEEP_S = 0.5
 KEYS = (keys.JOINTS, keys.CLOCK, keys.APPLIED, keys.JOINT_COMMAND, keys.CONTACTS, keys.POSE)
@@ -40,15 +39,9 @@ def main() -> None:
                 print(f"{STUCK}: {error.strerror}", flush=True)
             raise
 
-    def reads(_arrival: Arrival) -> None:
-        if not said:
-            said.append(True)
-            print(STUCK, flush=True)
-
-    act = {"sleep": sleeps, "disk": writes, "freeze": reads}[kind]
     with open_session(Link(endpoint, namespace)) as session:
-        for key in ("**",) if kind == "freeze" else KEYS:
-            session.on_arrival(key, act)
+        for key in KEYS:
+            session.on_arrival(key, sleeps if kind == "sleep" else writes)
         print(READY, flush=True)
         while True:
             time.sleep(1.0)

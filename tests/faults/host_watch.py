@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterator
 
 import msgspec
 
-from snakesim_hal.messages import Status
-from snakesim_hal.private_channel import MAX_BYTES, ToStarter, socket_pair
+from snakesim_hal.network.private_channel import MAX_BYTES, ToStarter, socket_pair
+from snakesim_hal.wire.messages import Status
 from tests.faults.observer import Heard, TrialError
 
 LOOK_S = 0.0005

@@ -9,10 +9,11 @@ from dataclasses import dataclass
 from queue import Empty, SimpleQueue
 from typing import Any, Generic, TypeVar
 
-from snakesim_hal import keys
-from snakesim_hal.codec import Decoder
 from snakesim_hal.errors import NotConnectedError, WireError
-from snakesim_hal.messages import (
+from snakesim_hal.network.session import Arrival, Session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import Decoder
+from snakesim_hal.wire.messages import (
     Answer,
     AppliedCommand,
     Clock,
@@ -24,7 +25,6 @@ from snakesim_hal.messages import (
     Mode,
     Status,
 )
-from snakesim_hal.session import Arrival, Session
 
 LIMIT_S = 30.0
 LOOK_S = 0.002

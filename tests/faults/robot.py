@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from snakesim_hal.errors import NotConnectedError
-from snakesim_hal.scenario import Override, RunConfig, load, write
-from snakesim_hal.session import Link, open_session
-from snakesim_operator import children
-from snakesim_operator.children import Child
+from snakesim_hal.model.scenario import Override, RunConfig, load, write
+from snakesim_hal.network.session import Link, open_session
+from snakesim_operator.run import children
+from snakesim_operator.run.children import Child
 from tests.e2e.command import free_endpoint
 from tests.faults.host_watch import HostWatch, urgently
 from tests.faults.observer import Observer, TrialError

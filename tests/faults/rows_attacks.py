@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 
-from snakesim_hal import keys
-from snakesim_hal.messages import EstopRequest, LifecycleRequest, Mode
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import EstopRequest, LifecycleRequest, Mode
 from tests.attack import datagrams
 from tests.attack.floods import flood, half_open
 from tests.faults.observer import Observer, TrialError

@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterator, Mapping
 
 import msgspec
 
-from snakesim_hal import keys
-from snakesim_hal.authority import Authority
-from snakesim_hal.messages import JointCommand, LeaseRequest, LifecycleRequest
+from snakesim_hal.safety.authority import Authority
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import JointCommand, LeaseRequest, LifecycleRequest
 from tests.faults.observer import Observer, TrialError
 from tests.faults.robot import robot
 from tests.faults.row import Request, Trial

@@ -4,7 +4,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 
-from snakesim_hal.messages import Mode
+from snakesim_hal.wire.messages import Mode
 from tests.faults.observer import Observer, TrialError
 from tests.faults.robot import START_LIMIT_S, Robot, recovered, robot
 from tests.faults.row import Request, Trial

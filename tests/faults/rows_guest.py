@@ -14,10 +14,10 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from snakesim_can_backend.protocol import LastStop, ModuleState, Opcode, node_of
+from snakesim_can_backend.protocol.definitions import LastStop, ModuleState, Opcode, node_of
 from snakesim_hal import host_process
-from snakesim_hal.scenario import Override, load
-from snakesim_hal.session import Link, open_session
+from snakesim_hal.model.scenario import Override, load
+from snakesim_hal.network.session import Link, open_session
 from tests.faults.observer import Observer, TrialError
 from tests.faults.robot import START_LIMIT_S, Robot
 from tests.faults.row import Measure, Request, Trial

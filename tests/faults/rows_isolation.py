@@ -4,8 +4,8 @@ import random
 import time
 from collections.abc import Iterator
 
-from snakesim_hal import keys
-from snakesim_hal.messages import AppliedCommand, LifecycleRequest, Mode
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import AppliedCommand, LifecycleRequest, Mode
 from tests.faults.observer import Heard, Observer, TrialError
 from tests.faults.robot import recovered, robot
 from tests.faults.row import Measure, Request, Trial

@@ -9,9 +9,9 @@ import re
 import time
 from collections.abc import Iterator
 
-from snakesim_can_backend.protocol import Action
-from snakesim_hal.injection import Injection, checked
-from snakesim_hal.messages import Answer, Status
+from snakesim_can_backend.protocol.definitions import Action
+from snakesim_hal.model.injection import Injection, checked
+from snakesim_hal.wire.messages import Answer, Status
 from tests.faults import bus_log
 from tests.faults.observer import Observer, TrialError
 from tests.faults.robot import START_LIMIT_S, Robot, configuration, recovered, robot

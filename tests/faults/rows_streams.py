@@ -3,9 +3,9 @@
 import time
 from collections.abc import Iterator
 
-from snakesim_hal import keys
-from snakesim_hal.injection import writer_of
-from snakesim_hal.messages import ControlState, Mode
+from snakesim_hal.model.injection import writer_of
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import ControlState, Mode
 from tests.faults.observer import Observer, TrialError
 from tests.faults.robot import Robot, recovered, robot
 from tests.faults.row import Measure, Request, Trial

@@ -7,11 +7,11 @@ from typing import Any
 
 import msgspec
 
-from snakesim_hal import keys
-from snakesim_hal.codec import MAX_PAYLOAD_BYTES, Decoder, encode, encoding_of
 from snakesim_hal.errors import WireError
-from snakesim_hal.messages import JointCommand
-from snakesim_hal.session import Session
+from snakesim_hal.network.session import Session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES, Decoder, encode, encoding_of
+from snakesim_hal.wire.messages import JointCommand
 from tests.faults.observer import Observer
 
 FORGED = 1_000_000_000  # sequences from here on are not the controller's

@@ -13,7 +13,8 @@ import can
 import pytest
 from can.interfaces.virtual import VirtualBus
 
-from snakesim_can_backend.protocol import (
+from snakesim_can_backend.bus.bus import VirtualWire
+from snakesim_can_backend.protocol.definitions import (
     FROM_HOST,
     NODE_BITS,
     WITH_CHECKSUM,
@@ -24,9 +25,8 @@ from snakesim_can_backend.protocol import (
     node_of,
     opcode_of,
 )
-from snakesim_can_backend.wire import VirtualWire
-from snakesim_hal.codec import Decoder, encode, encoding_of
 from snakesim_hal.errors import BackendError
+from snakesim_hal.wire.codec import Decoder, encode, encoding_of
 from tests.unit.can_backend.loop import JOINTS, Loop, config, loop
 
 PER_TICK = 40

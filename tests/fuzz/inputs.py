@@ -17,20 +17,20 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from snakesim_can_backend.mocap import MOST_BYTES, MocapReceiver
+from snakesim_can_backend.driver.mocap import MOST_BYTES, MocapReceiver
 from snakesim_can_backend.twin import faults as twin_faults
-from snakesim_hal import files, injection, scenario
-from snakesim_hal.codec import Decoder, encode, encoding_of
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.latch import ESTOP, EstopLatch
-from snakesim_hal.local_registry import LocalRobot, local_robots
-from snakesim_hal.messages import EstopRequest, Pose
-from snakesim_hal.robot import RobotFile
-from snakesim_hal.scene import SceneFile
-from snakesim_hal.session import router_settings
-from snakesim_hal.stop_port import REQUEST, ask_to_stop, open_stop_port, serve_stops
-from snakesim_operator import lastrun
-from snakesim_operator.record import RunRecord
+from snakesim_hal.host.latch import ESTOP, EstopLatch
+from snakesim_hal.model import files, injection, scenario
+from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.scene import SceneFile
+from snakesim_hal.network.local_registry import LocalRobot, local_robots
+from snakesim_hal.network.session import router_settings
+from snakesim_hal.network.stop_port import REQUEST, ask_to_stop, open_stop_port, serve_stops
+from snakesim_hal.wire.codec import Decoder, encode, encoding_of
+from snakesim_hal.wire.messages import EstopRequest, Pose
+from snakesim_operator.results import last_run as lastrun
+from snakesim_operator.results.record import RunRecord
 from tests.e2e.command import snakesim
 from tests.fuzz.texts import LARGEST, TextMaker
 

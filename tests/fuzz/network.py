@@ -17,12 +17,12 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from snakesim_hal import keys
-from snakesim_hal.blackbox import read_black_box
+from snakesim_hal.host.black_box import read_black_box
+from snakesim_hal.host.recorder import BLACK_BOX, HOST_RECORD
 from snakesim_hal.host_process import HostRecord
-from snakesim_hal.messages import Mode, Status
-from snakesim_hal.recorder import BLACK_BOX, HOST_RECORD
-from snakesim_hal.session import Link, Session, open_session
+from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Mode, Status
 from tests.e2e.command import LIMIT_S, Running, processes_of, running, wait_until
 from tests.fuzz.vitals import Vitals, complaints, parts, vitals
 from tests.fuzz.writer import Sent

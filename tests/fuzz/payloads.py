@@ -9,8 +9,8 @@ from typing import Any
 from msgspec import inspect
 from msgspec.msgpack import Ext
 
-from snakesim_hal.codec import MAX_PAYLOAD_BYTES, encode, encoding_of
-from snakesim_hal.messages import VERSIONS, JointCommand, JointState, LeaseRequest, LifecycleRequest, Message
+from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES, encode, encoding_of
+from snakesim_hal.wire.messages import VERSIONS, JointCommand, JointState, LeaseRequest, LifecycleRequest, Message
 from tests.unit.hal.rig import LEASE_NS, command, description, state
 from tests.unit.hal.strategies import Place, places, plain_example, poisons, replaced
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from snakesim_hal.authority import Authority
-from snakesim_hal.codec import Decoder, encode, encoding_of
 from snakesim_hal.errors import WireError
-from snakesim_hal.messages import (
+from snakesim_hal.safety.authority import Authority
+from snakesim_hal.wire.codec import Decoder, encode, encoding_of
+from snakesim_hal.wire.messages import (
     VERSIONS,
     Answer,
     EstopRequest,

@@ -15,12 +15,13 @@ import msgspec
 import zenoh
 from msgspec import inspect
 
-from snakesim_hal import injection, keys
-from snakesim_hal.codec import MAX_PAYLOAD_BYTES, Decoder
 from snakesim_hal.errors import WireError
-from snakesim_hal.mailbox import Mailbox
-from snakesim_hal.messages import Answer, JointCommand, Message
-from snakesim_hal.session import Arrival, Link, Session, open_session
+from snakesim_hal.model import injection
+from snakesim_hal.network.mailbox import Mailbox
+from snakesim_hal.network.session import Arrival, Link, Session, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES, Decoder
+from snakesim_hal.wire.messages import Answer, JointCommand, Message
 from tests.fuzz.payloads import Maker, Seed, seeds
 from tests.fuzz.withheld import Live, Withholding
 

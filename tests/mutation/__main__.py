@@ -28,7 +28,7 @@ def main() -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     trial.warm_up()
     started = time.monotonic()
-    sources = {file: (trial.ROOT / trial.PACKAGE / file).read_text() for file in asked.files}
+    sources = {file: (trial.ROOT / trial.place_of(file)).read_text() for file in asked.files}
     unchanged = [Mutant(file, "module", 0, "unchanged", source) for file, source in sources.items()]
     for mutant, outcome in outcomes(iter(unchanged), asked.workers, asked.time_limit):
         if outcome != trial.SURVIVED:

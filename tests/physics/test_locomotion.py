@@ -6,8 +6,8 @@ from itertools import groupby, pairwise
 import numpy as np
 import pytest
 
-from snakesim_hal.gate import bumpless_target
-from snakesim_hal.messages import Mode
+from snakesim_hal.safety.gate import bumpless_target
+from snakesim_hal.wire.messages import Mode
 from tests.in_process import Run, configure, run
 from tests.unit.gnc.stage import known
 

@@ -12,11 +12,11 @@ import pytest
 
 from snakesim_gnc.control.obstacle_triplet import TripletSolution, solve_triplet
 from snakesim_hal.backend import SetPoints
-from snakesim_hal.messages import Mode
-from snakesim_hal.robot import Limits, Motor
-from snakesim_hal.route import Route, lay_chain, sine_points
-from snakesim_hal.scenario import RunConfig, Start
-from snakesim_hal.scene import Cylinder, Ground, SceneFile, WaypointRoute
+from snakesim_hal.model.robot import Limits, Motor
+from snakesim_hal.model.route import Route, lay_chain, sine_points
+from snakesim_hal.model.scenario import RunConfig, Start
+from snakesim_hal.model.scene import Cylinder, Ground, SceneFile, WaypointRoute
+from snakesim_hal.wire.messages import Mode
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.settings import Settings, Tether
 from tests.in_process import configure

@@ -13,15 +13,15 @@ from typing import Literal
 
 import msgspec
 
-from snakesim_hal import keys
 from snakesim_hal.errors import NotConnectedError
+from snakesim_hal.host.recorder import HOST_RECORD
 from snakesim_hal.host_process import HostRecord
-from snakesim_hal.messages import Clock, EstopRequest, LifecycleRequest, Status
-from snakesim_hal.recorder import HOST_RECORD
-from snakesim_hal.session import Link, Session, open_session
-from snakesim_hal.stop_port import ask_to_stop
-from snakesim_operator.record import SUMMARY
-from snakesim_operator.summary import RunSummary
+from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.stop_port import ask_to_stop
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Clock, EstopRequest, LifecycleRequest, Status
+from snakesim_operator.results.record import SUMMARY
+from snakesim_operator.results.summary import RunSummary
 from tests.e2e.command import SNAKESIM, environment, free_endpoint
 from tests.fuzz.vitals import parts
 

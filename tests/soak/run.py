@@ -10,9 +10,9 @@ from typing import Any
 
 import msgspec
 
-from snakesim_hal import keys
 from snakesim_hal.errors import NotConnectedError
-from snakesim_hal.messages import Answer, LifecycleRequest, Status
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Answer, LifecycleRequest, Status
 from tests.e2e.command import processes_of, wait_until
 from tests.faults.observer import TrialError
 from tests.fuzz.network import running_and_joined

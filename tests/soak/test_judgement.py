@@ -4,9 +4,9 @@ from itertools import islice
 
 import pytest
 
-from snakesim_hal import keys
-from snakesim_hal.messages import AppliedCommand, Description, Fault, Mode, Status
-from snakesim_hal.session import Link, open_session
+from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import AppliedCommand, Description, Fault, Mode, Status
 from tests.soak.faults import Dice
 from tests.soak.watch import Watch
 from tests.unit.hal.network import free_endpoint, wait_until

@@ -4,10 +4,10 @@ import math
 from collections import Counter
 from typing import Any
 
-from snakesim_hal import keys
 from snakesim_hal.errors import WireError
-from snakesim_hal.messages import AppliedCommand, Clock, Description, Mode, Status
-from snakesim_hal.session import Arrival, Session
+from snakesim_hal.network.session import Arrival, Session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import AppliedCommand, Clock, Description, Mode, Status
 from tests.faults.observer import Observer
 
 ROUNDING_RAD = 1e-6

@@ -11,15 +11,15 @@ from math import inf
 
 import pytest
 
-from snakesim_can_backend import backend as driver
-from snakesim_can_backend.backend import CanBackend
-from snakesim_can_backend.protocol import FROM_HOST, Frame, ModuleState
+from snakesim_can_backend.bus.bus import SocketCanWire
+from snakesim_can_backend.driver import backend as driver
+from snakesim_can_backend.driver.backend import CanBackend
+from snakesim_can_backend.protocol.definitions import FROM_HOST, Frame, ModuleState
 from snakesim_can_backend.settings import Settings
 from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_can_backend.twin.server import TwinServer, make_plant
-from snakesim_can_backend.wire import SocketCanWire
 from snakesim_hal.backend import SetPoints
-from snakesim_hal.plant import Plant
+from snakesim_hal.model.plant import Plant
 from tests.unit.can_backend.loop import Loop, config
 
 ANSWER_LIMIT_S = 2.0  # of this machine's time; the modules' ends the wait before

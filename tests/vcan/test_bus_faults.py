@@ -8,9 +8,9 @@ import socket
 
 import pytest
 
-from snakesim_can_backend import commands
-from snakesim_can_backend.protocol import ModuleState, Opcode, frame_id, opcode_of
-from snakesim_can_backend.watch import IN_A_ROW
+from snakesim_can_backend.driver.module_monitor import IN_A_ROW
+from snakesim_can_backend.protocol import commands
+from snakesim_can_backend.protocol.definitions import ModuleState, Opcode, frame_id, opcode_of
 from tests.unit.can_backend.loop import armed, cleared_and_armed_again
 from tests.vcan.link import frame, ip, must, tc
 from tests.vcan.shared_bus import SharedBus, shared_bus

@@ -19,12 +19,12 @@ from pathlib import Path
 import pytest
 
 from snakesim_can_backend.can_command import COLUMNS
-from snakesim_can_backend.codec import codec
-from snakesim_can_backend.protocol import Action, Frame, LastStop, ModuleState, Opcode, node_of, opcode_of
-from snakesim_hal import keys
-from snakesim_hal.messages import Description, LifecycleRequest, Status
-from snakesim_hal.scenario import Override, RunConfig, load, write
-from snakesim_hal.session import Link, Session, open_session
+from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.definitions import Action, Frame, LastStop, ModuleState, Opcode, node_of, opcode_of
+from snakesim_hal.model.scenario import Override, RunConfig, load, write
+from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Description, LifecycleRequest, Status
 from tests.e2e.command import environment, free_endpoint, snakesim, wait_until
 from tests.unit.hal.rig import write_files
 from tests.vcan.link import FRAME

@@ -10,9 +10,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from snakesim_can_backend.codec import codec
-from snakesim_can_backend.protocol import COMMAND_KEY, Action, Frame, Opcode, node_of, opcode_of
-from snakesim_can_backend.wire import SocketCanWire, wait
+from snakesim_can_backend.bus.bus import SocketCanWire, wait
+from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.definitions import COMMAND_KEY, Action, Frame, Opcode, node_of, opcode_of
 
 pytestmark = pytest.mark.slow
 START_LIMIT_S, ANSWER_LIMIT_S = 90.0, 20.0  # an emulated machine is slow

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from snakesim_operator.record import RunRecord
+from snakesim_operator.results.record import RunRecord
 from tests.e2e.command import free_endpoint, snakesim
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]

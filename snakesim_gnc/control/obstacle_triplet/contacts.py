@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_gnc.control.body_on_path import Lie
-from snakesim_hal.messages import Obstacle
-from snakesim_hal.route import Route
+from snakesim_hal.model.route import Route
+from snakesim_hal.wire.messages import Obstacle
 
 Floats = NDArray[np.float64]
 Planar = tuple[float, float]

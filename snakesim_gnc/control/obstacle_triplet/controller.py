@@ -34,7 +34,7 @@ from snakesim_gnc.control.obstacle_triplet.telemetry import bending, largest_con
 from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_gnc.control.progress import Located, Progress
 from snakesim_hal.backend import SetPoints
-from snakesim_hal.messages import Description, Mode, Obstacle
+from snakesim_hal.wire.messages import Description, Mode, Obstacle
 
 Floats = NDArray[np.float64]
 

@@ -4,8 +4,8 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from snakesim_hal.files import FileStruct
-from snakesim_hal.quantities import above, from_zero
+from snakesim_hal.model.files import FileStruct
+from snakesim_hal.wire.quantities import above, from_zero
 
 
 class Settings(FileStruct, frozen=True, kw_only=True):

@@ -9,7 +9,7 @@ from snakesim_gnc.control.body_on_path import Lie
 from snakesim_gnc.control.obstacle_triplet.selection import Choice
 from snakesim_gnc.control.obstacle_triplet.statics import torque_under
 from snakesim_gnc.control.planar_body import PlanarBody
-from snakesim_hal.messages import World, WorldContact
+from snakesim_hal.wire.messages import World, WorldContact
 
 
 def bending(body: PlanarBody, lie: Lie, choice: Choice, force_n: float) -> list[float]:

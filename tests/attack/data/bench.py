@@ -4,8 +4,8 @@ from typing import Any
 
 import msgspec
 
-from snakesim_hal.messages import Description
-from snakesim_hal.scenario import RunConfig
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.wire.messages import Description
 from snakesim_sim_backend.backend import SimBackend
 
 

@@ -3,9 +3,9 @@
 from collections.abc import Iterable
 from typing import Any
 
-from snakesim_can_backend.codec import codec
-from snakesim_can_backend.protocol import Frame, ModuleState, Opcode
-from snakesim_can_backend.reading import Reading
+from snakesim_can_backend.driver.reports import Reading
+from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.definitions import Frame, ModuleState, Opcode
 
 
 def joint_state(node: int, count: int, angle: float = 0.1, **other: float) -> Frame:

@@ -7,15 +7,15 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from snakesim_can_backend.backend import CanBackend
-from snakesim_can_backend.protocol import ModuleState
+from snakesim_can_backend.bus.bus import VirtualWire
+from snakesim_can_backend.driver.backend import CanBackend
+from snakesim_can_backend.protocol.definitions import ModuleState
 from snakesim_can_backend.settings import Settings
 from snakesim_can_backend.twin.server import Here
-from snakesim_can_backend.wire import VirtualWire
 from snakesim_hal.backend import Samples, SetPoints
-from snakesim_hal.messages import Fault, LifecycleState, Mode
-from snakesim_hal.plant import Plant
-from snakesim_hal.scenario import RunConfig
+from snakesim_hal.model.plant import Plant
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.wire.messages import Fault, LifecycleState, Mode
 from tests.unit.hal.rig import run_config
 
 JOINTS = 4

@@ -10,13 +10,14 @@ import can
 import numpy as np
 import pytest
 
-from snakesim_can_backend import backend as backend_module
-from snakesim_can_backend.backend import CanBackend, _answer_time_s
-from snakesim_can_backend.bring_up import Bus
-from snakesim_can_backend.bus_load import Reports
-from snakesim_can_backend.commands import question
-from snakesim_can_backend.log import LoggedWire
-from snakesim_can_backend.protocol import (
+from snakesim_can_backend.bus.bus import OtherEnd, VirtualWire
+from snakesim_can_backend.bus.load import Reports
+from snakesim_can_backend.bus.log import LoggedWire
+from snakesim_can_backend.driver import backend as backend_module
+from snakesim_can_backend.driver.backend import CanBackend, _answer_time_s
+from snakesim_can_backend.driver.bring_up import Bus
+from snakesim_can_backend.protocol.commands import question
+from snakesim_can_backend.protocol.definitions import (
     BROADCAST,
     FROM_HOST,
     Action,
@@ -34,13 +35,12 @@ from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_can_backend.twin.firmware import Module
 from snakesim_can_backend.twin.inertia import InertiaPlant, InertiaSettings
 from snakesim_can_backend.twin.server import Here, TwinServer, here
-from snakesim_can_backend.wire import OtherEnd, VirtualWire
-from snakesim_hal import keys
 from snakesim_hal.backend import SetPoints
 from snakesim_hal.errors import BackendError, ConfigError
-from snakesim_hal.injection import Injection
-from snakesim_hal.messages import LifecycleState, Mode, Pose
-from snakesim_hal.scenario import RunConfig
+from snakesim_hal.model.injection import Injection
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import LifecycleState, Mode, Pose
 from tests.unit.can_backend.loop import JOINTS, Loop, armed, config, loop
 from tests.unit.can_backend.twin import rig
 

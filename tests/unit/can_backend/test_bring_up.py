@@ -8,11 +8,12 @@ from dataclasses import replace
 
 import pytest
 
-from snakesim_can_backend.bring_up import ASK_EVERY_S, LISTEN_ON_S, Bus, Identity, configure, find, objections
-from snakesim_can_backend.bus_load import reports_of
-from snakesim_can_backend.codec import codec
-from snakesim_can_backend.parameters import parameters_of
-from snakesim_can_backend.protocol import (
+from snakesim_can_backend.bus.bus import VirtualWire
+from snakesim_can_backend.bus.load import reports_of
+from snakesim_can_backend.driver.bring_up import ASK_EVERY_S, LISTEN_ON_S, Bus, Identity, configure, find, objections
+from snakesim_can_backend.driver.parameters import parameters_of
+from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.definitions import (
     PARAMETERS,
     Action,
     Frame,
@@ -25,9 +26,8 @@ from snakesim_can_backend.protocol import (
 )
 from snakesim_can_backend.settings import Settings
 from snakesim_can_backend.twin.chain import ModuleChain
-from snakesim_can_backend.wire import VirtualWire
 from snakesim_hal.errors import BackendError
-from snakesim_hal.injection import Injection
+from snakesim_hal.model.injection import Injection
 from tests.unit.can_backend.frames import heartbeat
 from tests.unit.can_backend.loop import config
 from tests.unit.can_backend.twin import rig

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from snakesim_can_backend.bus_load import (
+from snakesim_can_backend.bus.load import (
     BIT_RATE,
     MOST_EVERY,
     MOST_LOAD,
@@ -25,12 +25,12 @@ from snakesim_can_backend.bus_load import (
     streams,
     worst_bits,
 )
-from snakesim_can_backend.codec import codec
-from snakesim_can_backend.protocol import LAST_NODE, Opcode, frame_id
+from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.definitions import LAST_NODE, Opcode, frame_id
 from snakesim_can_backend.settings import Settings
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.scenario import RunConfig
-from snakesim_hal.scenario import load as load_scenario
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.model.scenario import load as load_scenario
 
 TRIPLET = load_scenario("triplet").config
 BEST_OF_8, WORST_OF_8 = 111, 135

@@ -6,17 +6,17 @@ from pathlib import Path
 import pytest
 
 from snakesim_can_backend import can_command
-from snakesim_can_backend.bus_load import check_load, load, reports_at
+from snakesim_can_backend.bus.bus import VirtualWire
+from snakesim_can_backend.bus.load import check_load, load, reports_at
 from snakesim_can_backend.can_command import COLUMNS, UNKNOWN, aligned, main, scan, settings_of
-from snakesim_can_backend.codec import codec
-from snakesim_can_backend.expanded import EXPANDED, expanded_dbc
-from snakesim_can_backend.protocol import Action, Frame, ModuleState, Opcode, opcode_of
+from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.definitions import Action, Frame, ModuleState, Opcode, opcode_of
+from snakesim_can_backend.protocol.expanded import EXPANDED, expanded_dbc
 from snakesim_can_backend.settings import Settings
-from snakesim_can_backend.wire import VirtualWire
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.injection import Injection
-from snakesim_hal.scenario import load as load_scenario
-from snakesim_hal.scenario import parse_set
+from snakesim_hal.model.injection import Injection
+from snakesim_hal.model.scenario import load as load_scenario
+from snakesim_hal.model.scenario import parse_set
 
 TRIPLET = load_scenario("triplet").config
 

@@ -7,9 +7,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snakesim_can_backend.codec import CodecError, Layout, Signal, codec, dbc_path, load_database
-from snakesim_can_backend.protocol import LAST_NODE, WITH_CHECKSUM, Opcode, checksum, intact, node_of, opcode_of
-from snakesim_hal.messages import Mode
+from snakesim_can_backend.protocol.codec import CodecError, Layout, Signal, codec, dbc_path, load_database
+from snakesim_can_backend.protocol.definitions import (
+    LAST_NODE,
+    WITH_CHECKSUM,
+    Opcode,
+    checksum,
+    intact,
+    node_of,
+    opcode_of,
+)
+from snakesim_hal.wire.messages import Mode
 
 DATABASE = load_database()
 TARGETS = ("position", "velocity", "torque")

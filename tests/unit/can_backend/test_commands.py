@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snakesim_can_backend import commands
-from snakesim_can_backend.codec import codec
-from snakesim_can_backend.protocol import (
+from snakesim_can_backend.protocol import commands
+from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.definitions import (
     BROADCAST,
     COMMAND_KEY,
     COUNTS,
@@ -23,7 +23,7 @@ from snakesim_can_backend.protocol import (
     opcode_of,
 )
 from snakesim_hal.backend import SetPoints
-from snakesim_hal.messages import LifecycleState, Mode
+from snakesim_hal.wire.messages import LifecycleState, Mode
 
 LIFECYCLES: tuple[LifecycleState, ...] = get_args(LifecycleState)
 TARGET = {Mode.POSITION: "position", Mode.VELOCITY: "velocity", Mode.TORQUE: "torque"}

@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from snakesim_can_backend import commands
-from snakesim_can_backend.bus_load import load, reports_at, worst_bits
-from snakesim_can_backend.codec import codec, load_database
-from snakesim_can_backend.protocol import (
+from snakesim_can_backend.bus.load import load, reports_at, worst_bits
+from snakesim_can_backend.protocol import commands
+from snakesim_can_backend.protocol.codec import codec, load_database
+from snakesim_can_backend.protocol.definitions import (
     FIRST_NODE,
     FROM_HOST,
     LAST_NODE,
@@ -26,8 +26,8 @@ from snakesim_can_backend.protocol import (
 from snakesim_can_backend.settings import Settings
 from snakesim_can_backend.twin.firmware import BOOT_US, Module
 from snakesim_can_backend.twin.parameters import Parameters, from_factory
-from snakesim_hal.scenario import load as load_scenario
-from snakesim_hal.thermal import HeatLimits
+from snakesim_hal.model.scenario import load as load_scenario
+from snakesim_hal.model.thermal import HeatLimits
 
 TEXT = (Path(__file__).parents[3] / "docs" / "can-protocol.md").read_text(encoding="utf-8")
 NODE = 5

@@ -7,11 +7,11 @@ import sys
 import cantools
 from cantools.database.can import Database, Message
 
-from snakesim_can_backend import commands
-from snakesim_can_backend.codec import codec, dbc_path, load_database
-from snakesim_can_backend.expanded import EXPANDED, expanded_dbc, nodes_of
-from snakesim_can_backend.log import LoggedWire
-from snakesim_can_backend.protocol import (
+from snakesim_can_backend.bus.bus import VirtualWire
+from snakesim_can_backend.bus.log import LoggedWire
+from snakesim_can_backend.protocol import commands
+from snakesim_can_backend.protocol.codec import codec, dbc_path, load_database
+from snakesim_can_backend.protocol.definitions import (
     BROADCAST,
     FIRST_NODE,
     LAST_NODE,
@@ -23,8 +23,8 @@ from snakesim_can_backend.protocol import (
     Operation,
     Parameter,
 )
-from snakesim_can_backend.wire import VirtualWire
-from snakesim_hal.messages import Mode
+from snakesim_can_backend.protocol.expanded import EXPANDED, expanded_dbc, nodes_of
+from snakesim_hal.wire.messages import Mode
 
 PUBLISHED = dbc_path().with_name(EXPANDED)
 EVERYBODY = list(range(FIRST_NODE, LAST_NODE + 1))

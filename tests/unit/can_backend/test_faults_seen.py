@@ -6,7 +6,7 @@
 import numpy as np
 import pytest
 
-from snakesim_can_backend.protocol import ModuleState
+from snakesim_can_backend.protocol.definitions import ModuleState
 from snakesim_hal.errors import BackendError
 from tests.unit.can_backend.loop import loop
 

@@ -9,13 +9,14 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from snakesim_can_backend.backend import CanBackend
+from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.settings import Settings as CanSettings
 from snakesim_can_backend.twin.server import Here
-from snakesim_hal import keys, thermal
 from snakesim_hal.conformance.rig import Rig
-from snakesim_hal.messages import Mode, Power
-from snakesim_hal.thermal import Thermal
+from snakesim_hal.model import thermal
+from snakesim_hal.model.thermal import Thermal
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Mode, Power
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.settings import Settings as SimSettings
 from tests.unit.hal.rig import run_config

@@ -7,17 +7,17 @@ from typing import Any
 
 import pytest
 
-from snakesim_can_backend.backend import CanBackend
-from snakesim_can_backend.protocol import Frame, ModuleState
+from snakesim_can_backend.bus.bus import VirtualWire
+from snakesim_can_backend.bus.bus_errors import Trouble
+from snakesim_can_backend.bus.bus_faults import inject_into_interface
+from snakesim_can_backend.driver.backend import CanBackend
+from snakesim_can_backend.protocol.definitions import Frame, ModuleState
 from snakesim_can_backend.settings import Settings
-from snakesim_can_backend.trouble import Trouble
 from snakesim_can_backend.twin.faults import ABOUT
-from snakesim_can_backend.wire import VirtualWire
-from snakesim_can_backend.wire_faults import inject_into_interface
 from snakesim_hal.backend import Injectable
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.faulty_backend import FaultyBackend
-from snakesim_hal.injection import parse
+from snakesim_hal.faults.faulty_backend import FaultyBackend
+from snakesim_hal.model.injection import parse
 from tests.unit.can_backend.loop import Loop, armed, cleared_and_armed_again, config, loop
 from tests.unit.can_backend.test_faults_seen import MODULE_FAULTS
 

@@ -9,18 +9,18 @@ from typing import Literal
 
 import pytest
 
-from snakesim_can_backend.backend import CanBackend
-from snakesim_can_backend.commands import command, emergency
-from snakesim_can_backend.protocol import Action, Frame, ModuleFault, ModuleState
+from snakesim_can_backend.bus.bus import VirtualWire
+from snakesim_can_backend.driver.backend import CanBackend
+from snakesim_can_backend.driver.module_monitor import CONCERNS_ALL
+from snakesim_can_backend.protocol.commands import command, emergency
+from snakesim_can_backend.protocol.definitions import Action, Frame, ModuleFault, ModuleState
 from snakesim_can_backend.settings import Settings
 from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_can_backend.twin.firmware import PASSIVE
 from snakesim_can_backend.twin.server import Here
-from snakesim_can_backend.watch import CONCERNS_ALL
-from snakesim_can_backend.wire import VirtualWire
 from snakesim_hal.conformance.rig import Rig
-from snakesim_hal.injection import parse
-from snakesim_hal.messages import LifecycleRequest, Mode
+from snakesim_hal.model.injection import parse
+from snakesim_hal.wire.messages import LifecycleRequest, Mode
 from tests.unit.can_backend.loop import JOINTS, config
 from tests.unit.can_backend.test_faults_seen import MODULE_FAULTS
 

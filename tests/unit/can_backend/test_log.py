@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from cantools.logreader import Parser
 
-from snakesim_can_backend.log import LoggedWire, open_log
-from snakesim_can_backend.protocol import Frame
-from snakesim_can_backend.trouble import Trouble
+from snakesim_can_backend.bus.bus_errors import Trouble
+from snakesim_can_backend.bus.log import LoggedWire, open_log
+from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_hal.errors import ConfigError
 
 LINE = re.compile(r"\((\d+\.\d{6})\) (\S+) ([0-9A-F]{3})#([0-9A-F]*)\n")

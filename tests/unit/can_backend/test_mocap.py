@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from snakesim_can_backend.mocap import MOST_AT_ONCE, MocapReceiver
+from snakesim_can_backend.driver.mocap import MOST_AT_ONCE, MocapReceiver
 from snakesim_hal.errors import BackendError, ConfigError
-from snakesim_hal.messages import Pose
+from snakesim_hal.wire.messages import Pose
 
 MS = 1_000_000
 TOLD: dict[str, Any] = {"velocity_w": [0.0, 0.0, 0.0], "angular_velocity_w": [0.1, 0.2, 0.3]}

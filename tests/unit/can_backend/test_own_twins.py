@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_can_backend import own_twins
-from snakesim_can_backend.own_twins import TwinProcess, check_twins, twins_here
+from snakesim_can_backend.driver import own_twins
+from snakesim_can_backend.driver.own_twins import TwinProcess, check_twins, twins_here
 from snakesim_can_backend.settings import Settings
 from snakesim_can_backend.twin.server import Here
 from snakesim_hal.errors import BackendError, ConfigError
-from snakesim_hal.injection import Injection
+from snakesim_hal.model.injection import Injection
 from tests.unit.can_backend.loop import config
 
 RUN = config()

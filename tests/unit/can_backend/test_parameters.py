@@ -5,15 +5,15 @@ from typing import Any
 import msgspec
 import pytest
 
-from snakesim_can_backend.bus_load import Reports
-from snakesim_can_backend.codec import codec
-from snakesim_can_backend.parameters import SPEED_ROOM, check_ratings, parameters_of
-from snakesim_can_backend.protocol import PARAMETERS, Opcode, Parameter, SafeMotion
+from snakesim_can_backend.bus.load import Reports
+from snakesim_can_backend.driver.parameters import SPEED_ROOM, check_ratings, parameters_of
+from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.definitions import PARAMETERS, Opcode, Parameter, SafeMotion
 from snakesim_can_backend.settings import Settings
 from snakesim_hal.errors import BackendError, ConfigError
-from snakesim_hal.files import decode, find, read_table, shipped
-from snakesim_hal.robot import RobotFile
-from snakesim_hal.scenario import load
+from snakesim_hal.model.files import decode, find, read_table, shipped
+from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.scenario import load
 
 ROBOT = load("triplet").config.robot
 RATED = (Parameter.RATED_TORQUE, Parameter.RATED_SPEED)

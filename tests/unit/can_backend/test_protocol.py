@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snakesim_can_backend.codec import codec, load_database
-from snakesim_can_backend.protocol import (
+from snakesim_can_backend.protocol.codec import codec, load_database
+from snakesim_can_backend.protocol.definitions import (
     FIRST_NODE,
     FROM_HOST,
     LAST_NODE,
@@ -32,7 +32,7 @@ from snakesim_can_backend.protocol import (
     node_of,
     opcode_of,
 )
-from snakesim_hal.messages import Mode
+from snakesim_hal.wire.messages import Mode
 
 DATABASE = load_database()
 NAMED: dict[str, type[IntEnum]] = {

@@ -7,9 +7,10 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from snakesim_can_backend.codec import codec
-from snakesim_can_backend.commands import command
-from snakesim_can_backend.protocol import (
+from snakesim_can_backend.driver.reports import LATE_SYNCS, Reading
+from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.commands import command
+from snakesim_can_backend.protocol.definitions import (
     LAST_NODE,
     Action,
     Frame,
@@ -21,7 +22,6 @@ from snakesim_can_backend.protocol import (
     node_of,
     opcode_of,
 )
-from snakesim_can_backend.reading import LATE_SYNCS, Reading
 from tests.unit.can_backend.frames import (
     accelerometer,
     answer,

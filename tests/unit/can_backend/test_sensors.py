@@ -10,21 +10,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snakesim_can_backend.bus_load import Reports, reports_of
-from snakesim_can_backend.codec import codec
-from snakesim_can_backend.mocap import MocapReceiver
-from snakesim_can_backend.protocol import Opcode
-from snakesim_can_backend.reading import Reading
-from snakesim_can_backend.sensors import LONG_AGO_NS, Sensors, contacts_due, described, on_surface
+from snakesim_can_backend.bus.load import Reports, reports_of
+from snakesim_can_backend.driver.mocap import MocapReceiver
+from snakesim_can_backend.driver.reports import Reading
+from snakesim_can_backend.driver.sensors import LONG_AGO_NS, Sensors, contacts_due, described, on_surface
+from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.definitions import Opcode
 from snakesim_can_backend.settings import Settings
 from snakesim_can_backend.twin.frames import write_contact, write_tail_contact
 from snakesim_can_backend.twin.reports import touch
-from snakesim_hal import keys
 from snakesim_hal.backend import Samples
-from snakesim_hal.messages import Contacts, Imu, Pose, Power
-from snakesim_hal.plant import LinkLoad
-from snakesim_hal.quantities import Vector
-from snakesim_hal.scenario import RunConfig
+from snakesim_hal.model.plant import LinkLoad
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Contacts, Imu, Pose, Power
+from snakesim_hal.wire.quantities import Vector
 from tests.unit.can_backend.frames import accelerometer, answer, begin, contact, gyro, health, syncs
 from tests.unit.can_backend.loop import config
 

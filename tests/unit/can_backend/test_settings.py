@@ -4,10 +4,10 @@ from typing import Any
 
 import pytest
 
-from snakesim_can_backend.protocol import PARAMETERS, Parameter
+from snakesim_can_backend.protocol.definitions import PARAMETERS, Parameter
 from snakesim_can_backend.settings import Settings
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.files import Table, decode
+from snakesim_hal.model.files import Table, decode
 
 GOOD: dict[str, Any] = {
     "channels": ["can0", "can1"],

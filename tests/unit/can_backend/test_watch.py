@@ -4,13 +4,13 @@ from collections.abc import Callable
 
 import pytest
 
-from snakesim_can_backend.codec import codec
-from snakesim_can_backend.commands import command
-from snakesim_can_backend.protocol import Action, Frame, LastStop, ModuleState, Opcode, frame_id
-from snakesim_can_backend.reading import Reading
-from snakesim_can_backend.trouble import Kind, Trouble
-from snakesim_can_backend.watch import ARM_GRACE, CLEAR_GRACE, CONCERNS_ALL, MOST_FRAMES, Finding, Watch
-from snakesim_hal.messages import LifecycleState
+from snakesim_can_backend.bus.bus_errors import Kind, Trouble
+from snakesim_can_backend.driver.module_monitor import ARM_GRACE, CLEAR_GRACE, CONCERNS_ALL, MOST_FRAMES, Finding, Watch
+from snakesim_can_backend.driver.reports import Reading
+from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.commands import command
+from snakesim_can_backend.protocol.definitions import Action, Frame, LastStop, ModuleState, Opcode, frame_id
+from snakesim_hal.wire.messages import LifecycleState
 from tests.unit.can_backend.frames import answer, begin, heartbeat, joint_state, spoilt
 
 JOINTS = 3

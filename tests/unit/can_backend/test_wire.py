@@ -14,10 +14,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snakesim_can_backend import wire as wire_module
-from snakesim_can_backend.protocol import FROM_HOST, Frame, Opcode
-from snakesim_can_backend.trouble import Kind, Trouble, troubles_of
-from snakesim_can_backend.wire import (
+from snakesim_can_backend.bus import bus as wire_module
+from snakesim_can_backend.bus.bus import (
     MOST_AT_ONCE,
     SocketCanWire,
     VirtualWire,
@@ -26,8 +24,10 @@ from snakesim_can_backend.wire import (
     is_up,
     wait,
 )
+from snakesim_can_backend.bus.bus_errors import Kind, Trouble, troubles_of
+from snakesim_can_backend.protocol.definitions import FROM_HOST, Frame, Opcode
 from snakesim_hal.errors import BackendError, ConfigError
-from snakesim_hal.injection import Injection
+from snakesim_hal.model.injection import Injection
 
 CAN_ERR_FLAG = 0x20000000  # linux/can.h, linux/can/error.h
 CAN_ERR_TX_TIMEOUT, CAN_ERR_LOSTARB, CAN_ERR_CRTL, CAN_ERR_PROT = 0x001, 0x002, 0x004, 0x008

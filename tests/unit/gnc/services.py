@@ -13,13 +13,13 @@ from snakesim_gnc.control.service import Control
 from snakesim_gnc.guidance.service import Guidance
 from snakesim_gnc.navigation.service import Navigation
 from snakesim_gnc.service import Service, be_there, loop
-from snakesim_hal import keys
-from snakesim_hal.client import Client
 from snakesim_hal.errors import SnakesimError
-from snakesim_hal.injector import Injector
-from snakesim_hal.messages import ControlState, Trajectory
-from snakesim_hal.scenario import RunConfig
-from snakesim_hal.session import Link, Reader, Session, open_session
+from snakesim_hal.faults.injector import Injector
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.network.client import Client
+from snakesim_hal.network.session import Link, Reader, Session, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import ControlState, Trajectory
 from tests.unit.hal.network import Running, running, wait_until
 from tests.unit.hal.rig import run_config
 

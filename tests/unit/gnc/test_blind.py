@@ -6,7 +6,7 @@ import pytest
 from snakesim_gnc.control.hold import Hold
 from snakesim_gnc.control.obstacle_triplet import ObstacleTriplet
 from snakesim_gnc.control.path_following import PathFollowing
-from snakesim_hal.messages import Mode
+from snakesim_hal.wire.messages import Mode
 from tests.unit.gnc.stage import make_stage
 
 TAIL_S_M = 0.3

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from snakesim_gnc.control.bumpless import HandOver
-from snakesim_hal.gate import bumpless_target
-from snakesim_hal.messages import JointState, Mode
+from snakesim_hal.safety.gate import bumpless_target
+from snakesim_hal.wire.messages import JointState, Mode
 from tests.unit.gnc.stage import make_robot
 
 ROBOT = make_robot(4)

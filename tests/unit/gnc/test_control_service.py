@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from snakesim_gnc.control.controller import Action, Report, positions
-from snakesim_hal import keys
 from snakesim_hal.errors import ControllerError
-from snakesim_hal.messages import Clock, FaultRequest, Intent, JointCommand, JointState
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Clock, FaultRequest, Intent, JointCommand, JointState
 from tests.unit.gnc.services import Stage, stage
 from tests.unit.hal.network import wait_until
 

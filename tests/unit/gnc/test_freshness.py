@@ -6,8 +6,8 @@ import msgspec
 import pytest
 
 from snakesim_gnc.control.freshness import Limits
-from snakesim_hal.messages import Description, SensorDescription, Trajectory, World
-from snakesim_hal.scenario import RunConfig
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.wire.messages import Description, SensorDescription, Trajectory, World
 from tests.unit.hal.rig import description, run_config, state
 
 SCHEDULE = {

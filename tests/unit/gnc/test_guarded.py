@@ -12,7 +12,7 @@ from snakesim_gnc.control.controller import Action, Report, View, positions
 from snakesim_gnc.control.guarded import Guarded
 from snakesim_hal.backend import SetPoints
 from snakesim_hal.errors import ControllerError
-from snakesim_hal.messages import Description, Mode
+from snakesim_hal.wire.messages import Description, Mode
 from tests.unit.gnc.stage import make_stage
 
 STAGE = make_stage(3)

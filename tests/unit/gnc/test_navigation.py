@@ -6,8 +6,8 @@ import pytest
 
 from snakesim_gnc.navigation.core import KnownPath
 from snakesim_gnc.navigation.intents import LONGEST_NS, Intents
-from snakesim_hal.messages import Intent, Obstacle, World
-from snakesim_hal.route import Route
+from snakesim_hal.model.route import Route
+from snakesim_hal.wire.messages import Intent, Obstacle, World
 
 MISSION_M_S = 0.2
 SECOND = 10**9

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from snakesim_gnc.control.obstacle_triplet import ObstacleTriplet, Settings
-from snakesim_hal.messages import Mode, WorldContact
+from snakesim_hal.wire.messages import Mode, WorldContact
 from tests.unit.gnc.stage import PERIOD_S, known, make_stage
 
 TAIL_S_M = 0.3

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from snakesim_gnc.control.path_following import PathFollowing
-from snakesim_hal.messages import Mode
+from snakesim_hal.wire.messages import Mode
 from tests.unit.gnc.stage import make_stage, nodes_of
 
 TAIL_S_M = 0.3

@@ -17,8 +17,8 @@ from snakesim_gnc.control.obstacle_triplet.selection import (
     propulsion_joint,
     solve,
 )
-from snakesim_hal.messages import Obstacle
-from snakesim_hal.route import Route
+from snakesim_hal.model.route import Route
+from snakesim_hal.wire.messages import Obstacle
 from tests.unit.gnc.stage import BODY_RADIUS_M, CLEARANCE_M, make_pegs, make_route, make_stage, nodes_of
 
 SEGMENTS = [0.055, *[0.11] * 12, 0.055]

@@ -11,12 +11,15 @@ from typing import Any
 
 import msgspec
 
-from snakesim_hal import keys
 from snakesim_hal.backend import Samples, SetPoints
-from snakesim_hal.client import Client, Commander
 from snakesim_hal.errors import BackendError
-from snakesim_hal.host import Host
-from snakesim_hal.messages import (
+from snakesim_hal.host.host import Host
+from snakesim_hal.model.robot import describe
+from snakesim_hal.model.scenario import RunConfig, config_hash
+from snakesim_hal.network.client import Client, Commander
+from snakesim_hal.network.session import Link, Reader, Session, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import (
     Answer,
     Clock,
     Description,
@@ -29,9 +32,6 @@ from snakesim_hal.messages import (
     Pose,
     Status,
 )
-from snakesim_hal.robot import describe
-from snakesim_hal.scenario import RunConfig, config_hash
-from snakesim_hal.session import Link, Reader, Session, open_session
 
 LIMIT_S = 20.0
 

@@ -6,9 +6,9 @@ from typing import Any
 
 import msgspec
 
-from snakesim_hal.messages import Description, JointCommand, JointState, Mode
-from snakesim_hal.robot import RobotFile, describe
-from snakesim_hal.scenario import RunConfig
+from snakesim_hal.model.robot import RobotFile, describe
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.wire.messages import Description, JointCommand, JointState, Mode
 
 PERIOD_NS = 10_000_000
 LEASE_NS = 50_000_000

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from snakesim_hal.arming import far_targets, mistaken
-from snakesim_hal.messages import LifecycleRequest, Mode
+from snakesim_hal.safety.lifecycle import far_targets, mistaken
+from snakesim_hal.wire.messages import LifecycleRequest, Mode
 from tests.unit.hal.rig import command, description
 
 ROBOT = description()

@@ -7,10 +7,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from snakesim_hal.authority import COMMANDS_KEPT, Authority, Decision
-from snakesim_hal.fault_log import MAX_FAULTS_KEPT
-from snakesim_hal.gate import FRESH_NS
-from snakesim_hal.messages import (
+from snakesim_hal.safety.authority import COMMANDS_KEPT, Authority, Decision
+from snakesim_hal.safety.fault_log import MAX_FAULTS_KEPT
+from snakesim_hal.safety.gate import FRESH_NS
+from snakesim_hal.wire.messages import (
     Answer,
     EstopRequest,
     Fault,

@@ -20,12 +20,12 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 
-from snakesim_hal import authority as under_test
-from snakesim_hal.authority import Authority, Decision
-from snakesim_hal.fault_log import MAX_FAULTS_KEPT
-from snakesim_hal.gate import FRESH_NS
-from snakesim_hal.lease import Lease
-from snakesim_hal.messages import (
+from snakesim_hal.safety import authority as under_test
+from snakesim_hal.safety.authority import Authority, Decision
+from snakesim_hal.safety.fault_log import MAX_FAULTS_KEPT
+from snakesim_hal.safety.gate import FRESH_NS
+from snakesim_hal.safety.lease import Lease
+from snakesim_hal.wire.messages import (
     Answer,
     EstopRequest,
     Fault,

@@ -5,10 +5,10 @@ from contextlib import ExitStack
 
 import pytest
 
-from snakesim_hal import keys
-from snakesim_hal.client import Client
-from snakesim_hal.messages import Clock, Done, Pace
-from snakesim_hal.session import Link, Session, open_session
+from snakesim_hal.network.client import Client
+from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Clock, Done, Pace
 from tests.e2e.command import free_endpoint, wait_until
 
 

@@ -11,14 +11,15 @@ import numpy as np
 import pytest
 import zenoh
 
-from snakesim_hal import keys
 from snakesim_hal.backend import SetPoints
-from snakesim_hal.client import Client, Commander, Feed
-from snakesim_hal.codec import ENCODING_PREFIX, Decoder, encode, encoding_of
 from snakesim_hal.errors import StalledError
-from snakesim_hal.host import Host
-from snakesim_hal.inbox import LIMITS, SAMPLES
-from snakesim_hal.messages import (
+from snakesim_hal.host.host import Host
+from snakesim_hal.host.inbox import LIMITS, SAMPLES
+from snakesim_hal.network.client import Client, Commander, Feed
+from snakesim_hal.network.session import Arrival, Link, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import ENCODING_PREFIX, Decoder, encode, encoding_of
+from snakesim_hal.wire.messages import (
     Answer,
     AppliedCommand,
     Clock,
@@ -32,7 +33,6 @@ from snakesim_hal.messages import (
     Mode,
     Pose,
 )
-from snakesim_hal.session import Arrival, Link, open_session
 from tests.unit.hal.network import Follower, LagBackend, following, free_endpoint, running, wait_until
 from tests.unit.hal.rig import command, description, run_config, state
 
@@ -402,7 +402,7 @@ def test_a_client_reads_what_the_clock_names_waits_for_it_and_reports_what_never
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     endpoint, robot = free_endpoint(), description()
-    monkeypatch.setattr("snakesim_hal.client.MISSING_LIMIT_S", 0.1)
+    monkeypatch.setattr("snakesim_hal.network.client.MISSING_LIMIT_S", 0.1)
     with open_session(Link(endpoint, "worm", listen=True)) as hal, open_session(Link(endpoint, "worm")) as session:
         client = Client(session, "control")
         feed = client.subscribe(keys.JOINTS, JointState)

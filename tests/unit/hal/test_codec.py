@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec import inspect
 
-from snakesim_hal.codec import ENCODING_PREFIX, MAX_PAYLOAD_BYTES, Decoder, encode, encoding_of
 from snakesim_hal.errors import WireError
-from snakesim_hal.messages import VERSIONS, Clock, JointCommand, JointState, Message, Mode
+from snakesim_hal.wire.codec import ENCODING_PREFIX, MAX_PAYLOAD_BYTES, Decoder, encode, encoding_of
+from snakesim_hal.wire.messages import VERSIONS, Clock, JointCommand, JointState, Message, Mode
 from tests.unit.hal.strategies import messages_of, places, plain_example, poisons, replaced
 
 ALL = list(VERSIONS)

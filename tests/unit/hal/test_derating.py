@@ -5,9 +5,9 @@ from typing import Any
 import msgspec
 import pytest
 
-from snakesim_hal import keys
-from snakesim_hal.derating import Derating
-from snakesim_hal.messages import Fault, Power, SensorDescription
+from snakesim_hal.safety.derating import Derating
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Fault, Power, SensorDescription
 from tests.unit.hal.rig import description
 
 ROBOT = description()

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snakesim_hal.codec import Decoder, encode, encoding_of
-from snakesim_hal.disturbance import MOST_AT_ONCE, Disturbance, spoilt
 from snakesim_hal.errors import WireError
-from snakesim_hal.injection import Injection, checked
-from snakesim_hal.messages import JointCommand
+from snakesim_hal.faults.disturbance import MOST_AT_ONCE, Disturbance, spoilt
+from snakesim_hal.model.injection import Injection, checked
+from snakesim_hal.wire.codec import Decoder, encode, encoding_of
+from snakesim_hal.wire.messages import JointCommand
 from tests.unit.hal.rig import command, description
 
 KEY = "sensor/joints"

@@ -2,8 +2,8 @@
 
 import pytest
 
-from snakesim_hal.endpoint import check_endpoint, check_namespace
 from snakesim_hal.errors import ConfigError
+from snakesim_hal.network.endpoint import check_endpoint, check_namespace
 
 GOOD = [
     *("tcp/127.0.0.1:7447", "tcp/localhost:1", "tls/lab-router.example:65535"),

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from msgspec import Meta
 
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.files import FileStruct, Table, decode, find, leaves, read_table, shipped
+from snakesim_hal.model.files import FileStruct, Table, decode, find, leaves, read_table, shipped
 
 
 class Part(FileStruct, frozen=True):

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from snakesim_hal import keys
-from snakesim_hal.gate import (
+from snakesim_hal.safety.gate import (
     Applied,
     JointLimits,
     Measured,
@@ -23,8 +22,9 @@ from snakesim_hal.gate import (
     stoppable_speed,
     why_limited,
 )
-from snakesim_hal.lease import Lease
-from snakesim_hal.messages import JointCommand, Mode, SensorDescription
+from snakesim_hal.safety.lease import Lease
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import JointCommand, Mode, SensorDescription
 from tests.unit.hal.rig import LEASE_NS, command, description
 
 ROBOT = description()

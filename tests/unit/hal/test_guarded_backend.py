@@ -6,8 +6,8 @@ import pytest
 
 from snakesim_hal.backend import Samples, SetPoints
 from snakesim_hal.errors import BackendError, SnakesimError
-from snakesim_hal.guarded_backend import GuardedBackend
-from snakesim_hal.messages import Fault, LifecycleState
+from snakesim_hal.host.guarded_backend import GuardedBackend
+from snakesim_hal.wire.messages import Fault, LifecycleState
 from tests.unit.hal.network import Follower, LagBackend, following, running, wait_until
 from tests.unit.hal.test_client_host import run_config
 

@@ -11,14 +11,14 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from snakesim_hal import keys
-from snakesim_hal.client import Client
 from snakesim_hal.errors import NotConnectedError
-from snakesim_hal.local_registry import LocalRobot, local_robots, registered, robot_folder
-from snakesim_hal.messages import Description, LifecycleRequest
-from snakesim_hal.private_channel import HostEnd, StarterEnd, ToStarter, socket_pair
-from snakesim_hal.run_key import RUN_KEY, is_proven, new_run_key, proven
-from snakesim_hal.session import open_session
+from snakesim_hal.network.client import Client
+from snakesim_hal.network.local_registry import LocalRobot, local_robots, registered, robot_folder
+from snakesim_hal.network.private_channel import HostEnd, StarterEnd, ToStarter, socket_pair
+from snakesim_hal.network.run_key import RUN_KEY, is_proven, new_run_key, proven
+from snakesim_hal.network.session import open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Description, LifecycleRequest
 from tests.unit.hal.network import Follower, following, running, wait_until
 from tests.unit.hal.test_client_host import run_config
 
@@ -111,7 +111,7 @@ def test_a_run_that_was_killed_is_not_found_any_more(tmp_path: Path, monkeypatch
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     script = """
         import os, time
-        from snakesim_hal.local_registry import LocalRobot, registered
+        from snakesim_hal.network.local_registry import LocalRobot, registered
         values = {"namespace": "worm", "robot": "worm", "backend": "sim", "endpoint": "tcp/127.0.0.1:7447"}
         with registered(LocalRobot(**values, stop_host="127.0.0.1", stop_port=7447, pid=os.getpid())):
             print("there", flush=True)
@@ -141,7 +141,7 @@ def test_one_robot_is_one_folder_whatever_its_name(tmp_path: Path, monkeypatch: 
 
 
 def test_of_two_runs_that_start_at_once_each_has_an_endpoint_of_its_own() -> None:
-    from snakesim_operator.meeting import meeting_point
+    from snakesim_operator.run.meeting import meeting_point
 
     first, its_port = meeting_point(None, None)
     second, other_port = meeting_point(None, None)

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snakesim_hal import keys
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.injection import (
+from snakesim_hal.model.fault_plan import check_backend_can, check_planned, planned
+from snakesim_hal.model.injection import (
     KINDS,
     Injection,
     Plan,
@@ -19,7 +19,7 @@ from snakesim_hal.injection import (
     parse,
     writer_of,
 )
-from snakesim_hal.planned import check_backend_can, check_planned, planned
+from snakesim_hal.wire import keys
 from tests.unit.hal.rig import run_config
 
 TARGETS = {

@@ -6,14 +6,14 @@ from typing import Any
 
 import pytest
 
-from snakesim_hal import keys
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.host import Host
-from snakesim_hal.injection import parse
-from snakesim_hal.injector import Injector
-from snakesim_hal.message_faults import MessageFaults
-from snakesim_hal.messages import Answer, Clock, FaultRequest, JointState
-from snakesim_hal.session import Link, open_session
+from snakesim_hal.faults.injector import Injector
+from snakesim_hal.faults.message_faults import MessageFaults
+from snakesim_hal.host.host import Host
+from snakesim_hal.model.injection import parse
+from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Answer, Clock, FaultRequest, JointState
 from tests.unit.hal.network import (
     Follower,
     LagBackend,

@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
-from snakesim_hal.fault_log import MAX_FAULTS_KEPT
-from snakesim_hal.messages import Fault, Mode
+from snakesim_hal.safety.fault_log import MAX_FAULTS_KEPT
+from snakesim_hal.wire.messages import Fault, Mode
 from tests.unit.hal.test_authority import CLEAR, DISARM, ESTOP, JOINTS, Rig, armed, hear
 
 SAYS_NO = [True, False, True]  # joint_2 has no valid state

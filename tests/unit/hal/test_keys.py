@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snakesim_hal import keys
-from snakesim_hal.messages import Done
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Done
 
 CHUNK = st.text(st.characters(categories=("L", "N"), include_characters="_-"), min_size=1, max_size=12)
 NAMESPACE = st.lists(CHUNK, min_size=1, max_size=3).map("/".join)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from snakesim_hal.kinematics import (
+from snakesim_hal.model.kinematics import (
     joint_positions_s_m,
     joint_rotation,
     link_frames,

@@ -9,10 +9,10 @@ from threading import Event
 
 import pytest
 
-from snakesim_hal import keys
-from snakesim_hal import latch as under_test
-from snakesim_hal.latch import ESTOP, EstopLatch
-from snakesim_hal.messages import EstopRequest
+from snakesim_hal.host import latch as under_test
+from snakesim_hal.host.latch import ESTOP, EstopLatch
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import EstopRequest
 from tests.unit.hal.network import running, wait_until
 from tests.unit.hal.test_client_host import run_config
 

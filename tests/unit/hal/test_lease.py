@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snakesim_hal.lease import Lease, Ruling, freed, renewed, rule
-from snakesim_hal.messages import LeaseRequest
+from snakesim_hal.safety.lease import Lease, Ruling, freed, renewed, rule
+from snakesim_hal.wire.messages import LeaseRequest
 
 TERM = 50
 HELD = Lease(holder="control", epoch=4, priority=100, expires_ns=1000)

@@ -4,8 +4,8 @@ from typing import get_args
 
 import pytest
 
-from snakesim_hal.lifecycle import Event, after
-from snakesim_hal.messages import LifecycleState
+from snakesim_hal.safety.lifecycle import Event, after
+from snakesim_hal.wire.messages import LifecycleState
 
 STATES, EVENTS = get_args(LifecycleState), get_args(Event)
 TABLE: dict[str, dict[str, str | None]] = {

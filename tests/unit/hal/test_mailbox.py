@@ -6,7 +6,7 @@ from queue import Empty
 
 import pytest
 
-from snakesim_hal.mailbox import Mailbox
+from snakesim_hal.network.mailbox import Mailbox
 
 TIMES = 20_000
 

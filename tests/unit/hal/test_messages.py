@@ -7,8 +7,8 @@ import msgspec
 import pytest
 from msgspec import inspect
 
-from snakesim_hal import keys, messages
-from snakesim_hal.messages import VERSIONS, Message, Mode
+from snakesim_hal.wire import keys, messages
+from snakesim_hal.wire.messages import VERSIONS, Message, Mode
 from tests.unit.hal.strategies import places, plain_example
 
 each_message = pytest.mark.parametrize("message", list(VERSIONS), ids=lambda message: message.__name__)

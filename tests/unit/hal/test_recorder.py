@@ -2,6 +2,7 @@
 
 import errno
 import os
+import threading
 import time
 from collections.abc import Iterator
 from functools import partial
@@ -11,13 +12,13 @@ from threading import Event
 import msgspec
 import pytest
 
-from snakesim_hal import recorder as under_test
-from snakesim_hal.authority import Decision
 from snakesim_hal.backend import Samples, SetPoints
-from snakesim_hal.blackbox import BlackBox, digest_of, read_black_box
+from snakesim_hal.host import recorder as under_test
+from snakesim_hal.host.black_box import BlackBox, digest_of, read_black_box
+from snakesim_hal.host.recorder import BLACK_BOX, DESCRIPTION, HOST_RECORD, Recorder
 from snakesim_hal.host_process import HostRecord, record_of
-from snakesim_hal.messages import Description, Mode
-from snakesim_hal.recorder import BLACK_BOX, DESCRIPTION, HOST_RECORD, Recorder
+from snakesim_hal.safety.authority import Decision
+from snakesim_hal.wire.messages import Description, Mode
 from tests.unit.hal.network import Follower, following, running, wait_until
 from tests.unit.hal.rig import description, run_config, state
 
@@ -56,6 +57,8 @@ def ticks_on_disk(folder: Path) -> list[int]:
 def memory() -> Iterator[int]:
     handle = os.memfd_create("test")
     yield handle
+    for thread in [thread for thread in threading.enumerate() if thread.name == "recorder"]:
+        thread.join(5.0)  # one that hung would write to whatever has this number next
     os.close(handle)
 
 

@@ -6,12 +6,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snakesim_hal import keys
-from snakesim_hal.codec import Decoder, encode, encoding_of
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.files import Table, decode, find, read_table, shipped
-from snakesim_hal.messages import Description
-from snakesim_hal.robot import RobotFile, describe, layout_hash
+from snakesim_hal.model.files import Table, decode, find, read_table, shipped
+from snakesim_hal.model.robot import RobotFile, describe, layout_hash
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import Decoder, encode, encoding_of
+from snakesim_hal.wire.messages import Description
 from tests.unit.hal.rig import LEASE_NS, PERIOD_NS, ROBOT, changed, description, robot_file
 
 

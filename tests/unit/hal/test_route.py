@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from snakesim_hal.route import Route, chain_angles, lay_chain, next_on_route, sine_points, yaw_segments_m
+from snakesim_hal.model.route import Route, chain_angles, lay_chain, next_on_route, sine_points, yaw_segments_m
 
 Floats = NDArray[np.float64]
 

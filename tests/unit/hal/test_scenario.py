@@ -11,11 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.files import shipped
-from snakesim_hal.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
-from snakesim_hal.participants import Participants
-from snakesim_hal.planned import check_planned
-from snakesim_hal.scenario import (
+from snakesim_hal.host.participants import Participants
+from snakesim_hal.model.fault_plan import check_planned
+from snakesim_hal.model.files import shipped
+from snakesim_hal.model.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
+from snakesim_hal.model.scenario import (
     Loaded,
     Override,
     Service,
@@ -28,7 +28,7 @@ from snakesim_hal.scenario import (
     start_of,
     write,
 )
-from snakesim_hal.scene import route_of
+from snakesim_hal.model.scene import route_of
 from tests.unit.hal.rig import ROBOT_TOML, SCENARIO_TOML, SCENE_TOML, run_config, write_files
 
 

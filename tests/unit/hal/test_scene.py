@@ -10,11 +10,9 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from snakesim_hal.codec import Decoder, encode, encoding_of
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.files import Table, decode
-from snakesim_hal.messages import Obstacle, World
-from snakesim_hal.scene import (
+from snakesim_hal.model.files import Table, decode
+from snakesim_hal.model.scene import (
     Capsule,
     Placed,
     SceneFile,
@@ -23,6 +21,8 @@ from snakesim_hal.scene import (
     place,
     route_of,
 )
+from snakesim_hal.wire.codec import Decoder, encode, encoding_of
+from snakesim_hal.wire.messages import Obstacle, World
 from tests.unit.hal.rig import SCENE
 
 SINE = {"kind": "sine", "amplitude_m": 0.1, "wavelength_m": 0.8, "length_m": 4.0}

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from snakesim_hal import keys
-from snakesim_hal.codec import ENCODING_PREFIX, encode
 from snakesim_hal.errors import ConfigError, NotConnectedError
-from snakesim_hal.messages import Answer, Done, EstopRequest, JointState, LeaseRequest
-from snakesim_hal.session import Arrival, Link, Question, open_router, open_session
+from snakesim_hal.network.session import Arrival, Link, Question, open_router, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import ENCODING_PREFIX, encode
+from snakesim_hal.wire.messages import Answer, Done, EstopRequest, JointState, LeaseRequest
 from tests.unit.hal.network import free_endpoint, wait_until
 from tests.unit.hal.rig import description, state
 

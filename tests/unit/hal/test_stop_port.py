@@ -9,7 +9,15 @@ from contextlib import contextmanager
 import pytest
 
 from snakesim_hal.errors import NotConnectedError
-from snakesim_hal.stop_port import ANSWER, REQUEST, Reply, ask_to_stop, open_stop_port, serve_stops, stop_address
+from snakesim_hal.network.stop_port import (
+    ANSWER,
+    REQUEST,
+    Reply,
+    ask_to_stop,
+    open_stop_port,
+    serve_stops,
+    stop_address,
+)
 
 LOOPBACK = "127.0.0.1"
 

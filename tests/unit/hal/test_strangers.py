@@ -7,13 +7,15 @@ import msgspec
 import pytest
 import zenoh
 
-from snakesim_hal import keys
-from snakesim_hal.client import Client, Commander
-from snakesim_hal.codec import MAX_PAYLOAD_BYTES
 from snakesim_hal.errors import NotConnectedError
-from snakesim_hal.fit import misfit
-from snakesim_hal.host import Host
-from snakesim_hal.messages import (
+from snakesim_hal.host.host import Host
+from snakesim_hal.model.route import Route
+from snakesim_hal.network.client import Client, Commander
+from snakesim_hal.network.robot_mismatch import misfit
+from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES
+from snakesim_hal.wire.messages import (
     Answer,
     Clock,
     Contact,
@@ -30,8 +32,6 @@ from snakesim_hal.messages import (
     World,
     WorldContact,
 )
-from snakesim_hal.route import Route
-from snakesim_hal.session import Link, Session, open_session
 from tests.unit.hal.network import LagBackend, free_endpoint, wait_until
 from tests.unit.hal.rig import description, run_config, state
 

@@ -2,12 +2,12 @@
 
 import pytest
 
-from snakesim_hal import keys
 from snakesim_hal.errors import RefusedError
-from snakesim_hal.messages import Answer
-from snakesim_hal.session import Link, Question, open_session
-from snakesim_operator import command, stop
-from snakesim_operator.targets import Where
+from snakesim_hal.network.session import Link, Question, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Answer
+from snakesim_operator.tools import command, stop
+from snakesim_operator.tools.targets import Where
 from tests.unit.hal.network import Follower, following, running
 from tests.unit.hal.test_client_host import run_config
 

@@ -12,15 +12,15 @@ import pytest
 
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.host_process import HostRecord
-from snakesim_hal.messages import ControlState, Mode
-from snakesim_hal.robot import Chain, describe
-from snakesim_hal.scenario import RunConfig, load, parse_set, write
-from snakesim_operator.compare.command import compare
-from snakesim_operator.compare.difference import Difference, differ
-from snakesim_operator.compare.page import page
-from snakesim_operator.compare.table import table
-from snakesim_operator.compare.verdict import within
-from snakesim_operator.record import RunRecord
+from snakesim_hal.model.robot import Chain, describe
+from snakesim_hal.model.scenario import RunConfig, load, parse_set, write
+from snakesim_hal.wire.messages import ControlState, Mode
+from snakesim_operator.results.compare.command import compare
+from snakesim_operator.results.compare.difference import Difference, differ
+from snakesim_operator.results.compare.page import page
+from snakesim_operator.results.compare.table import table
+from snakesim_operator.results.compare.verdict import within
+from snakesim_operator.results.record import RunRecord
 
 JOINTS = 13
 SPEED_M_S = 0.1

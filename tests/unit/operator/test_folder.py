@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.errors import ConfigError
-from snakesim_operator.folder import LOCK, claimed, named_after
+from snakesim_operator.run.folder import LOCK, claimed, named_after
 from tests.unit.hal.network import wait_until
 
 HOLD = """
 import sys, time
 from pathlib import Path
-from snakesim_operator.folder import claimed
+from snakesim_operator.run.folder import claimed
 with claimed(Path(sys.argv[1]), print):
     print("held", flush=True)
     time.sleep(60)

@@ -14,16 +14,16 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from snakesim_hal import keys
-from snakesim_hal.blackbox import Layout
-from snakesim_hal.recorder import BLACK_BOX, DESCRIPTION, HOST_RECORD
-from snakesim_hal.scenario import write
-from snakesim_operator.compare import page as compare_page
-from snakesim_operator.compare.difference import differ
-from snakesim_operator.compare.table import table
-from snakesim_operator.record import CONFIG, TELEMETRY, RunRecord
-from snakesim_operator.report import page
-from snakesim_operator.summary import RunSummary, summarise
+from snakesim_hal.host.black_box import Layout
+from snakesim_hal.host.recorder import BLACK_BOX, DESCRIPTION, HOST_RECORD
+from snakesim_hal.model.scenario import write
+from snakesim_hal.wire import keys
+from snakesim_operator.results.compare import page as compare_page
+from snakesim_operator.results.compare.difference import differ
+from snakesim_operator.results.compare.table import table
+from snakesim_operator.results.record import CONFIG, TELEMETRY, RunRecord
+from snakesim_operator.results.report import page
+from snakesim_operator.results.summary import RunSummary, summarise
 from tests.unit.operator.test_report import Reader, made_up
 
 FIRST, LAST = 240, 330  # rows of the made-up run that are kept: two joints propel in them

@@ -2,8 +2,8 @@
 
 import pytest
 
-from snakesim_hal.messages import LifecycleState, Status
-from snakesim_operator.progress import Progress
+from snakesim_hal.wire.messages import LifecycleState, Status
+from snakesim_operator.run.progress import Progress
 from tests.unit.hal.rig import run_config
 
 

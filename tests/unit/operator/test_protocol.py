@@ -10,12 +10,13 @@ import pytest
 import zenoh
 
 from snakesim_gnc.control.telling import TELEMETRY_S
-from snakesim_hal import arming, gate, keys
-from snakesim_hal.codec import encode
-from snakesim_hal.host import STATUS_PERIOD_NS
-from snakesim_hal.messages import Description, Done, JointCommand, JointState, Mode
-from snakesim_hal.session import DEFAULT_ENDPOINT, Link, open_session
-from snakesim_operator.schemas import contract
+from snakesim_hal.host.host import STATUS_PERIOD_NS
+from snakesim_hal.network.session import DEFAULT_ENDPOINT, Link, open_session
+from snakesim_hal.safety import gate, lifecycle
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import encode
+from snakesim_hal.wire.messages import Description, Done, JointCommand, JointState, Mode
+from snakesim_operator.tools.schemas import contract
 from tests.unit.hal.network import free_endpoint, wait_until
 from tests.unit.hal.rig import description
 
@@ -60,15 +61,15 @@ def test_every_refusal_is_told() -> None:
     source = "".join(
         (REPOSITORY / name).read_text(encoding="utf-8")
         for name in (
-            "snakesim_hal/host.py",
-            "snakesim_hal/lease.py",
-            "snakesim_hal/injector.py",
-            "snakesim_hal/codec.py",
+            "snakesim_hal/host/host.py",
+            "snakesim_hal/safety/lease.py",
+            "snakesim_hal/faults/injector.py",
+            "snakesim_hal/wire/codec.py",
         )
     )
     words = set(re.findall(r'(?:refusal|word)="(\w+)"|_no\([^"]*"[^"]*", "(\w+)"\)', source))
-    asked = {word for pair in words for word in pair if word} | set(arming.ORDER)
-    assert len(asked) > len(arming.ORDER) + 3
+    asked = {word for pair in words for word in pair if word} | set(lifecycle.ORDER)
+    assert len(asked) > len(lifecycle.ORDER) + 3
     for word in commands | asked:
         assert f"`{word}`" in PROTOCOL, word
 

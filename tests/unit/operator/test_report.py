@@ -14,31 +14,41 @@ import numpy as np
 import pytest
 
 from snakesim_hal.host_process import HostRecord
-from snakesim_hal.kinematics import quaternion_from_yaw
-from snakesim_hal.messages import ControlState, Fault, Mode, World, WorldContact
-from snakesim_hal.robot import Chain, ContactSensor, Limits, Module, Motor, PoseSensor, RobotFile, Sensors, describe
-from snakesim_hal.route import Route, lay_chain, sine_points
-from snakesim_hal.scenario import RunConfig, Service, Start
-from snakesim_hal.scene import Cylinder, Ground, SceneFile, SineRoute, place, route_of
-from snakesim_operator.record import RunRecord
-from snakesim_operator.report import page as report_page
-from snakesim_operator.report import write_picture
-from snakesim_operator.report.figures import joint_angle, joint_torque
-from snakesim_operator.report.instants import best_instant, pushing_instants
-from snakesim_operator.report.labels import Labels
-from snakesim_operator.report.polygon import force_polygon
-from snakesim_operator.report.svg import element, number, text, ticks
-from snakesim_operator.report.tables import ELSEWHERE
-from snakesim_operator.report.timeline import (
+from snakesim_hal.model.kinematics import quaternion_from_yaw
+from snakesim_hal.model.robot import (
+    Chain,
+    ContactSensor,
+    Limits,
+    Module,
+    Motor,
+    PoseSensor,
+    RobotFile,
+    Sensors,
+    describe,
+)
+from snakesim_hal.model.route import Route, lay_chain, sine_points
+from snakesim_hal.model.scenario import RunConfig, Service, Start
+from snakesim_hal.model.scene import Cylinder, Ground, SceneFile, SineRoute, place, route_of
+from snakesim_hal.wire.messages import ControlState, Fault, Mode, World, WorldContact
+from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.report import page as report_page
+from snakesim_operator.results.report import write_picture
+from snakesim_operator.results.report.figures import joint_angle, joint_torque
+from snakesim_operator.results.report.instants import best_instant, pushing_instants
+from snakesim_operator.results.report.labels import Labels
+from snakesim_operator.results.report.polygon import force_polygon
+from snakesim_operator.results.report.svg import element, number, text, ticks
+from snakesim_operator.results.report.tables import ELSEWHERE
+from snakesim_operator.results.report.timeline import (
     commanded_torque_nm,
     propulsion_intervals,
     reference_rad,
     state_bands,
     thinned,
 )
-from snakesim_operator.report.torque_map import coloured, strongest
-from snakesim_operator.report.verdict import Verdict, verdict
-from snakesim_operator.summary import RunSummary, summarise
+from snakesim_operator.results.report.torque_map import coloured, strongest
+from snakesim_operator.results.report.verdict import Verdict, verdict
+from snakesim_operator.results.summary import RunSummary, summarise
 
 SECTIONS = ["instants", "overview", "joints", "loads", "numbers", "again"]
 RATE_HZ, SECONDS, FORCE_N, SPEED_M_S = 100.0, 10.0, 35.0, 0.05

@@ -8,8 +8,8 @@ from threading import Event
 
 import pytest
 
-from snakesim_operator import run_files as under_test
-from snakesim_operator.run_files import RunFiles
+from snakesim_operator.run import run_files as under_test
+from snakesim_operator.run.run_files import RunFiles
 from tests.unit.hal.network import wait_until
 
 

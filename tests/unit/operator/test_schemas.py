@@ -12,16 +12,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec import inspect
 
-from snakesim_hal import keys
-from snakesim_hal.codec import Decoder, encode, encoding_of
 from snakesim_hal.errors import WireError
-from snakesim_hal.files import find, read_table, shipped
-from snakesim_hal.messages import VERSIONS, Message
-from snakesim_hal.robot import RobotFile
-from snakesim_hal.scenario import RunConfig, load
-from snakesim_hal.scene import SceneFile
-from snakesim_operator.schemas import contract, write_schemas
-from snakesim_operator.schemas import schema_of as published_schema
+from snakesim_hal.model.files import find, read_table, shipped
+from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.scenario import RunConfig, load
+from snakesim_hal.model.scene import SceneFile
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import Decoder, encode, encoding_of
+from snakesim_hal.wire.messages import VERSIONS, Message
+from snakesim_operator.tools.schemas import contract, write_schemas
+from snakesim_operator.tools.schemas import schema_of as published_schema
 from tests.unit.hal.strategies import messages_of, places, plain_example, poisons, replaced
 
 REPOSITORY = Path(__file__).parents[3]

@@ -5,9 +5,9 @@ from typing import Any
 import msgspec
 
 from snakesim_hal.backend import Samples, SetPoints
-from snakesim_hal.files import find, read_table
-from snakesim_hal.messages import Mode
-from snakesim_hal.scenario import RunConfig, check
+from snakesim_hal.model.files import find, read_table
+from snakesim_hal.model.scenario import RunConfig, check
+from snakesim_hal.wire.messages import Mode
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.settings import Settings
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.messages import Mode
+from snakesim_hal.wire.messages import Mode
 from tests.unit.sim_backend.rig import Run, make_config
 
 RESPONSE_S = 0.01

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from snakesim_hal.messages import Mode
+from snakesim_hal.wire.messages import Mode
 from tests.unit.sim_backend.rig import G, Run, make_config
 
 ICE = {"ground": {"friction": 0.0}}

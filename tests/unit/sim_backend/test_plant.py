@@ -8,10 +8,10 @@ import pytest
 from numpy.typing import ArrayLike
 
 from snakesim_hal.errors import BackendError
-from snakesim_hal.kinematics import rotation_from_quaternion
-from snakesim_hal.messages import Mode
-from snakesim_hal.plant import LinkLoad, Plant
-from snakesim_hal.scenario import load, start_of
+from snakesim_hal.model.kinematics import rotation_from_quaternion
+from snakesim_hal.model.plant import LinkLoad, Plant
+from snakesim_hal.model.scenario import load, start_of
+from snakesim_hal.wire.messages import Mode
 from snakesim_sim_backend.plant import MujocoPlant
 from snakesim_sim_backend.settings import PlantSettings, Tether
 from snakesim_sim_backend.tether import WINCH_N_S_PER_M

@@ -4,10 +4,10 @@ from math import inf
 
 import pytest
 
-from snakesim_hal import keys
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.injection import Injection
-from snakesim_hal.messages import Mode, Power, SensorDescription
+from snakesim_hal.model.injection import Injection
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Mode, Power, SensorDescription
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.settings import Settings
 from tests.unit.sim_backend.rig import Run, make_config

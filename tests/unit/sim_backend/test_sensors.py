@@ -5,11 +5,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from snakesim_hal import keys
-from snakesim_hal.codec import Decoder, encode, encoding_of
-from snakesim_hal.kinematics import link_frames, rotation_from_quaternion
-from snakesim_hal.messages import Contacts, Imu, Mode, Pose
-from snakesim_hal.scenario import load
+from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion
+from snakesim_hal.model.scenario import load
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import Decoder, encode, encoding_of
+from snakesim_hal.wire.messages import Contacts, Imu, Mode, Pose
 from snakesim_sim_backend.pace import Due
 from tests.unit.sim_backend.rig import G, Run, make_config
 

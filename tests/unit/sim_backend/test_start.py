@@ -4,9 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from snakesim_hal.kinematics import link_frames, rotation_from_quaternion
-from snakesim_hal.messages import Mode
-from snakesim_hal.scenario import load, start_of
+from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion
+from snakesim_hal.model.scenario import load, start_of
+from snakesim_hal.wire.messages import Mode
 from snakesim_sim_backend.ground import hills
 from tests.unit.sim_backend.rig import Run, make_config
 

@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from typing import Any
 
-from snakesim_can_backend.codec import codec
-from snakesim_can_backend.protocol import (
+from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.definitions import (
     COMMAND_KEY,
     Action,
     Frame,
@@ -22,9 +22,9 @@ from snakesim_can_backend.twin.firmware import Module
 from snakesim_can_backend.twin.inertia import InertiaPlant, InertiaSettings
 from snakesim_can_backend.twin.parameters import Parameters, from_factory
 from snakesim_can_backend.twin.reports import Sight
-from snakesim_hal.messages import Mode
-from snakesim_hal.scenario import RunConfig
-from snakesim_hal.thermal import HeatLimits
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.model.thermal import HeatLimits
+from snakesim_hal.wire.messages import Mode
 from tests.unit.hal.rig import run_config
 
 NODE = 3

@@ -2,9 +2,9 @@
 
 import pytest
 
-from snakesim_can_backend.bus_load import Reports, load, worst_bits
-from snakesim_can_backend.codec import codec
-from snakesim_can_backend.protocol import Frame, Opcode, frame_id, opcode_of
+from snakesim_can_backend.bus.load import Reports, load, worst_bits
+from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.definitions import Frame, Opcode, frame_id, opcode_of
 from snakesim_can_backend.twin.bus_time import MOST_AHEAD_US, BusTime, by_opcode
 from tests.unit.can_backend.twin.rig import run_at, set_point, sync
 

@@ -6,12 +6,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from snakesim_can_backend.mocap import MocapSample
-from snakesim_can_backend.protocol import Action, ModuleState, Opcode, Parameter
+from snakesim_can_backend.protocol.definitions import Action, ModuleState, Opcode, Parameter
+from snakesim_can_backend.protocol.mocap_sample import MocapSample
 from snakesim_can_backend.twin.chain import MOST_AT_ONCE_US
 from snakesim_can_backend.twin.reports import ALONG, ANGLE, FORCE
-from snakesim_hal.messages import Imu, Mode, Pose
-from snakesim_hal.plant import LinkLoad
+from snakesim_hal.model.plant import LinkLoad
+from snakesim_hal.wire.messages import Imu, Mode, Pose
 from tests.unit.can_backend.twin.rig import Host, chain, command, config, only, set_point, sync
 
 G = 9.81

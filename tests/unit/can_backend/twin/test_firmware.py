@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from snakesim_can_backend.protocol import Action, LastStop, ModuleFault, ModuleState, Opcode, Parameter
+from snakesim_can_backend.protocol.definitions import Action, LastStop, ModuleFault, ModuleState, Opcode, Parameter
 from snakesim_can_backend.twin.firmware import Module
-from snakesim_hal.messages import Mode
+from snakesim_hal.wire.messages import Mode
 from tests.unit.can_backend.twin.rig import (
     BOOTED,
     MS,

@@ -6,8 +6,8 @@ import pytest
 from snakesim_can_backend.twin.inertia import InertiaPlant, InertiaSettings
 from snakesim_can_backend.twin.motors import Motors
 from snakesim_hal.backend import SetPoints
-from snakesim_hal.messages import Mode
-from snakesim_hal.scenario import load
+from snakesim_hal.model.scenario import load
+from snakesim_hal.wire.messages import Mode
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.plant import MujocoPlant
 from snakesim_sim_backend.settings import PlantSettings, Settings

@@ -4,7 +4,7 @@ import struct
 
 import pytest
 
-from snakesim_can_backend.protocol import PARAMETERS, Frame, Opcode, Operation, Parameter, Result
+from snakesim_can_backend.protocol.definitions import PARAMETERS, Frame, Opcode, Operation, Parameter, Result
 from tests.unit.can_backend.twin.rig import BOOTED, armed, booted, only, parameter
 
 

@@ -7,12 +7,12 @@ from contextlib import contextmanager
 
 import pytest
 
-from snakesim_can_backend.protocol import Action, Frame, ModuleState, Opcode
+from snakesim_can_backend.bus.bus import VirtualWire, wait
+from snakesim_can_backend.protocol.definitions import Action, Frame, ModuleState, Opcode
 from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_can_backend.twin.server import Here, PoseSender, TwinServer
-from snakesim_can_backend.wire import VirtualWire, wait
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.messages import Mode
+from snakesim_hal.wire.messages import Mode
 from tests.unit.can_backend.twin.rig import chain, command, only, set_point, sync
 
 Wall = tuple[VirtualWire, TwinServer, Callable[[float], list[Frame]]]

@@ -1,0 +1,327 @@
+"""One CAN bus, seen from one end: frames in, frames out, and what is wrong with it.
+
+`SocketCanWire` is a kernel interface (can0, vcan0). python-can opens and filters it; frames go through its socket
+directly, which costs a third of a `can.Message` each. `VirtualWire` is python-can's virtual bus between two ends in one
+process, for machines whose kernel has no CAN. It does *not* simulate arbitration and bit rate; errors, a full queue and
+an interface that goes down only on request: see `wire_faults`.
+"""
+
+import contextlib
+import errno
+import math
+import select
+import socket
+import struct
+import time
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Protocol
+
+import can
+from can.interfaces.socketcan.socketcan import SocketcanBus
+from can.interfaces.virtual import VirtualBus
+
+from snakesim_can_backend.bus.bus_errors import Trouble, troubles_of
+from snakesim_can_backend.bus.bus_faults import VirtualFaults, inject_into_interface
+from snakesim_can_backend.protocol.definitions import NODE_BITS, Frame, Opcode
+from snakesim_hal.errors import BackendError, ConfigError
+from snakesim_hal.model.injection import Injection
+
+EXTENDED, REMOTE, ERROR = 0x80000000, 0x40000000, 0x20000000
+RECEIVE_BUFFER_BYTES = 1 << 20
+MOST_AT_ONCE = 4096  # a bus that babbles must not keep its reader for ever
+SO_MEMINFO, MEMINFO_DROPS, MEMINFO_BYTES = 55, 8, 36  # linux/sock_diag.h
+IO_ERRORS = (OSError, ValueError, can.CanError)  # of sockets, of `select` and of python-can
+_wire_format = struct.Struct("<IB3x8s")
+
+
+class Wire(Protocol):
+    """One end of a bus. Whatever is wrong with it is a trouble or a BackendError, never another exception."""
+
+    channel: str
+
+    def send(self, frame: Frame) -> bool:
+        """Hand over a frame. False when it was not taken; `troubles` says why, and nothing is queued for later."""
+        ...
+
+    def receive(self) -> list[Frame]:
+        """Every frame that is there now, in its order; never waits."""
+        ...
+
+    def troubles(self) -> list[Trouble]:
+        """What was found since the last call."""
+        ...
+
+    def fileno(self) -> int | None:
+        """What to wait on; None for a bus inside this process."""
+        ...
+
+    def idle(self) -> float | None:
+        """Let the other end run, if it lives in this process.
+
+        Seconds until a frame may be there, 0 for one that is; None: not before this end sends something.
+        """
+        ...
+
+    def inject(self, kind: str, *, begins: bool) -> None:
+        """Begin or end a fault of a bus on request: see `snakesim_hal.model.injection`. Raises ConfigError."""
+        ...
+
+    def close(self) -> None:
+        """Let go of the bus."""
+        ...
+
+
+class SocketCanWire:
+    """A SocketCAN interface."""
+
+    def __init__(self, channel: str, only: Iterable[Opcode] | None = None) -> None:
+        """only: messages to receive, filtered in the kernel; None: all with 11-bit ids.
+
+        Raises ConfigError for an interface that is not there, BackendError for one that cannot be opened.
+        """
+        check_interface(channel)
+        self.channel = channel
+        self._only = None if only is None else list(only)
+        try:
+            self._bus = SocketcanBus(channel=channel, ignore_rx_error_frames=False)
+            self._socket = self._bus.socket
+            self._set_filters()
+            self._socket.setblocking(False)
+        except IO_ERRORS as error:
+            raise BackendError(f"{channel}: cannot be opened: {error}") from error
+        with contextlib.suppress(OSError):
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+        self._buffer = bytearray(_wire_format.size)
+        self._found: list[Trouble] = []
+        self._down = self._gone = False
+        self._dropped = 0
+
+    def send(self, frame: Frame) -> bool:
+        """Hand over a frame; False when the queue is full or the interface is down."""
+        try:
+            self._socket.send(_wire_format.pack(frame.id, len(frame.data), frame.data))
+        except OSError as error:
+            self._note_failure(error)
+            return False
+        if self._down:
+            self._note_up()
+        return True
+
+    def receive(self) -> list[Frame]:
+        """Every frame that is there now."""
+        frames: list[Frame] = []
+        try:
+            drain(self._socket, self._buffer, frames, self._note_error)
+        except OSError as error:
+            self._note_failure(error)
+        return frames
+
+    def troubles(self) -> list[Trouble]:
+        """What was found since the last call."""
+        dropped = self._count_drops()
+        if dropped > self._dropped:
+            detail = f"the kernel dropped {dropped - self._dropped} frames: this process reads too slowly"
+            self._found.append(Trouble("receive_overflow", self.channel, detail))
+            self._dropped = dropped
+        if self._down and is_up(self.channel):
+            self._note_up()
+        found, self._found = self._found, []
+        return found
+
+    def fileno(self) -> int | None:
+        """The socket."""
+        return self._socket.fileno()
+
+    def idle(self) -> float | None:
+        """The other end runs by itself."""
+        return math.inf
+
+    def inject(self, kind: str, *, begins: bool) -> None:
+        """Begin or end a fault: the interface goes down, or an error frame says that something is wrong."""
+        inject_into_interface(self.channel, kind, begins=begins)
+
+    def close(self) -> None:
+        """Close the socket."""
+        try:
+            self._bus.shutdown()
+        except IO_ERRORS as error:
+            raise BackendError(f"{self.channel}: cannot be closed: {error}") from error
+
+    def _set_filters(self) -> None:
+        all_nodes = 0x7FF & ~((1 << NODE_BITS) - 1)
+        wanted = [(0, 0)] if self._only is None else [(opcode << NODE_BITS, all_nodes) for opcode in self._only]
+        data = b"".join(struct.pack("=II", id_, mask | EXTENDED | REMOTE) for id_, mask in wanted)
+        self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, data)
+
+    def _note_error(self, identifier: int, data: bytes) -> None:
+        self._found.extend(troubles_of(identifier, data, self.channel))
+
+    def _note_failure(self, error: OSError) -> None:
+        if error.errno in (errno.ENOBUFS, errno.EAGAIN):  # the interface's queue, or this socket's share of it
+            self._found.append(Trouble("queue_full", self.channel, "the transmit queue is full"))
+        elif error.errno in (errno.ENETDOWN, errno.ENODEV, errno.ENXIO):
+            self._gone |= error.errno != errno.ENETDOWN
+            if not self._down:
+                what = "gone" if self._gone else "down"
+                self._found.append(Trouble("interface_down", self.channel, f"the interface is {what}"))
+            self._down = True
+        else:
+            raise BackendError(f"{self.channel}: {error.strerror}") from error
+
+    def _note_up(self) -> None:
+        if self._gone:  # an adapter that was plugged in again is another interface of the same name
+            try:
+                self._socket.bind((self.channel,))
+                self._set_filters()  # the kernel forgot them with the interface
+            except OSError:
+                return
+        self._down = self._gone = False
+        self._found.append(Trouble("interface_up", self.channel, "the interface is up again"))
+
+    def _count_drops(self) -> int:
+        try:
+            raw = self._socket.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, MEMINFO_BYTES)
+        except OSError:
+            return 0
+        return struct.unpack("=9I", raw)[MEMINFO_DROPS] if len(raw) == MEMINFO_BYTES else 0
+
+
+class OtherEnd(Protocol):
+    """What is at the other end of a virtual bus, in the same process."""
+
+    def __call__(self) -> float | None:
+        """Run for a moment; seconds until it wants to run again, None: not before it hears something."""
+        ...
+
+    def inject(self, injection: Injection, *, begins: bool) -> None:
+        """Let something go wrong with a module there, or end."""
+        ...
+
+    def close(self) -> None:
+        """Leave the bus."""
+        ...
+
+
+class VirtualWire:
+    """One end of python-can's virtual bus."""
+
+    def __init__(self, channel: str, other_end: OtherEnd | None = None) -> None:
+        """other_end: lets the other end run whenever this one has nothing to do; returns when it wants to run again."""
+        self.channel = channel
+        self.other_end = other_end
+        self._bus = VirtualBus(channel=channel)
+        self._faults = VirtualFaults(channel)
+
+    def send(self, frame: Frame) -> bool:
+        """Hand over a frame; a virtual bus takes everything, unless a fault is on."""
+        if self._faults.on and (taken := self._faults.stops_sending()) is not None:
+            return taken
+        try:
+            self._bus.send(can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False))
+        except IO_ERRORS as error:
+            raise BackendError(f"{self.channel}: cannot send: {error}") from error
+        return True
+
+    def receive(self) -> list[Frame]:
+        """Every frame that is there now."""
+        frames: list[Frame] = []
+        try:
+            while (message := self._bus.recv(0)) is not None:
+                frames.append(Frame(message.arbitration_id, bytes(message.data)))
+        except IO_ERRORS as error:
+            raise BackendError(f"{self.channel}: cannot receive: {error}") from error
+        return self._faults.leaves(frames) if self._faults.on else frames
+
+    def troubles(self) -> list[Trouble]:
+        """A virtual bus has only those that were asked for."""
+        return self._faults.take_troubles()
+
+    def fileno(self) -> int | None:
+        """There is nothing to wait on."""
+        return None
+
+    def idle(self) -> float | None:
+        """Let the other end run."""
+        pause_s = math.inf if self.other_end is None else self.other_end()
+        return pause_s if self._bus.queue.empty() else 0.0
+
+    def inject(self, kind: str, *, begins: bool) -> None:
+        """Begin or end a fault, as this end would see it on a kernel interface; the other end hears nothing of it."""
+        self._faults.inject(kind, begins=begins)
+
+    def close(self) -> None:
+        """Leave the bus; the other end, if it lives on this one, leaves too."""
+        if self.other_end is not None:
+            self.other_end.close()
+        try:
+            self._bus.shutdown()
+        except IO_ERRORS as error:
+            raise BackendError(f"{self.channel}: cannot be closed: {error}") from error
+
+
+def drain(
+    source: socket.socket, buffer: bytearray, frames: list[Frame], on_error: Callable[[int, bytes], None]
+) -> None:
+    """Append everything that a non-blocking raw CAN socket has; error frames of the kernel go to `on_error`."""
+    receive_into, unpack, append = source.recv_into, _wire_format.unpack, frames.append
+    new = tuple.__new__  # what Frame(...) does, without its argument handling
+    with contextlib.suppress(BlockingIOError):
+        for _ in range(MOST_AT_ONCE):
+            receive_into(buffer)
+            identifier, length, data = unpack(buffer)
+            if identifier & ERROR:
+                on_error(identifier, data)
+            else:
+                append(new(Frame, (identifier, data[:length])))
+
+
+def wait(wires: Sequence[Wire], timeout_s: float) -> bool:
+    """Until a frame may be there on any of them, or the time is over. Other ends in this process run meanwhile.
+
+    False when nothing can come any more before this end sends something. Raises BackendError.
+    """
+    pauses = [pause for wire in wires if (pause := wire.idle()) is not None]
+    if not pauses:
+        return False
+    files = [number for wire in wires if (number := wire.fileno()) is not None]
+    timeout_s = max(min([timeout_s, *pauses]), 0.0)
+    if files:
+        try:
+            select.select(files, [], [], timeout_s)
+        except IO_ERRORS as error:
+            channels = ", ".join(wire.channel for wire in wires)
+            raise BackendError(f"{channels}: cannot be waited for: {error}") from error
+    elif timeout_s > 0:
+        time.sleep(timeout_s)
+    return True
+
+
+def check_interface(channel: str) -> None:
+    """Raise ConfigError unless a SocketCAN interface is there and up; the message says how to bring it up."""
+    if not hasattr(socket, "AF_CAN") or not _kernel_has_can():
+        raise ConfigError(
+            f"channel {channel!r}: this kernel has no CAN. Leave `backends.can.channels` empty for a virtual bus, or "
+            f"run in a VM that has CAN: see docs/hil.md"
+        )
+    bring_up = "deploy/can/up.sh"
+    if not Path("/sys/class/net", channel).exists():
+        raise ConfigError(f"channel {channel!r}: there is no such interface; `{bring_up} {channel}` makes it")
+    if not is_up(channel):
+        raise ConfigError(f"channel {channel!r}: the interface is down; `{bring_up} {channel}` brings it up")
+
+
+def is_up(channel: str) -> bool:
+    """Whether an interface is there and administratively up."""
+    try:
+        return bool(int(Path("/sys/class/net", channel, "flags").read_text(encoding="ascii"), 16) & 1)
+    except (OSError, ValueError):  # the latter: the file of an interface that is going away is empty
+        return False
+
+
+def _kernel_has_can() -> bool:
+    try:
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+    except OSError:
+        return False
+    return True

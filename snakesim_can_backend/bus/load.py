@@ -1,0 +1,208 @@
+"""What a configuration asks of its buses, in bits, and the refusal of what does not fit.
+
+A classic frame with an 11-bit id and n bytes takes 47 + 8 n bits: start, id, control, data, CRC, acknowledge, end and
+the gap to the next. After five equal bits the sender stuffs one in between; at worst that adds one for every four of
+the 34 + 8 n bits that can be stuffed. All loads here are worst cases, so that what fits always fits.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import ceil
+
+from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.definitions import HEALTH_PERIOD_S, HEARTBEAT_PERIOD_S, LAST_NODE, Opcode
+from snakesim_can_backend.settings import Settings
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.scenario import RunConfig
+
+BIT_RATE = 1_000_000
+MOST_LOAD = 0.8
+MOST_EVERY = 255  # Syncs; the parameters hold no more
+LEAST_RATE_HZ = 20
+FRAME_BITS = 47
+STUFFED_FROM = 34
+
+
+def worst_bits(length: int) -> int:
+    """Bits of a frame with `length` bytes, as many stuffed in as there can be."""
+    return FRAME_BITS + 8 * length + (STUFFED_FROM + 8 * length - 1) // 4
+
+
+@dataclass(frozen=True)
+class Reports:
+    """How often what is sent."""
+
+    rate_hz: float
+    contact_every: int = 1  # Syncs; 0: never
+    imu_every: int = 20
+    tail: bool = True  # somebody on the bus sends TailContact
+
+
+@dataclass(frozen=True)
+class Stream:
+    """One kind of frame on one bus."""
+
+    opcode: Opcode
+    frames_per_s: float
+
+    @property
+    def bits_per_s(self) -> float:
+        """Worst case."""
+        return self.frames_per_s * worst_bits(codec()[self.opcode].length)
+
+
+def streams(joints: int, reports: Reports) -> list[Stream]:
+    """Everything that goes over a bus with so many joints while the robot runs."""
+    rate = reports.rate_hz
+    contacts = rate / reports.contact_every if reports.contact_every else 0.0
+    imus = rate / reports.imu_every if reports.imu_every else 0.0
+    return [
+        Stream(Opcode.SYNC, rate),
+        Stream(Opcode.SET_POINT, joints * rate),
+        Stream(Opcode.JOINT_STATE, joints * rate),
+        Stream(Opcode.CONTACT, joints * contacts),
+        Stream(Opcode.TAIL_CONTACT, contacts if reports.tail else 0.0),
+        Stream(Opcode.GYRO, joints * imus),
+        Stream(Opcode.ACCELEROMETER, joints * imus),
+        Stream(Opcode.SHAFT_LOAD, joints * imus),
+        Stream(Opcode.HEARTBEAT, joints / HEARTBEAT_PERIOD_S),
+        Stream(Opcode.HEALTH, joints / HEALTH_PERIOD_S),
+    ]
+
+
+def load(joints: int, reports: Reports) -> float:
+    """Share of a bus's time that is taken, at worst."""
+    return sum(stream.bits_per_s for stream in streams(joints, reports)) / BIT_RATE
+
+
+def busiest_s(joints: int, reports: Reports) -> float:
+    """Bus time of one period in which forces are reported: Sync, all answers, all set-points, at worst."""
+    once = streams(joints, Reports(1.0, min(reports.contact_every, 1), 0, reports.tail))
+    each_period = (Opcode.SYNC, Opcode.SET_POINT, Opcode.JOINT_STATE, Opcode.CONTACT, Opcode.TAIL_CONTACT)
+    return sum(stream.bits_per_s for stream in once if stream.opcode in each_period) / BIT_RATE
+
+
+def fits(joints: int, reports: Reports) -> bool:
+    """Whether a bus can carry so many joints, on average and in the longest period."""
+    return load(joints, reports) <= MOST_LOAD and busiest_s(joints, reports) * reports.rate_hz <= 1
+
+
+def every(rate_hz: float, wanted_hz: float) -> int:
+    """How many Syncs apart reports of about a wanted rate are; 0 for never."""
+    return 0 if wanted_hz <= 0 else round(min(max(rate_hz / wanted_hz, 1.0), MOST_EVERY))
+
+
+def reports_of(config: RunConfig, settings: Settings) -> Reports:
+    """What the modules of a run report, and how often."""
+    return reports_at(config.rate_hz, config, settings)
+
+
+def reports_at(rate_hz: float, config: RunConfig, settings: Settings) -> Reports:
+    """The same for another rate of control: what is asked for in Hz then comes every so many other Syncs."""
+    sensors = config.robot.sensors
+    contact_hz = 0.0
+    if sensors.contacts is not None:
+        contact_hz = sensors.contacts.rate_hz if settings.contact_rate_hz is None else settings.contact_rate_hz
+    imu_hz = min(settings.imu_rate_hz, sensors.imu.rate_hz) if sensors.imu is not None else 0.0
+    return Reports(rate_hz, every(rate_hz, contact_hz), every(rate_hz, imu_hz))
+
+
+def shares(config: RunConfig, settings: Settings) -> list[int]:
+    """How many joints each bus has, tail to head. Raises ConfigError."""
+    joints, buses = config.robot.chain.modules, max(len(settings.channels), 1)
+    if len(set(settings.channels)) < len(settings.channels):
+        raise ConfigError(f"`backends.can.channels` = {settings.channels} names a channel twice")
+    if joints > LAST_NODE:
+        raise ConfigError(
+            f"robot {config.robot.name!r} has {joints} joints; node ids of protocol version 1 go to {LAST_NODE}"
+        )
+    given = settings.joints_per_channel
+    if given and (len(given) != buses or sum(given) != joints):
+        raise ConfigError(
+            f"`backends.can.joints_per_channel` = {given} must be {buses} numbers that add up to the {joints} joints "
+            f"of robot {config.robot.name!r}"
+        )
+    if buses > joints:
+        raise ConfigError(f"`backends.can.channels` names {buses} channels for {joints} joints")
+    return list(given) or [joints // buses + (i < joints % buses) for i in range(buses)]
+
+
+def check_load(config: RunConfig, settings: Settings) -> list[float]:
+    """The load of every bus. Raises ConfigError, with the arithmetic and what would fit, when one is too high.
+
+    Too high is more than `MOST_LOAD` of the time, or a single period that is longer than it may be.
+    """
+    reports = reports_of(config, settings)
+    joints = shares(config, settings)
+    loads = [load(count, on_bus(i, reports)) for i, count in enumerate(joints)]
+    worst = max(range(len(loads)), key=lambda i: loads[i])
+    if loads[worst] > MOST_LOAD:
+        raise ConfigError(
+            f"{joints[worst]} joints at {config.rate_hz:g} Hz do not fit on {_name(settings, worst)}:",
+            *arithmetic(joints[worst], on_bus(worst, reports)),
+            what_fits(joints, config, settings),
+        )
+    longest = max(range(len(joints)), key=lambda i: busiest_s(joints[i], on_bus(i, reports)))
+    needed_s = busiest_s(joints[longest], on_bus(longest, reports))
+    if needed_s * config.rate_hz > 1:
+        raise ConfigError(
+            f"{joints[longest]} joints at {config.rate_hz:g} Hz do not fit on {_name(settings, longest)}: a period "
+            f"with force reports takes {needed_s * 1000:.2f} ms of bus time and lasts {1000 / config.rate_hz:.2f} ms.",
+            what_fits(joints, config, settings),
+        )
+    return loads
+
+
+def _name(settings: Settings, bus: int) -> str:
+    return settings.channels[bus] if settings.channels else "the virtual bus"
+
+
+def arithmetic(joints: int, reports: Reports) -> list[str]:
+    """The sum, line by line."""
+    lines: list[str] = []
+    for stream in streams(joints, reports):
+        if stream.frames_per_s:
+            layout = codec()[stream.opcode]
+            bits = worst_bits(layout.length)
+            lines.append(
+                f"  {layout.name:<14}{stream.frames_per_s:7.0f} frames/s x {bits:3d} bits ({layout.length} bytes)"
+                f" = {100 * stream.bits_per_s / BIT_RATE:5.1f} %"
+            )
+    total = 100 * load(joints, reports)
+    return [*lines, f"  together {total:.1f} % of 1 Mbit/s at worst-case stuffing; at most {MOST_LOAD:.0%}"]
+
+
+def what_fits(joints: Sequence[int], config: RunConfig, settings: Settings) -> str:
+    """Ways out: a lower rate, more buses, fewer reports."""
+    fullest, total = max(joints), sum(joints)
+    reports = reports_of(config, settings)
+    ways = []
+    rate = most_rate_hz(fullest, config, settings)
+    if rate is not None:
+        ways.append(f"rate_hz = {rate} on {len(joints)} bus{'es' if len(joints) > 1 else ''}")
+    for buses in range(len(joints) + 1, min(total, 8) + 1):
+        if fits(ceil(total / buses), reports):
+            ways.append(f"{buses} channels with up to {ceil(total / buses)} joints each")
+            break
+    for times in (2, 4):
+        contact_every = times * reports.contact_every
+        if 0 < contact_every <= MOST_EVERY and fits(fullest, replace(reports, contact_every=contact_every)):
+            ways.append(f"backends.can.contact_rate_hz = {config.rate_hz / contact_every:g}")
+            break
+    return "What would fit: " + ("; or ".join(ways) or "nothing on classic CAN") + "."
+
+
+def most_rate_hz(joints: int, config: RunConfig, settings: Settings) -> int | None:
+    """The highest whole rate below the run's at which so many joints fit on a bus; None when none does.
+
+    Not found by halving: at some lower rate reports may come at every Sync instead of every second one.
+    """
+    for rate_hz in range(ceil(config.rate_hz) - 1, LEAST_RATE_HZ - 1, -1):
+        if fits(joints, reports_at(rate_hz, config, settings)):
+            return rate_hz
+    return None
+
+
+def on_bus(index: int, reports: Reports) -> Reports:
+    """Only the bus with the tail carries TailContact."""
+    return replace(reports, tail=reports.tail and index == 0)

@@ -1,0 +1,78 @@
+"""Everything that goes over the wires, in candump's format: `(1700000000.000000) can0 105#00112233`."""
+
+import contextlib
+import logging
+import time
+from pathlib import Path
+from typing import TextIO
+
+from snakesim_can_backend.bus.bus import Wire
+from snakesim_can_backend.bus.bus_errors import Trouble
+from snakesim_can_backend.protocol.definitions import Frame
+from snakesim_hal.errors import ConfigError
+
+FLUSH_BYTES = 1 << 16
+
+_log = logging.getLogger("snakesim.can")
+
+
+def open_log(path: Path) -> TextIO:
+    """Begin a log. Raises ConfigError."""
+    try:
+        return path.open("w", encoding="utf-8", errors="backslashreplace", buffering=FLUSH_BYTES)
+    except OSError as error:
+        raise ConfigError(f"`backends.can.log` = {str(path)!r}: {error.strerror}; choose another file") from error
+
+
+class LoggedWire:
+    """A wire that keeps a log. Several may share one file."""
+
+    def __init__(self, wire: Wire, log: TextIO) -> None:
+        self._wire, self._log = wire, log
+        self.channel = wire.channel
+        self._full = False
+
+    def send(self, frame: Frame) -> bool:
+        """Send, and log what was taken."""
+        taken = self._wire.send(frame)
+        if taken:
+            self._write(frame)
+        return taken
+
+    def receive(self) -> list[Frame]:
+        """Receive, and log it."""
+        frames = self._wire.receive()
+        for frame in frames:
+            self._write(frame)
+        return frames
+
+    def troubles(self) -> list[Trouble]:
+        """As the wire says."""
+        return self._wire.troubles()
+
+    def fileno(self) -> int | None:
+        """As the wire says."""
+        return self._wire.fileno()
+
+    def idle(self) -> float | None:
+        """As the wire does."""
+        return self._wire.idle()
+
+    def inject(self, kind: str, *, begins: bool) -> None:
+        """As the wire does; what does not go over it is not logged."""
+        self._wire.inject(kind, begins=begins)
+
+    def close(self) -> None:
+        """Close the wire; the log is complete."""
+        with contextlib.suppress(OSError):
+            self._log.flush()
+        self._wire.close()
+
+    def _write(self, frame: Frame) -> None:
+        if self._full:
+            return
+        try:
+            self._log.write(f"({time.time():.6f}) {self.channel} {frame.id:03X}#{frame.data.hex().upper()}\n")
+        except OSError as error:  # a full disk ends the log, and nothing else
+            self._full = True
+            _log.warning("the bus log ends here: %s", error.strerror)

@@ -1,0 +1,184 @@
+"""Finds every module, checks it, and gives it its parameters. Enables nothing: when it is done all motors are off.
+
+Everything that is wrong is told at once, so that a person with a screwdriver walks to the robot once.
+"""
+
+import time
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from snakesim_can_backend.bus.bus import Wire, wait
+from snakesim_can_backend.protocol import commands
+from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.definitions import (
+    PARAMETERS,
+    VERSION,
+    Action,
+    Frame,
+    Opcode,
+    Operation,
+    Parameter,
+    Result,
+    node_of,
+    opcode_of,
+)
+from snakesim_hal.errors import BackendError
+
+ASK_EVERY_S = 0.1
+PAUSE_S = 0.001
+LISTEN_ON_S = 0.06  # after the last module is found: a second one with its id may answer later
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Who a module says it is."""
+
+    node: int
+    channel: str
+    serial: int
+    firmware: str
+    protocol: int
+    emulated: bool
+    stepped: bool
+
+
+@dataclass(frozen=True)
+class Bus:
+    """One wire, and the nodes that belong on it."""
+
+    wire: Wire
+    nodes: range
+
+
+def find(buses: Sequence[Bus], limit_s: float, on_frame: Callable[[Frame], None] | None = None) -> list[Identity]:
+    """Ask who is there until everybody expected has answered, or the time is over. Two modules may share an id."""
+    read = codec()[Opcode.IDENTITY].values
+    found: dict[tuple[str, int, int], Identity] = {}
+    wanted = {(bus.wire.channel, node) for bus in buses for node in bus.nodes}
+    wires = [bus.wire for bus in buses]
+    end = time.monotonic() + limit_s
+    ask_at = 0.0
+    complete = False
+    while (now := time.monotonic()) < end:
+        if now >= ask_at:
+            for wire in wires:
+                wire.send(commands.command(Action.IDENTIFY))
+            ask_at = now + ASK_EVERY_S
+        if not wait(wires, min(0.01, end - now)):
+            time.sleep(PAUSE_S)
+        for wire in wires:
+            for frame in wire.receive():
+                if opcode_of(frame.id) == Opcode.IDENTITY and len(frame.data) == codec()[Opcode.IDENTITY].length:
+                    identity = _identity(wire.channel, node_of(frame.id), read(frame.data))
+                    found[identity.channel, identity.node, identity.serial] = identity
+                elif on_frame is not None:
+                    on_frame(frame)
+        if not complete and wanted <= {(i.channel, i.node) for i in found.values()}:
+            complete, end = True, min(end, time.monotonic() + LISTEN_ON_S)
+    return sorted(found.values(), key=lambda i: (i.node, i.channel, i.serial))
+
+
+def objections(buses: Sequence[Bus], found: Sequence[Identity], joints: Sequence[str], *, lockstep: bool) -> list[str]:
+    """What is wrong with who is there; empty when the robot is whole."""
+    wrong: list[str] = []
+    home = {node: bus.wire.channel for bus in buses for node in bus.nodes}
+    by_node: dict[int, list[Identity]] = defaultdict(list)
+    for identity in found:
+        by_node[identity.node].append(identity)
+    for node, channel in home.items():
+        who = f"{joints[node - 1]} (node {node} on {channel})"
+        here = [i for i in by_node[node] if i.channel == channel]
+        if not here:
+            elsewhere = f"; a node {node} answers on {by_node[node][0].channel}" if by_node[node] else ""
+            wrong.append(f"{who} does not answer{elsewhere}")
+        if len(here) > 1:
+            serials = " and ".join(f"{i.serial:08X}" for i in here)
+            wrong.append(f"{who} is there {len(here)} times, serials {serials}: give each module its own node id")
+        strays = [i for i in by_node[node] if here and i.channel != channel]
+        wrong += [
+            f"{who} has a namesake on {i.channel}, serial {i.serial:08X}: give it another node id" for i in strays
+        ]
+        for identity in here:
+            if identity.protocol != VERSION:
+                wrong.append(f"{who} speaks protocol version {identity.protocol}, this driver {VERSION}: update one")
+            if lockstep and not identity.stepped:
+                wrong.append(f"{who} cannot wait for lockstep: use --pace realtime")
+            if identity.stepped and not lockstep:
+                wrong.append(f"{who} is a twin whose time stands still between Syncs: start it without --stepped")
+    wrong += [
+        f"node {i.node} with serial {i.serial:08X} on {i.channel} is none of this robot's joints"
+        for i in found
+        if i.node not in home
+    ]
+    return wrong
+
+
+def configure(
+    buses: Sequence[Bus],
+    wanted: Mapping[int, Mapping[Parameter, float]],
+    limit_s: float,
+    on_frame: Callable[[Frame], None] | None = None,
+) -> dict[int, dict[Parameter, float]]:
+    """Write each node's parameters, read the others, and return what is in force. Raises BackendError."""
+    wire_of = {node: bus.wire for bus in buses for node in bus.nodes}
+    due = {node: list(Parameter) for node in wanted}
+    in_force: dict[int, dict[Parameter, float]] = {node: {} for node in wanted}
+    asked_at: dict[int, float] = {}
+    wires = [bus.wire for bus in buses]
+    end = time.monotonic() + limit_s
+    request, answers = codec()[Opcode.PARAMETER_REQUEST], codec()[Opcode.PARAMETER_ANSWER]
+    read, answer_length = answers.values, answers.length
+    while due:
+        now = time.monotonic()
+        if now > end:
+            raise BackendError(f"no answer about parameters from node {', '.join(map(str, due))} within {limit_s:g} s")
+        for node, left in due.items():
+            if now - asked_at.get(node, -1.0) > ASK_EVERY_S:
+                value = wanted[node].get(left[0])
+                operation = Operation.READ if value is None else Operation.WRITE
+                frame = request.frame(node, index=left[0], operation=operation, value=value or 0.0)
+                if wire_of[node].send(frame):
+                    asked_at[node] = now
+        if not wait(wires, 0.01):
+            time.sleep(PAUSE_S)
+        for wire in wires:
+            for frame in wire.receive():
+                node = node_of(frame.id)
+                known = opcode_of(frame.id) == Opcode.PARAMETER_ANSWER and len(frame.data) == answer_length
+                if not known or not due.get(node):
+                    if on_frame is not None:
+                        on_frame(frame)
+                    continue
+                answer = read(frame.data)
+                if answer["index"] != due[node][0]:
+                    continue
+                parameter = due[node].pop(0)
+                asked_at.pop(node, None)
+                _check(node, parameter, wanted[node].get(parameter), int(answer["result"]))
+                in_force[node][parameter] = answer["value"]
+        due = {node: left for node, left in due.items() if left}
+    return in_force
+
+
+def _check(node: int, parameter: Parameter, asked: float | None, result: int) -> None:
+    if result == Result.DONE:
+        return
+    allowed = PARAMETERS[parameter]
+    why = Result(result).name.lower().replace("_", " ") if result < len(Result) else f"result {result}"
+    raise BackendError(
+        f"node {node} refuses parameter {parameter.name.lower()} = {asked} {allowed.unit}: "
+        f"{why} (allowed: {allowed.low:g} to {allowed.high:g})"
+    )
+
+
+def _identity(channel: str, node: int, values: Mapping[str, float]) -> Identity:
+    return Identity(
+        node=node,
+        channel=channel,
+        serial=int(values["serial"]),
+        firmware=f"{values['firmware_major']:.0f}.{values['firmware_minor']:.0f}",
+        protocol=int(values["protocol"]),
+        emulated=bool(values["emulated"]),
+        stepped=bool(values["stepped"]),
+    )

@@ -1,0 +1,256 @@
+"""Says what is wrong with which module, or with the bus, in words that tell a person where to look.
+
+Pure: looks at a `Reading` and at the troubles of the wires once a tick. Each finding is told once, until somebody
+clears the robot's fault; what persists is then told again.
+"""
+
+from collections.abc import Iterable, Sequence, Set
+from dataclasses import dataclass
+
+from snakesim_can_backend.bus.bus_errors import Trouble
+from snakesim_can_backend.driver.reports import Module, Reading
+from snakesim_can_backend.protocol.definitions import ModuleState, Opcode
+from snakesim_hal.wire.messages import LifecycleState
+
+SILENT_AFTER = 3  # Syncs without an answer
+IN_A_ROW = 3  # bad frames of one kind, or periods that a bus is full, before they are a fault and not a glitch
+CLEAR_GRACE = 5  # Syncs that a module may take to follow a clearing
+ARM_GRACE = 5  # Syncs that a module may take to follow an arming
+STRANGER_FRAMES = 3  # of a node that should not be there, in ticks one after the other
+MOST_FRAMES = 16  # of one module in a tick; a healthy one sends 8 at most
+
+# Of one module, and yet nothing that the others could go on beside: two modules with one id, a bus that is full, water,
+# a supply that all share, an emergency; nor does a robot set out that is not whole.
+NEVER_ARMED = "module_never_armed"
+CONCERNS_ALL = {
+    "duplicate_node", "module_babbling", "module_leak", "module_voltage", "module_emergency", NEVER_ARMED
+}  # fmt: skip
+
+BUS_FAULTS = {
+    "bus_off": "the controller has left the bus after too many errors: look for a short, a wrong bit rate, a missing "
+    "terminator; bring the interface down and up again, then clear and arm",
+    "error_passive": "more than 127 errors: the bus is about to fail; look at cables, terminators and bit rate",
+    "interface_down": "nothing is sent or received; bring it up again, then clear and arm",
+    "restarted": "the controller has restarted after bus-off; clear and arm when the bus is sound",
+    "receive_overflow": "states may be missing",
+}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that is wrong."""
+
+    what: str
+    cause: str
+    joint: int | None = None  # index, tail to head
+    alone: bool = False  # whether it leaves the other joints as they were
+
+    @property
+    def subject(self) -> tuple[str, int | str, bool]:
+        """Two findings with the same are told once."""
+        return self.what, self.cause if self.joint is None else self.joint, self.alone
+
+
+class Watch:
+    """Remembers what has been told."""
+
+    def __init__(self, joints: Sequence[str], channel_of: Sequence[str], period_s: float) -> None:
+        """joints, channel_of: name and bus of every joint, tail to head."""
+        self._names, self._channels = joints, channel_of
+        self._period_s = period_s
+        self._told: set[tuple[str, int | str, bool]] = set()
+        self._restarts = [0] * len(joints)
+        self._unarmed = [0] * len(joints)  # Syncs in a row that found a module not armed, while the robot was
+        self._restart_at: dict[int, int] = {}  # joint -> Sync at which its uptime went back
+        self._quiet_until = -1  # Sync until which modules may take to follow a clearing
+        self._armed_sync: int | None = None
+        self._unsent: dict[str, int] = {}  # ticks in a row in which a bus did not take everything
+        self._unasked: dict[str, int] = {}  # the newest Sync at which it did not
+        self._down: set[str] = set()  # buses whose interface is
+        self._strangers: dict[int, int] = {}  # frames of nodes that should not be there, in ticks in a row
+        self._restarted: set[int] = set()  # joints, until somebody clears
+        self._changed: set[int] = set()  # joints whose parameters may have changed
+        self._was_armed: set[int] = set()  # joints, in this arming
+        self.seen: dict[str, int] = {}  # troubles that are no faults, counted
+
+    def forget(self, sync: int) -> None:
+        """Somebody has cleared the fault: tell again what is still there once the modules have followed."""
+        self._told.clear()
+        self._restarted.clear()
+        self._quiet_until = sync + CLEAR_GRACE
+
+    def look(
+        self,
+        reading: Reading,
+        lifecycle: LifecycleState,
+        troubles: Iterable[Trouble] = (),
+        unsent: Iterable[str] = (),
+        unconfigured: Iterable[int] = (),
+        isolated: Set[int] = frozenset(),
+    ) -> list[Finding]:
+        """What is newly wrong.
+
+        unsent: buses that did not take every frame of this tick; unconfigured: joints that must not be armed so;
+        isolated: joints that are set aside, of which nothing is news that concerns nobody else.
+        """
+        if lifecycle != "armed":
+            self._armed_sync = None
+            self._was_armed.clear()
+        elif self._armed_sync is None:
+            self._armed_sync = reading.sync
+        self._unasked |= dict.fromkeys(unsent := set(unsent), reading.sync)
+        found = [*self._of_bus(troubles, unsent), *self._of_strangers(reading)]
+        for i, module in enumerate(reading.modules):
+            found += self._of_answers(i, module, reading)
+            found += self._of_state(i, module, reading, lifecycle, aside=i in isolated)
+        if lifecycle == "armed":
+            found += [self._bare(i) for i in unconfigured if i not in isolated]
+        found = [finding for finding in found if not (finding.alone and finding.joint in isolated)]
+        fresh = [finding for finding in found if finding.subject not in self._told]
+        self._told.update(finding.subject for finding in fresh)
+        return fresh
+
+    def take_changed(self) -> set[int]:
+        """Joints whose parameters may not be ours any more, since the last call."""
+        changed, self._changed = self._changed, set()
+        return changed
+
+    # --- one module -------------------------------------------------------------------------------------------
+
+    def _finding(self, i: int, module: Module, what: str, cause: str, *also: str) -> Finding:
+        """also: what else would have been reason enough."""
+        who = f"{self._names[i]} (node {module.node} on {self._channels[i]})"
+        return Finding(what, f"{who} {cause}", i, alone=CONCERNS_ALL.isdisjoint((what, *also)))
+
+    def _of_answers(self, i: int, module: Module, reading: Reading) -> list[Finding]:
+        """What is wrong with its frames, or that there are none."""
+        found: list[Finding] = []
+
+        def tell(what: str, cause: str) -> None:
+            found.append(self._finding(i, module, what, cause))
+
+        if self._has_restarted(i, module, reading):
+            self._restarted.add(i)
+            self._changed.add(i)
+        if i in self._restarted:
+            up_s = module.uptime_ms / 1000
+            tell(
+                "module_restarted",
+                f"has restarted, its uptime is {up_s:.2f} s: clear, and it gets its parameters again",
+            )
+        if module.repeats >= IN_A_ROW:
+            tell("module_frozen", f"is frozen: it repeats its answer number {module.last_count} to every Sync")
+        elif module.wrong_counts >= IN_A_ROW:
+            tell("wrong_counter", f"answers Syncs that were not sent: {module.wrong_counts} wrong counters in a row")
+        if module.corrupt >= IN_A_ROW:
+            tell("bad_checksum", f"sends corrupt states: {module.corrupt} wrong checksums in a row")
+        if module.answered_twice(reading.sync) >= IN_A_ROW:
+            tell("duplicate_node", "is there twice: every Sync is answered two times; give each module its own node id")
+        if module.frames > MOST_FRAMES:
+            tell("module_babbling", f"floods the bus: {module.frames} frames within one period")
+        unanswered = reading.sync - module.sync - module.corrupt - max(module.repeats, module.wrong_counts)
+        unanswered = min(unanswered, reading.sync - self._unasked.get(self._channels[i], -1))
+        if unanswered >= SILENT_AFTER and not found:
+            tell(
+                "module_silent",
+                f"is silent: no state for {unanswered * self._period_s * 1000:.0f} ms{_alive(module, reading)}",
+            )
+        return found
+
+    def _of_state(
+        self, i: int, module: Module, reading: Reading, lifecycle: LifecycleState, *, aside: bool
+    ) -> list[Finding]:
+        """What it says that is wrong with it, or that it does not follow."""
+        state = module.state.name.lower()
+        as_told = lifecycle == "estop" and module.state == ModuleState.EMERGENCY
+        if module.needs_clearing and not as_told and reading.sync >= self._quiet_until:
+            faults = module.fault_names()
+            kinds = [f"module_{word}" for word in (*faults, state)]
+            why = f"it stopped because of {module.last_stop.name.lower()}"
+            return [self._finding(i, module, kinds[0], f"reports {', '.join(faults) or state}; {why}", *kinds)]
+        if aside or not self._refuses_to_arm(i, module, reading):
+            return []
+        if i in self._was_armed:
+            return [self._finding(i, module, "module_not_armed", f"is not armed any more: it is {state}")]
+        return [self._finding(i, module, "module_not_armed", f"does not arm: it is {state}", NEVER_ARMED)]
+
+    def _has_restarted(self, i: int, module: Module, reading: Reading) -> bool:
+        """A second module with the same id lets the uptime go back too, and then every Sync is answered twice."""
+        if module.restarts > self._restarts[i]:
+            self._restarts[i] = module.restarts
+            self._restart_at.setdefault(i, reading.sync)
+        if module.answered_twice(reading.sync) or reading.sync - self._restart_at.get(i, reading.sync) <= IN_A_ROW:
+            return False
+        del self._restart_at[i]
+        return True
+
+    def _refuses_to_arm(self, i: int, module: Module, reading: Reading) -> bool:
+        if self._armed_sync is None:
+            return False
+        if module.state == ModuleState.ARMED:
+            self._was_armed.add(i)
+        late = reading.sync - self._armed_sync > ARM_GRACE or i in self._was_armed
+        apart = (
+            late
+            and reading.sync == module.sync
+            and module.state != ModuleState.ARMED
+            and not module.answered_twice(reading.sync)
+        )
+        self._unarmed[i] = self._unarmed[i] + 1 if apart else 0
+        fell_back = i in self._was_armed and module.state in (ModuleState.BOOT, ModuleState.DISARMED)
+        return self._unarmed[i] >= (1 if fell_back else IN_A_ROW)
+
+    def _bare(self, i: int) -> Finding:
+        cause = (
+            f"{self._names[i]} has not taken its parameters, and is not armed; clear, or switch its power off and on"
+        )
+        return Finding("module_not_configured", cause, i)
+
+    # --- the bus ----------------------------------------------------------------------------------------------
+
+    def _of_bus(self, troubles: Iterable[Trouble], unsent: set[str]) -> list[Finding]:
+        found: list[Finding] = []
+        for trouble in troubles:
+            if trouble.kind == "interface_down":
+                self._down.add(trouble.channel)
+            elif trouble.kind == "interface_up":
+                self._down.discard(trouble.channel)
+            advice = BUS_FAULTS.get(trouble.kind)
+            if advice is not None:
+                found.append(Finding(trouble.kind, f"{trouble.channel}: {trouble.detail}; {advice}"))
+            else:
+                self.seen[trouble.kind] = self.seen.get(trouble.kind, 0) + 1
+        self._unsent = {channel: self._unsent.get(channel, 0) + 1 for channel in unsent - self._down}
+        for channel, ticks in self._unsent.items():
+            if ticks >= IN_A_ROW:
+                took_ms = 1000 * IN_A_ROW * self._period_s
+                cause = (
+                    f"{channel}: frames do not get out for {took_ms:.0f} ms, its transmit queue stays "
+                    f"full: nobody acknowledges (power, cable, terminator, bit rate), or txqueuelen is below 64"
+                )
+                found.append(Finding("bus_stuck", cause))
+        return found
+
+    def _of_strangers(self, reading: Reading) -> list[Finding]:
+        found: list[Finding] = []
+        self._strangers = {node: self._strangers.get(node, 0) + n for node, n in reading.strangers.items()}
+        for node, frames in self._strangers.items():
+            if frames >= STRANGER_FRAMES:
+                found.append(Finding("unknown_node", f"node {node} is on the bus, and this robot has no such joint"))
+        reading.strangers.clear()
+        others = reading.from_other_host
+        if others[Opcode.EMERGENCY]:
+            found.append(Finding("emergency", "somebody on the bus called an emergency"))
+        if others.keys() - {Opcode.EMERGENCY}:
+            found.append(Finding("second_host", "another program commands the modules on this bus; end one of the two"))
+            self._changed |= set(range(len(reading.modules)))
+        others.clear()
+        return found
+
+
+def _alive(module: Module, reading: Reading) -> str:
+    if module.heartbeat_sync > module.sync:
+        return "; its heart still beats, so it hears no Sync or its main loop hangs"
+    if reading.sync < 0 or module.uptime_ms < 0:
+        return ""
+    return "; no heartbeat either: power, cable or reset"

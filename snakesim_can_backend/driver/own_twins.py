@@ -1,0 +1,150 @@
+"""The module twins that a driver starts for itself: in its own process on a virtual bus, or as a child on vcan."""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import msgspec
+
+from snakesim_can_backend.bus.bus import OtherEnd
+from snakesim_can_backend.settings import Settings
+from snakesim_hal.errors import BackendError, ConfigError
+from snakesim_hal.model.fault_plan import check_backend_can
+from snakesim_hal.model.injection import KINDS, Injection
+from snakesim_hal.model.scenario import RunConfig, write
+from snakesim_hal.serve import START_LIMIT_S
+from snakesim_hal.terminal import complain
+
+READY = "modules ready"
+STOP_LIMIT_S = 5.0
+POLL_S = 0.02
+
+
+def check_twins(config: RunConfig, settings: Settings) -> None:
+    """Raise ConfigError for twins that cannot be."""
+    from snakesim_can_backend.twin.faults import parse
+
+    if settings.twins_run == "here" and settings.channels:
+        raise ConfigError(
+            f'`backends.can.twins` = "here" is a virtual bus inside the driver, and `channels` = {settings.channels} '
+            f'names real ones: leave `channels` empty, or let twins = "process"'
+        )
+    if settings.twins_run != "here" and not settings.channels:
+        raise ConfigError(
+            f'`backends.can.twins` = "{settings.twins_run}" needs a bus: name it in `backends.can.channels`, such as '
+            f'["vcan0"]'
+        )
+    if settings.faults and settings.twins_run == "none":
+        raise ConfigError("`backends.can.faults` are for twins; give them to `snakesim modules --fault` instead")
+    for text in settings.faults:
+        parse(text, config.robot.chain.modules)
+
+
+def check_faults(config: RunConfig, settings: Settings) -> None:
+    """Whether what the run has planned for joints and buses can be done. Raises ConfigError."""
+    from snakesim_can_backend.twin.faults import ABOUT
+
+    own, virtual = settings.twins_run != "none", not settings.channels
+    does = {*KINDS["bus"]} - (set() if virtual else {"full"}) | ({*ABOUT} if own else set())
+    because = f"its modules know {', '.join(ABOUT)}" if own else "its modules are not the driver's own"
+    because += "" if virtual else "; and no program can fill the queue of a kernel interface"
+    check_backend_can(config, does=does, buses=max(len(settings.channels), 1), because=because)
+
+
+def modules_know(injection: Injection, joints: int) -> bool:
+    """Whether module twins can have a fault. Raises ConfigError when its joint is not there."""
+    from snakesim_can_backend.twin.faults import ABOUT, checked
+
+    if injection.target_type != "joint" or injection.kind not in ABOUT:
+        return False
+    checked(injection, joints)
+    return True
+
+
+def twins_here(config: RunConfig, settings: Settings, channel: str, pose: str | None, *, stepped: bool) -> OtherEnd:
+    """Twins at the other end of a virtual bus; the returned function lets them run."""
+    from snakesim_can_backend.twin.server import here
+
+    return here(config, settings, channel, pose, stepped=stepped)
+
+
+class TwinProcess:
+    """`snakesim modules` as a child that dies with this process."""
+
+    def __init__(self, config: RunConfig, settings: Settings, pose: str | None, *, stepped: bool) -> None:
+        """Start it, and wait until its modules are on the bus. Raises BackendError."""
+        changed = msgspec.structs.replace(config, backends={**config.backends, "can": msgspec.to_builtins(settings)})
+        arguments = ["--parent", str(os.getpid()), "--pose", pose or "none"]
+        for channel in settings.channels:
+            arguments += ["--channel", channel]
+        arguments += ["--stepped"] if stepped else []
+        try:
+            self._folder = tempfile.TemporaryDirectory(prefix="snakesim-twins-", ignore_cleanup_errors=True)
+            self._said = Path(self._folder.name, "modules.log")
+            self._process = self._started(changed, arguments)
+        except OSError as error:
+            raise BackendError(f"the module twins cannot be started: {error}") from error
+        self._await_ready()
+
+    def _started(self, config: RunConfig, arguments: list[str]) -> subprocess.Popen[bytes]:
+        run = Path(self._folder.name, "config.json")
+        write(config, run)
+        with self._said.open("wb") as output:
+            return subprocess.Popen(
+                [sys.executable, "-m", "snakesim_can_backend.twin.command", str(run), *arguments, "--interactive"],
+                stdin=subprocess.PIPE,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, "PYTHONUNBUFFERED": "1"},
+                start_new_session=True,
+            )
+
+    def how_it_ended(self) -> str | None:
+        """In words; None while it runs."""
+        code = self._process.poll()
+        return None if code is None else f"the module twins have ended, with exit code {code}"
+
+    def inject(self, fault: Injection, *, begins: bool) -> None:
+        """Let something go wrong with a module, or end. Raises BackendError when the child is gone."""
+        from snakesim_can_backend.twin.faults import typed
+
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(f"{typed(fault, begins=begins)}\n".encode())
+            self._process.stdin.flush()
+        except (OSError, ValueError) as error:  # the latter when it was stopped
+            raise BackendError(f"the module twins do not take {fault}: {error}") from error
+
+    def stop(self) -> None:
+        """Ask it to end, then insist. What it said goes to this process's stderr."""
+        if self._process.poll() is None:
+            self._process.send_signal(signal.SIGTERM)
+            try:
+                self._process.wait(STOP_LIMIT_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+        if self._process.stdin is not None:
+            with contextlib.suppress(OSError):
+                self._process.stdin.close()
+        with contextlib.suppress(OSError):  # a log that cannot be read or passed on keeps nothing from ending
+            for line in self._said.read_text(encoding="utf-8", errors="replace").splitlines():
+                complain(line)
+        self._folder.cleanup()
+
+    def _await_ready(self) -> None:
+        end = time.monotonic() + START_LIMIT_S
+        while time.monotonic() < end:
+            with contextlib.suppress(OSError):
+                if READY in self._said.read_text(encoding="utf-8", errors="replace"):
+                    return
+            if self._process.poll() is not None:
+                break
+            time.sleep(POLL_S)
+        self.stop()
+        raise BackendError("the module twins did not start; see what they said above")

@@ -1,0 +1,83 @@
+"""A robot file in the modules' parameters, and whether modules and protocol can do what the file asks for."""
+
+from collections.abc import Mapping
+
+from snakesim_can_backend.bus.load import Reports
+from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.definitions import Opcode, Parameter, SafeMotion
+from snakesim_can_backend.settings import Settings
+from snakesim_hal.errors import BackendError, ConfigError
+from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.scenario import RunConfig
+
+LEAST_PERIODS = 2.2  # in a watchdog's time: one set-point may be lost, and the next be a little late
+SPEED_ROOM = 1.2  # a joint may be pushed faster than its motor turns, and must still be told
+
+
+def parameters_of(robot: RobotFile, settings: Settings, reports: Reports) -> dict[int, dict[Parameter, float]]:
+    """What to write to each node."""
+    motor, limits = robot.motor, robot.limits
+    safe = SafeMotion.DAMP if robot.safety.action == "damp" else SafeMotion.PASSIVE
+    common = {
+        Parameter.STIFFNESS: motor.stiffness_nm_per_rad,
+        Parameter.DAMPING: motor.damping_nm_s_per_rad,
+        Parameter.VELOCITY_GAIN: motor.velocity_gain_nm_s_per_rad,
+        Parameter.TORQUE_LIMIT: limits.torque_nm,
+        Parameter.SPEED_LIMIT: limits.speed_rad_s,
+        Parameter.ANGLE_LIMIT: limits.angle_rad,
+        Parameter.WATCHDOG: settings.watchdog_s,
+        Parameter.SAFE_ACTION: float(safe),
+        Parameter.CONTACT_EVERY: float(reports.contact_every),
+        Parameter.IMU_EVERY: float(reports.imu_every),
+    }
+    count = robot.chain.modules
+    return {node: {**common, Parameter.TAIL: float(node == 1 and reports.tail)} for node in range(1, count + 1)}
+
+
+def check_ratings(robot: RobotFile, in_force: Mapping[int, Mapping[Parameter, float]] | None = None) -> None:
+    """Raise ConfigError or BackendError when the robot file asks for more than the protocol, or a module, can do."""
+    signals = codec()[Opcode.JOINT_STATE].signals
+    for what, value, most, unit in (
+        ("limits.angle_rad", robot.limits.angle_rad, signals["angle"].high, "rad"),
+        ("limits.speed_rad_s", robot.limits.speed_rad_s, signals["velocity"].high / SPEED_ROOM, "rad/s"),
+        ("limits.torque_nm", robot.limits.torque_nm, signals["torque"].high, "N·m"),
+        ("limits.stop_at_c", robot.limits.stop_at_c, codec()[Opcode.HEALTH].signals["motor_temperature"].high, "°C"),
+    ):
+        if value > most:
+            raise ConfigError(
+                f"robot {robot.name!r}: `{what}` = {value} {unit} does not go through the bus, whose protocol ends at "
+                f"{most:.3g} {unit}"
+            )
+    reach_m = max(robot.link_lengths_m) + robot.module.radius_m
+    along_m = codec()[Opcode.CONTACT].signals["along"].high
+    if robot.sensors.contacts is not None and reach_m > along_m:
+        raise ConfigError(
+            f"robot {robot.name!r}: a touch at the end of a link, {reach_m:.3g} m from its joint (`module.length_m` + "
+            f"`module.radius_m`), cannot be told on the bus, whose protocol ends at {along_m:.3g} m"
+        )
+    if robot.safety.action == "hold":
+        raise ConfigError(
+            f'robot {robot.name!r}: `safety.action` = "hold" is nothing that a joint module does by itself: servos '
+            f'that hold stiffly overheat. Use "damp" or "passive"'
+        )
+    for node, values in (in_force or {}).items():
+        for parameter, asked, unit in (
+            (Parameter.RATED_TORQUE, robot.limits.torque_nm, "N·m"),
+            (Parameter.RATED_SPEED, robot.limits.speed_rad_s, "rad/s"),
+        ):
+            if not values[parameter] >= asked * 0.999:  # a rating of NaN, which the bus can carry, is none
+                raise BackendError(
+                    f"joint_{node} is rated for {values[parameter]:.3g} {unit}, robot {robot.name!r} asks for "
+                    f"{asked:g}: lower the limit in the robot file"
+                )
+
+
+def check_watchdog(config: RunConfig, settings: Settings) -> None:
+    """Raise ConfigError for modules that one lost set-point would stop."""
+    least_s = LEAST_PERIODS / config.rate_hz
+    if settings.watchdog_s < least_s:
+        least_hz = LEAST_PERIODS / settings.watchdog_s
+        raise ConfigError(
+            f"`backends.can.watchdog_s` = {settings.watchdog_s:g} s at `rate_hz` = {config.rate_hz:g}: one lost "
+            f"set-point would stop the modules; give them {least_s:.3g} s or more, or a rate from {least_hz:.0f} Hz on"
+        )

@@ -1,0 +1,119 @@
+"""What goes out to the modules: set-points in raw numbers, and what a change of the robot's lifecycle asks of them.
+
+Pure: frames come out, and the caller sends them. A set-point that the bus did not take is simply replaced by the next;
+nothing is ever queued.
+"""
+
+import math
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_can_backend.protocol.codec import Writer, codec
+from snakesim_can_backend.protocol.definitions import (
+    BROADCAST,
+    COMMAND_KEY,
+    COUNTS,
+    Action,
+    EmergencyReason,
+    Frame,
+    ModuleState,
+    Opcode,
+    Operation,
+    Parameter,
+)
+from snakesim_hal.backend import SetPoints
+from snakesim_hal.wire.messages import LifecycleState, Mode
+
+LATCHED: tuple[LifecycleState, ...] = ("fault", "estop")
+MOST_RAW = 32767
+MOST_LIMIT_RAW = 65535
+
+
+class SetPointWriter:
+    """Makes the set-points of all joints; knows what each module expects as its next count."""
+
+    def __init__(self, joints: int) -> None:
+        layout = codec()[Opcode.SET_POINT]
+        self._write = layout.writer("mode", "count", "position", "torque_limit")  # the targets share their bits
+        self._count = [0] * joints
+        scale = {
+            Mode.PASSIVE: math.inf,  # its bits are 0
+            Mode.POSITION: layout.signals["position"].scale,
+            Mode.VELOCITY: layout.signals["velocity"].scale,
+            Mode.TORQUE: layout.signals["torque"].scale,
+        }
+        self._steps_per_unit = np.array([1.0 / scale[mode] for mode in Mode])
+        self._limit_steps = 1.0 / layout.signals["torque_limit"].scale
+
+    def frames(self, set_points: SetPoints) -> list[Frame]:
+        """One frame a joint, tail to head."""
+        modes = np.array(set_points.mode, dtype=np.intp)
+        target = _steps(np.array(set_points.target) * self._steps_per_unit[modes], -MOST_RAW, MOST_RAW)
+        limit = _steps(np.array(set_points.torque_limit_nm) * self._limit_steps, 0, MOST_LIMIT_RAW)
+        rows = zip(set_points.mode, self._count, target.tolist(), limit.tolist(), strict=True)
+        return [self._write(node, row) for node, row in enumerate(rows, start=1)]
+
+    def sent(self, joint: int) -> None:
+        """The bus took the set-point of a joint; only then does its module expect the next count."""
+        self._count[joint] = (self._count[joint] + 1) % COUNTS
+
+
+def _steps(values: NDArray[np.float64], low: int, high: int) -> NDArray[np.int64]:
+    """The nearest whole steps; what is no number is nothing to move to, and the gate has refused it before."""
+    return np.clip(np.rint(values), low, high).astype(np.int64)
+
+
+def on_change(before: LifecycleState, now: LifecycleState) -> list[Frame]:
+    """What all modules are told when the robot's lifecycle changes; it may have passed through states between."""
+    if now == before:
+        return []
+    if now == "estop":
+        return [emergency()]
+    if before == "armed":
+        return [command(Action.STOP if now == "fault" else Action.DISARM)]
+    told = [command(Action.CLEAR)] if before in LATCHED and now not in LATCHED else []
+    return [*told, command(Action.ARM)] if now == "armed" else told
+
+
+def reminder(lifecycle: LifecycleState, state: ModuleState, node: int) -> Frame | None:
+    """What a module is told that does not stand where it should: a frame may have been lost."""
+    match lifecycle, state:
+        case "armed", ModuleState.DISARMED:
+            return command(Action.ARM, node)
+        case "estop", ModuleState.DISARMED | ModuleState.ARMED | ModuleState.STOPPING | ModuleState.FAULT:
+            return emergency()
+        case (("disarmed" | "fault"), ModuleState.ARMED):
+            return command(Action.STOP, node)
+    return None
+
+
+def is_arming(frame: Frame) -> bool:
+    """Whether a frame would switch motors on."""
+    return frame == command(Action.ARM)
+
+
+def command(action: Action, node: int = BROADCAST) -> Frame:
+    """A Command to one module, or to all."""
+    return codec()[Opcode.COMMAND].frame(node, action=action, key=COMMAND_KEY)
+
+
+def question(node: int) -> Frame:
+    """Asks a module for something that never changes: its answer comes after all that it had to say before."""
+    return codec()[Opcode.PARAMETER_REQUEST].frame(node, index=Parameter.TAIL, operation=Operation.READ, value=0.0)
+
+
+def emergency() -> Frame:
+    """Motors off, at once, everywhere."""
+    return codec()[Opcode.EMERGENCY].frame(BROADCAST, reason=EmergencyReason.HOST)
+
+
+def sync(count: int, time_us: int) -> Frame:
+    """Sample and enact, now."""
+    return _sync_writer()(BROADCAST, (count & 0xFF, time_us & 0xFFFFFFFF))
+
+
+@cache
+def _sync_writer() -> Writer:
+    return codec()[Opcode.SYNC].writer("count", "time")

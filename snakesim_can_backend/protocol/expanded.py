@@ -1,0 +1,38 @@
+"""The DBC file with every message of every node spelled out.
+
+For tools that know no id mask: candump with cantools, SavvyCAN, Wireshark.
+"""
+
+import copy
+from collections.abc import Iterable
+
+from cantools.database.can import Database, Message
+
+from snakesim_can_backend.protocol.codec import load_database
+from snakesim_can_backend.protocol.definitions import BROADCAST, FIRST_NODE, LAST_NODE, NODE_BITS, Opcode
+
+EXPANDED = "snakesim-expanded.dbc"
+TO_ALL = (Opcode.EMERGENCY, Opcode.SYNC)
+TO_ONE_OR_ALL = (Opcode.COMMAND,)
+
+
+def expanded_dbc() -> str:
+    """Text of the expanded file. `JointState` of node 5 is called `JointState_05`."""
+    source = load_database()
+    messages: list[Message] = []
+    for message in source.messages:
+        for node in nodes_of(Opcode(message.frame_id >> NODE_BITS)):
+            twin = copy.deepcopy(message)
+            twin.frame_id = message.frame_id | node
+            twin.name = message.name if node == BROADCAST else f"{message.name}_{node:02d}"
+            messages.append(twin)
+    database = Database(messages, nodes=source.nodes, version=source.version, dbc_specifics=source.dbc, strict=True)
+    return database.as_dbc_string(sort_signals="default").replace("\r\n", "\n")
+
+
+def nodes_of(opcode: Opcode) -> Iterable[int]:
+    """Which nodes a message can be to or from."""
+    if opcode in TO_ALL:
+        return [BROADCAST]
+    each = list(range(FIRST_NODE, LAST_NODE + 1))
+    return [BROADCAST, *each] if opcode in TO_ONE_OR_ALL else each

@@ -1,0 +1,81 @@
+"""A module's place on a bus, and what goes wrong there on request."""
+
+from dataclasses import dataclass
+
+from snakesim_can_backend.protocol.definitions import Frame, Opcode, checksum, opcode_of
+from snakesim_can_backend.twin.firmware import Demand, Module
+from snakesim_hal.model.thermal import LEAST_VOLTAGE_V, SUPPLY_V, board_c, current_a
+
+SAGGED_V = LEAST_VOLTAGE_V - 6.0
+
+
+@dataclass(slots=True, eq=False)
+class Seat:
+    """One module, the joint it moves, and the bus it is on."""
+
+    sender: int  # its place in the bus's queue
+    channel: int
+    joint: int  # 0 at the tail
+    module: Module
+    drives: bool = True  # False: it has no motor of its own; a duplicate
+    driven: Demand | None = None  # what its motor was last told
+    mute: bool = False
+    wrong_count: bool = False
+    wrong_checksum: bool = False
+
+    def begin(self, kind: str, now_us: float) -> None:
+        """Something goes wrong with this module alone."""
+        self._set(kind, True)
+        if kind == "reboot":
+            self.module.reboot(now_us)
+
+    def end(self, kind: str) -> None:
+        """It is over."""
+        self._set(kind, False)
+
+    def _set(self, kind: str, wrong: bool) -> None:
+        match kind:
+            case "mute":
+                self.mute = wrong
+            case "freeze":
+                self.module.hangs = wrong
+            case "counter":
+                self.wrong_count = wrong
+            case "checksum":
+                self.wrong_checksum = wrong
+            case "leak":
+                self.module.inside.leak = wrong
+            case "undervoltage":
+                self.module.inside.voltage_v = SAGGED_V if wrong else SUPPLY_V
+            case _:
+                pass
+
+    def feel(self, speed_rad_s: float, torque_nm: float, rated_nm: float, winding_c: float) -> None:
+        """Bring what it measures inside itself up to date."""
+        inside = self.module.inside
+        inside.speed_rad_s, inside.winding_c = speed_rad_s, winding_c
+        inside.board_c = board_c(winding_c)
+        inside.current_a = current_a(torque_nm, speed_rad_s, rated_nm, inside.voltage_v)
+
+    def outgoing(self) -> list[Frame]:
+        """What the module has to send, as it goes out; each frame once."""
+        frames = self.module.frames
+        if not frames:
+            return frames
+        self.module.frames = []
+        if self.mute:
+            return []
+        if self.wrong_count or self.wrong_checksum:
+            return [self._spoilt(frame) for frame in frames]
+        return frames
+
+    def _spoilt(self, frame: Frame) -> Frame:
+        if opcode_of(frame.id) != Opcode.JOINT_STATE:
+            return frame
+        data = bytearray(frame.data)
+        if self.wrong_count:
+            data[6] = (data[6] & 0xF0) | (data[6] + 7 & 0x0F)
+            data[7] = checksum(frame.id, bytes(data[:7]))
+        if self.wrong_checksum:
+            data[7] ^= 0x5A
+        return Frame(frame.id, bytes(data))

@@ -1,0 +1,109 @@
+"""Any backend, and what goes wrong with its joints, buses and simulator on request.
+
+The backend is asked first: it can let things go wrong more truly. What it does not know is done here to its samples, as
+far as that can be, or refused.
+"""
+
+import time
+
+import msgspec
+
+from snakesim_hal.backend import Backend, Injectable, Samples, SetPoints
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.fault_plan import ON_SAMPLES
+from snakesim_hal.model.injection import Injection
+from snakesim_hal.wire.messages import Description, Fault, JointState, LifecycleState
+
+NO_NUMBER = float("nan")
+
+
+class FaultyBackend:
+    """A `snakesim_hal.backend.Backend` around another."""
+
+    def __init__(self, inner: Backend) -> None:
+        self._inner = inner
+        self._description = inner.describe()
+        self._on: dict[int, dict[str, Injection]] = {}  # joint -> kind -> what is done here
+        self._last: JointState | None = None  # as told
+        self._share: float | None = None  # of real time that the simulator keeps
+
+    def inject(self, injection: Injection, begins: bool) -> None:
+        """Begin or end a fault. Raises ConfigError for one that cannot be had here."""
+        if injection.target == "simulator" and injection.kind == "slow":
+            self._slow_down(injection, begins)
+        elif isinstance(self._inner, Injectable) and self._inner.inject(injection, begins=begins):
+            return
+        elif injection.target_type == "joint" and injection.kind in ON_SAMPLES:
+            self._disturb(injection, begins)
+        else:
+            raise ConfigError(f"backend {self._description.backend!r} cannot do {injection.kind} to {injection.target}")
+
+    def describe(self) -> Description:
+        """As the backend says."""
+        return self._description
+
+    def sample(self, tick: int, stamp_ns: int) -> Samples:
+        """What the backend's sensors gave, or what is made of it."""
+        samples = self._inner.sample(tick, stamp_ns)
+        if self._on:
+            samples = Samples(self._disturbed(samples.joints), samples.others)
+        self._last = samples.joints
+        return samples
+
+    def enact(self, set_points: SetPoints, lifecycle: LifecycleState) -> None:
+        """As the backend does."""
+        self._inner.enact(set_points, lifecycle)
+
+    def advance(self) -> None:
+        """As the backend does, at a share of real time if that is asked for."""
+        began = time.monotonic()
+        self._inner.advance()
+        if self._share is not None:
+            takes_s = self._description.period_ns * 1e-9 / self._share
+            time.sleep(max(began + takes_s - time.monotonic(), 0.0))
+
+    def faults(self) -> list[Fault]:
+        """As the backend says."""
+        return self._inner.faults()
+
+    def close(self) -> None:
+        """As the backend does."""
+        self._inner.close()
+
+    # --- what is done here -----------------------------------------------------------------------------------
+
+    def _slow_down(self, injection: Injection, begins: bool) -> None:
+        if not self._description.emulated:
+            raise ConfigError(f"backend {self._description.backend!r} simulates nothing that could be slow")
+        self._share = injection.amount if begins else None
+
+    def _disturb(self, injection: Injection, begins: bool) -> None:
+        joint, count = injection.number, len(self._description.joints)
+        if joint >= count:
+            raise ConfigError(f"there is no {injection.target}; this robot has joint_1 to joint_{count}")
+        kinds = self._on.setdefault(joint, {})
+        if begins:
+            kinds[injection.kind] = injection
+        else:
+            kinds.pop(injection.kind, None)
+        if not kinds:
+            del self._on[joint]
+
+    def _disturbed(self, joints: JointState) -> JointState:
+        angle, velocity, torque = list(joints.angle_rad), list(joints.velocity_rad_s), list(joints.torque_nm)
+        valid, age = list(joints.valid), list(joints.age_ns)
+        for joint, kinds in self._on.items():
+            last = self._last
+            if last is not None and ("mute" in kinds or "freeze" in kinds):
+                angle[joint], velocity[joint] = last.angle_rad[joint], last.velocity_rad_s[joint]
+                torque[joint], valid[joint] = last.torque_nm[joint], last.valid[joint]
+                age[joint] = last.age_ns[joint] + joints.stamp_ns - last.stamp_ns
+            elif "wrong" in kinds:
+                angle[joint] += kinds["wrong"].amount or 0.0
+            if "mute" in kinds:
+                valid[joint] = False
+            if "nan" in kinds:
+                angle[joint] = NO_NUMBER
+        return msgspec.structs.replace(
+            joints, angle_rad=angle, velocity_rad_s=velocity, torque_nm=torque, valid=valid, age_ns=age
+        )

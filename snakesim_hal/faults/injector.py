@@ -1,0 +1,209 @@
+"""Carries out one part's faults on request: those that the run has planned, and those that somebody asks for.
+
+Every part of a run has one: the host, and each service. Times are robot time, so that lockstep repeats them. What is
+planned counts from the first arming. A part that was started anew while the robot was armed has no plan any more.
+"""
+
+import time
+from collections.abc import Callable
+from math import inf
+from queue import Empty, SimpleQueue
+
+import msgspec
+
+from snakesim_hal.errors import BackendError, ConfigError, WireError
+from snakesim_hal.faults.message_faults import MessageFaults
+from snakesim_hal.model.fault_plan import planned
+from snakesim_hal.model.injection import Change, Injection, Plan, checked
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.network.session import Question, Session
+from snakesim_hal.terminal import complain
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import Decoder
+from snakesim_hal.wire.messages import Answer, Clock, FaultRequest, LifecycleState
+
+HALF_A_NANOSECOND = 0.5e-9
+HOW_TO_ALLOW = "something real moves here; set `faults_allowed = true` in the scenario if that is what you want"
+
+CarryOut = Callable[[Injection, bool], None]  # the second: whether it begins, or ends. Raises ConfigError
+
+
+def nothing_more(injection: Injection, _begins: bool) -> None:
+    """For a part that can only disturb its messages and hang."""
+    raise ConfigError(f"{injection.part} cannot do {injection.kind} to {injection.target}")
+
+
+def print_note(text: str, now_s: float) -> None:
+    """For a part whose words go to a log."""
+    complain(f"{now_s:.3f} s: on request, {text}")
+
+
+class Injector:
+    """Of one part. Call `turn` once in every round of the part's loop."""
+
+    def __init__(
+        self,
+        part: str,
+        config: RunConfig,
+        session: Session,
+        *,
+        carry_out: CarryOut = nothing_more,
+        newest: Callable[[], Clock | None] | None = None,
+        note: Callable[[str, float], None] = print_note,
+        refused: Callable[[str], None] = lambda _text: None,
+    ) -> None:
+        """Declares the part's key; nothing is allowed before `allow` was called.
+
+        newest: the clock as it goes on while this part hangs; None: this part is the clock, and wall time stands in.
+        note: is told what begins and ends, and when; refused: what was planned and cannot be done.
+        """
+        self.part = part
+        self._messages = MessageFaults(session, config.seed)
+        self._carry_out, self._newest, self._note, self._refused = carry_out, newest, note, refused
+        self._allowed = False
+        self._planned = Plan(injection for injection in planned(config) if injection.part == part)
+        self._ends: list[tuple[float, Injection]] = []  # of what was asked for, and when
+        self._on: dict[tuple[str, str], Injection] = {}
+        self._decoder = Decoder(FaultRequest)
+        self._questions: SimpleQueue[Question] = SimpleQueue()
+        self._first_armed_s: float | None = None
+        self._lifecycle: LifecycleState = "disarmed"
+        self._seen = False
+        session.on_question(keys.fault(part), self._questions.put)
+
+    @property
+    def on(self) -> list[str]:
+        """What is wrong now, on request."""
+        return [str(injection) for injection in self._on.values()]
+
+    def allow(self, *, emulated: bool, faults_allowed: bool) -> None:
+        """Only where nothing real moves, or where the run says so. Raises ConfigError when more is planned."""
+        self._allowed = emulated or faults_allowed
+        if not self._allowed and self._planned.next_s() != inf:
+            raise ConfigError(f"`faults` are planned, and {HOW_TO_ALLOW}; otherwise leave them out")
+
+    def turn(self, stamp_ns: int, arming: int, lifecycle: LifecycleState) -> None:
+        """At a tick: begin and end what is due, answer who asks, and hang as long as that is asked for."""
+        now_s = stamp_ns / 1e9
+        self._lifecycle = lifecycle
+        if arming and self._first_armed_s is None:
+            self._first_armed_s = now_s
+            if not self._seen:
+                self._planned = Plan()
+        self._seen = True
+        self._change(now_s)
+        if self._hangs():
+            self._hang(now_s)
+
+    def idle(self) -> None:
+        """Answer who asks although no tick comes."""
+        self._answer_all(self._newest_s(0.0))
+
+    def close(self) -> None:
+        """Send nothing more that is late."""
+        self._messages.close()
+
+    # --- time ------------------------------------------------------------------------------------------------
+
+    def _newest_s(self, otherwise_s: float) -> float:
+        clock = None if self._newest is None else self._newest()
+        return otherwise_s if clock is None else clock.stamp_ns / 1e9
+
+    def _since_arming_s(self, now_s: float) -> float:
+        return 0.0 if self._first_armed_s is None else now_s - self._first_armed_s
+
+    def _change(self, now_s: float) -> None:
+        if not self._questions.empty():
+            self._answer_all(now_s)
+        soon_s = now_s + HALF_A_NANOSECOND  # sums of times are not exact
+        if self._ends:
+            due = [injection for end_s, injection in self._ends if end_s <= soon_s]
+            self._ends = [(end_s, injection) for end_s, injection in self._ends if end_s > soon_s]
+            self._do([Change(injection.end_s, injection, False) for injection in due], now_s)
+        if self._first_armed_s is not None and self._planned.next_s() <= soon_s - self._first_armed_s:
+            self._do(self._planned.until(soon_s - self._first_armed_s), now_s)
+
+    def _do(self, changes: list[Change], now_s: float) -> None:
+        for change in changes:
+            try:
+                if change.begins:
+                    self._begin(change.injection, now_s)
+                else:
+                    self._end(change.injection, now_s)
+            except (ConfigError, BackendError) as error:
+                self._note(f"{change.injection} is refused: {error}", now_s)
+                self._refused(f"{change.injection} is refused: {error}")
+
+    # --- what is asked for -----------------------------------------------------------------------------------
+
+    def _answer_all(self, now_s: float) -> None:
+        while True:
+            try:
+                question = self._questions.get_nowait()
+            except Empty:
+                return
+            try:
+                request = self._decoder.decode(question.payload, question.encoding)
+                answer = self._answer(request, now_s)
+            except WireError as error:
+                answer = self._no(str(error), error.reason)
+            except (ConfigError, BackendError) as error:
+                answer = self._no(str(error), "cannot")
+            question.reply(msgspec.structs.replace(answer, lifecycle=self._lifecycle))
+
+    def _answer(self, request: FaultRequest, now_s: float) -> Answer:
+        if not self._allowed:
+            return self._no(f"faults on request are not allowed: {HOW_TO_ALLOW}", "not_allowed")
+        start_s, for_s = self._since_arming_s(now_s), inf if request.for_s is None else request.for_s
+        injection = checked(Injection(request.kind, request.target, start_s, start_s + for_s, request.amount))
+        if injection.part != self.part:
+            return self._no(f"{injection.kind} of {injection.target} is for {injection.part} to do", "wrong_part")
+        if not request.end:
+            self._begin(injection, now_s)
+            if for_s != inf and not injection.about.once:
+                self._ends.append((now_s + for_s, injection))
+            return Answer(
+                ok=True, reason=f"{injection.kind} of {injection.target} has begun, at {now_s:.3f} s of robot time"
+            )
+        was = self._on.get((injection.kind, injection.target))
+        if was is None:
+            on = ", ".join(self.on) or "nothing"
+            return self._no(f"{injection.kind} of {injection.target} is not on; on is {on}", "wrong_state")
+        self._end(was, now_s)
+        return Answer(ok=True, reason=f"{injection.kind} of {injection.target} has ended")
+
+    def _no(self, reason: str, refusal: str) -> Answer:
+        return Answer(ok=False, reason=reason[:500], refusal=refusal)
+
+    # --- what happens ----------------------------------------------------------------------------------------
+
+    def _begin(self, injection: Injection, now_s: float) -> None:
+        if injection.target_type == "key":
+            self._messages.begin(injection)
+        elif injection.target_type != "process":
+            self._carry_out(injection, True)
+        if not injection.about.once:
+            self._on[injection.kind, injection.target] = injection
+        self._note(f"{injection} {'happens' if injection.about.once else 'begins'}", now_s)
+
+    def _end(self, injection: Injection, now_s: float) -> None:
+        """A newer one of the same kind has taken its place, or somebody has ended it: then there is nothing to do."""
+        place = injection.kind, injection.target
+        if self._on.get(place) is not injection:
+            return
+        del self._on[place]
+        if injection.target_type == "key":
+            self._messages.end(injection)
+        elif injection.target_type != "process":
+            self._carry_out(injection, False)
+        self._note(f"{injection} ends", now_s)
+
+    def _hangs(self) -> bool:
+        return any(kind == "hang" for kind, _ in self._on)
+
+    def _hang(self, began_s: float) -> None:
+        """Keep the interpreter busy. Only the end of it is heard."""
+        began = time.monotonic()
+        while self._hangs():
+            wall_s = began_s + time.monotonic() - began
+            self._change(wall_s if self._newest is None else self._newest_s(began_s))

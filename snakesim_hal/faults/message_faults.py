@@ -1,0 +1,109 @@
+"""Disturbs what this process publishes: the shell around `disturbance`, between a publisher and Zenoh.
+
+A publisher without a fault is not touched. What has to be sent later is sent by a thread that is there only as long as
+something is late or a flood is on.
+"""
+
+import threading
+import time
+from dataclasses import dataclass
+from math import inf
+
+from snakesim_hal.faults.disturbance import Disturbance
+from snakesim_hal.model.injection import Injection
+from snakesim_hal.network.session import Session
+
+SHORTEST_PAUSE_S = 0.001  # floods are sent in bursts, so that the thread does not take the interpreter for itself
+
+
+@dataclass
+class Line:
+    """One key's way out."""
+
+    faults: "MessageFaults"
+    key: str
+    disturbance: Disturbance
+
+    def put(self, payload: bytes) -> None:
+        """Stands in for the publisher's own."""
+        self.faults.put(self, payload)
+
+
+class MessageFaults:
+    """Everything that is wrong with the messages of one session. Safe to use from several threads."""
+
+    def __init__(self, session: Session, seed: int) -> None:
+        self._session, self._seed = session, seed
+        self._lines: dict[str, Line] = {}
+        self._changed = threading.Condition()
+        self._later: threading.Thread | None = None
+        self._closed = False
+
+    def begin(self, injection: Injection) -> None:
+        """From now on."""
+        with self._changed:
+            key = injection.target
+            line = self._lines.get(key)
+            if line is None:
+                line = self._lines[key] = Line(self, key, Disturbance(f"{self._seed} {key}"))
+                self._session.reroute(key, line.put)
+            line.disturbance.begin(injection, time.monotonic())
+            self._see_to(line)
+
+    def end(self, injection: Injection) -> None:
+        """No longer; what is under way still arrives."""
+        with self._changed:
+            line = self._lines.get(injection.target)
+            if line is not None:
+                self._send(line, line.disturbance.end(injection.kind, time.monotonic()))
+                self._see_to(line)
+
+    def put(self, line: Line, payload: bytes) -> None:
+        """A message on its way."""
+        with self._changed:
+            self._send(line, line.disturbance.put(payload, time.monotonic()))
+            self._see_to(line)
+
+    def close(self) -> None:
+        """Send nothing more that is late. Call it before the session is closed."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+            later = self._later
+        if later is not None:
+            later.join()
+
+    # --- with the lock held ----------------------------------------------------------------------------------
+
+    def _send(self, line: Line, payloads: list[bytes]) -> None:
+        for payload in payloads:
+            self._session.send(line.key, payload)
+
+    def _see_to(self, line: Line) -> None:
+        """Let go of a line on which all is well again; have somebody send later what is due later."""
+        if line.disturbance.over:
+            if self._lines.get(line.key) is line:
+                self._session.reroute(line.key, None)
+                del self._lines[line.key]
+        elif self._next_s() < inf and not self._closed:
+            if self._later is None:
+                self._later = threading.Thread(target=self._send_later, name="late messages", daemon=True)
+                self._later.start()
+            self._changed.notify()
+
+    def _next_s(self) -> float:
+        return min((line.disturbance.next_s() for line in self._lines.values()), default=inf)
+
+    # --- the thread ------------------------------------------------------------------------------------------
+
+    def _send_later(self) -> None:
+        with self._changed:
+            while not self._closed and (next_s := self._next_s()) < inf:
+                pause_s = max(next_s - time.monotonic(), SHORTEST_PAUSE_S)
+                self._changed.wait(pause_s)
+                now_s = time.monotonic()
+                for line in list(self._lines.values()):
+                    self._send(line, line.disturbance.due(now_s))
+                    if line.disturbance.over:
+                        self._see_to(line)
+            self._later = None

@@ -1,0 +1,479 @@
+"""The HAL host: runs any backend, tick by tick, and is the only process that touches it.
+
+A tick: sample the sensors, publish them, publish the clock, wait for the command that answers them, let the authority
+decide, hand the set-points to the backend, let a period pass. How long it waits is the pace:
+
+realtime  until the tick's deadline on the monotonic clock; an old command goes on until its lease ends
+lockstep  until every participant that owes something has delivered; frozen at tick 0 until the first arming
+free      not at all
+"""
+
+import contextlib
+import secrets
+import time
+from collections.abc import Callable, Sequence
+from math import inf
+from typing import Any, Literal
+
+import msgspec
+
+from snakesim_hal.backend import Backend, Samples
+from snakesim_hal.errors import BackendError, WireError
+from snakesim_hal.faults.host_faults import HostFaults
+from snakesim_hal.host.black_box import BlackBox
+from snakesim_hal.host.guarded_backend import GuardedBackend
+from snakesim_hal.host.inbox import Inbox, Request
+from snakesim_hal.host.latch import EstopLatch, replying
+from snakesim_hal.host.outbox import Outbox
+from snakesim_hal.host.participants import Participant, Participants
+from snakesim_hal.host.run_statistics import Tally
+from snakesim_hal.host.status_messages import applied_message, status_message
+from snakesim_hal.host.timing import Deadlines, PublishTimes
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.network.private_channel import HostEnd, ToStarter
+from snakesim_hal.network.run_key import own_run_key, proven
+from snakesim_hal.network.session import Session
+from snakesim_hal.safety.authority import Authority
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import (
+    Answer,
+    Clock,
+    Description,
+    EstopRequest,
+    Fault,
+    JointCommand,
+    LeaseRequest,
+    LifecycleRequest,
+    Pace,
+    Power,
+    Status,
+)
+
+# Not yet; as many armed ticks as were asked for; on request (`finish`); by a signal; a fault, or too little armed time.
+Ending = Literal["running", "complete", "finished", "stopped", "failed"]
+STATUS_PERIOD_NS = 200_000_000
+STANDBY_PERIOD_NS = 20_000_000
+STATUS_GAP_NS = 10_000_000  # of what changes again and again, such as a lease that people fight for
+TAKEN_SHARE = 0.25  # of a period, for what came in late: a flood must not take the whole
+MAX_REQUESTS_KEPT = 256
+RECORDED_AFTER_NS = 2_000_000_000  # what follows the last armed tick, in a host that stays
+
+
+class Host:
+    """One robot, one backend, one session."""
+
+    def __init__(
+        self,
+        config: RunConfig,
+        backend: Backend,
+        session: Session,
+        *,
+        max_ticks: int | None = None,
+        end_after_fault_s: float | None = None,
+        stay: bool = False,
+        latch: EstopLatch | None = None,
+        starter: HostEnd | None = None,
+        hygiene: Sequence[str] = (),
+    ) -> None:
+        """max_ticks: end this many ticks after the first arming; None: go on until asked to finish.
+
+        end_after_fault_s: end so long after a fault; None: stay, so that a person can clear it.
+        stay: also when others come between, of which a moment is recorded; else so many ticks after the first arming.
+        latch: keeps an emergency stop for the host that comes after this one.
+        starter: the private channel to whoever started this host.
+        hygiene: real-time measures that the system refused.
+        """
+        described = msgspec.structs.replace(backend.describe(), host=secrets.token_hex(8))
+        self.description: Description = proven(described, own_run_key())
+        self.authority = Authority(self.description, first_epoch=time.time_ns() // 1_000_000)
+        self.black_box = BlackBox(self.description)
+        self.tally = Tally()
+        self.requests: list[str] = []  # who asked to arm, disarm, clear, finish or stop, and what became of it
+        self.participants = Participants(config.services)
+        self._config = config
+        self.faults = HostFaults(config, GuardedBackend(backend), session, self.authority)
+        self._backend = self.faults.backend
+        self._max_ticks = max_ticks
+        self._end_after_fault_s = end_after_fault_s
+        self._stay = stay
+        self._latch = latch or EstopLatch(None)
+        self._starter = starter or HostEnd(None)
+        self._hygiene = list(hygiene)
+        self._pace: Pace = config.pace
+        self._period_ns = config.period_ns
+        self._tick = 0
+        self._deadlines = Deadlines(config.period_ns)
+        self._published = PublishTimes()
+        self._published_arming = 0
+        self._newest: dict[str, int] = {}
+        self._last_armed_tick = 0
+        self._other_hosts: set[str] = set()
+        self._network_faults: set[str] = set()
+        self._answered = -1  # newest tick that a good command answered
+        self._advance_ns = 0.0  # how long a period takes the backend, smoothed
+        self._stopping = False
+        self.ended: Ending = "running"
+        self.ended_why = ""
+        self._armed_at_ns: int | None = None
+        self._ended_ns = 0
+        self._faulted_at_ns: int | None = None
+        self._status_due_ns = 0
+        self._status_shown: Any = None
+        if (found := self._latch.found) is not None:
+            self.authority.on_estop(EstopRequest(who=f"{found.who[:40]}, before this host"), max(found.tick, 0))
+        self._outbox = Outbox(session, self.description, lockstep=config.pace == "lockstep")
+        self._inbox = Inbox(session, self, config.services, self._outbox.answer)
+        session.on_alive(self._another_host, keys.HOST_ALL)
+        self._starter.say(ToStarter(description=self.description))
+        self._starter.serve(self._inbox.ask)
+
+    def stop(self) -> None:
+        """End the run in order; may be called from a signal handler."""
+        self._end("stopped", "by a signal")
+
+    def _end(self, ended: Ending, why: str = "") -> None:
+        """End the run in order. What came first is why."""
+        if self.ended == "running":
+            self.ended, self.ended_why = ended, why
+        self._stopping = True
+
+    def take_stop(self, who: str, reply: Callable[[str], None]) -> None:
+        """An emergency stop that came past the network; from any thread."""
+        self._inbox.ask(EstopRequest(who=who[:64] or "somebody"), lambda answer: reply(answer.reason))
+
+    def run(self) -> None:
+        """Tick until the run is over. The joints are safe when this returns."""
+        last: Samples | None = None
+        self._deadlines.begin(0)
+        try:
+            while not self._over():
+                self.faults.turn(self._tick)
+                last = self._sample(last)
+                if last is None:
+                    break
+                self._publish(last)
+                if self._pace == "lockstep" and self.authority.arming == 0:
+                    self._inbox.take_until(time.monotonic_ns() + STANDBY_PERIOD_NS)
+                    self._show_status()
+                    continue
+                self._wait_for_answers(last)
+                self._finish_tick(last)
+        finally:
+            self._end("failed", "by an error of its own; host.log has it")
+            self._ended_ns = time.monotonic_ns()
+            self.authority.on_lifecycle(LifecycleRequest(action="finish", who="the host"), self._safety_now())
+            with contextlib.suppress(BackendError):
+                self._backend.enact(self.authority.decide().set_points, self.authority.state)
+            self._show_status(force=True)
+            self.faults.close()
+            self._latch.close()
+            self._outbox.close()
+
+    @property
+    def wall_s(self) -> float:
+        """Wall-clock time from the first arming to the end of the run, or until now."""
+        if self._armed_at_ns is None:
+            return 0.0
+        return ((self._ended_ns or time.monotonic_ns()) - self._armed_at_ns) * 1e-9
+
+    # --- one tick ------------------------------------------------------------------------------------------
+
+    def _sample(self, last: Samples | None) -> Samples | None:
+        """Sensors of this tick. While frozen at tick 0 the same sample serves again."""
+        if last is not None and self._published.last_tick == self._tick:
+            return last
+        try:
+            samples = self._backend.sample(self._tick, self._tick * self._period_ns)
+        except BackendError as error:
+            self._backend_failed(error)
+            return None
+        now_ns = self._safety_now()
+        self.authority.observe(samples.joints, now_ns)
+        power = samples.others.get(keys.POWER)
+        if isinstance(power, Power):
+            self.authority.observe_power(power, now_ns)
+        return samples
+
+    def _publish(self, samples: Samples) -> None:
+        tick = self._tick
+        self._outbox.put(keys.JOINTS, self.authority.readable(samples.joints))
+        self._newest[keys.JOINTS] = tick
+        for key, message in samples.others.items():
+            self._outbox.put(key, message)
+            self._newest[key] = tick
+        for name, participant in self.participants.items():
+            self._newest[name] = participant.service.counting_at(tick)
+        clock = Clock(
+            tick=tick,
+            stamp_ns=tick * self._period_ns,
+            period_ns=self._period_ns,
+            pace=self._pace,
+            lifecycle=self.authority.state,
+            arming=self.authority.arming,
+            lease_epoch=self.authority.lease.epoch if self.authority.lease.holder else 0,
+            newest=self._newest,
+        )
+        self._published_arming = self.authority.arming
+        self._published.put(tick, self._safety_now(), time.monotonic_ns())
+        self._outbox.put(keys.CLOCK, clock)
+
+    def _finish_tick(self, samples: Samples) -> None:
+        self.authority.expire(self._safety_now(), self._tick)
+        counting = self._counting_tick()
+        decision = self.authority.decide(counting)
+        if self.authority.arming:
+            self._armed_at_ns = self._armed_at_ns or time.monotonic_ns()
+        if self._recorded():
+            self.black_box.record(self._tick, self._tick * self._period_ns, samples, decision)
+        if self.authority.state == "armed":
+            self._last_armed_tick = self._tick
+            self.tally.ticks += 1
+            self.tally.answered_ticks += self._answered >= (self._tick if counting is None else counting)
+        started = time.monotonic_ns()
+        try:
+            self._backend.enact(decision.set_points, self.authority.state)
+            if self._outbox.applied_heard:
+                self._outbox.put(keys.APPLIED, applied_message(self.description, self._tick, decision))
+            self._backend.advance()
+            for fault in self._backend.faults():
+                self.authority.fault(fault)
+        except BackendError as error:
+            self._backend_failed(error)
+        self._advance_ns += 0.1 * (time.monotonic_ns() - started - self._advance_ns)
+        self._tick += 1
+        self._watch_network()
+        self._watch_fault()
+        self._show_status()
+        if self._pace == "realtime":
+            if not self._deadlines.missed(self._tick):
+                self._inbox.take_until(self._deadlines.of(self._tick))
+            elif self.authority.state == "armed":
+                self.tally.overruns += 1
+
+    def _recorded(self) -> bool:
+        """Whether this tick belongs into the black box: a host that stays must not fill memory while it waits."""
+        waited_ns = (self._tick - self._last_armed_tick) * self._period_ns
+        return self.authority.arming > 0 and not (self._stay and waited_ns > RECORDED_AFTER_NS)
+
+    def _wait_for_answers(self, samples: Samples) -> None:
+        if self._pace == "lockstep":
+            self._wait_for_participants(samples)
+        elif self._pace == "realtime":
+            spare_ns = 1.5 * self._advance_ns + 50_000
+            while self._answered < self._tick and not self._stopping:
+                left_ns = self._deadlines.of(self._tick + 1) - spare_ns - time.monotonic_ns()
+                if left_ns <= 0 or not self._inbox.take(left_ns * 1e-9):
+                    break
+        self._inbox.take_all(inf if self._pace == "lockstep" else TAKEN_SHARE * self._period_ns)
+
+    def _wait_for_participants(self, samples: Samples) -> None:
+        give_up_ns = time.monotonic_ns() + round(self._config.stall_limit_s * 1e9)
+        while (behind := self.participants.behind(self._tick)) and not self._stopping:
+            left_ns = give_up_ns - time.monotonic_ns()
+            if self._published_arming != self.authority.arming:  # armed in this very tick: tell everybody
+                self._publish(samples)
+            if left_ns > 0:
+                self._inbox.take(min(left_ns * 1e-9, 0.5))
+                self.faults.turn(self._tick)
+                self._show_status()
+                continue
+            for name in behind:
+                self.participants[name].given_up = True
+                cause = f"{name} owes tick {self._tick} for {self._config.stall_limit_s:g} s; not waited for any more"
+                self.authority.note(Fault(tick=self._tick, what="service_stalled", cause=cause))
+
+    # --- what comes in -------------------------------------------------------------------------------------
+
+    def take_command(self, command: JointCommand, monotonic_ns: int) -> None:
+        """A command, and when it came."""
+        if command.lease_epoch == self.authority.lease.epoch and self.authority.answers_arming(command):
+            self._delivered(self.authority.lease.holder, command.tick)
+        safety_ns, published_ns = self._published.of(command.tick)
+        now_ns = self._safety_now(monotonic_ns)
+        refusal = self.authority.offer(command, now_ns=now_ns, tick=self._tick, age_ns=now_ns - safety_ns)
+        if refusal is None and command.tick > self._answered:
+            self._answered = command.tick
+            if self.authority.state == "armed":
+                self.tally.state_to_command.add((monotonic_ns - published_ns) / 1000)
+
+    def take_done(self, service: str, tick: int) -> None:
+        """A service owes nothing more for a tick."""
+        self._delivered(service, tick)
+
+    def _delivered(self, service: str | None, tick: int) -> None:
+        if tick <= self._tick:
+            self.participants.delivered(service, tick)
+
+    def refuse(self, error: WireError) -> Answer:
+        """Something cannot be decoded."""
+        self.authority.reject(error.reason)
+        return Answer(
+            ok=False,
+            reason=str(error)[:500],
+            refusal=error.reason,
+            lifecycle=self.authority.state,
+            host=self.description.host,
+        )
+
+    def answer(self, request: Request, reply: Callable[[Answer], None]) -> None:
+        """Somebody asks for the lease, for another state, or for a stop."""
+        now_ns = self._safety_now()
+        if isinstance(request, LeaseRequest):
+            self.authority.expire(now_ns, self._tick)  # first, so that nobody takes over what is a fault
+            answer = self.authority.on_lease(request, now_ns)
+        elif isinstance(request, EstopRequest):
+            answer = self.authority.on_estop(request, self._tick)
+        elif request.host not in (None, self.description.host):
+            meant = f"this is host {self.description.host}, the request is for {request.host}: two have one name"
+            answer = Answer(ok=False, reason=meant, refusal="wrong_host", lifecycle=self.authority.state)
+        elif request.action == "arm" and (missing := self._missing()):
+            waiting = f"waiting for {', '.join(missing)}"
+            answer = Answer(ok=False, reason=waiting, refusal="not_ready", lifecycle=self.authority.state)
+        else:
+            answer = self.authority.on_lifecycle(request, now_ns)
+            if request.action == "arm" and answer.ok:
+                self._expect_first_command()
+            if request.action == "finish":
+                by = f" by {request.who}" if request.who else ""
+                self._end("finished", f"on request{by}")
+        answer = msgspec.structs.replace(answer, host=self.description.host)
+        if not isinstance(request, LeaseRequest):
+            self._keep(request, answer)
+        self._show_status()
+        if isinstance(request, EstopRequest):
+            self._latch.engage(request.who, self._tick, replying(reply, answer))
+        elif isinstance(request, LifecycleRequest) and request.action == "clear" and answer.ok:
+            self._latch.release(replying(reply, answer))
+        else:
+            reply(answer)
+
+    def _keep(self, request: LifecycleRequest | EstopRequest, answer: Answer) -> None:
+        """Who asked for what, for the record and the log."""
+        action = "estop" if isinstance(request, EstopRequest) else request.action
+        outcome = "done" if answer.ok else f"refused: {answer.reason}"
+        asked = f"tick {self._tick}: {action} by {request.who!r}, {outcome}"
+        if len(self.requests) < MAX_REQUESTS_KEPT:
+            self.requests.append(asked)
+            self._outbox.log(asked)
+
+    def _holder(self) -> Participant | None:
+        return self.participants.get(self.authority.lease.holder or "")
+
+    def _expect_first_command(self) -> None:
+        """What was streamed before the arming does not answer the tick of arming."""
+        holder = self._holder()
+        if holder is not None:
+            holder.done_tick = self._answered = -1
+
+    def _counting_tick(self) -> int | None:
+        """In lockstep: the newest tick whose command counts at the end of this one."""
+        holder = self._holder()
+        if self._pace != "lockstep" or holder is None:
+            return None
+        return holder.service.counting_at(self._tick + 1)
+
+    def came_or_went(self, service: str, present: bool) -> None:
+        """A service's token is there, or is not any more."""
+        if present:
+            self.participants.came(service)
+            return
+        if not self.participants.went(service):
+            return
+        if self.authority.arming and not self._stopping:
+            cause = f"{service} is gone: its process ended or its connection broke"
+            self.authority.note(Fault(tick=self._tick, what="service_lost", cause=cause))
+        if self.authority.lease.holder == service:
+            self.authority.holder_gone(f"{service} is gone")
+
+    def _another_host(self, key: str, present: bool) -> None:
+        """In Zenoh's thread: a host process came or went. One beside this one answers to this robot's name."""
+        host = keys.service_of(key)
+        if host != self.description.host:
+            (self._other_hosts.add if present else self._other_hosts.discard)(host)
+
+    def _watch_network(self) -> None:
+        """Note what is wrong with the network around the robot, once as it begins."""
+        # In lockstep a lease lasts by simulated time: a slow computer is not a network that is held up.
+        held_up_s = 0.0 if self._pace == "lockstep" else self._outbox.held_up_s()
+        wrong = {
+            f"another HAL host answers to this robot's name: {host}": "second_host" for host in set(self._other_hosts)
+        }
+        if held_up_s * 1e9 > self._config.lease_ns:
+            wrong["the network takes no message: it is congested, or somebody attacks it"] = "network_held_up"
+        for cause in wrong.keys() - self._network_faults:
+            self.authority.note(Fault(tick=self._tick, what=wrong[cause], cause=cause, reach="none"))
+        self._network_faults = set(wrong)
+
+    # --- what goes out -------------------------------------------------------------------------------------
+
+    def status(self) -> Status:
+        """How the robot is now, and why."""
+        return status_message(
+            self.authority,
+            self.participants,
+            tick=self._tick,
+            pace=self._pace,
+            safety_now_ns=self._safety_now(),
+            missing=self._missing(),
+            overruns=self.tally.overruns,
+            hygiene=self._hygiene,
+            injected=self.faults.on,
+        )
+
+    def _show_status(self, *, force: bool = False) -> None:
+        """Publish the status when it matters: at once when the lifecycle changed, else a few times a second."""
+        now_ns, was = time.monotonic_ns(), self._status_shown
+        mark = (self.authority.state, self.authority.lease.epoch, len(self.authority.faults))
+        due_ns = self._status_due_ns if mark == was else self._status_due_ns - STATUS_PERIOD_NS + STATUS_GAP_NS
+        if not force and now_ns < due_ns and was is not None and mark[0] == was[0]:
+            return
+        self._status_shown = mark
+        self._status_due_ns = now_ns + STATUS_PERIOD_NS
+        status = self.status()
+        self._outbox.put_status(status)
+        self._starter.say(ToStarter(status=status))
+
+    # --- time and endings ----------------------------------------------------------------------------------
+
+    def _safety_now(self, monotonic_ns: int | None = None) -> int:
+        """Time that leases and ages count in: simulated in lockstep, else the monotonic clock."""
+        if self._config.pace == "lockstep":
+            return self._tick * self._period_ns
+        return time.monotonic_ns() if monotonic_ns is None else monotonic_ns
+
+    def _missing(self) -> list[str]:
+        """Participants that are not here, or in lockstep have not answered tick 0 yet."""
+        return self.participants.missing(must_have_answered=self._config.pace == "lockstep")
+
+    def _backend_failed(self, error: BackendError) -> None:
+        self.authority.fault(Fault(tick=self._tick, what="backend_failed", cause=str(error)[:500]))
+        self._show_status(force=True)
+        self._end("failed", str(error)[:500])
+
+    def _watch_fault(self) -> None:
+        """After a fault nobody is waited for: what follows is shown in real time, and may end the run."""
+        if self.authority.state not in ("fault", "estop"):
+            if self._faulted_at_ns is not None:
+                self._pace = self._config.pace
+            self._faulted_at_ns = None
+        elif self._faulted_at_ns is None:
+            self._faulted_at_ns = time.monotonic_ns()
+            if self._pace != "realtime":
+                self._pace = "realtime"
+                self._deadlines.begin(self._tick)
+
+    def _over(self) -> bool:
+        if self._stopping:
+            return True
+        if self._max_ticks is not None and self.tally.ticks >= self._max_ticks:
+            self._end("complete")
+        elif self._max_ticks is not None and not self._stay and self.black_box.ticks >= self._max_ticks:
+            self._end("failed", "the time was over before that much of it was armed")
+        elif self._settled_after_fault():
+            self._end("failed", self.authority.why)
+        return self._stopping
+
+    def _settled_after_fault(self) -> bool:
+        if self._faulted_at_ns is None or self._end_after_fault_s is None:
+            return False
+        return time.monotonic_ns() - self._faulted_at_ns > self._end_after_fault_s * 1e9

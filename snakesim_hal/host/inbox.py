@@ -1,0 +1,161 @@
+"""What comes in to the HAL host: queued by other threads, decoded and handed over in the host's own.
+
+There are lanes, and what stands in a lower one goes first: an emergency stop waits for nothing, and no number of lease
+requests keeps a command waiting. Each lane is bounded, so a flood costs neither memory nor other people's turn.
+"""
+
+import time
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from queue import Empty
+from typing import Any, Protocol
+
+from snakesim_hal.errors import WireError
+from snakesim_hal.network.mailbox import Mailbox
+from snakesim_hal.network.session import Arrival, Question, Session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import Decoder
+from snakesim_hal.wire.messages import Answer, Done, EstopRequest, JointCommand, LeaseRequest, LifecycleRequest
+
+STOPS, PRESENCE, SAMPLES, REQUESTS = range(4)  # lanes
+LIMITS = (64, None, 4096, 64)  # only known services have a presence, so that lane needs no bound
+
+Request = LeaseRequest | LifecycleRequest | EstopRequest
+Reply = Callable[[Answer], None]
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A request that came another way than over Zenoh."""
+
+    request: Request
+    reply: Reply
+
+
+class Receiver(Protocol):
+    """Who acts on what comes in."""
+
+    def take_command(self, command: JointCommand, monotonic_ns: int) -> None:
+        """A command, and when it came."""
+        ...
+
+    def take_done(self, service: str, tick: int) -> None:
+        """A service owes nothing more for a tick."""
+        ...
+
+    def came_or_went(self, service: str, present: bool) -> None:
+        """A service's token is there, or is not any more."""
+        ...
+
+    def answer(self, request: Request, reply: Reply) -> None:
+        """Somebody asks; reply once, from any thread."""
+        ...
+
+    def refuse(self, error: WireError) -> Answer:
+        """Something cannot be decoded; what to answer if it was a question."""
+        ...
+
+
+class Inbox:
+    """What other threads fill and the host empties."""
+
+    def __init__(
+        self,
+        session: Session,
+        receiver: Receiver,
+        services: Collection[str],
+        reply: Callable[[Question, Answer], None],
+    ) -> None:
+        """Declares everything that the host listens to. services: whose presence counts; reply: answers a query."""
+        self._receiver, self._reply = receiver, reply
+        self._queue: Mailbox[Any] = Mailbox(LIMITS)
+        self._command_decoder = Decoder(JointCommand)
+        self._done_decoder = Decoder(Done)
+        self._request_decoders: dict[str, Decoder[Any]] = {
+            keys.LEASE: Decoder(LeaseRequest),
+            keys.LIFECYCLE: Decoder(LifecycleRequest),
+            keys.ESTOP: Decoder(EstopRequest),
+        }
+        self._services = frozenset(services)
+        self.dropped = 0
+        session.on_arrival(keys.JOINT_COMMAND, self._put_sample)
+        session.on_arrival(keys.DONE_ALL, self._put_sample)
+        session.on_question(keys.ESTOP, self._put_stop)
+        for key in (keys.LEASE, keys.LIFECYCLE):
+            session.on_question(key, self._put_request)
+        session.on_alive(self._put_presence)
+
+    def waiting(self) -> int:
+        """How much has not been taken yet."""
+        return self._queue.qsize()
+
+    def ask(self, request: Request, reply: Reply) -> None:
+        """Put a request that came another way than over Zenoh; from any thread."""
+        self._queue.put(Asked(request, reply), STOPS)
+
+    def take(self, timeout_s: float) -> bool:
+        """Handle the next thing that comes in; False when nothing came in time."""
+        try:
+            item = self._queue.get(timeout=timeout_s)
+        except Empty:
+            return False
+        self.handle(item)
+        return True
+
+    def take_until(self, monotonic_ns: int) -> None:
+        """Handle everything that comes in until a moment has come."""
+        while (left_ns := monotonic_ns - time.monotonic_ns()) > 0 and self.take(left_ns * 1e-9):
+            pass
+
+    def take_all(self, limit_ns: float) -> None:
+        """Handle what is there, for at most so long: what floods in may wait for the next tick."""
+        stop_ns = time.monotonic_ns() + limit_ns
+        for _ in range(self._queue.qsize()):
+            if not self.take(0.0) or time.monotonic_ns() > stop_ns:
+                return
+
+    def handle(self, item: Any) -> None:
+        """Decode one thing, and hand it over."""
+        receiver = self._receiver
+        if isinstance(item, Asked):
+            receiver.answer(item.request, item.reply)
+        elif isinstance(item, Question):
+            self._answer(item)
+        elif not isinstance(item, Arrival):
+            receiver.came_or_went(*item)
+        else:
+            try:
+                if item.key == keys.JOINT_COMMAND:
+                    command = self._command_decoder.decode(item.payload, item.encoding)
+                    receiver.take_command(command, item.monotonic_ns)
+                else:
+                    done = self._done_decoder.decode(item.payload, item.encoding)
+                    receiver.take_done(keys.service_of(item.key), done.tick)
+            except WireError as error:
+                receiver.refuse(error)
+
+    def _answer(self, question: Question) -> None:
+        try:
+            request = self._request_decoders[question.key].decode(question.payload, question.encoding)
+        except WireError as error:
+            self._reply(question, self._receiver.refuse(error))
+        else:
+            self._receiver.answer(request, lambda answer: self._reply(question, answer))
+
+    # --- in Zenoh's threads ----------------------------------------------------------------------------------
+
+    def _put_stop(self, question: Question) -> None:
+        self._queue.put(question, STOPS)
+
+    def _put_request(self, question: Question) -> None:
+        self.dropped += self._queue.full(REQUESTS)  # whoever asked is not answered, and may ask again
+        self._queue.put(question, REQUESTS)
+
+    def _put_sample(self, arrival: Arrival) -> None:
+        self.dropped += self._queue.full(SAMPLES)
+        self._queue.put(arrival, SAMPLES)
+
+    def _put_presence(self, key: str, present: bool) -> None:
+        service = keys.service_of(key)
+        if service in self._services:
+            self._queue.put((service, present), PRESENCE)

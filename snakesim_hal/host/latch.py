@@ -1,0 +1,146 @@
+"""An emergency stop kept on disk, so that it outlives the host: one that starts and finds it begins in `estop`.
+
+The file is written whole or not at all, and is on the disk before the stop is answered. One that cannot be read counts
+as latched. Writing happens beside the host's loop, in the order of the requests: the joints never wait for a disk, and
+an answer waits no longer than ANSWER_LIMIT_S; then it says that the stop is not kept yet.
+"""
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from queue import SimpleQueue
+
+import msgspec
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.whole_file import sync_folder, write_whole
+from snakesim_hal.network.local_registry import state_folder
+from snakesim_hal.wire.codec import UNDECODABLE
+from snakesim_hal.wire.messages import Answer
+
+ESTOP = "estop.json"
+ANSWER_LIMIT_S = 1.0  # of a disk that hangs; who asks waits longer
+
+
+class Latched(msgspec.Struct, frozen=True, kw_only=True):
+    """Who stopped the robot, and at which tick of which host's count."""
+
+    who: str
+    tick: int
+
+
+class EstopLatch:
+    """The file of one robot's emergency stop."""
+
+    def __init__(self, folder: Path | None) -> None:
+        """folder: where the file is kept; None: nowhere, the latch lives as long as the host."""
+        self._path = None if folder is None else folder / ESTOP
+        self._asked: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
+        self._waiting: SimpleQueue[_Once | None] = SimpleQueue()
+        self._writer = threading.Thread(target=self._write, name="estop", daemon=True)
+        self.found = None if self._path is None else _read(self._path)  # what an earlier host left
+        self._kept = self.found is not None and self.found.tick >= 0
+        self._writer.start()
+        threading.Thread(target=self._lose_patience, name="estop late", daemon=True).start()
+
+    def engage(self, who: str, tick: int, then: Callable[[str | None], None]) -> None:
+        """Keep a stop. `then` is called once, from another thread: with None, or with why it could not be kept."""
+        once = _Once(then, f"it is not kept yet, and may not outlive this host: {self._path}: the disk does not answer")
+        self._waiting.put(once)
+        self._asked.put(lambda: self._engage(Latched(who=who, tick=tick), once))
+
+    def release(self, then: Callable[[str | None], None]) -> None:
+        """Forget it. `then` is called as in `engage`."""
+        once = _Once(then, f"the next host may start in estop: {self._path}: the disk does not answer")
+        self._waiting.put(once)
+        self._asked.put(lambda: self._release(once))
+
+    def close(self) -> None:
+        """Finish what was asked for, unless the disk hangs; then at least answer."""
+        self._asked.put(None)
+        self._waiting.put(None)
+        self._writer.join(1.1 * ANSWER_LIMIT_S)
+
+    def _write(self) -> None:
+        while (ask := self._asked.get()) is not None:
+            ask()
+
+    def _lose_patience(self) -> None:
+        while (once := self._waiting.get()) is not None:
+            time.sleep(max(once.until_s - time.monotonic(), 0.0))
+            once(once.late)
+
+    def _engage(self, latched: Latched, then: Callable[[str | None], None]) -> None:
+        if self._path is None or self._kept:
+            then(None)
+            return
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            write_whole(self._path, msgspec.json.encode(latched), durable=True)
+            self._kept = True
+            then(None)
+        except OSError as error:
+            then(f"it will not outlive this host: {self._path}: {error.strerror}")
+
+    def _release(self, then: Callable[[str | None], None]) -> None:
+        if self._path is None:
+            then(None)
+            return
+        try:
+            self._path.unlink(missing_ok=True)
+            sync_folder(self._path.parent)
+            self._kept = False
+            then(None)
+        except OSError as error:
+            then(f"the next host will start in estop: {self._path}: {error.strerror}; remove it by hand")
+
+
+def _read(path: Path) -> Latched | None:
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=Latched)
+    except FileNotFoundError:
+        return None
+    except (OSError, *UNDECODABLE):
+        return Latched(who=f"somebody ({ESTOP} cannot be read)", tick=-1)
+
+
+def stops_kept() -> list[Path]:
+    """The file of every emergency stop that is latched on this computer, for this user."""
+    return sorted((state_folder() / "robots").glob(f"*/{ESTOP}"))
+
+
+def forget_stop(path: Path) -> str:
+    """Remove a latched stop, for a robot whose host does not run; returns what it was. Raises ConfigError."""
+    found = _read(path)
+    try:
+        path.unlink(missing_ok=True)
+        sync_folder(path.parent)
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}; remove it by hand") from error
+    return f"emergency stop by {'nobody' if found is None else found.who}"
+
+
+class _Once:
+    """Calls `then` with the first of what it is called with."""
+
+    def __init__(self, then: Callable[[str | None], None], late: str) -> None:
+        self.late = late
+        self.until_s = time.monotonic() + ANSWER_LIMIT_S
+        self._then = then
+        self._first = threading.Lock()
+
+    def __call__(self, trouble: str | None) -> None:
+        if self._first.acquire(blocking=False):  # and never released
+            self._then(trouble)
+
+
+def replying(reply: Callable[[Answer], None], answer: Answer) -> Callable[[str | None], None]:
+    """Reply as soon as the latch is written, and say what went wrong with that."""
+
+    def written(trouble: str | None) -> None:
+        reply(
+            answer if trouble is None else msgspec.structs.replace(answer, reason=f"{answer.reason}; {trouble}"[:500])
+        )
+
+    return written

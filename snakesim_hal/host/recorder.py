@@ -1,0 +1,141 @@
+"""Writes what a host leaves behind as it comes: black box, description and the host's own numbers.
+
+A thread of its own does it, twice a second, so no tick waits for a disk. What cannot be written is tried again each
+time, for as long as the black box holds it. The host's numbers also go to `memory`, a file without a disk that whoever
+started the host shares with it: they are known there when the disk is full or hangs, and after a SIGKILL.
+"""
+
+import contextlib
+import errno
+import os
+import threading
+from itertools import count
+from pathlib import Path
+from types import TracebackType
+from typing import Protocol, Self
+
+import msgspec
+
+from snakesim_hal.host.black_box import BlackBox
+from snakesim_hal.model.whole_file import write_whole
+from snakesim_hal.terminal import complain
+from snakesim_hal.wire.messages import Description
+
+BLACK_BOX = "blackbox.rows"
+DESCRIPTION = "description.json"
+HOST_RECORD = "host.json"
+PERIOD_S = 0.5
+CLOSE_LIMIT_S = 2.0  # for a disk that hangs
+
+
+class Numbers(Protocol):
+    """Makes the host's own numbers into a message, at any time and from any thread."""
+
+    def __call__(self, *, lost_ticks: int, trouble: str) -> msgspec.Struct:
+        """lost_ticks: rows that the file will never have; trouble: what cannot be written, and why, or empty."""
+        ...
+
+
+class Recorder:
+    """Writes into one run's folder, from `with` on until its end."""
+
+    def __init__(
+        self, box: BlackBox, description: Description, numbers: Numbers, folder: Path | None, memory: int | None = None
+    ) -> None:
+        """folder: None keeps nothing on disk; memory: a file descriptor, see above."""
+        self._box, self._description, self._numbers = box, description, numbers
+        self._folder, self._memory = folder, memory
+        self._file: int | None = None
+        self._begins = 0  # where rows begin in the file
+        self._next = 0  # the first row that is not in the file yet
+        self._skipped = 0  # rows that the black box had to forget before they were written
+        self._trouble = ""
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
+
+    def __enter__(self) -> Self:
+        if self._memory is not None:
+            os.ftruncate(self._memory, 0)  # of an earlier host
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Write what is left, and how the host ended. A disk that hangs is waited for no longer than CLOSE_LIMIT_S."""
+        self._closing.set()
+        self._thread.join(CLOSE_LIMIT_S)
+        if self._thread.is_alive():
+            self._note(f"{self._folder}: the disk has not answered for {CLOSE_LIMIT_S:g} s")
+            self._remember()
+
+    def _run(self) -> None:
+        closing = False
+        while not closing:
+            closing = self._closing.wait(PERIOD_S)
+            if self._folder is not None:
+                self._note(self._written(self._folder))
+            self._remember()
+        if self._file is not None:
+            os.close(self._file)
+
+    def _written(self, folder: Path) -> str:
+        """Bring the folder up to date. Returns what could not be written, and why."""
+        trouble = ""
+        for write in (self._write_rows, self._write_numbers):
+            try:
+                write(folder, trouble)
+            except OSError as error:
+                trouble = trouble or f"{folder}: {error.strerror or error}"
+        return trouble
+
+    def _write_numbers(self, folder: Path, trouble: str) -> None:
+        if self._file is not None:  # else they would take the place of an earlier host's
+            write_whole(folder / HOST_RECORD, msgspec.json.format(msgspec.json.encode(self._told(trouble))))
+
+    def _open(self, folder: Path) -> int:
+        """Begin the files of this host; those of an earlier one in this run get a number."""
+        if (folder / HOST_RECORD).exists() or (folder / BLACK_BOX).exists():
+            number = next(n for n in count(1) if not _numbered(folder / BLACK_BOX, n).exists())
+            for path in (folder / BLACK_BOX, folder / HOST_RECORD):
+                with contextlib.suppress(FileNotFoundError):
+                    path.rename(_numbered(path, number))
+        write_whole(folder / DESCRIPTION, msgspec.json.encode(self._description))
+        header = self._box.layout.header()
+        write_whole(folder / BLACK_BOX, header)
+        self._begins = len(header)
+        return os.open(folder / BLACK_BOX, os.O_WRONLY | os.O_CLOEXEC)
+
+    def _write_rows(self, folder: Path, _trouble: str) -> None:
+        if self._file is None:
+            self._file = self._open(folder)
+        size = self._box.layout.row_bytes
+        end = self._box.ticks  # now: a slow disk may never catch up with a host that goes on
+        while self._next < end:
+            first, rows = self._box.rows_from(self._next)
+            self._skipped += first - self._next
+            self._next = first
+            written = os.pwrite(self._file, rows, self._begins + (self._next - self._skipped) * size)
+            self._next += written // size  # of a row that is torn, the whole is written next time
+            if written < len(rows):  # a disk that is full takes a part first
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def _note(self, trouble: str) -> None:
+        if trouble and not self._trouble:
+            complain(f"record: {trouble}")
+        self._trouble = trouble
+
+    def _told(self, trouble: str) -> msgspec.Struct:
+        lost = self._skipped + (self._box.ticks - self._next if self._closing.is_set() else 0)
+        return self._numbers(lost_ticks=lost, trouble=trouble)
+
+    def _remember(self) -> None:
+        if self._memory is not None:
+            content = msgspec.json.encode(self._told(self._trouble))
+            with contextlib.suppress(OSError):  # no memory left: then the folder tells
+                os.pwrite(self._memory, content, 0)
+                os.ftruncate(self._memory, len(content))
+
+
+def _numbered(path: Path, number: int) -> Path:
+    return path.with_stem(f"{path.stem}-{number}")

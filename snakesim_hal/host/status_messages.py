@@ -1,0 +1,66 @@
+"""What the host tells of itself, made into messages. Pure."""
+
+from snakesim_hal.host.participants import Participants
+from snakesim_hal.safety.authority import Authority, Decision
+from snakesim_hal.wire.messages import AppliedCommand, Description, Pace, Status
+
+
+def applied_message(description: Description, tick: int, decision: Decision) -> AppliedCommand:
+    """What went to the motors in a tick."""
+    points = decision.set_points
+    return AppliedCommand(
+        tick=tick,
+        stamp_ns=tick * description.period_ns,
+        sequence=decision.sequence,
+        mode=points.mode,
+        target=points.target,
+        torque_limit_nm=points.torque_limit_nm,
+        limited={description.joints[i].name: word for i, word in decision.limited.items()},
+    )
+
+
+def status_message(
+    authority: Authority,
+    participants: Participants,
+    *,
+    tick: int,
+    pace: Pace,
+    safety_now_ns: int,
+    missing: list[str],
+    overruns: int,
+    hygiene: list[str],
+    injected: list[str],
+) -> Status:
+    """How the robot is now, and why. missing: the services that arming waits for."""
+    description = authority.description
+    against = authority.against_arming(safety_now_ns)
+    why = authority.why
+    if authority.state == "disarmed" and (against or missing):
+        why = "; ".join([why, *(f"waiting for {name}" for name in missing), *against])[:500]
+    return Status(
+        tick=tick,
+        stamp_ns=tick * description.period_ns,
+        robot=description.robot,
+        backend=description.backend,
+        pace=pace,
+        rate_hz=1e9 / description.period_ns,
+        lifecycle=authority.state,
+        why=why,
+        lease_holder=authority.lease.holder,
+        lease_epoch=authority.lease.epoch,
+        commands_accepted=authority.accepted,
+        commands_standby=authority.standby,
+        commands_rejected=dict(authority.rejected),
+        commands_limited=dict(authority.limited),
+        faults=authority.faults,
+        faults_left_out=authority.since_clear.left_out,
+        alive=participants.present(),
+        waiting_for=missing,
+        overruns=overruns,
+        hygiene=hygiene,
+        injected=injected,
+        ready_to_arm=not against and not missing,
+        derated=authority.derated,
+        isolated=authority.isolated,
+        host=description.host,
+    )

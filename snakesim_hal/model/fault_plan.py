@@ -1,0 +1,59 @@
+"""The faults on request that a run has planned, and whether it can have them at all."""
+
+from collections.abc import Collection
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.files import Table
+from snakesim_hal.model.injection import Injection, check_targets, parse
+from snakesim_hal.model.scenario import RunConfig
+
+MOST_BUSES = 8
+ON_SAMPLES = ("mute", "freeze", "wrong", "nan")  # of joints; the host does these itself where the backend cannot
+
+
+def planned(config: RunConfig, table: Table | None = None) -> list[Injection]:
+    """From their texts. Raises ConfigError with the number of the wrong one."""
+    found: list[Injection] = []
+    for i, text in enumerate(config.faults):
+        try:
+            found.append(parse(text))
+        except ConfigError as error:
+            raise ConfigError(f"{_place(config, i, table)}: {error}") from None
+    return found
+
+
+def check_planned(config: RunConfig, table: Table | None = None) -> None:
+    """Whether every process, key and joint that is to go wrong is there. Raises ConfigError."""
+    _check(config, table, MOST_BUSES)
+
+
+def check_backend_can(config: RunConfig, *, does: Collection[str], buses: int, because: str) -> None:
+    """Whether a backend can do what is planned for joints, buses and the simulator. Raises ConfigError.
+
+    does: kinds of these that it knows by itself; because: why it knows no more.
+    """
+    for i, injection in enumerate(_check(config, None, buses)):
+        if injection.target_type == "simulator" and injection.kind == "slow":
+            continue
+        if injection.target_type == "joint" and injection.kind in ON_SAMPLES:
+            continue
+        if injection.target_type in ("joint", "bus", "simulator") and injection.kind not in does:
+            raise ConfigError(
+                f"{_place(config, i, None)}: backend {config.backend!r} cannot do {injection.kind} to "
+                f"{injection.target}: {because}"
+            )
+
+
+def _check(config: RunConfig, table: Table | None, buses: int) -> list[Injection]:
+    found = planned(config, table)
+    for i, injection in enumerate(found):
+        try:
+            check_targets([injection], services=config.own_services, joints=config.robot.chain.modules, buses=buses)
+        except ConfigError as error:
+            raise ConfigError(f"{_place(config, i, table)}: {error}") from None
+    return found
+
+
+def _place(config: RunConfig, i: int, table: Table | None) -> str:
+    origin = f"scenario {config.name!r}" if table is None else table.origin_of("faults")
+    return f"{origin}: `faults[{i}]`"

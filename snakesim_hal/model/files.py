@@ -1,0 +1,230 @@
+"""Reading the files that people write: TOML (or JSON) in, a checked Struct out, one clear error otherwise.
+
+An error names the file, the field, the value, its unit, what is allowed, and what to do. `Table` keeps, for every
+value, the file or flag that it came from.
+"""
+
+import difflib
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+from msgspec import inspect
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.field_types import fields_at, in_words, options, type_at, unit_of, value_at
+from snakesim_hal.model.textfiles import MOST_DEPTH, parse_json, parse_toml, read_text
+
+StructT = TypeVar("StructT", bound=msgspec.Struct)
+_AT = re.compile(r"^(?P<what>.*?)(?: - at `(?P<where>[^`]*)`)?$", re.DOTALL)
+SHIPPED = Path(__file__).parents[1] / "shipped"
+ROUTER = SHIPPED / "router.json5"
+SCHEMAS = Path(__file__).parents[1] / "schemas"  # in the repository a link to the folder beside the packages
+
+
+class FileStruct(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
+    """Base of everything that is read from a file: an unknown field is an error, not a typo that does nothing."""
+
+
+@dataclass
+class Table:
+    """Values as read, with the place that each leaf came from; keys of `origin` are dotted."""
+
+    values: dict[str, Any]
+    source: str
+    origin: dict[str, str] = field(default_factory=dict)
+
+    def put(self, dotted: str, value: Any, origin: str) -> None:
+        """Set a value, making the tables on the way."""
+        *parents, last = dotted.split(".")
+        if len(parents) >= MOST_DEPTH:
+            raise ConfigError(f"{origin}: the key has {len(parents) + 1} parts, at most {MOST_DEPTH} are allowed")
+        place: Any = self.values
+        for i, name in enumerate(parents):
+            if isinstance(place, list):
+                place = _list_entry(place, name, ".".join(parents[: i + 1]), origin)
+                continue
+            place = place.setdefault(name, {})
+            if not isinstance(place, dict | list):
+                raise ConfigError(
+                    f"{origin}: `{'.'.join(parents[: i + 1])}` is the value {short(repr(place))}, not a section; "
+                    f"`{dotted}` cannot be set inside it"
+                )
+        if isinstance(place, list):
+            _list_entry(place, last, dotted, origin)
+            place[int(last)] = value
+        else:
+            place[last] = value
+        for key in [k for k in self.origin if k == dotted or k.startswith(dotted + ".")]:
+            del self.origin[key]
+        self.origin.update(_origins(value, origin, dotted))
+
+    def origin_of(self, dotted: str) -> str:
+        """The file or flag behind a dotted key; `default` when nobody set it."""
+        key = dotted
+        while key:
+            if key in self.origin:
+                return self.origin[key]
+            key = key.rpartition(".")[0]
+        return "default"
+
+    def file_of(self, dotted: str) -> str:
+        """The file in which a field stands, or in which its nearest neighbours do when it is missing."""
+        place = dotted
+        while place:
+            for key, origin in self.origin.items():
+                if (key == place or key.startswith(place + ".")) and not origin.startswith("--"):
+                    return origin
+            place = place.rpartition(".")[0]
+        return self.source
+
+
+def _origins(value: Any, origin: str, prefix: str = "") -> dict[str, str]:
+    """An empty section sets nothing, so everything in it is still a default."""
+    return {key: origin for key, leaf in leaves(value, prefix) if leaf != {}}
+
+
+def _list_entry(place: list[Any], name: str, dotted: str, origin: str) -> Any:
+    if not name.isdecimal() or len(name) > 9 or int(name) >= len(place):
+        has = f"has entries 0 to {len(place) - 1}; name one by its number" if place else "is empty"
+        raise ConfigError(f"{origin}: `{dotted}`: the list {has}")
+    return place[int(name)]
+
+
+def leaves(value: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Every leaf below a value as (dotted key, value); lists of tables are numbered from 0, other lists are leaves."""
+    join = f"{prefix}." if prefix else ""
+    if isinstance(value, dict) and value:
+        for key, inner in value.items():
+            yield from leaves(inner, f"{join}{key}")
+    elif isinstance(value, list) and value and all(isinstance(v, dict) for v in value):
+        for i, inner in enumerate(value):
+            yield from leaves(inner, f"{join}{i}")
+    else:
+        yield prefix, value
+
+
+def read_table(path: Path, suffix: str | None = None) -> Table:
+    """Read a TOML or JSON file. Raises ConfigError when it is absent or no such file.
+
+    suffix: says which; None: that of the path.
+    """
+    text = read_text(path)
+    is_json = (path.suffix if suffix is None else suffix) == ".json"
+    values = parse_json(text, str(path)) if is_json else parse_toml(text, str(path))
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path}: holds a {type(values).__name__}, not a table of settings")
+    return Table(values, str(path), _origins(values, str(path)))
+
+
+def find(name: str, kind: str, beside: Path | None = None) -> Path:
+    """Path of a robot, scene or scenario: a path to a file (relative to `beside`), or the name of a shipped one.
+
+    kind: `robots`, `scenes` or `scenarios`.
+    """
+    if name.endswith((".toml", ".json")) or "/" in name:
+        path = expanded(name)
+        return path if path.is_absolute() or beside is None else beside / path
+    if name not in shipped(kind):
+        raise ConfigError(
+            f"no {kind[:-1]} called {short(name)!r}; shipped are {', '.join(shipped(kind))}. "
+            f"For a file of your own give its path, such as ./{short(name)}.toml"
+        )
+    return SHIPPED / kind / f"{name}.toml"
+
+
+def expanded(name: str) -> Path:
+    """A path, with `~` for the home folder. Raises ConfigError when there is no such home."""
+    try:
+        return Path(name).expanduser()
+    except RuntimeError as error:
+        raise ConfigError(f"{short(name)}: {error}") from None
+
+
+def shipped(kind: str) -> list[str]:
+    """Names of the shipped files of a kind."""
+    return sorted(path.stem for path in (SHIPPED / kind).glob("*.toml"))
+
+
+def decode(table: Table, struct: type[StructT], under: str = "") -> StructT:
+    """Check a table against a Struct. Raises ConfigError naming file, field, value, unit and range."""
+    try:
+        return msgspec.convert(table.values, struct)
+    except msgspec.ValidationError as error:
+        raise ConfigError(_explain(error, table, struct, under)) from None
+    except UnicodeEncodeError as error:  # JSON may escape, and a command line may hold, half of a character
+        odd = ascii(error.object[error.start : error.end])[:40]
+        raise ConfigError(
+            f"{table.source}: a key or a text holds {odd}, which is no character; write it anew"
+        ) from None
+
+
+def _explain(error: msgspec.ValidationError, table: Table, struct: type[msgspec.Struct], under: str) -> str:
+    match = _AT.match(str(error))
+    assert match is not None
+    what, where = match["what"], (match["where"] or "$").removeprefix("$").lstrip(".")
+    steps = _steps(where, table.values, struct)
+    dotted = ".".join(filter(None, [under, *steps]))
+    unknown = re.match(r"Object contains unknown field `(.*)`", what, re.DOTALL)
+    missing = re.match(r"Object missing required field `(.*)`", what)
+    fields = fields_at(struct, steps, table.values)
+    if unknown:
+        name = short(unknown[1])
+        close = difflib.get_close_matches(name, fields, 1, 0.6)
+        full = f"{dotted}.{name}" if dotted else name
+        hint = f"did you mean `{close[0]}`?" if close else f"known here: {', '.join(sorted(fields))}."
+        set_by = [origin for key, origin in table.origin.items() if key == full or key.startswith(full + ".")]
+        return f"{set_by[0] if set_by else table.file_of(full)}: unknown field `{full}`; {hint}"
+    if missing:
+        name = missing[1]
+        full = f"{dotted}.{name}" if dotted else name
+        return f"{table.file_of(full)}: field `{full}` is missing; add it ({in_words(fields.get(name))})."
+    value = value_at(table.values, steps)
+    info = type_at(struct, steps, table.values)
+    unit = unit_of(info)
+    origin = table.origin_of(dotted)
+    origin = table.file_of(dotted) if origin == "default" else origin
+    shown = f"{short(_repr(value))}{' ' + unit if unit and isinstance(value, int | float) else ''}"
+    why = short(what[:1].lower() + what[1:])
+    return f"{origin}: `{short(dotted)}` = {shown} is not allowed: {why}; wanted is {in_words(info)}."
+
+
+def short(text: str, most: int = 120) -> str:
+    """A text that a person wrote, for quoting: its beginning, when it is long."""
+    return text if len(text) <= most else text[: most - 3] + "..."
+
+
+def _repr(value: Any) -> str:
+    try:
+        return repr(value)
+    except ValueError:  # Python writes no whole number of more than 4300 digits
+        return "a very large number"
+
+
+def _steps(where: str, values: dict[str, Any], struct: type[msgspec.Struct]) -> list[str]:
+    """The way to a wrong value. For a free key of a section msgspec says `[...]`: look which entry it is."""
+    steps: list[str] = []
+    value: Any = values
+    for match in re.finditer(r"\[(\.\.\.|\d+)\]|[^.\[\]]+", where):
+        step = match[1] or match[0]
+        if step == "...":
+            step = _wrong_entry(value, type_at(struct, steps, values)) if isinstance(value, dict) else step
+        steps.append(step)
+        value = value_at(value, [step])
+    return steps
+
+
+def _wrong_entry(section: dict[str, Any], info: inspect.Type | None) -> str:
+    wanted: Any = dict
+    for option in options(info):
+        if isinstance(option, inspect.DictType) and isinstance(option.value_type, inspect.StructType):
+            wanted = option.value_type.cls
+    for key, value in section.items():
+        try:
+            msgspec.convert(value, wanted)
+        except msgspec.ValidationError:
+            return key
+    return "..."

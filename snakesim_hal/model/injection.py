@@ -1,0 +1,294 @@
+"""What can be made to go wrong on request: one vocabulary for scenario files, `snakesim fault`, and module twins.
+
+    kill:control@2            at 2 s of robot time after the first arming
+    drop:actuator/joints@2-4=0.3    from 2 s to 4 s, three of ten
+    mute:joint_3@5-6.5        joint_3 says nothing for 1.5 s
+
+Pure: says what an injection means and who carries it out; whoever that is does it.
+"""
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from math import inf, isfinite
+from typing import Literal, get_args
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.wire import keys
+
+TargetType = Literal["process", "key", "joint", "bus", "simulator", "clock"]
+RUN, HAL, CONTROL = "run", "hal", "control"
+ROUTER = "router"  # that of a run with --with-router
+SUPERVISED = ("kill", "stop", "freeze")  # of a process; what is left of its faults it does to itself
+FORM = "KIND:TARGET@START, KIND:TARGET@START-END, or either with =AMOUNT; in seconds, such as mute:joint_3@2-3.5"
+LONGEST_TEXT = 200  # characters of one, as people write it
+_text = re.compile(
+    r"(?P<kind>[a-z_]+):(?P<target>[a-z0-9_/]+)@(?P<start>[0-9.]+)(-(?P<end>[0-9.]+))?(=(?P<amount>[-+0-9.e]+))?"
+)
+_numbered = re.compile(r"(?P<type>joint|bus)_(?P<number>[1-9][0-9]*)")
+
+
+@dataclass(frozen=True)
+class Amount:
+    """How much of it: the number behind `=`."""
+
+    about: str
+    unit: str
+    default: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One way to go wrong."""
+
+    about: str
+    amount: Amount | None = None
+    once: bool = False  # it happens, and has no end
+
+
+SHARE = Amount("share of the messages", "1", 1.0, 0.0, 1.0)
+
+KINDS: Mapping[TargetType, Mapping[str, Kind]] = {
+    "process": {
+        "kill": Kind("SIGKILL: gone without a word", once=True),
+        "stop": Kind("SIGTERM: ends in order", once=True),
+        "freeze": Kind("SIGSTOP until the end: there, and silent"),
+        "hang": Kind("its interpreter is busy until the end: alive on the network, and does nothing"),
+    },
+    "key": {
+        "drop": Kind("messages get lost", SHARE),
+        "delay": Kind("messages come late", Amount("delay", "s", 0.05, 0.0, 10.0)),
+        "duplicate": Kind("messages come twice", SHARE),
+        "reorder": Kind("a message comes after the one that follows it", SHARE),
+        "corrupt": Kind("bytes of messages are changed", SHARE),
+        "flood": Kind("the newest message is sent over and over", Amount("rate", "1/s", 5000.0, 1.0, 1e5)),
+    },
+    "joint": {
+        "mute": Kind("says nothing"),
+        "freeze": Kind("repeats what it said last; its age grows"),
+        "wrong": Kind("its angle is off", Amount("offset", "rad", 0.5, -6.3, 6.3)),
+        "nan": Kind("its angle is no number"),
+        "reboot": Kind("its module restarts", once=True),
+        "counter": Kind("joint states with a wrong count"),
+        "checksum": Kind("joint states with a wrong checksum"),
+        "duplicate": Kind("a second module with the same node id is on the bus"),
+        "overheat": Kind("its winding is heated to 5 °C above `stop_at_c`; kept there until the end, if one is given"),
+        "leak": Kind("finds water inside"),
+        "babble": Kind("sends its heartbeat over and over, as often as the bus lets it"),
+        "undervoltage": Kind("its supply falls to 12 V"),
+    },
+    "bus": {
+        "cut": Kind("the interface goes down; it comes up again at the end"),
+        "bus_off": Kind("the controller leaves the bus; it restarts at the end"),
+        "error_passive": Kind("the controller has counted more than 127 errors", once=True),
+        "overflow": Kind("received frames get lost", once=True),
+        "full": Kind("the transmit queue is full"),
+    },
+    "simulator": {
+        "slow": Kind("runs at a share of real time", Amount("share of real time", "1", 0.1, 0.001, 1.0)),
+        "diverge": Kind("its state becomes impossible", once=True),
+    },
+    "clock": {
+        "step": Kind("the wall clock jumps, with CAP_SYS_TIME", Amount("by", "s", 3600.0, -1e6, 1e6), once=True),
+    },
+}
+
+
+@dataclass(frozen=True)
+class Injection:
+    """One thing that goes wrong, for some time. Make it with `parse` or `checked`: those know what is allowed."""
+
+    kind: str
+    target: str
+    start_s: float = 0.0  # of robot time since the first arming; for twins, since they were started
+    end_s: float = inf
+    amount: float | None = None
+
+    @property
+    def target_type(self) -> TargetType:
+        """What sort of thing it happens to."""
+        return target_type(self.target)
+
+    @property
+    def about(self) -> Kind:
+        """What it is."""
+        return KINDS[self.target_type][self.kind]
+
+    @property
+    def number(self) -> int:
+        """Of a joint or bus: its index from the tail, from 0."""
+        match = _numbered.fullmatch(self.target)
+        assert match is not None, f"{self.target} has no number"
+        return int(match["number"]) - 1
+
+    @property
+    def part(self) -> str:
+        """Who carries it out: the supervisor `run`, the host `hal`, or a service."""
+        match self.target_type:
+            case "process":
+                return RUN if self.kind in SUPERVISED else HAL if self.target == "host" else self.target
+            case "key":
+                return writer_of(self.target)
+            case "clock":
+                return RUN
+            case _:
+                return HAL
+
+    def __str__(self) -> str:
+        end = "" if self.end_s == inf else f"-{self.end_s:g}"
+        amount = "" if self.amount is None else f"={self.amount:g}"
+        return f"{self.kind}:{self.target}@{self.start_s:g}{end}{amount}"
+
+
+def target_type(target: str) -> TargetType:
+    """What sort of thing a name means."""
+    numbered = _numbered.fullmatch(target)
+    if numbered is not None:
+        return "joint" if numbered["type"] == "joint" else "bus"
+    if "/" in target:
+        return "key"
+    if target in ("simulator", "clock"):
+        return target
+    return "process"
+
+
+def writer_of(key: str) -> str:
+    """The part that writes a key. Raises ConfigError for a key that no part of a run writes."""
+    for row in keys.SPACE:
+        if row.kind not in ("stream", "latched"):
+            continue
+        if row.key == key:
+            writer = {"HAL": HAL, "lease holder": CONTROL}.get(row.writer, row.writer)
+            if writer != "operator":
+                return writer
+    if keys.message_at(key) is not None and key.startswith(keys.done("")):
+        return keys.service_of(key)
+    streams = [row.key for row in keys.SPACE if row.kind in ("stream", "latched") and row.writer != "operator"]
+    raise ConfigError(f"{key!r}: no part of a run writes this key; those with a writer are {', '.join(streams)}")
+
+
+def parse(text: str) -> Injection:
+    """An injection from its text in a file. Raises ConfigError."""
+    if len(text) > LONGEST_TEXT:
+        raise ConfigError(f"fault {text[:40]!r}...: {len(text)} characters, at most {LONGEST_TEXT}: give {FORM}")
+    match = _text.fullmatch(text.strip())
+    if match is None:
+        raise ConfigError(f"fault {text!r}: give {FORM}. Kinds: {kinds_in_short()}")
+    try:
+        start_s, end_s = float(match["start"]), float(match["end"] or inf)
+        amount = None if match["amount"] is None else float(match["amount"])
+    except ValueError:
+        raise ConfigError(f"fault {text!r}: start, end and amount are numbers, such as @2.0-3.5=0.3") from None
+    if end_s <= start_s:
+        raise ConfigError(f"fault {text!r}: it ends at {end_s:g} s, which must be later than its start, {start_s:g} s")
+    return checked(Injection(match["kind"], match["target"], start_s, end_s, amount), text)
+
+
+def checked(injection: Injection, said: str | None = None) -> Injection:
+    """The same, when it is allowed, with the default of its amount filled in. Raises ConfigError."""
+    text = str(injection) if said is None else said
+    sort = injection.target_type
+    allowed = KINDS[sort]
+    if injection.kind not in allowed:
+        also = [f"{other}s" for other in get_args(TargetType) if injection.kind in KINDS[other]]
+        hint = f"; {injection.kind} is for {' and '.join(also)}" if also else ""
+        raise ConfigError(
+            f"fault {text!r}: a {sort} such as {injection.target} knows no {injection.kind!r}, only "
+            f"{', '.join(allowed)}{hint}"
+        )
+    kind = allowed[injection.kind]
+    if sort == "key":
+        writer_of(injection.target)
+    if kind.amount is None:
+        if injection.amount is not None:
+            raise ConfigError(f"fault {text!r}: {injection.kind} takes no amount; leave out ={injection.amount:g}")
+        return injection
+    amount = kind.amount.default if injection.amount is None else injection.amount
+    if not isfinite(amount) or not kind.amount.low <= amount <= kind.amount.high:
+        raise ConfigError(
+            f"fault {text!r}: {kind.amount.about} = {amount:g} must be from {kind.amount.low:g} to "
+            f"{kind.amount.high:g} {kind.amount.unit}"
+        )
+    return Injection(injection.kind, injection.target, injection.start_s, injection.end_s, amount)
+
+
+def check_targets(injections: Iterable[Injection], *, services: Iterable[str], joints: int, buses: int) -> None:
+    """Whether a run has everything that is to go wrong. Raises ConfigError."""
+    processes = [*services, "host", ROUTER]
+    for injection in injections:
+        sort = injection.target_type
+        if sort in ("joint", "bus"):
+            count = joints if sort == "joint" else buses
+            if injection.number >= count:
+                has = f"{sort}_1 to {sort}_{count}" if count else f"no {sort}"
+                raise ConfigError(f"fault {str(injection)!r}: there is no {injection.target}; this run has {has}")
+        elif sort == "process" and injection.target not in processes:
+            raise ConfigError(
+                f"fault {str(injection)!r}: there is no process {injection.target!r}; this run has "
+                f"{', '.join(processes)}"
+            )
+        elif sort == "key" and injection.part not in processes and injection.part != HAL:
+            raise ConfigError(
+                f"fault {str(injection)!r}: {injection.part} writes {injection.target}, and this run does not start it"
+            )
+        elif injection.target == ROUTER and injection.kind not in SUPERVISED:
+            raise ConfigError(
+                f"fault {str(injection)!r}: a router cannot {injection.kind}, only {', '.join(SUPERVISED)}"
+            )
+
+
+@dataclass(frozen=True)
+class Change:
+    """An injection begins or ends."""
+
+    at_s: float
+    injection: Injection
+    begins: bool
+
+
+class Plan:
+    """Injections in the order of time."""
+
+    def __init__(self, injections: Iterable[Injection] = ()) -> None:
+        self._changes: list[Change] = []
+        for injection in injections:
+            self.add(injection)
+
+    def add(self, injection: Injection) -> None:
+        """One more."""
+        self._changes.append(Change(injection.start_s, injection, True))
+        if injection.end_s != inf and not injection.about.once:
+            self._changes.append(Change(injection.end_s, injection, False))
+        self._changes.sort(key=lambda change: change.at_s)
+
+    def next_s(self) -> float:
+        """When the next one begins or ends; inf when none will."""
+        return self._changes[0].at_s if self._changes else inf
+
+    def until(self, now_s: float) -> list[Change]:
+        """What begins or ends by now, each once."""
+        due = [change for change in self._changes if change.at_s <= now_s]
+        self._changes = self._changes[len(due) :]
+        return due
+
+
+def explain() -> str:
+    """Every kind, for a command's help."""
+    lines: list[str] = []
+    for sort, kinds in KINDS.items():
+        lines.append(f"{sort}:")
+        for name, kind in kinds.items():
+            amount = kind.amount
+            much = ""
+            if amount is not None:
+                unit = "" if amount.unit == "1" else f" {amount.unit}"
+                much = f"; amount: {amount.about}, {amount.default:g}{unit} if not given"
+            lines.append(f"  {name:<14} {kind.about}{much}")
+    return "\n".join(lines)
+
+
+def kinds_in_short() -> str:
+    """Every kind by what it happens to."""
+    return "; ".join(f"{sort}: {', '.join(kinds)}" for sort, kinds in KINDS.items())

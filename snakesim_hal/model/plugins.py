@@ -1,0 +1,141 @@
+"""Backends, controllers, services and the like are found by name: an entry point of an installed package, or a file.
+
+`wave` is looked up among the entry points; `./wave.py:Wave` is the object `Wave` of that file, for trying things out.
+"""
+
+import ast
+import importlib.util
+import sys
+from collections.abc import Iterator
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.files import Table, decode, expanded, short
+from snakesim_hal.model.textfiles import read_bytes
+
+BACKENDS = "snakesim.backends"
+COMMANDS = "snakesim.commands"
+CONTROLLERS = "snakesim.controllers"
+PLANTS = "snakesim.plants"
+SERVICES = "snakesim.services"
+
+
+def installed(group: str) -> list[str]:
+    """Names of everything that is installed in a group."""
+    return sorted({entry.name for entry in entry_points(group=group)})
+
+
+def find_plugin(group: str, name: str) -> Any:
+    """Load what a name stands for. Raises ConfigError that says what is installed."""
+    kind = _kind(group)
+    if in_file(name):
+        return _from_file(name, kind)
+    found: dict[str, EntryPoint] = {entry.name: entry for entry in entry_points(group=group)}
+    if name not in found:
+        raise ConfigError(
+            f"no {kind} called {short(name)!r} is installed; installed are {', '.join(sorted(found)) or 'none'}. "
+            f"A package adds one by an entry point in the group {group!r}"
+        )
+    try:
+        return found[name].load()
+    except ModuleNotFoundError as error:
+        raise ConfigError(f"{kind} {name!r} cannot be loaded: {error}.{_extras_of(found[name])}") from error
+    except (ImportError, AttributeError) as error:
+        raise ConfigError(f"{kind} {name!r} ({found[name].value}) cannot be loaded: {error}") from error
+
+
+def _extras_of(entry: EntryPoint) -> str:
+    """How to install what a plugin needs and its package does not install by itself."""
+    extras = entry.dist.metadata.get_all("Provides-Extra") if entry.dist is not None else None
+    if entry.dist is None or not extras:
+        return ""
+    return f" Install it with: {sys.executable} -m pip install '{entry.dist.name}[{','.join(extras)}]'"
+
+
+def in_file(name: str) -> bool:
+    """Whether a name is the path of a Python file, with a class or without; the code in it runs when it is loaded."""
+    return ".py:" in name or name.endswith(".py")
+
+
+def find_installed(group: str, name: str) -> Any | None:
+    """Like `find_plugin`; but of a file it only looks whether the class is there, runs none of it, and returns None."""
+    if not in_file(name):
+        return find_plugin(group, name)
+    kind = _kind(group)
+    _, attribute, tree = _parsed(name, kind)
+    if not {attribute, "*"} & set(_names(tree)):
+        raise _not_there(name, kind, tree)
+    return None
+
+
+def _kind(group: str) -> str:
+    return group.rpartition(".")[2].removesuffix("s")
+
+
+def _parsed(name: str, kind: str) -> tuple[Path, str, ast.Module]:
+    """File, the name in it, and the file as Python reads it; none of it runs."""
+    path_text, _, attribute = (name if ".py:" in name else f"{name}:").rpartition(":")
+    try:
+        path = expanded(path_text).absolute()
+        tree = ast.parse(read_bytes(path), str(path))
+    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
+        why = error if isinstance(error, ConfigError) else f"{type(error).__name__}: {error}"
+        raise ConfigError(f"{kind} {short(name)!r} cannot be loaded: {why}") from None
+    if not attribute:
+        raise _not_there(name, kind, tree)
+    return path, attribute, tree
+
+
+def _not_there(name: str, kind: str, tree: ast.Module) -> ConfigError:
+    path, _, attribute = (name if ".py:" in name else f"{name}:").rpartition(":")
+    classes = [part.name for part in tree.body if isinstance(part, ast.ClassDef)]
+    what = f"the file has no {attribute!r}" if attribute else "the name of a class must follow"
+    has = f"the classes in it are {', '.join(classes)}" if classes else "there is no class in it"
+    example = f"{path}:{classes[0] if classes else 'Class'}"
+    return ConfigError(f"{kind} {short(name)!r}: {what}, as in {short(example)}; {short(has, 400)}")
+
+
+def _names(tree: ast.Module) -> Iterator[str]:
+    """Whatever the file may define."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ClassDef | ast.FunctionDef):
+            yield node.name
+        elif isinstance(node, ast.alias):
+            yield node.asname or node.name
+        elif isinstance(node, ast.Name):
+            yield node.id
+
+
+def _from_file(name: str, kind: str) -> Any:
+    path, attribute, tree = _parsed(name, kind)
+    spec = importlib.util.spec_from_file_location(f"snakesim_plugin_{path.stem}", path)
+    if spec is None or spec.loader is None:
+        raise ConfigError(f"{kind} {name!r}: {path} cannot be loaded as Python")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    try:
+        spec.loader.exec_module(module)
+    except (Exception, SystemExit) as error:
+        raise ConfigError(f"{kind} {short(name)!r} cannot be loaded: {type(error).__name__}: {error}") from error
+    if not hasattr(module, attribute):
+        raise _not_there(name, kind, tree)
+    return getattr(module, attribute)
+
+
+def plugin_settings(
+    plugin: Any, section: dict[str, Any], source: str, where: str, origin: dict[str, str] | None = None
+) -> Any:
+    """A plugin's section of the configuration, checked by its own `Settings`.
+
+    source, origin: the file, and what is known of where each of its dotted keys came from.
+    """
+    settings = getattr(plugin, "Settings", None)
+    if not (isinstance(settings, type) and issubclass(settings, msgspec.Struct)):
+        raise ConfigError(
+            f"{plugin!r} has no `Settings` Struct; a plugin states its settings there, if only an empty one"
+        )
+    return decode(Table(section, source, origin or {}), settings, where)

@@ -1,0 +1,231 @@
+"""The robot file: any chain of joint modules, in numbers. A module is one joint with half a body on either side.
+
+Chained modules are bolted together, so n modules make n joints and n + 1 rigid links; tail and head link are half as
+long as the others.
+"""
+
+import hashlib
+from typing import Annotated
+
+from msgspec import Meta
+
+from snakesim_hal.model.files import FileStruct
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import (
+    Axis,
+    Description,
+    JointDescription,
+    LinkDescription,
+    SafeAction,
+    SensorDescription,
+)
+from snakesim_hal.wire.quantities import MAX_JOINTS, above, from_zero
+
+
+class Chain(FileStruct, frozen=True, kw_only=True):
+    """How many modules, and how their joints are turned."""
+
+    modules: Annotated[int, Meta(ge=1, le=MAX_JOINTS)]
+    axes: Annotated[list[Axis], Meta(min_length=1, max_length=MAX_JOINTS)]  # repeated from tail to head
+
+
+class Module(FileStruct, frozen=True, kw_only=True):
+    """Body of one module."""
+
+    length_m: Annotated[float, above(2, "m")]
+    radius_m: Annotated[float, above(1, "m")]
+    mass_kg: Annotated[float, above(100, "kg")]
+
+
+class Limits(FileStruct, frozen=True, kw_only=True):
+    """What a joint may do; held by the gate and by the motor."""
+
+    angle_rad: Annotated[float, above(3.14159, "rad")]  # to either side
+    speed_rad_s: Annotated[float, above(100, "rad/s")]
+    acceleration_rad_s2: Annotated[float, above(1e5, "rad/s²")]
+    torque_nm: Annotated[float, above(1000, "N·m")]
+    torque_rate_nm_s: Annotated[float, above(1e5, "N·m/s")]
+    derate_from_c: Annotated[float, above(300, "°C")] = 80.0  # of the winding: from here on torque is taken away
+    stop_at_c: Annotated[float, above(300, "°C")] = 105.0  # a fifth of the torque is left, and the robot stops
+    least_voltage_v: Annotated[float, from_zero(1000, "V")] = 18.0  # below it the robot stops
+
+    def __post_init__(self) -> None:
+        """Torque must fade before the robot stops. Raises ValueError, which a reader of files explains."""
+        if self.stop_at_c <= self.derate_from_c:
+            raise ValueError(
+                f"`stop_at_c` = {self.stop_at_c:g} °C must be above `derate_from_c` = {self.derate_from_c:g} °C, "
+                f"so that torque fades before the robot stops"
+            )
+
+
+class Motor(FileStruct, frozen=True, kw_only=True):
+    """How a joint answers."""
+
+    stiffness_nm_per_rad: Annotated[float, above(1e5, "N·m/rad")]  # position mode
+    damping_nm_s_per_rad: Annotated[float, from_zero(1e4, "N·m·s/rad")]  # position mode
+    velocity_gain_nm_s_per_rad: Annotated[float, above(1e4, "N·m·s/rad")]  # velocity mode
+    response_time_s: Annotated[float, from_zero(1, "s")]  # first-order lag of the torque
+    armature_kg_m2: Annotated[float, from_zero(10, "kg·m²")]  # rotor inertia seen at the joint
+    friction_nm: Annotated[float, from_zero(100, "N·m")] = 0.0
+    viscous_nm_s_per_rad: Annotated[float, from_zero(100, "N·m·s/rad")] = 0.0
+
+
+class Safety(FileStruct, frozen=True, kw_only=True):
+    """What the joints do when nobody may command them."""
+
+    action: SafeAction = "damp"
+    max_step_rad: Annotated[float, above(3.2, "rad")] = 0.35  # furthest a position target may be from the measured
+    may_lose_joints: Annotated[int, Meta(ge=0, le=MAX_JOINTS)] = 0  # that fail and are left passive, before all stop
+
+
+class JointSensor(FileStruct, frozen=True, kw_only=True):
+    """Angle, velocity and torque of every joint. No rate: a sample every tick."""
+
+    delay_s: Annotated[float, from_zero(1, "s")] = 0.0
+    angle_noise_rad: Annotated[float, from_zero(1, "rad")] = 0.0  # standard deviation, as all noise here
+    velocity_noise_rad_s: Annotated[float, from_zero(10, "rad/s")] = 0.0
+    torque_noise_nm: Annotated[float, from_zero(100, "N·m")] = 0.0
+
+
+class ContactSensor(FileStruct, frozen=True, kw_only=True):
+    """Touches of the links by obstacles."""
+
+    rate_hz: Annotated[float, above(1e4, "Hz")] = 100.0
+    delay_s: Annotated[float, from_zero(1, "s")] = 0.0
+    position_noise_m: Annotated[float, from_zero(1, "m")] = 0.0
+    force_noise_n: Annotated[float, from_zero(100, "N")] = 0.0
+    threshold_n: Annotated[float, from_zero(100, "N")] = 0.0  # weaker touches go unfelt
+
+
+class ImuSensor(FileStruct, frozen=True, kw_only=True):
+    """Angular velocity and acceleration (gravity included) of every link."""
+
+    rate_hz: Annotated[float, above(1e4, "Hz")] = 100.0
+    delay_s: Annotated[float, from_zero(1, "s")] = 0.0
+    angular_velocity_noise_rad_s: Annotated[float, from_zero(10, "rad/s")] = 0.0
+    acceleration_noise_m_s2: Annotated[float, from_zero(100, "m/s²")] = 0.0
+
+
+class PoseSensor(FileStruct, frozen=True, kw_only=True):
+    """Pose of the base, as motion capture gives it."""
+
+    rate_hz: Annotated[float, above(1e4, "Hz")] = 100.0
+    delay_s: Annotated[float, from_zero(1, "s")] = 0.0
+    position_noise_m: Annotated[float, from_zero(1, "m")] = 0.0
+    angle_noise_rad: Annotated[float, from_zero(1, "rad")] = 0.0
+
+
+class PowerSensor(FileStruct, frozen=True, kw_only=True):
+    """Supply, temperatures and leaks of every joint module. Modules on a bus tell them at a rate of their own."""
+
+    rate_hz: Annotated[float, above(1e4, "Hz")] = 2.0
+    delay_s: Annotated[float, from_zero(1, "s")] = 0.0
+
+
+class Sensors(FileStruct, frozen=True, kw_only=True):
+    """The sensors that the robot has; a section that is left out is a sensor that it lacks."""
+
+    joints: JointSensor = JointSensor()
+    contacts: ContactSensor | None = None
+    imu: ImuSensor | None = None
+    pose: PoseSensor | None = None
+    power: PowerSensor | None = None
+
+
+class RobotFile(FileStruct, frozen=True, kw_only=True):
+    """A whole robot file."""
+
+    name: Annotated[str, Meta(min_length=1, max_length=40, pattern="^[A-Za-z0-9_-]+$")]
+    about: str = ""
+    chain: Chain
+    module: Module
+    limits: Limits
+    motor: Motor
+    safety: Safety = Safety()
+    sensors: Sensors = Sensors()
+
+    @property
+    def axes(self) -> list[Axis]:
+        """Axis of every joint, tail to head."""
+        pattern = self.chain.axes
+        return [pattern[i % len(pattern)] for i in range(self.chain.modules)]
+
+    @property
+    def link_lengths_m(self) -> list[float]:
+        """Length of every link, tail to head."""
+        return [self.module.length_m * share for share in self._shares]
+
+    @property
+    def link_masses_kg(self) -> list[float]:
+        """Mass of every link, tail to head."""
+        return [self.module.mass_kg * share for share in self._shares]
+
+    @property
+    def length_m(self) -> float:
+        """Length of the straight robot, without the caps of tail and head."""
+        return self.chain.modules * self.module.length_m
+
+    @property
+    def _shares(self) -> list[float]:
+        return [0.5] + [1.0] * (self.chain.modules - 1) + [0.5]
+
+
+def describe(
+    robot: RobotFile, *, backend: str, period_ns: int, lease_ns: int, config_hash: str, emulated: bool = False
+) -> Description:
+    """The description that the HAL publishes, from a robot file. emulated: nothing real moves."""
+    axes = robot.axes
+    joints = [
+        JointDescription(
+            name=f"joint_{i + 1}",
+            axis=axis,
+            angle_min_rad=-robot.limits.angle_rad,
+            angle_max_rad=robot.limits.angle_rad,
+            speed_limit_rad_s=robot.limits.speed_rad_s,
+            acceleration_limit_rad_s2=robot.limits.acceleration_rad_s2,
+            torque_limit_nm=robot.limits.torque_nm,
+            torque_rate_limit_nm_s=robot.limits.torque_rate_nm_s,
+            stiffness_nm_per_rad=robot.motor.stiffness_nm_per_rad,
+            damping_nm_s_per_rad=robot.motor.damping_nm_s_per_rad,
+            velocity_gain_nm_s_per_rad=robot.motor.velocity_gain_nm_s_per_rad,
+            derate_from_c=robot.limits.derate_from_c,
+            stop_at_c=robot.limits.stop_at_c,
+            least_voltage_v=robot.limits.least_voltage_v,
+        )
+        for i, axis in enumerate(axes)
+    ]
+    links = [
+        LinkDescription(name=f"link_{i}", length_m=length, radius_m=robot.module.radius_m, mass_kg=mass)
+        for i, (length, mass) in enumerate(zip(robot.link_lengths_m, robot.link_masses_kg, strict=True))
+    ]
+    rate_hz = 1e9 / period_ns
+    sensors = [SensorDescription(key=keys.JOINTS, rate_hz=rate_hz, delay_s=robot.sensors.joints.delay_s)]
+    for key, sensor in (
+        (keys.CONTACTS, robot.sensors.contacts),
+        (keys.IMU, robot.sensors.imu),
+        (keys.POSE, robot.sensors.pose),
+        (keys.POWER, robot.sensors.power),
+    ):
+        if sensor is not None:
+            sensors.append(SensorDescription(key=key, rate_hz=min(sensor.rate_hz, rate_hz), delay_s=sensor.delay_s))
+    return Description(
+        robot=robot.name,
+        backend=backend,
+        layout=layout_hash(joints),
+        config_hash=config_hash,
+        period_ns=period_ns,
+        lease_ns=lease_ns,
+        max_step_rad=robot.safety.max_step_rad,
+        safe_action=robot.safety.action,
+        may_lose_joints=robot.safety.may_lose_joints,
+        emulated=emulated,
+        joints=joints,
+        links=links,
+        sensors=sensors,
+    )
+
+
+def layout_hash(joints: list[JointDescription]) -> str:
+    """Hash of names, order and axes: two robots with the same hash take the same vectors."""
+    text = ";".join(f"{joint.name}:{joint.axis}" for joint in joints)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -1,0 +1,304 @@
+"""The scenario file, and the one effective configuration of a run that is made from it.
+
+A scenario names a robot, a scene, a controller, a pace and the services. `load` reads all three files, applies flags,
+and checks everything at once; the result is what every process of the run is given, and what repeats the run.
+"""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.files import FileStruct, Table, decode, find, leaves, read_table, short
+from snakesim_hal.model.injection import CONTROL
+from snakesim_hal.model.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
+from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.route import chain_angles, lay_chain, yaw_segments_m
+from snakesim_hal.model.scene import Capsule, Heading, Placed, Point, SceneFile, check_clear, place, route_of
+from snakesim_hal.model.textfiles import parse_toml
+from snakesim_hal.model.whole_file import write_whole
+from snakesim_hal.wire.messages import Pace
+from snakesim_hal.wire.quantities import above
+
+CHOSEN = (
+    "control.",
+    "backend.",
+)  # --set control.x=1 changes the chosen controller, --set backend.x=1 the backend
+
+
+class Start(FileStruct, frozen=True, kw_only=True):
+    """Where the snake lies when the run begins: along the scene's route, or straight at a pose."""
+
+    on_route: bool = True
+    tail_s_m: Annotated[float, Meta(ge=-100, le=1000, extra_json_schema={"unit": "m"})] = 0.0
+    position_m: Point = (0.0, 0.0)  # of the tail end, when not on the route
+    yaw_rad: Heading = 0.0
+
+
+class Mission(FileStruct, frozen=True, kw_only=True):
+    """What navigation is asked for."""
+
+    speed_m_s: Annotated[float, Meta(ge=0, le=10, extra_json_schema={"unit": "m/s"})] = 0.2
+
+
+class Service(FileStruct, frozen=True, kw_only=True):
+    """A process that takes part in the run: it acts every so many ticks.
+
+    In lockstep what it says of tick t counts from tick t + lag_ticks on, whenever it really arrived, so that a slow
+    service costs no determinism, and runs beside the simulator instead of holding it up. For control, a lag of 1 is a
+    command that acts in the period after its state; 2 adds a period of latency, in which control and physics overlap.
+    """
+
+    every_ticks: Annotated[int, Meta(ge=1, le=1000)] = 1
+    lag_ticks: Annotated[int, Meta(ge=1, le=1000)] = 1
+    restart: bool = True  # with `snakesim run --stay`, when its process ends; false: the run ends with it
+    external: bool = False  # somebody else's process: the run waits for it, and does not start it
+
+    def counting_at(self, tick: int) -> int:
+        """The newest tick whose output counts at `tick`. That of tick 0 counts from the start."""
+        due = max(tick - self.lag_ticks, 0)
+        return due - due % self.every_ticks
+
+
+Seconds = Annotated[float, above(60, "s")]
+
+
+class MaxAge(FileStruct, frozen=True, kw_only=True):
+    """How old what control acts on may be, in robot time; what is left out follows from rates, delays and schedules.
+
+    With joints older than this control sends no command, so that the lease ends and the robot stops. With an older
+    pose, contacts, world or trajectory the controller holds, and goes on when the stream is back.
+    """
+
+    joints_s: Seconds | None = None
+    pose_s: Seconds | None = None
+    contacts_s: Seconds | None = None
+    world_s: Seconds | None = None
+    trajectory_s: Seconds | None = None
+
+
+class RunConfig(FileStruct, frozen=True, kw_only=True):
+    """Everything that a run is made of."""
+
+    name: Annotated[str, Meta(min_length=1, max_length=60)]
+    title: str = ""
+    robot: RobotFile
+    scene: SceneFile
+    backend: str = "sim"
+    controller: str
+    pace: Pace = "lockstep"
+    rate_hz: Annotated[float, Meta(ge=20, le=5000, extra_json_schema={"unit": "Hz"})] = 100.0
+    duration_s: Annotated[float, Meta(gt=0, le=86400, extra_json_schema={"unit": "s"})] = 10.0
+    seed: Annotated[int, Meta(ge=0, le=2**31)] = 1
+    faults: list[
+        str
+    ] = []  # what goes wrong on request, at times since the first arming: see snakesim_hal.model.injection
+    faults_allowed: bool = False  # also where something real moves
+    stall_limit_s: Annotated[float, Meta(gt=0, le=600, extra_json_schema={"unit": "s"})] = 10.0
+    start: Start = Start()
+    mission: Mission = Mission()
+    services: dict[str, Service]
+    max_age: MaxAge = MaxAge()
+    controllers: dict[str, dict[str, Any]] = {}  # settings of each controller, checked by the controller
+    backends: dict[str, dict[str, Any]] = {}  # settings of each backend, checked by the backend
+
+    @property
+    def control_section(self) -> str:
+        """Where the settings of the chosen controller stand; for `./file.py:Wave` that is `controllers.Wave`."""
+        return f"controllers.{self.controller.rpartition(':')[2]}"
+
+    @property
+    def control_settings(self) -> dict[str, Any]:
+        """The settings of the chosen controller."""
+        return self.controllers.get(self.controller.rpartition(":")[2], {})
+
+    @property
+    def backend_section(self) -> str:
+        """Where the settings of the chosen backend stand; for `./file.py:Bench` that is `backends.Bench`."""
+        return f"backends.{self.backend.rpartition(':')[2]}"
+
+    @property
+    def backend_settings(self) -> dict[str, Any]:
+        """The settings of the chosen backend."""
+        return self.backends.get(self.backend.rpartition(":")[2], {})
+
+    @property
+    def own_services(self) -> dict[str, Service]:
+        """The services whose processes belong to the run."""
+        return {name: service for name, service in self.services.items() if not service.external}
+
+    @property
+    def has_own_control(self) -> bool:
+        """Whether the run commands the robot itself; otherwise whoever does also arms it."""
+        return CONTROL in self.own_services
+
+    @property
+    def commander(self) -> str:
+        """The controller, or `external` when the run starts none."""
+        return self.controller if self.has_own_control else "external"
+
+    @property
+    def period_ns(self) -> int:
+        """One control period."""
+        return round(1e9 / self.rate_hz)
+
+    @property
+    def lease_ns(self) -> int:
+        """How long the robot lives on one command: five periods or 50 ms, whichever is longer, at most 100 ms."""
+        return min(max(5 * self.period_ns, 50_000_000), 100_000_000)
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A checked configuration, with where each value came from."""
+
+    config: RunConfig
+    table: Table
+
+    def explain(self) -> list[tuple[str, Any, str]]:
+        """Every effective value as (dotted key, value, file or flag or `default`)."""
+        effective = msgspec.to_builtins(self.config)
+        return [(key, value, self.table.origin_of(key)) for key, value in leaves(effective)]
+
+
+@dataclass(frozen=True)
+class Override:
+    """A value given on the command line."""
+
+    key: str
+    value: Any
+    flag: str
+
+
+def parse_set(text: str) -> Override:
+    """`section.key=value` of --set; the value is read as TOML, and as plain text when it is none."""
+    key, equals, value = text.partition("=")
+    key = key.strip()
+    if not equals or not key:
+        raise ConfigError(f"--set {short(text)}: give section.key=value, such as --set control.propulsion_n=35")
+    try:
+        parsed = parse_toml(f"value = {value}", "--set")["value"]
+    except ConfigError:
+        parsed = value.strip()
+    return Override(key, parsed, f"--set {short(text)}")
+
+
+def load(scenario: str, overrides: Sequence[Override] = ()) -> Loaded:
+    """Read a scenario (shipped name or path), its robot and scene, and the flags. Raises ConfigError."""
+    path = find(scenario, "scenarios")
+    table = read_table(path)
+    table.values.setdefault("name", path.stem)
+    picks = [o for o in overrides if o.key in ("robot", "scene")]
+    for pick in picks:
+        table.put(pick.key, pick.value, pick.flag)
+    for part, kind in (("robot", "robots"), ("scene", "scenes")):
+        named = table.values.get(part)
+        if isinstance(named, str):
+            from_flag = any(o.key == part for o in picks)
+            inner = read_table(find(named, kind, None if from_flag else path.parent))
+            table.put(part, inner.values, inner.source)
+    for override in sorted(overrides, key=lambda o: o.key.startswith(CHOSEN)):
+        if override in picks:
+            continue
+        key = override.key
+        for alias, choice, section in (
+            (CHOSEN[0], "controller", "controllers"),
+            (CHOSEN[1], "backend", "backends"),
+        ):
+            if key.startswith(alias):
+                chosen = str(table.values.get(choice, "sim")).rpartition(":")[2]
+                key = f"{section}.{chosen}.{key.removeprefix(alias)}"
+        table.put(key, override.value, override.flag)
+    config = decode(table, RunConfig)
+    check(config)
+    return Loaded(config, table)
+
+
+def check(config: RunConfig) -> None:
+    """Checks that need more than one field. Raises ConfigError."""
+    start = config.start
+    if start.on_route and config.scene.route is None:
+        raise ConfigError(
+            f"scenario {config.name!r}: `start.on_route` is true but scene {config.scene.name!r} has no route; "
+            f"set start.on_route = false with position_m and yaw_rad, or add a [route] to the scene"
+        )
+    angles = start_of(config).angles_rad
+    worst = int(np.argmax(np.abs(angles)))
+    if abs(angles[worst]) > config.robot.limits.angle_rad:
+        raise ConfigError(
+            f"scenario {config.name!r}: lying on the route, joint_{worst + 1} would start at {angles[worst]:.2f} rad; "
+            f"robot {config.robot.name!r} allows +-{config.robot.limits.angle_rad} rad. Choose a smoother route"
+        )
+    place_all(config)
+
+
+@dataclass(frozen=True)
+class StartPose:
+    """The snake at tick 0."""
+
+    position_w: tuple[float, float]  # of the tail end, on the ground
+    yaw_rad: float
+    angles_rad: NDArray[np.float64]  # (n_joints,), tail to head
+
+
+def start_of(config: RunConfig) -> StartPose:
+    """Where the snake lies when the run begins."""
+    robot, start = config.robot, config.start
+    route = route_of(config.scene)
+    if not start.on_route or route is None:
+        return StartPose(start.position_m, start.yaw_rad, np.zeros(robot.chain.modules))
+    lay = lay_chain(route, start.tail_s_m, yaw_segments_m(robot.axes, robot.link_lengths_m))
+    return StartPose(lay.tail_w, lay.heading_rad, chain_angles(robot.axes, lay.angles_rad))
+
+
+def capsules_at_start(config: RunConfig) -> list[Capsule]:
+    """The links at tick 0, seen from above."""
+    robot, pose = config.robot, start_of(config)
+    rotation = rotation_from_quaternion(quaternion_from_yaw(pose.yaw_rad))
+    origins, rotations = link_frames(
+        (*pose.position_w, robot.module.radius_m), rotation, pose.angles_rad, robot.axes, robot.link_lengths_m
+    )
+    capsules: list[Capsule] = []
+    for i, length in enumerate(robot.link_lengths_m):
+        front = origins[i] + length * rotations[i][:, 0]
+        rear_m = (float(origins[i][0]), float(origins[i][1]))
+        front_m = (float(front[0]), float(front[1]))
+        capsules.append(Capsule(name=f"link_{i}", rear_m=rear_m, front_m=front_m, radius_m=robot.module.radius_m))
+    return capsules
+
+
+def place_all(config: RunConfig) -> list[Placed]:
+    """The scene's obstacles, expanded and clear of the snake's start."""
+    snake = capsules_at_start(config)
+    placed = place(config.scene, snake)
+    check_clear(config.scene, placed, snake)
+    return placed
+
+
+def config_hash(config: RunConfig) -> str:
+    """Hash of everything that the run's outcome depends on."""
+    plain = json.dumps(msgspec.to_builtins(config), sort_keys=True)
+    return hashlib.sha256(plain.encode()).hexdigest()[:16]
+
+
+def written(config: RunConfig) -> bytes:
+    """The effective configuration as a file holds it; `snakesim run` takes it like a scenario file."""
+    return msgspec.json.format(msgspec.json.encode(config), indent=2)
+
+
+def write(config: RunConfig, path: Path) -> None:
+    """Save the effective configuration."""
+    write_whole(path, written(config))
+
+
+def read(path: Path) -> RunConfig:
+    """Read back what `write` saved, whatever the file is called."""
+    return decode(read_table(path, ".json"), RunConfig)

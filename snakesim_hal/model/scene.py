@@ -1,0 +1,391 @@
+"""The scene file: ground, obstacles, and the route that a snake is to take through them.
+
+The simulator builds it, guidance knows it as its map, the report draws it. `obstacles` expands peg rows and random
+fields into plain obstacles; `check_clear` refuses a scene in which one of them overlaps the snake's start.
+"""
+
+import math
+from collections import Counter
+from typing import Annotated
+
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.files import FileStruct
+from snakesim_hal.model.route import Route, sine_points
+from snakesim_hal.wire.messages import Obstacle
+from snakesim_hal.wire.quantities import Name
+
+Floats = NDArray[np.float64]
+
+
+def _length(low: float | None = None, high: float = 1000.0) -> Meta:
+    if low is None:
+        return Meta(ge=-high, le=high, extra_json_schema={"unit": "m"})
+    return Meta(gt=low, le=high, extra_json_schema={"unit": "m"})
+
+
+Coordinate = Annotated[float, _length()]
+Size = Annotated[float, _length(0)]
+Clearance = Annotated[float, Meta(ge=0, le=100, extra_json_schema={"unit": "m"})]
+Friction = Annotated[float, Meta(ge=0, le=5, extra_json_schema={"unit": "1 (Coulomb coefficient)"})]
+Heading = Annotated[float, Meta(ge=-6.3, le=6.3, extra_json_schema={"unit": "rad"})]
+Point = tuple[Coordinate, Coordinate]
+
+
+class Uneven(FileStruct, frozen=True, kw_only=True):
+    """Smooth random hills."""
+
+    height_m: Annotated[float, _length(0, 1)]  # from lowest to highest point
+    wavelength_m: Annotated[float, _length(0, 100)]  # typical distance between two hills
+    area_m: Annotated[float, _length(0, 200)] = 20.0  # edge of the square around the origin
+    seed: Annotated[int, Meta(ge=0, le=2**31)] = 0
+
+
+class Ground(FileStruct, frozen=True, kw_only=True):
+    """The ground, and how it grips."""
+
+    friction: Friction
+    uneven: Uneven | None = None
+
+
+class SineRoute(FileStruct, frozen=True, kw_only=True, tag="sine", tag_field="kind"):
+    """y = amplitude sin(2 pi x / wavelength), from x = 0."""
+
+    amplitude_m: Annotated[float, Meta(ge=0, le=10, extra_json_schema={"unit": "m"})]
+    wavelength_m: Size
+    length_m: Size  # along x
+
+
+class WaypointRoute(FileStruct, frozen=True, kw_only=True, tag="waypoints", tag_field="kind"):
+    """Straight from point to point; give points densely for a smooth curve."""
+
+    points_m: Annotated[list[Point], Meta(min_length=2, max_length=20000)]
+
+
+class Cylinder(FileStruct, frozen=True, kw_only=True):
+    """An upright peg."""
+
+    position_m: Point
+    radius_m: Size
+    height_m: Size = 0.2
+    friction: Friction = 0.0
+    name: Name | None = None
+
+
+class Box(FileStruct, frozen=True, kw_only=True):
+    """An upright block."""
+
+    position_m: Point
+    size_m: tuple[Size, Size, Size]
+    yaw_rad: Heading = 0.0
+    friction: Friction = 0.0
+    name: Name | None = None
+
+
+class Sphere(FileStruct, frozen=True, kw_only=True):
+    """A ball fixed at its centre."""
+
+    position_m: Point
+    radius_m: Size
+    centre_height_m: Coordinate = 0.0
+    friction: Friction = 0.0
+    name: Name | None = None
+
+
+class Wall(FileStruct, frozen=True, kw_only=True):
+    """A straight wall from point to point."""
+
+    from_m: Point
+    to_m: Point
+    thickness_m: Size = 0.05
+    height_m: Size = 0.3
+    friction: Friction = 0.0
+    name: Name | None = None
+
+
+class Step(FileStruct, frozen=True, kw_only=True):
+    """A low platform that the snake may lie on or climb."""
+
+    position_m: Point
+    size_m: tuple[Size, Size]
+    height_m: Annotated[float, _length(0, 2)]
+    yaw_rad: Heading = 0.0
+    friction: Friction = 0.5
+    name: Name | None = None
+
+
+class PegsAlongRoute(FileStruct, frozen=True, kw_only=True):
+    """Pegs beside the route where a snake can push forward: at its inflections, on alternating sides.
+
+    `corridor_m` is the distance from the route to a peg's surface, so a body of radius r has `corridor_m - r` of
+    clearance on that side.
+    """
+
+    corridor_m: Size
+    radius_m: Size
+    count: Annotated[int, Meta(ge=1, le=2000)]
+    first: Annotated[int, Meta(ge=0, le=2000)] = 0  # inflections to leave out at the start
+    height_m: Size = 0.2
+    friction: Friction = 0.0
+
+
+class RandomField(FileStruct, frozen=True, kw_only=True):
+    """Pegs strewn by chance, the same for the same seed."""
+
+    seed: Annotated[int, Meta(ge=0, le=2**31)]
+    low_m: Point
+    high_m: Point
+    density_per_m2: Annotated[float, Meta(gt=0, le=200, extra_json_schema={"unit": "1/m²"})]
+    radius_m: tuple[Size, Size]  # smallest and largest
+    clearance_m: Clearance  # least gap between two pegs
+    route_clearance_m: Clearance | None = None  # least gap between the route and a peg's surface
+    height_m: Size = 0.2
+    friction: Friction = 0.0
+
+
+MOST_STREWN = 1000
+MOST_OBSTACLES = 4096  # that the message World holds
+
+
+class SceneFile(FileStruct, frozen=True, kw_only=True):
+    """A whole scene file."""
+
+    name: Annotated[str, Meta(min_length=1, max_length=40, pattern="^[A-Za-z0-9_-]+$")]
+    about: str = ""
+    ground: Ground
+    route: SineRoute | WaypointRoute | None = None
+    cylinder: list[Cylinder] = []
+    box: list[Box] = []
+    sphere: list[Sphere] = []
+    wall: list[Wall] = []
+    step: list[Step] = []
+    pegs_along_route: list[PegsAlongRoute] = []
+    random_field: list[RandomField] = []
+
+
+def route_of(scene: SceneFile) -> Route | None:
+    """The scene's route as a curve, or None when it has none."""
+    match scene.route:
+        case None:
+            return None
+        case SineRoute(amplitude_m=amplitude, wavelength_m=wavelength, length_m=length):
+            return Route(sine_points(amplitude, wavelength, length))
+        case WaypointRoute(points_m=points):
+            try:
+                return Route(np.asarray(points))
+            except ValueError as error:
+                raise ConfigError(f"scene {scene.name!r}: `route.points_m`: {error}") from None
+
+
+class Placed(FileStruct, frozen=True, kw_only=True):
+    """An obstacle as placed, with what only the simulator needs to know of it."""
+
+    obstacle: Obstacle
+    friction: float
+    walkable: bool = False  # a step is part of the ground: lying on it is no contact to push off
+
+
+def place(scene: SceneFile, keep_clear: "list[Capsule] | None" = None) -> list[Placed]:
+    """All obstacles of a scene, expanded, each with a unique name.
+
+    keep_clear: capsules (the snake at its start) that random fields stay away from.
+    """
+    _check_count(scene)
+    placed: list[Placed] = []
+    for i, c in enumerate(scene.cylinder):
+        placed.append(_peg(c.name or f"cylinder_{i}", c.position_m, c.radius_m, c.height_m, c.friction))
+    for i, b in enumerate(scene.box):
+        placed.append(_block(b.name or f"box_{i}", b.position_m, b.size_m, b.yaw_rad, b.friction))
+    for i, s in enumerate(scene.sphere):
+        ball = Obstacle(
+            name=s.name or f"sphere_{i}",
+            shape="sphere",
+            position_w=(*s.position_m, s.centre_height_m),
+            radius_m=s.radius_m,
+            height_m=2 * s.radius_m,
+        )
+        placed.append(Placed(obstacle=ball, friction=s.friction))
+    for i, w in enumerate(scene.wall):
+        run = (w.to_m[0] - w.from_m[0], w.to_m[1] - w.from_m[1])
+        length = math.hypot(*run)
+        if length == 0:
+            raise ConfigError(f"scene {scene.name!r}: `wall.{i}`: `from_m` and `to_m` are the same point")
+        middle = ((w.from_m[0] + w.to_m[0]) / 2, (w.from_m[1] + w.to_m[1]) / 2)
+        size = (length, w.thickness_m, w.height_m)
+        placed.append(_block(w.name or f"wall_{i}", middle, size, math.atan2(run[1], run[0]), w.friction))
+    for i, p in enumerate(scene.step):
+        size = (*p.size_m, p.height_m)
+        placed.append(_block(p.name or f"step_{i}", p.position_m, size, p.yaw_rad, p.friction, walkable=True))
+    route = route_of(scene)
+    for i, row in enumerate(scene.pegs_along_route):
+        placed.extend(_pegs_along(scene, i, row, route))
+    for i, field in enumerate(scene.random_field):
+        placed.extend(_strewn(scene, i, field, route, placed, keep_clear or []))
+    names = Counter(p.obstacle.name for p in placed)
+    twice = sorted(name for name, count in names.items() if count > 1)
+    if twice:
+        raise ConfigError(f"scene {scene.name!r}: two obstacles are called {twice[0]!r}; rename one")
+    return placed
+
+
+def _check_count(scene: SceneFile) -> None:
+    given = (scene.cylinder, scene.box, scene.sphere, scene.wall, scene.step)
+    count = sum(len(kind) for kind in given) + sum(row.count for row in scene.pegs_along_route)
+    count += sum(min(_wanted(field), MOST_STREWN) for field in scene.random_field)
+    if count > MOST_OBSTACLES:
+        raise ConfigError(f"scene {scene.name!r}: has {count} obstacles; at most {MOST_OBSTACLES} are allowed")
+
+
+def _wanted(field: RandomField) -> int:
+    """How many pegs a random field asks for."""
+    return round(field.density_per_m2 * math.prod(np.subtract(field.high_m, field.low_m).tolist()))
+
+
+def _peg(name: str, position: Point, radius: float, height: float, friction: float) -> Placed:
+    centre = (float(position[0]), float(position[1]), height / 2)
+    peg = Obstacle(name=name, shape="cylinder", position_w=centre, radius_m=radius, height_m=height)
+    return Placed(obstacle=peg, friction=friction)
+
+
+def _block(
+    name: str,
+    position: Point,
+    size: tuple[float, float, float],
+    yaw: float,
+    friction: float,
+    walkable: bool = False,
+) -> Placed:
+    block = Obstacle(
+        name=name,
+        shape="box",
+        position_w=(*position, size[2] / 2),
+        yaw_rad=yaw,
+        half_size_m=(size[0] / 2, size[1] / 2, size[2] / 2),
+        height_m=size[2],
+    )
+    return Placed(obstacle=block, friction=friction, walkable=walkable)
+
+
+def _pegs_along(scene: SceneFile, index: int, row: PegsAlongRoute, route: Route | None) -> list[Placed]:
+    where = f"scene {scene.name!r}: `pegs_along_route.{index}`"
+    if route is None:
+        raise ConfigError(f"{where}: the scene has no route; add a [route] section")
+    spots = route.inflections_s_m()[row.first : row.first + row.count]
+    if len(spots) < row.count:
+        have = len(route.inflections_s_m())
+        raise ConfigError(
+            f"{where}: `count` = {row.count} pegs from inflection {row.first} on, but the route has {have} "
+            f"inflections; make the route longer or `count` at most {max(have - row.first, 0)}"
+        )
+    ends = route.position_w(np.array([0.0, route.length_m]))
+    forward = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+    pegs: list[Placed] = []
+    for k, s in enumerate(spots):
+        tangent = route.tangent_w(s)
+        left = np.array([-tangent[1], tangent[0]])
+        push = left if left @ forward > 0 else -left  # from the peg into the body
+        centre = route.position_w(s) - push * (row.corridor_m + row.radius_m)
+        name = f"peg_{index}_{row.first + k}"
+        pegs.append(_peg(name, (float(centre[0]), float(centre[1])), row.radius_m, row.height_m, row.friction))
+    return pegs
+
+
+def _strewn(
+    scene: SceneFile,
+    index: int,
+    field: RandomField,
+    route: Route | None,
+    others: list[Placed],
+    keep_clear: "list[Capsule]",
+) -> list[Placed]:
+    where = f"scene {scene.name!r}: `random_field.{index}`"
+    low, high = np.array(field.low_m), np.array(field.high_m)
+    if not np.all(high > low):
+        raise ConfigError(f"{where}: `high_m` = {field.high_m} must exceed `low_m` = {field.low_m} in x and y")
+    if field.radius_m[1] < field.radius_m[0]:
+        raise ConfigError(f"{where}: `radius_m` = {field.radius_m}: smallest first, then largest")
+    if field.route_clearance_m is not None and route is None:
+        raise ConfigError(f"{where}: `route_clearance_m` is set but the scene has no route; add a [route] section")
+    wanted = _wanted(field)
+    if wanted > MOST_STREWN:
+        raise ConfigError(
+            f"{where}: `density_per_m2` = {field.density_per_m2} asks for {wanted} pegs on this area; at most "
+            f"{MOST_STREWN}"
+        )
+    random = np.random.default_rng([field.seed, index])
+    strewn: list[Placed] = []
+    fixed = [p.obstacle for p in others if not p.walkable]
+    for _ in range(200 * wanted):
+        if len(strewn) == wanted:
+            return strewn
+        centre = random.uniform(low, high)
+        radius = float(random.uniform(*field.radius_m))
+        standing = fixed + [p.obstacle for p in strewn]
+        if any(outline_distance_m(o, centre) < radius + field.clearance_m for o in standing):
+            continue
+        if any(c.distance_m(centre) < radius + field.clearance_m for c in keep_clear):
+            continue
+        if route is not None and field.route_clearance_m is not None:
+            nearest = route.position_w(float(np.clip(route.project(centre), 0, route.length_m)))
+            if np.hypot(*(nearest - centre)) < radius + field.route_clearance_m:
+                continue
+        name = f"random_{index}_{len(strewn)}"
+        spot = (float(centre[0]), float(centre[1]))
+        strewn.append(_peg(name, spot, radius, field.height_m, field.friction))
+    if len(strewn) < wanted:
+        raise ConfigError(
+            f"{where}: only {len(strewn)} of {wanted} pegs fit; lower `density_per_m2` = {field.density_per_m2} or "
+            f"`clearance_m` = {field.clearance_m}"
+        )
+    return strewn
+
+
+class Capsule(FileStruct, frozen=True, kw_only=True):
+    """A link lying on the ground, seen from above."""
+
+    name: str
+    rear_m: tuple[float, float]
+    front_m: tuple[float, float]
+    radius_m: float
+
+    def distance_m(self, point: Floats) -> float:
+        """From a point to the capsule's surface; negative inside."""
+        rear, front = np.array(self.rear_m), np.array(self.front_m)
+        axis = front - rear
+        along = float(np.clip((point - rear) @ axis / max(float(axis @ axis), 1e-12), 0.0, 1.0))
+        return float(np.hypot(*(point - rear - along * axis))) - self.radius_m
+
+
+def outline_distance_m(obstacle: Obstacle, point: Floats) -> float:
+    """From a point on the ground to an obstacle's outline seen from above; negative inside."""
+    offset = np.asarray(point, dtype=np.float64) - np.array(obstacle.position_w[:2])
+    if obstacle.shape != "box":
+        return float(np.hypot(*offset)) - obstacle.radius_m
+    c, s = math.cos(obstacle.yaw_rad), math.sin(obstacle.yaw_rad)
+    local = np.abs([c * offset[0] + s * offset[1], c * offset[1] - s * offset[0]])
+    beyond = local - np.array(obstacle.half_size_m[:2])
+    return float(np.hypot(*np.maximum(beyond, 0.0)) + min(float(beyond.max()), 0.0))
+
+
+def check_clear(scene: SceneFile, placed: list[Placed], snake: list[Capsule]) -> None:
+    """Raise ConfigError when an obstacle overlaps the snake's start."""
+    for item in placed:
+        if item.walkable:
+            continue
+        for capsule in snake:
+            rear, front = np.array(capsule.rear_m), np.array(capsule.front_m)
+            steps = np.linspace(0.0, 1.0, 24)[:, None]
+            gap = min(outline_distance_m(item.obstacle, p) for p in rear + steps * (front - rear))
+            gap = min(gap, capsule.distance_m(np.array(item.obstacle.position_w[:2])) + capsule.radius_m)
+            overlap = capsule.radius_m - gap
+            if item.obstacle.shape != "box":
+                overlap = item.obstacle.radius_m - capsule.distance_m(np.array(item.obstacle.position_w[:2]))
+            if overlap > 1e-4:
+                raise ConfigError(
+                    f"scene {scene.name!r}: obstacle {item.obstacle.name!r} overlaps {capsule.name} of the snake at "
+                    f"its start by {overlap * 1000:.1f} mm; move the obstacle, give the pegs more `corridor_m`, or "
+                    f"change [start] in the scenario"
+                )

@@ -1,0 +1,136 @@
+"""Text files from and to anywhere: bounded in size, depth and time, and never a pipe, a device or a symlink by mistake.
+
+What cannot be read or written ends in one ConfigError that names the file and the reason.
+"""
+
+import codecs
+import contextlib
+import json
+import os
+import re
+import stat
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.whole_file import write_whole
+
+MB = 1024 * 1024
+MOST_BYTES, MOST_TOML = 8 * MB, 2 * MB  # a route of 20,000 way-points has 1.8 MB as formatted JSON, 0.8 MB as TOML
+MOST_DEPTH = 16  # sections within sections; a run's configuration has 6
+_KEY = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
+_DEEP_KEY = re.compile(rf"(?<![\w-])(?:{_KEY}[ \t]*+\.[ \t]*+){{{MOST_DEPTH}}}")  # tomllib takes quadratic time for it
+_UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+_KINDS = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFIFO: "a pipe",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+    stat.S_IFLNK: "a symbolic link",
+}
+
+
+def read_text(path: Path) -> str:
+    """A whole file as text. Raises ConfigError. A UTF-8 byte-order mark is skipped."""
+    data = read_bytes(path)
+    if data.startswith(_UTF16) or b"\0" in data:
+        raise ConfigError(f"{path}: is UTF-16 text, or none at all; save it as UTF-8")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ConfigError(
+            f"{path}: is not UTF-8 text: byte 0x{data[error.start]:02x} at {error.start}; save it as UTF-8"
+        ) from None
+
+
+def read_bytes(path: Path) -> bytes:
+    """A whole file. Raises ConfigError."""
+    try:
+        mode = path.stat().st_mode
+        data = b""
+        if stat.S_ISREG(mode):  # opening a device may do something, opening a pipe waits
+            with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+                data = file.read(MOST_BYTES + 1)
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file") from None
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    except ValueError as error:  # a NUL in the name
+        raise ConfigError(f"{path}: cannot be read: {error}") from None
+    _check_plain(path, mode)
+    if len(data) > MOST_BYTES:
+        raise ConfigError(f"{path}: is larger than {MOST_BYTES // MB} MB, which no file of settings is")
+    return data
+
+
+def _check_plain(path: Path, mode: int) -> None:
+    if not stat.S_ISREG(mode):
+        kind = _KINDS.get(stat.S_IFMT(mode), "something else")
+        raise ConfigError(f"{path}: is {kind}, not a file; name a file")
+
+
+def parse_json(text: str, source: str) -> Any:
+    """A JSON text. Raises ConfigError."""
+    try:
+        value = json.loads(text)
+    except RecursionError:
+        raise ConfigError(f"{source}: not valid JSON: nested deeper than {MOST_DEPTH} levels") from None
+    except ValueError as error:  # JSONDecodeError; or a number of thousands of digits
+        raise ConfigError(f"{source}: not valid JSON: {error}") from None
+    _check_depth(value, source)
+    return value
+
+
+def parse_toml(text: str, source: str) -> dict[str, Any]:
+    """A TOML text. Raises ConfigError."""
+    if len(text) > MOST_TOML:
+        raise ConfigError(f"{source}: is larger than {MOST_TOML // MB} MB; make it smaller, or write it as JSON")
+    if deep := _DEEP_KEY.search(text):
+        raise ConfigError(f"{source}: key `{deep[0][:40]}...` has more than {MOST_DEPTH} parts")
+    try:
+        value = tomllib.loads(text)
+    except RecursionError:
+        raise ConfigError(f"{source}: not valid TOML: nested deeper than {MOST_DEPTH} levels") from None
+    except ValueError as error:  # TOMLDecodeError; or a number of thousands of digits
+        raise ConfigError(f"{source}: not valid TOML: {error}") from None
+    _check_depth(value, source)
+    return value
+
+
+def check_brackets(text: str, source: str) -> None:
+    """For a text that somebody else parses: Zenoh overflows its stack on deep nesting. Raises ConfigError."""
+    depth = 0
+    for bracket in re.findall(r"[][{}]", text):
+        depth += 1 if bracket in "[{" else -1
+        if depth > MOST_DEPTH:
+            raise ConfigError(f"{source}: is nested deeper than {MOST_DEPTH} levels")
+
+
+def _check_depth(value: Any, source: str) -> None:
+    """Everything that walks through values may call itself once a level after this."""
+    level: list[Any] = [value]
+    for _ in range(MOST_DEPTH):
+        inner: list[Any] = []
+        for one in level:
+            if isinstance(one, dict):
+                inner += one.values()
+            elif isinstance(one, list):
+                inner += one
+        level = [one for one in inner if isinstance(one, dict | list)]
+        if not level:
+            return
+    raise ConfigError(f"{source}: is nested deeper than {MOST_DEPTH} levels")
+
+
+def write_text(path: Path, text: str, encoding: str = "utf-8") -> None:
+    """Write a file whole, or leave what was there. Raises ConfigError; also where a link or a device stands."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with contextlib.suppress(FileNotFoundError):
+            _check_plain(path, path.lstat().st_mode)
+        write_whole(path, text.encode(encoding))
+    except OSError as error:
+        why = "its folder is a file" if isinstance(error, FileExistsError) else error.strerror
+        raise ConfigError(f"{path}: cannot be written: {why}") from None

@@ -1,0 +1,288 @@
+"""What guidance, navigation and control use of the HAL: ticks, readings, outputs, and the right to command.
+
+A service loops over `ticks()`. What it reads at a tick is what the clock's table of contents names, so a lockstep run
+gives every service the same inputs however the processes happened to be scheduled.
+"""
+
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from queue import Empty
+from typing import Any, Generic
+
+from snakesim_hal.backend import SetPoints
+from snakesim_hal.errors import NotConnectedError, StalledError, WireError
+from snakesim_hal.network.mailbox import Mailbox
+from snakesim_hal.network.robot_mismatch import misfit
+from snakesim_hal.network.run_key import is_proven, own_run_key
+from snakesim_hal.network.session import Arrival, Publisher, Reader, Session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import Decoder, MessageT
+from snakesim_hal.wire.messages import (
+    Answer,
+    Clock,
+    Description,
+    Done,
+    JointCommand,
+    JointState,
+    LeaseRequest,
+    Message,
+    Mode,
+    Pace,
+)
+
+KEPT_PER_KEY = 32
+NO_TICK = -1  # of messages that are of no tick, such as an intent: only the newest is kept
+MISSING_LIMIT_S = 2.0
+LEASE_RETRY_S = 0.25
+
+
+class Feed(Generic[MessageT]):
+    """The samples of one key, found by the tick that they are of."""
+
+    def __init__(
+        self, reader: Reader[MessageT], key: str, fits: Callable[[Message], bool] = lambda _message: True
+    ) -> None:
+        """fits: whether a message is about the robot that is there; what is not is left out."""
+        self._reader = reader
+        self._fits = fits
+        self._kept: OrderedDict[int, MessageT] = OrderedDict()
+        self.key = key
+
+    def take_in(self, *, newest_only: bool = False) -> None:
+        """Move what arrived into the shelf."""
+        if newest_only:
+            newest = self._reader.newest(self._fits)
+            fitting = [] if newest is None else [newest]
+        else:
+            fitting = [message for message in self._reader.drain() if self._fits(message)]
+        for message in fitting:
+            tick: int = getattr(message, "tick", NO_TICK)
+            self._kept[tick] = message
+            self._kept.move_to_end(tick)
+        while len(self._kept) > KEPT_PER_KEY:
+            self._kept.popitem(last=False)
+
+    def clear(self) -> None:
+        """Forget everything: the HAL started over."""
+        self._kept.clear()
+
+    def newest(self) -> MessageT | None:
+        """The sample that came last."""
+        return self._kept[next(reversed(self._kept))] if self._kept else None
+
+    def at(self, tick: int) -> MessageT | None:
+        """The sample of exactly this tick."""
+        return self._kept.get(tick)
+
+
+class Client:
+    """A service's connection to one robot's HAL."""
+
+    def __init__(self, session: Session, service: str, *, every_ticks: int = 1, pace: Pace = "lockstep") -> None:
+        """every_ticks: the service acts on ticks that are multiples of this, and sleeps through the others.
+
+        pace: of the run. A robot in real time has no clock in lockstep, for which a service would wait.
+        """
+        self.service = service
+        self.session = session
+        self._every_ticks, self._pace = every_ticks, pace
+        self._clocks: Mailbox[Clock] = Mailbox()
+        self._heard_at = time.monotonic()
+        self.heard: Clock | None = None  # the newest clock, due or not
+        self._clock_decoder = Decoder(Clock)
+        self._feeds: dict[str, Feed[Any]] = {}
+        self._publishers: dict[str, Publisher[Any]] = {}
+        self._done: Publisher[Done] | None = None
+        self._robot: Description | None = None
+        self._clock: Clock | None = None
+        self._ahead: Clock | None = None  # taken from the queue, and not due yet
+        self._started_over = False
+        self.commanded_tick = -1
+        session.on_arrival(keys.CLOCK, self._take_clock)
+
+    def description(self, timeout_s: float = 10.0) -> Description:
+        """The robot. Raises NotConnectedError when no HAL shows one in time."""
+        self._robot = self._robot or self._own_description(timeout_s)
+        if self._robot is None:
+            raise NotConnectedError(f"no robot description within {timeout_s} s; is the robot's HAL host running?")
+        return self._robot
+
+    def subscribe(self, key: str, message: type[MessageT]) -> Feed[MessageT]:
+        """Start listening to a key; do this for everything before `announce`."""
+        feed = Feed(self.session.reader(key, message), key, self._fits)
+        self._feeds[key] = feed
+        return feed
+
+    def _fits(self, message: Message) -> bool:
+        """Whether a message is about our robot, as far as it is known; what is not is counted."""
+        reason = None if self._robot is None else misfit(message, self._robot)
+        if reason is not None:
+            self.session.rejected[reason] += 1
+        return reason is None
+
+    def announce(self) -> None:
+        """Show that the service is here. A lockstep run waits for it from now on."""
+        self.session.declare_alive(self.service)
+
+    def ticks(self, silence_s: float | None = None) -> Iterator[Clock | None]:
+        """Every due tick in lockstep; the newest one otherwise. None after each `silence_s` without any clock."""
+        while True:
+            try:
+                clock = self._next_clock(silence_s)
+            except Empty:
+                if silence_s is None or time.monotonic() - self._heard_at >= silence_s:
+                    yield None
+                continue
+            if self._clock is not None and clock.tick < self._clock.tick:
+                self._started_over = True
+                for feed in self._feeds.values():
+                    feed.clear()
+            self._clock, self.commanded_tick = clock, -1
+            for feed in self._feeds.values():
+                feed.take_in(newest_only=clock.pace != "lockstep")
+            yield clock
+
+    def _next_clock(self, timeout_s: float | None) -> Clock:
+        """The next due clock; in lockstep the newest of its tick, which is shown again while time stands still."""
+        clock = self._ahead or self._clocks.get(timeout=timeout_s)
+        self._ahead = None
+        while not self._clocks.empty():
+            following = self._clocks.get()
+            if clock.pace == "lockstep" and following.tick != clock.tick:
+                self._ahead = following
+                break
+            clock = following
+        return clock
+
+    def hear(self, timeout_s: float) -> Clock | None:
+        """The newest clock, due or not; waits for the first one. None when there is none in time."""
+        deadline = time.monotonic() + timeout_s
+        while self.heard is None and time.monotonic() < deadline:
+            time.sleep(0.001)
+        return self.heard
+
+    def met_anew(self) -> Description | None:
+        """The robot, when its HAL has started over since the last call; else None."""
+        if not self._started_over:
+            return None
+        self._started_over = False
+        self._robot = self._own_description(MISSING_LIMIT_S) or self._robot
+        return self._robot
+
+    def _own_description(self, timeout_s: float) -> Description | None:
+        """What our own run's host shows; a forged one is not looked at."""
+        key = own_run_key()
+        return self.session.latest(keys.DESCRIPTION, Description, timeout_s, lambda found: is_proven(found, key))
+
+    def _take_clock(self, arrival: Arrival) -> None:
+        """Runs in Zenoh's thread: wakes the service only for ticks that are its own."""
+        self._heard_at = arrival.monotonic_ns * 1e-9
+        try:
+            clock = self._clock_decoder.decode(arrival.payload, arrival.encoding)
+        except WireError as error:
+            self.session.rejected[error.reason] += 1
+            return
+        if clock.pace == "lockstep" != self._pace:
+            self.session.rejected["other_pace"] += 1
+            return
+        self.heard = clock
+        if clock.tick % self._every_ticks == 0:
+            self._clocks.put(clock)
+
+    def read(self, feed: Feed[MessageT]) -> MessageT | None:
+        """What counts at this tick at the feed's key; None when there is none (yet).
+
+        Raises StalledError when a lockstep run promises a sample that does not come.
+        """
+        clock = self._clock
+        if clock is None:
+            return None
+        wanted = clock.newest.get(feed.key)
+        if wanted is None:
+            wanted = clock.newest.get(feed.key.partition("/")[0])
+        if clock.pace != "lockstep" or wanted is None:
+            return feed.newest()
+        found = feed.at(wanted)
+        if found is not None or clock.lifecycle != "armed":
+            return found
+        deadline = time.monotonic() + MISSING_LIMIT_S
+        while time.monotonic() < deadline:
+            time.sleep(0.0002)
+            feed.take_in()
+            found = feed.at(wanted)
+            if found is not None:
+                return found
+        raise StalledError(f"{feed.key} of tick {wanted} was promised at tick {clock.tick} and never came")
+
+    def put(self, key: str, message: Message) -> None:
+        """Publish an output of this service."""
+        publisher = self._publishers.get(key)
+        if publisher is None:
+            lossless = self._clock is not None and self._clock.pace == "lockstep"
+            publisher = self.session.publisher(key, type(message), lossless=lossless)
+            self._publishers[key] = publisher
+        publisher.put(message)
+
+    def done(self, tick: int) -> None:
+        """Say that everything owed for a tick is published. A command that answers the tick says so itself."""
+        if self.commanded_tick == tick:
+            return
+        if self._done is None:
+            lossless = self._clock is not None and self._clock.pace == "lockstep"
+            self._done = self.session.publisher(keys.done(self.service), Done, lossless=lossless)
+        self._done.put(Done(tick=tick))
+
+
+class Commander:
+    """The right to command: acquires the lease, and stamps every command with it."""
+
+    def __init__(self, client: Client, description: Description, *, priority: int = 100) -> None:
+        self._client = client
+        self._description = description
+        self._priority = priority
+        self._epoch = 0
+        self._sequence = 0
+        self._asked_at = 0.0
+        self.refusal: str | None = None
+
+    def holds(self, clock: Clock) -> bool:
+        """Whether the lease is ours at this tick; asks for it when nobody holds it."""
+        if self._epoch and clock.lease_epoch == self._epoch:
+            return True
+        now = time.monotonic()
+        if clock.lifecycle == "armed" or now - self._asked_at < LEASE_RETRY_S:
+            return False
+        self._asked_at = now
+        request = LeaseRequest(action="acquire", holder=self._client.service, priority=self._priority)
+        try:
+            answer: Answer = self._client.session.ask(keys.LEASE, request, host=self._description.host)
+        except NotConnectedError as error:
+            self.refusal = str(error)
+            return False
+        self.refusal = None if answer.ok else answer.reason
+        self._epoch = answer.epoch if answer.ok else 0
+        return answer.ok
+
+    def send(self, clock: Clock, joints: JointState, set_points: SetPoints) -> None:
+        """Publish set-points that answer a joint state; they are good for one lease term from when it was published."""
+        self._sequence += 1
+        command = JointCommand(
+            tick=joints.tick,
+            arming=clock.arming,
+            sequence=self._sequence,
+            lease_epoch=self._epoch,
+            layout=self._description.layout,
+            valid_for_ns=self._description.lease_ns,
+            mode=set_points.mode,
+            target=set_points.target,
+            torque_limit_nm=set_points.torque_limit_nm,
+        )
+        self._client.put(keys.JOINT_COMMAND, command)
+        self._client.commanded_tick = joints.tick
+
+    def stay(self, joints: JointState) -> SetPoints:
+        """Set-points that keep every joint where it is: what is streamed while the robot is not armed."""
+        count = len(self._description.joints)
+        limits = [joint.torque_limit_nm for joint in self._description.joints]
+        return SetPoints([Mode.POSITION] * count, list(joints.angle_rad), limits)

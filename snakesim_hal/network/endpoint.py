@@ -1,0 +1,37 @@
+"""Endpoints and namespaces as people type them, checked before Zenoh sees them: it says little about wrong ones."""
+
+import re
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.files import short
+
+PROTOCOLS = ("tcp", "tls", "quic", "udp", "ws")
+VALID = "such as tcp/127.0.0.1:7447: PROTOCOL/HOST:PORT"
+_parts = re.compile(
+    r"(?P<protocol>[^/]*)/(?P<host>\[[0-9a-fA-F:.]+\]|[A-Za-z0-9._-]+):(?P<port>[0-9]{1,9})(?P<more>[?#].*)?"
+)
+
+
+def check_endpoint(text: str, origin: str) -> str:
+    """The endpoint, when it is one to connect to. Raises ConfigError; origin: the flag or file that it came from."""
+    given = f"{origin} {short(text)}"
+    if text.startswith("unixsock-stream/") and len(text) > len("unixsock-stream/"):
+        return text
+    parts = _parts.fullmatch(text)
+    if parts is None:
+        raise ConfigError(f"{given}: this is not an endpoint; give one {VALID}")
+    if parts["protocol"] not in PROTOCOLS:
+        raise ConfigError(f"{given}: the protocol is one of {', '.join(PROTOCOLS)}; give an endpoint {VALID}")
+    if not 1 <= int(parts["port"]) <= 65535:
+        raise ConfigError(f"{given}: the port is a number from 1 to 65535; give an endpoint {VALID}")
+    return text
+
+
+def check_namespace(text: str, origin: str) -> str:
+    """The namespace, when it is one. Raises ConfigError."""
+    if not re.fullmatch(r"[^/*$?#\s@]+(/[^/*$?#\s@]+)*", text) or not text.isprintable():
+        raise ConfigError(
+            f"{origin} {short(text)!r}: this is not a namespace; give a name such as planar13 or lab/planar13, without "
+            "spaces and * $ ? # @"
+        )
+    return text

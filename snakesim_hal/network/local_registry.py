@@ -1,0 +1,89 @@
+"""The robots of this user on this computer: where tools find every running HAL, whatever port it got.
+
+Each run keeps a small file, locked for as long as its process lives; the kernel lets go of the lock however it dies.
+"""
+
+import contextlib
+import fcntl
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+
+from snakesim_hal.wire.codec import UNDECODABLE
+
+
+class LocalRobot(msgspec.Struct, frozen=True, kw_only=True):
+    """A robot whose HAL host runs on this computer, or is about to."""
+
+    namespace: str
+    robot: str
+    backend: str
+    endpoint: str  # where its network meets
+    stop_host: str  # of its stop port
+    stop_port: int
+    pid: int  # of the process that answers for it: `snakesim run`, or a host that was started by itself
+
+
+def state_folder() -> Path:
+    """Where SnakeSIM keeps what outlives a run: `$XDG_STATE_HOME/snakesim`, by default `~/.local/state/snakesim`."""
+    return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "snakesim"
+
+
+def robot_folder(robot: str, backend: str, hardware: str) -> Path:
+    """Where what belongs to one robot is kept: its emergency stop. The same in every run, from any folder."""
+    name = "-".join(filter(None, (robot, backend, hardware)))
+    return state_folder() / "robots" / "".join(c if c.isalnum() or c in "-_+." else "_" for c in name)
+
+
+@contextlib.contextmanager
+def registered(robot: LocalRobot) -> Iterator[str | None]:
+    """Have tools find a robot. Gives why they will not, when the file cannot be kept; None when all is well."""
+    path = _live() / f"{robot.pid}.json"
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW, 0o600)
+    except OSError as error:
+        yield f"{path}: {error.strerror}; `snakesim status` and `estop` find this run only with --endpoint"
+        return
+    trouble = None
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        os.write(handle, msgspec.json.encode(robot))
+    except OSError as error:
+        trouble = f"{path}: {error.strerror}; `snakesim status` and `estop` find this run only with --endpoint"
+    try:
+        yield trouble
+    finally:
+        with contextlib.suppress(OSError):
+            path.unlink()
+        os.close(handle)
+
+
+def local_robots() -> list[LocalRobot]:
+    """Every robot whose process lives, by process id. Files of those that are gone are removed."""
+    found: list[LocalRobot] = []
+    for path in sorted(_live().glob("*.json")) if _live().is_dir() else []:
+        with contextlib.suppress(OSError, *UNDECODABLE):
+            handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+            try:
+                if _is_locked(handle):
+                    found.append(msgspec.json.decode(os.read(handle, 65536), type=LocalRobot))
+                else:
+                    path.unlink()
+            finally:
+                os.close(handle)
+    return found
+
+
+def _live() -> Path:
+    return state_folder() / "live"
+
+
+def _is_locked(handle: int) -> bool:
+    try:
+        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    return False

@@ -1,0 +1,103 @@
+"""The private channel between a host and the process that started it: a socket pair that nobody else can reach.
+
+Over it the host shows its description and its status, and takes requests. So whoever started a host knows, without
+believing anything on the network, which robot that is, how it is, and that it is this one that is armed.
+"""
+
+import contextlib
+import socket
+import threading
+from collections.abc import Callable
+
+import msgspec
+
+from snakesim_hal.wire.messages import Answer, Description, LifecycleRequest, Status
+
+MAX_BYTES = 1 << 18
+
+
+class ToStarter(msgspec.Struct, frozen=True, kw_only=True):
+    """What a host says: one of these at a time."""
+
+    description: Description | None = None
+    status: Status | None = None
+    answer: Answer | None = None
+
+
+def socket_pair() -> tuple[socket.socket, socket.socket]:
+    """Two ends that keep messages apart: one for the starter, one to be inherited by the host."""
+    return socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+
+
+class HostEnd:
+    """The host's end. Never waits: a starter that does not read misses what it does not read."""
+
+    def __init__(self, inherited: socket.socket | None) -> None:
+        """inherited: None for a host that was started by itself."""
+        self._socket = inherited
+
+    @staticmethod
+    def of(descriptor: int | None) -> "HostEnd":
+        """From the inherited file descriptor."""
+        return HostEnd(None if descriptor is None else socket.socket(fileno=descriptor))
+
+    def say(self, message: ToStarter) -> None:
+        """Tell the starter."""
+        if self._socket is not None:
+            with contextlib.suppress(OSError):
+                self._socket.send(msgspec.msgpack.encode(message), socket.MSG_DONTWAIT)
+
+    def serve(self, take: Callable[[LifecycleRequest, Callable[[Answer], None]], None]) -> None:
+        """Call `take(request, reply)` for each request, from a thread of its own."""
+        opened = self._socket
+        if opened is None:
+            return
+        decoder = msgspec.msgpack.Decoder(LifecycleRequest)
+
+        def listen() -> None:
+            while True:
+                try:
+                    request = opened.recv(MAX_BYTES)
+                except OSError:
+                    return
+                if not request:
+                    return
+                take(decoder.decode(request), lambda answer: self.say(ToStarter(answer=answer)))
+
+        threading.Thread(target=listen, name="private channel", daemon=True).start()
+
+
+class StarterEnd:
+    """The starter's end: what its host said last."""
+
+    def __init__(self, opened: socket.socket) -> None:
+        self._socket = opened
+        self._socket.setblocking(False)
+        self._decoder = msgspec.msgpack.Decoder(ToStarter)
+        self.description: Description | None = None
+        self.status: Status | None = None
+        self.answers: list[Answer] = []
+
+    def take_in(self) -> None:
+        """Read what has come."""
+        while True:
+            try:
+                message = self._socket.recv(MAX_BYTES)
+            except OSError:  # nothing there, or the host is gone
+                return
+            if not message:
+                return
+            said = self._decoder.decode(message)
+            self.description = said.description or self.description
+            self.status = said.status or self.status
+            if said.answer is not None:
+                self.answers.append(said.answer)
+
+    def ask(self, request: LifecycleRequest) -> None:
+        """Ask; the answer comes into `answers`."""
+        with contextlib.suppress(OSError):
+            self._socket.send(msgspec.msgpack.encode(request))
+
+    def close(self) -> None:
+        """Let go of it."""
+        self._socket.close()

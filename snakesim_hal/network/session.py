@@ -1,0 +1,425 @@
+"""The Zenoh session: explicit endpoints, no scouting, one namespace a robot, and the quality of service per kind.
+
+Without a router of its own, a robot's HAL host is the place where its loopback sessions meet: it listens (mode
+`router`), and everything else connects to it (mode `client`). Zenoh peers do not forward for one another unless gossip
+tells them of each other, and gossip is off here. With `--router` the host too is a client of the lab's router.
+"""
+
+import json
+import os
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic
+
+import zenoh
+from zenoh import ext, handlers  # pyright: ignore[reportMissingModuleSource]
+
+from snakesim_hal.errors import ConfigError, NotConnectedError, WireError
+from snakesim_hal.model.files import short
+from snakesim_hal.model.textfiles import check_brackets, read_text
+from snakesim_hal.process import raise_open_files
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES, Decoder, MessageT, encode, encoding_of
+from snakesim_hal.wire.messages import Answer, Message
+
+DEFAULT_PORT = 7447
+DEFAULT_ENDPOINT = f"tcp/127.0.0.1:{DEFAULT_PORT}"
+MAX_MESSAGE_BYTES = MAX_PAYLOAD_BYTES + 4096  # with key and encoding; what is longer costs neither memory nor time
+# Who connects and says nothing is let go after a second, and there is room for many who do.
+UNICAST = {"accept_timeout": 1000, "accept_pending": 1000, "max_sessions": 4000}
+# A reader that does not read loses samples after 0.1 ms (Zenoh's default is 1 ms), so that ten of them cost a writer
+# little. With less, bursts to good readers are lost: at 0 ms, two thirds of six express messages in a row.
+TX = {"lease": 2000, "queue": {"congestion_control": {"drop": {"wait_before_drop": 100}}}}
+# Letting go of a frozen reader holds up a receiving thread of Zenoh, and it has two: three readers that freeze together
+# kept the controller's commands out for long enough to end its lease.
+RUNTIME = ("ZENOH_RUNTIME", "(rx: (worker_threads: 16))")
+MAX_OPEN_FILES = 16384  # a connection takes one, and a process has 1024 unless it asks for more
+READER_DEPTH = 256  # deep enough that a burst of noise on a key does not push out the sample that counts
+
+
+@dataclass(frozen=True)
+class Link:
+    """How a process joins the robot's network."""
+
+    endpoint: str = DEFAULT_ENDPOINT
+    namespace: str | None = None  # None: the whole network, for tools that look for robots
+    listen: bool = False  # True: be the meeting point; False: connect to it
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """A sample as it came in, not decoded yet."""
+
+    key: str
+    payload: bytes
+    encoding: str
+    monotonic_ns: int
+
+
+class Publisher(Generic[MessageT]):
+    """Puts one message type on one key."""
+
+    def __init__(self, publisher: Any, message: type[MessageT]) -> None:
+        self.message = message
+        self._publisher = publisher
+        self._put: Callable[[bytes], None] = publisher.put
+
+    def put(self, message: MessageT) -> None:
+        """Send it; may wait for a slow reader only when the publisher was declared lossless."""
+        self._put(encode(message))
+
+    def send(self, payload: bytes) -> None:
+        """Send bytes as they are, past whoever stands in the way."""
+        self._publisher.put(payload)
+
+    def reroute(self, put: Callable[[bytes], None] | None) -> None:
+        """Hand what is put to somebody who may `send` it; None: straight out again."""
+        self._put = self._publisher.put if put is None else put
+
+    def heard(self) -> bool:
+        """Whether anybody subscribes to it now."""
+        return bool(self._publisher.matching_status.matching)
+
+
+class Reader(Generic[MessageT]):
+    """The newest samples of one key, decoded when they are asked for, in the asking thread."""
+
+    def __init__(self, subscriber: Any, message: type[MessageT], rejected: Counter[str]) -> None:
+        self.subscriber = subscriber
+        self._decoder = Decoder(message)
+        self._rejected = rejected
+
+    def drain(self) -> list[MessageT]:
+        """Everything that arrived since the last call, oldest first. What cannot be decoded is counted and left out."""
+        return [message for sample in self._arrived() if (message := self._decoded(sample)) is not None]
+
+    def newest(self, wanted: Callable[[MessageT], bool]) -> MessageT | None:
+        """The newest that is wanted of what arrived since the last call.
+
+        What came before it is dropped unread, so that a flood costs its reader little.
+        """
+        for sample in reversed(self._arrived()):
+            message = self._decoded(sample)
+            if message is not None and wanted(message):
+                return message
+        return None
+
+    def _arrived(self) -> list[Any]:
+        arrived: list[Any] = []
+        while (sample := self.subscriber.try_recv()) is not None:
+            arrived.append(sample)
+        return arrived
+
+    def _decoded(self, sample: Any) -> MessageT | None:
+        try:
+            return self._decoder.decode(sample.payload.to_bytes(), str(sample.encoding))
+        except WireError as error:
+            self._rejected[error.reason] += 1
+            return None
+
+
+@dataclass(frozen=True)
+class Question:
+    """A query that waits for its answer."""
+
+    key: str
+    payload: bytes
+    encoding: str
+    _query: Any
+
+    def reply(self, answer: Answer) -> None:
+        """Answer and close it."""
+        self._query.reply(self.key, encode(answer), encoding=encoding_of(Answer))
+        self._query.drop()
+
+
+class Session:
+    """What SnakeSIM uses of Zenoh. Open one with `open_session`."""
+
+    def __init__(self, zenoh_session: zenoh.Session) -> None:
+        self._zenoh = zenoh_session
+        self._declared: list[Any] = []
+        self._publishers: dict[str, Publisher[Any]] = {}
+        self._reroutes: dict[str, Callable[[bytes], None]] = {}
+        self.rejected: Counter[str] = Counter()  # samples that readers could not take, by reason
+
+    def publisher(self, key: str, message: type[MessageT], *, lossless: bool = False) -> Publisher[MessageT]:
+        """A publisher for a stream. Lossless waits for slow readers (lockstep); otherwise samples are dropped."""
+        command = key == keys.JOINT_COMMAND
+        # What ends a tick is sent at once, and takes along what was put just before it: one packet instead of five.
+        ends_a_tick = command or key == keys.CLOCK or key.startswith(keys.done(""))
+        publisher = self._zenoh.declare_publisher(
+            key,
+            encoding=encoding_of(message),
+            congestion_control=zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.REAL_TIME if command else zenoh.Priority.DATA_HIGH,
+            express=ends_a_tick,
+        )
+        return self._published(key, publisher, message)
+
+    def latched_publisher(self, key: str, message: type[MessageT]) -> Publisher[MessageT]:
+        """A publisher whose last value is given to readers that come later."""
+        publisher = ext.declare_advanced_publisher(
+            self._zenoh,
+            key,
+            encoding=encoding_of(message),
+            cache=ext.CacheConfig(1),
+            publisher_detection=True,
+        )
+        return self._published(key, publisher, message)
+
+    def _published(self, key: str, publisher: Any, message: type[MessageT]) -> Publisher[MessageT]:
+        self._declared.append(publisher)
+        made = self._publishers[key] = Publisher(publisher, message)
+        made.reroute(self._reroutes.get(key))
+        return made
+
+    def reroute(self, key: str, put: Callable[[bytes], None] | None) -> None:
+        """Hand what is published on a key, now or later, to somebody who may `send` it; None: straight out again."""
+        if put is None:
+            self._reroutes.pop(key, None)
+        else:
+            self._reroutes[key] = put
+        if key in self._publishers:
+            self._publishers[key].reroute(put)
+
+    def send(self, key: str, payload: bytes) -> None:
+        """Send bytes on a key that this session publishes on."""
+        self._publishers[key].send(payload)
+
+    def reader(self, key: str, message: type[MessageT], *, depth: int = READER_DEPTH) -> Reader[MessageT]:
+        """The newest `depth` samples of a stream; older ones are dropped, nothing ever blocks."""
+        subscriber = self._zenoh.declare_subscriber(key, handlers.RingChannel(depth))
+        self._declared.append(subscriber)
+        return Reader(subscriber, message, self.rejected)
+
+    def latched_reader(self, key: str, message: type[MessageT]) -> Reader[MessageT]:
+        """Like `reader`, and it gets the value that was latched before it came."""
+        subscriber = ext.declare_advanced_subscriber(
+            self._zenoh,
+            key,
+            handlers.RingChannel(READER_DEPTH),
+            history=_last_value(),
+        )
+        self._declared.append(subscriber)
+        return Reader(subscriber, message, self.rejected)
+
+    def stop_reading(self, reader: Reader[Any]) -> None:
+        """Close a reader: what nobody asks it for any more need not be kept."""
+        self._declared.remove(reader.subscriber)
+        reader.subscriber.undeclare()
+
+    def latest(
+        self,
+        key: str,
+        message: type[MessageT],
+        timeout_s: float,
+        wanted: Callable[[MessageT], bool] = lambda _message: True,
+    ) -> MessageT | None:
+        """The value latched on a key; None when there is none (that is wanted) in time."""
+        reader, deadline = self.latched_reader(key, message), time.monotonic() + timeout_s
+        found: MessageT | None = None
+        while found is None and time.monotonic() < deadline:
+            time.sleep(0.01)
+            found = reader.newest(wanted)
+        self.stop_reading(reader)
+        return found
+
+    def on_arrival(self, key: str, take: Callable[[Arrival], None]) -> None:
+        """Call `take` for every sample, in Zenoh's thread: it must only store, never compute."""
+        self._declared.append(self._zenoh.declare_subscriber(key, _storing(take)))
+
+    def on_latched_arrival(self, key: str, take: Callable[[Arrival], None]) -> None:
+        """Like `on_arrival`, and it gets the values that were latched before it came."""
+        self._declared.append(ext.declare_advanced_subscriber(self._zenoh, key, _storing(take), history=_last_value()))
+
+    def on_question(self, key: str, take: Callable[[Question], None]) -> None:
+        """Call `take` for every query, in Zenoh's thread; answer it from your own."""
+
+        def handle(query: zenoh.Query) -> None:
+            payload = b"" if query.payload is None else query.payload.to_bytes()
+            # The query's own key may be a pattern, such as `hal/*`; the question is always about ours.
+            take(Question(key, payload, str(query.encoding or ""), query))
+
+        self._declared.append(self._zenoh.declare_queryable(key, handle))
+
+    def ask(self, key: str, request: Message, timeout_s: float = 2.0, *, host: str | None = None) -> Answer:
+        """Ask the HAL, and wait for the answer, which may be no. Raises NotConnectedError when there is none.
+
+        host: the host process that is meant; what others answer does not count. None: the first answer does.
+        """
+        unreadable: WireError | None = None
+        for _, answer in self._answers(key, request, timeout_s):
+            if isinstance(answer, WireError):
+                unreadable = answer
+            elif host is None or answer.host == host:
+                return answer
+        if unreadable is not None:
+            raise NotConnectedError(f"what answers on {key} cannot be read: {unreadable}")
+        raise NotConnectedError(f"nobody answers on {key} within {timeout_s} s; is the robot's HAL host running?")
+
+    def ask_all(self, pattern: str, request: Message, timeout_s: float = 2.0) -> Iterator[tuple[str, Answer]]:
+        """Ask everybody whose key matches, at once: (key, answer) as they come, until all answered or time is up."""
+        answers = self._answers(pattern, request, timeout_s)
+        return ((at, answer) for at, answer in answers if isinstance(answer, Answer))
+
+    def _answers(self, pattern: str, request: Message, timeout_s: float) -> Iterator[tuple[str, Answer | WireError]]:
+        """What comes back from which key; what cannot be read is counted. No answer takes the place of another."""
+        replies = self._zenoh.get(
+            pattern,
+            payload=encode(request),
+            encoding=encoding_of(type(request)),
+            timeout=timeout_s,
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+        )
+        decoder = Decoder(Answer)
+        for reply in replies:
+            if reply.ok is None:
+                continue
+            try:
+                yield str(reply.ok.key_expr), decoder.decode(reply.ok.payload.to_bytes(), str(reply.ok.encoding))
+            except WireError as error:
+                self.rejected[error.reason] += 1
+                yield str(reply.ok.key_expr), error
+
+    def present(self, pattern: str, timeout_s: float = 1.0) -> list[str]:
+        """The liveliness keys that match now."""
+        replies = self._zenoh.liveliness().get(pattern, timeout=timeout_s)
+        return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})
+
+    def declare_alive(self, service: str) -> None:
+        """Show the liveliness token of a service for as long as the session lives."""
+        self.declare_token(keys.alive(service))
+
+    def declare_token(self, key: str) -> None:
+        """Show a liveliness token for as long as the session lives."""
+        self._declared.append(self._zenoh.liveliness().declare_token(key))
+
+    def on_alive(self, take: Callable[[str, bool], None], key: str = keys.ALIVE_ALL) -> None:
+        """Call `take(key, present)` when a service comes or goes, in Zenoh's thread."""
+
+        def handle(sample: zenoh.Sample) -> None:
+            take(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+
+        self._declared.append(self._zenoh.liveliness().declare_subscriber(key, handle, history=True))
+
+    def close(self) -> None:
+        """Undeclare everything, then close."""
+        for declared in reversed(self._declared):
+            declared.undeclare()
+        self._declared.clear()
+        self._zenoh.close()
+
+
+def _last_value() -> ext.HistoryConfig:
+    """What a reader of a latched key wants: the value that was there before it, or before its writer."""
+    return ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
+
+
+def _storing(take: Callable[[Arrival], None]) -> Callable[[zenoh.Sample], None]:
+    def handle(sample: zenoh.Sample) -> None:
+        payload, encoding = sample.payload.to_bytes(), str(sample.encoding)
+        take(Arrival(str(sample.key_expr), payload, encoding, time.monotonic_ns()))
+
+    return handle
+
+
+def key_expression(text: str) -> str:
+    """A key that may have wildcards, in Zenoh's canonical form. Raises ConfigError."""
+    try:
+        return str(zenoh.KeyExpr.autocanonize(text))
+    except zenoh.ZError as error:
+        raise ConfigError(
+            f"{text!r} is not a key: {str(error).split(' at /')[0]}; valid are such as sensor/joints, sensor/* and **"
+        ) from None
+
+
+def intersects(pattern: str, key: str) -> bool:
+    """Whether two key expressions have a key in common."""
+    return zenoh.KeyExpr(pattern).intersects(zenoh.KeyExpr(key))
+
+
+@contextmanager
+def open_session(link: Link, connect_timeout_s: float = 5.0) -> Iterator[Session]:
+    """Join the network. Raises NotConnectedError when the endpoint does not answer or cannot be listened on."""
+    if link.listen:
+        raise_open_files(MAX_OPEN_FILES)
+        os.environ.setdefault(*RUNTIME)
+    session = Session(_open(_settings(link, connect_timeout_s), link))
+    try:
+        yield session
+    finally:
+        session.close()
+
+
+def _settings(link: Link, connect_timeout_s: float) -> dict[str, Any]:
+    settings: dict[str, Any] = {
+        "mode": "router" if link.listen else "client",
+        "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "timestamping": {"enabled": {"router": True, "peer": True, "client": True}},
+        "transport": {
+            "unicast": UNICAST,
+            "link": {"tx": TX, "rx": {"max_message_size": MAX_MESSAGE_BYTES}},
+            "shared_memory": {"enabled": False},
+        },
+        "listen": {"endpoints": [link.endpoint] if link.listen else [], "exit_on_failure": True},
+        "connect": {
+            "endpoints": [] if link.listen else [link.endpoint],
+            "timeout_ms": round(connect_timeout_s * 1000),
+            "exit_on_failure": True,
+            "retry": {"period_init_ms": 50, "period_max_ms": 250, "period_increase_factor": 1.5},
+        },
+    }
+    if link.namespace is not None:
+        settings["namespace"] = link.namespace
+    return settings
+
+
+def _open(settings: dict[str, Any], link: Link) -> zenoh.Session:
+    zenoh.init_log_from_env_or("off")
+    try:
+        return zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
+    except zenoh.ZError as error:
+        if link.listen:
+            raise NotConnectedError(
+                f"cannot listen on {link.endpoint}: {str(error).split(' at /')[0]}. Another run may hold the port; "
+                f"choose one with --endpoint tcp/127.0.0.1:PORT"
+            ) from error
+        raise NotConnectedError(f"nobody listens on {link.endpoint}; start a run or a router there first") from error
+
+
+def router_settings(config: Path) -> zenoh.Config:
+    """What a router's JSON5 file says; opens nothing. Raises ConfigError."""
+    text = read_text(config)
+    check_brackets(text, str(config))
+    try:
+        settings = zenoh.Config.from_json5(text)
+    except zenoh.ZError as error:
+        raise _refused_by_zenoh(config, error) from error
+    if json.loads(settings.get_json("mode")) != "router":
+        raise ConfigError(f'{config}: `mode` must be "router"')
+    return settings
+
+
+def _refused_by_zenoh(config: Path, error: zenoh.ZError) -> ConfigError:
+    return ConfigError(f"{config}: Zenoh refuses it: {short(' '.join(str(error).split()), 500)}")  # it quotes the file
+
+
+@contextmanager
+def open_router(config: Path) -> Iterator[None]:
+    """Run a Zenoh router from a JSON5 file for as long as the context lives. Raises ConfigError."""
+    zenoh.init_log_from_env_or("error")
+    settings = router_settings(config)
+    try:
+        session = zenoh.open(settings)
+    except zenoh.ZError as error:
+        raise _refused_by_zenoh(config, error) from error
+    try:
+        yield
+    finally:
+        session.close()

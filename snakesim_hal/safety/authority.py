@@ -1,0 +1,379 @@
+"""Who may move the robot, and what the motors are told: lifecycle, lease and gate in one place, without any I/O.
+
+The host passes in commands, requests, states and the time; it gets back set-points. `now_ns` is safety time: the
+monotonic clock, or simulated time in lockstep.
+"""
+
+from collections import Counter, deque
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+
+from snakesim_hal.backend import SetPoints
+from snakesim_hal.safety import gate, lifecycle
+from snakesim_hal.safety.derating import Derating
+from snakesim_hal.safety.fault_log import FaultLog
+from snakesim_hal.safety.gate import Applied, JointLimits
+from snakesim_hal.safety.isolation import Isolation, Mask
+from snakesim_hal.safety.lease import Lease, freed, renewed, rule
+from snakesim_hal.safety.plausibility import Doubt, JointWatch, readable
+from snakesim_hal.safety.stop_ramp import Halt
+from snakesim_hal.wire.messages import (
+    Answer,
+    Description,
+    EstopRequest,
+    Fault,
+    JointCommand,
+    JointState,
+    LeaseRequest,
+    LifecycleRequest,
+    LifecycleState,
+    Mode,
+    Power,
+)
+
+COMMANDS_KEPT = 1024
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What the motors get for one tick."""
+
+    set_points: SetPoints
+    sequence: int | None  # of the command behind it; None: the host's own safe action
+    limited: dict[int, str]  # joint index -> which limit changed its target
+
+
+class Authority:
+    """Lifecycle, lease and gate of one robot."""
+
+    def __init__(self, description: Description, *, first_epoch: int = 0) -> None:
+        """first_epoch: unlike that of any host before, so that what was meant for another host is refused."""
+        self.description = description
+        self.limits = JointLimits.of(description)
+        self.state: LifecycleState = "disarmed"
+        self.why = "not armed yet"
+        self.arming = 0
+        self.lease = Lease(epoch=first_epoch)
+        self.since_clear = FaultLog()
+        self.since_start = FaultLog()
+        self.accepted = 0
+        self.standby = 0
+        self.rejected: Counter[str] = Counter()
+        self.limited: Counter[str] = Counter()
+        count = len(description.joints)
+        self._applied = Applied(np.zeros(count, dtype=np.int64), np.zeros(count), self.limits.torque_nm)
+        self._watch = JointWatch(self.limits)
+        self._measured = self._watch.measured
+        self._state_tick = 0  # of the newest joint state
+        self._armed_tick = -1  # of the state that was the newest at the last arming
+        self._isolation = Isolation(description)
+        self._doubt: Doubt | None = self._unknown("no joint state yet")
+        self._derating = Derating(description)
+        self._command: JointCommand | None = None
+        self._command_ns = 0  # when it came
+        self._counting: JointCommand | None = None  # what the last decision since arming was made from
+        self._recent: deque[JointCommand] = deque(maxlen=COMMANDS_KEPT)  # good ones since arming, oldest first
+        self._last_sequence = -1
+        self._hold_at = np.zeros(count)
+        self._halt: Halt | None = None  # of a robot that was armed when the present fault came
+        self._told = True  # whether the motors were told that the robot is disarmed, since it is
+
+    # --- what comes in -------------------------------------------------------------------------------------
+
+    def observe(self, joints: JointState, now_ns: int | None = None) -> None:
+        """Take the newest joint state. What cannot be is no measurement: the last good one stays.
+
+        now_ns: safety time; None: that of the state's stamp.
+        """
+        applied = self._applied if self.state == "armed" else None
+        now_ns = joints.stamp_ns if now_ns is None else now_ns
+        self._state_tick = joints.tick
+        self._doubt = self._watch.take(joints, now_ns=now_ns, applied=applied, aside=self._isolation.joints)
+        self._measured = self._watch.measured
+
+    def observe_power(self, power: Power, now_ns: int) -> None:
+        """Take the newest that the modules say of supply, heat and leaks; `expire` draws the conclusions."""
+        self._derating.take(power, now_ns)
+
+    def readable(self, joints: JointState) -> JointState:
+        """A joint state as everybody may have it: all numbers are numbers."""
+        return readable(joints, self._measured)
+
+    @property
+    def derated(self) -> dict[str, float]:
+        """Joints that heat leaves less than their whole torque, and the share that is left."""
+        return self._derating.derated()
+
+    @property
+    def faults(self) -> list[Fault]:
+        """What went wrong since the last clear, as far as it is kept."""
+        return self.since_clear.kept
+
+    @property
+    def isolated(self) -> list[str]:
+        """Joints that failed, and are passive until a clear."""
+        return self._isolation.names
+
+    def offer(self, command: JointCommand, *, now_ns: int, tick: int, age_ns: int) -> str | None:
+        """Take a command, or return why not. `age_ns`: time since the state that it answers was published."""
+        refusal = gate.refuse(
+            command,
+            lease=self.lease,
+            now_ns=now_ns,
+            tick=tick,
+            last_sequence=self._last_sequence,
+            age_ns=age_ns,
+            limits=self.limits,
+        )
+        if refusal is not None:
+            self.rejected[refusal] += 1
+            return refusal
+        if not self.answers_arming(command):  # nor does it keep the lease: what moves the robot must be commanded now
+            if command.tick <= self._armed_tick:  # under way when the robot was armed: nobody's mistake
+                self.standby += 1
+            else:
+                self.rejected["before_arming"] += 1
+            return "before_arming"
+        self._last_sequence = command.sequence  # only now: what is refused must not make the next good one a replay
+        self.lease = renewed(self.lease, now_ns, self.description.lease_ns)
+        self._command, self._command_ns = command, now_ns
+        if self.state == "armed":
+            self.accepted += 1
+            self._recent.append(command)
+        else:
+            self.standby += 1
+        return None
+
+    def answers_arming(self, command: JointCommand) -> bool:
+        """Whether a command was sent in the knowledge that the robot is armed, if it is."""
+        return self.state != "armed" or command.arming == self.arming
+
+    def reject(self, reason: str) -> None:
+        """Count a sample that never became a command."""
+        self.rejected[reason] += 1
+
+    def on_lease(self, request: LeaseRequest, now_ns: int) -> Answer:
+        """Decide a lease request; when the lease changes hands the robot stops in between."""
+        ruling = rule(self.lease, request, now_ns, self.description.lease_ns)
+        if self.state == "armed" and request.action == "renew":
+            return self._answer(ruling.refusal, ruling.word)  # only a good command renews: asking is not commanding
+        self.lease = ruling.lease
+        if ruling.changed_hands:
+            self._forget_commands()
+            if self.state == "armed":
+                self._go("disarm", f"lease passed to {ruling.lease.holder or 'nobody'}")
+        return self._answer(ruling.refusal, ruling.word)
+
+    def on_lifecycle(self, request: LifecycleRequest, now_ns: int) -> Answer:
+        """Arm, disarm or clear. Arming says no with every condition that is not met."""
+        match request.action:
+            case "arm":
+                against = self._refusals(now_ns) + lifecycle.mistaken(request, self.description)
+                if against:
+                    words = {word for word, _ in against}
+                    return self._answer("; ".join(why for _, why in against), min(words, key=lifecycle.ORDER.index))
+                self._go("arm", f"armed by {request.who}, commanded by {self.lease.holder}")
+                self.arming += 1
+                self._armed_tick = self._state_tick
+                self._command = self._counting = None
+                self._recent.clear()
+                self.lease = renewed(self.lease, now_ns, self.description.lease_ns)
+            case "disarm":
+                if not self._go("disarm", f"disarmed by {request.who}"):
+                    return self._answer(f"cannot disarm in state {self.state}; clear it first", "wrong_state")
+            case "clear":
+                if not self._go("clear", f"cleared by {request.who}; arm to move again"):
+                    lost = ", ".join(self.isolated)
+                    hint = f"; disarm first, then a clear takes back {lost}" if lost else ""
+                    return self._answer(f"nothing to clear in state {self.state}{hint}", "wrong_state")
+                self._take_back()
+                self.since_clear = FaultLog()
+            case _:  # finish
+                if self.state == "armed":
+                    self._go("disarm", f"finished by {request.who}")
+        return self._answer(None)
+
+    def on_estop(self, request: EstopRequest, tick: int) -> Answer:
+        """Stop now, whoever asks."""
+        stopping = Fault(tick=tick, what="estop", cause=f"emergency stop by {request.who}")
+        self.note(stopping, stops=self.state != "estop")
+        self._go("estop", f"emergency stop by {request.who}; clear it to go on")
+        return self._answer(None)
+
+    def fault(self, fault: Fault, joints: Mask | None = None) -> None:
+        """Latch a fault: the joints go to the safe action until someone clears it.
+
+        What reaches no further than some joints sets them aside instead, if the robot file allows that. joints: which;
+        None: the one that the fault names.
+        """
+        joints = self._isolation.mask(fault.joint) if joints is None else joints
+        if fault.reach == "joint" and self._set_aside(fault, joints):
+            return
+        fault = msgspec.structs.replace(fault, reach="robot")
+        stops = self.state not in ("fault", "estop")  # what comes after the first is its consequence, as a rule
+        self.note(fault, stops=stops)
+        if stops:
+            self._go("fault", fault.cause[:500] or fault.what)
+        self._drop_lease()
+
+    def note(self, fault: Fault, *, stops: bool = False) -> None:
+        """Keep a fault that people should know of but that stops nothing by itself. stops: it does."""
+        fault = msgspec.structs.replace(fault, cause=fault.cause[:500])
+        for log in (self.since_clear, self.since_start):
+            log.add(fault, stops=stops)
+
+    def holder_gone(self, cause: str) -> None:
+        """The lease holder's process is known to be gone while disarmed: free the lease at once."""
+        if self.state != "armed":
+            self._drop_lease()
+        if self.state == "disarmed":
+            self.why = cause
+
+    # --- what goes out -------------------------------------------------------------------------------------
+
+    def against_arming(self, now_ns: int) -> list[str]:
+        """Every condition for arming that is not met; empty when ready."""
+        return [why for _, why in self._refusals(now_ns)]
+
+    def expire(self, now_ns: int, tick: int) -> None:
+        """Let the lease run out: armed, that is a fault; disarmed, the lease is simply free again.
+
+        A robot that is armed and does not know its joints any more is at fault too, and so is one, armed or not, whose
+        modules are too hot, leak or lack voltage.
+        """
+        if self.state == "armed" and self._doubt is not None:
+            self.fault(msgspec.structs.replace(self._doubt.fault, tick=tick), self._doubt.joints)
+        wrong, silent = self._derating.look(now_ns, tick)
+        for fault in wrong:
+            self.fault(fault)
+        if silent is not None and not self._isolation.has(silent.joint):
+            self.note(silent)
+        if self.lease.live(now_ns):
+            return
+        holder, term_ms = self.lease.holder, self.description.lease_ns / 1e6
+        if self.state == "armed":
+            cause = f"lease of {holder} expired: no good command for {term_ms:.0f} ms"
+            self.fault(Fault(tick=tick, what="lease_expired", cause=cause))
+        else:
+            self._drop_lease()
+
+    def decide(self, up_to: int | None = None) -> Decision:
+        """The set-points for the next period. Call `expire` first.
+
+        up_to: newest tick whose command counts already, in lockstep; None: the command that came last.
+        """
+        command = self._command
+        if up_to is not None:
+            command = next((c for c in reversed(self._recent) if c.tick <= up_to), self._counting)
+        sequence: int | None = None
+        limited: dict[int, str] = {}
+        if self.state != "armed":
+            applied = self._safe()
+            self._told = True
+        elif command is None:  # armed a moment ago: hold the pose until the first command
+            applied = self._uniform(Mode.POSITION, self.limits.inside(self._hold_at))
+        else:
+            measured, share = self._measured, self._derating.share
+            applied, asked = gate.limit(command, measured=measured, last=self._applied, limits=self.limits, share=share)
+            sequence, self._counting = command.sequence, command
+            if (applied.target != asked).any() or (share < 1.0).any():
+                limited = gate.why_limited(command, applied, measured=measured, limits=self.limits, share=share)
+            limited |= self._isolation.overruled(command)
+            self.limited.update(limited.values())
+        self._applied = applied = self._isolation.without(applied)
+        return Decision(gate.as_set_points(applied, self._isolation.indices), sequence, limited)
+
+    # --- inside --------------------------------------------------------------------------------------------
+
+    def _refusals(self, now_ns: int) -> list[tuple[str, str]]:
+        found: list[tuple[str, str]] = []
+        if self.state != "disarmed":
+            found.append(("wrong_state", f"state is {self.state}, must be disarmed"))
+        return found + [("not_ready", why) for why in self._unready(now_ns)]
+
+    def _unready(self, now_ns: int) -> list[str]:
+        against = [] if self._doubt is None else [self._doubt.fault.cause]
+        against += [fault.cause for fault in self._derating.wrong if not self._is_aside(fault)]
+        if self.arming and not self._told:
+            against.append("the motors have not been told yet that the robot was stopped; ask again in a period")
+        if not self.lease.live(now_ns):
+            against.append("nobody holds the lease")
+        elif self._command is None:
+            against.append(f"no commands from {self.lease.holder} yet")
+        elif now_ns - self._command_ns > self.description.lease_ns:  # the lease may be kept by asking, too
+            against.append(f"no commands from {self.lease.holder} any more")
+        else:
+            at, aside = self._measured.angle_rad, self._isolation.joints
+            against.extend(lifecycle.far_targets(self._command, at, self.description, aside))
+        return against
+
+    def _unknown(self, cause: str) -> Doubt:
+        fault = Fault(tick=0, what="state_invalid", cause=cause)
+        return Doubt(fault, np.ones(len(self.description.joints), dtype=np.bool_))
+
+    def _is_aside(self, fault: Fault) -> bool:
+        return fault.reach == "joint" and self._isolation.has(fault.joint)
+
+    def _set_aside(self, fault: Fault, joints: Mask) -> bool:
+        """Go on without joints that have failed, if that may be; what they complain of afterwards is no news."""
+        if self._isolation.covers(joints):
+            return True
+        if self.state != "armed" or not self._isolation.add(joints):
+            return False
+        self.note(fault)
+        self.why = f"armed, without {', '.join(self.isolated)}: {fault.cause}"[:500]
+        return True
+
+    def _take_back(self) -> None:
+        """Joints that were set aside count again; first they must be heard of."""
+        if self.isolated:
+            self._isolation.clear()
+            self._doubt = self._unknown("no joint state since the clear")
+
+    def _safe(self) -> Applied:
+        zeros = np.zeros_like(self._measured.angle_rad)
+        if self.state != "fault" or self._halt is None or self.description.safe_action == "passive":
+            return self._uniform(Mode.PASSIVE, zeros)
+        if self.description.safe_action == "damp":
+            return self._uniform(Mode.VELOCITY, zeros)
+        self._halt = self._halt.after_a_period(self.limits)
+        return self._uniform(Mode.POSITION, self._halt.target_rad)
+
+    def _uniform(self, mode: Mode, target: gate.Floats) -> Applied:
+        most_nm = self.limits.torque_nm * self._derating.share
+        return Applied(np.full(len(target), int(mode), dtype=np.int64), target, most_nm)
+
+    def _go(self, event: lifecycle.Event, why: str) -> bool:
+        """Follow an event; False when it is not allowed in this state."""
+        following = lifecycle.after(self.state, event)
+        if following is None:
+            return False
+        if following != self.state:
+            self._hold_at = self._measured.angle_rad
+            was_armed = self.state == "armed"
+            self._halt = Halt.begin(self._measured, self._applied, self.limits) if was_armed else None
+            self._told &= following != "disarmed"
+        if self.state == "armed":
+            self._command = None
+        self.state = following
+        self.why = why
+        return True
+
+    def _drop_lease(self) -> None:
+        self.lease = freed(self.lease)
+        self._forget_commands()
+
+    def _forget_commands(self) -> None:
+        self._command = None
+        self._last_sequence = -1
+
+    def _answer(self, reason: str | None, refusal: str | None = None) -> Answer:
+        return Answer(
+            ok=reason is None,
+            reason=(reason or self.why)[:500],
+            refusal=refusal,
+            epoch=self.lease.epoch,
+            lifecycle=self.state,
+        )

@@ -1,0 +1,140 @@
+"""Heat, supply and leaks: torque is derated before the robot is stopped. Pure; time is passed in.
+
+From `derate_from_c` on a winding loses torque, linearly, down to a fifth at `stop_at_c`: by `thermal.HeatLimits`, which
+the motors hold by themselves as well. There, with water inside, or with a supply that is below `least_voltage_v` for
+50 ms, the robot is stopped, and is not armed again before the winding has cooled below `derate_from_c`. Heat concerns
+the one joint; a leak or a weak supply is taken for the whole robot's. What no module has told for some seconds is not
+known: it is said, and does not count.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from snakesim_hal.model.thermal import HeatLimits
+from snakesim_hal.safety.gate import Floats
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Description, Fault, JointDescription, Power
+
+LOW_FOR_NS = 50_000_000
+KNOWN_FOR_NS = 3_000_000_000
+LONGEST_CAUSE = 400
+
+
+class Derating:
+    """What the power samples mean for every joint."""
+
+    def __init__(self, description: Description) -> None:
+        self._healths = [_Health(joint) for joint in description.joints]
+        self._expected = any(sensor.key == keys.POWER for sensor in description.sensors)
+        self._began_ns: int | None = None
+        self._due_ns = -math.inf  # before that nothing changes unless a sample comes
+        self._told: set[tuple[str, str | None]] = set()
+        self._silent: set[str] = set()
+        self.share: Floats = np.ones(len(self._healths))  # of its torque limit that each joint may use
+        self.wrong: list[Fault] = []  # what is wrong now
+
+    def take(self, power: Power, now_ns: int) -> None:
+        """Take a sample; an entry that is not valid says nothing, nor does a sample of another number of joints."""
+        lists = (power.voltage_v, power.motor_c, power.leak, power.valid)
+        if {len(values) for values in lists} != {len(self._healths)}:
+            return
+        for health, volts, winding_c, leak, valid in zip(self._healths, *lists, strict=True):
+            if valid and math.isfinite(volts) and math.isfinite(winding_c):
+                health.take(volts, winding_c, leak, now_ns)
+        self._due_ns = -math.inf
+
+    def look(self, now_ns: int, tick: int) -> tuple[list[Fault], Fault | None]:
+        """Bring all up to now. Returns what is newly wrong, and a note of the joints that have fallen silent."""
+        if now_ns < self._due_ns:
+            return [], None
+        began_ns = self._began_ns = now_ns if self._began_ns is None else self._began_ns
+        self._due_ns = min(min(health.due_ns(now_ns, began_ns) for health in self._healths), now_ns + KNOWN_FOR_NS)
+        self.share = np.array([health.share(now_ns) for health in self._healths])
+        self.wrong = [
+            Fault(
+                tick=tick,
+                what=what,
+                cause=cause,
+                joint=health.joint.name,
+                reach="joint" if what == "overheated" else "robot",
+            )
+            for health in self._healths
+            for what, cause in health.troubles(now_ns)
+        ]
+        before, self._told = self._told, {(fault.what, fault.joint) for fault in self.wrong}
+        fresh = [fault for fault in self.wrong if (fault.what, fault.joint) not in before]
+        return fresh, self._newly_silent(now_ns, tick)
+
+    def derated(self) -> dict[str, float]:
+        """Joints that may not use their whole torque, and the share that they may."""
+        shares = zip(self._healths, self.share.tolist(), strict=True)
+        return {health.joint.name: share for health, share in shares if share < 1.0}
+
+    def _newly_silent(self, now_ns: int, tick: int) -> Fault | None:
+        before, began_ns = self._silent, self._began_ns if self._expected else None
+        silent = [health.joint.name for health in self._healths if health.silent(now_ns, began_ns)]
+        self._silent = set(silent)
+        fresh = [name for name in silent if name not in before]
+        if not fresh:
+            return None
+        cause = f"supply and heat are unknown, and do not count, for {', '.join(fresh)}"[:LONGEST_CAUSE]
+        joint = fresh[0] if len(fresh) == 1 else None
+        return Fault(tick=tick, what="power_unknown", cause=cause, joint=joint)
+
+
+@dataclass
+class _Health:
+    """What one module said last."""
+
+    joint: JointDescription
+    heard_ns: int | None = None
+    winding_c: float = 0.0
+    voltage_v: float = 0.0
+    leak: bool = False
+    low_since_ns: int | None = None
+    hot: bool = False  # it was too hot, and has not cooled down since
+
+    def take(self, voltage_v: float, winding_c: float, leak: bool, now_ns: int) -> None:
+        """A valid entry of a sample."""
+        self.heard_ns, self.voltage_v, self.winding_c, self.leak = now_ns, voltage_v, winding_c, leak
+        self.hot = winding_c >= (self.joint.derate_from_c if self.hot else self.joint.stop_at_c)
+        low = voltage_v < self.joint.least_voltage_v
+        self.low_since_ns = (now_ns if self.low_since_ns is None else self.low_since_ns) if low else None
+
+    def known(self, now_ns: int) -> bool:
+        """Whether it has said something of late."""
+        return self.heard_ns is not None and now_ns - self.heard_ns <= KNOWN_FOR_NS
+
+    def silent(self, now_ns: int, expected_since_ns: int | None) -> bool:
+        """Whether it should have said something; expected_since_ns: None when there may be no such sensor."""
+        since_ns = expected_since_ns if self.heard_ns is None else self.heard_ns
+        return since_ns is not None and now_ns - since_ns > KNOWN_FOR_NS
+
+    def due_ns(self, now_ns: int, began_ns: int) -> float:
+        """When what it said last comes to mean something else."""
+        silent_ns = (began_ns if self.heard_ns is None else self.heard_ns) + KNOWN_FOR_NS + 1
+        low_ns = math.inf if self.low_since_ns is None else self.low_since_ns + LOW_FOR_NS
+        return min((at_ns for at_ns in (silent_ns, low_ns) if at_ns > now_ns), default=math.inf)
+
+    def share(self, now_ns: int) -> float:
+        """The share of the torque limit that heat leaves."""
+        if not self.known(now_ns):
+            return 1.0
+        return HeatLimits(self.joint.derate_from_c, self.joint.stop_at_c).share_left(self.winding_c)
+
+    def troubles(self, now_ns: int) -> list[tuple[str, str]]:
+        """What stops the robot: a word, and the whole story."""
+        joint, found = self.joint, list[tuple[str, str]]()
+        if self.hot:
+            limits = f"the limit is {joint.stop_at_c:g} °C, and it must cool below {joint.derate_from_c:g} °C"
+            found.append(("overheated", f"the winding of {joint.name} is at {self.winding_c:.1f} °C; {limits}"))
+        if not self.known(now_ns):
+            return found
+        if self.leak:
+            found.append(("leak", f"{joint.name} finds water inside"))
+        if self.low_since_ns is not None and now_ns - self.low_since_ns >= LOW_FOR_NS:
+            cause = f"the supply of {joint.name} is at {self.voltage_v:.1f} V, it needs {joint.least_voltage_v:g} V"
+            found.append(("undervoltage", cause))
+        return found

@@ -1,0 +1,24 @@
+"""Faults, kept within a bound: the first ones, the newest ones, and what stopped the robot last. Pure."""
+
+from snakesim_hal.wire.messages import Fault
+
+MAX_FAULTS_KEPT = 32
+FIRST_KEPT = MAX_FAULTS_KEPT // 2
+
+
+class FaultLog:
+    """Those that are left out came between the first and the newest."""
+
+    def __init__(self) -> None:
+        self.kept: list[Fault] = []  # in the order of their coming
+        self.left_out = 0
+        self._stop: Fault | None = None  # the newest that stopped the robot
+
+    def add(self, fault: Fault, *, stops: bool) -> None:
+        """Keep one. stops: it is why the robot is in `fault` or `estop` now."""
+        if stops:
+            self._stop = fault
+        self.kept.append(fault)
+        if len(self.kept) > MAX_FAULTS_KEPT:
+            del self.kept[FIRST_KEPT + (self.kept[FIRST_KEPT] is self._stop)]
+            self.left_out += 1

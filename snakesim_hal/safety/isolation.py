@@ -1,0 +1,72 @@
+"""Joints that are set aside: what fails is passive from then on, and the others go on, as the robot file says. Pure.
+
+Only a joint that fails while the robot is armed is set aside, and only as long as `may_lose_joints` is not exceeded;
+one more is a fault of the whole robot. A clear takes all of them back.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_hal.safety.gate import Applied
+from snakesim_hal.wire.messages import Description, JointCommand, Mode
+
+Mask = NDArray[np.bool_]
+
+
+class Isolation:
+    """Which joints are set aside."""
+
+    def __init__(self, description: Description) -> None:
+        self._names = [joint.name for joint in description.joints]
+        self._most = description.may_lose_joints
+        self.joints: Mask = np.zeros(len(self._names), dtype=np.bool_)
+        self.indices = frozenset[int]()  # the same, by their place in every vector
+
+    @property
+    def names(self) -> list[str]:
+        """Tail to head."""
+        return [self._names[i] for i in sorted(self.indices)]
+
+    def mask(self, name: str | None) -> Mask:
+        """The joint of that name; no joint for a name that is none."""
+        return np.array([name == own for own in self._names])
+
+    def has(self, name: str | None) -> bool:
+        """Whether the joint of that name is set aside."""
+        return name in self.names
+
+    def covers(self, joints: Mask) -> bool:
+        """Whether these are joints that are set aside already."""
+        return bool(joints.any() and (self.joints | ~joints).all())
+
+    def add(self, joints: Mask) -> bool:
+        """Set joints aside; False, and nothing changes, when the robot may not lose so many."""
+        together = self.joints | joints
+        if not joints.any() or np.count_nonzero(together) > self._most:
+            return False
+        self._now(together)
+        return True
+
+    def clear(self) -> None:
+        """Take all joints back."""
+        self._now(np.zeros_like(self.joints))
+
+    def without(self, applied: Applied) -> Applied:
+        """What goes to the motors, with the joints that are set aside passive and without torque."""
+        if not self.indices:
+            return applied
+        return replace(
+            applied,
+            mode=np.where(self.joints, int(Mode.PASSIVE), applied.mode),
+            target=np.where(self.joints, 0.0, applied.target),
+            torque_limit_nm=np.where(self.joints, 0.0, applied.torque_limit_nm),
+        )
+
+    def overruled(self, command: JointCommand) -> dict[int, str]:
+        """Joints that a command asks something of in vain, and the word to count by."""
+        return {i: "isolated" for i in sorted(self.indices) if command.mode[i] is not Mode.PASSIVE}
+
+    def _now(self, joints: Mask) -> None:
+        self.joints, self.indices = joints, frozenset(np.flatnonzero(joints).tolist())

@@ -1,0 +1,68 @@
+"""The lease: who may command the robot. One holder at a time; every good command renews it. Pure; time is passed in."""
+
+from dataclasses import dataclass, replace
+
+from snakesim_hal.wire.messages import LeaseRequest
+
+
+@dataclass(frozen=True)
+class Lease:
+    """The right to command, and until when. `epoch` grows with every new holder, so old commands are void."""
+
+    holder: str | None = None
+    epoch: int = 0
+    priority: int = 0
+    expires_ns: int = 0
+
+    def live(self, now_ns: int) -> bool:
+        """Whether somebody holds it at this time."""
+        return self.holder is not None and now_ns <= self.expires_ns
+
+
+@dataclass(frozen=True)
+class Ruling:
+    """What became of a request: the lease after it, and why it was refused (None: granted)."""
+
+    lease: Lease
+    refusal: str | None = None
+    changed_hands: bool = False
+    word: str | None = None  # the refusal in short
+
+
+def rule(lease: Lease, request: LeaseRequest, now_ns: int, term_ns: int) -> Ruling:
+    """Decide a request. A live lease yields only to its holder, or to a higher priority."""
+    mine = lease.live(now_ns) and lease.holder == request.holder and lease.epoch == request.epoch
+    match request.action:
+        case "acquire":
+            if lease.live(now_ns) and request.priority <= lease.priority:
+                left_ms = (lease.expires_ns - now_ns) / 1e6
+                return Ruling(
+                    lease,
+                    f"held by {lease.holder} (epoch {lease.epoch}, priority {lease.priority}) for another "
+                    f"{left_ms:.0f} ms; stop it, or ask with a priority above {lease.priority}",
+                    word="lease_held",
+                )
+            taken = Lease(request.holder, lease.epoch + 1, request.priority, now_ns + term_ns)
+            return Ruling(taken, changed_hands=True)
+        case "renew":
+            if not mine:
+                return _not_holder(lease, request, "acquire the lease first")
+            return Ruling(renewed(lease, now_ns, term_ns))
+        case _:  # release
+            if not mine:
+                return _not_holder(lease, request, "nothing to release")
+            return Ruling(freed(lease), changed_hands=True)
+
+
+def _not_holder(lease: Lease, request: LeaseRequest, then: str) -> Ruling:
+    return Ruling(lease, f"{request.holder} does not hold epoch {request.epoch}; {then}", word="not_holder")
+
+
+def renewed(lease: Lease, now_ns: int, term_ns: int) -> Lease:
+    """The lease, good for another term."""
+    return replace(lease, expires_ns=now_ns + term_ns)
+
+
+def freed(lease: Lease) -> Lease:
+    """Nobody's lease; the epoch stays, so that what the last holder still sends is refused."""
+    return Lease(epoch=lease.epoch)

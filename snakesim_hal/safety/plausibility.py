@@ -1,0 +1,182 @@
+"""Which joint states are believed. An angle that no joint could have reached is no measurement. Pure.
+
+Three nets, joint by joint. What one of the first two catches is not believed, and the last good value stays; joints
+that are set aside are not looked at:
+
+unknown   not valid, not finite, or older than three periods (and 30 ms, and its delay; at most a lease)
+jumped    further from the last good angle than twice the speed limit allows in the time between, and a little more.
+          What stays at the new place is believed again after a few samples, but never while the robot is armed
+frozen    angle, velocity and torque go on repeating to the bit for more than a lease after the position target has
+          moved so far that the torque must have changed, and the torque is not at its limit
+"""
+
+import math
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_hal.safety.gate import Applied, Floats, JointLimits, Measured
+from snakesim_hal.wire.messages import Fault, JointState, Mode
+
+Mask = NDArray[np.bool_]
+
+SPEED_MARGIN = 2.0  # a joint may be pushed faster than its motor turns
+SLACK_RAD = 0.05  # for noise
+AGREEING = 5  # samples in a row at a new place, until it is believed
+FROZEN_SHARE = 0.25  # of max_step_rad: a target that moves so far changes the torque of a joint that does not follow
+AT_LIMIT = 0.95  # of the torque limit
+LONGEST_CAUSE = 400
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """What is wrong with a joint state, and of which joints."""
+
+    fault: Fault
+    joints: Mask
+
+
+class JointWatch:
+    """The last good state of every joint, and what is wrong with the newest."""
+
+    def __init__(self, limits: JointLimits) -> None:
+        self._limits = limits
+        count = len(limits.joints)
+        self._columns = np.zeros((3, count))  # angle, velocity, torque: the last good ones
+        self._good_s = np.zeros((2, count))  # when they were taken, by both clocks
+        self._known: Mask = np.zeros(count, dtype=np.bool_)  # whether there ever were any
+        self._strays = _Strays(count, SPEED_MARGIN * limits.speed_rad_s)
+        self._stillness = _Stillness(limits)
+
+    @property
+    def measured(self) -> Measured:
+        """The last good state of every joint; zeros for one that never had any."""
+        return Measured(*self._columns)
+
+    def take(self, joints: JointState, *, now_ns: int, applied: Applied | None, aside: Mask) -> Doubt | None:
+        """Take a joint state; returns what is wrong with it, if anything.
+
+        now_ns: safety time. A host that was held up knows by it that more time has passed than its ticks say.
+        applied: what the motors of an armed robot were told last; None: the robot is not armed.
+        aside: joints that nobody relies on.
+        """
+        count = len(self._known)
+        lists = (joints.angle_rad, joints.velocity_rad_s, joints.torque_nm, joints.valid, joints.age_ns)
+        if {len(values) for values in lists} != {count}:
+            cause = f"no joint state of {count} joints"
+            return Doubt(Fault(tick=joints.tick, what="state_invalid", cause=cause), np.ones_like(self._known))
+        ages_ns = np.array(joints.age_ns, dtype=np.float64)
+        taken_s = (np.array([[joints.stamp_ns], [now_ns]], dtype=np.float64) - ages_ns) * 1e-9
+        columns = np.array(lists[:3])
+        fresh = ages_ns <= self._limits.oldest_state_ns
+        sound: Mask = np.isfinite(columns).all(axis=0) & fresh & np.array(joints.valid)
+        elapsed_s = (taken_s - self._good_s).max(axis=0)
+        jump_rad = np.where(sound, columns[0], 0.0) - self._columns[0]
+        jumped = sound & self._known & (np.abs(jump_rad) > self._strays.reach_rad(elapsed_s))
+        settled = self._strays.settled(jumped, columns[0], taken_s)
+        if applied is None:
+            jumped &= ~settled
+        good = sound & ~jumped
+        self._columns = np.where(good, columns, self._columns)
+        self._good_s = np.where(good, taken_s, self._good_s)
+        self._known |= good
+        frozen = self._stillness.look(columns, taken_s[0], applied)
+        unknown, jumped, frozen = ~sound & ~aside, jumped & ~aside, frozen & ~aside
+        if unknown.any():
+            return self._doubt(joints.tick, "state_invalid", "no valid and fresh state of ", unknown)
+        if jumped.any():
+            tails = [
+                f" by {by:+.2f} rad in {within * 1e3:.0f} ms" for by, within in zip(jump_rad, elapsed_s, strict=True)
+            ]
+            return self._doubt(joints.tick, "state_invalid", "faster than any joint turns: a jump of ", jumped, tails)
+        if frozen.any():
+            return self._doubt(
+                joints.tick, "joint_frozen", "the same state over and over while its target moves: ", frozen
+            )
+        return None
+
+    def _doubt(self, tick: int, what: str, words: str, which: Mask, tails: list[str] | None = None) -> Doubt:
+        found = np.flatnonzero(which).tolist()
+        names = [self._limits.joints[i].name for i in found]
+        told = names if tails is None else [name + tails[i] for name, i in zip(names, found, strict=True)]
+        cause = (words + ", ".join(told))[:LONGEST_CAUSE]
+        joint = names[0] if len(names) == 1 else None
+        return Doubt(Fault(tick=tick, what=what, cause=cause, joint=joint, reach="joint"), which)
+
+
+def readable(joints: JointState, good: Measured) -> JointState:
+    """What may be published: a number that is none would make a reader refuse the states of all joints.
+
+    The last good one takes its place, and is not valid. A state of another number of joints stays as it is.
+    """
+    columns = (joints.angle_rad, joints.velocity_rad_s, joints.torque_nm)
+    if all(math.isfinite(value) for column in columns for value in column):
+        return joints
+    if {len(values) for values in (*columns, joints.valid)} != {len(good.angle_rad)}:
+        return joints
+    kept = (good.angle_rad.tolist(), good.velocity_rad_s.tolist(), good.torque_nm.tolist())
+    sound = [all(map(math.isfinite, values)) for values in zip(*columns, strict=True)]
+    angle, velocity, torque = (
+        [value if fine else last for value, fine, last in zip(column, sound, before, strict=True)]
+        for column, before in zip(columns, kept, strict=True)
+    )
+    valid = [valid and fine for valid, fine in zip(joints.valid, sound, strict=True)]
+    return msgspec.structs.replace(joints, angle_rad=angle, velocity_rad_s=velocity, torque_nm=torque, valid=valid)
+
+
+class _Strays:
+    """Angles that were not believed: whether they agree with one another."""
+
+    def __init__(self, count: int, speed_rad_s: Floats) -> None:
+        self._speed_rad_s = speed_rad_s
+        self._angle_rad = np.zeros(count)
+        self._taken_s = np.zeros((2, count))
+        self._in_a_row = np.zeros(count, dtype=np.int64)
+
+    def reach_rad(self, elapsed_s: Floats) -> Floats:
+        """How far a joint may have turned in this time, (n_joints,)."""
+        return SLACK_RAD + self._speed_rad_s * np.maximum(elapsed_s, 0.0)
+
+    def settled(self, strayed: Mask, angle_rad: Floats, taken_s: Floats) -> Mask:
+        """Take the newest angles, of which some have strayed; returns which of those have been at a new place."""
+        if not strayed.any():
+            self._in_a_row[:] = 0
+            return strayed
+        elapsed_s = taken_s - self._taken_s
+        follows = np.abs(np.where(strayed, angle_rad, 0.0) - self._angle_rad) <= self.reach_rad(elapsed_s.max(axis=0))
+        repeated = follows & (elapsed_s[0] <= 0)  # the same sample once more says nothing new
+        counted = np.where(follows, self._in_a_row + ~repeated, 1)
+        self._in_a_row = np.where(strayed, counted, 0)
+        self._angle_rad, self._taken_s = np.where(strayed, angle_rad, 0.0), taken_s
+        return strayed & (self._in_a_row >= AGREEING)
+
+
+class _Stillness:
+    """For how long joints have said the same, and how far their targets have moved meanwhile."""
+
+    def __init__(self, limits: JointLimits) -> None:
+        self._lease_s = limits.lease_ns * 1e-9
+        self._far_rad = FROZEN_SHARE * limits.max_step_rad
+        count = len(limits.joints)
+        self._columns = np.full((3, count), np.nan)
+        self._followed: Mask = np.zeros(count, dtype=np.bool_)  # whether the joint had a position target before
+        self._low_rad, self._high_rad = np.zeros(count), np.zeros(count)
+        self._far_since_s = np.full(count, np.inf)  # since when a target has been far from where it was at the start
+
+    def look(self, columns: Floats, taken_s: Floats, applied: Applied | None) -> Mask:
+        """Take the newest states, (3, n_joints), and what was applied; returns which joints are frozen."""
+        follows = np.zeros_like(self._followed) if applied is None else applied.mode == Mode.POSITION
+        same = (columns == self._columns).all(axis=0) & follows & self._followed
+        self._columns, self._followed = columns, follows
+        if applied is None:
+            return same
+        target = applied.target
+        self._low_rad = np.where(same, np.minimum(self._low_rad, target), target)
+        self._high_rad = np.where(same, np.maximum(self._high_rad, target), target)
+        far = same & (self._high_rad - self._low_rad > self._far_rad)
+        self._far_since_s = np.where(far, np.minimum(self._far_since_s, taken_s), np.inf)
+        long = taken_s - self._far_since_s > self._lease_s
+        free = np.abs(columns[2]) < AT_LIMIT * applied.torque_limit_nm
+        return far & long & free

@@ -1,0 +1,43 @@
+"""The safe action `hold`: the joints are brought to rest, and held where they came to it. Pure.
+
+A wanted angle sets out from the measured one at the measured velocity, and slows down by the acceleration limit. The
+position target follows it no faster than the speed limit, from where the motor's torque goes on without a jump. Both
+stay inside the angle limits, which outranks the rate of the target.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from snakesim_hal.safety.gate import Applied, Floats, JointLimits, Measured, bumpless_target
+from snakesim_hal.wire.messages import Mode
+
+
+@dataclass(frozen=True)
+class Halt:
+    """A robot that comes to rest, (n_joints,) each."""
+
+    wanted_rad: Floats
+    velocity_rad_s: Floats  # of the wanted angle
+    target_rad: Floats
+
+    @staticmethod
+    def begin(measured: Measured, last: Applied, limits: JointLimits) -> "Halt":
+        """From what the joints do, and what they were told last."""
+        angle, velocity = measured.angle_rad, measured.velocity_rad_s
+        states = zip(limits.joints, angle.tolist(), velocity.tolist(), measured.torque_nm.tolist(), strict=True)
+        bumpless = [bumpless_target(joint, Mode.POSITION, *now) for joint, *now in states]
+        target = np.where(last.mode == Mode.POSITION, last.target, bumpless)
+        near = np.clip(target, angle - limits.max_step_rad, angle + limits.max_step_rad)
+        slowed = np.clip(velocity, -limits.speed_rad_s, limits.speed_rad_s)
+        return Halt(limits.inside(angle), slowed, limits.inside(near))
+
+    def after_a_period(self, limits: JointLimits) -> "Halt":
+        """One period later."""
+        period_s = limits.period_s
+        slower = np.maximum(np.abs(self.velocity_rad_s) - limits.acceleration_rad_s2 * period_s, 0.0)
+        slower *= np.sign(self.velocity_rad_s)
+        wanted = limits.inside(self.wanted_rad + 0.5 * (self.velocity_rad_s + slower) * period_s)
+        step = limits.speed_rad_s * period_s
+        target = np.clip(wanted, self.target_rad - step, self.target_rad + step)
+        return Halt(wanted, slower, target)

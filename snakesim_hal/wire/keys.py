@@ -1,0 +1,120 @@
+"""The key space, relative to the robot's Zenoh namespace. Keys are built and parsed here and nowhere else."""
+
+from dataclasses import dataclass
+
+from snakesim_hal.wire import messages as m
+
+JOINTS = "sensor/joints"
+CONTACTS = "sensor/contacts"
+IMU = "sensor/imu"
+POSE = "sensor/pose"
+POWER = "sensor/power"
+JOINT_COMMAND = "actuator/joints"
+DESCRIPTION = "hal/description"
+STATUS = "hal/status"
+CLOCK = "hal/clock"
+APPLIED = "hal/applied"
+LEASE = "hal/lease"
+LIFECYCLE = "hal/lifecycle"
+ESTOP = "hal/estop"
+FAULT_ALL = "fault/*"
+DONE_ALL = "hal/done/*"
+WORLD = "guidance/world"
+TRAJECTORY = "navigation/trajectory"
+CONTROL_STATE = "control/state"
+INTENT = "operator/intent"
+ALIVE_ALL = "alive/*"
+HOST_ALL = "hal/host/*"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the key space: what stands at a key, who writes it, how and when."""
+
+    key: str
+    message: type[m.Message] | None
+    writer: str
+    kind: str  # stream, latched, query, liveliness
+    when: str
+    about: str
+
+
+_TICK = "every tick"
+_SENSOR = "at its `rate_hz` in `Description.sensors`"
+_ASKED = "on request"
+_TURN = "every `every_ticks` of its service"
+_HEARD = f"{_TICK}, if somebody listens"
+_LIVES = "while connected"
+
+SPACE: tuple[Row, ...] = (
+    Row(JOINTS, m.JointState, "HAL", "stream", _TICK, "angle, velocity, torque of every joint"),
+    Row(CONTACTS, m.Contacts, "HAL", "stream", _SENSOR, "every touch of a link by an obstacle"),
+    Row(IMU, m.Imu, "HAL", "stream", _SENSOR, "angular velocity and acceleration of the links"),
+    Row(POSE, m.Pose, "HAL", "stream", _SENSOR, "base pose as a motion-capture system gives it"),
+    Row(POWER, m.Power, "HAL", "stream", _SENSOR, "supply, temperatures and leaks of the joint modules"),
+    Row(JOINT_COMMAND, m.JointCommand, "lease holder", "stream", _TICK, "mode and set-point of every joint"),
+    Row(DESCRIPTION, m.Description, "HAL", "latched", "once", "joints, order, limits, geometry, sensors"),
+    Row(STATUS, m.Status, "HAL", "latched", "on a change, and 5 Hz", "lifecycle and why, holder, faults, counters"),
+    Row(CLOCK, m.Clock, "HAL", "stream", f"{_TICK}, last", "tick, time, and what is newest at each key"),
+    Row(APPLIED, m.AppliedCommand, "HAL", "stream", _HEARD, "what went to the motors, and what was limited"),
+    Row(LEASE, m.LeaseRequest, "any", "query", _ASKED, "acquire, renew, release the right to command; replies Answer"),
+    Row(LIFECYCLE, m.LifecycleRequest, "any", "query", _ASKED, "arm, disarm, clear, finish; replies Answer"),
+    Row(ESTOP, m.EstopRequest, "any", "query", _ASKED, "stop now, needs no lease, latched; replies Answer"),
+    Row(FAULT_ALL, m.FaultRequest, "any", "query", _ASKED, "let something go wrong, where allowed; replies Answer"),
+    Row(DONE_ALL, m.Done, "each service", "stream", _TURN, "lockstep: all that is owed for a tick is published"),
+    Row(WORLD, m.World, "guidance", "stream", _TURN, "body pose, contacts and obstacles in the world"),
+    Row(TRAJECTORY, m.Trajectory, "navigation", "stream", _TURN, "path, speed, push-points ahead"),
+    Row(CONTROL_STATE, m.ControlState, "control", "stream", "on a change, and 20 Hz", "state, forces, torques, why"),
+    Row(INTENT, m.Intent, "operator", "stream", "before the last expires", "what a person or a mission wants"),
+    Row(ALIVE_ALL, None, "each service", "liveliness", _LIVES, "present while the service's process is connected"),
+    Row(HOST_ALL, None, "HAL", "liveliness", _LIVES, "one for each HAL host process: two of a robot are one too many"),
+)
+
+MESSAGE_AT: dict[str, type[m.Message]] = {row.key: row.message for row in SPACE if row.message is not None}
+
+
+def done(service: str) -> str:
+    """Key on which `service` reports a lockstep tick as done."""
+    return f"hal/done/{service}"
+
+
+def fault(part: str) -> str:
+    """Key on which a part of a run takes requests for faults."""
+    return f"fault/{part}"
+
+
+def alive(service: str) -> str:
+    """Liveliness key of `service`."""
+    return f"alive/{service}"
+
+
+def host(host_id: str) -> str:
+    """Liveliness key of one host process."""
+    return f"hal/host/{host_id}"
+
+
+def service_of(key: str) -> str:
+    """The service that a done or alive key names."""
+    return key.rpartition("/")[2]
+
+
+def message_at(key: str) -> type[m.Message] | None:
+    """The message that stands at `key`, or None when the key space has no such key."""
+    if key in MESSAGE_AT:
+        return MESSAGE_AT[key]
+    if key.startswith("hal/done/") and key.count("/") == 2:
+        return m.Done
+    if key.startswith("fault/") and key.count("/") == 1:
+        return m.FaultRequest
+    return None
+
+
+def split_namespace(full_key: str) -> tuple[str, str] | None:
+    """Split a key seen from outside a namespace: `lab/planar13/sensor/joints` -> (`lab/planar13`, `sensor/joints`)."""
+    parts = full_key.split("/")
+    for cut in range(1, len(parts)):
+        relative = "/".join(parts[cut:])
+        token = parts[cut:-1] in (["alive"], ["hal", "host"])
+        if message_at(relative) is not None or token:
+            return "/".join(parts[:cut]), relative
+    return None

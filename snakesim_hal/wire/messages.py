@@ -1,0 +1,505 @@
+"""The wire contract: every message that crosses Zenoh, as a frozen Struct with bounds.
+
+Vectors run over all joints, tail to head, in the order of the description. Frames are name suffixes: `_w` world,
+`_l` the link's own frame (x forward along the link, origin at its rear joint). Quaternions are wxyz.
+A new field gets a default; a change of meaning gets a new version in `VERSIONS`.
+
+What a field means stands in its `about`, because the published schemas are made from this file.
+"""
+
+from enum import IntEnum
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from snakesim_hal.wire import quantities as q
+from snakesim_hal.wire.quantities import about
+
+Pace = Literal["realtime", "lockstep", "free"]
+LifecycleState = Literal["disarmed", "armed", "fault", "estop"]
+LocomotionState = Literal["PowerOff", "Idle", "NotLocomoting", "Locomoting"]
+SafeAction = Literal["passive", "damp", "hold"]
+Reach = Literal["robot", "joint", "none"]
+Axis = Literal["yaw", "pitch"]
+
+A_JOINT = "one entry a joint"
+PACE = about("realtime: by the wall clock; lockstep: each tick waits for all services; free: waits for nobody")
+LIFECYCLE = about("only in armed do motors follow commands; fault and estop stay until somebody clears them")
+HOST = about("id of the host process, made up anew at its start; null: not told")
+
+
+class Mode(IntEnum):
+    """What a joint does with its target.
+
+    0 passive: motor off, the target is ignored
+    1 position: target in rad
+    2 velocity: target in rad/s
+    3 torque: target in N·m
+    """
+
+    PASSIVE = 0
+    POSITION = 1
+    VELOCITY = 2
+    TORQUE = 3
+
+
+Modes = Annotated[list[Mode], Meta(max_length=q.MAX_JOINTS), about(A_JOINT)]
+
+
+class Message(msgspec.Struct, frozen=True):
+    """Base of everything on the wire. Unknown fields are ignored, so that fields can be added."""
+
+
+# --- sensors ---------------------------------------------------------------------------------------------------
+
+
+class JointState(Message, frozen=True, kw_only=True):
+    """`sensor/joints`: every joint at one instant."""
+
+    tick: q.Tick
+    stamp_ns: q.Stamp
+    angle_rad: Annotated[q.Angles, about("positive: yaw to the left, pitch downwards, seen towards the head")]
+    velocity_rad_s: Annotated[q.AngularVelocities, about(A_JOINT)]
+    torque_nm: Annotated[q.Torques, about("of the motor; positive turns towards positive angles")]
+    valid: Annotated[q.Flags, about("false: its numbers are not of this instant, and not to be acted on")]
+    age_ns: Annotated[q.Ages, about("how long before `stamp_ns` each joint was measured")]
+
+
+class Contact(Message, frozen=True, kw_only=True):
+    """One touch of a link by something that is not the ground; all vectors in the link's frame."""
+
+    link: Annotated[q.LinkIndex, about("number of the link, from 0 at the tail")]
+    obstacle: Annotated[q.Name | None, about("what is touched; null: the sensor cannot tell")]
+    position_l: q.Vector
+    normal_l: Annotated[q.UnitVector, about("from the obstacle into the body")]
+    tangent_1_l: Annotated[q.UnitVector, about("across the normal, towards the head")]
+    tangent_2_l: Annotated[q.UnitVector, about("across both")]
+    force_l: Annotated[q.ForceVector, about("on the body")]
+    torque_l: Annotated[q.TorqueVector, about("on the body about the contact point")]
+
+
+class Contacts(Message, frozen=True, kw_only=True):
+    """`sensor/contacts`: all touches at one instant; an empty list says that nothing is touched."""
+
+    tick: q.Tick
+    stamp_ns: q.Stamp
+    contacts: Annotated[list[Contact], Meta(max_length=q.MAX_CONTACTS)]
+
+
+class Imu(Message, frozen=True, kw_only=True):
+    """`sensor/imu`: one entry a link that carries an IMU, at its middle, in the link's frame."""
+
+    tick: q.Tick
+    stamp_ns: q.Stamp
+    link: Annotated[list[q.LinkIndex], Meta(max_length=q.MAX_JOINTS + 1), about("their numbers, from 0 at the tail")]
+    angular_velocity_rad_s: Annotated[list[q.AngularVelocityVector], Meta(max_length=q.MAX_JOINTS + 1)]
+    acceleration_m_s2: Annotated[
+        list[q.AccelerationVector], Meta(max_length=q.MAX_JOINTS + 1), about("as it feels it: at rest 1 g upwards")
+    ]
+
+
+class Pose(Message, frozen=True, kw_only=True):
+    """`sensor/pose`: the base (tail end of link 0) as a motion-capture system gives it."""
+
+    tick: q.Tick
+    stamp_ns: q.Stamp
+    position_w: q.Vector
+    orientation_wxyz: q.Quaternion
+    velocity_w: q.VelocityVector
+    angular_velocity_w: q.AngularVelocityVector
+
+
+class Power(Message, frozen=True, kw_only=True):
+    """`sensor/power`: what the joint modules say of their supply and their health, one entry a joint."""
+
+    tick: q.Tick
+    stamp_ns: q.Stamp
+    voltage_v: Annotated[list[q.Voltage], Meta(max_length=q.MAX_JOINTS)]
+    current_a: Annotated[list[q.Current], Meta(max_length=q.MAX_JOINTS)]
+    motor_c: Annotated[list[q.Temperature], Meta(max_length=q.MAX_JOINTS), about("of the winding")]
+    board_c: Annotated[list[q.Temperature], Meta(max_length=q.MAX_JOINTS), about("of the electronics")]
+    leak: Annotated[q.Flags, about("true: water inside")]
+    valid: Annotated[q.Flags, about("false: nothing is known of this module now")]
+
+
+# --- actuators -------------------------------------------------------------------------------------------------
+
+
+class JointCommand(Message, frozen=True, kw_only=True):
+    """`actuator/joints`: what the lease holder wants of every joint. How it is judged stands in protocol.md."""
+
+    tick: Annotated[q.Tick, about("of the joint state that the command answers: the command is as old as that")]
+    sequence: Annotated[q.Count, about("greater than that of any command accepted under this lease; gaps are allowed")]
+    lease_epoch: Annotated[q.Count, about("`Answer.epoch` of the lease")]
+    layout: Annotated[q.Name, about("`Description.layout`")]
+    valid_for_ns: Annotated[
+        q.Nanoseconds,
+        about("refused as stale this long after the state was published; more than a lease term counts as a term"),
+    ]
+    mode: Modes
+    target: q.Targets
+    torque_limit_nm: Annotated[
+        q.TorqueLimits | None, about("bounds each motor below the robot's own limit; null: no lower than that")
+    ] = None
+    arming: Annotated[
+        q.Count,
+        about("`Clock.arming`; 0: before any arming. An armed robot refuses any other number than its own, and so 0"),
+    ] = 0
+
+
+class AppliedCommand(Message, frozen=True, kw_only=True):
+    """`hal/applied`: what really went to the motors in a tick, and where that differs from what was asked."""
+
+    tick: q.Tick
+    stamp_ns: q.Stamp
+    sequence: Annotated[q.Count | None, about("of the command behind it; null: the host's own safe action")]
+    mode: Modes
+    target: q.Targets
+    torque_limit_nm: q.TorqueLimits
+    limited: Annotated[
+        dict[q.Name, q.Reason],
+        Meta(max_length=q.MAX_JOINTS),
+        about(
+            "joint -> which limit changed its target: angle, angle_rate, speed, acceleration, torque, torque_rate, "
+            "thermal, isolated"
+        ),
+    ] = {}
+
+
+# --- the HAL itself --------------------------------------------------------------------------------------------
+
+
+class Clock(Message, frozen=True, kw_only=True):
+    """`hal/clock`: the only time that GNC knows, and the table of contents of everything published so far.
+
+    The clock is published last, so a reader that takes what `newest` names reads the same data in every lockstep run.
+    """
+
+    tick: q.Tick
+    stamp_ns: Annotated[q.Stamp, about("robot time: `tick` x `period_ns`")]
+    period_ns: q.Nanoseconds
+    pace: Annotated[Pace, PACE]
+    lifecycle: Annotated[LifecycleState, LIFECYCLE]
+    arming: Annotated[
+        q.Count, about("how often the robot has been armed since its host started; a new number: start afresh")
+    ]
+    lease_epoch: Annotated[q.Count, about("of the live lease; 0: nobody holds one")]
+    newest: Annotated[
+        dict[q.Name, q.Tick],
+        Meta(max_length=64),
+        about("sensor key or service -> tick of its newest sample that counts now"),
+    ]
+
+
+class JointDescription(Message, frozen=True, kw_only=True):
+    """One joint: its name, its place in every vector, and what it can do."""
+
+    name: q.Name
+    axis: Annotated[Axis, about("of its rear link about which the joint turns: yaw about z, pitch about y")]
+    angle_min_rad: q.Angle
+    angle_max_rad: q.Angle
+    speed_limit_rad_s: q.AngularVelocity
+    acceleration_limit_rad_s2: Annotated[float, Meta(gt=0, le=1e6)]
+    torque_limit_nm: q.Torque
+    torque_rate_limit_nm_s: Annotated[float, Meta(gt=0, le=1e6)]
+    stiffness_nm_per_rad: Annotated[float, Meta(ge=0, le=1e6), about("of position mode")]
+    damping_nm_s_per_rad: Annotated[float, Meta(ge=0, le=1e6), about("of position mode")]
+    velocity_gain_nm_s_per_rad: Annotated[float, Meta(gt=0, le=1e6), about("of velocity mode")]
+    derate_from_c: Annotated[q.Temperature, about("of the winding: from here on torque is taken away")] = 80.0
+    stop_at_c: Annotated[q.Temperature, about("of the winding: there the robot is stopped")] = 105.0
+    least_voltage_v: Annotated[q.Voltage, about("below it the robot is stopped")] = 18.0
+
+
+class LinkDescription(Message, frozen=True, kw_only=True):
+    """One rigid link, tail to head: a capsule along its own x axis."""
+
+    name: q.Name
+    length_m: q.Length
+    radius_m: q.Length
+    mass_kg: Annotated[float, Meta(gt=0, le=1e4)]
+
+
+class SensorDescription(Message, frozen=True, kw_only=True):
+    """What a sensor delivers, and how often; of IMUs it is the rate of each link, which need not come together."""
+
+    key: Annotated[q.Name, about("where it is published, such as sensor/pose; what is not listed is never published")]
+    rate_hz: Annotated[float, Meta(gt=0, le=1e5)]
+    delay_s: Annotated[float, Meta(ge=0, le=10)]
+
+
+class Description(Message, frozen=True, kw_only=True):
+    """`hal/description`, latched: the robot as the backend has it. The order of joints is defined here only."""
+
+    robot: q.Name
+    backend: Annotated[q.Name, about("what stands behind the keys: sim, can, ...")]
+    layout: Annotated[q.Name, about("hash of the joints' names, order and axes; every command carries it")]
+    config_hash: Annotated[q.Name, about("of the whole configuration; a request to arm carries it")]
+    period_ns: Annotated[q.Nanoseconds, about("from tick to tick")]
+    lease_ns: Annotated[q.Nanoseconds, about("a lease term: how long the robot lives on one good command")]
+    max_step_rad: Annotated[float, Meta(gt=0, le=10), about("a position target further from the measured is limited")]
+    safe_action: Annotated[SafeAction, about("in fault: passive, brake (damp), or decelerate and then hold")]
+    may_lose_joints: Annotated[
+        int, Meta(ge=0, le=q.MAX_JOINTS), about("so many may fail while armed before the robot stops")
+    ] = 0
+    emulated: Annotated[
+        bool, about("nothing real moves: a simulator, or emulated modules; faults on request are allowed")
+    ] = False
+    hardware: Annotated[
+        str, Meta(max_length=200), about("what it drives, such as `can0+can1`; empty: nothing real")
+    ] = ""
+    host: Annotated[q.Name | None, HOST] = None
+    proof: Annotated[str, Meta(max_length=64), about("for the run that started the host; means nothing to others")] = ""
+    joints: Annotated[list[JointDescription], Meta(min_length=1, max_length=q.MAX_JOINTS), about("tail to head")]
+    links: Annotated[
+        list[LinkDescription],
+        Meta(min_length=2, max_length=q.MAX_JOINTS + 1),
+        about("tail to head: joint i, from 0, stands between link i and link i + 1"),
+    ]
+    sensors: Annotated[list[SensorDescription], Meta(max_length=32)]
+
+
+class Fault(Message, frozen=True, kw_only=True):
+    """One thing that went wrong, and where."""
+
+    tick: q.Tick
+    what: Annotated[q.Name, about("a short word to count by: lease_expired, service_lost, diverged, ...")]
+    cause: q.Reason
+    joint: Annotated[q.Name | None, about("null: it is not about one joint")] = None
+    reach: Annotated[
+        Reach,
+        about(
+            "joint: the others are as they were, and the robot may go on if its file says so; none: it stops nothing"
+        ),
+    ] = "robot"
+
+
+class Status(Message, frozen=True, kw_only=True):
+    """`hal/status`, latched: how the robot is, and why."""
+
+    tick: q.Tick
+    stamp_ns: q.Stamp
+    robot: q.Name
+    backend: q.Name
+    pace: Annotated[Pace, PACE]
+    rate_hz: Annotated[float, Meta(gt=0, le=1e5)]
+    lifecycle: Annotated[LifecycleState, LIFECYCLE]
+    why: Annotated[q.Reason, about("why it is in this state, and while disarmed what stands against arming")]
+    lease_holder: Annotated[q.Name | None, about("null: nobody")]
+    lease_epoch: Annotated[q.Count, about("of the lease, or of the last one when nobody holds it")]
+    commands_accepted: Annotated[q.Count, about("while armed")]
+    commands_standby: Annotated[q.Count, about("good commands while disarmed: heard, not enacted")]
+    commands_rejected: Annotated[dict[q.Name, q.Count], Meta(max_length=64), about("how many, by reason")]
+    commands_limited: Annotated[dict[q.Name, q.Count], Meta(max_length=64), about("how many targets, by limit")]
+    faults: Annotated[list[Fault], Meta(max_length=64), about("since the last clear; not all of them stop the robot")]
+    alive: Annotated[list[q.Name], Meta(max_length=64), about("services of the run whose tokens are there")]
+    waiting_for: Annotated[list[q.Name], Meta(max_length=64), about("services that arming waits for")]
+    overruns: Annotated[q.Count, about("ticks that were late, while armed in real time")]
+    ready_to_arm: Annotated[bool, about("whether a request to arm that names the right robot would be granted now")]
+    injected: Annotated[list[q.Reason], Meta(max_length=64), about("faults on request that are on now")] = []
+    hygiene: Annotated[list[q.Reason], Meta(max_length=16), about("real-time measures that the system refused")] = []
+    derated: Annotated[
+        dict[q.Name, q.Fraction], Meta(max_length=q.MAX_JOINTS), about("joint -> share of its torque that heat leaves")
+    ] = {}
+    isolated: Annotated[
+        list[q.Name], Meta(max_length=q.MAX_JOINTS), about("joints that failed, and are passive until a clear")
+    ] = []
+    host: Annotated[q.Name | None, HOST] = None
+    faults_left_out: Annotated[q.Count, about("of `faults`, between the first and the newest")] = 0
+
+
+class LeaseRequest(Message, frozen=True, kw_only=True):
+    """Query payload on `hal/lease`: the right to command, for a term. Good commands renew it."""
+
+    action: Annotated[
+        Literal["acquire", "renew", "release"],
+        about("renew keeps the lease of a disarmed robot only: an armed one wants commands"),
+    ]
+    holder: Annotated[q.Name, about("who asks; a service of the run says its own name")]
+    epoch: Annotated[q.Count, about("of the lease that is renewed or released; acquire needs none")] = 0
+    priority: Annotated[
+        int,
+        Meta(ge=0, le=255),
+        about("a live lease yields to a greater one only, and an armed robot is disarmed by that"),
+    ] = 100
+
+
+class LifecycleRequest(Message, frozen=True, kw_only=True):
+    """Query payload on `hal/lifecycle`. Arming names robot and backend, so that the two cannot be mixed up."""
+
+    action: Annotated[
+        Literal["arm", "disarm", "clear", "finish"],
+        about("clear leads from fault or estop to disarmed; finish disarms, and ends the run"),
+    ]
+    who: Annotated[q.Name, about("who asks, for the status, the log and the summary")] = "somebody"
+    host: Annotated[q.Name | None, about("the host process that is meant; null: whoever is asked")] = None
+    robot: Annotated[q.Name | None, about("`Description.robot`; arm needs it, others may leave it null")] = None
+    backend: Annotated[q.Name | None, about("`Description.backend`; arm needs it, others may leave it null")] = None
+    config_hash: Annotated[
+        q.Name | None, about("`Description.config_hash`; arm needs it, others may leave it null")
+    ] = None
+
+
+class EstopRequest(Message, frozen=True, kw_only=True):
+    """Query payload on `hal/estop`; needs no lease. Latched until `clear` on `hal/lifecycle`."""
+
+    who: Annotated[q.Name, about("who asks, for the status, the log and the summary")]
+
+
+class FaultRequest(Message, frozen=True, kw_only=True):
+    """Query payload on `fault/<part>`: let something go wrong now, or end it. Only runs that allow faults do it."""
+
+    kind: Annotated[q.Name, about("what goes wrong: `snakesim fault list` prints all")]
+    target: Annotated[q.Name, about("a process, key, joint or bus, such as joint_3")]
+    for_s: Annotated[
+        Annotated[float, Meta(gt=0, le=86400)] | None, about("seconds of robot time; null: until it is ended")
+    ] = None
+    amount: Annotated[q.Scalar | None, about("how much of it; null: as is usual for this kind")] = None
+    end: Annotated[bool, about("true: end it")] = False
+
+
+class Answer(Message, frozen=True, kw_only=True):
+    """Reply to every query: whether it was done, and if not, why not, for people and in one stable word."""
+
+    ok: Annotated[bool, about("whether it was done")]
+    reason: Annotated[q.Reason, about("for people: why not, or when it was done why the robot is in its state")]
+    refusal: Annotated[q.Name | None, about("why not, in a word: see protocol.md; null: it was done")] = None
+    epoch: Annotated[q.Count, about("of the lease, or of the last one when nobody holds it")] = 0
+    lifecycle: Annotated[LifecycleState, LIFECYCLE] = "disarmed"
+    host: Annotated[q.Name | None, HOST] = None
+
+
+class Done(Message, frozen=True, kw_only=True):
+    """`hal/done/<service>`: a lockstep participant has published all that it owes for a tick."""
+
+    tick: q.Tick
+
+
+# --- guidance, navigation, control -----------------------------------------------------------------------------
+
+
+class Obstacle(Message, frozen=True, kw_only=True):
+    """Something known to stand in the world: an upright shape with its outline."""
+
+    name: q.Name
+    shape: Literal["cylinder", "box", "sphere"]
+    position_w: Annotated[q.Vector, about("centre of the shape")]
+    yaw_rad: q.Angle = 0.0
+    radius_m: Annotated[q.Length, about("of a cylinder or sphere")] = 0.0
+    half_size_m: Annotated[q.Vector, about("of a box")] = (0.0, 0.0, 0.0)
+    height_m: q.Length = 0.0
+    confidence: q.Fraction = 1.0
+
+
+class WorldContact(Message, frozen=True, kw_only=True):
+    """A contact in the world frame, and where along the body it is."""
+
+    link: Annotated[q.LinkIndex, about("number of the link, from 0 at the tail")]
+    obstacle: Annotated[q.Name | None, about("what is touched; null: unknown")]
+    body_s_m: Annotated[q.Length, about("arc length from the tail end along the chain")]
+    position_w: q.Vector
+    normal_w: Annotated[q.UnitVector, about("from the obstacle into the body")]
+    tangent_w: Annotated[q.UnitVector, about("across the normal, towards the head")]
+    force_w: Annotated[q.ForceVector, about("on the body")]
+    confidence: q.Fraction = 1.0
+
+
+class World(Message, frozen=True, kw_only=True):
+    """`guidance/world`: where the body is, what it touches, what stands near it. Each part carries its own age."""
+
+    tick: Annotated[q.Tick, about("of the clock that guidance acted on")]
+    stamp_ns: Annotated[q.Stamp, about("of the joint state that it was made from")]
+    base_position_w: q.Vector
+    base_orientation_wxyz: q.Quaternion
+    base_confidence: q.Fraction
+    contacts: Annotated[list[WorldContact], Meta(max_length=q.MAX_CONTACTS)]
+    obstacles: Annotated[list[Obstacle], Meta(max_length=4096)]
+    pose_stamp_ns: Annotated[q.Stamp | None, about("of the pose in it; null: unknown")] = None
+    contacts_stamp_ns: Annotated[
+        q.Stamp | None, about("of the contacts in it; null: no sample yet, or no such sensor")
+    ] = None
+    centre_w: Annotated[q.Vector | None, about("centre of mass of the body; null: unknown")] = None
+
+
+class Trajectory(Message, frozen=True, kw_only=True):
+    """`navigation/trajectory`: the path to take, how fast, and the push-points expected along it."""
+
+    tick: Annotated[q.Tick, about("of the clock that navigation acted on")]
+    stamp_ns: Annotated[q.Stamp | None, about("of the world model that it was planned from; null: without one")]
+    path_id: Annotated[q.Count, about("changes when `path_w` does")]
+    path_w: Annotated[list[tuple[q.Length, q.Length]], Meta(min_length=2, max_length=20000), about("x and y")]
+    speed_m_s: Annotated[q.Velocity, about("along the path; 0: stay")]
+    push_points: Annotated[
+        list[q.Name], Meta(max_length=512), about("obstacles within reach of the path, in the order along it")
+    ]
+    finished: Annotated[bool, about("the end of the path is reached")]
+    reason: Annotated[q.Reason, about("why the speed is not that of the mission; empty: it is")] = ""
+
+
+class ControlState(Message, frozen=True, kw_only=True):
+    """`control/state`: what the controller thinks it is doing, and why. Telemetry; nothing depends on it.
+
+    What a controller does not know or does not have is null or empty.
+    """
+
+    tick: Annotated[q.Tick, about("of the clock that control acted on")]
+    stamp_ns: q.Stamp
+    controller: q.Name
+    state: Annotated[LocomotionState, about("PowerOff: the HAL is silent; Idle: the robot is not armed, or is to stay")]
+    reason: q.Reason
+    path_s_m: Annotated[q.Length | None, about("arc length of the tail along the path; null: unknown")] = None
+    propulsion_joint: Annotated[q.Name | None, about("the joint that pushes; null: none does")] = None
+    propulsion_n: Annotated[q.Force | None, about("force along the path that is aimed at; null: none")] = None
+    push_points: Annotated[list[WorldContact], Meta(max_length=64), about("obstacles that are pushed off")] = []
+    solved_force_n: Annotated[list[q.Force], Meta(max_length=64), about("expected at each of `push_points`")] = []
+    propulsion_torque_nm: Annotated[q.Torque | None, about("of `propulsion_joint`; null: none pushes")] = None
+    bending_torque_nm: Annotated[q.Torques, about("of every joint, as the solved forces need it; or empty")] = []
+    reference_rad: Annotated[q.Angles, about("of every joint, as the path bends it; or empty")] = []
+    condition: Annotated[q.Scalar | None, about("number of the solved equations; null: none were solved")] = None
+    torque_headroom_nm: Annotated[q.Torque | None, about("what its limit leaves at full push; null: none pushes")] = (
+        None
+    )
+    saturated: Annotated[bool, about("the push is at its torque limit")] = False
+    jammed: Annotated[bool, about("the body is stuck though it pushes")] = False
+
+
+class Intent(Message, frozen=True, kw_only=True):
+    """`operator/intent`: what a person or a mission wants for now. Send it again and again: it expires.
+
+    When one that was followed has expired, the robot stops and waits for the next one; it does not go back to its
+    mission.
+    """
+
+    stamp_ns: Annotated[q.Stamp, about("robot time, from hal/clock: when it was meant")]
+    who: q.Name
+    speed_m_s: Annotated[q.Velocity | None, about("null: that of the mission")] = None
+    go: Annotated[bool, about("false: stop")] = True
+    valid_for_ns: Annotated[q.Nanoseconds, about("counts so long from `stamp_ns`, and 5 s at most")] = 1_000_000_000
+
+
+VERSIONS: dict[type[Message], int] = dict.fromkeys(
+    (
+        JointState,
+        Contacts,
+        Imu,
+        Pose,
+        Power,
+        JointCommand,
+        AppliedCommand,
+        Clock,
+        Description,
+        Status,
+        LeaseRequest,
+        LifecycleRequest,
+        EstopRequest,
+        FaultRequest,
+        Answer,
+        Done,
+        World,
+        Trajectory,
+        ControlState,
+        Intent,
+    ),
+    1,
+)
+"""Every message that may stand alone on the wire, with its version."""

@@ -1,0 +1,46 @@
+"""`snakesim compare RUN_A RUN_B`: read two run folders, print the table, write the page."""
+
+from pathlib import Path
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.textfiles import write_text
+from snakesim_hal.terminal import say
+from snakesim_operator.results.compare.difference import differ
+from snakesim_operator.results.compare.page import page
+from snakesim_operator.results.compare.table import table
+from snakesim_operator.results.compare.verdict import within
+from snakesim_operator.results.record import RunRecord
+
+PAGE = "compare.html"
+
+
+def compare(run_a: Path, run_b: Path, out: Path | None = None, within_percent: float | None = None) -> int:
+    """Returns 0; 1 when the distances differ by more than `within_percent`. Raises ConfigError on wrong input."""
+    if within_percent is not None and not 0 <= within_percent < float("inf"):
+        raise ConfigError(f"--within {within_percent:g}: give a percentage that is not negative, such as --within 10")
+    difference = differ(_load(run_a), _load(run_b))
+    asked = within(difference, within_percent) if within_percent is not None else None
+    if within_percent is not None and asked is None:
+        raise ConfigError(
+            f"--within {within_percent:g}: {run_a} and {run_b} have no common measure of the distance moved; "
+            "give the robot a pose sensor, or leave --within away"
+        )
+    path = out or run_b / PAGE
+    try:
+        write_text(path, page(difference, asked))
+    except ConfigError as error:
+        raise ConfigError(f"{error}; name another file with --out FILE.html") from None
+    for line in table(difference):
+        say(line)
+    say(f"page: {path}")
+    if asked is None:
+        return 0
+    say(asked.words)
+    return 0 if asked.holds else 1
+
+
+def _load(folder: Path) -> RunRecord:
+    if not folder.is_dir():
+        what = "not a folder" if folder.exists() else "no such folder"
+        raise ConfigError(f"{folder}: {what}; give the folder that `snakesim run --out FOLDER` left")
+    return RunRecord.load(folder.resolve())

@@ -1,0 +1,105 @@
+"""What a comparison amounts to, in a few sentences: for the end of the table and the top of the page."""
+
+from dataclasses import dataclass
+
+from snakesim_operator.results.compare.difference import STOOD_M, Advance, Difference
+
+SAME = "the same"
+
+
+@dataclass(frozen=True)
+class Within:
+    """What `--within` asked for, and whether it holds."""
+
+    percent: float
+    holds: bool
+    words: str
+
+
+def within(difference: Difference, percent: float) -> Within | None:
+    """Whether the distance differs by no more than so many per cent of A's; None when nobody knows the distance."""
+    advance = difference.advance
+    if advance is None:
+        return None
+    found = advance.percent
+    if found is None:
+        words = f"A stood still and B moved {advance.b_m:.3f} m, which is more than any percentage"
+        return Within(percent, False, f"not within {percent:g} %: {words}")
+    holds = abs(found) <= percent
+    return Within(percent, holds, f"{'within' if holds else 'not within'} {percent:g} %: {relation(advance)}")
+
+
+def sentences(difference: Difference) -> list[str]:
+    """How far, since when apart, and who propelled."""
+    if difference.identical:
+        return [f"The runs are the same, joint by joint, for all of their {_common(difference)}."]
+    advance = difference.advance
+    said = [*_untold(difference)]
+    said += [
+        "How far they moved cannot be compared: there is no measure of it that both runs have."
+        if advance is None
+        else f"{_capital(how_far(advance))}."
+    ]
+    parted = difference.parted
+    if parted is None:
+        said.append(f"No joint's angles were ever more than {difference.apart_rad:g} rad apart.")
+    else:
+        joint = difference.joints[parted.joint]
+        said.append(
+            f"The runs part at {parted.time_s:.2f} s, "
+            f"when {joint} is first more than {difference.apart_rad:g} rad apart."
+        )
+    hand_overs = difference.hand_overs
+    if hand_overs.a or hand_overs.b:
+        said.append(f"{_capital(who_propelled(difference))}.")
+    return said
+
+
+def _untold(difference: Difference) -> list[str]:
+    untold = [f"{gap.what} {100 * gap.untold:.2g} %" for gap in difference.gaps if gap.untold]
+    if not untold:
+        return []
+    return [f"Not a number in one run or in both, so that nobody can tell whether it is the same: {', '.join(untold)}."]
+
+
+def how_far(advance: Advance) -> str:
+    """Both distances, and B's relative to A's."""
+    told = f"A moved {advance.a_m:.3f} m, B {advance.b_m:.3f} m"
+    if advance.percent is None:
+        return f"{told}; A stood still"
+    if max(abs(advance.a_m), abs(advance.b_m)) < STOOD_M:
+        return f"{told}; both stood still"
+    return f"{told}: {relation(advance)}"
+
+
+def relation(advance: Advance) -> str:
+    """B relative to A, such as `B 1.6 % less`."""
+    if advance.percent is None:
+        return "A stood still"
+    size = f"{abs(advance.percent):.1f}"
+    if size == "0.0":
+        return SAME
+    return f"B {size} % {'more' if advance.percent > 0 else 'less'}"
+
+
+def who_propelled(difference: Difference) -> str:
+    """Whether propulsion was handed over in the same order, and if not, from where on."""
+    both, names = difference.hand_overs, difference.joints
+    if both.same_order:
+        return f"propulsion is handed over in the same order, {len(both.a)} joints one after another"
+    next_ones = [
+        f"{run} goes on with {names[taken[both.agreed].joint]} at {taken[both.agreed].time_s:.2f} s"
+        if both.agreed < len(taken)
+        else f"{run} with none"
+        for run, taken in (("A", both.a), ("B", both.b))
+    ]
+    return f"the order of propulsion agrees for the first {both.agreed}; then {', '.join(next_ones)}"
+
+
+def _common(difference: Difference) -> str:
+    count = len(difference.aligned.time_s)
+    return f"{count} common ticks" if difference.aligned.how == "tick by tick" else f"{count} common instants"
+
+
+def _capital(words: str) -> str:
+    return words[:1].upper() + words[1:]

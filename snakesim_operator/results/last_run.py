@@ -1,0 +1,46 @@
+"""Where the last run on this computer left its record, so that `snakesim status` can tell of a run that is over."""
+
+import contextlib
+import threading
+from pathlib import Path
+
+import msgspec
+
+from snakesim_hal.model.whole_file import write_whole
+from snakesim_hal.network.local_registry import state_folder
+from snakesim_hal.wire.codec import UNDECODABLE
+
+LIMIT_S = 1.0  # for a disk that hangs
+
+
+class LastRun(msgspec.Struct, frozen=True, kw_only=True):
+    """Which run it was, and how it ended."""
+
+    folder: str
+    ended: str
+
+
+def _file() -> Path:
+    return state_folder() / "last-run.json"
+
+
+def remember(folder: str, ended: str) -> None:
+    """Note a finished run. A home that cannot be written to is no reason to fail, nor to wait for long."""
+    thread = threading.Thread(target=_write, args=(LastRun(folder=folder, ended=ended),), daemon=True)
+    thread.start()
+    thread.join(LIMIT_S)
+
+
+def _write(noted: LastRun) -> None:
+    with contextlib.suppress(OSError, ValueError):  # the latter: a folder whose name is no text
+        _file().parent.mkdir(parents=True, exist_ok=True)
+        write_whole(_file(), msgspec.json.encode(noted))
+
+
+def recall() -> tuple[str, str] | None:
+    """Folder and ending of the last run, or None."""
+    try:
+        noted = msgspec.json.decode(_file().read_bytes(), type=LastRun)
+    except (OSError, *UNDECODABLE):
+        return None
+    return noted.folder, noted.ended

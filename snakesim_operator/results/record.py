@@ -1,0 +1,143 @@
+"""What a run leaves in its folder, read back: configuration, description, black box, host's record, telemetry."""
+
+from collections import Counter
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.host.black_box import Layout, digest_of, read_black_box
+from snakesim_hal.host.recorder import BLACK_BOX, DESCRIPTION, HOST_RECORD
+from snakesim_hal.host_process import HostRecord
+from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion
+from snakesim_hal.model.route import Route
+from snakesim_hal.model.scenario import RunConfig, read
+from snakesim_hal.model.scene import route_of
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import UNDECODABLE
+from snakesim_hal.wire.messages import ControlState, Description, World
+from snakesim_operator.results.gaps import cleaned, unread, unwritten
+
+CONFIG = "config.json"
+TELEMETRY = "telemetry.jsonl"
+SUMMARY = "summary.json"
+REPORT = "report.html"
+
+DAMAGED = (*UNDECODABLE, OSError, MemoryError)
+Floats = NDArray[np.float64]
+
+
+class TelemetryLine(msgspec.Struct, frozen=True):
+    """One line of the telemetry file."""
+
+    key: str
+    message: msgspec.Raw
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """A run, as its folder tells it. Every array has one row a tick."""
+
+    folder: Path
+    config: RunConfig
+    description: Description
+    host: HostRecord
+    control: list[ControlState]  # in time order, a few a second and at every change
+    worlds: list[World]  # in time order, a few a second
+    time_s: Floats  # (n,) robot time
+    angle_rad: Floats  # (n, joints)
+    velocity_rad_s: Floats
+    torque_nm: Floats
+    mode: NDArray[np.int8]  # (n, joints), values of messages.Mode
+    target: Floats  # (n, joints), in the unit of the mode
+    torque_limit_nm: Floats
+    position_w: Floats  # (n, 3) of the base; NaN when unknown, as everything here
+    orientation_wxyz: Floats  # (n, 4)
+    contact_peak_n: Floats  # (n,) strongest contact
+    contact_count: Floats  # (n,) obstacles touched
+    lacks: list[str] = field(default_factory=list[str])  # what is not known, in words
+
+    @staticmethod
+    def load(folder: Path, host: HostRecord | None = None) -> "RunRecord":
+        """Read a run's folder, also of a run that was killed. Raises ConfigError when it is none.
+
+        host: the host's numbers, when they are known otherwise; None: as they stand in the folder.
+        """
+        for name in (CONFIG, BLACK_BOX, DESCRIPTION, *([] if host is not None else [HOST_RECORD])):
+            if not (folder / name).is_file():
+                raise ConfigError(f"{folder} is not the folder of a run: {name} is missing")
+        try:
+            return RunRecord._read(folder, host)
+        except ConfigError:
+            raise
+        except DAMAGED as error:
+            why = f"{type(error).__name__}: {error}"[:300]
+            raise ConfigError(f"{folder}: the record of this run is damaged ({why}); run it again") from None
+
+    @staticmethod
+    def _read(folder: Path, host: HostRecord | None) -> "RunRecord":
+        config = read(folder / CONFIG)
+        description = msgspec.json.decode((folder / DESCRIPTION).read_bytes(), type=Description)
+        layout, columns = read_black_box(folder / BLACK_BOX)
+        if layout != Layout.of(description):
+            raise ConfigError(f"{folder / BLACK_BOX} is of another robot than {DESCRIPTION} beside it")
+        if host is None:
+            host = msgspec.json.decode((folder / HOST_RECORD).read_bytes(), type=HostRecord)
+        if host.ended == "running":
+            host = msgspec.structs.replace(host, ticks=len(columns["tick"]), command_digest=digest_of(columns))
+        known, lacks = cleaned(columns, description, has_pose=config.robot.sensors.pose is not None)
+        control: list[ControlState] = []
+        worlds: list[World] = []
+        lacks += unwritten(host) + unread(_read_telemetry(folder / TELEMETRY, control, worlds))
+        while control and control[-1].state == "PowerOff":  # the host has ended: that its clock is gone is no news
+            control.pop()
+        known = {name: column for name, column in known.items() if name != "tick"}
+        return RunRecord(folder, config, description, host, control, worlds, **known, lacks=lacks)
+
+    @cached_property
+    def route(self) -> Route | None:
+        """The route through the scene."""
+        return route_of(self.config.scene)
+
+    def row_at(self, time_s: float) -> int:
+        """The row whose time is nearest."""
+        return int(np.argmin(np.abs(self.time_s - time_s)))
+
+    @cached_property
+    def posed(self) -> NDArray[np.bool_]:
+        """Rows in which the pose and all angles are known, (n,)."""
+        told = (self.position_w, self.orientation_wxyz, self.angle_rad)
+        return np.logical_and.reduce([np.isfinite(signal).all(axis=1) for signal in told])
+
+    def nodes_w(self, row: int) -> Floats | None:
+        """Tail end, joints and head end in the world, (joints + 2, 3); None when the pose is unknown."""
+        if len(self.time_s) == 0 or not self.posed[row]:
+            return None
+        lengths = [link.length_m for link in self.description.links]
+        rotation = rotation_from_quaternion(self.orientation_wxyz[row])
+        axes = [joint.axis for joint in self.description.joints]
+        origins, rotations = link_frames(self.position_w[row], rotation, self.angle_rad[row], axes, lengths)
+        return np.vstack([origins, origins[-1] + lengths[-1] * rotations[-1][:, 0]])
+
+
+def _read_telemetry(path: Path, control: list[ControlState], worlds: list[World]) -> Counter[str]:
+    """Take what can be decoded; returns what cannot. A torn last line is the mark of a process that was killed."""
+    refused: Counter[str] = Counter()
+    decoder = msgspec.json.Decoder(TelemetryLine)
+    lines = path.read_bytes().split(b"\n")[:-1] if path.is_file() else []
+    for text in lines:
+        key = "no message"
+        try:
+            line = decoder.decode(text)
+            key = line.key
+            if key == keys.CONTROL_STATE:
+                control.append(msgspec.json.decode(line.message, type=ControlState))
+            elif key == keys.WORLD:
+                worlds.append(msgspec.json.decode(line.message, type=World))
+        except UNDECODABLE as error:
+            refused[f"{key}: {error}"[:200]] += 1
+    return refused

@@ -1,0 +1,171 @@
+"""Which instants of a run are drawn, and how the forces balance at each.
+
+The balance is the paper's equation (10), f_s + f_1 + f_2 + f_3 = 0, with f_s = -F t_1: the tether of the static
+model pulls the tail back along the tangent at o_1. So the contact forces add up to -f_s, and that sum, the resultant
+propulsion force, points forward along the path at o_1. It also acts through o_1, because the moments balance too (11).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_hal.wire.messages import ControlState, World, WorldContact
+from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.report.timeline import told_at_s
+
+Floats = NDArray[np.float64]
+HOW_MANY = 4
+NEEDED = 3
+WORLD_WITHIN_S = 0.021  # measured forces this far from the solved ones still count as simultaneous
+
+
+@dataclass(frozen=True)
+class Balance:
+    """Forces that a controller solved for, tail to head; world frame, on the ground plane."""
+
+    contacts: list[WorldContact]
+    size_n: list[float]
+    contact_n: Floats  # (k, 2)
+    tether_n: Floats  # (2,), f_s
+
+    @property
+    def resultant_n(self) -> Floats:
+        """Sum of the contact forces, (2,): what drives the snake."""
+        return self.contact_n.sum(axis=0)
+
+    @property
+    def gap_n(self) -> float:
+        """How far the polygon is from closing."""
+        return float(np.hypot(*(self.resultant_n + self.tether_n)))
+
+    @property
+    def corners_n(self) -> Floats:
+        """Corners of the polygon head to tail, (k + 2, 2): f_s from the origin, then the contact forces."""
+        return np.vstack([[0.0, 0.0], np.cumsum(np.vstack([self.tether_n, self.contact_n]), axis=0)])
+
+
+@dataclass(frozen=True)
+class Instant:
+    """One moment of a run."""
+
+    time_s: float  # on the time axis
+    row: int  # of the record
+    state: ControlState | None
+    balance: Balance | None
+    felt: list[WorldContact]  # measured
+    propulsion_joint: int | None
+
+
+def balance_of(state: ControlState) -> Balance | None:
+    """The solved forces; None when the controller solved for none."""
+    pairs = list(zip(state.push_points, state.solved_force_n, strict=False))
+    if len(pairs) < NEEDED or not state.propulsion_n:
+        return None
+    pairs.sort(key=lambda pair: pair[0].body_s_m)
+    contacts = [contact for contact, _ in pairs]
+    normals = np.array([contact.normal_w[:2] for contact in contacts])
+    sizes = [size for _, size in pairs]
+    tangent = np.array(contacts[0].tangent_w[:2])
+    length = float(np.hypot(*tangent))
+    if length < 1e-6:
+        return None
+    return Balance(contacts, sizes, normals * np.array(sizes)[:, None], -state.propulsion_n * tangent / length)
+
+
+def pushing_instants(record: RunRecord) -> list[Instant]:
+    """Up to four moments spread over the time of propelling, each with solved forces that balance."""
+    return _spread(balanced_instants(record))
+
+
+def best_instant(record: RunRecord) -> Instant | None:
+    """The moment at which the push-points were felt and drove the snake hardest; else one from the middle."""
+    found = balanced_instants(record)
+    if not found:
+        plain = plain_instants(record)
+        return plain[len(plain) // 2] if plain else None
+    return min(found, key=lambda one: (unfelt(one), _saturated(one), -_drive_n(one)))
+
+
+def balanced_instants(record: RunRecord) -> list[Instant]:
+    """Every moment of locomotion whose solved forces balance, in order of time."""
+    if not len(record.time_s):
+        return []
+    found: list[Instant] = []
+    for state in record.control:
+        balance = balance_of(state)
+        if balance is None or state.propulsion_joint is None or state.state != "Locomoting":
+            continue
+        if balance.gap_n > 0.05 * float(np.hypot(*balance.tether_n)) or min(balance.size_n) <= 0:
+            continue
+        instant = _instant(record, told_at_s(record, state), state, balance)
+        if record.nodes_w(instant.row) is not None:
+            found.append(instant)
+    return found
+
+
+def plain_instants(record: RunRecord) -> list[Instant]:
+    """Up to four moments spread over the whole run, for a run without solved forces."""
+    count = len(record.time_s)
+    chosen: list[Instant] = []
+    for row in sorted({round(share * (count - 1)) for share in (0.05, 0.35, 0.65, 0.98)} if count else set()):
+        if record.nodes_w(row) is None:
+            continue
+        time_s = float(record.time_s[row] - record.time_s[0])
+        earlier = [state for state in record.control if told_at_s(record, state) <= time_s]
+        chosen.append(_instant(record, time_s, earlier[-1] if earlier else None, None))
+    return chosen
+
+
+def felt_along_n(instant: Instant, direction_w: Floats) -> float:
+    """How much the measured contact forces push along a direction, (2,) of any length."""
+    unit = direction_w / max(float(np.hypot(*direction_w)), 1e-12)
+    return sum(float(np.dot(contact.force_w[:2], unit)) for contact in instant.felt)
+
+
+def _instant(record: RunRecord, time_s: float, state: ControlState | None, balance: Balance | None) -> Instant:
+    at_s = float(record.time_s[0]) + time_s
+    names = [joint.name for joint in record.description.joints]
+    joint = state.propulsion_joint if state is not None else None
+    world = _world_near(record, at_s, WORLD_WITHIN_S if balance is not None else 3 * WORLD_WITHIN_S)
+    return Instant(
+        time_s=time_s,
+        row=record.row_at(at_s),
+        state=state,
+        balance=balance,
+        felt=world.contacts if world is not None else [],
+        propulsion_joint=names.index(joint) if joint in names else None,
+    )
+
+
+def _world_near(record: RunRecord, at_s: float, within_s: float) -> World | None:
+    near = min(record.worlds, key=lambda world: abs(world.stamp_ns * 1e-9 - at_s), default=None)
+    return near if near is not None and abs(near.stamp_ns * 1e-9 - at_s) <= within_s else None
+
+
+def _spread(found: list[Instant]) -> list[Instant]:
+    """The best of each quarter: every solved contact felt, the torque not at its limit, well inside the quarter."""
+    if len(found) <= HOW_MANY:
+        return found
+    chosen: list[Instant] = []
+    for quarter in np.array_split(np.arange(len(found)), HOW_MANY):
+        members = [found[i] for i in quarter]
+        middle = members[len(members) // 2].time_s
+        chosen.append(min(members, key=lambda one: (unfelt(one), _saturated(one), abs(one.time_s - middle))))
+    return chosen
+
+
+def _saturated(instant: Instant) -> bool:
+    return instant.state is not None and instant.state.saturated
+
+
+def _drive_n(instant: Instant) -> float:
+    return felt_along_n(instant, instant.balance.resultant_n) if instant.balance is not None else 0.0
+
+
+def unfelt(instant: Instant) -> int:
+    """How many solved contacts no sensor felt."""
+    if instant.balance is None:
+        return 0
+    touched = {contact.obstacle for contact in instant.felt}
+    return sum(contact.obstacle not in touched for contact in instant.balance.contacts)

@@ -1,0 +1,186 @@
+"""What a record tells over time: states, propulsion intervals, references, distance; all from the first tick on."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_hal.wire.messages import ControlState, Mode
+from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.summary import arc_position_m
+
+Floats = NDArray[np.float64]
+POSE_SAMPLES = 400
+
+
+@dataclass(frozen=True)
+class Band:
+    """Something that held for a while."""
+
+    start_s: float
+    end_s: float
+    what: str
+
+
+@dataclass(frozen=True)
+class Propulsion:
+    """A joint propelled for a while."""
+
+    start_s: float
+    end_s: float
+    joint: int
+
+    @property
+    def length_s(self) -> float:
+        """How long."""
+        return self.end_s - self.start_s
+
+
+@dataclass(frozen=True)
+class Series:
+    """Values over time, and what they are."""
+
+    time_s: Floats
+    value: Floats
+    what: str
+
+
+def zero_s(record: RunRecord) -> float:
+    """The robot's time at the first tick: where every time axis begins."""
+    if len(record.time_s):
+        return float(record.time_s[0])
+    return record.control[0].stamp_ns * 1e-9 if record.control else 0.0
+
+
+def end_s(record: RunRecord) -> float:
+    """The end of the last tick, on the time axis."""
+    if len(record.time_s):
+        return float(record.time_s[-1]) - zero_s(record) + record.config.period_ns * 1e-9
+    return record.control[-1].stamp_ns * 1e-9 - zero_s(record) if record.control else 0.0
+
+
+def told_at_s(record: RunRecord, state: ControlState) -> float:
+    """When a state was told, on the time axis and within the run."""
+    return min(max(state.stamp_ns * 1e-9 - zero_s(record), 0.0), end_s(record))
+
+
+def state_bands(record: RunRecord) -> list[Band]:
+    """Locomotion states; each holds until the next is told."""
+    return _merged(record, [state.state for state in record.control])
+
+
+def jam_bands(record: RunRecord) -> list[Band]:
+    """When the controller said that the snake was jammed."""
+    bands = _merged(record, ["jammed" if state.jammed else None for state in record.control])
+    return [band for band in bands if band.what == "jammed"]
+
+
+def propulsion_intervals(record: RunRecord) -> list[Propulsion]:
+    """Which joint propelled when, in order of time."""
+    joints = {joint.name: i for i, joint in enumerate(record.description.joints)}
+    bands = _merged(record, [state.propulsion_joint for state in record.control])
+    return [Propulsion(b.start_s, b.end_s, joints[b.what]) for b in bands if b.what in joints]
+
+
+def most_used_joints(intervals: list[Propulsion], most: int = 6) -> list[int]:
+    """The joints that propelled longest, head to tail as the hand-over goes."""
+    spent: dict[int, float] = {}
+    for interval in intervals:
+        spent[interval.joint] = spent.get(interval.joint, 0.0) + interval.length_s
+    longest = sorted(spent, key=lambda joint: -spent[joint])[:most]
+    return sorted(longest, reverse=True)
+
+
+def propulsion_phase_s(record: RunRecord, intervals: list[Propulsion]) -> tuple[float, float]:
+    """From a little before the first propulsion to a little after the last; the whole run when that is most of it."""
+    end = end_s(record)
+    first, last = min(one.start_s for one in intervals), max(one.end_s for one in intervals)
+    air = 0.15 * (last - first)
+    if last - first + 2 * air > 0.7 * end:
+        return 0.0, end
+    return max(first - air, 0.0), min(last + air, end)
+
+
+def reference_rad(record: RunRecord, joint: int) -> Floats:
+    """Where a joint was meant to be, (n,): its target in position mode, else what the controller said; NaN unknown."""
+    reference = np.full(len(record.time_s), np.nan)
+    told = [state for state in record.control if len(state.reference_rad) > joint]
+    if told:
+        stamps = np.array([state.stamp_ns * 1e-9 for state in told])
+        angles = np.array([state.reference_rad[joint] for state in told])
+        reference = np.interp(record.time_s, stamps, angles, left=np.nan, right=angles[-1])
+    in_position = record.mode[:, joint] == Mode.POSITION
+    return np.where(in_position, record.target[:, joint], reference)
+
+
+def commanded_torque_nm(record: RunRecord, joint: int) -> Floats:
+    """The torque that a joint was given in torque mode, (n,); NaN in every other mode."""
+    return np.where(record.mode[:, joint] == Mode.TORQUE, record.target[:, joint], np.nan)
+
+
+def distance(record: RunRecord) -> Series | None:
+    """Advance since the first tick: along the route, else of the tail as the controller knew it, else as it flies."""
+    count = len(record.time_s)
+    rows = np.unique(np.linspace(0, count - 1, min(count, POSE_SAMPLES)).astype(int)) if count else np.array([], int)
+    rows = rows[record.posed[rows]]
+    if len(rows) > 1:
+        time_s = record.time_s[rows] - zero_s(record)
+        arc = [arc_position_m(record, int(row)) for row in rows]
+        if None not in arc:
+            along = np.array(arc, dtype=np.float64)
+            return Series(time_s, along - along[0], "advance along the route, mean over the body")
+        moved = record.position_w[rows, :2] - record.position_w[rows[0], :2]
+        return Series(time_s, np.hypot(*moved.T), "distance of the tail end from where it was")
+    return told_distance(record)
+
+
+def came_to_rest_s(record: RunRecord, within_m: float) -> float | None:
+    """Since when the body has stayed where it was at the end, on the time axis; None when nobody measured where."""
+    moved = distance(record)
+    if moved is None or not len(moved.value):
+        return None
+    away = np.flatnonzero(np.abs(moved.value - moved.value[-1]) > within_m)
+    return float(moved.time_s[away[-1] + 1]) if len(away) else 0.0
+
+
+def told_distance(record: RunRecord) -> Series | None:
+    """Advance of the tail since the controller first told its place on the path."""
+    told = [state for state in record.control if state.path_s_m is not None]
+    if len(told) < 2:
+        return None
+    along = np.array([state.path_s_m for state in told], dtype=np.float64)
+    stamps = np.array([told_at_s(record, state) for state in told])
+    return Series(stamps, along - along[0], "advance of the tail along the path, as the controller knew it")
+
+
+def thinned(time_s: Floats, values: Floats, buckets: int = 400) -> list[list[tuple[float, float]]]:
+    """At most two points a bucket, its extremes, in pieces that are broken where a value is unknown."""
+    pieces: list[list[tuple[float, float]]] = []
+    known = np.isfinite(values)
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], known.astype(np.int8), [0]))))
+    share = max(len(values) / buckets, 1.0)
+    for first, last in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        parts = max(int(np.ceil((last - first) / share)), 1)
+        keep: set[int] = {first, last - 1}
+        for part in np.array_split(np.arange(first, last), parts):
+            if len(part) <= 2:
+                keep.update(part.tolist())
+            else:
+                keep.update((int(part[values[part].argmin()]), int(part[values[part].argmax()])))
+        pieces.append([(float(time_s[i]), float(values[i])) for i in sorted(keep)])
+    return pieces
+
+
+def _merged(record: RunRecord, told: list[str | None]) -> list[Band]:
+    """Equal neighbours become one band; None is left out."""
+    starts = [told_at_s(record, state) for state in record.control]
+    bands: list[Band] = []
+    for i, what in enumerate(told):
+        until = starts[i + 1] if i + 1 < len(starts) else end_s(record)
+        if what is None or until <= starts[i]:
+            continue
+        if bands and bands[-1].what == what and bands[-1].end_s >= starts[i]:
+            bands[-1] = Band(bands[-1].start_s, until, what)
+        else:
+            bands.append(Band(starts[i], until, what))
+    return bands

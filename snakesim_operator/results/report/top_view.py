@@ -1,0 +1,185 @@
+"""The snake seen from above at one instant: body to scale, route, obstacles, contact frames, forces (Fig. 7-10)."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_hal.model.scenario import place_all
+from snakesim_hal.model.scene import Placed
+from snakesim_hal.wire.messages import Obstacle, WorldContact
+from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.report.instants import Instant
+from snakesim_operator.results.report.labels import Labels
+from snakesim_operator.results.report.palette import joint_class
+from snakesim_operator.results.report.svg import (
+    Point,
+    arrow,
+    element,
+    figure,
+    line,
+    points_text,
+    polyline,
+    round_below,
+    text,
+    text_width,
+    title,
+)
+from snakesim_operator.results.report.view import EDGE, FELT_SHARE, FOOT, View, nodes_xy_w
+
+Floats = NDArray[np.float64]
+UNIT_VECTOR = 24.0
+
+
+def top_view(record: RunRecord, instant: Instant, view: View) -> str:
+    """The whole drawing of one instant."""
+    nodes = nodes_xy_w(record, instant)
+    joint = instant.propulsion_joint
+    what = f"Top view at {instant.time_s:.2f} s" + (f", joint {joint + 1} propels" if joint is not None else "")
+    return figure(view.width, view.height, what, drawing(record, instant, view, nodes))
+
+
+def drawing(record: RunRecord, instant: Instant, view: View, nodes: Floats) -> str:
+    """Everything inside the drawing."""
+    labels = Labels(view.width, view.height - FOOT)
+    parts = [_route(record, view), *(_obstacle(item, view, labels) for item in place_all(record.config))]
+    parts.append(_body(record, instant, view, nodes, labels))
+    parts += [_felt(contact, view, labels) for contact in instant.felt]
+    parts.append(_solved(instant, view, labels))
+    parts.append(_names(record, instant, view, nodes, labels))
+    return "".join(parts) + _scales(view)
+
+
+def _route(record: RunRecord, view: View) -> str:
+    if record.route is None:
+        return ""
+    s = np.linspace(-0.2, record.route.length_m + 0.2, min(int(record.route.length_m * 50) + 20, 2000))
+    points = [view.at(point) for point in record.route.position_w(s)]
+    seen = [-60 < x < view.width + 60 and -60 < y < view.height + 60 for x, y in points]
+    lines: list[str] = []
+    stretch: list[Point] = []
+    for point, inside in zip([*points, (0.0, 0.0)], [*seen, False], strict=True):
+        if inside:
+            stretch.append(point)
+        elif stretch:
+            lines.append(polyline(stretch, "route"))
+            stretch = []
+    return "".join(lines)
+
+
+def _obstacle(item: Placed, view: View, labels: Labels) -> str:
+    obstacle: Obstacle = item.obstacle
+    x, y = view.at(obstacle.position_w)
+    class_ = "step" if item.walkable else "peg"
+    reach = max(obstacle.radius_m, math.hypot(*obstacle.half_size_m[:2])) * view.scale
+    if not (-reach < x < view.width + reach and -reach < y < view.height - FOOT + reach):
+        return ""
+    labels.keep_off((x - reach, y - reach, x + reach, y + reach), 0.15)
+    told = title(obstacle.name)
+    if obstacle.shape != "box":
+        return element("circle", told, cx=x, cy=y, r=obstacle.radius_m * view.scale, class_=class_)
+    c, s = math.cos(obstacle.yaw_rad), math.sin(obstacle.yaw_rad)
+    a, b = obstacle.half_size_m[:2]
+    centre = np.array(obstacle.position_w[:2])
+    around = [(a, b), (-a, b), (-a, -b), (a, -b)]
+    corners = [view.at(centre + np.array([c * u - s * v, s * u + c * v])) for u, v in around]
+    return element("polygon", told, points=points_text(corners), class_=class_)
+
+
+def _body(record: RunRecord, instant: Instant, view: View, nodes: Floats, labels: Labels) -> str:
+    """Capsules, tail to head, so that every link shows its cap over the one behind; then the joints."""
+    points = [view.at(node) for node in nodes]
+    parts: list[str] = []
+    for i, link in enumerate(record.description.links):
+        wide = 2 * link.radius_m * view.scale
+        kind = "head-link" if i == len(record.description.links) - 1 else "link"
+        for class_, width in ((f"{kind}-edge", wide), (kind, wide - 2.4)):
+            a, b = points[i], points[i + 1]
+            parts.append(
+                element("line", x1=a[0], y1=a[1], x2=b[0], y2=b[1], class_=class_, stroke_width=max(width, 1.0))
+            )
+        labels.keep_off_line(points[i], points[i + 1], wide / 2, 0.4)
+    for i, point in enumerate(points[1:-1]):
+        if i != instant.propulsion_joint:
+            parts.append(element("circle", cx=point[0], cy=point[1], r=2.4, class_="joint"))
+    return "".join(parts)
+
+
+def _felt(contact: WorldContact, view: View, labels: Labels) -> str:
+    """A measured force, drawn beside the solved one; too long an arrow is cut, and says how long it would be."""
+    size = math.hypot(*contact.force_w[:2])
+    cut = min(1.0, FELT_SHARE * view.longest / max(size * view.force_scale, 1e-9))
+    start = view.along(view.at(contact.position_w), contact.tangent_w, 7.0)
+    tip = view.along(start, contact.force_w, cut * view.force_scale)
+    labels.keep_off_line(start, tip, 3)
+    drawn = arrow(start, tip, "felt", head=8)
+    return drawn + labels.put(tip, f"{size:.0f} N", "halo felt-text", gaps=(6, 12)) if cut < 1.0 else drawn
+
+
+def _solved(instant: Instant, view: View, labels: Labels) -> str:
+    """Contact frames, solved forces and their resultant."""
+    if instant.balance is None:
+        return ""
+    parts: list[str] = []
+    for contact, force in zip(instant.balance.contacts, instant.balance.contact_n, strict=True):
+        at = view.at(contact.position_w)
+        parts.append(arrow(view.along(at, contact.normal_w, -UNIT_VECTOR), at, "frame", head=7))
+        ahead = view.along(at, contact.tangent_w, UNIT_VECTOR)
+        parts.append(arrow(at, ahead, "frame", head=7))
+        tip = view.along(at, force, view.force_scale)
+        parts.append(arrow(at, tip, "solved", head=11))
+        labels.keep_off_line(at, tip, 5)
+        labels.keep_off_line(at, ahead, 3)
+    start = view.at(instant.balance.contacts[0].position_w)
+    tip = view.along(start, instant.balance.resultant_n, view.force_scale)
+    labels.keep_off_line(start, tip, 7, 2.0)
+    parts.append(arrow(start, tip, "resultant under", head=14) + arrow(start, tip, "resultant", head=14))
+    return "".join(parts)
+
+
+def _names(record: RunRecord, instant: Instant, view: View, nodes: Floats, labels: Labels) -> str:
+    parts: list[str] = []
+    if instant.propulsion_joint is not None:
+        name = record.description.joints[instant.propulsion_joint].name
+        at = view.at(nodes[instant.propulsion_joint + 1])
+        colour = joint_class(instant.propulsion_joint)
+        parts.append(element("circle", cx=at[0], cy=at[1], r=6.5, class_=f"propelling {colour}"))
+        parts.append(labels.put(at, name, "halo strong", gaps=(16, 22, 30, 40)))
+    if instant.balance is not None:
+        for i, (contact, size) in enumerate(zip(instant.balance.contacts, instant.balance.size_n, strict=True)):
+            foot = view.at(contact.position_w)
+            tip = view.along(foot, contact.normal_w, size * view.force_scale)
+            parts.append(labels.put(tip, f"{size:.0f} N", "halo solved-text", gaps=(6, 10, 16), away_from=foot))
+            behind = view.along(foot, contact.normal_w, -18.0)
+            parts.append(labels.put(behind, f"o{_index(i + 1)}", "halo strong", away_from=foot))
+    parts.append(labels.put(view.at(nodes[0]), "tail", "halo soft", gaps=(16, 24, 34)))
+    parts.append(labels.put(view.at(nodes[-1]), "head", "halo soft", gaps=(16, 24, 34)))
+    return "".join(parts)
+
+
+def _index(number_: int) -> str:
+    return "".join(chr(ord("₀") + int(digit)) for digit in str(number_))
+
+
+def _scales(view: View) -> str:
+    """Bars of length and of force, and which way the axes point."""
+    y = view.height - 10
+    metres = round_below(0.25 * (view.width - 2 * EDGE) / view.scale)
+    x = EDGE
+    parts = [_bar(x, y, metres * view.scale, f"{metres * 100:g} cm" if metres < 1 else f"{metres:g} m")]
+    x += metres * view.scale + text_width(f"{metres * 100:g} cm") + 34
+    if view.force_scale > 0:
+        newtons = round_below(0.8 * view.longest / view.force_scale)
+        parts.append(_bar(x, y, newtons * view.force_scale, f"{newtons:g} N", "force-bar"))
+    corner = (view.width - 46, view.height - 8)
+    for vector, name in (((1.0, 0.0), "x"), ((0.0, 1.0), "y")):
+        tip = view.along(corner, vector, 20)
+        parts.append(arrow(corner, tip, "axes", head=6))
+        beyond = view.along(corner, vector, 28)
+        parts.append(text(beyond[0], beyond[1] + 4, name, "small soft", anchor="middle"))
+    return "".join(parts)
+
+
+def _bar(x: float, y: float, length: float, words: str, class_: str = "bar") -> str:
+    ends = line((x, y - 4), (x, y + 4), class_) + line((x + length, y - 4), (x + length, y + 4), class_)
+    return line((x, y), (x + length, y), class_) + ends + text(x + length + 7, y + 4.5, words, "small")

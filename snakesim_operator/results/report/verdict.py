@@ -1,0 +1,175 @@
+"""What a run amounted to, in one sentence, and its key numbers."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.report.timeline import (
+    came_to_rest_s,
+    end_s,
+    propulsion_intervals,
+    state_bands,
+    told_at_s,
+)
+from snakesim_operator.results.summary import RunSummary
+
+MOVED_M = 0.02  # less than this is no locomotion
+LEAST_STOP_S = 0.5  # a shorter stop at the end is not worth a word
+RESTING_SHARE = 0.02  # of all its way: what is so near to the end of it has arrived, but for who moves to the last,
+REST_SHARE, REST_S = 0.1, 5.0  # which is told from a rest by how long it takes: a tenth of the run, or so many seconds
+POOR_SHARE = 0.5  # a run that stood still for more of its time than this, up to its end, is no good one
+SHOWN_HANDOVERS = 8
+Kind = Literal["good", "poor", "bad"]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """One sentence, and how good the news is."""
+
+    kind: Kind
+    words: str
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A key number."""
+
+    name: str
+    value: str
+    unit: str = ""
+    alarming: bool = False
+
+
+def verdict(record: RunRecord, summary: RunSummary) -> Verdict:
+    """The run in plain words."""
+    if summary.ticks == 0 and len(record.time_s) == 0 and not summary.faults:
+        return Verdict("bad", f"Nothing was recorded: the robot was never armed ({summary.ended}).")
+    moved = _moved(summary)
+    stopping = [fault for fault in summary.faults if fault.reach == "robot"]
+    if stopping:
+        fault = stopping[0]
+        at_s = fault.tick / summary.rate_hz - (float(record.time_s[0]) if len(record.time_s) else 0.0)
+        joint = f" at {fault.joint}" if fault.joint else ""
+        what = f"Stopped by a fault after {max(at_s, 0.0):.1f} s{joint}: {_sentence(fault.cause)}"
+        said = _control_said(record, at_s)
+        return Verdict("bad", f"{what}{said} Before that: {moved[0].lower()}{moved[1:]}.")
+    harm = _harm(summary)
+    ending = "" if summary.ended == "complete" else f" The run ended early: {_sentence(summary.ended)}"
+    distance = _distance_m(summary)
+    if distance is None:
+        return Verdict("poor", f"{moved}; {_handed_over(record, summary)}{harm}.{ending}")
+    if abs(distance) < MOVED_M or summary.locomoting_fraction == 0:
+        why = summary.last_reason or "the controller gave no reason"
+        if summary.last_state == "Locomoting":
+            why = "the snake stayed where it was, although its controller reported Locomoting"
+        kind = "Jammed" if summary.jammed else "Did not locomote"
+        return Verdict("poor", f"{kind}: {_sentence(why)} {moved}; {harm}.{ending}")
+    stop = _stop(record, abs(distance))
+    stopped = "" if stop is None else f" Locomotion ended at {stop.at_s:.1f} s of {end_s(record):.1f} s: {stop.why}"
+    if stop is not None and not stop.on_purpose and (summary.jammed or stop.share > POOR_SHARE):
+        kind = "Jammed" if summary.jammed else "Stopped"
+        said = f"{kind} at {stop.at_s:.1f} s of {end_s(record):.1f} s: {stop.why.removeprefix('jammed: ')}"
+        return Verdict("poor", f"{said} {moved}; {_handed_over(record, summary)}{harm}.{ending}")
+    jam = "it jammed on the way; " if summary.jammed else ""
+    good: Kind = "poor" if ending or distance < 0 else "good"
+    return Verdict(good, f"{moved}; {_handed_over(record, summary)}{jam}{harm}.{stopped}{ending}")
+
+
+def tiles(record: RunRecord, summary: RunSummary) -> list[Tile]:
+    """The numbers to see first."""
+    limit = max(joint.torque_limit_nm for joint in record.description.joints)
+    saturated = summary.torque_saturated_fraction
+    along = summary.path_distance_m is not None
+    distance = _distance_m(summary)
+    rejected = sum(summary.rejected_commands.values())
+    return [
+        Tile("along the path" if along else "net displacement", _shown(distance, "{:.2f}"), "m"),
+        Tile("mean speed", _shown(summary.mean_speed_m_s, "{:.3f}"), "m/s"),
+        Tile("robot time", f"{summary.duration_s:.1f}", "s"),
+        Tile("time locomoting", _shown(_percent(summary.locomoting_fraction), "{:.0f}"), "%"),
+        Tile(f"peak joint torque (limit {limit:g})", _shown(summary.peak_joint_torque_nm, "{:.1f}"), "N·m"),
+        Tile("ticks at a torque limit", _shown(_percent(saturated), "{:.1f}"), "%", (saturated or 0) > 0.05),
+        Tile("peak contact force", _shown(summary.peak_contact_force_n, "{:.0f}"), "N"),
+        Tile("ticks answered in time", _shown(_percent(summary.answered_fraction), "{:.1f}"), "%"),
+        Tile("commands refused", str(rejected)),
+        Tile("faults", str(len(summary.faults)), "", bool(summary.faults)),
+    ]
+
+
+def _harm(summary: RunSummary) -> str:
+    """What went wrong, and stopped nothing."""
+    lost = list(dict.fromkeys(fault.joint for fault in summary.faults if fault.joint is not None))
+    return f"went on without {', '.join(lost)}" if lost else "no fault"
+
+
+def _distance_m(summary: RunSummary) -> float | None:
+    return summary.path_distance_m if summary.path_distance_m is not None else summary.net_displacement_m
+
+
+def _moved(summary: RunSummary) -> str:
+    duration = f"in {summary.duration_s:.1f} s"
+    if summary.path_distance_m is not None:
+        back = " backward" if summary.path_distance_m <= -MOVED_M else ""
+        return f"Moved {abs(summary.path_distance_m):.2f} m{back} along the path {duration}"
+    if summary.net_displacement_m is not None:
+        return f"Moved {summary.net_displacement_m:.2f} m {duration}"
+    return f"Ran for {summary.duration_s:.1f} s; nobody measured how far it moved, for the robot has no pose sensor"
+
+
+def _handed_over(record: RunRecord, summary: RunSummary) -> str:
+    names = summary.propulsion_joints
+    if not names:
+        return ""
+    if len(names) == 1:
+        return f"{names[0]} propelled throughout; "
+    if len(names) <= SHOWN_HANDOVERS:
+        return f"propulsion handed over {' → '.join(names)}; "
+    distinct = len({one.joint for one in propulsion_intervals(record)})
+    shown = " → ".join([*names[:4], "…", names[-1]])
+    return f"propulsion handed over {len(names) - 1} times among {distinct} joints ({shown}); "
+
+
+def _control_said(record: RunRecord, at_s: float) -> str:
+    """What control lacked when the robot was stopped: a fault of the lease only tells that no command came."""
+    told = [state for state in record.control if told_at_s(record, state) <= at_s]
+    return f" Control said: {_sentence(told[-1].reason)}" if told and told[-1].state == "NotLocomoting" else ""
+
+
+@dataclass(frozen=True)
+class _Stop:
+    """The end of locomotion, before that of the run."""
+
+    at_s: float
+    share: float  # of the run that it stood still for then
+    why: str
+    on_purpose: bool
+
+
+def _stop(record: RunRecord, moved_m: float) -> _Stop | None:
+    """When and why it came to rest, by what control told and by what was measured; None when it did not."""
+    bands, end = state_bands(record), end_s(record)
+    at_s = bands[-1].start_s if len(bands) > 1 and bands[-1].what != "Locomoting" else end
+    rest_s = came_to_rest_s(record, min(MOVED_M, RESTING_SHARE * moved_m))
+    if rest_s is not None and at_s - rest_s > max(LEAST_STOP_S, min(REST_SHARE * end, REST_S)):
+        at_s = rest_s
+    if end - at_s < LEAST_STOP_S:
+        return None
+    after = [state for state in record.control if told_at_s(record, state) >= at_s and state.state != "Locomoting"]
+    why = after[0].reason if after else "its controller reported Locomoting all the same"
+    return _Stop(at_s, (end - at_s) / end, _sentence(why), bool(after) and after[-1].state == "Idle")
+
+
+def _sentence(words: str) -> str:
+    words = words.strip().rstrip(".;")
+    return f"{words}." if words else ""
+
+
+def _percent(share: float | None) -> float | None:
+    return None if share is None else 100 * share
+
+
+def _shown(value: float | None, form: str) -> str:
+    if value is None:
+        return "–"
+    text = form.format(value)
+    return text.removeprefix("-") if float(text) == 0 else text.replace("-", "−")

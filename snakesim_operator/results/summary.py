@@ -1,0 +1,182 @@
+"""The numbers of a run, in one file that scripts can read: `summary.json`."""
+
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from snakesim_hal.wire.messages import Fault, Pace
+from snakesim_operator.results.record import RunRecord
+
+SATURATED_FROM = 0.99  # of a joint's torque limit
+TOLD_FOR_S = 0.5  # control tells its state twenty times a second: after a longer silence it is not known any more
+
+
+def _number(unit: str, about: str) -> Meta:
+    return Meta(description=about, extra_json_schema={"unit": unit})
+
+
+class Restart(msgspec.Struct, frozen=True, kw_only=True):
+    """A process that ended and was to be started again."""
+
+    name: str
+    how: str
+    at_s: float  # wall-clock time since the run's first process was started
+    after_s: float  # how long it was left alone
+
+
+class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
+    """What a run amounted to. Unknown is null, never zero."""
+
+    scenario: str
+    robot: str
+    scene: str
+    backend: str
+    controller: str
+    seed: int
+    pace: Pace
+    rate_hz: Annotated[float, _number("Hz", "control rate")]
+    duration_s: Annotated[float, _number("s", "robot time from the first arming to the end")]
+    wall_s: Annotated[float, _number("s", "wall-clock time of the same")]
+    real_time_factor: Annotated[float | None, _number("1", "duration over wall time")]
+    ticks: int
+    overruns: Annotated[int, Meta(description="ticks that missed their deadline (realtime)")]
+    answered_fraction: Annotated[float | None, _number("1", "ticks whose command came within the tick")]
+    command_digest: Annotated[str, Meta(description="SHA-256 of every set-point as applied")]
+    path_distance_m: Annotated[float | None, _number("m", "advance of the body along the scene's route")]
+    net_displacement_m: Annotated[float | None, _number("m", "distance of the centre of mass from where it was")]
+    mean_speed_m_s: Annotated[
+        float | None, _number("m/s", "path distance (or displacement) over the time in which it is known")
+    ]
+    locomoting_fraction: Annotated[float | None, _number("1", "share of the time in which it moved as it meant to")]
+    propulsion_joints: Annotated[list[str], Meta(description="in order of use")]
+    jammed: Annotated[bool, Meta(description="whether the controller reported a jam at any time")]
+    last_state: str | None
+    last_reason: str | None
+    peak_joint_torque_nm: Annotated[float | None, _number("N·m", "largest torque of any joint")]
+    torque_saturated_fraction: Annotated[float | None, _number("1", "ticks with a joint at its torque limit")]
+    peak_contact_force_n: Annotated[float | None, _number("N", "largest force of one contact")]
+    energy_j: Annotated[float | None, _number("J", "sum over joints of |torque x velocity| over time")]
+    state_to_command_us: Annotated[dict[str, float | None], _number("µs", "state published to command received")]
+    rejected_commands: Annotated[dict[str, int], Meta(description="by reason")]
+    limited_commands: Annotated[dict[str, int], Meta(description="joint set-points changed by the gate, by limit")]
+    faults: list[Fault]
+    faults_left_out: Annotated[int, Meta(description="of `faults`, between the first and the newest")] = 0
+    isolated: Annotated[list[str], Meta(description="joints that failed, and were passive at the end")] = []
+    hosts: Annotated[int, Meta(description="how many HAL hosts the run had; all numbers here are of the last one")] = 1
+    restarts: Annotated[list[Restart], Meta(description="processes that ended and were started again")] = []
+    ended: Annotated[str, Meta(description="complete, interrupted, or what failed")]
+    lacks: Annotated[list[str], Meta(description="what the record does not know; numbers are made of the rest")] = []
+    config: Annotated[dict[str, Any], Meta(description="the effective configuration; repeats the run")]
+
+
+def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), hosts: int = 1) -> RunSummary:
+    """Work out the numbers of a run."""
+    config, host = record.config, record.host
+    count = len(record.time_s)
+    duration_s = host.ticks * config.period_ns * 1e-9
+    path_m, net_m, known_s = _distances(record)
+    moved_m = path_m if path_m is not None else net_m
+    has_contacts = config.robot.sensors.contacts is not None and count > 0
+    last = record.control[-1] if record.control else None
+    limits = np.array([joint.torque_limit_nm for joint in record.description.joints])
+    power = np.abs(record.torque_nm * record.velocity_rad_s)
+    return RunSummary(
+        scenario=config.name,
+        robot=config.robot.name,
+        scene=config.scene.name,
+        backend=config.backend,
+        controller=config.commander,
+        seed=config.seed,
+        pace=config.pace,
+        rate_hz=config.rate_hz,
+        duration_s=duration_s,
+        wall_s=host.wall_s,
+        real_time_factor=duration_s / host.wall_s if host.wall_s > 0 else None,
+        ticks=host.ticks,
+        overruns=host.overruns,
+        answered_fraction=host.answered_ticks / host.armed_ticks if host.armed_ticks else None,
+        command_digest=host.command_digest,
+        path_distance_m=path_m,
+        net_displacement_m=net_m,
+        mean_speed_m_s=moved_m / known_s if moved_m is not None else None,
+        locomoting_fraction=_locomoting_fraction(record),
+        propulsion_joints=propulsion_sequence(record),
+        jammed=any(state.jammed for state in record.control),
+        last_state=last.state if last else None,
+        last_reason=last.reason if last else None,
+        peak_joint_torque_nm=largest(np.abs(record.torque_nm)),
+        torque_saturated_fraction=float((np.abs(record.torque_nm) >= SATURATED_FROM * limits).any(axis=1).mean())
+        if count
+        else None,
+        peak_contact_force_n=largest(record.contact_peak_n) if has_contacts else None,
+        energy_j=float(np.nansum(power) * config.period_ns * 1e-9) if np.isfinite(power).any() else None,
+        state_to_command_us=host.state_to_command_us,
+        rejected_commands=host.rejected_commands,
+        limited_commands=host.limited_commands,
+        faults=host.faults,
+        faults_left_out=host.faults_left_out,
+        isolated=host.isolated,
+        hosts=hosts,
+        restarts=list(restarts),
+        ended=ended,
+        lacks=record.lacks,
+        config=msgspec.to_builtins(config),
+    )
+
+
+def propulsion_sequence(record: RunRecord) -> list[str]:
+    """Joints that propelled, in order, each named anew when it takes over again."""
+    names: list[str] = []
+    for state in record.control:
+        joint = state.propulsion_joint
+        if joint is not None and (not names or names[-1] != joint):
+            names.append(joint)
+    return names
+
+
+def arc_position_m(record: RunRecord, row: int) -> float | None:
+    """Mean arc length along the route of the tail end, the joints and the head end."""
+    nodes = record.nodes_w(row)
+    if nodes is None or record.route is None:
+        return None
+    return float(np.mean([record.route.project(node[:2]) for node in nodes]))
+
+
+def largest(values: np.ndarray) -> float | None:
+    """Of all that are known; None when there is none."""
+    known = values[np.isfinite(values)]
+    return float(known.max()) if len(known) else None
+
+
+def _distances(record: RunRecord) -> tuple[float | None, float | None, float]:
+    """Along the route, and as the crow flies; from the first known pose to the last, and the time between them."""
+    posed = np.flatnonzero(record.posed)
+    if len(posed) < 2:
+        return None, None, 0.0
+    row, last_row = int(posed[0]), int(posed[-1])
+    first, last = record.nodes_w(row), record.nodes_w(last_row)
+    if first is None or last is None:
+        return None, None, 0.0
+    masses = np.array([link.mass_kg for link in record.description.links])[:, None]
+
+    def centre(nodes: np.ndarray) -> np.ndarray:
+        return (0.5 * (nodes[:-1] + nodes[1:]) * masses).sum(axis=0) / masses.sum()
+
+    net = float(np.linalg.norm((centre(last) - centre(first))[:2]))
+    start, end = arc_position_m(record, row), arc_position_m(record, last_row)
+    known_s = (last_row - row + 1) * record.config.period_ns * 1e-9
+    return (None if start is None or end is None else end - start), net, known_s
+
+
+def _locomoting_fraction(record: RunRecord) -> float | None:
+    """A state holds until the next one is told; but whoever says nothing more for a while is not known to move."""
+    if not record.control or len(record.time_s) == 0:
+        return None
+    begin, end = float(record.time_s[0]), float(record.time_s[-1])
+    stamps = [min(max(state.stamp_ns * 1e-9, begin), end) for state in record.control] + [end]
+    held_s = [min(stamps[i + 1] - stamps[i], TOLD_FOR_S) for i in range(len(record.control))]
+    moving = sum(held for held, state in zip(held_s, record.control, strict=True) if state.state == "Locomoting")
+    return moving / (end - begin) if end > begin else None

@@ -1,0 +1,150 @@
+"""What is left of a run when it is over: the summary, the report, and a few lines on the terminal."""
+
+from collections.abc import Sequence
+
+import msgspec
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.host.latch import ESTOP
+from snakesim_hal.host_process import HostRecord
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.network.local_registry import robot_folder
+from snakesim_hal.terminal import say
+from snakesim_hal.wire.messages import Description
+from snakesim_operator.results import last_run as lastrun
+from snakesim_operator.results.gaps import unwritten
+from snakesim_operator.results.record import REPORT, SUMMARY, RunRecord
+from snakesim_operator.results.report import page
+from snakesim_operator.results.summary import RunSummary, summarise
+from snakesim_operator.run.ending import Ending
+from snakesim_operator.run.run_files import RunFiles
+from snakesim_operator.run.supervisor import Supervisor
+
+JOINTS_SHOWN = 8
+DONE, FAILED, INCOMPLETE, INTERRUPTED = 0, 1, 3, 130
+
+
+def conclude(config: RunConfig, files: RunFiles, ending: Ending, supervisor: Supervisor, *, stay: bool) -> int:
+    """Write and print it all. Returns 0, 1 on a fault or an early end, 3 when the record lacks something, or 130.
+
+    stay: faults that a person could clear are part of the run, not its end.
+    """
+    host = supervisor.host_record()
+    files.settle()
+    lacks: list[str] = []
+    if host is not None:
+        explain(ending, host, config, stay=stay)
+        lacks = unwritten(host) if files.folder is not None else ["nothing was recorded"]
+        _leave(files, ending, supervisor, host, lacks)
+    lost = files.close()
+    lacks += [lost] if lost and lost not in lacks else []
+    _print_end(files, ending, host, supervisor.robot(), lacks)
+    lastrun.remember(str(files.folder or "no folder"), _ended(ending))
+    if ending.interrupted:
+        return INTERRUPTED
+    if host is None or ending.reason is not None:
+        return FAILED
+    return INCOMPLETE if lacks else DONE
+
+
+def explain(ending: Ending, host: HostRecord, config: RunConfig, *, stay: bool) -> None:
+    """Complete is a run whose whole time was armed time, and nothing else; of any other, say how it ended."""
+    for fault in () if stay else host.faults:
+        if fault.reach == "robot":
+            ending.because(fault.cause)
+    done = f"after {host.armed_ticks / config.rate_hz:.1f} of {config.duration_s:g} s"
+    if host.ended == "running":
+        ending.because(f"the record ends {done}, and may lack the last second")
+    elif ending.reason is None and host.ended in ("stopped", "finished"):
+        ending.because(f"the host was {host.ended} {host.ended_why} {done}")
+    elif ending.reason is None and host.ended != "complete":
+        ending.because(f"the run ended {done}: {host.ended_why}")
+
+
+def _ended(ending: Ending) -> str:
+    return "interrupted" if ending.interrupted else ending.reason or "complete"
+
+
+def _leave(files: RunFiles, ending: Ending, supervisor: Supervisor, host: HostRecord, lacks: list[str]) -> None:
+    """Summary and report, made of what is on disk."""
+    if files.folder is None:
+        _print_host(host)
+        return
+    try:
+        record = RunRecord.load(files.folder, host)
+    except ConfigError as error:
+        lacks.append(str(error))
+        _print_host(host)
+        return
+    summary = summarise(record, _ended(ending), supervisor.restarts, supervisor.hosts)
+    files.put(SUMMARY, msgspec.json.format(msgspec.json.encode(summary), indent=2))
+    files.put(REPORT, page(record, summary).encode())
+    _print_summary(summary)
+
+
+def _print_end(
+    files: RunFiles, ending: Ending, host: HostRecord | None, robot: Description | None, lacks: Sequence[str]
+) -> None:
+    out = files.folder
+    for what, name in (("summary", SUMMARY), ("report", REPORT)):
+        if out is not None and (out / name).is_file():
+            say(f"{what + ':':<9}{out / name}")
+    if host is None:
+        said = f"; what its parts said is in {out}" if out is not None else ""
+        say(f"the run left no record: {ending.reason or 'the host ended early'}{said}")
+    elif ending.reason is not None and not ending.interrupted:
+        say(f"fault: {ending.reason}")
+    if lacks:
+        say(f"record: incomplete: {'; '.join(lacks)}")
+    if robot is not None and (robot_folder(robot.robot, robot.backend, robot.hardware) / ESTOP).is_file():
+        say(f"{robot.robot} is still stopped, and begins so in every run: `snakesim clear` forgets it")
+
+
+def _print_host(host: HostRecord) -> None:
+    """What is known without a record on disk."""
+    say(f"  {'ticks':<22}{host.ticks}, of which {host.armed_ticks} armed, in {host.wall_s:.2f} s")
+    say(f"  {'command digest':<22}{host.command_digest[:16]}")
+    for fault in host.faults:
+        say(f"  {'fault':<22}{fault.cause}")
+
+
+def _print_summary(summary: RunSummary) -> None:
+    def number(value: float | None, unit: str, digits: int = 2) -> str:
+        return "unknown" if value is None else f"{value:.{digits}f} {unit}"
+
+    rows = [
+        ("moved along the path", number(summary.path_distance_m, "m", 3)),
+        (
+            "time",
+            f"{summary.duration_s:.2f} s in {summary.wall_s:.2f} s ({number(summary.real_time_factor, 'x', 1)})",
+        ),
+        (
+            "locomoting",
+            "unknown" if summary.locomoting_fraction is None else f"{100 * summary.locomoting_fraction:.0f} %",
+        ),
+        ("propulsion joints", _in_short(summary.propulsion_joints)),
+        ("peak joint torque", number(summary.peak_joint_torque_nm, "N·m")),
+        ("peak contact force", number(summary.peak_contact_force_n, "N", 1)),
+        ("last state", f"{summary.last_state or 'unknown'}: {summary.last_reason or ''}"),
+        ("command digest", summary.command_digest[:16]),
+    ]
+    if summary.faults:
+        count = len(summary.faults) + summary.faults_left_out
+        rows.append(("faults", f"{count}, the first: {summary.faults[0].cause}"))
+    if summary.isolated:
+        rows.append(("isolated", f"{', '.join(summary.isolated)}: failed, and passive since"))
+    if summary.restarts:
+        rows.append(("restarts", ", ".join(restart.name for restart in summary.restarts)))
+    if summary.hosts > 1:
+        rows.append(("host", f"the last of {summary.hosts}; everything above is of this one"))
+    if summary.jammed:
+        rows.append(("JAMMED", "the controller reported a jam; see the report"))
+    rows += [("not known", lack) for lack in summary.lacks]
+    for name, value in rows:
+        say(f"  {name:<22}{value}")
+
+
+def _in_short(joints: Sequence[str]) -> str:
+    if len(joints) <= JOINTS_SHOWN:
+        return " -> ".join(joints) or "none"
+    return f"{' -> '.join(joints[:JOINTS_SHOWN])} -> ... ({len(joints)} hand-overs in all)"

@@ -1,0 +1,101 @@
+"""The folder of one run: held by one process at a time, and never written over an earlier run."""
+
+import contextlib
+import fcntl
+import os
+from collections.abc import Callable, Iterator
+from datetime import datetime
+from itertools import count
+from pathlib import Path
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.host.recorder import BLACK_BOX, HOST_RECORD
+from snakesim_hal.model.whole_file import PARTIAL
+from snakesim_operator.results.record import CONFIG, REPORT, SUMMARY, TELEMETRY
+
+LOCK = "run.lock"  # holds the process id of the run that is writing here
+LEFT = (CONFIG, HOST_RECORD, BLACK_BOX, TELEMETRY, SUMMARY, REPORT, "blackbox.npz")  # the last: of older versions
+TIME = "%Y%m%d-%H%M%S"
+
+
+def named_after(name: str) -> Path:
+    """A new folder for a run that was given none: runs/NAME-TIME."""
+    out = Path("runs") / f"{name}-{datetime.now().strftime(TIME)}"
+    return _free(out)
+
+
+@contextlib.contextmanager
+def claimed(out: Path, say: Callable[[str], None]) -> Iterator[Path]:
+    """Hold a folder for a run, with what an earlier one left there moved aside; the kernel lets go after a SIGKILL.
+
+    Raises ConfigError when another run holds it or it cannot be one, OSError when it cannot be written to.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as error:
+        raise ConfigError(f"--out {out}: {error.strerror}: {error.filename}; choose another folder") from error
+    out = out.resolve()
+    with contextlib.ExitStack() as held:
+        held.enter_context(_lock(out))
+        if any((out / name).exists() for name in LEFT):
+            aside = _move_aside(out)
+            say(f"{out} held an earlier run: moved to {aside}")
+            out.mkdir(exist_ok=True)
+            held.enter_context(_lock(out))
+        try:
+            yield out
+        finally:
+            for partial in out.glob(f"*{PARTIAL}"):  # of a process that was killed while it wrote
+                with contextlib.suppress(OSError):
+                    partial.unlink()
+
+
+@contextlib.contextmanager
+def _lock(out: Path) -> Iterator[None]:
+    path = out / LOCK
+    while True:
+        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if os.path.samestat(os.fstat(handle), path.stat()):
+                break
+        except BlockingIOError:
+            holder = os.pread(handle, 20, 0).decode(errors="replace").strip()
+            os.close(handle)
+            raise ConfigError(
+                f"--out {out}: another run is writing there, process {holder or 'unknown'}; "
+                "choose another folder, or end that run"
+            ) from None
+        except FileNotFoundError:
+            pass  # the run that held it has ended just now, or has moved it aside
+        os.close(handle)
+    try:
+        with contextlib.suppress(OSError):  # a full disk: the lock holds, it only does not say whose it is
+            os.ftruncate(handle, 0)
+            os.pwrite(handle, str(os.getpid()).encode(), 0)
+        yield
+    finally:
+        with contextlib.suppress(OSError):
+            if os.path.samestat(os.fstat(handle), path.stat()):
+                path.unlink()
+        os.close(handle)
+
+
+def _move_aside(out: Path) -> Path:
+    if Path.cwd().is_relative_to(out):
+        raise ConfigError(f"--out {out} holds an earlier run, and you are in it; choose another folder")
+    began_s = min((out / name).stat().st_mtime for name in LEFT if (out / name).exists())
+    aside = _free(out.with_name(f"{out.name}.{datetime.fromtimestamp(began_s).strftime(TIME)}"))
+    try:
+        out.rename(aside)
+    except OSError as error:
+        raise ConfigError(
+            f"--out {out} holds an earlier run that cannot be moved to {aside}: {error.strerror}; choose another folder"
+        ) from error
+    (aside / LOCK).unlink(missing_ok=True)
+    return aside
+
+
+def _free(path: Path) -> Path:
+    """The path, or with a number behind it when it is taken."""
+    return next(p for n in count(1) if not (p := path if n == 1 else path.with_name(f"{path.name}-{n}")).exists())

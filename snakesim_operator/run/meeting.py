@@ -1,0 +1,82 @@
+"""Where the processes of a run meet: an endpoint that no other run can have, and the stop port beside it."""
+
+import contextlib
+import os
+import socket
+
+from snakesim_hal.errors import NotConnectedError, RefusedError
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.network.local_registry import LocalRobot
+from snakesim_hal.network.session import DEFAULT_PORT, Link, open_session
+from snakesim_hal.network.stop_port import open_stop_port, stop_address
+from snakesim_hal.wire import keys
+from snakesim_operator.tools.targets import robots_on
+
+CONNECT_S = 1.0
+LOOPBACK = "127.0.0.1"
+TRIES = 10
+
+
+def meeting_point(endpoint: str | None, router: str | None) -> tuple[str, socket.socket]:
+    """The run's endpoint and its stop port, which this process holds until the run is over.
+
+    Two runs that start at the same moment cannot get the same endpoint, because a port has one holder. Without
+    `endpoint` it is the default port, or any other when somebody has that. Raises NotConnectedError.
+    """
+    if router is not None:
+        return router, open_stop_port(*stop_address(router, listens=False))
+    if endpoint is not None:
+        stop_port = open_stop_port(*stop_address(endpoint, listens=True))
+        return endpoint, stop_port
+    for wanted in (DEFAULT_PORT, *[0] * TRIES):
+        with contextlib.suppress(NotConnectedError):
+            stop_port = open_stop_port(LOOPBACK, wanted)
+            port: int = stop_port.getsockname()[1]
+            if _is_free(port):
+                return f"tcp/{LOOPBACK}:{port}", stop_port
+            stop_port.close()
+    raise NotConnectedError("no free port on the loopback interface")
+
+
+def refuse_second_robot(endpoint: str | None, router: str | None, namespace: str) -> None:
+    """Raise RefusedError when a robot is there already: two would answer to one name, or share an endpoint.
+
+    Raises NotConnectedError when there is no such router.
+    """
+    if router is not None:
+        with open_session(Link(router, namespace), CONNECT_S) as session:
+            if session.present(keys.alive("hal")) or session.present(keys.HOST_ALL):
+                raise RefusedError(
+                    f"{namespace} is on {router} already; end that run first, or give this one another --namespace"
+                )
+    elif endpoint is not None:
+        with contextlib.suppress(NotConnectedError), open_session(Link(endpoint), CONNECT_S) as session:
+            there = ", ".join(robots_on(session)) or "somebody"
+            raise RefusedError(
+                f"{there} is on {endpoint} already; end that run first, choose another --endpoint, or join it by "
+                f"--router {endpoint} with another --namespace"
+            )
+
+
+def local_robot(config: RunConfig, namespace: str, endpoint: str, stop_port: socket.socket) -> LocalRobot:
+    """What other tools on this computer need to know of the run."""
+    stop_host, port = stop_port.getsockname()[:2]
+    return LocalRobot(
+        namespace=namespace,
+        robot=config.robot.name,
+        backend=config.backend,
+        endpoint=endpoint,
+        stop_host=stop_host,
+        stop_port=port,
+        pid=os.getpid(),
+    )
+
+
+def _is_free(port: int) -> bool:
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((LOOPBACK, port))
+        except OSError:
+            return False
+    return True

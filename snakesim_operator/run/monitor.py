@@ -1,0 +1,158 @@
+"""A run while it goes on: arms once, writes telemetry, shows progress, and sees that nothing stays unnoticed."""
+
+import time
+from collections.abc import Callable
+
+from snakesim_hal.errors import NotConnectedError, RefusedError
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.network.session import Session
+from snakesim_hal.serve import START_LIMIT_S
+from snakesim_hal.wire.messages import Description, LifecycleRequest, Status
+from snakesim_operator.run.ending import Ending
+from snakesim_operator.run.process_faults import ProcessFaults
+from snakesim_operator.run.progress import Progress
+from snakesim_operator.run.run_files import RunFiles
+from snakesim_operator.run.supervisor import Supervisor
+from snakesim_operator.run.telemetry import Telemetry
+
+AFTER_FAULT_S = 1.5
+POLL_S = 0.05
+ARM_LIMIT_S = 10.0
+WHO = "snakesim run"
+
+
+class Conductor:
+    """Watches one run over its network, until it is over."""
+
+    def __init__(
+        self,
+        config: RunConfig,
+        session: Session,
+        supervisor: Supervisor,
+        files: RunFiles,
+        ending: Ending,
+        say: Callable[[str], None],
+        *,
+        stay: bool,
+    ) -> None:
+        """stay: a fault ends nothing; a person clears it and arms again."""
+        self._session, self._supervisor = session, supervisor
+        self._ending, self._say, self._stay = ending, say, stay
+        self._telemetry = Telemetry(session, files)
+        self._faults = ProcessFaults(config, session, supervisor, say)
+        self._progress = Progress(config)
+        self._status: Status | None = None
+        self._robot: Description | None = None
+        self._armed = False  # once, by this run or by a person
+        self._may_arm = config.has_own_control  # until something went wrong: then a person does
+        self._own_services = frozenset(config.own_services)
+        self._hosts = supervisor.hosts
+        self._asked_at: float | None = None
+        self._told: str | None = None
+
+    def go(self) -> None:
+        """Until the run is over. Raises SnakesimError when it cannot go on."""
+        give_up = time.monotonic() + START_LIMIT_S
+        with self._progress:
+            try:
+                while self._supervisor.goes_on() and not self._ending.interrupted:
+                    self._take_in()
+                    self._see_to_faults()
+                    if self._ending.reason is not None and self._over_before_it_began():
+                        break
+                    self._arm_once()
+                    if not self._armed and self._may_arm and time.monotonic() > give_up:
+                        why = self._status.why if self._status else "no status"
+                        self._ending.because(f"not ready to arm within {START_LIMIT_S:.0f} s: {why}")
+                        break
+                    time.sleep(POLL_S)
+                if self._ending.reason is not None and self._armed and not self._ending.interrupted:
+                    self._let_it_settle()
+            finally:
+                self._faults.undo()
+                self._telemetry.take_in()
+
+    def _take_in(self) -> None:
+        """What arrived."""
+        if self._hosts != self._supervisor.hosts:
+            self._hosts = self._supervisor.hosts
+            self._may_arm = False
+            self._telemetry.expect_new_host()
+            self._progress.start_over()
+            self._asked_at = None
+        host = self._supervisor.host
+        if host is not None:
+            host.take_in()
+        self._status, self._robot = (None, None) if host is None else (host.status, host.description)
+        self._telemetry.take_in()
+        self._progress.show(self._status, self._telemetry.latest, armed=self._armed)
+
+    def _see_to_faults(self) -> None:
+        """Let go wrong what is to go wrong, and notice what did."""
+        status = self._status
+        if self._robot is not None and not self._armed:
+            refusal = self._faults.refusal(self._robot)
+            if refusal is not None:
+                raise RefusedError(refusal)
+        self._faults.carry_out(self._robot, status.lifecycle if status is not None else "disarmed")
+        if status is None:
+            return
+        if status.lifecycle in ("fault", "estop"):
+            self._may_arm = False
+        self._armed |= status.lifecycle == "armed"
+        if self._stay:
+            self._tell(status)
+        elif stopping := [fault for fault in status.faults if fault.reach == "robot"]:
+            self._ending.because(stopping[0].cause)
+
+    def _over_before_it_began(self) -> bool:
+        return not self._armed and not self._may_arm
+
+    def _tell(self, status: Status) -> None:
+        """Say once how a person gets on after a fault."""
+        latched = f"{status.lifecycle}: {status.why}" if status.lifecycle in ("fault", "estop") else None
+        if latched is not None and latched != self._told:
+            self._say(latched)
+            self._say(f"  go on with `snakesim clear`, then `snakesim arm {status.robot} {status.backend}`")
+        self._told = latched
+
+    def _arm_once(self) -> None:
+        status = self._status
+        if status is None:
+            return
+        if self._own_services.isdisjoint(status.waiting_for):
+            self._supervisor.came_up = True
+        if self._armed or not self._may_arm or not status.ready_to_arm or self._robot is None:
+            return
+        self._ask_to_arm(status, self._robot)
+
+    def _ask_to_arm(self, status: Status, robot: Description) -> None:
+        """Over the private channel: only the host that this run has started can be meant, and can answer."""
+        host = self._supervisor.host
+        assert host is not None
+        if self._asked_at is None:
+            host.ask(
+                LifecycleRequest(
+                    action="arm",
+                    who=WHO,
+                    host=robot.host,
+                    robot=status.robot,
+                    backend=status.backend,
+                    config_hash=robot.config_hash,
+                )
+            )
+            self._asked_at = time.monotonic()
+        elif host.answers:
+            answer, self._asked_at = host.answers.pop(0), None
+            if not answer.ok and answer.refusal != "not_ready":
+                raise RefusedError(answer.reason)
+            self._armed = answer.ok
+        elif time.monotonic() - self._asked_at > ARM_LIMIT_S:
+            raise NotConnectedError(f"the host does not answer within {ARM_LIMIT_S:.0f} s; see host.log")
+
+    def _let_it_settle(self) -> None:
+        """After a failure the host goes on for a moment: the safe stop belongs in the record, and in `status`."""
+        deadline = time.monotonic() + 2 * AFTER_FAULT_S
+        while self._supervisor.host_runs() and time.monotonic() < deadline and not self._ending.interrupted:
+            self._take_in()
+            time.sleep(POLL_S)

@@ -1,0 +1,85 @@
+"""The live line of a run: rewritten in place on a terminal, a line now and then elsewhere."""
+
+import sys
+import time
+from types import TracebackType
+from typing import Self
+
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.terminal import say, say_again
+from snakesim_hal.wire.messages import ControlState, Status
+
+TERMINAL_PERIOD_S = 0.1
+PLAIN_PERIOD_S = 5.0
+
+
+class Progress:
+    """Shows where a run is."""
+
+    def __init__(self, config: RunConfig) -> None:
+        self._duration_s = config.duration_s
+        self._rate_hz = config.rate_hz
+        self._terminal = sys.stdout.isatty()
+        self._next = 0.0
+        self._shown = 0
+        self._origin: tuple[float, float] | None = None  # wall and robot time at arming
+        self._armed_s = 0.0  # robot time so far in which the robot was armed: what a run's duration counts
+        self._before: Status | None = None
+        self._last = ""
+        self._armed = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._terminal and self._shown:
+            say("")
+
+    def start_over(self) -> None:
+        """Robot time begins at 0 again, with a new host."""
+        self._origin = self._before = None
+        self._armed_s = 0.0
+
+    def show(self, status: Status | None, control: ControlState | None, *, armed: bool) -> None:
+        """Update the line, if it is time to."""
+        now = time.monotonic()
+        if status is None:
+            return
+        self._count(status)
+        if now < self._next and armed == self._armed:
+            return
+        self._armed = armed
+        self._next = now + (TERMINAL_PERIOD_S if self._terminal else PLAIN_PERIOD_S)
+        text = self._running(status, control, now) if armed else f"starting: {status.why}"
+        if self._terminal:
+            self._shown = say_again(text, 118, self._shown)
+        elif text != self._last:
+            say(text)
+        self._last = text
+
+    def _count(self, status: Status) -> None:
+        before, self._before = self._before, status
+        if before is not None and before.lifecycle == "armed":
+            self._armed_s += max(status.tick - before.tick, 0) / self._rate_hz
+
+    def _running(self, status: Status, control: ControlState | None, now: float) -> str:
+        time_s = status.tick / self._rate_hz
+        if self._origin is None:
+            self._origin = (now, time_s)
+        passed_s, wall_s = time_s - self._origin[1], now - self._origin[0]
+        parts = [f"{min(self._armed_s, self._duration_s):6.2f} of {self._duration_s:g} s"]
+        if wall_s > 0.3:
+            parts.append(f"{passed_s / wall_s:.1f}x real time")
+        if status.lifecycle != "armed":
+            parts.append(f"{status.lifecycle}: {status.why}")
+        elif control is not None:
+            parts.append(control.state)
+            if control.propulsion_joint is not None:
+                parts.append(f"{control.propulsion_joint} at {control.propulsion_torque_nm or 0:+.1f} N·m")
+            if control.state == "NotLocomoting":
+                parts.append(control.reason)
+            if control.path_s_m is not None:
+                parts.append(f"tail at {control.path_s_m:.2f} m")
+        return "  ".join(parts)

@@ -1,0 +1,193 @@
+"""`snakesim run`: starts backend host and services, arms, shows progress, ends everything, writes what is left.
+
+Nothing is started before the whole configuration has been checked. Whatever happens afterwards (the run completes,
+somebody presses Ctrl-C, a part fails, this process is killed) no process stays behind.
+"""
+
+import contextlib
+import os
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import msgspec
+
+from snakesim_hal.errors import ConfigError, NotConnectedError, SnakesimError
+from snakesim_hal.model.fault_plan import check_planned, planned
+from snakesim_hal.model.files import Table
+from snakesim_hal.model.injection import ROUTER
+from snakesim_hal.model.plugins import BACKENDS, CONTROLLERS, SERVICES, find_installed, find_plugin, plugin_settings
+from snakesim_hal.model.scenario import RunConfig, written
+from snakesim_hal.model.whole_file import write_whole
+from snakesim_hal.network.local_registry import registered
+from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.serve import START_LIMIT_S
+from snakesim_hal.terminal import say
+from snakesim_operator.results.record import CONFIG
+from snakesim_operator.run.ending import Ending, interruptible
+from snakesim_operator.run.folder import claimed, named_after
+from snakesim_operator.run.meeting import local_robot, meeting_point, refuse_second_robot
+from snakesim_operator.run.monitor import AFTER_FAULT_S, Conductor
+from snakesim_operator.run.run_files import RunFiles
+from snakesim_operator.run.supervisor import HOST, Supervisor
+
+CONNECT_S = 0.5
+TELL_S = 20.0  # between two signs of life while nothing is heard
+
+
+@dataclass(frozen=True)
+class RunRequest:
+    """What the command line asks for."""
+
+    config: RunConfig
+    out: Path | None = None
+    endpoint: str | None = None
+    router: str | None = None
+    namespace: str | None = None
+    stay: bool = False  # a fault ends nothing: processes are started again, a person clears and arms
+    with_router: bool = False  # the run's parts meet at a router of its own
+
+    @property
+    def network_name(self) -> str:
+        """The robot's namespace."""
+        return self.namespace or self.config.robot.name
+
+
+def check_plugins(config: RunConfig, table: Table | None = None, *, run_files: bool = True) -> RunConfig:
+    """Everything that a run needs is installed and agrees with its settings. Raises ConfigError.
+
+    Returns the configuration, with a pace that the backend can keep: a scenario is written for any backend.
+    run_files: False runs no code of a `./file.py:Class`, so that its settings and its pace are not checked.
+    """
+    source = table.source if table is not None else f"scenario {config.name!r}"
+    origin = table.origin if table is not None else None
+    find = find_plugin if run_files else find_installed
+    backend, controller = find(BACKENDS, config.backend), find(CONTROLLERS, config.controller)
+    if controller is not None:
+        plugin_settings(controller, config.control_settings, source, config.control_section, origin)
+    for service in config.own_services:
+        find(SERVICES, service)
+    check_planned(config, table)
+    if backend is None:
+        return config
+    settings = plugin_settings(backend, config.backend_settings, source, config.backend_section, origin)
+    paces = backend.check(config, settings)
+    if config.pace in paces:
+        return config
+    asked_by = table.origin_of("pace") if table is not None else source
+    if asked_by.startswith("--"):
+        raise ConfigError(f"{asked_by}: backend {config.backend!r} cannot keep this pace, only {' or '.join(paces)}")
+    return msgspec.structs.replace(config, pace=paces[0])
+
+
+def run(request: RunRequest) -> int:
+    """Run it. Returns 0, 1 on a fault or an early end, 3 when the record lacks something, 130 when interrupted."""
+    request = replace(request, config=check_plugins(request.config))
+    _check_router(request)
+    refuse_second_robot(request.endpoint, request.router, request.network_name)
+    endpoint, stop_port = meeting_point(request.endpoint, request.router)
+    ending = Ending()
+    with contextlib.closing(stop_port), _files(request) as (files, config_file):
+        supervisor = Supervisor(files, ending, say, stop_port, stay=request.stay)
+        with (
+            interruptible(ending),
+            registered(local_robot(request.config, request.network_name, endpoint, stop_port)) as trouble,
+        ):
+            if trouble is not None:
+                say(trouble)
+            _conduct(request, supervisor, endpoint, files, config_file, ending)
+        from snakesim_operator.run.conclusion import conclude
+
+        return conclude(request.config, files, ending, supervisor, stay=request.stay)
+
+
+@contextlib.contextmanager
+def _files(request: RunRequest) -> Iterator[tuple[RunFiles, Path]]:
+    """The run's folder, held, and where its configuration is.
+
+    A folder that cannot be written to is no reason not to run: then nothing is kept.
+    """
+    out = request.out or named_after(request.config.name)
+    content = written(request.config)
+    with contextlib.ExitStack() as held:
+        try:
+            folder = held.enter_context(claimed(out, say))
+            write_whole(folder / CONFIG, content)
+        except OSError as error:
+            held.close()
+            say(f"warning: --out {out}: {error.strerror}; the run goes on, but nothing of it is recorded")
+            memory = os.memfd_create("snakesim-config")
+            held.callback(os.close, memory)
+            os.write(memory, content)
+            yield RunFiles(None, _warn), Path(f"/proc/{os.getpid()}/fd/{memory}")
+        else:
+            yield RunFiles(folder, _warn), folder / CONFIG
+
+
+def _warn(trouble: str) -> None:
+    say(f"warning: {trouble}; the run goes on, its record may lack something")
+
+
+def _check_router(request: RunRequest) -> None:
+    if request.with_router:
+        if request.router is not None:
+            raise ConfigError(
+                "--with-router starts a router of the run's own, --router joins another: give one of them"
+            )
+        return
+    wanted = [injection for injection in planned(request.config) if injection.target == ROUTER]
+    if wanted:
+        raise ConfigError(f"fault {str(wanted[0])!r}: this run has no router of its own; add --with-router")
+
+
+def _conduct(
+    request: RunRequest, supervisor: Supervisor, endpoint: str, files: RunFiles, config_file: Path, ending: Ending
+) -> None:
+    config, namespace = request.config, request.network_name
+    common = ["--config", str(config_file), "--endpoint", endpoint, "--namespace", namespace]
+    ticks = round(config.duration_s * config.rate_hz)
+    host_arguments = [
+        *("snakesim_hal.host_process", *common, "--max-ticks", str(ticks), "--memory", supervisor.memory),
+        *(["--out", str(files.folder)] if files.folder else []),
+        *(["--stay"] if request.stay else ["--end-after-fault", str(AFTER_FAULT_S)]),
+        *(["--router"] if request.router or request.with_router else []),
+    ]
+    try:
+        if request.with_router:
+            supervisor.start(ROUTER, ["snakesim_hal.router_process", *common])
+        supervisor.start(HOST, host_arguments)
+        for name, service in config.own_services.items():
+            supervisor.start(name, ["snakesim_hal.serve", name, *common], may_restart=service.restart)
+        with _joined(Link(endpoint, namespace), supervisor, ending) as session:
+            say(f"{config.name}: {config.robot.name} in {config.scene.name}, {config.commander}, {config.pace}")
+            say(f"network: {endpoint}, namespace {namespace}")
+            if not config.has_own_control:
+                say("whoever takes the lease commands the robot, and arms it")
+            Conductor(config, session, supervisor, files, ending, say, stay=request.stay).go()
+    except SnakesimError as error:
+        ending.because(str(error))
+    finally:
+        supervisor.end()
+
+
+@contextlib.contextmanager
+def _joined(link: Link, supervisor: Supervisor, ending: Ending) -> Iterator[Session]:
+    """A session on the run's network, as soon as there is one. Raises NotConnectedError when a part has ended."""
+    began = told = time.monotonic()
+    with contextlib.ExitStack() as stack:
+        while True:
+            try:
+                session = stack.enter_context(open_session(link, connect_timeout_s=CONNECT_S))
+                break
+            except NotConnectedError:
+                ended = supervisor.first_ended()
+                if ended is not None:
+                    raise NotConnectedError(ended) from None
+                now = time.monotonic()
+                if now > began + START_LIMIT_S or ending.interrupted:
+                    raise
+                if now > told + TELL_S:
+                    say(f"starting: the host has not opened its network yet, after {now - began:.0f} s")
+                    told = now
+        yield session

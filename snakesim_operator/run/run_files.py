@@ -1,0 +1,154 @@
+"""Writes what a run's supervisor leaves in the run's folder, in a thread of its own: a robot never waits for a disk.
+
+What cannot be written is kept in bounded memory and tried again; what is lost in the end is told.
+"""
+
+import contextlib
+import os
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from snakesim_hal.model.whole_file import write_whole
+
+MEMORY_BYTES = 8 * 2**20
+TOGETHER_BYTES = 2**16  # what is appended in one go, when it waited
+RETRY_S = 0.5
+LIMIT_S = 5.0  # for a disk that hangs
+
+
+@dataclass
+class _Task:
+    """Something to write; rename: `content` is the new name."""
+
+    kind: Literal["append", "put", "rename"]
+    name: str
+    content: bytes
+
+    def takes(self, other: "_Task") -> bool:
+        """Whether another can be done in one go with this one."""
+        alike = self.kind == other.kind == "append" and self.name == other.name
+        return alike and len(self.content) < TOGETHER_BYTES
+
+
+class RunFiles:
+    """The files of one run. Whatever is asked for is done soon, in that order; nothing here waits but `settle`."""
+
+    def __init__(self, folder: Path | None, warn: Callable[[str], None]) -> None:
+        """folder: None keeps nothing. warn: called once, from another thread, when something cannot be written."""
+        self.folder = folder
+        self._warn = warn
+        self._trouble = ""  # of the last attempt
+        self._warned = False
+        self._lost = ""  # why something is
+        self._tasks: deque[_Task] = deque()
+        self._waiting_bytes = 0
+        self._handles: dict[str, int] = {}
+        self._closing = False
+        self._changed = threading.Condition()
+        self._thread = threading.Thread(target=self._work, name="files", daemon=True)
+        self._thread.start()
+
+    def append(self, name: str, content: bytes) -> None:
+        """Append to a file. With too much waiting already, this is lost."""
+        self._ask(_Task("append", name, content))
+
+    def put(self, name: str, content: bytes) -> None:
+        """Write a whole file."""
+        self._ask(_Task("put", name, content))
+
+    def rename(self, name: str, to: str) -> None:
+        """Give a file that was appended to another name; what is appended after that begins a new one."""
+        self._ask(_Task("rename", name, to.encode()))
+
+    def settle(self) -> None:
+        """Wait until all that was asked for is written, or the disk is found to be full or to hang."""
+        with self._changed:
+            self._changed.wait_for(lambda: not self._tasks or self._trouble, LIMIT_S)
+
+    def close(self) -> str:
+        """Try everything that is left once more. Returns why something is lost, or nothing."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        self._thread.join(LIMIT_S)
+        if self._thread.is_alive():
+            return f"{self.folder}: the disk has not answered for {LIMIT_S:g} s"
+        return self._lost
+
+    def _ask(self, task: _Task) -> None:
+        with self._changed:
+            if self.folder is None:
+                return
+            if self._waiting_bytes + len(task.content) > MEMORY_BYTES:
+                self._lost = self._trouble or f"{self.folder}: the disk is too slow for what the run tells"
+                return
+            if len(self._tasks) > 1 and self._tasks[-1].takes(task):  # the first one may be at work
+                self._tasks[-1].content += task.content
+            else:
+                self._tasks.append(task)
+            self._waiting_bytes += len(task.content)
+            self._changed.notify_all()
+
+    def _work(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._tasks or self._closing)
+                if not self._tasks:
+                    break
+                task = self._tasks[0]
+            before = len(task.content)
+            self._trouble = self._attempt(task)
+            if self._trouble and not self._warned:
+                self._warned = True
+                self._warn(self._trouble)
+            with self._changed:
+                if not self._trouble or self._closing:
+                    self._tasks.popleft()
+                    self._waiting_bytes -= before
+                    self._lost = self._lost or self._trouble
+                else:
+                    self._waiting_bytes -= before - len(task.content)
+                    self._changed.notify_all()
+                    self._changed.wait_for(lambda: self._closing, RETRY_S)
+                self._changed.notify_all()
+        for handle in self._handles.values():
+            os.close(handle)
+
+    def _attempt(self, task: _Task) -> str:
+        """Do it; of an append, what is left stays in it. Returns why not, or nothing."""
+        assert self.folder is not None
+        try:
+            if task.kind == "append":
+                self._append(self.folder, task)
+            elif task.kind == "put":
+                write_whole(self.folder / task.name, task.content)
+            else:
+                self._rename(self.folder, task.name, task.content.decode())
+        except OSError as error:
+            return f"{self.folder}: {error.strerror}"
+        return ""
+
+    def _append(self, folder: Path, task: _Task) -> None:
+        path = folder / task.name
+        if task.name not in self._handles:
+            flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC
+            self._handles[task.name] = os.open(path, flags, 0o644)
+        handle = self._handles[task.name]
+        try:
+            while task.content:
+                task.content = task.content[os.write(handle, task.content) :]
+        except OSError:
+            if os.fstat(handle).st_size == 0:
+                os.close(self._handles.pop(task.name))
+                with contextlib.suppress(OSError):
+                    path.unlink()
+            raise
+
+    def _rename(self, folder: Path, name: str, to: str) -> None:
+        if name in self._handles:
+            os.close(self._handles.pop(name))
+            (folder / name).rename(folder / to)

@@ -1,0 +1,206 @@
+"""The processes of a run: started in order, started again with back-off where that is allowed, and never left behind.
+
+Nothing here arms anything: a host that is started again boots disarmed, and a person arms it.
+"""
+
+import contextlib
+import os
+import socket
+import subprocess
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+
+import msgspec
+
+from snakesim_hal.host_process import HostRecord
+from snakesim_hal.network.private_channel import StarterEnd, socket_pair
+from snakesim_hal.network.run_key import RUN_KEY, new_run_key
+from snakesim_hal.wire.codec import UNDECODABLE
+from snakesim_hal.wire.messages import Description
+from snakesim_operator.results.summary import Restart
+from snakesim_operator.run import children
+from snakesim_operator.run.children import Child
+from snakesim_operator.run.ending import Ending
+from snakesim_operator.run.run_files import RunFiles
+
+HOST = "host"
+FIRST_DELAY_S, LAST_DELAY_S = 0.5, 10.0
+HEALTHY_S = 30.0  # after which the next restart is the first one again
+
+
+@dataclass
+class Part:
+    """One process of a run, through all its restarts."""
+
+    name: str
+    arguments: Sequence[str]
+    may_restart: bool
+    child: Child
+    started_s: float = field(default_factory=time.monotonic)
+    delay_s: float = FIRST_DELAY_S
+    again_s: float | None = None  # when it is started again; None while it runs
+
+    def ended(self) -> str | None:
+        """How it ended, once for each time it ends."""
+        return self.child.how_it_ended() if self.again_s is None else None
+
+    def put_off(self) -> float:
+        """Decide when it is started again; returns after how long."""
+        now = time.monotonic()
+        if now - self.started_s > HEALTHY_S:
+            self.delay_s = FIRST_DELAY_S
+        delay_s, self.again_s = self.delay_s, now + self.delay_s
+        self.delay_s = min(2 * delay_s, LAST_DELAY_S)
+        return delay_s
+
+    def is_due(self) -> bool:
+        """Whether it is time to start it again."""
+        return self.again_s is not None and time.monotonic() >= self.again_s
+
+
+class Supervisor:
+    """Watches over all processes of a run."""
+
+    def __init__(
+        self,
+        files: RunFiles,
+        ending: Ending,
+        say: Callable[[str], None],
+        stop_port: socket.socket,
+        *,
+        stay: bool = False,
+    ) -> None:
+        """stop_port: for every host of the run, one after the other; what comes while there is none waits in it.
+
+        stay: processes that end are started again, once the run has come up.
+        """
+        self.restarts: list[Restart] = []
+        self.came_up = False  # until then a process that ends has a reason that a restart would not mend
+        self._files = files
+        self._memory = os.memfd_create("snakesim-host")
+        self._ending = ending
+        self._say = say
+        self._stay = stay
+        self._stop_port = stop_port
+        self._secret = {RUN_KEY: new_run_key()}
+        self._parts: dict[str, Part] = {}
+        self.host: StarterEnd | None = None  # the private channel to the host that was started last
+        self._begun_s = time.monotonic()
+
+    def start(self, name: str, arguments: Sequence[str], *, may_restart: bool = True) -> None:
+        """Start a Python module as a part of the run."""
+        self._parts[name] = Part(name, arguments, may_restart, self._launch(name, arguments))
+
+    def _launch(self, name: str, arguments: Sequence[str]) -> Child:
+        keep = partial(self._files.append, f"{name}.log")
+        if name != HOST:
+            return children.start(name, arguments, keep, more=self._secret)
+        ours, its = socket_pair()
+        with its:
+            private = ["--channel", str(its.fileno()), "--stop-port", str(self._stop_port.fileno())]
+            inherits = (its.fileno(), self._stop_port.fileno())
+            child = children.start(name, [*arguments, *private], keep, inherits=inherits, more=self._secret)
+        if self.host is not None:
+            self.host.close()
+        self.host = StarterEnd(ours)
+        return child
+
+    @property
+    def memory(self) -> str:
+        """Path of a file without a disk, where the host keeps its numbers for this process."""
+        return f"/proc/{os.getpid()}/fd/{self._memory}"
+
+    def host_record(self) -> HostRecord | None:
+        """The host's own numbers, half a second old while it runs; None while nothing is known."""
+        with contextlib.suppress(OSError, *UNDECODABLE):
+            return msgspec.json.decode(os.pread(self._memory, 2**20, 0), type=HostRecord)
+        return None
+
+    def robot(self) -> Description | None:
+        """What the host said that it is; None while nothing is known."""
+        return self.host.description if self.host is not None else None
+
+    @property
+    def names(self) -> list[str]:
+        """Every process of the run."""
+        return list(self._parts)
+
+    @property
+    def hosts(self) -> int:
+        """How many HAL hosts the run has had."""
+        return 1 + sum(restart.name == HOST for restart in self.restarts)
+
+    def signal(self, name: str, number: int) -> None:
+        """Send a signal to a process of the run; one that has ended gets none."""
+        self._parts[name].child.process.send_signal(number)
+
+    def host_runs(self) -> bool:
+        """Whether there is a host now."""
+        return self._parts[HOST].child.process.poll() is None
+
+    def first_ended(self) -> str | None:
+        """How the first of the processes that are gone ended; None while all run."""
+        return next((how for part in self._parts.values() if (how := part.child.how_it_ended()) is not None), None)
+
+    def goes_on(self) -> bool:
+        """Start again what has ended and may; False when the run is over, for a good reason or a bad one."""
+        for part in self._parts.values():
+            how = part.ended()
+            if how is None:
+                if part.is_due():
+                    part.child = self._launch(part.name, part.arguments)
+                    part.again_s, part.started_s = None, time.monotonic()
+            elif part.name == HOST and self._host_is_done():
+                return False
+            elif self._stay and self.came_up and part.may_restart:
+                self._put_off(part, how)
+            else:
+                self._ending.because(how, first=True)
+                return False
+        return True
+
+    def _put_off(self, part: Part, how: str) -> None:
+        delay_s = part.put_off()
+        if part.name == HOST and self.host is not None:
+            self.host.close()
+            self.host = None
+        at_s = time.monotonic() - self._begun_s
+        self.restarts.append(Restart(name=part.name, how=how, at_s=round(at_s, 3), after_s=delay_s))
+        self._say(f"{how}; it is started again in {delay_s:g} s")
+
+    def _host_is_done(self) -> bool:
+        """Whether a host that ended has left its record, and nothing more is to be done."""
+        record = self.host_record()
+        if record is None or self._parts[HOST].child.process.returncode not in (0, 1):
+            return False
+        return not self._stay or record.ended in ("complete", "finished")
+
+    def end(self) -> None:
+        """End everything, the host first and in order, so that its record is written. Nothing is left after this."""
+        running = [part.child for part in self._parts.values()]
+        host = self._parts.get(HOST)
+        if host is not None and host.again_s is None:
+            children.ask_to_end(host.child)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                host.child.process.wait(children.STOP_LIMIT_S)
+            how = host.child.how_it_ended()
+            if how is not None and host.child.process.returncode not in (0, 1):
+                self._ending.because(how)
+        for part in self._parts.values():
+            how = part.ended()
+            if part.name != HOST and how is not None:
+                self._ending.because(how, first=True)  # whatever fault the host has noted since
+        children.stop_all(running)
+        self._print_last_words()
+
+    def _print_last_words(self) -> None:
+        if self._ending.reason is None or self._ending.interrupted:
+            return
+        for part in self._parts.values():
+            words = part.child.last_words()
+            if words:
+                self._say(f"--- {part.name} said:")
+                for line in words:
+                    self._say(line)

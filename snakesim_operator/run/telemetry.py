@@ -1,0 +1,54 @@
+"""What control and guidance tell during a run, written as it comes."""
+
+from pathlib import PurePath
+
+import msgspec
+
+from snakesim_hal.network.session import Session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import ControlState, Message, World
+from snakesim_operator.results.record import TELEMETRY
+from snakesim_operator.run.run_files import RunFiles
+
+DEPTH = 8192
+WORLDS_PER_S = 20.0  # as often as control tells its state
+
+
+class Telemetry:
+    """Writes control states and worlds, decoded once."""
+
+    def __init__(self, session: Session, files: RunFiles) -> None:
+        self.latest: ControlState | None = None
+        self._control = session.reader(keys.CONTROL_STATE, ControlState, depth=DEPTH)
+        self._world = session.reader(keys.WORLD, World, depth=DEPTH)
+        self._files = files
+        self._next_world_ns = 0
+        self._hosts = 0
+        self._new_host = False
+
+    def expect_new_host(self) -> None:
+        """The host has ended; what control says of the old one's time still belongs to it."""
+        self._new_host = True
+
+    def _start_over(self) -> None:
+        """Time begins at 0 again, with a new host: what was told under the old one goes to a file of its own."""
+        self._new_host = False
+        self._hosts += 1
+        path = PurePath(TELEMETRY)
+        self._files.rename(TELEMETRY, path.with_stem(f"{path.stem}-{self._hosts}").name)
+        self._next_world_ns = 0
+
+    def take_in(self) -> None:
+        """Write what arrived."""
+        for state in self._control.drain():
+            if self._new_host and (self.latest is None or state.stamp_ns < self.latest.stamp_ns):
+                self._start_over()
+            self.latest = state
+            self._write(keys.CONTROL_STATE, state)
+        for world in self._world.drain():
+            if world.stamp_ns >= self._next_world_ns:
+                self._next_world_ns = world.stamp_ns + round(1e9 / WORLDS_PER_S)
+                self._write(keys.WORLD, world)
+
+    def _write(self, key: str, message: Message) -> None:
+        self._files.append(TELEMETRY, msgspec.json.encode({"key": key, "message": message}) + b"\n")

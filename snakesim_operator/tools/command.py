@@ -1,0 +1,140 @@
+"""What a person tells a robot: `snakesim arm`, `disarm`, `clear`.
+
+Names are no identity: anybody on the network can answer in a robot's name. So everybody is asked, two answers are one
+too many, and an answer counts once the robot's host shows the new state itself.
+"""
+
+import getpass
+import time
+from collections.abc import Sequence
+
+from snakesim_hal.errors import NotConnectedError, RefusedError
+from snakesim_hal.host.latch import forget_stop, stops_kept
+from snakesim_hal.network.session import Link, Reader, Session, open_session
+from snakesim_hal.terminal import Say, say
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Answer, Description, LifecycleRequest, Status
+from snakesim_operator.tools.targets import CONNECT_S, Where, the_one
+
+ANSWER_S = 5.0
+DESCRIPTION_S = 3.0
+SHOWN_S = 1.5  # until the host's status must show what its answer says
+
+
+def arm(robot: str, backend: str, where: Where, say: Say = say) -> int:
+    """Arm a robot, when it is the one that is meant. Raises RefusedError with the reason."""
+    link = the_one(where, f"arm {robot} {backend}")
+    with open_session(link, CONNECT_S) as session:
+        description = _description(session, link)
+        wrong = [
+            f"{what} here is {there!r}, not {named!r}"
+            for what, there, named in (
+                ("the robot", description.robot, robot),
+                ("the backend", description.backend, backend),
+            )
+            if there != named
+        ]
+        if wrong:
+            raise RefusedError(
+                f"not armed: {'; '.join(wrong)}. Armed is only what is named: "
+                f"`snakesim arm {description.robot} {description.backend}`"
+            )
+        request = LifecycleRequest(
+            action="arm",
+            who=who(),
+            host=description.host,
+            robot=robot,
+            backend=backend,
+            config_hash=description.config_hash,
+        )
+        return _ask(session, request, "armed", link, say)
+
+
+def disarm(where: Where, say: Say = say) -> int:
+    """Let the joints go passive; also what is streamed then does not move them."""
+    link = the_one(where, "disarm")
+    with open_session(link, CONNECT_S) as session:
+        return _ask(session, LifecycleRequest(action="disarm", who=who()), "disarmed", link, say)
+
+
+def clear(where: Where, say: Say = say) -> int:
+    """Forget a fault or an emergency stop. The robot is disarmed then.
+
+    Where no robot runs, an emergency stop that the last run left is forgotten.
+    """
+    try:
+        link = the_one(where, "clear")
+    except NotConnectedError:
+        kept = [path for path in stops_kept() if where.namespace in (None, path.parent.name)]
+        if not kept or where.endpoint is not None:
+            raise
+        for path in kept:
+            say(f"{path.parent.name}: {forget_stop(path)}; cleared by {who()}. No robot of that name runs here")
+        return 0
+    with open_session(link, CONNECT_S) as session:
+        return _ask(session, LifecycleRequest(action="clear", who=who()), "cleared", link, say)
+
+
+def who() -> str:
+    """Who types this."""
+    try:
+        return getpass.getuser()[:64]
+    except (KeyError, OSError):
+        return "operator"
+
+
+def _ask(session: Session, request: LifecycleRequest, done: str, link: Link, say: Say) -> int:
+    statuses = session.latched_reader(keys.STATUS, Status)
+    answers = [answer for _, answer in session.ask_all(keys.LIFECYCLE, request, ANSWER_S)]
+    doubt, shown = judge(answers, statuses)
+    name = link.namespace
+    if not answers:
+        raise NotConnectedError(f"{name}: NO ANSWER on {link.endpoint}; if the robot moves, `snakesim estop`")
+    if doubt is not None:
+        now = "unknown" if shown is None else f"{shown.lifecycle} - {shown.why}"
+        raise RefusedError(f"{name}: NOT CONFIRMED that it is {done}: {doubt}. Its status: {now}")
+    if not answers[0].ok:
+        raise RefusedError(f"{name}: not {done}: {answers[0].reason}")
+    say(f"{name}: {done}: {answers[0].reason}")
+    return 0
+
+
+def judge(answers: Sequence[Answer], statuses: Reader[Status]) -> tuple[str | None, Status | None]:
+    """Whether answers can be believed: (why not, the newest status). None: one host answered, and shows it."""
+    if len(answers) > 1:
+        return f"{len(answers)} answered in its name; at least one is an impostor", _newest(statuses, None)
+    wanted = answers[0].lifecycle if answers else None
+    shown = _newest(statuses, wanted)
+    hosts = {status.host for status in (shown,) if status is not None} | {answer.host for answer in answers}
+    if len(hosts) > 1:
+        return "who answered is not who publishes its status; one of them is an impostor", shown
+    if shown is None or shown.lifecycle != wanted:
+        return "its status does not show it; the host may hang, and who answered be an impostor", shown
+    return None, shown
+
+
+def _newest(statuses: Reader[Status], lifecycle: str | None) -> Status | None:
+    """The newest status, once it shows a state, or when it does not in time."""
+    shown: Status | None = None
+    deadline = time.monotonic() + SHOWN_S
+    while time.monotonic() < deadline:
+        shown = (statuses.drain() or [shown])[-1]
+        if shown is not None and lifecycle in (None, shown.lifecycle):
+            break
+        time.sleep(0.01)
+    return shown
+
+
+def _description(session: Session, link: Link) -> Description:
+    """What the robot's host shows. Raises RefusedError when two hosts show something."""
+    reader = session.latched_reader(keys.DESCRIPTION, Description)
+    deadline = time.monotonic() + DESCRIPTION_S
+    found: list[Description] = []
+    while not found and time.monotonic() < deadline:
+        time.sleep(0.05)
+        found = reader.drain()
+    if not found:
+        raise NotConnectedError(f"{link.namespace} shows no description on {link.endpoint}; is its HAL host running?")
+    if len({description.host for description in found}) > 1:
+        raise RefusedError(f"{link.namespace}: {len(found)} hosts describe it; at least one is an impostor. Not armed")
+    return found[-1]

@@ -1,0 +1,166 @@
+"""`snakesim echo`: what is published on a key, as one JSON object a line, or how often."""
+
+import contextlib
+import itertools
+import json
+import statistics
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from queue import Empty
+from typing import Any
+
+import msgspec
+
+from snakesim_hal.errors import ConfigError, NotConnectedError, WireError
+from snakesim_hal.network.mailbox import Mailbox
+from snakesim_hal.network.session import Arrival, Link, Session, intersects, key_expression, open_session
+from snakesim_hal.terminal import Say, complain, say
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import Decoder
+from snakesim_operator.tools.targets import CONNECT_S, Where
+
+RATE_PERIOD_S = 1.0
+MOST_WAITING_BYTES = 64 * 1024 * 1024  # while the terminal, or who reads the pipe, is slower than the network
+
+
+@dataclass(frozen=True)
+class EchoRequest:
+    """What the command line asks for. key: relative to the robot, wildcards allowed; None: which keys there are."""
+
+    key: str | None
+    rate_only: bool = False
+    count: int | None = None
+
+
+def echo(request: EchoRequest, where: Where, say: Say = say) -> int:
+    """Print what arrives on a key, from every robot that is meant. Raises NotConnectedError, ConfigError."""
+    if request.key is None:
+        for line in _key_lines():
+            say(line)
+        return 0
+    relative = key_expression(request.key.strip("/"))
+    rows = [row for row in _echoed() if intersects(relative, row.key)]
+    if not rows:
+        raise ConfigError(f"there is no key {request.key!r}; what can be echoed:", *_key_lines())
+    latched = tuple(row.key for row in rows if row.kind == "latched")
+    within = "" if where.namespace is not None else "**/"
+    waiting = Waiting()
+    with contextlib.ExitStack() as stack:
+        for session in _sessions(where, stack):
+            # A latched value is older than what streams beside it: a subscriber to both would drop it as too old.
+            for key in latched:
+                session.on_latched_arrival(f"{within}{key}", waiting.put)
+            if len(latched) < len(rows):
+                session.on_arrival(key_expression(f"{within}{relative}"), waiting.unless_at(latched))
+        if request.rate_only:
+            _print_rates(waiting, request.count, say)
+        else:
+            _print_messages(waiting, request.count, say)
+    return 0
+
+
+def _sessions(where: Where, stack: contextlib.ExitStack) -> list[Session]:
+    """One on every network that answers."""
+    found: list[Session] = []
+    for endpoint in where.endpoints():
+        with contextlib.suppress(NotConnectedError):
+            found.append(stack.enter_context(open_session(Link(endpoint, where.namespace), CONNECT_S)))
+    if not found:
+        raise NotConnectedError(
+            f"nobody listens on {', '.join(where.endpoints())}; start a run or a router there first"
+        )
+    return found
+
+
+def _echoed() -> list[keys.Row]:
+    return [row for row in keys.SPACE if row.kind in ("stream", "latched")]
+
+
+def _key_lines() -> list[str]:
+    return [f"  {row.key:<24}{row.about}" for row in _echoed()]
+
+
+class Waiting:
+    """Samples on their way to the terminal; when it is too slow, the newest are dropped, and that is said."""
+
+    def __init__(self) -> None:
+        self._arrivals: Mailbox[Arrival] = Mailbox()
+        self._lock = threading.Lock()
+        self._bytes = 0
+        self._dropped = 0
+
+    def put(self, arrival: Arrival) -> None:
+        """Add one; in Zenoh's threads."""
+        with self._lock:
+            if self._bytes + len(arrival.payload) > MOST_WAITING_BYTES:
+                self._dropped += 1
+                return
+            self._bytes += len(arrival.payload)
+        self._arrivals.put(arrival)
+
+    def unless_at(self, keys: tuple[str, ...]) -> Callable[[Arrival], None]:
+        """Adds what is not at one of these keys of a robot."""
+
+        def put(arrival: Arrival) -> None:
+            if not f"/{arrival.key}".endswith(suffixes):
+                self.put(arrival)
+
+        suffixes = tuple(f"/{key}" for key in keys)
+        return put
+
+    def get(self, timeout: float | None = None) -> Arrival:
+        """The oldest one. Raises queue.Empty."""
+        if self._dropped and self._arrivals.empty():
+            complain(f"{self._dropped} messages were left out: they came faster than they could be printed")
+            self._dropped = 0
+        arrival = self._arrivals.get(timeout)
+        with self._lock:
+            self._bytes -= len(arrival.payload)
+        return arrival
+
+
+def _print_messages(waiting: Waiting, count: int | None, say: Say) -> None:
+    for _ in itertools.count() if count is None else range(count):
+        arrival = waiting.get()
+        told = {"key": arrival.key, **_content(arrival)}
+        say(json.dumps(told, ensure_ascii=False, separators=(",", ":")))
+
+
+def _content(arrival: Arrival) -> dict[str, Any]:
+    message = keys.message_at(arrival.key)
+    if message is None and (split := keys.split_namespace(arrival.key)) is not None:
+        message = keys.message_at(split[1])
+    if message is None:
+        return {"error": "no message is known on this key"}
+    try:
+        return {"message": msgspec.to_builtins(_decoder(message).decode(arrival.payload, arrival.encoding))}
+    except WireError as error:
+        return {"error": str(error)}
+
+
+_decoder = cache(Decoder)
+
+
+def _print_rates(waiting: Waiting, count: int | None, say: Say) -> None:
+    for _ in itertools.count() if count is None else range(count):
+        stamps: dict[str, list[int]] = {}
+        until = time.monotonic() + RATE_PERIOD_S
+        while (left := until - time.monotonic()) > 0:
+            try:
+                arrival = waiting.get(timeout=left)
+            except Empty:
+                break
+            stamps.setdefault(arrival.key, []).append(arrival.monotonic_ns)
+        for key, times in sorted(stamps.items()):
+            gaps_ms = [(b - a) / 1e6 for a, b in itertools.pairwise(times)]
+            if gaps_ms:
+                spread = statistics.pstdev(gaps_ms)
+                say(
+                    f"{key}: {1000 / statistics.fmean(gaps_ms):.1f} Hz  gap {min(gaps_ms):.2f} to {max(gaps_ms):.2f} ms"
+                    f"  deviation {spread:.2f} ms  over {len(times)}"
+                )
+        if not stamps:
+            say("nothing arrives")

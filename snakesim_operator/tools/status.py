@@ -1,0 +1,129 @@
+"""Looking at running robots from another terminal, `snakesim status`; and `snakesim router`."""
+
+import contextlib
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+from queue import Empty
+
+from snakesim_hal.errors import NotConnectedError, WireError
+from snakesim_hal.model.files import ROUTER
+from snakesim_hal.network.mailbox import Mailbox
+from snakesim_hal.network.session import DEFAULT_ENDPOINT, Arrival, Link, open_session
+from snakesim_hal.terminal import Say, say
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import Decoder
+from snakesim_hal.wire.messages import Status
+from snakesim_operator.results import last_run as lastrun
+from snakesim_operator.tools.targets import Where, namespace_of
+
+STATUS_WAIT_S = 1.0
+CONNECT_S = 1.0
+
+
+def show_status(where: Where, say: Say = say) -> int:
+    """Print the state of every robot that can be reached. Returns 0 when all are well, 1 otherwise."""
+    found: list[tuple[Link, list[Status]]] = []
+    for endpoint in where.endpoints():
+        link = Link(endpoint, where.namespace)
+        with contextlib.suppress(NotConnectedError):
+            found += _statuses(link)
+    silent = [
+        robot
+        for robot in where.local()
+        if not any(link.endpoint == robot.endpoint and link.namespace == robot.namespace for link, _ in found)
+    ]
+    for robot in silent:
+        say(f"{robot.namespace}: NO ANSWER on {robot.endpoint}; its run is process {robot.pid}")
+    if not found and not silent:
+        noted = lastrun.recall()
+        last = f"; the last run on this computer ended so: {noted[1]} ({noted[0]})" if noted is not None else ""
+        say(f"no robot answers on {', '.join(where.endpoints())}{last}")
+        return 1
+    for link, statuses in found:
+        for line in _in_words(link, statuses[-1]):
+            say(line)
+        if len({status.host for status in statuses}) > 1:
+            say("  IMPOSTOR: more than one host shows a status under this name; believe none of them")
+        for line in _what_to_type(link, statuses[-1]):
+            say(line)
+    well = all(statuses[-1].lifecycle in ("armed", "disarmed") for _, statuses in found)
+    return 0 if well and not silent else 1
+
+
+def _statuses(link: Link) -> list[tuple[Link, list[Status]]]:
+    """The newest status of each host of each robot on a network."""
+    arrivals: Mailbox[Arrival] = Mailbox()
+    decoder = Decoder(Status)
+    found: dict[str, dict[str | None, Status]] = {}
+    with open_session(link, CONNECT_S) as session:
+        key = keys.STATUS if link.namespace is not None else f"**/{keys.STATUS}"
+        session.on_latched_arrival(key, arrivals.put)
+        until = time.monotonic() + STATUS_WAIT_S
+        while (left := until - time.monotonic()) > 0:
+            try:
+                arrival = arrivals.get(timeout=left)
+                status = decoder.decode(arrival.payload, arrival.encoding)
+            except Empty:
+                break
+            except WireError:
+                continue
+            name = link.namespace or namespace_of(arrival.key)
+            found.setdefault(name, {})[status.host] = status
+    return [(replace(link, namespace=name), list(of_host.values())) for name, of_host in sorted(found.items())]
+
+
+def _in_words(link: Link, status: Status) -> list[str]:
+    def counts(numbers: dict[str, int]) -> str:
+        return ", ".join(f"{word} {number}" for word, number in sorted(numbers.items())) or "none"
+
+    lines = [
+        f"{link.namespace}: {status.lifecycle} - {status.why}",
+        f"  robot {status.robot}, backend {status.backend}, {status.pace} at {status.rate_hz:g} Hz, tick {status.tick}"
+        f", on {link.endpoint}",
+        f"  lease: {status.lease_holder or 'free'} (epoch {status.lease_epoch})",
+        f"  alive: {', '.join(status.alive) or 'nobody'}",
+        f"  commands: {status.commands_accepted} accepted, {status.commands_standby} in standby, rejected: "
+        f"{counts(status.commands_rejected)}; joint targets limited: {counts(status.commands_limited)}",
+    ]
+    for joint, share in sorted(status.derated.items()):
+        lines.append(f"  derated: {joint} has {100 * share:.0f} % of its torque left")
+    if status.isolated:
+        lines.append(f"  isolated: {', '.join(status.isolated)}; passive until a clear")
+    for what in status.hygiene:
+        lines.append(f"  real time: {what}")
+    for what in status.injected:
+        lines.append(f"  fault on request: {what}")
+    if status.waiting_for:
+        lines.append(f"  waiting for: {', '.join(status.waiting_for)}")
+    for fault in status.faults:
+        where = f" at {fault.joint}" if fault.joint else ""
+        lines.append(f"  fault {fault.what}{where} at tick {fault.tick}: {fault.cause}")
+    if status.faults_left_out:
+        lines.append(f"  and {status.faults_left_out} more faults, between the first and the newest of these")
+    return lines
+
+
+def _what_to_type(link: Link, status: Status) -> list[str]:
+    """What a person does next; nothing while the robot moves, or cannot be armed yet."""
+    where = f" --endpoint {link.endpoint}" if link.endpoint != DEFAULT_ENDPOINT else ""
+    where += f" --namespace {link.namespace}" if link.namespace != status.robot else ""
+    arm = f"`snakesim arm {status.robot} {status.backend}{where}`"
+    if status.lifecycle in ("fault", "estop"):
+        return [f"  next: `snakesim clear{where}`, then {arm}"]
+    if status.isolated and status.lifecycle == "disarmed":
+        back = f"`snakesim clear{where}`, to take back {', '.join(status.isolated)}"
+        return [f"  next: {back}", *([f"  or, without: {arm}"] if status.ready_to_arm else [])]
+    return [f"  next: {arm}"] if status.ready_to_arm else []
+
+
+def run_router(config: Path | None) -> int:
+    """Run a router until Ctrl-C."""
+    from snakesim_hal.network.session import open_router
+
+    path = config or ROUTER
+    with open_router(path):
+        say(f"router running from {path}; Ctrl-C ends it")
+        threading.Event().wait()
+    return 0

@@ -1,0 +1,206 @@
+"""The black box: keeps every tick, and its digest stands for what the motors were told."""
+
+import threading
+import tracemalloc
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from snakesim_hal.backend import Samples, SetPoints
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.host.black_box import BlackBox, digest_of, read_black_box
+from snakesim_hal.safety.authority import Decision
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Contact, Contacts, Mode, Pose
+from tests.unit.hal.rig import description, state
+
+ROBOT = description()
+STILL = (0.0, 0.0, 0.0)
+
+
+def decision(target: float = 0.1, mode: Mode = Mode.POSITION, torque_limit: float = 4.0) -> Decision:
+    return Decision(SetPoints([mode] * 3, [target] * 3, [torque_limit] * 3), 1, {})
+
+
+def digest(*rows: tuple[int, Decision], angle: float = 0.0) -> str:
+    box = BlackBox(ROBOT)
+    for tick, told in rows:
+        box.record(tick, tick * 10_000_000, Samples(state(ROBOT, angle)), told)
+    return box.command_digest
+
+
+def all_rows(box: BlackBox) -> dict[str, Any]:
+    """Everything that the box holds, as columns."""
+    rows = bytearray()
+    row, taken = box.rows_from(0)
+    while taken:
+        rows += taken
+        row, taken = box.rows_from(row + len(taken) // box.layout.row_bytes)
+    return box.layout.arrays(bytes(rows))
+
+
+def contact(obstacle: str | None, force: tuple[float, float, float]) -> Contact:
+    return Contact(
+        link=1, obstacle=obstacle, position_l=STILL, normal_l=STILL, tangent_1_l=STILL, tangent_2_l=STILL,
+        force_l=force, torque_l=STILL,
+    )  # fmt: skip
+
+
+def test_columns_hold_what_was_recorded_however_long_the_run() -> None:
+    box = BlackBox(ROBOT)
+    count = 9000  # several times what is taken at once
+    for tick in range(count):
+        others: dict[str, Any] = {}
+        if tick == 2:
+            others[keys.POSE] = Pose(
+                tick=tick, stamp_ns=0, position_w=(1.0, 2.0, 3.0), orientation_wxyz=(1.0, 0.0, 0.0, 0.0),
+                velocity_w=STILL, angular_velocity_w=STILL,
+            )  # fmt: skip
+        if tick in (3, 6):
+            touches = [contact("a", (3.0, 4.0, 0.0)), contact("a", STILL), contact("b", STILL)] if tick == 3 else []
+            others[keys.CONTACTS] = Contacts(tick=tick, stamp_ns=0, contacts=touches)
+        joints = state(ROBOT, [0.1, 0.2, 0.001 * tick], 2.0, [3.0, 4.0, 5.0])
+        box.record(tick, tick * 10_000_000, Samples(joints, others), decision(tick * 1e-4, Mode.TORQUE))
+    columns = all_rows(box)
+    assert digest_of(columns) == box.command_digest
+    assert box.ticks == count and all(len(column) == count for column in columns.values())
+    assert columns["time_s"] == pytest.approx(0.01 * np.arange(count))
+    assert columns["angle_rad"][-1].tolist() == pytest.approx([0.1, 0.2, 0.001 * (count - 1)])
+    assert columns["velocity_rad_s"][7].tolist() == [2.0] * 3 and columns["torque_nm"][7].tolist() == [3.0, 4.0, 5.0]
+    assert columns["target"][4321] == pytest.approx([0.4321] * 3)
+    assert columns["torque_limit_nm"][0].tolist() == [4.0] * 3 and set(columns["mode"].flat) == {3}
+    assert np.isnan(columns["position_w"][:2]).all()  # unknown until the first pose
+    assert columns["position_w"][2:].tolist() == [[1.0, 2.0, 3.0]] * (count - 2)
+    assert columns["orientation_wxyz"][5].tolist() == [1.0, 0.0, 0.0, 0.0]
+    assert columns["contact_peak_n"][:8].tolist() == [0, 0, 0, 5, 5, 5, 0, 0]
+    assert columns["contact_count"][:8].tolist() == [0, 0, 0, 2, 2, 2, 0, 0]
+
+
+def test_the_digest_stands_for_tick_mode_target_and_torque_limit_and_nothing_else() -> None:
+    same = digest((0, decision()), (1, decision()))
+    assert digest((0, decision()), (1, decision()), angle=0.5) == same
+    others = [
+        digest((0, decision())),
+        digest((0, decision()), (2, decision())),
+        digest((0, decision()), (1, decision(0.1 + 1e-15))),
+        digest((0, decision()), (1, decision(mode=Mode.VELOCITY))),
+        digest((0, decision()), (1, decision(torque_limit=3.9))),
+        digest((1, decision()), (0, decision())),
+    ]
+    assert len({same, *others}) == 7
+
+
+def on_disk(box: BlackBox, path: Path, torn: int = 0) -> Path:
+    content = box.layout.header() + box.rows_from(0)[1]
+    path.write_bytes(content[: len(content) - torn])
+    return path
+
+
+@pytest.mark.parametrize("torn", [0, 1, 100])
+def test_a_box_on_disk_reads_back_without_its_torn_row(tmp_path: Path, torn: int) -> None:
+    box = BlackBox(ROBOT)
+    for tick in range(5):
+        box.record(tick, tick * 10_000_000, Samples(state(ROBOT, 0.3 * tick)), decision())
+    layout, columns = read_black_box(on_disk(box, tmp_path / "box", torn))
+    assert (layout.robot, layout.joints) == ("worm", ["joint_1", "joint_2", "joint_3"])
+    whole = all_rows(box)
+    assert set(columns) == set(whole) and columns["tick"].tolist() == list(range(5 - bool(torn)))
+    for name, column in columns.items():
+        assert np.array_equal(column, whole[name][: len(column)], equal_nan=True), name
+    assert (digest_of(columns) == box.command_digest) == (not torn)
+
+
+@pytest.mark.parametrize("joints", [1, 2, 13])
+def test_a_column_has_one_number_for_each_joint(tmp_path: Path, joints: int) -> None:
+    robot = description(chain__modules=joints)
+    box = BlackBox(robot)
+    told = Decision(SetPoints([Mode.TORQUE] * joints, [0.1] * joints, [4.0] * joints), 1, {})
+    box.record(7, 0, Samples(state(robot, 0.3)), told)
+    _, columns = read_black_box(on_disk(box, tmp_path / "box"))
+    assert columns["mode"].tolist() == [[3] * joints] and columns["angle_rad"].shape == (1, joints)
+    assert columns["tick"].tolist() == [7] and digest_of(columns) == box.command_digest
+
+
+def test_a_box_of_a_run_that_never_armed_is_empty(tmp_path: Path) -> None:
+    _, columns = read_black_box(on_disk(BlackBox(ROBOT), tmp_path / "box"))
+    assert columns["angle_rad"].shape == (0, 3) and digest_of(columns) == BlackBox(ROBOT).command_digest
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"\0" * 100,
+        b"{}\n",
+        BlackBox(ROBOT).layout.header()[:-50],
+        BlackBox(ROBOT).layout.header().replace(b'"row_bytes":', b'"row_bytes":1'),
+        BlackBox(ROBOT).layout.header().replace(b"<f8", b"<O8"),
+        BlackBox(ROBOT).layout.header().replace(b"blackbox/1", b"blackbox/2"),
+        b"[" * 3_000_000,
+    ],
+)
+def test_what_is_no_box_is_named(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "box").write_bytes(content)
+    try:
+        _, columns = read_black_box(tmp_path / "box")
+    except ConfigError as error:
+        assert str(tmp_path / "box") in str(error)
+    else:  # wider rows than the columns need are padding
+        assert all(len(column) == 0 for column in columns.values())
+    with pytest.raises(ConfigError, match="gone"):
+        read_black_box(tmp_path / "gone")
+
+
+def test_when_nobody_takes_them_the_newest_rows_are_kept() -> None:
+    box = BlackBox(ROBOT, memory_bytes=10 * BlackBox(ROBOT).layout.row_bytes)
+    for tick in range(25):
+        box.record(tick, tick, Samples(state(ROBOT, 0.001 * tick)), decision())
+    first, rows = box.rows_from(3)
+    assert first == 16 and all_rows(box)["tick"].tolist() == list(range(16, 25)) and box.ticks == 25
+    assert box.layout.arrays(rows)["angle_rad"][:, 1] == pytest.approx([0.001 * tick for tick in range(16, 20)])
+    assert box.command_digest == digest(*((tick, decision()) for tick in range(25)))  # of all, kept or not
+
+
+def test_rows_are_whole_while_another_thread_takes_them() -> None:
+    box = BlackBox(ROBOT, memory_bytes=50 * BlackBox(ROBOT).layout.row_bytes)
+    count, over = 20_000, threading.Event()
+    torn: list[int] = []
+
+    def take() -> None:
+        row = 0
+        while not over.is_set():
+            first, rows = box.rows_from(row)
+            columns = box.layout.arrays(rows)
+            same = columns["angle_rad"][:, 0] == columns["tick"]
+            torn.extend(columns["tick"][~same].tolist())
+            if len(rows) and columns["tick"][0] != first:
+                torn.append(first)
+            row = first + len(columns["tick"])
+
+    thread = threading.Thread(target=take)
+    thread.start()
+    for tick in range(count):
+        box.record(tick, tick, Samples(state(ROBOT, float(tick))), decision())
+    over.set()
+    thread.join(10)
+    assert torn == []
+
+
+def test_a_tick_costs_the_same_after_any_time_and_keeps_no_memory() -> None:
+    robot = description(chain__modules=100)
+    box, row = BlackBox(robot, memory_bytes=100 * BlackBox(robot).layout.row_bytes), Samples(state(robot, 0.1))
+    told = Decision(SetPoints([Mode.POSITION] * 100, [0.1] * 100, [4.0] * 100), 1, {})
+    for tick in range(300):
+        box.record(tick, tick, row, told)
+    peaks = [0] * 700
+    tracemalloc.start()
+    before = tracemalloc.get_traced_memory()[0]
+    for i in range(len(peaks)):
+        tracemalloc.reset_peak()
+        box.record(300 + i, i, row, told)
+        peaks[i] = tracemalloc.get_traced_memory()[1] - before - 36 * i  # the list's own numbers
+    kept = tracemalloc.get_traced_memory()[0] - before - 36 * len(peaks)
+    tracemalloc.stop()
+    assert max(peaks) < 20_000 and kept < 2_000

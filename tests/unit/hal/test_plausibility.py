@@ -1,0 +1,322 @@
+"""Which joint states are believed: glitches, lost and late samples, and sensors that are stuck."""
+
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from snakesim_hal.safety.gate import FRESH_PERIODS, Applied, JointLimits
+from snakesim_hal.safety.plausibility import JointWatch, Mask, readable
+from snakesim_hal.wire.messages import Fault, Mode
+from tests.unit.hal.rig import LEASE_NS, PERIOD_NS, description, state
+
+ROBOT = description()
+LIMITS = JointLimits.of(ROBOT)
+JOINTS = len(ROBOT.joints)
+REACH = 0.05 + 2 * 5.0 * 0.01  # rad in a period
+WORD = "state_invalid"
+NOBODY: Mask = np.zeros(JOINTS, dtype=np.bool_)
+
+
+def told(target: Any = 0.0, mode: Mode = Mode.POSITION, torque_limit: float = 4.0) -> Applied:
+    return Applied(np.full(JOINTS, int(mode)), np.full(JOINTS, target), np.full(JOINTS, torque_limit))
+
+
+class Bench:
+    """A watch that gets a sample a period."""
+
+    def __init__(self, **values: Any) -> None:
+        self.watch = JointWatch(LIMITS)
+        self.stamp_ns = 0
+        assert self.see(**values) is None
+
+    def see(
+        self,
+        angle: Any = 0.0,
+        *values: Any,
+        applied: Applied | None = None,
+        periods: float = 1,
+        late_ns: int = 0,
+        aside: Mask = NOBODY,
+        **other: Any,
+    ) -> Fault | None:
+        self.stamp_ns += round(periods * PERIOD_NS)
+        seen = state(ROBOT, angle, *values, stamp_ns=self.stamp_ns, tick=7, **other)
+        doubt = self.watch.take(seen, now_ns=self.stamp_ns + late_ns, applied=applied, aside=aside)
+        self.doubted = [] if doubt is None else np.flatnonzero(doubt.joints).tolist()
+        return None if doubt is None else doubt.fault
+
+    @property
+    def angles(self) -> list[float]:
+        return self.watch.measured.angle_rad.tolist()
+
+
+# --- jumps -----------------------------------------------------------------------------------------------------
+
+
+def test_the_first_angle_is_believed_wherever_it_is() -> None:
+    assert Bench(angle=1.4).angles == [1.4] * JOINTS
+
+
+@pytest.mark.parametrize("applied", [None, told()])
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_glitch_is_not_believed_and_named(applied: Applied | None, side: int) -> None:
+    bench = Bench()
+    assert bench.see([0.0, side * (REACH - 1e-6), 0.0], applied=applied) is None
+    fault = bench.see([0.01, side * 0.9, 0.0], 1.0, 2.0, applied=applied)
+    assert fault is not None and (fault.what, fault.joint, fault.tick) == (WORD, "joint_2", 7)
+    assert fault.cause == f"faster than any joint turns: a jump of joint_2 by {side * 0.75:+.2f} rad in 10 ms"
+    assert bench.angles == pytest.approx([0.01, side * REACH, 0.0], abs=1e-5)
+    assert bench.watch.measured.velocity_rad_s.tolist() == [1.0, 0.0, 1.0]
+    assert bench.watch.measured.torque_nm.tolist() == [2.0, 0.0, 2.0]
+    assert bench.see([0.02, side * 0.16, 0.0], applied=applied) is None  # back where it was
+
+
+def test_a_jump_of_several_joints_names_them_all() -> None:
+    fault = Bench().see([0.5, 0.0, -0.6])
+    assert fault is not None and fault.joint is None
+    assert fault.cause.endswith("joint_1 by +0.50 rad in 10 ms, joint_3 by -0.60 rad in 10 ms")
+
+
+@pytest.mark.parametrize("periods", [2, 10])
+def test_after_lost_samples_a_joint_may_be_further_away(periods: int) -> None:
+    far = 0.05 + 10.0 * periods * 0.01
+    assert Bench().see(far - 1e-6, periods=periods) is None
+    assert Bench().see(far + 1e-6, periods=periods) is not None
+
+
+def test_age_counts_as_time() -> None:
+    """A sample that says again what was taken before may not differ from it; one that was old has time to make good."""
+    bench = Bench()
+    assert bench.see(0.1, age_ns=[PERIOD_NS] * JOINTS) is not None
+    assert bench.see(0.04, age_ns=[2 * PERIOD_NS] * JOINTS) is None
+    bench = Bench(age_ns=[3 * PERIOD_NS] * JOINTS)
+    assert bench.see(0.4, age_ns=[0] * JOINTS) is None
+
+
+def test_a_host_that_was_held_up_knows_that_more_time_has_passed() -> None:
+    assert Bench().see(0.5) is not None
+    assert Bench().see(0.5, late_ns=4 * PERIOD_NS) is None
+
+
+def test_what_stays_at_a_new_place_is_believed_again_but_not_while_armed() -> None:
+    """A joint that was bent by hand between two samples; slowly, so that time alone does not make it good."""
+    for applied, seen in ((None, 5), (told(), 6)):
+        bench = Bench()
+        found = [bench.see(1.2 + 0.01 * k, applied=applied) for k in range(5)] + [bench.see(1.25, periods=0.5)]
+        assert [fault is None for fault in found].index(True) == seen - 1
+        assert bench.angles == pytest.approx([1.24 if seen == 5 else 1.25] * JOINTS, abs=0.011)
+
+
+def test_places_that_do_not_agree_are_not_believed() -> None:
+    bench = Bench()
+    for k in range(6):
+        assert bench.see((5.0, -5.0)[k % 2]) is not None
+    for _ in range(3):  # the newest place, once more than before
+        assert bench.see(-5.0) is not None
+    assert bench.see(0.0) is None and bench.see(-5.0) is not None  # one good sample, and counting begins again
+    for _ in range(3):
+        assert bench.see(-5.0) is not None
+    assert bench.see(-5.0) is None
+
+
+def test_a_sample_that_is_repeated_does_not_count_again() -> None:
+    bench = Bench()
+    for k in range(8):
+        assert bench.see(1.4, periods=0.0 if k else 1.0) is not None
+    for _ in range(3):
+        assert bench.see(1.4) is not None
+    assert bench.see(1.4) is None
+
+
+def test_a_sample_that_comes_again_and_again_does_not_count_however_late() -> None:
+    bench = Bench()
+    for k in range(12):
+        assert bench.see(1.4, periods=0.0 if k else 1.0, late_ns=k) is not None
+
+
+def test_a_stamp_that_goes_back_leaves_no_less_room_than_none() -> None:
+    assert Bench().see(0.04, periods=-0.5) is None
+
+
+def test_who_strays_first_does_not_help_who_strays_later() -> None:
+    """All must be at a new place for as many samples, also one that goes to zero."""
+    bench = Bench(angle=[0.0, 1.0, 0.0])
+    assert bench.see([3.0, 1.0, 0.0]) is not None
+    for k in range(4):
+        assert bench.see([3.0, 0.0, 0.0]) is not None, k
+    assert bench.angles[:2] == [3.0, 1.0]
+    assert bench.see([3.0, 0.0, 0.0]) is None
+
+
+def test_joints_are_judged_each_by_itself() -> None:
+    bench = Bench()
+    for _ in range(4):
+        assert bench.see([1.4, 0.0, 0.0]) is not None
+    fault = bench.see([1.4, 0.0, 1.4])
+    assert fault is not None and fault.joint == "joint_3" and bench.angles == [1.4, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    "bad", [{"valid": [True, False, True]}, {"age_ns": [0, LEASE_NS + 1, 0]}, {"angle": [0.1, float("nan"), 0.1]}]
+)
+def test_what_is_not_known_changes_nothing_else(bad: dict[str, Any]) -> None:
+    bench = Bench()
+    values: dict[str, Any] = {"angle": 0.1, **bad}
+    fault = bench.see(**values)
+    assert fault is not None and fault.joint == "joint_2" and fault.cause == "no valid and fresh state of joint_2"
+    assert bench.angles == [0.1, 0.0, 0.1]
+
+
+def test_a_long_story_fits_into_a_message() -> None:
+    robot = description(chain__modules=100)
+    watch = JointWatch(JointLimits.of(robot))
+    nobody = np.zeros(100, dtype=np.bool_)
+    watch.take(state(robot), now_ns=0, applied=None, aside=nobody)
+    doubt = watch.take(state(robot, 1.0), now_ns=0, applied=None, aside=nobody)
+    assert doubt is not None and len(doubt.fault.cause) == 400 and doubt.joints.all()
+
+
+@pytest.mark.parametrize("at", [1, 2])
+def test_who_is_set_aside_is_not_looked_at(at: int) -> None:
+    bench, aside = Bench(), NOBODY.copy()
+    aside[1] = True
+    valid = [i != at for i in range(JOINTS)]
+    found = bench.see(valid=valid, aside=aside)
+    assert (found is None) == (at == 1) and bench.doubted == [2] * (at == 2)
+    jumped = [0.0, 0.0, 0.0]
+    jumped[at] = 1.0
+    assert (bench.see(jumped, aside=aside) is None) == (at == 1) and bench.doubted == [2] * (at == 2)
+
+
+def test_what_is_wrong_concerns_joints_and_a_state_of_no_joints_the_robot() -> None:
+    bench = Bench()
+    fault = bench.see(valid=[True, False, False])
+    assert fault is not None and fault.reach == "joint" and bench.doubted == [1, 2]
+    fault = bench.see(valid=[])
+    assert fault is not None and fault.reach == "robot" and bench.doubted == [0, 1, 2]
+    assert (fault.tick, fault.what, fault.cause, fault.joint) == (7, WORD, "no joint state of 3 joints", None)
+
+
+def test_as_far_as_a_joint_may_turn_is_not_too_far() -> None:
+    assert Bench(angle=0.0).see(0.05, periods=0) is None
+    assert Bench(angle=0.0).see(float(np.nextafter(0.05, 1.0)), periods=0) is not None
+
+
+@pytest.mark.parametrize("column", ["angle_rad", "velocity_rad_s", "torque_nm"])
+def test_what_is_published_has_numbers_only(column: str) -> None:
+    bench = Bench(angle=0.1)
+    sound = state(ROBOT, 0.12, 0.2, 0.3)
+    assert readable(sound, bench.watch.measured) is sound
+    spoilt = msgspec.structs.replace(sound, **{column: [0.5, float("nan"), 0.7]})
+    told = readable(spoilt, bench.watch.measured)
+    assert told.valid == [True, False, True]
+    assert told.angle_rad[1] == 0.1 and told.velocity_rad_s[1] == told.torque_nm[1] == 0.0
+    assert getattr(told, column)[::2] == [0.5, 0.7] and told.age_ns == sound.age_ns
+    assert [told.angle_rad[0], told.velocity_rad_s[2], told.torque_nm[2]] != [0.1, 0.0, 0.0]
+    assert readable(msgspec.structs.replace(spoilt, valid=[False, True, True]), bench.watch.measured).valid == [
+        False,
+        False,
+        True,
+    ]
+
+
+@pytest.mark.parametrize("column", ["angle_rad", "velocity_rad_s", "torque_nm", "valid"])
+def test_a_state_of_another_number_of_joints_is_published_as_it_is(column: str) -> None:
+    odd = msgspec.structs.replace(state(ROBOT, float("nan")), **{column: [float("nan")]})
+    assert readable(odd, Bench().watch.measured) is odd
+
+
+# --- stuck sensors ---------------------------------------------------------------------------------------------
+
+LEASE_PERIODS = LEASE_NS // PERIOD_NS
+
+
+FAR_PERIODS = 4  # until a target that moves by 0.02 rad a period is further than 0.075 rad
+
+
+def stuck(bench: Bench, periods: int, step: float = 0.02, **other: Any) -> Fault | None:
+    fault = None
+    for k in range(periods):
+        fault = bench.see(0.0, 0.0, other.get("torque", 0.5), applied=told(step * k, other.get("mode", Mode.POSITION)))
+    return fault
+
+
+def test_a_joint_that_repeats_itself_while_its_target_moves_is_frozen() -> None:
+    bench = Bench(torque=0.5)
+    assert stuck(bench, FAR_PERIODS + LEASE_PERIODS + 1) is None  # for a lease, and no longer
+    fault = bench.see(0.0, 0.0, 0.5, applied=told(0.2))
+    assert fault is not None and fault.what == "joint_frozen"
+    assert fault.cause == "the same state over and over while its target moves: joint_1, joint_2, joint_3"
+
+
+@pytest.mark.parametrize("step", [0.02, -0.02])
+def test_the_way_of_the_target_counts_in_both_directions(step: float) -> None:
+    assert stuck(Bench(torque=0.5), 20, step) is not None
+
+
+def test_a_target_that_hardly_moves_proves_nothing() -> None:
+    assert stuck(Bench(torque=0.5), 50, 0.0014) is None  # 0.069 rad of the 0.075 that it takes
+    assert stuck(Bench(torque=0.5), 70, 0.0014) is not None
+
+
+def test_a_joint_that_rested_for_long_has_a_lease_to_follow_a_target_that_jumps() -> None:
+    bench = Bench(torque=0.5)
+    assert stuck(bench, 100, 0.0) is None
+    seen = [bench.see(0.0, 0.0, 0.5, applied=told(0.3)) for _ in range(LEASE_PERIODS + 2)]
+    assert seen[:LEASE_PERIODS] == [None] * LEASE_PERIODS and seen[-1] is not None
+
+
+def test_a_motor_at_its_limit_may_say_the_same_for_ever() -> None:
+    assert stuck(Bench(torque=4.0), 50, torque=3.9) is None
+    assert stuck(Bench(torque=-4.0), 50, torque=-3.9) is None
+    bench = Bench()
+    for k in range(50):
+        assert bench.see(applied=told(0.02 * k, torque_limit=0.0)) is None
+
+
+def test_only_joints_with_a_position_target_of_an_armed_robot_can_be_frozen() -> None:
+    for mode in (Mode.PASSIVE, Mode.VELOCITY, Mode.TORQUE):
+        assert stuck(Bench(torque=0.5), 50, mode=mode) is None
+    bench = Bench(torque=0.5)
+    for _ in range(50):
+        assert bench.see(0.0, 0.0, 0.5) is None
+    stuck(bench, FAR_PERIODS + LEASE_PERIODS)
+    assert bench.see(0.0, 0.0, 0.5) is None  # disarmed, and everything begins again
+    assert stuck(bench, FAR_PERIODS + LEASE_PERIODS) is None
+
+
+def test_a_mode_between_begins_anew() -> None:
+    bench = Bench(torque=0.5)
+    for _ in range(4):
+        assert stuck(bench, FAR_PERIODS + LEASE_PERIODS) is None
+        assert bench.see(0.0, 0.0, 0.5, applied=told(9.0, Mode.VELOCITY)) is None
+
+
+@pytest.mark.parametrize("column", [0, 1, 2])
+def test_whatever_still_changes_is_alive(column: int) -> None:
+    bench = Bench()
+    for k in range(50):
+        row = np.array([0.0, 0.0, 0.5]) + 1e-9 * (k % 2) * (np.arange(3) == column)
+        assert bench.see(float(row[0]), float(row[1]), float(row[2]), applied=told(0.02 * k)) is None
+
+
+def test_a_target_that_moved_just_so_far_proves_nothing() -> None:
+    bench = Bench(torque=0.5)
+    assert bench.see(0.0, 0.0, 0.5, applied=told(0.0)) is None
+    for _ in range(3 * LEASE_PERIODS):
+        assert bench.see(0.0, 0.0, 0.5, applied=told(0.075)) is None
+
+
+def test_that_the_host_was_held_up_makes_no_joint_frozen() -> None:
+    bench = Bench(torque=0.5)
+    for k in range(FAR_PERIODS + 4):
+        assert bench.see(0.0, 0.0, 0.5, applied=told(0.02 * k), late_ns=k * LEASE_NS) is None
+
+
+def test_a_sample_that_is_only_old_is_not_frozen() -> None:
+    """It was taken once: what is lost is judged by its age."""
+    bench = Bench(torque=0.5)
+    for k in range(1, FRESH_PERIODS + 1):
+        assert bench.see(0.0, 0.0, 0.5, applied=told(0.1 * k), age_ns=[k * PERIOD_NS] * JOINTS) is None
