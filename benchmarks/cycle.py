@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.whole import run
-from snakesim_can_backend.bus.load import MOST_LOAD, Reports, load
+from snakesim_can_backend.bus.load import MAX_LOAD, Reports, load
 from snakesim_can_backend.protocol.definitions import Opcode, opcode_of
 from tests.unit.can_backend.twin.rig import run_at
 
@@ -85,6 +85,6 @@ def load_table() -> list[str]:
             _, before, after, _ = run_at(joints, rate_hz)
             computed, measured = load(joints, Reports(rate_hz)), after.load_since(before)
             apart = f"{100 * (measured / computed - 1):+.1f} %" if computed < 1 else "bus is full"
-            says = "takes it" if computed <= MOST_LOAD else "refuses it"
+            says = "takes it" if computed <= MAX_LOAD else "refuses it"
             rows.append(f"| {joints} | {rate_hz} Hz | {computed:.1%} | {measured:.1%} | {apart} | {says} |")
     return rows

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from snakesim_can_backend.bus.bus import SocketCanWire, Wire
 from snakesim_can_backend.bus.load import (
-    LEAST_RATE_HZ,
-    MOST_LOAD,
+    MAX_LOAD,
+    MIN_RATE_HZ,
     Reports,
     arithmetic,
     busiest_s,
@@ -33,7 +33,7 @@ from snakesim_hal.model.textfiles import write_text
 from snakesim_hal.terminal import say
 
 OK, FAILED = 0, 1
-MOST_RATE_HZ = 5000  # of a scenario
+MAX_RATE_HZ = 5000  # of a scenario
 COLUMNS = (
     *("channel", "node", "serial", "firmware", "protocol", "emulated", "state", "faults", "uptime"),
     *("voltage", "motor", "board", "shaft"),
@@ -122,7 +122,7 @@ def table(
         cells = [_cell(ceil(count / buses), reports_at(rate, config, settings)) for rate in rates]
         yield f"{count:6}" + "".join(f"{cell:>16}" for cell in cells)
     on = "one bus" if buses == 1 else f"the fullest of {buses} buses"
-    yield f"Worst-case load of {on}, 1 Mbit/s; above {MOST_LOAD:.0%}, or with a period that is too full, it is refused."
+    yield f"Worst-case load of {on}, 1 Mbit/s; above {MAX_LOAD:.0%}, or with a period that is too full, it is refused."
 
 
 def _cell(joints: int, reports: Reports) -> str:
@@ -226,8 +226,8 @@ def _joints(text: str) -> int:
 
 def _rate(text: str) -> float:
     rate_hz = float(text)
-    if not LEAST_RATE_HZ <= rate_hz <= MOST_RATE_HZ:
-        raise argparse.ArgumentTypeError(f"{text} Hz; from {LEAST_RATE_HZ} to {MOST_RATE_HZ}")
+    if not MIN_RATE_HZ <= rate_hz <= MAX_RATE_HZ:
+        raise argparse.ArgumentTypeError(f"{text} Hz; from {MIN_RATE_HZ} to {MAX_RATE_HZ}")
     return rate_hz
 
 

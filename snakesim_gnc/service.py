@@ -10,7 +10,7 @@ from snakesim_hal.model.scenario import Service as Schedule
 from snakesim_hal.network.client import Client
 from snakesim_hal.network.session import open_session
 from snakesim_hal.process import SERVICE_PRIORITY, calm_down_after, hurry, settle_for_timing
-from snakesim_hal.serve import START_LIMIT_S, arguments, duty
+from snakesim_hal.serve import START_LIMIT_S, arguments, process_options
 from snakesim_hal.terminal import complain_of
 from snakesim_hal.wire.messages import Clock, Description, Message
 
@@ -41,7 +41,7 @@ class Service(Protocol):
 def serve(service_type: type[Service], argv: Sequence[str] | None = None) -> int:
     """Run a service process. Ends when it is told to stop; exit code 1 when it could not go on."""
     name = service_type.name
-    given = duty(arguments(f"Run the {name} service of a robot."), argv)
+    given = process_options(arguments(f"Run the {name} service of a robot."), argv)
     try:
         if service_type.urgent and given.config.pace == "realtime":
             hurry(SERVICE_PRIORITY)

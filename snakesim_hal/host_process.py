@@ -24,7 +24,7 @@ from snakesim_hal.network.private_channel import HostEnd
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.network.stop_port import open_stop_port, serve_stops, stop_address
 from snakesim_hal.process import HOST_PRIORITY, hurry, on_stop_signal, settle_for_timing
-from snakesim_hal.serve import Duty, arguments, duty
+from snakesim_hal.serve import ProcessOptions, arguments, process_options
 from snakesim_hal.terminal import complain_of
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Fault
@@ -68,7 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--channel", type=int, metavar="FD", help="inherited socket to whoever starts this host")
     parser.add_argument("--stop-port", type=int, metavar="FD", help="inherited UDP socket for emergency stops")
     listen = "--router" not in (sys.argv[1:] if argv is None else argv)
-    given = duty(parser, argv, listen=listen)
+    given = process_options(parser, argv, listen=listen)
     try:
         host = _run(given)
     except SnakesimError as error:
@@ -78,7 +78,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 1 if stopped or host.ended != "complete" else 0
 
 
-def _run(given: Duty) -> Host:
+def _run(given: ProcessOptions) -> Host:
     """Open everything, run the host to its end, close everything."""
     config, wanted = given.config, given.arguments
     with contextlib.ExitStack() as opened:
@@ -90,7 +90,7 @@ def _run(given: Duty) -> Host:
         opened.callback(stop_port.close)
         backend = open_backend(find_plugin(BACKENDS, config.backend), config)
         opened.callback(backend.close)
-        hygiene = hurry(HOST_PRIORITY) if config.pace == "realtime" else []
+        realtime_warnings = hurry(HOST_PRIORITY) if config.pace == "realtime" else []
         session = opened.enter_context(open_session(given.link))
         refuse_second_host(session, given.link)
         described = backend.describe()
@@ -103,7 +103,7 @@ def _run(given: Duty) -> Host:
             stay=wanted.stay,
             latch=EstopLatch(robot_folder(described.robot, described.backend, described.hardware)),
             starter=HostEnd.of(wanted.channel),
-            hygiene=hygiene,
+            realtime_warnings=realtime_warnings,
         )
         serve_stops(stop_port, given.link.namespace or described.robot, host.take_stop)
         on_stop_signal(host.stop)
@@ -125,7 +125,7 @@ def refuse_second_host(session: Session, link: Link) -> None:
             )
 
 
-def _entry(given: Duty, stop_port: socket.socket) -> LocalRobot:
+def _entry(given: ProcessOptions, stop_port: socket.socket) -> LocalRobot:
     stop_host, port = stop_port.getsockname()[:2]
     return LocalRobot(
         namespace=given.link.namespace or given.config.robot.name,
@@ -156,15 +156,15 @@ def backend_settings(config: RunConfig, factory: BackendFactory) -> Any:
 
 def record_of(host: Host, *, lost_ticks: int = 0, trouble: str = "") -> HostRecord:
     """The host's numbers as they are now; called beside its loop, which replaces or copies nothing half."""
-    tally, authority = host.tally, host.authority
+    statistics, authority = host.statistics, host.authority
     return HostRecord(
         ticks=host.black_box.ticks,
         wall_s=host.wall_s,
-        overruns=tally.overruns,
-        answered_ticks=tally.answered_ticks,
-        armed_ticks=tally.ticks,
+        overruns=statistics.overruns,
+        answered_ticks=statistics.answered_ticks,
+        armed_ticks=statistics.ticks,
         command_digest=host.black_box.command_digest,
-        state_to_command_us={f"p{p}": tally.state_to_command.percentile_us(p) for p in (50, 99)},
+        state_to_command_us={f"p{p}": statistics.state_to_command.percentile_us(p) for p in (50, 99)},
         rejected_commands=dict(authority.rejected),
         limited_commands=dict(authority.limited),
         faults=list(authority.since_start.kept),

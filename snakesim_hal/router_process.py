@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from snakesim_hal.errors import SnakesimError
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.process import on_stop_signal
-from snakesim_hal.serve import arguments, duty
+from snakesim_hal.serve import arguments, process_options
 from snakesim_hal.terminal import complain_of
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Forward between all who connect, until told to stop."""
-    given = duty(arguments("Run a Zenoh router on a run's endpoint."), argv)
+    given = process_options(arguments("Run a Zenoh router on a run's endpoint."), argv)
     stopped = threading.Event()
     on_stop_signal(stopped.set)
     try:

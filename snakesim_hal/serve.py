@@ -17,7 +17,7 @@ START_LIMIT_S = 600.0  # until a part of a run is there: MuJoCo starts slowly in
 
 
 @dataclass(frozen=True)
-class Duty:
+class ProcessOptions:
     """What a process was started for."""
 
     config: RunConfig
@@ -39,14 +39,16 @@ def arguments(about: str) -> argparse.ArgumentParser:
     return parser
 
 
-def duty(parser: argparse.ArgumentParser, argv: Sequence[str] | None, *, listen: bool = False) -> Duty:
+def process_options(
+    parser: argparse.ArgumentParser, argv: Sequence[str] | None, *, listen: bool = False
+) -> ProcessOptions:
     """Parse, and tie this process to its parent when it has one."""
     parsed = parser.parse_args(argv)
     if parsed.parent is not None:
         die_with_parent(parsed.parent)
     config = read(parsed.config)
     link = Link(parsed.endpoint, parsed.namespace or config.robot.name, listen)
-    return Duty(config, link, parsed.out, parsed)
+    return ProcessOptions(config, link, parsed.out, parsed)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

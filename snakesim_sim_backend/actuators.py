@@ -25,7 +25,7 @@ from snakesim_hal.wire.messages import Mode
 Floats = NDArray[np.float64]
 
 # Where MuJoCo keeps a dcmotor's parameters in actuator_gainprm; held against the compiled model in `Motors`.
-KP, KD, MOST_VOLTS = 4, 6, 7
+KP, KD, MAX_VOLTS = 4, 6, 7
 INPUTS = 3  # position, velocity, feed-forward torque
 INPUT_OF_MODE = {Mode.PASSIVE: 2, Mode.POSITION: 0, Mode.VELOCITY: 1, Mode.TORQUE: 2}
 
@@ -71,7 +71,7 @@ class Motors:
             Mode.VELOCITY: (0.0, motor.velocity_gain_nm_s_per_rad, speed),
             Mode.TORQUE: (0.0, 0.0, speed),
         }
-        assert np.all(self._gains[:, [KP, KD, MOST_VOLTS]] == [1.0, 1.0, speed])
+        assert np.all(self._gains[:, [KP, KD, MAX_VOLTS]] == [1.0, 1.0, speed])
         self._mode: list[Mode] = []
         self._slots = np.empty(0, dtype=np.intp)
         self.switch_off()
@@ -125,7 +125,7 @@ class Motors:
 
     def _change_modes(self, modes: list[Mode]) -> None:
         self._mode = list(modes)
-        self._gains[:, [KP, KD, MOST_VOLTS]] = [self._gains_of_mode[mode] for mode in modes]
+        self._gains[:, [KP, KD, MAX_VOLTS]] = [self._gains_of_mode[mode] for mode in modes]
         self._slots = np.array([INPUTS * i + INPUT_OF_MODE[mode] for i, mode in enumerate(modes)], dtype=np.intp)
         self._passive = [INPUTS * i + 2 for i, mode in enumerate(modes) if mode == Mode.PASSIVE]
         self._inputs[:] = 0.0

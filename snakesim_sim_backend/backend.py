@@ -16,7 +16,7 @@ from snakesim_hal.model.thermal import HeatLimits, Thermal
 from snakesim_hal.wire.messages import Description, Fault, LifecycleState, Pace
 from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.contacts import TouchReader
-from snakesim_sim_backend.divergence import MOST_SPEED, DivergenceWatch, log_warnings
+from snakesim_sim_backend.divergence import MAX_SPEED, DivergenceWatch, log_warnings
 from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS, SimModel, build
 from snakesim_sim_backend.sensors import Sensors, rotate
 from snakesim_sim_backend.settings import Settings
@@ -131,7 +131,7 @@ class SimBackend:
         if injection.target_type != "simulator" or injection.kind != "diverge":
             return False
         if begins:
-            self._data.qvel[0] = 10.0 * MOST_SPEED
+            self._data.qvel[0] = 10.0 * MAX_SPEED
         return True
 
     def close(self) -> None:

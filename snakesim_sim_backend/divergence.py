@@ -10,9 +10,9 @@ from snakesim_sim_backend.model import FREE_DOFS
 
 _log = logging.getLogger("snakesim.sim")
 
-MOST_POSITION = 1e4  # m or rad: of any coordinate
-MOST_SPEED = 1e3  # m/s or rad/s
-MOST_ACCELERATION = 1e9  # m/s² or rad/s²
+MAX_POSITION = 1e4  # m or rad: of any coordinate
+MAX_SPEED = 1e3  # m/s or rad/s
+MAX_ACCELERATION = 1e9  # m/s² or rad/s²
 BASE = ["the base along x", "the base along y", "the base along z"] + ["the base, turning,"] * 3
 WHOLE = int(mujoco.mjtState.mjSTATE_INTEGRATION)  # plain numbers: the binding converts an enumeration at every call
 INPUTS = int(mujoco.mjtState.mjSTATE_USER)
@@ -55,9 +55,9 @@ class DivergenceWatch:
         qpos, qvel, qacc, warnings = self._qpos, self._qvel, self._qacc, self._warnings
         # One comparison each, which NaN fails too: the squared length bounds every coordinate.
         return bool(
-            qpos.dot(qpos) < MOST_POSITION**2
-            and qvel.dot(qvel) < MOST_SPEED**2
-            and qacc.dot(qacc) < MOST_ACCELERATION**2
+            qpos.dot(qpos) < MAX_POSITION**2
+            and qvel.dot(qvel) < MAX_SPEED**2
+            and qacc.dot(qacc) < MAX_ACCELERATION**2
             and warnings.dot(warnings) == 0
         )
 
@@ -85,7 +85,7 @@ class DivergenceWatch:
 
     def _worst(self) -> str | None:
         """The greatest speed, or acceleration if that is nearer to its bound; None when they are no numbers."""
-        share_v, share_a = np.abs(self._qvel) / MOST_SPEED, np.abs(self._qacc) / MOST_ACCELERATION
+        share_v, share_a = np.abs(self._qvel) / MAX_SPEED, np.abs(self._qacc) / MAX_ACCELERATION
         shares = np.maximum(share_v, share_a)
         if not np.all(np.isfinite(shares)):
             return None

@@ -13,7 +13,7 @@ Floats = NDArray[np.float64]
 GROUND, HILLS = "ground", "hills"
 GROUND_GROUP = 1  # MuJoCo geom group of all that the snake may lie on, steps too
 SAMPLES_PER_WAVE = 12
-MOST_SAMPLES = 500  # along an edge
+MAX_SAMPLES = 500  # along an edge
 WAVES = 40
 DEPTH_M = 0.5  # of the height field below its lowest point
 
@@ -48,7 +48,7 @@ def hills(uneven: Uneven) -> Floats:
     A sum of plane waves of one wavelength, give or take, in random directions: smooth, and the same for a seed.
     """
     random = np.random.default_rng(uneven.seed)
-    n = int(np.clip(SAMPLES_PER_WAVE * uneven.area_m / uneven.wavelength_m, 16, MOST_SAMPLES))
+    n = int(np.clip(SAMPLES_PER_WAVE * uneven.area_m / uneven.wavelength_m, 16, MAX_SAMPLES))
     x = np.linspace(-uneven.area_m / 2, uneven.area_m / 2, n)
     heights = np.zeros((n, n))
     for _ in range(WAVES):

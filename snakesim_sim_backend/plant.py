@@ -15,7 +15,7 @@ from snakesim_hal.model.robot import ImuSensor, PoseSensor
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import Imu, Pose
 from snakesim_sim_backend.actuators import Motors
-from snakesim_sim_backend.divergence import MOST_ACCELERATION, DivergenceWatch, log_warnings
+from snakesim_sim_backend.divergence import MAX_ACCELERATION, DivergenceWatch, log_warnings
 from snakesim_sim_backend.loads import LoadReader
 from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS, SimModel, build
 from snakesim_sim_backend.sensors import ImuReader, PoseReader
@@ -26,7 +26,7 @@ from snakesim_sim_backend.tether import Rope
 Floats = NDArray[np.float64]
 
 STEPS_PER_CHECK = 10  # the search for a culprit goes through them again under the last torques
-MOST_SQUARED = MOST_ACCELERATION**2
+MAX_SQUARED = MAX_ACCELERATION**2
 NO_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 
 
@@ -84,7 +84,7 @@ class MujocoPlant:
             raise BackendError(f"MuJoCo cannot go on at step {self._steps}: {error}") from error
         self._unchecked += 1
         # What blows up does so here first; it is caught in its very step, or firmware would read what is no number.
-        if self._unchecked == STEPS_PER_CHECK or not self._qacc.dot(self._qacc) < MOST_SQUARED:
+        if self._unchecked == STEPS_PER_CHECK or not self._qacc.dot(self._qacc) < MAX_SQUARED:
             self._check()
 
     @property

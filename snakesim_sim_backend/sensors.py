@@ -23,7 +23,7 @@ from snakesim_hal.wire.quantities import MAX_CONTACTS, Quaternion, Vector
 from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.contacts import Touch, TouchReader
 from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS, SimModel
-from snakesim_sim_backend.pace import DelayLine, Due, ticks_of
+from snakesim_sim_backend.sensor_timing import DelayLine, Due, ticks_of
 
 Floats = NDArray[np.float64]
 Noise = Callable[[int], Floats]  # n -> (n,) standard normal numbers

@@ -14,7 +14,7 @@ from snakesim_sim_backend.settings import Tether
 ROPE_M = 50.0
 SLACK_M = 1e4
 WINCH_N_S_PER_M = 300.0
-WINCH_MOST_N = 1000.0
+WINCH_MAX_N = 1000.0
 HOOK, ANCHOR, TENDON, WINCH = "tether_hook", "tether_anchor", "tether", "tether_winch"
 
 
@@ -44,7 +44,7 @@ def add_tether(spec: mujoco.MjSpec, tether: Tether, robot: RobotFile, contact_ti
             biastype=mujoco.mjtBias.mjBIAS_AFFINE,
             biasprm=[0.0, 0.0, -WINCH_N_S_PER_M] + [0.0] * 7,
             forcelimited=True,
-            forcerange=[-WINCH_MOST_N, 0.0],  # shortens the rope, and never pushes it
+            forcerange=[-WINCH_MAX_N, 0.0],  # shortens the rope, and never pushes it
         )
 
 

@@ -21,7 +21,7 @@ import can
 from can.interfaces.socketcan.socketcan import SocketcanBus
 from can.interfaces.virtual import VirtualBus
 
-from snakesim_can_backend.bus.bus_errors import Trouble, troubles_of
+from snakesim_can_backend.bus.bus_errors import BusError, bus_errors_of
 from snakesim_can_backend.bus.bus_faults import VirtualFaults, inject_into_interface
 from snakesim_can_backend.protocol.definitions import NODE_BITS, Frame, Opcode
 from snakesim_hal.errors import BackendError, ConfigError
@@ -29,7 +29,7 @@ from snakesim_hal.model.injection import Injection
 
 EXTENDED, REMOTE, ERROR = 0x80000000, 0x40000000, 0x20000000
 RECEIVE_BUFFER_BYTES = 1 << 20
-MOST_AT_ONCE = 4096  # a bus that babbles must not keep its reader for ever
+MAX_AT_ONCE = 4096  # a bus that babbles must not keep its reader for ever
 SO_MEMINFO, MEMINFO_DROPS, MEMINFO_BYTES = 55, 8, 36  # linux/sock_diag.h
 IO_ERRORS = (OSError, ValueError, can.CanError)  # of sockets, of `select` and of python-can
 _wire_format = struct.Struct("<IB3x8s")
@@ -48,7 +48,7 @@ class Wire(Protocol):
         """Every frame that is there now, in its order; never waits."""
         ...
 
-    def troubles(self) -> list[Trouble]:
+    def troubles(self) -> list[BusError]:
         """What was found since the last call."""
         ...
 
@@ -93,7 +93,7 @@ class SocketCanWire:
         with contextlib.suppress(OSError):
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
         self._buffer = bytearray(_wire_format.size)
-        self._found: list[Trouble] = []
+        self._found: list[BusError] = []
         self._down = self._gone = False
         self._dropped = 0
 
@@ -117,12 +117,12 @@ class SocketCanWire:
             self._note_failure(error)
         return frames
 
-    def troubles(self) -> list[Trouble]:
+    def troubles(self) -> list[BusError]:
         """What was found since the last call."""
         dropped = self._count_drops()
         if dropped > self._dropped:
             detail = f"the kernel dropped {dropped - self._dropped} frames: this process reads too slowly"
-            self._found.append(Trouble("receive_overflow", self.channel, detail))
+            self._found.append(BusError("receive_overflow", self.channel, detail))
             self._dropped = dropped
         if self._down and is_up(self.channel):
             self._note_up()
@@ -155,16 +155,16 @@ class SocketCanWire:
         self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, data)
 
     def _note_error(self, identifier: int, data: bytes) -> None:
-        self._found.extend(troubles_of(identifier, data, self.channel))
+        self._found.extend(bus_errors_of(identifier, data, self.channel))
 
     def _note_failure(self, error: OSError) -> None:
         if error.errno in (errno.ENOBUFS, errno.EAGAIN):  # the interface's queue, or this socket's share of it
-            self._found.append(Trouble("queue_full", self.channel, "the transmit queue is full"))
+            self._found.append(BusError("queue_full", self.channel, "the transmit queue is full"))
         elif error.errno in (errno.ENETDOWN, errno.ENODEV, errno.ENXIO):
             self._gone |= error.errno != errno.ENETDOWN
             if not self._down:
                 what = "gone" if self._gone else "down"
-                self._found.append(Trouble("interface_down", self.channel, f"the interface is {what}"))
+                self._found.append(BusError("interface_down", self.channel, f"the interface is {what}"))
             self._down = True
         else:
             raise BackendError(f"{self.channel}: {error.strerror}") from error
@@ -177,7 +177,7 @@ class SocketCanWire:
             except OSError:
                 return
         self._down = self._gone = False
-        self._found.append(Trouble("interface_up", self.channel, "the interface is up again"))
+        self._found.append(BusError("interface_up", self.channel, "the interface is up again"))
 
     def _count_drops(self) -> int:
         try:
@@ -233,7 +233,7 @@ class VirtualWire:
             raise BackendError(f"{self.channel}: cannot receive: {error}") from error
         return self._faults.leaves(frames) if self._faults.on else frames
 
-    def troubles(self) -> list[Trouble]:
+    def troubles(self) -> list[BusError]:
         """A virtual bus has only those that were asked for."""
         return self._faults.take_troubles()
 
@@ -267,7 +267,7 @@ def drain(
     receive_into, unpack, append = source.recv_into, _wire_format.unpack, frames.append
     new = tuple.__new__  # what Frame(...) does, without its argument handling
     with contextlib.suppress(BlockingIOError):
-        for _ in range(MOST_AT_ONCE):
+        for _ in range(MAX_AT_ONCE):
             receive_into(buffer)
             identifier, length, data = unpack(buffer)
             if identifier & ERROR:

@@ -26,7 +26,7 @@ CONTROLLER_STATES: tuple[tuple[int, Kind], ...] = (
 
 
 @dataclass(frozen=True)
-class Trouble:
+class BusError:
     """Something that is wrong with a bus, not with a module on it."""
 
     kind: Kind
@@ -34,11 +34,11 @@ class Trouble:
     detail: str
 
 
-def troubles_of(identifier: int, data: bytes, channel: str) -> list[Trouble]:
+def bus_errors_of(identifier: int, data: bytes, channel: str) -> list[BusError]:
     """What an error frame of the kernel says."""
     kinds: list[Kind] = [kind for bit, kind in ERROR_CLASSES if identifier & bit]
     if identifier & 0x04:
         states: list[Kind] = [kind for bits, kind in CONTROLLER_STATES if data[1] & bits]
         kinds.extend(states)
     counters = f"transmit errors {data[6]}, receive errors {data[7]}"
-    return [Trouble(kind, channel, counters) for kind in kinds or NOTHING_KNOWN]
+    return [BusError(kind, channel, counters) for kind in kinds or NOTHING_KNOWN]

@@ -8,16 +8,16 @@ import socket
 import struct
 import subprocess
 
-from snakesim_can_backend.bus.bus_errors import Trouble
+from snakesim_can_backend.bus.bus_errors import BusError
 from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_hal.errors import ConfigError
 
 VIRTUAL = "vcan"
 ERROR_FRAME, CONTROLLER, BUS_OFF, RESTARTED = 0x20000000, 0x04, 0x40, 0x100  # linux/can.h, linux/can/error.h
 RECEIVE_OVERFLOW, TRANSMIT_PASSIVE = 0x01, 0x20  # in data[1] of the class `CONTROLLER`
-PASSIVE_ERRORS, MOST_ERRORS = 128, 255
+PASSIVE_ERRORS, MAX_ERRORS = 128, 255
 ERROR_FRAMES = {  # fault, begins -> class, state of the controller, transmit errors
-    ("bus_off", True): (BUS_OFF, 0, MOST_ERRORS),
+    ("bus_off", True): (BUS_OFF, 0, MAX_ERRORS),
     ("bus_off", False): (RESTARTED, 0, 0),
     ("error_passive", True): (CONTROLLER, TRANSMIT_PASSIVE, PASSIVE_ERRORS),
     ("overflow", True): (CONTROLLER, RECEIVE_OVERFLOW, 0),
@@ -29,7 +29,7 @@ class VirtualFaults:
 
     def __init__(self, channel: str) -> None:
         self._channel = channel
-        self._found: list[Trouble] = []
+        self._found: list[BusError] = []
         self.on: set[str] = set()
 
     def inject(self, kind: str, *, begins: bool) -> None:
@@ -37,21 +37,21 @@ class VirtualFaults:
         channel = self._channel
         if kind == "error_passive":
             counters = f"transmit errors {PASSIVE_ERRORS}, receive errors 0"
-            self._found.append(Trouble("error_passive", channel, counters))
+            self._found.append(BusError("error_passive", channel, counters))
             return
         if begins == (kind in self.on):
             return
         self.on.symmetric_difference_update([kind])
         match kind, begins:
             case "cut", True:
-                self._found.append(Trouble("interface_down", channel, "the interface is down"))
+                self._found.append(BusError("interface_down", channel, "the interface is down"))
             case "cut", False:
-                self._found.append(Trouble("interface_up", channel, "the interface is up again"))
+                self._found.append(BusError("interface_up", channel, "the interface is up again"))
             case "bus_off", True:
-                counters = f"transmit errors {MOST_ERRORS}, receive errors 0"
-                self._found.append(Trouble("bus_off", channel, counters))
+                counters = f"transmit errors {MAX_ERRORS}, receive errors 0"
+                self._found.append(BusError("bus_off", channel, counters))
             case "bus_off", False:
-                self._found.append(Trouble("restarted", channel, "transmit errors 0, receive errors 0"))
+                self._found.append(BusError("restarted", channel, "transmit errors 0, receive errors 0"))
             case _:
                 pass
 
@@ -62,7 +62,7 @@ class VirtualFaults:
         if "bus_off" in self.on:  # its queue is gone with the carrier: the kernel takes frames and drops them
             return True
         if "full" in self.on:
-            self._found.append(Trouble("queue_full", self._channel, "the transmit queue is full"))
+            self._found.append(BusError("queue_full", self._channel, "the transmit queue is full"))
             return False
         return None
 
@@ -73,11 +73,11 @@ class VirtualFaults:
         if frames and "overflow" in self.on:
             self.on.discard("overflow")
             detail = f"the kernel dropped {len(frames)} frames: this process reads too slowly"
-            self._found.append(Trouble("receive_overflow", self._channel, detail))
+            self._found.append(BusError("receive_overflow", self._channel, detail))
             return []
         return frames
 
-    def take_troubles(self) -> list[Trouble]:
+    def take_troubles(self) -> list[BusError]:
         """What was found since the last call."""
         found, self._found = self._found, []
         return found

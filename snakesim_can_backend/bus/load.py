@@ -16,9 +16,9 @@ from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.scenario import RunConfig
 
 BIT_RATE = 1_000_000
-MOST_LOAD = 0.8
-MOST_EVERY = 255  # Syncs; the parameters hold no more
-LEAST_RATE_HZ = 20
+MAX_LOAD = 0.8
+MAX_EVERY = 255  # Syncs; the parameters hold no more
+MIN_RATE_HZ = 20
 FRAME_BITS = 47
 STUFFED_FROM = 34
 
@@ -84,12 +84,12 @@ def busiest_s(joints: int, reports: Reports) -> float:
 
 def fits(joints: int, reports: Reports) -> bool:
     """Whether a bus can carry so many joints, on average and in the longest period."""
-    return load(joints, reports) <= MOST_LOAD and busiest_s(joints, reports) * reports.rate_hz <= 1
+    return load(joints, reports) <= MAX_LOAD and busiest_s(joints, reports) * reports.rate_hz <= 1
 
 
 def every(rate_hz: float, wanted_hz: float) -> int:
     """How many Syncs apart reports of about a wanted rate are; 0 for never."""
-    return 0 if wanted_hz <= 0 else round(min(max(rate_hz / wanted_hz, 1.0), MOST_EVERY))
+    return 0 if wanted_hz <= 0 else round(min(max(rate_hz / wanted_hz, 1.0), MAX_EVERY))
 
 
 def reports_of(config: RunConfig, settings: Settings) -> Reports:
@@ -130,13 +130,13 @@ def shares(config: RunConfig, settings: Settings) -> list[int]:
 def check_load(config: RunConfig, settings: Settings) -> list[float]:
     """The load of every bus. Raises ConfigError, with the arithmetic and what would fit, when one is too high.
 
-    Too high is more than `MOST_LOAD` of the time, or a single period that is longer than it may be.
+    Too high is more than `MAX_LOAD` of the time, or a single period that is longer than it may be.
     """
     reports = reports_of(config, settings)
     joints = shares(config, settings)
     loads = [load(count, on_bus(i, reports)) for i, count in enumerate(joints)]
     worst = max(range(len(loads)), key=lambda i: loads[i])
-    if loads[worst] > MOST_LOAD:
+    if loads[worst] > MAX_LOAD:
         raise ConfigError(
             f"{joints[worst]} joints at {config.rate_hz:g} Hz do not fit on {_name(settings, worst)}:",
             *arithmetic(joints[worst], on_bus(worst, reports)),
@@ -169,7 +169,7 @@ def arithmetic(joints: int, reports: Reports) -> list[str]:
                 f" = {100 * stream.bits_per_s / BIT_RATE:5.1f} %"
             )
     total = 100 * load(joints, reports)
-    return [*lines, f"  together {total:.1f} % of 1 Mbit/s at worst-case stuffing; at most {MOST_LOAD:.0%}"]
+    return [*lines, f"  together {total:.1f} % of 1 Mbit/s at worst-case stuffing; at most {MAX_LOAD:.0%}"]
 
 
 def what_fits(joints: Sequence[int], config: RunConfig, settings: Settings) -> str:
@@ -186,7 +186,7 @@ def what_fits(joints: Sequence[int], config: RunConfig, settings: Settings) -> s
             break
     for times in (2, 4):
         contact_every = times * reports.contact_every
-        if 0 < contact_every <= MOST_EVERY and fits(fullest, replace(reports, contact_every=contact_every)):
+        if 0 < contact_every <= MAX_EVERY and fits(fullest, replace(reports, contact_every=contact_every)):
             ways.append(f"backends.can.contact_rate_hz = {config.rate_hz / contact_every:g}")
             break
     return "What would fit: " + ("; or ".join(ways) or "nothing on classic CAN") + "."
@@ -197,7 +197,7 @@ def most_rate_hz(joints: int, config: RunConfig, settings: Settings) -> int | No
 
     Not found by halving: at some lower rate reports may come at every Sync instead of every second one.
     """
-    for rate_hz in range(ceil(config.rate_hz) - 1, LEAST_RATE_HZ - 1, -1):
+    for rate_hz in range(ceil(config.rate_hz) - 1, MIN_RATE_HZ - 1, -1):
         if fits(joints, reports_at(rate_hz, config, settings)):
             return rate_hz
     return None

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TextIO
 
 from snakesim_can_backend.bus.bus import Wire
-from snakesim_can_backend.bus.bus_errors import Trouble
+from snakesim_can_backend.bus.bus_errors import BusError
 from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_hal.errors import ConfigError
 
@@ -46,7 +46,7 @@ class LoggedWire:
             self._write(frame)
         return frames
 
-    def troubles(self) -> list[Trouble]:
+    def troubles(self) -> list[BusError]:
         """As the wire says."""
         return self._wire.troubles()
 

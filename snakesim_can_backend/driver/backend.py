@@ -13,10 +13,10 @@ from pathlib import Path
 import msgspec
 
 from snakesim_can_backend.bus.bus import OtherEnd, SocketCanWire, VirtualWire, Wire, check_interface, wait
-from snakesim_can_backend.bus.bus_errors import Trouble
+from snakesim_can_backend.bus.bus_errors import BusError
 from snakesim_can_backend.bus.load import BIT_RATE, Reports, check_load, reports_of, shares, worst_bits
 from snakesim_can_backend.bus.log import LoggedWire, open_log
-from snakesim_can_backend.driver.bring_up import Bus, configure, find, objections
+from snakesim_can_backend.driver.bring_up import Bus, configure, discovery_errors, find
 from snakesim_can_backend.driver.mocap import MocapReceiver, check_pose, pose_address
 from snakesim_can_backend.driver.module_monitor import ARM_GRACE, Finding, Watch
 from snakesim_can_backend.driver.own_twins import TwinProcess, check_faults, check_twins, modules_know, twins_here
@@ -37,7 +37,7 @@ from snakesim_hal.wire.messages import Description, Fault, LifecycleState, Pace
 NAME = "can"
 ANSWER_MARGIN = 1.25  # of the bus time that all answers take
 ANSWER_SLACK_S = 0.002
-MOST_OF_PERIOD = 0.75
+MAX_OF_PERIOD = 0.75
 CONFIGURE_LIMIT_S = 1.0  # while the robot is up; an emergency stop waits no longer than that, with motors that are off
 LOCKSTEP_ANSWER_S = 2.0  # twins that are slow are waited for; those that are dead are not waited for again
 FIRST_STATE_SYNCS = 20
@@ -163,7 +163,7 @@ class CanBackend:
         """What the modules and the buses complain of, and what the driver sees wrong with them."""
         if not self._open:
             return []
-        troubles: list[Trouble] = [trouble for wire in self._wires for trouble in wire.troubles()]
+        troubles: list[BusError] = [trouble for wire in self._wires for trouble in wire.troubles()]
         names = self._description.joints
         found = self._watch.look(
             self._reading, self._lifecycle, troubles, self._unsent, self._unconfigured, self._isolated
@@ -276,7 +276,7 @@ class CanBackend:
         found = find(self._buses, limit_s, self._reading.take)
         if self._reading.from_other_host:
             raise BackendError("another program commands the modules on this bus; end it first. Nothing was sent")
-        wrong = objections(self._buses, found, names, lockstep=self._lockstep)
+        wrong = discovery_errors(self._buses, found, names, lockstep=self._lockstep)
         if wrong:
             raise BackendError("the robot is not whole; nothing was enabled:", *(f"  {what}" for what in wrong))
         self._ours = True
@@ -426,4 +426,4 @@ def _answer_time_s(buses: list[Bus], reports: Reports) -> float:
     """How long all answers to a Sync may take on the fullest bus; the rest of the period is the controller's."""
     frames = max(len(bus.nodes) for bus in buses) * (1 + (reports.contact_every > 0)) + reports.tail
     bus_s = frames * worst_bits(8) / BIT_RATE
-    return min(ANSWER_MARGIN * bus_s + ANSWER_SLACK_S, MOST_OF_PERIOD / reports.rate_hz)
+    return min(ANSWER_MARGIN * bus_s + ANSWER_SLACK_S, MAX_OF_PERIOD / reports.rate_hz)

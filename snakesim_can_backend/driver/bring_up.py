@@ -79,7 +79,9 @@ def find(buses: Sequence[Bus], limit_s: float, on_frame: Callable[[Frame], None]
     return sorted(found.values(), key=lambda i: (i.node, i.channel, i.serial))
 
 
-def objections(buses: Sequence[Bus], found: Sequence[Identity], joints: Sequence[str], *, lockstep: bool) -> list[str]:
+def discovery_errors(
+    buses: Sequence[Bus], found: Sequence[Identity], joints: Sequence[str], *, lockstep: bool
+) -> list[str]:
     """What is wrong with who is there; empty when the robot is whole."""
     wrong: list[str] = []
     home = {node: bus.wire.channel for bus in buses for node in bus.nodes}

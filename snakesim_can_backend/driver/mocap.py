@@ -7,7 +7,7 @@ of the motion-capture system that goes on evenly; `mocap_times` relates it to ou
 `angular_velocity_w` may follow; both are derived from two poses and their stamps otherwise, and a pose without a
 velocity is not handed on.
 
-Datagrams come from anybody who reaches the port. At most `MOST_AT_ONCE` are read per tick, what cannot be used is
+Datagrams come from anybody who reaches the port. At most `MAX_AT_ONCE` are read per tick, what cannot be used is
 counted by its reason and left out.
 """
 
@@ -28,12 +28,12 @@ from snakesim_hal.wire import quantities as q
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import Pose
 
-MOST_BYTES = 2048
-MOST_AT_ONCE = 64  # datagrams a tick: 10 ms of a camera with 1 kHz six times over, and 0.6 ms at worst to refuse them
+MAX_BYTES = 2048
+MAX_AT_ONCE = 64  # datagrams a tick: 10 ms of a camera with 1 kHz six times over, and 0.6 ms at worst to refuse them
 RECEIVE_BUFFER_BYTES = 1 << 15  # the kernel keeps about as many: what a flood leaves in it is soon read
 UNIT_WITHIN = 0.05  # of the length of a quaternion
 LONGEST_GAP_NS = 200_000_000  # between two poses that give a velocity
-MOST_SPEED_M_S = 100.0  # of the base; two poses further apart are of two bodies, or of markers that were confused
+MAX_SPEED_M_S = 100.0  # of the base; two poses further apart are of two bodies, or of markers that were confused
 
 _log = logging.getLogger("snakesim.can")
 
@@ -131,11 +131,11 @@ class MocapReceiver:
         return newest
 
     def _read(self) -> list[MocapSample]:
-        """Well-formed samples in the order in which they came; at most `MOST_AT_ONCE` datagrams are looked at."""
+        """Well-formed samples in the order in which they came; at most `MAX_AT_ONCE` datagrams are looked at."""
         samples: list[MocapSample] = []
-        for _ in range(MOST_AT_ONCE):
+        for _ in range(MAX_AT_ONCE):
             try:
-                datagram = self._socket.recv(MOST_BYTES)
+                datagram = self._socket.recv(MAX_BYTES)
             except BlockingIOError:
                 break
             except OSError as error:
@@ -164,7 +164,7 @@ class MocapReceiver:
         if before is None or now.stamp_ns - before.stamp_ns > LONGEST_GAP_NS:
             return None
         seconds = (now.stamp_ns - before.stamp_ns) * 1e-9
-        if math.dist(before.position_w, now.position_w) > MOST_SPEED_M_S * seconds:
+        if math.dist(before.position_w, now.position_w) > MAX_SPEED_M_S * seconds:
             self._refuse("leap", f"from {before.position_w} to {now.position_w} m in {seconds:.3g} s")
             return None
         return (

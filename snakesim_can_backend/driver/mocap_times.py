@@ -18,9 +18,9 @@ from typing import Literal
 
 Refusal = Literal["duplicate", "reordered", "late", "future"]
 
-LEAST_APART_NS = 1_000_000
-MOST_LATE_NS = 250_000_000
-MOST_EARLY_NS = 50_000_000
+MIN_APART_NS = 1_000_000
+MAX_LATE_NS = 250_000_000
+MAX_EARLY_NS = 50_000_000
 SAME_CLOCK_NS = 50_000_000  # two offsets no further apart are of one clock
 READINGS_TO_BELIEVE = 5
 WINDOW_NS = 10_000_000_000  # the offset is the least of one to two of these, so that clocks may drift
@@ -58,12 +58,12 @@ class CaptureTimes:
         newest_ns = self._newest_ns
         if newest_ns is not None and stamp_ns < newest_ns:
             return "reordered"
-        if newest_ns is not None and stamp_ns < newest_ns + LEAST_APART_NS:
+        if newest_ns is not None and stamp_ns < newest_ns + MIN_APART_NS:
             return "duplicate"
         late_ns = now_ns - stamp_ns - self._offset.least_ns
-        if late_ns > MOST_LATE_NS:
+        if late_ns > MAX_LATE_NS:
             return "late"
-        if late_ns < -MOST_EARLY_NS:
+        if late_ns < -MAX_EARLY_NS:
             return "future"
         self._newest_ns = stamp_ns
         self._offset.take(now_ns - stamp_ns, now_ns)

@@ -7,7 +7,7 @@ clears the robot's fault; what persists is then told again.
 from collections.abc import Iterable, Sequence, Set
 from dataclasses import dataclass
 
-from snakesim_can_backend.bus.bus_errors import Trouble
+from snakesim_can_backend.bus.bus_errors import BusError
 from snakesim_can_backend.driver.reports import Module, Reading
 from snakesim_can_backend.protocol.definitions import ModuleState, Opcode
 from snakesim_hal.wire.messages import LifecycleState
@@ -17,7 +17,7 @@ IN_A_ROW = 3  # bad frames of one kind, or periods that a bus is full, before th
 CLEAR_GRACE = 5  # Syncs that a module may take to follow a clearing
 ARM_GRACE = 5  # Syncs that a module may take to follow an arming
 STRANGER_FRAMES = 3  # of a node that should not be there, in ticks one after the other
-MOST_FRAMES = 16  # of one module in a tick; a healthy one sends 8 at most
+MAX_FRAMES = 16  # of one module in a tick; a healthy one sends 8 at most
 
 # Of one module, and yet nothing that the others could go on beside: two modules with one id, a bus that is full, water,
 # a supply that all share, an emergency; nor does a robot set out that is not whole.
@@ -83,7 +83,7 @@ class Watch:
         self,
         reading: Reading,
         lifecycle: LifecycleState,
-        troubles: Iterable[Trouble] = (),
+        troubles: Iterable[BusError] = (),
         unsent: Iterable[str] = (),
         unconfigured: Iterable[int] = (),
         isolated: Set[int] = frozenset(),
@@ -146,7 +146,7 @@ class Watch:
             tell("bad_checksum", f"sends corrupt states: {module.corrupt} wrong checksums in a row")
         if module.answered_twice(reading.sync) >= IN_A_ROW:
             tell("duplicate_node", "is there twice: every Sync is answered two times; give each module its own node id")
-        if module.frames > MOST_FRAMES:
+        if module.frames > MAX_FRAMES:
             tell("module_babbling", f"floods the bus: {module.frames} frames within one period")
         unanswered = reading.sync - module.sync - module.corrupt - max(module.repeats, module.wrong_counts)
         unanswered = min(unanswered, reading.sync - self._unasked.get(self._channels[i], -1))
@@ -208,7 +208,7 @@ class Watch:
 
     # --- the bus ----------------------------------------------------------------------------------------------
 
-    def _of_bus(self, troubles: Iterable[Trouble], unsent: set[str]) -> list[Finding]:
+    def _of_bus(self, troubles: Iterable[BusError], unsent: set[str]) -> list[Finding]:
         found: list[Finding] = []
         for trouble in troubles:
             if trouble.kind == "interface_down":

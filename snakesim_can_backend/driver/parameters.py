@@ -10,7 +10,7 @@ from snakesim_hal.errors import BackendError, ConfigError
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig
 
-LEAST_PERIODS = 2.2  # in a watchdog's time: one set-point may be lost, and the next be a little late
+MIN_PERIODS = 2.2  # in a watchdog's time: one set-point may be lost, and the next be a little late
 SPEED_ROOM = 1.2  # a joint may be pushed faster than its motor turns, and must still be told
 
 
@@ -74,9 +74,9 @@ def check_ratings(robot: RobotFile, in_force: Mapping[int, Mapping[Parameter, fl
 
 def check_watchdog(config: RunConfig, settings: Settings) -> None:
     """Raise ConfigError for modules that one lost set-point would stop."""
-    least_s = LEAST_PERIODS / config.rate_hz
+    least_s = MIN_PERIODS / config.rate_hz
     if settings.watchdog_s < least_s:
-        least_hz = LEAST_PERIODS / settings.watchdog_s
+        least_hz = MIN_PERIODS / settings.watchdog_s
         raise ConfigError(
             f"`backends.can.watchdog_s` = {settings.watchdog_s:g} s at `rate_hz` = {config.rate_hz:g}: one lost "
             f"set-point would stop the modules; give them {least_s:.3g} s or more, or a rate from {least_hz:.0f} Hz on"

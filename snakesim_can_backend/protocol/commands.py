@@ -27,8 +27,8 @@ from snakesim_hal.backend import SetPoints
 from snakesim_hal.wire.messages import LifecycleState, Mode
 
 LATCHED: tuple[LifecycleState, ...] = ("fault", "estop")
-MOST_RAW = 32767
-MOST_LIMIT_RAW = 65535
+MAX_RAW = 32767
+MAX_LIMIT_RAW = 65535
 
 
 class SetPointWriter:
@@ -50,8 +50,8 @@ class SetPointWriter:
     def frames(self, set_points: SetPoints) -> list[Frame]:
         """One frame a joint, tail to head."""
         modes = np.array(set_points.mode, dtype=np.intp)
-        target = _steps(np.array(set_points.target) * self._steps_per_unit[modes], -MOST_RAW, MOST_RAW)
-        limit = _steps(np.array(set_points.torque_limit_nm) * self._limit_steps, 0, MOST_LIMIT_RAW)
+        target = _steps(np.array(set_points.target) * self._steps_per_unit[modes], -MAX_RAW, MAX_RAW)
+        limit = _steps(np.array(set_points.torque_limit_nm) * self._limit_steps, 0, MAX_LIMIT_RAW)
         rows = zip(set_points.mode, self._count, target.tolist(), limit.tolist(), strict=True)
         return [self._write(node, row) for node, row in enumerate(rows, start=1)]
 

@@ -6,7 +6,7 @@
 `firmware`    one module: states, watchdog, set-points, reports; `parameters` is what it keeps in its flash
 `motors`      all motors as vectors; their heat is `snakesim_hal.model.thermal`
 `senses`      what the sensors feel, with their noise; `reports` rounds it as the bus does; `frames` are the layouts
-`seat`        a module's place on a bus, and what is wrong there
+`slot`        a module's place on a bus, and what is wrong there
 `bus_time`    what a bus of 1 Mbit/s would make of the frames: who waits for whom, and how full it is
 `faults`      what can go wrong, on request
 `inertia`     a plant for machines without physics: every joint an inertia of its own

@@ -16,9 +16,9 @@ from snakesim_can_backend.protocol.definitions import NODE_BITS, Frame, Opcode
 OPCODES = 32
 US_PER_BIT = 1e6 / BIT_RATE
 FRAME_US = [worst_bits(length) * US_PER_BIT for length in range(9)]
-MOST_AHEAD_US = 20_000.0  # of frames that the host sends faster than any bus could take
+MAX_AHEAD_US = 20_000.0  # of frames that the host sends faster than any bus could take
 IN_ORDER = frozenset((Opcode.PARAMETER_ANSWER,))  # each answers another question: none replaces another
-MOST_ANSWERS = 64
+MAX_ANSWERS = 64
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class BusTime:
         """A frame of the host is there."""
         self._proceed(now_us)
         took = FRAME_US[len(frame.data)]
-        self._free_us = min(max(self._free_us, now_us) + took, now_us + MOST_AHEAD_US)
+        self._free_us = min(max(self._free_us, now_us) + took, now_us + MAX_AHEAD_US)
         self._count(frame, took)
 
     def offer(self, sender: int, frame: Frame, now_us: float) -> None:
@@ -65,7 +65,7 @@ class BusTime:
         slot = frame.id
         if frame.id >> NODE_BITS in IN_ORDER:
             self._answers += 1
-            slot |= (self._answers % MOST_ANSWERS + 1) << 11
+            slot |= (self._answers % MAX_ANSWERS + 1) << 11
         if slot in queue:
             queue[slot] = (frame, queue[slot][1])
             self._replaced += 1

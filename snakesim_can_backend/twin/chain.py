@@ -20,7 +20,7 @@ from snakesim_can_backend.twin.bus_time import FRAME_US, BusTime, Traffic
 from snakesim_can_backend.twin.faults import parse
 from snakesim_can_backend.twin.firmware import BOOT_US, Module
 from snakesim_can_backend.twin.frames import LENGTHS, read_sync
-from snakesim_can_backend.twin.module_slot import Seat
+from snakesim_can_backend.twin.module_slot import ModuleSlot
 from snakesim_can_backend.twin.motors import Motors
 from snakesim_can_backend.twin.parameters import Parameters, from_factory
 from snakesim_can_backend.twin.senses import PoseCamera, Senses
@@ -30,7 +30,7 @@ from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.thermal import HeatLimits, Thermal
 from snakesim_hal.wire.messages import Mode
 
-MOST_AT_ONCE_US = 200_000.0  # after a longer hiccup of this process, the modules have missed the rest of it
+MAX_AT_ONCE_US = 200_000.0  # after a longer hiccup of this process, the modules have missed the rest of it
 HEAT_EVERY = 10  # steps
 ROUND_US = 1 << 32  # Sync times go round
 LONGEST_STEP_US = 60_000_000  # a Sync that is later by more is of another clock; no bus is cut for so long in lockstep
@@ -69,7 +69,7 @@ class ModuleChain:
         self._pose_time: int | None = None
         self._seed = config.seed
         starts = [0, *accumulate(self.counts)]
-        self.seats: list[Seat] = []
+        self.slots: list[ModuleSlot] = []
         for channel, count in enumerate(self.counts):
             for joint in range(starts[channel], starts[channel] + count):
                 self._seat(joint, channel, self._serial(joint), -BOOT_US if stepped else 0.0)
@@ -83,7 +83,7 @@ class ModuleChain:
             self._camera = PoseCamera(robot.sensors.pose, plant, (config.seed, len(self.counts)), config.period_ns)
         self._encode = msgspec.json.Encoder().encode
         self._out: list[list[Frame]] = [[] for _ in self.counts]
-        self._babblers: dict[Seat, float] = {}  # in stepped time: until when they have spoken
+        self._babblers: dict[ModuleSlot, float] = {}  # in stepped time: until when they have spoken
         self._poll(0.0)
 
     # --- time ----------------------------------------------------------------------------------------------
@@ -91,9 +91,9 @@ class ModuleChain:
     def advance_to(self, clock_us: float) -> None:
         """Bring everything up to a time since the start. Not for stepped chains, whose time passes at Syncs."""
         now_us = clock_us - self.skipped_us
-        if now_us - self.now_us > MOST_AT_ONCE_US:
-            self.skipped_us += now_us - self.now_us - MOST_AT_ONCE_US
-            now_us = self.now_us + MOST_AT_ONCE_US
+        if now_us - self.now_us > MAX_AT_ONCE_US:
+            self.skipped_us += now_us - self.now_us - MAX_AT_ONCE_US
+            now_us = self.now_us + MAX_AT_ONCE_US
         if now_us > self.now_us:
             self._pass(now_us, int(now_us / self._step_us) - self._steps)
 
@@ -135,15 +135,15 @@ class ModuleChain:
         speeds, torques = self.plant.velocity_rad_s.tolist(), self.motors.torque_nm.tolist()
         windings, rated = self.thermal.winding_c.tolist(), self.motors.rated_nm
         due_us = self._plan.next_s() * 1e6
-        for seat in self.seats:
-            j = seat.joint
-            seat.feel(speeds[j], torques[j], rated, windings[j])
-            due_us = min(due_us, seat.module.poll(now_us))
-            self._follow_up(seat)
-        for seat, since_us in self._babblers.items():
+        for slot in self.slots:
+            j = slot.joint
+            slot.feel(speeds[j], torques[j], rated, windings[j])
+            due_us = min(due_us, slot.module.poll(now_us))
+            self._follow_up(slot)
+        for slot, since_us in self._babblers.items():
             burst = int((now_us - since_us) / FRAME_US[8])
-            self._out[seat.channel].extend([seat.module.heartbeat(now_us)] * burst)
-            self._babblers[seat] = since_us + burst * FRAME_US[8]
+            self._out[slot.channel].extend([slot.module.heartbeat(now_us)] * burst)
+            self._babblers[slot] = since_us + burst * FRAME_US[8]
         self._due_us = now_us if self._babblers else due_us
 
     # --- what comes from the bus ---------------------------------------------------------------------------
@@ -162,16 +162,16 @@ class ModuleChain:
         if opcode == Opcode.SYNC:
             self._sync(channel, frame)
         elif opcode == Opcode.SET_POINT:
-            for seat in self._at(channel, node):
-                seat.module.hear_set_point(frame, self.now_us)
-                if seat.module.frames:
-                    self._follow_up(seat)
+            for slot in self._at(channel, node):
+                slot.module.hear_set_point(frame, self.now_us)
+                if slot.module.frames:
+                    self._follow_up(slot)
         else:
             everybody = node == BROADCAST and opcode != Opcode.PARAMETER_REQUEST
-            for seat in self.seats if everybody else self._at(channel, node):
-                if seat.channel == channel:
-                    seat.module.hear(frame, self.now_us)
-                    self._follow_up(seat)
+            for slot in self.slots if everybody else self._at(channel, node):
+                if slot.channel == channel:
+                    slot.module.hear(frame, self.now_us)
+                    self._follow_up(slot)
             if opcode != Opcode.PARAMETER_REQUEST:
                 self._poll(self.now_us)
 
@@ -199,16 +199,16 @@ class ModuleChain:
             if sample is not None:
                 self._send_pose(self._encode(sample))
         first = sum(self.counts[:channel])
-        seats = self.seats[first : first + self.counts[channel]]
-        imu_due = [seat.module.imu_is_due() for seat in seats]
+        slots = self.slots[first : first + self.counts[channel]]
+        imu_due = [slot.module.imu_is_due() for slot in slots]
         sights = self._senses[channel].look(self.motors.torque_nm, self.motors.derated(), imu_due)
-        for seat, sight in zip(seats, sights, strict=True):
-            seat.module.sync(count, sight)
-            self._follow_up(seat)
-        for seat in self.seats[self.count :]:
-            if seat.channel == channel:
-                seat.module.sync(count, sights[seat.joint - first])
-                self._follow_up(seat)
+        for slot, sight in zip(slots, sights, strict=True):
+            slot.module.sync(count, sight)
+            self._follow_up(slot)
+        for slot in self.slots[self.count :]:
+            if slot.channel == channel:
+                slot.module.sync(count, sights[slot.joint - first])
+                self._follow_up(slot)
         out = self._out[channel]
         out[sent:] = sorted(out[sent:], key=lambda frame: frame.id)  # as they would win the bus
 
@@ -222,29 +222,29 @@ class ModuleChain:
             return
         self._sync_time = sync_time
 
-    def _at(self, channel: int, node: int) -> list[Seat]:
-        found = [self.seats[node - 1]] if 1 <= node <= self.count else []
-        if len(self.seats) > self.count:
-            found += [seat for seat in self.seats[self.count :] if seat.module.node == node]
-        return [seat for seat in found if seat.channel == channel]
+    def _at(self, channel: int, node: int) -> list[ModuleSlot]:
+        found = [self.slots[node - 1]] if 1 <= node <= self.count else []
+        if len(self.slots) > self.count:
+            found += [slot for slot in self.slots[self.count :] if slot.module.node == node]
+        return [slot for slot in found if slot.channel == channel]
 
     # --- what goes out -------------------------------------------------------------------------------------
 
-    def _follow_up(self, seat: Seat) -> None:
+    def _follow_up(self, slot: ModuleSlot) -> None:
         """Send what a module has to say, and do with its motor what it wants."""
-        for frame in seat.outgoing():
+        for frame in slot.outgoing():
             if self.stepped:
-                self._out[seat.channel].append(frame)
+                self._out[slot.channel].append(frame)
             else:
-                self.buses[seat.channel].offer(seat.sender, frame, self.now_us)
-        demand = seat.module.demand
-        if demand is seat.driven or not seat.drives:
+                self.buses[slot.channel].offer(slot.sender, frame, self.now_us)
+        demand = slot.module.demand
+        if demand is slot.driven or not slot.drives:
             return
-        seat.driven = demand
-        values = seat.module.parameters.values
+        slot.driven = demand
+        values = slot.module.parameters.values
         damping = Parameter.DAMPING if demand.mode == Mode.POSITION else Parameter.VELOCITY_GAIN
         self.motors.drive(
-            seat.joint,
+            slot.joint,
             demand.mode,
             demand.target,
             min(demand.torque_limit_nm, values[Parameter.TORQUE_LIMIT]) if demand.mode else self.motors.rated_nm,
@@ -262,7 +262,7 @@ class ModuleChain:
 
     def _go_wrong(self, change: Change, now_us: float) -> None:
         fault, joint = change.injection, change.injection.number
-        seat = self.seats[joint]
+        slot = self.slots[joint]
         self.happened.append(f"{now_us * 1e-6:.2f} s {fault} {'begins' if change.begins else 'ends'}")
         match fault.kind:
             case "overheat":
@@ -270,26 +270,26 @@ class ModuleChain:
                 self._derate()
             case "duplicate":
                 if change.begins:
-                    self._seat(joint, seat.channel, seat.module.serial ^ OTHER_SERIAL, now_us - BOOT_US, drives=False)
+                    self._seat(joint, slot.channel, slot.module.serial ^ OTHER_SERIAL, now_us - BOOT_US, drives=False)
                 else:
-                    self.seats[self.count :] = [s for s in self.seats[self.count :] if s.joint != joint]
+                    self.slots[self.count :] = [s for s in self.slots[self.count :] if s.joint != joint]
             case "babble" if self.stepped:
-                self._babblers.pop(seat, None)
+                self._babblers.pop(slot, None)
                 if change.begins:
-                    self._babblers[seat] = now_us
+                    self._babblers[slot] = now_us
             case "babble":
-                frame = seat.module.heartbeat(now_us) if change.begins else None
-                self.buses[seat.channel].babble(seat.sender, frame, now_us)
+                frame = slot.module.heartbeat(now_us) if change.begins else None
+                self.buses[slot.channel].babble(slot.sender, frame, now_us)
             case kind if change.begins:
-                seat.begin(kind, now_us)
+                slot.begin(kind, now_us)
             case kind:
-                seat.end(kind)
+                slot.end(kind)
 
     def _seat(self, joint: int, channel: int, serial: int, now_us: float, *, drives: bool = True) -> None:
         module = Module(
             joint + 1, serial, Parameters(self._flash), self._heat_limits, stepped=self.stepped, now_us=now_us
         )
-        self.seats.append(Seat(len(self.seats), channel, joint, module, drives))
+        self.slots.append(ModuleSlot(len(self.slots), channel, joint, module, drives))
 
     def _serial(self, joint: int) -> int:
         return crc32(f"{self._seed}:{joint + 1}".encode())

@@ -16,7 +16,7 @@ from snakesim_can_backend.protocol.definitions import (
     COUNTS,
     HEALTH_PERIOD_S,
     HEARTBEAT_PERIOD_S,
-    MOST_LOST,
+    MAX_LOST,
     VERSION,
     WRONG_COUNTS,
     Action,
@@ -46,8 +46,8 @@ from snakesim_can_backend.twin.frames import (
     write_tail_contact,
 )
 from snakesim_can_backend.twin.parameters import Parameters
-from snakesim_can_backend.twin.reports import Inside, Sight, health
-from snakesim_hal.model.thermal import LEAST_VOLTAGE_V, HeatLimits
+from snakesim_can_backend.twin.reports import ModuleHealth, Readings, health
+from snakesim_hal.model.thermal import MIN_VOLTAGE_V, HeatLimits
 from snakesim_hal.wire.messages import Mode
 
 BOOT_US = 100_000
@@ -86,7 +86,7 @@ class Module:
         """heat: where its winding stops it, and below which it must have cooled before a clear helps."""
         self.node, self.serial, self.parameters, self.heat = node, serial, parameters, heat
         self.frames: list[Frame] = []
-        self.inside = Inside()
+        self.inside = ModuleHealth()
         self.hangs = False  # its main loop stands still; only hardware still works
         self.refused = 0  # frames with a wrong checksum, count or length
         self._stepped = stepped
@@ -132,7 +132,7 @@ class Module:
             return
         mode, count, number, limit = read_set_point(frame.data)
         expected, self._expected = self._expected, (count + 1) % COUNTS
-        if expected is not None and (count - expected) % COUNTS > MOST_LOST:
+        if expected is not None and (count - expected) % COUNTS > MAX_LOST:
             self.refused += 1
             self._wrong_counts += 1
             if self._wrong_counts >= WRONG_COUNTS:
@@ -149,7 +149,7 @@ class Module:
             target = self._within(target)
         self._pending = Demand(MODES[mode], target, limit * LIMIT_STEP)
 
-    def sync(self, count: int, sight: Sight) -> None:
+    def sync(self, count: int, sight: Readings) -> None:
         """Answer a Sync with what the sensors gave at that instant, then enact the newest set-point."""
         if self.state == ModuleState.BOOT:
             return
@@ -281,7 +281,7 @@ class Module:
         return (
             (inside.winding_c >= hot) << ModuleFault.OVERHEAT
             | inside.leak << ModuleFault.LEAK
-            | (inside.voltage_v < LEAST_VOLTAGE_V) << ModuleFault.VOLTAGE
+            | (inside.voltage_v < MIN_VOLTAGE_V) << ModuleFault.VOLTAGE
         )
 
     def _watch_conditions(self, now_us: float) -> None:
@@ -318,7 +318,7 @@ class Module:
     def _identify(self, _now_us: float) -> None:
         self.frames.append(write_identity(self.node, (self.serial, *FIRMWARE, VERSION, 1, self._stepped)))
 
-    def _report_imu(self, count: int, sight: Sight) -> None:
+    def _report_imu(self, count: int, sight: Readings) -> None:
         if sight.gyro is not None and sight.acceleration is not None:
             self.frames.append(write_gyro(self.node, (*sight.gyro, count)))
             self.frames.append(write_acceleration(self.node, (*sight.acceleration, count)))

@@ -4,13 +4,13 @@ from dataclasses import dataclass
 
 from snakesim_can_backend.protocol.definitions import Frame, Opcode, checksum, opcode_of
 from snakesim_can_backend.twin.firmware import Demand, Module
-from snakesim_hal.model.thermal import LEAST_VOLTAGE_V, SUPPLY_V, board_c, current_a
+from snakesim_hal.model.thermal import MIN_VOLTAGE_V, SUPPLY_V, board_c, current_a
 
-SAGGED_V = LEAST_VOLTAGE_V - 6.0
+SAGGED_V = MIN_VOLTAGE_V - 6.0
 
 
 @dataclass(slots=True, eq=False)
-class Seat:
+class ModuleSlot:
     """One module, the joint it moves, and the bus it is on."""
 
     sender: int  # its place in the bus's queue

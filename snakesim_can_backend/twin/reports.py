@@ -37,7 +37,7 @@ class Rounder:
 
 
 @dataclass(slots=True)
-class Sight:
+class Readings:
     """What one module's sensors give at a Sync, in raw numbers."""
 
     angle: int
@@ -52,7 +52,7 @@ class Sight:
 
 
 @dataclass(slots=True)
-class Inside:
+class ModuleHealth:
     """What a module measures inside itself."""
 
     speed_rad_s: float = 0.0
@@ -70,7 +70,7 @@ def touch(load: LinkLoad) -> tuple[int, int, int, int, int, int]:
     return FORCE.one(fx), FORCE.one(fy), FORCE.one(fz), ALONG.one(x), round(math.atan2(z, y) / BEARING_STEP), 1
 
 
-def health(inside: Inside) -> tuple[int, int, int, int, int, int]:
+def health(inside: ModuleHealth) -> tuple[int, int, int, int, int, int]:
     """The raw numbers of a Health."""
     leak = inside.leak
     return (

@@ -20,7 +20,7 @@ from snakesim_can_backend.twin.reports import (
     TORQUE,
     UNTOUCHED,
     VELOCITY,
-    Sight,
+    Readings,
     touch,
 )
 from snakesim_hal.model.plant import LinkLoad, Plant
@@ -43,14 +43,14 @@ class Senses:
         self._contacts, self._imu = robot.sensors.contacts, robot.sensors.imu
         self._torque_sigma = joints.torque_noise_nm
 
-    def look(self, torque_nm: Floats, derated: NDArray[np.bool_], imu_due: Sequence[bool]) -> list[Sight]:
+    def look(self, torque_nm: Floats, derated: NDArray[np.bool_], imu_due: Sequence[bool]) -> list[Readings]:
         """What every module sees now; torque and derating are those of all motors of the chain."""
         here = slice(self._first, self._first + self._count)
         joints = np.stack((self._plant.angle_rad[here], self._plant.velocity_rad_s[here], torque_nm[here]))
         if self._noisy:
             joints += self._joint_sigma * self._noise((3, self._count))
         sights = [
-            Sight(angle, velocity, torque, bool(hot))
+            Readings(angle, velocity, torque, bool(hot))
             for angle, velocity, torque, hot in zip(
                 ANGLE.many(joints[0]), VELOCITY.many(joints[1]), TORQUE.many(joints[2]), derated[here], strict=True
             )
@@ -60,7 +60,7 @@ class Senses:
             self._weigh(sights, imu_due)
         return sights
 
-    def _feel(self, sights: list[Sight]) -> None:
+    def _feel(self, sights: list[Readings]) -> None:
         sensor = self._contacts
         if sensor is None:
             return
@@ -82,7 +82,7 @@ class Senses:
         m, n = sensor.position_noise_m, sensor.force_noise_n
         return LinkLoad(load.link, (x + m * a, y + m * b, z + m * c), (fx + n * d, fy + n * e, fz + n * f))
 
-    def _weigh(self, sights: list[Sight], due: Sequence[bool]) -> None:
+    def _weigh(self, sights: list[Readings], due: Sequence[bool]) -> None:
         shaft = self._plant.shaft_torque_nm()[self._first : self._first + self._count]
         shafts = SHAFT_LOAD.many(shaft + self._torque_sigma * self._noise(self._count))
         imu = self._plant.imu() if self._imu is not None else None

@@ -14,11 +14,11 @@ Floats = NDArray[np.float64]
 
 SPACING_M = 0.01  # of the rows; half a percent of a radian is lost between them on paths that bend once in 0.15 m
 CHORD_SPACING_M = 0.005
-MOST_STEP_M = 0.05  # of one correction of the arc length
+MAX_STEP_M = 0.05  # of one correction of the arc length
 
 
 @dataclass(frozen=True)
-class Lie:
+class BodyPose:
     """How the body lies on the path when its tail end is at `tail_s_m`.
 
     Its nodes are the tail end, the joints that bend, and the head end: all on the path.
@@ -45,10 +45,10 @@ class BodyOnPath:
         self._rows: dict[int, Floats] = {}
         self._chord_ends: dict[float, dict[int, float]] = {length: {} for length in segments_m}
 
-    def at(self, tail_s_m: float) -> Lie:
+    def at(self, tail_s_m: float) -> BodyPose:
         """The body with its tail end at an arc length, which may be before the path's start or beyond its end."""
         row, _ = self._between(tail_s_m)
-        return Lie(
+        return BodyPose(
             tail_s_m,
             row[: self._bends],
             row[self._xy].reshape(2, self._nodes),
@@ -67,7 +67,7 @@ class BodyOnPath:
             row, slope = self._between(s)
             along = slope[self._xy]
             step = float((measured - row[self._xy]) @ along / (along @ along))
-            s += min(max(step, -MOST_STEP_M), MOST_STEP_M)
+            s += min(max(step, -MAX_STEP_M), MAX_STEP_M)
         return s
 
     def _between(self, s_m: float) -> tuple[Floats, Floats]:

@@ -20,7 +20,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, JointState, Trajectory, World
 
 MISSED = 3
-LEAST_MARGIN_S = 0.2  # guidance and navigation have no real-time priority: a busy computer holds them up
+MIN_MARGIN_S = 0.2  # guidance and navigation have no real-time priority: a busy computer holds them up
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Limits:
 
 
 def _margin_s(turn_s: float) -> float:
-    return max(MISSED * turn_s, LEAST_MARGIN_S)
+    return max(MISSED * turn_s, MIN_MARGIN_S)
 
 
 def _off(key: str, stamp_ns: int | None, now_ns: int, limit_s: float) -> str:

@@ -14,7 +14,7 @@ from snakesim_gnc.control.controller import Action, Controller, Report, View
 from snakesim_hal.backend import SetPoints
 from snakesim_hal.errors import ControllerError
 from snakesim_hal.wire.messages import Description, Mode
-from snakesim_hal.wire.quantities import MOST_TARGET
+from snakesim_hal.wire.quantities import MAX_TARGET
 
 NUMBERS = {float, int}  # exactly: a NumPy number or a bool is none that can be sent
 MODES = ", ".join(f"Mode.{mode.name}" for mode in Mode)
@@ -70,7 +70,7 @@ def check(action: Action, joints: Sequence[str]) -> None:
     for i, mode in enumerate(points.mode):
         if type(mode) is not Mode:
             raise ValueError(f"SetPoints.mode[{i}] ({joints[i]}) is {_shown(mode)}, must be one of {MODES}")
-    _check_numbers("target", points.target, joints, least=-MOST_TARGET)
+    _check_numbers("target", points.target, joints, least=-MAX_TARGET)
     _check_numbers("torque_limit_nm", points.torque_limit_nm, joints, least=0.0)
     _check_report(report, joints)
 
@@ -87,13 +87,13 @@ def _check_length(field: str, values: Any, joints: Sequence[str]) -> None:
 def _check_numbers(field: str, values: Any, joints: Sequence[str], *, least: float) -> None:
     _check_length(field, values, joints)
     for i, value in enumerate(values):
-        if type(value) in NUMBERS and least <= value <= MOST_TARGET:  # which no NaN is
+        if type(value) in NUMBERS and least <= value <= MAX_TARGET:  # which no NaN is
             continue
         where = f"SetPoints.{field}[{i}] ({joints[i]}) is {_shown(value)}"
         if type(value) not in NUMBERS:
             raise ValueError(f"{where}, must be a plain float: use float(), or .tolist() of an array")
         unit = "N·m" if field == "torque_limit_nm" else "rad, rad/s or N·m"
-        raise ValueError(f"{where}, must be a finite number of {unit} from {least:g} to {MOST_TARGET:g}")
+        raise ValueError(f"{where}, must be a finite number of {unit} from {least:g} to {MAX_TARGET:g}")
 
 
 def _check_report(report: Report, joints: Sequence[str]) -> None:

@@ -5,7 +5,7 @@ from bisect import bisect_right
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_gnc.control.body_on_path import Lie
+from snakesim_gnc.control.body_on_path import BodyPose
 from snakesim_hal.model.route import yaw_segments_m
 from snakesim_hal.wire.messages import Description
 
@@ -32,19 +32,19 @@ class PlanarBody:
         self._joint_s: list[float] = self.joint_s_m.tolist()
         self._all_bend = len(self.bends) == len(axes)
 
-    def all_angles(self, lie: Lie) -> Floats:
+    def all_angles(self, body_pose: BodyPose) -> Floats:
         """Angles of all joints, (n_joints,): those that bend as on the path, the others straight."""
         if self._all_bend:
-            return lie.angles_rad
+            return body_pose.angles_rad
         angles = np.zeros(len(self.names))
-        angles[self.bends] = lie.angles_rad
+        angles[self.bends] = body_pose.angles_rad
         return angles
 
-    def joints_w(self, lie: Lie) -> Floats:
+    def joints_w(self, body_pose: BodyPose) -> Floats:
         """Places of all joints on the path, (n_joints, 2)."""
-        x, y = lie.nodes_w
+        x, y = body_pose.nodes_w
         if self._all_bend:
-            return lie.nodes_w[:, 1:-1].T
+            return body_pose.nodes_w[:, 1:-1].T
         return np.column_stack([np.interp(self.joint_s_m, self.node_s_m, values) for values in (x, y)])
 
     def link_at(self, body_s_m: float) -> int:

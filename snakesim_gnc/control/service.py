@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from snakesim_gnc.control.controller import Controller, View
 from snakesim_gnc.control.freshness import Limits
 from snakesim_gnc.control.guarded import Guarded
-from snakesim_gnc.control.telling import Telling
+from snakesim_gnc.control.state_reports import StateReports
 from snakesim_gnc.service import Service, serve
 from snakesim_hal.errors import ControllerError
 from snakesim_hal.model.plugins import CONTROLLERS, find_plugin, plugin_settings
@@ -49,7 +49,7 @@ class Control(Service):
         self._robot = robot
         self._commander = Commander(self._client, robot)
         self._limits = Limits.of(self._config, robot)
-        self._telling = Telling(self._config.controller, robot)
+        self._reports = StateReports(self._config.controller, robot)
         self._controller: Guarded | None = None
 
     def outputs(self, clock: Clock) -> list[tuple[str, Message]] | None:
@@ -64,22 +64,22 @@ class Control(Service):
             self._controller = None
         if not mine:
             why = f"no right to command: {self._commander.refusal or 'the lease is not ours'}"
-            return _told(self._telling.state(clock, armed=armed, missing=why))
+            return _told(self._reports.state(clock, armed=armed, missing=why))
         late = self._limits.against_joints(joints, clock.stamp_ns)
         if late:
             self._note(clock, [late], "no commands")
-            return _told(self._telling.state(clock, armed=armed, missing=late))
+            return _told(self._reports.state(clock, armed=armed, missing=late))
         if not armed:
             self._note(clock)
             self._commander.send(clock, joints, self._commander.stay(joints))
-            return _told(self._telling.state(clock))
+            return _told(self._reports.state(clock))
         return self._act(clock, joints)
 
     def silence(self) -> list[tuple[str, Message]]:
         """The HAL is gone, or a slow computer holds it up: PowerOff. The next tick decides about the controller."""
         if self._last_clock is None:
             return []
-        return _told(self._telling.state(self._last_clock, answers=False))
+        return _told(self._reports.state(self._last_clock, answers=False))
 
     def _act(self, clock: Clock, joints: JointState) -> list[tuple[str, Message]]:
         """Let the controller answer, with what is fresh of the world and the trajectory."""
@@ -98,11 +98,11 @@ class Control(Service):
             self._commander.send(clock, joints, action.set_points)
             rests = _why_it_rests(trajectory)
             try:
-                told = self._telling.state(clock, action.report, armed=True, missing=missing, rests=rests)
+                told = self._reports.state(clock, action.report, armed=True, missing=missing, rests=rests)
             except ValueError as error:
                 raise controller.wrong(str(error)) from None
         except ControllerError as error:
-            self._client.put(keys.CONTROL_STATE, self._telling.failure(clock, str(error)))
+            self._client.put(keys.CONTROL_STATE, self._reports.failure(clock, str(error)))
             raise
         return _told(told)
 
@@ -116,7 +116,7 @@ class Control(Service):
             trajectory, late = None, [*late, why]
         self._note(clock, late, "the controller holds")
         if world is not None:
-            self._telling.follow(world)
+            self._reports.follow(world)
         return world, trajectory, "; ".join(late)
 
     def _made_for(self, clock: Clock) -> Guarded:

@@ -11,7 +11,7 @@ from math import inf
 
 from snakesim_hal.model.injection import Injection
 
-MOST_AT_ONCE = 256  # repeats of a flood in one go: after a hiccup of this process the rest of it is left out
+MAX_AT_ONCE = 256  # repeats of a flood in one go: after a hiccup of this process the rest of it is left out
 LONGEST_BURST = 64  # bytes that are put in, or taken from elsewhere in the message
 DOUBLE = 0xCB  # MessagePack's mark of a float64
 NASTY_DOUBLES = (float("nan"), inf, -inf, 1e308, -1e308, 5e-324, -0.0)
@@ -64,7 +64,7 @@ class Disturbance:
             out.append(self._late.popleft()[1])
         if self._repeat_s <= now_s and self._newest is not None:
             every_s = 1.0 / self._on["flood"]
-            repeats = min(int((now_s - self._repeat_s) / every_s) + 1, MOST_AT_ONCE)
+            repeats = min(int((now_s - self._repeat_s) / every_s) + 1, MAX_AT_ONCE)
             self._repeat_s += repeats * every_s
             if self._repeat_s <= now_s:
                 self._repeat_s = now_s + every_s

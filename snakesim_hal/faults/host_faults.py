@@ -9,7 +9,7 @@ from snakesim_hal.network.session import Session
 from snakesim_hal.safety.authority import Authority
 from snakesim_hal.wire.messages import Fault
 
-MOST_KEPT = 10_000
+MAX_KEPT = 10_000
 
 
 class HostFaults:
@@ -44,7 +44,7 @@ class HostFaults:
         self._injector.close()
 
     def _note(self, text: str, _now_s: float) -> None:
-        if len(self.noted) < MOST_KEPT:
+        if len(self.noted) < MAX_KEPT:
             self.noted.append(f"tick {self._tick}: {text}")
 
     def _refused(self, text: str) -> None:

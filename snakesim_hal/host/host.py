@@ -26,7 +26,7 @@ from snakesim_hal.host.inbox import Inbox, Request
 from snakesim_hal.host.latch import EstopLatch, replying
 from snakesim_hal.host.outbox import Outbox
 from snakesim_hal.host.participants import Participant, Participants
-from snakesim_hal.host.run_statistics import Tally
+from snakesim_hal.host.run_statistics import RunStatistics
 from snakesim_hal.host.status_messages import applied_message, status_message
 from snakesim_hal.host.timing import Deadlines, PublishTimes
 from snakesim_hal.model.scenario import RunConfig
@@ -73,7 +73,7 @@ class Host:
         stay: bool = False,
         latch: EstopLatch | None = None,
         starter: HostEnd | None = None,
-        hygiene: Sequence[str] = (),
+        realtime_warnings: Sequence[str] = (),
     ) -> None:
         """max_ticks: end this many ticks after the first arming; None: go on until asked to finish.
 
@@ -81,13 +81,13 @@ class Host:
         stay: also when others come between, of which a moment is recorded; else so many ticks after the first arming.
         latch: keeps an emergency stop for the host that comes after this one.
         starter: the private channel to whoever started this host.
-        hygiene: real-time measures that the system refused.
+        realtime_warnings: real-time measures that the system refused.
         """
         described = msgspec.structs.replace(backend.describe(), host=secrets.token_hex(8))
         self.description: Description = proven(described, own_run_key())
         self.authority = Authority(self.description, first_epoch=time.time_ns() // 1_000_000)
         self.black_box = BlackBox(self.description)
-        self.tally = Tally()
+        self.statistics = RunStatistics()
         self.requests: list[str] = []  # who asked to arm, disarm, clear, finish or stop, and what became of it
         self.participants = Participants(config.services)
         self._config = config
@@ -98,7 +98,7 @@ class Host:
         self._stay = stay
         self._latch = latch or EstopLatch(None)
         self._starter = starter or HostEnd(None)
-        self._hygiene = list(hygiene)
+        self._realtime_warnings = list(realtime_warnings)
         self._pace: Pace = config.pace
         self._period_ns = config.period_ns
         self._tick = 0
@@ -227,8 +227,8 @@ class Host:
             self.black_box.record(self._tick, self._tick * self._period_ns, samples, decision)
         if self.authority.state == "armed":
             self._last_armed_tick = self._tick
-            self.tally.ticks += 1
-            self.tally.answered_ticks += self._answered >= (self._tick if counting is None else counting)
+            self.statistics.ticks += 1
+            self.statistics.answered_ticks += self._answered >= (self._tick if counting is None else counting)
         started = time.monotonic_ns()
         try:
             self._backend.enact(decision.set_points, self.authority.state)
@@ -248,7 +248,7 @@ class Host:
             if not self._deadlines.missed(self._tick):
                 self._inbox.take_until(self._deadlines.of(self._tick))
             elif self.authority.state == "armed":
-                self.tally.overruns += 1
+                self.statistics.overruns += 1
 
     def _recorded(self) -> bool:
         """Whether this tick belongs into the black box: a host that stays must not fill memory while it waits."""
@@ -294,7 +294,7 @@ class Host:
         if refusal is None and command.tick > self._answered:
             self._answered = command.tick
             if self.authority.state == "armed":
-                self.tally.state_to_command.add((monotonic_ns - published_ns) / 1000)
+                self.statistics.state_to_command.add((monotonic_ns - published_ns) / 1000)
 
     def take_done(self, service: str, tick: int) -> None:
         """A service owes nothing more for a tick."""
@@ -415,8 +415,8 @@ class Host:
             pace=self._pace,
             safety_now_ns=self._safety_now(),
             missing=self._missing(),
-            overruns=self.tally.overruns,
-            hygiene=self._hygiene,
+            overruns=self.statistics.overruns,
+            realtime_warnings=self._realtime_warnings,
             injected=self.faults.on,
         )
 
@@ -465,7 +465,7 @@ class Host:
     def _over(self) -> bool:
         if self._stopping:
             return True
-        if self._max_ticks is not None and self.tally.ticks >= self._max_ticks:
+        if self._max_ticks is not None and self.statistics.ticks >= self._max_ticks:
             self._end("complete")
         elif self._max_ticks is not None and not self._stay and self.black_box.ticks >= self._max_ticks:
             self._end("failed", "the time was over before that much of it was armed")

@@ -30,7 +30,7 @@ class Latencies:
 
 
 @dataclass
-class Tally:
+class RunStatistics:
     """What the host measures of itself while armed."""
 
     ticks: int = 0

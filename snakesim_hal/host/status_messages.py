@@ -28,7 +28,7 @@ def status_message(
     safety_now_ns: int,
     missing: list[str],
     overruns: int,
-    hygiene: list[str],
+    realtime_warnings: list[str],
     injected: list[str],
 ) -> Status:
     """How the robot is now, and why. missing: the services that arming waits for."""
@@ -57,7 +57,7 @@ def status_message(
         alive=participants.present(),
         waiting_for=missing,
         overruns=overruns,
-        hygiene=hygiene,
+        realtime_warnings=realtime_warnings,
         injected=injected,
         ready_to_arm=not against and not missing,
         derated=authority.derated,

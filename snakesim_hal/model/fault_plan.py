@@ -7,7 +7,7 @@ from snakesim_hal.model.files import Table
 from snakesim_hal.model.injection import Injection, check_targets, parse
 from snakesim_hal.model.scenario import RunConfig
 
-MOST_BUSES = 8
+MAX_BUSES = 8
 ON_SAMPLES = ("mute", "freeze", "wrong", "nan")  # of joints; the host does these itself where the backend cannot
 
 
@@ -24,7 +24,7 @@ def planned(config: RunConfig, table: Table | None = None) -> list[Injection]:
 
 def check_planned(config: RunConfig, table: Table | None = None) -> None:
     """Whether every process, key and joint that is to go wrong is there. Raises ConfigError."""
-    _check(config, table, MOST_BUSES)
+    _check(config, table, MAX_BUSES)
 
 
 def check_backend_can(config: RunConfig, *, does: Collection[str], buses: int, because: str) -> None:

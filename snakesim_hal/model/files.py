@@ -16,7 +16,7 @@ from msgspec import inspect
 
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.field_types import fields_at, in_words, options, type_at, unit_of, value_at
-from snakesim_hal.model.textfiles import MOST_DEPTH, parse_json, parse_toml, read_text
+from snakesim_hal.model.textfiles import MAX_DEPTH, parse_json, parse_toml, read_text
 
 StructT = TypeVar("StructT", bound=msgspec.Struct)
 _AT = re.compile(r"^(?P<what>.*?)(?: - at `(?P<where>[^`]*)`)?$", re.DOTALL)
@@ -40,8 +40,8 @@ class Table:
     def put(self, dotted: str, value: Any, origin: str) -> None:
         """Set a value, making the tables on the way."""
         *parents, last = dotted.split(".")
-        if len(parents) >= MOST_DEPTH:
-            raise ConfigError(f"{origin}: the key has {len(parents) + 1} parts, at most {MOST_DEPTH} are allowed")
+        if len(parents) >= MAX_DEPTH:
+            raise ConfigError(f"{origin}: the key has {len(parents) + 1} parts, at most {MAX_DEPTH} are allowed")
         place: Any = self.values
         for i, name in enumerate(parents):
             if isinstance(place, list):

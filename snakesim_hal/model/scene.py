@@ -146,8 +146,8 @@ class RandomField(FileStruct, frozen=True, kw_only=True):
     friction: Friction = 0.0
 
 
-MOST_STREWN = 1000
-MOST_OBSTACLES = 4096  # that the message World holds
+MAX_STREWN = 1000
+MAX_OBSTACLES = 4096  # that the message World holds
 
 
 class SceneFile(FileStruct, frozen=True, kw_only=True):
@@ -234,9 +234,9 @@ def place(scene: SceneFile, keep_clear: "list[Capsule] | None" = None) -> list[P
 def _check_count(scene: SceneFile) -> None:
     given = (scene.cylinder, scene.box, scene.sphere, scene.wall, scene.step)
     count = sum(len(kind) for kind in given) + sum(row.count for row in scene.pegs_along_route)
-    count += sum(min(_wanted(field), MOST_STREWN) for field in scene.random_field)
-    if count > MOST_OBSTACLES:
-        raise ConfigError(f"scene {scene.name!r}: has {count} obstacles; at most {MOST_OBSTACLES} are allowed")
+    count += sum(min(_wanted(field), MAX_STREWN) for field in scene.random_field)
+    if count > MAX_OBSTACLES:
+        raise ConfigError(f"scene {scene.name!r}: has {count} obstacles; at most {MAX_OBSTACLES} are allowed")
 
 
 def _wanted(field: RandomField) -> int:
@@ -310,10 +310,10 @@ def _strewn(
     if field.route_clearance_m is not None and route is None:
         raise ConfigError(f"{where}: `route_clearance_m` is set but the scene has no route; add a [route] section")
     wanted = _wanted(field)
-    if wanted > MOST_STREWN:
+    if wanted > MAX_STREWN:
         raise ConfigError(
             f"{where}: `density_per_m2` = {field.density_per_m2} asks for {wanted} pegs on this area; at most "
-            f"{MOST_STREWN}"
+            f"{MAX_STREWN}"
         )
     random = np.random.default_rng([field.seed, index])
     strewn: list[Placed] = []

@@ -17,10 +17,10 @@ from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.whole_file import write_whole
 
 MB = 1024 * 1024
-MOST_BYTES, MOST_TOML = 8 * MB, 2 * MB  # a route of 20,000 way-points has 1.8 MB as formatted JSON, 0.8 MB as TOML
-MOST_DEPTH = 16  # sections within sections; a run's configuration has 6
+MAX_BYTES, MAX_TOML = 8 * MB, 2 * MB  # a route of 20,000 way-points has 1.8 MB as formatted JSON, 0.8 MB as TOML
+MAX_DEPTH = 16  # sections within sections; a run's configuration has 6
 _KEY = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
-_DEEP_KEY = re.compile(rf"(?<![\w-])(?:{_KEY}[ \t]*+\.[ \t]*+){{{MOST_DEPTH}}}")  # tomllib takes quadratic time for it
+_DEEP_KEY = re.compile(rf"(?<![\w-])(?:{_KEY}[ \t]*+\.[ \t]*+){{{MAX_DEPTH}}}")  # tomllib takes quadratic time for it
 _UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _KINDS = {
     stat.S_IFDIR: "a folder",
@@ -52,7 +52,7 @@ def read_bytes(path: Path) -> bytes:
         data = b""
         if stat.S_ISREG(mode):  # opening a device may do something, opening a pipe waits
             with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
-                data = file.read(MOST_BYTES + 1)
+                data = file.read(MAX_BYTES + 1)
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file") from None
     except OSError as error:
@@ -60,8 +60,8 @@ def read_bytes(path: Path) -> bytes:
     except ValueError as error:  # a NUL in the name
         raise ConfigError(f"{path}: cannot be read: {error}") from None
     _check_plain(path, mode)
-    if len(data) > MOST_BYTES:
-        raise ConfigError(f"{path}: is larger than {MOST_BYTES // MB} MB, which no file of settings is")
+    if len(data) > MAX_BYTES:
+        raise ConfigError(f"{path}: is larger than {MAX_BYTES // MB} MB, which no file of settings is")
     return data
 
 
@@ -76,7 +76,7 @@ def parse_json(text: str, source: str) -> Any:
     try:
         value = json.loads(text)
     except RecursionError:
-        raise ConfigError(f"{source}: not valid JSON: nested deeper than {MOST_DEPTH} levels") from None
+        raise ConfigError(f"{source}: not valid JSON: nested deeper than {MAX_DEPTH} levels") from None
     except ValueError as error:  # JSONDecodeError; or a number of thousands of digits
         raise ConfigError(f"{source}: not valid JSON: {error}") from None
     _check_depth(value, source)
@@ -85,14 +85,14 @@ def parse_json(text: str, source: str) -> Any:
 
 def parse_toml(text: str, source: str) -> dict[str, Any]:
     """A TOML text. Raises ConfigError."""
-    if len(text) > MOST_TOML:
-        raise ConfigError(f"{source}: is larger than {MOST_TOML // MB} MB; make it smaller, or write it as JSON")
+    if len(text) > MAX_TOML:
+        raise ConfigError(f"{source}: is larger than {MAX_TOML // MB} MB; make it smaller, or write it as JSON")
     if deep := _DEEP_KEY.search(text):
-        raise ConfigError(f"{source}: key `{deep[0][:40]}...` has more than {MOST_DEPTH} parts")
+        raise ConfigError(f"{source}: key `{deep[0][:40]}...` has more than {MAX_DEPTH} parts")
     try:
         value = tomllib.loads(text)
     except RecursionError:
-        raise ConfigError(f"{source}: not valid TOML: nested deeper than {MOST_DEPTH} levels") from None
+        raise ConfigError(f"{source}: not valid TOML: nested deeper than {MAX_DEPTH} levels") from None
     except ValueError as error:  # TOMLDecodeError; or a number of thousands of digits
         raise ConfigError(f"{source}: not valid TOML: {error}") from None
     _check_depth(value, source)
@@ -104,14 +104,14 @@ def check_brackets(text: str, source: str) -> None:
     depth = 0
     for bracket in re.findall(r"[][{}]", text):
         depth += 1 if bracket in "[{" else -1
-        if depth > MOST_DEPTH:
-            raise ConfigError(f"{source}: is nested deeper than {MOST_DEPTH} levels")
+        if depth > MAX_DEPTH:
+            raise ConfigError(f"{source}: is nested deeper than {MAX_DEPTH} levels")
 
 
 def _check_depth(value: Any, source: str) -> None:
     """Everything that walks through values may call itself once a level after this."""
     level: list[Any] = [value]
-    for _ in range(MOST_DEPTH):
+    for _ in range(MAX_DEPTH):
         inner: list[Any] = []
         for one in level:
             if isinstance(one, dict):
@@ -121,7 +121,7 @@ def _check_depth(value: Any, source: str) -> None:
         level = [one for one in inner if isinstance(one, dict | list)]
         if not level:
             return
-    raise ConfigError(f"{source}: is nested deeper than {MOST_DEPTH} levels")
+    raise ConfigError(f"{source}: is nested deeper than {MAX_DEPTH} levels")
 
 
 def write_text(path: Path, text: str, encoding: str = "utf-8") -> None:

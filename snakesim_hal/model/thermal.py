@@ -24,9 +24,9 @@ AMBIENT_C = 20.0
 RISE_AT_RATED_K = 240.0
 TIME_CONSTANT_S = 60.0
 LOSS_AT_RATED_W = 48.0  # 5 K/W from winding to water, a guess of the right order for a housing of 100 mm
-LEAST_SHARE = 0.2  # of its torque, that the hottest winding may still use
+MIN_SHARE = 0.2  # of its torque, that the hottest winding may still use
 INJECTED_ABOVE_STOP_K = 5.0  # by a fault on request
-SUPPLY_V, LEAST_VOLTAGE_V = 24.0, 18.0
+SUPPLY_V, MIN_VOLTAGE_V = 24.0, 18.0
 IDLE_A = 0.05
 BOARD_OVER_AMBIENT = 0.3  # of what the winding is warmer than the water, a guess
 
@@ -41,7 +41,7 @@ class HeatLimits:
     def share_left(self, winding_c: float) -> float:
         """Which share of its rated torque a winding leaves its motor: 1 up to the one, a fifth from the other on."""
         over = (winding_c - self.derate_from_c) / (self.stop_at_c - self.derate_from_c)
-        return 1.0 - (1.0 - LEAST_SHARE) * min(max(over, 0.0), 1.0)
+        return 1.0 - (1.0 - MIN_SHARE) * min(max(over, 0.0), 1.0)
 
 
 class Thermal:

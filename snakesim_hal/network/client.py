@@ -13,7 +13,7 @@ from typing import Any, Generic
 from snakesim_hal.backend import SetPoints
 from snakesim_hal.errors import NotConnectedError, StalledError, WireError
 from snakesim_hal.network.mailbox import Mailbox
-from snakesim_hal.network.robot_mismatch import misfit
+from snakesim_hal.network.robot_mismatch import mismatch
 from snakesim_hal.network.run_key import is_proven, own_run_key
 from snakesim_hal.network.session import Arrival, Publisher, Reader, Session
 from snakesim_hal.wire import keys
@@ -116,7 +116,7 @@ class Client:
 
     def _fits(self, message: Message) -> bool:
         """Whether a message is about our robot, as far as it is known; what is not is counted."""
-        reason = None if self._robot is None else misfit(message, self._robot)
+        reason = None if self._robot is None else mismatch(message, self._robot)
         if reason is not None:
             self.session.rejected[reason] += 1
         return reason is None

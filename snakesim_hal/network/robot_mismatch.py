@@ -16,7 +16,7 @@ MAX_PATH_M = 1e5
 UNIT_NORM_ERROR = 0.1  # of a rotation; rounding makes far less
 
 
-def misfit(message: Message, robot: Description) -> str | None:
+def mismatch(message: Message, robot: Description) -> str | None:
     """Why a message cannot be of this robot, in a word to count by; None when it can be."""
     joints, links = len(robot.joints), len(robot.links)
     match message:

@@ -17,8 +17,8 @@ from snakesim_hal.safety.fault_log import FaultLog
 from snakesim_hal.safety.gate import Applied, JointLimits
 from snakesim_hal.safety.isolation import Isolation, Mask
 from snakesim_hal.safety.lease import Lease, freed, renewed, rule
-from snakesim_hal.safety.plausibility import Doubt, JointWatch, readable
-from snakesim_hal.safety.stop_ramp import Halt
+from snakesim_hal.safety.plausibility import Doubt, PlausibilityCheck, readable
+from snakesim_hal.safety.stop_ramp import StopRamp
 from snakesim_hal.wire.messages import (
     Answer,
     Description,
@@ -64,7 +64,7 @@ class Authority:
         self.limited: Counter[str] = Counter()
         count = len(description.joints)
         self._applied = Applied(np.zeros(count, dtype=np.int64), np.zeros(count), self.limits.torque_nm)
-        self._watch = JointWatch(self.limits)
+        self._watch = PlausibilityCheck(self.limits)
         self._measured = self._watch.measured
         self._state_tick = 0  # of the newest joint state
         self._armed_tick = -1  # of the state that was the newest at the last arming
@@ -77,7 +77,7 @@ class Authority:
         self._recent: deque[JointCommand] = deque(maxlen=COMMANDS_KEPT)  # good ones since arming, oldest first
         self._last_sequence = -1
         self._hold_at = np.zeros(count)
-        self._halt: Halt | None = None  # of a robot that was armed when the present fault came
+        self._halt: StopRamp | None = None  # of a robot that was armed when the present fault came
         self._told = True  # whether the motors were told that the robot is disarmed, since it is
 
     # --- what comes in -------------------------------------------------------------------------------------
@@ -353,7 +353,7 @@ class Authority:
         if following != self.state:
             self._hold_at = self._measured.angle_rad
             was_armed = self.state == "armed"
-            self._halt = Halt.begin(self._measured, self._applied, self.limits) if was_armed else None
+            self._halt = StopRamp.begin(self._measured, self._applied, self.limits) if was_armed else None
             self._told &= following != "disarmed"
         if self.state == "armed":
             self._command = None

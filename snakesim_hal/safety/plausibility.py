@@ -38,7 +38,7 @@ class Doubt:
     joints: Mask
 
 
-class JointWatch:
+class PlausibilityCheck:
     """The last good state of every joint, and what is wrong with the newest."""
 
     def __init__(self, limits: JointLimits) -> None:
@@ -47,8 +47,8 @@ class JointWatch:
         self._columns = np.zeros((3, count))  # angle, velocity, torque: the last good ones
         self._good_s = np.zeros((2, count))  # when they were taken, by both clocks
         self._known: Mask = np.zeros(count, dtype=np.bool_)  # whether there ever were any
-        self._strays = _Strays(count, SPEED_MARGIN * limits.speed_rad_s)
-        self._stillness = _Stillness(limits)
+        self._jumps = _JumpDetector(count, SPEED_MARGIN * limits.speed_rad_s)
+        self._frozen = _FrozenDetector(limits)
 
     @property
     def measured(self) -> Measured:
@@ -74,15 +74,15 @@ class JointWatch:
         sound: Mask = np.isfinite(columns).all(axis=0) & fresh & np.array(joints.valid)
         elapsed_s = (taken_s - self._good_s).max(axis=0)
         jump_rad = np.where(sound, columns[0], 0.0) - self._columns[0]
-        jumped = sound & self._known & (np.abs(jump_rad) > self._strays.reach_rad(elapsed_s))
-        settled = self._strays.settled(jumped, columns[0], taken_s)
+        jumped = sound & self._known & (np.abs(jump_rad) > self._jumps.reach_rad(elapsed_s))
+        settled = self._jumps.settled(jumped, columns[0], taken_s)
         if applied is None:
             jumped &= ~settled
         good = sound & ~jumped
         self._columns = np.where(good, columns, self._columns)
         self._good_s = np.where(good, taken_s, self._good_s)
         self._known |= good
-        frozen = self._stillness.look(columns, taken_s[0], applied)
+        frozen = self._frozen.look(columns, taken_s[0], applied)
         unknown, jumped, frozen = ~sound & ~aside, jumped & ~aside, frozen & ~aside
         if unknown.any():
             return self._doubt(joints.tick, "state_invalid", "no valid and fresh state of ", unknown)
@@ -126,7 +126,7 @@ def readable(joints: JointState, good: Measured) -> JointState:
     return msgspec.structs.replace(joints, angle_rad=angle, velocity_rad_s=velocity, torque_nm=torque, valid=valid)
 
 
-class _Strays:
+class _JumpDetector:
     """Angles that were not believed: whether they agree with one another."""
 
     def __init__(self, count: int, speed_rad_s: Floats) -> None:
@@ -153,7 +153,7 @@ class _Strays:
         return strayed & (self._in_a_row >= AGREEING)
 
 
-class _Stillness:
+class _FrozenDetector:
     """For how long joints have said the same, and how far their targets have moved meanwhile."""
 
     def __init__(self, limits: JointLimits) -> None:

@@ -14,7 +14,7 @@ from snakesim_hal.wire.messages import Mode
 
 
 @dataclass(frozen=True)
-class Halt:
+class StopRamp:
     """A robot that comes to rest, (n_joints,) each."""
 
     wanted_rad: Floats
@@ -22,7 +22,7 @@ class Halt:
     target_rad: Floats
 
     @staticmethod
-    def begin(measured: Measured, last: Applied, limits: JointLimits) -> "Halt":
+    def begin(measured: Measured, last: Applied, limits: JointLimits) -> "StopRamp":
         """From what the joints do, and what they were told last."""
         angle, velocity = measured.angle_rad, measured.velocity_rad_s
         states = zip(limits.joints, angle.tolist(), velocity.tolist(), measured.torque_nm.tolist(), strict=True)
@@ -30,9 +30,9 @@ class Halt:
         target = np.where(last.mode == Mode.POSITION, last.target, bumpless)
         near = np.clip(target, angle - limits.max_step_rad, angle + limits.max_step_rad)
         slowed = np.clip(velocity, -limits.speed_rad_s, limits.speed_rad_s)
-        return Halt(limits.inside(angle), slowed, limits.inside(near))
+        return StopRamp(limits.inside(angle), slowed, limits.inside(near))
 
-    def after_a_period(self, limits: JointLimits) -> "Halt":
+    def after_a_period(self, limits: JointLimits) -> "StopRamp":
         """One period later."""
         period_s = limits.period_s
         slower = np.maximum(np.abs(self.velocity_rad_s) - limits.acceleration_rad_s2 * period_s, 0.0)
@@ -40,4 +40,4 @@ class Halt:
         wanted = limits.inside(self.wanted_rad + 0.5 * (self.velocity_rad_s + slower) * period_s)
         step = limits.speed_rad_s * period_s
         target = np.clip(wanted, self.target_rad - step, self.target_rad + step)
-        return Halt(wanted, slower, target)
+        return StopRamp(wanted, slower, target)

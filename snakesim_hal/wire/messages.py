@@ -297,7 +297,9 @@ class Status(Message, frozen=True, kw_only=True):
     overruns: Annotated[q.Count, about("ticks that were late, while armed in real time")]
     ready_to_arm: Annotated[bool, about("whether a request to arm that names the right robot would be granted now")]
     injected: Annotated[list[q.Reason], Meta(max_length=64), about("faults on request that are on now")] = []
-    hygiene: Annotated[list[q.Reason], Meta(max_length=16), about("real-time measures that the system refused")] = []
+    realtime_warnings: Annotated[
+        list[q.Reason], Meta(max_length=16), about("real-time measures that the system refused")
+    ] = []
     derated: Annotated[
         dict[q.Name, q.Fraction], Meta(max_length=q.MAX_JOINTS), about("joint -> share of its torque that heat leaves")
     ] = {}

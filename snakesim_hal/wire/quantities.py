@@ -8,10 +8,10 @@ from typing import Annotated
 
 from msgspec import Meta
 
-MOST_COUNT = 2**62
+MAX_COUNT = 2**62
 MAX_JOINTS = 256
 MAX_CONTACTS = 512
-MOST_TARGET = 1e5  # of a set-point or a torque limit, in the unit of its mode
+MAX_TARGET = 1e5  # of a set-point or a torque limit, in the unit of its mode
 
 
 def _bounded(low: float, high: float, unit: str) -> Meta:
@@ -47,12 +47,12 @@ Unit = Annotated[float, _bounded(-1.001, 1.001, "1")]
 Scalar = Annotated[float, _bounded(-1e12, 1e12, "1")]
 Fraction = Annotated[float, _bounded(0.0, 1.0, "1")]
 
-Target = Annotated[float, _bounded(-MOST_TARGET, MOST_TARGET, "rad, rad/s or N·m, as the joint's mode says")]
-TorqueLimit = Annotated[float, _bounded(0.0, MOST_TARGET, "N·m")]
+Target = Annotated[float, _bounded(-MAX_TARGET, MAX_TARGET, "rad, rad/s or N·m, as the joint's mode says")]
+TorqueLimit = Annotated[float, _bounded(0.0, MAX_TARGET, "N·m")]
 
-Count = Annotated[int, Meta(ge=0, le=MOST_COUNT)]
-Tick = Annotated[int, Meta(ge=0, le=MOST_COUNT), about("number of a control period, from 0 at the start of the host")]
-Nanoseconds = Annotated[int, Meta(ge=0, le=MOST_COUNT, extra_json_schema={"unit": "ns"})]
+Count = Annotated[int, Meta(ge=0, le=MAX_COUNT)]
+Tick = Annotated[int, Meta(ge=0, le=MAX_COUNT), about("number of a control period, from 0 at the start of the host")]
+Nanoseconds = Annotated[int, Meta(ge=0, le=MAX_COUNT, extra_json_schema={"unit": "ns"})]
 Stamp = Annotated[Nanoseconds, about("robot time: as in hal/clock, from 0 at the start of the host")]
 LinkIndex = Annotated[int, Meta(ge=0, le=MAX_JOINTS)]
 JointIndex = Annotated[int, Meta(ge=0, lt=MAX_JOINTS)]

@@ -21,7 +21,7 @@ ARM_LIMIT_S = 10.0
 WHO = "snakesim run"
 
 
-class Conductor:
+class RunMonitor:
     """Watches one run over its network, until it is over."""
 
     def __init__(

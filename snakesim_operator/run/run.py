@@ -28,7 +28,7 @@ from snakesim_operator.results.record import CONFIG
 from snakesim_operator.run.ending import Ending, interruptible
 from snakesim_operator.run.folder import claimed, named_after
 from snakesim_operator.run.meeting import local_robot, meeting_point, refuse_second_robot
-from snakesim_operator.run.monitor import AFTER_FAULT_S, Conductor
+from snakesim_operator.run.monitor import AFTER_FAULT_S, RunMonitor
 from snakesim_operator.run.run_files import RunFiles
 from snakesim_operator.run.supervisor import HOST, Supervisor
 
@@ -164,7 +164,7 @@ def _conduct(
             say(f"network: {endpoint}, namespace {namespace}")
             if not config.has_own_control:
                 say("whoever takes the lease commands the robot, and arms it")
-            Conductor(config, session, supervisor, files, ending, say, stay=request.stay).go()
+            RunMonitor(config, session, supervisor, files, ending, say, stay=request.stay).go()
     except SnakesimError as error:
         ending.because(str(error))
     finally:

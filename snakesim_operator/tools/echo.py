@@ -23,7 +23,7 @@ from snakesim_hal.wire.codec import Decoder
 from snakesim_operator.tools.targets import CONNECT_S, Where
 
 RATE_PERIOD_S = 1.0
-MOST_WAITING_BYTES = 64 * 1024 * 1024  # while the terminal, or who reads the pipe, is slower than the network
+MAX_WAITING_BYTES = 64 * 1024 * 1024  # while the terminal, or who reads the pipe, is slower than the network
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class Waiting:
     def put(self, arrival: Arrival) -> None:
         """Add one; in Zenoh's threads."""
         with self._lock:
-            if self._bytes + len(arrival.payload) > MOST_WAITING_BYTES:
+            if self._bytes + len(arrival.payload) > MAX_WAITING_BYTES:
                 self._dropped += 1
                 return
             self._bytes += len(arrival.payload)

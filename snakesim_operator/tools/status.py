@@ -91,7 +91,7 @@ def _in_words(link: Link, status: Status) -> list[str]:
         lines.append(f"  derated: {joint} has {100 * share:.0f} % of its torque left")
     if status.isolated:
         lines.append(f"  isolated: {', '.join(status.isolated)}; passive until a clear")
-    for what in status.hygiene:
+    for what in status.realtime_warnings:
         lines.append(f"  real time: {what}")
     for what in status.injected:
         lines.append(f"  fault on request: {what}")

@@ -108,7 +108,7 @@ def test_control_characters_in_forged_streams_reach_no_terminal(robot: Robot) ->
     fault = {"tick": 1, "what": EVIL[:60], "cause": EVIL, "joint": EVIL[:60], "reach": "robot"}
     status = {**operator.status(), "lifecycle": "fault", "why": EVIL, "faults": [fault], "injected": [EVIL]}
     status |= {"robot": EVIL, "backend": EVIL, "lease_holder": EVIL, "alive": [EVIL], "waiting_for": [EVIL]}
-    status |= {"isolated": [EVIL], "derated": {EVIL: 0.5}, "hygiene": [EVIL], "commands_rejected": {EVIL: 1}}
+    status |= {"isolated": [EVIL], "derated": {EVIL: 0.5}, "realtime_warnings": [EVIL], "commands_rejected": {EVIL: 1}}
     clock = operator.next("hal/clock")
     state = {"tick": clock["tick"], "stamp_ns": clock["stamp_ns"], "controller": EVIL, "state": "Idle", "reason": EVIL}
     with Stranger(robot.endpoint) as stranger:

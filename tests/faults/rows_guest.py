@@ -40,7 +40,7 @@ CHANNEL = "vcan0"
 ARM_LIMIT_S = 120.0
 LIVE_S = 0.3
 LEFT_S = 0.8
-MOST_RETRIES = 10  # of each trial, on average
+MAX_RETRIES = 10  # of each trial, on average
 LOOK_S = 0.4
 WATCHDOG_MS = 100.0
 STEP_S = 3600.0
@@ -70,7 +70,7 @@ def host_gone(number: signal.Signals) -> Measure:
                     yield trial
                     continue
                 request.retry()
-                if request.retried > MOST_RETRIES * request.trials:
+                if request.retried > MAX_RETRIES * request.trials:
                     raise TrialError(f"this machine is too busy: the robot stopped by itself {request.retried} times")
         request.note(
             f"the real host process and control, {JOINTS} modules in a process of their own, at {RATE_HZ:g} Hz on "

@@ -15,7 +15,7 @@ from tests.faults.row import Request, Trial
 
 SHARE = 0.1  # of real time
 WINDOW_TICKS = 15
-MOST_STEP_RAD = 0.2  # of a joint within one period; a diverged one is further off
+MAX_STEP_RAD = 0.2  # of a joint within one period; a diverged one is further off
 
 
 def slow(request: Request) -> Iterator[Trial]:
@@ -64,7 +64,7 @@ def diverges(request: Request) -> Iterator[Trial]:
             last = [h for _, h in sorted(observer.joints.items())][-1]
             if not all(map(math.isfinite, last.angle_rad)):
                 troubles.append("a state that is no number was published")
-            elif np.abs(np.array(last.angle_rad) - angles[-1]).max() > MOST_STEP_RAD:
+            elif np.abs(np.array(last.angle_rad) - angles[-1]).max() > MAX_STEP_RAD:
                 troubles.append("the last state that was published is not the last good one")
             observer.forget()
             made.start("host")

@@ -17,7 +17,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from snakesim_can_backend.driver.mocap import MOST_BYTES, MocapReceiver
+from snakesim_can_backend.driver.mocap import MAX_BYTES, MocapReceiver
 from snakesim_can_backend.twin import faults as twin_faults
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.host.latch import ESTOP, EstopLatch
@@ -138,7 +138,7 @@ def mocap() -> Iterator[Input]:
 
         try:
             yield Input(
-                "motion capture", [*map(_pose, (1, 10**7, 10**9)), _pose(10**8, told=False)], take, MOST_BYTES + 100
+                "motion capture", [*map(_pose, (1, 10**7, 10**9)), _pose(10**8, told=False)], take, MAX_BYTES + 100
             )
         finally:
             receiver.close()

@@ -13,7 +13,7 @@ from tests.unit.gnc.stage import known
 
 TRIPLET = "controllers.obstacle_triplet"
 STARTED = 50  # ticks until the body has moved far enough to be seen moving
-FADE_MOST = 0.13  # period / blend_s + speed * period / blend_m at 0.5 m/s
+FADE_MAX = 0.13  # period / blend_s + speed * period / blend_m at 0.5 m/s
 
 
 @cache
@@ -113,7 +113,7 @@ def test_no_command_jumps_at_a_hand_over():
         else:
             full_nm = robot.joints[j].torque_limit_nm - known(report.torque_headroom_nm)
             way = full_nm + 0.5 * abs(speed) + abs(torque)
-        assert abs(whole.target[tick, j] - steady) <= FADE_MOST * way + 1e-9
+        assert abs(whole.target[tick, j] - steady) <= FADE_MAX * way + 1e-9
         switches += 1
     assert switches >= 8
 

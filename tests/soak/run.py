@@ -28,7 +28,7 @@ SETTLE_S = 1.0  # after a fault has ended, until what follows must have followed
 RECOVERY_S = 60.0  # back-off of a supervisor included
 MOVING = 50  # ticks with a controller's command
 MOVING_S = 5.0
-MOST_VIOLATIONS = 20
+MAX_VIOLATIONS = 20
 LOOK_S = 0.01
 ONLY_BEHIND_THE_ROBOT = ("Traceback", "panicked", "Exception")
 
@@ -70,7 +70,7 @@ class Operator:
     def go(self, dice: Dice, seconds: float) -> None:
         """Until the time is over, or too much is wrong."""
         for event in dice.events():
-            if time.monotonic() - self._started > seconds or len(self._soak.violations) >= MOST_VIOLATIONS:
+            if time.monotonic() - self._started > seconds or len(self._soak.violations) >= MAX_VIOLATIONS:
                 return
             self._spend(event.pause_s)
             answer = self._ask(event)

@@ -81,7 +81,7 @@ class SharedBus(Loop):
 
     def true_states(self) -> list[ModuleState]:
         """What the modules are, whether or not they can tell."""
-        return [seat.module.state for seat in self.wire.server.chain.seats]
+        return [slot.module.state for slot in self.wire.server.chain.slots]
 
     def at_rest(self) -> bool:
         return bool((abs(self.plant.velocity_rad_s) < 0.05).all())

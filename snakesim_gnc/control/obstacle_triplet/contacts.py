@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_gnc.control.body_on_path import Lie
+from snakesim_gnc.control.body_on_path import BodyPose
 from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import Obstacle
 
@@ -101,7 +101,7 @@ def _from_box(box: Obstacle, points_w: Floats) -> tuple[Floats, Floats]:
 def push_points(
     planned: Sequence[PlannedContact],
     kept: Collection[str],
-    lie: Lie,
+    body_pose: BodyPose,
     measured_w: Floats,
     node_body_s_m: Sequence[float],
     *,
@@ -115,7 +115,7 @@ def push_points(
     `give_up_gap_m` if it is among `kept`: felt to touch it, or pushing on it already. measured_w: (2, n_nodes).
     node_body_s_m: (n_nodes,), arc lengths along the body.
     """
-    places: list[float] = lie.node_s_m.tolist()
+    places: list[float] = body_pose.node_s_m.tolist()
     xs, ys = measured_w.tolist()
     length = node_body_s_m[-1]
     found: list[PushPoint] = []

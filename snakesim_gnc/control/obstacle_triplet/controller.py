@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_gnc.control.body_on_path import Lie
+from snakesim_gnc.control.body_on_path import BodyPose
 from snakesim_gnc.control.bumpless import HandOver
 from snakesim_gnc.control.controller import Action, Report, View, positions
 from snakesim_gnc.control.obstacle_triplet.contacts import PlannedContact, PushPoint, plan_contact, push_points
@@ -72,7 +72,7 @@ class ObstacleTriplet:
         self._stall_watch = StallWatch(
             stall_m=settings.stall_m, stall_s=settings.stall_s, propulsion_n=settings.propulsion_n
         )
-        self._lie: Lie | None = None  # of the body that the joints in position mode follow
+        self._body_pose: BodyPose | None = None  # of the body that the joints in position mode follow
         self._reference = np.empty(0)  # the same as angles of all joints
         self._planned: dict[str, tuple[Obstacle, PlannedContact]] = {}
         self._points: list[PushPoint] = []
@@ -89,14 +89,14 @@ class ObstacleTriplet:
         located = self._progress.update(view)
         if isinstance(located, str):
             return self._wait(view, located)
-        lie = self._follow(view, located)
+        body_pose = self._follow(view, located)
         if located.trajectory.speed_m_s <= 0:
             self._choice = None
             self._stall_watch.forget()
         if located.fresh or located.anew:
-            self._look(located, lie)
-            self._choose(view, located, lie)
-        self._guard(view, lie)
+            self._look(located, body_pose)
+            self._choose(view, located, body_pose)
+        self._guard(view, body_pose)
         choice, set_ = self._choice, self._set
         turn = None if choice is None else self._body.bends[choice.joint]
         self._hand_over.pass_to(turn, view.joints, self._reference)
@@ -110,24 +110,24 @@ class ObstacleTriplet:
         push = self._push(view, located, choice, turn)
         mode[turn], targets[turn] = Mode.TORQUE, push.torque_nm
         self._watch_progress(view, located, choice, push)
-        return Action(SetPoints(mode, targets, limits_nm), self._report_push(located, lie, choice, push))
+        return Action(SetPoints(mode, targets, limits_nm), self._report_push(located, body_pose, choice, push))
 
-    def _follow(self, view: View, located: Located) -> Lie:
+    def _follow(self, view: View, located: Located) -> BodyPose:
         """Where the joints in position mode want the body; starts, and goes on from another place, without a jump."""
-        set_, s, before = self._set, located.tail_s_m, self._lie
+        set_, s, before = self._set, located.tail_s_m, self._body_pose
         if before is None or located.anew:
-            lie = located.on_path.at(s)
+            body_pose = located.on_path.at(s)
         else:
             most_m = max(located.trajectory.speed_m_s, 0.0) * set_.overspeed_share * view.period_s
             followed = min(max(before.tail_s_m, s - set_.slack_m), s + set_.slack_m, before.tail_s_m + most_m)
-            lie = located.on_path.at(max(followed, s - set_.brake_m))
-        reference = self._body.all_angles(lie)
+            body_pose = located.on_path.at(max(followed, s - set_.brake_m))
+        reference = self._body.all_angles(body_pose)
         if not len(self._reference):
             self._hand_over.start(view.joints, reference)
         elif located.anew:
             self._hand_over.shift(reference - self._reference)
-        self._lie, self._reference = lie, reference
-        return lie
+        self._body_pose, self._reference = body_pose, reference
+        return body_pose
 
     def _push(self, view: View, located: Located, choice: Choice, turn: int) -> Push:
         """The propulsion: less the faster the body moves, and the further the joint has swung out."""
@@ -147,7 +147,7 @@ class ObstacleTriplet:
 
     # --- what there is to push on ----------------------------------------------------------------------------
 
-    def _look(self, located: Located, lie: Lie) -> None:
+    def _look(self, located: Located, body_pose: BodyPose) -> None:
         """Plan the contacts with the obstacles near the body, and see which of them it is at."""
         world = located.world
         if located.anew:
@@ -165,7 +165,7 @@ class ObstacleTriplet:
         self._points = push_points(
             [contact for _, contact in self._planned.values()],
             kept,
-            lie,
+            body_pose,
             located.nodes_w,
             self._body.node_s_m,
             gap_m=self._set.gap_m,
@@ -178,7 +178,7 @@ class ObstacleTriplet:
         near_s_m, window_m = located.tail_s_m + half_m, half_m + PLAN_WINDOW_M
         return plan_contact(located.on_path.route, obstacle, self._body.radius_m, near_s_m=near_s_m, window_m=window_m)
 
-    def _choose(self, view: View, located: Located, lie: Lie) -> None:
+    def _choose(self, view: View, located: Located, body_pose: BodyPose) -> None:
         """Take a triplet, or none."""
         s, blend_m, share = located.tail_s_m, self._set.blend_m, self._set.switch_share
         self._banned = {names: at for names, at in self._banned.items() if abs(s - at) < blend_m}
@@ -188,7 +188,7 @@ class ObstacleTriplet:
             self._barred = None
         barred = None if self._barred is None else self._barred[0]
         choices, self._refused = self._triplets.choices(
-            self._points, lie.nodes_w, self._body.node_s_m, self._choice, barred
+            self._points, body_pose.nodes_w, self._body.node_s_m, self._choice, barred
         )
         if located.trajectory.speed_m_s <= 0 or view.time_s < self._position_until_s:
             self._choice = None
@@ -200,13 +200,13 @@ class ObstacleTriplet:
 
     # --- keeping out of trouble ------------------------------------------------------------------------------
 
-    def _guard(self, view: View, lie: Lie) -> None:
+    def _guard(self, view: View, body_pose: BodyPose) -> None:
         """Take the turn from a propulsion joint that has left its reference too far."""
         if self._choice is None:
             return
         joint, guard_s = self._choice.joint, self._set.guard_s
         turn = self._body.bends[joint]
-        off_rad = view.joints.angle_rad[turn] - float(lie.angles_rad[joint])
+        off_rad = view.joints.angle_rad[turn] - float(body_pose.angles_rad[joint])
         if abs(off_rad) > self._set.angle_guard_rad:
             self._barred = (joint, view.time_s + guard_s)
             name = self._body.names[turn]
@@ -265,7 +265,7 @@ class ObstacleTriplet:
             jammed=self._stall is not None and self._stall[0].jammed,
         )
 
-    def _report_push(self, located: Located, lie: Lie, choice: Choice, push: Push) -> Report:
+    def _report_push(self, located: Located, body_pose: BodyPose, choice: Choice, push: Push) -> Report:
         """What pushes, and how hard."""
         forces_n: list[float] = (push.force_n * choice.triplet.unit.forces).tolist()
         full_nm = abs(self._set.propulsion_n * choice.torque_per_n)
@@ -278,7 +278,7 @@ class ObstacleTriplet:
             push_points=planned_contacts(self._body, located.world, choice, forces_n),
             solved_force_n=forces_n,
             propulsion_torque_nm=push.torque_nm,
-            bending_torque_nm=bending(self._body, lie, choice, push.force_n),
+            bending_torque_nm=bending(self._body, body_pose, choice, push.force_n),
             reference_rad=self._reference.tolist(),
             condition=choice.triplet.unit.condition,
             torque_headroom_nm=self._body.torque_limit_nm[push.turn] - full_nm,

@@ -5,17 +5,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from snakesim_gnc.control.body_on_path import Lie
+from snakesim_gnc.control.body_on_path import BodyPose
 from snakesim_gnc.control.obstacle_triplet.selection import Choice
 from snakesim_gnc.control.obstacle_triplet.statics import torque_under
 from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_hal.wire.messages import World, WorldContact
 
 
-def bending(body: PlanarBody, lie: Lie, choice: Choice, force_n: float) -> list[float]:
+def bending(body: PlanarBody, body_pose: BodyPose, choice: Choice, force_n: float) -> list[float]:
     """Torque that the solved forces ask of every joint, tail to head; the tether's force stands for all resistance."""
     places = np.array(choice.body_s_m)
-    torques = force_n * torque_under(body.joints_w(lie), body.joint_s_m, places, choice.triplet.unit_wrenches)
+    torques = force_n * torque_under(body.joints_w(body_pose), body.joint_s_m, places, choice.triplet.unit_wrenches)
     return torques.tolist()
 
 

@@ -14,7 +14,7 @@ from snakesim_operator.results.report.timeline import (
 from snakesim_operator.results.summary import RunSummary
 
 MOVED_M = 0.02  # less than this is no locomotion
-LEAST_STOP_S = 0.5  # a shorter stop at the end is not worth a word
+MIN_STOP_S = 0.5  # a shorter stop at the end is not worth a word
 RESTING_SHARE = 0.02  # of all its way: what is so near to the end of it has arrived, but for who moves to the last,
 REST_SHARE, REST_S = 0.1, 5.0  # which is told from a rest by how long it takes: a tenth of the run, or so many seconds
 POOR_SHARE = 0.5  # a run that stood still for more of its time than this, up to its end, is no good one
@@ -150,9 +150,9 @@ def _stop(record: RunRecord, moved_m: float) -> _Stop | None:
     bands, end = state_bands(record), end_s(record)
     at_s = bands[-1].start_s if len(bands) > 1 and bands[-1].what != "Locomoting" else end
     rest_s = came_to_rest_s(record, min(MOVED_M, RESTING_SHARE * moved_m))
-    if rest_s is not None and at_s - rest_s > max(LEAST_STOP_S, min(REST_SHARE * end, REST_S)):
+    if rest_s is not None and at_s - rest_s > max(MIN_STOP_S, min(REST_SHARE * end, REST_S)):
         at_s = rest_s
-    if end - at_s < LEAST_STOP_S:
+    if end - at_s < MIN_STOP_S:
         return None
     after = [state for state in record.control if told_at_s(record, state) >= at_s and state.state != "Locomoting"]
     why = after[0].reason if after else "its controller reported Locomoting all the same"

@@ -117,7 +117,7 @@ def module_of(run: Loop, node: int) -> Module:
     wire = run.backend._wires[0]
     wire = wire._wire if isinstance(wire, LoggedWire) else wire
     assert isinstance(wire, RecordedWire) and isinstance(wire.other_end, Here)
-    return wire.other_end.server.chain.seats[node - 1].module
+    return wire.other_end.server.chain.slots[node - 1].module
 
 
 def go(run: Loop, lifecycle: LifecycleState, ticks: int = 1) -> list[Frame]:
@@ -186,7 +186,7 @@ def test_what_a_killed_driver_left_is_cleared_and_nothing_else(
 ) -> None:
     def twins(run: RunConfig, settings: Settings, channel: str, pose: str | None, *, stepped: bool) -> Here:
         end = here(run, settings, channel, pose, stepped=stepped)
-        left_behind(end.server.chain.seats[1].module, kind)
+        left_behind(end.server.chain.slots[1].module, kind)
         return end
 
     monkeypatch.setattr(backend_module, "twins_here", twins)
@@ -201,7 +201,7 @@ def test_what_a_killed_driver_left_is_cleared_and_nothing_else(
 def test_a_module_that_is_too_weak_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     def twins(run: RunConfig, settings: Settings, channel: str, pose: str | None, *, stepped: bool) -> Here:
         end = here(run, settings, channel, pose, stepped=stepped)
-        end.server.chain.seats[2].module.parameters.values[Parameter.RATED_TORQUE] = 1.0
+        end.server.chain.slots[2].module.parameters.values[Parameter.RATED_TORQUE] = 1.0
         return end
 
     monkeypatch.setattr(backend_module, "twins_here", twins)

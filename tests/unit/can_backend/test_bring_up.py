@@ -10,7 +10,15 @@ import pytest
 
 from snakesim_can_backend.bus.bus import VirtualWire
 from snakesim_can_backend.bus.load import reports_of
-from snakesim_can_backend.driver.bring_up import ASK_EVERY_S, LISTEN_ON_S, Bus, Identity, configure, find, objections
+from snakesim_can_backend.driver.bring_up import (
+    ASK_EVERY_S,
+    LISTEN_ON_S,
+    Bus,
+    Identity,
+    configure,
+    discovery_errors,
+    find,
+)
 from snakesim_can_backend.driver.parameters import parameters_of
 from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.definitions import (
@@ -89,11 +97,11 @@ def actions(frames: list[Frame]) -> list[float]:
 def test_everybody_is_found_and_only_asked_who_they_are(modules: Modules) -> None:
     found = find([modules.bus], 5.0)
     assert [i.node for i in found] == [1, 2, 3, 4] and {i.channel for i in found} == {modules.channel}
-    assert [i.serial for i in found] == [seat.module.serial for seat in modules.chain.seats]
+    assert [i.serial for i in found] == [slot.module.serial for slot in modules.chain.slots]
     assert {(i.firmware, i.protocol, i.emulated, i.stepped) for i in found} == {("1.0", 1, True, True)}
     assert set(actions(modules.heard)) == {Action.IDENTIFY}
     assert {opcode_of(frame.id) for frame in modules.heard} == {Opcode.COMMAND}
-    assert objections([modules.bus], found, NAMES, lockstep=True) == []
+    assert discovery_errors([modules.bus], found, NAMES, lockstep=True) == []
 
 
 def test_it_listens_on_for_a_second_module_with_the_same_id(modules: Modules) -> None:
@@ -165,7 +173,7 @@ def two_buses() -> list[Bus]:
 
 
 def wrong_with(found: list[Identity], *, lockstep: bool = False) -> list[str]:
-    return objections(two_buses(), found, NAMES, lockstep=lockstep)
+    return discovery_errors(two_buses(), found, NAMES, lockstep=lockstep)
 
 
 def test_a_whole_robot_is_not_objected_to() -> None:
@@ -233,7 +241,7 @@ def test_every_parameter_is_written_and_the_others_are_read(modules: Modules) ->
     assert set(in_force) == {1, 2, 3, 4}
     for node, values in in_force.items():
         assert set(values) == set(Parameter)
-        assert values == pytest.approx(modules.chain.seats[node - 1].module.parameters.values)
+        assert values == pytest.approx(modules.chain.slots[node - 1].module.parameters.values)
     assert in_force[2][Parameter.STIFFNESS] == 12.5 and in_force[1][Parameter.STIFFNESS] == 40.0
     assert [in_force[node][Parameter.TAIL] for node in (1, 2, 3, 4)] == [1, 0, 0, 0]
     assert in_force[1][Parameter.RATED_TORQUE] == pytest.approx(4.0)

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from snakesim_can_backend.bus.load import (
     BIT_RATE,
-    MOST_EVERY,
-    MOST_LOAD,
+    MAX_EVERY,
+    MAX_LOAD,
     Reports,
     arithmetic,
     busiest_s,
@@ -156,8 +156,8 @@ def test_the_busiest_period_is_one_with_forces() -> None:
 @given(st.floats(20, 5000), st.floats(0.001, 1e4))
 def test_reports_come_as_nearly_as_wanted_as_whole_syncs_allow(rate_hz: float, wanted_hz: float) -> None:
     apart = every(rate_hz, wanted_hz)
-    assert 1 <= apart <= MOST_EVERY
-    if 1 < apart < MOST_EVERY:
+    assert 1 <= apart <= MAX_EVERY
+    if 1 < apart < MAX_EVERY:
         assert abs(rate_hz / wanted_hz - apart) <= 0.5
     assert every(rate_hz, 0.0) == 0
 
@@ -276,7 +276,7 @@ def test_everything_that_is_suggested_really_fits(
     config = run_of(joints, rate_hz)
     text = refusal(config, settings)
     if text is None:
-        assert all(share <= MOST_LOAD for share in check_load(config, settings))
+        assert all(share <= MAX_LOAD for share in check_load(config, settings))
         return
     for way in ways_out(text, config, settings):
         assert refusal(*way) is None

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from snakesim_can_backend.bus.bus import VirtualWire
-from snakesim_can_backend.bus.bus_errors import Trouble
+from snakesim_can_backend.bus.bus_errors import BusError
 from snakesim_can_backend.bus.bus_faults import inject_into_interface
 from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.protocol.definitions import Frame, ModuleState
@@ -200,7 +200,7 @@ def test_one_end_of_a_virtual_bus() -> None:
         ]
         here.inject("cut", begins=True)
         here.inject("cut", begins=True)
-        assert here.troubles() == [Trouble("interface_down", "wire-faults", "the interface is down")]
+        assert here.troubles() == [BusError("interface_down", "wire-faults", "the interface is down")]
     finally:
         here.close()
         there.close()

@@ -144,7 +144,7 @@ def swallowed(robot: Lame, *joints: int) -> None:
     """Modules fail with a fault that lasts until they are cleared, and a person clears before a period has passed."""
     chain = robot.chain
     for joint in joints:
-        chain.seats[joint].module._fail(ModuleFault.SENSOR, chain.now_us)
+        chain.slots[joint].module._fail(ModuleFault.SENSOR, chain.now_us)
     for _ in range(20):
         if robot.authority.isolated or robot.authority.state == "fault":
             break
@@ -210,7 +210,7 @@ def test_a_lost_module_is_switched_off_at_once() -> None:
         robot.wave(3)
         robot.must_be_armed()
         assert robot.states()[FAILS] == ModuleState.DISARMED
-        assert robot.chain.seats[FAILS].module.demand == PASSIVE
+        assert robot.chain.slots[FAILS].module.demand == PASSIVE
 
 
 def test_what_the_host_alone_finds_switches_the_module_off_too() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from cantools.logreader import Parser
 
-from snakesim_can_backend.bus.bus_errors import Trouble
+from snakesim_can_backend.bus.bus_errors import BusError
 from snakesim_can_backend.bus.log import LoggedWire, open_log
 from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_hal.errors import ConfigError
@@ -31,8 +31,8 @@ class FakeWire:
         frames, self.incoming = self.incoming, []
         return frames
 
-    def troubles(self) -> list[Trouble]:
-        return [Trouble("queue_full", self.channel, "full")]
+    def troubles(self) -> list[BusError]:
+        return [BusError("queue_full", self.channel, "full")]
 
     def fileno(self) -> int | None:
         return 42

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from snakesim_can_backend.driver.mocap import MOST_AT_ONCE, MocapReceiver
+from snakesim_can_backend.driver.mocap import MAX_AT_ONCE, MocapReceiver
 from snakesim_hal.errors import BackendError, ConfigError
 from snakesim_hal.wire.messages import Pose
 
@@ -204,7 +204,7 @@ def test_a_flood_is_bounded_per_tick_and_soon_over(caplog: pytest.LogCaptureFixt
         while (before := mocap.refused["malformed"]) >= 0 and mocap.read() is None:
             ticks += 1
             read_now = mocap.refused["malformed"] - before
-            assert read_now <= MOST_AT_ONCE
+            assert read_now <= MAX_AT_ONCE
             if not read_now:
                 break
         assert ticks < 10, "what the kernel keeps is soon read"

@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from snakesim_can_backend.driver.mocap_times import MOST_LATE_NS, READINGS_TO_BELIEVE, CaptureTimes
+from snakesim_can_backend.driver.mocap_times import MAX_LATE_NS, READINGS_TO_BELIEVE, CaptureTimes
 
 MS = 1_000_000
 AHEAD_NS = 5_000_000_000_000  # what the other clock shows when ours shows 0
@@ -83,8 +83,8 @@ def test_within_one_reading_order_counts_too() -> None:
 def test_what_is_too_late_or_from_the_future_is_refused() -> None:
     camera = running()
     camera.now_ns += 1000 * MS
-    assert camera.read(MOST_LATE_NS / MS + 1) == ["late"]
-    assert camera.read(MOST_LATE_NS / MS - 1) == [None]
+    assert camera.read(MAX_LATE_NS / MS + 1) == ["late"]
+    assert camera.read(MAX_LATE_NS / MS - 1) == [None]
     assert camera.read(-51.0) == ["future"]
     assert camera.read(0.0) == [None] and camera.times.jumps == 0
 

@@ -4,8 +4,8 @@ from collections.abc import Callable
 
 import pytest
 
-from snakesim_can_backend.bus.bus_errors import Kind, Trouble
-from snakesim_can_backend.driver.module_monitor import ARM_GRACE, CLEAR_GRACE, CONCERNS_ALL, MOST_FRAMES, Finding, Watch
+from snakesim_can_backend.bus.bus_errors import BusError, Kind
+from snakesim_can_backend.driver.module_monitor import ARM_GRACE, CLEAR_GRACE, CONCERNS_ALL, MAX_FRAMES, Finding, Watch
 from snakesim_can_backend.driver.reports import Reading
 from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.commands import command
@@ -36,7 +36,7 @@ class Bench:
         self.ticks(3)
 
     def tick(
-        self, speak: Speak | None = None, troubles: list[Trouble] | None = None, unsent: str = ""
+        self, speak: Speak | None = None, troubles: list[BusError] | None = None, unsent: str = ""
     ) -> list[Finding]:
         """One Sync and its look. speak: what comes of node 2, instead of an answer."""
         begin(self.reading)
@@ -79,7 +79,7 @@ def doubled(reading: Reading) -> None:
 
 def babbling(reading: Reading) -> None:
     reading.take(joint_state(2, reading.sync))
-    for _ in range(MOST_FRAMES):
+    for _ in range(MAX_FRAMES):
         reading.take(heartbeat(2, 1.0))
 
 
@@ -94,7 +94,7 @@ WRONGS = [
         "duplicate_node",
         "is there twice: every Sync is answered two times; give each module its own node id",
     ),
-    (babbling, 1, "module_babbling", f"floods the bus: {MOST_FRAMES + 1} frames within one period"),
+    (babbling, 1, "module_babbling", f"floods the bus: {MAX_FRAMES + 1} frames within one period"),
 ]
 each_wrong = pytest.mark.parametrize(("speak", "after", "what", "cause"), WRONGS, ids=[row[2] for row in WRONGS])
 
@@ -363,12 +363,12 @@ def test_the_grace_begins_with_every_arming() -> None:
 )
 def test_a_bus_that_fails_is_a_fault_of_no_joint(kind: Kind, advice: str) -> None:
     bench = Bench()
-    trouble = Trouble(kind, "can0", "transmit errors 200, receive errors 3")
+    trouble = BusError(kind, "can0", "transmit errors 200, receive errors 3")
     (found,) = bench.tick(troubles=[trouble, trouble][:1])
     assert (found.what, found.joint) == (kind, None)
     assert found.cause.startswith("can0: transmit errors 200, receive errors 3; ") and advice in found.cause
     assert bench.tick(troubles=[trouble]) == []
-    assert [f.cause[:5] for f in bench.tick(troubles=[Trouble(kind, "can1", "")])] == ["can1:"], "the other bus is new"
+    assert [f.cause[:5] for f in bench.tick(troubles=[BusError(kind, "can1", "")])] == ["can1:"], "the other bus is new"
     bench.clear()
     assert said(bench.tick(troubles=[trouble])) == [(kind, None)]
 
@@ -377,7 +377,7 @@ def test_a_bus_that_fails_is_a_fault_of_no_joint(kind: Kind, advice: str) -> Non
 def test_lesser_troubles_are_only_counted(kind: Kind) -> None:
     bench = Bench()
     for _ in range(2):
-        assert bench.tick(troubles=[Trouble(kind, "can0", "")]) == []
+        assert bench.tick(troubles=[BusError(kind, "can0", "")]) == []
     assert bench.watch.seen == {kind: 2}
 
 
@@ -468,7 +468,7 @@ def test_a_module_is_not_silent_that_was_not_asked() -> None:
 
 def test_a_bus_whose_interface_is_down_is_not_called_stuck_too() -> None:
     bench = Bench()
-    down, up = (Trouble(kind, "can1", "") for kind in ("interface_down", "interface_up"))
+    down, up = (BusError(kind, "can1", "") for kind in ("interface_down", "interface_up"))
     assert said(bench.tick(troubles=[down], unsent="can1")) == [("interface_down", None)]
     for _ in range(10):
         assert bench.tick(unsent="can1") == []

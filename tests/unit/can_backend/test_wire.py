@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from snakesim_can_backend.bus import bus as wire_module
 from snakesim_can_backend.bus.bus import (
-    MOST_AT_ONCE,
+    MAX_AT_ONCE,
     SocketCanWire,
     VirtualWire,
     check_interface,
@@ -24,7 +24,7 @@ from snakesim_can_backend.bus.bus import (
     is_up,
     wait,
 )
-from snakesim_can_backend.bus.bus_errors import Kind, Trouble, troubles_of
+from snakesim_can_backend.bus.bus_errors import BusError, Kind, bus_errors_of
 from snakesim_can_backend.protocol.definitions import FROM_HOST, Frame, Opcode
 from snakesim_hal.errors import BackendError, ConfigError
 from snakesim_hal.model.injection import Injection
@@ -67,13 +67,13 @@ def can_frame(identifier: int, data: bytes) -> bytes:
 )
 def test_an_error_frame_in_words(classes: int, controller: int, kinds: list[Kind]) -> None:
     data = bytes((0, controller, 0, 0, 0, 0, 130, 7))
-    expected = [Trouble(kind, "can0", "transmit errors 130, receive errors 7") for kind in kinds]
-    assert troubles_of(CAN_ERR_FLAG | classes, data, "can0") == expected
+    expected = [BusError(kind, "can0", "transmit errors 130, receive errors 7") for kind in kinds]
+    assert bus_errors_of(CAN_ERR_FLAG | classes, data, "can0") == expected
 
 
 @given(st.integers(0, 0x1FFFFFFF), st.binary(min_size=8, max_size=8))
 def test_every_error_frame_says_something(classes: int, data: bytes) -> None:
-    found = troubles_of(CAN_ERR_FLAG | classes, data, "can0")
+    found = bus_errors_of(CAN_ERR_FLAG | classes, data, "can0")
     assert found and len({trouble.kind for trouble in found}) == len(found)
 
 
@@ -175,7 +175,7 @@ def test_a_bus_that_babbles_does_not_keep_its_reader() -> None:
 
     taken: list[Frame] = []
     drain(Babbling(), bytearray(16), taken, lambda *_: None)  # pyright: ignore[reportArgumentType]
-    assert len(taken) == MOST_AT_ONCE
+    assert len(taken) == MAX_AT_ONCE
 
 
 def test_a_frame_goes_out_as_the_kernel_wants_it(rig: Rig) -> None:
@@ -211,7 +211,7 @@ def test_a_full_queue_is_told_and_nothing_is_kept_for_later(rig: Rig) -> None:
 def test_the_kernels_ways_to_say_full(rig: Rig, number: int) -> None:
     rig.socket.fails = OSError(number, "full")
     assert not rig.wire.send(Frame(0x101, b""))
-    assert rig.wire.troubles() == [Trouble("queue_full", "can7", "the transmit queue is full")]
+    assert rig.wire.troubles() == [BusError("queue_full", "can7", "the transmit queue is full")]
 
 
 @pytest.mark.parametrize(("number", "word"), [(errno.ENETDOWN, "down"), (errno.ENODEV, "gone"), (errno.ENXIO, "gone")])
@@ -219,10 +219,10 @@ def test_an_interface_that_goes_is_told_once_and_again_when_it_is_back(rig: Rig,
     rig.socket.fails, rig.up = OSError(number, ""), False
     for _ in range(3):
         assert not rig.wire.send(Frame(0x101, b"")) and rig.wire.receive() == []
-    assert rig.wire.troubles() == [Trouble("interface_down", "can7", f"the interface is {word}")]
+    assert rig.wire.troubles() == [BusError("interface_down", "can7", f"the interface is {word}")]
     assert rig.kinds() == []
     rig.socket.fails, rig.up = None, True
-    assert rig.wire.troubles() == [Trouble("interface_up", "can7", "the interface is up again")]
+    assert rig.wire.troubles() == [BusError("interface_up", "can7", "the interface is up again")]
     assert rig.socket.bound_to == (("can7",) if word == "gone" else None)
     assert rig.kinds() == [] and rig.wire.send(Frame(0x101, b""))
 

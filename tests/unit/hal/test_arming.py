@@ -8,7 +8,7 @@ from snakesim_hal.wire.messages import LifecycleRequest, Mode
 from tests.unit.hal.rig import command, description
 
 ROBOT = description()
-MOST = ROBOT.max_step_rad
+MAX = ROBOT.max_step_rad
 NONE = np.zeros(len(ROBOT.joints), dtype=np.bool_)
 GOOD = LifecycleRequest(action="arm", robot=ROBOT.robot, backend=ROBOT.backend, config_hash=ROBOT.config_hash)
 
@@ -32,8 +32,8 @@ def test_a_request_without_the_configuration_says_what_to_do(given: str | None, 
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_a_target_may_be_a_whole_step_away_and_no_further(side: float) -> None:
     here = np.zeros(len(ROBOT.joints))
-    assert far_targets(command(ROBOT, side * MOST), here, ROBOT, NONE) == []
-    further = np.nextafter(MOST, np.inf)
+    assert far_targets(command(ROBOT, side * MAX), here, ROBOT, NONE) == []
+    further = np.nextafter(MAX, np.inf)
     assert len(far_targets(command(ROBOT, side * further), here, ROBOT, NONE)) == len(ROBOT.joints)
 
 
@@ -48,5 +48,5 @@ def test_only_staying_is_allowed() -> None:
 def test_a_joint_that_is_set_aside_may_be_anywhere() -> None:
     here, aside = np.zeros(len(ROBOT.joints)), NONE.copy()
     aside[1] = True
-    told = far_targets(command(ROBOT, 2 * MOST), here, ROBOT, aside)
+    told = far_targets(command(ROBOT, 2 * MAX), here, ROBOT, aside)
     assert [words.partition(" ")[0] for words in told] == ["joint_1", "joint_3"]

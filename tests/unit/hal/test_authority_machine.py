@@ -50,7 +50,7 @@ ANGLE, SPEED, ACCELERATION, TORQUE, TORQUE_RATE, FAR = 1.5, 5.0, 100.0, 4.0, 80.
 STIFFNESS, DAMPING, VELOCITY_GAIN = 40.0, 1.0, 1.0
 REACH, SLACK = 2 * SPEED, 0.05  # rad/s and rad: what is believed of a joint
 REACTION_S = 4 * PERIOD_S
-DERATE_FROM, STOP_AT, LEAST_V, LEAST_SHARE = 80.0, 105.0, 18.0, 0.2
+DERATE_FROM, STOP_AT, MIN_V, MIN_SHARE = 80.0, 105.0, 18.0, 0.2
 KNOWN_FOR_NS, LOW_FOR_NS = 3_000_000_000, 50_000_000
 LONG_NS = 1_000_000_000  # a joint may be anywhere after that
 TINY = 1e-9
@@ -109,7 +109,7 @@ class Health:
 
     def share(self, now_ns: int) -> float:
         over = (self.celsius - DERATE_FROM) / (STOP_AT - DERATE_FROM)
-        return 1.0 - (1.0 - LEAST_SHARE) * within(over, 0.0, 1.0) if self.known(now_ns) else 1.0
+        return 1.0 - (1.0 - MIN_SHARE) * within(over, 0.0, 1.0) if self.known(now_ns) else 1.0
 
 
 class Everything(RuleBasedStateMachine):
@@ -363,7 +363,7 @@ class Everything(RuleBasedStateMachine):
                 continue
             health.heard_ns, health.celsius, health.volts, health.leak = self.now_ns, celsius[i], volts[i], leaks[i]
             health.hot = celsius[i] >= (DERATE_FROM if health.hot else STOP_AT)
-            if volts[i] >= LEAST_V:
+            if volts[i] >= MIN_V:
                 health.low_since_ns = None
             elif health.low_since_ns is None:
                 health.low_since_ns = self.now_ns

@@ -57,8 +57,8 @@ def lockstep_run(amplitude_rad: float, ticks: int) -> tuple[str, dict[str, Any]]
     with running(run_config(), max_ticks=ticks) as run, following(run.link, Follower(amplitude_rad)) as control:
         run.arm()
         wait_until(run.ended, "the end of the run")
-        tally, box = run.host.tally, run.host.black_box
-        assert (tally.ticks, tally.answered_ticks, box.ticks, run.backend.advanced) == (ticks,) * 4
+        statistics, box = run.host.statistics, run.host.black_box
+        assert (statistics.ticks, statistics.answered_ticks, box.ticks, run.backend.advanced) == (ticks,) * 4
         assert control.armed_ticks == list(range(ticks)) or control.armed_ticks == list(range(1, ticks))
         assert set(itertools.pairwise(control.ticks_seen)) <= {(0, 0)} | {(t, t + 1) for t in range(ticks)}
         assert not run.host.authority.faults and not run.host.authority.rejected
@@ -306,10 +306,10 @@ def test_realtime_keeps_its_deadlines_on_average() -> None:
         run.arm()
         wait_until(run.ended, "the end of the run")
         assert run.host.wall_s == pytest.approx(1.0, rel=0.1)
-        assert run.host.tally.ticks == 50 and run.host.tally.overruns <= 10
-        assert run.host.tally.answered_ticks >= 35
+        assert run.host.statistics.ticks == 50 and run.host.statistics.overruns <= 10
+        assert run.host.statistics.answered_ticks >= 35
         assert not run.host.authority.faults
-        latency = run.host.tally.state_to_command
+        latency = run.host.statistics.state_to_command
         median_us = latency.percentile_us(50)
         assert latency.count >= 35 and median_us is not None and 0 < median_us < 20_000
 

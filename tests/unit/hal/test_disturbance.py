@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from snakesim_hal.errors import WireError
-from snakesim_hal.faults.disturbance import MOST_AT_ONCE, Disturbance, spoilt
+from snakesim_hal.faults.disturbance import MAX_AT_ONCE, Disturbance, spoilt
 from snakesim_hal.model.injection import Injection, checked
 from snakesim_hal.wire.codec import Decoder, encode, encoding_of
 from snakesim_hal.wire.messages import JointCommand
@@ -128,7 +128,7 @@ def test_a_flood_repeats_the_newest_message_at_its_rate() -> None:
     repeated = [way.due(1.0 + i / 1000) for i in range(100)]
     assert 100 <= sum(map(len, repeated)) <= 101
     way.put(b"2", 1.2)
-    assert set(way.due(1.3)) == {b"2"} and len(way.due(99.0)) == MOST_AT_ONCE, "a hiccup is not made up for"
+    assert set(way.due(1.3)) == {b"2"} and len(way.due(99.0)) == MAX_AT_ONCE, "a hiccup is not made up for"
     assert way.due(99.0) == []
     way.end("flood", 99.0)
     assert way.over and way.due(100.0) == []

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from snakesim_hal.safety.gate import FRESH_PERIODS, Applied, JointLimits
-from snakesim_hal.safety.plausibility import JointWatch, Mask, readable
+from snakesim_hal.safety.plausibility import Mask, PlausibilityCheck, readable
 from snakesim_hal.wire.messages import Fault, Mode
 from tests.unit.hal.rig import LEASE_NS, PERIOD_NS, description, state
 
@@ -27,7 +27,7 @@ class Bench:
     """A watch that gets a sample a period."""
 
     def __init__(self, **values: Any) -> None:
-        self.watch = JointWatch(LIMITS)
+        self.watch = PlausibilityCheck(LIMITS)
         self.stamp_ns = 0
         assert self.see(**values) is None
 
@@ -171,7 +171,7 @@ def test_what_is_not_known_changes_nothing_else(bad: dict[str, Any]) -> None:
 
 def test_a_long_story_fits_into_a_message() -> None:
     robot = description(chain__modules=100)
-    watch = JointWatch(JointLimits.of(robot))
+    watch = PlausibilityCheck(JointLimits.of(robot))
     nobody = np.zeros(100, dtype=np.bool_)
     watch.take(state(robot), now_ns=0, applied=None, aside=nobody)
     doubt = watch.take(state(robot, 1.0), now_ns=0, applied=None, aside=nobody)

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from snakesim_hal.safety.gate import Applied, JointLimits, Measured
-from snakesim_hal.safety.stop_ramp import Halt
+from snakesim_hal.safety.stop_ramp import StopRamp
 from snakesim_hal.wire.messages import Mode
 from tests.unit.hal.rig import description
 
@@ -17,12 +17,14 @@ STEP = 5.0 * 0.01  # rad a period
 TINY = 1e-9
 
 
-def beginning(angle: float, velocity: float, torque: float, mode: Mode, target: float) -> Halt:
+def beginning(angle: float, velocity: float, torque: float, mode: Mode, target: float) -> StopRamp:
     measured = Measured(*(np.full(JOINTS, value) for value in (angle, velocity, torque)))
-    return Halt.begin(measured, Applied(np.full(JOINTS, int(mode)), np.full(JOINTS, target), LIMITS.torque_nm), LIMITS)
+    return StopRamp.begin(
+        measured, Applied(np.full(JOINTS, int(mode)), np.full(JOINTS, target), LIMITS.torque_nm), LIMITS
+    )
 
 
-def targets(halt: Halt, periods: int) -> list[float]:
+def targets(halt: StopRamp, periods: int) -> list[float]:
     found = [float(halt.target_rad[0])]
     for _ in range(periods):
         halt = halt.after_a_period(LIMITS)

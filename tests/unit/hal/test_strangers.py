@@ -11,7 +11,7 @@ from snakesim_hal.errors import NotConnectedError
 from snakesim_hal.host.host import Host
 from snakesim_hal.model.route import Route
 from snakesim_hal.network.client import Client, Commander
-from snakesim_hal.network.robot_mismatch import misfit
+from snakesim_hal.network.robot_mismatch import mismatch
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES
@@ -122,13 +122,13 @@ def trajectory(*path: tuple[float, float]) -> Trajectory:
     ],
 )
 def test_a_message_that_cannot_be_of_this_robot(message: Message, why: str | None) -> None:
-    assert misfit(message, ROBOT) == why
+    assert mismatch(message, ROBOT) == why
 
 
 def test_what_passes_as_a_path_makes_a_route() -> None:
     tiny = 5e-324  # the shortest step there is: its length is no number to divide by
     for path in ([(0.0, 0.0), (tiny, 0.0)], [(1e6, 0.0), (-1e6, 0.0)]):
-        if misfit(trajectory(*path), ROBOT) is None:
+        if mismatch(trajectory(*path), ROBOT) is None:
             assert Route(path).length_m > 0
 
 

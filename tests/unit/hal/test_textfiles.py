@@ -11,7 +11,7 @@ import pytest
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.files import Table, find, read_table
 from snakesim_hal.model.scenario import load, parse_set
-from snakesim_hal.model.textfiles import MOST_DEPTH, MOST_TOML, parse_toml, read_text, write_text
+from snakesim_hal.model.textfiles import MAX_DEPTH, MAX_TOML, parse_toml, read_text, write_text
 from snakesim_hal.network.session import open_router
 
 LIMIT_S = 10.0  # on a busy machine; alone each takes less than two
@@ -46,8 +46,8 @@ ODD: dict[str, tuple[Callable[[Path], object], str]] = {
     "UTF-16": (lambda path: path.write_text("a = 1", encoding="utf-16"), "is UTF-16 text, or none at all; save it as"),
     "UTF-16 without a mark": (lambda path: path.write_text("a = 1", encoding="utf-16-le"), "is UTF-16 text"),
     "Latin-1": (lambda path: path.write_bytes(b"a = '\xe4'"), "is not UTF-8 text: byte 0xe4 at 5"),
-    "key of 50,000 parts": (lambda path: path.write_text(f"{DEEP} = 1"), f"has more than {MOST_DEPTH} parts"),
-    "section of 50,000 parts": (lambda path: path.write_text(f"[{DEEP}]"), f"has more than {MOST_DEPTH} parts"),
+    "key of 50,000 parts": (lambda path: path.write_text(f"{DEEP} = 1"), f"has more than {MAX_DEPTH} parts"),
+    "section of 50,000 parts": (lambda path: path.write_text(f"[{DEEP}]"), f"has more than {MAX_DEPTH} parts"),
     "quoted key of 50,000 parts": (lambda path: path.write_text('"a"."b" . ' * 25_000), "parts"),
     "key of 50,000 parts inside": (lambda path: path.write_text(f"x = {{ {DEEP} = 1 }}"), "parts"),
     "deep lists": (lambda path: path.write_text("a = " + "[" * 100_000), "nested deeper"),
@@ -71,7 +71,7 @@ def test_an_odd_file_is_one_clear_line_at_once(odd: str, tmp_path: Path, monkeyp
     assert len(caught.value.lines) == 1 and "\n" not in str(caught.value) and len(str(caught.value)) < 500
 
 
-@pytest.mark.parametrize("depth", [MOST_DEPTH + 1, 900, 100_000])
+@pytest.mark.parametrize("depth", [MAX_DEPTH + 1, 900, 100_000])
 def test_a_deep_json_file_is_refused(depth: int, tmp_path: Path) -> None:
     path = tmp_path / "config.json"
     path.write_text('{"a":' * depth + "1" + "}" * depth)
@@ -80,8 +80,8 @@ def test_a_deep_json_file_is_refused(depth: int, tmp_path: Path) -> None:
 
 
 def test_a_large_file_with_as_much_as_is_allowed_takes_bounded_time(tmp_path: Path) -> None:
-    key = ".".join("k" * (MOST_DEPTH - 1))
-    text = "".join(f"a{i}.{key} = 1\n" for i in range(80_000))[: MOST_TOML - 10]
+    key = ".".join("k" * (MAX_DEPTH - 1))
+    text = "".join(f"a{i}.{key} = 1\n" for i in range(80_000))[: MAX_TOML - 10]
     (tmp_path / "large.toml").write_text(text[: text.rindex("\n")])
     started = time.monotonic()
     with pytest.raises(ConfigError, match="unknown field"):

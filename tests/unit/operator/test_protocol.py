@@ -9,7 +9,7 @@ from typing import Any, get_args
 import pytest
 import zenoh
 
-from snakesim_gnc.control.telling import TELEMETRY_S
+from snakesim_gnc.control.state_reports import TELEMETRY_S
 from snakesim_hal.host.host import STATUS_PERIOD_NS
 from snakesim_hal.network.session import DEFAULT_ENDPOINT, Link, open_session
 from snakesim_hal.safety import gate, lifecycle

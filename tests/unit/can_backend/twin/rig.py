@@ -21,7 +21,7 @@ from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_can_backend.twin.firmware import Module
 from snakesim_can_backend.twin.inertia import InertiaPlant, InertiaSettings
 from snakesim_can_backend.twin.parameters import Parameters, from_factory
-from snakesim_can_backend.twin.reports import Sight
+from snakesim_can_backend.twin.reports import Readings
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.thermal import HeatLimits
 from snakesim_hal.wire.messages import Mode
@@ -32,7 +32,7 @@ SERIAL = 0xC0FFEE
 MS = 1000.0
 BOOTED = 100 * MS
 HEAT = HeatLimits(derate_from_c=80.0, stop_at_c=105.0)
-QUIET = Sight(0, 0, 0)
+QUIET = Readings(0, 0, 0)
 
 
 def emergency() -> Frame:
@@ -102,8 +102,8 @@ def chain(run: RunConfig | None = None, *, stepped: bool = True, **given: Any) -
     settings = Settings(**{k: given.pop(k) for k in list(given) if k in Settings.__struct_fields__})
     made = ModuleChain(run, settings, plant, stepped=stepped, **given)
     motor = run.robot.motor
-    for seat in made.seats:
-        seat.module.parameters.values |= {
+    for slot in made.slots:
+        slot.module.parameters.values |= {
             Parameter.STIFFNESS: motor.stiffness_nm_per_rad,
             Parameter.DAMPING: motor.damping_nm_s_per_rad,
             Parameter.VELOCITY_GAIN: motor.velocity_gain_nm_s_per_rad,
@@ -136,15 +136,15 @@ class Host:
         return [self.tick(target, mode) for _ in range(count)][-1]
 
     def states(self) -> list[ModuleState]:
-        return [seat.module.state for seat in self.chain.seats[: self.chain.count]]
+        return [slot.module.state for slot in self.chain.slots[: self.chain.count]]
 
 
 def run_at(joints: int, rate_hz: int, seconds: float = 2.0) -> tuple[list[int], Traffic, Traffic, int]:
     """A whole bus for some time; how late each joint state came, in periods, and the traffic."""
     twins = chain(config(joints, rate_hz=rate_hz), stepped=False)
-    twins.seats[0].module.parameters.values[Parameter.TAIL] = 1.0
-    for seat in twins.seats:
-        seat.module.parameters.values |= {Parameter.CONTACT_EVERY: 1.0, Parameter.IMU_EVERY: 20.0}
+    twins.slots[0].module.parameters.values[Parameter.TAIL] = 1.0
+    for slot in twins.slots:
+        slot.module.parameters.values |= {Parameter.CONTACT_EVERY: 1.0, Parameter.IMU_EVERY: 20.0}
     twins.advance_to(110_000.0)
     twins.hear(0, command(Action.ARM))
     period_us, before = 1e6 / rate_hz, twins.traffic()[0]

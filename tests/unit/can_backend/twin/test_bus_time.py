@@ -5,7 +5,7 @@ import pytest
 from snakesim_can_backend.bus.load import Reports, load, worst_bits
 from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.definitions import Frame, Opcode, frame_id, opcode_of
-from snakesim_can_backend.twin.bus_time import MOST_AHEAD_US, BusTime, by_opcode
+from snakesim_can_backend.twin.bus_time import MAX_AHEAD_US, BusTime, by_opcode
 from tests.unit.can_backend.twin.rig import run_at, set_point, sync
 
 FULL = worst_bits(8)
@@ -47,7 +47,7 @@ def test_the_host_s_frames_take_their_time():
     assert bus.next_us() == 10 * worst_bits(6) + FULL
     for _ in range(10_000):
         bus.heard(set_point(0), 0.0)
-    assert bus.next_us() <= MOST_AHEAD_US + FULL
+    assert bus.next_us() <= MAX_AHEAD_US + FULL
 
 
 def test_a_newer_frame_takes_the_place_of_an_unsent_one_but_answers_are_all_sent():

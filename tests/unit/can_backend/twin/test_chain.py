@@ -8,7 +8,7 @@ import pytest
 
 from snakesim_can_backend.protocol.definitions import Action, ModuleState, Opcode, Parameter
 from snakesim_can_backend.protocol.mocap_sample import MocapSample
-from snakesim_can_backend.twin.chain import MOST_AT_ONCE_US
+from snakesim_can_backend.twin.chain import MAX_AT_ONCE_US
 from snakesim_can_backend.twin.reports import ALONG, ANGLE, FORCE
 from snakesim_hal.model.plant import LinkLoad
 from snakesim_hal.wire.messages import Imu, Mode, Pose
@@ -88,14 +88,14 @@ def test_two_buses_with_one_sync_time_share_one_step_of_time():
     assert plant.steps == 20 and made.counts == [3, 2]
     assert [s["count"] for s in only(made.take(1), Opcode.JOINT_STATE)] == [0, 0, 1, 1, 2, 2]
     made.hear(1, command(Action.ARM))
-    assert [s.module.state for s in made.seats] == [1, 1, 1, 2, 2]
+    assert [s.module.state for s in made.slots] == [1, 1, 1, 2, 2]
     made.hear(0, set_point(0, node=4))
-    assert made.seats[3].module._pending is None, "node 4 is on the other bus"
+    assert made.slots[3].module._pending is None, "node 4 is on the other bus"
 
 
 def test_forces_are_felt_by_the_link_in_front_and_the_tail():
     made = chain(config(**SENSORS), plant=Pushed(4))
-    made.seats[0].module.parameters.values[Parameter.TAIL] = 1.0
+    made.slots[0].module.parameters.values[Parameter.TAIL] = 1.0
     made.hear(0, sync(0))
     frames = made.take(0)
     contacts = only(frames, Opcode.CONTACT)
@@ -110,8 +110,8 @@ def test_forces_are_felt_by_the_link_in_front_and_the_tail():
 
 def test_neighbours_take_turns_with_their_imus():
     made = chain(config(**SENSORS), plant=Pushed(4))
-    for seat in made.seats:
-        seat.module.parameters.values[Parameter.IMU_EVERY] = 4.0
+    for slot in made.slots:
+        slot.module.parameters.values[Parameter.IMU_EVERY] = 4.0
     for tick in range(4):
         made.hear(0, sync(tick))
         gyros = only(made.take(0), Opcode.GYRO)
@@ -188,7 +188,7 @@ def test_in_wall_clock_time_a_hiccup_is_caught_up_but_not_a_long_one():
     made.advance_to(150_000.0)
     assert plant.steps == 150
     made.advance_to(1_150_000.0)
-    assert plant.steps == 350 and made.skipped_us == 1e6 - MOST_AT_ONCE_US
+    assert plant.steps == 350 and made.skipped_us == 1e6 - MAX_AT_ONCE_US
     made.advance_to(1_160_000.0)
     assert plant.steps == 360
 

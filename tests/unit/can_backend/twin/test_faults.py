@@ -64,7 +64,7 @@ def test_a_frozen_module_repeats_itself_and_ends_passive():
     run = host("freeze:joint_2@0.05")
     answers = [of_node_2(run.tick(0.1)) for _ in range(30)]
     assert len({a[0].data for a in answers[6:]}) == 1 and all(len(a) == 1 for a in answers)
-    assert run.chain.seats[1].module.demand.mode == 0
+    assert run.chain.slots[1].module.demand.mode == 0
 
 
 def test_a_reboot_is_a_boot_with_uptime_from_0():

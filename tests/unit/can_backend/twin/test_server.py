@@ -63,7 +63,7 @@ def test_by_the_clock_modules_boot_answer_and_follow():
         states = only(answers, Opcode.JOINT_STATE, 1)
         assert [s["count"] for s in states] == [tick % 16 for tick in range(50)]
         assert states[-1]["angle"] == pytest.approx(0.2, abs=0.01)
-        assert [seat.module.state for seat in made.seats] == [ModuleState.ARMED] * JOINTS
+        assert [slot.module.state for slot in made.slots] == [ModuleState.ARMED] * JOINTS
 
 
 def test_without_set_points_everybody_is_passive_after_the_watchdog_s_time():
@@ -72,9 +72,9 @@ def test_without_set_points_everybody_is_passive_after_the_watchdog_s_time():
         until(0.11)
         near.send(command(Action.ARM))
         until(0.2)
-        assert made.seats[0].module.state == ModuleState.ARMED
+        assert made.slots[0].module.state == ModuleState.ARMED
         until(0.215)
-        assert [seat.module.state for seat in made.seats] == [ModuleState.FAULT] * JOINTS
+        assert [slot.module.state for slot in made.slots] == [ModuleState.FAULT] * JOINTS
 
 
 def test_what_slept_here_does_not_look_like_a_host_that_slept():
@@ -88,7 +88,7 @@ def test_what_slept_here_does_not_look_like_a_host_that_slept():
         for tick in range(5, 20):  # the host goes on while the server sleeps for 150 ms
             send_tick(near, tick)
         server.run_due(round(0.31e9))
-        assert [seat.module.state for seat in made.seats] == [ModuleState.ARMED] * JOINTS
+        assert [slot.module.state for slot in made.slots] == [ModuleState.ARMED] * JOINTS
 
 
 def test_stepped_twins_run_when_the_host_has_nothing_to_do():

@@ -11,7 +11,7 @@ TELEMETRY_S = 0.05
 LONGEST = 500  # characters of a reason
 
 
-class Telling:
+class StateReports:
     """Makes the state's message when it is time for one."""
 
     def __init__(self, controller: str, robot: Description) -> None:
