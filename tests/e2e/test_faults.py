@@ -65,7 +65,7 @@ def ask(run: Running, *words: str):
     return snakesim("fault", *words, "--endpoint", run.endpoint, cwd=run.out.parent)
 
 
-@pytest.mark.parametrize("backend", ["sim", "can"])
+@pytest.mark.parametrize("backend", ["can", pytest.param("sim", marks=pytest.mark.slow)])
 def test_a_fault_is_asked_for_with_a_command(tmp_path: Path, backend: str) -> None:
     arguments = ["triplet", "--controller", "hold", "--duration", "600", "--pace", "realtime", "--backend", backend]
     with running(tmp_path / "run", *arguments) as run:
@@ -105,6 +105,7 @@ def test_a_joint_that_may_be_lost_is_passive_and_the_run_goes_on(tmp_path: Path,
     nothing_left(tmp_path / "run")
 
 
+@pytest.mark.slow
 def test_an_operator_takes_back_a_joint_that_was_lost(tmp_path: Path) -> None:
     def operator(*words: str):
         return snakesim(*words, "--endpoint", run.endpoint, cwd=tmp_path)

@@ -293,6 +293,7 @@ def test_a_slow_disk_delays_no_tick_and_loses_nothing(tmp_path: Path, hangs: Pat
     assert len(RunRecord.load(tmp_path / "run").time_s) == 200 and not hangs.exists()
 
 
+@pytest.mark.slow
 def test_a_disk_that_hangs_delays_neither_ticks_nor_a_stop_nor_the_end(tmp_path: Path, hangs: Path) -> None:
     with running(tmp_path / "run", *LONG, "--stay") as run:
         run.wait_for(" s  ")

@@ -87,7 +87,9 @@ def test_other_paces_complete(tmp_path: Path, pace: str) -> None:
         assert summary.state_to_command_us["p50"] is not None
 
 
-@pytest.mark.parametrize("modules", [8, 13, 30])
+@pytest.mark.parametrize(
+    "modules", [8, pytest.param(13, marks=pytest.mark.slow), pytest.param(30, marks=pytest.mark.slow)]
+)
 def test_any_number_of_modules_without_a_code_change(tmp_path: Path, modules: int) -> None:
     ended, summary = run_to_summary(
         tmp_path / "run", "peg_row", "--duration", "6", "--set", f"robot.chain.modules={modules}"

@@ -96,8 +96,12 @@ def test_a_backend_that_keeps_real_time_only_passes() -> None:
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ((), "give --backend"),
-        (("--backend", "nothing_of_that_name"), "no backend called 'nothing_of_that_name' is installed"),
+        pytest.param((), "give --backend", marks=pytest.mark.slow),
+        pytest.param(
+            ("--backend", "nothing_of_that_name"),
+            "no backend called 'nothing_of_that_name' is installed",
+            marks=pytest.mark.slow,
+        ),
         (("--backend", "sim", "--set", "robot.limits.torque_nm=-1"), "robot.limits.torque_nm"),
     ],
 )

@@ -79,6 +79,7 @@ def test_a_deep_json_file_is_refused(depth: int, tmp_path: Path) -> None:
         read_table(path)
 
 
+@pytest.mark.slow
 def test_a_large_file_with_as_much_as_is_allowed_takes_bounded_time(tmp_path: Path) -> None:
     key = ".".join("k" * (MAX_DEPTH - 1))
     text = "".join(f"a{i}.{key} = 1\n" for i in range(80_000))[: MAX_TOML - 10]
