@@ -20,7 +20,7 @@ from snakesim_hal.network.client import Client
 from snakesim_hal.network.session import Link, Reader, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlState, Trajectory
-from tests.unit.hal.network import Running, running, wait_until
+from tests.unit.hal.local_network import Running, running, wait_until
 from tests.unit.hal.rig import run_config
 
 SERVICES: dict[str, type[Service]] = {"guidance": Guidance, "navigation": Navigation, "control": Control}

@@ -12,7 +12,7 @@ from snakesim_hal.errors import ControllerError
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, FaultRequest, Intent, JointCommand, JointState
 from tests.unit.gnc.services import Stage, stage
-from tests.unit.hal.network import wait_until
+from tests.unit.hal.local_network import wait_until
 
 PERIOD_NS = 20_000_000
 SEEN = 10  # views in a row

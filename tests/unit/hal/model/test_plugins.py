@@ -22,7 +22,7 @@ from snakesim_hal.model.plugins import (
     plugin_settings,
 )
 
-REPOSITORY = Path(__file__).parents[3]
+REPOSITORY = Path(__file__).parents[4]
 WAVE = """\
 import msgspec
 

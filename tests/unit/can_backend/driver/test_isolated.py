@@ -21,8 +21,8 @@ from snakesim_can_backend.twin.server import Here
 from snakesim_hal.conformance.rig import Rig
 from snakesim_hal.model.injection import parse
 from snakesim_hal.wire.messages import LifecycleRequest, Mode
+from tests.unit.can_backend.driver.test_faults_seen import MODULE_FAULTS
 from tests.unit.can_backend.loop import JOINTS, config
-from tests.unit.can_backend.test_faults_seen import MODULE_FAULTS
 
 FAILS = 2  # joint_3
 OTHERS = [i for i in range(JOINTS) if i != FAILS]

@@ -14,7 +14,7 @@ from snakesim_hal.model.injection import parse
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, Clock, FaultRequest, JointState
-from tests.unit.hal.network import (
+from tests.unit.hal.local_network import (
     Follower,
     LagBackend,
     Running,

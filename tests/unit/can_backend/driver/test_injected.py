@@ -18,8 +18,8 @@ from snakesim_hal.backend import Injectable
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.faults.faulty_backend import FaultyBackend
 from snakesim_hal.model.injection import parse
+from tests.unit.can_backend.driver.test_faults_seen import MODULE_FAULTS
 from tests.unit.can_backend.loop import Loop, armed, cleared_and_armed_again, config, loop
-from tests.unit.can_backend.test_faults_seen import MODULE_FAULTS
 
 PERIOD_MS, LEASE_MS = 10, 50
 

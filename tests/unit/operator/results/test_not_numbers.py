@@ -24,7 +24,7 @@ from snakesim_operator.results.compare.table import table
 from snakesim_operator.results.record import CONFIG, TELEMETRY, RunRecord
 from snakesim_operator.results.report import page
 from snakesim_operator.results.summary import RunSummary, summarise
-from tests.unit.operator.test_report import Reader, made_up
+from tests.unit.operator.results.test_report import Reader, made_up
 
 FIRST, LAST = 240, 330  # rows of the made-up run that are kept: two joints propel in them
 FIRST_TICK = 37 + FIRST

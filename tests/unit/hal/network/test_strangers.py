@@ -32,7 +32,7 @@ from snakesim_hal.wire.messages import (
     World,
     WorldContact,
 )
-from tests.unit.hal.network import LagBackend, free_endpoint, wait_until
+from tests.unit.hal.local_network import LagBackend, free_endpoint, wait_until
 from tests.unit.hal.rig import description, run_config, state
 
 ROBOT = description()  # three joints, four links

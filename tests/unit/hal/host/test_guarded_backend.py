@@ -8,8 +8,8 @@ from snakesim_hal.backend import Samples, SetPoints
 from snakesim_hal.errors import BackendError, SnakesimError
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.wire.messages import Fault, LifecycleState
-from tests.unit.hal.network import Follower, LagBackend, following, running, wait_until
-from tests.unit.hal.test_client_host import run_config
+from tests.unit.hal.local_network import Follower, LagBackend, following, running, wait_until
+from tests.unit.hal.network.test_client_host import run_config
 
 
 class Clumsy(LagBackend):

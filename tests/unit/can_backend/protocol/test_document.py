@@ -29,7 +29,7 @@ from snakesim_can_backend.twin.parameters import Parameters, from_factory
 from snakesim_hal.model.scenario import load as load_scenario
 from snakesim_hal.model.thermal import HeatLimits
 
-TEXT = (Path(__file__).parents[3] / "docs" / "can-protocol.md").read_text(encoding="utf-8")
+TEXT = (Path(__file__).parents[4] / "docs" / "can-protocol.md").read_text(encoding="utf-8")
 NODE = 5
 
 
@@ -253,13 +253,13 @@ def test_only_armed_and_stopping_modules_drive_their_motor() -> None:
 
 
 def test_pictures_and_files_that_are_named_are_there() -> None:
-    here = Path(__file__).parents[3] / "docs"
+    here = Path(__file__).parents[4] / "docs"
     for target in re.findall(r"\]\(([^)#:]+)\)", TEXT):
         assert (here / target).exists(), target
 
 
 def test_the_picture_of_a_cycle_is_in_proportion() -> None:
-    picture = (Path(__file__).parents[3] / "docs" / "can-cycle.svg").read_text(encoding="utf-8")
+    picture = (Path(__file__).parents[4] / "docs" / "can-cycle.svg").read_text(encoding="utf-8")
     bars: list[dict[str, Any]] = [
         dict(re.findall(r'([\w-]+)="([^"]*)"', bar)) for bar in re.findall(r"<rect [^>]*data-bits[^>]*>", picture)
     ]

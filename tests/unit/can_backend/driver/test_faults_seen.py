@@ -1,6 +1,6 @@
 """Every fault of a module, from its first moment to the rest of the joints: what the driver said, and how soon.
 
-`pytest -rP tests/unit/can_backend/test_faults_seen.py` prints a row for each.
+`pytest -rP tests/unit/can_backend/driver/test_faults_seen.py` prints a row for each.
 """
 
 import numpy as np

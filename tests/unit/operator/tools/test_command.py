@@ -8,8 +8,8 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer
 from snakesim_operator.tools import command, stop
 from snakesim_operator.tools.targets import Where
-from tests.unit.hal.network import Follower, following, running
-from tests.unit.hal.test_client_host import run_config
+from tests.unit.hal.local_network import Follower, following, running
+from tests.unit.hal.network.test_client_host import run_config
 
 
 def test_a_robot_that_does_not_answer_a_stop_is_named() -> None:

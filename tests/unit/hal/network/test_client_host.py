@@ -33,7 +33,7 @@ from snakesim_hal.wire.messages import (
     Mode,
     Pose,
 )
-from tests.unit.hal.network import Follower, LagBackend, following, free_endpoint, running, wait_until
+from tests.unit.hal.local_network import Follower, LagBackend, following, free_endpoint, running, wait_until
 from tests.unit.hal.rig import command, description, run_config, state
 
 

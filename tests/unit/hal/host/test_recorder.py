@@ -19,7 +19,7 @@ from snakesim_hal.host.recorder import BLACK_BOX, DESCRIPTION, HOST_RECORD, Reco
 from snakesim_hal.host_process import HostRecord, record_of
 from snakesim_hal.safety.authority import Decision
 from snakesim_hal.wire.messages import Description, Mode
-from tests.unit.hal.network import Follower, following, running, wait_until
+from tests.unit.hal.local_network import Follower, following, running, wait_until
 from tests.unit.hal.rig import description, run_config, state
 
 ROBOT = description()

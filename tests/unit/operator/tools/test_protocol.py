@@ -17,10 +17,10 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode
 from snakesim_hal.wire.messages import Description, Done, JointCommand, JointState, Mode
 from snakesim_operator.tools.schemas import contract
-from tests.unit.hal.network import free_endpoint, wait_until
+from tests.unit.hal.local_network import free_endpoint, wait_until
 from tests.unit.hal.rig import description
 
-REPOSITORY = Path(__file__).parents[3]
+REPOSITORY = Path(__file__).parents[4]
 PROTOCOL = (REPOSITORY / "schemas" / "protocol.md").read_text(encoding="utf-8")
 CONTRACT = dict(contract())
 

@@ -24,7 +24,7 @@ from snakesim_operator.tools.schemas import contract, write_schemas
 from snakesim_operator.tools.schemas import schema_of as published_schema
 from tests.unit.hal.strategies import messages_of, places, plain_example, poisons, replaced
 
-REPOSITORY = Path(__file__).parents[3]
+REPOSITORY = Path(__file__).parents[4]
 PUBLISHED = REPOSITORY / "schemas"
 each_message = pytest.mark.parametrize("message", list(VERSIONS), ids=lambda message: message.__name__)
 

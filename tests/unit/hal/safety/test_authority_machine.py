@@ -1,7 +1,7 @@
 """The authority under everything that can happen to it, in any order, against a plain model of what may be.
 
 200 sequences a run; as many as one likes with
-`SNAKESIM_SEQUENCES=10000 python -m pytest -n 2 tests/unit/hal/test_authority_machine.py`.
+`SNAKESIM_SEQUENCES=10000 python -m pytest -n 2 tests/unit/hal/safety/test_authority_machine.py`.
 """
 
 import math
