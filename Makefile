@@ -84,7 +84,6 @@ bench: $(stamp) ## Measure the ratios in benchmarks/
 
 schemas: $(stamp) ## Write the JSON Schemas of every message and config anew
 	$(bin)/snakesim schemas --write schemas
-	$(bin)/snakesim can expand --write schemas/can
 
 docs: $(stamp) ## Write the API reference into build/docs
 	PDOC_ALLOW_EXEC=1 $(bin)/python -m pdoc --output-directory build/docs $(packages)

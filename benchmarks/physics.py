@@ -15,7 +15,7 @@ from snakesim_hal.wire.codec import encode
 from snakesim_hal.wire.keys import CLOCK, JOINTS
 from snakesim_hal.wire.messages import Clock, JointCommand, Mode
 from snakesim_sim_backend.backend import SimBackend
-from tests.in_process import run as run_in_process
+from tests.whole_run import run as run_in_process
 
 TICKS_A_BLOCK = 50
 
@@ -97,12 +97,12 @@ class BareLoop:
 def motion(config: RunConfig) -> tuple[list[SetPoints], float]:
     """Every set-point of a run of the scenario, and the mean µs of the controller alone; all in this process."""
     whole = run_in_process(config)
-    limits = [joint.torque_limit_nm for joint in whole.backend.describe().joints]
+    limits = [joint.torque_limit_nm for joint in whole.record.description.joints]
     points = [
         SetPoints([Mode(code) for code in mode], target, limits)
-        for mode, target in zip(whole.mode.tolist(), whole.target.tolist(), strict=True)
+        for mode, target in zip(whole.record.mode.tolist(), whole.record.target.tolist(), strict=True)
     ]
-    return points, float(whole.update_us.mean())
+    return points, sum(whole.update_us) / len(whole.update_us)
 
 
 def sensing(config: RunConfig) -> tuple[list[float], list[float]]:

@@ -66,8 +66,8 @@ def parser() -> argparse.ArgumentParser:
     answering.add_argument("--seconds", type=_seconds, default=1.0, help="how long to listen on each (default: 1)")
     answering.set_defaults(act=_scan)
 
-    expand = commands.add_parser("expand", help=f"write {EXPANDED}: every message of every node spelled out")
-    expand.add_argument("--write", type=Path, required=True, metavar="FOLDER")
+    expand = commands.add_parser("expand", help="write the DBC file with every message of every node spelled out")
+    expand.add_argument("--out", type=Path, default=Path(EXPANDED), metavar="FILE", help=f"(default: {EXPANDED})")
     expand.set_defaults(act=_expand)
     return parser
 
@@ -208,9 +208,8 @@ def _shaft(raw: int | None) -> str:
 
 
 def _expand(arguments: argparse.Namespace) -> int:
-    path = arguments.write / EXPANDED
-    write_text(path, expanded_dbc(), encoding="cp1252")
-    say(str(path))
+    write_text(arguments.out, expanded_dbc(), encoding="cp1252")
+    say(str(arguments.out))
     return OK
 
 

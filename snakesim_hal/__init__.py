@@ -9,7 +9,8 @@ From the ground up:
 `network`   Zenoh, and nothing else imports it: sessions, the client of controllers, the stop port
 `faults`    carries out faults on request
 `host`      the process that owns a robot: its loop, and what it records
-`conformance`, and the entry points `host_process`, `router_process`, `serve`
+`service`   what guidance, navigation and control are, and the loop around each
+`conformance`, and the entry points `host_process`, `router_process`, `serve`; `in_process` runs all in one process
 
 Each imports only what stands above it. No backend, no GNC, no MuJoCo and no CAN is imported here.
 """

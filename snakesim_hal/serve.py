@@ -1,4 +1,7 @@
-"""Running one process of a robot from its effective configuration: argument parsing that host and services share."""
+"""Running one process of a robot from its effective configuration: arguments that all share, and a service's process.
+
+`python -m snakesim_hal.serve NAME ...` runs the service that an installed package offers under a name.
+"""
 
 import argparse
 import sys
@@ -6,14 +9,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.errors import ConfigError, SnakesimError
 from snakesim_hal.model.plugins import SERVICES, find_plugin
 from snakesim_hal.model.scenario import RunConfig, read
-from snakesim_hal.network.session import DEFAULT_ENDPOINT, Link
-from snakesim_hal.process import die_with_parent
+from snakesim_hal.network.session import DEFAULT_ENDPOINT, Link, open_session
+from snakesim_hal.process import SERVICE_PRIORITY, calm_down_after, die_with_parent, hurry, settle_for_timing
+from snakesim_hal.service import START_LIMIT_S, Service, ServiceLoop
 from snakesim_hal.terminal import complain, complain_of
-
-START_LIMIT_S = 600.0  # until a part of a run is there: MuJoCo starts slowly in an emulated machine on a busy one
 
 
 @dataclass(frozen=True)
@@ -51,15 +53,38 @@ def process_options(
     return ProcessOptions(config, link, parsed.out, parsed)
 
 
+def serve(service_type: type[Service], argv: Sequence[str] | None = None) -> int:
+    """Run a service process. Ends when it is told to stop; exit code 1 when it could not go on."""
+    name = service_type.name
+    given = process_options(arguments(f"Run the {name} service of a robot."), argv)
+    try:
+        if service_type.urgent and given.config.pace == "realtime":
+            hurry(SERVICE_PRIORITY)
+            calm_down_after(given.config.lease_ns * 1e-9)
+        with open_session(given.link, connect_timeout_s=START_LIMIT_S) as session:
+            loop = ServiceLoop(service_type, given.config, session)
+            loop.join()
+            settle_for_timing()
+            try:
+                loop.run()
+            finally:
+                loop.close()
+    except SnakesimError as error:
+        complain_of(error, f"snakesim {name}")
+        return 1
+    except KeyboardInterrupt:
+        return 0
+    return 0
+
+
 def main(argv: Sequence[str] | None = None) -> int:
-    """`python -m snakesim_hal.serve NAME ...`: run the service that an installed package offers under a name."""
+    """Find the service, and run it."""
     given = list(sys.argv[1:] if argv is None else argv)
     if not given or given[0].startswith("-"):
         complain("usage: python -m snakesim_hal.serve NAME [--help]")
         return 2
     try:
-        service_main = find_plugin(SERVICES, given[0])
-        return service_main(given[1:])
+        return serve(find_plugin(SERVICES, given[0]), given[1:])
     except ConfigError as error:
         complain_of(error, f"snakesim {given[0]}")
         return 2

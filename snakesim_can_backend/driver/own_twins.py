@@ -17,7 +17,7 @@ from snakesim_hal.errors import BackendError, ConfigError
 from snakesim_hal.model.fault_plan import check_backend_can
 from snakesim_hal.model.injection import KINDS, Injection
 from snakesim_hal.model.scenario import RunConfig, write
-from snakesim_hal.serve import START_LIMIT_S
+from snakesim_hal.service import START_LIMIT_S
 from snakesim_hal.terminal import complain
 
 READY = "modules ready"

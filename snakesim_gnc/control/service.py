@@ -4,18 +4,17 @@ A controller is given only what is fresh enough (`freshness`). With stale joints
 the robot is stopped. What it answers is checked (`guarded`): a controller that cannot go on ends this process at once.
 """
 
-import sys
 from collections.abc import Sequence
 
 from snakesim_gnc.control.controller import Controller, View
 from snakesim_gnc.control.freshness import Limits
 from snakesim_gnc.control.guarded import Guarded
 from snakesim_gnc.control.state_reports import StateReports
-from snakesim_gnc.service import Service, serve
 from snakesim_hal.errors import ControllerError
 from snakesim_hal.model.plugins import CONTROLLERS, find_plugin, plugin_settings
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.client import Client, Commander
+from snakesim_hal.service import Service
 from snakesim_hal.terminal import complain
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, ControlState, Description, JointState, Message, Trajectory, World
@@ -146,12 +145,3 @@ def _why_it_rests(trajectory: Trajectory | None) -> str:
 
 def _told(state: ControlState | None) -> list[tuple[str, Message]]:
     return [] if state is None else [(keys.CONTROL_STATE, state)]
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run control until its robot is gone."""
-    return serve(Control, argv)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,12 +1,9 @@
 """The guidance process: sensors in, `guidance/world` out."""
 
-import sys
-from collections.abc import Sequence
-
 from snakesim_gnc.guidance.core import WorldModel
-from snakesim_gnc.service import Service, serve
 from snakesim_hal.model.scenario import RunConfig, place_all
 from snakesim_hal.network.client import Client
+from snakesim_hal.service import Service
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, Contacts, Description, JointState, Message, Pose
 
@@ -36,12 +33,3 @@ class Guidance(Service):
             return None
         contacts = self._client.read(self._contacts)
         return [(keys.WORLD, self._model.update(clock.tick, clock.stamp_ns, joints, contacts, pose))]
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run guidance until its robot is gone."""
-    return serve(Guidance, argv)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,16 +1,13 @@
 """The navigation process: world model and intent in, `navigation/trajectory` out."""
 
-import sys
-from collections.abc import Sequence
-
 import numpy as np
 
 from snakesim_gnc.navigation.core import KnownPath
-from snakesim_gnc.service import Service, serve
 from snakesim_hal.model.route import Route
 from snakesim_hal.model.scenario import RunConfig, place_all, start_of
 from snakesim_hal.model.scene import route_of
 from snakesim_hal.network.client import Client
+from snakesim_hal.service import Service
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, Description, Intent, Message, World
 
@@ -43,12 +40,3 @@ class Navigation(Service):
         """The trajectory at this tick. An operator's intent counts as soon as it arrives."""
         world, intent = self._client.read(self._world), self._intent.newest()
         return [(keys.TRAJECTORY, self._planner.update(clock.tick, clock.stamp_ns, world, intent))]
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run navigation until its robot is gone."""
-    return serve(Navigation, argv)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -11,7 +11,7 @@ free      not at all
 import contextlib
 import secrets
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from math import inf
 from typing import Any, Literal
 
@@ -125,7 +125,7 @@ class Host:
         self._inbox = Inbox(session, self, config.services, self._outbox.answer)
         session.on_alive(self._another_host, keys.HOST_ALL)
         self._starter.say(ToStarter(description=self.description))
-        self._starter.serve(self._inbox.ask)
+        self._starter.serve(self.ask)
 
     def stop(self) -> None:
         """End the run in order; may be called from a signal handler."""
@@ -139,10 +139,19 @@ class Host:
 
     def take_stop(self, who: str, reply: Callable[[str], None]) -> None:
         """An emergency stop that came past the network; from any thread."""
-        self._inbox.ask(EstopRequest(who=who[:64] or "somebody"), lambda answer: reply(answer.reason))
+        self.ask(EstopRequest(who=who[:64] or "somebody"), lambda answer: reply(answer.reason))
+
+    def ask(self, request: Request, reply: Callable[[Answer], None]) -> None:
+        """A request that came past the network; from any thread."""
+        self._inbox.ask(request, reply)
 
     def run(self) -> None:
         """Tick until the run is over. The joints are safe when this returns."""
+        for _ in self.turns():
+            pass
+
+    def turns(self) -> Generator[None]:
+        """Like `run`; yields in each tick when the clock is out, for those who act in the same thread."""
         last: Samples | None = None
         self._deadlines.begin(0)
         try:
@@ -152,6 +161,7 @@ class Host:
                 if last is None:
                     break
                 self._publish(last)
+                yield
                 if self._pace == "lockstep" and self.authority.arming == 0:
                     self._inbox.take_until(time.monotonic_ns() + STANDBY_PERIOD_NS)
                     self._show_status()
@@ -168,6 +178,10 @@ class Host:
             self.faults.close()
             self._latch.close()
             self._outbox.close()
+
+    def take_in(self) -> None:
+        """Handle what has come in, and return."""
+        self._inbox.take_all(inf)
 
     @property
     def wall_s(self) -> float:

@@ -1,9 +1,11 @@
 """Backends, controllers, services and the like are found by name: an entry point of an installed package, or a file.
 
 `wave` is looked up among the entry points; `./wave.py:Wave` is the object `Wave` of that file, for trying things out.
+A program that runs everything in one process may offer objects of its own.
 """
 
 import ast
+import contextlib
 import importlib.util
 import sys
 from collections.abc import Iterator
@@ -22,6 +24,19 @@ COMMANDS = "snakesim.commands"
 CONTROLLERS = "snakesim.controllers"
 PLANTS = "snakesim.plants"
 SERVICES = "snakesim.services"
+_offered: dict[tuple[str, str], Any] = {}
+
+
+@contextlib.contextmanager
+def offered(group: str, name: str, plugin: Any) -> Iterator[None]:
+    """Have a name stand for an object, in this process and as long as the context lives, whatever is installed."""
+    before = _offered.copy()
+    _offered[group, name] = plugin
+    try:
+        yield
+    finally:
+        _offered.clear()
+        _offered.update(before)
 
 
 def installed(group: str) -> list[str]:
@@ -32,6 +47,8 @@ def installed(group: str) -> list[str]:
 def find_plugin(group: str, name: str) -> Any:
     """Load what a name stands for. Raises ConfigError that says what is installed."""
     kind = _kind(group)
+    if (group, name) in _offered:
+        return _offered[group, name]
     if in_file(name):
         return _from_file(name, kind)
     found: dict[str, EntryPoint] = {entry.name: entry for entry in entry_points(group=group)}

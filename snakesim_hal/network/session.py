@@ -63,26 +63,19 @@ class Arrival:
 class Publisher(Generic[MessageT]):
     """Puts one message type on one key."""
 
-    def __init__(self, publisher: Any, message: type[MessageT]) -> None:
+    def __init__(self, message: type[MessageT], send: Callable[[bytes], None], heard: Callable[[], bool]) -> None:
+        """send: sends bytes as they are, bypassing any reroute; heard: whether anybody subscribes to it now."""
         self.message = message
-        self._publisher = publisher
-        self._put: Callable[[bytes], None] = publisher.put
+        self.send, self.heard = send, heard
+        self._put = send
 
     def put(self, message: MessageT) -> None:
         """Send it; may wait for a slow reader only when the publisher was declared lossless."""
         self._put(encode(message))
 
-    def send(self, payload: bytes) -> None:
-        """Send bytes as they are, past whoever stands in the way."""
-        self._publisher.put(payload)
-
     def reroute(self, put: Callable[[bytes], None] | None) -> None:
         """Hand what is put to somebody who may `send` it; None: straight out again."""
-        self._put = self._publisher.put if put is None else put
-
-    def heard(self) -> bool:
-        """Whether anybody subscribes to it now."""
-        return bool(self._publisher.matching_status.matching)
+        self._put = self.send if put is None else put
 
 
 class Reader(Generic[MessageT]):
@@ -116,10 +109,14 @@ class Reader(Generic[MessageT]):
 
     def _decoded(self, sample: Any) -> MessageT | None:
         try:
-            return self._decoder.decode(sample.payload.to_bytes(), str(sample.encoding))
+            return self._decoder.decode(*self._content(sample))
         except WireError as error:
             self._rejected[error.reason] += 1
             return None
+
+    def _content(self, sample: Any) -> tuple[bytes, str]:
+        """Payload and encoding."""
+        return sample.payload.to_bytes(), str(sample.encoding)
 
 
 @dataclass(frozen=True)
@@ -140,7 +137,7 @@ class Question:
 class Session:
     """What SnakeSIM uses of Zenoh. Open one with `open_session`."""
 
-    def __init__(self, zenoh_session: zenoh.Session) -> None:
+    def __init__(self, zenoh_session: Any) -> None:
         self._zenoh = zenoh_session
         self._declared: list[Any] = []
         self._publishers: dict[str, Publisher[Any]] = {}
@@ -174,7 +171,11 @@ class Session:
 
     def _published(self, key: str, publisher: Any, message: type[MessageT]) -> Publisher[MessageT]:
         self._declared.append(publisher)
-        made = self._publishers[key] = Publisher(publisher, message)
+        made = Publisher(message, publisher.put, lambda: bool(publisher.matching_status.matching))
+        return self._routed(key, made)
+
+    def _routed(self, key: str, made: Publisher[MessageT]) -> Publisher[MessageT]:
+        self._publishers[key] = made
         made.reroute(self._reroutes.get(key))
         return made
 
@@ -222,10 +223,8 @@ class Session:
     ) -> MessageT | None:
         """The value latched on a key; None when there is none (that is wanted) in time."""
         reader, deadline = self.latched_reader(key, message), time.monotonic() + timeout_s
-        found: MessageT | None = None
-        while found is None and time.monotonic() < deadline:
+        while (found := reader.newest(wanted)) is None and time.monotonic() < deadline:
             time.sleep(0.01)
-            found = reader.newest(wanted)
         self.stop_reading(reader)
         return found
 

@@ -1,6 +1,8 @@
 """What is left of a run when it is over: the summary, the report, and a few lines on the terminal."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import msgspec
 
@@ -15,30 +17,37 @@ from snakesim_operator.results import last_run as lastrun
 from snakesim_operator.results.gaps import unwritten
 from snakesim_operator.results.record import REPORT, SUMMARY, RunRecord
 from snakesim_operator.results.report import page
-from snakesim_operator.results.summary import RunSummary, summarise
+from snakesim_operator.results.summary import Restart, RunSummary, summarise
 from snakesim_operator.run.ending import Ending
 from snakesim_operator.run.run_files import RunFiles
-from snakesim_operator.run.supervisor import Supervisor
 
 JOINTS_SHOWN = 8
 DONE, FAILED, INCOMPLETE, INTERRUPTED = 0, 1, 3, 130
 
 
-def conclude(config: RunConfig, files: RunFiles, ending: Ending, supervisor: Supervisor, *, stay: bool) -> int:
+@dataclass(frozen=True)
+class Outcome:
+    """What is known of a run beside its folder."""
+
+    host: HostRecord | None  # the host's own numbers, as far as they are known
+    robot: Description | None
+    restarts: Sequence[Restart] = ()
+    hosts: int = 1
+
+
+def conclude(config: RunConfig, files: RunFiles, ending: Ending, outcome: Outcome, *, stay: bool = False) -> int:
     """Write and print it all. Returns 0, 1 on a fault or an early end, 3 when the record lacks something, or 130.
 
     stay: faults that a person could clear are part of the run, not its end.
     """
-    host = supervisor.host_record()
-    files.settle()
+    host = outcome.host
     lacks: list[str] = []
     if host is not None:
         explain(ending, host, config, stay=stay)
-        lacks = unwritten(host) if files.folder is not None else ["nothing was recorded"]
-        _leave(files, ending, supervisor, host, lacks)
+        lacks = _leave(files, ending, outcome, host)
     lost = files.close()
     lacks += [lost] if lost and lost not in lacks else []
-    _print_end(files, ending, host, supervisor.robot(), lacks)
+    _print_end(files, ending, outcome, lacks)
     lastrun.remember(str(files.folder or "no folder"), _ended(ending))
     if ending.interrupted:
         return INTERRUPTED
@@ -47,7 +56,7 @@ def conclude(config: RunConfig, files: RunFiles, ending: Ending, supervisor: Sup
     return INCOMPLETE if lacks else DONE
 
 
-def explain(ending: Ending, host: HostRecord, config: RunConfig, *, stay: bool) -> None:
+def explain(ending: Ending, host: HostRecord, config: RunConfig, *, stay: bool = False) -> None:
     """Complete is a run whose whole time was armed time, and nothing else; of any other, say how it ended."""
     for fault in () if stay else host.faults:
         if fault.reach == "robot":
@@ -65,27 +74,34 @@ def _ended(ending: Ending) -> str:
     return "interrupted" if ending.interrupted else ending.reason or "complete"
 
 
-def _leave(files: RunFiles, ending: Ending, supervisor: Supervisor, host: HostRecord, lacks: list[str]) -> None:
-    """Summary and report, made of what is on disk."""
+def _leave(files: RunFiles, ending: Ending, outcome: Outcome, host: HostRecord) -> list[str]:
+    """Summary and report, in the folder and on the terminal. Returns what the record lacks."""
     if files.folder is None:
         _print_host(host)
-        return
+        return ["nothing was recorded"]
     try:
-        record = RunRecord.load(files.folder, host)
+        _print_summary(leave(files, files.folder, ending, outcome)[1])
     except ConfigError as error:
-        lacks.append(str(error))
         _print_host(host)
-        return
-    summary = summarise(record, _ended(ending), supervisor.restarts, supervisor.hosts)
+        return [*unwritten(host), str(error)]
+    return unwritten(host)
+
+
+def leave(
+    files: RunFiles, folder: Path, ending: Ending, outcome: Outcome, *, report: bool = True
+) -> tuple[RunRecord, RunSummary]:
+    """Summary and report, made of what is on disk. Raises ConfigError when that is no record."""
+    files.settle()
+    record = RunRecord.load(folder, outcome.host)
+    summary = summarise(record, _ended(ending), outcome.restarts, outcome.hosts)
     files.put(SUMMARY, msgspec.json.format(msgspec.json.encode(summary), indent=2))
-    files.put(REPORT, page(record, summary).encode())
-    _print_summary(summary)
+    if report:
+        files.put(REPORT, page(record, summary).encode())
+    return record, summary
 
 
-def _print_end(
-    files: RunFiles, ending: Ending, host: HostRecord | None, robot: Description | None, lacks: Sequence[str]
-) -> None:
-    out = files.folder
+def _print_end(files: RunFiles, ending: Ending, outcome: Outcome, lacks: Sequence[str]) -> None:
+    out, host, robot = files.folder, outcome.host, outcome.robot
     for what, name in (("summary", SUMMARY), ("report", REPORT)):
         if out is not None and (out / name).is_file():
             say(f"{what + ':':<9}{out / name}")

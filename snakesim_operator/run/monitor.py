@@ -6,7 +6,7 @@ from collections.abc import Callable
 from snakesim_hal.errors import NotConnectedError, RefusedError
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Session
-from snakesim_hal.serve import START_LIMIT_S
+from snakesim_hal.service import START_LIMIT_S
 from snakesim_hal.wire.messages import Description, LifecycleRequest, Status
 from snakesim_operator.run.ending import Ending
 from snakesim_operator.run.process_faults import ProcessFaults

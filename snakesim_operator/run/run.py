@@ -22,7 +22,7 @@ from snakesim_hal.model.scenario import RunConfig, written
 from snakesim_hal.model.whole_file import write_whole
 from snakesim_hal.network.local_registry import registered
 from snakesim_hal.network.session import Link, Session, open_session
-from snakesim_hal.serve import START_LIMIT_S
+from snakesim_hal.service import START_LIMIT_S
 from snakesim_hal.terminal import say
 from snakesim_operator.results.record import CONFIG
 from snakesim_operator.run.ending import Ending, interruptible
@@ -88,7 +88,7 @@ def run(request: RunRequest) -> int:
     refuse_second_robot(request.endpoint, request.router, request.network_name)
     endpoint, stop_port = meeting_point(request.endpoint, request.router)
     ending = Ending()
-    with contextlib.closing(stop_port), _files(request) as (files, config_file):
+    with contextlib.closing(stop_port), opened_files(request.config, request.out) as (files, config_file):
         supervisor = Supervisor(files, ending, say, stop_port, stay=request.stay)
         with (
             interruptible(ending),
@@ -97,19 +97,20 @@ def run(request: RunRequest) -> int:
             if trouble is not None:
                 say(trouble)
             _conduct(request, supervisor, endpoint, files, config_file, ending)
-        from snakesim_operator.run.conclusion import conclude
+        from snakesim_operator.run.conclusion import Outcome, conclude
 
-        return conclude(request.config, files, ending, supervisor, stay=request.stay)
+        outcome = Outcome(supervisor.host_record(), supervisor.robot(), supervisor.restarts, supervisor.hosts)
+        return conclude(request.config, files, ending, outcome, stay=request.stay)
 
 
 @contextlib.contextmanager
-def _files(request: RunRequest) -> Iterator[tuple[RunFiles, Path]]:
+def opened_files(config: RunConfig, out: Path | None) -> Iterator[tuple[RunFiles, Path]]:
     """The run's folder, held, and where its configuration is.
 
     A folder that cannot be written to is no reason not to run: then nothing is kept.
     """
-    out = request.out or named_after(request.config.name)
-    content = written(request.config)
+    out = out or named_after(config.name)
+    content = written(config)
     with contextlib.ExitStack() as held:
         try:
             folder = held.enter_context(claimed(out, say))

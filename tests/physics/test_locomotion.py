@@ -8,8 +8,8 @@ import pytest
 
 from snakesim_hal.safety.gate import bumpless_target
 from snakesim_hal.wire.messages import Mode
-from tests.in_process import Run, configure, run
 from tests.unit.gnc.stage import known
+from tests.whole_run import Run, configure, run
 
 TRIPLET = "controllers.obstacle_triplet"
 STARTED = 50  # ticks until the body has moved far enough to be seen moving
@@ -37,7 +37,7 @@ def propelled(whole: Run) -> list[int]:
 
 def test_35_newtons_move_the_snake_half_a_metre_in_10_seconds():
     whole = triplet()
-    assert whole.time_s[-1] <= 10.0
+    assert whole.record.time_s[-1] <= 10.0
     assert whole.moved_m >= 0.5
 
 
@@ -59,13 +59,13 @@ def test_without_a_world_or_a_trajectory_it_stands_still_and_then_goes_on(what: 
     gap = range(200, 400)
     blind, lost = (gap, ()) if what == "blind" else ((), gap)
     whole = run(configure("triplet"), duration_s=8.0, blind=blind, lost=lost)
-    where, pushes = whole.path_s_m, (whole.mode == Mode.TORQUE).any(axis=1)
+    where, pushes = whole.path_s_m, (whole.record.mode == Mode.TORQUE).any(axis=1)
     assert pushes[150:200].all() and not pushes[gap.start + 2 : gap.stop].any() and pushes[450:500].all()
     assert np.ptp(where[250:400]) < 0.01 and where[500] - where[400] > 0.05
-    held = np.abs(whole.torque_nm[280:400]).max(axis=1)
-    assert held.max() < 0.5 * np.abs(whole.torque_nm[150:200]).max()
-    steps = np.abs(np.diff(whole.target, axis=0))[190:460]
-    angles = (whole.mode[1:] == Mode.POSITION)[190:460] & (whole.mode[:-1] == Mode.POSITION)[190:460]
+    held = np.abs(whole.record.torque_nm[280:400]).max(axis=1)
+    assert held.max() < 0.5 * np.abs(whole.record.torque_nm[150:200]).max()
+    steps = np.abs(np.diff(whole.record.target, axis=0))[190:460]
+    angles = (whole.record.mode[1:] == Mode.POSITION)[190:460] & (whole.record.mode[:-1] == Mode.POSITION)[190:460]
     assert steps[angles].max() < 0.03  # rad; the gate would allow 0.075
     assert set(whole.states[gap.start + 2 : gap.stop]) <= {"NotLocomoting", "Idle"}
 
@@ -73,65 +73,66 @@ def test_without_a_world_or_a_trajectory_it_stands_still_and_then_goes_on(what: 
 def test_one_joint_is_in_torque_mode_and_all_others_in_position_mode():
     whole = triplet()
     pushing = np.array([report.propulsion_joint is not None for report in whole.reports])
-    torque_joints = (whole.mode == Mode.TORQUE).sum(axis=1)
-    lag = whole.config.services["control"].lag_ticks - 1  # periods from a controller's word to its deed
+    torque_joints = (whole.record.mode == Mode.TORQUE).sum(axis=1)
+    lag = whole.record.config.services["control"].lag_ticks - 1  # periods from a controller's word to its deed
     assert (torque_joints[lag + 1 :] == pushing[1 : len(pushing) - lag]).all()
-    assert np.isin(whole.mode, [Mode.TORQUE, Mode.POSITION]).all()
+    assert np.isin(whole.record.mode, [Mode.TORQUE, Mode.POSITION]).all()
 
 
 def test_the_propulsion_joint_leaves_its_reference_and_the_others_do_not():
     """As in the paper's Figure 12."""
     whole = triplet()
-    off = np.abs(whole.angle_rad - np.array([report.reference_rad for report in whole.reports]))
-    torque = whole.mode == Mode.TORQUE
+    off = np.abs(whole.record.angle_rad - np.array([report.reference_rad for report in whole.reports]))
+    torque = whole.record.mode == Mode.TORQUE
     assert 0.1 < off[torque].max() < 0.7
-    settled = np.array([whole.mode[max(i - 40, 0) : i + 1].max(axis=0) == Mode.POSITION for i in range(len(off))])
+    settled = np.array(
+        [whole.record.mode[max(i - 40, 0) : i + 1].max(axis=0) == Mode.POSITION for i in range(len(off))]
+    )
     assert np.median(off[settled]) < 0.02
 
 
 def test_nothing_is_saturated_or_limited_in_the_case_study():
     whole = triplet()
     assert not any(report.saturated for report in whole.reports)
-    assert not any(whole.limited)
-    assert np.abs(whole.torque_nm).max() < whole.config.robot.limits.torque_nm
+    assert not whole.record.host.limited_commands
+    assert np.abs(whole.record.torque_nm).max() < whole.record.config.robot.limits.torque_nm
     headroom = [r.torque_headroom_nm for r in whole.reports if r.torque_headroom_nm is not None]
     assert min(headroom) > 0
 
 
 def test_no_command_jumps_at_a_hand_over():
     """In the tick of a change of mode the applied target is within the stated bound of what would change nothing."""
-    whole = triplet()
-    robot = whole.backend.describe()
+    whole, record = triplet(), triplet().record
     switches = 0
-    for i, j in zip(*np.nonzero(np.diff(whole.mode, axis=0)), strict=True):
-        tick, mode = i + 1, Mode(int(whole.mode[i + 1, j]))
-        angle, speed, torque = (float(x[tick, j]) for x in (whole.angle_rad, whole.velocity_rad_s, whole.torque_nm))
-        steady = bumpless_target(robot.joints[j], mode, angle, speed, torque)
+    for i, j in zip(*np.nonzero(np.diff(record.mode, axis=0)), strict=True):
+        tick, mode = i + 1, Mode(int(record.mode[i + 1, j]))
+        angle, speed, torque = (float(x[tick, j]) for x in (record.angle_rad, record.velocity_rad_s, record.torque_nm))
+        steady = bumpless_target(record.description.joints[j], mode, angle, speed, torque)
         report = whole.reports[tick]
         if mode == Mode.POSITION:
             way = abs(steady - report.reference_rad[j])
         else:
-            full_nm = robot.joints[j].torque_limit_nm - known(report.torque_headroom_nm)
+            full_nm = record.description.joints[j].torque_limit_nm - known(report.torque_headroom_nm)
             way = full_nm + 0.5 * abs(speed) + abs(torque)
-        assert abs(whole.target[tick, j] - steady) <= FADE_MAX * way + 1e-9
+        assert abs(record.target[tick, j] - steady) <= FADE_MAX * way + 1e-9
         switches += 1
     assert switches >= 8
 
 
 def test_commands_are_smooth_through_the_whole_run():
     whole = triplet()
-    steps = np.abs(np.diff(whole.target, axis=0))
-    same = np.diff(whole.mode, axis=0) == 0
-    limits = whole.config.robot.limits
-    assert steps[same & (whole.mode[1:] == Mode.TORQUE)].max() < limits.torque_rate_nm_s * 0.01
-    assert steps[same & (whole.mode[1:] == Mode.POSITION)].max() < 0.6 * limits.speed_rad_s * 0.01
+    steps = np.abs(np.diff(whole.record.target, axis=0))
+    same = np.diff(whole.record.mode, axis=0) == 0
+    limits = whole.record.config.robot.limits
+    assert steps[same & (whole.record.mode[1:] == Mode.TORQUE)].max() < limits.torque_rate_nm_s * 0.01
+    assert steps[same & (whole.record.mode[1:] == Mode.POSITION)].max() < 0.6 * limits.speed_rad_s * 0.01
 
 
 def test_the_same_seed_gives_the_same_run():
     config = configure("triplet")
     first, again = (run(config, duration_s=2.0) for _ in range(2))
-    assert np.array_equal(first.target, again.target)
-    assert np.array_equal(first.angle_rad, again.angle_rad)
+    assert np.array_equal(first.record.target, again.record.target)
+    assert np.array_equal(first.record.angle_rad, again.record.angle_rad)
 
 
 @pytest.mark.parametrize("seed", [2, 3])
@@ -164,7 +165,7 @@ def test_holding_does_not_move():
 @pytest.mark.slow
 def test_three_body_lengths_without_a_stop():
     whole = peg_row()
-    body_m = whole.config.robot.length_m
+    body_m = whole.record.config.robot.length_m
     assert whole.moved_m >= 3 * body_m >= 4.29
     assert set(whole.states[STARTED:]) == {"Locomoting"}
     every_second = whole.path_s_m[::100]
@@ -192,13 +193,13 @@ def test_any_number_of_modules_moves_with_the_same_code(modules, least_m):
 def test_a_robot_with_pitch_joints_moves_on_hills_among_random_pegs():
     whole = run(configure("clutter", "controller=obstacle_triplet"))
     assert whole.moved_m >= 0.3
-    axes = [joint.axis for joint in whole.backend.describe().joints]
+    axes = [joint.axis for joint in whole.record.description.joints]
     assert {axes[turn] for turn in propelled(whole)} == {"yaw"}
 
 
 def test_path_following_moves_steadily_along_the_row():
     whole = run(configure("peg_row", "controller=path_following"), duration_s=6.0)
-    wanted = whole.config.mission.speed_m_s * 6.0
+    wanted = whole.record.config.mission.speed_m_s * 6.0
     assert 0.7 * wanted < whole.moved_m < 1.2 * wanted
     assert set(whole.states[STARTED:]) == {"Locomoting"}
 

@@ -19,7 +19,7 @@ from snakesim_hal.model.scene import Cylinder, Ground, SceneFile, WaypointRoute
 from snakesim_hal.wire.messages import Mode
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.settings import Settings, Tether
-from tests.in_process import configure
+from tests.whole_run import configure
 
 PROPULSION_N = 35.0
 PEG_RADIUS_M = 0.05

@@ -11,7 +11,7 @@ from snakesim_can_backend.bus.load import check_load, load, reports_at
 from snakesim_can_backend.can_command import COLUMNS, UNKNOWN, aligned, main, scan, settings_of
 from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.definitions import Action, Frame, ModuleState, Opcode, opcode_of
-from snakesim_can_backend.protocol.expanded import EXPANDED, expanded_dbc
+from snakesim_can_backend.protocol.expanded import expanded_dbc
 from snakesim_can_backend.settings import Settings
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.injection import Injection
@@ -76,15 +76,16 @@ def test_load_refuses_what_no_robot_is(flags: list[str], capsys: pytest.CaptureF
 
 
 def test_expand_writes_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["expand", "--write", str(tmp_path)]) == 0
-    assert (tmp_path / EXPANDED).read_bytes() == expanded_dbc().encode("cp1252")
-    assert capsys.readouterr().out.strip() == str(tmp_path / EXPANDED)
+    path = tmp_path / "all.dbc"
+    assert main(["expand", "--out", str(path)]) == 0
+    assert path.read_bytes() == expanded_dbc().encode("cp1252")
+    assert capsys.readouterr().out.strip() == str(path)
 
 
 def test_expand_needs_a_folder(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(ConfigError, match=r"file/snakesim-expanded\.dbc: cannot be written: its folder is a file"):
-        main(["expand", "--write", str(tmp_path / "file")])
+    with pytest.raises(ConfigError, match=r"file/all\.dbc: cannot be written: its folder is a file"):
+        main(["expand", "--out", str(tmp_path / "file" / "all.dbc")])
 
 
 # --- scan --------------------------------------------------------------------------------------------------

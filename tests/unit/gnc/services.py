@@ -12,12 +12,10 @@ from snakesim_gnc.control.controller import View
 from snakesim_gnc.control.service import Control
 from snakesim_gnc.guidance.service import Guidance
 from snakesim_gnc.navigation.service import Navigation
-from snakesim_gnc.service import Service, be_there, loop
 from snakesim_hal.errors import SnakesimError
-from snakesim_hal.faults.injector import Injector
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.network.client import Client
 from snakesim_hal.network.session import Link, Reader, Session, open_session
+from snakesim_hal.service import Service, ServiceLoop
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlState, Trajectory
 from tests.unit.hal.local_network import Running, running, wait_until
@@ -135,21 +133,17 @@ def _serve(name: str, config: RunConfig, link: Link) -> Serving:
                 serving.error = error
 
     def _loop(session: Session) -> None:
-        client = Client(session, name, every_ticks=config.services[name].every_ticks)
-        service = SERVICES[name](client, config)
-        service.meet(client.description())
-        outputs = service.outputs
+        loop = ServiceLoop(SERVICES[name], config, session)
+        outputs = loop.service.outputs
 
         def stoppable(clock: Any) -> Any:
             if serving.stopped.is_set():
                 raise StopError
             return outputs(clock)
 
-        service.outputs = stoppable
-        injector = Injector(name, config, session)
-        injector.allow(emulated=False, faults_allowed=True)
-        be_there(client, injector)
-        loop(client, service, injector)
+        loop.service.outputs = stoppable
+        loop.join()
+        loop.run()
 
     serving.thread = threading.Thread(target=work, name=name)
     serving.thread.start()

@@ -1,16 +1,18 @@
-"""The spelled-out DBC file is the one that is generated, and stock cantools reads our logs with it."""
+"""The spelled-out DBC file has every message of every node, and stock cantools reads our logs with it."""
 
 import io
 import subprocess
 import sys
+from pathlib import Path
 
 import cantools
+import pytest
 from cantools.database.can import Database, Message
 
 from snakesim_can_backend.bus.bus import VirtualWire
 from snakesim_can_backend.bus.log import LoggedWire
 from snakesim_can_backend.protocol import commands
-from snakesim_can_backend.protocol.codec import codec, dbc_path, load_database
+from snakesim_can_backend.protocol.codec import codec, load_database
 from snakesim_can_backend.protocol.definitions import (
     BROADCAST,
     FIRST_NODE,
@@ -23,30 +25,34 @@ from snakesim_can_backend.protocol.definitions import (
     Operation,
     Parameter,
 )
-from snakesim_can_backend.protocol.expanded import EXPANDED, expanded_dbc, nodes_of
+from snakesim_can_backend.protocol.expanded import expanded_dbc, nodes_of
 from snakesim_hal.wire.messages import Mode
 
-PUBLISHED = dbc_path().with_name(EXPANDED)
 EVERYBODY = list(range(FIRST_NODE, LAST_NODE + 1))
 
 
-def published() -> Database:
-    database = cantools.database.load_file(PUBLISHED)
+@pytest.fixture(scope="module")
+def expanded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The file, as `snakesim can expand` writes it."""
+    path = tmp_path_factory.mktemp("dbc") / "expanded.dbc"
+    path.write_bytes(expanded_dbc().encode("cp1252"))
+    return path
+
+
+@pytest.fixture(scope="module")
+def database(expanded: Path) -> Database:
+    database = cantools.database.load_file(expanded)
     assert isinstance(database, Database)
     return database
 
 
-def test_the_published_file_is_the_generated_one() -> None:
-    assert PUBLISHED.read_bytes() == expanded_dbc().encode("cp1252"), "run `make schemas` and commit what it changes"
-
-
-def test_every_message_of_every_node_is_there_and_no_other() -> None:
+def test_every_message_of_every_node_is_there_and_no_other(database: Database) -> None:
     expected = {
         opcode << NODE_BITS | node: layout.name if node == BROADCAST else f"{layout.name}_{node:02d}"
         for opcode, layout in codec().layouts.items()
         for node in nodes_of(opcode)
     }
-    assert {message.frame_id: message.name for message in published().messages} == expected
+    assert {message.frame_id: message.name for message in database.messages} == expected
 
 
 def test_who_can_be_meant() -> None:
@@ -56,9 +62,9 @@ def test_who_can_be_meant() -> None:
         assert list(nodes_of(opcode)) == [BROADCAST] * to_all + EVERYBODY * to_one
 
 
-def test_signals_are_the_same_for_every_node() -> None:
+def test_signals_are_the_same_for_every_node(database: Database) -> None:
     source = {message.name: message for message in load_database().messages}
-    for message in published().messages:
+    for message in database.messages:
         original = source[message.name.partition("_")[0]]
         assert message.length == original.length and message.senders == original.senders
         assert layout_of(message) == layout_of(original)
@@ -102,15 +108,15 @@ def sent() -> list[tuple[Frame, str]]:
     ]
 
 
-def decoded(lines: list[str]) -> list[str]:
+def decoded(lines: list[str], expanded: Path) -> list[str]:
     """What `python -m cantools decode` makes of candump's lines."""
-    command = [sys.executable, "-m", "cantools", "decode", "--single-line", str(PUBLISHED)]
+    command = [sys.executable, "-m", "cantools", "decode", "--single-line", str(expanded)]
     done = subprocess.run(command, input="\n".join(lines) + "\n", capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()
 
 
-def test_stock_cantools_decodes_our_log() -> None:
+def test_stock_cantools_decodes_our_log(expanded: Path) -> None:
     log = io.StringIO()
     wire = LoggedWire(VirtualWire("expanded-log"), log)
     other = VirtualWire("expanded-log")
@@ -123,13 +129,13 @@ def test_stock_cantools_decodes_our_log() -> None:
             assert wire.receive() == [frame]
     wire.close()
     other.close()
-    found = decoded(log.getvalue().splitlines())
+    found = decoded(log.getvalue().splitlines(), expanded)
     assert len(found) == len(frames)
     for line, (_, words) in zip(found, frames, strict=True):
         assert words in line
 
 
-def test_stock_cantools_decodes_what_candump_prints_to_a_terminal() -> None:
+def test_stock_cantools_decodes_what_candump_prints_to_a_terminal(expanded: Path) -> None:
     lines = [f"  can0  {frame.id:03X}   [{len(frame.data)}]  {frame.data.hex(' ').upper()}" for frame, _ in sent()]
-    for line, (_, words) in zip(decoded(lines), sent(), strict=True):
+    for line, (_, words) in zip(decoded(lines, expanded), sent(), strict=True):
         assert words in line

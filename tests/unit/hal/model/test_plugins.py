@@ -19,6 +19,7 @@ from snakesim_hal.model.plugins import (
     find_installed,
     find_plugin,
     installed,
+    offered,
     plugin_settings,
 )
 
@@ -112,6 +113,15 @@ def test_a_file_that_cannot_be_loaded_is_one_error(broken: str, tmp_path: Path) 
     assert "controller '" in str(caught.value)
 
 
+def test_a_program_may_offer_what_a_name_stands_for() -> None:
+    installed_one = find_plugin(CONTROLLERS, "hold")
+    with offered(CONTROLLERS, "hold", Plugin), offered(CONTROLLERS, "mine", Plugin):
+        assert find_plugin(CONTROLLERS, "hold") is find_plugin(CONTROLLERS, "mine") is Plugin
+    assert find_plugin(CONTROLLERS, "hold") is installed_one
+    with pytest.raises(ConfigError, match="no controller called 'mine'"):
+        find_plugin(CONTROLLERS, "mine")
+
+
 def test_an_absent_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"none\.py: no such file"):
         find_plugin(BACKENDS, f"{tmp_path}/none.py:None")
@@ -176,7 +186,7 @@ PURE = "What keeps a robot safe is pure"
 WRONG = [  # (folder, import, contract that it breaks)
     ("snakesim_gnc", "mujoco", "Only the simulator runs MuJoCo"),
     ("snakesim_gnc", "snakesim_sim_backend.model", NEIGHBOURS),
-    ("snakesim_hal/host", "snakesim_gnc.service", NEIGHBOURS),
+    ("snakesim_hal/host", "snakesim_gnc.guidance.service", NEIGHBOURS),
     ("snakesim_operator/run", "zenoh", "Only the HAL's network room talks Zenoh"),
     ("snakesim_hal/host", "zenoh", "Only the HAL's network room talks Zenoh"),
     ("snakesim_gnc", "can", "Only the CAN backend touches CAN"),
@@ -188,6 +198,7 @@ WRONG = [  # (folder, import, contract that it breaks)
     ("snakesim_hal/network", "snakesim_hal.faults.injector", HAL),
     ("snakesim_hal/faults", "snakesim_hal.host.host", HAL),
     ("snakesim_hal/host", "snakesim_hal.serve", HAL),
+    ("snakesim_hal/faults", "snakesim_hal.service", HAL),
     ("snakesim_operator/results", "snakesim_operator.tools.targets", OPERATOR),
     ("snakesim_operator/tools", "snakesim_operator.run.supervisor", OPERATOR),
     ("snakesim_operator/run", "snakesim_operator.cli", OPERATOR),

@@ -1,0 +1,136 @@
+"""A whole run in one process and one thread, without a network: host, guidance, navigation and control take turns.
+
+    with InProcessRun(config) as run:
+        for _ in run.turns():
+            ...  # once a tick; run.host.authority, run.network.session() for readers, run.stop()
+    record_of(run.host).command_digest
+
+The parts are those of a run in lockstep: the same host with its authority, the same services, the same bytes between
+them. So a configuration drives the motors alike in both, to the bit. What needs processes or a network is refused.
+"""
+
+import time
+from collections.abc import Generator
+from contextlib import ExitStack, closing
+from types import TracebackType
+from typing import Self
+
+from snakesim_hal.errors import ConfigError, RefusedError, SnakesimError
+from snakesim_hal.host.host import Host
+from snakesim_hal.host_process import open_backend
+from snakesim_hal.model.fault_plan import planned
+from snakesim_hal.model.plugins import BACKENDS, SERVICES, find_plugin
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.network.local_network import LocalNetwork
+from snakesim_hal.service import ServiceLoop
+from snakesim_hal.terminal import complain_of
+from snakesim_hal.wire.messages import LifecycleRequest
+
+AFTER_FAULT_S = 1.5
+ARM_LIMIT_S = 10.0
+WHO = "run in one process"
+
+
+def check(config: RunConfig) -> None:
+    """Whether a run needs neither processes of its own nor a network. Raises ConfigError."""
+    where = f"scenario {config.name!r} in one process"
+    if config.pace != "lockstep":
+        raise ConfigError(f"{where}: pace is {config.pace!r}, must be 'lockstep'; add --pace lockstep")
+    if not config.has_own_control:
+        raise ConfigError(f"{where}: nobody commands the robot; it needs a control service that is not external")
+    for name, service in config.services.items():
+        if service.external:
+            raise ConfigError(f"{where}: services.{name} is external, and there is no network to meet it")
+    for injection in planned(config):
+        if injection.target_type in ("process", "clock"):
+            raise ConfigError(f"{where}: fault {str(injection)!r} needs processes of their own")
+
+
+class InProcessRun:
+    """One run, from `with` to its end."""
+
+    def __init__(self, config: RunConfig) -> None:
+        """Raises ConfigError for a run that needs more than one process."""
+        check(config)
+        self.config = config
+        self.network = LocalNetwork()
+        self.failed: list[str] = []  # services that could not go on, and why
+        self._loops: dict[str, ServiceLoop] = {}
+        self._parts: dict[str, ExitStack] = {}
+        self._opened = ExitStack()
+
+    def __enter__(self) -> Self:
+        """Open the backend and all services. Raises SnakesimError."""
+        with ExitStack() as opening:
+            self._open(opening)
+            self._opened = opening.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._opened.close()
+
+    def _open(self, opened: ExitStack) -> None:
+        config = self.config
+        backend = open_backend(find_plugin(BACKENDS, config.backend), config)
+        opened.callback(backend.close)
+        if not backend.describe().emulated:
+            raise RefusedError(f"backend {config.backend!r} moves something real, which nobody could stop from outside")
+        ticks = round(config.duration_s * config.rate_hz)
+        session = self.network.session()
+        opened.callback(session.close)
+        self.host = Host(config, backend, session, max_ticks=ticks, end_after_fault_s=AFTER_FAULT_S)
+        self.network.answer = self.host.take_in
+        for name in config.services:
+            part = self._parts[name] = opened.enter_context(ExitStack())
+            session = self.network.session()
+            part.callback(session.close)
+            loop = self._loops[name] = ServiceLoop(find_plugin(SERVICES, name), config, session)
+            part.callback(loop.close)
+
+    def turns(self) -> Generator[None]:
+        """Run. Yields after each turn of all parts, also before the arming. Raises SnakesimError when it cannot begin.
+
+        The joints are safe at the end, also when this generator is closed early.
+        """
+        joined, give_up = False, time.monotonic() + ARM_LIMIT_S
+        with closing(self.host.turns()) as turns:
+            for _ in turns:
+                if not joined:
+                    for loop in self._loops.values():
+                        loop.join()
+                    joined = True
+                self._let_act()
+                if not self.host.authority.arming and not self.failed:
+                    self._arm(give_up)
+                yield
+
+    def stop(self) -> None:
+        """End the run in order."""
+        self.host.stop()
+
+    def _let_act(self) -> None:
+        for name, loop in list(self._loops.items()):
+            try:
+                loop.act()
+            except SnakesimError as error:  # its process would end here, and the host would go on
+                complain_of(error, f"snakesim {name}")
+                self.failed.append(f"{name} ended: {error}")
+                del self._loops[name]
+                self._parts[name].close()
+
+    def _arm(self, give_up: float) -> None:
+        status, robot = self.host.status(), self.host.description
+        if time.monotonic() > give_up:
+            raise RefusedError(f"not ready to arm within {ARM_LIMIT_S:g} s: {status.why}")
+        if status.ready_to_arm:
+            request = LifecycleRequest(
+                action="arm",
+                who=WHO,
+                host=robot.host,
+                robot=robot.robot,
+                backend=robot.backend,
+                config_hash=robot.config_hash,
+            )
+            self.host.ask(request, lambda _answer: None)

@@ -1,0 +1,92 @@
+"""What a service is, and the loop around it: join, act on ticks, publish what the service says, report it done."""
+
+from typing import Protocol
+
+from snakesim_hal.faults.injector import Injector
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.model.scenario import Service as Schedule
+from snakesim_hal.network.client import Client
+from snakesim_hal.network.session import Session
+from snakesim_hal.wire.messages import Clock, Description, Message
+
+SILENCE_S = 1.0
+START_LIMIT_S = 600.0  # until a part of a run is there: MuJoCo starts slowly in an emulated machine on a busy one
+
+
+class Service(Protocol):
+    """What stands behind an entry point in the group `snakesim.services`, and in `[services.NAME]` of a scenario.
+
+    The constructor subscribes to everything that the service will read.
+    """
+
+    name: str
+    urgent: bool = False  # whether the robot waits for this service in every tick
+
+    def __init__(self, client: Client, config: RunConfig) -> None: ...
+
+    def meet(self, robot: Description) -> None:
+        """Learn what robot is there; called before the first tick, and again when the HAL has started over."""
+        ...
+
+    def outputs(self, clock: Clock) -> list[tuple[str, Message]] | None:
+        """What to publish for a tick, as (key, message); None when the service is not able to say anything yet."""
+        ...
+
+    def silence(self) -> list[tuple[str, Message]]:
+        """What to publish when the HAL's clock has been silent for a second."""
+        return []
+
+
+class ServiceLoop:
+    """One service of one robot, over one session."""
+
+    def __init__(self, service_type: type[Service], config: RunConfig, session: Session) -> None:
+        """Meets the robot. Raises NotConnectedError when there is none."""
+        name = service_type.name
+        schedule = config.services.get(name, Schedule())
+        self._client = client = Client(session, name, every_ticks=schedule.every_ticks, pace=config.pace)
+        self.service = service_type(client, config)
+        robot = client.description(timeout_s=START_LIMIT_S)
+        self.service.meet(robot)
+        self._injector = Injector(name, config, session, newest=lambda: client.heard)
+        self._injector.allow(emulated=robot.emulated, faults_allowed=config.faults_allowed)
+        self._due = client.ticks(0.0)
+
+    def join(self) -> None:
+        """Show that the service is here. From now on the robot may be armed, perhaps before the first tick here."""
+        clock = self._client.hear(SILENCE_S)
+        if clock is not None:
+            self._injector.turn(clock.stamp_ns, clock.arming, clock.lifecycle)
+        self._client.announce()
+
+    def run(self) -> None:
+        """Act on every tick that is due, for as long as this process lives."""
+        for clock in self._client.ticks(SILENCE_S):
+            if clock is not None:
+                self._act(clock)
+                continue
+            self._injector.idle()
+            for key, message in self.service.silence():
+                self._client.put(key, message)
+
+    def act(self) -> None:
+        """Act on the ticks that are due now, and return."""
+        while (clock := next(self._due)) is not None:
+            self._act(clock)
+
+    def close(self) -> None:
+        """Send nothing more that is late."""
+        self._injector.close()
+
+    def _act(self, clock: Clock) -> None:
+        """A tick that is shown again, because time stands still, is answered again."""
+        self._injector.turn(clock.stamp_ns, clock.arming, clock.lifecycle)
+        robot = self._client.met_anew()
+        if robot is not None:
+            self.service.meet(robot)
+        outputs = self.service.outputs(clock)
+        if outputs is None:
+            return
+        for key, message in outputs:
+            self._client.put(key, message)
+        self._client.done(clock.tick)
