@@ -34,6 +34,11 @@ def die_with_parent(parent_pid: int | None = None) -> None:
         sys.exit(1)
 
 
+def accept_interrupts() -> None:
+    """From here on a SIGINT counts: a supervisor starts its children with it blocked, until they can handle it."""
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+
+
 def on_stop_signal(stop: Callable[[], None]) -> None:
     """Call `stop` on SIGTERM and SIGINT instead of dying in the middle of something."""
 
@@ -42,6 +47,7 @@ def on_stop_signal(stop: Callable[[], None]) -> None:
 
     signal.signal(signal.SIGTERM, handle)
     signal.signal(signal.SIGINT, handle)
+    accept_interrupts()
 
 
 def settle_for_timing() -> None:

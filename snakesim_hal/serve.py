@@ -13,7 +13,14 @@ from snakesim_hal.errors import ConfigError, SnakesimError
 from snakesim_hal.model.plugins import SERVICES, find_plugin
 from snakesim_hal.model.scenario import RunConfig, read
 from snakesim_hal.network.session import DEFAULT_ENDPOINT, Link, open_session
-from snakesim_hal.process import SERVICE_PRIORITY, calm_down_after, die_with_parent, hurry, settle_for_timing
+from snakesim_hal.process import (
+    SERVICE_PRIORITY,
+    accept_interrupts,
+    calm_down_after,
+    die_with_parent,
+    hurry,
+    settle_for_timing,
+)
 from snakesim_hal.service import START_LIMIT_S, Service, ServiceLoop
 from snakesim_hal.terminal import complain, complain_of
 
@@ -58,6 +65,7 @@ def serve(service_type: type[Service], argv: Sequence[str] | None = None) -> int
     name = service_type.name
     given = process_options(arguments(f"Run the {name} service of a robot."), argv)
     try:
+        accept_interrupts()
         if service_type.urgent and given.config.pace == "realtime":
             hurry(SERVICE_PRIORITY)
             calm_down_after(given.config.lease_ns * 1e-9)

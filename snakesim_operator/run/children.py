@@ -79,9 +79,11 @@ def start(
     variables.
 
     It gets a session of its own, so that Ctrl-C reaches only the supervisor, which then ends its children in order.
+    A SIGINT that comes while its interpreter starts waits until it has a handler.
     """
     environment = {**os.environ, **ONE_THREAD, "PYTHONUNBUFFERED": "1", "PYTHONHASHSEED": "0", **more}
     ours, theirs = os.pipe()
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited
     try:
         process = subprocess.Popen(
             [sys.executable, "-m", *arguments, "--parent", str(os.getpid())],
@@ -96,6 +98,7 @@ def start(
         os.close(ours)
         raise
     finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         os.close(theirs)
     return Child(name, process, Words(ours, keep))
 
