@@ -1,4 +1,4 @@
-"""Running one process of a robot from its effective configuration: argument parsing that host and services share."""
+"""Run one process of a robot from its effective configuration: argument parsing shared by host and services."""
 
 import argparse
 import sys
@@ -13,12 +13,12 @@ from snakesim_hal.network.session import DEFAULT_ENDPOINT, Link
 from snakesim_hal.process import die_with_parent
 from snakesim_hal.terminal import complain, complain_of
 
-START_LIMIT_S = 600.0  # until a part of a run is there: MuJoCo starts slowly in an emulated machine on a busy one
+START_LIMIT_S = 600.0  # for a process to start: MuJoCo starts slowly in an emulated machine on a busy one
 
 
 @dataclass(frozen=True)
 class ProcessOptions:
-    """What a process was started for."""
+    """The options of one process."""
 
     config: RunConfig
     link: Link
@@ -32,9 +32,9 @@ def arguments(about: str) -> argparse.ArgumentParser:
     parser.add_argument(
         "--config", type=Path, required=True, help="effective configuration, as `snakesim run` saves it"
     )
-    parser.add_argument("--endpoint", default=DEFAULT_ENDPOINT, help="where the robot's network meets")
+    parser.add_argument("--endpoint", default=DEFAULT_ENDPOINT, help="Zenoh endpoint of the robot")
     parser.add_argument("--namespace", help="Zenoh namespace of the robot (default: the robot's name)")
-    parser.add_argument("--out", type=Path, help="folder for what the process leaves behind")
+    parser.add_argument("--out", type=Path, help="folder for the process's output files")
     parser.add_argument("--parent", type=int, help="process id of the parent; this process dies with it")
     return parser
 
@@ -52,7 +52,7 @@ def process_options(
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """`python -m snakesim_hal.serve NAME ...`: run the service that an installed package offers under a name."""
+    """`python -m snakesim_hal.serve NAME ...`: run the service that an installed package registers under a name."""
     given = list(sys.argv[1:] if argv is None else argv)
     if not given or given[0].startswith("-"):
         complain("usage: python -m snakesim_hal.serve NAME [--help]")

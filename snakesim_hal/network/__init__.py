@@ -1,8 +1,8 @@
-"""The network; the only home of Zenoh.
+"""The network; the only room that imports Zenoh.
 
-`session`         publishers, readers and questions on Zenoh; `endpoint`, `mailbox`, `run_key` beside it
-`client`          what guidance, navigation and control use; it never names a backend
-`robot_mismatch`  messages that decode, but do not fit the robot
-`stop_port`       emergency stops by UDP, beside Zenoh; `local_registry` finds the robots of this machine
+`session`         publishers, readers and queries on Zenoh; with `endpoint`, `mailbox`, `run_key`
+`client`          the interface of guidance, navigation and control; independent of the backend
+`robot_mismatch`  rejects messages that do not fit the robot
+`stop_port`       emergency stops by UDP, without Zenoh; `local_registry` finds the robots of this machine
 `private_channel` between a host and the process that started it
 """
