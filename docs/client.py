@@ -16,7 +16,7 @@ BLOCK = zenoh.CongestionControl.BLOCK  # lose no command, so that lockstep goes 
 
 
 def newest(arrivals, meanwhile=lambda: time.sleep(0.0005), known=None):
-    """What came last; without anything new what is known, or what comes within a second."""
+    """The newest arrival; if there is none, `known`, or what arrives within a second."""
     give_up = time.monotonic() + 1.0
     while (arrival := arrivals.try_recv()) is None:
         if known is not None:

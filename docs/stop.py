@@ -1,4 +1,4 @@
-"""Stop the robot at HOST PORT, past Zenoh. Explained in client.md."""
+"""Stop the robot at HOST PORT, without Zenoh. Explained in client.md."""
 
 import contextlib
 import secrets

@@ -1,4 +1,4 @@
-"""The hardware abstraction: everything that a controller and a robot have to agree on.
+"""The hardware abstraction: the interface contract between controllers and robots.
 
 From the ground up:
 
@@ -7,10 +7,10 @@ From the ground up:
 `backend`   the one protocol that a simulator or a driver implements
 `safety`    who may move the robot, by how much, and what stops it; pure
 `network`   Zenoh, and nothing else imports it: sessions, the client of controllers, the stop port
-`faults`    carries out faults on request
+`faults`    carries out injected faults
 `host`      the process that owns a robot: its loop, and what it records
 `service`   what guidance, navigation and control are, and the loop around each
 `conformance`, and the entry points `host_process`, `router_process`, `serve`; `in_process` runs all in one process
 
-Each imports only what stands above it. No backend, no GNC, no MuJoCo and no CAN is imported here.
+Each imports only those listed above it. No backend, no GNC, no MuJoCo and no CAN is imported here.
 """

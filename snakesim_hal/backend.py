@@ -1,7 +1,7 @@
-"""What a backend implements.
+"""The interface of a backend.
 
-A backend is opened from the run's settings, asked for samples once a tick, given set-points once a tick, and told
-when to let a period pass. It never sees Zenoh or leases: the host does those, for every backend alike.
+A backend is opened from the run's settings, asked for samples once a tick, given set-points once a tick, and advanced
+by one period at a time. It never sees Zenoh or leases: the host handles those, for every backend alike.
 """
 
 from collections.abc import Mapping
@@ -19,17 +19,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SetPoints:
-    """What the joints are to do from now on, tail to head; already inside every limit."""
+    """Set-points of all joints from now on, tail to head; already inside every limit."""
 
     mode: list[Mode]
     target: list[float]  # rad, rad/s or N·m, as the mode says
     torque_limit_nm: list[float]
-    isolated: frozenset[int] = frozenset()  # joints that are set aside: passive here, and to be switched off
+    isolated: frozenset[int] = frozenset()  # isolated joints: passive here, and to be switched off
 
 
 @dataclass(frozen=True)
 class Samples:
-    """What the sensors gave for one tick. `others` holds only what was due: key -> message."""
+    """Sensor samples of one tick. `others` holds only those that were due: key -> message."""
 
     joints: JointState
     others: Mapping[str, Message] = field(default_factory=dict[str, Message])
@@ -39,11 +39,11 @@ class Backend(Protocol):
     """A robot, simulated or real."""
 
     def describe(self) -> Description:
-        """The robot as this backend has it; readable at once after opening."""
+        """The description of the robot; available right after opening."""
         ...
 
     def sample(self, tick: int, stamp_ns: int) -> Samples:
-        """Read every sensor that is due at `tick`. Raises BackendError when no state can be trusted any more."""
+        """Read every sensor that is due at `tick`. Raises BackendError when it has no valid state any more."""
         ...
 
     def enact(self, set_points: SetPoints, lifecycle: LifecycleState) -> None:
@@ -59,32 +59,32 @@ class Backend(Protocol):
         ...
 
     def faults(self) -> list[Fault]:
-        """Faults found since the last call; empty when all is well."""
+        """Faults detected since the last call; empty in normal operation."""
         ...
 
     def close(self) -> None:
-        """Make the joints safe and let go of everything. Called once, also after an error."""
+        """Make the joints safe and release all resources. Called once, also after an error."""
         ...
 
 
 @runtime_checkable
 class Injectable(Protocol):
-    """A backend that can let things go wrong by itself, more truly than the host could for it."""
+    """A backend that injects faults itself, more realistically than the host could."""
 
     def inject(self, injection: "Injection", *, begins: bool) -> bool:
-        """Begin or end a fault on request; False when this backend knows no such fault. Raises ConfigError."""
+        """Begin or end an injected fault; False when this backend has no such fault. Raises ConfigError."""
         ...
 
 
 class BackendFactory(Protocol):
-    """What stands behind an entry point in the group `snakesim.backends`: usually the backend's class."""
+    """The object of an entry point in the group `snakesim.backends`: usually the backend's class."""
 
     Settings: type[msgspec.Struct]  # the scenario's [backends.<name>] section
 
     def check(self, config: "RunConfig", settings: Any) -> tuple[Pace, ...]:
-        """Which paces it could keep, the preferred one first; a real robot waits for nobody. Opens nothing.
+        """The supported paces, the preferred one first; a real robot supports real time only. Opens nothing.
 
-        Raises ConfigError for a run that this backend cannot do, whatever the pace, so that nothing is started for it.
+        Raises ConfigError for a run that this backend does not support at any pace, so that nothing is started.
         """
         ...
 

@@ -2,9 +2,9 @@
 
 
 class SnakesimError(Exception):
-    """Anything that SnakeSIM refuses or fails at; the message says what, and what to do next.
+    """Base of all errors of SnakeSIM; the message says what is wrong, and what to do next.
 
-    lines: one, as a rule. Each is printed as one line, whatever it quotes from a file or from the network.
+    lines: usually one. Each is printed as one line, whatever it quotes from a file or from the network.
     """
 
     def __init__(self, *lines: str) -> None:
@@ -17,7 +17,7 @@ class ConfigError(SnakesimError, ValueError):
 
 
 class WireError(SnakesimError, ValueError):
-    """A sample from the network cannot be taken: malformed, out of bounds, or of an unknown version.
+    """A sample from the network is rejected: malformed, out of bounds, or of an unknown version.
 
     `reason` is a short word to count by: `unknown_message`, `unknown_version`, `malformed`.
     """
@@ -32,11 +32,11 @@ class NotConnectedError(SnakesimError, ConnectionError):
 
 
 class StalledError(SnakesimError, TimeoutError):
-    """Something that had to arrive did not arrive in its time."""
+    """Something expected did not arrive in time."""
 
 
 class ControllerError(SnakesimError, RuntimeError):
-    """A controller raised, or gave what cannot be sent: names the controller, the field, the value, what is allowed."""
+    """A controller raised, or returned an invalid action: names the controller, field, value, and what is allowed."""
 
 
 class BackendError(SnakesimError, RuntimeError):
@@ -44,4 +44,4 @@ class BackendError(SnakesimError, RuntimeError):
 
 
 class RefusedError(SnakesimError, PermissionError):
-    """The HAL answered no, with its reason: a lease held by another, an arming condition not met."""
+    """The HAL refused a request, with its reason: a lease held by another, an arming condition not met."""

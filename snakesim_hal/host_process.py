@@ -29,11 +29,11 @@ from snakesim_hal.terminal import complain_of
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Fault
 
-GONE_LIMIT_S = 3.0  # until a host that died is not seen any more: longer than the lease of its connection
+GONE_LIMIT_S = 3.0  # until the token of a dead host has vanished: longer than the lease of its connection
 
 
 class HostRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """What the host leaves behind: its own numbers of the run. They are written twice a second, while it runs too."""
+    """`host.json`: the host's statistics of the run, written twice a second while it runs, and at the end."""
 
     ticks: int  # recorded: from the first arming on
     wall_s: float
@@ -49,12 +49,12 @@ class HostRecord(msgspec.Struct, frozen=True, kw_only=True):
     why: str
     ended: Ending = "complete"
     ended_why: str = ""  # unless complete
-    lost_ticks: int = 0  # that the black box on disk lacks
-    trouble: str = ""  # what could not be written, and why
+    lost_ticks: int = 0  # missing from the black box on disk
+    trouble: str = ""  # which files could not be written, and why
     faults_left_out: int = 0  # of `faults`, in the middle
-    injected: list[str] = []  # faults on request, as they began and ended
-    requests: list[str] = []  # to arm, disarm, clear, finish or stop: by whom, and what became of it
-    isolated: list[str] = []  # joints that were set aside at the end
+    injected: list[str] = []  # injected faults, each begin and end
+    requests: list[str] = []  # to arm, disarm, clear, finish or stop: by whom, and the result
+    isolated: list[str] = []  # joints that were isolated at the end
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -62,10 +62,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = arguments("Run a robot's HAL host.")
     parser.add_argument("--router", action="store_true", help="connect to a router instead of listening")
     parser.add_argument("--max-ticks", type=int, help="end this many ticks after the first arming")
-    parser.add_argument("--end-after-fault", type=float, help="end so many seconds after a fault")
+    parser.add_argument("--end-after-fault", type=float, help="end this many seconds after a fault")
     parser.add_argument("--stay", action="store_true", help="go on until that many ticks were armed")
-    parser.add_argument("--memory", metavar="PATH", help="file without a disk that gets the host's own numbers")
-    parser.add_argument("--channel", type=int, metavar="FD", help="inherited socket to whoever starts this host")
+    parser.add_argument("--memory", metavar="PATH", help="in-memory file for the host's statistics")
+    parser.add_argument("--channel", type=int, metavar="FD", help="inherited socket to the parent process")
     parser.add_argument("--stop-port", type=int, metavar="FD", help="inherited UDP socket for emergency stops")
     listen = "--router" not in (sys.argv[1:] if argv is None else argv)
     given = process_options(parser, argv, listen=listen)
@@ -115,7 +115,7 @@ def _run(given: ProcessOptions) -> Host:
 
 
 def refuse_second_host(session: Session, link: Link) -> None:
-    """Raise RefusedError when another HAL host answers to the robot's name; one that has just died may take a while."""
+    """Raise RefusedError when another HAL host has the robot's name; a dead one may stay visible for a while."""
     deadline = time.monotonic() + GONE_LIMIT_S
     while others := session.present(keys.HOST_ALL):
         if time.monotonic() > deadline:
@@ -139,13 +139,13 @@ def _entry(given: ProcessOptions, stop_port: socket.socket) -> LocalRobot:
 
 
 def open_backend(factory: BackendFactory, config: RunConfig) -> GuardedBackend:
-    """Open the run's backend. Raises BackendError for whatever goes wrong in it."""
+    """Open the run's backend. Raises BackendError for any error in it."""
     settings = backend_settings(config, factory)
     try:
         return GuardedBackend(factory(config, settings))
     except SnakesimError:
         raise
-    except Exception as error:  # a backend is somebody else's code
+    except Exception as error:  # a backend may be third-party code
         raise BackendError(f"backend {config.backend!r} does not open: {type(error).__name__}: {error}") from error
 
 
@@ -155,7 +155,7 @@ def backend_settings(config: RunConfig, factory: BackendFactory) -> Any:
 
 
 def record_of(host: Host, *, lost_ticks: int = 0, trouble: str = "") -> HostRecord:
-    """The host's numbers as they are now; called beside its loop, which replaces or copies nothing half."""
+    """The host's present statistics. Called from another thread than its loop, which updates each value atomically."""
     statistics, authority = host.statistics, host.authority
     return HostRecord(
         ticks=host.black_box.ticks,

@@ -1,4 +1,4 @@
-"""Processes that never outlive what started them, and that stop in order when asked to."""
+"""Processes that never outlive their parent, and that shut down in order on a signal."""
 
 import ctypes
 import gc
@@ -18,14 +18,14 @@ PR_SET_PDEATHSIG = 1
 CAP_IPC_LOCK = 14
 MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT = 1, 2, 4
 SWITCH_INTERVAL_S = 0.0005  # of the interpreter, 5 ms by default: as long as half a control period
-# Of 99: above every ordinary process, below the kernel's own threads. A controller that hangs holds up no host.
+# Of 99: above every ordinary process, below the kernel's own threads. A controller that hangs does not delay the host.
 HOST_PRIORITY, SERVICE_PRIORITY = 20, 19
 
 
 def die_with_parent(parent_pid: int | None = None) -> None:
     """Have the kernel kill this process the moment its parent dies, however it dies.
 
-    parent_pid: the parent as the parent itself knows it; when it is gone already, exit at once.
+    parent_pid: the parent's process id, passed by the parent; if it is gone already, exit at once.
     """
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0) != 0:
@@ -40,7 +40,7 @@ def accept_interrupts() -> None:
 
 
 def on_stop_signal(stop: Callable[[], None]) -> None:
-    """Call `stop` on SIGTERM and SIGINT instead of dying in the middle of something."""
+    """Call `stop` on SIGTERM and SIGINT instead of ending at once."""
 
     def handle(_number: int, _frame: FrameType | None) -> None:
         stop()
@@ -51,16 +51,16 @@ def on_stop_signal(stop: Callable[[], None]) -> None:
 
 
 def settle_for_timing() -> None:
-    """Keep the garbage collector out of the loop: what lives now is frozen, and collections become rare."""
+    """Keep the garbage collector out of the loop: freeze all present objects, and make collections rare."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(50_000, 50, 1000)
 
 
 def hurry(priority: int) -> list[str]:
-    """Take every measure for a process that the robot waits for in real time. Call it before a session is opened.
+    """Apply all real-time measures to a process in the control loop. Call it before a session is opened.
 
-    Best effort: what the system refuses is printed to stderr, and returned as short reasons.
+    Best effort: measures that the system refuses are printed to stderr, and returned as short reasons.
     """
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     refused = [reason for reason in (take_priority(priority), lock_memory()) if reason is not None]
@@ -82,15 +82,15 @@ def take_priority(priority: int) -> str | None:
 
 
 def calm_down_after(longest_s: float) -> None:
-    """Have this process give up its priority once it has computed for so long without a pause: it hangs.
+    """Have this process give up its priority once it has computed for this long without a pause: it hangs.
 
-    A busy thread with real-time priority lets ordinary processes starve, until the kernel sets real time aside for
-    some 50 ms, for everybody.
+    A busy thread with real-time priority starves ordinary processes, until the kernel throttles all real-time
+    processes for some 50 ms.
     """
 
     def calm_down(_number: int, _frame: FrameType | None) -> None:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-        complain(f"real time: given up, after computing for {longest_s * 1e3:.0f} ms without a pause")
+        complain(f"real time: priority dropped after computing for {longest_s * 1e3:.0f} ms without a pause")
 
     signal.signal(signal.SIGXCPU, calm_down)
     _, most = resource.getrlimit(resource.RLIMIT_RTTIME)
@@ -98,7 +98,7 @@ def calm_down_after(longest_s: float) -> None:
 
 
 def lock_memory() -> str | None:
-    """Keep every page that this process has or will have in memory. Returns why it was refused, or None.
+    """Lock all present and future pages of this process into memory. Returns why it was refused, or None.
 
     Pages are locked as they are first touched, so that the unused part of each thread's stack costs nothing. Under a
     limit nothing is locked: the first allocation beyond it would fail in the middle of a run.
@@ -113,7 +113,7 @@ def lock_memory() -> str | None:
 
 
 def raise_open_files(most: int) -> None:
-    """Let this process have more files and connections open than by default, as far as the system allows."""
+    """Raise this process's limit of open files and connections, as far as the system allows."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     allowed = most if hard == resource.RLIM_INFINITY else min(most, hard)
     if soft != resource.RLIM_INFINITY and soft < allowed:
@@ -126,7 +126,7 @@ def step_wall_clock(by_s: float) -> None:
         time.clock_settime(time.CLOCK_REALTIME, time.time() + by_s)
     except PermissionError as error:
         raise RefusedError(
-            "the wall clock cannot be stepped: that needs CAP_SYS_TIME; run as root, or leave step:clock out"
+            "the wall clock cannot be stepped: that needs CAP_SYS_TIME; run as root, or omit step:clock"
         ) from error
 
 

@@ -1,4 +1,4 @@
-"""`python -m snakesim_hal.router_process`: a router for one run, so that its death can be tried."""
+"""`python -m snakesim_hal.router_process`: a router for one run, for tests of router failures."""
 
 import sys
 import threading
@@ -12,7 +12,7 @@ from snakesim_hal.terminal import complain_of
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Forward between all who connect, until told to stop."""
+    """Forward between all connected sessions, until a stop signal."""
     given = process_options(arguments("Run a Zenoh router on a run's endpoint."), argv)
     stopped = threading.Event()
     on_stop_signal(stopped.set)

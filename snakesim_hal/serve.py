@@ -1,6 +1,6 @@
-"""Running one process of a robot from its effective configuration: arguments that all share, and a service's process.
+"""Run one process of a robot from its effective configuration: shared arguments, and the process of a service.
 
-`python -m snakesim_hal.serve NAME ...` runs the service that an installed package offers under a name.
+`python -m snakesim_hal.serve NAME ...` runs the service that an installed package registers under a name.
 """
 
 import argparse
@@ -27,7 +27,7 @@ from snakesim_hal.terminal import complain, complain_of
 
 @dataclass(frozen=True)
 class ProcessOptions:
-    """What a process was started for."""
+    """The options of one process."""
 
     config: RunConfig
     link: Link
@@ -41,9 +41,9 @@ def arguments(about: str) -> argparse.ArgumentParser:
     parser.add_argument(
         "--config", type=Path, required=True, help="effective configuration, as `snakesim run` saves it"
     )
-    parser.add_argument("--endpoint", default=DEFAULT_ENDPOINT, help="where the robot's network meets")
+    parser.add_argument("--endpoint", default=DEFAULT_ENDPOINT, help="Zenoh endpoint of the robot")
     parser.add_argument("--namespace", help="Zenoh namespace of the robot (default: the robot's name)")
-    parser.add_argument("--out", type=Path, help="folder for what the process leaves behind")
+    parser.add_argument("--out", type=Path, help="folder for the process's output files")
     parser.add_argument("--parent", type=int, help="process id of the parent; this process dies with it")
     return parser
 

@@ -1,7 +1,7 @@
-"""Everything that a tool prints goes through here: text from files and from the network cannot steer the terminal.
+"""All terminal output of the tools: text from files and from the network cannot control the terminal.
 
 A robot's name, the reason of an answer, a field of a file may hold escape sequences, C1 controls, line breaks or
-bidirectional overrides. They are shown as the escapes of JSON instead, so that a printed JSON text stays one.
+bidirectional overrides. They are printed as JSON escapes instead, so that printed JSON stays valid.
 """
 
 import sys
@@ -13,7 +13,7 @@ Say = Callable[[str], None]
 
 
 def printable(text: str, keep: str = "") -> str:
-    """The text with every character that is not visible written as `\\u001b`; a space stays, and what is in `keep`."""
+    """The text with every invisible character escaped as `\\u001b`; except spaces, and characters in `keep`."""
     if text.isprintable():
         return text
     return "".join(char if char.isprintable() or char in keep else _escaped(char) for char in text)
@@ -42,7 +42,7 @@ def complain_of(error: SnakesimError, tool: str) -> None:
 
 
 def say_again(line: str, most: int, before: int) -> int:
-    """Print a line, cut to `most` characters, over the one before, which had `before`; returns how many it has."""
+    """Print a line, cut to `most` characters, over the previous one of `before` characters; returns its length."""
     shown = printable(line)[:most]
     print("\r" + shown.ljust(before), end="", flush=True)
     return len(shown)

@@ -1,12 +1,12 @@
-"""The contract of a backend as tests: whoever writes a backend runs them with one command.
+"""The contract of a backend as tests: run them on a backend of your own with one command.
 
     python -m pytest --pyargs snakesim_hal.conformance --backend NAME_or_./file.py:Class
 
-`plugin`      options, fixtures and the table at the end; what pytest loads
+`plugin`      the pytest plugin: options, fixtures and the table at the end
 `bench`       one backend with its settings, opened by one user at a time
 `rig`         an open backend, driven tick by tick through the real gate
 `loopback`    the same behind the real host, with a real client
-`tolerances`  every number that the tests allow, and why
+`tolerances`  all tolerances of the tests, with their reasons
 `test_*`      the clauses
 
 pytest is imported in `plugin` and `test_*` only; the rest of the HAL imports nothing from here.

@@ -33,7 +33,7 @@ class Bench:
     ) -> None:
         """backend: an installed one's name, `./file.py:Class`, or the class itself.
 
-        sets: as `--set` of `snakesim run`; mute: `mute(backend, joint)` makes one joint's module fall silent, as by a
+        sets: as `--set` of `snakesim run`; mute: `mute(backend, joint)` silences one joint's module, as by a
         broken wire; unavailable: why the bench cannot be used on this machine.
         """
         self.name = name
@@ -50,7 +50,7 @@ class Bench:
 
     @cached_property
     def factory(self) -> BackendFactory:
-        """What opens the backend. Raises ConfigError when there is no such backend."""
+        """The backend's factory. Raises ConfigError when there is no such backend."""
         return find_plugin(BACKENDS, self._backend) if isinstance(self._backend, str) else self._backend
 
     @cached_property
@@ -63,7 +63,7 @@ class Bench:
         return msgspec.structs.replace(config, pace=self.pace_of(config), services={HOLDER: Service()})
 
     def pace_of(self, config: RunConfig) -> Pace:
-        """Lockstep where time can wait: quick, and the same on every machine. Else real time."""
+        """Lockstep if supported: quick, and the same on every machine. Else real time."""
         paces = self.factory.check(config, self._settings(config))
         return "lockstep" if "lockstep" in paces else "realtime"
 
@@ -75,7 +75,7 @@ class Bench:
     # --- opening and closing -------------------------------------------------------------------------------
 
     def open(self) -> Backend:
-        """A fresh backend; whatever was open is closed before."""
+        """A new backend; an open one is closed before."""
         self.close()
         self.was_opened = True
         return self.factory(self.config, self._settings(self.config))
@@ -91,7 +91,7 @@ class Bench:
         return self._rig
 
     def rig(self) -> Rig:
-        """The rig that tests share, since opening may be slow; a fresh one where that is spoiled."""
+        """The rig that tests share, since opening may be slow; a new one if that is spoiled."""
         return self._rig if self._rig is not None and not self._rig.spoiled else self.fresh_rig()
 
     def hosted(self) -> Hosted:
@@ -102,11 +102,11 @@ class Bench:
         return self._hosted
 
     def spoil(self) -> None:
-        """Open anew for the next test: after this one nobody knows how the backend is."""
+        """Reopen for the next test: after this one the backend's state is unknown."""
         self.close()
 
     def close(self) -> None:
-        """Close whatever is open."""
+        """Close the open backend."""
         rig, hosted = self._rig, self._hosted
         self._rig = self._hosted = None
         if hosted is not None:

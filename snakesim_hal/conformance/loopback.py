@@ -1,4 +1,4 @@
-"""A backend behind the real host, a real client that commands it, and somebody who watches; over Zenoh on loopback."""
+"""A backend behind the real host, a real client that commands it, and an observer; over Zenoh on loopback."""
 
 import contextlib
 import socket
@@ -28,17 +28,17 @@ from snakesim_hal.wire.messages import (
     Mode,
 )
 
-LIMIT_S = 60.0  # for what takes a tenth of a second; slow machines are no failure
-Plan = Callable[[int], "Asked | None"]  # ticks since arming -> what is asked of joints; None: say nothing
+LIMIT_S = 60.0  # for operations of a tenth of a second; a slow machine is not a failure
+Plan = Callable[[int], "Asked | None"]  # ticks since arming -> commanded joints; None: send nothing
 
 
 def stay(_ticks: int) -> Asked:
-    """Ask nothing of any joint: all stay."""
+    """Command no joint: all hold their position."""
     return {}
 
 
 def wait_until(happened: Callable[[], Any], what: str) -> None:
-    """Until a condition holds; fails with its name when it does not in time."""
+    """Wait until a condition holds; fails with its name if it does not in time."""
     deadline = time.monotonic() + LIMIT_S
     while not happened():
         assert time.monotonic() < deadline, f"not within {LIMIT_S} s: {what}"
@@ -47,7 +47,7 @@ def wait_until(happened: Callable[[], Any], what: str) -> None:
 
 @dataclass
 class Watched:
-    """A backend that passes everything on and keeps what went through; a fault can be planted in it."""
+    """A backend that forwards and records all calls; a fault can be planted in it."""
 
     inner: Backend
     seen: list[JointState] = field(default_factory=list[JointState])
@@ -58,7 +58,7 @@ class Watched:
         return self.inner.describe()
 
     def sample(self, tick: int, stamp_ns: int) -> Samples:
-        """The backend's, kept."""
+        """The backend's, recorded."""
         samples = self.inner.sample(tick, stamp_ns)
         self.seen.append(samples.joints)
         return samples
@@ -132,7 +132,7 @@ class Controller:
 
 
 class Hosted:
-    """Host, controller and watcher, each with a session of its own."""
+    """Host, controller and observer, each with a session of its own."""
 
     def __init__(self, backend: Backend, config: RunConfig) -> None:
         with socket.socket() as probe:
@@ -153,14 +153,14 @@ class Hosted:
         """Open the sessions and start the threads."""
         self._open.callback(self.backend.close)
         self._open.callback(sys.setswitchinterval, sys.getswitchinterval())
-        sys.setswitchinterval(0.0005)  # host and controller share one interpreter here; in real life they are processes
+        sys.setswitchinterval(0.0005)  # host and controller share one interpreter here; otherwise they are processes
         try:
             own = self._open.enter_context(open_session(self._own_link))
             self.host = Host(self.config, self.backend, own)
             self.robot = self.host.description
             self.session: Session = self._open.enter_context(open_session(self._link))
             self._commands = self.session.publisher(keys.JOINT_COMMAND, JointCommand)
-            wait_until(self._commands.heard, "the host hears our commands")  # what is put before that is lost
+            wait_until(self._commands.heard, "the host receives our commands")  # earlier ones are lost
             self._start("host", self.host.run, self.host.stop)
             self._start("controller", lambda: self.controller.run(self._link), self.controller.stopped.set)
         except BaseException:
@@ -202,14 +202,14 @@ class Hosted:
         assert self.host.authority.state == state, self.host.authority.why
 
     def passes(self, periods: int) -> list[JointState]:
-        """Wait for so many more ticks, and return their joint states."""
+        """Wait for this many more ticks, and return their joint states."""
         since = len(self.backend.seen)
         wait_until(lambda: len(self.backend.seen) >= since + periods or not self._threads_live(), f"{periods} ticks")
         assert len(self.backend.seen) >= since + periods, f"the host ended: {self.host.authority.why}"
         return self.backend.seen[since:]
 
     def forge(self, **wrong: Any) -> None:
-        """Put a command on the network that would turn the first joint, good but for what is given here."""
+        """Publish a command that would turn the first joint, valid except for the fields given here."""
         count = len(self.robot.joints)
         good: dict[str, Any] = {
             "tick": self.tick,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-if TYPE_CHECKING:  # nothing of ours is imported before it is used: every pytest run loads this module
+if TYPE_CHECKING:  # nothing else of SnakeSIM is imported before it is used: every pytest run loads this module
     from snakesim_hal.conformance.bench import Bench
     from snakesim_hal.conformance.loopback import Hosted
     from snakesim_hal.conformance.recordings import Pushing
@@ -22,7 +22,7 @@ pytest.register_assert_rewrite("snakesim_hal.conformance.loopback", "snakesim_ha
 CLAUSE, BENCH = "snakesim_clause", "snakesim_bench"  # properties that a test's report carries, also between workers
 PACKAGE = "snakesim_hal.conformance."
 WORST_FIRST = ("error", "fail", "skip", "pass")
-# What shares an opening of the backend stands together; what needs openings of its own comes last.
+# Tests that share an opening of the backend are adjacent; those that need their own openings come last.
 SUBJECTS = ("description", "samples", "modes", "limits", "switching", "lifecycle", "faults", "host", "closing")
 _failed = pytest.StashKey[bool]()
 
@@ -49,13 +49,13 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption(
         "--mute",
         metavar="./FILE.py:FUNCTION",
-        help="function(backend, joint) that makes a joint's module fall silent",
+        help="function(backend, joint) that silences a joint's module",
     )
     group.addoption("--contract-table", metavar="FILE.md", help="write the table of tests and benches as Markdown")
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """A place for the benches, and somebody who collects the outcomes."""
+    """Storage for the benches, and a collector of the outcomes."""
     config.stash[_benches] = {}
     config.pluginmanager.register(Outcomes(), "snakesim-outcomes")
 
@@ -64,7 +64,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """Run every contract test on every bench; all tests of a bench in one go, so that it is opened seldom."""
+    """Run every contract test on every bench; all tests of a bench in a row, so that it is opened seldom."""
     if "bench" not in metafunc.fixturenames or not metafunc.function.__module__.startswith(PACKAGE):
         return
     benches = _from_options(metafunc.config)
@@ -85,7 +85,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def _module_of(item: pytest.Item) -> str:
-    """Where a test was written, which is not always the file that it is collected from."""
+    """The module that defines a test, which is not always the file that it is collected from."""
     return getattr(getattr(item, "function", None), "__module__", "")
 
 
@@ -94,7 +94,7 @@ COMMAND_LINE = "--backend"
 
 
 def _from_hook(metafunc: pytest.Metafunc) -> "list[Bench]":
-    """What conftest.py files offer. The hook is asked for every test; tests share the bench that came first."""
+    """Benches of conftest.py files. The hook is called for every test; tests share the first bench of a name."""
     found: list[list[Bench] | None] = metafunc.definition.ihook.pytest_snakesim_benches(config=metafunc.config)
     known = metafunc.config.stash[_benches]
     return [known.setdefault(bench.name, bench) for some in found if some for bench in some]
@@ -120,7 +120,7 @@ def _from_options(config: pytest.Config) -> "list[Bench]":
                 sets=tuple(sets),
                 mute=find_plugin(BACKENDS, mute) if mute else None,
             )
-            assert bench.config  # a wrong setting is said once, not by every test
+            assert bench.config  # a wrong setting is reported once, not by every test
         except ConfigError as error:
             raise pytest.UsageError(str(error)) from error
         known[COMMAND_LINE] = bench
@@ -139,7 +139,7 @@ def bench(request: pytest.FixtureRequest) -> "Iterator[Bench]":
 
 @pytest.fixture
 def rig(bench: "Bench", request: pytest.FixtureRequest) -> "Iterator[Rig]":
-    """The backend, opened, at its start pose, at rest and disarmed. After a failed test it is opened anew."""
+    """The backend, opened, at its start pose, at rest and disarmed. After a failed test it is reopened."""
     rig = bench.rig()
     rig.go_home()
     yield rig
@@ -153,7 +153,7 @@ def rig(bench: "Bench", request: pytest.FixtureRequest) -> "Iterator[Rig]":
 
 @pytest.fixture
 def hosted(bench: "Bench", request: pytest.FixtureRequest) -> "Iterator[Hosted]":
-    """The backend behind a real host, with a controller. After a failed test both are opened anew."""
+    """The backend behind a real host, with a controller. After a failed test both are reopened."""
     yield bench.hosted()
     if request.node.stash.get(_failed, False):
         bench.spoil()
@@ -161,7 +161,7 @@ def hosted(bench: "Bench", request: pytest.FixtureRequest) -> "Iterator[Hosted]"
 
 @pytest.fixture
 def healthy(bench: "Bench", request: pytest.FixtureRequest) -> "Record":
-    """A second of a robot at work: every joint sways. Recorded once for all tests that read it."""
+    """A second of normal operation: every joint sways. Recorded once for all tests that read it."""
     from snakesim_hal.conformance.recordings import sway
 
     return bench.keep("healthy", lambda: sway(request.getfixturevalue("rig")))
@@ -190,7 +190,7 @@ def switching(bench: "Bench", request: pytest.FixtureRequest) -> "dict[tuple[Mod
 def pytest_runtest_makereport(
     item: pytest.Item, call: pytest.CallInfo[None]
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Note on the report which clause it is about, and on the item whether it failed."""
+    """Note the clause on the report, and on the item whether it failed."""
     report = yield
     module = _module_of(item)
     if module.startswith(PACKAGE) and isinstance(item, pytest.Function) and hasattr(item, "callspec"):
@@ -205,13 +205,13 @@ def pytest_runtest_makereport(
 
 
 class Outcomes:
-    """Collects what every contract test came to on every bench, and shows it as one table."""
+    """Collects the outcome of every contract test on every bench, and prints them as one table."""
 
     def __init__(self) -> None:
         self._rows: dict[tuple[str, str], dict[str, list[tuple[str, str]]]] = {}  # clause -> bench -> (word, why)
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Keep an outcome; with pytest-xdist this runs where the reports meet."""
+        """Store an outcome; with pytest-xdist this runs in the controller process."""
         told = dict(report.user_properties)
         if CLAUSE not in told or (report.when != "call" and report.passed):
             return
@@ -221,7 +221,7 @@ class Outcomes:
             cell.append(outcome)
 
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
-        """Show the table, and write it where asked."""
+        """Print the table, and write it to the requested file."""
         if not self._rows:
             return
         rows = dict(sorted(self._rows.items(), key=lambda row: _place(row[0][0])))
@@ -285,7 +285,7 @@ def _worst(outcomes: list[tuple[str, str]]) -> str:
 
 
 def _without_repetition(reasons: list[str]) -> list[str]:
-    """A bench that is not there at all is said once, not for every clause."""
+    """An unavailable bench is reported once, not for every clause."""
     seen: dict[str, list[str]] = {}
     for reason in reasons:
         seen.setdefault(reason.partition(", on ")[2], []).append(reason)

@@ -1,4 +1,4 @@
-"""What the joints are made to do for several tests at once: opening and waiting are what costs time on a real bus."""
+"""Motions that several tests share: opening and waiting take most of the time on a real bus."""
 
 import math
 from collections.abc import Callable
@@ -14,7 +14,7 @@ from snakesim_hal.wire.messages import Mode
 # Every ordered pair of modes once, and back to the first: an Eulerian circuit.
 CIRCUIT = tuple(Mode(int(code)) for code in "1012023031321")
 PAIRS = list(pairwise(CIRCUIT))
-HELD_S = 0.16  # how long a mode is kept before the next change
+HELD_S = 0.16  # of a mode before the next change
 
 
 @dataclass

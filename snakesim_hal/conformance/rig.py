@@ -1,4 +1,4 @@
-"""An open backend on the bench, driven tick by tick as the host does it, through the real authority and its gate."""
+"""An open backend on the bench, driven tick by tick as by the host, through the real authority and its gate."""
 
 import contextlib
 import time
@@ -34,11 +34,11 @@ REANCHOR_PERIODS = 10
 
 @dataclass
 class Record:
-    """What the joints did over some ticks, and what they were told. All arrays are (ticks, n_joints)."""
+    """Joint states and set-points over some ticks. All arrays are (ticks, n_joints)."""
 
     samples: list[Samples]
     told: list[SetPoints]
-    faults: list[Fault]  # that the backend reported meanwhile
+    faults: list[Fault]  # reported by the backend in these ticks
 
     @property
     def joints(self) -> list[JointState]:
@@ -68,7 +68,7 @@ class Rig:
     backend: Backend
     pace: Pace
     period_ns: int
-    spoiled: bool = False  # of no use for further tests: closed, or a joint is silent
+    spoiled: bool = False  # unusable for further tests: closed, or a joint is silent
     closed: bool = False
     tick: int = 0
     late_periods: float = 0.0  # how far this machine fell behind real time at worst
@@ -84,7 +84,7 @@ class Rig:
         self._samples: list[Samples] = []
         self._told: list[SetPoints] = []
         self.first = self._sample()
-        # A robot on a bus may know its joints only after a few periods.
+        # On a bus the first joint states may take a few periods.
         for _ in range(t.ARMING_PERIODS):
             self.idle()
             if all(self.now.valid):
@@ -92,11 +92,11 @@ class Rig:
         self.home_rad = list(self.now.angle_rad)
         self.faults_at_opening = self.faults
 
-    # --- what there is to read -----------------------------------------------------------------------------
+    # --- readings ------------------------------------------------------------------------------------------
 
     @property
     def faults(self) -> list[Fault]:
-        """Everything that the backend reported since it was opened."""
+        """All faults that the backend reported since it was opened."""
         return [fault for _, fault in self._found]
 
     @property
@@ -111,13 +111,13 @@ class Rig:
         return Record(self._samples[first:], self._told[first - 1 :], faults)
 
     def periods(self, seconds: float) -> int:
-        """How many periods make so many seconds, rounded up."""
+        """Number of periods in a time, rounded up."""
         return int(np.ceil(seconds * 1e9 / self.period_ns))
 
     # --- one period ----------------------------------------------------------------------------------------
 
     def hand(self, points: SetPoints, lifecycle: LifecycleState) -> None:
-        """Hand set-points to the backend past every gate, and let a period pass."""
+        """Hand set-points to the backend without the gate, and let a period pass."""
         self.backend.enact(points, lifecycle)
         self.let_pass(points)
 
@@ -134,7 +134,7 @@ class Rig:
         self._sample()
 
     def idle(self, periods: int = 1) -> Record:
-        """Periods without a new command: what was commanded goes on while its lease lasts."""
+        """Periods without a new command: the last one stays active while its lease lasts."""
         began = self.tick
         for _ in range(periods):
             self.authority.expire(self._now_ns, self.tick)
@@ -142,7 +142,7 @@ class Rig:
         return self.since(began)
 
     def drive(self, asked: Asked, periods: int = 1, *, torque_limit_nm: list[float] | None = None) -> Record:
-        """Command some joints, while the others stay at home; through lease, gate and lifecycle."""
+        """Command some joints, while the others hold the start pose; through lease, gate and lifecycle."""
         began = self.tick
         for _ in range(periods):
             self._offer(self.points(asked, torque_limit_nm))
@@ -150,7 +150,7 @@ class Rig:
         return self.since(began)
 
     def press(self, asked: Asked, periods: int = 1, *, torque_limit_nm: list[float] | None = None) -> Record:
-        """The same past the gate, which lets nothing drive a joint against its stop; the lifecycle goes on."""
+        """The same without the gate, which would not drive a joint against its stop; the lifecycle still applies."""
         began = self.tick
         for _ in range(periods):
             self._offer(self.points(dict.fromkeys(asked, (Mode.PASSIVE, 0.0))))
@@ -160,7 +160,7 @@ class Rig:
         return self.since(began)
 
     def points(self, asked: Asked, torque_limit_nm: list[float] | None = None) -> SetPoints:
-        """Set-points of all joints; those that nothing is asked of stay at home."""
+        """Set-points of all joints; those without a command hold the start pose."""
         mode, target = [Mode.POSITION] * self.count, list(self.home_rad)
         for joint, (wanted_mode, wanted) in asked.items():
             mode[joint], target[joint] = wanted_mode, wanted
@@ -169,7 +169,7 @@ class Rig:
     # --- the lifecycle -------------------------------------------------------------------------------------
 
     def arm(self) -> None:
-        """Arm where the robot is, and give its modules time to follow."""
+        """Arm at the present pose, and give the modules time to follow."""
         if self.authority.state == "armed":
             return
         if self.authority.state != "disarmed":
@@ -197,7 +197,7 @@ class Rig:
             self.clear()
 
     def clear(self) -> None:
-        """Clear a stop, and take back what was set aside."""
+        """Clear a stop, and end isolations."""
         self.authority.on_lifecycle(LifecycleRequest(action="clear"), self._now_ns)
 
     def estop(self) -> None:
@@ -205,12 +205,12 @@ class Rig:
         self.authority.on_estop(EstopRequest(who="bench"), self.tick)
 
     def fault(self) -> None:
-        """A fault that somebody else found."""
-        self.authority.fault(Fault(tick=self.tick, what="bench", cause="the contract tests say so"))
+        """A fault that the backend has not reported."""
+        self.authority.fault(Fault(tick=self.tick, what="bench", cause="planted by the contract tests"))
 
     @contextlib.contextmanager
     def may_lose_a_joint(self) -> Iterator[None]:
-        """Meanwhile one joint that fails is set aside, whatever the robot file says. It begins and ends disarmed."""
+        """Context in which one failed joint is isolated, whatever the robot file allows. Begins and ends disarmed."""
         usual = self.authority
         self.authority = Authority(msgspec.structs.replace(self.robot, may_lose_joints=1))
         self.idle()
@@ -221,13 +221,13 @@ class Rig:
         self.idle()
 
     def lose(self, joint: int) -> None:
-        """Somebody found that a joint has failed."""
+        """Isolate a joint, as after a failure."""
         name = self.robot.joints[joint].name
-        cause = f"the contract tests set {name} aside"
+        cause = f"the contract tests isolate {name}"
         self.authority.fault(Fault(tick=self.tick, what="bench", cause=cause, joint=name, reach="joint"))
 
     def cruise(self, joint: int = 0) -> Record:
-        """Arm, and set one joint going."""
+        """Arm, and move one joint at constant speed."""
         self.arm()
         record = self.drive({joint: (Mode.VELOCITY, t.CRUISE_RAD_S)}, self.periods(t.CRUISE_S))
         self.must_be_armed()
@@ -236,7 +236,7 @@ class Rig:
         return record
 
     def go_home(self) -> None:
-        """Bring every joint back to where it was at opening, at rest and disarmed; no work when it is there."""
+        """Bring every joint back to the start pose, at rest and disarmed; does nothing if it is there."""
         if self.authority.state == "armed" or not self._is_home():
             if not self._is_home():
                 self.arm()
@@ -263,7 +263,7 @@ class Rig:
         return bool(away.max() < t.REACHED_RAD and np.abs(self.now.velocity_rad_s).max() < t.STILL_RAD_S)
 
     def _offer(self, points: SetPoints) -> None:
-        """Send a command; a refusal shows in what the joints do."""
+        """Send a command; a rejection shows in the joint states."""
         if self.authority.state == "disarmed" and not self.authority.lease.live(self._now_ns):
             self.authority.on_lease(LeaseRequest(action="acquire", holder=HOLDER), self._now_ns)
         self._sequence += 1

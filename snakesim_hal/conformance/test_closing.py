@@ -1,4 +1,4 @@
-"""Closing, opening again, and running twice."""
+"""Closing, reopening, and repeatability."""
 
 import contextlib
 
@@ -47,7 +47,7 @@ def test_closing_twice_does_no_harm(bench: Bench) -> None:
 
 
 def test_a_backend_opens_again_after_it_was_closed(bench: Bench) -> None:
-    """In the same process, and as good as new: disarmed, at rest, and it moves when it is armed."""
+    """In the same process, as after the first opening: disarmed, at rest, and it moves when it is armed."""
     if not bench.was_opened:
         bench.open().close()
     again = bench.fresh_rig()
@@ -56,9 +56,9 @@ def test_a_backend_opens_again_after_it_was_closed(bench: Bench) -> None:
 
 
 def test_in_lockstep_the_same_seed_and_commands_give_the_same_samples(bench: Bench) -> None:
-    """To the last bit, when time waits for everybody."""
+    """Bit-identical in lockstep."""
     if bench.pace != "lockstep":
-        pytest.skip("this backend keeps real time only, which repeats nothing exactly")
+        pytest.skip("this backend supports real time only, which is not exactly repeatable")
 
     def once() -> list[Samples]:
         rig = bench.fresh_rig()

@@ -1,4 +1,4 @@
-"""The description: what the robot is, readable before anything moves."""
+"""The description of the robot, readable before anything moves."""
 
 from collections import Counter
 
@@ -36,7 +36,7 @@ def test_the_layout_is_the_hash_of_the_joints(rig: Rig) -> None:
 
 
 def test_the_description_is_readable_at_once_and_stays(bench: Bench, rig: Rig, healthy: Record) -> None:
-    """It is there before the first sample (the rig has read it then), and the same after running."""
+    """It is available before the first sample (the rig has read it then), and the same after running."""
     assert healthy.samples
     assert rig.backend.describe() == rig.robot
 
@@ -48,7 +48,7 @@ def test_the_description_survives_the_wire(rig: Rig) -> None:
 
 
 def test_every_sensor_listed_is_a_key_of_the_hal_once(rig: Rig) -> None:
-    """Sensors stand at the sensor keys, with a rate that the control rate can carry; the joints are always there."""
+    """Sensors are at the sensor keys, with a rate up to the control rate; the joints are always listed."""
     listed = [sensor.key for sensor in rig.robot.sensors]
     assert len(set(listed)) == len(listed), f"listed twice: {listed}"
     assert keys.JOINTS in listed
@@ -58,7 +58,7 @@ def test_every_sensor_listed_is_a_key_of_the_hal_once(rig: Rig) -> None:
 
 
 def test_every_sensor_listed_delivers_at_about_its_rate(rig: Rig, healthy: Record) -> None:
-    """A sensor that is listed comes; one that this robot lacks is left out of the list."""
+    """A listed sensor is published; an absent one is not listed."""
     seconds = len(healthy.samples) * rig.period_ns * 1e-9
     for sensor in rig.robot.sensors:
         if sensor.key == keys.JOINTS:
@@ -66,21 +66,21 @@ def test_every_sensor_listed_delivers_at_about_its_rate(rig: Rig, healthy: Recor
         came = how_often(sensor.key, healthy)
         wanted = seconds * sensor.rate_hz
         slack = 1 + t.RATE_SHARE * wanted
-        assert came >= 1 or wanted < 2, f"{sensor.key} is listed and never comes"
+        assert came >= 1 or wanted < 2, f"{sensor.key} is listed but never published"
         assert abs(came - wanted) <= slack, f"{sensor.key}: {came} in {seconds} s, stated are {sensor.rate_hz} Hz"
 
 
 def how_often(key: str, record: Record) -> int:
-    """How many readings came. IMUs may answer in turns, so there the link that came most often counts."""
+    """Number of readings. IMUs may answer in turns, so there it is that of the most frequent link."""
     messages = [sample.others[key] for sample in record.samples if key in sample.others]
     links = Counter(link for message in messages if isinstance(message, Imu) for link in message.link)
     return max(links.values()) if links else len(messages)
 
 
 def test_nothing_comes_that_is_not_listed(rig: Rig, healthy: Record) -> None:
-    """Whoever reads the description knows every key; and each key has the message that belongs there."""
+    """The description lists every key; and each key has its own message type."""
     listed = {sensor.key for sensor in rig.robot.sensors}
     for sample in healthy.samples:
         for key, message in sample.others.items():
-            assert key in listed, f"{key} comes and is not listed"
+            assert key in listed, f"{key} is published but not listed"
             assert type(message) is keys.MESSAGE_AT[key], f"{key}: {type(message).__name__}"

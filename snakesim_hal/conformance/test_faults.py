@@ -1,4 +1,4 @@
-"""Faults: none while all is well; a silent joint shows, and stops the robot."""
+"""Faults: none in normal operation; a silent joint is detected, and stops the robot."""
 
 import math
 
@@ -16,13 +16,13 @@ LOST = 1
 
 
 def test_a_healthy_robot_reports_no_fault(rig: Rig, healthy: Record) -> None:
-    """`faults()` is empty after opening, and at work."""
+    """`faults()` is empty after opening, and in operation."""
     assert not rig.faults_at_opening, rig.faults_at_opening
     assert healthy.samples and not healthy.faults, healthy.faults
 
 
 def test_a_joint_that_is_set_aside_is_let_go_and_the_others_go_on(rig: Rig) -> None:
-    """While it is in `isolated`, a joint has no torque, whatever is asked of it; a clear takes it back."""
+    """While it is in `isolated`, a joint has no torque, whatever is commanded; a clear ends that."""
     with rig.may_lose_a_joint():
         began = rig.tick
         rig.cruise()
@@ -41,17 +41,17 @@ def test_a_joint_that_is_set_aside_is_let_go_and_the_others_go_on(rig: Rig) -> N
         rig.arm()
         record = rig.drive({LOST: asked[LOST]}, rig.periods(t.SETTLE_S))
         away = record.angle_rad[-1, LOST] - asked[LOST][1]
-        assert abs(away) < t.REACHED_RAD, f"taken back, it stops {away:.3f} rad from its target"
+        assert abs(away) < t.REACHED_RAD, f"after the clear it stops {away:.3f} rad from its target"
         assert not rig.since(began).faults, rig.since(began).faults
 
 
 def test_a_silent_joint_grows_old_and_the_robot_stops(bench: Bench, rig: Rig) -> None:
-    """No news is never good news: the joint is invalid, or its age grows with time, until the robot is at fault.
+    """The silent joint is invalid, or its age grows with time, until the robot is at fault.
 
-    The others stay fresh. Faults that the backend reports besides say what and why, and each is reported once.
+    The others stay fresh. Faults that the backend reports besides have a word and a cause, and each is reported once.
     """
     if bench.mute is None:
-        pytest.skip("this bench has no way to make a joint fall silent; give --mute")
+        pytest.skip("this bench cannot silence a joint; give --mute")
     rig.cruise()
     rig.spoiled = True
     began = rig.tick
@@ -64,7 +64,7 @@ def test_a_silent_joint_grows_old_and_the_robot_stops(bench: Bench, rig: Rig) ->
         assert not known, f"silent for {silent_ns * 1e-6} ms, reported as {joints.age_ns[MUTED] * 1e-6} ms old"
         others = [i for i in range(rig.count) if i != MUTED]
         assert all(joints.valid[i] and joints.age_ns[i] <= rig.period_ns for i in others), "the others are fresh"
-    assert rig.authority.state == "fault", "the robot goes on with a joint that it does not know"
+    assert rig.authority.state == "fault", "the robot goes on with a joint of unknown state"
     must_rest_but_the_muted(rig)
     told = len(rig.faults)
     assert all(fault.what and fault.cause for fault in rig.faults)
@@ -74,7 +74,7 @@ def test_a_silent_joint_grows_old_and_the_robot_stops(bench: Bench, rig: Rig) ->
 
 
 def must_rest_but_the_muted(rig: Rig) -> None:
-    """Nobody knows where the silent joint is; the others rest."""
+    """The position of the silent joint is unknown; the others rest."""
     record = rig.idle(rig.periods(t.SETTLE_S))
     for sample in record.samples:
         sample.joints.velocity_rad_s[MUTED] = 0.0

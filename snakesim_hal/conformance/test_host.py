@@ -14,7 +14,7 @@ from snakesim_hal.wire.messages import Fault, JointState, Mode
 
 
 def undisturbed(hosted: Hosted, act: Callable[[], None]) -> None:
-    """Do it, and again when a lease ran out meanwhile: then this machine was too slow, and no backend is to blame."""
+    """Do it, and again if a lease ran out meanwhile: then this machine was too slow, not the backend."""
     for left in reversed(range(t.ATTEMPTS)):
         try:
             act()
@@ -26,7 +26,7 @@ def undisturbed(hosted: Hosted, act: Callable[[], None]) -> None:
 
 
 def moves_then(silent: bool, hosted: Hosted) -> int:
-    """Arm and set a joint going for a while; returns how many ticks that is."""
+    """Arm and move a joint for a while; returns for how many ticks."""
     angle = hosted.backend.seen[-1].angle_rad[0]
     go: Asked = {0: (Mode.VELOCITY, -math.copysign(t.CRUISE_RAD_S, angle))}  # away from the nearer stop
     ticks = t.ARMING_PERIODS + math.ceil(t.CRUISE_S * 1e9 / hosted.config.period_ns)
@@ -41,7 +41,7 @@ def moves_then(silent: bool, hosted: Hosted) -> int:
 
 
 def must_have_moved(hosted: Hosted) -> None:
-    """Fail when joint 0 did not move lately: then its stopping would prove nothing."""
+    """Fail if joint 0 has not moved recently: then its stopping would prove nothing."""
     lately = [abs(joints.velocity_rad_s[0]) for joints in hosted.backend.seen[-2 * t.ARMING_PERIODS :]]
     assert max(lately) > t.STILL_RAD_S, "the joint did not move, so stopping cannot be tested"
 
@@ -55,12 +55,12 @@ def must_come_to_rest(hosted: Hosted) -> None:
 
 
 def test_bad_commands_are_refused_and_counted_and_move_nothing(bench: Bench, hosted: Hosted) -> None:
-    """Of another lease, for another robot, too long, not a number, too old, from the future: each by its own name."""
+    """Of another lease, for another robot, too long, NaN, too old, from the future: each by its own word."""
     undisturbed(hosted, lambda: refuses_bad_commands(hosted))
 
 
 def refuses_bad_commands(hosted: Hosted) -> None:
-    """One go of it."""
+    """One attempt."""
     hosted.arm(stay)
     hosted.passes(t.ARMING_PERIODS)
     count = len(hosted.robot.joints)
@@ -84,12 +84,12 @@ def refuses_bad_commands(hosted: Hosted) -> None:
 
 
 def test_a_fault_of_the_backend_latches_and_stops_the_joints(bench: Bench, hosted: Hosted) -> None:
-    """Whatever the controller still sends; and only a clear leads out."""
+    """Whatever the controller still sends; and only a clear ends it."""
     undisturbed(hosted, lambda: stops_at_a_fault(hosted))
 
 
 def stops_at_a_fault(hosted: Hosted) -> None:
-    """One go of it."""
+    """One attempt."""
     ticks = moves_then(silent=False, hosted=hosted)
     at = hosted.armed_at + ticks
     hosted.backend.planted = lambda tick: Fault(tick=tick, what="planted", cause="by the test") if tick >= at else None
@@ -104,7 +104,7 @@ def stops_at_a_fault(hosted: Hosted) -> None:
 
 
 def test_a_controller_that_falls_silent_stops_the_joints_within_the_lease(bench: Bench, hosted: Hosted) -> None:
-    """The lease is the deadman: it runs out, that is a fault, and the joints come to rest."""
+    """The lease is the dead-man switch: it runs out, that is a fault, and the joints come to rest."""
     try:
         moves_then(silent=True, hosted=hosted)
         hosted.reaches("fault")
@@ -115,4 +115,4 @@ def test_a_controller_that_falls_silent_stops_the_joints_within_the_lease(bench:
         assert late <= t.TRANSPORT_PERIODS, f"{late} periods after the end of the lease"
         must_come_to_rest(hosted)
     finally:
-        bench.spoil()  # a lockstep host does not wait again for a service that it has given up
+        bench.spoil()  # a lockstep host does not wait again for a service that has stalled

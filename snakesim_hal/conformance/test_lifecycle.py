@@ -1,4 +1,4 @@
-"""The lifecycle: nothing moves unless armed, and what stops stays stopped."""
+"""The lifecycle: nothing moves unless armed, and a stop is permanent."""
 
 from collections.abc import Callable
 
@@ -14,7 +14,7 @@ GO: Asked = {0: (Mode.VELOCITY, t.CRUISE_RAD_S)}
 
 
 def must_rest(record: Record, rig: Rig) -> None:
-    """Fail when a joint moves, or is driven, at the end of a record."""
+    """Fail if a joint moves, or is driven, at the end of a record."""
     last = record.velocity_rad_s[-1]
     assert np.abs(last).max() < t.STILL_RAD_S, f"still moving: {last} rad/s"
     tail = record.angle_rad[-rig.periods(t.SETTLE_S / 3) :]
@@ -22,7 +22,7 @@ def must_rest(record: Record, rig: Rig) -> None:
 
 
 def test_nothing_moves_while_disarmed_whatever_is_commanded(rig: Rig) -> None:
-    """Commands flow and are heard; the joints stay, without torque."""
+    """Commands are sent and received; the joints stay, without torque."""
     asked = {i: (Mode.POSITION, rig.home_rad[i] + t.STEP_RAD) for i in range(rig.count)}
     before = np.array(rig.now.angle_rad)
     record = rig.drive(asked, rig.periods(t.CRUISE_S))
@@ -33,15 +33,15 @@ def test_nothing_moves_while_disarmed_whatever_is_commanded(rig: Rig) -> None:
 
 @pytest.mark.parametrize("state", ["disarmed", "estop"])
 def test_a_robot_with_modules_stops_them_itself_when_not_armed(bench: Bench, rig: Rig, state: LifecycleState) -> None:
-    """The second line of defence: handed moving set-points by mistake, a robot that is not armed does not follow.
+    """The second line of defence: given moving set-points by mistake, a robot that is not armed does not follow.
 
-    A simulator may do without (see `Backend.enact`); the host hands it none.
+    A simulator need not do this (see `Backend.enact`); the host hands it none.
     """
     asked = {i: (Mode.POSITION, rig.home_rad[i] + 0.5 * t.STEP_RAD) for i in range(rig.count)}
     before, began = np.array(rig.now.angle_rad), rig.tick
     for _ in range(rig.periods(t.CRUISE_S)):
         rig.hand(rig.points(asked), state)
-    rig.idle(t.TRANSPORT_PERIODS)  # disarmed: the lifecycle leads out of a stop through there
+    rig.idle(t.TRANSPORT_PERIODS)  # disarmed: the only state after a stop
     moved = float(np.abs(rig.since(began).angle_rad - before).max())
     if moved >= t.STILL_RAD and bench.pace == "lockstep":
         pytest.skip("a simulator may follow set-points in every state; the host hands it safe ones only")
@@ -57,7 +57,7 @@ def test_leaving_armed_brings_a_moving_joint_to_rest(rig: Rig, stop: Callable[[R
 
 
 def test_disarmed_joints_have_no_torque(rig: Rig) -> None:
-    """Passive is passive: away from home nothing pulls back."""
+    """Passive means no torque, also away from the start pose."""
     rig.arm()
     rig.drive({0: (Mode.POSITION, rig.home_rad[0] + t.STEP_RAD)}, rig.periods(t.SETTLE_S))
     rig.disarm()
@@ -67,7 +67,7 @@ def test_disarmed_joints_have_no_torque(rig: Rig) -> None:
 
 
 def test_arming_again_goes_on_from_where_the_robot_is(rig: Rig) -> None:
-    """Stopped on its way, cleared and armed again: no joint takes up what it was told before."""
+    """Stopped on its way, cleared and armed again: no joint resumes an earlier set-point."""
     rig.cruise()
     rig.estop()
     rig.idle(rig.periods(t.SETTLE_S))
@@ -81,7 +81,7 @@ def test_arming_again_goes_on_from_where_the_robot_is(rig: Rig) -> None:
 
 
 def test_after_clear_and_arm_it_moves_again(rig: Rig) -> None:
-    """A stop is no end: cleared and armed, the robot works as before."""
+    """After a stop, cleared and armed, the robot works as before."""
     rig.cruise()
     rig.fault()
     rig.idle(rig.periods(t.SETTLE_S))

@@ -1,4 +1,4 @@
-"""Modes and units: rad, rad/s and N·m, the right joint, the right way round."""
+"""Modes and units: rad, rad/s and N·m, the right joint, the right direction."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from snakesim_hal.wire.messages import Mode
 
 
 def test_position_mode_turns_the_joint_that_is_asked_and_no_other(rig: Rig) -> None:
-    """Each joint in turn goes STEP_RAD from home, in rad, in the right direction, and stays there."""
+    """Each joint in turn moves STEP_RAD from the start pose, in rad, in the right direction, and stays there."""
     rig.arm()
     for joint in range(rig.count):
         angles = rig.drive({joint: (Mode.POSITION, rig.home_rad[joint] + t.STEP_RAD)}, rig.periods(t.SETTLE_S))
@@ -20,7 +20,7 @@ def test_position_mode_turns_the_joint_that_is_asked_and_no_other(rig: Rig) -> N
 
 
 def test_velocity_mode_turns_at_the_speed_that_is_asked(rig: Rig) -> None:
-    """Each way, in rad/s; a motor may lag behind by what friction takes."""
+    """In both directions, in rad/s; friction may reduce a motor's speed."""
     rig.arm()
     for speed in (t.CRUISE_RAD_S, -t.CRUISE_RAD_S):
         record = rig.drive({0: (Mode.VELOCITY, speed)}, rig.periods(t.CRUISE_S))
@@ -49,7 +49,7 @@ def test_torque_mode_pushes_with_the_torque_that_is_asked(pushing: Pushing) -> N
 
 
 def test_a_passive_joint_has_no_torque_and_moves_by_itself_nowhere(rig: Rig) -> None:
-    """Armed and passive: let go away from home, a joint stays where it is, without torque."""
+    """Armed and passive: released away from the start pose, a joint stays where it is, without torque."""
     rig.arm()
     rig.drive({0: (Mode.POSITION, rig.home_rad[0] + t.STEP_RAD)}, rig.periods(t.SETTLE_S))
     record = rig.drive({0: (Mode.PASSIVE, 0.0)}, rig.periods(t.SETTLE_S))
@@ -71,14 +71,14 @@ def test_joints_may_be_in_different_modes_at_once(rig: Rig) -> None:
 
 
 def test_set_points_hold_until_the_next_ones(rig: Rig) -> None:
-    """Commands may stay away for less than a lease: the joint goes on as it was told."""
+    """Without commands for less than a lease the joint keeps its set-point."""
     rig.cruise()
     rig.idle(t.LAPSE_PERIODS)
     must_cruise(rig)
 
 
 def test_set_points_hold_without_being_handed_over_again(rig: Rig) -> None:
-    """`advance` alone lets the last set-points act."""
+    """`advance` alone keeps the last set-points active."""
     rig.cruise()
     for _ in range(t.HELD_PERIODS):
         rig.let_pass()

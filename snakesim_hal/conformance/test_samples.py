@@ -1,4 +1,4 @@
-"""Samples: what the sensors say at a tick."""
+"""Sensor samples of a tick."""
 
 import math
 from itertools import chain, pairwise
@@ -22,7 +22,7 @@ def test_joints_carry_the_tick_and_stamp_that_were_asked_for(rig: Rig, healthy: 
 
 
 def test_other_sensors_are_stamped_when_they_were_read(rig: Rig, healthy: Record) -> None:
-    """Never from the future, never older than delay, interval and transport explain; and in order."""
+    """Never from the future, never older than delay, interval and transport together; and in order."""
     for sensor in rig.robot.sensors:
         if sensor.key == keys.JOINTS:
             continue
@@ -55,7 +55,7 @@ def test_every_sample_survives_the_wire(healthy: Record) -> None:
 
 
 def test_every_joint_is_valid_and_fresh_at_every_tick(rig: Rig, healthy: Record) -> None:
-    """A healthy robot knows all its joints; a reading is at most a period old, besides the delay that is stated."""
+    """In normal operation all joints are known; a reading is at most a period old, besides the stated delay."""
     delay_s = next(sensor.delay_s for sensor in rig.robot.sensors if sensor.key == keys.JOINTS)
     oldest_ns = t.AGE_PERIODS * rig.period_ns + delay_s * 1e9
     for joints in healthy.joints:
@@ -64,7 +64,7 @@ def test_every_joint_is_valid_and_fresh_at_every_tick(rig: Rig, healthy: Record)
 
 
 def test_what_is_not_known_yet_is_not_reported_as_valid(rig: Rig) -> None:
-    """The very first sample: a joint is where it is found to be afterwards, or it is not valid."""
+    """The very first sample: a joint has the same angle as afterwards, or it is not valid."""
     for i, valid in enumerate(rig.first.joints.valid):
         away = rig.first.joints.angle_rad[i] - rig.home_rad[i]
         assert not valid or abs(away) < t.STILL_RAD, f"joint {i} was {away:+.3f} rad off and called valid"

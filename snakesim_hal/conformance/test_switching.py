@@ -15,7 +15,7 @@ NAMES = [f"{before.name}_to_{after.name}".lower() for before, after in PAIRS]
 def test_a_mode_switch_makes_no_jump(
     rig: Rig, switching: dict[tuple[Mode, Mode], Floats], before: Mode, after: Mode
 ) -> None:
-    """Every ordered pair of modes, with nothing large asked for: no tick changes the torque by a quarter of full."""
+    """Every ordered pair of modes, with small targets: no tick changes the torque by a quarter of the maximum."""
     most = t.BUMP_SHARE * rig.full_torque_nm[0]
     steps = np.abs(np.diff(switching[before, after]))
     assert steps.max() < most, f"torque changed by {steps.max():.2f} N·m in a tick; at most {most:.2f} N·m"

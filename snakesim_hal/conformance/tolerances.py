@@ -1,7 +1,7 @@
-"""Every number that the contract tests allow, and why. Transport counts in periods, mechanics in seconds.
+"""All tolerances of the contract tests, with their reasons. Transport in periods, mechanics in seconds.
 
 They are wide enough for a robot on a bus (quantised, a period late, armed module by module) and narrow enough that
-degrees, a wrong order or sign, a lost limit, or a joint that goes on moving cannot hide in them.
+degrees, a wrong order or sign, a missing limit, or a joint that goes on moving are detected.
 """
 
 # --- transport, in control periods -----------------------------------------------------------------------------
@@ -9,10 +9,10 @@ degrees, a wrong order or sign, a lost limit, or a joint that goes on moving can
 TRANSPORT_PERIODS = 2  # set-points act from the next sample's synchronisation on; the sample after that shows it
 ARMING_PERIODS = 15  # modules change their state one after another, and confirm it
 AGE_PERIODS = 1  # every joint is read every tick: a reading is of this tick, or of the one before
-LAPSE_PERIODS = 3  # how long commands stay away when set-points have to hold; less than a lease of five
-SENSOR_PERIODS = 3  # a sensor of its own rate may start late by this much, besides its delay and one interval
+LAPSE_PERIODS = 3  # without commands, when set-points have to hold; less than a lease of five
+SENSOR_PERIODS = 3  # a sensor with its own rate may start late by this much, besides its delay and one interval
 HELD_PERIODS = 5  # how long set-points have to hold without being handed over again: a lease
-CLOSING_PERIODS = 5  # for how long a closed backend is watched
+CLOSING_PERIODS = 5  # for how long a closed backend is observed
 ATTEMPTS = 3  # with host and controller in real time in one process, a busy machine may miss a lease of 100 ms
 
 # --- mechanics, in seconds -------------------------------------------------------------------------------------
@@ -21,7 +21,7 @@ SETTLE_S = 0.6  # bench4 let go at CRUISE is at rest after 0.3 s; a reached targ
 CRUISE_S = 0.3  # long enough to reach CRUISE_RAD_S, short enough to stay inside the limits of the joint
 PUSH_S = 0.5  # against a stop: the impact is over
 
-# --- what is asked for -----------------------------------------------------------------------------------------
+# --- commands --------------------------------------------------------------------------------------------------
 
 STEP_RAD = 0.2  # 11 degrees: hundreds of quantisation steps, well inside bench4's 0.6 rad
 CRUISE_RAD_S = 0.5
@@ -30,17 +30,17 @@ PUSH_SHARE = 0.08  # of full torque, in torque mode against the stop
 LIMIT_SHARE = 0.1  # of full torque, as the limit in the set-points...
 DEMAND_SHARE = 0.25  # ... while velocity mode asks for this much
 
-# --- how near is right -----------------------------------------------------------------------------------------
+# --- tolerances ------------------------------------------------------------------------------------------------
 
 REACHED_RAD = 0.03  # friction of joint and ground over stiffness, noise, quantisation (1e-4 rad)
-STILL_RAD = 0.02  # has not moved: a tenth of STEP_RAD, several times noise and what neighbours shake
+STILL_RAD = 0.02  # has not moved: a tenth of STEP_RAD, several times the noise and the vibration from neighbours
 STILL_RAD_S = 0.05  # is at rest: a tenth of CRUISE_RAD_S; quantisation is 1e-3 rad/s
 OVERSHOOT_RAD = 0.08  # beyond the joint's limit: a stop gives a little
-SPEED_SHARE = 0.35  # velocity mode is a gain, not an integrator: friction takes its part
+SPEED_SHARE = 0.35  # velocity mode is a gain, not an integrator: friction reduces the speed
 INTEGRAL_RAD = 0.03  # angle against integrated velocity: sampling, and a period of disagreement
-TORQUE_SHARE = 0.15  # of the torque asked for; gauges and motor constants are not better
+TORQUE_SHARE = 0.15  # of the commanded torque; gauges and motor constants are not better
 TORQUE_NM = 0.06  # besides: friction between motor and gauge, noise, quantisation (1e-3 N·m, limits 1e-2 N·m)
-# Of full torque, in a tick, while nothing large is asked for. The gate's start is up to two periods old on a bus: at
-# these speeds that is a tenth. A target that is not bumpless, or a motor that starts anew, makes several tenths.
+# Of full torque, in a tick, with small targets. The gate's start is up to two periods old on a bus: at
+# these speeds that is a tenth. A target that is not bumpless, or a motor that restarts, makes several tenths.
 BUMP_SHARE = 0.25
 RATE_SHARE = 0.3  # of a sensor's stated rate

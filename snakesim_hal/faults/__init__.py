@@ -1,6 +1,6 @@
-"""Carries out faults on request; their words stand in `model.injection`.
+"""Carries out injected faults; their vocabulary is in `model.injection`.
 
-`injector`        one per process: what is planned and what is asked for, at its time
-`message_faults`  lost, late, doubled and damaged messages; `disturbance` is their arithmetic
-`faulty_backend`  any backend, with what goes wrong at its joints; `host_faults` puts both into a host
+`injector`        one per process: planned and requested faults, at their times
+`message_faults`  lost, late, duplicated and corrupted messages; `disturbance` is the pure part
+`faulty_backend`  wraps any backend, with faults of its joints; `host_faults` puts both into a host
 """

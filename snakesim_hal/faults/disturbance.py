@@ -1,7 +1,7 @@
-"""What goes wrong with the messages of one key on their way out: which go now, which later, and with what bytes.
+"""Injected faults of the messages of one key: which are sent now, which later, and with which bytes.
 
-Pure: is given payloads, the time and a seed; says what to send. In this order: bytes are changed, messages get lost,
-come twice, change places, come late; a flood repeats the newest. What is late keeps its order.
+Pure: payloads, the time and a seed in; payloads to send out. In this order messages are corrupted, dropped,
+duplicated, reordered, delayed; a flood repeats the newest. Delayed messages keep their order.
 """
 
 import random
@@ -11,8 +11,8 @@ from math import inf
 
 from snakesim_hal.model.injection import Injection
 
-MAX_AT_ONCE = 256  # repeats of a flood in one go: after a hiccup of this process the rest of it is left out
-LONGEST_BURST = 64  # bytes that are put in, or taken from elsewhere in the message
+MAX_AT_ONCE = 256  # repeats of a flood at once: after a delay of this process the others are skipped
+LONGEST_BURST = 64  # bytes that are inserted, or copied from elsewhere in the message
 DOUBLE = 0xCB  # MessagePack's mark of a float64
 NASTY_DOUBLES = (float("nan"), inf, -inf, 1e308, -1e308, 5e-324, -0.0)
 
@@ -23,20 +23,20 @@ class Disturbance:
     def __init__(self, seed: str) -> None:
         self._random = random.Random(seed)
         self._on: dict[str, float] = {}  # kind -> amount
-        self._held: bytes | None = None  # waits for the message that is to overtake it
+        self._held: bytes | None = None  # held back until the next message has overtaken it
         self._late: deque[tuple[float, bytes]] = deque()
         self._newest: bytes | None = None
-        self._repeat_s = inf  # when the flood comes again
+        self._repeat_s = inf  # time of the next repeat of a flood
 
     def begin(self, injection: Injection, now_s: float) -> None:
-        """One more thing goes wrong; of a kind that is on already, the new amount counts."""
+        """Begin a fault; for an active kind, the new amount replaces the old."""
         assert injection.amount is not None, f"{injection} was not checked"
         self._on[injection.kind] = injection.amount
         if injection.kind == "flood":
             self._repeat_s = now_s
 
     def end(self, kind: str, now_s: float) -> list[bytes]:
-        """It is over. What to send now; what is late still comes late."""
+        """End a fault. Returns payloads to send now; delayed ones still come later."""
         self._on.pop(kind, None)
         if kind == "flood":
             self._repeat_s = inf
@@ -47,18 +47,18 @@ class Disturbance:
 
     @property
     def over(self) -> bool:
-        """Whether nothing goes wrong any more, and nothing is under way."""
+        """Whether no fault is active, and nothing is pending."""
         return not self._on and not self._late
 
     def put(self, payload: bytes, now_s: float) -> list[bytes]:
-        """A message of the writer. What to send now."""
+        """Take a message of the writer. Returns payloads to send now."""
         if self._newest is None:
             self._repeat_s = max(self._repeat_s, now_s)
         self._newest = payload
         return self._passed(payload, now_s)
 
     def due(self, now_s: float) -> list[bytes]:
-        """What was kept for later, or is repeated, and has to be sent by now."""
+        """Delayed or repeated payloads that are due."""
         out: list[bytes] = []
         while self._late and self._late[0][0] <= now_s:
             out.append(self._late.popleft()[1])
@@ -95,7 +95,7 @@ class Disturbance:
         return share > 0.0 and self._random.random() < share
 
     def _delayed(self, payloads: list[bytes], now_s: float) -> list[bytes]:
-        """Later than what is late already, so that nothing overtakes."""
+        """Queue payloads behind the delayed ones, so that the order is kept."""
         delay_s = self._on.get("delay", 0.0)
         if not delay_s and not self._late:
             return payloads
@@ -105,7 +105,7 @@ class Disturbance:
 
 
 def spoilt(payload: bytes, rng: random.Random) -> bytes:
-    """Other bytes: some flipped, cut off, put in, taken from elsewhere, a number that is none, or nothing but noise."""
+    """A corrupted payload: bytes flipped, cut off, inserted or copied, a NaN, or pure noise."""
     data = bytearray(payload)
     match rng.randrange(7):
         case 0 if data:

@@ -1,7 +1,7 @@
-"""Any backend, and what goes wrong with its joints, buses and simulator on request.
+"""Wraps any backend, with injected faults of its joints, buses and simulator.
 
-The backend is asked first: it can let things go wrong more truly. What it does not know is done here to its samples, as
-far as that can be, or refused.
+The backend comes first: it injects faults more realistically. Other kinds are applied to its samples here, if
+possible, or refused.
 """
 
 import time
@@ -23,12 +23,12 @@ class FaultyBackend:
     def __init__(self, inner: Backend) -> None:
         self._inner = inner
         self._description = inner.describe()
-        self._on: dict[int, dict[str, Injection]] = {}  # joint -> kind -> what is done here
-        self._last: JointState | None = None  # as told
-        self._share: float | None = None  # of real time that the simulator keeps
+        self._on: dict[int, dict[str, Injection]] = {}  # joint -> kind -> fault applied here
+        self._last: JointState | None = None  # as returned
+        self._share: float | None = None  # of real time, speed of a slowed simulator
 
     def inject(self, injection: Injection, begins: bool) -> None:
-        """Begin or end a fault. Raises ConfigError for one that cannot be had here."""
+        """Begin or end a fault. Raises ConfigError for one that is not supported."""
         if injection.target == "simulator" and injection.kind == "slow":
             self._slow_down(injection, begins)
         elif isinstance(self._inner, Injectable) and self._inner.inject(injection, begins=begins):
@@ -39,11 +39,11 @@ class FaultyBackend:
             raise ConfigError(f"backend {self._description.backend!r} cannot do {injection.kind} to {injection.target}")
 
     def describe(self) -> Description:
-        """As the backend says."""
+        """As the backend does."""
         return self._description
 
     def sample(self, tick: int, stamp_ns: int) -> Samples:
-        """What the backend's sensors gave, or what is made of it."""
+        """The backend's samples, with the active faults applied."""
         samples = self._inner.sample(tick, stamp_ns)
         if self._on:
             samples = Samples(self._disturbed(samples.joints), samples.others)
@@ -55,7 +55,7 @@ class FaultyBackend:
         self._inner.enact(set_points, lifecycle)
 
     def advance(self) -> None:
-        """As the backend does, at a share of real time if that is asked for."""
+        """As the backend does, at a share of real time if requested."""
         began = time.monotonic()
         self._inner.advance()
         if self._share is not None:
@@ -63,18 +63,18 @@ class FaultyBackend:
             time.sleep(max(began + takes_s - time.monotonic(), 0.0))
 
     def faults(self) -> list[Fault]:
-        """As the backend says."""
+        """As the backend does."""
         return self._inner.faults()
 
     def close(self) -> None:
         """As the backend does."""
         self._inner.close()
 
-    # --- what is done here -----------------------------------------------------------------------------------
+    # --- faults applied here ---------------------------------------------------------------------------------
 
     def _slow_down(self, injection: Injection, begins: bool) -> None:
         if not self._description.emulated:
-            raise ConfigError(f"backend {self._description.backend!r} simulates nothing that could be slow")
+            raise ConfigError(f"backend {self._description.backend!r} has no simulation that could be slow")
         self._share = injection.amount if begins else None
 
     def _disturb(self, injection: Injection, begins: bool) -> None:

@@ -1,4 +1,4 @@
-"""Faults on request in the host: around its backend, and in what it publishes; kept for the record, with their tick."""
+"""Injected faults in the host: of its backend, and of its messages; recorded with their tick."""
 
 from snakesim_hal.backend import Backend
 from snakesim_hal.faults.faulty_backend import FaultyBackend
@@ -13,7 +13,7 @@ MAX_KEPT = 10_000
 
 
 class HostFaults:
-    """What goes wrong with the host on request. `backend` is the one to use."""
+    """Injected faults of the host. Use `backend` instead of the original one."""
 
     def __init__(self, config: RunConfig, backend: Backend, session: Session, authority: Authority) -> None:
         """Raises ConfigError when faults are planned where something real moves."""
@@ -30,17 +30,17 @@ class HostFaults:
         self._injector.allow(emulated=emulated, faults_allowed=config.faults_allowed)
 
     def turn(self, tick: int) -> None:
-        """Begin and end what is due, answer who asks, and hang as long as that is asked for."""
+        """Begin and end due faults, answer requests, and hang if requested."""
         self._tick = tick
         self._injector.turn(tick * self._period_ns, self._authority.arming, self._authority.state)
 
     @property
     def on(self) -> list[str]:
-        """What is wrong now."""
+        """Active faults."""
         return self._injector.on
 
     def close(self) -> None:
-        """Send nothing more that is late."""
+        """Drop delayed messages."""
         self._injector.close()
 
     def _note(self, text: str, _now_s: float) -> None:

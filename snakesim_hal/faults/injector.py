@@ -1,7 +1,7 @@
-"""Carries out one part's faults on request: those that the run has planned, and those that somebody asks for.
+"""Carries out one part's injected faults: those planned by the run, and those requested on the network.
 
-Every part of a run has one: the host, and each service. Times are robot time, so that lockstep repeats them. What is
-planned counts from the first arming. A part that was started anew while the robot was armed has no plan any more.
+Every part of a run has one: the host, and each service. Times are robot time, so that lockstep repeats them. Planned
+times are relative to the first arming. A part that was restarted while the robot was armed drops its plan.
 """
 
 import time
@@ -23,23 +23,23 @@ from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import Answer, Clock, FaultRequest, LifecycleState
 
 HALF_A_NANOSECOND = 0.5e-9
-HOW_TO_ALLOW = "something real moves here; set `faults_allowed = true` in the scenario if that is what you want"
+HOW_TO_ALLOW = "something real moves here; to allow it set `faults_allowed = true` in the scenario"
 
 CarryOut = Callable[[Injection, bool], None]  # the second: whether it begins, or ends. Raises ConfigError
 
 
 def nothing_more(injection: Injection, _begins: bool) -> None:
-    """For a part that can only disturb its messages and hang."""
+    """For a part that supports only message faults and `hang`."""
     raise ConfigError(f"{injection.part} cannot do {injection.kind} to {injection.target}")
 
 
 def print_note(text: str, now_s: float) -> None:
-    """For a part whose words go to a log."""
-    complain(f"{now_s:.3f} s: on request, {text}")
+    """For a part that reports to a log."""
+    complain(f"{now_s:.3f} s: injected: {text}")
 
 
 class Injector:
-    """Of one part. Call `turn` once in every round of the part's loop."""
+    """The injector of one part. Call `turn` once in every cycle of the part's loop."""
 
     def __init__(
         self,
@@ -52,17 +52,17 @@ class Injector:
         note: Callable[[str, float], None] = print_note,
         refused: Callable[[str], None] = lambda _text: None,
     ) -> None:
-        """Declares the part's key; nothing is allowed before `allow` was called.
+        """Declares the part's key; nothing is allowed before a call of `allow`.
 
-        newest: the clock as it goes on while this part hangs; None: this part is the clock, and wall time stands in.
-        note: is told what begins and ends, and when; refused: what was planned and cannot be done.
+        newest: the newest clock, also while this part hangs; None: this part is the clock, and wall time is used.
+        note: called with each begin and end, and its time; refused: called with planned faults that are not possible.
         """
         self.part = part
         self._messages = MessageFaults(session, config.seed)
         self._carry_out, self._newest, self._note, self._refused = carry_out, newest, note, refused
         self._allowed = False
         self._planned = Plan(injection for injection in planned(config) if injection.part == part)
-        self._ends: list[tuple[float, Injection]] = []  # of what was asked for, and when
+        self._ends: list[tuple[float, Injection]] = []  # when requested faults end
         self._on: dict[tuple[str, str], Injection] = {}
         self._decoder = Decoder(FaultRequest)
         self._questions: SimpleQueue[Question] = SimpleQueue()
@@ -73,17 +73,17 @@ class Injector:
 
     @property
     def on(self) -> list[str]:
-        """What is wrong now, on request."""
+        """Active injected faults."""
         return [str(injection) for injection in self._on.values()]
 
     def allow(self, *, emulated: bool, faults_allowed: bool) -> None:
-        """Only where nothing real moves, or where the run says so. Raises ConfigError when more is planned."""
+        """Allow faults where nothing real moves, or if the run allows them. Raises ConfigError for planned ones."""
         self._allowed = emulated or faults_allowed
         if not self._allowed and self._planned.next_s() != inf:
             raise ConfigError(f"`faults` are planned, and {HOW_TO_ALLOW}; otherwise leave them out")
 
     def turn(self, stamp_ns: int, arming: int, lifecycle: LifecycleState) -> None:
-        """At a tick: begin and end what is due, answer who asks, and hang as long as that is asked for."""
+        """At a tick: begin and end due faults, answer requests, and hang if requested."""
         now_s = stamp_ns / 1e9
         self._lifecycle = lifecycle
         if arming and self._first_armed_s is None:
@@ -96,11 +96,11 @@ class Injector:
             self._hang(now_s)
 
     def idle(self) -> None:
-        """Answer who asks although no tick comes."""
+        """Answer requests while no tick comes."""
         self._answer_all(self._newest_s(0.0))
 
     def close(self) -> None:
-        """Send nothing more that is late."""
+        """Drop delayed messages."""
         self._messages.close()
 
     # --- time ------------------------------------------------------------------------------------------------
@@ -134,7 +134,7 @@ class Injector:
                 self._note(f"{change.injection} is refused: {error}", now_s)
                 self._refused(f"{change.injection} is refused: {error}")
 
-    # --- what is asked for -----------------------------------------------------------------------------------
+    # --- requests --------------------------------------------------------------------------------------------
 
     def _answer_all(self, now_s: float) -> None:
         while True:
@@ -153,11 +153,11 @@ class Injector:
 
     def _answer(self, request: FaultRequest, now_s: float) -> Answer:
         if not self._allowed:
-            return self._no(f"faults on request are not allowed: {HOW_TO_ALLOW}", "not_allowed")
+            return self._no(f"fault injection is not allowed: {HOW_TO_ALLOW}", "not_allowed")
         start_s, for_s = self._since_arming_s(now_s), inf if request.for_s is None else request.for_s
         injection = checked(Injection(request.kind, request.target, start_s, start_s + for_s, request.amount))
         if injection.part != self.part:
-            return self._no(f"{injection.kind} of {injection.target} is for {injection.part} to do", "wrong_part")
+            return self._no(f"{injection.kind} of {injection.target} is carried out by {injection.part}", "wrong_part")
         if not request.end:
             self._begin(injection, now_s)
             if for_s != inf and not injection.about.once:
@@ -168,14 +168,14 @@ class Injector:
         was = self._on.get((injection.kind, injection.target))
         if was is None:
             on = ", ".join(self.on) or "nothing"
-            return self._no(f"{injection.kind} of {injection.target} is not on; on is {on}", "wrong_state")
+            return self._no(f"{injection.kind} of {injection.target} is not active; active: {on}", "wrong_state")
         self._end(was, now_s)
         return Answer(ok=True, reason=f"{injection.kind} of {injection.target} has ended")
 
     def _no(self, reason: str, refusal: str) -> Answer:
         return Answer(ok=False, reason=reason[:500], refusal=refusal)
 
-    # --- what happens ----------------------------------------------------------------------------------------
+    # --- faults ----------------------------------------------------------------------------------------------
 
     def _begin(self, injection: Injection, now_s: float) -> None:
         if injection.target_type == "key":
@@ -187,7 +187,7 @@ class Injector:
         self._note(f"{injection} {'happens' if injection.about.once else 'begins'}", now_s)
 
     def _end(self, injection: Injection, now_s: float) -> None:
-        """A newer one of the same kind has taken its place, or somebody has ended it: then there is nothing to do."""
+        """End a fault, unless a newer one of the same kind has replaced it, or a request has ended it."""
         place = injection.kind, injection.target
         if self._on.get(place) is not injection:
             return
@@ -202,7 +202,7 @@ class Injector:
         return any(kind == "hang" for kind, _ in self._on)
 
     def _hang(self, began_s: float) -> None:
-        """Keep the interpreter busy. Only the end of it is heard."""
+        """Keep the interpreter busy. Only a request to end it is processed."""
         began = time.monotonic()
         while self._hangs():
             wall_s = began_s + time.monotonic() - began

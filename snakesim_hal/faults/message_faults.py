@@ -1,7 +1,7 @@
-"""Disturbs what this process publishes: the shell around `disturbance`, between a publisher and Zenoh.
+"""Message faults of this process: applies `disturbance` between a publisher and Zenoh.
 
-A publisher without a fault is not touched. What has to be sent later is sent by a thread that is there only as long as
-something is late or a flood is on.
+A publisher without a fault is not touched. A thread sends delayed messages; it exists only while messages are delayed
+or a flood is active.
 """
 
 import threading
@@ -13,24 +13,24 @@ from snakesim_hal.faults.disturbance import Disturbance
 from snakesim_hal.model.injection import Injection
 from snakesim_hal.network.session import Session
 
-SHORTEST_PAUSE_S = 0.001  # floods are sent in bursts, so that the thread does not take the interpreter for itself
+SHORTEST_PAUSE_S = 0.001  # floods are sent in bursts, so that the thread does not block the interpreter
 
 
 @dataclass
 class Line:
-    """One key's way out."""
+    """The outgoing messages of one key."""
 
     faults: "MessageFaults"
     key: str
     disturbance: Disturbance
 
     def put(self, payload: bytes) -> None:
-        """Stands in for the publisher's own."""
+        """Replaces the publisher's own `put`."""
         self.faults.put(self, payload)
 
 
 class MessageFaults:
-    """Everything that is wrong with the messages of one session. Safe to use from several threads."""
+    """All message faults of one session. Thread-safe."""
 
     def __init__(self, session: Session, seed: int) -> None:
         self._session, self._seed = session, seed
@@ -40,7 +40,7 @@ class MessageFaults:
         self._closed = False
 
     def begin(self, injection: Injection) -> None:
-        """From now on."""
+        """Begin a fault."""
         with self._changed:
             key = injection.target
             line = self._lines.get(key)
@@ -51,7 +51,7 @@ class MessageFaults:
             self._see_to(line)
 
     def end(self, injection: Injection) -> None:
-        """No longer; what is under way still arrives."""
+        """End a fault; pending messages are still sent."""
         with self._changed:
             line = self._lines.get(injection.target)
             if line is not None:
@@ -59,13 +59,13 @@ class MessageFaults:
                 self._see_to(line)
 
     def put(self, line: Line, payload: bytes) -> None:
-        """A message on its way."""
+        """Take a message of the writer."""
         with self._changed:
             self._send(line, line.disturbance.put(payload, time.monotonic()))
             self._see_to(line)
 
     def close(self) -> None:
-        """Send nothing more that is late. Call it before the session is closed."""
+        """Drop delayed messages. Call it before the session is closed."""
         with self._changed:
             self._closed = True
             self._changed.notify()
@@ -80,7 +80,7 @@ class MessageFaults:
             self._session.send(line.key, payload)
 
     def _see_to(self, line: Line) -> None:
-        """Let go of a line on which all is well again; have somebody send later what is due later."""
+        """Release a line without faults; start the thread for delayed messages."""
         if line.disturbance.over:
             if self._lines.get(line.key) is line:
                 self._session.reroute(line.key, None)

@@ -1,12 +1,12 @@
-"""The black box: every tick of a run as the host saw it, in memory of fixed size that `recorder` empties to disk.
+"""The black box: every tick of a run, in a ring buffer of fixed size that `recorder` writes to disk.
 
-A tick costs one packed copy into memory that was allocated before the run. When nobody empties it, because the disk is
+A tick costs one packed copy into memory that was allocated before the run. If it is not emptied, because the disk is
 full or hangs, the newest rows are kept.
 
-On disk it is one flat file: a line of JSON that names the columns, then the rows. `read_black_box` reads it, also when
-its last row is torn, as after a SIGKILL.
+On disk it is one flat file: a line of JSON that names the columns, then the rows. `read_black_box` reads it, also with
+an incomplete last row, as after a SIGKILL.
 
-`command_digest` is a hash over every set-point as applied, so two runs with one digest drove the motors alike.
+`command_digest` is a hash over every applied set-point, so runs with equal digests drove the motors equally.
 """
 
 import hashlib
@@ -40,27 +40,27 @@ class Column(msgspec.Struct, frozen=True):
 
     @property
     def format(self) -> Any:
-        """As NumPy writes it."""
+        """NumPy dtype."""
         return self.type if self.width is None else (self.type, (self.width,))
 
     @property
     def bytes(self) -> int:
-        """In each row."""
+        """Size in each row."""
         return np.dtype(self.format).itemsize
 
 
 class Layout(msgspec.Struct, frozen=True, kw_only=True):
-    """The first line of the file: what stands in a row."""
+    """The first line of the file: the columns of a row."""
 
     format: Literal["snakesim.blackbox/1"] = "snakesim.blackbox/1"
     robot: str
     joints: list[str]  # the order within a column
     row_bytes: Annotated[int, Meta(ge=1, le=2**20)]
-    columns: list[Column]  # one after the other; what is left of the row is padding
+    columns: list[Column]  # in order; the rest of the row is padding
 
     @staticmethod
     def of(robot: Description) -> "Layout":
-        """What the host records of a robot. Units stand in the names; vectors are in the frame that `Pose` says."""
+        """The columns for a robot. Names contain the units; vectors are in the frame of `Pose`."""
         joints = len(robot.joints)
         each = ("angle_rad", "velocity_rad_s", "torque_nm", "target", "torque_limit_nm")
         columns = [
@@ -98,23 +98,23 @@ class Layout(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class BlackBox:
-    """A row a tick; holds the newest ones until they are taken."""
+    """A row a tick; keeps the newest rows until they are read."""
 
     def __init__(self, description: Description, memory_bytes: int = MEMORY_BYTES) -> None:
         self.layout = Layout.of(description)
         joints = len(description.joints)
         self._pack_into = struct.Struct(f"<qd{5 * joints + 9}d{joints}b").pack_into
         self._capacity = max(memory_bytes // self.layout.row_bytes, 2)
-        self._memory = bytearray(b"\0") * (self._capacity * self.layout.row_bytes)  # touched: no page is missing later
+        self._memory = bytearray(b"\0") * (self._capacity * self.layout.row_bytes)  # touched: no page faults
         self._rows = 0
         self._digest = hashlib.sha256()
-        self._pack_told = struct.Struct(f"<q{joints}b{2 * joints}d").pack
+        self._pack_set_points = struct.Struct(f"<q{joints}b{2 * joints}d").pack
         self._pose = [np.nan] * 7
         self._contact_peak_n = 0.0
         self._contact_count = 0
 
     def record(self, tick: int, stamp_ns: int, samples: Samples, decision: Decision) -> None:
-        """Keep one tick."""
+        """Record one tick."""
         pose = samples.others.get(keys.POSE)
         if isinstance(pose, Pose):
             self._pose = [*pose.position_w, *pose.orientation_wxyz]
@@ -139,12 +139,12 @@ class BlackBox:
             self._contact_count,
             *points.mode,
         )
-        self._digest.update(self._pack_told(tick, *points.mode, *points.target, *points.torque_limit_nm))
-        self._rows += 1  # last: another thread takes what is counted
+        self._digest.update(self._pack_set_points(tick, *points.mode, *points.target, *points.torque_limit_nm))
+        self._rows += 1  # last: another thread reads the counted rows
 
     @property
     def ticks(self) -> int:
-        """Rows recorded so far, taken or not."""
+        """Rows recorded so far, read or not."""
         return self._rows
 
     @property
@@ -155,12 +155,12 @@ class BlackBox:
     def rows_from(self, row: int) -> tuple[int, bytes]:
         """Some rows from number `row` on, or from the oldest that is still kept: the first one's number, and the rows.
 
-        May be called from another thread: what is returned is whole, also while the host goes on.
+        May be called from another thread: the rows are consistent, also while the host goes on.
         """
         size = self.layout.row_bytes
         while True:
             end = self._rows
-            first = max(row, end - self._capacity + 1)  # the oldest place may be written to right now
+            first = max(row, end - self._capacity + 1)  # the oldest row may be overwritten right now
             at = first % self._capacity
             count = min(end - first, self._capacity - at, max(TAKEN_BYTES // size, 1))
             rows = bytes(memoryview(self._memory)[at * size : (at + count) * size])
@@ -169,7 +169,7 @@ class BlackBox:
 
 
 def read_black_box(path: Path) -> tuple[Layout, dict[str, NDArray[Any]]]:
-    """Every whole row of a file that `recorder` wrote. Raises ConfigError when it is none."""
+    """Every complete row of a file that `recorder` wrote. Raises ConfigError for any other file."""
     try:
         with path.open("rb") as file:
             line = file.readline(HEADER_LIMIT)
@@ -180,7 +180,7 @@ def read_black_box(path: Path) -> tuple[Layout, dict[str, NDArray[Any]]]:
 
 
 def digest_of(columns: dict[str, NDArray[Any]]) -> str:
-    """`command_digest` worked out anew from what was recorded, for a host that could not tell it any more."""
+    """`command_digest` recomputed from recorded rows, for a host that was killed."""
     names = {"tick": "<i8", "mode": "|i1", "target": "<f8", "torque_limit_nm": "<f8"}
     dtype = [(name, type_, columns[name].shape[1:]) for name, type_ in names.items()]
     packed = np.empty(len(columns["tick"]), dtype=dtype)

@@ -1,7 +1,7 @@
-"""Any backend, with one way to fail: whatever goes wrong inside becomes a `BackendError` that names the call.
+"""Wraps any backend: every exception inside becomes a `BackendError` that names the call.
 
-So an I/O error, or a defect in somebody's backend, ends in a safe stop with a record, and never in a bare end of the
-host.
+So an I/O error, or a defect in a third-party backend, leads to a safe stop with a record, and never to an uncontrolled
+end of the host.
 """
 
 import functools
@@ -23,7 +23,7 @@ def _guarded(method: MethodT) -> MethodT:
             return method(self, *arguments, **named)
         except SnakesimError:
             raise
-        except Exception as error:  # a backend is somebody else's code, and the host must outlive it
+        except Exception as error:  # third-party code, which must not end the host
             where = f"{self.name}.{method.__name__}"
             raise BackendError(f"{where} failed: {type(error).__name__}: {error}") from error
 
@@ -69,5 +69,5 @@ class GuardedBackend:
 
     @_guarded
     def inject(self, injection: Injection, *, begins: bool) -> bool:
-        """As the backend does, if it can let things go wrong by itself."""
+        """As the backend does, if it injects faults itself."""
         return isinstance(self._inner, Injectable) and self._inner.inject(injection, begins=begins)

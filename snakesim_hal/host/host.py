@@ -1,10 +1,10 @@
 """The HAL host: runs any backend, tick by tick, and is the only process that touches it.
 
 A tick: sample the sensors, publish them, publish the clock, wait for the command that answers them, let the authority
-decide, hand the set-points to the backend, let a period pass. How long it waits is the pace:
+decide, hand the set-points to the backend, let a period pass. The pace decides how long it waits:
 
-realtime  until the tick's deadline on the monotonic clock; an old command goes on until its lease ends
-lockstep  until every participant that owes something has delivered; frozen at tick 0 until the first arming
+realtime  until the tick's deadline on the monotonic clock; an old command stays active until its lease ends
+lockstep  until every participant whose output is due has delivered; stays at tick 0 until the first arming
 free      not at all
 """
 
@@ -49,14 +49,14 @@ from snakesim_hal.wire.messages import (
     Status,
 )
 
-# Not yet; as many armed ticks as were asked for; on request (`finish`); by a signal; a fault, or too little armed time.
+# Not yet; after the requested armed ticks; on request (`finish`); by a signal; by a fault, or too little armed time.
 Ending = Literal["running", "complete", "finished", "stopped", "failed"]
 STATUS_PERIOD_NS = 200_000_000
 STANDBY_PERIOD_NS = 20_000_000
-STATUS_GAP_NS = 10_000_000  # of what changes again and again, such as a lease that people fight for
-TAKEN_SHARE = 0.25  # of a period, for what came in late: a flood must not take the whole
+STATUS_GAP_NS = 10_000_000  # between status messages for frequent changes, such as a contested lease
+TAKEN_SHARE = 0.25  # of a period, for late arrivals: a flood must not take all of it
 MAX_REQUESTS_KEPT = 256
-RECORDED_AFTER_NS = 2_000_000_000  # what follows the last armed tick, in a host that stays
+RECORDED_AFTER_NS = 2_000_000_000  # recorded after the last armed tick, in a host that stays
 
 
 class Host:
@@ -77,10 +77,10 @@ class Host:
     ) -> None:
         """max_ticks: end this many ticks after the first arming; None: go on until asked to finish.
 
-        end_after_fault_s: end so long after a fault; None: stay, so that a person can clear it.
-        stay: also when others come between, of which a moment is recorded; else so many ticks after the first arming.
-        latch: keeps an emergency stop for the host that comes after this one.
-        starter: the private channel to whoever started this host.
+        end_after_fault_s: end this long after a fault; None: stay, so that a person can clear it.
+        stay: count only armed ticks, and record little in between; else count all ticks from the first arming.
+        latch: stores an emergency stop for later hosts.
+        starter: the private channel to the process that started this host.
         realtime_warnings: real-time measures that the system refused.
         """
         described = msgspec.structs.replace(backend.describe(), host=secrets.token_hex(8))
@@ -88,7 +88,7 @@ class Host:
         self.authority = Authority(self.description, first_epoch=time.time_ns() // 1_000_000)
         self.black_box = BlackBox(self.description)
         self.statistics = RunStatistics()
-        self.requests: list[str] = []  # who asked to arm, disarm, clear, finish or stop, and what became of it
+        self.requests: list[str] = []  # who requested to arm, disarm, clear, finish or stop, and the result
         self.participants = Participants(config.services)
         self._config = config
         self.faults = HostFaults(config, GuardedBackend(backend), session, self.authority)
@@ -109,8 +109,8 @@ class Host:
         self._last_armed_tick = 0
         self._other_hosts: set[str] = set()
         self._network_faults: set[str] = set()
-        self._answered = -1  # newest tick that a good command answered
-        self._advance_ns = 0.0  # how long a period takes the backend, smoothed
+        self._answered = -1  # newest tick that an accepted command answered
+        self._advance_ns = 0.0  # duration of the backend's `advance`, smoothed
         self._stopping = False
         self.ended: Ending = "running"
         self.ended_why = ""
@@ -132,17 +132,17 @@ class Host:
         self._end("stopped", "by a signal")
 
     def _end(self, ended: Ending, why: str = "") -> None:
-        """End the run in order. What came first is why."""
+        """End the run in order. The first reason is kept."""
         if self.ended == "running":
             self.ended, self.ended_why = ended, why
         self._stopping = True
 
     def take_stop(self, who: str, reply: Callable[[str], None]) -> None:
-        """An emergency stop that came past the network; from any thread."""
-        self.ask(EstopRequest(who=who[:64] or "somebody"), lambda answer: reply(answer.reason))
+        """An emergency stop from the stop port; from any thread."""
+        self.ask(EstopRequest(who=who[:64] or "an unnamed client"), lambda answer: reply(answer.reason))
 
     def ask(self, request: Request, reply: Callable[[Answer], None]) -> None:
-        """A request that came past the network; from any thread."""
+        """A request that does not come over the network; from any thread."""
         self._inbox.ask(request, reply)
 
     def run(self) -> None:
@@ -169,7 +169,7 @@ class Host:
                 self._wait_for_answers(last)
                 self._finish_tick(last)
         finally:
-            self._end("failed", "by an error of its own; host.log has it")
+            self._end("failed", "by an internal error; see host.log")
             self._ended_ns = time.monotonic_ns()
             self.authority.on_lifecycle(LifecycleRequest(action="finish", who="the host"), self._safety_now())
             with contextlib.suppress(BackendError):
@@ -193,7 +193,7 @@ class Host:
     # --- one tick ------------------------------------------------------------------------------------------
 
     def _sample(self, last: Samples | None) -> Samples | None:
-        """Sensors of this tick. While frozen at tick 0 the same sample serves again."""
+        """Samples of this tick. While waiting at tick 0 the same sample is used again."""
         if last is not None and self._published.last_tick == self._tick:
             return last
         try:
@@ -265,7 +265,7 @@ class Host:
                 self.statistics.overruns += 1
 
     def _recorded(self) -> bool:
-        """Whether this tick belongs into the black box: a host that stays must not fill memory while it waits."""
+        """Whether to record this tick: a host that stays must not fill memory while it waits."""
         waited_ns = (self._tick - self._last_armed_tick) * self._period_ns
         return self.authority.arming > 0 and not (self._stay and waited_ns > RECORDED_AFTER_NS)
 
@@ -284,7 +284,7 @@ class Host:
         give_up_ns = time.monotonic_ns() + round(self._config.stall_limit_s * 1e9)
         while (behind := self.participants.behind(self._tick)) and not self._stopping:
             left_ns = give_up_ns - time.monotonic_ns()
-            if self._published_arming != self.authority.arming:  # armed in this very tick: tell everybody
+            if self._published_arming != self.authority.arming:  # armed in this tick: publish it
                 self._publish(samples)
             if left_ns > 0:
                 self._inbox.take(min(left_ns * 1e-9, 0.5))
@@ -293,13 +293,13 @@ class Host:
                 continue
             for name in behind:
                 self.participants[name].given_up = True
-                cause = f"{name} owes tick {self._tick} for {self._config.stall_limit_s:g} s; not waited for any more"
+                cause = f"{name} is {self._config.stall_limit_s:g} s late with tick {self._tick}; no longer waited for"
                 self.authority.note(Fault(tick=self._tick, what="service_stalled", cause=cause))
 
-    # --- what comes in -------------------------------------------------------------------------------------
+    # --- inputs --------------------------------------------------------------------------------------------
 
     def take_command(self, command: JointCommand, monotonic_ns: int) -> None:
-        """A command, and when it came."""
+        """A command, and its time of arrival."""
         if command.lease_epoch == self.authority.lease.epoch and self.authority.answers_arming(command):
             self._delivered(self.authority.lease.holder, command.tick)
         safety_ns, published_ns = self._published.of(command.tick)
@@ -311,7 +311,7 @@ class Host:
                 self.statistics.state_to_command.add((monotonic_ns - published_ns) / 1000)
 
     def take_done(self, service: str, tick: int) -> None:
-        """A service owes nothing more for a tick."""
+        """A service has completed a tick."""
         self._delivered(service, tick)
 
     def _delivered(self, service: str | None, tick: int) -> None:
@@ -319,7 +319,7 @@ class Host:
             self.participants.delivered(service, tick)
 
     def refuse(self, error: WireError) -> Answer:
-        """Something cannot be decoded."""
+        """A message cannot be decoded."""
         self.authority.reject(error.reason)
         return Answer(
             ok=False,
@@ -330,10 +330,10 @@ class Host:
         )
 
     def answer(self, request: Request, reply: Callable[[Answer], None]) -> None:
-        """Somebody asks for the lease, for another state, or for a stop."""
+        """A request for the lease, for another state, or for a stop."""
         now_ns = self._safety_now()
         if isinstance(request, LeaseRequest):
-            self.authority.expire(now_ns, self._tick)  # first, so that nobody takes over what is a fault
+            self.authority.expire(now_ns, self._tick)  # first: an expired lease is a fault
             answer = self.authority.on_lease(request, now_ns)
         elif isinstance(request, EstopRequest):
             answer = self.authority.on_estop(request, self._tick)
@@ -362,7 +362,7 @@ class Host:
             reply(answer)
 
     def _keep(self, request: LifecycleRequest | EstopRequest, answer: Answer) -> None:
-        """Who asked for what, for the record and the log."""
+        """Store a request and its result, for the record and the log."""
         action = "estop" if isinstance(request, EstopRequest) else request.action
         outcome = "done" if answer.ok else f"refused: {answer.reason}"
         asked = f"tick {self._tick}: {action} by {request.who!r}, {outcome}"
@@ -374,20 +374,20 @@ class Host:
         return self.participants.get(self.authority.lease.holder or "")
 
     def _expect_first_command(self) -> None:
-        """What was streamed before the arming does not answer the tick of arming."""
+        """Commands sent before the arming do not answer the tick of arming."""
         holder = self._holder()
         if holder is not None:
             holder.done_tick = self._answered = -1
 
     def _counting_tick(self) -> int | None:
-        """In lockstep: the newest tick whose command counts at the end of this one."""
+        """In lockstep: the newest tick whose command is used at the end of this one."""
         holder = self._holder()
         if self._pace != "lockstep" or holder is None:
             return None
         return holder.service.counting_at(self._tick + 1)
 
     def came_or_went(self, service: str, present: bool) -> None:
-        """A service's token is there, or is not any more."""
+        """A service's liveliness token has appeared or vanished."""
         if present:
             self.participants.came(service)
             return
@@ -400,28 +400,26 @@ class Host:
             self.authority.holder_gone(f"{service} is gone")
 
     def _another_host(self, key: str, present: bool) -> None:
-        """In Zenoh's thread: a host process came or went. One beside this one answers to this robot's name."""
+        """In Zenoh's thread: a host process of this robot's name appeared or vanished."""
         host = keys.service_of(key)
         if host != self.description.host:
             (self._other_hosts.add if present else self._other_hosts.discard)(host)
 
     def _watch_network(self) -> None:
-        """Note what is wrong with the network around the robot, once as it begins."""
-        # In lockstep a lease lasts by simulated time: a slow computer is not a network that is held up.
+        """Note problems of the network, once when each begins."""
+        # In lockstep a lease counts in simulated time: a slow computer is not a blocked network.
         held_up_s = 0.0 if self._pace == "lockstep" else self._outbox.held_up_s()
-        wrong = {
-            f"another HAL host answers to this robot's name: {host}": "second_host" for host in set(self._other_hosts)
-        }
+        wrong = {f"another HAL host has this robot's name: {host}": "second_host" for host in set(self._other_hosts)}
         if held_up_s * 1e9 > self._config.lease_ns:
-            wrong["the network takes no message: it is congested, or somebody attacks it"] = "network_held_up"
+            wrong["the network accepts no message: it is congested, or under attack"] = "network_held_up"
         for cause in wrong.keys() - self._network_faults:
             self.authority.note(Fault(tick=self._tick, what=wrong[cause], cause=cause, reach="none"))
         self._network_faults = set(wrong)
 
-    # --- what goes out -------------------------------------------------------------------------------------
+    # --- outputs -------------------------------------------------------------------------------------------
 
     def status(self) -> Status:
-        """How the robot is now, and why."""
+        """The present status of the robot."""
         return status_message(
             self.authority,
             self.participants,
@@ -435,7 +433,7 @@ class Host:
         )
 
     def _show_status(self, *, force: bool = False) -> None:
-        """Publish the status when it matters: at once when the lifecycle changed, else a few times a second."""
+        """Publish the status: at once when the lifecycle changed, else a few times a second."""
         now_ns, was = time.monotonic_ns(), self._status_shown
         mark = (self.authority.state, self.authority.lease.epoch, len(self.authority.faults))
         due_ns = self._status_due_ns if mark == was else self._status_due_ns - STATUS_PERIOD_NS + STATUS_GAP_NS
@@ -450,13 +448,13 @@ class Host:
     # --- time and endings ----------------------------------------------------------------------------------
 
     def _safety_now(self, monotonic_ns: int | None = None) -> int:
-        """Time that leases and ages count in: simulated in lockstep, else the monotonic clock."""
+        """Time of leases and ages: simulated in lockstep, else the monotonic clock."""
         if self._config.pace == "lockstep":
             return self._tick * self._period_ns
         return time.monotonic_ns() if monotonic_ns is None else monotonic_ns
 
     def _missing(self) -> list[str]:
-        """Participants that are not here, or in lockstep have not answered tick 0 yet."""
+        """Participants that are not connected, or in lockstep have not answered tick 0 yet."""
         return self.participants.missing(must_have_answered=self._config.pace == "lockstep")
 
     def _backend_failed(self, error: BackendError) -> None:
@@ -465,7 +463,7 @@ class Host:
         self._end("failed", str(error)[:500])
 
     def _watch_fault(self) -> None:
-        """After a fault nobody is waited for: what follows is shown in real time, and may end the run."""
+        """After a fault the host stops waiting for services, goes on in real time, and may end the run."""
         if self.authority.state not in ("fault", "estop"):
             if self._faulted_at_ns is not None:
                 self._pace = self._config.pace
@@ -482,7 +480,7 @@ class Host:
         if self._max_ticks is not None and self.statistics.ticks >= self._max_ticks:
             self._end("complete")
         elif self._max_ticks is not None and not self._stay and self.black_box.ticks >= self._max_ticks:
-            self._end("failed", "the time was over before that much of it was armed")
+            self._end("failed", "the time was over before the requested armed time was reached")
         elif self._settled_after_fault():
             self._end("failed", self.authority.why)
         return self._stopping

@@ -1,7 +1,7 @@
-"""What comes in to the HAL host: queued by other threads, decoded and handed over in the host's own.
+"""Input of the HAL host: queued by other threads, decoded and handed over in the host's own.
 
-There are lanes, and what stands in a lower one goes first: an emergency stop waits for nothing, and no number of lease
-requests keeps a command waiting. Each lane is bounded, so a flood costs neither memory nor other people's turn.
+It has lanes, and a lower lane has priority: an emergency stop waits for nothing, and no number of lease
+requests delays a command. Each lane is bounded, so a flood costs no memory and blocks no other lane.
 """
 
 import time
@@ -18,7 +18,7 @@ from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import Answer, Done, EstopRequest, JointCommand, LeaseRequest, LifecycleRequest
 
 STOPS, PRESENCE, SAMPLES, REQUESTS = range(4)  # lanes
-LIMITS = (64, None, 4096, 64)  # only known services have a presence, so that lane needs no bound
+LIMITS = (64, None, 4096, 64)  # presence is limited to known services, so that lane needs no bound
 
 Request = LeaseRequest | LifecycleRequest | EstopRequest
 Reply = Callable[[Answer], None]
@@ -26,38 +26,38 @@ Reply = Callable[[Answer], None]
 
 @dataclass(frozen=True)
 class Asked:
-    """A request that came another way than over Zenoh."""
+    """A request that did not come over Zenoh."""
 
     request: Request
     reply: Reply
 
 
 class Receiver(Protocol):
-    """Who acts on what comes in."""
+    """Handles the input."""
 
     def take_command(self, command: JointCommand, monotonic_ns: int) -> None:
-        """A command, and when it came."""
+        """A command, and its time of arrival."""
         ...
 
     def take_done(self, service: str, tick: int) -> None:
-        """A service owes nothing more for a tick."""
+        """A service has completed a tick."""
         ...
 
     def came_or_went(self, service: str, present: bool) -> None:
-        """A service's token is there, or is not any more."""
+        """A service's liveliness token has appeared or vanished."""
         ...
 
     def answer(self, request: Request, reply: Reply) -> None:
-        """Somebody asks; reply once, from any thread."""
+        """A request; reply once, from any thread."""
         ...
 
     def refuse(self, error: WireError) -> Answer:
-        """Something cannot be decoded; what to answer if it was a question."""
+        """A message cannot be decoded; returns the answer if it was a query."""
         ...
 
 
 class Inbox:
-    """What other threads fill and the host empties."""
+    """Queues filled by other threads and emptied by the host."""
 
     def __init__(
         self,
@@ -66,7 +66,7 @@ class Inbox:
         services: Collection[str],
         reply: Callable[[Question, Answer], None],
     ) -> None:
-        """Declares everything that the host listens to. services: whose presence counts; reply: answers a query."""
+        """Declares all subscriptions of the host. services: those whose presence matters; reply: answers a query."""
         self._receiver, self._reply = receiver, reply
         self._queue: Mailbox[Any] = Mailbox(LIMITS)
         self._command_decoder = Decoder(JointCommand)
@@ -86,15 +86,15 @@ class Inbox:
         session.on_alive(self._put_presence)
 
     def waiting(self) -> int:
-        """How much has not been taken yet."""
+        """Number of queued items."""
         return self._queue.qsize()
 
     def ask(self, request: Request, reply: Reply) -> None:
-        """Put a request that came another way than over Zenoh; from any thread."""
+        """Put a request that did not come over Zenoh; from any thread."""
         self._queue.put(Asked(request, reply), STOPS)
 
     def take(self, timeout_s: float) -> bool:
-        """Handle the next thing that comes in; False when nothing came in time."""
+        """Handle the next item; False when none came in time."""
         try:
             item = self._queue.get(timeout=timeout_s)
         except Empty:
@@ -103,19 +103,19 @@ class Inbox:
         return True
 
     def take_until(self, monotonic_ns: int) -> None:
-        """Handle everything that comes in until a moment has come."""
+        """Handle all items that arrive until a point in time."""
         while (left_ns := monotonic_ns - time.monotonic_ns()) > 0 and self.take(left_ns * 1e-9):
             pass
 
     def take_all(self, limit_ns: float) -> None:
-        """Handle what is there, for at most so long: what floods in may wait for the next tick."""
+        """Handle queued items, for at most this long: the rest of a flood waits for the next tick."""
         stop_ns = time.monotonic_ns() + limit_ns
         for _ in range(self._queue.qsize()):
             if not self.take(0.0) or time.monotonic_ns() > stop_ns:
                 return
 
     def handle(self, item: Any) -> None:
-        """Decode one thing, and hand it over."""
+        """Decode one item, and hand it over."""
         receiver = self._receiver
         if isinstance(item, Asked):
             receiver.answer(item.request, item.reply)
@@ -148,7 +148,7 @@ class Inbox:
         self._queue.put(question, STOPS)
 
     def _put_request(self, question: Question) -> None:
-        self.dropped += self._queue.full(REQUESTS)  # whoever asked is not answered, and may ask again
+        self.dropped += self._queue.full(REQUESTS)  # the requester gets no answer, and may ask again
         self._queue.put(question, REQUESTS)
 
     def _put_sample(self, arrival: Arrival) -> None:

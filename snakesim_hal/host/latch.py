@@ -1,8 +1,8 @@
-"""An emergency stop kept on disk, so that it outlives the host: one that starts and finds it begins in `estop`.
+"""An emergency stop stored on disk, so that it outlives the host: the next host finds it and begins in `estop`.
 
-The file is written whole or not at all, and is on the disk before the stop is answered. One that cannot be read counts
-as latched. Writing happens beside the host's loop, in the order of the requests: the joints never wait for a disk, and
-an answer waits no longer than ANSWER_LIMIT_S; then it says that the stop is not kept yet.
+The file is written atomically, and is on the disk before the stop is answered. An unreadable file counts
+as latched. A separate thread writes, in the order of the requests: the joints never wait for a disk, and
+an answer waits no longer than ANSWER_LIMIT_S; then it says that the stop is not stored yet.
 """
 
 import threading
@@ -20,11 +20,11 @@ from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import Answer
 
 ESTOP = "estop.json"
-ANSWER_LIMIT_S = 1.0  # of a disk that hangs; who asks waits longer
+ANSWER_LIMIT_S = 1.0  # for a disk that hangs; requesters wait longer
 
 
 class Latched(msgspec.Struct, frozen=True, kw_only=True):
-    """Who stopped the robot, and at which tick of which host's count."""
+    """Who stopped the robot, and at which tick of that host."""
 
     who: str
     tick: int
@@ -34,30 +34,31 @@ class EstopLatch:
     """The file of one robot's emergency stop."""
 
     def __init__(self, folder: Path | None) -> None:
-        """folder: where the file is kept; None: nowhere, the latch lives as long as the host."""
+        """folder: of the file; None: no file, the latch lives as long as the host."""
         self._path = None if folder is None else folder / ESTOP
         self._asked: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self._waiting: SimpleQueue[_Once | None] = SimpleQueue()
         self._writer = threading.Thread(target=self._write, name="estop", daemon=True)
-        self.found = None if self._path is None else _read(self._path)  # what an earlier host left
+        self.found = None if self._path is None else _read(self._path)  # left by an earlier host
         self._kept = self.found is not None and self.found.tick >= 0
         self._writer.start()
         threading.Thread(target=self._lose_patience, name="estop late", daemon=True).start()
 
     def engage(self, who: str, tick: int, then: Callable[[str | None], None]) -> None:
-        """Keep a stop. `then` is called once, from another thread: with None, or with why it could not be kept."""
-        once = _Once(then, f"it is not kept yet, and may not outlive this host: {self._path}: the disk does not answer")
+        """Store a stop. `then` is called once, from another thread: with None, or with why it could not be stored."""
+        late = f"it is not stored yet, and may not outlive this host: {self._path}: the disk does not answer"
+        once = _Once(then, late)
         self._waiting.put(once)
         self._asked.put(lambda: self._engage(Latched(who=who, tick=tick), once))
 
     def release(self, then: Callable[[str | None], None]) -> None:
-        """Forget it. `then` is called as in `engage`."""
+        """Remove it. `then` is called as in `engage`."""
         once = _Once(then, f"the next host may start in estop: {self._path}: the disk does not answer")
         self._waiting.put(once)
         self._asked.put(lambda: self._release(once))
 
     def close(self) -> None:
-        """Finish what was asked for, unless the disk hangs; then at least answer."""
+        """Finish pending requests, unless the disk hangs; then at least answer them."""
         self._asked.put(None)
         self._waiting.put(None)
         self._writer.join(1.1 * ANSWER_LIMIT_S)
@@ -102,7 +103,7 @@ def _read(path: Path) -> Latched | None:
     except FileNotFoundError:
         return None
     except (OSError, *UNDECODABLE):
-        return Latched(who=f"somebody ({ESTOP} cannot be read)", tick=-1)
+        return Latched(who=f"unknown ({ESTOP} cannot be read)", tick=-1)
 
 
 def stops_kept() -> list[Path]:
@@ -111,7 +112,7 @@ def stops_kept() -> list[Path]:
 
 
 def forget_stop(path: Path) -> str:
-    """Remove a latched stop, for a robot whose host does not run; returns what it was. Raises ConfigError."""
+    """Remove a latched stop, for a robot whose host does not run; returns a description of it. Raises ConfigError."""
     found = _read(path)
     try:
         path.unlink(missing_ok=True)
@@ -122,7 +123,7 @@ def forget_stop(path: Path) -> str:
 
 
 class _Once:
-    """Calls `then` with the first of what it is called with."""
+    """Calls `then` once, with its first argument."""
 
     def __init__(self, then: Callable[[str | None], None], late: str) -> None:
         self.late = late
@@ -136,7 +137,7 @@ class _Once:
 
 
 def replying(reply: Callable[[Answer], None], answer: Answer) -> Callable[[str | None], None]:
-    """Reply as soon as the latch is written, and say what went wrong with that."""
+    """Reply as soon as the latch is written, and report errors of that."""
 
     def written(trouble: str | None) -> None:
         reply(

@@ -1,8 +1,8 @@
-"""What goes out of the HAL host: streams, the status and answers, sent by threads of their own.
+"""Output of the HAL host: streams, the status and answers, sent by separate threads.
 
-The host's loop never calls Zenoh while a robot moves in real time: a network that is held up (a thousand readers that
-leave at once, a reader that does not read) costs freshness there, and never a tick here. In lockstep, where only
-simulated time passes, the loop sends streams itself, and waits for slow readers.
+The host's loop never calls Zenoh while a robot moves in real time: a blocked network (a thousand subscribers that
+leave at once, a subscriber that does not read) delays messages, but never a tick. In lockstep, where only
+simulated time passes, the loop sends streams itself, and waits for slow subscribers.
 """
 
 import threading
@@ -17,31 +17,31 @@ from snakesim_hal.terminal import complain
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, AppliedCommand, Description, Message, Status
 
-WAITING_LIMIT = 256  # messages that wait to be sent; the oldest of more are forgotten
-FLUSH_S = 1.0  # how long what waits is still sent at the end
+WAITING_LIMIT = 256  # queued messages; beyond that the oldest are dropped
+FLUSH_S = 1.0  # how long queued messages are still sent at the end
 
 
 class Sender:
-    """A thread that does one thing after another."""
+    """A thread that runs actions one after another."""
 
     def __init__(self, name: str) -> None:
         self._waiting: Mailbox[Callable[[], None] | None] = Mailbox((WAITING_LIMIT,))
         self._closing = False
-        self._since_ns = 0  # when the thing under way began; 0: none is
+        self._since_ns = 0  # when the present action began; 0: idle
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
     def do(self, action: Callable[[], None]) -> None:
-        """Have it done soon; never waits."""
+        """Queue an action; never waits."""
         self._waiting.put(action)
 
     def held_up_s(self) -> float:
-        """For how long the thing under way has taken."""
+        """For how long the present action has taken."""
         began_ns = self._since_ns
         return (time.monotonic_ns() - began_ns) * 1e-9 if began_ns else 0.0
 
     def close(self) -> None:
-        """Do what waits, for a moment, and end."""
+        """Run queued actions for at most FLUSH_S, and end."""
         self._closing = True
         self._waiting.put(None)
         self._thread.join(FLUSH_S)
@@ -51,22 +51,22 @@ class Sender:
             self._since_ns = time.monotonic_ns()
             try:
                 action()
-            except Exception as error:  # noqa: BLE001 - this thread's outermost loop; the network is closed, as a rule
+            except Exception as error:  # noqa: BLE001 - this thread's outermost loop; usually the network is closed
                 if not self._closing:
                     complain(f"not sent: {type(error).__name__}: {error}")
             self._since_ns = 0
 
 
 class Outbox:
-    """Of one host."""
+    """The output of one host."""
 
     def __init__(self, session: Session, description: Description, *, lockstep: bool) -> None:
-        """Shows the robot, and that its host is there."""
+        """Publishes the description, and declares the host's liveliness token."""
         self._session, self._lockstep = session, lockstep
         self._publishers: dict[str, Publisher[Any]] = {keys.STATUS: session.latched_publisher(keys.STATUS, Status)}
         self._streams = Sender("streams")
         self._answers = Sender("answers")
-        self.applied_heard = False  # whether anybody listens to hal/applied
+        self.applied_heard = False  # whether hal/applied has a subscriber
         session.latched_publisher(keys.DESCRIPTION, Description).put(description)
         session.declare_alive(HAL)
         if description.host is not None:
@@ -80,7 +80,7 @@ class Outbox:
             self._streams.do(lambda: self._publisher(key, type(message)).put(message))
 
     def put_status(self, status: Status) -> None:
-        """Publish the status, and look who listens."""
+        """Publish the status, and check for subscribers."""
 
         def send() -> None:
             self._publishers[keys.STATUS].put(status)
@@ -89,7 +89,7 @@ class Outbox:
         self._streams.do(send)
 
     def answer(self, question: Question, answer: Answer) -> None:
-        """Answer a query. Whoever asked may be slow to hear it."""
+        """Answer a query. The requester may be slow."""
         self._answers.do(lambda: question.reply(answer))
 
     def log(self, text: str) -> None:
@@ -97,11 +97,11 @@ class Outbox:
         self._answers.do(lambda: complain(text))
 
     def held_up_s(self) -> float:
-        """For how long the network has not taken a stream."""
+        """For how long the network has been blocked."""
         return self._streams.held_up_s()
 
     def close(self) -> None:
-        """Send what waits, for a moment."""
+        """Send queued messages for at most FLUSH_S."""
         self._answers.close()
         self._streams.close()
 

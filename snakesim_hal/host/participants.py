@@ -1,4 +1,4 @@
-"""The services of a run as the host sees them: who is here, and in lockstep who still owes something. Pure."""
+"""The services of a run in the host: which are connected, and in lockstep which are still due. Pure."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -27,30 +27,30 @@ class Participants(dict[str, Participant]):
         super().__init__({name: Participant(service) for name, service in services.items()})
 
     def behind(self, tick: int) -> list[str]:
-        """Who holds up the end of `tick`."""
+        """Services for which the end of `tick` has to wait."""
         return [name for name, participant in self.items() if participant.behind(tick)]
 
     def missing(self, *, must_have_answered: bool) -> list[str]:
-        """Who is not here, or has not answered any tick yet where that is asked for."""
+        """Services that are not connected, or on request those that have not answered any tick yet."""
         return [n for n, p in self.items() if not p.present or (must_have_answered and p.done_tick < 0)]
 
     def present(self) -> list[str]:
-        """Who is here."""
+        """Connected services."""
         return sorted(name for name, participant in self.items() if participant.present)
 
     def delivered(self, service: str | None, tick: int) -> None:
-        """A service has published all that it owes for a tick."""
+        """A service has published all its output for a tick."""
         participant = self.get(service or "")
         if participant is not None:
             participant.done_tick = max(participant.done_tick, tick)
 
     def came(self, service: str) -> None:
-        """A service's liveliness token is there."""
+        """A service's liveliness token has appeared."""
         if service in self:
             self[service].present, self[service].given_up = True, False
 
     def went(self, service: str) -> bool:
-        """A service's token is gone. Returns whether it is one of ours."""
+        """A service's token has vanished. Returns whether it is a service of the run."""
         if service not in self:
             return False
         self[service].present, self[service].done_tick = False, -1

@@ -1,8 +1,8 @@
-"""Writes what a host leaves behind as it comes: black box, description and the host's own numbers.
+"""Writes the record of a host while it runs: black box, description and statistics.
 
-A thread of its own does it, twice a second, so no tick waits for a disk. What cannot be written is tried again each
-time, for as long as the black box holds it. The host's numbers also go to `memory`, a file without a disk that whoever
-started the host shares with it: they are known there when the disk is full or hangs, and after a SIGKILL.
+A separate thread writes, twice a second, so no tick waits for a disk. A failed write is retried each
+time, for as long as the black box keeps the rows. The statistics also go to `memory`, an in-memory file shared with the
+parent process: they are known there when the disk is full or hangs, and after a SIGKILL.
 """
 
 import contextlib
@@ -29,10 +29,10 @@ CLOSE_LIMIT_S = 2.0  # for a disk that hangs
 
 
 class Numbers(Protocol):
-    """Makes the host's own numbers into a message, at any time and from any thread."""
+    """Makes a message of the host's statistics, at any time and from any thread."""
 
     def __call__(self, *, lost_ticks: int, trouble: str) -> msgspec.Struct:
-        """lost_ticks: rows that the file will never have; trouble: what cannot be written, and why, or empty."""
+        """lost_ticks: rows missing from the file for good; trouble: which file cannot be written, and why, or empty."""
         ...
 
 
@@ -42,13 +42,13 @@ class Recorder:
     def __init__(
         self, box: BlackBox, description: Description, numbers: Numbers, folder: Path | None, memory: int | None = None
     ) -> None:
-        """folder: None keeps nothing on disk; memory: a file descriptor, see above."""
+        """folder: None for no files; memory: a file descriptor, see above."""
         self._box, self._description, self._numbers = box, description, numbers
         self._folder, self._memory = folder, memory
         self._file: int | None = None
-        self._begins = 0  # where rows begin in the file
+        self._begins = 0  # offset of the first row in the file
         self._next = 0  # the first row that is not in the file yet
-        self._skipped = 0  # rows that the black box had to forget before they were written
+        self._skipped = 0  # rows that were overwritten before they were written to disk
         self._trouble = ""
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
@@ -62,7 +62,7 @@ class Recorder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Write what is left, and how the host ended. A disk that hangs is waited for no longer than CLOSE_LIMIT_S."""
+        """Write the rest, and how the host ended. Waits for a hanging disk no longer than CLOSE_LIMIT_S."""
         self._closing.set()
         self._thread.join(CLOSE_LIMIT_S)
         if self._thread.is_alive():
@@ -80,7 +80,7 @@ class Recorder:
             os.close(self._file)
 
     def _written(self, folder: Path) -> str:
-        """Bring the folder up to date. Returns what could not be written, and why."""
+        """Bring the folder up to date. Returns which file could not be written, and why."""
         trouble = ""
         for write in (self._write_rows, self._write_numbers):
             try:
@@ -90,11 +90,11 @@ class Recorder:
         return trouble
 
     def _write_numbers(self, folder: Path, trouble: str) -> None:
-        if self._file is not None:  # else they would take the place of an earlier host's
-            write_whole(folder / HOST_RECORD, msgspec.json.format(msgspec.json.encode(self._told(trouble))))
+        if self._file is not None:  # else they would overwrite an earlier host's
+            write_whole(folder / HOST_RECORD, msgspec.json.format(msgspec.json.encode(self._message(trouble))))
 
     def _open(self, folder: Path) -> int:
-        """Begin the files of this host; those of an earlier one in this run get a number."""
+        """Create the files of this host; those of an earlier one in this run get a number."""
         if (folder / HOST_RECORD).exists() or (folder / BLACK_BOX).exists():
             number = next(n for n in count(1) if not _numbered(folder / BLACK_BOX, n).exists())
             for path in (folder / BLACK_BOX, folder / HOST_RECORD):
@@ -116,8 +116,8 @@ class Recorder:
             self._skipped += first - self._next
             self._next = first
             written = os.pwrite(self._file, rows, self._begins + (self._next - self._skipped) * size)
-            self._next += written // size  # of a row that is torn, the whole is written next time
-            if written < len(rows):  # a disk that is full takes a part first
+            self._next += written // size  # an incomplete row is written again next time
+            if written < len(rows):  # a full disk first takes a part
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def _note(self, trouble: str) -> None:
@@ -125,14 +125,14 @@ class Recorder:
             complain(f"record: {trouble}")
         self._trouble = trouble
 
-    def _told(self, trouble: str) -> msgspec.Struct:
+    def _message(self, trouble: str) -> msgspec.Struct:
         lost = self._skipped + (self._box.ticks - self._next if self._closing.is_set() else 0)
         return self._numbers(lost_ticks=lost, trouble=trouble)
 
     def _remember(self) -> None:
         if self._memory is not None:
-            content = msgspec.json.encode(self._told(self._trouble))
-            with contextlib.suppress(OSError):  # no memory left: then the folder tells
+            content = msgspec.json.encode(self._message(self._trouble))
+            with contextlib.suppress(OSError):  # no memory left: then only the folder has them
                 os.pwrite(self._memory, content, 0)
                 os.ftruncate(self._memory, len(content))
 

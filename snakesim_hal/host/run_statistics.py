@@ -1,4 +1,4 @@
-"""The numbers that the HAL host leaves behind."""
+"""The run statistics of the HAL host."""
 
 import math
 from dataclasses import dataclass, field
@@ -8,14 +8,14 @@ BINS = 1 + math.ceil(math.log(1e7) / STEP)  # 1 us to 10 s
 
 
 class Latencies:
-    """How long something took, each time, to 1 %: in memory of fixed size, however long the run."""
+    """A histogram of durations, to 1 %: in memory of fixed size, however long the run."""
 
     def __init__(self) -> None:
         self.count = 0
         self._bins = [0] * BINS
 
     def add(self, took_us: float) -> None:
-        """Count one."""
+        """Add one."""
         self._bins[min(max(round(math.log(max(took_us, 1.0)) / STEP), 0), BINS - 1)] += 1
         self.count += 1
 
@@ -31,9 +31,9 @@ class Latencies:
 
 @dataclass
 class RunStatistics:
-    """What the host measures of itself while armed."""
+    """Statistics of the host while armed."""
 
     ticks: int = 0
     overruns: int = 0
-    answered_ticks: int = 0  # commands that came within their own tick
+    answered_ticks: int = 0  # ticks with a command that came in time
     state_to_command: Latencies = field(default_factory=Latencies)

@@ -1,4 +1,4 @@
-"""What the host tells of itself, made into messages. Pure."""
+"""Builds the host's status messages. Pure."""
 
 from snakesim_hal.host.participants import Participants
 from snakesim_hal.safety.authority import Authority, Decision
@@ -6,7 +6,7 @@ from snakesim_hal.wire.messages import AppliedCommand, Description, Pace, Status
 
 
 def applied_message(description: Description, tick: int, decision: Decision) -> AppliedCommand:
-    """What went to the motors in a tick."""
+    """The applied set-points of a tick."""
     points = decision.set_points
     return AppliedCommand(
         tick=tick,
@@ -31,7 +31,7 @@ def status_message(
     realtime_warnings: list[str],
     injected: list[str],
 ) -> Status:
-    """How the robot is now, and why. missing: the services that arming waits for."""
+    """The status of the robot. missing: the services that arming waits for."""
     description = authority.description
     against = authority.against_arming(safety_now_ns)
     why = authority.why

@@ -1,4 +1,4 @@
-"""The faults on request that a run has planned, and whether it can have them at all."""
+"""The injected faults that a run has planned, and whether the run supports them."""
 
 from collections.abc import Collection
 
@@ -8,11 +8,11 @@ from snakesim_hal.model.injection import Injection, check_targets, parse
 from snakesim_hal.model.scenario import RunConfig
 
 MAX_BUSES = 8
-ON_SAMPLES = ("mute", "freeze", "wrong", "nan")  # of joints; the host does these itself where the backend cannot
+ON_SAMPLES = ("mute", "freeze", "wrong", "nan")  # of joints; the host applies these itself if the backend cannot
 
 
 def planned(config: RunConfig, table: Table | None = None) -> list[Injection]:
-    """From their texts. Raises ConfigError with the number of the wrong one."""
+    """Parse them from their texts. Raises ConfigError with the number of the wrong one."""
     found: list[Injection] = []
     for i, text in enumerate(config.faults):
         try:
@@ -23,14 +23,14 @@ def planned(config: RunConfig, table: Table | None = None) -> list[Injection]:
 
 
 def check_planned(config: RunConfig, table: Table | None = None) -> None:
-    """Whether every process, key and joint that is to go wrong is there. Raises ConfigError."""
+    """Check that every target exists: process, key or joint. Raises ConfigError."""
     _check(config, table, MAX_BUSES)
 
 
 def check_backend_can(config: RunConfig, *, does: Collection[str], buses: int, because: str) -> None:
-    """Whether a backend can do what is planned for joints, buses and the simulator. Raises ConfigError.
+    """Check that a backend supports the planned faults of joints, buses and the simulator. Raises ConfigError.
 
-    does: kinds of these that it knows by itself; because: why it knows no more.
+    does: kinds of these that it supports itself; because: why it supports no others.
     """
     for i, injection in enumerate(_check(config, None, buses)):
         if injection.target_type == "simulator" and injection.kind == "slow":

@@ -1,4 +1,4 @@
-"""What a Struct takes at a place of a file, in words: for the errors that `snakesim_hal.model.files` writes."""
+"""The type that a Struct expects at a place of a file, in words: for the errors of `snakesim_hal.model.files`."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -8,7 +8,7 @@ from msgspec import inspect
 
 
 def type_at(struct: type[msgspec.Struct], steps: list[str], values: Any) -> inspect.Type | None:
-    """The declared type at a path inside a Struct, as msgspec describes it; `values` tell which of several Structs."""
+    """The declared type at a path inside a Struct, as msgspec describes it; `values` select among several Structs."""
     info: inspect.Type | None = inspect.type_info(struct)
     for step in steps:
         info = next((found for option in _options_for(info, values) if (found := _inside(option, step, info))), None)
@@ -17,7 +17,7 @@ def type_at(struct: type[msgspec.Struct], steps: list[str], values: Any) -> insp
 
 
 def fields_at(struct: type[msgspec.Struct], steps: list[str], values: Any) -> dict[str, inspect.Type]:
-    """Every field that the Struct at a path has, its tag included."""
+    """All fields of the Struct at a path, including its tag."""
     info = type_at(struct, steps, values)
     fields: dict[str, inspect.Type] = {}
     for option in _options_for(info, value_at(values, steps)):
@@ -59,7 +59,7 @@ def unit_of(info: inspect.Type | None) -> str:
 
 
 def in_words(info: inspect.Type | None) -> str:
-    """What a field takes."""
+    """The type of a field, in words."""
     said: list[str] = []
     for option in options(info):
         word = _word(option, unit_of(info))

@@ -1,6 +1,6 @@
-"""Reading the files that people write: TOML (or JSON) in, a checked Struct out, one clear error otherwise.
+"""Read configuration files: TOML (or JSON) in, a checked Struct out, otherwise one clear error.
 
-An error names the file, the field, the value, its unit, what is allowed, and what to do. `Table` keeps, for every
+An error names the file, the field, the value, its unit, what is allowed, and what to do. `Table` stores, for every
 value, the file or flag that it came from.
 """
 
@@ -26,19 +26,19 @@ SCHEMAS = Path(__file__).parents[1] / "schemas"  # in the repository a link to t
 
 
 class FileStruct(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
-    """Base of everything that is read from a file: an unknown field is an error, not a typo that does nothing."""
+    """Base of everything that is read from a file: an unknown field is an error, so that typos are not ignored."""
 
 
 @dataclass
 class Table:
-    """Values as read, with the place that each leaf came from; keys of `origin` are dotted."""
+    """Values as read, with the origin of each leaf; keys of `origin` are dotted."""
 
     values: dict[str, Any]
     source: str
     origin: dict[str, str] = field(default_factory=dict)
 
     def put(self, dotted: str, value: Any, origin: str) -> None:
-        """Set a value, making the tables on the way."""
+        """Set a value, creating the parent tables."""
         *parents, last = dotted.split(".")
         if len(parents) >= MAX_DEPTH:
             raise ConfigError(f"{origin}: the key has {len(parents) + 1} parts, at most {MAX_DEPTH} are allowed")
@@ -63,7 +63,7 @@ class Table:
         self.origin.update(_origins(value, origin, dotted))
 
     def origin_of(self, dotted: str) -> str:
-        """The file or flag behind a dotted key; `default` when nobody set it."""
+        """The file or flag that set a dotted key; `default` when none did."""
         key = dotted
         while key:
             if key in self.origin:
@@ -72,7 +72,7 @@ class Table:
         return "default"
 
     def file_of(self, dotted: str) -> str:
-        """The file in which a field stands, or in which its nearest neighbours do when it is missing."""
+        """The file that contains a field, or its nearest neighbours if it is missing."""
         place = dotted
         while place:
             for key, origin in self.origin.items():
@@ -83,7 +83,7 @@ class Table:
 
 
 def _origins(value: Any, origin: str, prefix: str = "") -> dict[str, str]:
-    """An empty section sets nothing, so everything in it is still a default."""
+    """An empty section sets nothing, so all its fields keep their defaults."""
     return {key: origin for key, leaf in leaves(value, prefix) if leaf != {}}
 
 
@@ -108,9 +108,9 @@ def leaves(value: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def read_table(path: Path, suffix: str | None = None) -> Table:
-    """Read a TOML or JSON file. Raises ConfigError when it is absent or no such file.
+    """Read a TOML or JSON file. Raises ConfigError when it is missing or not valid.
 
-    suffix: says which; None: that of the path.
+    suffix: selects the format; None: that of the path.
     """
     text = read_text(path)
     is_json = (path.suffix if suffix is None else suffix) == ".json"
@@ -158,7 +158,7 @@ def decode(table: Table, struct: type[StructT], under: str = "") -> StructT:
     except UnicodeEncodeError as error:  # JSON may escape, and a command line may hold, half of a character
         odd = ascii(error.object[error.start : error.end])[:40]
         raise ConfigError(
-            f"{table.source}: a key or a text holds {odd}, which is no character; write it anew"
+            f"{table.source}: a key or a text holds {odd}, which is not a character; write it again"
         ) from None
 
 
@@ -175,7 +175,7 @@ def _explain(error: msgspec.ValidationError, table: Table, struct: type[msgspec.
         name = short(unknown[1])
         close = difflib.get_close_matches(name, fields, 1, 0.6)
         full = f"{dotted}.{name}" if dotted else name
-        hint = f"did you mean `{close[0]}`?" if close else f"known here: {', '.join(sorted(fields))}."
+        hint = f"did you mean `{close[0]}`?" if close else f"known fields: {', '.join(sorted(fields))}."
         set_by = [origin for key, origin in table.origin.items() if key == full or key.startswith(full + ".")]
         return f"{set_by[0] if set_by else table.file_of(full)}: unknown field `{full}`; {hint}"
     if missing:
@@ -189,23 +189,23 @@ def _explain(error: msgspec.ValidationError, table: Table, struct: type[msgspec.
     origin = table.file_of(dotted) if origin == "default" else origin
     shown = f"{short(_repr(value))}{' ' + unit if unit and isinstance(value, int | float) else ''}"
     why = short(what[:1].lower() + what[1:])
-    return f"{origin}: `{short(dotted)}` = {shown} is not allowed: {why}; wanted is {in_words(info)}."
+    return f"{origin}: `{short(dotted)}` = {shown} is not allowed: {why}; expected {in_words(info)}."
 
 
 def short(text: str, most: int = 120) -> str:
-    """A text that a person wrote, for quoting: its beginning, when it is long."""
+    """User text for quoting in a message: its beginning, if it is long."""
     return text if len(text) <= most else text[: most - 3] + "..."
 
 
 def _repr(value: Any) -> str:
     try:
         return repr(value)
-    except ValueError:  # Python writes no whole number of more than 4300 digits
+    except ValueError:  # Python does not print integers of more than 4300 digits
         return "a very large number"
 
 
 def _steps(where: str, values: dict[str, Any], struct: type[msgspec.Struct]) -> list[str]:
-    """The way to a wrong value. For a free key of a section msgspec says `[...]`: look which entry it is."""
+    """The path to a wrong value. For a free key of a section msgspec says `[...]`: find which entry it is."""
     steps: list[str] = []
     value: Any = values
     for match in re.finditer(r"\[(\.\.\.|\d+)\]|[^.\[\]]+", where):

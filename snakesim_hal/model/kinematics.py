@@ -1,4 +1,4 @@
-"""Where every link is, given the base pose and the joint angles. Pure; shared by both sides of the HAL.
+"""Forward kinematics: poses of all links from base pose and joint angles. Pure; shared by both sides of the HAL.
 
 Link i's frame has its origin at the joint at its rear and x along the link; link 0's origin is the tail end, and its
 frame is the base. A yaw joint turns about z of its link, a pitch joint about y.
@@ -69,7 +69,7 @@ def link_frames(
 def _yaw_only_frames(
     base_w: Floats, base_rotation: Floats, angles_rad: Floats, link_lengths_m: Sequence[float]
 ) -> tuple[Floats, Floats]:
-    """All joints turn about one and the same axis, so angles add up; the loop over links becomes a sum."""
+    """All joints turn about the same axis, so angles add up; the loop over links becomes a sum."""
     turn = np.concatenate(([0.0], np.cumsum(angles_rad)))
     c, s = np.cos(turn)[:, None], np.sin(turn)[:, None]
     x, y, z = base_rotation.T
@@ -87,7 +87,7 @@ def joint_positions_s_m(link_lengths_m: Sequence[float]) -> Floats:
 
 
 def tangents(normal: Vector) -> tuple[Vector, Vector]:
-    """Two unit vectors across a contact normal: as near as can be to the link's x axis, and normal times that."""
+    """Two unit tangents of a contact: the one closest to the link's x axis, and the cross product of normal and it."""
     x, y, z = normal
     across = math.sqrt(max(1.0 - x * x, 0.0))
     if across < 1e-6:

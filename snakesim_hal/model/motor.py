@@ -1,6 +1,6 @@
-"""The law of a joint's motor, as far as simulator, module twins and the checks before a run share it.
+"""The motor model of a joint, as shared by simulator, module twins and the checks before a run.
 
-A joint's torque follows its demand as a first-order lag, is clipped to a limit, and fades to 0 at the limit of speed.
+A joint's torque follows its demand as a first-order lag, is clipped to a limit, and falls to 0 at the speed limit.
 """
 
 import numpy as np
@@ -8,13 +8,14 @@ import numpy as np
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.robot import RobotFile
 
-STEEPEST_ROLL_OFF = 10.0  # full torque is there up to 1 - 1/10 of the limit of speed, and fades to 0 at it
+STEEPEST_ROLL_OFF = 10.0  # full torque up to 1 - 1/10 of the speed limit, falling to 0 at it
 
 
 def roll_off(robot: RobotFile, step_s: float) -> float:
-    """How steeply torque fades at the limit of speed: less than `STEEPEST_ROLL_OFF` where steps would not resolve it.
+    """Slope of the torque at the speed limit: less than `STEEPEST_ROLL_OFF` if the time step cannot resolve that.
 
-    The fading acts on the rotor as a damper behind the motor's lag, which explicit steps only bear up to a strength.
+    The roll-off acts on the rotor as a damper behind the motor's lag, which explicit steps can only integrate up to a
+    certain strength.
     """
     motor, module, limits = robot.motor, robot.module, robot.limits
     inertia_kg_m2 = motor.armature_kg_m2 + module.mass_kg * module.length_m**2 / 12
@@ -23,13 +24,13 @@ def roll_off(robot: RobotFile, step_s: float) -> float:
 
 
 def check_gains(robot: RobotFile) -> None:
-    """Raise ConfigError for a position mode that would swing up, by Routh's criterion for a lagging PD loop."""
+    """Raise ConfigError for an unstable position mode, by Routh's criterion for a lagging PD loop."""
     motor = robot.motor
     least = motor.stiffness_nm_per_rad * motor.response_time_s
     damping = motor.damping_nm_s_per_rad + motor.viscous_nm_s_per_rad
     if damping <= least and least > 0:
         raise ConfigError(
-            f"robot {robot.name!r}: position mode would swing up: a motor that answers in `motor.response_time_s` = "
+            f"robot {robot.name!r}: position mode is unstable: a motor with `motor.response_time_s` = "
             f"{motor.response_time_s} s with `motor.stiffness_nm_per_rad` = {motor.stiffness_nm_per_rad} N·m/rad needs "
             f"`motor.damping_nm_s_per_rad` above {least:g} N·m·s/rad; it is {motor.damping_nm_s_per_rad}"
         )

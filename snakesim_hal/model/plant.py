@@ -1,7 +1,7 @@
-"""The body that emulated motors move: what a module twin needs to know of mechanics, and nothing of CAN or MuJoCo.
+"""The body that emulated motors move: the mechanics that a module twin needs, independent of CAN and MuJoCo.
 
 A plant is found by name among the entry points of the group `snakesim.plants`, so that the module twins of one backend
-can stand on the physics of another without importing it.
+can use the physics of another without importing it.
 """
 
 from dataclasses import dataclass
@@ -22,20 +22,20 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LinkLoad:
-    """The resultant of all touches of one link by obstacles, in the link's frame: what its force sensor feels."""
+    """The resultant of all contacts of one link with obstacles, in the link's frame: what its force sensor measures."""
 
     link: int
-    position_l: Vector  # m; mean of the touches, weighted by force
+    position_l: Vector  # m; mean of the contacts, weighted by force
     force_l: Vector  # N, on the body
 
 
 class Plant(Protocol):
-    """Joints that turn under motor torques, with or without a world around them. Time passes only in `advance`."""
+    """Joints that turn under motor torques, with or without a world around them. Time advances only in `advance`."""
 
-    step_s: float  # the longest time for which torques may be held
+    step_s: float  # the longest time for which torques may be held constant
 
     def advance(self, torque_nm: Floats) -> None:
-        """Let `step_s` pass under these motor torques, (n_joints,). Raises BackendError when the numbers blow up."""
+        """Advance by `step_s` under these motor torques, (n_joints,). Raises BackendError if the state diverges."""
         ...
 
     @property
@@ -49,11 +49,11 @@ class Plant(Protocol):
         ...
 
     def shaft_torque_nm(self) -> Floats:
-        """Torque through each joint's shaft, as its strain gauge feels it, (n_joints,)."""
+        """Torque through each joint's shaft, as its strain gauge measures it, (n_joints,)."""
         ...
 
     def loads(self) -> list[LinkLoad]:
-        """Links that are touched; empty in a plant without a world."""
+        """Loads of the links in contact; empty in a plant without a world."""
         ...
 
     def imu(self) -> Imu | None:
@@ -61,15 +61,15 @@ class Plant(Protocol):
         ...
 
     def pose(self) -> Pose | None:
-        """The base, as motion capture would see it; None in a plant without a world. Its tick is 0."""
+        """Pose of the base, as from motion capture; None in a plant without a world. Its tick is 0."""
         ...
 
 
 class PlantFactory(Protocol):
-    """What stands behind an entry point in the group `snakesim.plants`: usually the plant's class."""
+    """The object of an entry point in the group `snakesim.plants`: usually the plant's class."""
 
     Settings: type[msgspec.Struct]
 
     def __call__(self, config: "RunConfig", settings: Any) -> Plant:
-        """Make the plant at the run's start pose, at rest."""
+        """Create the plant at the run's start pose, at rest."""
         ...

@@ -1,6 +1,6 @@
-"""Backends, controllers, services and the like are found by name: an entry point of an installed package, or a file.
+"""Find backends, controllers and services by name: an entry point of an installed package, or a file.
 
-`wave` is looked up among the entry points; `./wave.py:Wave` is the object `Wave` of that file, for trying things out.
+`wave` is looked up among the entry points; `./wave.py:Wave` is the object `Wave` of that file, for development.
 A program that runs everything in one process may offer objects of its own.
 """
 
@@ -40,12 +40,12 @@ def offered(group: str, name: str, plugin: Any) -> Iterator[None]:
 
 
 def installed(group: str) -> list[str]:
-    """Names of everything that is installed in a group."""
+    """Names of all installed plugins of a group."""
     return sorted({entry.name for entry in entry_points(group=group)})
 
 
 def find_plugin(group: str, name: str) -> Any:
-    """Load what a name stands for. Raises ConfigError that says what is installed."""
+    """Load the plugin of a name. Raises ConfigError that lists the installed ones."""
     kind = _kind(group)
     if (group, name) in _offered:
         return _offered[group, name]
@@ -66,7 +66,7 @@ def find_plugin(group: str, name: str) -> Any:
 
 
 def _extras_of(entry: EntryPoint) -> str:
-    """How to install what a plugin needs and its package does not install by itself."""
+    """How to install a plugin's optional dependencies."""
     extras = entry.dist.metadata.get_all("Provides-Extra") if entry.dist is not None else None
     if entry.dist is None or not extras:
         return ""
@@ -74,12 +74,12 @@ def _extras_of(entry: EntryPoint) -> str:
 
 
 def in_file(name: str) -> bool:
-    """Whether a name is the path of a Python file, with a class or without; the code in it runs when it is loaded."""
+    """Whether a name is the path of a Python file, with or without a class; loading it runs its code."""
     return ".py:" in name or name.endswith(".py")
 
 
 def find_installed(group: str, name: str) -> Any | None:
-    """Like `find_plugin`; but of a file it only looks whether the class is there, runs none of it, and returns None."""
+    """Like `find_plugin`; but for a file it only checks that the class exists, without running it, and returns None."""
     if not in_file(name):
         return find_plugin(group, name)
     kind = _kind(group)
@@ -94,7 +94,7 @@ def _kind(group: str) -> str:
 
 
 def _parsed(name: str, kind: str) -> tuple[Path, str, ast.Module]:
-    """File, the name in it, and the file as Python reads it; none of it runs."""
+    """The file, the name in it, and its parsed code, which is not run."""
     path_text, _, attribute = (name if ".py:" in name else f"{name}:").rpartition(":")
     try:
         path = expanded(path_text).absolute()
@@ -117,7 +117,7 @@ def _not_there(name: str, kind: str, tree: ast.Module) -> ConfigError:
 
 
 def _names(tree: ast.Module) -> Iterator[str]:
-    """Whatever the file may define."""
+    """All names that the file may define."""
     for node in ast.walk(tree):
         if isinstance(node, ast.ClassDef | ast.FunctionDef):
             yield node.name
@@ -148,11 +148,9 @@ def plugin_settings(
 ) -> Any:
     """A plugin's section of the configuration, checked by its own `Settings`.
 
-    source, origin: the file, and what is known of where each of its dotted keys came from.
+    source, origin: the file, and the known origin of each of its dotted keys.
     """
     settings = getattr(plugin, "Settings", None)
     if not (isinstance(settings, type) and issubclass(settings, msgspec.Struct)):
-        raise ConfigError(
-            f"{plugin!r} has no `Settings` Struct; a plugin states its settings there, if only an empty one"
-        )
+        raise ConfigError(f"{plugin!r} has no `Settings` Struct; every plugin needs one, even if it is empty")
     return decode(Table(section, source, origin or {}), settings, where)

@@ -1,4 +1,4 @@
-"""The robot file: any chain of joint modules, in numbers. A module is one joint with half a body on either side.
+"""The robot file: the parameters of a chain of joint modules. A module is one joint with half a body on either side.
 
 Chained modules are bolted together, so n modules make n joints and n + 1 rigid links; tail and head link are half as
 long as the others.
@@ -23,7 +23,7 @@ from snakesim_hal.wire.quantities import MAX_JOINTS, above, from_zero
 
 
 class Chain(FileStruct, frozen=True, kw_only=True):
-    """How many modules, and how their joints are turned."""
+    """Number of modules, and axes of their joints."""
 
     modules: Annotated[int, Meta(ge=1, le=MAX_JOINTS)]
     axes: Annotated[list[Axis], Meta(min_length=1, max_length=MAX_JOINTS)]  # repeated from tail to head
@@ -38,28 +38,28 @@ class Module(FileStruct, frozen=True, kw_only=True):
 
 
 class Limits(FileStruct, frozen=True, kw_only=True):
-    """What a joint may do; held by the gate and by the motor."""
+    """Limits of a joint; enforced by the gate and by the motor."""
 
     angle_rad: Annotated[float, above(3.14159, "rad")]  # to either side
     speed_rad_s: Annotated[float, above(100, "rad/s")]
     acceleration_rad_s2: Annotated[float, above(1e5, "rad/s²")]
     torque_nm: Annotated[float, above(1000, "N·m")]
     torque_rate_nm_s: Annotated[float, above(1e5, "N·m/s")]
-    derate_from_c: Annotated[float, above(300, "°C")] = 80.0  # of the winding: from here on torque is taken away
+    derate_from_c: Annotated[float, above(300, "°C")] = 80.0  # of the winding: above it torque is derated
     stop_at_c: Annotated[float, above(300, "°C")] = 105.0  # a fifth of the torque is left, and the robot stops
     least_voltage_v: Annotated[float, from_zero(1000, "V")] = 18.0  # below it the robot stops
 
     def __post_init__(self) -> None:
-        """Torque must fade before the robot stops. Raises ValueError, which a reader of files explains."""
+        """Derating must begin before the robot stops. Raises ValueError, which the file reader explains."""
         if self.stop_at_c <= self.derate_from_c:
             raise ValueError(
                 f"`stop_at_c` = {self.stop_at_c:g} °C must be above `derate_from_c` = {self.derate_from_c:g} °C, "
-                f"so that torque fades before the robot stops"
+                f"so that torque is derated before the robot stops"
             )
 
 
 class Motor(FileStruct, frozen=True, kw_only=True):
-    """How a joint answers."""
+    """Motor parameters of a joint."""
 
     stiffness_nm_per_rad: Annotated[float, above(1e5, "N·m/rad")]  # position mode
     damping_nm_s_per_rad: Annotated[float, from_zero(1e4, "N·m·s/rad")]  # position mode
@@ -71,11 +71,11 @@ class Motor(FileStruct, frozen=True, kw_only=True):
 
 
 class Safety(FileStruct, frozen=True, kw_only=True):
-    """What the joints do when nobody may command them."""
+    """Behaviour of the joints in a fault, and limits of commands."""
 
     action: SafeAction = "damp"
-    max_step_rad: Annotated[float, above(3.2, "rad")] = 0.35  # furthest a position target may be from the measured
-    may_lose_joints: Annotated[int, Meta(ge=0, le=MAX_JOINTS)] = 0  # that fail and are left passive, before all stop
+    max_step_rad: Annotated[float, above(3.2, "rad")] = 0.35  # of a position target from the measured
+    may_lose_joints: Annotated[int, Meta(ge=0, le=MAX_JOINTS)] = 0  # isolated, before the robot stops
 
 
 class JointSensor(FileStruct, frozen=True, kw_only=True):
@@ -88,13 +88,13 @@ class JointSensor(FileStruct, frozen=True, kw_only=True):
 
 
 class ContactSensor(FileStruct, frozen=True, kw_only=True):
-    """Touches of the links by obstacles."""
+    """Contacts of the links with obstacles."""
 
     rate_hz: Annotated[float, above(1e4, "Hz")] = 100.0
     delay_s: Annotated[float, from_zero(1, "s")] = 0.0
     position_noise_m: Annotated[float, from_zero(1, "m")] = 0.0
     force_noise_n: Annotated[float, from_zero(100, "N")] = 0.0
-    threshold_n: Annotated[float, from_zero(100, "N")] = 0.0  # weaker touches go unfelt
+    threshold_n: Annotated[float, from_zero(100, "N")] = 0.0  # weaker contacts are not detected
 
 
 class ImuSensor(FileStruct, frozen=True, kw_only=True):
@@ -107,7 +107,7 @@ class ImuSensor(FileStruct, frozen=True, kw_only=True):
 
 
 class PoseSensor(FileStruct, frozen=True, kw_only=True):
-    """Pose of the base, as motion capture gives it."""
+    """Pose of the base, from motion capture."""
 
     rate_hz: Annotated[float, above(1e4, "Hz")] = 100.0
     delay_s: Annotated[float, from_zero(1, "s")] = 0.0
@@ -116,14 +116,14 @@ class PoseSensor(FileStruct, frozen=True, kw_only=True):
 
 
 class PowerSensor(FileStruct, frozen=True, kw_only=True):
-    """Supply, temperatures and leaks of every joint module. Modules on a bus tell them at a rate of their own."""
+    """Supply, temperatures and leaks of every joint module. Modules on a bus report them at their own rate."""
 
     rate_hz: Annotated[float, above(1e4, "Hz")] = 2.0
     delay_s: Annotated[float, from_zero(1, "s")] = 0.0
 
 
 class Sensors(FileStruct, frozen=True, kw_only=True):
-    """The sensors that the robot has; a section that is left out is a sensor that it lacks."""
+    """The sensors of the robot; without its section a sensor is absent."""
 
     joints: JointSensor = JointSensor()
     contacts: ContactSensor | None = None

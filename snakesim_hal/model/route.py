@@ -13,7 +13,7 @@ Floats = NDArray[np.float64]
 
 
 def is_line(points_w: Floats) -> bool:
-    """Whether (n, 2) points make a line: two at least, and a way to go from each to the next."""
+    """Whether (n, 2) points make a line: two at least, and no two neighbours coincide."""
     return len(points_w) >= 2 and bool((points_w[1:] != points_w[:-1]).any(axis=1).all())
 
 
@@ -127,7 +127,7 @@ def next_on_route(route: Route, from_w: tuple[float, float], from_s_m: float, di
 
 @dataclass(frozen=True)
 class ChainOnRoute:
-    """How a chain of straight segments lies with every joint on a route."""
+    """The pose of a chain of straight segments with every joint on a route."""
 
     tail_w: tuple[float, float]
     heading_rad: float  # of the first segment
@@ -149,7 +149,7 @@ def lay_chain(route: Route, tail_s_m: float, segment_lengths_m: Sequence[float])
 
 
 def yaw_segments_m(axes: Sequence[str], link_lengths_m: Sequence[float]) -> list[float]:
-    """Lengths of the straight pieces that are left when only the yaw joints bend.
+    """Lengths of the straight segments between yaw joints.
 
     axes: n joints, tail to head; link_lengths_m: n + 1 links.
     """

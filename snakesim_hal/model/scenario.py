@@ -1,7 +1,7 @@
-"""The scenario file, and the one effective configuration of a run that is made from it.
+"""The scenario file, and the effective configuration of a run that is made from it.
 
 A scenario names a robot, a scene, a controller, a pace and the services. `load` reads all three files, applies flags,
-and checks everything at once; the result is what every process of the run is given, and what repeats the run.
+and checks everything at once; every process of the run gets the result, and it is enough to repeat the run.
 """
 
 import hashlib
@@ -35,7 +35,7 @@ CHOSEN = (
 
 
 class Start(FileStruct, frozen=True, kw_only=True):
-    """Where the snake lies when the run begins: along the scene's route, or straight at a pose."""
+    """Start pose of the snake: along the scene's route, or straight at a pose."""
 
     on_route: bool = True
     tail_s_m: Annotated[float, Meta(ge=-100, le=1000, extra_json_schema={"unit": "m"})] = 0.0
@@ -44,26 +44,26 @@ class Start(FileStruct, frozen=True, kw_only=True):
 
 
 class Mission(FileStruct, frozen=True, kw_only=True):
-    """What navigation is asked for."""
+    """The goal of navigation."""
 
     speed_m_s: Annotated[float, Meta(ge=0, le=10, extra_json_schema={"unit": "m/s"})] = 0.2
 
 
 class Service(FileStruct, frozen=True, kw_only=True):
-    """A process that takes part in the run: it acts every so many ticks.
+    """A process of the run that acts every `every_ticks`.
 
-    In lockstep what it says of tick t counts from tick t + lag_ticks on, whenever it really arrived, so that a slow
-    service costs no determinism, and runs beside the simulator instead of holding it up. For control, a lag of 1 is a
+    In lockstep its output for tick t is used from tick t + lag_ticks on, whenever it really arrived, so that a slow
+    service does not break determinism, and runs in parallel to the simulator. For control, a lag of 1 is a
     command that acts in the period after its state; 2 adds a period of latency, in which control and physics overlap.
     """
 
     every_ticks: Annotated[int, Meta(ge=1, le=1000)] = 1
     lag_ticks: Annotated[int, Meta(ge=1, le=1000)] = 1
     restart: bool = True  # with `snakesim run --stay`, when its process ends; false: the run ends with it
-    external: bool = False  # somebody else's process: the run waits for it, and does not start it
+    external: bool = False  # a process that the run waits for, but does not start
 
     def counting_at(self, tick: int) -> int:
-        """The newest tick whose output counts at `tick`. That of tick 0 counts from the start."""
+        """The newest tick whose output is used at `tick`. That of tick 0 is used from the start."""
         due = max(tick - self.lag_ticks, 0)
         return due - due % self.every_ticks
 
@@ -72,10 +72,10 @@ Seconds = Annotated[float, above(60, "s")]
 
 
 class MaxAge(FileStruct, frozen=True, kw_only=True):
-    """How old what control acts on may be, in robot time; what is left out follows from rates, delays and schedules.
+    """Maximum age of control's inputs, in robot time; the defaults follow from rates, delays and schedules.
 
-    With joints older than this control sends no command, so that the lease ends and the robot stops. With an older
-    pose, contacts, world or trajectory the controller holds, and goes on when the stream is back.
+    With older joint states control sends no command, so that the lease ends and the robot stops. With an older pose,
+    contacts, world or trajectory the controller holds, and resumes when the stream is back.
     """
 
     joints_s: Seconds | None = None
@@ -86,7 +86,7 @@ class MaxAge(FileStruct, frozen=True, kw_only=True):
 
 
 class RunConfig(FileStruct, frozen=True, kw_only=True):
-    """Everything that a run is made of."""
+    """The whole configuration of a run."""
 
     name: Annotated[str, Meta(min_length=1, max_length=60)]
     title: str = ""
@@ -98,9 +98,7 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
     rate_hz: Annotated[float, Meta(ge=20, le=5000, extra_json_schema={"unit": "Hz"})] = 100.0
     duration_s: Annotated[float, Meta(gt=0, le=86400, extra_json_schema={"unit": "s"})] = 10.0
     seed: Annotated[int, Meta(ge=0, le=2**31)] = 1
-    faults: list[
-        str
-    ] = []  # what goes wrong on request, at times since the first arming: see snakesim_hal.model.injection
+    faults: list[str] = []  # injected faults, at times since the first arming: see snakesim_hal.model.injection
     faults_allowed: bool = False  # also where something real moves
     stall_limit_s: Annotated[float, Meta(gt=0, le=600, extra_json_schema={"unit": "s"})] = 10.0
     start: Start = Start()
@@ -112,7 +110,7 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
 
     @property
     def control_section(self) -> str:
-        """Where the settings of the chosen controller stand; for `./file.py:Wave` that is `controllers.Wave`."""
+        """Section with the settings of the chosen controller; for `./file.py:Wave` that is `controllers.Wave`."""
         return f"controllers.{self.controller.rpartition(':')[2]}"
 
     @property
@@ -122,7 +120,7 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
 
     @property
     def backend_section(self) -> str:
-        """Where the settings of the chosen backend stand; for `./file.py:Bench` that is `backends.Bench`."""
+        """Section with the settings of the chosen backend; for `./file.py:Bench` that is `backends.Bench`."""
         return f"backends.{self.backend.rpartition(':')[2]}"
 
     @property
@@ -132,12 +130,12 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
 
     @property
     def own_services(self) -> dict[str, Service]:
-        """The services whose processes belong to the run."""
+        """The services that the run starts itself."""
         return {name: service for name, service in self.services.items() if not service.external}
 
     @property
     def has_own_control(self) -> bool:
-        """Whether the run commands the robot itself; otherwise whoever does also arms it."""
+        """Whether the run has its own controller; otherwise the external one also arms the robot."""
         return CONTROL in self.own_services
 
     @property
@@ -152,13 +150,13 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
 
     @property
     def lease_ns(self) -> int:
-        """How long the robot lives on one command: five periods or 50 ms, whichever is longer, at most 100 ms."""
+        """Term of a lease: five periods or 50 ms, whichever is longer, at most 100 ms."""
         return min(max(5 * self.period_ns, 50_000_000), 100_000_000)
 
 
 @dataclass(frozen=True)
 class Loaded:
-    """A checked configuration, with where each value came from."""
+    """A checked configuration, with the origin of each value."""
 
     config: RunConfig
     table: Table
@@ -179,7 +177,7 @@ class Override:
 
 
 def parse_set(text: str) -> Override:
-    """`section.key=value` of --set; the value is read as TOML, and as plain text when it is none."""
+    """`section.key=value` of --set; the value is parsed as TOML, else taken as plain text."""
     key, equals, value = text.partition("=")
     key = key.strip()
     if not equals or not key:
@@ -242,7 +240,7 @@ def check(config: RunConfig) -> None:
 
 @dataclass(frozen=True)
 class StartPose:
-    """The snake at tick 0."""
+    """Pose of the snake at tick 0."""
 
     position_w: tuple[float, float]  # of the tail end, on the ground
     yaw_rad: float
@@ -250,7 +248,7 @@ class StartPose:
 
 
 def start_of(config: RunConfig) -> StartPose:
-    """Where the snake lies when the run begins."""
+    """Start pose of the snake."""
     robot, start = config.robot, config.start
     route = route_of(config.scene)
     if not start.on_route or route is None:
@@ -260,7 +258,7 @@ def start_of(config: RunConfig) -> StartPose:
 
 
 def capsules_at_start(config: RunConfig) -> list[Capsule]:
-    """The links at tick 0, seen from above."""
+    """Outlines of the links at tick 0, from above."""
     robot, pose = config.robot, start_of(config)
     rotation = rotation_from_quaternion(quaternion_from_yaw(pose.yaw_rad))
     origins, rotations = link_frames(
@@ -276,7 +274,7 @@ def capsules_at_start(config: RunConfig) -> list[Capsule]:
 
 
 def place_all(config: RunConfig) -> list[Placed]:
-    """The scene's obstacles, expanded and clear of the snake's start."""
+    """The scene's obstacles, expanded, and checked against the snake's start pose."""
     snake = capsules_at_start(config)
     placed = place(config.scene, snake)
     check_clear(config.scene, placed, snake)
@@ -290,7 +288,7 @@ def config_hash(config: RunConfig) -> str:
 
 
 def written(config: RunConfig) -> bytes:
-    """The effective configuration as a file holds it; `snakesim run` takes it like a scenario file."""
+    """The effective configuration as JSON; `snakesim run` accepts it like a scenario file."""
     return msgspec.json.format(msgspec.json.encode(config), indent=2)
 
 
@@ -300,5 +298,5 @@ def write(config: RunConfig, path: Path) -> None:
 
 
 def read(path: Path) -> RunConfig:
-    """Read back what `write` saved, whatever the file is called."""
+    """Read back a file saved by `write`, whatever its name."""
     return decode(read_table(path, ".json"), RunConfig)

@@ -1,7 +1,7 @@
-"""The scene file: ground, obstacles, and the route that a snake is to take through them.
+"""The scene file: ground, obstacles, and the route of the snake through them.
 
-The simulator builds it, guidance knows it as its map, the report draws it. `obstacles` expands peg rows and random
-fields into plain obstacles; `check_clear` refuses a scene in which one of them overlaps the snake's start.
+The simulator builds it, guidance uses it as its map, the report draws it. `place` expands peg rows and random
+fields into plain obstacles; `check_clear` rejects a scene in which one of them overlaps the snake's start pose.
 """
 
 import math
@@ -45,7 +45,7 @@ class Uneven(FileStruct, frozen=True, kw_only=True):
 
 
 class Ground(FileStruct, frozen=True, kw_only=True):
-    """The ground, and how it grips."""
+    """The ground, and its friction."""
 
     friction: Friction
     uneven: Uneven | None = None
@@ -60,7 +60,7 @@ class SineRoute(FileStruct, frozen=True, kw_only=True, tag="sine", tag_field="ki
 
 
 class WaypointRoute(FileStruct, frozen=True, kw_only=True, tag="waypoints", tag_field="kind"):
-    """Straight from point to point; give points densely for a smooth curve."""
+    """Straight lines between points; use many points for a smooth curve."""
 
     points_m: Annotated[list[Point], Meta(min_length=2, max_length=20000)]
 
@@ -118,7 +118,7 @@ class Step(FileStruct, frozen=True, kw_only=True):
 
 
 class PegsAlongRoute(FileStruct, frozen=True, kw_only=True):
-    """Pegs beside the route where a snake can push forward: at its inflections, on alternating sides.
+    """Pegs beside the route where a snake can push off: at its inflections, on alternating sides.
 
     `corridor_m` is the distance from the route to a peg's surface, so a body of radius r has `corridor_m - r` of
     clearance on that side.
@@ -127,13 +127,13 @@ class PegsAlongRoute(FileStruct, frozen=True, kw_only=True):
     corridor_m: Size
     radius_m: Size
     count: Annotated[int, Meta(ge=1, le=2000)]
-    first: Annotated[int, Meta(ge=0, le=2000)] = 0  # inflections to leave out at the start
+    first: Annotated[int, Meta(ge=0, le=2000)] = 0  # inflections to skip at the start
     height_m: Size = 0.2
     friction: Friction = 0.0
 
 
 class RandomField(FileStruct, frozen=True, kw_only=True):
-    """Pegs strewn by chance, the same for the same seed."""
+    """Randomly placed pegs, the same for the same seed."""
 
     seed: Annotated[int, Meta(ge=0, le=2**31)]
     low_m: Point
@@ -147,7 +147,7 @@ class RandomField(FileStruct, frozen=True, kw_only=True):
 
 
 MAX_STREWN = 1000
-MAX_OBSTACLES = 4096  # that the message World holds
+MAX_OBSTACLES = 4096  # bound of the message World
 
 
 class SceneFile(FileStruct, frozen=True, kw_only=True):
@@ -181,11 +181,11 @@ def route_of(scene: SceneFile) -> Route | None:
 
 
 class Placed(FileStruct, frozen=True, kw_only=True):
-    """An obstacle as placed, with what only the simulator needs to know of it."""
+    """A placed obstacle, with parameters that only the simulator needs."""
 
     obstacle: Obstacle
     friction: float
-    walkable: bool = False  # a step is part of the ground: lying on it is no contact to push off
+    walkable: bool = False  # a step is part of the ground: contacts with it are not for pushing off
 
 
 def place(scene: SceneFile, keep_clear: "list[Capsule] | None" = None) -> list[Placed]:
@@ -240,7 +240,7 @@ def _check_count(scene: SceneFile) -> None:
 
 
 def _wanted(field: RandomField) -> int:
-    """How many pegs a random field asks for."""
+    """Number of pegs of a random field."""
     return round(field.density_per_m2 * math.prod(np.subtract(field.high_m, field.low_m).tolist()))
 
 
@@ -344,7 +344,7 @@ def _strewn(
 
 
 class Capsule(FileStruct, frozen=True, kw_only=True):
-    """A link lying on the ground, seen from above."""
+    """Outline of a link on the ground, from above."""
 
     name: str
     rear_m: tuple[float, float]
@@ -352,7 +352,7 @@ class Capsule(FileStruct, frozen=True, kw_only=True):
     radius_m: float
 
     def distance_m(self, point: Floats) -> float:
-        """From a point to the capsule's surface; negative inside."""
+        """Distance from a point to the capsule's surface; negative inside."""
         rear, front = np.array(self.rear_m), np.array(self.front_m)
         axis = front - rear
         along = float(np.clip((point - rear) @ axis / max(float(axis @ axis), 1e-12), 0.0, 1.0))
@@ -360,7 +360,7 @@ class Capsule(FileStruct, frozen=True, kw_only=True):
 
 
 def outline_distance_m(obstacle: Obstacle, point: Floats) -> float:
-    """From a point on the ground to an obstacle's outline seen from above; negative inside."""
+    """Distance from a point on the ground to an obstacle's outline from above; negative inside."""
     offset = np.asarray(point, dtype=np.float64) - np.array(obstacle.position_w[:2])
     if obstacle.shape != "box":
         return float(np.hypot(*offset)) - obstacle.radius_m

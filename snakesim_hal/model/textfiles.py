@@ -1,6 +1,6 @@
-"""Text files from and to anywhere: bounded in size, depth and time, and never a pipe, a device or a symlink by mistake.
+"""Read and write text files safely: bounded in size, depth and time, and never a pipe, a device or a symlink.
 
-What cannot be read or written ends in one ConfigError that names the file and the reason.
+Every failure is one ConfigError that names the file and the reason.
 """
 
 import codecs
@@ -36,7 +36,7 @@ def read_text(path: Path) -> str:
     """A whole file as text. Raises ConfigError. A UTF-8 byte-order mark is skipped."""
     data = read_bytes(path)
     if data.startswith(_UTF16) or b"\0" in data:
-        raise ConfigError(f"{path}: is UTF-16 text, or none at all; save it as UTF-8")
+        raise ConfigError(f"{path}: is UTF-16 text, or not text; save it as UTF-8")
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -50,7 +50,7 @@ def read_bytes(path: Path) -> bytes:
     try:
         mode = path.stat().st_mode
         data = b""
-        if stat.S_ISREG(mode):  # opening a device may do something, opening a pipe waits
+        if stat.S_ISREG(mode):  # opening a device may have side effects, opening a pipe blocks
             with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
                 data = file.read(MAX_BYTES + 1)
     except FileNotFoundError:
@@ -61,7 +61,7 @@ def read_bytes(path: Path) -> bytes:
         raise ConfigError(f"{path}: cannot be read: {error}") from None
     _check_plain(path, mode)
     if len(data) > MAX_BYTES:
-        raise ConfigError(f"{path}: is larger than {MAX_BYTES // MB} MB, which no file of settings is")
+        raise ConfigError(f"{path}: is larger than {MAX_BYTES // MB} MB, the limit of a settings file")
     return data
 
 
@@ -100,7 +100,7 @@ def parse_toml(text: str, source: str) -> dict[str, Any]:
 
 
 def check_brackets(text: str, source: str) -> None:
-    """For a text that somebody else parses: Zenoh overflows its stack on deep nesting. Raises ConfigError."""
+    """For a text that another library parses: Zenoh overflows its stack on deep nesting. Raises ConfigError."""
     depth = 0
     for bracket in re.findall(r"[][{}]", text):
         depth += 1 if bracket in "[{" else -1
@@ -109,7 +109,7 @@ def check_brackets(text: str, source: str) -> None:
 
 
 def _check_depth(value: Any, source: str) -> None:
-    """Everything that walks through values may call itself once a level after this."""
+    """After this check, code that walks through the values may recurse once a level."""
     level: list[Any] = [value]
     for _ in range(MAX_DEPTH):
         inner: list[Any] = []
@@ -125,7 +125,7 @@ def _check_depth(value: Any, source: str) -> None:
 
 
 def write_text(path: Path, text: str, encoding: str = "utf-8") -> None:
-    """Write a file whole, or leave what was there. Raises ConfigError; also where a link or a device stands."""
+    """Write a file atomically, or leave it unchanged. Raises ConfigError; also for a link or a device."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with contextlib.suppress(FileNotFoundError):

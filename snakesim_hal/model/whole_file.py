@@ -1,4 +1,4 @@
-"""Files that are there whole, or not at all."""
+"""Atomic file writes: a file is complete, or absent."""
 
 import contextlib
 import os
@@ -8,9 +8,9 @@ PARTIAL = ".partial"
 
 
 def write_whole(path: Path, content: bytes, *, durable: bool = False) -> None:
-    """Put a file in the place of an earlier one. Raises OSError; then the earlier one is still there, and nothing new.
+    """Replace a file atomically. Raises OSError; then the earlier file is unchanged.
 
-    durable: only return when it is on the disk, and survives a loss of power.
+    durable: return only when it is on the disk, and survives a loss of power.
     """
     partial = path.with_name(path.name + PARTIAL)
     try:
@@ -30,7 +30,7 @@ def write_whole(path: Path, content: bytes, *, durable: bool = False) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Have a folder's entries on the disk."""
+    """Flush a folder's entries to the disk."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)

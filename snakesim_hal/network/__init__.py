@@ -1,9 +1,9 @@
-"""The network; the only home of Zenoh.
+"""The network; the only room that imports Zenoh.
 
-`session`         publishers, readers and questions on Zenoh; `endpoint`, `mailbox`, `run_key` beside it
+`session`         publishers, readers and queries on Zenoh; with `endpoint`, `mailbox`, `run_key`
 `local_network`   the same sessions within one process, without Zenoh
-`client`          what guidance, navigation and control use; it never names a backend
-`robot_mismatch`  messages that decode, but do not fit the robot
-`stop_port`       emergency stops by UDP, beside Zenoh; `local_registry` finds the robots of this machine
+`client`          the interface of guidance, navigation and control; independent of the backend
+`robot_mismatch`  rejects messages that do not fit the robot
+`stop_port`       emergency stops by UDP, without Zenoh; `local_registry` finds the robots of this machine
 `private_channel` between a host and the process that started it
 """

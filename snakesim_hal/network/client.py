@@ -1,7 +1,7 @@
-"""What guidance, navigation and control use of the HAL: ticks, readings, outputs, and the right to command.
+"""The HAL client of guidance, navigation and control: ticks, readings, outputs, and the right to command.
 
-A service loops over `ticks()`. What it reads at a tick is what the clock's table of contents names, so a lockstep run
-gives every service the same inputs however the processes happened to be scheduled.
+A service loops over `ticks()`. At a tick it reads the samples that the clock names, so a lockstep run
+gives every service the same inputs, however the processes were scheduled.
 """
 
 import time
@@ -32,25 +32,25 @@ from snakesim_hal.wire.messages import (
 )
 
 KEPT_PER_KEY = 32
-NO_TICK = -1  # of messages that are of no tick, such as an intent: only the newest is kept
+NO_TICK = -1  # of messages without a tick, such as an intent: only the newest is kept
 MISSING_LIMIT_S = 2.0
 LEASE_RETRY_S = 0.25
 
 
 class Feed(Generic[MessageT]):
-    """The samples of one key, found by the tick that they are of."""
+    """The samples of one key, by tick."""
 
     def __init__(
         self, reader: Reader[MessageT], key: str, fits: Callable[[Message], bool] = lambda _message: True
     ) -> None:
-        """fits: whether a message is about the robot that is there; what is not is left out."""
+        """fits: whether a message fits the robot; others are dropped."""
         self._reader = reader
         self._fits = fits
         self._kept: OrderedDict[int, MessageT] = OrderedDict()
         self.key = key
 
     def take_in(self, *, newest_only: bool = False) -> None:
-        """Move what arrived into the shelf."""
+        """Store newly arrived samples."""
         if newest_only:
             newest = self._reader.newest(self._fits)
             fitting = [] if newest is None else [newest]
@@ -64,11 +64,11 @@ class Feed(Generic[MessageT]):
             self._kept.popitem(last=False)
 
     def clear(self) -> None:
-        """Forget everything: the HAL started over."""
+        """Drop everything: the HAL has restarted."""
         self._kept.clear()
 
     def newest(self) -> MessageT | None:
-        """The sample that came last."""
+        """The sample that arrived last."""
         return self._kept[next(reversed(self._kept))] if self._kept else None
 
     def at(self, tick: int) -> MessageT | None:
@@ -80,9 +80,9 @@ class Client:
     """A service's connection to one robot's HAL."""
 
     def __init__(self, session: Session, service: str, *, every_ticks: int = 1, pace: Pace = "lockstep") -> None:
-        """every_ticks: the service acts on ticks that are multiples of this, and sleeps through the others.
+        """every_ticks: the service acts on ticks that are multiples of this, and ignores the others.
 
-        pace: of the run. A robot in real time has no clock in lockstep, for which a service would wait.
+        pace: of the run. Clocks of another pace are rejected: a service would wait for a lockstep clock.
         """
         self.service = service
         self.session = session
@@ -96,33 +96,33 @@ class Client:
         self._done: Publisher[Done] | None = None
         self._robot: Description | None = None
         self._clock: Clock | None = None
-        self._ahead: Clock | None = None  # taken from the queue, and not due yet
+        self._ahead: Clock | None = None  # taken from the queue, but not due yet
         self._started_over = False
         self.commanded_tick = -1
         session.on_arrival(keys.CLOCK, self._take_clock)
 
     def description(self, timeout_s: float = 10.0) -> Description:
-        """The robot. Raises NotConnectedError when no HAL shows one in time."""
+        """The robot's description. Raises NotConnectedError when no HAL publishes one in time."""
         self._robot = self._robot or self._own_description(timeout_s)
         if self._robot is None:
             raise NotConnectedError(f"no robot description within {timeout_s} s; is the robot's HAL host running?")
         return self._robot
 
     def subscribe(self, key: str, message: type[MessageT]) -> Feed[MessageT]:
-        """Start listening to a key; do this for everything before `announce`."""
+        """Subscribe to a key; do this for all keys before `announce`."""
         feed = Feed(self.session.reader(key, message), key, self._fits)
         self._feeds[key] = feed
         return feed
 
     def _fits(self, message: Message) -> bool:
-        """Whether a message is about our robot, as far as it is known; what is not is counted."""
+        """Whether a message fits our robot, as far as it is known; others are counted."""
         reason = None if self._robot is None else mismatch(message, self._robot)
         if reason is not None:
             self.session.rejected[reason] += 1
         return reason is None
 
     def announce(self) -> None:
-        """Show that the service is here. A lockstep run waits for it from now on."""
+        """Declare the service's liveliness token. A lockstep run waits for it from now on."""
         self.session.declare_alive(self.service)
 
     def ticks(self, silence_s: float | None = None) -> Iterator[Clock | None]:
@@ -144,7 +144,7 @@ class Client:
             yield clock
 
     def _next_clock(self, timeout_s: float | None) -> Clock:
-        """The next due clock; in lockstep the newest of its tick, which is shown again while time stands still."""
+        """The next due clock; in lockstep the newest of its tick, which is repeated while time stands still."""
         clock = self._ahead or self._clocks.get(timeout=timeout_s)
         self._ahead = None
         while not self._clocks.empty():
@@ -156,14 +156,14 @@ class Client:
         return clock
 
     def hear(self, timeout_s: float) -> Clock | None:
-        """The newest clock, due or not; waits for the first one. None when there is none in time."""
+        """The newest clock, due or not; waits for the first one. None when none comes in time."""
         deadline = time.monotonic() + timeout_s
         while self.heard is None and time.monotonic() < deadline:
             time.sleep(0.001)
         return self.heard
 
     def met_anew(self) -> Description | None:
-        """The robot, when its HAL has started over since the last call; else None."""
+        """The robot's description, if its HAL has restarted since the last call; else None."""
         if not self._started_over:
             return None
         self._started_over = False
@@ -171,12 +171,12 @@ class Client:
         return self._robot
 
     def _own_description(self, timeout_s: float) -> Description | None:
-        """What our own run's host shows; a forged one is not looked at."""
+        """The description of our own run's host; a forged one is ignored."""
         key = own_run_key()
         return self.session.latest(keys.DESCRIPTION, Description, timeout_s, lambda found: is_proven(found, key))
 
     def _take_clock(self, arrival: Arrival) -> None:
-        """Runs in Zenoh's thread: wakes the service only for ticks that are its own."""
+        """Runs in Zenoh's thread: wakes the service only for its due ticks."""
         self._heard_at = arrival.monotonic_ns * 1e-9
         try:
             clock = self._clock_decoder.decode(arrival.payload, arrival.encoding)
@@ -191,9 +191,9 @@ class Client:
             self._clocks.put(clock)
 
     def read(self, feed: Feed[MessageT]) -> MessageT | None:
-        """What counts at this tick at the feed's key; None when there is none (yet).
+        """The valid sample at this tick of the feed's key; None when there is none (yet).
 
-        Raises StalledError when a lockstep run promises a sample that does not come.
+        Raises StalledError when in lockstep the clock names a sample that does not come.
         """
         clock = self._clock
         if clock is None:
@@ -213,7 +213,7 @@ class Client:
             found = feed.at(wanted)
             if found is not None:
                 return found
-        raise StalledError(f"{feed.key} of tick {wanted} was promised at tick {clock.tick} and never came")
+        raise StalledError(f"{feed.key} of tick {wanted} was named by the clock of tick {clock.tick} and never came")
 
     def put(self, key: str, message: Message) -> None:
         """Publish an output of this service."""
@@ -225,7 +225,7 @@ class Client:
         publisher.put(message)
 
     def done(self, tick: int) -> None:
-        """Say that everything owed for a tick is published. A command that answers the tick says so itself."""
+        """Report that all output for a tick is published. A command that answers the tick implies it."""
         if self.commanded_tick == tick:
             return
         if self._done is None:
@@ -247,7 +247,7 @@ class Commander:
         self.refusal: str | None = None
 
     def holds(self, clock: Clock) -> bool:
-        """Whether the lease is ours at this tick; asks for it when nobody holds it."""
+        """Whether the lease is ours at this tick; requests it when it is free."""
         if self._epoch and clock.lease_epoch == self._epoch:
             return True
         now = time.monotonic()
@@ -265,7 +265,7 @@ class Commander:
         return answer.ok
 
     def send(self, clock: Clock, joints: JointState, set_points: SetPoints) -> None:
-        """Publish set-points that answer a joint state; they are good for one lease term from when it was published."""
+        """Publish set-points that answer a joint state; they are valid for one lease term after its publishing."""
         self._sequence += 1
         command = JointCommand(
             tick=joints.tick,
@@ -282,7 +282,7 @@ class Commander:
         self._client.commanded_tick = joints.tick
 
     def stay(self, joints: JointState) -> SetPoints:
-        """Set-points that keep every joint where it is: what is streamed while the robot is not armed."""
+        """Set-points that hold every joint at its angle: sent while the robot is not armed."""
         count = len(self._description.joints)
         limits = [joint.torque_limit_nm for joint in self._description.joints]
         return SetPoints([Mode.POSITION] * count, list(joints.angle_rad), limits)

@@ -1,4 +1,4 @@
-"""Endpoints and namespaces as people type them, checked before Zenoh sees them: it says little about wrong ones."""
+"""Checks of endpoints and namespaces that people type, because Zenoh's own error messages are terse."""
 
 import re
 
@@ -13,7 +13,7 @@ _parts = re.compile(
 
 
 def check_endpoint(text: str, origin: str) -> str:
-    """The endpoint, when it is one to connect to. Raises ConfigError; origin: the flag or file that it came from."""
+    """The endpoint, if it is valid. Raises ConfigError; origin: the flag or file that it came from."""
     given = f"{origin} {short(text)}"
     if text.startswith("unixsock-stream/") and len(text) > len("unixsock-stream/"):
         return text
@@ -28,7 +28,7 @@ def check_endpoint(text: str, origin: str) -> str:
 
 
 def check_namespace(text: str, origin: str) -> str:
-    """The namespace, when it is one. Raises ConfigError."""
+    """The namespace, if it is valid. Raises ConfigError."""
     if not re.fullmatch(r"[^/*$?#\s@]+(/[^/*$?#\s@]+)*", text) or not text.isprintable():
         raise ConfigError(
             f"{origin} {short(text)!r}: this is not a namespace; give a name such as planar13 or lab/planar13, without "

@@ -1,6 +1,6 @@
-"""The robots of this user on this computer: where tools find every running HAL, whatever port it got.
+"""The robots of this user on this computer: tools find every running HAL here, whatever its port.
 
-Each run keeps a small file, locked for as long as its process lives; the kernel lets go of the lock however it dies.
+Each run keeps a small file, locked for as long as its process lives; the kernel releases the lock however it dies.
 """
 
 import contextlib
@@ -15,31 +15,31 @@ from snakesim_hal.wire.codec import UNDECODABLE
 
 
 class LocalRobot(msgspec.Struct, frozen=True, kw_only=True):
-    """A robot whose HAL host runs on this computer, or is about to."""
+    """A robot whose HAL host runs, or is starting, on this computer."""
 
     namespace: str
     robot: str
     backend: str
-    endpoint: str  # where its network meets
+    endpoint: str  # Zenoh endpoint
     stop_host: str  # of its stop port
     stop_port: int
-    pid: int  # of the process that answers for it: `snakesim run`, or a host that was started by itself
+    pid: int  # of the responsible process: `snakesim run`, or a host that was started on its own
 
 
 def state_folder() -> Path:
-    """Where SnakeSIM keeps what outlives a run: `$XDG_STATE_HOME/snakesim`, by default `~/.local/state/snakesim`."""
+    """Folder of state that outlives a run: `$XDG_STATE_HOME/snakesim`, by default `~/.local/state/snakesim`."""
     return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "snakesim"
 
 
 def robot_folder(robot: str, backend: str, hardware: str) -> Path:
-    """Where what belongs to one robot is kept: its emergency stop. The same in every run, from any folder."""
+    """Folder of one robot's state: its emergency stop. The same in every run, from any folder."""
     name = "-".join(filter(None, (robot, backend, hardware)))
     return state_folder() / "robots" / "".join(c if c.isalnum() or c in "-_+." else "_" for c in name)
 
 
 @contextlib.contextmanager
 def registered(robot: LocalRobot) -> Iterator[str | None]:
-    """Have tools find a robot. Gives why they will not, when the file cannot be kept; None when all is well."""
+    """Register a robot for tools. Yields why they will not find it, if the file cannot be written; otherwise None."""
     path = _live() / f"{robot.pid}.json"
     try:
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -62,7 +62,7 @@ def registered(robot: LocalRobot) -> Iterator[str | None]:
 
 
 def local_robots() -> list[LocalRobot]:
-    """Every robot whose process lives, by process id. Files of those that are gone are removed."""
+    """Every robot whose process lives, by process id. Removes files of dead ones."""
     found: list[LocalRobot] = []
     for path in sorted(_live().glob("*.json")) if _live().is_dir() else []:
         with contextlib.suppress(OSError, *UNDECODABLE):

@@ -1,7 +1,7 @@
-"""A queue between Zenoh's threads and one that waits with a deadline.
+"""A queue from Zenoh's threads to one that waits with a deadline.
 
-`queue.SimpleQueue.get(timeout=...)` of CPython 3.11 may wait for ever: when the thread is held up for longer than the
-timeout between its two looks at the clock, what is left is negative, and the lock takes that for no limit at all. On a
+`queue.SimpleQueue.get(timeout=...)` of CPython 3.11 may wait for ever: if the thread is delayed for longer than the
+timeout between its two readings of the clock, the remaining time is negative, which the lock takes for no limit. On a
 busy machine that stopped a host for good: it waited for a command, and the controller for its clock.
 """
 
@@ -19,8 +19,7 @@ ItemT = TypeVar("ItemT")
 class Mailbox(Generic[ItemT]):
     """Any number of threads put, one takes. Raises queue.Empty, as the queues of the standard library do.
 
-    It may have lanes: an item of a lower lane is taken before all of a higher one. A lane that is full forgets its
-    oldest item.
+    It may have lanes: items of a lower lane are taken before those of a higher one. A full lane drops its oldest item.
     """
 
     def __init__(self, limits: Sequence[int | None] = (None,)) -> None:
@@ -32,11 +31,11 @@ class Mailbox(Generic[ItemT]):
     def put(self, item: ItemT, lane: int = 0) -> None:
         """Add an item; never waits."""
         self._lanes[lane].append(item)
-        with contextlib.suppress(RuntimeError):  # it has rung already
+        with contextlib.suppress(RuntimeError):  # already released
             self._bell.release()
 
     def full(self, lane: int = 0) -> bool:
-        """Whether one more item would push out the oldest."""
+        """Whether one more item would displace the oldest."""
         return len(self._lanes[lane]) == self._lanes[lane].maxlen
 
     def get(self, timeout: float | None = None) -> ItemT:
@@ -56,9 +55,9 @@ class Mailbox(Generic[ItemT]):
         return self.get(timeout=0.0)
 
     def empty(self) -> bool:
-        """Whether nothing is there now."""
+        """Whether there are no items now."""
         return not any(self._lanes)
 
     def qsize(self) -> int:
-        """How much is there now."""
+        """Number of items now."""
         return sum(map(len, self._lanes))

@@ -1,7 +1,7 @@
-"""The private channel between a host and the process that started it: a socket pair that nobody else can reach.
+"""The private channel between a host and the process that started it: a socket pair without other access.
 
-Over it the host shows its description and its status, and takes requests. So whoever started a host knows, without
-believing anything on the network, which robot that is, how it is, and that it is this one that is armed.
+Over it the host sends its description and its status, and takes requests. So the starter knows, without
+trusting anything on the network, which robot that is, its state, and that it is this one that is armed.
 """
 
 import contextlib
@@ -17,7 +17,7 @@ MAX_BYTES = 1 << 18
 
 
 class ToStarter(msgspec.Struct, frozen=True, kw_only=True):
-    """What a host says: one of these at a time."""
+    """A message of the host: one of these at a time."""
 
     description: Description | None = None
     status: Status | None = None
@@ -25,15 +25,15 @@ class ToStarter(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def socket_pair() -> tuple[socket.socket, socket.socket]:
-    """Two ends that keep messages apart: one for the starter, one to be inherited by the host."""
+    """Two ends with message boundaries: one for the starter, one to be inherited by the host."""
     return socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
 
 
 class HostEnd:
-    """The host's end. Never waits: a starter that does not read misses what it does not read."""
+    """The host's end. Never waits: messages that the starter does not read are lost."""
 
     def __init__(self, inherited: socket.socket | None) -> None:
-        """inherited: None for a host that was started by itself."""
+        """inherited: None for a host that was started on its own."""
         self._socket = inherited
 
     @staticmethod
@@ -42,13 +42,13 @@ class HostEnd:
         return HostEnd(None if descriptor is None else socket.socket(fileno=descriptor))
 
     def say(self, message: ToStarter) -> None:
-        """Tell the starter."""
+        """Send a message to the starter."""
         if self._socket is not None:
             with contextlib.suppress(OSError):
                 self._socket.send(msgspec.msgpack.encode(message), socket.MSG_DONTWAIT)
 
     def serve(self, take: Callable[[LifecycleRequest, Callable[[Answer], None]], None]) -> None:
-        """Call `take(request, reply)` for each request, from a thread of its own."""
+        """Call `take(request, reply)` for each request, from a separate thread."""
         opened = self._socket
         if opened is None:
             return
@@ -68,7 +68,7 @@ class HostEnd:
 
 
 class StarterEnd:
-    """The starter's end: what its host said last."""
+    """The starter's end: the last messages of its host."""
 
     def __init__(self, opened: socket.socket) -> None:
         self._socket = opened
@@ -79,11 +79,11 @@ class StarterEnd:
         self.answers: list[Answer] = []
 
     def take_in(self) -> None:
-        """Read what has come."""
+        """Read new messages."""
         while True:
             try:
                 message = self._socket.recv(MAX_BYTES)
-            except OSError:  # nothing there, or the host is gone
+            except OSError:  # no message, or the host is gone
                 return
             if not message:
                 return
@@ -94,10 +94,10 @@ class StarterEnd:
                 self.answers.append(said.answer)
 
     def ask(self, request: LifecycleRequest) -> None:
-        """Ask; the answer comes into `answers`."""
+        """Send a request; the answer is appended to `answers`."""
         with contextlib.suppress(OSError):
             self._socket.send(msgspec.msgpack.encode(request))
 
     def close(self) -> None:
-        """Let go of it."""
+        """Close the socket."""
         self._socket.close()

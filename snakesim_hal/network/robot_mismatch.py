@@ -1,6 +1,6 @@
-"""Whether a message that could be decoded is about the robot that is there. Pure.
+"""Checks that a decoded message fits the robot. Pure.
 
-The wire's bounds know no robot. A joint state of three joints is a good message, and still none of a snake of thirteen.
+The wire's bounds do not depend on the robot. A joint state of three joints is valid, but not for a snake of thirteen.
 """
 
 import math
@@ -13,11 +13,11 @@ from snakesim_hal.model.route import is_line
 from snakesim_hal.wire.messages import Contacts, Description, Imu, JointState, Message, Pose, Power, Trajectory, World
 
 MAX_PATH_M = 1e5
-UNIT_NORM_ERROR = 0.1  # of a rotation; rounding makes far less
+UNIT_NORM_ERROR = 0.1  # of a rotation; rounding errors are far smaller
 
 
 def mismatch(message: Message, robot: Description) -> str | None:
-    """Why a message cannot be of this robot, in a word to count by; None when it can be."""
+    """Why a message does not fit this robot, as a word to count by; None when it fits."""
     joints, links = len(robot.joints), len(robot.links)
     match message:
         case JointState():
@@ -45,7 +45,7 @@ def mismatch(message: Message, robot: Description) -> str | None:
 
 
 def _is_path(points_w: NDArray[np.float64]) -> bool:
-    """Whether a snake could go along it; lengths beyond that could not be told in `control/state`."""
+    """Whether it is a usable path; longer ones would exceed the bounds of `control/state`."""
     return (
         is_line(points_w)
         and float(np.hypot(*np.diff(points_w, axis=0).T).sum()) <= MAX_PATH_M

@@ -1,7 +1,7 @@
-"""The run key: a secret that a run's processes inherit, by which they know their own host's description.
+"""The run key: a secret that a run's processes inherit, by which they recognise their own host's description.
 
-Anybody on the network can publish a description. The one of a run's own host carries a proof that only somebody with
-the run's key could make, so no service of a run believes another.
+Any client on the network can publish a description. The one of a run's own host carries a proof that needs
+the run's key, so the services of a run reject any other.
 """
 
 import hmac
@@ -17,12 +17,12 @@ RUN_KEY = "SNAKESIM_RUN_KEY"  # environment variable: the processes of other use
 
 
 def new_run_key() -> str:
-    """For one run."""
+    """A new key, for one run."""
     return secrets.token_hex(32)
 
 
 def own_run_key() -> str | None:
-    """Of the run that this process is part of; None when it was started by itself."""
+    """The key of the run that this process is part of; None when it was started on its own."""
     return os.environ.get(RUN_KEY) or None
 
 
@@ -32,7 +32,7 @@ def proven(description: Description, key: str | None) -> Description:
 
 
 def is_proven(description: Description, key: str | None) -> bool:
-    """Whether it is of the run's own host; without a key nobody can tell, and any will do."""
+    """Whether it is of the run's own host; without a key this cannot be checked, and any is accepted."""
     return key is None or hmac.compare_digest(description.proof, _proof(description, key))
 
 

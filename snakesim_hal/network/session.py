@@ -1,8 +1,8 @@
 """The Zenoh session: explicit endpoints, no scouting, one namespace a robot, and the quality of service per kind.
 
-Without a router of its own, a robot's HAL host is the place where its loopback sessions meet: it listens (mode
+Without a router of its own, all loopback sessions of a robot connect to its HAL host: the host listens (mode
 `router`), and everything else connects to it (mode `client`). Zenoh peers do not forward for one another unless gossip
-tells them of each other, and gossip is off here. With `--router` the host too is a client of the lab's router.
+introduces them, and gossip is off here. With `--router` the host too is a client of the lab's router.
 """
 
 import json
@@ -28,31 +28,31 @@ from snakesim_hal.wire.messages import Answer, Message
 
 DEFAULT_PORT = 7447
 DEFAULT_ENDPOINT = f"tcp/127.0.0.1:{DEFAULT_PORT}"
-MAX_MESSAGE_BYTES = MAX_PAYLOAD_BYTES + 4096  # with key and encoding; what is longer costs neither memory nor time
-# Who connects and says nothing is let go after a second, and there is room for many who do.
+MAX_MESSAGE_BYTES = MAX_PAYLOAD_BYTES + 4096  # with key and encoding; longer messages cost neither memory nor time
+# Connections that stay silent are closed after a second, and many of them are allowed.
 UNICAST = {"accept_timeout": 1000, "accept_pending": 1000, "max_sessions": 4000}
-# A reader that does not read loses samples after 0.1 ms (Zenoh's default is 1 ms), so that ten of them cost a writer
-# little. With less, bursts to good readers are lost: at 0 ms, two thirds of six express messages in a row.
+# A subscriber that does not read loses samples after 0.1 ms (Zenoh's default is 1 ms), so that ten of them hardly delay
+# a writer. With less, bursts to good subscribers are lost: at 0 ms, two thirds of six express messages in a row.
 TX = {"lease": 2000, "queue": {"congestion_control": {"drop": {"wait_before_drop": 100}}}}
-# Letting go of a frozen reader holds up a receiving thread of Zenoh, and it has two: three readers that freeze together
-# kept the controller's commands out for long enough to end its lease.
+# Closing a frozen subscriber blocks a receiving thread of Zenoh, and by default it has two: three subscribers that
+# froze together blocked the controller's commands for long enough to end its lease.
 RUNTIME = ("ZENOH_RUNTIME", "(rx: (worker_threads: 16))")
-MAX_OPEN_FILES = 16384  # a connection takes one, and a process has 1024 unless it asks for more
-READER_DEPTH = 256  # deep enough that a burst of noise on a key does not push out the sample that counts
+MAX_OPEN_FILES = 16384  # each connection takes one, and the default limit of a process is 1024
+READER_DEPTH = 256  # so that a burst of noise on a key does not displace the valid sample
 
 
 @dataclass(frozen=True)
 class Link:
-    """How a process joins the robot's network."""
+    """How a process connects to the robot's network."""
 
     endpoint: str = DEFAULT_ENDPOINT
-    namespace: str | None = None  # None: the whole network, for tools that look for robots
-    listen: bool = False  # True: be the meeting point; False: connect to it
+    namespace: str | None = None  # None: the whole network, for tools that search for robots
+    listen: bool = False  # True: listen on the endpoint; False: connect to it
 
 
 @dataclass(frozen=True)
 class Arrival:
-    """A sample as it came in, not decoded yet."""
+    """A received sample, not decoded yet."""
 
     key: str
     payload: bytes
@@ -70,16 +70,16 @@ class Publisher(Generic[MessageT]):
         self._put = send
 
     def put(self, message: MessageT) -> None:
-        """Send it; may wait for a slow reader only when the publisher was declared lossless."""
+        """Send it; waits for a slow subscriber only when the publisher was declared lossless."""
         self._put(encode(message))
 
     def reroute(self, put: Callable[[bytes], None] | None) -> None:
-        """Hand what is put to somebody who may `send` it; None: straight out again."""
+        """Pass payloads to `put` instead of sending them; None: send directly again."""
         self._put = self.send if put is None else put
 
 
 class Reader(Generic[MessageT]):
-    """The newest samples of one key, decoded when they are asked for, in the asking thread."""
+    """The newest samples of one key, decoded on request, in the caller's thread."""
 
     def __init__(self, subscriber: Any, message: type[MessageT], rejected: Counter[str]) -> None:
         self.subscriber = subscriber
@@ -87,13 +87,13 @@ class Reader(Generic[MessageT]):
         self._rejected = rejected
 
     def drain(self) -> list[MessageT]:
-        """Everything that arrived since the last call, oldest first. What cannot be decoded is counted and left out."""
+        """All samples since the last call, oldest first. Those that cannot be decoded are counted and dropped."""
         return [message for sample in self._arrived() if (message := self._decoded(sample)) is not None]
 
     def newest(self, wanted: Callable[[MessageT], bool]) -> MessageT | None:
-        """The newest that is wanted of what arrived since the last call.
+        """The newest sample since the last call for which `wanted` is true.
 
-        What came before it is dropped unread, so that a flood costs its reader little.
+        Earlier ones are dropped without decoding, so that a flood costs little.
         """
         for sample in reversed(self._arrived()):
             message = self._decoded(sample)
@@ -135,19 +135,19 @@ class Question:
 
 
 class Session:
-    """What SnakeSIM uses of Zenoh. Open one with `open_session`."""
+    """A Zenoh session, as SnakeSIM uses it. Open one with `open_session`."""
 
     def __init__(self, zenoh_session: Any) -> None:
         self._zenoh = zenoh_session
         self._declared: list[Any] = []
         self._publishers: dict[str, Publisher[Any]] = {}
         self._reroutes: dict[str, Callable[[bytes], None]] = {}
-        self.rejected: Counter[str] = Counter()  # samples that readers could not take, by reason
+        self.rejected: Counter[str] = Counter()  # samples that could not be decoded, by reason
 
     def publisher(self, key: str, message: type[MessageT], *, lossless: bool = False) -> Publisher[MessageT]:
-        """A publisher for a stream. Lossless waits for slow readers (lockstep); otherwise samples are dropped."""
+        """A publisher for a stream. Lossless waits for slow subscribers (lockstep); otherwise samples are dropped."""
         command = key == keys.JOINT_COMMAND
-        # What ends a tick is sent at once, and takes along what was put just before it: one packet instead of five.
+        # The last message of a tick is sent at once, batched with those put just before it: one packet instead of five.
         ends_a_tick = command or key == keys.CLOCK or key.startswith(keys.done(""))
         publisher = self._zenoh.declare_publisher(
             key,
@@ -159,7 +159,7 @@ class Session:
         return self._published(key, publisher, message)
 
     def latched_publisher(self, key: str, message: type[MessageT]) -> Publisher[MessageT]:
-        """A publisher whose last value is given to readers that come later."""
+        """A publisher whose last value is sent to later subscribers."""
         publisher = ext.declare_advanced_publisher(
             self._zenoh,
             key,
@@ -180,7 +180,7 @@ class Session:
         return made
 
     def reroute(self, key: str, put: Callable[[bytes], None] | None) -> None:
-        """Hand what is published on a key, now or later, to somebody who may `send` it; None: straight out again."""
+        """Pass payloads of a key's present and future publishers to `put`; None: send them directly again."""
         if put is None:
             self._reroutes.pop(key, None)
         else:
@@ -189,7 +189,7 @@ class Session:
             self._publishers[key].reroute(put)
 
     def send(self, key: str, payload: bytes) -> None:
-        """Send bytes on a key that this session publishes on."""
+        """Send raw bytes on a key that this session publishes on, bypassing any reroute."""
         self._publishers[key].send(payload)
 
     def reader(self, key: str, message: type[MessageT], *, depth: int = READER_DEPTH) -> Reader[MessageT]:
@@ -199,7 +199,7 @@ class Session:
         return Reader(subscriber, message, self.rejected)
 
     def latched_reader(self, key: str, message: type[MessageT]) -> Reader[MessageT]:
-        """Like `reader`, and it gets the value that was latched before it came."""
+        """Like `reader`, and it also gets the value that was latched before."""
         subscriber = ext.declare_advanced_subscriber(
             self._zenoh,
             key,
@@ -210,7 +210,7 @@ class Session:
         return Reader(subscriber, message, self.rejected)
 
     def stop_reading(self, reader: Reader[Any]) -> None:
-        """Close a reader: what nobody asks it for any more need not be kept."""
+        """Close a reader that is no longer used."""
         self._declared.remove(reader.subscriber)
         reader.subscriber.undeclare()
 
@@ -221,7 +221,7 @@ class Session:
         timeout_s: float,
         wanted: Callable[[MessageT], bool] = lambda _message: True,
     ) -> MessageT | None:
-        """The value latched on a key; None when there is none (that is wanted) in time."""
+        """The value latched on a key (for which `wanted` is true); None when there is none in time."""
         reader, deadline = self.latched_reader(key, message), time.monotonic() + timeout_s
         while (found := reader.newest(wanted)) is None and time.monotonic() < deadline:
             time.sleep(0.01)
@@ -229,11 +229,11 @@ class Session:
         return found
 
     def on_arrival(self, key: str, take: Callable[[Arrival], None]) -> None:
-        """Call `take` for every sample, in Zenoh's thread: it must only store, never compute."""
+        """Call `take` for every sample, in Zenoh's thread: it must only store the sample."""
         self._declared.append(self._zenoh.declare_subscriber(key, _storing(take)))
 
     def on_latched_arrival(self, key: str, take: Callable[[Arrival], None]) -> None:
-        """Like `on_arrival`, and it gets the values that were latched before it came."""
+        """Like `on_arrival`, and it also gets the values that were latched before."""
         self._declared.append(ext.declare_advanced_subscriber(self._zenoh, key, _storing(take), history=_last_value()))
 
     def on_question(self, key: str, take: Callable[[Question], None]) -> None:
@@ -241,15 +241,15 @@ class Session:
 
         def handle(query: zenoh.Query) -> None:
             payload = b"" if query.payload is None else query.payload.to_bytes()
-            # The query's own key may be a pattern, such as `hal/*`; the question is always about ours.
+            # The query's own key may be a pattern, such as `hal/*`; the question is always for our key.
             take(Question(key, payload, str(query.encoding or ""), query))
 
         self._declared.append(self._zenoh.declare_queryable(key, handle))
 
     def ask(self, key: str, request: Message, timeout_s: float = 2.0, *, host: str | None = None) -> Answer:
-        """Ask the HAL, and wait for the answer, which may be no. Raises NotConnectedError when there is none.
+        """Send a request to the HAL, and wait for the answer. Raises NotConnectedError when there is none.
 
-        host: the host process that is meant; what others answer does not count. None: the first answer does.
+        host: id of the addressed host process; answers of others are ignored. None: the first answer is taken.
         """
         unreadable: WireError | None = None
         for _, answer in self._answers(key, request, timeout_s):
@@ -258,16 +258,16 @@ class Session:
             elif host is None or answer.host == host:
                 return answer
         if unreadable is not None:
-            raise NotConnectedError(f"what answers on {key} cannot be read: {unreadable}")
-        raise NotConnectedError(f"nobody answers on {key} within {timeout_s} s; is the robot's HAL host running?")
+            raise NotConnectedError(f"the answer on {key} cannot be decoded: {unreadable}")
+        raise NotConnectedError(f"no answer on {key} within {timeout_s} s; is the robot's HAL host running?")
 
     def ask_all(self, pattern: str, request: Message, timeout_s: float = 2.0) -> Iterator[tuple[str, Answer]]:
-        """Ask everybody whose key matches, at once: (key, answer) as they come, until all answered or time is up."""
+        """Query all matching keys at once: (key, answer) as they come, until all answered or time is up."""
         answers = self._answers(pattern, request, timeout_s)
         return ((at, answer) for at, answer in answers if isinstance(answer, Answer))
 
     def _answers(self, pattern: str, request: Message, timeout_s: float) -> Iterator[tuple[str, Answer | WireError]]:
-        """What comes back from which key; what cannot be read is counted. No answer takes the place of another."""
+        """All answers with their keys; undecodable ones are counted. No answer replaces another."""
         replies = self._zenoh.get(
             pattern,
             payload=encode(request),
@@ -292,15 +292,15 @@ class Session:
         return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})
 
     def declare_alive(self, service: str) -> None:
-        """Show the liveliness token of a service for as long as the session lives."""
+        """Declare the liveliness token of a service for as long as the session lives."""
         self.declare_token(keys.alive(service))
 
     def declare_token(self, key: str) -> None:
-        """Show a liveliness token for as long as the session lives."""
+        """Declare a liveliness token for as long as the session lives."""
         self._declared.append(self._zenoh.liveliness().declare_token(key))
 
     def on_alive(self, take: Callable[[str, bool], None], key: str = keys.ALIVE_ALL) -> None:
-        """Call `take(key, present)` when a service comes or goes, in Zenoh's thread."""
+        """Call `take(key, present)` when a service appears or vanishes, in Zenoh's thread."""
 
         def handle(sample: zenoh.Sample) -> None:
             take(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
@@ -316,7 +316,7 @@ class Session:
 
 
 def _last_value() -> ext.HistoryConfig:
-    """What a reader of a latched key wants: the value that was there before it, or before its writer."""
+    """History of a latched key: the last value, also of a publisher that appears later."""
     return ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
 
 
@@ -345,7 +345,7 @@ def intersects(pattern: str, key: str) -> bool:
 
 @contextmanager
 def open_session(link: Link, connect_timeout_s: float = 5.0) -> Iterator[Session]:
-    """Join the network. Raises NotConnectedError when the endpoint does not answer or cannot be listened on."""
+    """Connect to the network. Raises NotConnectedError when the endpoint does not answer or cannot be listened on."""
     if link.listen:
         raise_open_files(MAX_OPEN_FILES)
         os.environ.setdefault(*RUNTIME)
@@ -389,11 +389,11 @@ def _open(settings: dict[str, Any], link: Link) -> zenoh.Session:
                 f"cannot listen on {link.endpoint}: {str(error).split(' at /')[0]}. Another run may hold the port; "
                 f"choose one with --endpoint tcp/127.0.0.1:PORT"
             ) from error
-        raise NotConnectedError(f"nobody listens on {link.endpoint}; start a run or a router there first") from error
+        raise NotConnectedError(f"nothing listens on {link.endpoint}; start a run or a router there first") from error
 
 
 def router_settings(config: Path) -> zenoh.Config:
-    """What a router's JSON5 file says; opens nothing. Raises ConfigError."""
+    """The settings in a router's JSON5 file; opens nothing. Raises ConfigError."""
     text = read_text(config)
     check_brackets(text, str(config))
     try:

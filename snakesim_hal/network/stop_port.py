@@ -1,13 +1,13 @@
-"""The stop port: a UDP socket beside the robot's endpoint, through which an emergency stop comes past everything else.
+"""The stop port: a UDP socket beside the robot's endpoint for emergency stops, independent of Zenoh.
 
-It shares nothing with Zenoh: no session, no connection, no queue. Whatever shuts people out there (half-open
-connections, idle sessions, floods) leaves this path open. A datagram is
+It shares nothing with Zenoh: no session, no connection, no queue. Attacks there (half-open
+connections, idle sessions, floods) leave this path open. A datagram is
 
-    request  b"SNAKSTOP", 16 bytes made up by the sender, who asks in UTF-8 (at most 64 bytes)
-    answer   b"SNAKDONE", the same 16 bytes, in UTF-8: the robot's namespace, a line feed, what was done
+    request  b"SNAKSTOP", 16 bytes chosen by the sender, name of the requester in UTF-8 (at most 64 bytes)
+    answer   b"SNAKDONE", the same 16 bytes, in UTF-8: the robot's namespace, a line feed, the result
 
-The kernel drops what is no request before it is queued, so a flood of anything else takes no room from a stop; and a
-flood of requests is a stop. Who may reach the port is the network's to decide: stopping a robot needs no right.
+The kernel drops all other datagrams before they are queued, so a flood of them takes no room from a stop; and a
+flood of requests is a stop. Restrict access to the port by the network: stopping a robot needs no permission.
 """
 
 import ctypes
@@ -25,15 +25,15 @@ REQUEST, ANSWER = b"SNAKSTOP", b"SNAKDONE"
 NONCE_BYTES, MAX_WHO_BYTES, MAX_ANSWER_BYTES = 16, 64, 1024
 UDP_HEADER = 8
 SO_ATTACH_FILTER = 26
-PAUSE_S = 0.001  # between two requests: a flood of them must not take the interpreter for itself
-MAX_REFUSED = 10  # answers of the kernel that nobody has the port
-REPEAT_S = 0.02  # a sender repeats a request that is not answered
+PAUSE_S = 0.001  # between two requests: a flood of them must not block the interpreter
+MAX_REFUSED = 10  # answers of the kernel that the port is closed
+REPEAT_S = 0.02  # after which a sender repeats an unanswered request
 
 Reply = Callable[[str], None]
 
 
 def stop_address(endpoint: str, *, listens: bool) -> tuple[str, int]:
-    """Where the stop port of a robot belongs: beside the endpoint that its host listens on, else on loopback."""
+    """Address of a robot's stop port: that of the endpoint on which its host listens, else on loopback."""
     protocol, _, address = endpoint.partition("/")
     host, _, port = address.partition("?")[0].partition("#")[0].rpartition(":")
     if listens and protocol in ("tcp", "tls", "ws") and port.isdigit():
@@ -42,7 +42,7 @@ def stop_address(endpoint: str, *, listens: bool) -> tuple[str, int]:
 
 
 def open_stop_port(host: str, port: int) -> socket.socket:
-    """Bind the port. port 0: any. Raises NotConnectedError when somebody else has it."""
+    """Bind the port. port 0: any. Raises NotConnectedError when it is in use."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     opened = socket.socket(family, socket.SOCK_DGRAM)
     try:
@@ -69,7 +69,8 @@ def serve_stops(opened: socket.socket, robot: str, take: Callable[[str, Reply], 
             if not datagram.startswith(REQUEST) or len(datagram) < len(REQUEST) + NONCE_BYTES:
                 continue
             nonce, who = datagram[len(REQUEST) :][:NONCE_BYTES], datagram[len(REQUEST) + NONCE_BYTES :]
-            take(who.decode(errors="replace") or "somebody", _replying(opened, nonce + robot.encode() + b"\n", sender))
+            reply = _replying(opened, nonce + robot.encode() + b"\n", sender)
+            take(who.decode(errors="replace") or "an unnamed client", reply)
             time.sleep(PAUSE_S)
 
     threading.Thread(target=serve, name="stop port", daemon=True).start()
@@ -77,16 +78,16 @@ def serve_stops(opened: socket.socket, robot: str, take: Callable[[str, Reply], 
 
 @dataclass(frozen=True)
 class Stopped:
-    """What a stop port answers."""
+    """The answer of a stop port."""
 
     robot: str  # its namespace
     text: str
 
 
 def ask_to_stop(host: str, port: int, who: str, timeout_s: float) -> Stopped | None:
-    """Ask until it is answered; None when no answer came in time.
+    """Repeat the request until it is answered; None when no answer came in time.
 
-    Raises NotConnectedError when nobody has that port.
+    Raises NotConnectedError when that port is closed.
     """
     nonce = secrets.token_bytes(NONCE_BYTES)
     request = REQUEST + nonce + who.encode()[:MAX_WHO_BYTES]
@@ -96,7 +97,7 @@ def ask_to_stop(host: str, port: int, who: str, timeout_s: float) -> Stopped | N
         asking.settimeout(REPEAT_S)
         while time.monotonic() < deadline:
             try:
-                asking.connect((host, port))  # so that the kernel takes answers from there alone
+                asking.connect((host, port))  # so that the kernel accepts answers only from there
                 asking.send(request)
                 until = time.monotonic() + REPEAT_S
                 while time.monotonic() < until:
@@ -109,9 +110,9 @@ def ask_to_stop(host: str, port: int, who: str, timeout_s: float) -> Stopped | N
             except ConnectionRefusedError:
                 refused += 1
                 if refused > MAX_REFUSED:
-                    raise NotConnectedError(f"nobody takes emergency stops on udp/{host}:{port}") from None
+                    raise NotConnectedError(f"no host takes emergency stops on udp/{host}:{port}") from None
                 time.sleep(REPEAT_S)
-            except OSError:  # the way there is closed for now
+            except OSError:  # currently unreachable
                 time.sleep(REPEAT_S)
     return None
 
@@ -120,26 +121,26 @@ def _replying(opened: socket.socket, head: bytes, sender: object) -> Reply:
     def reply(text: str) -> None:
         try:
             opened.sendto(ANSWER + head + text.encode()[: MAX_ANSWER_BYTES - 64], sender)  # pyright: ignore
-        except OSError:  # whoever asked is gone; the robot is stopped all the same
+        except OSError:  # the requester is gone; the robot is stopped all the same
             return
 
     return reply
 
 
 def _accept_requests_only(opened: socket.socket) -> None:
-    """Have the kernel drop what does not begin like a request, and cut off what is too long.
+    """Have the kernel drop datagrams that do not begin like a request, and truncate long ones.
 
-    Classic BPF; offsets count from the UDP header. Where the kernel refuses, `serve_stops` still looks at each.
+    Classic BPF; offsets count from the UDP header. If the kernel refuses the filter, `serve_stops` still checks each.
     """
     first, second = struct.unpack(">II", REQUEST)
     most = UDP_HEADER + len(REQUEST) + NONCE_BYTES + MAX_WHO_BYTES
     program = [  # (code, jump if true, jump if false, constant)
         (0x20, 0, 0, UDP_HEADER),  # load the word there
-        (0x15, 0, 3, first),  # go on if it is equal
+        (0x15, 0, 3, first),  # continue if it is equal
         (0x20, 0, 0, UDP_HEADER + 4),
         (0x15, 0, 1, second),
-        (0x06, 0, 0, most),  # take so many bytes
-        (0x06, 0, 0, 0),  # take none
+        (0x06, 0, 0, most),  # accept this many bytes
+        (0x06, 0, 0, 0),  # accept none
     ]
     code = b"".join(struct.pack("HBBI", *line) for line in program)
     kept = ctypes.create_string_buffer(code)

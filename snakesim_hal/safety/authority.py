@@ -1,6 +1,6 @@
-"""Who may move the robot, and what the motors are told: lifecycle, lease and gate in one place, without any I/O.
+"""Who may move the robot, and the set-points of the motors: lifecycle, lease and gate in one place, without any I/O.
 
-The host passes in commands, requests, states and the time; it gets back set-points. `now_ns` is safety time: the
+The host passes in commands, requests, states and the time, and gets set-points. `now_ns` is safety time: the
 monotonic clock, or simulated time in lockstep.
 """
 
@@ -38,10 +38,10 @@ COMMANDS_KEPT = 1024
 
 @dataclass(frozen=True)
 class Decision:
-    """What the motors get for one tick."""
+    """The set-points of one tick."""
 
     set_points: SetPoints
-    sequence: int | None  # of the command behind it; None: the host's own safe action
+    sequence: int | None  # of the command; None: the host's own safe action
     limited: dict[int, str]  # joint index -> which limit changed its target
 
 
@@ -49,7 +49,7 @@ class Authority:
     """Lifecycle, lease and gate of one robot."""
 
     def __init__(self, description: Description, *, first_epoch: int = 0) -> None:
-        """first_epoch: unlike that of any host before, so that what was meant for another host is refused."""
+        """first_epoch: different from that of any earlier host, so that commands for another host are rejected."""
         self.description = description
         self.limits = JointLimits.of(description)
         self.state: LifecycleState = "disarmed"
@@ -72,18 +72,18 @@ class Authority:
         self._doubt: Doubt | None = self._unknown("no joint state yet")
         self._derating = Derating(description)
         self._command: JointCommand | None = None
-        self._command_ns = 0  # when it came
-        self._counting: JointCommand | None = None  # what the last decision since arming was made from
-        self._recent: deque[JointCommand] = deque(maxlen=COMMANDS_KEPT)  # good ones since arming, oldest first
+        self._command_ns = 0  # when it was received
+        self._counting: JointCommand | None = None  # command of the last decision since arming
+        self._recent: deque[JointCommand] = deque(maxlen=COMMANDS_KEPT)  # accepted ones since arming, oldest first
         self._last_sequence = -1
         self._hold_at = np.zeros(count)
-        self._halt: StopRamp | None = None  # of a robot that was armed when the present fault came
-        self._told = True  # whether the motors were told that the robot is disarmed, since it is
+        self._halt: StopRamp | None = None  # set if the robot was armed when the present fault came
+        self._stop_sent = True  # whether the motors have received set-points since the robot stopped being armed
 
-    # --- what comes in -------------------------------------------------------------------------------------
+    # --- inputs --------------------------------------------------------------------------------------------
 
     def observe(self, joints: JointState, now_ns: int | None = None) -> None:
-        """Take the newest joint state. What cannot be is no measurement: the last good one stays.
+        """Take the newest joint state. Implausible values are rejected: the last good ones stay.
 
         now_ns: safety time; None: that of the state's stamp.
         """
@@ -94,21 +94,21 @@ class Authority:
         self._measured = self._watch.measured
 
     def observe_power(self, power: Power, now_ns: int) -> None:
-        """Take the newest that the modules say of supply, heat and leaks; `expire` draws the conclusions."""
+        """Take the newest power sample: supply, heat and leaks; `expire` acts on it."""
         self._derating.take(power, now_ns)
 
     def readable(self, joints: JointState) -> JointState:
-        """A joint state as everybody may have it: all numbers are numbers."""
+        """A joint state for publishing: without NaN or infinity."""
         return readable(joints, self._measured)
 
     @property
     def derated(self) -> dict[str, float]:
-        """Joints that heat leaves less than their whole torque, and the share that is left."""
+        """Derated joints, and the share of their torque that is left."""
         return self._derating.derated()
 
     @property
     def faults(self) -> list[Fault]:
-        """What went wrong since the last clear, as far as it is kept."""
+        """Faults since the last clear, as far as they are kept."""
         return self.since_clear.kept
 
     @property
@@ -117,7 +117,7 @@ class Authority:
         return self._isolation.names
 
     def offer(self, command: JointCommand, *, now_ns: int, tick: int, age_ns: int) -> str | None:
-        """Take a command, or return why not. `age_ns`: time since the state that it answers was published."""
+        """Take a command, or return why it is rejected. `age_ns`: age of the state that it answers."""
         refusal = gate.refuse(
             command,
             lease=self.lease,
@@ -130,13 +130,13 @@ class Authority:
         if refusal is not None:
             self.rejected[refusal] += 1
             return refusal
-        if not self.answers_arming(command):  # nor does it keep the lease: what moves the robot must be commanded now
-            if command.tick <= self._armed_tick:  # under way when the robot was armed: nobody's mistake
+        if not self.answers_arming(command):  # nor does it renew the lease, which takes commands of this arming
+            if command.tick <= self._armed_tick:  # sent before the robot was armed: not an error
                 self.standby += 1
             else:
                 self.rejected["before_arming"] += 1
             return "before_arming"
-        self._last_sequence = command.sequence  # only now: what is refused must not make the next good one a replay
+        self._last_sequence = command.sequence  # only now: a rejected command must not make the next good one a replay
         self.lease = renewed(self.lease, now_ns, self.description.lease_ns)
         self._command, self._command_ns = command, now_ns
         if self.state == "armed":
@@ -147,18 +147,18 @@ class Authority:
         return None
 
     def answers_arming(self, command: JointCommand) -> bool:
-        """Whether a command was sent in the knowledge that the robot is armed, if it is."""
+        """Whether a command names the present arming, if the robot is armed."""
         return self.state != "armed" or command.arming == self.arming
 
     def reject(self, reason: str) -> None:
-        """Count a sample that never became a command."""
+        """Count a sample that could not be decoded."""
         self.rejected[reason] += 1
 
     def on_lease(self, request: LeaseRequest, now_ns: int) -> Answer:
-        """Decide a lease request; when the lease changes hands the robot stops in between."""
+        """Decide a lease request; when the lease changes hands the robot is disarmed."""
         ruling = rule(self.lease, request, now_ns, self.description.lease_ns)
         if self.state == "armed" and request.action == "renew":
-            return self._answer(ruling.refusal, ruling.word)  # only a good command renews: asking is not commanding
+            return self._answer(ruling.refusal, ruling.word)  # while armed only a command renews the lease
         self.lease = ruling.lease
         if ruling.changed_hands:
             self._forget_commands()
@@ -167,7 +167,7 @@ class Authority:
         return self._answer(ruling.refusal, ruling.word)
 
     def on_lifecycle(self, request: LifecycleRequest, now_ns: int) -> Answer:
-        """Arm, disarm or clear. Arming says no with every condition that is not met."""
+        """Arm, disarm or clear. A refused arming lists every condition that is not met."""
         match request.action:
             case "arm":
                 against = self._refusals(now_ns) + lifecycle.mistaken(request, self.description)
@@ -186,7 +186,7 @@ class Authority:
             case "clear":
                 if not self._go("clear", f"cleared by {request.who}; arm to move again"):
                     lost = ", ".join(self.isolated)
-                    hint = f"; disarm first, then a clear takes back {lost}" if lost else ""
+                    hint = f"; disarm first, then a clear ends the isolation of {lost}" if lost else ""
                     return self._answer(f"nothing to clear in state {self.state}{hint}", "wrong_state")
                 self._take_back()
                 self.since_clear = FaultLog()
@@ -196,51 +196,51 @@ class Authority:
         return self._answer(None)
 
     def on_estop(self, request: EstopRequest, tick: int) -> Answer:
-        """Stop now, whoever asks."""
+        """Stop now, for any requester."""
         stopping = Fault(tick=tick, what="estop", cause=f"emergency stop by {request.who}")
         self.note(stopping, stops=self.state != "estop")
         self._go("estop", f"emergency stop by {request.who}; clear it to go on")
         return self._answer(None)
 
     def fault(self, fault: Fault, joints: Mask | None = None) -> None:
-        """Latch a fault: the joints go to the safe action until someone clears it.
+        """Latch a fault: the joints take the safe action until a clear.
 
-        What reaches no further than some joints sets them aside instead, if the robot file allows that. joints: which;
+        A fault that concerns only some joints isolates them instead, if the robot file allows that. joints: which;
         None: the one that the fault names.
         """
         joints = self._isolation.mask(fault.joint) if joints is None else joints
         if fault.reach == "joint" and self._set_aside(fault, joints):
             return
         fault = msgspec.structs.replace(fault, reach="robot")
-        stops = self.state not in ("fault", "estop")  # what comes after the first is its consequence, as a rule
+        stops = self.state not in ("fault", "estop")  # later faults are usually consequences of the first
         self.note(fault, stops=stops)
         if stops:
             self._go("fault", fault.cause[:500] or fault.what)
         self._drop_lease()
 
     def note(self, fault: Fault, *, stops: bool = False) -> None:
-        """Keep a fault that people should know of but that stops nothing by itself. stops: it does."""
+        """Record a fault for people that stops nothing by itself. stops: it does."""
         fault = msgspec.structs.replace(fault, cause=fault.cause[:500])
         for log in (self.since_clear, self.since_start):
             log.add(fault, stops=stops)
 
     def holder_gone(self, cause: str) -> None:
-        """The lease holder's process is known to be gone while disarmed: free the lease at once."""
+        """The lease holder's process has ended: while disarmed, free the lease at once."""
         if self.state != "armed":
             self._drop_lease()
         if self.state == "disarmed":
             self.why = cause
 
-    # --- what goes out -------------------------------------------------------------------------------------
+    # --- outputs -------------------------------------------------------------------------------------------
 
     def against_arming(self, now_ns: int) -> list[str]:
         """Every condition for arming that is not met; empty when ready."""
         return [why for _, why in self._refusals(now_ns)]
 
     def expire(self, now_ns: int, tick: int) -> None:
-        """Let the lease run out: armed, that is a fault; disarmed, the lease is simply free again.
+        """Check the lease for expiry: while armed, that is a fault; while disarmed, the lease becomes free.
 
-        A robot that is armed and does not know its joints any more is at fault too, and so is one, armed or not, whose
+        An armed robot without plausible joint states goes to fault too, and so does one, armed or not, whose
         modules are too hot, leak or lack voltage.
         """
         if self.state == "armed" and self._doubt is not None:
@@ -254,7 +254,7 @@ class Authority:
             return
         holder, term_ms = self.lease.holder, self.description.lease_ns / 1e6
         if self.state == "armed":
-            cause = f"lease of {holder} expired: no good command for {term_ms:.0f} ms"
+            cause = f"lease of {holder} expired: no accepted command for {term_ms:.0f} ms"
             self.fault(Fault(tick=tick, what="lease_expired", cause=cause))
         else:
             self._drop_lease()
@@ -262,7 +262,7 @@ class Authority:
     def decide(self, up_to: int | None = None) -> Decision:
         """The set-points for the next period. Call `expire` first.
 
-        up_to: newest tick whose command counts already, in lockstep; None: the command that came last.
+        up_to: in lockstep, the newest tick whose command is used; None: the newest command.
         """
         command = self._command
         if up_to is not None:
@@ -271,8 +271,8 @@ class Authority:
         limited: dict[int, str] = {}
         if self.state != "armed":
             applied = self._safe()
-            self._told = True
-        elif command is None:  # armed a moment ago: hold the pose until the first command
+            self._stop_sent = True
+        elif command is None:  # just armed: hold the pose until the first command
             applied = self._uniform(Mode.POSITION, self.limits.inside(self._hold_at))
         else:
             measured, share = self._measured, self._derating.share
@@ -296,13 +296,13 @@ class Authority:
     def _unready(self, now_ns: int) -> list[str]:
         against = [] if self._doubt is None else [self._doubt.fault.cause]
         against += [fault.cause for fault in self._derating.wrong if not self._is_aside(fault)]
-        if self.arming and not self._told:
-            against.append("the motors have not been told yet that the robot was stopped; ask again in a period")
+        if self.arming and not self._stop_sent:
+            against.append("the motors have not received the stop yet; ask again in a period")
         if not self.lease.live(now_ns):
-            against.append("nobody holds the lease")
+            against.append("the lease is free")
         elif self._command is None:
             against.append(f"no commands from {self.lease.holder} yet")
-        elif now_ns - self._command_ns > self.description.lease_ns:  # the lease may be kept by asking, too
+        elif now_ns - self._command_ns > self.description.lease_ns:  # the lease may also be renewed by requests
             against.append(f"no commands from {self.lease.holder} any more")
         else:
             at, aside = self._measured.angle_rad, self._isolation.joints
@@ -317,7 +317,7 @@ class Authority:
         return fault.reach == "joint" and self._isolation.has(fault.joint)
 
     def _set_aside(self, fault: Fault, joints: Mask) -> bool:
-        """Go on without joints that have failed, if that may be; what they complain of afterwards is no news."""
+        """Isolate failed joints, if allowed; later faults of isolated joints are ignored."""
         if self._isolation.covers(joints):
             return True
         if self.state != "armed" or not self._isolation.add(joints):
@@ -327,7 +327,7 @@ class Authority:
         return True
 
     def _take_back(self) -> None:
-        """Joints that were set aside count again; first they must be heard of."""
+        """End the isolation of joints; first a new joint state must arrive."""
         if self.isolated:
             self._isolation.clear()
             self._doubt = self._unknown("no joint state since the clear")
@@ -346,7 +346,7 @@ class Authority:
         return Applied(np.full(len(target), int(mode), dtype=np.int64), target, most_nm)
 
     def _go(self, event: lifecycle.Event, why: str) -> bool:
-        """Follow an event; False when it is not allowed in this state."""
+        """Make a transition; False when the event is not allowed in this state."""
         following = lifecycle.after(self.state, event)
         if following is None:
             return False
@@ -354,7 +354,7 @@ class Authority:
             self._hold_at = self._measured.angle_rad
             was_armed = self.state == "armed"
             self._halt = StopRamp.begin(self._measured, self._applied, self.limits) if was_armed else None
-            self._told &= following != "disarmed"
+            self._stop_sent &= following != "disarmed"
         if self.state == "armed":
             self._command = None
         self.state = following

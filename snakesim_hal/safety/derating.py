@@ -1,10 +1,10 @@
 """Heat, supply and leaks: torque is derated before the robot is stopped. Pure; time is passed in.
 
-From `derate_from_c` on a winding loses torque, linearly, down to a fifth at `stop_at_c`: by `thermal.HeatLimits`, which
-the motors hold by themselves as well. There, with water inside, or with a supply that is below `least_voltage_v` for
-50 ms, the robot is stopped, and is not armed again before the winding has cooled below `derate_from_c`. Heat concerns
-the one joint; a leak or a weak supply is taken for the whole robot's. What no module has told for some seconds is not
-known: it is said, and does not count.
+From `derate_from_c` on the torque limit falls linearly, to a fifth at `stop_at_c`: by `thermal.HeatLimits`, which
+the motors apply themselves as well. At `stop_at_c`, with water inside, or with a supply below `least_voltage_v` for
+50 ms, the robot is stopped, and cannot be armed before the winding has cooled below `derate_from_c`. Heat concerns
+only its joint; a leak or a weak supply concerns the whole robot. Values that a module has not reported for some seconds
+are unknown: this is noted, and they are ignored.
 """
 
 import math
@@ -23,20 +23,20 @@ LONGEST_CAUSE = 400
 
 
 class Derating:
-    """What the power samples mean for every joint."""
+    """Torque share and health of every joint, from power samples."""
 
     def __init__(self, description: Description) -> None:
         self._healths = [_Health(joint) for joint in description.joints]
         self._expected = any(sensor.key == keys.POWER for sensor in description.sensors)
         self._began_ns: int | None = None
-        self._due_ns = -math.inf  # before that nothing changes unless a sample comes
+        self._due_ns = -math.inf  # before that nothing changes without a sample
         self._told: set[tuple[str, str | None]] = set()
         self._silent: set[str] = set()
-        self.share: Floats = np.ones(len(self._healths))  # of its torque limit that each joint may use
-        self.wrong: list[Fault] = []  # what is wrong now
+        self.share: Floats = np.ones(len(self._healths))  # of its torque limit, left to each joint
+        self.wrong: list[Fault] = []  # present faults
 
     def take(self, power: Power, now_ns: int) -> None:
-        """Take a sample; an entry that is not valid says nothing, nor does a sample of another number of joints."""
+        """Take a sample; invalid entries are ignored, and so is a sample of another number of joints."""
         lists = (power.voltage_v, power.motor_c, power.leak, power.valid)
         if {len(values) for values in lists} != {len(self._healths)}:
             return
@@ -46,7 +46,7 @@ class Derating:
         self._due_ns = -math.inf
 
     def look(self, now_ns: int, tick: int) -> tuple[list[Fault], Fault | None]:
-        """Bring all up to now. Returns what is newly wrong, and a note of the joints that have fallen silent."""
+        """Evaluate at `now_ns`. Returns new faults, and a note of the joints that have fallen silent."""
         if now_ns < self._due_ns:
             return [], None
         began_ns = self._began_ns = now_ns if self._began_ns is None else self._began_ns
@@ -68,7 +68,7 @@ class Derating:
         return fresh, self._newly_silent(now_ns, tick)
 
     def derated(self) -> dict[str, float]:
-        """Joints that may not use their whole torque, and the share that they may."""
+        """Derated joints, and the share of their torque that is left."""
         shares = zip(self._healths, self.share.tolist(), strict=True)
         return {health.joint.name: share for health, share in shares if share < 1.0}
 
@@ -79,14 +79,14 @@ class Derating:
         fresh = [name for name in silent if name not in before]
         if not fresh:
             return None
-        cause = f"supply and heat are unknown, and do not count, for {', '.join(fresh)}"[:LONGEST_CAUSE]
+        cause = f"supply and heat are unknown, and ignored, for {', '.join(fresh)}"[:LONGEST_CAUSE]
         joint = fresh[0] if len(fresh) == 1 else None
         return Fault(tick=tick, what="power_unknown", cause=cause, joint=joint)
 
 
 @dataclass
 class _Health:
-    """What one module said last."""
+    """The last report of one module."""
 
     joint: JointDescription
     heard_ns: int | None = None
@@ -94,7 +94,7 @@ class _Health:
     voltage_v: float = 0.0
     leak: bool = False
     low_since_ns: int | None = None
-    hot: bool = False  # it was too hot, and has not cooled down since
+    hot: bool = False  # it was too hot, and has not cooled down yet
 
     def take(self, voltage_v: float, winding_c: float, leak: bool, now_ns: int) -> None:
         """A valid entry of a sample."""
@@ -104,28 +104,28 @@ class _Health:
         self.low_since_ns = (now_ns if self.low_since_ns is None else self.low_since_ns) if low else None
 
     def known(self, now_ns: int) -> bool:
-        """Whether it has said something of late."""
+        """Whether its last report is recent."""
         return self.heard_ns is not None and now_ns - self.heard_ns <= KNOWN_FOR_NS
 
     def silent(self, now_ns: int, expected_since_ns: int | None) -> bool:
-        """Whether it should have said something; expected_since_ns: None when there may be no such sensor."""
+        """Whether its report is overdue; expected_since_ns: None when there may be no such sensor."""
         since_ns = expected_since_ns if self.heard_ns is None else self.heard_ns
         return since_ns is not None and now_ns - since_ns > KNOWN_FOR_NS
 
     def due_ns(self, now_ns: int, began_ns: int) -> float:
-        """When what it said last comes to mean something else."""
+        """When its state next changes without a new report."""
         silent_ns = (began_ns if self.heard_ns is None else self.heard_ns) + KNOWN_FOR_NS + 1
         low_ns = math.inf if self.low_since_ns is None else self.low_since_ns + LOW_FOR_NS
         return min((at_ns for at_ns in (silent_ns, low_ns) if at_ns > now_ns), default=math.inf)
 
     def share(self, now_ns: int) -> float:
-        """The share of the torque limit that heat leaves."""
+        """The share of the torque limit that is left after derating."""
         if not self.known(now_ns):
             return 1.0
         return HeatLimits(self.joint.derate_from_c, self.joint.stop_at_c).share_left(self.winding_c)
 
     def troubles(self, now_ns: int) -> list[tuple[str, str]]:
-        """What stops the robot: a word, and the whole story."""
+        """Reasons to stop the robot: a word, and the full cause."""
         joint, found = self.joint, list[tuple[str, str]]()
         if self.hot:
             limits = f"the limit is {joint.stop_at_c:g} °C, and it must cool below {joint.derate_from_c:g} °C"
@@ -133,7 +133,7 @@ class _Health:
         if not self.known(now_ns):
             return found
         if self.leak:
-            found.append(("leak", f"{joint.name} finds water inside"))
+            found.append(("leak", f"{joint.name} reports water inside"))
         if self.low_since_ns is not None and now_ns - self.low_since_ns >= LOW_FOR_NS:
             cause = f"the supply of {joint.name} is at {self.voltage_v:.1f} V, it needs {joint.least_voltage_v:g} V"
             found.append(("undervoltage", cause))

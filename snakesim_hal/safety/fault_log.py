@@ -1,4 +1,4 @@
-"""Faults, kept within a bound: the first ones, the newest ones, and what stopped the robot last. Pure."""
+"""A bounded log of faults: the first ones, the newest ones, and the one that stopped the robot last. Pure."""
 
 from snakesim_hal.wire.messages import Fault
 
@@ -7,15 +7,15 @@ FIRST_KEPT = MAX_FAULTS_KEPT // 2
 
 
 class FaultLog:
-    """Those that are left out came between the first and the newest."""
+    """The dropped ones came between the first and the newest."""
 
     def __init__(self) -> None:
-        self.kept: list[Fault] = []  # in the order of their coming
+        self.kept: list[Fault] = []  # in order of time
         self.left_out = 0
         self._stop: Fault | None = None  # the newest that stopped the robot
 
     def add(self, fault: Fault, *, stops: bool) -> None:
-        """Keep one. stops: it is why the robot is in `fault` or `estop` now."""
+        """Add one. stops: it is why the robot is in `fault` or `estop` now."""
         if stops:
             self._stop = fault
         self.kept.append(fault)

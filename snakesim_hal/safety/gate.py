@@ -1,17 +1,17 @@
-"""The gate: the one pure function between a command from the network and a motor. The same for every backend.
+"""The gate: the pure function between a command from the network and a motor. The same for every backend.
 
-In this order: lease, freshness, layout and length, finite. What fails there is refused whole. Then every target is
-brought inside its limits: angle, torque, distance to the measured angle, and rate. The rate limit of a joint that
-changes mode starts from what its motor is doing at that instant, so no mode switch makes the torque jump.
+It checks, in this order: lease, freshness, layout and length, finite. A command that fails one is rejected whole. Then
+every target is limited: angle, torque, distance to the measured angle, and rate. The rate limit of a joint that
+changes mode starts from the present state of its motor, so no mode switch makes the torque jump.
 
-Near its end a joint is bound in every mode, and that outranks the rate limits:
+Near its angle limit ("end") a joint is limited in every mode, which takes precedence over the rate limits:
 
 position  the target is never beyond the end
-velocity  never faster towards the end than what the acceleration limit stops before it, with four periods to spare for
-          the way to the motor and back; at the end or beyond it, only away from it
-torque    no more towards the end than what a motor would exert that was told that velocity. So a joint that comes too
+velocity  never faster towards the end than the acceleration limit can stop before it, with four periods to spare for
+          the latency to the motor and back; at the end or beyond it, only away from it
+torque    no more towards the end than a motor would exert with that velocity target. So a joint that is too
           fast is braked; at the end or beyond it, no torque pushes outwards. A load that is stronger than the torque
-          limit, or inertia that the torque limit cannot stop in time, may still take a joint there.
+          limit, or inertia that the torque limit cannot stop in time, may still drive a joint there.
 """
 
 import math
@@ -29,8 +29,8 @@ from snakesim_hal.wire.messages import Description, JointCommand, JointDescripti
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-FRESH_PERIODS, FRESH_NS = 3, 30_000_000  # how old a joint state may be, the longer of the two, besides its delay
-REACTION_PERIODS = 4  # the least that lets no joint swing past its end, with a latency of two as a bus has
+FRESH_PERIODS, FRESH_NS = 3, 30_000_000  # maximum age of a joint state, the longer of the two, plus its delay
+REACTION_PERIODS = 4  # the minimum that keeps joints from overshooting their end, with two periods of latency on a bus
 
 
 Refusal = Literal[
@@ -57,7 +57,7 @@ class JointLimits:
     max_step_rad: float
     period_s: float
     lease_ns: int
-    oldest_state_ns: int  # a joint state that is older is not believed any more
+    oldest_state_ns: int  # an older joint state is rejected
     layout: str
     joints: tuple[JointDescription, ...]  # the same, joint by joint
 
@@ -84,12 +84,12 @@ class JointLimits:
         )
 
     def inside(self, angle_rad: Floats) -> Floats:
-        """Angles brought inside the angle limits, (n_joints,)."""
+        """Angles clamped to the angle limits, (n_joints,)."""
         return np.clip(angle_rad, self.angle_min_rad, self.angle_max_rad)
 
 
 def _oldest_state_ns(description: Description) -> int:
-    """Sooner than the lease, so that a joint that says nothing new is at fault within the lease."""
+    """Shorter than the lease, so that a silent joint is a fault within the lease."""
     delay_s = next((sensor.delay_s for sensor in description.sensors if sensor.key == keys.JOINTS), 0.0)
     fresh_ns = max(FRESH_PERIODS * description.period_ns, FRESH_NS)
     return min(fresh_ns + round(delay_s * 1e9), description.lease_ns)
@@ -97,7 +97,7 @@ def _oldest_state_ns(description: Description) -> int:
 
 @dataclass(frozen=True)
 class Measured:
-    """What the joints are doing now, (n_joints,) each."""
+    """Measured state of the joints, (n_joints,) each."""
 
     angle_rad: Floats
     velocity_rad_s: Floats
@@ -106,7 +106,7 @@ class Measured:
 
 @dataclass(frozen=True)
 class Applied:
-    """What the motors were last told, (n_joints,) each."""
+    """The last applied set-points, (n_joints,) each."""
 
     mode: Ints
     target: Floats
@@ -123,7 +123,7 @@ def refuse(
     age_ns: int,
     limits: JointLimits,
 ) -> Refusal | None:
-    """Why a command may not be used at all, or None. `age_ns` is how long ago the state it answers was published."""
+    """Why a command is rejected, or None. `age_ns` is how long ago the state it answers was published."""
     if not lease.live(now_ns):
         return "no_lease"
     if command.lease_epoch != lease.epoch:
@@ -132,7 +132,7 @@ def refuse(
         return "replayed"
     if command.tick > tick:
         return "from_the_future"
-    if age_ns > min(command.valid_for_ns, limits.lease_ns):  # a sender may ask for less than a lease term, not more
+    if age_ns > min(command.valid_for_ns, limits.lease_ns):  # a sender may set less than a lease term, not more
         return "stale"
     if command.layout != limits.layout:
         return "wrong_layout"
@@ -151,15 +151,15 @@ def refuse(
 def limit(
     command: JointCommand, *, measured: Measured, last: Applied, limits: JointLimits, share: Floats
 ) -> tuple[Applied, Floats]:
-    """Bring an accepted command inside every limit. Returns what is applied, and what was asked for (n_joints,).
+    """Limit an accepted command. Returns the applied set-points, and the commanded targets (n_joints,).
 
-    share: of its torque limit that heat leaves to each joint, (n_joints,), from 0 to 1.
+    share: of its torque limit that is left to each joint after derating, (n_joints,), from 0 to 1.
     """
     asked_limits = limits.torque_nm.tolist() if command.torque_limit_nm is None else command.torque_limit_nm
     most = (limits.torque_nm * share).tolist()
     torque_limits: list[float] = []
     for asked, joint, cool, held in zip(asked_limits, limits.joints, most, last.torque_limit_nm.tolist(), strict=True):
-        # It may fall at once, but rises no faster than a torque may.
+        # It may fall at once, but rises no faster than the torque rate limit.
         rise = held + joint.torque_rate_limit_nm_s * limits.period_s
         torque_limits.append(_within(asked, 0.0, min(cool, rise)))
     before = zip(last.mode.tolist(), last.target.tolist(), strict=True)
@@ -177,7 +177,7 @@ def limit(
         start = last_target if same else bumpless_target(joint, mode, angle, velocity, torque)
         if mode is Mode.POSITION:
             step, low, high = joint.speed_limit_rad_s, joint.angle_min_rad, joint.angle_max_rad
-            # The measured angle moves on its own: staying near it outranks the rate limit, and being in range both.
+            # The measured angle moves by itself: its distance has precedence over the rate limit, the range over both.
             low, high = _within(angle - max_step_rad, low, high), _within(angle + max_step_rad, low, high)
         else:
             low, high = bounds_at_ends(joint, mode, angle, velocity, period_s)
@@ -195,12 +195,12 @@ def limit(
 def bounds_at_ends(
     joint: JointDescription, mode: Mode, angle_rad: float, velocity_rad_s: float, period_s: float
 ) -> tuple[float, float]:
-    """Least and greatest velocity or torque with which a joint stays between its angle limits."""
+    """Minimum and maximum velocity or torque that keep a joint between its angle limits."""
     back = stoppable_speed(angle_rad - joint.angle_min_rad, joint.acceleration_limit_rad_s2, period_s)
     ahead = stoppable_speed(joint.angle_max_rad - angle_rad, joint.acceleration_limit_rad_s2, period_s)
     if mode is Mode.VELOCITY:
         return -back, ahead
-    # A weak velocity mode would bound torque far from the end: a motor at rest has its full torque at full speed.
+    # A low velocity gain would limit torque far from the end: so allow full torque to a motor at rest at full speed.
     gain = max(joint.velocity_gain_nm_s_per_rad, joint.torque_limit_nm / max(joint.speed_limit_rad_s, 1e-9))
     low, high = -gain * (back + velocity_rad_s), gain * (ahead - velocity_rad_s)
     if ahead == 0.0:
@@ -211,7 +211,7 @@ def bounds_at_ends(
 
 
 def stoppable_speed(distance_rad: float, acceleration_rad_s2: float, period_s: float) -> float:
-    """The greatest speed with which a joint stops within a distance, with some periods to go on before it slows down.
+    """The maximum speed from which a joint can stop within a distance, after some periods of reaction time.
 
     Solves speed * reaction time + speed^2 / (2 acceleration) = distance; 0 for a joint that is past it.
     """
@@ -228,7 +228,7 @@ def _within(value: float, low: float, high: float) -> float:
 def bumpless_target(
     joint: JointDescription, mode: Mode, angle_rad: float, velocity_rad_s: float, torque_nm: float
 ) -> float:
-    """The target with which a motor that changes to `mode` goes on with the torque it has now."""
+    """The target with which a motor that changes to `mode` keeps its present torque."""
     if mode is Mode.POSITION:
         push_nm = torque_nm + joint.damping_nm_s_per_rad * velocity_rad_s
         return angle_rad + push_nm / max(joint.stiffness_nm_per_rad, 1e-9)
@@ -240,7 +240,7 @@ def bumpless_target(
 def why_limited(
     command: JointCommand, applied: Applied, *, measured: Measured, limits: JointLimits, share: Floats
 ) -> dict[int, str]:
-    """For each joint that does not get what was asked: a short word to count by. Only called when there is one."""
+    """For each limited joint: a short word to count by. Only called when there is one."""
     words: dict[int, str] = {}
     hot = bound_by_heat(command, limits, share)
     for i, (mode, want) in enumerate(zip(command.mode, command.target, strict=True)):
@@ -255,7 +255,7 @@ def why_limited(
 
 
 def bound_by_heat(command: JointCommand, limits: JointLimits, share: Floats) -> NDArray[np.bool_]:
-    """Which joints get a lower torque limit than asked because they are hot, (n_joints,)."""
+    """Which joints get a lower torque limit than commanded because they are hot, (n_joints,)."""
     asked = (
         limits.torque_nm if command.torque_limit_nm is None else np.minimum(command.torque_limit_nm, limits.torque_nm)
     )
@@ -279,7 +279,7 @@ def _why(
 
 
 def as_set_points(applied: Applied, isolated: frozenset[int]) -> SetPoints:
-    """For the backend. isolated: joints that are set aside."""
+    """For the backend. isolated: indices of isolated joints."""
     modes = [_MODES[code] for code in applied.mode.tolist()]
     return SetPoints(modes, applied.target.tolist(), applied.torque_limit_nm.tolist(), isolated)
 

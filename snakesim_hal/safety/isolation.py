@@ -1,7 +1,7 @@
-"""Joints that are set aside: what fails is passive from then on, and the others go on, as the robot file says. Pure.
+"""Isolated joints: a failed joint is passive from then on, and the others go on, if the robot file allows it. Pure.
 
-Only a joint that fails while the robot is armed is set aside, and only as long as `may_lose_joints` is not exceeded;
-one more is a fault of the whole robot. A clear takes all of them back.
+Only a joint that fails while the robot is armed is isolated, and only as long as `may_lose_joints` is not exceeded;
+one more is a fault of the whole robot. A clear ends all isolations.
 """
 
 from dataclasses import replace
@@ -16,13 +16,13 @@ Mask = NDArray[np.bool_]
 
 
 class Isolation:
-    """Which joints are set aside."""
+    """Which joints are isolated."""
 
     def __init__(self, description: Description) -> None:
         self._names = [joint.name for joint in description.joints]
         self._most = description.may_lose_joints
         self.joints: Mask = np.zeros(len(self._names), dtype=np.bool_)
-        self.indices = frozenset[int]()  # the same, by their place in every vector
+        self.indices = frozenset[int]()  # the same, by their index in every vector
 
     @property
     def names(self) -> list[str]:
@@ -30,19 +30,19 @@ class Isolation:
         return [self._names[i] for i in sorted(self.indices)]
 
     def mask(self, name: str | None) -> Mask:
-        """The joint of that name; no joint for a name that is none."""
+        """The joint of that name; none for an unknown name."""
         return np.array([name == own for own in self._names])
 
     def has(self, name: str | None) -> bool:
-        """Whether the joint of that name is set aside."""
+        """Whether the joint of that name is isolated."""
         return name in self.names
 
     def covers(self, joints: Mask) -> bool:
-        """Whether these are joints that are set aside already."""
+        """Whether all these joints are isolated already."""
         return bool(joints.any() and (self.joints | ~joints).all())
 
     def add(self, joints: Mask) -> bool:
-        """Set joints aside; False, and nothing changes, when the robot may not lose so many."""
+        """Isolate joints; False, without any change, when the robot may not lose so many."""
         together = self.joints | joints
         if not joints.any() or np.count_nonzero(together) > self._most:
             return False
@@ -50,11 +50,11 @@ class Isolation:
         return True
 
     def clear(self) -> None:
-        """Take all joints back."""
+        """End all isolations."""
         self._now(np.zeros_like(self.joints))
 
     def without(self, applied: Applied) -> Applied:
-        """What goes to the motors, with the joints that are set aside passive and without torque."""
+        """The set-points, with isolated joints passive and without torque."""
         if not self.indices:
             return applied
         return replace(
@@ -65,7 +65,7 @@ class Isolation:
         )
 
     def overruled(self, command: JointCommand) -> dict[int, str]:
-        """Joints that a command asks something of in vain, and the word to count by."""
+        """Isolated joints that a command would move, and the word to count by."""
         return {i: "isolated" for i in sorted(self.indices) if command.mode[i] is not Mode.PASSIVE}
 
     def _now(self, joints: Mask) -> None:

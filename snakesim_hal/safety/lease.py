@@ -1,4 +1,4 @@
-"""The lease: who may command the robot. One holder at a time; every good command renews it. Pure; time is passed in."""
+"""The lease: the right to command. One holder at a time; every accepted command renews it. Pure; time is passed in."""
 
 from dataclasses import dataclass, replace
 
@@ -15,22 +15,22 @@ class Lease:
     expires_ns: int = 0
 
     def live(self, now_ns: int) -> bool:
-        """Whether somebody holds it at this time."""
+        """Whether it is held at this time."""
         return self.holder is not None and now_ns <= self.expires_ns
 
 
 @dataclass(frozen=True)
 class Ruling:
-    """What became of a request: the lease after it, and why it was refused (None: granted)."""
+    """The result of a request: the lease after it, and why it was refused (None: granted)."""
 
     lease: Lease
     refusal: str | None = None
     changed_hands: bool = False
-    word: str | None = None  # the refusal in short
+    word: str | None = None  # the refusal as one word
 
 
 def rule(lease: Lease, request: LeaseRequest, now_ns: int, term_ns: int) -> Ruling:
-    """Decide a request. A live lease yields only to its holder, or to a higher priority."""
+    """Decide a request. A live lease is granted only to its holder, or to a higher priority."""
     mine = lease.live(now_ns) and lease.holder == request.holder and lease.epoch == request.epoch
     match request.action:
         case "acquire":
@@ -59,10 +59,10 @@ def _not_holder(lease: Lease, request: LeaseRequest, then: str) -> Ruling:
 
 
 def renewed(lease: Lease, now_ns: int, term_ns: int) -> Lease:
-    """The lease, good for another term."""
+    """The lease, extended by a term."""
     return replace(lease, expires_ns=now_ns + term_ns)
 
 
 def freed(lease: Lease) -> Lease:
-    """Nobody's lease; the epoch stays, so that what the last holder still sends is refused."""
+    """The free lease; the epoch stays, so that later commands of the last holder are rejected."""
     return Lease(epoch=lease.epoch)

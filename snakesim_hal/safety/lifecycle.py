@@ -1,11 +1,11 @@
-"""The lifecycle of a robot: disarmed, armed, fault, estop, and nothing else; and what arming asks for. Pure functions.
+"""The lifecycle of a robot: disarmed, armed, fault, estop; and the conditions for arming. Pure functions.
 
     disarmed --arm--> armed --disarm--> disarmed
     any but estop --fault--> fault --clear--> disarmed
     any --estop--> estop --clear--> disarmed
 
-Fault and estop are latched: only an explicit clear leads out, and it leads to disarmed, never to armed.
-What stands against arming is told in words and in short.
+Fault and estop are latched: only an explicit clear ends them, and leads to disarmed, never to armed.
+Each unmet condition for arming has a reason as text and as one word.
 """
 
 from collections.abc import Sequence
@@ -44,11 +44,11 @@ def after(state: LifecycleState, event: Event) -> LifecycleState | None:
 
 # --- arming --------------------------------------------------------------------------------------------------
 
-ORDER = ("wrong_robot", "wrong_backend", "wrong_config", "wrong_state", "not_ready")  # what matters most first
+ORDER = ("wrong_robot", "wrong_backend", "wrong_config", "wrong_state", "not_ready")  # the most important first
 
 
 def mistaken(request: LifecycleRequest, description: Description) -> list[tuple[str, str]]:
-    """What a request to arm takes the robot for that it is not: (refusal, reason)."""
+    """Names in a request to arm that do not match this robot: (refusal, reason)."""
     found: list[tuple[str, str]] = []
     if request.robot != description.robot:
         found.append(
@@ -73,7 +73,7 @@ def mistaken(request: LifecycleRequest, description: Description) -> list[tuple[
 def far_targets(
     command: JointCommand, angle_rad: Floats, description: Description, aside: NDArray[np.bool_]
 ) -> Sequence[str]:
-    """Joints that a command would move at once: only staying is allowed at arming. aside: joints that stay passive."""
+    """Joints that a command would move at once: it must hold the pose at arming. aside: joints that stay passive."""
     far: list[str] = []
     most = description.max_step_rad
     for joint, mode, target, angle, passive in zip(
@@ -82,9 +82,9 @@ def far_targets(
         if passive:
             continue
         if mode not in (Mode.POSITION, Mode.PASSIVE):
-            far.append(f"{joint.name} is asked for {mode.name.lower()}; only staying is allowed at arming")
+            far.append(f"{joint.name} is commanded in mode {mode.name.lower()}; it must hold its position at arming")
         if mode is Mode.POSITION and abs(target - angle) > most:
             far.append(
-                f"{joint.name} is asked to go {target - angle:+.2f} rad from where it is; at most {most} rad at arming"
+                f"{joint.name} has a target {target - angle:+.2f} rad from its angle; at most {most} rad at arming"
             )
     return far

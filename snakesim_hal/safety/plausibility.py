@@ -1,12 +1,12 @@
-"""Which joint states are believed. An angle that no joint could have reached is no measurement. Pure.
+"""Plausibility checks of joint states: an angle that a joint cannot have reached is rejected. Pure.
 
-Three nets, joint by joint. What one of the first two catches is not believed, and the last good value stays; joints
-that are set aside are not looked at:
+Three checks, joint by joint. A value that fails one of the first two is rejected, and the last good value stays;
+isolated joints are not checked:
 
 unknown   not valid, not finite, or older than three periods (and 30 ms, and its delay; at most a lease)
-jumped    further from the last good angle than twice the speed limit allows in the time between, and a little more.
-          What stays at the new place is believed again after a few samples, but never while the robot is armed
-frozen    angle, velocity and torque go on repeating to the bit for more than a lease after the position target has
+jumped    further from the last good angle than twice the speed limit allows in the time between, plus a margin.
+          A value that stays at the new place is accepted after a few samples, but never while the robot is armed
+frozen    angle, velocity and torque stay bit-identical for more than a lease after the position target has
           moved so far that the torque must have changed, and the torque is not at its limit
 """
 
@@ -22,24 +22,24 @@ from snakesim_hal.wire.messages import Fault, JointState, Mode
 
 Mask = NDArray[np.bool_]
 
-SPEED_MARGIN = 2.0  # a joint may be pushed faster than its motor turns
+SPEED_MARGIN = 2.0  # an external load may turn a joint faster than its motor
 SLACK_RAD = 0.05  # for noise
-AGREEING = 5  # samples in a row at a new place, until it is believed
-FROZEN_SHARE = 0.25  # of max_step_rad: a target that moves so far changes the torque of a joint that does not follow
+AGREEING = 5  # samples in a row at a new place, until it is accepted
+FROZEN_SHARE = 0.25  # of max_step_rad: a target that moves this far changes the torque of a joint that does not follow
 AT_LIMIT = 0.95  # of the torque limit
 LONGEST_CAUSE = 400
 
 
 @dataclass(frozen=True)
 class Doubt:
-    """What is wrong with a joint state, and of which joints."""
+    """An implausible joint state: its fault, and the joints concerned."""
 
     fault: Fault
     joints: Mask
 
 
 class PlausibilityCheck:
-    """The last good state of every joint, and what is wrong with the newest."""
+    """The last good state of every joint, and the checks of the newest."""
 
     def __init__(self, limits: JointLimits) -> None:
         self._limits = limits
@@ -56,11 +56,11 @@ class PlausibilityCheck:
         return Measured(*self._columns)
 
     def take(self, joints: JointState, *, now_ns: int, applied: Applied | None, aside: Mask) -> Doubt | None:
-        """Take a joint state; returns what is wrong with it, if anything.
+        """Take a joint state; returns what is implausible, or None.
 
-        now_ns: safety time. A host that was held up knows by it that more time has passed than its ticks say.
-        applied: what the motors of an armed robot were told last; None: the robot is not armed.
-        aside: joints that nobody relies on.
+        now_ns: safety time. After a delay of the host, more time has passed than its ticks show.
+        applied: the last set-points of an armed robot; None: the robot is not armed.
+        aside: isolated joints.
         """
         count = len(self._known)
         lists = (joints.angle_rad, joints.velocity_rad_s, joints.torque_nm, joints.valid, joints.age_ns)
@@ -92,9 +92,7 @@ class PlausibilityCheck:
             ]
             return self._doubt(joints.tick, "state_invalid", "faster than any joint turns: a jump of ", jumped, tails)
         if frozen.any():
-            return self._doubt(
-                joints.tick, "joint_frozen", "the same state over and over while its target moves: ", frozen
-            )
+            return self._doubt(joints.tick, "joint_frozen", "the same state repeated while its target moves: ", frozen)
         return None
 
     def _doubt(self, tick: int, what: str, words: str, which: Mask, tails: list[str] | None = None) -> Doubt:
@@ -107,9 +105,9 @@ class PlausibilityCheck:
 
 
 def readable(joints: JointState, good: Measured) -> JointState:
-    """What may be published: a number that is none would make a reader refuse the states of all joints.
+    """A joint state for publishing: NaN or infinity would make a reader reject the states of all joints.
 
-    The last good one takes its place, and is not valid. A state of another number of joints stays as it is.
+    The last good value replaces it, marked invalid. A state of another number of joints is unchanged.
     """
     columns = (joints.angle_rad, joints.velocity_rad_s, joints.torque_nm)
     if all(math.isfinite(value) for column in columns for value in column):
@@ -127,7 +125,7 @@ def readable(joints: JointState, good: Measured) -> JointState:
 
 
 class _JumpDetector:
-    """Angles that were not believed: whether they agree with one another."""
+    """Rejected angles: whether they agree with one another."""
 
     def __init__(self, count: int, speed_rad_s: Floats) -> None:
         self._speed_rad_s = speed_rad_s
@@ -136,17 +134,17 @@ class _JumpDetector:
         self._in_a_row = np.zeros(count, dtype=np.int64)
 
     def reach_rad(self, elapsed_s: Floats) -> Floats:
-        """How far a joint may have turned in this time, (n_joints,)."""
+        """Maximum turn of a joint in this time, (n_joints,)."""
         return SLACK_RAD + self._speed_rad_s * np.maximum(elapsed_s, 0.0)
 
     def settled(self, strayed: Mask, angle_rad: Floats, taken_s: Floats) -> Mask:
-        """Take the newest angles, of which some have strayed; returns which of those have been at a new place."""
+        """Take the newest angles, of which some have jumped; returns which of those have settled at a new place."""
         if not strayed.any():
             self._in_a_row[:] = 0
             return strayed
         elapsed_s = taken_s - self._taken_s
         follows = np.abs(np.where(strayed, angle_rad, 0.0) - self._angle_rad) <= self.reach_rad(elapsed_s.max(axis=0))
-        repeated = follows & (elapsed_s[0] <= 0)  # the same sample once more says nothing new
+        repeated = follows & (elapsed_s[0] <= 0)  # a repeated sample is not new information
         counted = np.where(follows, self._in_a_row + ~repeated, 1)
         self._in_a_row = np.where(strayed, counted, 0)
         self._angle_rad, self._taken_s = np.where(strayed, angle_rad, 0.0), taken_s
@@ -154,7 +152,7 @@ class _JumpDetector:
 
 
 class _FrozenDetector:
-    """For how long joints have said the same, and how far their targets have moved meanwhile."""
+    """For how long joints have repeated a state, and how far their targets have moved meanwhile."""
 
     def __init__(self, limits: JointLimits) -> None:
         self._lease_s = limits.lease_ns * 1e-9

@@ -1,8 +1,8 @@
-"""The safe action `hold`: the joints are brought to rest, and held where they came to it. Pure.
+"""The safe action `hold`: the joints are brought to rest, and held there. Pure.
 
-A wanted angle sets out from the measured one at the measured velocity, and slows down by the acceleration limit. The
-position target follows it no faster than the speed limit, from where the motor's torque goes on without a jump. Both
-stay inside the angle limits, which outranks the rate of the target.
+A reference angle starts from the measured one at the measured velocity, and slows down by the acceleration limit. The
+position target follows it no faster than the speed limit, starting where the motor keeps its torque. Both
+stay inside the angle limits, which takes precedence over the rate of the target.
 """
 
 from dataclasses import dataclass
@@ -15,15 +15,15 @@ from snakesim_hal.wire.messages import Mode
 
 @dataclass(frozen=True)
 class StopRamp:
-    """A robot that comes to rest, (n_joints,) each."""
+    """A robot that is brought to rest, (n_joints,) each."""
 
     wanted_rad: Floats
-    velocity_rad_s: Floats  # of the wanted angle
+    velocity_rad_s: Floats  # of the reference angle
     target_rad: Floats
 
     @staticmethod
     def begin(measured: Measured, last: Applied, limits: JointLimits) -> "StopRamp":
-        """From what the joints do, and what they were told last."""
+        """From the measured state, and the last set-points."""
         angle, velocity = measured.angle_rad, measured.velocity_rad_s
         states = zip(limits.joints, angle.tolist(), velocity.tolist(), measured.torque_nm.tolist(), strict=True)
         bumpless = [bumpless_target(joint, Mode.POSITION, *now) for joint, *now in states]

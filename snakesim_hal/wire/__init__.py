@@ -1,5 +1,5 @@
-"""What crosses the network, and how it looks there.
+"""The messages on the network, and their encoding.
 
-`quantities`  numbers with their units and ranges      `messages`  what is said, made of them
-`keys`        where it is said, by whom, how often     `codec`     MessagePack, checked on reading
+`quantities`  numbers with their units and ranges      `messages`  the messages, made of them
+`keys`        the keys: message, writer, rate          `codec`     MessagePack, checked on decoding
 """

@@ -15,7 +15,7 @@ MessageT = TypeVar("MessageT", bound=Message)
 ENCODING_PREFIX = "application/msgpack;snakesim."
 MAX_PAYLOAD_BYTES = 1024 * 1024  # a world of 4096 obstacles fits; longer ones are dropped by the session unread
 MAX_WHY = 300  # characters of the reason why a payload is malformed
-# Everything that a msgspec decoder raises for bytes of a stranger: a payload may be nested too deeply, or be no text.
+# Everything that a msgspec decoder raises for untrusted bytes: a payload may be nested too deeply, or not be UTF-8.
 UNDECODABLE = (msgspec.DecodeError, UnicodeDecodeError, RecursionError, OverflowError, ValueError)
 
 _encoder = msgspec.msgpack.Encoder()
@@ -28,7 +28,7 @@ def encoding_of(message: type[Message]) -> str:
 
 
 class Decoder(Generic[MessageT]):
-    """Decodes one message type and refuses everything else with a `WireError`, never anything else."""
+    """Decodes one message type and rejects everything else with a `WireError`, never another exception."""
 
     def __init__(self, message: type[MessageT]) -> None:
         self.message = message

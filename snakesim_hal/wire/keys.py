@@ -1,4 +1,4 @@
-"""The key space, relative to the robot's Zenoh namespace. Keys are built and parsed here and nowhere else."""
+"""The key space, relative to the robot's Zenoh namespace. Keys are built and parsed only here."""
 
 from dataclasses import dataclass
 
@@ -29,7 +29,7 @@ HOST_ALL = "hal/host/*"
 
 @dataclass(frozen=True)
 class Row:
-    """One line of the key space: what stands at a key, who writes it, how and when."""
+    """One line of the key space: the message at a key, who writes it, how and when."""
 
     key: str
     message: type[m.Message] | None
@@ -43,31 +43,31 @@ _TICK = "every tick"
 _SENSOR = "at its `rate_hz` in `Description.sensors`"
 _ASKED = "on request"
 _TURN = "every `every_ticks` of its service"
-_HEARD = f"{_TICK}, if somebody listens"
+_HEARD = f"{_TICK}, if there is a subscriber"
 _LIVES = "while connected"
 
 SPACE: tuple[Row, ...] = (
     Row(JOINTS, m.JointState, "HAL", "stream", _TICK, "angle, velocity, torque of every joint"),
-    Row(CONTACTS, m.Contacts, "HAL", "stream", _SENSOR, "every touch of a link by an obstacle"),
+    Row(CONTACTS, m.Contacts, "HAL", "stream", _SENSOR, "every contact of a link with an obstacle"),
     Row(IMU, m.Imu, "HAL", "stream", _SENSOR, "angular velocity and acceleration of the links"),
-    Row(POSE, m.Pose, "HAL", "stream", _SENSOR, "base pose as a motion-capture system gives it"),
+    Row(POSE, m.Pose, "HAL", "stream", _SENSOR, "base pose from motion capture"),
     Row(POWER, m.Power, "HAL", "stream", _SENSOR, "supply, temperatures and leaks of the joint modules"),
     Row(JOINT_COMMAND, m.JointCommand, "lease holder", "stream", _TICK, "mode and set-point of every joint"),
     Row(DESCRIPTION, m.Description, "HAL", "latched", "once", "joints, order, limits, geometry, sensors"),
-    Row(STATUS, m.Status, "HAL", "latched", "on a change, and 5 Hz", "lifecycle and why, holder, faults, counters"),
-    Row(CLOCK, m.Clock, "HAL", "stream", f"{_TICK}, last", "tick, time, and what is newest at each key"),
-    Row(APPLIED, m.AppliedCommand, "HAL", "stream", _HEARD, "what went to the motors, and what was limited"),
+    Row(STATUS, m.Status, "HAL", "latched", "on a change, and 5 Hz", "lifecycle, reason, holder, faults, counters"),
+    Row(CLOCK, m.Clock, "HAL", "stream", f"{_TICK}, last", "tick, time, and the newest sample at each key"),
+    Row(APPLIED, m.AppliedCommand, "HAL", "stream", _HEARD, "set-points that the motors got, and limits applied"),
     Row(LEASE, m.LeaseRequest, "any", "query", _ASKED, "acquire, renew, release the right to command; replies Answer"),
     Row(LIFECYCLE, m.LifecycleRequest, "any", "query", _ASKED, "arm, disarm, clear, finish; replies Answer"),
     Row(ESTOP, m.EstopRequest, "any", "query", _ASKED, "stop now, needs no lease, latched; replies Answer"),
-    Row(FAULT_ALL, m.FaultRequest, "any", "query", _ASKED, "let something go wrong, where allowed; replies Answer"),
-    Row(DONE_ALL, m.Done, "each service", "stream", _TURN, "lockstep: all that is owed for a tick is published"),
+    Row(FAULT_ALL, m.FaultRequest, "any", "query", _ASKED, "inject a fault, where allowed; replies Answer"),
+    Row(DONE_ALL, m.Done, "each service", "stream", _TURN, "lockstep: all output for a tick is published"),
     Row(WORLD, m.World, "guidance", "stream", _TURN, "body pose, contacts and obstacles in the world"),
     Row(TRAJECTORY, m.Trajectory, "navigation", "stream", _TURN, "path, speed, push-points ahead"),
-    Row(CONTROL_STATE, m.ControlState, "control", "stream", "on a change, and 20 Hz", "state, forces, torques, why"),
-    Row(INTENT, m.Intent, "operator", "stream", "before the last expires", "what a person or a mission wants"),
+    Row(CONTROL_STATE, m.ControlState, "control", "stream", "on a change, and 20 Hz", "state, reason, forces, torques"),
+    Row(INTENT, m.Intent, "operator", "stream", "before the last expires", "speed asked for by a person or a mission"),
     Row(ALIVE_ALL, None, "each service", "liveliness", _LIVES, "present while the service's process is connected"),
-    Row(HOST_ALL, None, "HAL", "liveliness", _LIVES, "one for each HAL host process: two of a robot are one too many"),
+    Row(HOST_ALL, None, "HAL", "liveliness", _LIVES, "one for each HAL host process; a robot must have only one"),
 )
 
 MESSAGE_AT: dict[str, type[m.Message]] = {row.key: row.message for row in SPACE if row.message is not None}
@@ -79,7 +79,7 @@ def done(service: str) -> str:
 
 
 def fault(part: str) -> str:
-    """Key on which a part of a run takes requests for faults."""
+    """Key on which a part of a run takes requests for fault injection."""
     return f"fault/{part}"
 
 
@@ -99,7 +99,7 @@ def service_of(key: str) -> str:
 
 
 def message_at(key: str) -> type[m.Message] | None:
-    """The message that stands at `key`, or None when the key space has no such key."""
+    """The message at `key`, or None when the key space has no such key."""
     if key in MESSAGE_AT:
         return MESSAGE_AT[key]
     if key.startswith("hal/done/") and key.count("/") == 2:

@@ -4,7 +4,7 @@ Vectors run over all joints, tail to head, in the order of the description. Fram
 `_l` the link's own frame (x forward along the link, origin at its rear joint). Quaternions are wxyz.
 A new field gets a default; a change of meaning gets a new version in `VERSIONS`.
 
-What a field means stands in its `about`, because the published schemas are made from this file.
+The meaning of a field is its `about`, because the published schemas are generated from this file.
 """
 
 from enum import IntEnum
@@ -24,13 +24,13 @@ Reach = Literal["robot", "joint", "none"]
 Axis = Literal["yaw", "pitch"]
 
 A_JOINT = "one entry a joint"
-PACE = about("realtime: by the wall clock; lockstep: each tick waits for all services; free: waits for nobody")
-LIFECYCLE = about("only in armed do motors follow commands; fault and estop stay until somebody clears them")
-HOST = about("id of the host process, made up anew at its start; null: not told")
+PACE = about("realtime: by the wall clock; lockstep: each tick waits for all services; free: without waiting")
+LIFECYCLE = about("motors follow commands only in armed; fault and estop stay until a clear")
+HOST = about("random id of the host process, new at each start; null: unknown")
 
 
 class Mode(IntEnum):
-    """What a joint does with its target.
+    """How a joint uses its target.
 
     0 passive: motor off, the target is ignored
     1 position: target in rad
@@ -62,15 +62,15 @@ class JointState(Message, frozen=True, kw_only=True):
     angle_rad: Annotated[q.Angles, about("positive: yaw to the left, pitch downwards, seen towards the head")]
     velocity_rad_s: Annotated[q.AngularVelocities, about(A_JOINT)]
     torque_nm: Annotated[q.Torques, about("of the motor; positive turns towards positive angles")]
-    valid: Annotated[q.Flags, about("false: its numbers are not of this instant, and not to be acted on")]
+    valid: Annotated[q.Flags, about("false: its numbers are outdated, and must not be used")]
     age_ns: Annotated[q.Ages, about("how long before `stamp_ns` each joint was measured")]
 
 
 class Contact(Message, frozen=True, kw_only=True):
-    """One touch of a link by something that is not the ground; all vectors in the link's frame."""
+    """One contact of a link with an obstacle (not the ground); all vectors in the link's frame."""
 
     link: Annotated[q.LinkIndex, about("number of the link, from 0 at the tail")]
-    obstacle: Annotated[q.Name | None, about("what is touched; null: the sensor cannot tell")]
+    obstacle: Annotated[q.Name | None, about("touched obstacle; null: the sensor cannot tell")]
     position_l: q.Vector
     normal_l: Annotated[q.UnitVector, about("from the obstacle into the body")]
     tangent_1_l: Annotated[q.UnitVector, about("across the normal, towards the head")]
@@ -80,7 +80,7 @@ class Contact(Message, frozen=True, kw_only=True):
 
 
 class Contacts(Message, frozen=True, kw_only=True):
-    """`sensor/contacts`: all touches at one instant; an empty list says that nothing is touched."""
+    """`sensor/contacts`: all contacts at one instant; an empty list means no contact."""
 
     tick: q.Tick
     stamp_ns: q.Stamp
@@ -95,12 +95,12 @@ class Imu(Message, frozen=True, kw_only=True):
     link: Annotated[list[q.LinkIndex], Meta(max_length=q.MAX_JOINTS + 1), about("their numbers, from 0 at the tail")]
     angular_velocity_rad_s: Annotated[list[q.AngularVelocityVector], Meta(max_length=q.MAX_JOINTS + 1)]
     acceleration_m_s2: Annotated[
-        list[q.AccelerationVector], Meta(max_length=q.MAX_JOINTS + 1), about("as it feels it: at rest 1 g upwards")
+        list[q.AccelerationVector], Meta(max_length=q.MAX_JOINTS + 1), about("specific force: at rest 1 g upwards")
     ]
 
 
 class Pose(Message, frozen=True, kw_only=True):
-    """`sensor/pose`: the base (tail end of link 0) as a motion-capture system gives it."""
+    """`sensor/pose`: pose of the base (tail end of link 0) from motion capture."""
 
     tick: q.Tick
     stamp_ns: q.Stamp
@@ -111,7 +111,7 @@ class Pose(Message, frozen=True, kw_only=True):
 
 
 class Power(Message, frozen=True, kw_only=True):
-    """`sensor/power`: what the joint modules say of their supply and their health, one entry a joint."""
+    """`sensor/power`: supply and health of the joint modules, one entry a joint."""
 
     tick: q.Tick
     stamp_ns: q.Stamp
@@ -120,40 +120,40 @@ class Power(Message, frozen=True, kw_only=True):
     motor_c: Annotated[list[q.Temperature], Meta(max_length=q.MAX_JOINTS), about("of the winding")]
     board_c: Annotated[list[q.Temperature], Meta(max_length=q.MAX_JOINTS), about("of the electronics")]
     leak: Annotated[q.Flags, about("true: water inside")]
-    valid: Annotated[q.Flags, about("false: nothing is known of this module now")]
+    valid: Annotated[q.Flags, about("false: the state of this module is unknown")]
 
 
 # --- actuators -------------------------------------------------------------------------------------------------
 
 
 class JointCommand(Message, frozen=True, kw_only=True):
-    """`actuator/joints`: what the lease holder wants of every joint. How it is judged stands in protocol.md."""
+    """`actuator/joints`: set-points for every joint from the lease holder. The checks are in protocol.md."""
 
-    tick: Annotated[q.Tick, about("of the joint state that the command answers: the command is as old as that")]
+    tick: Annotated[q.Tick, about("of the joint state that the command answers: its age is the command's age")]
     sequence: Annotated[q.Count, about("greater than that of any command accepted under this lease; gaps are allowed")]
     lease_epoch: Annotated[q.Count, about("`Answer.epoch` of the lease")]
     layout: Annotated[q.Name, about("`Description.layout`")]
     valid_for_ns: Annotated[
         q.Nanoseconds,
-        about("refused as stale this long after the state was published; more than a lease term counts as a term"),
+        about("rejected as stale this long after the state was published; at most a lease term"),
     ]
     mode: Modes
     target: q.Targets
     torque_limit_nm: Annotated[
-        q.TorqueLimits | None, about("bounds each motor below the robot's own limit; null: no lower than that")
+        q.TorqueLimits | None, about("limit of each motor, if lower than the robot's own; null: the robot's own")
     ] = None
     arming: Annotated[
         q.Count,
-        about("`Clock.arming`; 0: before any arming. An armed robot refuses any other number than its own, and so 0"),
+        about("`Clock.arming`; 0: before any arming. An armed robot rejects any number but its own, including 0"),
     ] = 0
 
 
 class AppliedCommand(Message, frozen=True, kw_only=True):
-    """`hal/applied`: what really went to the motors in a tick, and where that differs from what was asked."""
+    """`hal/applied`: the set-points that the motors got in a tick, and where they differ from the command."""
 
     tick: q.Tick
     stamp_ns: q.Stamp
-    sequence: Annotated[q.Count | None, about("of the command behind it; null: the host's own safe action")]
+    sequence: Annotated[q.Count | None, about("of the command; null: the host's own safe action")]
     mode: Modes
     target: q.Targets
     torque_limit_nm: q.TorqueLimits
@@ -171,9 +171,9 @@ class AppliedCommand(Message, frozen=True, kw_only=True):
 
 
 class Clock(Message, frozen=True, kw_only=True):
-    """`hal/clock`: the only time that GNC knows, and the table of contents of everything published so far.
+    """`hal/clock`: the only clock of GNC, and an index of everything published so far.
 
-    The clock is published last, so a reader that takes what `newest` names reads the same data in every lockstep run.
+    It is published last, so a reader that uses the samples named by `newest` reads the same data in every lockstep run.
     """
 
     tick: q.Tick
@@ -182,18 +182,18 @@ class Clock(Message, frozen=True, kw_only=True):
     pace: Annotated[Pace, PACE]
     lifecycle: Annotated[LifecycleState, LIFECYCLE]
     arming: Annotated[
-        q.Count, about("how often the robot has been armed since its host started; a new number: start afresh")
+        q.Count, about("how often the robot has been armed since its host started; a new number: reset the controller")
     ]
-    lease_epoch: Annotated[q.Count, about("of the live lease; 0: nobody holds one")]
+    lease_epoch: Annotated[q.Count, about("of the live lease; 0: there is none")]
     newest: Annotated[
         dict[q.Name, q.Tick],
         Meta(max_length=64),
-        about("sensor key or service -> tick of its newest sample that counts now"),
+        about("sensor key or service -> tick of its newest sample that is valid now"),
     ]
 
 
 class JointDescription(Message, frozen=True, kw_only=True):
-    """One joint: its name, its place in every vector, and what it can do."""
+    """One joint: its name, its position in every vector, and its limits."""
 
     name: q.Name
     axis: Annotated[Axis, about("of its rear link about which the joint turns: yaw about z, pitch about y")]
@@ -206,8 +206,8 @@ class JointDescription(Message, frozen=True, kw_only=True):
     stiffness_nm_per_rad: Annotated[float, Meta(ge=0, le=1e6), about("of position mode")]
     damping_nm_s_per_rad: Annotated[float, Meta(ge=0, le=1e6), about("of position mode")]
     velocity_gain_nm_s_per_rad: Annotated[float, Meta(gt=0, le=1e6), about("of velocity mode")]
-    derate_from_c: Annotated[q.Temperature, about("of the winding: from here on torque is taken away")] = 80.0
-    stop_at_c: Annotated[q.Temperature, about("of the winding: there the robot is stopped")] = 105.0
+    derate_from_c: Annotated[q.Temperature, about("of the winding: above it torque is derated")] = 80.0
+    stop_at_c: Annotated[q.Temperature, about("of the winding: at it the robot is stopped")] = 105.0
     least_voltage_v: Annotated[q.Voltage, about("below it the robot is stopped")] = 18.0
 
 
@@ -221,46 +221,46 @@ class LinkDescription(Message, frozen=True, kw_only=True):
 
 
 class SensorDescription(Message, frozen=True, kw_only=True):
-    """What a sensor delivers, and how often; of IMUs it is the rate of each link, which need not come together."""
+    """A sensor and its rate; for IMUs the rate of each link, which need not be sampled together."""
 
-    key: Annotated[q.Name, about("where it is published, such as sensor/pose; what is not listed is never published")]
+    key: Annotated[q.Name, about("where it is published, such as sensor/pose; only listed keys are published")]
     rate_hz: Annotated[float, Meta(gt=0, le=1e5)]
     delay_s: Annotated[float, Meta(ge=0, le=10)]
 
 
 class Description(Message, frozen=True, kw_only=True):
-    """`hal/description`, latched: the robot as the backend has it. The order of joints is defined here only."""
+    """`hal/description`, latched: the robot, as described by its backend. Only this defines the order of joints."""
 
     robot: q.Name
-    backend: Annotated[q.Name, about("what stands behind the keys: sim, can, ...")]
+    backend: Annotated[q.Name, about("name of the backend: sim, can, ...")]
     layout: Annotated[q.Name, about("hash of the joints' names, order and axes; every command carries it")]
     config_hash: Annotated[q.Name, about("of the whole configuration; a request to arm carries it")]
     period_ns: Annotated[q.Nanoseconds, about("from tick to tick")]
-    lease_ns: Annotated[q.Nanoseconds, about("a lease term: how long the robot lives on one good command")]
+    lease_ns: Annotated[q.Nanoseconds, about("a lease term: how long one accepted command keeps the robot armed")]
     max_step_rad: Annotated[float, Meta(gt=0, le=10), about("a position target further from the measured is limited")]
     safe_action: Annotated[SafeAction, about("in fault: passive, brake (damp), or decelerate and then hold")]
     may_lose_joints: Annotated[
-        int, Meta(ge=0, le=q.MAX_JOINTS), about("so many may fail while armed before the robot stops")
+        int, Meta(ge=0, le=q.MAX_JOINTS), about("how many may fail while armed before the robot stops")
     ] = 0
     emulated: Annotated[
-        bool, about("nothing real moves: a simulator, or emulated modules; faults on request are allowed")
+        bool, about("nothing real moves: a simulator, or emulated modules; fault injection is allowed")
     ] = False
     hardware: Annotated[
-        str, Meta(max_length=200), about("what it drives, such as `can0+can1`; empty: nothing real")
+        str, Meta(max_length=200), about("hardware that it drives, such as `can0+can1`; empty: none")
     ] = ""
     host: Annotated[q.Name | None, HOST] = None
-    proof: Annotated[str, Meta(max_length=64), about("for the run that started the host; means nothing to others")] = ""
+    proof: Annotated[str, Meta(max_length=64), about("for the run that started the host; of no use to others")] = ""
     joints: Annotated[list[JointDescription], Meta(min_length=1, max_length=q.MAX_JOINTS), about("tail to head")]
     links: Annotated[
         list[LinkDescription],
         Meta(min_length=2, max_length=q.MAX_JOINTS + 1),
-        about("tail to head: joint i, from 0, stands between link i and link i + 1"),
+        about("tail to head: joint i, from 0, connects link i and link i + 1"),
     ]
     sensors: Annotated[list[SensorDescription], Meta(max_length=32)]
 
 
 class Fault(Message, frozen=True, kw_only=True):
-    """One thing that went wrong, and where."""
+    """One fault, and its location."""
 
     tick: q.Tick
     what: Annotated[q.Name, about("a short word to count by: lease_expired, service_lost, diverged, ...")]
@@ -269,13 +269,13 @@ class Fault(Message, frozen=True, kw_only=True):
     reach: Annotated[
         Reach,
         about(
-            "joint: the others are as they were, and the robot may go on if its file says so; none: it stops nothing"
+            "joint: the others are not affected, and the robot may go on if its file allows it; none: it stops nothing"
         ),
     ] = "robot"
 
 
 class Status(Message, frozen=True, kw_only=True):
-    """`hal/status`, latched: how the robot is, and why."""
+    """`hal/status`, latched: the state of the robot, and its reason."""
 
     tick: q.Tick
     stamp_ns: q.Stamp
@@ -284,24 +284,24 @@ class Status(Message, frozen=True, kw_only=True):
     pace: Annotated[Pace, PACE]
     rate_hz: Annotated[float, Meta(gt=0, le=1e5)]
     lifecycle: Annotated[LifecycleState, LIFECYCLE]
-    why: Annotated[q.Reason, about("why it is in this state, and while disarmed what stands against arming")]
-    lease_holder: Annotated[q.Name | None, about("null: nobody")]
-    lease_epoch: Annotated[q.Count, about("of the lease, or of the last one when nobody holds it")]
+    why: Annotated[q.Reason, about("why it is in this state, and while disarmed what prevents arming")]
+    lease_holder: Annotated[q.Name | None, about("null: the lease is free")]
+    lease_epoch: Annotated[q.Count, about("of the lease, or of the last one when it is free")]
     commands_accepted: Annotated[q.Count, about("while armed")]
-    commands_standby: Annotated[q.Count, about("good commands while disarmed: heard, not enacted")]
+    commands_standby: Annotated[q.Count, about("valid commands while disarmed: received, not enacted")]
     commands_rejected: Annotated[dict[q.Name, q.Count], Meta(max_length=64), about("how many, by reason")]
     commands_limited: Annotated[dict[q.Name, q.Count], Meta(max_length=64), about("how many targets, by limit")]
     faults: Annotated[list[Fault], Meta(max_length=64), about("since the last clear; not all of them stop the robot")]
-    alive: Annotated[list[q.Name], Meta(max_length=64), about("services of the run whose tokens are there")]
+    alive: Annotated[list[q.Name], Meta(max_length=64), about("services of the run with a liveliness token")]
     waiting_for: Annotated[list[q.Name], Meta(max_length=64), about("services that arming waits for")]
     overruns: Annotated[q.Count, about("ticks that were late, while armed in real time")]
     ready_to_arm: Annotated[bool, about("whether a request to arm that names the right robot would be granted now")]
-    injected: Annotated[list[q.Reason], Meta(max_length=64), about("faults on request that are on now")] = []
+    injected: Annotated[list[q.Reason], Meta(max_length=64), about("injected faults that are active now")] = []
     realtime_warnings: Annotated[
         list[q.Reason], Meta(max_length=16), about("real-time measures that the system refused")
     ] = []
     derated: Annotated[
-        dict[q.Name, q.Fraction], Meta(max_length=q.MAX_JOINTS), about("joint -> share of its torque that heat leaves")
+        dict[q.Name, q.Fraction], Meta(max_length=q.MAX_JOINTS), about("joint -> share of its torque left by derating")
     ] = {}
     isolated: Annotated[
         list[q.Name], Meta(max_length=q.MAX_JOINTS), about("joints that failed, and are passive until a clear")
@@ -311,30 +311,30 @@ class Status(Message, frozen=True, kw_only=True):
 
 
 class LeaseRequest(Message, frozen=True, kw_only=True):
-    """Query payload on `hal/lease`: the right to command, for a term. Good commands renew it."""
+    """Query payload on `hal/lease`: the right to command, for a term. Accepted commands renew it."""
 
     action: Annotated[
         Literal["acquire", "renew", "release"],
-        about("renew keeps the lease of a disarmed robot only: an armed one wants commands"),
+        about("renew works only while disarmed: an armed robot needs commands"),
     ]
-    holder: Annotated[q.Name, about("who asks; a service of the run says its own name")]
+    holder: Annotated[q.Name, about("name of the requester; a service of the run uses its own name")]
     epoch: Annotated[q.Count, about("of the lease that is renewed or released; acquire needs none")] = 0
     priority: Annotated[
         int,
         Meta(ge=0, le=255),
-        about("a live lease yields to a greater one only, and an armed robot is disarmed by that"),
+        about("a live lease is taken over only by a greater one, which disarms an armed robot"),
     ] = 100
 
 
 class LifecycleRequest(Message, frozen=True, kw_only=True):
-    """Query payload on `hal/lifecycle`. Arming names robot and backend, so that the two cannot be mixed up."""
+    """Query payload on `hal/lifecycle`. Arming names robot and backend, so that the wrong one is not armed."""
 
     action: Annotated[
         Literal["arm", "disarm", "clear", "finish"],
         about("clear leads from fault or estop to disarmed; finish disarms, and ends the run"),
     ]
-    who: Annotated[q.Name, about("who asks, for the status, the log and the summary")] = "somebody"
-    host: Annotated[q.Name | None, about("the host process that is meant; null: whoever is asked")] = None
+    who: Annotated[q.Name, about("name of the requester, for status, log and summary")] = "an unnamed client"
+    host: Annotated[q.Name | None, about("id of the addressed host process; null: any")] = None
     robot: Annotated[q.Name | None, about("`Description.robot`; arm needs it, others may leave it null")] = None
     backend: Annotated[q.Name | None, about("`Description.backend`; arm needs it, others may leave it null")] = None
     config_hash: Annotated[
@@ -345,34 +345,34 @@ class LifecycleRequest(Message, frozen=True, kw_only=True):
 class EstopRequest(Message, frozen=True, kw_only=True):
     """Query payload on `hal/estop`; needs no lease. Latched until `clear` on `hal/lifecycle`."""
 
-    who: Annotated[q.Name, about("who asks, for the status, the log and the summary")]
+    who: Annotated[q.Name, about("name of the requester, for status, log and summary")]
 
 
 class FaultRequest(Message, frozen=True, kw_only=True):
-    """Query payload on `fault/<part>`: let something go wrong now, or end it. Only runs that allow faults do it."""
+    """Query payload on `fault/<part>`: inject a fault now, or end it. Only in runs that allow it."""
 
-    kind: Annotated[q.Name, about("what goes wrong: `snakesim fault list` prints all")]
+    kind: Annotated[q.Name, about("kind of fault: `snakesim fault list` prints all")]
     target: Annotated[q.Name, about("a process, key, joint or bus, such as joint_3")]
     for_s: Annotated[
         Annotated[float, Meta(gt=0, le=86400)] | None, about("seconds of robot time; null: until it is ended")
     ] = None
-    amount: Annotated[q.Scalar | None, about("how much of it; null: as is usual for this kind")] = None
+    amount: Annotated[q.Scalar | None, about("amount, in the unit of the kind; null: the default of this kind")] = None
     end: Annotated[bool, about("true: end it")] = False
 
 
 class Answer(Message, frozen=True, kw_only=True):
-    """Reply to every query: whether it was done, and if not, why not, for people and in one stable word."""
+    """Reply to every query: whether it was done, and if not, why, as a text and as one stable word."""
 
     ok: Annotated[bool, about("whether it was done")]
-    reason: Annotated[q.Reason, about("for people: why not, or when it was done why the robot is in its state")]
-    refusal: Annotated[q.Name | None, about("why not, in a word: see protocol.md; null: it was done")] = None
-    epoch: Annotated[q.Count, about("of the lease, or of the last one when nobody holds it")] = 0
+    reason: Annotated[q.Reason, about("a text: why not, or if it was done why the robot is in its state")]
+    refusal: Annotated[q.Name | None, about("why not, as one word: see protocol.md; null: it was done")] = None
+    epoch: Annotated[q.Count, about("of the lease, or of the last one when it is free")] = 0
     lifecycle: Annotated[LifecycleState, LIFECYCLE] = "disarmed"
     host: Annotated[q.Name | None, HOST] = None
 
 
 class Done(Message, frozen=True, kw_only=True):
-    """`hal/done/<service>`: a lockstep participant has published all that it owes for a tick."""
+    """`hal/done/<service>`: a lockstep participant has published all its output for a tick."""
 
     tick: q.Tick
 
@@ -381,7 +381,7 @@ class Done(Message, frozen=True, kw_only=True):
 
 
 class Obstacle(Message, frozen=True, kw_only=True):
-    """Something known to stand in the world: an upright shape with its outline."""
+    """A known obstacle in the world: an upright shape with its outline."""
 
     name: q.Name
     shape: Literal["cylinder", "box", "sphere"]
@@ -394,10 +394,10 @@ class Obstacle(Message, frozen=True, kw_only=True):
 
 
 class WorldContact(Message, frozen=True, kw_only=True):
-    """A contact in the world frame, and where along the body it is."""
+    """A contact in the world frame, with its position along the body."""
 
     link: Annotated[q.LinkIndex, about("number of the link, from 0 at the tail")]
-    obstacle: Annotated[q.Name | None, about("what is touched; null: unknown")]
+    obstacle: Annotated[q.Name | None, about("touched obstacle; null: unknown")]
     body_s_m: Annotated[q.Length, about("arc length from the tail end along the chain")]
     position_w: q.Vector
     normal_w: Annotated[q.UnitVector, about("from the obstacle into the body")]
@@ -407,10 +407,10 @@ class WorldContact(Message, frozen=True, kw_only=True):
 
 
 class World(Message, frozen=True, kw_only=True):
-    """`guidance/world`: where the body is, what it touches, what stands near it. Each part carries its own age."""
+    """`guidance/world`: pose of the body, contacts, obstacles nearby. Each part has its own stamp."""
 
     tick: Annotated[q.Tick, about("of the clock that guidance acted on")]
-    stamp_ns: Annotated[q.Stamp, about("of the joint state that it was made from")]
+    stamp_ns: Annotated[q.Stamp, about("of the joint state that it was computed from")]
     base_position_w: q.Vector
     base_orientation_wxyz: q.Quaternion
     base_confidence: q.Fraction
@@ -424,13 +424,13 @@ class World(Message, frozen=True, kw_only=True):
 
 
 class Trajectory(Message, frozen=True, kw_only=True):
-    """`navigation/trajectory`: the path to take, how fast, and the push-points expected along it."""
+    """`navigation/trajectory`: path, speed, and the push-points expected along it."""
 
     tick: Annotated[q.Tick, about("of the clock that navigation acted on")]
     stamp_ns: Annotated[q.Stamp | None, about("of the world model that it was planned from; null: without one")]
     path_id: Annotated[q.Count, about("changes when `path_w` does")]
     path_w: Annotated[list[tuple[q.Length, q.Length]], Meta(min_length=2, max_length=20000), about("x and y")]
-    speed_m_s: Annotated[q.Velocity, about("along the path; 0: stay")]
+    speed_m_s: Annotated[q.Velocity, about("along the path; 0: stand still")]
     push_points: Annotated[
         list[q.Name], Meta(max_length=512), about("obstacles within reach of the path, in the order along it")
     ]
@@ -439,44 +439,42 @@ class Trajectory(Message, frozen=True, kw_only=True):
 
 
 class ControlState(Message, frozen=True, kw_only=True):
-    """`control/state`: what the controller thinks it is doing, and why. Telemetry; nothing depends on it.
+    """`control/state`: the controller's own state, and its reason. Telemetry; nothing depends on it.
 
-    What a controller does not know or does not have is null or empty.
+    Values that a controller does not know or have are null or empty.
     """
 
     tick: Annotated[q.Tick, about("of the clock that control acted on")]
     stamp_ns: q.Stamp
     controller: q.Name
-    state: Annotated[LocomotionState, about("PowerOff: the HAL is silent; Idle: the robot is not armed, or is to stay")]
+    state: Annotated[LocomotionState, about("PowerOff: the HAL is silent; Idle: not armed, or told to stand still")]
     reason: q.Reason
     path_s_m: Annotated[q.Length | None, about("arc length of the tail along the path; null: unknown")] = None
     propulsion_joint: Annotated[q.Name | None, about("the joint that pushes; null: none does")] = None
-    propulsion_n: Annotated[q.Force | None, about("force along the path that is aimed at; null: none")] = None
-    push_points: Annotated[list[WorldContact], Meta(max_length=64), about("obstacles that are pushed off")] = []
+    propulsion_n: Annotated[q.Force | None, about("commanded force along the path; null: none")] = None
+    push_points: Annotated[list[WorldContact], Meta(max_length=64), about("obstacles that the body pushes off")] = []
     solved_force_n: Annotated[list[q.Force], Meta(max_length=64), about("expected at each of `push_points`")] = []
     propulsion_torque_nm: Annotated[q.Torque | None, about("of `propulsion_joint`; null: none pushes")] = None
-    bending_torque_nm: Annotated[q.Torques, about("of every joint, as the solved forces need it; or empty")] = []
-    reference_rad: Annotated[q.Angles, about("of every joint, as the path bends it; or empty")] = []
-    condition: Annotated[q.Scalar | None, about("number of the solved equations; null: none were solved")] = None
-    torque_headroom_nm: Annotated[q.Torque | None, about("what its limit leaves at full push; null: none pushes")] = (
-        None
-    )
+    bending_torque_nm: Annotated[q.Torques, about("of every joint, for the solved forces; or empty")] = []
+    reference_rad: Annotated[q.Angles, about("of every joint, from the path; or empty")] = []
+    condition: Annotated[q.Scalar | None, about("condition number of the equations; null: none were solved")] = None
+    torque_headroom_nm: Annotated[q.Torque | None, about("left below its limit at full push; null: none pushes")] = None
     saturated: Annotated[bool, about("the push is at its torque limit")] = False
-    jammed: Annotated[bool, about("the body is stuck though it pushes")] = False
+    jammed: Annotated[bool, about("the body is stuck although a joint pushes")] = False
 
 
 class Intent(Message, frozen=True, kw_only=True):
-    """`operator/intent`: what a person or a mission wants for now. Send it again and again: it expires.
+    """`operator/intent`: speed asked for by a person or a mission. Send it repeatedly: it expires.
 
-    When one that was followed has expired, the robot stops and waits for the next one; it does not go back to its
+    When one that was followed has expired, the robot stops and waits for the next one; it does not return to its
     mission.
     """
 
-    stamp_ns: Annotated[q.Stamp, about("robot time, from hal/clock: when it was meant")]
+    stamp_ns: Annotated[q.Stamp, about("robot time of the request, from hal/clock")]
     who: q.Name
     speed_m_s: Annotated[q.Velocity | None, about("null: that of the mission")] = None
     go: Annotated[bool, about("false: stop")] = True
-    valid_for_ns: Annotated[q.Nanoseconds, about("counts so long from `stamp_ns`, and 5 s at most")] = 1_000_000_000
+    valid_for_ns: Annotated[q.Nanoseconds, about("valid for this long from `stamp_ns`, at most 5 s")] = 1_000_000_000
 
 
 VERSIONS: dict[type[Message], int] = dict.fromkeys(
@@ -504,4 +502,4 @@ VERSIONS: dict[type[Message], int] = dict.fromkeys(
     ),
     1,
 )
-"""Every message that may stand alone on the wire, with its version."""
+"""Every message that may be sent on its own, with its version."""

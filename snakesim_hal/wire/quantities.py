@@ -1,7 +1,7 @@
-"""Numbers with a unit and bounds, as types. A decoder that meets NaN, infinity or an absurd value refuses it.
+"""Numbers with a unit and bounds, as types. A decoder rejects NaN, infinity and absurd values.
 
-The bounds here are sanity bounds of the wire (no snake robot has them); a robot's own limits stand in its robot
-file and are held by the gate.
+The bounds here are sanity bounds of the wire, far beyond any snake robot; a robot's own limits are in its robot
+file and are enforced by the gate.
 """
 
 from typing import Annotated
@@ -29,7 +29,7 @@ def from_zero(high: float, unit: str) -> Meta:
 
 
 def about(text: str) -> Meta:
-    """What a field means, for whoever has only the schema."""
+    """The meaning of a field, for readers of the schema."""
     return Meta(description=text)
 
 

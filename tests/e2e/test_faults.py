@@ -120,7 +120,10 @@ def test_an_operator_takes_back_a_joint_that_was_lost(tmp_path: Path) -> None:
         told("isolated: joint_3; passive until a clear")
         assert "armed, without joint_3: no valid and fresh state of joint_3" in operator("status").out
         refused = operator("clear")
-        assert refused.code == 1 and "disarm first, then a clear takes back joint_3" in refused.err + refused.out
+        assert (
+            refused.code == 1
+            and "disarm first, then a clear ends the isolation of joint_3" in refused.err + refused.out
+        )
         assert operator("disarm").code == 0
         told("or, without: `snakesim arm planar13 sim")
         assert operator("arm", "planar13", "sim").code == 0
@@ -180,7 +183,7 @@ def test_where_something_real_moves_faults_are_not_allowed(tmp_path: Path) -> No
         run.wait_for(" s  ")
         for words in (("mute", "joint_3"), ("hang", "control")):
             told = ask(run, *words)
-            assert told.code == 1 and "faults on request are not allowed: something real moves here" in told.err
+            assert told.code == 1 and "fault injection is not allowed: something real moves here" in told.err
         run.process.terminate()
         run.end()
     ended = snakesim("run", *arguments, "--fault", "mute:joint_3@1", "--out", str(tmp_path / "other"), cwd=tmp_path)

@@ -119,7 +119,7 @@ def test_time_in_which_the_robot_was_not_armed_does_not_count(tmp_path: Path) ->
         assert told.code == 0, told.err
         assert run.end() == 1, run.said()
     ended = summary_of(tmp_path / "run").ended
-    assert "of 3 s" in ended and "the time was over before that much of it was armed" in ended
+    assert "of 3 s" in ended and "the time was over before the requested armed time was reached" in ended
 
 
 # --- one folder, two runs --------------------------------------------------------------------------------------
@@ -306,7 +306,7 @@ def test_a_disk_that_hangs_delays_neither_ticks_nor_a_stop_nor_the_end(tmp_path:
             began = time.monotonic()
             answer = session.ask(keys.ESTOP, EstopRequest(who="anna"))
             assert answer.ok and answer.lifecycle == "estop" and time.monotonic() - began < 3.0
-            assert "not kept yet" in answer.reason or (tmp_path / "run" / ESTOP).exists()
+            assert "not stored yet" in answer.reason or (tmp_path / "run" / ESTOP).exists()
             assert session.ask(keys.LIFECYCLE, LifecycleRequest(action="finish")).ok
         assert run.end(30.0) == 1, run.said()
         assert "the disk has not answered" in run.said() and "Traceback" not in run.said()

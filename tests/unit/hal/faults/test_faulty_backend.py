@@ -119,5 +119,5 @@ def test_the_backend_is_asked_first_and_what_nobody_can_do_is_refused(bench: Ben
             backend.inject("reboot:joint_1")
     with pytest.raises(ConfigError, match="there is no joint_4; this robot has joint_1 to joint_3"):
         bench.inject("mute:joint_4")
-    with pytest.raises(ConfigError, match="simulates nothing that could be slow"):
+    with pytest.raises(ConfigError, match="has no simulation that could be slow"):
         Bench(LagBackend(run_config())).inject("slow:simulator")

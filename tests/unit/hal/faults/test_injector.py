@@ -77,9 +77,9 @@ def test_what_was_planned_comes_at_its_tick_after_the_first_arming_in_every_run(
         (("mote", "joint_1", {}), "cannot", "knows no 'mote'"),
         (("mute", "joint_9", {}), "cannot", "no joint_9; this robot has joint_1 to joint_3"),
         (("leak", "joint_1", {}), "cannot", "backend 'lag' cannot do leak to joint_1"),
-        (("kill", "control", {}), "wrong_part", "is for run to do"),
-        (("drop", "actuator/joints", {}), "wrong_part", "is for control to do"),
-        (("mute", "joint_1", {"end": True}), "wrong_state", "is not on; on is nothing"),
+        (("kill", "control", {}), "wrong_part", "is carried out by run"),
+        (("drop", "actuator/joints", {}), "wrong_part", "is carried out by control"),
+        (("mute", "joint_1", {"end": True}), "wrong_state", "is not active; active: nothing"),
     ],
 )
 def test_what_cannot_be_is_refused_with_the_reason(request_: Any, refusal: str, words: str) -> None:

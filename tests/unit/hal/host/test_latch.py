@@ -94,7 +94,7 @@ def test_a_stop_is_answered_although_the_disk_hangs(tmp_path: Path, hanging: Eve
         latch.engage("anna", 7, answers.put)
     for _ in range(1000):
         said = answers.get(timeout=5)
-        assert said is not None and "not kept yet" in said and str(tmp_path / ESTOP) in said
+        assert said is not None and "not stored yet" in said and str(tmp_path / ESTOP) in said
     assert time.monotonic() - began < 2.0 and threading.active_count() < 50
     latch.close()
     assert time.monotonic() - began < 2.0
@@ -107,6 +107,6 @@ def test_a_host_on_a_disk_that_hangs_stops_at_once_answers_and_ends(tmp_path: Pa
     with running(run_config(pace="realtime"), latch=EstopLatch(tmp_path)) as run:
         began = time.monotonic()
         answer = run.ask(keys.ESTOP, EstopRequest(who="anna"))
-        assert answer.ok and answer.lifecycle == "estop" and "not kept yet" in answer.reason
+        assert answer.ok and answer.lifecycle == "estop" and "not stored yet" in answer.reason
         assert time.monotonic() - began < 2.0
         run.reaches("estop")

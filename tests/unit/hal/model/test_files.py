@@ -46,7 +46,7 @@ WRONG: dict[str, tuple[dict[str, Any], list[str]]] = {
     "infinite": ({"part": {"size_m": float("inf")}}, ["`part.size_m` = inf m"]),
     "fraction": ({"part": {"size_m": 1, "many": 1.5}}, ["`part.many` = 1.5", "a whole number >= 1 and < 10"]),
     "unknown": ({"part": {"size_m": 1, "mnay": 2}}, ["unknown field `part.mnay`", "did you mean `many`?"]),
-    "unknown, nothing like it": ({**GOOD, "zzz": 1}, ["unknown field `zzz`", "known here: at_m, by_name, free"]),
+    "unknown, nothing like it": ({**GOOD, "zzz": 1}, ["unknown field `zzz`", "known fields: at_m, by_name, free"]),
     "unknown section": ({**GOOD, "prat": {"x": 1}}, ["unknown field `prat`", "did you mean `part`?"]),
     "in a list": ({**GOOD, "parts": [{"size_m": 1}, {"size_m": 9}]}, ["`parts.1.size_m` = 9 m", "<= 2"]),
     "unknown in a list": ({**GOOD, "parts": [{"size": 1}]}, ["unknown field `parts.0.size`", "`size_m`"]),
@@ -142,7 +142,7 @@ UNION: dict[str, tuple[dict[str, Any], list[str]]] = {
     "no section": ({"shape": 3}, ["`shape` = 3", "kind = 'round', radius_m", "kind = 'square', edge_m, colour"]),
     "field of the other kind": (
         {"shape": {"kind": "square", "edge_m": 1, "radius_m": 1}},
-        ["unknown field `shape.radius_m`", "known here: colour, edge_m, kind"],
+        ["unknown field `shape.radius_m`", "known fields: colour, edge_m, kind"],
     ),
     "field missing": ({"shape": {"kind": "square"}}, ["`shape.edge_m` is missing", "a number"]),
     "wrong in the second kind": (

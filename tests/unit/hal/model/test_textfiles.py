@@ -43,7 +43,7 @@ ODD: dict[str, tuple[Callable[[Path], object], str]] = {
     "10 MB": (lambda path: path.write_text("a = 1\n" * 1_700_000), "is larger than 8 MB"),
     "5 MB of TOML": (lambda path: path.write_text("a = 1\n" * 850_000), "is larger than 2 MB"),
     "link in a circle": (lambda path: path.symlink_to(path), "symbolic links"),
-    "UTF-16": (lambda path: path.write_text("a = 1", encoding="utf-16"), "is UTF-16 text, or none at all; save it as"),
+    "UTF-16": (lambda path: path.write_text("a = 1", encoding="utf-16"), "is UTF-16 text, or not text; save it as"),
     "UTF-16 without a mark": (lambda path: path.write_text("a = 1", encoding="utf-16-le"), "is UTF-16 text"),
     "Latin-1": (lambda path: path.write_bytes(b"a = '\xe4'"), "is not UTF-8 text: byte 0xe4 at 5"),
     "key of 50,000 parts": (lambda path: path.write_text(f"{DEEP} = 1"), f"has more than {MAX_DEPTH} parts"),

@@ -99,7 +99,7 @@ def test_nobody_has_the_port() -> None:
         port = opened.getsockname()[1]
         with pytest.raises(NotConnectedError, match=rf"udp/127\.0\.0\.1:{port}.*--endpoint"):
             open_stop_port(LOOPBACK, port)
-    with pytest.raises(NotConnectedError, match="nobody takes"):
+    with pytest.raises(NotConnectedError, match="no host takes"):
         ask_to_stop(LOOPBACK, port, "anna", 5.0)
 
 

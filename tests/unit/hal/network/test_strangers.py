@@ -172,12 +172,12 @@ def test_an_answer_that_cannot_be_read_is_no_answer() -> None:
         stranger = network.declare_queryable(
             keys.LEASE, lambda query: query.reply(keys.LEASE, b"\xc1", encoding="zenoh/bytes")
         )
-        with pytest.raises(NotConnectedError, match="hal/lease cannot be read: unknown_message"):
+        with pytest.raises(NotConnectedError, match="hal/lease cannot be decoded: unknown_message"):
             session.ask(keys.LEASE, LeaseRequest(action="acquire", holder="control"))
         commander = Commander(Client(session, "control"), ROBOT)
         time.sleep(0.3)  # it asks at most so often
         assert not commander.holds(CLOCK)
-        assert commander.refusal is not None and "cannot be read" in commander.refusal
+        assert commander.refusal is not None and "cannot be decoded" in commander.refusal
         assert session.rejected == {"unknown_message": 2}
         stranger.undeclare()
 

@@ -42,7 +42,7 @@ def test_only_staying_is_allowed() -> None:
     assert far_targets(command(ROBOT, 9.0, Mode.PASSIVE), here, ROBOT, NONE) == []
     for mode in (Mode.VELOCITY, Mode.TORQUE):
         (first, *_) = far_targets(command(ROBOT, 0.0, mode), here, ROBOT, NONE)
-        assert first == f"joint_1 is asked for {mode.name.lower()}; only staying is allowed at arming"
+        assert first == f"joint_1 is commanded in mode {mode.name.lower()}; it must hold its position at arming"
 
 
 def test_a_joint_that_is_set_aside_may_be_anywhere() -> None:

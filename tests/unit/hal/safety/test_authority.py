@@ -85,8 +85,8 @@ def modes(decision: Decision) -> set[Mode]:
 def test_the_way_to_armed() -> None:
     rig = Rig()
     steps = [
-        (lambda: None, ["no joint state yet", "nobody holds the lease"]),
-        (lambda: rig.observe(0.1), ["nobody holds the lease"]),
+        (lambda: None, ["no joint state yet", "the lease is free"]),
+        (lambda: rig.observe(0.1), ["the lease is free"]),
         (rig.acquire, ["no commands from control yet"]),
         (lambda: rig.send(0.1), []),
     ]
@@ -191,7 +191,7 @@ def test_arming_is_refused_while_a_target_is_far_and_names_the_joint() -> None:
     rig.acquire()
     rig.send([0.1, 0.6, 0.1])
     answer = rig.arm()
-    assert not answer.ok and "joint_2 is asked to go +0.50 rad" in answer.reason and "0.3" in answer.reason
+    assert not answer.ok and "joint_2 has a target +0.50 rad" in answer.reason and "0.3" in answer.reason
     rig.send(0.3)
     assert rig.arm().ok
 
@@ -242,7 +242,7 @@ def test_arming_is_refused_to_a_stream_that_moves(mode: Mode) -> None:
     rig.observe(0.1)
     rig.acquire()
     rig.send([0.1, 0.0, 0.1], [Mode.POSITION, mode, Mode.PASSIVE])
-    reason = f"joint_2 is asked for {mode.name.lower()}; only staying is allowed at arming"
+    reason = f"joint_2 is commanded in mode {mode.name.lower()}; it must hold its position at arming"
     assert rig.arm().reason == reason and rig.authority.state == "disarmed"
 
 
@@ -387,7 +387,7 @@ def test_commands_keep_the_lease_and_silence_ends_it_with_a_fault() -> None:
     assert modes(decision) == {Mode.VELOCITY} and decision.set_points.target == [0.0] * JOINTS
     (fault,) = rig.authority.faults
     assert (fault.what, fault.tick) == ("lease_expired", rig.tick)
-    assert fault.cause == "lease of control expired: no good command for 50 ms"
+    assert fault.cause == "lease of control expired: no accepted command for 50 ms"
     assert rig.authority.lease.holder is None
 
 
@@ -744,7 +744,7 @@ def test_no_arming_before_the_motors_were_told_of_a_stop(stop: str) -> None:
     rig.acquire()
     rig.send(0.1)
     answer = rig.arm()
-    assert (answer.ok, answer.refusal) == (False, "not_ready") and "have not been told" in answer.reason
+    assert (answer.ok, answer.refusal) == (False, "not_ready") and "have not received the stop" in answer.reason
     assert rig.authority.decide().set_points.mode == [Mode.PASSIVE] * JOINTS
     assert rig.arm().ok
 

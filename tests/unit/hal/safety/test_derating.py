@@ -98,7 +98,7 @@ def test_heat_that_was_too_much_is_not_forgotten_in_silence() -> None:
 def test_water_stops_the_robot() -> None:
     bench = Bench()
     (fault,) = bench.hear(leak=[False, False, True])
-    assert (fault.what, fault.joint, fault.cause) == ("leak", "joint_3", "joint_3 finds water inside")
+    assert (fault.what, fault.joint, fault.cause) == ("leak", "joint_3", "joint_3 reports water inside")
     assert bench.hear() == [] and bench.derating.wrong == []
 
 
@@ -146,7 +146,7 @@ def test_who_falls_silent_is_told_once_and_is_not_derated() -> None:
     bench.hear(90.0, valid=valid, after_ns=1)
     (note,) = bench.notes
     assert (note.what, note.joint, note.tick) == ("power_unknown", None, 3)
-    assert note.cause == "supply and heat are unknown, and do not count, for joint_2, joint_3"
+    assert note.cause == "supply and heat are unknown, and ignored, for joint_2, joint_3"
     assert bench.shares == pytest.approx([0.68, 1.0, 1.0])
     bench.hear(90.0, valid=[True, True, False])
     bench.look(3 * S)

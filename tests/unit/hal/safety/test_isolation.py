@@ -133,7 +133,7 @@ def test_a_clear_takes_the_joint_back_once_it_is_heard_of() -> None:
     rig = lame()
     answer = rig.authority.on_lifecycle(CLEAR, rig.now_ns)  # not while it moves
     assert answer.refusal == "wrong_state"
-    assert answer.reason == "nothing to clear in state armed; disarm first, then a clear takes back joint_2"
+    assert answer.reason == "nothing to clear in state armed; disarm first, then a clear ends the isolation of joint_2"
     rig.authority.on_lifecycle(DISARM, rig.now_ns)
     rig.pass_tick()
     assert rig.authority.on_lifecycle(CLEAR, rig.now_ns).ok

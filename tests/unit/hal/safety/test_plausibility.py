@@ -248,7 +248,7 @@ def test_a_joint_that_repeats_itself_while_its_target_moves_is_frozen() -> None:
     assert stuck(bench, FAR_PERIODS + LEASE_PERIODS + 1) is None  # for a lease, and no longer
     fault = bench.see(0.0, 0.0, 0.5, applied=told(0.2))
     assert fault is not None and fault.what == "joint_frozen"
-    assert fault.cause == "the same state over and over while its target moves: joint_1, joint_2, joint_3"
+    assert fault.cause == "the same state repeated while its target moves: joint_1, joint_2, joint_3"
 
 
 @pytest.mark.parametrize("step", [0.02, -0.02])

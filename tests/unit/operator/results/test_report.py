@@ -525,9 +525,9 @@ def test_a_run_that_went_on_without_a_joint(record: RunRecord) -> None:
     lost = Fault(tick=537, what="joint_frozen", cause="joint_3 repeats itself", joint="joint_3", reach="joint")
     page = read(changed(record, host=msgspec.structs.replace(record.host, faults=[lost], isolated=["joint_3"])))
     assert "went on without joint_3." in page.text and "Stopped by a fault" not in page.text
-    stop = Fault(tick=600, what="leak", cause="joint_4 finds water inside", joint="joint_4")
+    stop = Fault(tick=600, what="leak", cause="joint_4 reports water inside", joint="joint_4")
     page = read(changed(record, host=msgspec.structs.replace(record.host, faults=[lost, stop])), stop.cause)
-    assert "Stopped by a fault" in page.text and "at joint_4: joint_4 finds water inside." in page.text
+    assert "Stopped by a fault" in page.text and "at joint_4: joint_4 reports water inside." in page.text
 
 
 def test_a_run_that_ended_by_a_fault(record: RunRecord) -> None:
