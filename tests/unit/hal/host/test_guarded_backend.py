@@ -40,7 +40,7 @@ class Clumsy(LagBackend):
 
 @pytest.mark.parametrize("where", ["sample", "enact", "advance", "faults"])
 def test_an_error_anywhere_is_a_latched_fault(where: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tests.unit.hal.network.LagBackend", Clumsy)
+    monkeypatch.setattr("tests.unit.hal.local_network.LagBackend", Clumsy)
     with running(run_config(pace="realtime")) as run, following(run.link, Follower()):
         run.arm()
         backend: Any = run.backend
