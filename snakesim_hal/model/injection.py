@@ -137,9 +137,9 @@ class Injection:
                 return HAL
 
     def __str__(self) -> str:
-        end = "" if self.end_s == inf else f"-{self.end_s:g}"
+        end = "" if self.end_s == inf else f"-{self.end_s:.12g}"
         amount = "" if self.amount is None else f"={self.amount:g}"
-        return f"{self.kind}:{self.target}@{self.start_s:g}{end}{amount}"
+        return f"{self.kind}:{self.target}@{self.start_s:.12g}{end}{amount}"
 
 
 def target_type(target: str) -> TargetType:
