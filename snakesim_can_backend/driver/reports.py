@@ -89,11 +89,11 @@ class Reading:
         self.from_other_host: Counter[Opcode] = Counter()
         self.malformed = 0
         layouts = codec().layouts
-        self._joint = [[0] * 5 for _ in range(joints)]  # as `_read_state` gives it
+        self._joint = [(0,) * 5 for _ in range(joints)]  # as `_read_state` gives it
         self._contact: list[bytes | None] = [None] * (joints + 1)  # by link; None: not told yet
-        self._gyro: list[list[int] | None] = [None] * joints
-        self._acceleration: list[list[int] | None] = [None] * joints
-        self._health: list[list[int] | None] = [None] * joints
+        self._gyro: list[tuple[int, ...] | None] = [None] * joints
+        self._acceleration: list[tuple[int, ...] | None] = [None] * joints
+        self._health: list[tuple[int, ...] | None] = [None] * joints
         self.shaft_raw: list[int | None] = [None] * joints
         self._read_state = layouts[Opcode.JOINT_STATE].reader("angle", "velocity", "torque", "count", "state")
         signals = layouts[Opcode.JOINT_STATE].signals
@@ -175,7 +175,7 @@ class Reading:
     def _only_asks(self, frame: Frame) -> bool:
         """Whether somebody merely wants to know who is there."""
         is_command = opcode_of(frame.id) == Opcode.COMMAND and len(frame.data) == self._command_length
-        return is_command and self._read_action(frame.data) == [Action.IDENTIFY]
+        return is_command and self._read_action(frame.data) == (Action.IDENTIFY,)
 
     def forget_frames(self) -> None:
         """Frames counted so far do not belong to one period."""
@@ -188,7 +188,7 @@ class Reading:
         """Angle, velocity and torque of every joint, (3, n_joints)."""
         return np.array(self._joint).T[:COUNT_AT] * self._state_scale
 
-    def links_touched(self) -> list[tuple[int, list[int]]]:
+    def links_touched(self) -> list[tuple[int, tuple[int, ...]]]:
         """(link, raw force x y z, place along and bearing) of every link that reported a touch at this Sync."""
         return [(link, self._read_contact(data)) for link, data in enumerate(self._contact) if data]
 
@@ -201,7 +201,7 @@ class Reading:
                 self._gyro[i] = self._acceleration[i] = None
         return found
 
-    def health(self) -> list[list[int] | None]:
+    def health(self) -> list[tuple[int, ...] | None]:
         """Raw voltage, current, two temperatures and leak of every module; None: not told yet."""
         return self._health
 

@@ -78,7 +78,7 @@ class Sensors:
         strong = [contact for contact in felt if math.hypot(*contact.force_l) >= self._threshold_n]
         return Contacts(tick=tick, stamp_ns=stamp_ns, contacts=strong)
 
-    def _contact(self, link: int, raw: list[int]) -> Contact:
+    def _contact(self, link: int, raw: tuple[int, ...]) -> Contact:
         newton, metre, radian = self._contact_scales
         outward, position = on_surface(raw[3] * metre, raw[4] * radian, self._lengths_m[link], self._radius_m)
         normal = (-outward[0], -outward[1], -outward[2])

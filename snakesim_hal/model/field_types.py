@@ -1,53 +1,115 @@
-"""The type that a Struct expects at a place of a file, in words: for the errors of `snakesim_hal.model.files`."""
+"""Where a value of a file departs from its Struct, and what is wanted there in words: for the errors of `files`."""
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from types import UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import msgspec
 from msgspec import inspect
 
 
-def type_at(struct: type[msgspec.Struct], steps: list[str], values: Any) -> inspect.Type | None:
-    """The declared type at a path inside a Struct, as msgspec describes it; `values` select among several Structs."""
-    info: inspect.Type | None = inspect.type_info(struct)
-    for step in steps:
-        info = next((found for option in _options_for(info, values) if (found := _inside(option, step, info))), None)
-        values = value_at(values, [step])
-    return info
+@dataclass(frozen=True)
+class Flaw:
+    """The first place where a value is not what it should be."""
+
+    kind: Literal["unknown", "missing", "wrong"]
+    steps: list[str]  # the way to it
+    value: Any = None
+    wanted: Any = None  # type
+    why: str = ""
+    known: Sequence[str] = ()  # fields beside an unknown one
 
 
-def fields_at(struct: type[msgspec.Struct], steps: list[str], values: Any) -> dict[str, inspect.Type]:
-    """All fields of the Struct at a path, including its tag."""
-    info = type_at(struct, steps, values)
-    fields: dict[str, inspect.Type] = {}
-    for option in _options_for(info, value_at(values, steps)):
-        if isinstance(option, inspect.StructType):
-            fields |= {field.encode_name: field.type for field in option.fields}
-            if option.tag_field is not None:
-                fields[option.tag_field] = _tags(info)
-    return fields
+def first_flaw(value: Any, wanted: Any, steps: Sequence[str] = ()) -> Flaw | None:
+    """None when the value is of the type; else the innermost part that is wrong by itself."""
+    try:
+        msgspec.convert(value, wanted)
+    except msgspec.ValidationError as error:
+        why = str(error)
+    else:
+        return None
+    structs = [option for option in _options(wanted) if _is_struct(option)]
+    if isinstance(value, dict) and structs:
+        chosen = [struct for struct in structs if _is_meant(value, struct)]
+        found = _flaw_of_section(value, chosen[0], steps) if chosen else _flaw_of_tag(value, structs, steps)
+        if found is not None:
+            return found
+    for step, part, type_ in _parts(value, wanted):
+        found = first_flaw(part, type_, [*steps, step])
+        if found is not None:
+            return found
+    return Flaw("wrong", list(steps), value, wanted, why)
 
 
-def value_at(values: Any, steps: list[str]) -> Any:
-    """The value at a path; None where there is none."""
-    for step in steps:
-        if isinstance(values, dict):
-            values = values.get(step)
-        elif isinstance(values, list) and step.isdecimal() and int(step) < len(values):
-            values = values[int(step)]
-        else:
-            return None
-    return values
+def _flaw_of_section(section: dict[str, Any], struct: type[msgspec.Struct], steps: Sequence[str]) -> Flaw | None:
+    """A field too many, or one too few."""
+    config, fields = struct.__struct_config__, msgspec.structs.fields(struct)
+    known = [field.encode_name for field in fields] + ([config.tag_field] if config.tag_field else [])
+    for name in section if config.forbid_unknown_fields else ():
+        if name not in known:
+            return Flaw("unknown", [*steps, name], known=known)
+    for field in fields:
+        if field.required and field.encode_name not in section:
+            return Flaw("missing", [*steps, field.encode_name], wanted=field.type)
+    return None
 
 
-def options(info: inspect.Type | None) -> list[inspect.Type]:
+def _flaw_of_tag(section: dict[str, Any], structs: Sequence[type[msgspec.Struct]], steps: Sequence[str]) -> Flaw:
+    tag = str(structs[0].__struct_config__.tag_field)
+    wanted = Literal[tuple(struct.__struct_config__.tag for struct in structs)]
+    if tag not in section:
+        return Flaw("missing", [*steps, tag], wanted=wanted)
+    return Flaw("wrong", [*steps, tag], section[tag], wanted, "there is no such kind")
+
+
+def _parts(value: Any, wanted: Any) -> Iterator[tuple[str, Any, Any]]:
+    """What is inside of a value: (step, part, wanted type)."""
+    for option in _options(wanted):
+        container, inner = get_origin(option), get_args(option)
+        if isinstance(value, dict) and _is_struct(option) and _is_meant(value, option):
+            for field in msgspec.structs.fields(option):
+                if field.encode_name in value:
+                    yield field.encode_name, value[field.encode_name], field.type
+        elif container is dict and isinstance(value, dict):
+            for key, part in value.items():
+                yield key, part, inner[1]
+        elif container is list and isinstance(value, list):
+            for i, part in enumerate(value):
+                yield str(i), part, inner[0]
+        elif container is tuple and isinstance(value, list):
+            for i, (part, type_) in enumerate(zip(value, inner, strict=False)):
+                yield str(i), part, type_
+
+
+def _options(wanted: Any) -> list[Any]:
+    """The alternatives of a union, without their notes; one for any other type."""
+    origin = get_origin(wanted)
+    if origin is Annotated:
+        return _options(get_args(wanted)[0])
+    if origin in (Union, UnionType):
+        return [leaf for option in get_args(wanted) for leaf in _options(option)]
+    return [wanted]
+
+
+def _is_struct(option: Any) -> bool:
+    return isinstance(option, type) and issubclass(option, msgspec.Struct)
+
+
+def _is_meant(section: dict[str, Any], struct: type[msgspec.Struct]) -> bool:
+    """Whether a section is of this Struct, by its tag where it has one."""
+    config = struct.__struct_config__
+    return config.tag_field is None or section.get(config.tag_field) == config.tag
+
+
+def _alternatives(info: inspect.Type | None) -> list[inspect.Type]:
     """The alternatives of a union; one for any other type."""
     if info is None:
         return []
     if isinstance(info, inspect.Metadata):
-        return options(info.type)
+        return _alternatives(info.type)
     if isinstance(info, inspect.UnionType):
-        return [leaf for option in info.types for leaf in options(option)]
+        return [leaf for option in info.types for leaf in _alternatives(option)]
     return [info]
 
 
@@ -61,39 +123,11 @@ def unit_of(info: inspect.Type | None) -> str:
 def in_words(info: inspect.Type | None) -> str:
     """The type of a field, in words."""
     said: list[str] = []
-    for option in options(info):
+    for option in _alternatives(info):
         word = _word(option, unit_of(info))
         if word is not None:
             said.append(word)
     return " or ".join(said) or "another value"
-
-
-def _options_for(info: inspect.Type | None, value: Any) -> Sequence[inspect.Type]:
-    """Of a union of tagged Structs the one whose tag the value has, if it has one of them."""
-    every = options(info)
-    tagged = [o for o in every if isinstance(o, inspect.StructType) and _has_tag(value, o)]
-    return tagged or every
-
-
-def _has_tag(value: Any, option: inspect.StructType) -> bool:
-    return isinstance(value, dict) and option.tag_field is not None and value.get(option.tag_field) == option.tag
-
-
-def _tags(info: inspect.Type | None) -> inspect.Type:
-    tags = [option.tag for option in options(info) if isinstance(option, inspect.StructType)]
-    return inspect.LiteralType(tuple(tag for tag in tags if tag is not None))
-
-
-def _inside(option: inspect.Type, step: str, union: inspect.Type | None) -> inspect.Type | None:
-    if isinstance(option, inspect.StructType):
-        if step == option.tag_field:
-            return _tags(union)
-        return next((field.type for field in option.fields if field.encode_name == step), None)
-    if isinstance(option, inspect.ListType):
-        return option.item_type
-    if isinstance(option, inspect.TupleType) and step.isdecimal():
-        return option.item_types[int(step)] if int(step) < len(option.item_types) else None
-    return option.value_type if isinstance(option, inspect.DictType) else None
 
 
 def _word(option: inspect.Type, unit: str) -> str | None:

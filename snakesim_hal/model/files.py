@@ -5,21 +5,18 @@ value, the file or flag that it came from.
 """
 
 import difflib
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
-from msgspec import inspect
 
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.field_types import fields_at, in_words, options, type_at, unit_of, value_at
+from snakesim_hal.model.field_types import Flaw, first_flaw, in_words, unit_of
 from snakesim_hal.model.textfiles import MAX_DEPTH, parse_json, parse_toml, read_text
 
 StructT = TypeVar("StructT", bound=msgspec.Struct)
-_AT = re.compile(r"^(?P<what>.*?)(?: - at `(?P<where>[^`]*)`)?$", re.DOTALL)
 SHIPPED = Path(__file__).parents[1] / "shipped"
 ROUTER = SHIPPED / "router.json5"
 SCHEMAS = Path(__file__).parents[1] / "schemas"  # in the repository a link to the folder beside the packages
@@ -154,7 +151,9 @@ def decode(table: Table, struct: type[StructT], under: str = "") -> StructT:
     try:
         return msgspec.convert(table.values, struct)
     except msgspec.ValidationError as error:
-        raise ConfigError(_explain(error, table, struct, under)) from None
+        flaw = first_flaw(table.values, struct)
+        assert flaw is not None, error
+        raise ConfigError(_explain(flaw, table, under)) from None
     except UnicodeEncodeError as error:  # JSON may escape, and a command line may hold, half of a character
         odd = ascii(error.object[error.start : error.end])[:40]
         raise ConfigError(
@@ -162,34 +161,23 @@ def decode(table: Table, struct: type[StructT], under: str = "") -> StructT:
         ) from None
 
 
-def _explain(error: msgspec.ValidationError, table: Table, struct: type[msgspec.Struct], under: str) -> str:
-    match = _AT.match(str(error))
-    assert match is not None
-    what, where = match["what"], (match["where"] or "$").removeprefix("$").lstrip(".")
-    steps = _steps(where, table.values, struct)
-    dotted = ".".join(filter(None, [under, *steps]))
-    unknown = re.match(r"Object contains unknown field `(.*)`", what, re.DOTALL)
-    missing = re.match(r"Object missing required field `(.*)`", what)
-    fields = fields_at(struct, steps, table.values)
-    if unknown:
-        name = short(unknown[1])
-        close = difflib.get_close_matches(name, fields, 1, 0.6)
-        full = f"{dotted}.{name}" if dotted else name
-        hint = f"did you mean `{close[0]}`?" if close else f"known fields: {', '.join(sorted(fields))}."
-        set_by = [origin for key, origin in table.origin.items() if key == full or key.startswith(full + ".")]
-        return f"{set_by[0] if set_by else table.file_of(full)}: unknown field `{full}`; {hint}"
-    if missing:
-        name = missing[1]
-        full = f"{dotted}.{name}" if dotted else name
-        return f"{table.file_of(full)}: field `{full}` is missing; add it ({in_words(fields.get(name))})."
-    value = value_at(table.values, steps)
-    info = type_at(struct, steps, table.values)
-    unit = unit_of(info)
+def _explain(flaw: Flaw, table: Table, under: str) -> str:
+    *steps, name = [under, *flaw.steps] if under else flaw.steps or [""]
+    dotted = ".".join([*steps, short(name)])
+    if flaw.kind == "unknown":
+        close = difflib.get_close_matches(name, flaw.known, 1, 0.6)
+        hint = f"did you mean `{close[0]}`?" if close else f"known fields: {', '.join(sorted(flaw.known))}."
+        set_by = [origin for key, origin in table.origin.items() if key == dotted or key.startswith(dotted + ".")]
+        return f"{set_by[0] if set_by else table.file_of(dotted)}: unknown field `{dotted}`; {hint}"
+    info = msgspec.inspect.type_info(flaw.wanted)
+    if flaw.kind == "missing":
+        return f"{table.file_of(dotted)}: field `{dotted}` is missing; add it ({in_words(info)})."
+    unit, value = unit_of(info), flaw.value
     origin = table.origin_of(dotted)
     origin = table.file_of(dotted) if origin == "default" else origin
     shown = f"{short(_repr(value))}{' ' + unit if unit and isinstance(value, int | float) else ''}"
-    why = short(what[:1].lower() + what[1:])
-    return f"{origin}: `{short(dotted)}` = {shown} is not allowed: {why}; expected {in_words(info)}."
+    why = short(flaw.why[:1].lower() + flaw.why[1:])
+    return f"{origin}: `{dotted}` = {shown} is not allowed: {why}; expected {in_words(info)}."
 
 
 def short(text: str, most: int = 120) -> str:
@@ -202,29 +190,3 @@ def _repr(value: Any) -> str:
         return repr(value)
     except ValueError:  # Python does not print integers of more than 4300 digits
         return "a very large number"
-
-
-def _steps(where: str, values: dict[str, Any], struct: type[msgspec.Struct]) -> list[str]:
-    """The path to a wrong value. For a free key of a section msgspec says `[...]`: find which entry it is."""
-    steps: list[str] = []
-    value: Any = values
-    for match in re.finditer(r"\[(\.\.\.|\d+)\]|[^.\[\]]+", where):
-        step = match[1] or match[0]
-        if step == "...":
-            step = _wrong_entry(value, type_at(struct, steps, values)) if isinstance(value, dict) else step
-        steps.append(step)
-        value = value_at(value, [step])
-    return steps
-
-
-def _wrong_entry(section: dict[str, Any], info: inspect.Type | None) -> str:
-    wanted: Any = dict
-    for option in options(info):
-        if isinstance(option, inspect.DictType) and isinstance(option.value_type, inspect.StructType):
-            wanted = option.value_type.cls
-    for key, value in section.items():
-        try:
-            msgspec.convert(value, wanted)
-        except msgspec.ValidationError:
-            return key
-    return "..."

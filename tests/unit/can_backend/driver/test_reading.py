@@ -303,7 +303,7 @@ def test_health_and_shaft_load_are_kept() -> None:
     made = reading()
     made.take(health(3, voltage=24.0, current=-1.0, motor_temperature=50, board_temperature=30, leak=1))
     made.take(codec()[Opcode.SHAFT_LOAD].frame(2, torque=-1.5))
-    assert made.health() == [None, None, [24000, -1000, 90, 70, 1]]
+    assert made.health() == [None, None, (24000, -1000, 90, 70, 1)]
     assert made.shaft_raw == [None, -1500, None]
 
 

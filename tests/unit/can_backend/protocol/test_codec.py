@@ -151,7 +151,7 @@ def test_a_writer_writes_what_a_reader_reads(layout: Layout, data: st.DataObject
     numbers = data.draw(contents(layout))
     names = data.draw(st.permutations(list(numbers)))
     frame = layout.writer(*names)(node, [numbers[name] for name in names])
-    assert layout.reader(*names)(frame.data) == [numbers[name] for name in names]
+    assert layout.reader(*names)(frame.data) == tuple(numbers[name] for name in names)
     if layout.opcode in WITH_CHECKSUM:
         assert intact(frame) and frame.data[-1] == checksum(frame.id, frame.data[:-1])
 
