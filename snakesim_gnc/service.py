@@ -1,4 +1,4 @@
-"""The thin shell around a pure core: join, wait for ticks, publish what the core says, report it done."""
+"""The thin shell around a pure core: connect, wait for ticks, publish the core's output, report it done."""
 
 from collections.abc import Sequence
 from typing import Protocol
@@ -18,7 +18,7 @@ SILENCE_S = 1.0
 
 
 class Service(Protocol):
-    """What a service process is made of. The constructor subscribes to everything that it will read."""
+    """The interface of a service process. The constructor subscribes to everything that it will read."""
 
     name: str
     urgent: bool = False  # whether the robot waits for this service in every tick
@@ -26,20 +26,20 @@ class Service(Protocol):
     def __init__(self, client: Client, config: RunConfig) -> None: ...
 
     def meet(self, robot: Description) -> None:
-        """Learn what robot is there; called before the first tick, and again when the HAL has started over."""
+        """Take the robot's description; called before the first tick, and again when the HAL has restarted."""
         ...
 
     def outputs(self, clock: Clock) -> list[tuple[str, Message]] | None:
-        """What to publish for a tick, as (key, message); None when the service is not able to say anything yet."""
+        """Output for a tick, as (key, message); None when the service has none yet."""
         ...
 
     def silence(self) -> list[tuple[str, Message]]:
-        """What to publish when the HAL's clock has been silent for a second."""
+        """Output when the HAL's clock has been silent for a second."""
         return []
 
 
 def serve(service_type: type[Service], argv: Sequence[str] | None = None) -> int:
-    """Run a service process. Ends when it is told to stop; exit code 1 when it could not go on."""
+    """Run a service process until a stop signal; exit code 1 when it failed."""
     name = service_type.name
     given = process_options(arguments(f"Run the {name} service of a robot."), argv)
     try:
@@ -69,7 +69,7 @@ def serve(service_type: type[Service], argv: Sequence[str] | None = None) -> int
 
 
 def be_there(client: Client, injector: Injector) -> None:
-    """Show that the service is here; from now on the robot may be armed, perhaps before the service's first tick."""
+    """Declare the service present; from now on the robot may be armed, perhaps before the service's first tick."""
     clock = client.hear(SILENCE_S)
     if clock is not None:
         injector.turn(clock.stamp_ns, clock.arming, clock.lifecycle)
@@ -77,7 +77,7 @@ def be_there(client: Client, injector: Injector) -> None:
 
 
 def loop(client: Client, service: Service, injector: Injector) -> None:
-    """Act on every tick that is due. A tick that is shown again, because time stands still, is answered again."""
+    """Act on every due tick. A tick that is repeated, because time stands still, is answered again."""
     for clock in client.ticks(SILENCE_S):
         if clock is None:
             injector.idle()
