@@ -1,4 +1,4 @@
-"""`snakesim can`: what a configuration asks of its buses, who answers on them, and the DBC file spelled out."""
+"""`snakesim can`: bus load of a configuration, modules that answer on a bus, and the expanded DBC file."""
 
 import argparse
 from collections.abc import Iterator, Sequence
@@ -42,31 +42,31 @@ UNKNOWN = "-"
 
 
 def main(argv: Sequence[str]) -> int:
-    """Exit code: 0 done, 1 does not fit or nobody answers. Raises SnakesimError."""
+    """Exit code: 0 done, 1 does not fit or no module answers. Raises SnakesimError."""
     arguments = parser().parse_args(list(argv))
     return arguments.act(arguments)
 
 
 def parser() -> argparse.ArgumentParser:
-    """What the command takes."""
+    """The command's arguments."""
     parser = argparse.ArgumentParser(prog="snakesim can", description="Joint modules and their buses.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
-    asked = commands.add_parser("load", help="the sum of what a scenario asks of its buses, at worst")
+    asked = commands.add_parser("load", help="print the worst-case load of a scenario's buses")
     asked.add_argument("scenario", help="name of a shipped scenario, or path of a scenario file or a run's config.json")
     asked.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change any value")
-    asked.add_argument("--joints", type=_joints, nargs="+", metavar="N", help="as if the robot had so many joints")
-    asked.add_argument("--rates", type=_rate, nargs="+", metavar="HZ", help="as if it ran at these rates")
+    asked.add_argument("--joints", type=_joints, nargs="+", metavar="N", help="for a robot with this many joints")
+    asked.add_argument("--rates", type=_rate, nargs="+", metavar="HZ", help="for these control rates")
     asked.set_defaults(act=_load)
 
     answering = commands.add_parser(
-        "scan", help="list every module that answers; asks who is there, and changes nothing"
+        "scan", help="list every module that answers; sends only identify, and changes nothing"
     )
     answering.add_argument("channel", nargs="+", help="SocketCAN interface, such as can0")
     answering.add_argument("--seconds", type=_seconds, default=1.0, help="how long to listen on each (default: 1)")
     answering.set_defaults(act=_scan)
 
-    expand = commands.add_parser("expand", help="write the DBC file with every message of every node spelled out")
+    expand = commands.add_parser("expand", help="write the DBC file with every message of every node")
     expand.add_argument("--out", type=Path, default=Path(EXPANDED), metavar="FILE", help=f"(default: {EXPANDED})")
     expand.set_defaults(act=_expand)
     return parser
@@ -122,7 +122,7 @@ def table(
         cells = [_cell(ceil(count / buses), reports_at(rate, config, settings)) for rate in rates]
         yield f"{count:6}" + "".join(f"{cell:>16}" for cell in cells)
     on = "one bus" if buses == 1 else f"the fullest of {buses} buses"
-    yield f"Worst-case load of {on}, 1 Mbit/s; above {MAX_LOAD:.0%}, or with a period that is too full, it is refused."
+    yield f"Worst-case load of {on}, 1 Mbit/s; above {MAX_LOAD:.0%}, or with too long a period, it is refused."
 
 
 def _cell(joints: int, reports: Reports) -> str:
@@ -140,14 +140,14 @@ def _scan(arguments: argparse.Namespace) -> int:
             rows = scan(wire, arguments.seconds)
         finally:
             wire.close()
-        for line in aligned(rows) if rows else [f"{channel}: nobody answers"]:
+        for line in aligned(rows) if rows else [f"{channel}: no module answers"]:
             say(line)
         found += len(rows)
     return OK if found else FAILED
 
 
 def scan(wire: Wire, seconds: float) -> list[dict[str, str]]:
-    """Ask who is on a bus, and listen; one row a module, as text by `COLUMNS`. Sends nothing but identify."""
+    """Discover the modules on a bus; one row a module, as text by `COLUMNS`. Sends only identify."""
     reading = Reading(LAST_NODE)
     everybody = Bus(wire, range(FIRST_NODE, LAST_NODE + 1))
     return [_row(identity, reading) for identity in find([everybody], seconds, reading.take)]
@@ -200,7 +200,7 @@ def _inside(raw: Sequence[int] | None) -> dict[str, str]:
 
 
 def _shaft(raw: int | None) -> str:
-    """Known only while somebody sends Syncs, and modules report their IMUs."""
+    """Known only while a host sends Syncs, and modules report their IMUs."""
     return UNKNOWN if raw is None else f"{codec()[Opcode.SHAFT_LOAD].signals['torque'].value(raw):.3f} N·m"
 
 

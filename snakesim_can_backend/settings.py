@@ -1,4 +1,4 @@
-"""What a scenario's `[backends.can]` section may say."""
+"""The schema of a scenario's `[backends.can]` section."""
 
 from typing import Annotated, Any, Literal
 
@@ -10,27 +10,27 @@ from snakesim_hal.wire.quantities import from_zero
 
 
 class Settings(FileStruct, frozen=True, kw_only=True):
-    """Which buses, which modules on them, and what they report how often."""
+    """Buses, modules on them, and their reports."""
 
     # SocketCAN interfaces, tail to head. Empty: a virtual bus in this process, with module twins on it.
     channels: Annotated[list[Annotated[str, Meta(min_length=1, max_length=15)]], Meta(max_length=8)] = []
-    # How many joints each channel has, tail to head. Empty: as evenly as can be.
+    # Number of joints of each channel, tail to head. Empty: distributed evenly.
     joints_per_channel: Annotated[list[Annotated[int, Meta(ge=1, le=LAST_NODE)]], Meta(max_length=8)] = []
     # Where module twins run: `here` (virtual bus), as a `process` that this one starts, or `none`: real modules, or
-    # `snakesim modules` in another terminal. Left out: `here` without channels, `none` with them.
+    # `snakesim modules` in another terminal. Default: `here` without channels, `none` with them.
     twins: Literal["here", "process", "none"] | None = None
-    plant: str = "mujoco"  # what the twins' motors move: an entry point in the group `snakesim.plants`
+    plant: str = "mujoco"  # body that the twins' motors move: an entry point in the group `snakesim.plants`
     plant_settings: dict[str, Any] = {}
     faults: list[str] = []  # of the twins, such as "mute:joint_3@2"; `snakesim modules --help` lists them
-    contact_rate_hz: Annotated[float, from_zero(1e4, "Hz")] | None = None  # left out: the robot file's
+    contact_rate_hz: Annotated[float, from_zero(1e4, "Hz")] | None = None  # default: the robot file's
     imu_rate_hz: Annotated[float, from_zero(1e4, "Hz")] = 5.0
     watchdog_s: Annotated[float, Meta(ge=0.02, le=0.1, extra_json_schema={"unit": "s"})] = 0.1
-    # How long modules may take to be found and to take their parameters.
+    # Time limit for discovery and parameters of the modules.
     bring_up_limit_s: Annotated[float, Meta(gt=0, le=600, extra_json_schema={"unit": "s"})] = 10.0
-    # Where a motion-capture system sends the base's pose: HOST:PORT for UDP. Port 0: only own twins know it.
-    # Left out: "127.0.0.1:0" with own twins, nothing otherwise.
+    # UDP address for the base's pose from motion capture: HOST:PORT. Port 0: known only to own twins.
+    # Default: "127.0.0.1:0" with own twins, none otherwise.
     pose_listen: Annotated[str, Meta(pattern="^[^:]*:[0-9]{1,5}$")] | None = None
-    log: str = ""  # candump file of everything sent and received; empty: none
+    log: str = ""  # candump file of all frames sent and received; empty: none
 
     @property
     def twins_run(self) -> Literal["here", "process", "none"]:

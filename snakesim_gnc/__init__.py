@@ -4,5 +4,5 @@
 `navigation`   mission or velocity intent -> a trajectory
 `control`      trajectory and world model -> set-points of every joint; pluggable
 
-Everything here talks to the HAL's client only. It imports no backend, names none, and never asks which one it drives.
+Everything here uses only the HAL's client. It imports no backend and names none.
 """

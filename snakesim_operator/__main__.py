@@ -1,4 +1,4 @@
-"""Where the `snakesim` command begins."""
+"""Entry point of the `snakesim` command."""
 
 import signal
 import sys
@@ -7,11 +7,11 @@ import sys
 def main() -> int:
     """The command's exit code.
 
-    Ctrl-C ends a command at once, by the signal itself: while modules are imported, while it runs, while it ends.
-    Python would print a traceback at most of these moments. `snakesim run` and `snakesim modules`, which have something
-    to end in order, handle the signal themselves.
+    Ctrl-C ends a command at once, by the signal itself, also during import and exit, where
+    Python would print a traceback. `snakesim run` and `snakesim modules`, which must shut
+    down in order, handle the signal themselves.
     """
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not when a shell has it ignored
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not if the shell ignores it
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     from snakesim_operator.cli import main as command
 

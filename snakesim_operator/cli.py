@@ -34,14 +34,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         return FAILED
     except OSError as error:  # such as a full disk under what is printed
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        if isinstance(error, BrokenPipeError):  # somebody has seen enough
+        if isinstance(error, BrokenPipeError):  # the reader of a pipe has closed it
             return OK
         complain(f"snakesim: {error}")
         return FAILED
 
 
 def parser() -> argparse.ArgumentParser:
-    """What the command takes, without the commands of installed packages."""
+    """The command's arguments, without the commands of installed packages."""
     parser = argparse.ArgumentParser(
         prog="snakesim",
         description="Snake robots that push themselves off obstacles: one controller, simulator or robot.",
@@ -49,37 +49,37 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"snakesim {version('snakesim')}")
     more = installed(COMMANDS)
     if more:
-        parser.epilog = f"From installed backends: {', '.join(more)}; each explains itself with --help."
+        parser.epilog = f"From installed backends: {', '.join(more)}; see their --help."
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     run = commands.add_parser(
         "run",
         help="run a scenario: backend, guidance, navigation and control",
-        epilog="Exit code: 0 complete, all of the time was armed time; 1 a fault, or ended before that; 2 wrong input, "
-        "nothing was started; 3 complete, but the record lacks something; 130 interrupted. 1 and 130 outrank 3.",
+        epilog="Exit code: 0 complete, armed for all of the requested time; 1 a fault, or ended before that; 2 wrong "
+        "input, nothing was started; 3 complete, but the record has gaps; 130 interrupted. 1 and 130 take precedence.",
     )
     _add_scenario(run)
     run.add_argument(
         "--fault",
         action="append",
         metavar="KIND:TARGET@START[-END][=AMOUNT]",
-        help="what goes wrong, at seconds after arming, instead of what the scenario plans; may be repeated",
+        help="inject a fault, at seconds after arming; replaces the scenario's faults; may be repeated",
     )
-    run.add_argument("--stay", action="store_true", help="a fault ends nothing: processes restart, you clear and arm")
-    run.add_argument("--with-router", action="store_true", help="meet at a router of the run's own, as in a lab")
+    run.add_argument(
+        "--stay", action="store_true", help="faults do not end the run: processes restart, you clear and arm"
+    )
+    run.add_argument("--with-router", action="store_true", help="start a router for the run, as in a lab")
     run.add_argument(
         "--in-process",
         action="store_true",
-        help="in one process and without a network: in lockstep, and faster; nobody can join, arm or stop it",
+        help="run in one process, without a network: lockstep, and faster; nothing can connect, arm or stop it",
     )
-    run.add_argument("--out", type=Path, help="folder for what the run leaves (default: runs/NAME-TIME)")
+    run.add_argument("--out", type=Path, help="folder for the run's record (default: runs/NAME-TIME)")
     _add_network(run)
     run.set_defaults(act=_run)
 
-    compare = commands.add_parser("compare", help="tell how two runs differ, as a table and as a page with plots")
-    compare.add_argument(
-        "run_a", type=Path, metavar="RUN_A", help="folder that a run left; percentages are of this one"
-    )
+    compare = commands.add_parser("compare", help="compare two runs, as a table and as a page with plots")
+    compare.add_argument("run_a", type=Path, metavar="RUN_A", help="folder of a run; percentages refer to this one")
     compare.add_argument(
         "run_b", type=Path, metavar="RUN_B", help="folder of the other run, of a robot with the same joints"
     )
@@ -93,27 +93,27 @@ def parser() -> argparse.ArgumentParser:
     _add_scenario(config)
     config.set_defaults(act=_config)
 
-    scenarios = commands.add_parser("scenarios", help="list the scenarios, robots and scenes that are shipped")
+    scenarios = commands.add_parser("scenarios", help="list the shipped scenarios, robots and scenes")
     scenarios.set_defaults(act=_scenarios)
 
     echo = commands.add_parser("echo", help="print what is published on a key, one JSON object a line")
-    echo.add_argument("key", nargs="?", help="such as sensor/joints or sensor/*; without it, the keys are listed")
-    echo.add_argument("--hz", action="store_true", help="print only how often, and how regularly")
-    echo.add_argument("--count", type=int, help="end after so many messages")
+    echo.add_argument("key", nargs="?", help="such as sensor/joints or sensor/*; without it, list the keys")
+    echo.add_argument("--hz", action="store_true", help="print only rate and jitter")
+    echo.add_argument("--count", type=int, help="end after this many messages")
     _add_network(echo)
     echo.set_defaults(act=_echo)
 
-    status = commands.add_parser("status", help="say how the robots on the network are, and why")
+    status = commands.add_parser("status", help="print the state of the robots on the network, and its reason")
     _add_network(status)
     status.set_defaults(act=_status)
 
-    arm = commands.add_parser("arm", help="let a robot move; it and its backend are named, so that none is mixed up")
-    arm.add_argument("robot", metavar="ROBOT", help="name of the robot, as `snakesim status` shows it")
-    arm.add_argument("backend", metavar="BACKEND", help="sim, can, ...: what stands behind its keys")
+    arm = commands.add_parser("arm", help="allow a robot to move; names robot and backend, to avoid mix-ups")
+    arm.add_argument("robot", metavar="ROBOT", help="name of the robot, as printed by `snakesim status`")
+    arm.add_argument("backend", metavar="BACKEND", help="its backend: sim, can, ...")
     for name, act, about in (
-        ("disarm", _disarm, "let a robot's joints go passive"),
-        ("clear", _clear, "forget a fault or an emergency stop; the robot is disarmed then"),
-        ("estop", _estop, "stop a robot now, or all on the network when no --namespace is given"),
+        ("disarm", _disarm, "make a robot's joints passive"),
+        ("clear", _clear, "clear a fault or an emergency stop; the robot is disarmed then"),
+        ("estop", _estop, "stop a robot now, or all on the network without --namespace"),
     ):
         told = commands.add_parser(name, help=about)
         _add_network(told)
@@ -123,14 +123,14 @@ def parser() -> argparse.ArgumentParser:
 
     fault = commands.add_parser(
         "fault",
-        help="let something go wrong in a run that allows it",
-        epilog=f"kinds, by what they happen to:\n{explain()}",
+        help="inject a fault into a run that allows it",
+        epilog=f"kinds, by target:\n{explain()}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     fault.add_argument("kind", metavar="KIND", help="such as mute; `list` prints all of them")
     fault.add_argument("target", nargs="?", metavar="TARGET", help="such as joint_3, bus_1, control, actuator/joints")
     fault.add_argument("--for", dest="for_s", type=float, metavar="S", help="seconds of robot time until it ends")
-    fault.add_argument("--amount", type=float, metavar="X", help="how much of it, for kinds that have an amount")
+    fault.add_argument("--amount", type=float, metavar="X", help="amount, for kinds that have one")
     fault.add_argument("--end", action="store_true", help="end it")
     _add_network(fault)
     fault.set_defaults(act=_fault)
@@ -139,8 +139,8 @@ def parser() -> argparse.ArgumentParser:
     router.add_argument("config", type=Path, nargs="?", help=f"JSON5 file (default: {str(ROUTER).replace('%', '%%')})")
     router.set_defaults(act=_router)
 
-    schemas = commands.add_parser("schemas", help="say where the JSON Schemas, the key space and the DBC file are")
-    schemas.add_argument("--write", type=Path, metavar="FOLDER", help="write schemas and key space anew, from the code")
+    schemas = commands.add_parser("schemas", help="print where the JSON Schemas, the key space and the DBC file are")
+    schemas.add_argument("--write", type=Path, metavar="FOLDER", help="write schemas and key space, from the code")
     schemas.set_defaults(act=_schemas)
 
     completion = commands.add_parser("completion", help="print a script for tab completion: source <(snakesim ...)")
@@ -153,7 +153,7 @@ def _add_scenario(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "scenario", help="name of a shipped scenario, or path of a scenario file or a run's config.json"
     )
-    parser.add_argument("--backend", help="sim or can: what stands behind the keys")
+    parser.add_argument("--backend", help="sim or can")
     parser.add_argument("--controller", help="installed controller, or ./file.py:Class")
     parser.add_argument("--pace", choices=["realtime", "lockstep", "free"])
     parser.add_argument("--duration", type=float, metavar="S", help="seconds of robot time")
@@ -168,9 +168,9 @@ def _add_scenario(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_network(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--endpoint", help="where the robot's own network meets (default: tcp/127.0.0.1:7447)")
+    parser.add_argument("--endpoint", help="Zenoh endpoint of the robot (default: tcp/127.0.0.1:7447)")
     parser.add_argument(
-        "--router", metavar="ENDPOINT", help="join a lab's Zenoh router instead, such as tcp/10.0.0.1:7447"
+        "--router", metavar="ENDPOINT", help="connect to a lab's Zenoh router instead, such as tcp/10.0.0.1:7447"
     )
     parser.add_argument("--namespace", help="namespace of the robot (default: the robot's name)")
 

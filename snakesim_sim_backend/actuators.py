@@ -3,12 +3,12 @@
 Each joint has a `dcmotor` with motor constant 1, so that its current is its torque. At every physics step
 
     demand = kp (position - angle) + kd (velocity - speed) + feed-forward       the mode chooses the gains
-    demand is held below the line that falls from `roll_off` times full torque at rest to 0 at the limit of speed
+    demand is limited by the line that falls from `roll_off` times full torque at rest to 0 at the speed limit
     torque follows the demand as a first-order lag of `response_time_s`, integrated exactly
-    torque is clipped to the command's limit and the joint's, less what heat takes from the latter
+    torque is clipped to the command's limit and the joint's derated one
 
-The torque is the motor's state; a change of mode changes the demand alone. So torque never jumps on a change of mode:
-it goes to the new demand as the motor's response lets it, also to zero in passive mode.
+The torque is the motor's state; a change of mode changes only the demand. So torque never jumps on a change of mode:
+it follows the new demand with the motor's response time, also to zero in passive mode.
 """
 
 import math
@@ -24,14 +24,14 @@ from snakesim_hal.wire.messages import Mode
 
 Floats = NDArray[np.float64]
 
-# Where MuJoCo keeps a dcmotor's parameters in actuator_gainprm; held against the compiled model in `Motors`.
+# Indices of a dcmotor's parameters in actuator_gainprm; checked against the compiled model in `Motors`.
 KP, KD, MAX_VOLTS = 4, 6, 7
 INPUTS = 3  # position, velocity, feed-forward torque
 INPUT_OF_MODE = {Mode.PASSIVE: 2, Mode.POSITION: 0, Mode.VELOCITY: 1, Mode.TORQUE: 2}
 
 
 def add_motor(spec: mujoco.MjSpec, joint: str, robot: RobotFile, step_s: float) -> None:
-    """Put the motor of one joint into a model; it starts passive."""
+    """Add the motor of one joint to a model; it starts passive."""
     limits = robot.limits
     motor = spec.add_actuator(name=f"motor_{joint}", target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
     inputs = mujoco.mjtCtrlInput
@@ -54,11 +54,11 @@ class Motors:
         self._gains = model.actuator_gainprm[: self.count]
         self._force_range = model.actuator_forcerange[: self.count]
         self._least, self._most = self._force_range[:, 0], self._force_range[:, 1]
-        self._torque = data.act  # empty when the motors answer at once
+        self._torque = data.act  # empty when the motors have no lag
         self._applied = data.actuator_force[: self.count]
         self._inputs = data.ctrl[: INPUTS * self.count]
         self._full_limit = np.full(self.count, robot.limits.torque_nm)
-        self._own_limit = self._full_limit  # what heat leaves of it
+        self._own_limit = self._full_limit  # after derating
         self._limit = self._full_limit.copy()
         self._limit_asked: list[float] = self._limit.tolist()
         self._fading = False
@@ -88,7 +88,7 @@ class Motors:
             self._bound()
 
     def derate(self, share_left: Floats) -> None:
-        """Heat leaves this share of each joint's own limit, (n_joints,), whatever a command allows."""
+        """Derate each joint's own limit to this share, (n_joints,), whatever a command allows."""
         self._own_limit = self._full_limit * share_left
         self._bound()
 
@@ -98,7 +98,7 @@ class Motors:
         self.enact(SetPoints([Mode.PASSIVE] * self.count, zeros, self._full_limit.tolist()))
 
     def before_steps(self) -> None:
-        """Once a tick: let a lowered limit take hold as fast as the motor can follow, and end wind-up above it."""
+        """Once a tick: apply a lowered limit as fast as the motor can follow, and end wind-up above it."""
         if len(self._torque) == 0:
             if self._fading:
                 self._set_range(self._limit)

@@ -1,4 +1,4 @@
-"""The simulated robot behind the HAL. Thin: every job has its own module."""
+"""The simulated robot behind the HAL. Thin: every task has its own module."""
 
 import math
 
@@ -35,13 +35,13 @@ class SimBackend:
 
     @staticmethod
     def check(config: RunConfig, _settings: Settings) -> tuple[Pace, ...]:
-        """Simulated time goes as one likes. Raises ConfigError."""
+        """Simulated time supports all paces. Raises ConfigError."""
         check_gains(config.robot)
         does, because = ["diverge"], "the simulator has neither modules nor buses"
         if config.robot.sensors.power is not None:
             does.append("overheat")
         else:
-            because += ", and without [sensors.power] in the robot file nobody would feel heat"
+            because += ", and without [sensors.power] in the robot file heat would not be measured"
         check_backend_can(config, does=does, buses=0, because=because)
         return ("lockstep", "realtime", "free")
 
@@ -80,15 +80,15 @@ class SimBackend:
         self._open = True
 
     def describe(self) -> Description:
-        """The robot as its file says."""
+        """The robot of the robot file."""
         return self._description
 
     def sample(self, tick: int, stamp_ns: int) -> Samples:
-        """What the sensors give at `tick`; after a divergence, of the last good state."""
+        """Sensor samples at `tick`; after a divergence, of the last good state."""
         return self._sensors.sample(tick, stamp_ns)
 
     def enact(self, set_points: SetPoints, lifecycle: LifecycleState) -> None:
-        """Give the motors new set-points. Disarmed, they are off, whatever the set-points say."""
+        """Give the motors new set-points. While disarmed they are off, whatever the set-points."""
         if lifecycle in OFF:
             self._motors.switch_off()
         else:
@@ -105,7 +105,7 @@ class SimBackend:
             self._watch.check(self._tick)
         except mujoco.FatalError as error:
             raise BackendError(f"MuJoCo cannot go on at tick {self._tick}: {error}") from error
-        if self._heats:  # by the torque of the last step: windings are slow
+        if self._heats:  # from the torque of the last step: windings are slow
             self._windings.pass_time(self._period_s, np.square(self._motors.applied_nm()))
             if (share_left := self._windings.share_left()) is not None:
                 self._motors.derate(share_left)
@@ -123,7 +123,7 @@ class SimBackend:
         return []
 
     def inject(self, injection: Injection, *, begins: bool) -> bool:
-        """`diverge`: the base becomes impossibly fast, as if the simulation blew up. `overheat`: a winding is hot."""
+        """`diverge`: the base becomes impossibly fast, as in a divergence. `overheat`: a winding is hot."""
         if injection.target_type == "joint" and injection.kind == "overheat" and self._heats:
             hold = begins and injection.end_s != math.inf
             self._windings.inject(injection.number, heat=begins, hold=hold)
@@ -140,7 +140,7 @@ class SimBackend:
             self._motors.switch_off()
             self._open = False
 
-    # --- for tests, benchmarks and reports; GNC cannot see these --------------------------------------------
+    # --- for tests, benchmarks and reports; not available to GNC --------------------------------------------
 
     @property
     def sim(self) -> SimModel:

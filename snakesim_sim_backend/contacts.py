@@ -1,7 +1,7 @@
-"""Touches of the snake by obstacles, read from MuJoCo's contacts.
+"""Contacts of the snake with obstacles, read from MuJoCo's contacts.
 
-Ground, steps and the snake's own links are passed over by number before anything is computed. Between two ticks the
-physics has flushed the processor's caches, and then a handful of plain floats costs less than a chain of numpy calls.
+Ground, steps and the snake's own links are skipped by number before anything is computed. Between two ticks the
+physics has flushed the processor's caches, and then a few plain floats cost less than a chain of numpy calls.
 """
 
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ from snakesim_sim_backend.model import SimModel
 
 
 class Touch(NamedTuple):
-    """One touch of a link by an obstacle over the last physics step; world frame."""
+    """One contact of a link with an obstacle over the last physics step; world frame."""
 
     body: int  # MuJoCo's number
     obstacle: str
@@ -24,7 +24,7 @@ class Touch(NamedTuple):
 
 
 class TouchReader:
-    """Finds the touches in a simulation's data."""
+    """Finds the contacts in a simulation's data."""
 
     def __init__(self, sim: SimModel, data: mujoco.MjData) -> None:
         self._data, self._contact = data, data.contact
@@ -33,7 +33,7 @@ class TouchReader:
         self._bodies: list[int] = sim.model.geom_bodyid.tolist()
 
     def read(self) -> Iterator[Touch]:
-        """All touches, in MuJoCo's order."""
+        """All contacts, in MuJoCo's order."""
         struck = self._struck
         for i, (first, second) in enumerate(self._contact.geom.tolist()):
             if first in struck:

@@ -1,4 +1,4 @@
-"""Watches that the numbers stay numbers, and keeps the last state that was good."""
+"""Detects divergence of the simulation, and keeps the last good state."""
 
 import logging
 
@@ -24,10 +24,10 @@ def log_warnings() -> None:
 
 
 class DivergenceWatch:
-    """Checks the state once a tick, or once in whatever else is counted."""
+    """Checks the state once a tick, or once per other counted unit."""
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, steps: int, counted: str = "tick") -> None:
-        """steps: from one check to the next, under the same inputs; counted: what the number of a check counts."""
+        """steps: from one check to the next, under the same inputs; counted: unit of a check's number."""
         self._model, self._data, self._steps, self._counted = model, data, steps, counted
         self._good = np.empty(mujoco.mj_stateSize(model, WHOLE))
         self._qpos, self._qvel, self._qacc = data.qpos, data.qvel, data.qacc
@@ -36,7 +36,7 @@ class DivergenceWatch:
         self._keep()
 
     def check(self, number: int) -> None:
-        """Keep a good state. For a bad one, go back to the last good one and raise BackendError, from now on always."""
+        """Keep a good state. For a bad one, restore the last good one and raise BackendError, from now on always."""
         if self._why is None:
             if self._is_good():
                 self._keep()
@@ -45,7 +45,7 @@ class DivergenceWatch:
             said = f" MuJoCo says {', '.join(warned)}." if warned else ""
             self._why = (
                 f"the simulation diverged at {self._counted} {number}: {self._find_culprit()}.{said} Lower "
-                f"`timestep_s` or the gains in [motor]; stiff gains want armature"
+                f"`timestep_s` or the gains in [motor]; stiff gains need armature"
             )
             self._go_back()
             mujoco.mj_forward(self._model, self._data)
@@ -53,7 +53,7 @@ class DivergenceWatch:
 
     def _is_good(self) -> bool:
         qpos, qvel, qacc, warnings = self._qpos, self._qvel, self._qacc, self._warnings
-        # One comparison each, which NaN fails too: the squared length bounds every coordinate.
+        # One comparison each, which also fails for NaN: the squared length bounds every coordinate.
         return bool(
             qpos.dot(qpos) < MAX_POSITION**2
             and qvel.dot(qvel) < MAX_SPEED**2
@@ -69,11 +69,11 @@ class DivergenceWatch:
         self._warnings[:] = 0
 
     def _find_culprit(self) -> str:
-        """Where it began. A diverged state is bad all over; so the tick is gone through again, step by step."""
+        """Where it began. A diverged state is bad everywhere; so the tick is repeated, step by step."""
         model, data = self._model, self._data
         inputs = np.empty(mujoco.mj_stateSize(model, INPUTS))
         mujoco.mj_getState(model, data, inputs, INPUTS)
-        bad = self._worst() or "no number is left"
+        bad = self._worst() or "all values are NaN"
         self._go_back()
         mujoco.mj_setState(model, data, inputs, INPUTS)
         for _ in range(self._steps):
@@ -81,10 +81,10 @@ class DivergenceWatch:
             bad = self._worst() or bad
             if not self._is_good():
                 return bad
-        return "not by its own physics: something from outside has written to its state"
+        return "not by its own physics: its state was modified from outside"
 
     def _worst(self) -> str | None:
-        """The greatest speed, or acceleration if that is nearer to its bound; None when they are no numbers."""
+        """The greatest speed, or acceleration if that is nearer to its bound; None when they are NaN."""
         share_v, share_a = np.abs(self._qvel) / MAX_SPEED, np.abs(self._qacc) / MAX_ACCELERATION
         shares = np.maximum(share_v, share_a)
         if not np.all(np.isfinite(shares)):

@@ -11,7 +11,7 @@ from snakesim_hal.model.scene import Ground, Uneven
 Floats = NDArray[np.float64]
 
 GROUND, HILLS = "ground", "hills"
-GROUND_GROUP = 1  # MuJoCo geom group of all that the snake may lie on, steps too
+GROUND_GROUP = 1  # MuJoCo geom group of everything that the snake may lie on, including steps
 SAMPLES_PER_WAVE = 12
 MAX_SAMPLES = 500  # along an edge
 WAVES = 40
@@ -19,7 +19,7 @@ DEPTH_M = 0.5  # of the height field below its lowest point
 
 
 def add_ground(spec: mujoco.MjSpec, ground: Ground) -> list[str]:
-    """Put the ground into a model. Returns the names of its geoms, which touch nothing until they are paired."""
+    """Add the ground to a model. Returns the names of its geoms, which have no contacts until they are paired."""
     uneven = ground.uneven
     lowest = 0.0 if uneven is None else -uneven.height_m / 2
     _add(spec, GROUND, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=[0, 0, lowest])
@@ -45,7 +45,7 @@ def _add(spec: mujoco.MjSpec, name: str, **shape: Any) -> None:
 def hills(uneven: Uneven) -> Floats:
     """Heights over the square area, (n, n) float64 in metres, row by row along y; from -height/2 to +height/2.
 
-    A sum of plane waves of one wavelength, give or take, in random directions: smooth, and the same for a seed.
+    A sum of plane waves of about one wavelength, in random directions: smooth, and the same for a seed.
     """
     random = np.random.default_rng(uneven.seed)
     n = int(np.clip(SAMPLES_PER_WAVE * uneven.area_m / uneven.wavelength_m, 16, MAX_SAMPLES))

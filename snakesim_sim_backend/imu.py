@@ -6,7 +6,7 @@ import mujoco
 
 
 def add_imus(spec: mujoco.MjSpec, link_lengths_m: Sequence[float]) -> None:
-    """Put IMUs into a model whose links are complete. In `sensordata` all gyroscopes come first, tail to head."""
+    """Add IMUs to a model whose links are complete. In `sensordata` all gyroscopes come first, tail to head."""
     sites: list[str] = []
     for i, length in enumerate(link_lengths_m):
         sites.append(f"imu_{i}")

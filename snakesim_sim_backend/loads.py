@@ -1,4 +1,4 @@
-"""What the force sensors of the links feel: per link, the resultant of all touches by obstacles."""
+"""Readings of the force sensors: per link, the resultant of all contacts with obstacles."""
 
 import math
 
@@ -13,7 +13,7 @@ Sums = tuple[float, float, float, float, float, float, float]
 
 
 class LoadReader:
-    """Adds up the touches in a simulation's data."""
+    """Adds up the contacts in a simulation's data."""
 
     def __init__(self, sim: SimModel, data: mujoco.MjData) -> None:
         self._touches = TouchReader(sim, data)
@@ -21,7 +21,7 @@ class LoadReader:
         self._origins, self._rotations = data.xpos, data.xmat  # (nbody, 3), (nbody, 9)
 
     def read(self) -> list[LinkLoad]:
-        """Loads of the links that are pushed, tail to head; a touch without force is none."""
+        """Loads of the links in contact, tail to head; a contact without force is ignored."""
         sums: dict[int, Sums] = {}
         for touch in self._touches.read():
             (fx, fy, fz), (x, y, z) = touch.force_w, touch.position_w

@@ -2,7 +2,7 @@
 
 The snake is a chain of capsules, tail to head. The free joint sits on link 0, whose body frame is the base: origin at
 the tail end, x forward. Every other body's frame is the link frame of `model.kinematics`: origin at the rear joint.
-Bodies, hinges and motors therefore stand in the order of the robot description.
+Bodies, hinges and motors are therefore in the order of the robot description.
 """
 
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ AXES: dict[Axis, list[float]] = {"yaw": [0.0, 0.0, 1.0], "pitch": [0.0, 1.0, 0.0
 
 @dataclass(frozen=True)
 class SimModel:
-    """A compiled model, and where in MuJoCo's arrays the robot and the obstacles are."""
+    """A compiled model, and the indices of the robot and the obstacles in MuJoCo's arrays."""
 
     model: mujoco.MjModel
     steps_per_tick: int
@@ -39,9 +39,9 @@ class SimModel:
 
 
 def build(config: RunConfig, settings: Settings, *, motors: bool = True) -> SimModel:
-    """Compile the model of a run. Raises ConfigError when settings and robot do not go together.
+    """Compile the model of a run. Raises ConfigError when settings and robot do not match.
 
-    Without motors the joints are only hinges with a rotor's inertia and friction, for torques that come from outside.
+    Without motors the joints are only hinges with a rotor's inertia and friction, for external torques.
     """
     steps = int(np.ceil(config.period_ns * 1e-9 / settings.timestep_s - 1e-9))
     step_s = config.period_ns * 1e-9 / steps
@@ -85,15 +85,15 @@ def _set_options(spec: mujoco.MjSpec, step_s: float, settings: Settings) -> None
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC  # a pyramid would grip less along its diagonals
     option.impratio = settings.friction_hold
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE  # faster for a snake; 4.0.0's sparse Newton factor has a defect
-    # A run that blows up is reported, not quietly started anew. One snake is one constraint island.
+    # A diverged run is reported, not silently restarted. One snake is one constraint island.
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET | mujoco.mjtDisableBit.mjDSBL_ISLAND
 
 
 def _add_scene(spec: mujoco.MjSpec, config: RunConfig, settings: Settings) -> None:
-    """Ground and obstacles, paired with the links that are to come.
+    """Ground and obstacles, paired with the links that are added later.
 
-    A plane bears a chain of capsules at the balls around joints and ends, and nowhere else. Each ball is there once,
-    while capsules would bring two of them to every joint. Hills, steps and obstacles meet the capsules.
+    A plane supports a chain of capsules only at the spheres around joints and ends. Each sphere is there once,
+    while capsules would have two of them at every joint. Hills, steps and obstacles have contacts with the capsules.
     """
     scene, robot = config.scene, config.robot
     hills_m = scene.ground.uneven.height_m if scene.ground.uneven else 0.0
@@ -141,7 +141,7 @@ def _add_snake(spec: mujoco.MjSpec, robot: RobotFile, settings: Settings) -> Non
 
 
 def _add_foot(body: mujoco.MjsBody, name: str, along_m: float, robot: RobotFile) -> None:
-    """A massless ball as thick as the body, at a joint or an end."""
+    """A massless sphere of the body's radius, at a joint or an end."""
     ball = mujoco.mjtGeom.mjGEOM_SPHERE
     size = [robot.module.radius_m, 0.0, 0.0]
     body.add_geom(name=name, type=ball, size=size, pos=[along_m, 0.0, 0.0], mass=0.0, contype=0, conaffinity=0)

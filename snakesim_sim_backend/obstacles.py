@@ -28,10 +28,10 @@ class Shape(TypedDict):
 def add_obstacle(
     spec: mujoco.MjSpec, placed: Placed, settings: Settings, *, body_radius_m: float, hills_m: float
 ) -> str | None:
-    """Put an obstacle into a model; its geom is called `obstacle:<name>`, or `step:<name>` when it is walkable.
+    """Add an obstacle to a model; its geom is called `obstacle:<name>`, or `step:<name>` when it is walkable.
 
-    Returns the geom's name when it touches nothing until it is paired: a walkable or a rough one. A smooth one, the
-    usual kind, meets the links by itself, which keeps large fields of pegs fast.
+    Returns the geom's name when it has no contacts until it is paired: a walkable or a rough one. A smooth one, the
+    usual kind, has contacts with the links by default, which keeps large fields of pegs fast.
     body_radius_m: of the snake; hills_m: from the ground's lowest to its highest point.
     """
     shape = _shape(placed.obstacle, body_radius_m, hills_m)

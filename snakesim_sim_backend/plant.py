@@ -1,7 +1,7 @@
 """The simulated body for joint modules that are emulated elsewhere: MuJoCo without motors.
 
-The modules' firmware is no part of this model. It computes its motors' torques, hands them over for one physics step
-at a time, and reads back what its encoders, strain gauges and force sensors feel.
+The modules' firmware is not part of this model. It computes its motors' torques, passes them in for one physics step
+at a time, and reads back its encoders, strain gauges and force sensors.
 """
 
 import msgspec
@@ -25,7 +25,7 @@ from snakesim_sim_backend.tether import Rope
 
 Floats = NDArray[np.float64]
 
-STEPS_PER_CHECK = 10  # the search for a culprit goes through them again under the last torques
+STEPS_PER_CHECK = 10  # the search for the cause repeats them under the last torques
 MAX_SQUARED = MAX_ACCELERATION**2
 NO_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 
@@ -33,8 +33,8 @@ NO_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 class MujocoPlant:
     """A `snakesim_hal.model.plant.Plant` on MuJoCo. Deterministic: start and torques decide every byte.
 
-    Angles, velocities and the pose are those of now. Loads, shaft torques and what the IMUs feel are forces and
-    accelerations, so they are those that acted over the step just made; before the first one, at the start.
+    Angles, velocities and the pose are present values. Loads, shaft torques and IMU readings are forces and
+    accelerations, so they are those of the last step; before the first one, of the start.
     """
 
     Settings = PlantSettings
@@ -83,7 +83,7 @@ class MujocoPlant:
         except mujoco.FatalError as error:
             raise BackendError(f"MuJoCo cannot go on at step {self._steps}: {error}") from error
         self._unchecked += 1
-        # What blows up does so here first; it is caught in its very step, or firmware would read what is no number.
+        # Divergence shows here first; it is detected in the same step, or firmware would read NaN.
         if self._unchecked == STEPS_PER_CHECK or not self._qacc.dot(self._qacc) < MAX_SQUARED:
             self._check()
 
@@ -98,15 +98,15 @@ class MujocoPlant:
         return self._velocities
 
     def shaft_torque_nm(self) -> Floats:
-        """Torque through each joint's shaft, as a strain gauge between gear and outer link feels it, (n_joints,).
+        """Torque through each joint's shaft, as measured by a strain gauge between gear and outer link, (n_joints,).
 
-        The rotor, seen through its gear, stands between motor and gauge, and with it what rubs inside the module:
+        The rotor, seen through its gear, is between motor and gauge, and so is the friction inside the module:
 
             armature * acceleration = motor torque + viscous and dry friction - shaft torque
 
-        So at rest it is the motor's torque, less what dry friction holds, and in motion it lacks what speeds up the
-        rotor. End stops act on the outer link, past the gauge: a motor that pushes against its stop is felt in full,
-        and a load that the stop bears is not.
+        So at rest it is the motor's torque minus dry friction, and in motion also minus the torque that accelerates the
+        rotor. End stops act on the outer link, beyond the gauge: a motor that pushes against its stop is measured in
+        full, a load on the stop is not.
         """
         torque = self._torques + self._passive
         torque -= self._armature * self._accelerations
@@ -115,7 +115,7 @@ class MujocoPlant:
         return torque
 
     def loads(self) -> list[LinkLoad]:
-        """Resultant of the touches of every link that obstacles push."""
+        """Resultant of the contacts of every link that obstacles push."""
         return self._loads.read()
 
     def imu(self) -> Imu | None:
@@ -165,9 +165,9 @@ class MujocoPlant:
 
 
 def _rest(config: RunConfig, settings: PlantSettings) -> Floats:
-    """Where `SimBackend` comes to rest, (nq,): motors are needed to hold the start angles until then.
+    """The rest pose of `SimBackend`, (nq,): motors are needed to hold the start angles until then.
 
-    On rough ground that depends on the step by millimetres, so the step is the one that `SimBackend` has by default.
+    On rough ground it depends on the step by millimetres, so the step is the default one of `SimBackend`.
     """
     step_s = min(Settings().timestep_s, settings.contact_time_s / 2)
     sim = build(config, msgspec.structs.replace(settings, timestep_s=step_s))

@@ -1,4 +1,4 @@
-"""When a sensor is due, and how long its samples are under way."""
+"""When a sensor is due, and the delay of its samples."""
 
 from collections import deque
 from typing import Generic, TypeVar
@@ -33,14 +33,14 @@ def ticks_of(delay_s: float, period_ns: int) -> int:
 
 
 class DelayLine(Generic[SampleT]):
-    """Holds samples back. Their stamp stays that of taking; their tick becomes that of handing over."""
+    """Delays samples. Their stamp stays that of sampling; their tick becomes that of delivery."""
 
     def __init__(self, ticks: int) -> None:
         self._ticks = ticks
         self._under_way: deque[SampleT] = deque()
 
     def pass_on(self, tick: int, taken: SampleT | None) -> SampleT | None:
-        """Put in what was taken at this tick, if anything; get out what arrives at it, if anything."""
+        """Put in the sample of this tick, if any; returns the one that arrives at it, if any."""
         if not self._ticks:
             return taken
         if taken is not None:

@@ -1,7 +1,7 @@
-"""What the robot feels: joint state, contacts, IMUs and the base's pose, with the noise, rate and delay of its file.
+"""The robot's sensors: joint state, contacts, IMUs and the base's pose, with the noise, rate and delay of its file.
 
-All numbers are read as the last physics step left them. Angles, speeds and the pose are those of the tick itself;
-forces, torques and accelerations are those that acted over the step that led to it.
+All values are read after the last physics step. Angles, speeds and the pose are those of the tick itself;
+forces, torques and accelerations are those of the step that led to it.
 """
 
 import math
@@ -32,7 +32,7 @@ NO_TORQUE = (0.0, 0.0, 0.0)  # a point contact carries no moment about its own p
 
 
 class Sensors:
-    """All sensors of the robot, on one source of noise: the same seed and commands give the same bytes."""
+    """All sensors of the robot, with one noise generator: the same seed and commands give the same bytes."""
 
     def __init__(
         self, sim: SimModel, data: mujoco.MjData, config: RunConfig, motors: Motors, windings: Thermal
@@ -78,7 +78,7 @@ class Channel:
         self._line: DelayLine[Contacts | Imu | Pose | Power] = DelayLine(ticks_of(sensor.delay_s, config.period_ns))
 
     def arriving(self, tick: int, stamp_ns: int) -> Message | None:
-        """Take a sample if due, and hand over what arrives at this tick."""
+        """Take a sample if due, and return the one that arrives at this tick."""
         taken = self._read(tick, stamp_ns) if self._due.at(stamp_ns) else None
         return self._line.pass_on(tick, taken)
 
@@ -86,8 +86,8 @@ class Channel:
 class JointReader:
     """Angle, velocity and torque of every joint, every tick.
 
-    A delayed reading has the stamp of its tick, and its age says how old it is. Until the first one has arrived the
-    reading of the start serves.
+    A delayed reading has the stamp of its tick, and its age is the delay. Until the first one has arrived the
+    reading of the start is used.
     """
 
     def __init__(self, data: mujoco.MjData, sensor: JointSensor, motors: Motors, noise: Noise, period_ns: int) -> None:
@@ -121,7 +121,7 @@ class JointReader:
 
 
 class ContactReader:
-    """Touches by obstacles, in the frames of the links."""
+    """Contacts with obstacles, in the frames of the links."""
 
     def __init__(self, sim: SimModel, data: mujoco.MjData, sensor: ContactSensor, noise: Noise) -> None:
         self._touches = TouchReader(sim, data)
@@ -132,7 +132,7 @@ class ContactReader:
         self._noise = noise if self._sigma_m or self._sigma_n else None
 
     def read(self, tick: int, stamp_ns: int) -> Contacts:
-        """All touches that are strong enough to be felt."""
+        """All contacts above the threshold."""
         found = [
             self._in_link(touch) for touch in self._touches.read() if math.hypot(*touch.force_w) >= self._threshold_n
         ]
@@ -163,7 +163,7 @@ class ContactReader:
 
 
 class ImuReader:
-    """Angular velocity and specific force (what an accelerometer feels: 1 g upwards at rest) at every link's middle."""
+    """Angular velocity and specific force (as of an accelerometer: 1 g upwards at rest) at every link's middle."""
 
     def __init__(self, data: mujoco.MjData, sensor: ImuSensor, count: int, noise: Noise) -> None:
         self._count = count
@@ -198,7 +198,7 @@ class PoseReader:
         self._noise = noise if any(sigma) else None
 
     def read(self, tick: int, stamp_ns: int) -> Pose:
-        """The base, as motion capture sees it. Velocities carry no noise of their own."""
+        """The base, as from motion capture. Velocities have no noise of their own."""
         px, py, pz, w, x, y, z = self._qpos.tolist()
         vx, vy, vz, ox, oy, oz = self._qvel.tolist()
         spin_w = rotate((w, x, y, z), (ox, oy, oz))  # MuJoCo gives a free joint's turning in its own frame
@@ -224,7 +224,7 @@ class PoseReader:
 
 
 class PowerReader:
-    """Supply, current and temperatures of the modules that the joints would be in. No noise, and never a leak."""
+    """Supply, current and temperatures of the joints' modules. No noise, and never a leak."""
 
     def __init__(self, data: mujoco.MjData, motors: Motors, windings: Thermal, rated_nm: float) -> None:
         self._velocities, self._torques = data.qvel[FREE_DOFS:], motors.applied_nm()
@@ -232,7 +232,7 @@ class PowerReader:
         self._count = motors.count
 
     def read(self, tick: int, stamp_ns: int) -> Power:
-        """What the modules would say now."""
+        """The modules' present values."""
         winding_c = self._windings.winding_c
         return Power(
             tick=tick,

@@ -1,4 +1,4 @@
-"""What a scenario may say of the physics: its `[backends.sim]` section, and a plant's settings."""
+"""The schema of the physics settings: a scenario's `[backends.sim]` section, and a plant's settings."""
 
 from typing import Annotated
 
@@ -22,9 +22,9 @@ class Tether(FileStruct, frozen=True, kw_only=True):
 
 
 class Settings(FileStruct, frozen=True, kw_only=True):
-    """How the physics is computed. The defaults suit robots of centimetres to decimetres and of a few kilograms."""
+    """Parameters of the physics. The defaults suit robots of centimetres to decimetres and of a few kilograms."""
 
-    # The longest physics step; it is shortened so that a whole number of steps makes a control period.
+    # The longest physics step; it is shortened so that a control period is a multiple of it.
     timestep_s: Annotated[float, Meta(ge=1e-5, le=0.01, extra_json_schema={"unit": "s"})] = 0.002
     # How fast a penetration is pushed out; softer contacts are more forgiving at long steps. At least two steps.
     contact_time_s: Annotated[float, Meta(ge=1e-4, le=0.1, extra_json_schema={"unit": "s"})] = 0.005

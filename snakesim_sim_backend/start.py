@@ -1,4 +1,4 @@
-"""Lays the snake on the ground where the scenario wants it, and lets it come to rest before the run begins."""
+"""Lays the snake on the ground at the scenario's start pose, and lets it come to rest before the run begins."""
 
 import mujoco
 import numpy as np
@@ -14,16 +14,16 @@ from snakesim_sim_backend.model import FREE_QPOS, SimModel
 REST = 1e-3  # m/s and rad/s: slower is at rest
 REST_ROUNDS = 5
 ROUND_S = 0.01
-# Friction of the ground while settling (sliding, torsion and rolling): the snake stays where it is put.
+# Friction of the ground while settling (sliding, torsion and rolling): the snake stays in place.
 GRIP = np.array([2.0, 2.0, 0.1, 0.1, 0.1])
 ALL_FRICTION = 6  # condim with which all three act
 
 
 def lay_down(sim: SimModel, data: mujoco.MjData, config: RunConfig, motors: Motors, settle_s: float) -> None:
-    """Put the snake at its start, at rest at time 0 with motors off.
+    """Put the snake at its start pose, at rest at time 0 with motors off.
 
-    It is set down above the highest ground under it and falls; the motors hold its start angles meanwhile. What has
-    not come to rest after `settle_s` is stopped.
+    It is placed above the highest ground under it and falls; the motors hold its start angles meanwhile. If it has
+    not come to rest after `settle_s` it is stopped.
     """
     model = sim.model
     pose = start_of(config)
@@ -42,7 +42,7 @@ def lay_down(sim: SimModel, data: mujoco.MjData, config: RunConfig, motors: Moto
 
 
 def highest_ground_m(model: mujoco.MjModel, data: mujoco.MjData, config: RunConfig, pose: StartPose) -> float:
-    """Height of the highest ground or step under the snake's outline, felt by rays from above."""
+    """Height of the highest ground or step under the snake's outline, by ray casting from above."""
     mujoco.mj_kinematics(model, data)
     robot = config.robot
     rotation = rotation_from_quaternion(quaternion_from_yaw(pose.yaw_rad))

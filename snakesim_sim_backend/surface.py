@@ -1,10 +1,10 @@
-"""How surfaces grip and yield: the contact parameters of everything that a link can touch.
+"""Friction and softness of surfaces: the contact parameters of everything that a link can touch.
 
-MuJoCo relaxes friction to a convex problem, which has a price: a contact that slides at speed v is also pushed apart,
-with an acceleration of friction * 2 v / (time in which slip is undone). Where that exceeds what the softness of the
-contact takes up, a sliding body hops by micrometres, hundreds of times a second, and its IMUs and contact forces
-flicker. So slip is undone slowly, and sliding contacts are softer than frictionless ones. Creep at rest stays small
-all the same, because `friction_hold` makes friction much stiffer than normals.
+MuJoCo relaxes friction to a convex problem, with a side effect: a contact that slides at speed v is also pushed apart,
+with an acceleration of friction * 2 v / (time in which slip is corrected). If that exceeds what the softness of the
+contact can absorb, a sliding body hops by micrometres, hundreds of times a second, and its IMUs and contact forces
+are noisy. So slip is corrected slowly, and sliding contacts are softer than frictionless ones. Creep at rest stays
+small, because `friction_hold` makes friction much stiffer than normals.
 """
 
 from typing import TypedDict

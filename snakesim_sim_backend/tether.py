@@ -1,7 +1,7 @@
 """The rope of the static checks and of towing: a tendon from a point of the snake to an anchor far away.
 
-A tendon that may not grow longer than it is holds the point on a circle of `ROPE_M` around the anchor, which over
-0.1 m to the side departs from a straight line by 0.1 mm.
+A tendon with a limited length keeps the point on a circle of `ROPE_M` around the anchor, which deviates over
+0.1 m to the side from a straight line by 0.1 mm.
 """
 
 import mujoco
@@ -19,11 +19,11 @@ HOOK, ANCHOR, TENDON, WINCH = "tether_hook", "tether_anchor", "tether", "tether_
 
 
 def add_tether(spec: mujoco.MjSpec, tether: Tether, robot: RobotFile, contact_time_s: float) -> None:
-    """Put a slack tether into a model whose motors are complete. Raises ConfigError for a link that is not there."""
+    """Add a slack tether to a model whose motors are complete. Raises ConfigError for an unknown link."""
     if tether.link > robot.chain.modules:
         raise ConfigError(f"`tether.link` = {tether.link}: robot {robot.name!r} has links 0 to {robot.chain.modules}")
     if np.hypot(*tether.direction_w) == 0:
-        raise ConfigError("`tether.direction_w` = (0, 0) is no direction; give x and y, such as [-1, 0]")
+        raise ConfigError("`tether.direction_w` = (0, 0) is not a direction; give x and y, such as [-1, 0]")
     spec.body(f"link_{tether.link}").add_site(name=HOOK, pos=[tether.point_m, 0.0, 0.0])
     spec.worldbody.add_site(name=ANCHOR, pos=[ROPE_M, 0.0, 0.0])  # at the origin MuJoCo would take it as unmovable
     tendon = spec.add_tendon(
@@ -56,7 +56,7 @@ class Rope:
         self._winch = model.actuator(WINCH).id if tether.reel_in_m_s > 0 else None
 
     def tighten(self) -> None:
-        """Put the anchor where it belongs for the snake's present place, and take up the slack."""
+        """Place the anchor for the snake's present position, and take up the slack."""
         model, data = self._model, self._data
         mujoco.mj_forward(model, data)
         along = np.array([*self._tether.direction_w, 0.0])

@@ -1,4 +1,4 @@
-"""The state of the simulation as it is, without noise, rate or delay: for tests, benchmarks and reports."""
+"""The exact state of the simulation, without noise, rate or delay: for tests, benchmarks and reports."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class TrueContact:
-    """One touch of a link by an obstacle over the last physics step; world frame."""
+    """One contact of a link with an obstacle over the last physics step; world frame."""
 
     link: int
     obstacle: str

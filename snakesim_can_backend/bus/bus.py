@@ -1,9 +1,9 @@
-"""One CAN bus, seen from one end: frames in, frames out, and what is wrong with it.
+"""One end of a CAN bus: frames in, frames out, and bus errors.
 
 `SocketCanWire` is a kernel interface (can0, vcan0). python-can opens and filters it; frames go through its socket
 directly, which costs a third of a `can.Message` each. `VirtualWire` is python-can's virtual bus between two ends in one
 process, for machines whose kernel has no CAN. It does *not* simulate arbitration and bit rate; errors, a full queue and
-an interface that goes down only on request: see `wire_faults`.
+an interface that goes down only as injected faults: see `bus_faults`.
 """
 
 import contextlib
@@ -29,46 +29,46 @@ from snakesim_hal.model.injection import Injection
 
 EXTENDED, REMOTE, ERROR = 0x80000000, 0x40000000, 0x20000000
 RECEIVE_BUFFER_BYTES = 1 << 20
-MAX_AT_ONCE = 4096  # a bus that babbles must not keep its reader for ever
+MAX_AT_ONCE = 4096  # a babbling bus must not block its reader for ever
 SO_MEMINFO, MEMINFO_DROPS, MEMINFO_BYTES = 55, 8, 36  # linux/sock_diag.h
 IO_ERRORS = (OSError, ValueError, can.CanError)  # of sockets, of `select` and of python-can
 _wire_format = struct.Struct("<IB3x8s")
 
 
 class Wire(Protocol):
-    """One end of a bus. Whatever is wrong with it is a trouble or a BackendError, never another exception."""
+    """One end of a bus. Errors are reported by `troubles` or a BackendError, never another exception."""
 
     channel: str
 
     def send(self, frame: Frame) -> bool:
-        """Hand over a frame. False when it was not taken; `troubles` says why, and nothing is queued for later."""
+        """Send a frame. False when it was not accepted; `troubles` says why, and nothing is queued for later."""
         ...
 
     def receive(self) -> list[Frame]:
-        """Every frame that is there now, in its order; never waits."""
+        """All received frames, in order; never waits."""
         ...
 
     def troubles(self) -> list[BusError]:
-        """What was found since the last call."""
+        """Bus errors since the last call."""
         ...
 
     def fileno(self) -> int | None:
-        """What to wait on; None for a bus inside this process."""
+        """File descriptor to wait on; None for a bus inside this process."""
         ...
 
     def idle(self) -> float | None:
-        """Let the other end run, if it lives in this process.
+        """Let the other end run, if it is in this process.
 
-        Seconds until a frame may be there, 0 for one that is; None: not before this end sends something.
+        Seconds until a frame may arrive, 0 if there is one; None: not before this end sends something.
         """
         ...
 
     def inject(self, kind: str, *, begins: bool) -> None:
-        """Begin or end a fault of a bus on request: see `snakesim_hal.model.injection`. Raises ConfigError."""
+        """Begin or end an injected bus fault: see `snakesim_hal.model.injection`. Raises ConfigError."""
         ...
 
     def close(self) -> None:
-        """Let go of the bus."""
+        """Close the bus."""
         ...
 
 
@@ -78,7 +78,7 @@ class SocketCanWire:
     def __init__(self, channel: str, only: Iterable[Opcode] | None = None) -> None:
         """only: messages to receive, filtered in the kernel; None: all with 11-bit ids.
 
-        Raises ConfigError for an interface that is not there, BackendError for one that cannot be opened.
+        Raises ConfigError for a missing interface, BackendError for one that cannot be opened.
         """
         check_interface(channel)
         self.channel = channel
@@ -98,7 +98,7 @@ class SocketCanWire:
         self._dropped = 0
 
     def send(self, frame: Frame) -> bool:
-        """Hand over a frame; False when the queue is full or the interface is down."""
+        """Send a frame; False when the queue is full or the interface is down."""
         try:
             self._socket.send(_wire_format.pack(frame.id, len(frame.data), frame.data))
         except OSError as error:
@@ -109,7 +109,7 @@ class SocketCanWire:
         return True
 
     def receive(self) -> list[Frame]:
-        """Every frame that is there now."""
+        """All received frames."""
         frames: list[Frame] = []
         try:
             drain(self._socket, self._buffer, frames, self._note_error)
@@ -118,7 +118,7 @@ class SocketCanWire:
         return frames
 
     def troubles(self) -> list[BusError]:
-        """What was found since the last call."""
+        """Bus errors since the last call."""
         dropped = self._count_drops()
         if dropped > self._dropped:
             detail = f"the kernel dropped {dropped - self._dropped} frames: this process reads too slowly"
@@ -138,7 +138,7 @@ class SocketCanWire:
         return math.inf
 
     def inject(self, kind: str, *, begins: bool) -> None:
-        """Begin or end a fault: the interface goes down, or an error frame says that something is wrong."""
+        """Begin or end a fault: the interface goes down, or an error frame reports an error."""
         inject_into_interface(self.channel, kind, begins=begins)
 
     def close(self) -> None:
@@ -173,7 +173,7 @@ class SocketCanWire:
         if self._gone:  # an adapter that was plugged in again is another interface of the same name
             try:
                 self._socket.bind((self.channel,))
-                self._set_filters()  # the kernel forgot them with the interface
+                self._set_filters()  # the kernel dropped them with the interface
             except OSError:
                 return
         self._down = self._gone = False
@@ -188,14 +188,14 @@ class SocketCanWire:
 
 
 class OtherEnd(Protocol):
-    """What is at the other end of a virtual bus, in the same process."""
+    """The other end of a virtual bus, in the same process."""
 
     def __call__(self) -> float | None:
-        """Run for a moment; seconds until it wants to run again, None: not before it hears something."""
+        """Run briefly; seconds until the next run is due, None: not before it receives something."""
         ...
 
     def inject(self, injection: Injection, *, begins: bool) -> None:
-        """Let something go wrong with a module there, or end."""
+        """Begin or end a fault of a module there."""
         ...
 
     def close(self) -> None:
@@ -207,14 +207,14 @@ class VirtualWire:
     """One end of python-can's virtual bus."""
 
     def __init__(self, channel: str, other_end: OtherEnd | None = None) -> None:
-        """other_end: lets the other end run whenever this one has nothing to do; returns when it wants to run again."""
+        """other_end: runs the other end whenever this one is idle; returns when its next run is due."""
         self.channel = channel
         self.other_end = other_end
         self._bus = VirtualBus(channel=channel)
         self._faults = VirtualFaults(channel)
 
     def send(self, frame: Frame) -> bool:
-        """Hand over a frame; a virtual bus takes everything, unless a fault is on."""
+        """Send a frame; a virtual bus accepts everything, unless a fault is active."""
         if self._faults.on and (taken := self._faults.stops_sending()) is not None:
             return taken
         try:
@@ -224,7 +224,7 @@ class VirtualWire:
         return True
 
     def receive(self) -> list[Frame]:
-        """Every frame that is there now."""
+        """All received frames."""
         frames: list[Frame] = []
         try:
             while (message := self._bus.recv(0)) is not None:
@@ -234,11 +234,11 @@ class VirtualWire:
         return self._faults.leaves(frames) if self._faults.on else frames
 
     def troubles(self) -> list[BusError]:
-        """A virtual bus has only those that were asked for."""
+        """A virtual bus has only injected errors."""
         return self._faults.take_troubles()
 
     def fileno(self) -> int | None:
-        """There is nothing to wait on."""
+        """None: there is nothing to wait on."""
         return None
 
     def idle(self) -> float | None:
@@ -247,11 +247,11 @@ class VirtualWire:
         return pause_s if self._bus.queue.empty() else 0.0
 
     def inject(self, kind: str, *, begins: bool) -> None:
-        """Begin or end a fault, as this end would see it on a kernel interface; the other end hears nothing of it."""
+        """Begin or end a fault, as this end would see it on a kernel interface; the other end is not affected."""
         self._faults.inject(kind, begins=begins)
 
     def close(self) -> None:
-        """Leave the bus; the other end, if it lives on this one, leaves too."""
+        """Close this end, and the other one if it is run by this one."""
         if self.other_end is not None:
             self.other_end.close()
         try:
@@ -263,9 +263,9 @@ class VirtualWire:
 def drain(
     source: socket.socket, buffer: bytearray, frames: list[Frame], on_error: Callable[[int, bytes], None]
 ) -> None:
-    """Append everything that a non-blocking raw CAN socket has; error frames of the kernel go to `on_error`."""
+    """Append all frames of a non-blocking raw CAN socket; error frames of the kernel go to `on_error`."""
     receive_into, unpack, append = source.recv_into, _wire_format.unpack, frames.append
-    new = tuple.__new__  # what Frame(...) does, without its argument handling
+    new = tuple.__new__  # as Frame(...), without its argument handling
     with contextlib.suppress(BlockingIOError):
         for _ in range(MAX_AT_ONCE):
             receive_into(buffer)
@@ -277,9 +277,9 @@ def drain(
 
 
 def wait(wires: Sequence[Wire], timeout_s: float) -> bool:
-    """Until a frame may be there on any of them, or the time is over. Other ends in this process run meanwhile.
+    """Wait until a frame may have arrived on any of them, or the timeout. Other ends in this process run meanwhile.
 
-    False when nothing can come any more before this end sends something. Raises BackendError.
+    False when nothing can arrive before this end sends something. Raises BackendError.
     """
     pauses = [pause for wire in wires if (pause := wire.idle()) is not None]
     if not pauses:
@@ -298,7 +298,7 @@ def wait(wires: Sequence[Wire], timeout_s: float) -> bool:
 
 
 def check_interface(channel: str) -> None:
-    """Raise ConfigError unless a SocketCAN interface is there and up; the message says how to bring it up."""
+    """Raise ConfigError unless a SocketCAN interface exists and is up; the message says how to bring it up."""
     if not hasattr(socket, "AF_CAN") or not _kernel_has_can():
         raise ConfigError(
             f"channel {channel!r}: this kernel has no CAN. Leave `backends.can.channels` empty for a virtual bus, or "
@@ -306,13 +306,13 @@ def check_interface(channel: str) -> None:
         )
     bring_up = "deploy/can/up.sh"
     if not Path("/sys/class/net", channel).exists():
-        raise ConfigError(f"channel {channel!r}: there is no such interface; `{bring_up} {channel}` makes it")
+        raise ConfigError(f"channel {channel!r}: there is no such interface; `{bring_up} {channel}` creates it")
     if not is_up(channel):
         raise ConfigError(f"channel {channel!r}: the interface is down; `{bring_up} {channel}` brings it up")
 
 
 def is_up(channel: str) -> bool:
-    """Whether an interface is there and administratively up."""
+    """Whether an interface exists and is administratively up."""
     try:
         return bool(int(Path("/sys/class/net", channel, "flags").read_text(encoding="ascii"), 16) & 1)
     except (OSError, ValueError):  # the latter: the file of an interface that is going away is empty

@@ -1,4 +1,4 @@
-"""What can be wrong with a bus, and what the kernel's error frames say of it."""
+"""Bus errors, and how to read them from the kernel's error frames."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -27,7 +27,7 @@ CONTROLLER_STATES: tuple[tuple[int, Kind], ...] = (
 
 @dataclass(frozen=True)
 class BusError:
-    """Something that is wrong with a bus, not with a module on it."""
+    """An error of a bus, not of a module on it."""
 
     kind: Kind
     channel: str
@@ -35,7 +35,7 @@ class BusError:
 
 
 def bus_errors_of(identifier: int, data: bytes, channel: str) -> list[BusError]:
-    """What an error frame of the kernel says."""
+    """The bus errors in an error frame of the kernel."""
     kinds: list[Kind] = [kind for bit, kind in ERROR_CLASSES if identifier & bit]
     if identifier & 0x04:
         states: list[Kind] = [kind for bits, kind in CONTROLLER_STATES if data[1] & bits]

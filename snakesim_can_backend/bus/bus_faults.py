@@ -1,6 +1,6 @@
-"""Faults of a bus on request: imitated at one end of a virtual bus, and made on a kernel interface.
+"""Injected faults of a bus: imitated at one end of a virtual bus, and made on a kernel interface.
 
-A virtual bus behaves like a kernel interface with the same fault: what is said of it, what is taken, what arrives.
+A virtual bus behaves like a kernel interface with the same fault: its errors, accepted frames and received frames.
 """
 
 import contextlib
@@ -25,7 +25,7 @@ ERROR_FRAMES = {  # fault, begins -> class, state of the controller, transmit er
 
 
 class VirtualFaults:
-    """Of one end of a virtual bus."""
+    """Injected faults of one end of a virtual bus."""
 
     def __init__(self, channel: str) -> None:
         self._channel = channel
@@ -56,10 +56,10 @@ class VirtualFaults:
                 pass
 
     def stops_sending(self) -> bool | None:
-        """What comes of a frame: False, refused; True, taken and lost; None, it goes out."""
+        """What happens to a frame: False, rejected; True, accepted and lost; None, sent."""
         if "cut" in self.on:
             return False
-        if "bus_off" in self.on:  # its queue is gone with the carrier: the kernel takes frames and drops them
+        if "bus_off" in self.on:  # its queue is gone with the carrier: the kernel accepts frames and drops them
             return True
         if "full" in self.on:
             self._found.append(BusError("queue_full", self._channel, "the transmit queue is full"))
@@ -67,7 +67,7 @@ class VirtualFaults:
         return None
 
     def leaves(self, frames: list[Frame]) -> list[Frame]:
-        """What arrives of the frames that were sent."""
+        """The sent frames that arrive."""
         if self.on & {"cut", "bus_off"}:
             return []
         if frames and "overflow" in self.on:
@@ -78,20 +78,20 @@ class VirtualFaults:
         return frames
 
     def take_troubles(self) -> list[BusError]:
-        """What was found since the last call."""
+        """Bus errors since the last call."""
         found, self._found = self._found, []
         return found
 
 
 def inject_into_interface(channel: str, kind: str, *, begins: bool) -> None:
-    """Begin or end a fault of a kernel interface. Raises ConfigError where that cannot be done."""
+    """Begin or end a fault of a kernel interface. Raises ConfigError if that is not possible."""
     if kind == "cut":
         _set_link(channel, "down" if begins else "up")
     elif (kind, begins) in ERROR_FRAMES:
         _send_error(channel, *ERROR_FRAMES[kind, begins])
     elif kind == "full":
         raise ConfigError(
-            f"{channel}: no program can fill an interface's queue and let it go again; a traffic limit does: "
+            f"{channel}: a program cannot fill an interface's queue and release it again; a traffic limit does: "
             f"`tc qdisc add dev {channel} root tbf rate 8bit burst 16 limit 32`, and `tc qdisc del dev {channel} root`"
         )
 
@@ -108,9 +108,9 @@ def _set_link(channel: str, state: str) -> None:
 
 
 def _send_error(channel: str, kind: int, controller: int, transmit_errors: int) -> None:
-    """As the driver of a controller would: only virtual interfaces carry an error frame that a program sends."""
+    """As the driver of a controller would: only virtual interfaces carry error frames sent by a program."""
     if not channel.startswith(VIRTUAL):
-        raise ConfigError(f"{channel}: error frames can only be had on virtual interfaces, called {VIRTUAL}...")
+        raise ConfigError(f"{channel}: error frames can only be sent on virtual interfaces, called {VIRTUAL}...")
     data = bytes([0, controller, 0, 0, 0, 0, transmit_errors, 0])
     with contextlib.closing(socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)) as other:
         try:

@@ -1,8 +1,8 @@
-"""What a configuration asks of its buses, in bits, and the refusal of what does not fit.
+"""Bus load of a configuration, in bits; refuses one that does not fit.
 
 A classic frame with an 11-bit id and n bytes takes 47 + 8 n bits: start, id, control, data, CRC, acknowledge, end and
 the gap to the next. After five equal bits the sender stuffs one in between; at worst that adds one for every four of
-the 34 + 8 n bits that can be stuffed. All loads here are worst cases, so that what fits always fits.
+the 34 + 8 n bits that can be stuffed. All loads here are worst cases.
 """
 
 from collections.abc import Sequence
@@ -17,25 +17,25 @@ from snakesim_hal.model.scenario import RunConfig
 
 BIT_RATE = 1_000_000
 MAX_LOAD = 0.8
-MAX_EVERY = 255  # Syncs; the parameters hold no more
+MAX_EVERY = 255  # Syncs; limit of the parameters
 MIN_RATE_HZ = 20
 FRAME_BITS = 47
 STUFFED_FROM = 34
 
 
 def worst_bits(length: int) -> int:
-    """Bits of a frame with `length` bytes, as many stuffed in as there can be."""
+    """Bits of a frame with `length` bytes, with the maximum of stuff bits."""
     return FRAME_BITS + 8 * length + (STUFFED_FROM + 8 * length - 1) // 4
 
 
 @dataclass(frozen=True)
 class Reports:
-    """How often what is sent."""
+    """Which reports are sent, and how often."""
 
     rate_hz: float
     contact_every: int = 1  # Syncs; 0: never
     imu_every: int = 20
-    tail: bool = True  # somebody on the bus sends TailContact
+    tail: bool = True  # a module on the bus sends TailContact
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Stream:
 
 
 def streams(joints: int, reports: Reports) -> list[Stream]:
-    """Everything that goes over a bus with so many joints while the robot runs."""
+    """All frames on a bus with this many joints while the robot runs."""
     rate = reports.rate_hz
     contacts = rate / reports.contact_every if reports.contact_every else 0.0
     imus = rate / reports.imu_every if reports.imu_every else 0.0
@@ -71,7 +71,7 @@ def streams(joints: int, reports: Reports) -> list[Stream]:
 
 
 def load(joints: int, reports: Reports) -> float:
-    """Share of a bus's time that is taken, at worst."""
+    """Worst-case load of a bus, as a share of its time."""
     return sum(stream.bits_per_s for stream in streams(joints, reports)) / BIT_RATE
 
 
@@ -83,22 +83,22 @@ def busiest_s(joints: int, reports: Reports) -> float:
 
 
 def fits(joints: int, reports: Reports) -> bool:
-    """Whether a bus can carry so many joints, on average and in the longest period."""
+    """Whether a bus can carry this many joints, on average and in the longest period."""
     return load(joints, reports) <= MAX_LOAD and busiest_s(joints, reports) * reports.rate_hz <= 1
 
 
 def every(rate_hz: float, wanted_hz: float) -> int:
-    """How many Syncs apart reports of about a wanted rate are; 0 for never."""
+    """Number of Syncs between reports at about `wanted_hz`; 0 for never."""
     return 0 if wanted_hz <= 0 else round(min(max(rate_hz / wanted_hz, 1.0), MAX_EVERY))
 
 
 def reports_of(config: RunConfig, settings: Settings) -> Reports:
-    """What the modules of a run report, and how often."""
+    """The reports of a run's modules, and how often."""
     return reports_at(config.rate_hz, config, settings)
 
 
 def reports_at(rate_hz: float, config: RunConfig, settings: Settings) -> Reports:
-    """The same for another rate of control: what is asked for in Hz then comes every so many other Syncs."""
+    """The same for another control rate: rates in Hz are converted to Syncs."""
     sensors = config.robot.sensors
     contact_hz = 0.0
     if sensors.contacts is not None:
@@ -108,7 +108,7 @@ def reports_at(rate_hz: float, config: RunConfig, settings: Settings) -> Reports
 
 
 def shares(config: RunConfig, settings: Settings) -> list[int]:
-    """How many joints each bus has, tail to head. Raises ConfigError."""
+    """Number of joints of each bus, tail to head. Raises ConfigError."""
     joints, buses = config.robot.chain.modules, max(len(settings.channels), 1)
     if len(set(settings.channels)) < len(settings.channels):
         raise ConfigError(f"`backends.can.channels` = {settings.channels} names a channel twice")
@@ -128,9 +128,9 @@ def shares(config: RunConfig, settings: Settings) -> list[int]:
 
 
 def check_load(config: RunConfig, settings: Settings) -> list[float]:
-    """The load of every bus. Raises ConfigError, with the arithmetic and what would fit, when one is too high.
+    """The load of every bus. Raises ConfigError, with the sum and alternatives that fit, when one is too high.
 
-    Too high is more than `MAX_LOAD` of the time, or a single period that is longer than it may be.
+    Too high is more than `MAX_LOAD` of the time, or a single period that is too long.
     """
     reports = reports_of(config, settings)
     joints = shares(config, settings)
@@ -173,7 +173,7 @@ def arithmetic(joints: int, reports: Reports) -> list[str]:
 
 
 def what_fits(joints: Sequence[int], config: RunConfig, settings: Settings) -> str:
-    """Ways out: a lower rate, more buses, fewer reports."""
+    """Alternatives that fit: a lower rate, more buses, fewer reports."""
     fullest, total = max(joints), sum(joints)
     reports = reports_of(config, settings)
     ways = []
@@ -193,9 +193,9 @@ def what_fits(joints: Sequence[int], config: RunConfig, settings: Settings) -> s
 
 
 def most_rate_hz(joints: int, config: RunConfig, settings: Settings) -> int | None:
-    """The highest whole rate below the run's at which so many joints fit on a bus; None when none does.
+    """The highest integer rate below the run's at which this many joints fit on a bus; None when none does.
 
-    Not found by halving: at some lower rate reports may come at every Sync instead of every second one.
+    Bisection does not work: at some lower rate reports may come at every Sync instead of every second one.
     """
     for rate_hz in range(ceil(config.rate_hz) - 1, MIN_RATE_HZ - 1, -1):
         if fits(joints, reports_at(rate_hz, config, settings)):

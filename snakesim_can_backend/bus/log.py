@@ -1,4 +1,4 @@
-"""Everything that goes over the wires, in candump's format: `(1700000000.000000) can0 105#00112233`."""
+"""A log of all frames on the wires, in candump's format: `(1700000000.000000) can0 105#00112233`."""
 
 import contextlib
 import logging
@@ -33,25 +33,25 @@ class LoggedWire:
         self._full = False
 
     def send(self, frame: Frame) -> bool:
-        """Send, and log what was taken."""
+        """Send, and log accepted frames."""
         taken = self._wire.send(frame)
         if taken:
             self._write(frame)
         return taken
 
     def receive(self) -> list[Frame]:
-        """Receive, and log it."""
+        """Receive, and log all frames."""
         frames = self._wire.receive()
         for frame in frames:
             self._write(frame)
         return frames
 
     def troubles(self) -> list[BusError]:
-        """As the wire says."""
+        """As the wire does."""
         return self._wire.troubles()
 
     def fileno(self) -> int | None:
-        """As the wire says."""
+        """As the wire does."""
         return self._wire.fileno()
 
     def idle(self) -> float | None:
@@ -59,7 +59,7 @@ class LoggedWire:
         return self._wire.idle()
 
     def inject(self, kind: str, *, begins: bool) -> None:
-        """As the wire does; what does not go over it is not logged."""
+        """As the wire does; frames that do not reach it are not logged."""
         self._wire.inject(kind, begins=begins)
 
     def close(self) -> None:

@@ -1,6 +1,6 @@
-"""Joint modules on CAN behind the HAL. Thin: every job has its own module.
+"""Joint modules on CAN as a backend. Thin: every task has its own module.
 
-A tick: Sync goes out, every module answers with what it sampled at that instant, and enacts the set-point that it got
+A tick: Sync is sent, every module answers with its samples of that instant, and enacts the set-point that it received
 in the period before. So a command acts exactly one period after the state that it answers, whatever the load.
 """
 
@@ -38,8 +38,8 @@ NAME = "can"
 ANSWER_MARGIN = 1.25  # of the bus time that all answers take
 ANSWER_SLACK_S = 0.002
 MAX_OF_PERIOD = 0.75
-CONFIGURE_LIMIT_S = 1.0  # while the robot is up; an emergency stop waits no longer than that, with motors that are off
-LOCKSTEP_ANSWER_S = 2.0  # twins that are slow are waited for; those that are dead are not waited for again
+CONFIGURE_LIMIT_S = 1.0  # while the robot is up; an emergency stop waits no longer than that, with motors off
+LOCKSTEP_ANSWER_S = 2.0  # to wait for slow twins; dead ones are not waited for again
 FIRST_STATE_SYNCS = 20
 FIRST_STATE_PAUSE_S = 0.02
 LEFT_BEHIND = {"watchdog", "stream"}  # faults of a module whose driver was killed
@@ -49,7 +49,7 @@ _log = logging.getLogger("snakesim.can")
 
 @dataclass
 class Arming:
-    """The newest arming: the Sync of its beginning, and which joints have followed."""
+    """The newest arming: its first Sync, and which joints have followed."""
 
     sync: int = -1
     done: set[int] = field(default_factory=set[int])
@@ -62,7 +62,7 @@ class CanBackend:
 
     @staticmethod
     def check(config: RunConfig, settings: Settings) -> tuple[Pace, ...]:
-        """Real modules wait for nobody; twins that this backend starts can. Raises ConfigError."""
+        """Real modules support real time only; twins that this backend starts support lockstep. Raises ConfigError."""
         check_load(config, settings)
         check_gains(config.robot)
         check_ratings(config.robot)
@@ -86,8 +86,10 @@ class CanBackend:
         self._here: OtherEnd | None = None
         self._wires: list[Wire] = []
         self._open = True
-        self._ours = False  # whether the modules are: before that is known, nothing that disturbs them is sent
-        self._unconfigured = set(range(joints))  # joints whose parameters may not be what the robot file says
+        self._ours = (
+            False  # whether no other host uses the modules: before that is known, nothing that disturbs them is sent
+        )
+        self._unconfigured = set(range(joints))  # joints whose parameters may differ from the robot file
         try:
             camera = config.robot.sensors.pose
             if camera is not None and (pose_listen := pose_address(settings)):
@@ -106,26 +108,26 @@ class CanBackend:
         self._sensors = Sensors(config, self._reports, self._reading, self._mocap)
         self._set_points = commands.SetPointWriter(joints)
         self._lifecycle: LifecycleState = "disarmed"
-        self._isolated: frozenset[int] = frozenset()  # joints that are set aside: motors off, and no set-points
-        self._owed: frozenset[int] = frozenset()  # joints that were just told to have failed, and nothing was stopped
+        self._isolated: frozenset[int] = frozenset()  # isolated joints: motors off, and no set-points
+        self._pending: frozenset[int] = frozenset()  # joints just reported as failed, whose isolation is expected
         self._unsent: list[str] = []
         self._arming = Arming()
         self._answer_limit_s = LOCKSTEP_ANSWER_S if self._lockstep else _answer_time_s(self._buses, self._reports)
         self._tick = 0
 
     def describe(self) -> Description:
-        """The robot as its file says, with the sensors that its modules have."""
+        """The robot of the robot file, with the sensors of its modules."""
         return self._description
 
     def sample(self, tick: int, stamp_ns: int) -> Samples:
-        """Send Sync, and take what the modules sampled at it. Who is late is waited for only so long."""
+        """Send Sync, and collect the modules' samples. Waits for late ones only for a limited time."""
         self._must_be_open()
         self._tick = tick
         self._sync(stamp_ns)
         return self._sensors.sample(tick, stamp_ns)
 
     def enact(self, set_points: SetPoints, lifecycle: LifecycleState) -> None:
-        """Armed: send the set-points. Otherwise none go out: the modules bring themselves to rest and stay passive."""
+        """Armed: send the set-points. Otherwise send none: the modules bring themselves to rest and stay passive."""
         if not self._open:
             return
         if lifecycle == self._lifecycle:
@@ -135,10 +137,10 @@ class CanBackend:
         told = commands.on_change(self._lifecycle, lifecycle)
         for frame in told:
             if not commands.is_arming(frame):
-                self._broadcast(frame)  # what stops or ends goes first: what follows may take a while
+                self._broadcast(frame)  # stop and disarm first: the rest may take a while
         back = self._isolate(set_points.isolated)
         if lifecycle not in commands.LATCHED and (back or self._lifecycle in commands.LATCHED):
-            self._cleared(back)  # before they are told to arm: parameters are written to motors that are off
+            self._cleared(back)  # before the arm command: parameters are written while motors are off
         if any(map(commands.is_arming, told)) and not self._unconfigured - self._isolated:
             self._arm()
         self._lifecycle = lifecycle
@@ -149,18 +151,18 @@ class CanBackend:
                 continue
             if self._wire_of[i].send(frame):
                 self._set_points.sent(i)
-            else:  # the queue is full or the interface down: the next set-point takes its place
+            else:  # the queue is full or the interface down: the next set-point replaces it
                 self._unsent.append(self._wire_of[i].channel)
 
     def advance(self) -> None:
-        """The world goes on by itself: take in what has come meanwhile. Raises BackendError when it is closed."""
+        """Time passes by itself: process frames received meanwhile. Raises BackendError when closed."""
         self._must_be_open()
         if self._twins is not None and (how := self._twins.how_it_ended()) is not None:
             raise BackendError(how)
         self._receive()
 
     def faults(self) -> list[Fault]:
-        """What the modules and the buses complain of, and what the driver sees wrong with them."""
+        """Faults reported by the modules and the buses, or detected by the driver."""
         if not self._open:
             return []
         troubles: list[BusError] = [trouble for wire in self._wires for trouble in wire.troubles()]
@@ -171,13 +173,13 @@ class CanBackend:
         failed = frozenset(finding.joint for finding in found if finding.joint is not None)
         few = len(self._isolated | failed) <= self._description.may_lose_joints
         if self._lifecycle == "armed" and few and all(finding.alone for finding in found):
-            self._owed |= failed  # the HAL sets them aside
+            self._pending |= failed  # the HAL isolates them
         elif found and self._lifecycle not in commands.LATCHED:
-            # Stopped here and now. From now on only a clear leads out, also one that comes before the next period.
+            # Stopped here and now. From now on only a clear ends it, also one that comes before the next period.
             try:
                 for frame in commands.on_change(self._lifecycle, "fault"):
                     self._broadcast(frame)
-            except BackendError as error:  # what was found is told all the same; the bus that fails raises again
+            except BackendError as error:  # the faults are reported all the same; the failing bus raises again
                 found.append(Finding("stop_not_sent", str(error)))
             self._lifecycle = "fault"
         self._unconfigured |= self._watch.take_changed()
@@ -193,7 +195,7 @@ class CanBackend:
         ]
 
     def inject(self, injection: Injection, *, begins: bool) -> bool:
-        """Own twins and buses can be let go wrong; False for what else there is. Raises ConfigError."""
+        """Injects faults of own twins and buses; False for other kinds. Raises ConfigError."""
         if injection.target_type == "bus":
             if injection.number >= len(self._wires):
                 raise ConfigError(f"there is no {injection.target}; this robot has bus_1 to bus_{len(self._wires)}")
@@ -220,7 +222,7 @@ class CanBackend:
     # --- inside -----------------------------------------------------------------------------------------------
 
     def _let_go(self, wire: Wire) -> None:
-        """Motors off, and the bus closed, as far as it still works; the other buses have their turn in any case."""
+        """Motors off, and the bus closed, as far as it still works; errors do not prevent closing the other buses."""
         try:
             if self._ours:
                 wire.send(commands.command(Action.DISARM))
@@ -278,7 +280,7 @@ class CanBackend:
             raise BackendError("another program commands the modules on this bus; end it first. Nothing was sent")
         wrong = discovery_errors(self._buses, found, names, lockstep=self._lockstep)
         if wrong:
-            raise BackendError("the robot is not whole; nothing was enabled:", *(f"  {what}" for what in wrong))
+            raise BackendError("the robot is not complete; nothing was enabled:", *(f"  {what}" for what in wrong))
         self._ours = True
         emulated = all(identity.emulated for identity in found)
         self._description = msgspec.structs.replace(self._description, emulated=emulated)
@@ -288,8 +290,8 @@ class CanBackend:
         self._forgive_old_faults()
 
     def _forgive_old_faults(self) -> None:
-        """What a driver that was killed has left behind is cleared; heat, leaks and emergencies are not."""
-        for _ in range(FIRST_STATE_SYNCS):  # their heartbeats say why they stopped
+        """Clear the faults that a killed driver has left; but not heat, leaks and emergencies."""
+        for _ in range(FIRST_STATE_SYNCS):  # their heartbeats have the reason of the stop
             if all(module.faults or module.state != ModuleState.FAULT for module in self._reading.modules):
                 break
             time.sleep(FIRST_STATE_PAUSE_S)
@@ -297,17 +299,17 @@ class CanBackend:
         for module, wire in zip(self._reading.modules, self._wire_of, strict=True):
             faults = module.fault_names()
             if module.state == ModuleState.FAULT and faults and set(faults) <= LEFT_BEHIND:
-                _log.warning("node %d: clearing a fault of before: %s", module.node, ", ".join(faults))
+                _log.warning("node %d: clearing an earlier fault: %s", module.node, ", ".join(faults))
                 wire.send(commands.command(Action.CLEAR, module.node))
 
     def _configure(self, limit_s: float) -> None:
-        """Give every module that needs them its parameters. Raises BackendError."""
+        """Write the parameters of every module that needs them. Raises BackendError."""
         wanted = parameters_of(self._config.robot, self._settings, self._reports)
         due = {joint + 1: wanted[joint + 1] for joint in self._unconfigured}
         try:
             check_ratings(self._config.robot, configure(self._buses, due, limit_s, self._reading.take))
         finally:
-            self._reading.forget_frames()  # they came over more than one period
+            self._reading.forget_frames()  # they arrived over more than one period
         self._unconfigured.clear()
 
     def _await_first_states(self, names: list[str]) -> None:
@@ -330,7 +332,7 @@ class CanBackend:
         self._unsent = [wire.channel for wire in self._wires if not wire.send(frame)]
         for wire, question in questions:
             wire.send(question)
-        if reading.complete:  # nobody is expected to answer; but twins in this process live only while they are awaited
+        if reading.complete:  # no answer is expected; but twins in this process run only while this one waits
             wait(self._wires, 0.0)
         end = time.monotonic() + self._answer_limit_s
         while not reading.complete and (left_s := end - time.monotonic()) > 0:
@@ -339,13 +341,13 @@ class CanBackend:
             self._receive()
 
     def _now_ns(self, stamp_ns: int) -> int:
-        """The time by this driver's clock: in lockstep the robot's own, which is that of the tick's stamp."""
+        """The time of this driver's clock: in lockstep robot time, the tick's stamp."""
         return stamp_ns if self._lockstep else time.monotonic_ns()
 
     def _questions(self) -> list[tuple[Wire, Frame]]:
-        """In lockstep, what is asked of twins behind a Sync: once it is answered, everything that they said is here.
+        """In lockstep, a question to twins after each Sync: once it is answered, all earlier frames have arrived.
 
-        Some reports answer only some Syncs, and nobody could tell whether one is still on its way.
+        Some reports come only at some Syncs, so that otherwise a missing one could still be on its way.
         """
         if self._twins is None or not self._lockstep:
             return []
@@ -362,7 +364,7 @@ class CanBackend:
                 take(frame)
 
     def _broadcast(self, frame: Frame) -> None:
-        """To everybody: a bus that fails must not keep the others from hearing it."""
+        """Send to all buses; an error of one must not prevent sending on the others."""
         failed: BackendError | None = None
         for wire in self._wires:
             try:
@@ -373,7 +375,7 @@ class CanBackend:
             raise failed
 
     def _remind(self, lifecycle: LifecycleState) -> None:
-        """Tell those again who missed a frame. Who was armed already, and is not now, was stopped by something."""
+        """Repeat a command to modules that missed it. A module that was armed, and no longer is, has been stopped."""
         arming = self._arming
         in_time = self._reading.sync - arming.sync <= ARM_GRACE and not self._unconfigured - self._isolated
         for i, module in enumerate(self._reading.modules):
@@ -388,18 +390,18 @@ class CanBackend:
                 self._wire_of[i].send(frame)
 
     def _isolate(self, isolated: frozenset[int]) -> frozenset[int]:
-        """Switch off the modules that are newly set aside; returns the joints that count again.
+        """Switch off the newly isolated modules; returns the joints whose isolation has ended.
 
-        Those are also joints that were told to have failed, if somebody has cleared that before it was seen here.
+        These include joints just reported as failed, if they were cleared before their isolation was seen here.
         """
-        fresh, back = isolated - self._isolated, (self._isolated | self._owed) - isolated
-        self._isolated, self._owed = isolated, frozenset()
+        fresh, back = isolated - self._isolated, (self._isolated | self._pending) - isolated
+        self._isolated, self._pending = isolated, frozenset()
         for i in sorted(fresh):
             self._wire_of[i].send(commands.command(Action.DISARM, i + 1))
         return back
 
     def _arm(self) -> None:
-        """Tell the modules to arm, but not those that are set aside."""
+        """Send arm to all modules, except isolated ones."""
         if not self._isolated:
             self._broadcast(commands.command(Action.ARM))
             return
@@ -408,9 +410,9 @@ class CanBackend:
                 wire.send(commands.command(Action.ARM, i + 1))
 
     def _cleared(self, back: frozenset[int]) -> None:
-        """Somebody cleared the fault. Modules that may have other parameters get their own again, in a moment or never.
+        """The fault was cleared. Modules whose parameters may have changed are configured again, once.
 
-        What is not configured then is told as a fault, and nothing is armed. back: joints that count again.
+        A module that is not configured then is reported as a fault, and nothing is armed. back: joints to use again.
         """
         self._watch.forget(self._reading.sync)
         for i in sorted(back):
@@ -423,7 +425,7 @@ class CanBackend:
 
 
 def _answer_time_s(buses: list[Bus], reports: Reports) -> float:
-    """How long all answers to a Sync may take on the fullest bus; the rest of the period is the controller's."""
+    """How long all answers to a Sync may take on the fullest bus; the rest of the period is for the controller."""
     frames = max(len(bus.nodes) for bus in buses) * (1 + (reports.contact_every > 0)) + reports.tail
     bus_s = frames * worst_bits(8) / BIT_RATE
     return min(ANSWER_MARGIN * bus_s + ANSWER_SLACK_S, MAX_OF_PERIOD / reports.rate_hz)

@@ -1,6 +1,6 @@
-"""Finds every module, checks it, and gives it its parameters. Enables nothing: when it is done all motors are off.
+"""Find every module, check it, and write its parameters. Enables nothing: when it is done all motors are off.
 
-Everything that is wrong is told at once, so that a person with a screwdriver walks to the robot once.
+All errors are reported at once, so that a person can fix them in one go.
 """
 
 import time
@@ -32,7 +32,7 @@ LISTEN_ON_S = 0.06  # after the last module is found: a second one with its id m
 
 @dataclass(frozen=True)
 class Identity:
-    """Who a module says it is."""
+    """A module's answer to `identify`."""
 
     node: int
     channel: str
@@ -52,7 +52,7 @@ class Bus:
 
 
 def find(buses: Sequence[Bus], limit_s: float, on_frame: Callable[[Frame], None] | None = None) -> list[Identity]:
-    """Ask who is there until everybody expected has answered, or the time is over. Two modules may share an id."""
+    """Send `identify` until all expected nodes have answered, or the timeout. Two modules may share an id."""
     read = codec()[Opcode.IDENTITY].values
     found: dict[tuple[str, int, int], Identity] = {}
     wanted = {(bus.wire.channel, node) for bus in buses for node in bus.nodes}
@@ -82,7 +82,7 @@ def find(buses: Sequence[Bus], limit_s: float, on_frame: Callable[[Frame], None]
 def discovery_errors(
     buses: Sequence[Bus], found: Sequence[Identity], joints: Sequence[str], *, lockstep: bool
 ) -> list[str]:
-    """What is wrong with who is there; empty when the robot is whole."""
+    """Errors of the discovered nodes; empty when the robot is complete."""
     wrong: list[str] = []
     home = {node: bus.wire.channel for bus in buses for node in bus.nodes}
     by_node: dict[int, list[Identity]] = defaultdict(list)
@@ -96,20 +96,20 @@ def discovery_errors(
             wrong.append(f"{who} does not answer{elsewhere}")
         if len(here) > 1:
             serials = " and ".join(f"{i.serial:08X}" for i in here)
-            wrong.append(f"{who} is there {len(here)} times, serials {serials}: give each module its own node id")
+            wrong.append(f"{who} answers {len(here)} times, serials {serials}: give each module its own node id")
         strays = [i for i in by_node[node] if here and i.channel != channel]
         wrong += [
-            f"{who} has a namesake on {i.channel}, serial {i.serial:08X}: give it another node id" for i in strays
+            f"{who} is duplicated on {i.channel}, serial {i.serial:08X}: give that one another node id" for i in strays
         ]
         for identity in here:
             if identity.protocol != VERSION:
-                wrong.append(f"{who} speaks protocol version {identity.protocol}, this driver {VERSION}: update one")
+                wrong.append(f"{who} has protocol version {identity.protocol}, this driver {VERSION}: update one")
             if lockstep and not identity.stepped:
-                wrong.append(f"{who} cannot wait for lockstep: use --pace realtime")
+                wrong.append(f"{who} does not support lockstep: use --pace realtime")
             if identity.stepped and not lockstep:
                 wrong.append(f"{who} is a twin whose time stands still between Syncs: start it without --stepped")
     wrong += [
-        f"node {i.node} with serial {i.serial:08X} on {i.channel} is none of this robot's joints"
+        f"node {i.node} with serial {i.serial:08X} on {i.channel} is not a joint of this robot"
         for i in found
         if i.node not in home
     ]
@@ -122,7 +122,7 @@ def configure(
     limit_s: float,
     on_frame: Callable[[Frame], None] | None = None,
 ) -> dict[int, dict[Parameter, float]]:
-    """Write each node's parameters, read the others, and return what is in force. Raises BackendError."""
+    """Write each node's parameters, read the others, and return the present values. Raises BackendError."""
     wire_of = {node: bus.wire for bus in buses for node in bus.nodes}
     due = {node: list(Parameter) for node in wanted}
     in_force: dict[int, dict[Parameter, float]] = {node: {} for node in wanted}

@@ -1,14 +1,14 @@
-"""The base's pose from a motion-capture system: one JSON datagram by UDP for every frame that it captures.
+"""The base's pose from a motion-capture system: one JSON datagram by UDP for every captured frame.
 
     {"stamp_ns": 1234567890, "position_w": [x, y, z], "orientation_wxyz": [w, x, y, z]}
 
-in m, in the world of the scene file, of the tail end of link 0. `stamp_ns` is when the frame was captured, by any clock
-of the motion-capture system that goes on evenly; `mocap_times` relates it to ours. `velocity_w` and
-`angular_velocity_w` may follow; both are derived from two poses and their stamps otherwise, and a pose without a
-velocity is not handed on.
+in m, in the world of the scene file, of the tail end of link 0. `stamp_ns` is the capture time by any steady
+clock of the motion-capture system; `mocap_times` relates it to ours. `velocity_w` and
+`angular_velocity_w` are optional; otherwise both are derived from two poses and their stamps, and a pose without a
+velocity is dropped.
 
-Datagrams come from anybody who reaches the port. At most `MAX_AT_ONCE` are read per tick, what cannot be used is
-counted by its reason and left out.
+Any host that reaches the port can send datagrams. At most `MAX_AT_ONCE` are read per tick; unusable ones are counted by
+reason and dropped.
 """
 
 import logging
@@ -29,37 +29,39 @@ from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import Pose
 
 MAX_BYTES = 2048
-MAX_AT_ONCE = 64  # datagrams a tick: 10 ms of a camera with 1 kHz six times over, and 0.6 ms at worst to refuse them
-RECEIVE_BUFFER_BYTES = 1 << 15  # the kernel keeps about as many: what a flood leaves in it is soon read
+MAX_AT_ONCE = (
+    64  # datagrams a tick: six times those of a camera with 1 kHz in 10 ms, and 0.6 ms at worst to reject them
+)
+RECEIVE_BUFFER_BYTES = 1 << 15  # the kernel buffers about as many: the rest of a flood is soon read
 UNIT_WITHIN = 0.05  # of the length of a quaternion
 LONGEST_GAP_NS = 200_000_000  # between two poses that give a velocity
-MAX_SPEED_M_S = 100.0  # of the base; two poses further apart are of two bodies, or of markers that were confused
+MAX_SPEED_M_S = 100.0  # of the base; two poses further apart are of two bodies, or of confused markers
 
 _log = logging.getLogger("snakesim.can")
 
 
 def pose_address(settings: Settings) -> str:
-    """Where to listen for poses, HOST:PORT; empty: nowhere."""
+    """UDP address for poses, HOST:PORT; empty: none."""
     return settings.pose_listen or ("" if settings.twins_run == "none" else "127.0.0.1:0")
 
 
 def check_pose(config: RunConfig, settings: Settings) -> None:
-    """Raise ConfigError for poses whose delay nobody has stated."""
+    """Raise ConfigError for poses without a stated delay."""
     if settings.pose_listen and config.robot.sensors.pose is None:
         raise ConfigError(
             f"`backends.can.pose_listen` = {settings.pose_listen!r} needs a section [sensors.pose] in the file of "
-            f"robot {config.robot.name!r}: its `delay_s` is how old a pose is when it arrives, 0 to 1 s, from the "
+            f"robot {config.robot.name!r}: its `delay_s` is the age of a pose when it arrives, 0 to 1 s, from the "
             f"manual of the motion-capture system"
         )
 
 
 class MocapReceiver:
-    """Listens for datagrams and hands on the newest pose."""
+    """Receives datagrams and returns the newest pose."""
 
     def __init__(self, address: str, delay_s: float, clock: Callable[[int], int]) -> None:
-        """address: HOST:PORT to listen on; delay_s: from capture to arrival, at best. Raises ConfigError.
+        """address: HOST:PORT to listen on; delay_s: minimum from capture to arrival. Raises ConfigError.
 
-        clock: the time in ns by the driver's clock, at the tick of a stamp.
+        clock: the time in ns of the driver's clock, at the tick of a stamp.
         """
         host, _, port = address.rpartition(":")
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -74,19 +76,19 @@ class MocapReceiver:
         self._delay_ns = round(delay_s * 1e9)
         self._decoder = msgspec.json.Decoder(MocapSample)
         self._times = CaptureTimes()
-        self._jumps = 0  # of the other clock, as far as they are known here
+        self._jumps = 0  # of the other clock, as far as they are processed here
         self._last: MocapSample | None = None
-        self._told_ns = -1  # the newest stamp that was handed on
+        self._told_ns = -1  # the newest stamp that was returned
         self.refused: Counter[str] = Counter()  # datagrams, by reason
 
     @property
     def address(self) -> str:
-        """Where to send to, as HOST:PORT."""
+        """Address to send to, as HOST:PORT."""
         host, port = self._socket.getsockname()
         return f"{host}:{port}"
 
     def newest(self, tick: int, stamp_ns: int) -> Pose | None:
-        """The newest pose since the last call, stamped with the robot's time of its capture; None when none counts."""
+        """The newest pose since the last call, stamped with the robot time of its capture; None without a valid one."""
         now_ns = self._clock(stamp_ns)
         sample = self._newest_sample(now_ns)
         if sample is None:
@@ -96,7 +98,7 @@ class MocapReceiver:
         age_ns = self._times.late_ns(sample.stamp_ns, now_ns) + self._delay_ns
         if velocities is None or age_ns > stamp_ns:  # the latter: captured before the robot's time began
             return None
-        # A tick that is late makes what came meanwhile seem older; yet it was captured after the one before.
+        # A late tick makes poses that arrived meanwhile seem older; but each was captured after the one before.
         self._told_ns = max(stamp_ns - age_ns, self._told_ns + 1)
         return Pose(
             tick=tick,
@@ -108,10 +110,10 @@ class MocapReceiver:
         )
 
     def close(self) -> None:
-        """Stop listening, and log what was refused."""
+        """Stop listening, and log the rejected datagrams."""
         if self.refused:
             counts = ", ".join(f"{count} {why}" for why, count in self.refused.most_common())
-            _log.warning("pose: datagrams refused: %s; its clock jumped %d times", counts, self._times.jumps)
+            _log.warning("pose: datagrams rejected: %s; its clock jumped %d times", counts, self._times.jumps)
         self._socket.close()
 
     # --- inside -----------------------------------------------------------------------------------------------
@@ -127,11 +129,11 @@ class MocapReceiver:
                 self._refuse(refusal, f"stamp_ns = {sample.stamp_ns}")
         if self._times.jumps != self._jumps:
             self._jumps, self._last = self._times.jumps, None
-            _log.warning("pose: the clock of the motion-capture system has jumped; its new time is taken")
+            _log.warning("pose: the clock of the motion-capture system has jumped; its new time is accepted")
         return newest
 
     def _read(self) -> list[MocapSample]:
-        """Well-formed samples in the order in which they came; at most `MAX_AT_ONCE` datagrams are looked at."""
+        """Well-formed samples in their order of arrival; reads at most `MAX_AT_ONCE` datagrams."""
         samples: list[MocapSample] = []
         for _ in range(MAX_AT_ONCE):
             try:
@@ -146,7 +148,7 @@ class MocapReceiver:
                 self._refuse("malformed", str(error)[:200])
                 continue
             if abs(math.hypot(*sample.orientation_wxyz) - 1.0) > UNIT_WITHIN:
-                self._refuse("malformed", f"orientation_wxyz = {sample.orientation_wxyz} is no unit quaternion")
+                self._refuse("malformed", f"orientation_wxyz = {sample.orientation_wxyz} is not a unit quaternion")
             else:
                 samples.append(sample)
         return samples
@@ -158,7 +160,7 @@ class MocapReceiver:
             _log.warning("pose: first %s datagram: %s; more are only counted", why, detail)
 
     def _velocities(self, before: MocapSample | None, now: MocapSample) -> tuple[q.Vector, q.Vector] | None:
-        """Linear and angular, in the world; None when they are not told, and two poses do not give them either."""
+        """Linear and angular, in the world; None if they are neither sent nor derived from two poses."""
         if now.velocity_w is not None and now.angular_velocity_w is not None:
             return now.velocity_w, now.angular_velocity_w
         if before is None or now.stamp_ns - before.stamp_ns > LONGEST_GAP_NS:

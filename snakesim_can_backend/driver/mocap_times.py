@@ -1,7 +1,7 @@
-"""What the stamps of a motion-capture system tell: order, lateness, and whether its clock has jumped.
+"""Checks of the stamps of a motion-capture system: order, lateness, and jumps of its clock.
 
-Its clock and ours share no zero. The smallest difference of the last seconds between when a stamp was read here and the
-stamp itself is taken as the offset of the two clocks; a sample is late by what its own difference is more. Refused:
+Its clock and ours have different epochs. The smallest difference of the last seconds between reading time and
+stamp is taken as the offset of the two clocks; a sample is late by the excess of its own difference. Rejected:
 
     duplicate   the newest stamp again, or less than 1 ms after it
     reordered   older than the newest stamp
@@ -9,7 +9,7 @@ stamp itself is taken as the offset of the two clocks; a sample is late by what 
     future      more than 50 ms ahead of the fastest samples
 
 A clock that was set or restarted makes every stamp late, reordered or from the future. When five readings in a row
-bring only such stamps, and these agree with one another, they are believed from then on.
+bring only such stamps, and these agree with one another, they are accepted from then on.
 """
 
 from collections.abc import Sequence
@@ -23,11 +23,11 @@ MAX_LATE_NS = 250_000_000
 MAX_EARLY_NS = 50_000_000
 SAME_CLOCK_NS = 50_000_000  # two offsets no further apart are of one clock
 READINGS_TO_BELIEVE = 5
-WINDOW_NS = 10_000_000_000  # the offset is the least of one to two of these, so that clocks may drift
+WINDOW_NS = 10_000_000_000  # the offset is the minimum over one to two of these, so that clocks may drift
 
 
 class CaptureTimes:
-    """Judges stamps in the order in which they came. Pure: stamps and the time of reading in, no clock."""
+    """Checks stamps in their order of arrival. Pure: stamps and the time of reading in, no clock."""
 
     def __init__(self) -> None:
         self._newest_ns: int | None = None
@@ -36,7 +36,7 @@ class CaptureTimes:
         self.jumps = 0  # of the other clock
 
     def judge(self, stamps_ns: Sequence[int], now_ns: int) -> list[Refusal | None]:
-        """Why each of the stamps that were read at one time is refused; None for those that count."""
+        """Why each of the stamps of one reading is rejected; None for the valid ones."""
         if not stamps_ns:
             return []
         if self._newest_ns is None:
@@ -51,7 +51,7 @@ class CaptureTimes:
         return verdicts
 
     def late_ns(self, stamp_ns: int, now_ns: int) -> int:
-        """How much later than the fastest a sample is, or came."""
+        """Delay of a sample relative to the fastest ones."""
         return max(now_ns - stamp_ns - self._offset.least_ns, 0)
 
     def _take(self, stamp_ns: int, now_ns: int) -> Refusal | None:
@@ -70,7 +70,7 @@ class CaptureTimes:
         return None
 
     def _believed(self, stamp_ns: int, now_ns: int) -> bool:
-        """A reading brought only strange stamps; this is its last. True when the other clock has jumped."""
+        """A reading brought only rejected stamps; this is its last. True when the other clock has jumped."""
         other, offset_ns = self._other, now_ns - stamp_ns
         agrees = other is not None and abs(offset_ns - other.offset_ns) <= SAME_CLOCK_NS and stamp_ns > other.stamp_ns
         if other is None or not agrees:
@@ -87,7 +87,7 @@ class CaptureTimes:
 
 @dataclass
 class _Candidate:
-    """What the other clock would be if the stamps that are refused were right."""
+    """The other clock's offset if the rejected stamps were right."""
 
     offset_ns: int
     stamp_ns: int
@@ -95,7 +95,7 @@ class _Candidate:
 
 
 class _Offset:
-    """The least difference of the two clocks that was seen in the last one or two windows."""
+    """The minimum difference of the two clocks in the last one or two windows."""
 
     def __init__(self) -> None:
         self._began_ns: int | None = None

@@ -1,7 +1,7 @@
-"""Says what is wrong with which module, or with the bus, in words that tell a person where to look.
+"""Detects module and bus faults, and reports each with a cause that helps a person to locate it.
 
-Pure: looks at a `Reading` and at the troubles of the wires once a tick. Each finding is told once, until somebody
-clears the robot's fault; what persists is then told again.
+Pure: checks a `Reading` and the bus errors once a tick. Each finding is reported once, until the robot's fault is
+cleared; a persistent one is then reported again.
 """
 
 from collections.abc import Iterable, Sequence, Set
@@ -13,14 +13,14 @@ from snakesim_can_backend.protocol.definitions import ModuleState, Opcode
 from snakesim_hal.wire.messages import LifecycleState
 
 SILENT_AFTER = 3  # Syncs without an answer
-IN_A_ROW = 3  # bad frames of one kind, or periods that a bus is full, before they are a fault and not a glitch
+IN_A_ROW = 3  # bad frames of one kind, or periods with a full bus, that make a fault instead of a glitch
 CLEAR_GRACE = 5  # Syncs that a module may take to follow a clearing
 ARM_GRACE = 5  # Syncs that a module may take to follow an arming
-STRANGER_FRAMES = 3  # of a node that should not be there, in ticks one after the other
+STRANGER_FRAMES = 3  # of an unexpected node, in consecutive ticks
 MAX_FRAMES = 16  # of one module in a tick; a healthy one sends 8 at most
 
-# Of one module, and yet nothing that the others could go on beside: two modules with one id, a bus that is full, water,
-# a supply that all share, an emergency; nor does a robot set out that is not whole.
+# Faults of one module that concern all others: two modules with one id, a full bus, water,
+# the common supply, an emergency; and a robot that is not complete does not start.
 NEVER_ARMED = "module_never_armed"
 CONCERNS_ALL = {
     "duplicate_node", "module_babbling", "module_leak", "module_voltage", "module_emergency", NEVER_ARMED
@@ -31,28 +31,28 @@ BUS_FAULTS = {
     "terminator; bring the interface down and up again, then clear and arm",
     "error_passive": "more than 127 errors: the bus is about to fail; look at cables, terminators and bit rate",
     "interface_down": "nothing is sent or received; bring it up again, then clear and arm",
-    "restarted": "the controller has restarted after bus-off; clear and arm when the bus is sound",
+    "restarted": "the controller has restarted after bus-off; clear and arm when the bus is in order",
     "receive_overflow": "states may be missing",
 }
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that is wrong."""
+    """One detected fault."""
 
     what: str
     cause: str
     joint: int | None = None  # index, tail to head
-    alone: bool = False  # whether it leaves the other joints as they were
+    alone: bool = False  # whether the other joints are not affected
 
     @property
     def subject(self) -> tuple[str, int | str, bool]:
-        """Two findings with the same are told once."""
+        """Findings with the same subject are reported once."""
         return self.what, self.cause if self.joint is None else self.joint, self.alone
 
 
 class Watch:
-    """Remembers what has been told."""
+    """Remembers which findings have been reported."""
 
     def __init__(self, joints: Sequence[str], channel_of: Sequence[str], period_s: float) -> None:
         """joints, channel_of: name and bus of every joint, tail to head."""
@@ -60,21 +60,21 @@ class Watch:
         self._period_s = period_s
         self._told: set[tuple[str, int | str, bool]] = set()
         self._restarts = [0] * len(joints)
-        self._unarmed = [0] * len(joints)  # Syncs in a row that found a module not armed, while the robot was
-        self._restart_at: dict[int, int] = {}  # joint -> Sync at which its uptime went back
-        self._quiet_until = -1  # Sync until which modules may take to follow a clearing
+        self._unarmed = [0] * len(joints)  # Syncs in a row in which a module was not armed although the robot was
+        self._restart_at: dict[int, int] = {}  # joint -> Sync at which its uptime decreased
+        self._quiet_until = -1  # last Sync at which modules may not have followed a clear yet
         self._armed_sync: int | None = None
-        self._unsent: dict[str, int] = {}  # ticks in a row in which a bus did not take everything
-        self._unasked: dict[str, int] = {}  # the newest Sync at which it did not
+        self._unsent: dict[str, int] = {}  # ticks in a row in which a bus rejected frames
+        self._unasked: dict[str, int] = {}  # the newest Sync at which it did
         self._down: set[str] = set()  # buses whose interface is
-        self._strangers: dict[int, int] = {}  # frames of nodes that should not be there, in ticks in a row
-        self._restarted: set[int] = set()  # joints, until somebody clears
+        self._strangers: dict[int, int] = {}  # frames of unexpected nodes, in ticks in a row
+        self._restarted: set[int] = set()  # joints, until a clear
         self._changed: set[int] = set()  # joints whose parameters may have changed
         self._was_armed: set[int] = set()  # joints, in this arming
-        self.seen: dict[str, int] = {}  # troubles that are no faults, counted
+        self.seen: dict[str, int] = {}  # bus errors that are not faults, counted
 
     def forget(self, sync: int) -> None:
-        """Somebody has cleared the fault: tell again what is still there once the modules have followed."""
+        """The fault was cleared: report persistent findings again once the modules have followed."""
         self._told.clear()
         self._restarted.clear()
         self._quiet_until = sync + CLEAR_GRACE
@@ -88,10 +88,10 @@ class Watch:
         unconfigured: Iterable[int] = (),
         isolated: Set[int] = frozenset(),
     ) -> list[Finding]:
-        """What is newly wrong.
+        """New findings.
 
-        unsent: buses that did not take every frame of this tick; unconfigured: joints that must not be armed so;
-        isolated: joints that are set aside, of which nothing is news that concerns nobody else.
+        unsent: buses that rejected a frame of this tick; unconfigured: joints that must not be armed;
+        isolated: isolated joints, whose findings are ignored if they concern no other joint.
         """
         if lifecycle != "armed":
             self._armed_sync = None
@@ -111,19 +111,19 @@ class Watch:
         return fresh
 
     def take_changed(self) -> set[int]:
-        """Joints whose parameters may not be ours any more, since the last call."""
+        """Joints whose parameters may have changed since the last call."""
         changed, self._changed = self._changed, set()
         return changed
 
     # --- one module -------------------------------------------------------------------------------------------
 
     def _finding(self, i: int, module: Module, what: str, cause: str, *also: str) -> Finding:
-        """also: what else would have been reason enough."""
+        """also: further kinds that apply."""
         who = f"{self._names[i]} (node {module.node} on {self._channels[i]})"
         return Finding(what, f"{who} {cause}", i, alone=CONCERNS_ALL.isdisjoint((what, *also)))
 
     def _of_answers(self, i: int, module: Module, reading: Reading) -> list[Finding]:
-        """What is wrong with its frames, or that there are none."""
+        """Findings about its frames, or that there are none."""
         found: list[Finding] = []
 
         def tell(what: str, cause: str) -> None:
@@ -136,7 +136,7 @@ class Watch:
             up_s = module.uptime_ms / 1000
             tell(
                 "module_restarted",
-                f"has restarted, its uptime is {up_s:.2f} s: clear, and it gets its parameters again",
+                f"has restarted, its uptime is {up_s:.2f} s: a clear writes its parameters again",
             )
         if module.repeats >= IN_A_ROW:
             tell("module_frozen", f"is frozen: it repeats its answer number {module.last_count} to every Sync")
@@ -145,7 +145,7 @@ class Watch:
         if module.corrupt >= IN_A_ROW:
             tell("bad_checksum", f"sends corrupt states: {module.corrupt} wrong checksums in a row")
         if module.answered_twice(reading.sync) >= IN_A_ROW:
-            tell("duplicate_node", "is there twice: every Sync is answered two times; give each module its own node id")
+            tell("duplicate_node", "is duplicated: every Sync is answered twice; give each module its own node id")
         if module.frames > MAX_FRAMES:
             tell("module_babbling", f"floods the bus: {module.frames} frames within one period")
         unanswered = reading.sync - module.sync - module.corrupt - max(module.repeats, module.wrong_counts)
@@ -160,7 +160,7 @@ class Watch:
     def _of_state(
         self, i: int, module: Module, reading: Reading, lifecycle: LifecycleState, *, aside: bool
     ) -> list[Finding]:
-        """What it says that is wrong with it, or that it does not follow."""
+        """Findings about faults that it reports, or that it does not follow."""
         state = module.state.name.lower()
         as_told = lifecycle == "estop" and module.state == ModuleState.EMERGENCY
         if module.needs_clearing and not as_told and reading.sync >= self._quiet_until:
@@ -175,7 +175,7 @@ class Watch:
         return [self._finding(i, module, "module_not_armed", f"does not arm: it is {state}", NEVER_ARMED)]
 
     def _has_restarted(self, i: int, module: Module, reading: Reading) -> bool:
-        """A second module with the same id lets the uptime go back too, and then every Sync is answered twice."""
+        """A second module with the same id also makes the uptime decrease, but then every Sync is answered twice."""
         if module.restarts > self._restarts[i]:
             self._restarts[i] = module.restarts
             self._restart_at.setdefault(i, reading.sync)
@@ -201,9 +201,7 @@ class Watch:
         return self._unarmed[i] >= (1 if fell_back else IN_A_ROW)
 
     def _bare(self, i: int) -> Finding:
-        cause = (
-            f"{self._names[i]} has not taken its parameters, and is not armed; clear, or switch its power off and on"
-        )
+        cause = f"{self._names[i]} has not accepted its parameters, and is not armed; clear, or power-cycle it"
         return Finding("module_not_configured", cause, i)
 
     # --- the bus ----------------------------------------------------------------------------------------------
@@ -225,8 +223,8 @@ class Watch:
             if ticks >= IN_A_ROW:
                 took_ms = 1000 * IN_A_ROW * self._period_s
                 cause = (
-                    f"{channel}: frames do not get out for {took_ms:.0f} ms, its transmit queue stays "
-                    f"full: nobody acknowledges (power, cable, terminator, bit rate), or txqueuelen is below 64"
+                    f"{channel}: no frames sent for {took_ms:.0f} ms, its transmit queue stays "
+                    f"full: no node acknowledges (power, cable, terminator, bit rate), or txqueuelen is below 64"
                 )
                 found.append(Finding("bus_stuck", cause))
         return found
@@ -236,11 +234,11 @@ class Watch:
         self._strangers = {node: self._strangers.get(node, 0) + n for node, n in reading.strangers.items()}
         for node, frames in self._strangers.items():
             if frames >= STRANGER_FRAMES:
-                found.append(Finding("unknown_node", f"node {node} is on the bus, and this robot has no such joint"))
+                found.append(Finding("unknown_node", f"node {node} is on the bus, but is not a joint of this robot"))
         reading.strangers.clear()
         others = reading.from_other_host
         if others[Opcode.EMERGENCY]:
-            found.append(Finding("emergency", "somebody on the bus called an emergency"))
+            found.append(Finding("emergency", "a node on the bus sent an Emergency"))
         if others.keys() - {Opcode.EMERGENCY}:
             found.append(Finding("second_host", "another program commands the modules on this bus; end one of the two"))
             self._changed |= set(range(len(reading.modules)))
@@ -250,7 +248,7 @@ class Watch:
 
 def _alive(module: Module, reading: Reading) -> str:
     if module.heartbeat_sync > module.sync:
-        return "; its heart still beats, so it hears no Sync or its main loop hangs"
+        return "; it still sends heartbeats, so it receives no Sync or its main loop hangs"
     if reading.sync < 0 or module.uptime_ms < 0:
         return ""
     return "; no heartbeat either: power, cable or reset"

@@ -1,4 +1,4 @@
-"""The module twins that a driver starts for itself: in its own process on a virtual bus, or as a child on vcan."""
+"""The module twins that a driver starts itself: in its own process on a virtual bus, or as a child on vcan."""
 
 import contextlib
 import os
@@ -26,13 +26,13 @@ POLL_S = 0.02
 
 
 def check_twins(config: RunConfig, settings: Settings) -> None:
-    """Raise ConfigError for twins that cannot be."""
+    """Raise ConfigError for impossible settings of the twins."""
     from snakesim_can_backend.twin.faults import parse
 
     if settings.twins_run == "here" and settings.channels:
         raise ConfigError(
             f'`backends.can.twins` = "here" is a virtual bus inside the driver, and `channels` = {settings.channels} '
-            f'names real ones: leave `channels` empty, or let twins = "process"'
+            f'names real ones: leave `channels` empty, or set twins = "process"'
         )
     if settings.twins_run != "here" and not settings.channels:
         raise ConfigError(
@@ -46,18 +46,18 @@ def check_twins(config: RunConfig, settings: Settings) -> None:
 
 
 def check_faults(config: RunConfig, settings: Settings) -> None:
-    """Whether what the run has planned for joints and buses can be done. Raises ConfigError."""
+    """Check that the planned faults of joints and buses are possible. Raises ConfigError."""
     from snakesim_can_backend.twin.faults import ABOUT
 
     own, virtual = settings.twins_run != "none", not settings.channels
     does = {*KINDS["bus"]} - (set() if virtual else {"full"}) | ({*ABOUT} if own else set())
-    because = f"its modules know {', '.join(ABOUT)}" if own else "its modules are not the driver's own"
-    because += "" if virtual else "; and no program can fill the queue of a kernel interface"
+    because = f"its modules support {', '.join(ABOUT)}" if own else "its modules are not the driver's own twins"
+    because += "" if virtual else "; and a program cannot fill the queue of a kernel interface"
     check_backend_can(config, does=does, buses=max(len(settings.channels), 1), because=because)
 
 
 def modules_know(injection: Injection, joints: int) -> bool:
-    """Whether module twins can have a fault. Raises ConfigError when its joint is not there."""
+    """Whether module twins support a fault. Raises ConfigError for an unknown joint."""
     from snakesim_can_backend.twin.faults import ABOUT, checked
 
     if injection.target_type != "joint" or injection.kind not in ABOUT:
@@ -67,7 +67,7 @@ def modules_know(injection: Injection, joints: int) -> bool:
 
 
 def twins_here(config: RunConfig, settings: Settings, channel: str, pose: str | None, *, stepped: bool) -> OtherEnd:
-    """Twins at the other end of a virtual bus; the returned function lets them run."""
+    """Twins at the other end of a virtual bus; the returned function runs them."""
     from snakesim_can_backend.twin.server import here
 
     return here(config, settings, channel, pose, stepped=stepped)
@@ -105,12 +105,12 @@ class TwinProcess:
             )
 
     def how_it_ended(self) -> str | None:
-        """In words; None while it runs."""
+        """Its exit as text; None while it runs."""
         code = self._process.poll()
         return None if code is None else f"the module twins have ended, with exit code {code}"
 
     def inject(self, fault: Injection, *, begins: bool) -> None:
-        """Let something go wrong with a module, or end. Raises BackendError when the child is gone."""
+        """Begin or end a fault of a module. Raises BackendError when the child is gone."""
         from snakesim_can_backend.twin.faults import typed
 
         assert self._process.stdin is not None
@@ -118,10 +118,10 @@ class TwinProcess:
             self._process.stdin.write(f"{typed(fault, begins=begins)}\n".encode())
             self._process.stdin.flush()
         except (OSError, ValueError) as error:  # the latter when it was stopped
-            raise BackendError(f"the module twins do not take {fault}: {error}") from error
+            raise BackendError(f"the module twins do not accept {fault}: {error}") from error
 
     def stop(self) -> None:
-        """Ask it to end, then insist. What it said goes to this process's stderr."""
+        """Terminate it, then kill it. Its output goes to this process's stderr."""
         if self._process.poll() is None:
             self._process.send_signal(signal.SIGTERM)
             try:
@@ -132,7 +132,7 @@ class TwinProcess:
         if self._process.stdin is not None:
             with contextlib.suppress(OSError):
                 self._process.stdin.close()
-        with contextlib.suppress(OSError):  # a log that cannot be read or passed on keeps nothing from ending
+        with contextlib.suppress(OSError):  # an unreadable log does not prevent ending
             for line in self._said.read_text(encoding="utf-8", errors="replace").splitlines():
                 complain(line)
         self._folder.cleanup()
@@ -147,4 +147,4 @@ class TwinProcess:
                 break
             time.sleep(POLL_S)
         self.stop()
-        raise BackendError("the module twins did not start; see what they said above")
+        raise BackendError("the module twins did not start; see their output above")

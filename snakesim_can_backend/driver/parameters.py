@@ -1,4 +1,4 @@
-"""A robot file in the modules' parameters, and whether modules and protocol can do what the file asks for."""
+"""Module parameters from a robot file, and checks that modules and protocol support that file."""
 
 from collections.abc import Mapping
 
@@ -11,11 +11,11 @@ from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig
 
 MIN_PERIODS = 2.2  # in a watchdog's time: one set-point may be lost, and the next be a little late
-SPEED_ROOM = 1.2  # a joint may be pushed faster than its motor turns, and must still be told
+SPEED_ROOM = 1.2  # a load may turn a joint faster than its motor, and the bus must still represent that
 
 
 def parameters_of(robot: RobotFile, settings: Settings, reports: Reports) -> dict[int, dict[Parameter, float]]:
-    """What to write to each node."""
+    """The parameters to write to each node."""
     motor, limits = robot.motor, robot.limits
     safe = SafeMotion.DAMP if robot.safety.action == "damp" else SafeMotion.PASSIVE
     common = {
@@ -35,7 +35,7 @@ def parameters_of(robot: RobotFile, settings: Settings, reports: Reports) -> dic
 
 
 def check_ratings(robot: RobotFile, in_force: Mapping[int, Mapping[Parameter, float]] | None = None) -> None:
-    """Raise ConfigError or BackendError when the robot file asks for more than the protocol, or a module, can do."""
+    """Raise ConfigError or BackendError when the robot file exceeds the protocol's range or a module's rating."""
     signals = codec()[Opcode.JOINT_STATE].signals
     for what, value, most, unit in (
         ("limits.angle_rad", robot.limits.angle_rad, signals["angle"].high, "rad"),
@@ -45,19 +45,19 @@ def check_ratings(robot: RobotFile, in_force: Mapping[int, Mapping[Parameter, fl
     ):
         if value > most:
             raise ConfigError(
-                f"robot {robot.name!r}: `{what}` = {value} {unit} does not go through the bus, whose protocol ends at "
+                f"robot {robot.name!r}: `{what}` = {value} {unit} exceeds the range of the bus protocol, which ends at "
                 f"{most:.3g} {unit}"
             )
     reach_m = max(robot.link_lengths_m) + robot.module.radius_m
     along_m = codec()[Opcode.CONTACT].signals["along"].high
     if robot.sensors.contacts is not None and reach_m > along_m:
         raise ConfigError(
-            f"robot {robot.name!r}: a touch at the end of a link, {reach_m:.3g} m from its joint (`module.length_m` + "
-            f"`module.radius_m`), cannot be told on the bus, whose protocol ends at {along_m:.3g} m"
+            f"robot {robot.name!r}: a contact at a link's end, {reach_m:.3g} m from its joint (`module.length_m` + "
+            f"`module.radius_m`), exceeds the range of the bus protocol, which ends at {along_m:.3g} m"
         )
     if robot.safety.action == "hold":
         raise ConfigError(
-            f'robot {robot.name!r}: `safety.action` = "hold" is nothing that a joint module does by itself: servos '
+            f'robot {robot.name!r}: `safety.action` = "hold" is not supported by joint modules: servos '
             f'that hold stiffly overheat. Use "damp" or "passive"'
         )
     for node, values in (in_force or {}).items():
@@ -65,15 +65,15 @@ def check_ratings(robot: RobotFile, in_force: Mapping[int, Mapping[Parameter, fl
             (Parameter.RATED_TORQUE, robot.limits.torque_nm, "N·m"),
             (Parameter.RATED_SPEED, robot.limits.speed_rad_s, "rad/s"),
         ):
-            if not values[parameter] >= asked * 0.999:  # a rating of NaN, which the bus can carry, is none
+            if not values[parameter] >= asked * 0.999:  # also rejects a rating of NaN, which the bus can carry
                 raise BackendError(
-                    f"joint_{node} is rated for {values[parameter]:.3g} {unit}, robot {robot.name!r} asks for "
+                    f"joint_{node} is rated for {values[parameter]:.3g} {unit}, robot {robot.name!r} needs "
                     f"{asked:g}: lower the limit in the robot file"
                 )
 
 
 def check_watchdog(config: RunConfig, settings: Settings) -> None:
-    """Raise ConfigError for modules that one lost set-point would stop."""
+    """Raise ConfigError if one lost set-point would stop the modules."""
     least_s = MIN_PERIODS / config.rate_hz
     if settings.watchdog_s < least_s:
         least_hz = MIN_PERIODS / settings.watchdog_s

@@ -1,7 +1,7 @@
-"""What the modules say, as it comes in: raw numbers per joint, and how their frames depart from what is right.
+"""The modules' reports: raw numbers per joint, and counts of wrong frames.
 
-Pure: frames and Sync numbers in, no clock and no bus. Everything is kept as raw integers, and scaled for all joints at
-once when a tick asks for it.
+Pure: frames and Sync numbers in, no clock and no bus. Values are stored as raw integers, and scaled for all joints at
+once when a tick reads them.
 """
 
 from binascii import crc_hqx
@@ -29,42 +29,44 @@ from snakesim_can_backend.protocol.definitions import (
 
 Floats = NDArray[np.float64]
 TOLD_WITHIN = 3  # Syncs from a module's fault to its heartbeat, at most
-ONE_CLOCK_MS = 350  # two heartbeats no further apart are of one and the same module
-LATE_SYNCS = 3  # a state this many Syncs late is still taken, with its age; older counts are wrong ones
-COUNT_AT, STATE_AT = 3, 4  # in what `_read_state` gives
+ONE_CLOCK_MS = 350  # two heartbeats whose uptimes differ by no more are of the same module
+LATE_SYNCS = 3  # a state this many Syncs late is still accepted, with its age; older counts are wrong
+COUNT_AT, STATE_AT = 3, 4  # in the result of `_read_state`
 UNTOUCHED = b""
-STATES = [ModuleState(i) if i < len(ModuleState) else ModuleState.FAULT for i in range(16)]  # what is unknown is bad
+STATES = [
+    ModuleState(i) if i < len(ModuleState) else ModuleState.FAULT for i in range(16)
+]  # unknown ones count as FAULT
 STOPPED = (ModuleState.FAULT, ModuleState.EMERGENCY)  # until a Clear
 
 
 @dataclass
 class Module:
-    """What is known of one module. Numbers of Syncs are whole, not modulo."""
+    """The state of one module. Numbers of Syncs are not modulo."""
 
     node: int
     sync: int = -1  # that the newest good state answers; -1: none yet
     state: ModuleState = ModuleState.BOOT
     last_count: int = -1
-    repeats: int = 0  # states in a row with one and the same count
+    repeats: int = 0  # states in a row with the same count
     wrong_counts: int = 0  # in a row
     corrupt: int = 0  # in a row
     twice: int = 0  # Syncs in a row that were answered more than once, up to `twice_at`
     twice_at: int = -1
     frames: int = 0  # in this tick
-    awaited: bool = True  # whether it answered of late
+    awaited: bool = True  # whether it has answered recently
     uptime_ms: int = -1
     uptime_before_ms: int = -1
-    went_back: bool = False  # its uptime, in the newest heartbeat
-    restarts: int = 0  # uptimes that went back, and went on from there; one that came late goes on from before
+    went_back: bool = False  # whether its uptime decreased in the newest heartbeat
+    restarts: int = 0  # times that its uptime decreased and continued from there, unlike after a late heartbeat
     faults: int = 0  # bits, from the newest heartbeat
     last_stop: LastStop = LastStop.NONE
     heartbeat_sync: int = -1
-    health_sync: int = -1  # when it last told its health
+    health_sync: int = -1  # of the last Health report
     stopped_syncs: int = 0  # in a row, in which its state was fault or emergency
 
     @property
     def needs_clearing(self) -> bool:
-        """Whether it is in a latched state, and its heartbeat had the time to say why."""
+        """Whether it is in a latched state, and its heartbeat had the time to report the reason."""
         return self.state in STOPPED and (bool(self.faults) or self.stopped_syncs >= TOLD_WITHIN)
 
     def answered_twice(self, sync: int) -> int:
@@ -72,25 +74,25 @@ class Module:
         return self.twice if self.twice_at >= sync - 1 else 0
 
     def fault_names(self) -> list[str]:
-        """The fault bits in words."""
+        """Names of the fault bits."""
         return [fault.name.lower() for fault in ModuleFault if self.faults >> fault & 1]
 
 
 class Reading:
-    """Everything that the modules of a robot have said so far; joint i is node i + 1."""
+    """The reports of all modules of a robot so far; joint i is node i + 1."""
 
     def __init__(self, joints: int) -> None:
         self.modules = [Module(node) for node in range(1, joints + 1)]
         self.sync = -1  # the newest one sent
         self.states_missing = joints
         self.contacts_missing = 0
-        self.answers_missing = 0  # to questions about parameters
-        self.strangers: Counter[int] = Counter()  # frames of nodes that should not be there, since the last tick
+        self.answers_missing = 0  # to parameter requests
+        self.strangers: Counter[int] = Counter()  # frames of unexpected nodes, since the last tick
         self.from_other_host: Counter[Opcode] = Counter()
         self.malformed = 0
         layouts = codec().layouts
-        self._joint = [(0,) * 5 for _ in range(joints)]  # as `_read_state` gives it
-        self._contact: list[bytes | None] = [None] * (joints + 1)  # by link; None: not told yet
+        self._joint = [(0,) * 5 for _ in range(joints)]  # as returned by `_read_state`
+        self._contact: list[bytes | None] = [None] * (joints + 1)  # by link; None: no report yet
         self._gyro: list[tuple[int, ...] | None] = [None] * joints
         self._acceleration: list[tuple[int, ...] | None] = [None] * joints
         self._health: list[tuple[int, ...] | None] = [None] * joints
@@ -128,10 +130,10 @@ class Reading:
         }
 
     def begin(self, sync: int, *, contacts: bool, tail: bool, questions: int = 0) -> None:
-        """A Sync goes out. Only modules that answered of late are waited for.
+        """A Sync is sent. Only modules that have answered recently are waited for.
 
-        contacts, tail: whether it asks for force reports, and whether the tail link sends one of its own.
-        questions: about parameters, that go out with it.
+        contacts, tail: whether force reports are due, and whether the tail link sends one of its own.
+        questions: number of parameter requests that are sent with it.
         """
         self.sync = sync
         for module in self.modules:
@@ -145,11 +147,11 @@ class Reading:
 
     @property
     def complete(self) -> bool:
-        """Whether everybody has answered who can be expected to."""
+        """Whether all awaited modules have answered."""
         return self.states_missing <= 0 and self.contacts_missing <= 0 and self.answers_missing <= 0
 
     def take(self, frame: Frame) -> None:
-        """Take in one frame."""
+        """Process one frame."""
         known = self._known.get(frame.id)
         if known is None:
             self._take_other(frame)
@@ -173,23 +175,23 @@ class Reading:
             self.answers_missing -= opcode == Opcode.PARAMETER_ANSWER
 
     def _only_asks(self, frame: Frame) -> bool:
-        """Whether somebody merely wants to know who is there."""
+        """Whether it is only an `identify` of another host."""
         is_command = opcode_of(frame.id) == Opcode.COMMAND and len(frame.data) == self._command_length
         return is_command and self._read_action(frame.data) == (Action.IDENTIFY,)
 
     def forget_frames(self) -> None:
-        """Frames counted so far do not belong to one period."""
+        """Reset the frame counts, which cover more than one period."""
         for module in self.modules:
             module.frames = 0
 
-    # --- what the joints are, in SI units ---------------------------------------------------------------------
+    # --- joint states, in SI units ----------------------------------------------------------------------------
 
     def joints(self) -> Floats:
         """Angle, velocity and torque of every joint, (3, n_joints)."""
         return np.array(self._joint).T[:COUNT_AT] * self._state_scale
 
     def links_touched(self) -> list[tuple[int, tuple[int, ...]]]:
-        """(link, raw force x y z, place along and bearing) of every link that reported a touch at this Sync."""
+        """(link, raw force x y z, place along and bearing) of every link that reported a contact at this Sync."""
         return [(link, self._read_contact(data)) for link, data in enumerate(self._contact) if data]
 
     def imus(self) -> list[tuple[int, Sequence[int], Sequence[int]]]:
@@ -202,7 +204,7 @@ class Reading:
         return found
 
     def health(self) -> list[tuple[int, ...] | None]:
-        """Raw voltage, current, two temperatures and leak of every module; None: not told yet."""
+        """Raw voltage, current, two temperatures and leak of every module; None: no report yet."""
         return self._health
 
     # --- one kind of frame each ---------------------------------------------------------------------------------

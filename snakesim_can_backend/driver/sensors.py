@@ -1,6 +1,6 @@
-"""What the HAL publishes of the modules: joint state, contacts, IMUs, power, and the base's pose.
+"""Sensor messages from the modules' reports: joint state, contacts, IMUs, power, and the base's pose.
 
-Every value is as the modules sampled it at the tick's Sync. What did not arrive keeps its last value, with its age.
+Every value was sampled at the tick's Sync. A missing one keeps its last value, with its age.
 """
 
 import math
@@ -42,7 +42,7 @@ class Sensors:
         self._health_lasts = round(HEALTH_LASTS_S * config.rate_hz)  # Syncs
 
     def sample(self, tick: int, stamp_ns: int) -> Samples:
-        """Everything that is new at `tick`."""
+        """All new samples at `tick`."""
         others: dict[str, Message] = {}
         if contacts_due(self._reports, self._reading.sync):
             others[keys.CONTACTS] = self._contacts(tick, stamp_ns)
@@ -85,7 +85,7 @@ class Sensors:
         tangent_1, tangent_2 = tangents(normal)
         return Contact(
             link=link,
-            obstacle=None,  # a force sensor does not know what it touches
+            obstacle=None,  # unknown to a force sensor
             position_l=position,
             normal_l=normal,
             tangent_1_l=tangent_1,
@@ -132,7 +132,7 @@ def contacts_due(reports: Reports, sync: int) -> bool:
 
 
 def described(config: RunConfig, reports: Reports, *, pose_delay_s: float | None) -> list[SensorDescription]:
-    """What this robot's modules deliver, and how often; pose_delay_s: of motion capture, None without any."""
+    """The sensors of this robot's modules, with their rates; pose_delay_s: of motion capture, None without it."""
     rate = config.rate_hz
     sensors = [SensorDescription(key=keys.JOINTS, rate_hz=rate, delay_s=0.0)]
     if reports.contact_every:
@@ -148,7 +148,7 @@ def described(config: RunConfig, reports: Reports, *, pose_delay_s: float | None
 def on_surface(along_m: float, bearing_rad: float, length_m: float, radius_m: float) -> tuple[Vector, Vector]:
     """Outward normal and point of a link's capsule at a place along it and a bearing about it.
 
-    Beyond its ends a capsule is a ball, and its normal leans forward or back.
+    Beyond its ends a capsule is a sphere, and its normal tilts forward or back.
     """
     base_m = min(max(along_m, 0.0), length_m)
     lean = min(max((along_m - base_m) / radius_m, -1.0), 1.0)

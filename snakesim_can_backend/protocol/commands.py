@@ -1,6 +1,6 @@
-"""What goes out to the modules: set-points in raw numbers, and what a change of the robot's lifecycle asks of them.
+"""Frames to the modules: set-points in raw numbers, and commands for changes of the robot's lifecycle.
 
-Pure: frames come out, and the caller sends them. A set-point that the bus did not take is simply replaced by the next;
+Pure: returns frames, and the caller sends them. A set-point that the bus did not accept is replaced by the next;
 nothing is ever queued.
 """
 
@@ -32,7 +32,7 @@ MAX_LIMIT_RAW = 65535
 
 
 class SetPointWriter:
-    """Makes the set-points of all joints; knows what each module expects as its next count."""
+    """Makes the set-point frames of all joints; tracks the next count that each module expects."""
 
     def __init__(self, joints: int) -> None:
         layout = codec()[Opcode.SET_POINT]
@@ -56,17 +56,17 @@ class SetPointWriter:
         return [self._write(node, row) for node, row in enumerate(rows, start=1)]
 
     def sent(self, joint: int) -> None:
-        """The bus took the set-point of a joint; only then does its module expect the next count."""
+        """The bus accepted the set-point of a joint; only then does its module expect the next count."""
         self._count[joint] = (self._count[joint] + 1) % COUNTS
 
 
 def _steps(values: NDArray[np.float64], low: int, high: int) -> NDArray[np.int64]:
-    """The nearest whole steps; what is no number is nothing to move to, and the gate has refused it before."""
+    """The nearest integer steps. Values are finite: the gate rejects NaN."""
     return np.clip(np.rint(values), low, high).astype(np.int64)
 
 
 def on_change(before: LifecycleState, now: LifecycleState) -> list[Frame]:
-    """What all modules are told when the robot's lifecycle changes; it may have passed through states between."""
+    """Frames to all modules when the robot's lifecycle changes; it may have passed through states in between."""
     if now == before:
         return []
     if now == "estop":
@@ -78,7 +78,7 @@ def on_change(before: LifecycleState, now: LifecycleState) -> list[Frame]:
 
 
 def reminder(lifecycle: LifecycleState, state: ModuleState, node: int) -> Frame | None:
-    """What a module is told that does not stand where it should: a frame may have been lost."""
+    """The frame to repeat to a module in an unexpected state, because one may have been lost."""
     match lifecycle, state:
         case "armed", ModuleState.DISARMED:
             return command(Action.ARM, node)
@@ -100,17 +100,17 @@ def command(action: Action, node: int = BROADCAST) -> Frame:
 
 
 def question(node: int) -> Frame:
-    """Asks a module for something that never changes: its answer comes after all that it had to say before."""
+    """A request for a constant value: its answer comes after all earlier frames of the module."""
     return codec()[Opcode.PARAMETER_REQUEST].frame(node, index=Parameter.TAIL, operation=Operation.READ, value=0.0)
 
 
 def emergency() -> Frame:
-    """Motors off, at once, everywhere."""
+    """Motors off at once, on all modules."""
     return codec()[Opcode.EMERGENCY].frame(BROADCAST, reason=EmergencyReason.HOST)
 
 
 def sync(count: int, time_us: int) -> Frame:
-    """Sample and enact, now."""
+    """All modules sample and enact now."""
     return _sync_writer()(BROADCAST, (count & 0xFF, time_us & 0xFFFFFFFF))
 
 

@@ -1,7 +1,7 @@
 """The bus protocol of the joint modules, version 1: ids, states, actions and parameters.
 
-Layouts and scales stand in `schemas/can/snakesim.dbc` and nowhere else; the numbers here are held against its value
-tables by the tests. `docs/can-protocol.md` explains it all.
+Layouts and scales are only in `schemas/can/snakesim.dbc`; tests compare the numbers here with its value
+tables. The specification is `docs/can-protocol.md`.
 """
 
 from binascii import crc_hqx
@@ -15,15 +15,15 @@ FIRST_NODE, LAST_NODE = 1, 62
 NODE_BITS = 6
 NODE_MASK = (1 << NODE_BITS) - 1
 COMMAND_KEY = 0x5AAE
-COUNTS = 16  # set-point and state counters go round in four bits
-MAX_LOST = 2  # set-points that may be missing before one; a count further ahead, or one of before, is a wrong one
-WRONG_COUNTS = 5  # in a row, and a module stops: its command stream is not one
+COUNTS = 16  # set-point and state counters have four bits
+MAX_LOST = 2  # set-points that may be missing before one; a count further ahead, or an earlier one, is wrong
+WRONG_COUNTS = 5  # in a row, after which a module stops
 HEARTBEAT_PERIOD_S = 0.1
 HEALTH_PERIOD_S = 0.5
 
 
 class Opcode(IntEnum):
-    """Upper five bits of an id; the lowest wins the bus."""
+    """Upper five bits of an id; the lowest wins arbitration."""
 
     EMERGENCY = 0
     COMMAND = 1
@@ -47,7 +47,7 @@ WITH_CHECKSUM = frozenset((Opcode.COMMAND, Opcode.SET_POINT, Opcode.JOINT_STATE)
 
 
 class ModuleState(IntEnum):
-    """Where a module stands. Only `ARMED` follows set-points; only `ARMED` and `STOPPING` drive the motor."""
+    """State of a module. Only `ARMED` follows set-points; only `ARMED` and `STOPPING` drive the motor."""
 
     BOOT = 0
     DISARMED = 1
@@ -58,7 +58,7 @@ class ModuleState(IntEnum):
 
 
 class Action(IntEnum):
-    """What a Command asks for."""
+    """Action of a Command."""
 
     ARM = 1
     DISARM = 2  # passive at once
@@ -69,7 +69,7 @@ class Action(IntEnum):
 
 
 class LastStop(IntEnum):
-    """Why a module left `ARMED` the last time."""
+    """Why a module last left `ARMED`."""
 
     NONE = 0
     DISARM = 1
@@ -96,7 +96,7 @@ class ModuleFault(IntEnum):
 
 
 class EmergencyReason(IntEnum):
-    """Who called an emergency."""
+    """Who sent an Emergency."""
 
     UNSPECIFIED = 0
     PERSON = 1
@@ -104,7 +104,7 @@ class EmergencyReason(IntEnum):
 
 
 class Operation(IntEnum):
-    """What a ParameterRequest asks for."""
+    """Operation of a ParameterRequest."""
 
     READ = 0
     WRITE = 1
@@ -112,7 +112,7 @@ class Operation(IntEnum):
 
 
 class Result(IntEnum):
-    """How a ParameterRequest went."""
+    """Result of a ParameterRequest."""
 
     DONE = 0
     UNKNOWN_INDEX = 1
@@ -123,7 +123,7 @@ class Result(IntEnum):
 
 
 class SafeMotion(IntEnum):
-    """Parameter `safe_action`: what `STOPPING` does."""
+    """Parameter `safe_action`: action in `STOPPING`."""
 
     PASSIVE = 0
     DAMP = 1
@@ -149,7 +149,7 @@ class Parameter(IntEnum):
 
 @dataclass(frozen=True)
 class ParameterRange:
-    """What a parameter may be, and its unit."""
+    """Range and unit of a parameter."""
 
     low: float
     high: float
@@ -182,22 +182,22 @@ class Frame(NamedTuple):
 
 
 def frame_id(opcode: Opcode, node: int) -> int:
-    """The id of a message to or from a node; node 0 is everybody."""
+    """The id of a message to or from a node; node 0 is broadcast."""
     return opcode << NODE_BITS | node
 
 
 def opcode_of(identifier: int) -> int:
-    """Which message an id stands for."""
+    """The opcode of an id."""
     return identifier >> NODE_BITS
 
 
 def node_of(identifier: int) -> int:
-    """Whom an id is from, or for."""
+    """The node of an id: sender or receiver."""
     return identifier & NODE_MASK
 
 
 def checksum(identifier: int, data: bytes) -> int:
-    """Low byte of CRC-16/XMODEM over `data`, begun with the id, so that no frame passes for another's."""
+    """Low byte of CRC-16/XMODEM over `data`, with the id as initial value, so that frames cannot be confused."""
     return crc_hqx(data, identifier) & 0xFF
 
 

@@ -1,6 +1,6 @@
-"""The DBC file with every message of every node spelled out.
+"""The DBC file with every message of every node.
 
-For tools that know no id mask: candump with cantools, SavvyCAN, Wireshark.
+For tools without an id mask: candump with cantools, SavvyCAN, Wireshark.
 """
 
 import copy
@@ -31,7 +31,7 @@ def expanded_dbc() -> str:
 
 
 def nodes_of(opcode: Opcode) -> Iterable[int]:
-    """Which nodes a message can be to or from."""
+    """The nodes that send or receive a message."""
     if opcode in TO_ALL:
         return [BROADCAST]
     each = list(range(FIRST_NODE, LAST_NODE + 1))

@@ -1,4 +1,4 @@
-"""The datagram by which a motion-capture system tells the base's pose; docs/can-protocol.md has it in full."""
+"""The datagram with the base's pose from a motion-capture system; specified in docs/hil.md."""
 
 import msgspec
 
@@ -6,7 +6,7 @@ from snakesim_hal.wire import quantities as q
 
 
 class MocapSample(msgspec.Struct, frozen=True, kw_only=True):
-    """One datagram: the base (tail end of link 0) in the world, and when it was there."""
+    """One datagram: pose of the base (tail end of link 0) in the world, and its capture time."""
 
     stamp_ns: q.Nanoseconds  # of the motion-capture system's own clock
     position_w: q.Vector

@@ -1,9 +1,9 @@
-"""What a bus of 1 Mbit/s makes of the frames that are sent over one that has no bit rate.
+"""Emulates the timing of a bus of 1 Mbit/s for frames on a bus without a bit rate.
 
-Every frame takes as long as it would with as many stuffed bits as there can be. A module's frames wait in its order;
-whenever the bus is free the lowest id among the first of all modules wins it. The host's frames are seen when they are
-there already: they take their time on the bus, but cannot be held back. A newer frame of a module takes the place of an
-unsent one with the same id, as in the one mailbox that firmware has for it, so that nothing piles up for ever.
+Every frame takes as long as with the maximum of stuff bits. A module's frames wait in its order;
+whenever the bus is free the lowest id among the first of all modules wins it. The host's frames are seen only after
+they have arrived: they take their time on the bus, but cannot be delayed. A newer frame of a module replaces an
+unsent one with the same id, as in a transmit mailbox of firmware, so that no queue grows for ever.
 """
 
 from dataclasses import dataclass
@@ -16,23 +16,23 @@ from snakesim_can_backend.protocol.definitions import NODE_BITS, Frame, Opcode
 OPCODES = 32
 US_PER_BIT = 1e6 / BIT_RATE
 FRAME_US = [worst_bits(length) * US_PER_BIT for length in range(9)]
-MAX_AHEAD_US = 20_000.0  # of frames that the host sends faster than any bus could take
+MAX_AHEAD_US = 20_000.0  # of frames that the host sends faster than any bus could carry
 IN_ORDER = frozenset((Opcode.PARAMETER_ANSWER,))  # each answers another question: none replaces another
 MAX_ANSWERS = 64
 
 
 @dataclass(frozen=True)
 class Traffic:
-    """What went over a bus until some moment, by opcode."""
+    """Traffic of a bus up to a point in time, by opcode."""
 
     now_us: float
     frames: tuple[int, ...]
     bits: tuple[float, ...]
-    replaced: int  # frames that a newer one overtook before the bus was free for them
+    replaced: int  # frames that were replaced by newer ones before the bus was free
     late_us: float  # the longest that a frame waited for the bus
 
     def load_since(self, before: "Traffic") -> float:
-        """Share of the bus's time that was taken."""
+        """Load of the bus, as a share of time."""
         took = self.now_us - before.now_us
         return (sum(self.bits) - sum(before.bits)) * US_PER_BIT / took if took > 0 else 0.0
 
@@ -52,7 +52,7 @@ class BusTime:
         self._replaced, self._late_us = 0, 0.0
 
     def heard(self, frame: Frame, now_us: float) -> None:
-        """A frame of the host is there."""
+        """A frame of the host has arrived."""
         self._proceed(now_us)
         took = FRAME_US[len(frame.data)]
         self._free_us = min(max(self._free_us, now_us) + took, now_us + MAX_AHEAD_US)
@@ -75,13 +75,13 @@ class BusTime:
             heappush(self._first, (frame.id, sender, slot))
 
     def released(self, now_us: float) -> list[Frame]:
-        """Frames whose last bit is through by now, in their order, each once."""
+        """Frames that are completely sent by now, in order, each once."""
         self._proceed(now_us)
         through, self._through = self._through, []
         return through
 
     def next_us(self) -> float:
-        """When the next frame will be through; inf when none waits."""
+        """When the next frame will be completely sent; inf when none waits."""
         if self._under_way is not None:
             return self._under_way[1]
         if not self._first:
@@ -90,11 +90,11 @@ class BusTime:
         return max(self._free_us, since) + FRAME_US[len(frame.data)]
 
     def count(self, frame: Frame) -> None:
-        """A frame that takes bus time which nobody waits for."""
+        """Add the bus time of a frame that is not delivered."""
         self._count(frame, FRAME_US[len(frame.data)])
 
     def babble(self, sender: int, frame: Frame | None, now_us: float) -> None:
-        """From now on a module sends a frame over and over, as often as the bus lets it; None ends that."""
+        """From now on a module repeats a frame, as often as the bus allows; None ends that."""
         self._proceed(now_us)
         if frame is None:
             self._endless.pop(sender, None)
@@ -103,11 +103,11 @@ class BusTime:
             self.offer(sender, frame, now_us)
 
     def traffic(self, now_us: float) -> Traffic:
-        """What went over the bus until now."""
+        """Traffic of the bus until now."""
         return Traffic(now_us, tuple(self._frames), tuple(self._bits), self._replaced, self._late_us)
 
     def _proceed(self, now_us: float) -> None:
-        """Let the bus run until now; a frame that would begin now waits for what else is offered now."""
+        """Run the bus until now; a frame that would begin now waits for others that are offered now."""
         while True:
             if self._under_way is not None:
                 frame, end_us = self._under_way
@@ -146,7 +146,7 @@ class BusTime:
 
 
 def by_opcode(before: Traffic, after: Traffic) -> list[tuple[Opcode, int, float]]:
-    """What went over between two moments: message, frames, share of the bus's time; only what was there."""
+    """Traffic between two points in time: message, frames, share of time; only messages that occurred."""
     took_us = max(after.now_us - before.now_us, 1.0)
     return [
         (opcode, frames, (after.bits[opcode] - before.bits[opcode]) * US_PER_BIT / took_us)

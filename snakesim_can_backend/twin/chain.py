@@ -1,9 +1,9 @@
-"""All modules of a robot, their motors and what those move, on one clock.
+"""All modules of a robot, their motors and the plant that they move, on one clock.
 
-    at a Sync: the plant is brought up to now, sensors are read, every module answers, then enacts its set-point
+    at a Sync: the plant is advanced to now, sensors are read, every module answers, then enacts its set-point
 
-With `stepped`, time passes only when a Sync's time is later than that of the one before, and frames go out at once: a
-host may think for as long as it likes, and every run is the same. Otherwise whoever serves the chain tells it the time.
+With `stepped`, time advances only when a Sync's time is later than that of the one before, and frames are sent at once:
+a host may compute for any time, and every run is the same. Otherwise the caller passes in the time.
 """
 
 from collections.abc import Callable
@@ -30,11 +30,13 @@ from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.thermal import HeatLimits, Thermal
 from snakesim_hal.wire.messages import Mode
 
-MAX_AT_ONCE_US = 200_000.0  # after a longer hiccup of this process, the modules have missed the rest of it
+MAX_AT_ONCE_US = 200_000.0  # after a longer delay of this process, the modules skip the rest of it
 HEAT_EVERY = 10  # steps
-ROUND_US = 1 << 32  # Sync times go round
-LONGEST_STEP_US = 60_000_000  # a Sync that is later by more is of another clock; no bus is cut for so long in lockstep
-NEW_HOST_US = 1_000_000  # a Sync that is so much earlier is no latecomer on another bus, but a host that began anew
+ROUND_US = 1 << 32  # Sync times wrap around
+LONGEST_STEP_US = (
+    60_000_000  # a Sync that is later by more is of another clock; no bus is cut for that long in lockstep
+)
+NEW_HOST_US = 1_000_000  # a Sync that is earlier by this much is of a restarted host, not a late one of another bus
 OTHER_SERIAL = 0x0D0B1E00
 
 
@@ -50,7 +52,7 @@ class ModuleChain:
         stepped: bool,
         send_pose: Callable[[bytes], None] | None = None,
     ) -> None:
-        """send_pose: is given a MocapSample as JSON after every Sync, before the joint states. Raises ConfigError."""
+        """send_pose: gets a MocapSample as JSON after every Sync, before the joint states. Raises ConfigError."""
         robot, self.stepped, self.plant = config.robot, stepped, plant
         self.count = robot.chain.modules
         self.counts = shares(config, settings)  # modules on each bus
@@ -59,9 +61,9 @@ class ModuleChain:
         self.thermal = Thermal(self.count, robot.limits.torque_nm, self._heat_limits)
         self.buses = [BusTime() for _ in self.counts]
         self.now_us = 0.0  # module time: since the twins were started
-        self.skipped_us = 0.0  # what this process slept through
+        self.skipped_us = 0.0  # time in which this process did not run
         self.refused = 0  # frames that no host sends
-        self.happened: list[str] = []  # faults on request, as they began and ended
+        self.happened: list[str] = []  # injected faults, each begin and end
         self._plan = Plan(parse(text, self.count) for text in settings.faults)
         self._flash = from_factory(robot.limits.torque_nm, robot.limits.speed_rad_s)
         self._step_us, self._steps, self._due_us = plant.step_s * 1e6, 0, 0.0
@@ -83,13 +85,13 @@ class ModuleChain:
             self._camera = PoseCamera(robot.sensors.pose, plant, (config.seed, len(self.counts)), config.period_ns)
         self._encode = msgspec.json.Encoder().encode
         self._out: list[list[Frame]] = [[] for _ in self.counts]
-        self._babblers: dict[ModuleSlot, float] = {}  # in stepped time: until when they have spoken
+        self._babblers: dict[ModuleSlot, float] = {}  # in stepped time: until when they have sent
         self._poll(0.0)
 
     # --- time ----------------------------------------------------------------------------------------------
 
     def advance_to(self, clock_us: float) -> None:
-        """Bring everything up to a time since the start. Not for stepped chains, whose time passes at Syncs."""
+        """Advance everything to a time since the start. Not for stepped chains, whose time advances at Syncs."""
         now_us = clock_us - self.skipped_us
         if now_us - self.now_us > MAX_AT_ONCE_US:
             self.skipped_us += now_us - self.now_us - MAX_AT_ONCE_US
@@ -98,7 +100,7 @@ class ModuleChain:
             self._pass(now_us, int(now_us / self._step_us) - self._steps)
 
     def next_us(self) -> float:
-        """Module time at which a frame is through or a module wants to do something; inf for a stepped chain."""
+        """Module time at which a frame is sent or a module is due; inf for a stepped chain."""
         if self.stepped:
             return inf
         return min(self._due_us, *(bus.next_us() for bus in self.buses))
@@ -129,7 +131,7 @@ class ModuleChain:
             self.motors.derate(share_left)
 
     def _poll(self, now_us: float) -> None:
-        """Everything that time brings, but the physics."""
+        """Everything that depends on time, except physics."""
         for change in self._plan.until(now_us / 1e6):
             self._go_wrong(change, now_us)
         speeds, torques = self.plant.velocity_rad_s.tolist(), self.motors.torque_nm.tolist()
@@ -146,12 +148,14 @@ class ModuleChain:
             self._babblers[slot] = since_us + burst * FRAME_US[8]
         self._due_us = now_us if self._babblers else due_us
 
-    # --- what comes from the bus ---------------------------------------------------------------------------
+    # --- frames from the bus -------------------------------------------------------------------------------
 
     def hear(self, channel: int, frame: Frame) -> None:
-        """A frame of the host is there now."""
+        """A frame of the host has arrived."""
         opcode, node = opcode_of(frame.id), node_of(frame.id)
-        wrong_length = opcode != Opcode.EMERGENCY and len(frame.data) != LENGTHS.get(opcode)  # a stop is a stop
+        wrong_length = opcode != Opcode.EMERGENCY and len(frame.data) != LENGTHS.get(
+            opcode
+        )  # which is valid at any length
         if opcode not in FROM_HOST or wrong_length:
             self.refused += 1
             return
@@ -176,7 +180,7 @@ class ModuleChain:
                 self._poll(self.now_us)
 
     def take(self, channel: int) -> list[Frame]:
-        """Frames that are on the bus by now, in the order in which they won it, each once."""
+        """Frames that are on the bus by now, in the order of arbitration, each once."""
         if not self.stepped:
             return self.buses[channel].released(self.now_us)
         frames, self._out[channel] = self._out[channel], []
@@ -185,7 +189,7 @@ class ModuleChain:
         return frames
 
     def traffic(self) -> list[Traffic]:
-        """What went over each bus until now."""
+        """Traffic of each bus until now."""
         return [bus.traffic(self.now_us) for bus in self.buses]
 
     def _sync(self, channel: int, frame: Frame) -> None:
@@ -210,10 +214,10 @@ class ModuleChain:
                 slot.module.sync(count, sights[slot.joint - first])
                 self._follow_up(slot)
         out = self._out[channel]
-        out[sent:] = sorted(out[sent:], key=lambda frame: frame.id)  # as they would win the bus
+        out[sent:] = sorted(out[sent:], key=lambda frame: frame.id)  # in the order of arbitration
 
     def _step_to(self, sync_time: int) -> None:
-        """Let the time from the latest Sync to this one pass. The first sets zero, as does one of another clock."""
+        """Advance by the time from the latest Sync to this one. The first sets zero, as does one of another clock."""
         later_us = 0 if self._sync_time is None else (sync_time - self._sync_time) % ROUND_US
         if 0 < later_us <= LONGEST_STEP_US:
             until_us = self.now_us + later_us
@@ -231,7 +235,7 @@ class ModuleChain:
     # --- what goes out -------------------------------------------------------------------------------------
 
     def _follow_up(self, slot: ModuleSlot) -> None:
-        """Send what a module has to say, and do with its motor what it wants."""
+        """Send a module's frames, and apply its demand to its motor."""
         for frame in slot.outgoing():
             if self.stepped:
                 self._out[slot.channel].append(frame)
@@ -253,10 +257,10 @@ class ModuleChain:
             values[Parameter.SPEED_LIMIT],
         )
 
-    # --- faults on request ---------------------------------------------------------------------------------
+    # --- injected faults -----------------------------------------------------------------------------------
 
     def inject(self, fault: Injection, *, begins: bool = True) -> None:
-        """Let something go wrong now, or end."""
+        """Begin or end a fault now."""
         self._go_wrong(Change(self.now_us / 1e6, fault, begins), self.now_us)
         self._poll(self.now_us)
 

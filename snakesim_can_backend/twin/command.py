@@ -28,7 +28,7 @@ DEFAULT_CHANNEL = "vcan0"
 DEFAULT_POSE, NO_POSE = "127.0.0.1:7450", "none"
 VIRTUAL = "vcan"
 STATS_EVERY_S = 1.0
-LONGEST_PAUSE_S = 0.5  # until a stop signal is looked at
+LONGEST_PAUSE_S = 0.5  # until a stop signal is checked
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -48,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def parser() -> argparse.ArgumentParser:
-    """What the command takes."""
+    """The command's arguments."""
     parser = argparse.ArgumentParser(
         prog="snakesim modules",
         description=__doc__,
@@ -58,18 +58,18 @@ def parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("scenario", help="name of a shipped scenario, or path of a scenario file or a run's config.json")
     add("--channel", action="append", metavar="vcan0", help="interface; repeat for several buses, tail to head")
-    add("--plant", help="what the motors move: mujoco, inertia, or ./file.py:Class")
+    add("--plant", help="body that the motors move: mujoco, inertia, or ./file.py:Class")
     add("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change any value; may be repeated")
-    add("--fault", action="append", default=[], metavar="KIND:JOINT@START[-END]", help="what goes wrong, and when")
+    add("--fault", action="append", default=[], metavar="KIND:JOINT@START[-END]", help="inject a fault, at this time")
     add("--interactive", action="store_true", help="read `KIND joint_N` and `KIND joint_N off` from the terminal")
-    add("--stepped", action="store_true", help="let time pass only from Sync to Sync, for a host in lockstep")
+    add("--stepped", action="store_true", help="advance time only from Sync to Sync, for a host in lockstep")
     add(
         "--pose",
         default=DEFAULT_POSE,
         metavar="HOST:PORT",
         help=f"where to send poses, or none (default: {DEFAULT_POSE})",
     )
-    add("--duration", type=float, metavar="S", help="end after so many seconds")
+    add("--duration", type=float, metavar="S", help="end after this many seconds")
     add("--seed", type=int, help="of the sensors' noise and the serial numbers")
     add("--stats", action="store_true", help="print the load of every bus once a second")
     add("--on-real-bus", action="store_true", help="allow interfaces that are not called vcan...")
@@ -146,7 +146,7 @@ class Loop:
         self._start_s = time.monotonic()
 
     def stop(self) -> None:
-        """End after this round."""
+        """End after this cycle."""
         self._running = False
 
     def run(self) -> None:
@@ -169,7 +169,7 @@ class Loop:
                 self._late_s = max(self._late_s, time.monotonic() - now_s - asked_s)
 
     def summary(self) -> list[str]:
-        """What went over the buses, and how well time was kept."""
+        """Traffic of the buses, and timing accuracy."""
         seconds = time.monotonic() - self._start_s
         lines = [f"{seconds:.1f} s; latest wake-up {1e3 * self._late_s:.1f} ms after its time"]
         for wire, before, after in zip(self._server.wires, self._start, self._chain.traffic(), strict=True):
@@ -180,9 +180,9 @@ class Loop:
             )
             lines += [f"  {op.name.lower():<18}{n:8d} frames {share:7.2%}" for op, n, share in by_opcode(before, after)]
         if self._server.unsent:
-            lines.append(f"{self._server.unsent} frames were not taken by their interface")
+            lines.append(f"{self._server.unsent} frames were not accepted by their interface")
         if self._chain.skipped_us:
-            lines.append(f"{self._chain.skipped_us / 1e3:.0f} ms slept through: this computer was too busy")
+            lines.append(f"{self._chain.skipped_us / 1e3:.0f} ms skipped: this computer was too busy")
         return lines + [f"fault: {text}" for text in self._chain.happened]
 
     def _show(self, before: list[Traffic], now_s: float) -> list[Traffic]:

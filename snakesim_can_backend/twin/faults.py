@@ -1,7 +1,7 @@
-"""What can go wrong with a module twin on request: those faults of a joint that a module can have.
+"""Injected faults of a module twin: those faults of a joint that a module can have.
 
-The words are those of `model.injection` in the HAL, with times since the twins were started: `mute:joint_3@2.0-3.5` is
-a module that says nothing for 1.5 s. In a terminal it is `mute joint_3`, and later `mute joint_3 off`.
+The vocabulary is that of `model.injection` in the HAL, with times since the twins were started: `mute:joint_3@2.0-3.5`
+is a module that sends nothing for 1.5 s. In a terminal it is `mute joint_3`, and later `mute joint_3 off`.
 """
 
 import re
@@ -11,10 +11,10 @@ from snakesim_hal.errors import ConfigError
 from snakesim_hal.model import injection
 from snakesim_hal.model.injection import KINDS, Injection
 
-NOT_A_MODULES = ("wrong", "nan")  # a module cannot know that its angle is off; the host makes these
+NOT_A_MODULES = ("wrong", "nan")  # a module cannot know that its angle is off; the host applies these
 ABOUT: Mapping[str, str] = {
     **{name: kind.about for name, kind in KINDS["joint"].items() if name not in NOT_A_MODULES},
-    "mute": "sends nothing; still hears, and follows",
+    "mute": "sends nothing; still receives, and follows",
     "freeze": "its main loop hangs: repeats its last joint state, no heartbeat; passive after the watchdog's time",
     "duplicate": "a second module with the same node id and another serial is on the bus",
 }
@@ -44,10 +44,10 @@ def typed(fault: Injection, *, begins: bool) -> str:
 
 
 def checked(fault: Injection, joints: int) -> Injection:
-    """The same, when the modules of a robot can have it. Raises ConfigError."""
+    """The same fault, if modules of a robot support it. Raises ConfigError."""
     if fault.target_type != "joint" or fault.kind not in ABOUT:
         raise ConfigError(
-            f"fault {str(fault)!r}: modules know {', '.join(ABOUT)}, as {FORM}; what else there is goes into the "
+            f"fault {str(fault)!r}: modules support {', '.join(ABOUT)}, as {FORM}; put other kinds into the "
             f"scenario's `faults`"
         )
     injection.check_targets([fault], services=(), joints=joints, buses=0)

@@ -5,7 +5,7 @@
                +-- clear -- FAULT <-+          EMERGENCY from everywhere, left by clear only
 
 Only ARMED and STOPPING drive the motor. Only a valid set-point feeds the watchdog. Times are microseconds on one clock,
-passed in; nothing here waits. `frames` collects what is to be sent; whoever runs the module empties it.
+passed in; nothing here waits. `frames` collects frames to send; the caller empties it.
 """
 
 from collections.abc import Callable
@@ -60,7 +60,7 @@ STOP_OF_FAULT = {fault: LastStop[fault.name] for fault in ModuleFault}
 
 
 class Demand(NamedTuple):
-    """What the motor is to do."""
+    """Set-point of the motor."""
 
     mode: Mode
     target: float  # rad, rad/s or N·m, as the mode says
@@ -83,11 +83,11 @@ class Module:
         stepped: bool = False,
         now_us: float = 0.0,
     ) -> None:
-        """heat: where its winding stops it, and below which it must have cooled before a clear helps."""
+        """heat: temperature of its winding that stops it, and below which a clear is possible again."""
         self.node, self.serial, self.parameters, self.heat = node, serial, parameters, heat
         self.frames: list[Frame] = []
         self.inside = ModuleHealth()
-        self.hangs = False  # its main loop stands still; only hardware still works
+        self.hangs = False  # its main loop hangs; only hardware still works
         self.refused = 0  # frames with a wrong checksum, count or length
         self._stepped = stepped
         self._last_joint_state: Frame | None = None
@@ -102,7 +102,7 @@ class Module:
         self._forget(now_us)
         self.last_stop = LastStop.NONE
 
-    # --- what comes from the bus ---------------------------------------------------------------------------
+    # --- frames from the bus -------------------------------------------------------------------------------
 
     def hear(self, frame: Frame, now_us: float) -> None:
         """An Emergency, Command or ParameterRequest for this node or, the first two, for all."""
@@ -142,19 +142,19 @@ class Module:
         if mode > Mode.TORQUE:
             self.refused += 1
             return
-        if self._synced:  # a host that sends no Sync any more would keep an old demand alive for ever
+        if self._synced:  # otherwise a host without Syncs would keep an old demand active for ever
             self._fed_us, self._synced = now_us, False
-        target = number * STEPS[mode]  # position, velocity and torque stand in the same place
+        target = number * STEPS[mode]  # position, velocity and torque share their bits
         if mode == Mode.POSITION:
             target = self._within(target)
         self._pending = Demand(MODES[mode], target, limit * LIMIT_STEP)
 
     def sync(self, count: int, sight: Readings) -> None:
-        """Answer a Sync with what the sensors gave at that instant, then enact the newest set-point."""
+        """Answer a Sync with the sensor readings of that instant, then enact the newest set-point."""
         if self.state == ModuleState.BOOT:
             return
         if self.hangs:
-            if self._last_joint_state is not None:  # a mailbox of the CAN controller that nobody refills
+            if self._last_joint_state is not None:  # a transmit mailbox that is no longer refilled
                 self.frames.append(self._last_joint_state)
             return
         values = self.parameters.values
@@ -178,10 +178,10 @@ class Module:
         every = int(self.parameters.values[Parameter.IMU_EVERY])
         return every > 0 and (self._syncs + self.node) % every == 0
 
-    # --- what time brings ----------------------------------------------------------------------------------
+    # --- time ----------------------------------------------------------------------------------------------
 
     def poll(self, now_us: float) -> float:
-        """Do what is due, by `inside` as it is now; returns when there is something to do again."""
+        """Do what is due, with the present `inside`; returns the next due time."""
         if self.hangs:
             return self._poll_hanging(now_us)
         if self.state == ModuleState.BOOT:
@@ -207,11 +207,11 @@ class Module:
 
     @property
     def watchdog_us(self) -> float:
-        """How long a module lives on one set-point."""
+        """How long a module acts on one set-point."""
         return self.parameters.values[Parameter.WATCHDOG] * 1e6
 
     def reboot(self, now_us: float) -> None:
-        """Forget everything unsaved, and start again."""
+        """Reset everything that is not saved, and restart."""
         driven = self.state in (ModuleState.ARMED, ModuleState.STOPPING)
         self.parameters.restart()
         self._forget(now_us)
@@ -231,7 +231,7 @@ class Module:
         self._synced = True  # since the set-point that last fed the watchdog
 
     def _enter(self, state: ModuleState, now_us: float, why: LastStop | None = None, demand: Demand = PASSIVE) -> None:
-        """Change state, and drop what was demanded; why: said of a module that was ARMED."""
+        """Change state, and drop the demand; why: reported for a module that was ARMED."""
         if self.state == ModuleState.ARMED and why is not None:
             self.last_stop = why
         self.state = state
@@ -275,7 +275,7 @@ class Module:
             self._enter(ModuleState.FAULT, now_us, STOP_OF_FAULT[fault])
 
     def _conditions(self) -> int:
-        """Bits of the faults whose cause is there now. A winding that overheated must cool well below that."""
+        """Bits of the faults whose cause is present. A winding that overheated must cool well below that."""
         inside = self.inside
         hot = self.heat.derate_from_c if self.faults >> ModuleFault.OVERHEAT & 1 else self.heat.stop_at_c
         return (
@@ -309,7 +309,7 @@ class Module:
     # --- reports -------------------------------------------------------------------------------------------
 
     def heartbeat(self, now_us: float) -> Frame:
-        """The heartbeat of this moment."""
+        """The present heartbeat."""
         uptime_ms = round(now_us - self._booted_us) // 1000
         faults = [self.faults >> fault & 1 for fault in ModuleFault]
         state = (self.state, self.demand.mode, self.last_stop, *faults, uptime_ms)

@@ -1,4 +1,4 @@
-"""The frames that a module reads and writes, as functions of raw numbers."""
+"""Readers and writers of a module's frames, as functions of raw numbers."""
 
 from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.definitions import ModuleFault, Opcode

@@ -1,6 +1,6 @@
-"""A plant without a world: every joint turns an inertia of its own. For tests of the bus, where physics is a burden.
+"""A plant without a world: every joint turns an inertia of its own. For tests of the bus without physics.
 
-It does *not* simulate: gravity, ground, obstacles, what one joint does to the next.
+It does *not* simulate gravity, ground, obstacles, or coupling between joints.
 """
 
 from typing import Annotated
@@ -22,10 +22,10 @@ LEAST_INERTIA_KG_M2 = 1e-6
 
 
 class InertiaSettings(FileStruct, frozen=True, kw_only=True):
-    """How time is cut, and what stands for gears and ground."""
+    """Time step, and friction of gears and ground."""
 
     timestep_s: Annotated[float, Meta(ge=1e-5, le=0.01, extra_json_schema={"unit": "s"})] = 0.001
-    # Dry friction of every joint, beside the robot file's: without it a joint that is let go turns for ever.
+    # Dry friction of every joint, in addition to the robot file's: without it a released joint would turn for ever.
     drag_nm: Annotated[float, from_zero(100, "N·m")] = 0.1
 
 
@@ -35,7 +35,7 @@ class InertiaPlant:
     Settings = InertiaSettings
 
     def __init__(self, config: RunConfig, settings: InertiaSettings) -> None:
-        """At the run's start pose, at rest. The step is shortened so that a whole number makes a control period."""
+        """At the run's start pose, at rest. The step is shortened so that a control period is a multiple of it."""
         robot, motor = config.robot, config.robot.motor
         period_s = config.period_ns * 1e-9
         self.step_s = period_s / max(int(np.ceil(period_s / settings.timestep_s - 1e-9)), 1)
@@ -51,7 +51,7 @@ class InertiaPlant:
         self._change = np.zeros(len(self._angle))
 
     def advance(self, torque_nm: Floats) -> None:
-        """One step, semi-implicit; dry friction never turns a joint round, and end stops take all its motion."""
+        """One step, semi-implicit; dry friction never reverses a joint, and end stops absorb all its motion."""
         angle, velocity, change = self._angle, self._velocity, self._change
         self._torque[:] = torque_nm
         np.multiply(torque_nm, self._speed_per_nm, out=change)
@@ -75,11 +75,11 @@ class InertiaPlant:
         return self._velocity
 
     def shaft_torque_nm(self) -> Floats:
-        """The motors' torques of the last step, as if rotors weighed nothing, (n_joints,)."""
+        """The motors' torques of the last step, as for rotors without inertia, (n_joints,)."""
         return self._torque
 
     def loads(self) -> list[LinkLoad]:
-        """Nothing is there to touch."""
+        """No world, no contacts."""
         return []
 
     def imu(self) -> Imu | None:
@@ -92,7 +92,7 @@ class InertiaPlant:
 
     def _stop(self) -> None:
         if not np.isfinite(self._angle).all():
-            raise BackendError("inertia plant: a joint angle is no number; a torque was none")
+            raise BackendError("inertia plant: a joint angle is NaN or infinite, because a torque was")
         beyond = np.abs(self._angle) > self._most
         outward = beyond & (self._velocity * self._angle > 0)
         self._velocity[outward] = 0.0

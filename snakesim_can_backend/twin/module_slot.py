@@ -1,4 +1,4 @@
-"""A module's place on a bus, and what goes wrong there on request."""
+"""A module's place on a bus, and its injected faults."""
 
 from dataclasses import dataclass
 
@@ -13,24 +13,24 @@ SAGGED_V = MIN_VOLTAGE_V - 6.0
 class ModuleSlot:
     """One module, the joint it moves, and the bus it is on."""
 
-    sender: int  # its place in the bus's queue
+    sender: int  # its index in the bus's queue
     channel: int
     joint: int  # 0 at the tail
     module: Module
     drives: bool = True  # False: it has no motor of its own; a duplicate
-    driven: Demand | None = None  # what its motor was last told
+    driven: Demand | None = None  # the last demand applied to its motor
     mute: bool = False
     wrong_count: bool = False
     wrong_checksum: bool = False
 
     def begin(self, kind: str, now_us: float) -> None:
-        """Something goes wrong with this module alone."""
+        """Begin a fault of this module."""
         self._set(kind, True)
         if kind == "reboot":
             self.module.reboot(now_us)
 
     def end(self, kind: str) -> None:
-        """It is over."""
+        """End it."""
         self._set(kind, False)
 
     def _set(self, kind: str, wrong: bool) -> None:
@@ -51,14 +51,14 @@ class ModuleSlot:
                 pass
 
     def feel(self, speed_rad_s: float, torque_nm: float, rated_nm: float, winding_c: float) -> None:
-        """Bring what it measures inside itself up to date."""
+        """Update its internal measurements."""
         inside = self.module.inside
         inside.speed_rad_s, inside.winding_c = speed_rad_s, winding_c
         inside.board_c = board_c(winding_c)
         inside.current_a = current_a(torque_nm, speed_rad_s, rated_nm, inside.voltage_v)
 
     def outgoing(self) -> list[Frame]:
-        """What the module has to send, as it goes out; each frame once."""
+        """The module's frames to send, with faults applied; each frame once."""
         frames = self.module.frames
         if not frames:
             return frames

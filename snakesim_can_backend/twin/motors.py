@@ -3,12 +3,12 @@
 At every step of the plant
 
     demand = kp (position - angle) + kd (velocity - speed) + feed-forward       the mode chooses the gains
-    demand is held below the line that falls from some times full torque at rest to 0 at the limit of speed
+    demand is limited by the line that falls from a multiple of full torque at rest to 0 at the speed limit
     torque follows the demand as a first-order lag of `response_time_s`, integrated exactly
-    torque is clipped to the least of the set-point's limit, the parameter's, and what heat leaves of rated torque
+    torque is clipped to the smallest of the set-point's limit, the parameter's, and the derated rated torque
 
-The torque is the motor's state, and a change of mode or limit moves the demand alone, so torque never jumps. Torque is
-brought up to date before the joint moves under it, which keeps explicit steps stable far beyond 1 ms.
+The torque is the motor's state, and a change of mode or limit changes only the demand, so torque never jumps. Torque is
+updated before the joint moves under it, which keeps explicit steps stable far beyond 1 ms.
 """
 
 import math
@@ -24,7 +24,7 @@ Floats = NDArray[np.float64]
 
 
 class Motors:
-    """What the power stages of all modules do. All passive at first."""
+    """The power stages of all modules. All passive at first."""
 
     def __init__(self, robot: RobotFile, step_s: float) -> None:
         count = robot.chain.modules
@@ -47,7 +47,7 @@ class Motors:
     def drive(
         self, i: int, mode: Mode, target: float, limit_nm: float, gain: float, damping: float, speed: float
     ) -> None:
-        """From now on motor i does this.
+        """Set the demand of motor i.
 
         target: rad, rad/s or N·m as the mode says; gain, damping: kp and kd of the mode; speed: the limit, rad/s.
         """
@@ -63,12 +63,12 @@ class Motors:
         self._limit[i] = min(self._asked_limit[i], self._own_limit[i])
 
     def derate(self, share_left: Floats) -> None:
-        """Heat leaves this share of rated torque, (n_joints,), from 0 to 1; what is asked for below that is given."""
+        """Limit torque to this share of rated torque, (n_joints,), from 0 to 1; lower demands are not reduced."""
         np.multiply(self.rated_nm, share_left, out=self._own_limit)
         np.minimum(self._asked_limit, self._own_limit, out=self._limit)
 
     def derated(self) -> NDArray[np.bool_]:
-        """Whether heat holds a torque below what is asked for, (n_joints,)."""
+        """Whether derating limits a torque below the demand, (n_joints,)."""
         return np.minimum(np.abs(self._demand), self._asked_limit) > self._limit
 
     def step(self, angle_rad: Floats, speed_rad_s: Floats) -> Floats:
@@ -88,7 +88,7 @@ class Motors:
         np.maximum(demand, spare, out=demand)
         np.abs(torque, out=cap)
         cap *= self._decay
-        np.maximum(cap, self._limit, out=cap)  # a lowered limit takes hold no faster than the motor can follow
+        np.maximum(cap, self._limit, out=cap)  # a lowered limit takes effect no faster than the motor can follow
         torque -= demand
         torque *= self._decay
         torque += demand

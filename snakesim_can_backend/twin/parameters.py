@@ -1,4 +1,4 @@
-"""A module's parameters: what is in force, and what its flash keeps over a restart."""
+"""A module's parameters: present values, and those in its flash, which survive a restart."""
 
 import math
 from struct import Struct
@@ -20,7 +20,7 @@ _single = Struct("<f")
 
 
 def from_factory(rated_torque_nm: float, rated_speed_rad_s: float) -> dict[Parameter, float]:
-    """What is in a new module's flash. Gains are 0: a module that nobody has told its robot's gains holds nothing."""
+    """The flash of a new module. Gains are 0: a module that has not been configured holds nothing."""
     torque = min(rated_torque_nm, PARAMETERS[Parameter.RATED_TORQUE].high)
     speed = min(rated_speed_rad_s, PARAMETERS[Parameter.RATED_SPEED].high)
     return {
@@ -41,18 +41,18 @@ def from_factory(rated_torque_nm: float, rated_speed_rad_s: float) -> dict[Param
 
 
 class Parameters:
-    """Reads, writes and saves; writing takes effect at once and is forgotten at a restart unless saved."""
+    """Reads, writes and saves; a write takes effect at once and is lost at a restart unless saved."""
 
     def __init__(self, flash: dict[Parameter, float]) -> None:
         self._flash = dict(flash)
         self.values = dict(flash)
 
     def restart(self) -> None:
-        """Only what was saved is left."""
+        """Reload the saved values."""
         self.values = dict(self._flash)
 
     def answer(self, node: int, data: bytes, armed: bool) -> Frame:
-        """Do what a ParameterRequest asks, and the frame that says how it went."""
+        """Carry out a ParameterRequest; returns the ParameterAnswer."""
         index, operation, raw = _read_request(data)
         parameter = _known(index)
         result = Result.UNKNOWN_INDEX if parameter is None else self._do(parameter, operation, raw, armed)
@@ -80,7 +80,7 @@ class Parameters:
 
 
 def within(allowed: ParameterRange, value: float) -> float | None:
-    """The value if it is in range, None if not. On the bus bounds are single precision, a little off: 0.1 is more."""
+    """The value if it is in range, None if not. On the bus bounds are single precision: 0.1 becomes slightly more."""
     if not math.isfinite(value):
         return None
     slack = 1e-6 * max(abs(allowed.low), abs(allowed.high))

@@ -1,4 +1,4 @@
-"""What a module says, as frames: numbers rounded to the steps of the bus, and held at the end of their range."""
+"""A module's reports as frames: numbers rounded to the steps of the bus, and clamped to their range."""
 
 import math
 from collections.abc import Sequence
@@ -16,14 +16,14 @@ UNTOUCHED = (0, 0, 0, 0, 0, 0)
 
 
 class Rounder:
-    """Raw numbers of one or more signals with the same layout but for their place."""
+    """Raw numbers of one or more signals with the same layout except for their place."""
 
     def __init__(self, signal: Signal) -> None:
         self._offset, self._per_unit = signal.offset, 1.0 / signal.scale
         self._low, self._high = (round((end - signal.offset) / signal.scale) for end in (signal.low, signal.high))
 
     def one(self, value: float) -> int:
-        """The nearest step; what is no number becomes 0."""
+        """The nearest step; NaN becomes 0."""
         if math.isnan(value):
             return 0
         return int(
@@ -38,7 +38,7 @@ class Rounder:
 
 @dataclass(slots=True)
 class Readings:
-    """What one module's sensors give at a Sync, in raw numbers."""
+    """One module's sensor readings at a Sync, in raw numbers."""
 
     angle: int
     velocity: int
@@ -53,7 +53,7 @@ class Readings:
 
 @dataclass(slots=True)
 class ModuleHealth:
-    """What a module measures inside itself."""
+    """A module's internal measurements."""
 
     speed_rad_s: float = 0.0
     winding_c: float = 20.0
@@ -64,7 +64,7 @@ class ModuleHealth:
 
 
 def touch(load: LinkLoad) -> tuple[int, int, int, int, int, int]:
-    """The raw numbers of a Contact. A bearing goes round: what is half a turn to one side is so to the other."""
+    """The raw numbers of a Contact. A bearing wraps around: half a turn to either side is the same."""
     x, y, z = load.position_l
     fx, fy, fz = load.force_l
     return FORCE.one(fx), FORCE.one(fy), FORCE.one(fz), ALONG.one(x), round(math.atan2(z, y) / BEARING_STEP), 1

@@ -1,7 +1,7 @@
-"""What the sensors of modules give at a Sync: the plant as it is, with the noise and threshold of the robot file.
+"""Sensor readings of modules at a Sync: the plant's state, with the noise and threshold of the robot file.
 
-Rates are what the host asks of the modules, and the bus is the delay: those of the robot file mean nothing here, but
-for the delay of motion capture.
+The host sets the rates of the modules, and the bus is the delay: rates and delays of the robot file are not used here,
+except for the delay of motion capture.
 """
 
 import math
@@ -30,7 +30,7 @@ Floats = NDArray[np.float64]
 
 
 class Senses:
-    """Sensors of neighbouring modules on one bus, with a source of noise of their own."""
+    """Sensors of neighbouring modules on one bus, with a noise generator of their own."""
 
     def __init__(self, robot: RobotFile, plant: Plant, first: int, count: int, seed: Sequence[int]) -> None:
         """first: index of their first joint, 0 at the tail."""
@@ -44,7 +44,7 @@ class Senses:
         self._torque_sigma = joints.torque_noise_nm
 
     def look(self, torque_nm: Floats, derated: NDArray[np.bool_], imu_due: Sequence[bool]) -> list[Readings]:
-        """What every module sees now; torque and derating are those of all motors of the chain."""
+        """The readings of every module now; torque and derating are those of all motors of the chain."""
         here = slice(self._first, self._first + self._count)
         joints = np.stack((self._plant.angle_rad[here], self._plant.velocity_rad_s[here], torque_nm[here]))
         if self._noisy:
@@ -108,7 +108,7 @@ class PoseCamera:
         self._sigma = np.repeat([sensor.position_noise_m, 0.5 * sensor.angle_noise_rad], 3)  # quaternions halve angles
 
     def look(self, stamp_ns: int) -> MocapSample | None:
-        """What arrives at this Sync: the base as it was before the delay; None before that, or without a world.
+        """The sample that arrives at this Sync: the base's pose before the delay; None at first, or without a world.
 
         Velocities carry no noise of their own.
         """

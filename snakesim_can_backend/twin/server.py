@@ -1,4 +1,4 @@
-"""Serves a chain of module twins on its buses: frames in, frames out, and the time for what runs by the clock.
+"""Serves a chain of module twins on its buses: frames in, frames out, and time for chains that run by the clock.
 
 server = TwinServer(wires, chain)
 while ...:
@@ -22,8 +22,8 @@ from snakesim_hal.model.plant import Plant
 from snakesim_hal.model.plugins import PLANTS, find_plugin, plugin_settings
 from snakesim_hal.model.scenario import RunConfig
 
-IN_STEP_US = 2000.0  # the plant is kept this near to now, so that a Sync finds little left to do
-FINEST_US = 200.0  # frames are let through in groups of this length, to wake up less often
+IN_STEP_US = 2000.0  # the plant lags now by at most this, so that a Sync needs little computing
+FINEST_US = 200.0  # frames are released in groups of this length, for fewer wake-ups
 
 
 class TwinServer:
@@ -33,11 +33,11 @@ class TwinServer:
         if len(wires) != len(chain.counts):
             raise ConfigError(f"{len(wires)} channels for modules on {len(chain.counts)} buses")
         self.wires, self.chain = wires, chain
-        self.unsent = 0  # frames that an interface did not take
+        self.unsent = 0  # frames that an interface did not accept
         self._start_ns: int | None = None
 
     def run_due(self, now_ns: int) -> float | None:
-        """Handle every frame that is there, send what is due; seconds until it wants to run again. None: never."""
+        """Handle received frames, send due ones; seconds until the next run is due. None: never."""
         arrived = [wire.receive() for wire in self.wires]
         if self.chain.stepped:
             for channel, frames in enumerate(arrived):
@@ -59,10 +59,10 @@ class TwinServer:
             self.chain.hear(channel, frame)
 
     def _hear_in_time(self, arrived: Sequence[Sequence[Frame]], clock_us: float) -> None:
-        """Frames as if they had come when they did, as far as that can be known.
+        """Handle frames at their estimated times of arrival.
 
-        After a hiccup of this process several periods lie in the queue: they are spread over the time that it took, so
-        that what slept here does not look like a host that slept.
+        After a delay of this process several periods are in the queue: they are spread over the time that it took, so
+        that a delay here does not look like a delay of the host.
         """
         before_us = self.chain.now_us + self.chain.skipped_us
         for channel, frames in enumerate(arrived):
@@ -85,7 +85,7 @@ class TwinServer:
 
 
 class PoseSender:
-    """Sends datagrams and never complains: motion capture does not know whether anybody listens."""
+    """Sends datagrams and ignores errors: motion capture does not know whether it has receivers."""
 
     def __init__(self, address: str) -> None:
         """address: HOST:PORT. Raises ConfigError."""
@@ -102,7 +102,7 @@ class PoseSender:
             self._socket.sendto(datagram, self._address)
 
     def close(self) -> None:
-        """Let go of the socket."""
+        """Close the socket."""
         self._socket.close()
 
 
@@ -114,22 +114,22 @@ def make_plant(config: RunConfig, settings: Settings) -> Plant:
 
 
 class Here:
-    """Twins in this process, at the other end of a virtual bus: calling it lets them run."""
+    """Twins in this process, at the other end of a virtual bus: calling it runs them."""
 
     def __init__(self, server: TwinServer, send_pose: PoseSender | None, clock_ns: Callable[[], int]) -> None:
         self.server = server
         self._send_pose, self._clock_ns = send_pose, clock_ns
 
     def __call__(self) -> float | None:
-        """Handle what is there and send what is due; seconds until it wants to run again, None for never."""
+        """Handle received frames and send due ones; seconds until the next run is due, None for never."""
         return self.server.run_due(self._clock_ns())
 
     def inject(self, injection: Injection, *, begins: bool) -> None:
-        """Let something go wrong with a module, or end."""
+        """Begin or end a fault of a module."""
         self.server.chain.inject(injection, begins=begins)
 
     def close(self) -> None:
-        """Leave the bus."""
+        """Close the bus."""
         for wire in self.server.wires:
             wire.close()
         if self._send_pose is not None:
@@ -145,7 +145,7 @@ def here(
     stepped: bool,
     clock_ns: Callable[[], int] = time.monotonic_ns,
 ) -> Here:
-    """All twins of a run on one virtual bus; pose: where to send poses, HOST:PORT. Raises ConfigError."""
+    """All twins of a run on one virtual bus; pose: address for poses, HOST:PORT. Raises ConfigError."""
     send_pose = None if pose is None else PoseSender(pose)
     chain = ModuleChain(config, settings, make_plant(config, settings), stepped=stepped, send_pose=send_pose)
     return Here(TwinServer([VirtualWire(channel)], chain), send_pose, clock_ns)

@@ -1,4 +1,4 @@
-"""How far the body has come of late, by what guidance measured. Pure but for its own memory."""
+"""Recent displacement of the body, from guidance's measurements. Pure except for its own state."""
 
 import math
 from collections import deque
@@ -6,12 +6,12 @@ from collections import deque
 from snakesim_hal.wire.quantities import Vector
 
 WINDOW_S = 1.0
-MOVING_M = 0.005  # in a whole window: what is less counts as standing still
-SMOOTHED_S = 0.1  # time constant: a pose's noise is no movement
+MOVING_M = 0.005  # in a whole window: less counts as standing still
+SMOOTHED_S = 0.1  # time constant: filters the noise of the pose
 
 
 class Advance:
-    """Follows the body's centre of mass: a body that only wriggles moves its tail and its head, but hardly that."""
+    """Tracks the body's centre of mass, which hardly moves when the body only wriggles."""
 
     def __init__(self) -> None:
         self._smooth: Vector | None = None
@@ -36,7 +36,7 @@ class Advance:
 
     @property
     def metres(self) -> float | None:
-        """How far the centre is from where it was a window ago, or at the first time; None: it was never known."""
+        """Distance of the centre from its position a window ago, or at the first time; None: it was never known."""
         if not self._recent:
             return None
         return math.dist(self._recent[0][1], self._recent[-1][1])

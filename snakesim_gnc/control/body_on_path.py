@@ -1,4 +1,4 @@
-"""A chain on a path: the angles with which the body lies on it, and where along it a measured body is. Pure."""
+"""A chain on a path: the joint angles of a body on it, and the arc length of a measured body. Pure."""
 
 import math
 from collections.abc import Sequence
@@ -12,14 +12,14 @@ from snakesim_hal.model.route import Route, next_on_route
 
 Floats = NDArray[np.float64]
 
-SPACING_M = 0.01  # of the rows; half a percent of a radian is lost between them on paths that bend once in 0.15 m
+SPACING_M = 0.01  # of the rows; the interpolation error is 0.005 rad on paths that bend once in 0.15 m
 CHORD_SPACING_M = 0.005
 MAX_STEP_M = 0.05  # of one correction of the arc length
 
 
 @dataclass(frozen=True)
 class BodyPose:
-    """How the body lies on the path when its tail end is at `tail_s_m`.
+    """Pose of the body on the path with its tail end at `tail_s_m`.
 
     Its nodes are the tail end, the joints that bend, and the head end: all on the path.
     """
@@ -31,7 +31,7 @@ class BodyPose:
 
 
 class BodyOnPath:
-    """Lays one body on one path; what it has computed it keeps, in rows `SPACING_M` apart.
+    """Lays one body on one path; results are cached, in rows `SPACING_M` apart.
 
     segments_m: lengths of the straight pieces between the joints that bend, tail to head.
     """
@@ -60,7 +60,7 @@ class BodyOnPath:
         return self.fit(nodes_w, self.route.project(nodes_w[:, 0]), steps=8)
 
     def fit(self, nodes_w: Floats, near_s_m: float, *, steps: int = 2) -> float:
-        """Arc length at which the body on the path lies nearest to a measured one (least squares over the nodes)."""
+        """Arc length at which the body on the path is closest to a measured one (least squares over the nodes)."""
         measured = nodes_w.ravel()
         s = near_s_m
         for _ in range(steps):

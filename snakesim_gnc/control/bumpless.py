@@ -1,8 +1,8 @@
-"""Passing joints between position and torque mode without a jump. Pure but for its own memory.
+"""Switching joints between position and torque mode without a jump. Pure except for its own state.
 
-A joint that is released goes on from the position target with which its servo gives the torque that it has
-(`q + (torque + kd speed) / kp`), and the difference to its reference fades. A joint that takes over goes on from the
-torque that it has, and the propulsion torque fades in. Both fades move by `fade` a tick.
+A released joint starts from the position target with which its servo gives the present torque
+(`q + (torque + kd speed) / kp`), and the difference to its reference fades out. A joint that takes over starts from its
+present torque, and the propulsion torque fades in. Both fades move by `fade` a tick.
 """
 
 import numpy as np
@@ -25,7 +25,7 @@ class HandOver:
         self._share = 1.0  # of the propulsion torque that has faded in
 
     def start(self, joints: JointState, reference_rad: Floats) -> None:
-        """Take the joints as they are, all in position mode."""
+        """Start from the present joint states, all in position mode."""
         torque, speed = np.array(joints.torque_nm), np.array(joints.velocity_rad_s)
         held = np.array(joints.angle_rad) + (torque + self._damping * speed) / self._stiffness
         self._offset = held - reference_rad
@@ -36,12 +36,12 @@ class HandOver:
         self._offset -= change_rad
 
     def fade(self, fade: float) -> None:
-        """Let differences fade by a share."""
+        """Reduce differences by a share."""
         self._offset *= max(0.0, 1.0 - fade)
         self._share = min(1.0, self._share + fade)
 
     def pass_to(self, turn: int | None, joints: JointState, reference_rad: Floats) -> None:
-        """Give the turn to propel to a joint, or to none."""
+        """Hand propulsion over to a joint, or to none."""
         if turn == self._turn:
             return
         if self._turn is not None:

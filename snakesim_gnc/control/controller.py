@@ -1,8 +1,8 @@
-"""What a controller is: settings in, then a view of the world each tick, set-points out. No clock, no I/O.
+"""The interface of a controller: settings in, then a view of the world each tick, set-points out. No clock, no I/O.
 
 A controller is a class with a `Settings` Struct, a constructor that takes the robot and the settings, and `update`.
-It is made anew at every arming, and called once a tick while the robot is armed. Any view may lack the world or the
-trajectory, also in the middle of a run: then it must not push, but hold, and go on without a jump when they are back.
+It is created anew at every arming, and called once a tick while the robot is armed. Any view may lack the world or the
+trajectory, also during a run: then it must not push, but hold, and resume without a jump when they are back.
 """
 
 from collections.abc import Sequence
@@ -17,19 +17,19 @@ from snakesim_hal.wire.messages import Description, JointState, Mode, Trajectory
 
 @dataclass(frozen=True)
 class View:
-    """What a controller sees at one tick."""
+    """The inputs of a controller at one tick."""
 
     tick: int
     time_s: float  # since arming, by the robot's clock
     period_s: float
     joints: JointState
-    world: World | None  # None: there is none yet, or it is too old to act on; the same goes for the trajectory
+    world: World | None  # None: there is none yet, or it is too old; also for the trajectory
     trajectory: Trajectory | None
 
 
 @dataclass(frozen=True)
 class Report:
-    """What a controller tells of itself; everything is optional, and shows in `control/state` and in the report."""
+    """A controller's own report; all fields are optional, and shown in `control/state` and in the run's report."""
 
     why: str = ""
     usable_push_points: int | None = None  # None: this controller does not push off obstacles
@@ -56,7 +56,7 @@ class Action:
 
 
 class Controller(Protocol):
-    """What stands behind an entry point in the group `snakesim.controllers`, or behind `./file.py:Name`."""
+    """The object of an entry point in the group `snakesim.controllers`, or of `./file.py:Name`."""
 
     Settings: type[msgspec.Struct]  # the scenario's [control] section
 

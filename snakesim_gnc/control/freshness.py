@@ -1,15 +1,15 @@
-"""Whether what control is about to act on is fresh enough, by the stamps that it carries. Pure.
+"""Whether control's inputs are fresh enough, by their stamps. Pure.
 
-Ages count in robot time, from the instant that a sample is of. The limits are the scenario's `[max_age]`; what it
-leaves out follows from how often a stream comes when all is well:
+Ages are in robot time, from the time of measurement. The limits are the scenario's `[max_age]`; the
+defaults follow from the normal rate of a stream:
 
-joints      what the gate allows: three periods or 30 ms, and the sensor's delay; at most a lease
+joints      as in the gate: three periods or 30 ms, and the sensor's delay; at most a lease
 world       guidance's lag, and three of its turns missed, or 0.2 s
 pose,       the sensor's delay, guidance's turn and lag, and three samples missed, or 0.2 s
 contacts
 trajectory  guidance's turn and lag, navigation's lag, and three of its turns missed, or 0.2 s
 
-A stamp that is further ahead of the clock than its limit is refused as well: it is of another host, or forged.
+A stamp that is further ahead of the clock than its limit is rejected as well: it is of another host, or forged.
 """
 
 from dataclasses import dataclass
@@ -20,21 +20,21 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, JointState, Trajectory, World
 
 MISSED = 3
-MIN_MARGIN_S = 0.2  # guidance and navigation have no real-time priority: a busy computer holds them up
+MIN_MARGIN_S = 0.2  # guidance and navigation have no real-time priority: a busy computer delays them
 
 
 @dataclass(frozen=True)
 class Limits:
-    """The greatest ages, in s; a sensor that the robot lacks has none."""
+    """Maximum ages, in s; none for an absent sensor."""
 
     joints_s: float
     world_s: float
     trajectory_s: float
-    sensors_s: dict[str, float]  # by key: what a world model was made of
+    sensors_s: dict[str, float]  # by key: inputs of a world model
 
     @staticmethod
     def of(config: RunConfig, robot: Description) -> "Limits":
-        """Those of a run, as its scenario says or as they follow from it."""
+        """Those of a run: from its scenario, or the defaults."""
         period_s, own = robot.period_ns * 1e-9, config.max_age
         guidance = config.services.get("guidance", Service())
         navigation = config.services.get("navigation", Service())
@@ -55,11 +55,11 @@ class Limits:
         )
 
     def against_joints(self, joints: JointState, now_ns: int) -> str:
-        """Why a joint state is not acted on; empty when it is. now_ns: robot time."""
+        """Why a joint state is rejected; empty when it is fresh. now_ns: robot time."""
         return _off(keys.JOINTS, joints.stamp_ns, now_ns, self.joints_s)
 
     def against_world(self, world: World, now_ns: int) -> str:
-        """Why a world model is not acted on; empty when it is."""
+        """Why a world model is rejected; empty when it is fresh."""
         off = _off(keys.WORLD, world.stamp_ns, now_ns, self.world_s)
         if off:
             return off
@@ -68,7 +68,7 @@ class Limits:
         return "; ".join(filter(None, found))
 
     def against_trajectory(self, trajectory: Trajectory, now_ns: int) -> str:
-        """Why a trajectory is not acted on; empty when it is."""
+        """Why a trajectory is rejected; empty when it is fresh."""
         if trajectory.stamp_ns is None:
             return f"{keys.TRAJECTORY} was planned without a world model"
         return _off(keys.TRAJECTORY, trajectory.stamp_ns, now_ns, self.trajectory_s)

@@ -1,7 +1,7 @@
-"""A controller, and a check of all that it gives. A controller is somebody else's code: what is wrong with it is named.
+"""Wraps a controller, and checks all its outputs, because it may be third-party code: errors name it.
 
-What a controller must give is what the wire takes: a list of modes, targets and torque limits with one entry a joint,
-of `Mode` and plain Python numbers that are finite.
+The output must be what the wire accepts: lists of modes, targets and torque limits with one entry a joint,
+of `Mode` and plain, finite Python numbers.
 """
 
 import contextlib
@@ -16,22 +16,22 @@ from snakesim_hal.errors import ControllerError
 from snakesim_hal.wire.messages import Description, Mode
 from snakesim_hal.wire.quantities import MAX_TARGET
 
-NUMBERS = {float, int}  # exactly: a NumPy number or a bool is none that can be sent
+NUMBERS = {float, int}  # exactly: a NumPy number or a bool cannot be sent
 MODES = ", ".join(f"Mode.{mode.name}" for mode in Mode)
 
 
 class Guarded:
-    """Stands for a controller, made for one arming. Every call may raise ControllerError."""
+    """A checked controller, created for one arming. Every call may raise ControllerError."""
 
     def __init__(self, name: str, plugin: type[Controller], robot: Description, settings: Any) -> None:
-        """name: as it was asked for: an entry point, or `./file.py:Class`."""
+        """name: as configured: an entry point, or `./file.py:Class`."""
         self._who = f"controller {name} (class {getattr(plugin, '__name__', plugin)})"
         self._joints = [joint.name for joint in robot.joints]
         with self._named("__init__"):
             self._controller = plugin(robot, settings)
 
     def update(self, view: View) -> Action:
-        """The controller's answer, which can be sent."""
+        """The controller's action, checked."""
         with self._named("update"):
             action = self._controller.update(view)
         try:
@@ -46,7 +46,7 @@ class Guarded:
 
     @contextlib.contextmanager
     def _named(self, method: str) -> Iterator[None]:
-        """Name what a method raises; its traceback goes to the log."""
+        """Turn exceptions of a method into errors that name it; the traceback goes to the log."""
         try:
             yield
         except (Exception, SystemExit) as error:
@@ -87,7 +87,7 @@ def _check_length(field: str, values: Any, joints: Sequence[str]) -> None:
 def _check_numbers(field: str, values: Any, joints: Sequence[str], *, least: float) -> None:
     _check_length(field, values, joints)
     for i, value in enumerate(values):
-        if type(value) in NUMBERS and least <= value <= MAX_TARGET:  # which no NaN is
+        if type(value) in NUMBERS and least <= value <= MAX_TARGET:  # false for NaN
             continue
         where = f"SetPoints.{field}[{i}] ({joints[i]}) is {_shown(value)}"
         if type(value) not in NUMBERS:
@@ -97,7 +97,7 @@ def _check_numbers(field: str, values: Any, joints: Sequence[str], *, least: flo
 
 
 def _check_report(report: Report, joints: Sequence[str]) -> None:
-    """What decides about the state; the rest is checked when it is told."""
+    """Checks the fields that decide about the state; the others are checked when published."""
     if not isinstance(report.why, str):
         raise ValueError(f"Report.why is {_shown(report.why)}, must be a str")
     for field, most in (("usable_push_points", math.inf), ("propulsion_joint", len(joints) - 1)):
@@ -108,7 +108,7 @@ def _check_report(report: Report, joints: Sequence[str]) -> None:
 
 
 def _shown(value: Any) -> str:
-    """A value as an error shows it: its type too where that is not plain."""
+    """A value for an error message, with its type unless that is plain."""
     text = repr(value)
     text = text if len(text) <= 60 else f"{text[:57]}..."
     return text if value is None or type(value) in (int, float, str) else f"{text} ({type(value).__name__})"

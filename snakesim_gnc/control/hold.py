@@ -1,4 +1,4 @@
-"""Hold: every joint stays at the angle that it had at arming. The control experiment, and the safest controller."""
+"""Hold: every joint stays at its angle at arming. The control experiment, and the safest controller."""
 
 from snakesim_gnc.control.controller import Action, Report, View, positions
 from snakesim_hal.model.files import FileStruct
@@ -9,7 +9,7 @@ class Hold:
     """Keeps the pose."""
 
     class Settings(FileStruct, frozen=True):
-        """Nothing to set."""
+        """No settings."""
 
     def __init__(self, robot: Description, settings: Settings) -> None:
         self._robot = robot

@@ -1,7 +1,7 @@
-"""Path following: every joint in position mode, towards a body that lies a little further along the path.
+"""Path following: every joint in position mode, towards a body pose slightly further along the path.
 
 The obstacles turn the change of shape into motion. The reference moves with the mission's speed, but never more than
-`look_ahead_m` ahead of where the body is measured to be, so a snake that is held up does not wind up.
+`look_ahead_m` ahead of the measured body, so a blocked snake does not wind up.
 """
 
 from typing import Annotated
@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 
 
 class PathFollowing:
-    """Shape control along a path; knows of no obstacles."""
+    """Shape control along a path; does not use obstacles."""
 
     class Settings(FileStruct, frozen=True, kw_only=True):
         """Too little look-ahead does not overcome the drag; too much wedges the body between tight obstacles."""
@@ -41,7 +41,7 @@ class PathFollowing:
         self._ahead_s_m = 0.0
 
     def update(self, view: View) -> Action:
-        """Angles of the body a little further on."""
+        """Angles of the body slightly further along the path."""
         located = self._progress.update(view)
         if isinstance(located, str):
             return self._wait(view, located)
@@ -60,7 +60,7 @@ class PathFollowing:
         return Action(self._towards(), Report(path_s_m=tail_s_m, reference_rad=reference.tolist()))
 
     def _wait(self, view: View, why: str) -> Action:
-        """Without knowing where the body is: every joint stays where it was meant to be."""
+        """Without a known body pose every joint keeps its reference."""
         if self._reference is None:
             self._reference = np.array(view.joints.angle_rad)
             self._hand_over.start(view.joints, self._reference)

@@ -1,4 +1,4 @@
-"""The body as controllers see it: a planar chain that bends at its yaw joints, worked out once from the description."""
+"""The body model of controllers: a planar chain that bends at its yaw joints, computed once from the description."""
 
 from bisect import bisect_right
 

@@ -1,4 +1,4 @@
-"""Where the body is along its path now, and how fast it moves, from a world model that is some ticks old."""
+"""Present position and speed of the body along its path, from a world model that is some ticks old."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from snakesim_hal.wire.messages import Trajectory, World
 Floats = NDArray[np.float64]
 
 TICKS_KEPT = 128
-AGAIN_STEPS = 8  # to find a body again that may have slid meanwhile
+AGAIN_STEPS = 8  # to localise a body again that may have slid meanwhile
 
 
 @dataclass(frozen=True)
@@ -25,19 +25,19 @@ class Located:
     on_path: BodyOnPath
     tail_s_m: float  # arc length of the tail end
     speed_m_s: float
-    nodes_w: Floats  # (2, n_nodes), as measured last
-    fresh: bool  # a new world model has come
-    anew: bool  # on a new path, or found again after it was unknown: the place may have jumped
+    nodes_w: Floats  # (2, n_nodes), last measurement
+    fresh: bool  # there is a new world model
+    anew: bool  # on a new path, or localised again after it was unknown: the position may have jumped
     world: World
     trajectory: Trajectory
 
 
 class Progress:
-    """Follows the body along the path with an alpha-beta filter over poses, each with the joints of its instant.
+    """Tracks the body along the path with an alpha-beta filter over poses, each with the joints of its instant.
 
-    The joints that bend are the yaw joints; all others count as straight. Between poses the tail goes on at the speed
-    last seen, so what is returned is always the present. A world model that repeats a pose is no new measurement: taken
-    for one, it would look like a body that stands still.
+    Only the yaw joints bend; all others count as straight. Between poses the tail is extrapolated at the last
+    speed, so the result is always for the present. A world model that repeats a pose is not a new measurement: used
+    as one, it would look like a body that stands still.
     """
 
     def __init__(self, body: PlanarBody, *, speed_filter_s: float) -> None:
@@ -47,13 +47,13 @@ class Progress:
         self._body: BodyOnPath | None = None
         self._path_id: int | None = None
         self._world_tick: int | None = None
-        self._measured_ns: int | None = None  # the pose's instant; None: where the body is, is unknown
+        self._measured_ns: int | None = None  # the pose's instant; None: the body's position is unknown
         self._nodes = np.empty((2, 0))
         self._s_m = 0.0  # at that instant
         self._speed_m_s = 0.0
 
     def update(self, view: View) -> Located | str:
-        """Where the body is at this tick, or why that is unknown."""
+        """Position of the body at this tick, or why it is unknown."""
         self._angles.append((view.joints.stamp_ns, view.joints.angle_rad))
         world, trajectory = view.world, view.trajectory
         if world is None or trajectory is None:
@@ -98,5 +98,5 @@ class Progress:
 
 
 def _seconds(elapsed_ns: int, view: View) -> float:
-    """In whole periods as a rule: those come out alike on every machine."""
+    """In whole periods if possible: these are equal on every machine."""
     return elapsed_ns / round(view.period_s * 1e9) * view.period_s

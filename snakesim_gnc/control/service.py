@@ -1,7 +1,7 @@
-"""The control process: runs one controller, holds the lease, sends the commands, and says what it is doing.
+"""The control process: runs one controller, holds the lease, sends the commands, and publishes its state.
 
-A controller is given only what is fresh enough (`freshness`). With stale joints no command is sent: the lease ends, and
-the robot is stopped. What it answers is checked (`guarded`): a controller that cannot go on ends this process at once.
+A controller gets only fresh inputs (`freshness`). With stale joints no command is sent: the lease ends, and
+the robot is stopped. Its output is checked (`guarded`): a controller that fails ends this process at once.
 """
 
 from collections.abc import Sequence
@@ -52,7 +52,7 @@ class Control(Service):
         self._controller: Guarded | None = None
 
     def outputs(self, clock: Clock) -> list[tuple[str, Message]] | None:
-        """Command the robot; armed, as the controller says, otherwise to stay as it is."""
+        """Command the robot: while armed by the controller, otherwise to hold its pose."""
         self._last_clock = clock
         joints = self._client.read(self._joints)
         if joints is None:
@@ -75,13 +75,13 @@ class Control(Service):
         return self._act(clock, joints)
 
     def silence(self) -> list[tuple[str, Message]]:
-        """The HAL is gone, or a slow computer holds it up: PowerOff. The next tick decides about the controller."""
+        """The HAL is gone, or delayed by a slow computer: PowerOff. The next tick decides about the controller."""
         if self._last_clock is None:
             return []
         return _told(self._reports.state(self._last_clock, answers=False))
 
     def _act(self, clock: Clock, joints: JointState) -> list[tuple[str, Message]]:
-        """Let the controller answer, with what is fresh of the world and the trajectory."""
+        """Call the controller, with world and trajectory as far as they are fresh."""
         world, trajectory, missing = self._outlook(clock)
         try:
             controller = self._made_for(clock)
@@ -106,7 +106,7 @@ class Control(Service):
         return _told(told)
 
     def _outlook(self, clock: Clock) -> tuple[World | None, Trajectory | None, str]:
-        """World and trajectory, as far as they are there and fresh, and why they are not."""
+        """World and trajectory as far as they are available and fresh, and why they are not."""
         world, trajectory = self._client.read(self._world), self._client.read(self._trajectory)
         late: list[str] = []
         if world is not None and (why := self._limits.against_world(world, clock.stamp_ns)):
@@ -130,7 +130,7 @@ class Control(Service):
         """Write into the log when other streams are too old than before, and when all is fresh again."""
         streams = {why.partition(" ")[0] for why in late}
         if streams != self._noted:
-            text = f"{'; '.join(late)}: {so}" if late else "all that control acts on is fresh again"
+            text = f"{'; '.join(late)}: {so}" if late else "all inputs of control are fresh again"
             complain(f"{clock.stamp_ns * 1e-9:.3f} s: {text}")
         self._noted = streams
 

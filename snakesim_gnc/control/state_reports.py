@@ -1,4 +1,4 @@
-"""What control tells of itself: `control/state` a few times a second, and at once when it changes."""
+"""Control's state: `control/state` a few times a second, and at once when it changes."""
 
 import msgspec
 
@@ -12,7 +12,7 @@ LONGEST = 500  # characters of a reason
 
 
 class StateReports:
-    """Makes the state's message when it is time for one."""
+    """Makes the state's message when it is due."""
 
     def __init__(self, controller: str, robot: Description) -> None:
         self._controller = controller[-64:]
@@ -37,9 +37,9 @@ class StateReports:
         missing: str = "",
         rests: str = "",
     ) -> ControlState | None:
-        """The message, or None when there is no news and the last one is recent. See `locomotion_state`.
+        """The message, or None when nothing has changed and the last one is recent. See `locomotion_state`.
 
-        Raises ValueError when the report holds what cannot be told.
+        Raises ValueError when the report contains an invalid value.
         """
         report = report or Report()
         state, reason = locomotion_state(

@@ -16,12 +16,12 @@ def locomotion_state(
     obstacle: str = "",
     advanced_m: float | None,
 ) -> tuple[LocomotionState, str]:
-    """The state, and the reason for it in words. To locomote is to move, as it is measured, and to mean to.
+    """The state, and its reason as text. Locomoting means intended and measured motion.
 
-    missing: what control would need to act and does not have, such as a fresh pose. rests: why nobody wants to move.
+    missing: inputs that control lacks, such as a fresh pose. rests: why no motion is intended.
     usable_push_points: None for a controller that does not push off obstacles.
-    obstacle: what the controller itself says is in the way (no feasible triplet, a jam), empty when nothing is.
-    advanced_m: how far the body has come within the last second; None when nobody measures it.
+    obstacle: what prevents motion according to the controller (no feasible triplet, a jam), else empty.
+    advanced_m: displacement of the body within the last second; None when it is not measured.
     """
     if not hal_answers:
         return "PowerOff", "no clock from the HAL: no backend, or it is without power"
@@ -30,14 +30,14 @@ def locomotion_state(
     if missing:
         return "NotLocomoting", missing
     if rests:
-        return "Idle", f"nobody wants to move: {rests}"
+        return "Idle", f"no motion intended: {rests}"
     if usable_push_points is not None and usable_push_points < PUSH_POINTS_NEEDED:
         why = f"{usable_push_points} usable push-points, {PUSH_POINTS_NEEDED} are needed"
         return "NotLocomoting", f"{why}; {obstacle}" if obstacle else why
     if obstacle:
         return "NotLocomoting", obstacle
     if advanced_m is None:
-        return "NotLocomoting", "nobody measures whether the body moves"
+        return "NotLocomoting", "the motion of the body is not measured"
     if advanced_m < MOVING_M:
         return "NotLocomoting", f"standing still: less than {MOVING_M * 1e3:g} mm in {WINDOW_S:g} s"
     return "Locomoting", "pushing" if usable_push_points is not None else "moving"

@@ -1,1 +1,1 @@
-"""Guidance: what the snake feels and where it is, made into a world model that others can use."""
+"""Guidance: makes a world model of contacts and pose for the other services."""

@@ -74,7 +74,7 @@ class WorldModel:
         )
 
     def _touching(self, position_w: np.ndarray) -> str | None:
-        """Which known obstacle a sensor that cannot tell must have touched."""
+        """The known obstacle at a contact, for sensors that do not identify it."""
         if not self._known:
             return None
         candidates = np.flatnonzero(np.hypot(*(self._centres - position_w[:2]).T) < self._sizes + 0.1)

@@ -14,7 +14,7 @@ class Guidance(Service):
     name = "guidance"
 
     def __init__(self, client: Client, config: RunConfig) -> None:
-        """The scene file is the survey: its obstacles are what guidance knows beforehand."""
+        """The obstacles of the scene file are known beforehand, as from a survey."""
         self._known = [placed.obstacle for placed in place_all(config) if not placed.walkable]
         self._joints = client.subscribe(keys.JOINTS, JointState)
         self._contacts = client.subscribe(keys.CONTACTS, Contacts)
@@ -23,7 +23,7 @@ class Guidance(Service):
         self._model: WorldModel | None = None
 
     def meet(self, robot: Description) -> None:
-        """Make the model for the robot that is there."""
+        """Create the model for this robot."""
         self._model = WorldModel(robot, self._known)
 
     def outputs(self, clock: Clock) -> list[tuple[str, Message]] | None:

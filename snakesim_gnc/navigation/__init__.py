@@ -1,1 +1,1 @@
-"""Navigation: where the snake shall go and how fast, from a mission or from somebody's intent."""
+"""Navigation: path and speed of the snake, from a mission or an operator's intent."""

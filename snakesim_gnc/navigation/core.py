@@ -1,4 +1,4 @@
-"""The planner of the case study: the path is known; speed and progress are what is decided. Pure."""
+"""The planner of the case study: the path is given; it decides speed and progress. Pure."""
 
 from collections.abc import Sequence
 
@@ -29,14 +29,14 @@ class KnownPath:
         self._tail_s_m: float | None = None
 
     def start_over(self) -> None:
-        """Another robot, or another start: the body may be anywhere, and robot time begins anew."""
+        """Another robot, or another start: the body may be anywhere, and robot time restarts."""
         self._tail_s_m = None
         self._intents.start_over()
 
     def update(self, tick: int, now_ns: int, world: World | None, intent: Intent | None) -> Trajectory:
         """The trajectory from where the body was by this world model; its stamp is the world model's.
 
-        tick, now_ns: of the clock. intent: the one that came last, if any ever did.
+        tick, now_ns: of the clock. intent: the newest one, if any.
         """
         if world is not None:
             tail = np.array(world.base_position_w[:2])

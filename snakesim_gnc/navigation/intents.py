@@ -1,26 +1,26 @@
-"""Whether anybody's intent counts now, and what speed it asks for. Pure but for its own memory."""
+"""Whether an intent is valid now, and its speed. Pure except for its own state."""
 
 from dataclasses import dataclass
 
 from snakesim_hal.wire.messages import Intent
 
-LONGEST_NS = 5_000_000_000  # an intent that asks for more counts no longer than this
+LONGEST_NS = 5_000_000_000  # upper limit of an intent's validity
 FASTEST_M_S = 10.0  # as a scenario's mission
-AHEAD_NS = 100_000_000  # its sender may have heard a newer clock than navigation, which acts a few times a second
+AHEAD_NS = 100_000_000  # its sender may have received a newer clock than navigation, which acts a few times a second
 
 
 @dataclass(frozen=True)
 class Wish:
-    """How fast to go, and why that is not the mission's speed; empty when it is."""
+    """The speed, and why it is not the mission's; empty when it is."""
 
     speed_m_s: float
     why: str = ""
 
 
 class Intents:
-    """Follows the newest good intent until it expires, and then stops.
+    """Follows the newest valid intent until it expires, and then stops.
 
-    Whoever takes over from the mission keeps it: an operator whose connection breaks must not set the robot in motion.
+    The mission does not resume: an operator whose connection breaks must not set the robot in motion.
     """
 
     def __init__(self, mission_m_s: float) -> None:
@@ -29,12 +29,12 @@ class Intents:
         self._stopped = ""  # why it stands still, after an intent that was followed; empty before any was
 
     def start_over(self) -> None:
-        """Robot time begins anew: what was stamped before says nothing any more."""
+        """Robot time restarts: earlier stamps are void."""
         if self._followed is not None:
             self._stop(f"the intent of {self._followed.who} was for another start of the robot")
 
     def wish(self, newest: Intent | None, now_ns: int) -> Wish:
-        """What counts now. newest: the intent that came last; now_ns: robot time."""
+        """The present speed. newest: the newest intent; now_ns: robot time."""
         refused = ""
         if newest is not None and newest != self._followed:
             refused = _against(newest, now_ns)
@@ -55,7 +55,7 @@ class Intents:
 
 
 def _against(intent: Intent, now_ns: int) -> str:
-    """Why an intent does not count; empty when it does."""
+    """Why an intent is rejected; empty when it is valid."""
     age_ns, valid_ns = now_ns - intent.stamp_ns, min(intent.valid_for_ns, LONGEST_NS)
     if age_ns < -AHEAD_NS:
         return f"the intent of {intent.who} is stamped {-age_ns * 1e-9:.3g} s ahead of the robot's clock"

@@ -33,10 +33,10 @@ class Navigation(Service):
         self._client = client
 
     def meet(self, robot: Description) -> None:
-        """Any robot will do; where it is, is not known any more."""
+        """Works for any robot; its position is unknown again."""
         self._planner.start_over()
 
     def outputs(self, clock: Clock) -> list[tuple[str, Message]]:
-        """The trajectory at this tick. An operator's intent counts as soon as it arrives."""
+        """The trajectory at this tick. An operator's intent is used as soon as it arrives."""
         world, intent = self._client.read(self._world), self._intent.newest()
         return [(keys.TRAJECTORY, self._planner.update(clock.tick, clock.stamp_ns, world, intent))]

@@ -1,5 +1,5 @@
-"""What a run leaves behind, read back.
+"""The results of a run.
 
-`record`    a run's folder as arrays     `summary`   its numbers     `gaps`   what is not known, in words
-`report`, `compare`   the pages made of it     `last_run`   where the last run of this user stands
+`record`    a run's folder as arrays     `summary`   its numbers     `gaps`   missing data, as text
+`report`, `compare`   the pages made of it     `last_run`   folder of the user's last run
 """

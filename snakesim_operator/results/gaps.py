@@ -1,4 +1,4 @@
-"""What a record does not know: numbers that are none, and lines that cannot be read. Said, and marked as NaN. Pure."""
+"""Gaps of a record: invalid numbers, and lines that cannot be decoded. Reported, and marked as NaN. Pure."""
 
 from collections import Counter
 from typing import Any
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from snakesim_hal.host_process import HostRecord
 from snakesim_hal.wire.messages import Description
 
-LARGEST = 1e9  # no signal is larger, in its SI unit; beyond it, it is as good as infinite
+LARGEST = 1e9  # no signal is larger, in its SI unit; beyond it a number counts as infinite
 OF_JOINTS = ("angle_rad", "velocity_rad_s", "torque_nm", "target", "torque_limit_nm")
 POSE = ("position_w", "orientation_wxyz")
 CONTACTS = ("contact_peak_n", "contact_count")
@@ -18,9 +18,9 @@ CONTACTS = ("contact_peak_n", "contact_count")
 def cleaned(
     columns: dict[str, NDArray[Any]], robot: Description, *, has_pose: bool
 ) -> tuple[dict[str, NDArray[Any]], list[str]]:
-    """Columns in which all that is no number is NaN, and what was found, in words. Time is worked out from the tick.
+    """Columns with invalid numbers replaced by NaN, and a list of these as text. Time is computed from the tick.
 
-    has_pose: the robot has a pose sensor; even so its pose is unknown until it is first told.
+    has_pose: the robot has a pose sensor; even so its pose is unknown until the first sample.
     """
     found = dict(columns)
     said: list[str] = []
@@ -44,12 +44,12 @@ def cleaned(
 
 
 def unwritten(host: HostRecord) -> list[str]:
-    """What the host could not write."""
+    """Data that the host could not write."""
     found = [host.trouble] if host.trouble else []
     if host.lost_ticks:
         found.append(f"{host.lost_ticks} of {host.ticks} ticks are missing in the black box")
     if host.ended == "running":
-        found.append("the last second may be missing: the host did not come to write its end")
+        found.append("the last second may be missing: the host did not finish its record")
     return found
 
 

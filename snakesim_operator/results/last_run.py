@@ -1,4 +1,4 @@
-"""Where the last run on this computer left its record, so that `snakesim status` can tell of a run that is over."""
+"""Folder of the last run on this computer, so that `snakesim status` can report a finished run."""
 
 import contextlib
 import threading
@@ -25,14 +25,14 @@ def _file() -> Path:
 
 
 def remember(folder: str, ended: str) -> None:
-    """Note a finished run. A home that cannot be written to is no reason to fail, nor to wait for long."""
+    """Note a finished run. Ignores write errors, and waits only briefly."""
     thread = threading.Thread(target=_write, args=(LastRun(folder=folder, ended=ended),), daemon=True)
     thread.start()
     thread.join(LIMIT_S)
 
 
 def _write(noted: LastRun) -> None:
-    with contextlib.suppress(OSError, ValueError):  # the latter: a folder whose name is no text
+    with contextlib.suppress(OSError, ValueError):  # the latter: a folder whose name is not text
         _file().parent.mkdir(parents=True, exist_ok=True)
         write_whole(_file(), msgspec.json.encode(noted))
 

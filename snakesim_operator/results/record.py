@@ -1,4 +1,4 @@
-"""What a run leaves in its folder, read back: configuration, description, black box, host's record, telemetry."""
+"""Reads a run's folder: configuration, description, black box, host's record, telemetry."""
 
 from collections import Counter
 from dataclasses import dataclass, field
@@ -40,7 +40,7 @@ class TelemetryLine(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class RunRecord:
-    """A run, as its folder tells it. Every array has one row a tick."""
+    """The record of a run. Every array has one row a tick."""
 
     folder: Path
     config: RunConfig
@@ -55,17 +55,17 @@ class RunRecord:
     mode: NDArray[np.int8]  # (n, joints), values of messages.Mode
     target: Floats  # (n, joints), in the unit of the mode
     torque_limit_nm: Floats
-    position_w: Floats  # (n, 3) of the base; NaN when unknown, as everything here
+    position_w: Floats  # (n, 3) of the base; NaN when unknown, as all values here
     orientation_wxyz: Floats  # (n, 4)
     contact_peak_n: Floats  # (n,) strongest contact
     contact_count: Floats  # (n,) obstacles touched
-    lacks: list[str] = field(default_factory=list[str])  # what is not known, in words
+    lacks: list[str] = field(default_factory=list[str])  # missing data, as text
 
     @staticmethod
     def load(folder: Path, host: HostRecord | None = None) -> "RunRecord":
-        """Read a run's folder, also of a run that was killed. Raises ConfigError when it is none.
+        """Read a run's folder, also of a run that was killed. Raises ConfigError for any other folder.
 
-        host: the host's numbers, when they are known otherwise; None: as they stand in the folder.
+        host: the host's statistics, if known from elsewhere; None: from the folder.
         """
         for name in (CONFIG, BLACK_BOX, DESCRIPTION, *([] if host is not None else [HOST_RECORD])):
             if not (folder / name).is_file():
@@ -93,7 +93,7 @@ class RunRecord:
         control: list[ControlState] = []
         worlds: list[World] = []
         lacks += unwritten(host) + unread(_read_telemetry(folder / TELEMETRY, control, worlds))
-        while control and control[-1].state == "PowerOff":  # the host has ended: that its clock is gone is no news
+        while control and control[-1].state == "PowerOff":  # the host has ended, so its clock is expected to stop
             control.pop()
         known = {name: column for name, column in known.items() if name != "tick"}
         return RunRecord(folder, config, description, host, control, worlds, **known, lacks=lacks)
@@ -125,7 +125,7 @@ class RunRecord:
 
 
 def _read_telemetry(path: Path, control: list[ControlState], worlds: list[World]) -> Counter[str]:
-    """Take what can be decoded; returns what cannot. A torn last line is the mark of a process that was killed."""
+    """Read the decodable lines; returns counts of the others. An incomplete last line means a killed process."""
     refused: Counter[str] = Counter()
     decoder = msgspec.json.Decoder(TelemetryLine)
     lines = path.read_bytes().split(b"\n")[:-1] if path.is_file() else []

@@ -11,7 +11,7 @@ from snakesim_hal.wire.messages import Fault, Pace
 from snakesim_operator.results.record import RunRecord
 
 SATURATED_FROM = 0.99  # of a joint's torque limit
-TOLD_FOR_S = 0.5  # control tells its state twenty times a second: after a longer silence it is not known any more
+TOLD_FOR_S = 0.5  # control publishes its state twenty times a second: after a longer silence it is unknown
 
 
 def _number(unit: str, about: str) -> Meta:
@@ -19,16 +19,16 @@ def _number(unit: str, about: str) -> Meta:
 
 
 class Restart(msgspec.Struct, frozen=True, kw_only=True):
-    """A process that ended and was to be started again."""
+    """A process that ended and was restarted."""
 
     name: str
     how: str
     at_s: float  # wall-clock time since the run's first process was started
-    after_s: float  # how long it was left alone
+    after_s: float  # delay before the restart
 
 
 class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """What a run amounted to. Unknown is null, never zero."""
+    """The summary of a run. Unknown is null, never zero."""
 
     scenario: str
     robot: str
@@ -46,11 +46,11 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     answered_fraction: Annotated[float | None, _number("1", "ticks whose command came within the tick")]
     command_digest: Annotated[str, Meta(description="SHA-256 of every set-point as applied")]
     path_distance_m: Annotated[float | None, _number("m", "advance of the body along the scene's route")]
-    net_displacement_m: Annotated[float | None, _number("m", "distance of the centre of mass from where it was")]
+    net_displacement_m: Annotated[float | None, _number("m", "distance of the centre of mass from its start")]
     mean_speed_m_s: Annotated[
         float | None, _number("m/s", "path distance (or displacement) over the time in which it is known")
     ]
-    locomoting_fraction: Annotated[float | None, _number("1", "share of the time in which it moved as it meant to")]
+    locomoting_fraction: Annotated[float | None, _number("1", "share of the time in state Locomoting")]
     propulsion_joints: Annotated[list[str], Meta(description="in order of use")]
     jammed: Annotated[bool, Meta(description="whether the controller reported a jam at any time")]
     last_state: str | None
@@ -64,11 +64,11 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     limited_commands: Annotated[dict[str, int], Meta(description="joint set-points changed by the gate, by limit")]
     faults: list[Fault]
     faults_left_out: Annotated[int, Meta(description="of `faults`, between the first and the newest")] = 0
-    isolated: Annotated[list[str], Meta(description="joints that failed, and were passive at the end")] = []
+    isolated: Annotated[list[str], Meta(description="joints that were isolated at the end")] = []
     hosts: Annotated[int, Meta(description="how many HAL hosts the run had; all numbers here are of the last one")] = 1
-    restarts: Annotated[list[Restart], Meta(description="processes that ended and were started again")] = []
+    restarts: Annotated[list[Restart], Meta(description="processes that ended and were restarted")] = []
     ended: Annotated[str, Meta(description="complete, interrupted, or what failed")]
-    lacks: Annotated[list[str], Meta(description="what the record does not know; numbers are made of the rest")] = []
+    lacks: Annotated[list[str], Meta(description="gaps of the record; numbers are computed from the rest")] = []
     config: Annotated[dict[str, Any], Meta(description="the effective configuration; repeats the run")]
 
 
@@ -128,7 +128,7 @@ def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), h
 
 
 def propulsion_sequence(record: RunRecord) -> list[str]:
-    """Joints that propelled, in order, each named anew when it takes over again."""
+    """Joints that propelled, in order, each listed again when it takes over again."""
     names: list[str] = []
     for state in record.control:
         joint = state.propulsion_joint
@@ -146,13 +146,13 @@ def arc_position_m(record: RunRecord, row: int) -> float | None:
 
 
 def largest(values: np.ndarray) -> float | None:
-    """Of all that are known; None when there is none."""
+    """The largest known value; None when there is none."""
     known = values[np.isfinite(values)]
     return float(known.max()) if len(known) else None
 
 
 def _distances(record: RunRecord) -> tuple[float | None, float | None, float]:
-    """Along the route, and as the crow flies; from the first known pose to the last, and the time between them."""
+    """Along the route, and straight; from the first known pose to the last, and the time between them."""
     posed = np.flatnonzero(record.posed)
     if len(posed) < 2:
         return None, None, 0.0
@@ -172,7 +172,7 @@ def _distances(record: RunRecord) -> tuple[float | None, float | None, float]:
 
 
 def _locomoting_fraction(record: RunRecord) -> float | None:
-    """A state holds until the next one is told; but whoever says nothing more for a while is not known to move."""
+    """A state holds until the next one, but at most for TOLD_FOR_S."""
     if not record.control or len(record.time_s) == 0:
         return None
     begin, end = float(record.time_s[0]), float(record.time_s[-1])

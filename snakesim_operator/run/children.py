@@ -1,4 +1,4 @@
-"""The processes of a run: started together, watched, ended by id, and never left behind."""
+"""The child processes of a run: started together, monitored, ended by id, and never left behind."""
 
 import contextlib
 import fcntl
@@ -14,12 +14,12 @@ from types import MappingProxyType
 
 STOP_LIMIT_S = 5.0
 LINES_SHOWN, LAST_BYTES = 15, 16384
-PIPE_BYTES = 2**20  # what a child may say while this process is frozen
+PIPE_BYTES = 2**20  # of output, while this process is frozen
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
 class Words:
-    """What a process says: taken from a pipe at once, so that it never waits for a disk, and handed on."""
+    """The output of a process: read from a pipe at once, so that it never waits for a disk, and passed on."""
 
     def __init__(self, pipe: int, keep: Callable[[bytes], object]) -> None:
         self._pipe, self._keep = pipe, keep
@@ -28,12 +28,12 @@ class Words:
         self._thread.start()
 
     def last(self) -> list[str]:
-        """The end of it, in lines, once the process has ended."""
+        """The last lines, once the process has ended."""
         self._thread.join(1.0)
         return self._last.decode(errors="replace").strip().splitlines()[-LINES_SHOWN:]
 
     def _listen(self) -> None:
-        with contextlib.suppress(OSError):  # a pipe may be larger than it is by default
+        with contextlib.suppress(OSError):  # a larger pipe than the default
             fcntl.fcntl(self._pipe, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
         while words := os.read(self._pipe, 65536):
             self._last = (self._last + words)[-LAST_BYTES:]
@@ -43,14 +43,14 @@ class Words:
 
 @dataclass(frozen=True)
 class Child:
-    """One process, and what it says."""
+    """One process, and its output."""
 
     name: str
     process: subprocess.Popen[bytes]
     words: Words
 
     def how_it_ended(self) -> str | None:
-        """In words; None while it runs."""
+        """Its exit as text; None while it runs."""
         code = self.process.poll()
         if code is None:
             return None
@@ -61,7 +61,7 @@ class Child:
         return f"{self.name} ended with exit code {code}" + (f": {why[len(said) :]}" if why.startswith(said) else "")
 
     def last_words(self) -> list[str]:
-        """The last lines of what it wrote to stdout and stderr, once it has ended."""
+        """The last lines of its stdout and stderr, once it has ended."""
         return self.words.last()
 
 
@@ -75,7 +75,7 @@ def start(
 ) -> Child:
     """Start a Python module as a child that dies with this process.
 
-    keep: gets what it says, from another thread; inherits: file descriptors that stay open in it; more: environment
+    keep: gets its output, from another thread; inherits: file descriptors that stay open in it; more: environment
     variables.
 
     It gets a session of its own, so that Ctrl-C reaches only the supervisor, which then ends its children in order.
@@ -104,14 +104,14 @@ def start(
 
 
 def ask_to_end(child: Child) -> None:
-    """Have a child end in order; one that is frozen must first be thawed."""
+    """Terminate a child in order; a frozen one must be continued first."""
     if child.process.poll() is None:
         child.process.send_signal(signal.SIGTERM)
         child.process.send_signal(signal.SIGCONT)
 
 
 def stop_all(children: Sequence[Child]) -> None:
-    """Ask every child to end, wait, then insist. Returns when all are gone."""
+    """Terminate every child, wait, then kill. Returns when all have ended."""
     for child in children:
         ask_to_end(child)
     deadline = time.monotonic() + STOP_LIMIT_S
@@ -120,5 +120,5 @@ def stop_all(children: Sequence[Child]) -> None:
             child.process.wait(max(deadline - time.monotonic(), 0.05))
         except subprocess.TimeoutExpired:
             child.process.kill()
-            with contextlib.suppress(subprocess.TimeoutExpired):  # in the hands of a disk that hangs
+            with contextlib.suppress(subprocess.TimeoutExpired):  # blocked by a disk that hangs
                 child.process.wait(STOP_LIMIT_S)

@@ -1,4 +1,4 @@
-"""What is left of a run when it is over: the summary, the report, and a few lines on the terminal."""
+"""The end of a run: the summary, the report, and a few lines on the terminal."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -36,7 +36,7 @@ class Outcome:
 
 
 def conclude(config: RunConfig, files: RunFiles, ending: Ending, outcome: Outcome, *, stay: bool = False) -> int:
-    """Write and print it all. Returns 0, 1 on a fault or an early end, 3 when the record lacks something, or 130.
+    """Write and print it all. Returns 0, 1 on a fault or an early end, 3 when the record has gaps, or 130.
 
     stay: faults that a person could clear are part of the run, not its end.
     """
@@ -57,7 +57,7 @@ def conclude(config: RunConfig, files: RunFiles, ending: Ending, outcome: Outcom
 
 
 def explain(ending: Ending, host: HostRecord, config: RunConfig, *, stay: bool = False) -> None:
-    """Complete is a run whose whole time was armed time, and nothing else; of any other, say how it ended."""
+    """A run is complete if it was armed for all of its time, and only then; otherwise note how it ended."""
     for fault in () if stay else host.faults:
         if fault.reach == "robot":
             ending.because(fault.cause)
@@ -106,18 +106,18 @@ def _print_end(files: RunFiles, ending: Ending, outcome: Outcome, lacks: Sequenc
         if out is not None and (out / name).is_file():
             say(f"{what + ':':<9}{out / name}")
     if host is None:
-        said = f"; what its parts said is in {out}" if out is not None else ""
+        said = f"; the logs of its processes are in {out}" if out is not None else ""
         say(f"the run left no record: {ending.reason or 'the host ended early'}{said}")
     elif ending.reason is not None and not ending.interrupted:
         say(f"fault: {ending.reason}")
     if lacks:
         say(f"record: incomplete: {'; '.join(lacks)}")
     if robot is not None and (robot_folder(robot.robot, robot.backend, robot.hardware) / ESTOP).is_file():
-        say(f"{robot.robot} is still stopped, and begins so in every run: `snakesim clear` forgets it")
+        say(f"{robot.robot} is still stopped, and begins so in every run: `snakesim clear` ends that")
 
 
 def _print_host(host: HostRecord) -> None:
-    """What is known without a record on disk."""
+    """Print what is known without a record on disk."""
     say(f"  {'ticks':<22}{host.ticks}, of which {host.armed_ticks} armed, in {host.wall_s:.2f} s")
     say(f"  {'command digest':<22}{host.command_digest[:16]}")
     for fault in host.faults:

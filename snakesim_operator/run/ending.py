@@ -1,4 +1,4 @@
-"""How a run ends: why, and on whose wish."""
+"""How a run ends: the reason, and who requested it."""
 
 import contextlib
 import signal
@@ -16,11 +16,11 @@ class Ending:
 
     @property
     def reason(self) -> str | None:
-        """Everything that went wrong, causes before consequences; None when nothing did."""
+        """All causes, before their consequences; None when there are none."""
         return "; ".join(self.causes) or None
 
     def because(self, cause: str, *, first: bool = False) -> None:
-        """Note what went wrong. first: what was noted before is a consequence of it."""
+        """Note a cause. first: the causes noted before are consequences of it."""
         if cause not in self.causes:
             self.causes.insert(0 if first else len(self.causes), cause)
 

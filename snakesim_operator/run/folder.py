@@ -1,4 +1,4 @@
-"""The folder of one run: held by one process at a time, and never written over an earlier run."""
+"""The folder of one run: locked by one process at a time, and never overwriting an earlier run."""
 
 import contextlib
 import fcntl
@@ -19,16 +19,16 @@ TIME = "%Y%m%d-%H%M%S"
 
 
 def named_after(name: str) -> Path:
-    """A new folder for a run that was given none: runs/NAME-TIME."""
+    """The default folder of a run: runs/NAME-TIME."""
     out = Path("runs") / f"{name}-{datetime.now().strftime(TIME)}"
     return _free(out)
 
 
 @contextlib.contextmanager
 def claimed(out: Path, say: Callable[[str], None]) -> Iterator[Path]:
-    """Hold a folder for a run, with what an earlier one left there moved aside; the kernel lets go after a SIGKILL.
+    """Lock a folder for a run, after renaming an earlier run there; the kernel unlocks it after a SIGKILL.
 
-    Raises ConfigError when another run holds it or it cannot be one, OSError when it cannot be written to.
+    Raises ConfigError when another run has locked it or it is not usable, OSError when it is not writable.
     """
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -45,7 +45,7 @@ def claimed(out: Path, say: Callable[[str], None]) -> Iterator[Path]:
         try:
             yield out
         finally:
-            for partial in out.glob(f"*{PARTIAL}"):  # of a process that was killed while it wrote
+            for partial in out.glob(f"*{PARTIAL}"):  # of a process that was killed while writing
                 with contextlib.suppress(OSError):
                     partial.unlink()
 
@@ -67,10 +67,10 @@ def _lock(out: Path) -> Iterator[None]:
                 "choose another folder, or end that run"
             ) from None
         except FileNotFoundError:
-            pass  # the run that held it has ended just now, or has moved it aside
+            pass  # the run that had locked it has just ended, or has renamed it
         os.close(handle)
     try:
-        with contextlib.suppress(OSError):  # a full disk: the lock holds, it only does not say whose it is
+        with contextlib.suppress(OSError):  # a full disk: the lock is valid, but without the process id
             os.ftruncate(handle, 0)
             os.pwrite(handle, str(os.getpid()).encode(), 0)
         yield
@@ -97,5 +97,5 @@ def _move_aside(out: Path) -> Path:
 
 
 def _free(path: Path) -> Path:
-    """The path, or with a number behind it when it is taken."""
+    """The path, with a number appended if it exists."""
     return next(p for n in count(1) if not (p := path if n == 1 else path.with_name(f"{path.name}-{n}")).exists())

@@ -1,4 +1,4 @@
-"""Where the processes of a run meet: an endpoint that no other run can have, and the stop port beside it."""
+"""The endpoint of a run, which no other run can have, and its stop port."""
 
 import contextlib
 import os
@@ -18,10 +18,10 @@ TRIES = 10
 
 
 def meeting_point(endpoint: str | None, router: str | None) -> tuple[str, socket.socket]:
-    """The run's endpoint and its stop port, which this process holds until the run is over.
+    """The run's endpoint and its stop port, which this process keeps bound until the run is over.
 
     Two runs that start at the same moment cannot get the same endpoint, because a port has one holder. Without
-    `endpoint` it is the default port, or any other when somebody has that. Raises NotConnectedError.
+    `endpoint` it is the default port, or any other if that is in use. Raises NotConnectedError.
     """
     if router is not None:
         return router, open_stop_port(*stop_address(router, listens=False))
@@ -39,7 +39,7 @@ def meeting_point(endpoint: str | None, router: str | None) -> tuple[str, socket
 
 
 def refuse_second_robot(endpoint: str | None, router: str | None, namespace: str) -> None:
-    """Raise RefusedError when a robot is there already: two would answer to one name, or share an endpoint.
+    """Raise RefusedError when there is a robot already: two would have one name, or share an endpoint.
 
     Raises NotConnectedError when there is no such router.
     """
@@ -51,7 +51,7 @@ def refuse_second_robot(endpoint: str | None, router: str | None, namespace: str
                 )
     elif endpoint is not None:
         with contextlib.suppress(NotConnectedError), open_session(Link(endpoint), CONNECT_S) as session:
-            there = ", ".join(robots_on(session)) or "somebody"
+            there = ", ".join(robots_on(session)) or "another host"
             raise RefusedError(
                 f"{there} is on {endpoint} already; end that run first, choose another --endpoint, or join it by "
                 f"--router {endpoint} with another --namespace"
@@ -59,7 +59,7 @@ def refuse_second_robot(endpoint: str | None, router: str | None, namespace: str
 
 
 def local_robot(config: RunConfig, namespace: str, endpoint: str, stop_port: socket.socket) -> LocalRobot:
-    """What other tools on this computer need to know of the run."""
+    """The run's entry in the local registry."""
     stop_host, port = stop_port.getsockname()[:2]
     return LocalRobot(
         namespace=namespace,

@@ -1,4 +1,4 @@
-"""A run while it goes on: arms once, writes telemetry, shows progress, and sees that nothing stays unnoticed."""
+"""Monitors a running run: arms once, writes telemetry, shows progress, and notices faults."""
 
 import time
 from collections.abc import Callable
@@ -22,7 +22,7 @@ WHO = "snakesim run"
 
 
 class RunMonitor:
-    """Watches one run over its network, until it is over."""
+    """Monitors one run over its network, until it is over."""
 
     def __init__(
         self,
@@ -35,7 +35,7 @@ class RunMonitor:
         *,
         stay: bool,
     ) -> None:
-        """stay: a fault ends nothing; a person clears it and arms again."""
+        """stay: a fault does not end the run; a person clears it and arms again."""
         self._session, self._supervisor = session, supervisor
         self._ending, self._say, self._stay = ending, say, stay
         self._telemetry = Telemetry(session, files)
@@ -44,7 +44,7 @@ class RunMonitor:
         self._status: Status | None = None
         self._robot: Description | None = None
         self._armed = False  # once, by this run or by a person
-        self._may_arm = config.has_own_control  # until something went wrong: then a person does
+        self._may_arm = config.has_own_control  # until the first fault: then a person does
         self._own_services = frozenset(config.own_services)
         self._hosts = supervisor.hosts
         self._asked_at: float | None = None
@@ -73,7 +73,7 @@ class RunMonitor:
                 self._telemetry.take_in()
 
     def _take_in(self) -> None:
-        """What arrived."""
+        """Process arrived messages."""
         if self._hosts != self._supervisor.hosts:
             self._hosts = self._supervisor.hosts
             self._may_arm = False
@@ -88,7 +88,7 @@ class RunMonitor:
         self._progress.show(self._status, self._telemetry.latest, armed=self._armed)
 
     def _see_to_faults(self) -> None:
-        """Let go wrong what is to go wrong, and notice what did."""
+        """Carry out injected faults, and detect real ones."""
         status = self._status
         if self._robot is not None and not self._armed:
             refusal = self._faults.refusal(self._robot)
@@ -109,7 +109,7 @@ class RunMonitor:
         return not self._armed and not self._may_arm
 
     def _tell(self, status: Status) -> None:
-        """Say once how a person gets on after a fault."""
+        """Print once how to recover from a fault."""
         latched = f"{status.lifecycle}: {status.why}" if status.lifecycle in ("fault", "estop") else None
         if latched is not None and latched != self._told:
             self._say(latched)
@@ -127,7 +127,7 @@ class RunMonitor:
         self._ask_to_arm(status, self._robot)
 
     def _ask_to_arm(self, status: Status, robot: Description) -> None:
-        """Over the private channel: only the host that this run has started can be meant, and can answer."""
+        """Over the private channel, which reaches only the host that this run has started."""
         host = self._supervisor.host
         assert host is not None
         if self._asked_at is None:
@@ -151,7 +151,7 @@ class RunMonitor:
             raise NotConnectedError(f"the host does not answer within {ARM_LIMIT_S:.0f} s; see host.log")
 
     def _let_it_settle(self) -> None:
-        """After a failure the host goes on for a moment: the safe stop belongs in the record, and in `status`."""
+        """After a failure keep the host running briefly, so that the safe stop is in the record and in `status`."""
         deadline = time.monotonic() + 2 * AFTER_FAULT_S
         while self._supervisor.host_runs() and time.monotonic() < deadline and not self._ending.interrupted:
             self._take_in()

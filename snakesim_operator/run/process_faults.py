@@ -1,7 +1,7 @@
-"""Faults on request that only the supervisor can carry out: a process is killed, stopped or frozen; the clock steps.
+"""Injected faults that only the supervisor can carry out: a process is killed, stopped or frozen; the clock steps.
 
-When one begins is told in robot time since the first arming. How long a process stays frozen is told by the wall clock:
-while the host is frozen, or waits for somebody who is, robot time stands still.
+They begin at robot time since the first arming. The duration of a freeze is wall-clock time:
+while the host is frozen, or waits for a frozen service, robot time stands still.
 """
 
 import signal
@@ -45,7 +45,7 @@ class RobotTime:
 
 
 class ProcessFaults:
-    """Carries out what the scenario plans, and what is asked for on `fault/run`."""
+    """Carries out faults planned in the scenario, and those requested on `fault/run`."""
 
     def __init__(self, config: RunConfig, session: Session, supervisor: Supervisor, say: Callable[[str], None]) -> None:
         self._allowed = config.faults_allowed
@@ -53,7 +53,7 @@ class ProcessFaults:
         self._say = say
         self._plan = Plan(injection for injection in planned(config) if injection.part == RUN)
         self._time = RobotTime(session)
-        self._frozen: dict[str, float] = {}  # name of a process -> monotonic time of its thaw
+        self._frozen: dict[str, float] = {}  # name of a process -> monotonic time at which it continues
         self._asked: list[Injection] = []
         self._stepped_s = 0.0
         self._decoder = Decoder(FaultRequest)
@@ -61,13 +61,13 @@ class ProcessFaults:
         session.on_question(keys.fault(RUN), self._questions.put)
 
     def refusal(self, robot: Description) -> str | None:
-        """Why the scenario's faults may not happen to this robot; None when they may, or when there are none."""
+        """Why the scenario's faults are not allowed on this robot; None if they are, or if there are none."""
         return self._forbidden(robot) if self._plan.next_s() != inf else None
 
     def carry_out(self, robot: Description | None, lifecycle: LifecycleState) -> None:
-        """Do what is due, and answer who asks. robot: None while it is not known yet.
+        """Carry out due faults, and answer requests. robot: None while it is unknown.
 
-        Raises RefusedError when something planned is not permitted.
+        Raises RefusedError when a planned fault is not permitted.
         """
         now_s = self._time.seconds()
         if now_s is not None:
@@ -83,7 +83,7 @@ class ProcessFaults:
             question.reply(self._answer(question, robot, lifecycle))
 
     def undo(self) -> None:
-        """Leave the machine as it was found."""
+        """Undo all changes to the computer."""
         for name in list(self._frozen):
             self._thaw(name)
         if self._stepped_s:
@@ -104,7 +104,7 @@ class ProcessFaults:
                 return Answer(ok=True, reason=f"ended: {injection.kind}:{injection.target}", lifecycle=lifecycle)
             self._check(injection)
             if injection.kind in SUPERVISED:
-                self._asked.append(injection)  # when the answer is on its way: it may pass through that process
+                self._asked.append(injection)  # after the answer is sent: it may pass through that process
             else:
                 self._begin(injection)
         except WireError as error:
@@ -119,7 +119,7 @@ class ProcessFaults:
         if robot.emulated or self._allowed:
             return None
         return (
-            f"{robot.robot} on backend {robot.backend} is real: faults on request need `faults_allowed = true` in the "
+            f"{robot.robot} on backend {robot.backend} is real: fault injection needs `faults_allowed = true` in the "
             f"scenario, or --set faults_allowed=true"
         )
 
@@ -132,12 +132,12 @@ class ProcessFaults:
             )
         if injection.kind == "freeze" and injection.target in MEETING_POINTS and injection.end_s == inf:
             raise ConfigError(
-                f"freeze:{injection.target} on request needs an end, because nobody could ask for it through a frozen "
-                f"{injection.target}: give --for SECONDS"
+                f"freeze:{injection.target} needs an end, because a frozen {injection.target} cannot receive the "
+                f"request to end it: give --for SECONDS"
             )
 
     def _begin(self, injection: Injection) -> None:
-        self._say(f"fault on request: {injection.kind}:{injection.target}")
+        self._say(f"injected fault: {injection.kind}:{injection.target}")
         if injection.kind not in SUPERVISED:
             step_s = injection.amount or 0.0
             step_wall_clock(step_s)
@@ -149,10 +149,10 @@ class ProcessFaults:
 
     def _end(self, injection: Injection) -> None:
         if injection.target not in self._frozen:
-            raise ConfigError(f"{injection.kind}:{injection.target} is not on; what can be ended is a freeze")
+            raise ConfigError(f"{injection.kind}:{injection.target} is not active; only a freeze can be ended")
         self._thaw(injection.target)
 
     def _thaw(self, name: str) -> None:
         del self._frozen[name]
         self._supervisor.signal(name, signal.SIGCONT)
-        self._say(f"fault on request ends: freeze:{name}")
+        self._say(f"injected fault ends: freeze:{name}")

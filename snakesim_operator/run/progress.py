@@ -1,4 +1,4 @@
-"""The live line of a run: rewritten in place on a terminal, a line now and then elsewhere."""
+"""The progress line of a run: rewritten in place on a terminal, otherwise a line at intervals."""
 
 import sys
 import time
@@ -14,7 +14,7 @@ PLAIN_PERIOD_S = 5.0
 
 
 class Progress:
-    """Shows where a run is."""
+    """Shows the progress of a run."""
 
     def __init__(self, config: RunConfig) -> None:
         self._duration_s = config.duration_s
@@ -23,7 +23,7 @@ class Progress:
         self._next = 0.0
         self._shown = 0
         self._origin: tuple[float, float] | None = None  # wall and robot time at arming
-        self._armed_s = 0.0  # robot time so far in which the robot was armed: what a run's duration counts
+        self._armed_s = 0.0  # armed robot time so far, which a run's duration counts
         self._before: Status | None = None
         self._last = ""
         self._armed = False
@@ -38,12 +38,12 @@ class Progress:
             say("")
 
     def start_over(self) -> None:
-        """Robot time begins at 0 again, with a new host."""
+        """Robot time restarts at 0, with a new host."""
         self._origin = self._before = None
         self._armed_s = 0.0
 
     def show(self, status: Status | None, control: ControlState | None, *, armed: bool) -> None:
-        """Update the line, if it is time to."""
+        """Update the line, if it is due."""
         now = time.monotonic()
         if status is None:
             return

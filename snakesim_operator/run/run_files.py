@@ -1,6 +1,6 @@
-"""Writes what a run's supervisor leaves in the run's folder, in a thread of its own: a robot never waits for a disk.
+"""Writes the supervisor's files into the run's folder, in a separate thread: a robot never waits for a disk.
 
-What cannot be written is kept in bounded memory and tried again; what is lost in the end is told.
+Failed writes are kept in bounded memory and retried; lost data is reported.
 """
 
 import contextlib
@@ -15,7 +15,7 @@ from typing import Literal
 from snakesim_hal.model.whole_file import write_whole
 
 MEMORY_BYTES = 8 * 2**20
-TOGETHER_BYTES = 2**16  # what is appended in one go, when it waited
+TOGETHER_BYTES = 2**16  # pending appends are merged up to this size
 RETRY_S = 0.5
 LIMIT_S = 5.0  # for a disk that hangs
 
@@ -29,21 +29,21 @@ class _Task:
     content: bytes
 
     def takes(self, other: "_Task") -> bool:
-        """Whether another can be done in one go with this one."""
+        """Whether another task can be merged into this one."""
         alike = self.kind == other.kind == "append" and self.name == other.name
         return alike and len(self.content) < TOGETHER_BYTES
 
 
 class RunFiles:
-    """The files of one run. Whatever is asked for is done soon, in that order; nothing here waits but `settle`."""
+    """The files of one run. Tasks are carried out soon, in order; only `settle` and `close` wait."""
 
     def __init__(self, folder: Path | None, warn: Callable[[str], None]) -> None:
-        """folder: None keeps nothing. warn: called once, from another thread, when something cannot be written."""
+        """folder: None for no files. warn: called once, from another thread, when something cannot be written."""
         self.folder = folder
         self._warn = warn
         self._trouble = ""  # of the last attempt
         self._warned = False
-        self._lost = ""  # why something is
+        self._lost = ""  # why data was lost
         self._tasks: deque[_Task] = deque()
         self._waiting_bytes = 0
         self._handles: dict[str, int] = {}
@@ -53,7 +53,7 @@ class RunFiles:
         self._thread.start()
 
     def append(self, name: str, content: bytes) -> None:
-        """Append to a file. With too much waiting already, this is lost."""
+        """Append to a file. With too much pending data, it is lost."""
         self._ask(_Task("append", name, content))
 
     def put(self, name: str, content: bytes) -> None:
@@ -61,16 +61,16 @@ class RunFiles:
         self._ask(_Task("put", name, content))
 
     def rename(self, name: str, to: str) -> None:
-        """Give a file that was appended to another name; what is appended after that begins a new one."""
+        """Rename an appended file; later appends begin a new one."""
         self._ask(_Task("rename", name, to.encode()))
 
     def settle(self) -> None:
-        """Wait until all that was asked for is written, or the disk is found to be full or to hang."""
+        """Wait until everything is written, or the disk is found to be full or to hang."""
         with self._changed:
             self._changed.wait_for(lambda: not self._tasks or self._trouble, LIMIT_S)
 
     def close(self) -> str:
-        """Try everything that is left once more. Returns why something is lost, or nothing."""
+        """Retry everything pending once more. Returns why data is lost, or an empty text."""
         with self._changed:
             self._closing = True
             self._changed.notify_all()
@@ -84,9 +84,9 @@ class RunFiles:
             if self.folder is None:
                 return
             if self._waiting_bytes + len(task.content) > MEMORY_BYTES:
-                self._lost = self._trouble or f"{self.folder}: the disk is too slow for what the run tells"
+                self._lost = self._trouble or f"{self.folder}: the disk is too slow for the run's output"
                 return
-            if len(self._tasks) > 1 and self._tasks[-1].takes(task):  # the first one may be at work
+            if len(self._tasks) > 1 and self._tasks[-1].takes(task):  # the first one may be in progress
                 self._tasks[-1].content += task.content
             else:
                 self._tasks.append(task)
@@ -119,7 +119,7 @@ class RunFiles:
             os.close(handle)
 
     def _attempt(self, task: _Task) -> str:
-        """Do it; of an append, what is left stays in it. Returns why not, or nothing."""
+        """Carry out a task; the unwritten rest of an append stays in it. Returns the error, or an empty text."""
         assert self.folder is not None
         try:
             if task.kind == "append":

@@ -1,6 +1,6 @@
-"""The processes of a run: started in order, started again with back-off where that is allowed, and never left behind.
+"""The processes of a run: started in order, restarted with back-off where allowed, and never left behind.
 
-Nothing here arms anything: a host that is started again boots disarmed, and a person arms it.
+Nothing here arms anything: a restarted host boots disarmed, and a person arms it.
 """
 
 import contextlib
@@ -40,14 +40,14 @@ class Part:
     child: Child
     started_s: float = field(default_factory=time.monotonic)
     delay_s: float = FIRST_DELAY_S
-    again_s: float | None = None  # when it is started again; None while it runs
+    again_s: float | None = None  # time of its restart; None while it runs
 
     def ended(self) -> str | None:
-        """How it ended, once for each time it ends."""
+        """How it ended; reported once for each time it ends."""
         return self.child.how_it_ended() if self.again_s is None else None
 
     def put_off(self) -> float:
-        """Decide when it is started again; returns after how long."""
+        """Schedule its restart; returns the delay."""
         now = time.monotonic()
         if now - self.started_s > HEALTHY_S:
             self.delay_s = FIRST_DELAY_S
@@ -56,12 +56,12 @@ class Part:
         return delay_s
 
     def is_due(self) -> bool:
-        """Whether it is time to start it again."""
+        """Whether its restart is due."""
         return self.again_s is not None and time.monotonic() >= self.again_s
 
 
 class Supervisor:
-    """Watches over all processes of a run."""
+    """Supervises all processes of a run."""
 
     def __init__(
         self,
@@ -72,12 +72,12 @@ class Supervisor:
         *,
         stay: bool = False,
     ) -> None:
-        """stop_port: for every host of the run, one after the other; what comes while there is none waits in it.
+        """stop_port: for every host of the run, one after the other; requests without a host wait in it.
 
-        stay: processes that end are started again, once the run has come up.
+        stay: processes that end are restarted, once the run has started up.
         """
         self.restarts: list[Restart] = []
-        self.came_up = False  # until then a process that ends has a reason that a restart would not mend
+        self.came_up = False  # until then a restart would not help a process that ends
         self._files = files
         self._memory = os.memfd_create("snakesim-host")
         self._ending = ending
@@ -86,7 +86,7 @@ class Supervisor:
         self._stop_port = stop_port
         self._secret = {RUN_KEY: new_run_key()}
         self._parts: dict[str, Part] = {}
-        self.host: StarterEnd | None = None  # the private channel to the host that was started last
+        self.host: StarterEnd | None = None  # the private channel to the newest host
         self._begun_s = time.monotonic()
 
     def start(self, name: str, arguments: Sequence[str], *, may_restart: bool = True) -> None:
@@ -109,17 +109,17 @@ class Supervisor:
 
     @property
     def memory(self) -> str:
-        """Path of a file without a disk, where the host keeps its numbers for this process."""
+        """Path of an in-memory file for the host's statistics."""
         return f"/proc/{os.getpid()}/fd/{self._memory}"
 
     def host_record(self) -> HostRecord | None:
-        """The host's own numbers, half a second old while it runs; None while nothing is known."""
+        """The host's statistics, half a second old while it runs; None while unknown."""
         with contextlib.suppress(OSError, *UNDECODABLE):
             return msgspec.json.decode(os.pread(self._memory, 2**20, 0), type=HostRecord)
         return None
 
     def robot(self) -> Description | None:
-        """What the host said that it is; None while nothing is known."""
+        """The host's description; None while unknown."""
         return self.host.description if self.host is not None else None
 
     @property
@@ -137,15 +137,15 @@ class Supervisor:
         self._parts[name].child.process.send_signal(number)
 
     def host_runs(self) -> bool:
-        """Whether there is a host now."""
+        """Whether the host runs now."""
         return self._parts[HOST].child.process.poll() is None
 
     def first_ended(self) -> str | None:
-        """How the first of the processes that are gone ended; None while all run."""
+        """How the first process that ended did so; None while all run."""
         return next((how for part in self._parts.values() if (how := part.child.how_it_ended()) is not None), None)
 
     def goes_on(self) -> bool:
-        """Start again what has ended and may; False when the run is over, for a good reason or a bad one."""
+        """Restart ended processes where allowed; False when the run is over, regularly or not."""
         for part in self._parts.values():
             how = part.ended()
             if how is None:
@@ -168,10 +168,10 @@ class Supervisor:
             self.host = None
         at_s = time.monotonic() - self._begun_s
         self.restarts.append(Restart(name=part.name, how=how, at_s=round(at_s, 3), after_s=delay_s))
-        self._say(f"{how}; it is started again in {delay_s:g} s")
+        self._say(f"{how}; restart in {delay_s:g} s")
 
     def _host_is_done(self) -> bool:
-        """Whether a host that ended has left its record, and nothing more is to be done."""
+        """Whether the host has ended with a complete record."""
         record = self.host_record()
         if record is None or self._parts[HOST].child.process.returncode not in (0, 1):
             return False
@@ -191,7 +191,7 @@ class Supervisor:
         for part in self._parts.values():
             how = part.ended()
             if part.name != HOST and how is not None:
-                self._ending.because(how, first=True)  # whatever fault the host has noted since
+                self._ending.because(how, first=True)  # before any fault that the host has noted since
         children.stop_all(running)
         self._print_last_words()
 
@@ -201,6 +201,6 @@ class Supervisor:
         for part in self._parts.values():
             words = part.child.last_words()
             if words:
-                self._say(f"--- {part.name} said:")
+                self._say(f"--- output of {part.name}:")
                 for line in words:
                     self._say(line)

@@ -1,4 +1,4 @@
-"""What control and guidance tell during a run, written as it comes."""
+"""Telemetry of control and guidance during a run, written as it arrives."""
 
 from pathlib import PurePath
 
@@ -11,7 +11,7 @@ from snakesim_operator.results.record import TELEMETRY
 from snakesim_operator.run.run_files import RunFiles
 
 DEPTH = 8192
-WORLDS_PER_S = 20.0  # as often as control tells its state
+WORLDS_PER_S = 20.0  # as often as control publishes its state
 
 
 class Telemetry:
@@ -27,11 +27,11 @@ class Telemetry:
         self._new_host = False
 
     def expect_new_host(self) -> None:
-        """The host has ended; what control says of the old one's time still belongs to it."""
+        """The host has ended; control's messages with the old host's time still belong to it."""
         self._new_host = True
 
     def _start_over(self) -> None:
-        """Time begins at 0 again, with a new host: what was told under the old one goes to a file of its own."""
+        """Time restarts at 0, with a new host: the telemetry under the old one gets a file of its own."""
         self._new_host = False
         self._hosts += 1
         path = PurePath(TELEMETRY)
@@ -39,7 +39,7 @@ class Telemetry:
         self._next_world_ns = 0
 
     def take_in(self) -> None:
-        """Write what arrived."""
+        """Write arrived messages."""
         for state in self._control.drain():
             if self._new_host and (self.latest is None or state.stamp_ns < self.latest.stamp_ns):
                 self._start_over()

@@ -1,6 +1,6 @@
-"""Commands on robots that are there.
+"""Commands on running robots.
 
-`targets`   which robots a command is about: those of this machine, or of a network
-`status`, `echo`   look     `command`, `stop`, `fault`   act: arm, disarm, clear; emergency stop; faults on request
+`targets`   which robots a command addresses: those of this machine, or of a network
+`status`, `echo`   read     `command`, `stop`, `fault`   act: arm, disarm, clear; emergency stop; fault injection
 `schemas`, `completion`   need no robot
 """

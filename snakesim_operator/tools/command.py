@@ -1,7 +1,7 @@
-"""What a person tells a robot: `snakesim arm`, `disarm`, `clear`.
+"""Commands to a robot: `snakesim arm`, `disarm`, `clear`.
 
-Names are no identity: anybody on the network can answer in a robot's name. So everybody is asked, two answers are one
-too many, and an answer counts once the robot's host shows the new state itself.
+A name is not an identity: any client on the network can answer in a robot's name. So all hosts are queried, two answers
+are an error, and an answer is accepted once the robot's host publishes the new state itself.
 """
 
 import getpass
@@ -22,7 +22,7 @@ SHOWN_S = 1.5  # until the host's status must show what its answer says
 
 
 def arm(robot: str, backend: str, where: Where, say: Say = say) -> int:
-    """Arm a robot, when it is the one that is meant. Raises RefusedError with the reason."""
+    """Arm a robot, if robot and backend match. Raises RefusedError with the reason."""
     link = the_one(where, f"arm {robot} {backend}")
     with open_session(link, CONNECT_S) as session:
         description = _description(session, link)
@@ -36,7 +36,7 @@ def arm(robot: str, backend: str, where: Where, say: Say = say) -> int:
         ]
         if wrong:
             raise RefusedError(
-                f"not armed: {'; '.join(wrong)}. Armed is only what is named: "
+                f"not armed: {'; '.join(wrong)}. To arm, name robot and backend: "
                 f"`snakesim arm {description.robot} {description.backend}`"
             )
         request = LifecycleRequest(
@@ -51,16 +51,16 @@ def arm(robot: str, backend: str, where: Where, say: Say = say) -> int:
 
 
 def disarm(where: Where, say: Say = say) -> int:
-    """Let the joints go passive; also what is streamed then does not move them."""
+    """Make the joints passive; later commands do not move them."""
     link = the_one(where, "disarm")
     with open_session(link, CONNECT_S) as session:
         return _ask(session, LifecycleRequest(action="disarm", who=who()), "disarmed", link, say)
 
 
 def clear(where: Where, say: Say = say) -> int:
-    """Forget a fault or an emergency stop. The robot is disarmed then.
+    """Clear a fault or an emergency stop. The robot is disarmed then.
 
-    Where no robot runs, an emergency stop that the last run left is forgotten.
+    If no robot runs, an emergency stop stored by the last run is removed.
     """
     try:
         link = the_one(where, "clear")
@@ -76,7 +76,7 @@ def clear(where: Where, say: Say = say) -> int:
 
 
 def who() -> str:
-    """Who types this."""
+    """The user's name."""
     try:
         return getpass.getuser()[:64]
     except (KeyError, OSError):
@@ -100,21 +100,21 @@ def _ask(session: Session, request: LifecycleRequest, done: str, link: Link, say
 
 
 def judge(answers: Sequence[Answer], statuses: Reader[Status]) -> tuple[str | None, Status | None]:
-    """Whether answers can be believed: (why not, the newest status). None: one host answered, and shows it."""
+    """Check answers: (why not confirmed, the newest status). None: one host answered, and its status confirms it."""
     if len(answers) > 1:
         return f"{len(answers)} answered in its name; at least one is an impostor", _newest(statuses, None)
     wanted = answers[0].lifecycle if answers else None
     shown = _newest(statuses, wanted)
     hosts = {status.host for status in (shown,) if status is not None} | {answer.host for answer in answers}
     if len(hosts) > 1:
-        return "who answered is not who publishes its status; one of them is an impostor", shown
+        return "the answer is not from the host that publishes its status; one of them is an impostor", shown
     if shown is None or shown.lifecycle != wanted:
-        return "its status does not show it; the host may hang, and who answered be an impostor", shown
+        return "its status does not show it; the host may hang, and the answer be from an impostor", shown
     return None, shown
 
 
 def _newest(statuses: Reader[Status], lifecycle: str | None) -> Status | None:
-    """The newest status, once it shows a state, or when it does not in time."""
+    """The newest status, once it shows a state, or after the timeout."""
     shown: Status | None = None
     deadline = time.monotonic() + SHOWN_S
     while time.monotonic() < deadline:
@@ -126,7 +126,7 @@ def _newest(statuses: Reader[Status], lifecycle: str | None) -> Status | None:
 
 
 def _description(session: Session, link: Link) -> Description:
-    """What the robot's host shows. Raises RefusedError when two hosts show something."""
+    """The robot's description. Raises RefusedError when two hosts publish one."""
     reader = session.latched_reader(keys.DESCRIPTION, Description)
     deadline = time.monotonic() + DESCRIPTION_S
     found: list[Description] = []
@@ -134,7 +134,9 @@ def _description(session: Session, link: Link) -> Description:
         time.sleep(0.05)
         found = reader.drain()
     if not found:
-        raise NotConnectedError(f"{link.namespace} shows no description on {link.endpoint}; is its HAL host running?")
+        raise NotConnectedError(
+            f"{link.namespace} publishes no description on {link.endpoint}; is its HAL host running?"
+        )
     if len({description.host for description in found}) > 1:
         raise RefusedError(f"{link.namespace}: {len(found)} hosts describe it; at least one is an impostor. Not armed")
     return found[-1]

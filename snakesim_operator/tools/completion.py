@@ -1,4 +1,4 @@
-"""`snakesim completion bash|zsh`: tab completion, written from the parsers themselves.
+"""`snakesim completion bash|zsh`: tab completion, generated from the parsers.
 
 source <(snakesim completion bash)        # in ~/.bashrc
 source <(snakesim completion zsh)         # in ~/.zshrc
@@ -104,7 +104,7 @@ def _walk(parser: argparse.ArgumentParser, path: str) -> Iterator[Command]:
 
 
 def _of_package(name: str) -> list[Command]:
-    """A command of an installed package, when a `parser` stands beside its `main`."""
+    """A command of an installed package, if it has a `parser` beside its `main`."""
     entry = next(iter(entry_points(group=COMMANDS, name=name)))
     try:
         parser = getattr(import_module(entry.module), "parser", None)

@@ -1,4 +1,4 @@
-"""`snakesim echo`: what is published on a key, as one JSON object a line, or how often."""
+"""`snakesim echo`: prints the messages on a key, as one JSON object a line, or their rate."""
 
 import contextlib
 import itertools
@@ -23,12 +23,12 @@ from snakesim_hal.wire.codec import Decoder
 from snakesim_operator.tools.targets import CONNECT_S, Where
 
 RATE_PERIOD_S = 1.0
-MAX_WAITING_BYTES = 64 * 1024 * 1024  # while the terminal, or who reads the pipe, is slower than the network
+MAX_WAITING_BYTES = 64 * 1024 * 1024  # while the terminal or pipe is slower than the network
 
 
 @dataclass(frozen=True)
 class EchoRequest:
-    """What the command line asks for. key: relative to the robot, wildcards allowed; None: which keys there are."""
+    """The command's options. key: relative to the robot, wildcards allowed; None: list the keys."""
 
     key: str | None
     rate_only: bool = False
@@ -36,7 +36,7 @@ class EchoRequest:
 
 
 def echo(request: EchoRequest, where: Where, say: Say = say) -> int:
-    """Print what arrives on a key, from every robot that is meant. Raises NotConnectedError, ConfigError."""
+    """Print messages on a key, from every addressed robot. Raises NotConnectedError, ConfigError."""
     if request.key is None:
         for line in _key_lines():
             say(line)
@@ -44,13 +44,13 @@ def echo(request: EchoRequest, where: Where, say: Say = say) -> int:
     relative = key_expression(request.key.strip("/"))
     rows = [row for row in _echoed() if intersects(relative, row.key)]
     if not rows:
-        raise ConfigError(f"there is no key {request.key!r}; what can be echoed:", *_key_lines())
+        raise ConfigError(f"there is no key {request.key!r}; available keys:", *_key_lines())
     latched = tuple(row.key for row in rows if row.kind == "latched")
     within = "" if where.namespace is not None else "**/"
     waiting = Waiting()
     with contextlib.ExitStack() as stack:
         for session in _sessions(where, stack):
-            # A latched value is older than what streams beside it: a subscriber to both would drop it as too old.
+            # A latched value is older than the streams: a subscriber to both would drop it as too old.
             for key in latched:
                 session.on_latched_arrival(f"{within}{key}", waiting.put)
             if len(latched) < len(rows):
@@ -70,7 +70,7 @@ def _sessions(where: Where, stack: contextlib.ExitStack) -> list[Session]:
             found.append(stack.enter_context(open_session(Link(endpoint, where.namespace), CONNECT_S)))
     if not found:
         raise NotConnectedError(
-            f"nobody listens on {', '.join(where.endpoints())}; start a run or a router there first"
+            f"nothing listens on {', '.join(where.endpoints())}; start a run or a router there first"
         )
     return found
 
@@ -84,7 +84,7 @@ def _key_lines() -> list[str]:
 
 
 class Waiting:
-    """Samples on their way to the terminal; when it is too slow, the newest are dropped, and that is said."""
+    """Samples queued for the terminal; if it is too slow, the newest are dropped, and this is reported."""
 
     def __init__(self) -> None:
         self._arrivals: Mailbox[Arrival] = Mailbox()
@@ -102,7 +102,7 @@ class Waiting:
         self._arrivals.put(arrival)
 
     def unless_at(self, keys: tuple[str, ...]) -> Callable[[Arrival], None]:
-        """Adds what is not at one of these keys of a robot."""
+        """Adds samples that are not at one of these keys of a robot."""
 
         def put(arrival: Arrival) -> None:
             if not f"/{arrival.key}".endswith(suffixes):
@@ -114,7 +114,7 @@ class Waiting:
     def get(self, timeout: float | None = None) -> Arrival:
         """The oldest one. Raises queue.Empty."""
         if self._dropped and self._arrivals.empty():
-            complain(f"{self._dropped} messages were left out: they came faster than they could be printed")
+            complain(f"{self._dropped} messages were dropped: they came faster than they could be printed")
             self._dropped = 0
         arrival = self._arrivals.get(timeout)
         with self._lock:

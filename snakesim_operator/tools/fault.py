@@ -1,4 +1,4 @@
-"""`snakesim fault`: let something go wrong in a run that allows it, and end it again."""
+"""`snakesim fault`: inject a fault into a run that allows it, and end it."""
 
 from dataclasses import dataclass
 from math import inf
@@ -17,7 +17,7 @@ LIST = "list"
 
 @dataclass(frozen=True)
 class FaultOrder:
-    """What the command line asks for."""
+    """The command's options."""
 
     kind: str
     target: str | None = None
@@ -27,18 +27,18 @@ class FaultOrder:
 
 
 def fault(order: FaultOrder, where: Where, say: Say = say) -> int:
-    """Ask the part that can do it. Raises RefusedError when it says no, NotConnectedError when nobody answers."""
+    """Send the request to the responsible part. Raises RefusedError if it refuses, NotConnectedError without answer."""
     if order.kind == LIST and order.target is None:
         for line in explain().splitlines():
             say(line)
         return 0
     if order.target is None:
-        raise ConfigError(f"fault {order.kind}: name what it happens to, such as joint_3; `snakesim fault list` helps")
+        raise ConfigError(f"fault {order.kind}: give a target, such as joint_3; see `snakesim fault list`")
     injection = checked(Injection(order.kind, order.target, amount=order.amount), f"{order.kind} {order.target}")
     if order.for_s is not None and not 0.0 < order.for_s < inf:
         raise ConfigError(f"--for {order.for_s:g}: give more than 0 s")
     if injection.about.once and (order.end or order.for_s is not None):
-        raise ConfigError(f"{order.kind} happens once and has no end; leave out --for and --end")
+        raise ConfigError(f"{order.kind} happens once and has no end; omit --for and --end")
     request = FaultRequest(kind=order.kind, target=order.target, for_s=order.for_s, amount=order.amount, end=order.end)
     with open_session(the_one(where, f"fault {order.kind} {order.target}"), CONNECT_S) as session:
         try:
@@ -46,7 +46,7 @@ def fault(order: FaultOrder, where: Where, say: Say = say) -> int:
         except NotConnectedError:
             raise NotConnectedError(
                 f"{injection.part} does not answer, and only it can {order.kind} {order.target}; `snakesim status` "
-                f"shows who is alive"
+                f"shows which services are alive"
             ) from None
     if not answer.ok:
         raise RefusedError(f"not done: {answer.reason}")

@@ -1,4 +1,4 @@
-"""Writes the published wire contract into `schemas/`: made from the code, so that it cannot say anything else."""
+"""Writes the published wire contract into `schemas/`: generated from the code, so that both agree."""
 
 import json
 from collections.abc import Iterator
@@ -25,12 +25,12 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 
 def published() -> list[Path]:
-    """Every file that came with the installation, the DBC file of the bus included."""
+    """Every installed file, including the DBC file of the bus."""
     return sorted(path for path in SCHEMAS.rglob("*") if path.is_file())
 
 
 def write_schemas(folder: Path) -> list[Path]:
-    """Write everything; returns the files in order. What an earlier call wrote, and this one does not, is removed."""
+    """Write everything; returns the files in order. Files of an earlier call that are no longer written are removed."""
     contents = dict(contract())
     if _is_contract(folder):
         for old in [*folder.glob("messages/*.json"), *folder.glob("files/*.json")]:
@@ -42,7 +42,7 @@ def write_schemas(folder: Path) -> list[Path]:
 
 
 def _is_contract(folder: Path) -> bool:
-    """Whether a folder is one that was written here: somebody else's `files/` stay as they are."""
+    """Whether a folder was written by this command: other folders called `files/` stay unchanged."""
     try:
         return read_text(folder / KEYS).startswith(TITLE)
     except ConfigError:
@@ -85,10 +85,10 @@ def _key_space() -> str:
         TITLE,
         "",
         "Made by `make schemas` from `snakesim_hal/wire/keys.py`. Keys are relative to the robot's Zenoh namespace.",
-        "`*` stands for a service's name, of `hal/host/*` for the id of a host. How to talk to a robot with these keys",
-        "is told in [protocol.md](protocol.md).",
+        "`*` stands for a service's name, of `hal/host/*` for the id of a host. How to use these keys",
+        "is described in [protocol.md](protocol.md).",
         "",
-        "| key | message | writer | kind | when | what it tells |",
+        "| key | message | writer | kind | when | content |",
         "|---|---|---|---|---|---|",
     ]
     for row in keys.SPACE:
@@ -100,8 +100,8 @@ def _key_space() -> str:
         rows.append(f"| `{row.key}` | {message} | {row.writer} | {row.kind} | {row.when} | {row.about} |")
     rows += [
         "",
-        "Kinds: a *stream* is published every so often and old samples are worthless; a *latched* value is kept for",
-        "readers that come later, who must ask for it; a *query* is answered with an [Answer](messages/Answer.json);",
+        "Kinds: a *stream* is published regularly and old samples are useless; a *latched* value is kept for",
+        "later subscribers, who must query it; a *query* is answered with an [Answer](messages/Answer.json);",
         "*liveliness* is a token that vanishes with its process. A *tick* lasts `Description.period_ns`.",
         "",
     ]

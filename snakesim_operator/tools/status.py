@@ -1,4 +1,4 @@
-"""Looking at running robots from another terminal, `snakesim status`; and `snakesim router`."""
+"""`snakesim status`: the state of running robots; and `snakesim router`."""
 
 import contextlib
 import threading
@@ -23,7 +23,7 @@ CONNECT_S = 1.0
 
 
 def show_status(where: Where, say: Say = say) -> int:
-    """Print the state of every robot that can be reached. Returns 0 when all are well, 1 otherwise."""
+    """Print the state of every reachable robot. Returns 0 without faults, 1 otherwise."""
     found: list[tuple[Link, list[Status]]] = []
     for endpoint in where.endpoints():
         link = Link(endpoint, where.namespace)
@@ -45,7 +45,7 @@ def show_status(where: Where, say: Say = say) -> int:
         for line in _in_words(link, statuses[-1]):
             say(line)
         if len({status.host for status in statuses}) > 1:
-            say("  IMPOSTOR: more than one host shows a status under this name; believe none of them")
+            say("  IMPOSTOR: more than one host publishes a status under this name; trust none of them")
         for line in _what_to_type(link, statuses[-1]):
             say(line)
     well = all(statuses[-1].lifecycle in ("armed", "disarmed") for _, statuses in found)
@@ -83,7 +83,7 @@ def _in_words(link: Link, status: Status) -> list[str]:
         f"  robot {status.robot}, backend {status.backend}, {status.pace} at {status.rate_hz:g} Hz, tick {status.tick}"
         f", on {link.endpoint}",
         f"  lease: {status.lease_holder or 'free'} (epoch {status.lease_epoch})",
-        f"  alive: {', '.join(status.alive) or 'nobody'}",
+        f"  alive: {', '.join(status.alive) or 'none'}",
         f"  commands: {status.commands_accepted} accepted, {status.commands_standby} in standby, rejected: "
         f"{counts(status.commands_rejected)}; joint targets limited: {counts(status.commands_limited)}",
     ]
@@ -94,7 +94,7 @@ def _in_words(link: Link, status: Status) -> list[str]:
     for what in status.realtime_warnings:
         lines.append(f"  real time: {what}")
     for what in status.injected:
-        lines.append(f"  fault on request: {what}")
+        lines.append(f"  injected fault: {what}")
     if status.waiting_for:
         lines.append(f"  waiting for: {', '.join(status.waiting_for)}")
     for fault in status.faults:
@@ -106,14 +106,14 @@ def _in_words(link: Link, status: Status) -> list[str]:
 
 
 def _what_to_type(link: Link, status: Status) -> list[str]:
-    """What a person does next; nothing while the robot moves, or cannot be armed yet."""
+    """The next commands for a person; none while the robot moves, or cannot be armed yet."""
     where = f" --endpoint {link.endpoint}" if link.endpoint != DEFAULT_ENDPOINT else ""
     where += f" --namespace {link.namespace}" if link.namespace != status.robot else ""
     arm = f"`snakesim arm {status.robot} {status.backend}{where}`"
     if status.lifecycle in ("fault", "estop"):
         return [f"  next: `snakesim clear{where}`, then {arm}"]
     if status.isolated and status.lifecycle == "disarmed":
-        back = f"`snakesim clear{where}`, to take back {', '.join(status.isolated)}"
+        back = f"`snakesim clear{where}`, to end the isolation of {', '.join(status.isolated)}"
         return [f"  next: {back}", *([f"  or, without: {arm}"] if status.ready_to_arm else [])]
     return [f"  next: {arm}"] if status.ready_to_arm else []
 

@@ -1,7 +1,7 @@
-"""`snakesim estop`: stop a robot now, every one that can be reached when none is named.
+"""`snakesim estop`: stop a robot now, or without a name every reachable one.
 
 Two ways at once, until one is answered or five seconds have passed: each robot's stop port, which floods and full
-sessions leave open, and the network, through which a robot behind a lab's router is reached.
+sessions do not block, and the network, for robots behind a lab's router.
 """
 
 import socket
@@ -20,22 +20,22 @@ from snakesim_operator.tools.targets import CONNECT_S, Where, namespace_of, robo
 
 LIMIT_S = 5.0
 ASK_S = 1.0
-UNCONFIRMED = "a stop port says so, and nothing on the network shows it"
+UNCONFIRMED = "a stop port reports it, but nothing on the network confirms it"
 
 
 @dataclass(frozen=True)
 class Told:
-    """What became of one robot."""
+    """The result for one robot."""
 
     name: str
     endpoint: str
     stopped: bool
     text: str
-    in_doubt: bool = False  # somebody may answer in its name
+    in_doubt: bool = False  # an impostor may answer in its name
 
 
 def estop(where: Where, say: Say = say) -> int:
-    """Stop them. Returns 0 when every robot that is known of has confirmed that it is stopped."""
+    """Stop them. Returns 0 when every known robot has confirmed that it is stopped."""
     local = {(robot.stop_host, robot.stop_port): Link(robot.endpoint, robot.namespace) for robot in where.local()}
     elsewhere: dict[tuple[str, int], Link] = {}
     if where.endpoint is not None and not local and (address := stop_address(where.endpoint, listens=True))[1]:
@@ -60,19 +60,19 @@ def estop(where: Where, say: Say = say) -> int:
 
 
 def _confirmed(there: list[Told], shown: list[Told]) -> list[Told]:
-    """What stop ports of other computers say, once the robot's network shows it: anybody may have such a port."""
+    """Answers of stop ports of other computers, once the robot's network confirms them: such a port may be forged."""
     return [
         told
         if not told.stopped or any(_same(told, other) and other.stopped for other in shown)
         else replace(
-            told, stopped=False, text=f"its stop port says so, and nothing on its network shows it: {told.text}"
+            told, stopped=False, text=f"its stop port reports it, but nothing on its network confirms it: {told.text}"
         )
         for told in there
     ]
 
 
 def _others(here: list[Told], there: list[Told], shown: list[Told]) -> list[Told]:
-    """What only the network tells of."""
+    """Robots that only the network reports."""
     return [told for told in shown if not any(_same(told, other) for other in (*here, *there))]
 
 
@@ -81,7 +81,7 @@ def _same(a: Told, b: Told) -> bool:
 
 
 def _at_port(link: Link, host: str, port: int) -> Told | None:
-    """Ask a stop port; None when nobody has it."""
+    """Send a stop to a stop port; None when the port is closed."""
     try:
         answer = ask_to_stop(host, port, who(), LIMIT_S)
     except NotConnectedError:
@@ -93,7 +93,7 @@ def _at_port(link: Link, host: str, port: int) -> Told | None:
 
 
 def _on_network(link: Link) -> list[Told]:
-    """Ask everybody on a network, again and again while nobody can be reached."""
+    """Query all hosts on a network, repeatedly while none can be reached."""
     deadline = time.monotonic() + LIMIT_S
     while True:
         try:
@@ -105,7 +105,7 @@ def _on_network(link: Link) -> list[Told]:
 
 
 def _anybody(link: Link) -> bool:
-    """Whether something listens at the endpoint at all, though it lets nobody in."""
+    """Whether anything listens at the endpoint, even if it accepts no session."""
     host, port = stop_address(link.endpoint, listens=True)
     try:
         with socket.create_connection((host, port), timeout=ASK_S):

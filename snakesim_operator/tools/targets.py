@@ -1,4 +1,4 @@
-"""Which robots a command is about: those on the endpoint that is named, else all that run on this computer."""
+"""Which robots a command addresses: those on the given endpoint, else all that run on this computer."""
 
 from dataclasses import dataclass
 
@@ -13,13 +13,13 @@ HAL_EVERYWHERE = f"**/{keys.alive('hal')}"
 
 @dataclass(frozen=True)
 class Where:
-    """What the command line says of where to look."""
+    """The command's network options."""
 
     endpoint: str | None = None  # None: every network of a robot on this computer, and the default endpoint
     namespace: str | None = None  # None: every robot there
 
     def local(self) -> list[LocalRobot]:
-        """Robots of this computer that are meant."""
+        """Addressed robots on this computer."""
         return [
             robot
             for robot in local_robots()
@@ -27,7 +27,7 @@ class Where:
         ]
 
     def endpoints(self) -> list[str]:
-        """Every network to look at."""
+        """Endpoints of all networks to search."""
         if self.endpoint is not None:
             return [self.endpoint]
         return list(dict.fromkeys([*(robot.endpoint for robot in self.local()), DEFAULT_ENDPOINT]))
@@ -39,13 +39,13 @@ def robots_on(session: Session) -> list[str]:
 
 
 def namespace_of(key: str) -> str:
-    """The robot that a key is of, seen from outside its namespace."""
+    """The namespace of a full key."""
     split = keys.split_namespace(key)
     return key if split is None else split[0]
 
 
 def find_robots(where: Where) -> list[Link]:
-    """Every robot that is meant and can be reached."""
+    """Every addressed robot that can be reached."""
     found: list[Link] = []
     for endpoint in where.endpoints():
         try:
@@ -58,14 +58,14 @@ def find_robots(where: Where) -> list[Link]:
 
 
 def the_one(where: Where, command: str) -> Link:
-    """The one robot that is meant. Raises NotConnectedError when there is none, RefusedError when there are more."""
+    """The single addressed robot. Raises NotConnectedError when there is none, RefusedError when there are more."""
     found = find_robots(where)
     if not found:
         named = "" if where.namespace is None else f" named {where.namespace}"
         raise NotConnectedError(
-            f"no robot{named} on {', '.join(where.endpoints())}; start a run there, or say where with --endpoint"
+            f"no robot{named} on {', '.join(where.endpoints())}; start a run there, or give --endpoint"
         )
     if len(found) > 1:
         choices = [f"  snakesim {command} --endpoint {link.endpoint} --namespace {link.namespace}" for link in found]
-        raise RefusedError("several robots are here; say which one is meant:", *choices)
+        raise RefusedError("several robots found; choose one:", *choices)
     return found[0]

@@ -99,7 +99,7 @@ def test_a_killed_host_is_started_again_and_not_armed(tmp_path: Path, pace: str)
         summary = interrupt(run)
     assert summary.hosts == 2 and [restart.name for restart in summary.restarts] == ["host"]
     assert (tmp_path / "run" / "telemetry-1.jsonl").is_file()
-    assert summary.ticks > 0 and "host was ended by SIGKILL; it is started again in 0.5 s" in run.said()
+    assert summary.ticks > 0 and "host was ended by SIGKILL; restart in 0.5 s" in run.said()
 
 
 def test_a_killed_controller_is_a_latched_fault_until_a_person_clears_it(tmp_path: Path) -> None:
@@ -160,10 +160,10 @@ def test_processes_go_wrong_on_request(tmp_path: Path) -> None:
             robot.reaches("armed")
             assert robot.fault("freeze", "control", for_s=0.5).ok
             robot.reaches("fault")
-            wait_until(lambda: "fault on request ends: freeze:control" in run.said(), "the thaw")
+            wait_until(lambda: "injected fault ends: freeze:control" in run.said(), "the thaw")
             before = run.part("navigation")
             assert robot.fault("stop", "navigation").ok
-            wait_until(lambda: run.said().count("it is started again") == 1, "navigation's end")
+            wait_until(lambda: run.said().count("; restart in") == 1, "navigation's end")
             wait_until(lambda: not robot.status().waiting_for, "navigation again", BACK_S)
             assert run.part("navigation") != before
             for kind, target, word in (
@@ -176,14 +176,14 @@ def test_processes_go_wrong_on_request(tmp_path: Path) -> None:
                 answer = robot.fault(kind, target)
                 assert not answer.ok and answer.refusal == "unknown_fault" and word in answer.reason, answer
             assert robot.fault("freeze", "host", for_s=60.0).ok
-            run.wait_for("fault on request: freeze:host")
+            run.wait_for("injected fault: freeze:host")
         interrupt(run)  # a frozen host is thawed to end in order
 
 
 def test_a_planned_kill_ends_a_run_that_does_not_stay(tmp_path: Path) -> None:
     arguments = [*LONG, "--pace", "realtime", "--set", 'faults=["kill:control@0.5"]']
     ended, summary = run_to_summary(tmp_path / "run", *arguments)
-    assert ended.code == 1 and "fault on request: kill:control" in ended.out
+    assert ended.code == 1 and "injected fault: kill:control" in ended.out
     assert "control was ended by SIGKILL" in summary.ended
     expired = next(fault for fault in summary.faults if fault.what == "lease_expired")
     assert 0.5 <= expired.tick * 0.02 - _armed_at_s(tmp_path / "run") < 1.5
@@ -205,7 +205,7 @@ def test_a_killed_supervisor_leaves_no_frozen_child(tmp_path: Path) -> None:
         'faults=["freeze:control@0.2","freeze:host@0.2"]',
     ]
     with running(tmp_path / "run", *arguments) as run:
-        run.wait_for("fault on request: freeze:host")
+        run.wait_for("injected fault: freeze:host")
         frozen = [Path(f"/proc/{run.part(name)}/stat").read_text() for name in ("control", "host")]
         assert [re.sub(r".*\) ", "", line)[0] for line in frozen] == ["T", "T"]
         assert len(processes_of(tmp_path / "run")) == 5

@@ -1,8 +1,8 @@
-"""Push-points: where the path passes an obstacle, and which of these places the body is at. Pure.
+"""Push-points: where the path passes an obstacle, and at which of these places the body is. Pure.
 
 The geometry is the planned one: the path's point nearest to the obstacle, and the path's normal there. A measured
-contact point wanders over the flank of a link as joints move; the planned one does not, and the body is meant to be
-there. What is measured decides only whether the body is near enough to push.
+contact point moves along a link as joints move; the planned one does not. Measurements decide only whether the body is
+near enough to push.
 """
 
 import math
@@ -43,7 +43,7 @@ class PushPoint:
 
     contact: PlannedContact
     body_s_m: float  # from the tail end
-    gap_m: float  # from the obstacle to the body as measured, across the path
+    gap_m: float  # from the obstacle to the measured body, across the path
 
 
 def plan_contact(
@@ -73,7 +73,7 @@ def plan_contact(
 
 
 def _past_box(route: Route, box: Obstacle, near_s_m: float, window_m: float) -> tuple[float, Planar, float]:
-    """Arc length nearest to a box, the way from the box to there, and the distance."""
+    """Arc length nearest to a box, the vector from the box to there, and the distance."""
     step, low, high = COARSE_M, near_s_m - window_m, near_s_m + window_m
     s, away, distance = near_s_m, np.zeros(2), 0.0
     for finer in (FINE_M, 0.0):
@@ -86,7 +86,7 @@ def _past_box(route: Route, box: Obstacle, near_s_m: float, window_m: float) -> 
 
 
 def _from_box(box: Obstacle, points_w: Floats) -> tuple[Floats, Floats]:
-    """The way from a box's nearest point to each point (k, 2), and the distances (k,); negative inside."""
+    """The vector from a box's nearest point to each point (k, 2), and the distances (k,); negative inside."""
     c, s = math.cos(box.yaw_rad), math.sin(box.yaw_rad)
     world_from_box = np.array([[c, -s], [s, c]])
     local = (points_w - np.array(box.position_w[:2])) @ world_from_box
@@ -111,8 +111,8 @@ def push_points(
 ) -> list[PushPoint]:
     """The planned contacts that the body can push at now, tail to head.
 
-    One counts when the body covers it, `end_m` from either tip or more, and is at most `gap_m` from it as measured, or
-    `give_up_gap_m` if it is among `kept`: felt to touch it, or pushing on it already. measured_w: (2, n_nodes).
+    One counts when the body covers it, `end_m` from either tip or more, and the measured body is at most `gap_m` from
+    it, or `give_up_gap_m` if it is among `kept`: in contact, or already used for pushing. measured_w: (2, n_nodes).
     node_body_s_m: (n_nodes,), arc lengths along the body.
     """
     places: list[float] = body_pose.node_s_m.tolist()

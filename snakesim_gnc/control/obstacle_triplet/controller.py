@@ -1,21 +1,21 @@
 """The obstacle-triplet controller: one joint pushes with a torque, all others keep the body on its path.
 
-Each time the world model is new it finds the push-points that the body is at, solves every triplet of neighbours
-among them, and chooses one; its propulsion joint is the first joint ahead of o_2. As the body moves on, o_2 passes
-joint after joint towards the tail, and the turn to propel with it, until the triplet's last obstacle is lost.
+For each new world model it finds the push-points of the body, solves every triplet of neighbours
+among them, and chooses one; its propulsion joint is the first joint ahead of o_2. As the body moves forward, o_2 passes
+joint after joint towards the tail, and with it the propulsion joint, until the triplet's last obstacle is lost.
 
 The propulsion force is `propulsion_n (1 - speed / mission speed)`, never below zero. A force below the drag moves
-nothing: positions follow the path at the measured arc length, with no look-ahead that would push by itself. They follow
-it no faster than the mission wants, and so brake a body that runs away.
+nothing: positions follow the path at the measured arc length, without a look-ahead that would push by itself. They
+follow it no faster than the mission's speed, which brakes a body that is too fast.
 
-Between push-points the propulsion joint swings freely until its contacts carry. It is damped, the force fades as it
-swings out, and a joint that has left its reference too far goes back to position mode. A body that stands still while
-it pushes is reported with the cause; when it is a jam, the triplet is let go of for a while and others are tried.
+Between push-points the propulsion joint swings freely until its contacts carry load. It is damped, the force is reduced
+as it swings out, and a joint that has left its reference too far returns to position mode. A body that stands still
+while it pushes is reported with the cause; in a jam, the triplet is released for a while and others are tried.
 
 Nothing jumps at a hand-over. In the tick of a change of mode, a position target is within `fade` times the joint's
 angle from its reference, and a torque target within `fade` times (measured torque - propulsion torque), of the target
-with which the motor goes on as it is; `fade = period / blend_s + |speed| period / blend_m`, 0.07 with the defaults at
-100 Hz and 0.2 m/s. The gate of the HAL bounds it once more: `speed_limit * period` and `torque_rate_limit * period`.
+with which the motor keeps its torque; `fade = period / blend_s + |speed| period / blend_m`, 0.07 with the defaults at
+100 Hz and 0.2 m/s. The gate of the HAL limits it once more: `speed_limit * period` and `torque_rate_limit * period`.
 """
 
 from dataclasses import dataclass
@@ -43,14 +43,14 @@ PLAN_WINDOW_M = 1.0  # beyond the body's ends: where the path may pass an obstac
 
 @dataclass(frozen=True)
 class Push:
-    """What the propulsion joint is told, and why."""
+    """Demand of the propulsion joint, and its reasons."""
 
     turn: int  # index of the joint
-    wanted_n: float  # propulsion force by the speed alone
-    force_n: float  # after fading and within the joint's torque
+    wanted_n: float  # propulsion force from the speed alone
+    force_n: float  # after fading, and within the joint's torque
     torque_nm: float
-    saturated: bool  # the limit of torque took from the force
-    swung: bool  # the joint is so far from its reference that the force is faded
+    saturated: bool  # the torque limit has reduced the force
+    swung: bool  # the joint is so far from its reference that the force is reduced
 
 
 class ObstacleTriplet:
@@ -113,7 +113,7 @@ class ObstacleTriplet:
         return Action(SetPoints(mode, targets, limits_nm), self._report_push(located, body_pose, choice, push))
 
     def _follow(self, view: View, located: Located) -> BodyPose:
-        """Where the joints in position mode want the body; starts, and goes on from another place, without a jump."""
+        """Reference of the joints in position mode; starts, and continues from another place, without a jump."""
         set_, s, before = self._set, located.tail_s_m, self._body_pose
         if before is None or located.anew:
             body_pose = located.on_path.at(s)
@@ -130,7 +130,7 @@ class ObstacleTriplet:
         return body_pose
 
     def _push(self, view: View, located: Located, choice: Choice, turn: int) -> Push:
-        """The propulsion: less the faster the body moves, and the further the joint has swung out."""
+        """The propulsion: reduced with the speed of the body, and with the swing of the joint."""
         set_, limit_nm = self._set, self._body.torque_limit_nm[turn]
         slow = 1.0 - located.speed_m_s / located.trajectory.speed_m_s
         off_rad = view.joints.angle_rad[turn] - float(self._reference[turn])
@@ -145,10 +145,10 @@ class ObstacleTriplet:
         torque_nm = min(max(self._hand_over.torque_nm(torque_nm), -limit_nm), limit_nm)
         return Push(turn, wanted_n, force_n, torque_nm, saturated=force_n < asked_n, swung=near < 1.0)
 
-    # --- what there is to push on ----------------------------------------------------------------------------
+    # --- push-points -----------------------------------------------------------------------------------------
 
     def _look(self, located: Located, body_pose: BodyPose) -> None:
-        """Plan the contacts with the obstacles near the body, and see which of them it is at."""
+        """Plan the contacts with the obstacles near the body, and find those that the body is at."""
         world = located.world
         if located.anew:
             self._planned.clear()
@@ -179,7 +179,7 @@ class ObstacleTriplet:
         return plan_contact(located.on_path.route, obstacle, self._body.radius_m, near_s_m=near_s_m, window_m=window_m)
 
     def _choose(self, view: View, located: Located, body_pose: BodyPose) -> None:
-        """Take a triplet, or none."""
+        """Choose a triplet, or none."""
         s, blend_m, share = located.tail_s_m, self._set.blend_m, self._set.switch_share
         self._banned = {names: at for names, at in self._banned.items() if abs(s - at) < blend_m}
         if self._stall is not None and abs(s - self._stall[1]) > blend_m:
@@ -198,10 +198,10 @@ class ObstacleTriplet:
             choices, present, switch_share=share
         )
 
-    # --- keeping out of trouble ------------------------------------------------------------------------------
+    # --- supervision -----------------------------------------------------------------------------------------
 
     def _guard(self, view: View, body_pose: BodyPose) -> None:
-        """Take the turn from a propulsion joint that has left its reference too far."""
+        """End the turn of a propulsion joint that has left its reference too far."""
         if self._choice is None:
             return
         joint, guard_s = self._choice.joint, self._set.guard_s
@@ -214,7 +214,7 @@ class ObstacleTriplet:
             self._choice = None
 
     def _watch_progress(self, view: View, located: Located, choice: Choice, push: Push) -> None:
-        """Notice standing still; let go of a triplet that is jammed."""
+        """Detect standing still; release a jammed triplet."""
         if not self._stall_watch.stands(view.time_s, located.tail_s_m, push.wanted_n):
             return
         self._stall_watch.forget()
@@ -234,10 +234,10 @@ class ObstacleTriplet:
             self._banned[choice.triplet.names] = located.tail_s_m
             self._position_until_s = view.time_s + self._set.release_s
 
-    # --- what it tells ---------------------------------------------------------------------------------------
+    # --- reports ---------------------------------------------------------------------------------------------
 
     def _wait(self, view: View, why: str) -> Action:
-        """Without knowing where the body is, nothing pushes: every joint goes where it was meant to be, and stays."""
+        """Without a known body pose nothing pushes: every joint goes to its reference, and stays there."""
         self._choice, self._asked_n = None, 0.0
         self._stall_watch.forget()
         if not len(self._reference):

@@ -1,8 +1,8 @@
-"""Which three push-points, and which joint: the choice that a propulsion torque needs. Pure.
+"""The choice of three push-points and a joint for propulsion. Pure.
 
 Only neighbours on alternating sides make a triplet: from the middle contact, the nearest one on the other side behind
-it and the nearest one on the other side ahead of it. So a body of thirty modules has a handful of candidates, and the
-choice moves along the body instead of jumping between all threes.
+it and the nearest one on the other side ahead of it. So a body of thirty modules has few candidates, and the
+choice moves along the body instead of jumping between all combinations.
 """
 
 from bisect import bisect_right
@@ -28,7 +28,7 @@ Names = tuple[str, str, str]
 
 @dataclass(frozen=True)
 class Triplet:
-    """Three planned contacts, solved once; nothing here depends on where the body is."""
+    """Three planned contacts, solved once; independent of the body's position."""
 
     names: Names
     contacts: tuple[PlannedContact, PlannedContact, PlannedContact]
@@ -40,7 +40,7 @@ class Triplet:
 
 @dataclass(frozen=True)
 class Choice:
-    """A triplet, where on the body it is now, and the joint that propels."""
+    """A triplet, its present place on the body, and the propulsion joint."""
 
     triplet: Triplet
     body_s_m: tuple[float, float, float]
@@ -85,8 +85,8 @@ def propulsion_joint(
 ) -> int | None:
     """The first joint ahead of o_2 and behind o_3, or None: it has the longest lever.
 
-    Joint i is node i + 1. The present joint keeps its turn until the one behind it is `hold_on_m` past o_2, so that
-    noise does not pass the turn to and fro.
+    Joint i is node i + 1. The present joint remains until the one behind it is `hold_on_m` past o_2, so that
+    noise does not switch back and forth.
     """
     joint = max(bisect_right(node_body_s_m, behind_m) - 1, 0)
     last = len(node_body_s_m) - 3
@@ -104,9 +104,9 @@ def choose(
     """The triplet to push with, or None when there is none.
 
     The present one stays as long as it can be used, unless another needs less than `switch_share` of its torque. Its
-    successor shares as many push-points with it as possible, among those that need little more torque than the least;
-    then the one with the least torque, and of equals the one nearest to the tail: what swings with the propulsion
-    joint is then the short end of the body, and the long one stays in its corridor.
+    successor shares as many push-points with it as possible, among those that need little more than the minimum torque;
+    then the one with the minimum torque, and of equals the one nearest to the tail: then the short end of the body
+    swings with the propulsion joint, and the long one stays in its corridor.
     """
     free = [c for c in choices if c.triplet.names not in banned]
     if not free:
@@ -125,7 +125,7 @@ def _shared(choice: Choice, names: Collection[str]) -> int:
 
 
 class Triplets:
-    """All choices that the push-points leave now; solves each three contacts once."""
+    """All choices for the present push-points; solves each three contacts once."""
 
     def __init__(self, *, condition_max: float, authority_min: float, hold_on_m: float) -> None:
         self._condition_max = condition_max

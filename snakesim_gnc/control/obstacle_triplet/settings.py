@@ -1,4 +1,4 @@
-"""What a scenario's `[controllers.obstacle_triplet]` section may say."""
+"""The schema of a scenario's `[controllers.obstacle_triplet]` section."""
 
 from typing import Annotated
 

@@ -1,4 +1,4 @@
-"""Standing still although pushing: noticed, told apart by cause, and let go of. Pure but for its own memory."""
+"""Detects standing still although pushing, and its cause. Pure except for its own state."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -49,10 +49,10 @@ def explain(
     jam_force_n: float,
     drag_share: float,
 ) -> Stall:
-    """The cause of a stall: wedged between obstacles, at the end of the motor, held by friction, or too little push.
+    """The cause of a stall: wedged between obstacles, motor saturated, held by friction, or too little push.
 
-    force_n: what the speed alone would have propelled with. saturated, swung: name of the propulsion joint if it is at
-    its limit of torque, or has swung out so far that the propulsion was faded.
+    force_n: propulsion from the speed alone. saturated, swung: name of the propulsion joint if it is at
+    its torque limit, or has swung out so far that the propulsion was reduced.
     """
     pushing = f"standing still with {force_n:.1f} N of propulsion"
     if contact_force_n > jam_force_n:

@@ -1,4 +1,4 @@
-"""The obstacle triplet model: contact forces and joint torques that a propulsion force asks for. Pure and planar.
+"""The obstacle triplet model: contact forces and joint torques for a propulsion force. Pure and planar.
 
 The equations are those of the paper's section IV-A, solved at once. The obstacles push along their normals only (no
 friction), `f_i = lambda_i n_i`, and an imagined tether at o_1 pulls back with `f_s = -propulsion t_1`. Balance of
@@ -28,7 +28,7 @@ UNIT_TOLERANCE = 1e-6
 
 @dataclass(frozen=True)
 class UnitForces:
-    """What three contacts carry for each newton of propulsion."""
+    """Forces of three contacts for each newton of propulsion."""
 
     forces: Floats  # (3,) N/N, tail to head; NaN where the contacts decide nothing
     condition: float  # of the balance, with lengths in units of the triplet's span; infinite when singular
@@ -37,7 +37,7 @@ class UnitForces:
 
 @dataclass(frozen=True)
 class TripletSolution:
-    """What three contacts and one joint do together for a propulsion force."""
+    """Forces of three contacts and torque of one joint for a propulsion force."""
 
     forces_n: Floats  # (3,) tail to head, along the normals; NaN when the contacts decide nothing
     torque_nm: float  # internal torque on the part of the body ahead of the joint, left turn positive; NaN like forces
@@ -65,7 +65,7 @@ def solve_triplet(
     Not feasible, with the reason, when the balance is ill-conditioned (its condition number, with lengths in units of
     |o_3 - o_1|, exceeds `condition_max`), when a contact would have to pull (lambda_i <= 0), or when the joint has no
     authority: r, from the joint to o_3, is parallel to n_3 (|r x n_3| / |r| below `authority_min`).
-    Raises ValueError for arguments that are no triplet at all: wrong shapes, NaN, directions that are not unit
+    Raises ValueError for invalid arguments: wrong shapes, NaN, directions that are not unit
     vectors, a propulsion force that is not positive.
     """
     points = _planar("points_w", points_w, (3, 2))

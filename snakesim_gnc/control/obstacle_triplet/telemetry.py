@@ -1,4 +1,4 @@
-"""What the obstacle-triplet controller tells of its triplet, forces and torques. Pure."""
+"""Telemetry of the obstacle-triplet controller: triplet, forces and torques. Pure."""
 
 import math
 from collections.abc import Sequence
@@ -13,14 +13,14 @@ from snakesim_hal.wire.messages import World, WorldContact
 
 
 def bending(body: PlanarBody, body_pose: BodyPose, choice: Choice, force_n: float) -> list[float]:
-    """Torque that the solved forces ask of every joint, tail to head; the tether's force stands for all resistance."""
+    """Torque of every joint for the solved forces, tail to head; the tether's force represents all resistance."""
     places = np.array(choice.body_s_m)
     torques = force_n * torque_under(body.joints_w(body_pose), body.joint_s_m, places, choice.triplet.unit_wrenches)
     return torques.tolist()
 
 
 def planned_contacts(body: PlanarBody, world: World, choice: Choice, forces_n: Sequence[float]) -> list[WorldContact]:
-    """The triplet's push-points where they are planned, with the forces that were solved for, tail to head."""
+    """The triplet's planned push-points, with the solved forces, tail to head."""
     height = world.base_position_w[2]
     told: list[WorldContact] = []
     for contact, body_s, force in zip(choice.triplet.contacts, choice.body_s_m, forces_n, strict=True):
@@ -40,5 +40,5 @@ def planned_contacts(body: PlanarBody, world: World, choice: Choice, forces_n: S
 
 
 def largest_contact_force_n(world: World) -> float:
-    """Size of the strongest touch felt."""
+    """Magnitude of the strongest measured contact force."""
     return max((math.hypot(*contact.force_w) for contact in world.contacts), default=0.0)

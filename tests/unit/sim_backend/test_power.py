@@ -66,7 +66,7 @@ def test_heat_on_request_goes_away_by_itself_or_is_held():
 
 def test_without_the_sensor_there_is_no_heat_on_request():
     config = make_config({"sensors!": {"joints": {}}}, faults=["overheat:joint_1@1"])
-    with pytest.raises(ConfigError, match=r"without \[sensors.power\] in the robot file nobody would feel heat"):
+    with pytest.raises(ConfigError, match=r"without \[sensors.power\] in the robot file heat would not be measured"):
         SimBackend.check(config, Settings())
     assert not Run(make_config({"sensors!": {"joints": {}}})).sim.inject(overheat(), begins=True)
     assert SimBackend.check(make_config(WITH, faults=["overheat:joint_1@1"]), Settings())

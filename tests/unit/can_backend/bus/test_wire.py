@@ -292,7 +292,9 @@ def test_an_interface_must_be_there_and_up(monkeypatch: pytest.MonkeyPatch) -> N
     with pytest.raises(ConfigError, match=r"'lo': this kernel has no CAN.*`backends\.can\.channels` empty.*docs/hil"):
         check_interface("lo")
     monkeypatch.setattr(wire_module, "_kernel_has_can", lambda: True)
-    with pytest.raises(ConfigError, match=r"'nocan7': there is no such interface; `deploy/can/up.sh nocan7` makes it"):
+    with pytest.raises(
+        ConfigError, match=r"'nocan7': there is no such interface; `deploy/can/up.sh nocan7` creates it"
+    ):
         check_interface("nocan7")
     monkeypatch.setattr(wire_module, "is_up", lambda _channel: False)
     with pytest.raises(ConfigError, match=r"'lo': the interface is down; `deploy/can/up.sh lo` brings it up"):

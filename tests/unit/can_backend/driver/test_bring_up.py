@@ -187,17 +187,17 @@ def test_a_whole_robot_is_not_objected_to() -> None:
         (GOOD[:2] + GOOD[3:], "joint_3 (node 3 on can_b) does not answer"),
         (
             [*GOOD, replace(GOOD[1], serial=0xBEEF)],
-            "joint_2 (node 2 on can_a) is there 2 times, serials 00001002 and 0000BEEF: give each module its own",
+            "joint_2 (node 2 on can_a) answers 2 times, serials 00001002 and 0000BEEF: give each module its own",
         ),
-        ([*GOOD, replace(GOOD[0], node=9)], "node 9 with serial 00001001 on can_a is none of this robot's joints"),
+        ([*GOOD, replace(GOOD[0], node=9)], "node 9 with serial 00001001 on can_a is not a joint of this robot"),
         (
             [*GOOD[:2], replace(GOOD[2], channel=A), GOOD[3]],
             "joint_3 (node 3 on can_b) does not answer; a node 3 answers on can_a",
         ),
-        ([*GOOD, replace(GOOD[2], channel=A, serial=0xF)], "joint_3 (node 3 on can_b) has a namesake on can_a, serial"),
+        ([*GOOD, replace(GOOD[2], channel=A, serial=0xF)], "joint_3 (node 3 on can_b) is duplicated on can_a, serial"),
         (
             [replace(GOOD[0], protocol=2), *GOOD[1:]],
-            "joint_1 (node 1 on can_a) speaks protocol version 2, this driver 1",
+            "joint_1 (node 1 on can_a) has protocol version 2, this driver 1",
         ),
         ([replace(GOOD[0], stepped=True), *GOOD[1:]], "joint_1 (node 1 on can_a) is a twin whose time stands still"),
     ],
@@ -209,7 +209,7 @@ def test_what_is_wrong_is_told_with_joint_node_and_bus(found: list[Identity], wo
 
 def test_modules_that_cannot_wait_are_no_good_for_lockstep() -> None:
     told = wrong_with([replace(i, stepped=i.node > 1) for i in GOOD], lockstep=True)
-    assert told == ["joint_1 (node 1 on can_a) cannot wait for lockstep: use --pace realtime"]
+    assert told == ["joint_1 (node 1 on can_a) does not support lockstep: use --pace realtime"]
 
 
 def test_everything_is_told_at_once() -> None:
@@ -222,7 +222,7 @@ def test_everything_is_told_at_once() -> None:
     ]
     told = wrong_with(found)
     assert len(told) == 7
-    for words in ("is there 2 times", "version 3", "joint_2 .*does not answer$", "answers on can_a", "--stepped", "62"):
+    for words in ("answers 2 times", "version 3", "joint_2 .*does not answer$", "answers on can_a", "--stepped", "62"):
         assert any(re.search(words, line) for line in told), words
 
 

@@ -54,7 +54,7 @@ def test_a_fault_of_a_module_is_named_with_its_joint_and_everything_comes_to_res
 
 
 def test_a_module_that_is_there_twice_is_found_before_anything_is_enabled() -> None:
-    words = r"joint_3 .* is there 2 times, serials .*give each module its own node id"
+    words = r"joint_3 .* answers 2 times, serials .*give each module its own node id"
     with pytest.raises(BackendError, match=words), loop(faults=["duplicate:joint_3@0"]):
         pass
 

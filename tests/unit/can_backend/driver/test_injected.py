@@ -84,7 +84,7 @@ def test_what_a_module_cannot_know_the_host_makes() -> None:
 @pytest.mark.parametrize(
     ("settings", "text", "words"),
     [
-        (Settings(), "diverge:simulator@1", "its modules know mute, freeze"),
+        (Settings(), "diverge:simulator@1", "its modules support mute, freeze"),
         (Settings(), "cut:bus_2@1", "this run has bus_1 to bus_1"),
         (Settings(channels=["vcan0"]), "leak:joint_1@1", "its modules are not the driver's own"),
         (Settings(channels=["vcan0"], twins="process"), "full:bus_1@1", "fill the queue of a kernel interface"),
@@ -211,7 +211,7 @@ def test_one_end_of_a_virtual_bus() -> None:
     [
         (("lo0", "full"), "tc qdisc add dev lo0"),
         (("nothere0", "cut"), "`ip link set nothere0 down`"),
-        (("can7", "bus_off"), "error frames can only be had on virtual interfaces"),
+        (("can7", "bus_off"), "error frames can only be sent on virtual interfaces"),
     ],
 )
 def test_what_cannot_be_done_to_an_interface_is_told(given: Any, words: str) -> None:

@@ -211,7 +211,7 @@ def test_a_flood_is_bounded_per_tick_and_soon_over(caplog: pytest.LogCaptureFixt
         assert read(mocap, mocap.at()) is not None
     assert [record.message.split(":")[1] for record in caplog.records] == [
         " first malformed datagram",
-        " datagrams refused",
+        " datagrams rejected",
     ]
 
 

@@ -88,7 +88,9 @@ def test_limits_end_where_the_bus_ends(field: str, opcode: Opcode, signal: str, 
     most = codec()[opcode].signals[signal].high / room
     if field != "angle_rad" or most <= 3.1:
         check_ratings(changed("limits", **{field: most * 0.999}))
-    with pytest.raises(ConfigError, match=rf"planar13.*limits\.{field}` = .* {unit} does not go through the bus"):
+    with pytest.raises(
+        ConfigError, match=rf"planar13.*limits\.{field}` = .* {unit} exceeds the range of the bus protocol"
+    ):
         check_ratings(changed("limits", **{field: most * 1.001}))
 
 
@@ -100,9 +102,9 @@ def test_modules_that_can_do_what_the_robot_asks_for_are_taken() -> None:
 @pytest.mark.parametrize(
     ("torque_nm", "speed_rad_s", "words"),
     [
-        (6.9, 7.5, "rated for 6.9 N·m.*asks for 7"),
-        (7.0, 7.0, "rated for 7 rad/s.*asks for 7.5"),
-        (float("nan"), 7.5, "rated for nan N·m.*asks for 7"),
+        (6.9, 7.5, "rated for 6.9 N·m.*needs 7"),
+        (7.0, 7.0, "rated for 7 rad/s.*needs 7.5"),
+        (float("nan"), 7.5, "rated for nan N·m.*needs 7"),
     ],
 )
 def test_a_weaker_module_is_named_with_what_to_do(torque_nm: float, speed_rad_s: float, words: str) -> None:

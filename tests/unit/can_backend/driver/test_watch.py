@@ -92,7 +92,7 @@ WRONGS = [
         doubled,
         3,
         "duplicate_node",
-        "is there twice: every Sync is answered two times; give each module its own node id",
+        "is duplicated: every Sync is answered twice; give each module its own node id",
     ),
     (babbling, 1, "module_babbling", f"floods the bus: {MAX_FRAMES + 1} frames within one period"),
 ]
@@ -158,7 +158,7 @@ def test_a_silent_module_whose_heart_beats_is_told_from_a_dead_one() -> None:
     bench = Bench()
     bench.tick(lambda reading: reading.take(heartbeat(2, 1.0)))
     (found,) = bench.ticks(2, quiet)
-    assert "its heart still beats" in found.cause
+    assert "it still sends heartbeats" in found.cause
     bench = Bench()
     bench.tick(lambda reading: (answer(reading, [2]), reading.take(heartbeat(2, 1.0)))[0])
     (found,) = bench.ticks(3, quiet)
@@ -357,7 +357,7 @@ def test_the_grace_begins_with_every_arming() -> None:
         ("bus_off", "look for a short, a wrong bit rate, a missing terminator"),
         ("error_passive", "look at cables, terminators and bit rate"),
         ("interface_down", "bring it up again, then clear and arm"),
-        ("restarted", "clear and arm when the bus is sound"),
+        ("restarted", "clear and arm when the bus is in order"),
         ("receive_overflow", "states may be missing"),
     ],
 )
@@ -387,7 +387,7 @@ def test_a_bus_that_takes_nothing_for_three_periods_is_stuck() -> None:
         assert bench.tick(unsent="can1") == []
     (found,) = bench.tick(unsent="can1")
     assert (found.what, found.joint) == ("bus_stuck", None)
-    for words in ("can1: ", "do not get out for 30 ms", "nobody acknowledges", "txqueuelen is below 64"):
+    for words in ("can1: ", "no frames sent for 30 ms", "no node acknowledges", "txqueuelen is below 64"):
         assert words in found.cause
     assert bench.tick(unsent="can1") == []
 
@@ -412,7 +412,7 @@ def test_a_stranger_that_answers_every_sync_is_found() -> None:
     bench = Bench()
     assert bench.ticks(2, stranger) == []
     (found,) = bench.tick(stranger)
-    assert found == Finding("unknown_node", "node 9 is on the bus, and this robot has no such joint")
+    assert found == Finding("unknown_node", "node 9 is on the bus, but is not a joint of this robot")
     assert bench.ticks(5, stranger) == []
 
 
@@ -428,7 +428,7 @@ def test_a_stray_frame_now_and_then_is_none() -> None:
         (codec()[Opcode.SYNC].frame(0), "second_host", "another program commands the modules"),
         (codec()[Opcode.SET_POINT].frame(2), "second_host", "end one of the two"),
         (codec()[Opcode.COMMAND].frame(2, action=Action.STOP), "second_host", "another program"),
-        (Frame(frame_id(Opcode.EMERGENCY, 0), b"\x01"), "emergency", "somebody on the bus called an emergency"),
+        (Frame(frame_id(Opcode.EMERGENCY, 0), b"\x01"), "emergency", "a node on the bus sent an Emergency"),
     ],
 )
 def test_another_host_is_told(frame: Frame, what: str, words: str) -> None:

@@ -44,8 +44,8 @@ def test_every_fault_of_a_joint_is_known_but_those_that_a_module_cannot_have():
         ("mute:joint_5@2", "no joint_5; this run has joint_1 to joint_4"),
         ("mute:joint_1@2-1", "must be later than its start"),
         ("mute:joint_1@1.2.3", "are numbers"),
-        ("wrong:joint_1@1", "modules know mute, freeze, reboot"),
-        ("kill:control@1", "modules know mute, freeze, reboot"),
+        ("wrong:joint_1@1", "modules support mute, freeze, reboot"),
+        ("kill:control@1", "modules support mute, freeze, reboot"),
     ],
 )
 def test_wrong_texts_are_told_what_is_allowed(text: str, message: str):

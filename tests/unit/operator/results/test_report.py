@@ -591,7 +591,7 @@ def test_a_jam_is_one_whatever_control_told_at_the_very_end(record: RunRecord) -
 
 
 def test_a_run_that_rests_at_the_end_of_its_path_has_not_failed(record: RunRecord) -> None:
-    rests = judged(stopped_at(record, 4.0, state="Idle", reason="nobody wants to move: the path is finished"))
+    rests = judged(stopped_at(record, 4.0, state="Idle", reason="no motion intended: the path is finished"))
     assert rests.kind == "good" and "Locomotion ended at 4.0 s" in rests.words
 
 

@@ -120,7 +120,7 @@ def test_what_comes_too_fast_for_a_slow_disk_is_told(
         files.append("a.log", b"%099d\n" % i)
     disk.hangs = False
     disk.goes_on.set()
-    assert files.close() == f"{tmp_path}: the disk is too slow for what the run tells"
+    assert files.close() == f"{tmp_path}: the disk is too slow for the run's output"
     kept = (tmp_path / "a.log").read_bytes().splitlines()
     assert [int(line) for line in kept] == list(range(100))
 
