@@ -82,8 +82,9 @@ check: $(stamp) ## Lint, format, types and import rules, without changing anythi
 bench: $(stamp) ## Measure the ratios in benchmarks/
 	$(bin)/python -m benchmarks $(ARGS)
 
-schemas: $(stamp) ## Write the JSON Schemas of every message and config anew
+schemas: $(stamp) ## Write anew what is made from the code: JSON Schemas, key space, table of faults
 	$(bin)/snakesim schemas --write schemas
+	$(bin)/python -m tests.kinds_table
 
 docs: $(stamp) ## Write the API reference into build/docs
 	PDOC_ALLOW_EXEC=1 $(bin)/python -m pdoc --output-directory build/docs $(packages)

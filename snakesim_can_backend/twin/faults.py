@@ -11,12 +11,8 @@ from snakesim_hal.errors import ConfigError
 from snakesim_hal.model import injection
 from snakesim_hal.model.injection import KINDS, Injection
 
-NOT_A_MODULES = ("wrong", "nan")  # a module cannot know that its angle is off; the host applies these
 ABOUT: Mapping[str, str] = {
-    **{name: kind.about for name, kind in KINDS["joint"].items() if name not in NOT_A_MODULES},
-    "mute": "sends nothing; still receives, and follows",
-    "freeze": "its main loop hangs: repeats its last joint state, no heartbeat; passive after the watchdog's time",
-    "duplicate": "a second module with the same node id and another serial is on the bus",
+    name: kind.in_module or kind.about for name, kind in KINDS["joint"].items() if "module" in kind.by
 }
 FORM = "KIND:JOINT@START or KIND:JOINT@START-END, in seconds, such as mute:joint_3@2.0 or leak:joint_1@1-4"
 _typed = re.compile(r"(?P<kind>[a-z_]+)[ :]+(?P<joint>joint_[0-9]+)(?: +(?P<off>off))?")

@@ -10,7 +10,6 @@ import msgspec
 
 from snakesim_hal.backend import Backend, Injectable, Samples, SetPoints
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.fault_plan import ON_SAMPLES
 from snakesim_hal.model.injection import Injection
 from snakesim_hal.wire.messages import Description, Fault, JointState, LifecycleState
 
@@ -28,12 +27,12 @@ class FaultyBackend:
         self._share: float | None = None  # of real time, speed of a slowed simulator
 
     def inject(self, injection: Injection, begins: bool) -> None:
-        """Begin or end a fault. Raises ConfigError for one that is not supported."""
-        if injection.target == "simulator" and injection.kind == "slow":
+        """Begin or end a fault. Raises ConfigError for one that cannot be had here."""
+        if "host" in injection.about.by:
             self._slow_down(injection, begins)
         elif isinstance(self._inner, Injectable) and self._inner.inject(injection, begins=begins):
             return
-        elif injection.target_type == "joint" and injection.kind in ON_SAMPLES:
+        elif "samples" in injection.about.by:
             self._disturb(injection, begins)
         else:
             raise ConfigError(f"backend {self._description.backend!r} cannot do {injection.kind} to {injection.target}")

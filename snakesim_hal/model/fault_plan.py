@@ -4,11 +4,10 @@ from collections.abc import Collection
 
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.files import Table
-from snakesim_hal.model.injection import Injection, check_targets, parse
+from snakesim_hal.model.injection import HAL, Injection, check_targets, parse
 from snakesim_hal.model.scenario import RunConfig
 
 MAX_BUSES = 8
-ON_SAMPLES = ("mute", "freeze", "wrong", "nan")  # of joints; the host applies these itself if the backend cannot
 
 
 def planned(config: RunConfig, table: Table | None = None) -> list[Injection]:
@@ -30,14 +29,11 @@ def check_planned(config: RunConfig, table: Table | None = None) -> None:
 def check_backend_can(config: RunConfig, *, does: Collection[str], buses: int, because: str) -> None:
     """Check that a backend supports the planned faults of joints, buses and the simulator. Raises ConfigError.
 
-    does: kinds of these that it supports itself; because: why it supports no others.
+    does: kinds of these that it knows by itself; because: why it knows no more. The host does some for any backend.
     """
     for i, injection in enumerate(_check(config, None, buses)):
-        if injection.target_type == "simulator" and injection.kind == "slow":
-            continue
-        if injection.target_type == "joint" and injection.kind in ON_SAMPLES:
-            continue
-        if injection.target_type in ("joint", "bus", "simulator") and injection.kind not in does:
+        own = injection.part == HAL and injection.target_type not in ("process", "key")
+        if own and not {"host", "samples"} & {*injection.about.by} and injection.kind not in does:
             raise ConfigError(
                 f"{_place(config, i, None)}: backend {config.backend!r} cannot do {injection.kind} to "
                 f"{injection.target}: {because}"

@@ -1,4 +1,4 @@
-"""What can be made to go wrong on request: one vocabulary for scenario files, `snakesim fault`, and module twins.
+"""What can be made to go wrong on request: the one registry of kinds, and the words for files, commands and twins.
 
     kill:control@2            at 2 s of robot time after the first arming
     drop:actuator/joints@2-4=0.3    from 2 s to 4 s, three of ten
@@ -17,9 +17,19 @@ from snakesim_hal.errors import ConfigError
 from snakesim_hal.wire import keys
 
 TargetType = Literal["process", "key", "joint", "bus", "simulator", "clock"]
+Doer = Literal["supervisor", "process", "writer", "module", "samples", "driver", "host", "simulator"]
+DOERS: Mapping[Doer, str] = {
+    "supervisor": "the supervisor, `snakesim run`",
+    "process": "the process itself",
+    "writer": "whoever writes the key",
+    "module": "the module",
+    "samples": "the host, on what the sensors gave",
+    "driver": "the driver",
+    "host": "the host",
+    "simulator": "the simulator",
+}
 RUN, HAL, CONTROL = "run", "hal", "control"
 ROUTER = "router"  # that of a run with --with-router
-SUPERVISED = ("kill", "stop", "freeze")  # of a process; what is left of its faults it does to itself
 FORM = "KIND:TARGET@START, KIND:TARGET@START-END, or either with =AMOUNT; in seconds, such as mute:joint_3@2-3.5"
 LONGEST_TEXT = 200  # characters of one, as people write it
 _text = re.compile(
@@ -44,54 +54,74 @@ class Kind:
     """One way to go wrong."""
 
     about: str
+    by: tuple[Doer, ...]  # who carries it out; of two the first, where it can
     amount: Amount | None = None
     once: bool = False  # it happens, and has no end
+    in_module: str = ""  # what it is in a module, where that is more than `about`
 
 
 SHARE = Amount("share of the messages", "1", 1.0, 0.0, 1.0)
 
 KINDS: Mapping[TargetType, Mapping[str, Kind]] = {
     "process": {
-        "kill": Kind("SIGKILL: gone without a word", once=True),
-        "stop": Kind("SIGTERM: ends in order", once=True),
-        "freeze": Kind("SIGSTOP until the end: there, and silent"),
-        "hang": Kind("its interpreter is busy until the end: alive on the network, and does nothing"),
+        "kill": Kind("SIGKILL: gone without a word", ("supervisor",), once=True),
+        "stop": Kind("SIGTERM: ends in order", ("supervisor",), once=True),
+        "freeze": Kind("SIGSTOP until the end: there, and silent", ("supervisor",)),
+        "hang": Kind(
+            "its interpreter is busy until the end: alive on the network, and does nothing",
+            ("process",),
+        ),
     },
     "key": {
-        "drop": Kind("messages get lost", SHARE),
-        "delay": Kind("messages come late", Amount("delay", "s", 0.05, 0.0, 10.0)),
-        "duplicate": Kind("messages come twice", SHARE),
-        "reorder": Kind("a message comes after the one that follows it", SHARE),
-        "corrupt": Kind("bytes of messages are changed", SHARE),
-        "flood": Kind("the newest message is sent over and over", Amount("rate", "1/s", 5000.0, 1.0, 1e5)),
+        "drop": Kind("messages get lost", ("writer",), SHARE),
+        "delay": Kind("messages come late", ("writer",), Amount("delay", "s", 0.05, 0.0, 10.0)),
+        "duplicate": Kind("messages come twice", ("writer",), SHARE),
+        "reorder": Kind("a message comes after the one that follows it", ("writer",), SHARE),
+        "corrupt": Kind("bytes of messages are changed", ("writer",), SHARE),
+        "flood": Kind("the newest message is sent over and over", ("writer",), Amount("rate", "1/s", 5000.0, 1.0, 1e5)),
     },
     "joint": {
-        "mute": Kind("says nothing"),
-        "freeze": Kind("repeats what it said last; its age grows"),
-        "wrong": Kind("its angle is off", Amount("offset", "rad", 0.5, -6.3, 6.3)),
-        "nan": Kind("its angle is no number"),
-        "reboot": Kind("its module restarts", once=True),
-        "counter": Kind("joint states with a wrong count"),
-        "checksum": Kind("joint states with a wrong checksum"),
-        "duplicate": Kind("a second module with the same node id is on the bus"),
-        "overheat": Kind("its winding is heated to 5 °C above `stop_at_c`; kept there until the end, if one is given"),
-        "leak": Kind("finds water inside"),
-        "babble": Kind("sends its heartbeat over and over, as often as the bus lets it"),
-        "undervoltage": Kind("its supply falls to 12 V"),
+        "mute": Kind("says nothing", ("module", "samples"), in_module="sends nothing; still hears, and follows"),
+        "freeze": Kind(
+            "repeats what it said last; its age grows",
+            ("module", "samples"),
+            in_module="its main loop hangs: repeats its last joint state, no heartbeat; passive after its watchdog",
+        ),
+        "wrong": Kind("its angle is off", ("samples",), Amount("offset", "rad", 0.5, -6.3, 6.3)),
+        "nan": Kind("its angle is no number", ("samples",)),
+        "reboot": Kind("its module restarts", ("module",), once=True),
+        "counter": Kind("joint states with a wrong count", ("module",)),
+        "checksum": Kind("joint states with a wrong checksum", ("module",)),
+        "duplicate": Kind(
+            "a second module with the same node id is on the bus",
+            ("module",),
+            in_module="a second module with the same node id and another serial is on the bus",
+        ),
+        "overheat": Kind(
+            "its winding is heated to 5 °C above `stop_at_c`; kept there until the end, if one is given", ("module",)
+        ),
+        "leak": Kind("finds water inside", ("module",)),
+        "babble": Kind("sends its heartbeat over and over, as often as the bus lets it", ("module",)),
+        "undervoltage": Kind("its supply falls to 12 V", ("module",)),
     },
     "bus": {
-        "cut": Kind("the interface goes down; it comes up again at the end"),
-        "bus_off": Kind("the controller leaves the bus; it restarts at the end"),
-        "error_passive": Kind("the controller has counted more than 127 errors", once=True),
-        "overflow": Kind("received frames get lost", once=True),
-        "full": Kind("the transmit queue is full"),
+        "cut": Kind("the interface goes down; it comes up again at the end", ("driver",)),
+        "bus_off": Kind("the controller leaves the bus; it restarts at the end", ("driver",)),
+        "error_passive": Kind("the controller has counted more than 127 errors", ("driver",), once=True),
+        "overflow": Kind("received frames get lost", ("driver",), once=True),
+        "full": Kind("the transmit queue is full", ("driver",)),
     },
     "simulator": {
-        "slow": Kind("runs at a share of real time", Amount("share of real time", "1", 0.1, 0.001, 1.0)),
-        "diverge": Kind("its state becomes impossible", once=True),
+        "slow": Kind("runs at a share of real time", ("host",), Amount("share of real time", "1", 0.1, 0.001, 1.0)),
+        "diverge": Kind("its state becomes impossible", ("simulator",), once=True),
     },
     "clock": {
-        "step": Kind("the wall clock jumps, with CAP_SYS_TIME", Amount("by", "s", 3600.0, -1e6, 1e6), once=True),
+        "step": Kind(
+            "the wall clock jumps, with CAP_SYS_TIME",
+            ("supervisor",),
+            Amount("by", "s", 3600.0, -1e6, 1e6),
+            once=True,
+        ),
     },
 }
 
@@ -126,13 +156,13 @@ class Injection:
     @property
     def part(self) -> str:
         """Who carries it out: the supervisor `run`, the host `hal`, or a service."""
-        match self.target_type:
-            case "process":
-                return RUN if self.kind in SUPERVISED else HAL if self.target == "host" else self.target
-            case "key":
-                return writer_of(self.target)
-            case "clock":
+        match self.about.by[0]:
+            case "supervisor":
                 return RUN
+            case "process":
+                return HAL if self.target == "host" else self.target
+            case "writer":
+                return writer_of(self.target)
             case _:
                 return HAL
 
@@ -233,10 +263,9 @@ def check_targets(injections: Iterable[Injection], *, services: Iterable[str], j
             raise ConfigError(
                 f"fault {str(injection)!r}: {injection.part} writes {injection.target}, and this run does not start it"
             )
-        elif injection.target == ROUTER and injection.kind not in SUPERVISED:
-            raise ConfigError(
-                f"fault {str(injection)!r}: a router cannot {injection.kind}, only {', '.join(SUPERVISED)}"
-            )
+        elif injection.target == ROUTER and injection.part != RUN:
+            can = [kind for kind, about in KINDS["process"].items() if "supervisor" in about.by]
+            raise ConfigError(f"fault {str(injection)!r}: a router cannot {injection.kind}, only {', '.join(can)}")
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from queue import SimpleQueue
 
 from snakesim_hal.errors import ConfigError, RefusedError, WireError
 from snakesim_hal.model.fault_plan import planned
-from snakesim_hal.model.injection import RUN, SUPERVISED, Injection, Plan, checked
+from snakesim_hal.model.injection import RUN, Injection, Plan, checked
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Question, Session
 from snakesim_hal.process import step_wall_clock
@@ -103,8 +103,8 @@ class ProcessFaults:
                 self._end(injection)
                 return Answer(ok=True, reason=f"ended: {injection.kind}:{injection.target}", lifecycle=lifecycle)
             self._check(injection)
-            if injection.kind in SUPERVISED:
-                self._asked.append(injection)  # after the answer is sent: it may pass through that process
+            if injection.target_type == "process":
+                self._asked.append(injection)  # when the answer is on its way: it may pass through that process
             else:
                 self._begin(injection)
         except WireError as error:
@@ -137,8 +137,8 @@ class ProcessFaults:
             )
 
     def _begin(self, injection: Injection) -> None:
-        self._say(f"injected fault: {injection.kind}:{injection.target}")
-        if injection.kind not in SUPERVISED:
+        self._say(f"fault on request: {injection.kind}:{injection.target}")
+        if injection.target_type != "process":
             step_s = injection.amount or 0.0
             step_wall_clock(step_s)
             self._stepped_s += step_s

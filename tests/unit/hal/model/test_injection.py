@@ -20,6 +20,7 @@ from snakesim_hal.model.injection import (
     writer_of,
 )
 from snakesim_hal.wire import keys
+from tests.kinds_table import PAGE, with_table
 from tests.unit.hal.rig import run_config
 
 TARGETS = {
@@ -145,6 +146,10 @@ def test_help_explains_every_kind() -> None:
     for kinds in KINDS.values():
         for name, kind in kinds.items():
             assert name in kinds_in_short() and name in explain() and kind.about in explain()
+
+
+def test_the_page_has_every_kind() -> None:
+    assert PAGE.read_text(encoding="utf-8") == with_table(), "run `make schemas` and commit what it changes"
 
 
 # --- of a run ------------------------------------------------------------------------------------------------
