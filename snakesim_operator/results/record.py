@@ -38,7 +38,7 @@ class TelemetryLine(msgspec.Struct, frozen=True):
     message: msgspec.Raw
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RunRecord:
     """A run, as its folder tells it. Every array has one row a tick."""
 

@@ -14,7 +14,6 @@ from snakesim_hal.wire.messages import Description
 from snakesim_operator.results import last_run as lastrun
 from snakesim_operator.results.gaps import unwritten
 from snakesim_operator.results.record import REPORT, SUMMARY, RunRecord
-from snakesim_operator.results.report import page
 from snakesim_operator.results.summary import RunSummary, summarise
 from snakesim_operator.run.ending import Ending
 from snakesim_operator.run.run_files import RunFiles
@@ -67,6 +66,8 @@ def _ended(ending: Ending) -> str:
 
 def _leave(files: RunFiles, ending: Ending, supervisor: Supervisor, host: HostRecord, lacks: list[str]) -> None:
     """Summary and report, made of what is on disk."""
+    from snakesim_operator.results.report import page  # templates take a while to import, which no start waits for
+
     if files.folder is None:
         _print_host(host)
         return

@@ -1,4 +1,4 @@
-"""Which instants of a run are drawn, and how the forces balance at each.
+"""What is known of one instant of a run, and how the forces balance in it.
 
 The balance is the paper's equation (10), f_s + f_1 + f_2 + f_3 = 0, with f_s = -F t_1: the tether of the static
 model pulls the tail back along the tangent at o_1. So the contact forces add up to -f_s, and that sum, the resultant
@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from snakesim_hal.wire.messages import ControlState, World, WorldContact
 from snakesim_operator.results.record import RunRecord
-from snakesim_operator.results.report.timeline import told_at_s
+from snakesim_operator.results.report.timeline import end_s, told_at_s
 
 Floats = NDArray[np.float64]
-HOW_MANY = 4
 NEEDED = 3
 WORLD_WITHIN_S = 0.021  # measured forces this far from the solved ones still count as simultaneous
 
@@ -27,7 +26,7 @@ class Balance:
     contacts: list[WorldContact]
     size_n: list[float]
     contact_n: Floats  # (k, 2)
-    tether_n: Floats  # (2,), f_s
+    tether_n: Floats  # (2,), f_s: the commanded force, the other way round
 
     @property
     def resultant_n(self) -> Floats:
@@ -73,18 +72,12 @@ def balance_of(state: ControlState) -> Balance | None:
     return Balance(contacts, sizes, normals * np.array(sizes)[:, None], -state.propulsion_n * tangent / length)
 
 
-def pushing_instants(record: RunRecord) -> list[Instant]:
-    """Up to four moments spread over the time of propelling, each with solved forces that balance."""
-    return _spread(balanced_instants(record))
-
-
 def best_instant(record: RunRecord) -> Instant | None:
     """The moment at which the push-points were felt and drove the snake hardest; else one from the middle."""
     found = balanced_instants(record)
     if not found:
-        plain = plain_instants(record)
-        return plain[len(plain) // 2] if plain else None
-    return min(found, key=lambda one: (unfelt(one), _saturated(one), -_drive_n(one)))
+        return instant_at(record, 0.5 * end_s(record)) if len(record.time_s) else None
+    return min(found, key=lambda one: (unfelt(one), saturated(one), -_drive_n(one)))
 
 
 def balanced_instants(record: RunRecord) -> list[Instant]:
@@ -104,17 +97,13 @@ def balanced_instants(record: RunRecord) -> list[Instant]:
     return found
 
 
-def plain_instants(record: RunRecord) -> list[Instant]:
-    """Up to four moments spread over the whole run, for a run without solved forces."""
-    count = len(record.time_s)
-    chosen: list[Instant] = []
-    for row in sorted({round(share * (count - 1)) for share in (0.05, 0.35, 0.65, 0.98)} if count else set()):
-        if record.nodes_w(row) is None:
-            continue
-        time_s = float(record.time_s[row] - record.time_s[0])
-        earlier = [state for state in record.control if told_at_s(record, state) <= time_s]
-        chosen.append(_instant(record, time_s, earlier[-1] if earlier else None, None))
-    return chosen
+def instant_at(record: RunRecord, time_s: float) -> Instant | None:
+    """A moment as it was, without solved forces; None when the pose is unknown then."""
+    row = record.row_at(float(record.time_s[0]) + time_s)
+    if record.nodes_w(row) is None:
+        return None
+    earlier = [state for state in record.control if told_at_s(record, state) <= time_s]
+    return _instant(record, time_s, earlier[-1] if earlier else None, None)
 
 
 def felt_along_n(instant: Instant, direction_w: Floats) -> float:
@@ -143,19 +132,8 @@ def _world_near(record: RunRecord, at_s: float, within_s: float) -> World | None
     return near if near is not None and abs(near.stamp_ns * 1e-9 - at_s) <= within_s else None
 
 
-def _spread(found: list[Instant]) -> list[Instant]:
-    """The best of each quarter: every solved contact felt, the torque not at its limit, well inside the quarter."""
-    if len(found) <= HOW_MANY:
-        return found
-    chosen: list[Instant] = []
-    for quarter in np.array_split(np.arange(len(found)), HOW_MANY):
-        members = [found[i] for i in quarter]
-        middle = members[len(members) // 2].time_s
-        chosen.append(min(members, key=lambda one: (unfelt(one), _saturated(one), abs(one.time_s - middle))))
-    return chosen
-
-
-def _saturated(instant: Instant) -> bool:
+def saturated(instant: Instant) -> bool:
+    """Whether the push was at its torque limit."""
     return instant.state is not None and instant.state.saturated
 
 

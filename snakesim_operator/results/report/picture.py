@@ -4,16 +4,16 @@ from pathlib import Path
 
 import numpy as np
 
+from snakesim_operator.results.page.palette import LIGHT, baked, joint_colours
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.instants import Instant, best_instant
-from snakesim_operator.results.report.page import HERE
-from snakesim_operator.results.report.palette import LIGHT, baked
-from snakesim_operator.results.report.polygon import polygon_drawing
+from snakesim_operator.results.report.polygon import polygon_drawing, units_per_n
 from snakesim_operator.results.report.svg import arrow, element, figure, line, text, text_width
 from snakesim_operator.results.report.top_view import drawing
 from snakesim_operator.results.report.view import nodes_xy_w, views
 from snakesim_operator.results.summary import RunSummary
 
+FIGURE_STYLE = Path(__file__).parent / "figure.css"
 WIDTH, EDGE = 920.0, 20.0
 POLYGON_WIDTH = 250.0
 ARROW = 150.0  # of the strongest force
@@ -33,23 +33,24 @@ def picture(record: RunRecord, summary: RunSummary) -> str:
     view_width = WIDTH - 2 * EDGE - (POLYGON_WIDTH if instant.balance is not None else 0.0)
     view = views(record, [instant], view_width, ARROW)[0]
     height = HEAD + view.height + FOOT
-    style = baked((HERE / "figure.css").read_text(encoding="utf-8"), LIGHT)
     parts = [
-        element("style", style),
+        element("style", FIGURE_STYLE.read_text(encoding="utf-8")),
         element("rect", x=0, y=0, width=WIDTH, height=height, rx=8, style=f"fill:{LIGHT['card']}"),
         _words(record, summary, instant),
         _inset(EDGE, HEAD, view.width, view.height, drawing(record, instant, view, nodes_xy_w(record, instant))),
     ]
     if instant.balance is not None:
         tall = min(view.height, 300.0)
-        drawn = polygon_drawing(instant.balance, POLYGON_WIDTH, tall, upright=view.upright)
+        scale = units_per_n([instant.balance], POLYGON_WIDTH, tall, upright=view.upright)
+        drawn = polygon_drawing(instant.balance, POLYGON_WIDTH, tall, scale, upright=view.upright)
         left = EDGE + view.width
         parts.append(line((left + 4, HEAD), (left + 4, HEAD + view.height), "zero"))
         parts.append(_inset(left, HEAD + (view.height - tall) / 2, POLYGON_WIDTH, tall, drawn))
         parts.append(text(left + POLYGON_WIDTH / 2, HEAD + 4, "force polygon", "small soft", anchor="middle"))
     parts.append(_legend(instant, height - 16))
     label = f"{record.config.title or summary.scenario}: the snake from above at {instant.time_s:.2f} s"
-    return figure(WIDTH, height, label, *parts, xmlns="http://www.w3.org/2000/svg", width=WIDTH, height=height) + "\n"
+    drawn = figure(WIDTH, height, label, *parts, xmlns="http://www.w3.org/2000/svg", width=WIDTH, height=height)
+    return baked(drawn, LIGHT | joint_colours(len(record.description.joints), dark=False)) + "\n"
 
 
 def _inset(x: float, y: float, width: float, height: float, content: str) -> str:
@@ -72,7 +73,7 @@ def _legend(instant: Instant, y: float) -> str:
         entries += [
             ("solved", "solved force"),
             ("resultant", "their resultant, which propels"),
-            ("tether", "tether fₛ of the model"),
+            ("commanded", "commanded force F"),
             ("frame", "normal, tangent"),
         ]
     if instant.felt:

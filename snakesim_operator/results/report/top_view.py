@@ -11,16 +11,15 @@ from snakesim_hal.wire.messages import Obstacle, WorldContact
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.instants import Instant
 from snakesim_operator.results.report.labels import Labels
-from snakesim_operator.results.report.palette import joint_class
 from snakesim_operator.results.report.svg import (
     Point,
     arrow,
     element,
     figure,
-    line,
     points_text,
     polyline,
     round_below,
+    scale_bar,
     text,
     text_width,
     title,
@@ -42,12 +41,16 @@ def top_view(record: RunRecord, instant: Instant, view: View) -> str:
 def drawing(record: RunRecord, instant: Instant, view: View, nodes: Floats) -> str:
     """Everything inside the drawing."""
     labels = Labels(view.width, view.height - FOOT)
-    parts = [_route(record, view), *(_obstacle(item, view, labels) for item in place_all(record.config))]
-    parts.append(_body(record, instant, view, nodes, labels))
+    parts = [ground(record, view, labels), body(record, view, nodes, labels)]
     parts += [_felt(contact, view, labels) for contact in instant.felt]
     parts.append(_solved(instant, view, labels))
     parts.append(_names(record, instant, view, nodes, labels))
-    return "".join(parts) + _scales(view)
+    return "".join(parts) + scales(view)
+
+
+def ground(record: RunRecord, view: View, labels: Labels) -> str:
+    """What stands still: route and obstacles."""
+    return _route(record, view) + "".join(_obstacle(item, view, labels) for item in place_all(record.config))
 
 
 def _route(record: RunRecord, view: View) -> str:
@@ -72,7 +75,7 @@ def _obstacle(item: Placed, view: View, labels: Labels) -> str:
     x, y = view.at(obstacle.position_w)
     class_ = "step" if item.walkable else "peg"
     reach = max(obstacle.radius_m, math.hypot(*obstacle.half_size_m[:2])) * view.scale
-    if not (-reach < x < view.width + reach and -reach < y < view.height - FOOT + reach):
+    if not view.shows(obstacle):
         return ""
     labels.keep_off((x - reach, y - reach, x + reach, y + reach), 0.15)
     told = title(obstacle.name)
@@ -86,7 +89,7 @@ def _obstacle(item: Placed, view: View, labels: Labels) -> str:
     return element("polygon", told, points=points_text(corners), class_=class_)
 
 
-def _body(record: RunRecord, instant: Instant, view: View, nodes: Floats, labels: Labels) -> str:
+def body(record: RunRecord, view: View, nodes: Floats, labels: Labels) -> str:
     """Capsules, tail to head, so that every link shows its cap over the one behind; then the joints."""
     points = [view.at(node) for node in nodes]
     parts: list[str] = []
@@ -99,9 +102,7 @@ def _body(record: RunRecord, instant: Instant, view: View, nodes: Floats, labels
                 element("line", x1=a[0], y1=a[1], x2=b[0], y2=b[1], class_=class_, stroke_width=max(width, 1.0))
             )
         labels.keep_off_line(points[i], points[i + 1], wide / 2, 0.4)
-    for i, point in enumerate(points[1:-1]):
-        if i != instant.propulsion_joint:
-            parts.append(element("circle", cx=point[0], cy=point[1], r=2.4, class_="joint"))
+    parts += [element("circle", cx=x, cy=y, r=2.4, class_="joint") for x, y in points[1:-1]]
     return "".join(parts)
 
 
@@ -142,8 +143,8 @@ def _names(record: RunRecord, instant: Instant, view: View, nodes: Floats, label
     if instant.propulsion_joint is not None:
         name = record.description.joints[instant.propulsion_joint].name
         at = view.at(nodes[instant.propulsion_joint + 1])
-        colour = joint_class(instant.propulsion_joint)
-        parts.append(element("circle", cx=at[0], cy=at[1], r=6.5, class_=f"propelling {colour}"))
+        fill = f"fill:var(--joint-{instant.propulsion_joint})"
+        parts.append(element("circle", cx=at[0], cy=at[1], r=6.5, class_="propelling", style=fill))
         parts.append(labels.put(at, name, "halo strong", gaps=(16, 22, 30, 40)))
     if instant.balance is not None:
         for i, (contact, size) in enumerate(zip(instant.balance.contacts, instant.balance.size_n, strict=True)):
@@ -161,16 +162,16 @@ def _index(number_: int) -> str:
     return "".join(chr(ord("₀") + int(digit)) for digit in str(number_))
 
 
-def _scales(view: View) -> str:
+def scales(view: View) -> str:
     """Bars of length and of force, and which way the axes point."""
     y = view.height - 10
     metres = round_below(0.25 * (view.width - 2 * EDGE) / view.scale)
     x = EDGE
-    parts = [_bar(x, y, metres * view.scale, f"{metres * 100:g} cm" if metres < 1 else f"{metres:g} m")]
+    parts = [scale_bar(x, y, metres * view.scale, f"{metres * 100:g} cm" if metres < 1 else f"{metres:g} m")]
     x += metres * view.scale + text_width(f"{metres * 100:g} cm") + 34
     if view.force_scale > 0:
         newtons = round_below(0.8 * view.longest / view.force_scale)
-        parts.append(_bar(x, y, newtons * view.force_scale, f"{newtons:g} N", "force-bar"))
+        parts.append(scale_bar(x, y, newtons * view.force_scale, f"{newtons:g} N", "force-bar"))
     corner = (view.width - 46, view.height - 8)
     for vector, name in (((1.0, 0.0), "x"), ((0.0, 1.0), "y")):
         tip = view.along(corner, vector, 20)
@@ -178,8 +179,3 @@ def _scales(view: View) -> str:
         beyond = view.along(corner, vector, 28)
         parts.append(text(beyond[0], beyond[1] + 4, name, "small soft", anchor="middle"))
     return "".join(parts)
-
-
-def _bar(x: float, y: float, length: float, words: str, class_: str = "bar") -> str:
-    ends = line((x, y - 4), (x, y + 4), class_) + line((x + length, y - 4), (x + length, y + 4), class_)
-    return line((x, y), (x + length, y), class_) + ends + text(x + length + 7, y + 4.5, words, "small")

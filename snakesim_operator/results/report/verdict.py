@@ -19,6 +19,9 @@ RESTING_SHARE = 0.02  # of all its way: what is so near to the end of it has arr
 REST_SHARE, REST_S = 0.1, 5.0  # which is told from a rest by how long it takes: a tenth of the run, or so many seconds
 POOR_SHARE = 0.5  # a run that stood still for more of its time than this, up to its end, is no good one
 SHOWN_HANDOVERS = 8
+ALARMING_SHARE = 0.05  # of the ticks with a joint at its limit
+ANSWERED_SHARE = 0.999  # fewer ticks answered in time are news
+UNKNOWN = "–"
 Kind = Literal["good", "poor", "bad"]
 
 
@@ -52,10 +55,11 @@ def verdict(record: RunRecord, summary: RunSummary) -> Verdict:
         joint = f" at {fault.joint}" if fault.joint else ""
         what = f"Stopped by a fault after {max(at_s, 0.0):.1f} s{joint}: {_sentence(fault.cause)}"
         said = _control_said(record, at_s)
-        return Verdict("bad", f"{what}{said} Before that: {moved[0].lower()}{moved[1:]}.")
+        before = ", ".join([moved[0].lower() + moved[1:], *_refused(summary)])
+        return Verdict("bad", f"{what}{said} Before that: {before}.")
     harm = _harm(summary)
     ending = "" if summary.ended == "complete" else f" The run ended early: {_sentence(summary.ended)}"
-    distance = _distance_m(summary)
+    distance = distance_m(summary)
     if distance is None:
         return Verdict("poor", f"{moved}; {_handed_over(record, summary)}{harm}.{ending}")
     if abs(distance) < MOVED_M or summary.locomoting_fraction == 0:
@@ -64,7 +68,7 @@ def verdict(record: RunRecord, summary: RunSummary) -> Verdict:
             why = "the snake stayed where it was, although its controller reported Locomoting"
         kind = "Jammed" if summary.jammed else "Did not locomote"
         return Verdict("poor", f"{kind}: {_sentence(why)} {moved}; {harm}.{ending}")
-    stop = _stop(record, abs(distance))
+    stop = stop_of(record, abs(distance))
     stopped = "" if stop is None else f" Locomotion ended at {stop.at_s:.1f} s of {end_s(record):.1f} s: {stop.why}"
     if stop is not None and not stop.on_purpose and (summary.jammed or stop.share > POOR_SHARE):
         kind = "Jammed" if summary.jammed else "Stopped"
@@ -76,33 +80,44 @@ def verdict(record: RunRecord, summary: RunSummary) -> Verdict:
 
 
 def tiles(record: RunRecord, summary: RunSummary) -> list[Tile]:
-    """The numbers to see first."""
+    """The numbers to see first; of what can go wrong, only what did."""
     limit = max(joint.torque_limit_nm for joint in record.description.joints)
-    saturated = summary.torque_saturated_fraction
-    along = summary.path_distance_m is not None
-    distance = _distance_m(summary)
-    rejected = sum(summary.rejected_commands.values())
-    return [
-        Tile("along the path" if along else "net displacement", _shown(distance, "{:.2f}"), "m"),
-        Tile("mean speed", _shown(summary.mean_speed_m_s, "{:.3f}"), "m/s"),
-        Tile("robot time", f"{summary.duration_s:.1f}", "s"),
-        Tile("time locomoting", _shown(_percent(summary.locomoting_fraction), "{:.0f}"), "%"),
-        Tile(f"peak joint torque (limit {limit:g})", _shown(summary.peak_joint_torque_nm, "{:.1f}"), "N·m"),
-        Tile("ticks at a torque limit", _shown(_percent(saturated), "{:.1f}"), "%", (saturated or 0) > 0.05),
-        Tile("peak contact force", _shown(summary.peak_contact_force_n, "{:.0f}"), "N"),
-        Tile("ticks answered in time", _shown(_percent(summary.answered_fraction), "{:.1f}"), "%"),
-        Tile("commands refused", str(rejected)),
-        Tile("faults", str(len(summary.faults)), "", bool(summary.faults)),
+    saturated, answered = summary.torque_saturated_fraction or 0.0, summary.answered_fraction
+    along = "along the path" if summary.path_distance_m is not None else "net displacement"
+    found = [
+        Tile(along, shown_as(distance_m(summary), "{:.2f}"), "m"),
+        Tile("mean speed", shown_as(summary.mean_speed_m_s, "{:.3f}"), "m/s"),
+        Tile("time in which it moved as meant", shown_as(_percent(summary.locomoting_fraction), "{:.0f}"), "%"),
+        Tile(f"largest joint torque, of {limit:g} N·m", shown_as(summary.peak_joint_torque_nm, "{:.1f}"), "N·m"),
+        Tile("largest contact force", shown_as(summary.peak_contact_force_n, "{:.0f}"), "N"),
+        Tile("ticks with a joint at its torque limit", f"{100 * saturated:.1f}", "%", saturated > ALARMING_SHARE),
+        Tile("ticks answered in time", shown_as(_percent(answered), "{:.1f}"), "%", alarming=True),
+        Tile("commands refused", str(sum(summary.rejected_commands.values())), "", alarming=True),
+        Tile("faults", str(len(summary.faults) + summary.faults_left_out), "", alarming=True),
     ]
+    late = answered is not None and answered < ANSWERED_SHARE
+    news = [True] * 5 + [saturated > 0, late, bool(sum(summary.rejected_commands.values())), bool(summary.faults)]
+    return [one for one, told in zip(found, news, strict=True) if told and one.value != UNKNOWN]
 
 
 def _harm(summary: RunSummary) -> str:
-    """What went wrong, and stopped nothing."""
+    """What went wrong, and stopped nothing: joints lost, other faults, commands refused."""
     lost = list(dict.fromkeys(fault.joint for fault in summary.faults if fault.joint is not None))
-    return f"went on without {', '.join(lost)}" if lost else "no fault"
+    others = [fault for fault in summary.faults if fault.joint is None]
+    said = [f"went on without {', '.join(lost)}"] if lost else []
+    if others:
+        said.append(f"{'a fault' if len(others) == 1 else f'{len(others)} faults'} ({_sentence(others[0].cause)[:-1]})")
+    return ", ".join([*(said or ["no fault"]), *_refused(summary)])
 
 
-def _distance_m(summary: RunSummary) -> float | None:
+def _refused(summary: RunSummary) -> list[str]:
+    reasons = {reason: count for reason, count in summary.rejected_commands.items() if count}
+    count = sum(reasons.values())
+    return [f"{count} {'command' if count == 1 else 'commands'} refused ({', '.join(reasons)})"] if reasons else []
+
+
+def distance_m(summary: RunSummary) -> float | None:
+    """Along the path, else as the crow flies."""
     return summary.path_distance_m if summary.path_distance_m is not None else summary.net_displacement_m
 
 
@@ -136,7 +151,7 @@ def _control_said(record: RunRecord, at_s: float) -> str:
 
 
 @dataclass(frozen=True)
-class _Stop:
+class Stop:
     """The end of locomotion, before that of the run."""
 
     at_s: float
@@ -145,7 +160,7 @@ class _Stop:
     on_purpose: bool
 
 
-def _stop(record: RunRecord, moved_m: float) -> _Stop | None:
+def stop_of(record: RunRecord, moved_m: float) -> Stop | None:
     """When and why it came to rest, by what control told and by what was measured; None when it did not."""
     bands, end = state_bands(record), end_s(record)
     at_s = bands[-1].start_s if len(bands) > 1 and bands[-1].what != "Locomoting" else end
@@ -156,7 +171,7 @@ def _stop(record: RunRecord, moved_m: float) -> _Stop | None:
         return None
     after = [state for state in record.control if told_at_s(record, state) >= at_s and state.state != "Locomoting"]
     why = after[0].reason if after else "its controller reported Locomoting all the same"
-    return _Stop(at_s, (end - at_s) / end, _sentence(why), bool(after) and after[-1].state == "Idle")
+    return Stop(at_s, (end - at_s) / end, _sentence(why), bool(after) and after[-1].state == "Idle")
 
 
 def _sentence(words: str) -> str:
@@ -168,8 +183,9 @@ def _percent(share: float | None) -> float | None:
     return None if share is None else 100 * share
 
 
-def _shown(value: float | None, form: str) -> str:
+def shown_as(value: float | None, form: str) -> str:
+    """A number in a format, a dash when it is unknown."""
     if value is None:
-        return "–"
+        return UNKNOWN
     text = form.format(value)
     return text.removeprefix("-") if float(text) == 0 else text.replace("-", "−")

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesim_hal.model.scenario import place_all
+from snakesim_hal.wire.messages import Obstacle
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.instants import Instant
 from snakesim_operator.results.report.svg import Point
@@ -14,6 +16,8 @@ Floats = NDArray[np.float64]
 LONGEST_ARROW = 92.0  # of the strongest force, in units of the drawing
 FELT_SHARE = 1.4  # of the longest arrow: a longer measured force is cut, so that one impact does not dwarf the rest
 EDGE = 22.0
+LARGE = 0.5  # of the window: an obstacle that reaches further, a wall, is cut at the edge
+GROWN_AT_MOST = 4
 FOOT = 30.0  # under the drawing, for the scales
 
 
@@ -43,6 +47,51 @@ class View:
         x, y = self.turned(np.asarray(vector_w, dtype=np.float64)[:2])
         return float(start[0] + units * x), float(start[1] - units * y)
 
+    def shows(self, obstacle: Obstacle) -> bool:
+        """Whether an obstacle is drawn: as a whole, unless it is too large for that."""
+        (x, y), reach = self.at(obstacle.position_w), self.scale * reach_m(obstacle)
+        across, tall = self.width, self.height - FOOT
+        if reach > LARGE * min(across, tall):
+            return -reach < x < across + reach and -reach < y < tall + reach
+        return reach <= x <= across - reach and reach <= y <= tall - reach
+
+
+def reach_m(obstacle: Obstacle) -> float:
+    """How far an obstacle reaches from its middle, on the ground."""
+    return max(obstacle.radius_m, math.hypot(*obstacle.half_size_m[:2]))
+
+
+def map_view(record: RunRecord, nodes: list[Floats], width: float) -> View:
+    """One window for a whole run. nodes: the body at some of its instants, (k, 2) each."""
+    everything = np.vstack(nodes)
+    upright = bool(np.ptp(everything[:, 1]) > 1.3 * np.ptp(everything[:, 0]))
+    plain = View(np.zeros(2), 1.0, 0.0, 0.0, 0.0, upright, LONGEST_ARROW)
+    radius = 3 * max(link.radius_m for link in record.description.links)
+    reached = plain.turned(everything)
+    low, high = _with_obstacles(record, plain, reached.min(axis=0) - radius, reached.max(axis=0) + radius)
+    scale = width / float(high[0] - low[0])
+    height = min(float(high[1] - low[1]) * scale, 0.8 * width)
+    if height < float(high[1] - low[1]) * scale:
+        scale = height / float(high[1] - low[1])
+    corner = (low + high) / 2 - np.array([width, height]) / (2 * scale)
+    return View(corner, scale, 0.0, width, height + FOOT, upright, LONGEST_ARROW)
+
+
+def _with_obstacles(record: RunRecord, plain: View, low: Floats, high: Floats) -> tuple[Floats, Floats]:
+    """A window that is grown until it cuts no obstacle but large ones."""
+    found = [item.obstacle for item in place_all(record.config)]
+    large = LARGE * float((high - low).min())
+    small = [(plain.turned(np.array(one.position_w[:2])), 1.1 * reach_m(one)) for one in found if reach_m(one) <= large]
+    for _ in range(GROWN_AT_MOST):
+        cut = [(at, r) for at, r in small if (at + r > low).all() and (at - r < high).all()]
+        if not cut:
+            break
+        grown = np.min([low, *(at - r for at, r in cut)], axis=0), np.max([high, *(at + r for at, r in cut)], axis=0)
+        if np.array_equal(grown, (low, high)):
+            break
+        low, high = grown
+    return low, high
+
 
 def nodes_xy_w(record: RunRecord, instant: Instant) -> Floats:
     """Tail end, joints and head end on the ground, (joints + 2, 2)."""
@@ -60,17 +109,21 @@ def views(record: RunRecord, instants: list[Instant], width: float, longest: flo
     upright = bool(abs(ends[1]) > 1.3 * abs(ends[0]))
     plain = View(np.zeros(2), 1.0, _force_scale(instants, longest), 0.0, 0.0, upright, longest)
     body_m = max(float(np.ptp(plain.turned(body), axis=0)[0]) for body in bodies)
-    metres_per_unit = body_m / (width - 2 * EDGE)  # near enough to find out how far the arrows reach
-    reached = [plain.turned(_reached_w(record, one, plain.force_scale * metres_per_unit)) for one in instants]
-    lows, highs = np.array([r.min(axis=0) for r in reached]), np.array([r.max(axis=0) for r in reached])
-    across, tall = (highs - lows).max(axis=0)
-    union = highs.max(axis=0) - lows.min(axis=0)
-    fixed = bool(union[0] < 1.5 * across)
-    if fixed:
-        across, tall = union
-        lows, highs = np.broadcast_to(lows.min(axis=0), lows.shape), np.broadcast_to(highs.max(axis=0), highs.shape)
-    scale = (width - 2 * EDGE) / float(across)
-    height = min(float(tall) * scale + 2 * EDGE, 1.1 * width) + FOOT
+    across, tall = body_m, 0.0  # how far the arrows reach depends on the scale, and the scale on how far they reach
+    lows = highs = np.zeros((len(instants), 2))
+    for _ in range(GROWN_AT_MOST):
+        metres_per_unit = across / (width - 2 * EDGE)
+        reached = [plain.turned(_reached_w(record, one, plain.force_scale * metres_per_unit)) for one in instants]
+        air = EDGE * metres_per_unit
+        boxes = [_with_obstacles(record, plain, r.min(axis=0) - air, r.max(axis=0) + air) for r in reached]
+        lows, highs = np.array([low for low, _ in boxes]), np.array([high for _, high in boxes])
+        across, tall = (highs - lows).max(axis=0)
+        union = highs.max(axis=0) - lows.min(axis=0)
+        if union[0] < 1.5 * across:  # one window holds them all
+            across, tall = union
+            lows[:], highs[:] = lows.min(axis=0), highs.max(axis=0)
+    scale = width / float(across)
+    height = min(float(tall) * scale, 1.1 * width) + FOOT
     corners = (lows + highs) / 2 - np.array([width, height - FOOT]) / (2 * scale)
     return [View(corner, scale, plain.force_scale, width, height, upright, longest) for corner in corners]
 

@@ -1,0 +1,93 @@
+"""Colours, light and dark, told apart by people with any kind of colour vision (after Okabe and Ito).
+
+A joint has one colour of its own, the same in every figure of every report.
+"""
+
+import colorsys
+import re
+
+LIGHT: dict[str, str] = {
+    "page": "#fbfbf9",
+    "card": "#ffffff",
+    "ink": "#1b1f24",
+    "soft": "#59626d",
+    "faint": "#8b95a1",
+    "rule": "#d9dde2",
+    "grid": "#eceef0",
+    "body": "#e4e7ea",
+    "body-edge": "#6b7683",
+    "head": "#b9c2cc",
+    "peg": "#cfc3ae",
+    "peg-edge": "#8a7a5c",
+    "route": "#7d8894",
+    "measured": "#0067b0",
+    "reference": "#c8321f",
+    "felt": "#0067b0",
+    "frame": "#00795c",
+    "commanded": "#7a3fa8",
+    "bad": "#b3261e",
+    "locomoting": "#bfe0cd",
+    "notlocomoting": "#f6d9a8",
+    "idle": "#dfe3e8",
+    "poweroff": "#c4c9cf",
+    "negative": "#0067b0",
+    "positive": "#d2691e",
+}
+
+DARK: dict[str, str] = {
+    "page": "#14171a",
+    "card": "#1c2024",
+    "ink": "#f0f2f4",
+    "soft": "#a9b2bc",
+    "faint": "#7b8590",
+    "rule": "#363c43",
+    "grid": "#272c31",
+    "body": "#3a4149",
+    "body-edge": "#98a3af",
+    "head": "#5f6b78",
+    "peg": "#5b5140",
+    "peg-edge": "#a8966f",
+    "route": "#808c98",
+    "measured": "#5cb3f2",
+    "reference": "#ff7b66",
+    "felt": "#5cb3f2",
+    "frame": "#3ccba0",
+    "commanded": "#c79bf0",
+    "bad": "#ff8a80",
+    "locomoting": "#24553d",
+    "notlocomoting": "#69501d",
+    "idle": "#343a41",
+    "poweroff": "#4a5159",
+    "negative": "#5cb3f2",
+    "positive": "#f39a4d",
+}
+
+GOLDEN = 0.381966  # of a turn of hue: neighbours are far apart, and no hue comes twice
+
+
+def joint_colours(count: int, *, dark: bool) -> dict[str, str]:
+    """A colour for every joint, tail to head."""
+    found: dict[str, str] = {}
+    for joint in range(count):
+        light = (0.66, 0.76)[joint % 2] if dark else (0.45, 0.34)[joint % 2]
+        rgb = colorsys.hls_to_rgb((0.56 + GOLDEN * joint) % 1, light, 0.72)
+        found[f"joint-{joint}"] = "#" + "".join(f"{round(255 * part):02x}" for part in rgb)
+    return found
+
+
+def themes(joints: int) -> str:
+    """The colours of both themes as CSS variables. Paper is always light."""
+    light, dark = LIGHT | joint_colours(joints, dark=False), DARK | joint_colours(joints, dark=True)
+    return (
+        f":root{{{_variables(light)}}}@media screen and (prefers-color-scheme:dark)"
+        f"{{:root:not(.paper){{{_variables(dark)}}}}}"
+    )
+
+
+def baked(drawing: str, colours: dict[str, str]) -> str:
+    """A drawing with every variable replaced, for viewers of pictures that know no variables."""
+    return re.sub(r"var\(--([a-z0-9-]+)\)", lambda found: colours.get(found[1], found[0]), drawing)
+
+
+def _variables(colours: dict[str, str]) -> str:
+    return "".join(f"--{name}:{value};" for name, value in colours.items())
