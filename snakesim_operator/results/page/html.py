@@ -49,7 +49,8 @@ def data(told: Any) -> Markup:
 
 
 def shown(value: float, digits: int = 4) -> str:
-    """A number for people: so many significant digits, a real minus sign."""
+    """A number for people: so many significant digits, a real minus sign, and none before a zero."""
+    value += 0.0
     if value != 0 and (abs(value) >= 10**digits or abs(value) < 1e-4):
         whole = f"{value:,.0f}".replace(",", "\u202f")
         return (whole if abs(value) >= 1 else f"{value:.2e}").translate(MINUS)

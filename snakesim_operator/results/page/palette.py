@@ -4,7 +4,6 @@ A joint has one colour of its own, the same in every figure of every report.
 """
 
 import colorsys
-import re
 
 LIGHT: dict[str, str] = {
     "page": "#fbfbf9",
@@ -82,11 +81,6 @@ def themes(joints: int) -> str:
         f":root{{{_variables(light)}}}@media screen and (prefers-color-scheme:dark)"
         f"{{:root:not(.paper){{{_variables(dark)}}}}}"
     )
-
-
-def baked(drawing: str, colours: dict[str, str]) -> str:
-    """A drawing with every variable replaced, for viewers of pictures that know no variables."""
-    return re.sub(r"var\(--([a-z0-9-]+)\)", lambda found: colours.get(found[1], found[0]), drawing)
 
 
 def _variables(colours: dict[str, str]) -> str:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from snakesim_hal.wire.messages import ControlState, World, WorldContact
 from snakesim_operator.results.record import RunRecord
-from snakesim_operator.results.report.timeline import end_s, told_at_s
+from snakesim_operator.results.report.timeline import told_at_s
 
 Floats = NDArray[np.float64]
 NEEDED = 3
@@ -34,9 +34,19 @@ class Balance:
         return self.contact_n.sum(axis=0)
 
     @property
+    def commanded_n(self) -> float:
+        """The force along the path that the controller aims at."""
+        return float(np.hypot(*self.tether_n))
+
+    @property
     def gap_n(self) -> float:
         """How far the polygon is from closing."""
         return float(np.hypot(*(self.resultant_n + self.tether_n)))
+
+    def felt_n(self, felt: list[WorldContact], index: int) -> float | None:
+        """The measured force at a push-point; None when none was felt there."""
+        there = [np.hypot(*one.force_w[:2]) for one in felt if one.obstacle == self.contacts[index].obstacle]
+        return float(sum(there)) if there else None
 
     @property
     def corners_n(self) -> Floats:
@@ -72,14 +82,6 @@ def balance_of(state: ControlState) -> Balance | None:
     return Balance(contacts, sizes, normals * np.array(sizes)[:, None], -state.propulsion_n * tangent / length)
 
 
-def best_instant(record: RunRecord) -> Instant | None:
-    """The moment at which the push-points were felt and drove the snake hardest; else one from the middle."""
-    found = balanced_instants(record)
-    if not found:
-        return instant_at(record, 0.5 * end_s(record)) if len(record.time_s) else None
-    return min(found, key=lambda one: (unfelt(one), saturated(one), -_drive_n(one)))
-
-
 def balanced_instants(record: RunRecord) -> list[Instant]:
     """Every moment of locomotion whose solved forces balance, in order of time."""
     if not len(record.time_s):
@@ -89,7 +91,7 @@ def balanced_instants(record: RunRecord) -> list[Instant]:
         balance = balance_of(state)
         if balance is None or state.propulsion_joint is None or state.state != "Locomoting":
             continue
-        if balance.gap_n > 0.05 * float(np.hypot(*balance.tether_n)) or min(balance.size_n) <= 0:
+        if balance.gap_n > 0.05 * balance.commanded_n or min(balance.size_n) <= 0:
             continue
         instant = _instant(record, told_at_s(record, state), state, balance)
         if record.nodes_w(instant.row) is not None:
@@ -135,10 +137,6 @@ def _world_near(record: RunRecord, at_s: float, within_s: float) -> World | None
 def saturated(instant: Instant) -> bool:
     """Whether the push was at its torque limit."""
     return instant.state is not None and instant.state.saturated
-
-
-def _drive_n(instant: Instant) -> float:
-    return felt_along_n(instant, instant.balance.resultant_n) if instant.balance is not None else 0.0
 
 
 def unfelt(instant: Instant) -> int:

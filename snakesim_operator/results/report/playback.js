@@ -74,5 +74,19 @@
   for (const jump of document.querySelectorAll("[data-seek]")) {
     jump.addEventListener("click", () => { play(false); seek(+jump.dataset.seek); });
   }
+  const LOOKS = ["fill", "fill-opacity", "stroke", "stroke-width", "stroke-dasharray", "stroke-linecap", "font", "display"];
+  find(".save").addEventListener("click", () => {
+    const drawn = find("svg.figure"), copy = drawn.cloneNode(true), copies = copy.querySelectorAll("*");
+    drawn.querySelectorAll("*").forEach((node, i) => {
+      const look = getComputedStyle(node);
+      copies[i].setAttribute("style", LOOKS.map((name) => `${name}:${look.getPropertyValue(name)}`).join(";"));
+    });
+    set(copy, { xmlns: "http://www.w3.org/2000/svg", style: `background:${getComputedStyle(player).backgroundColor}` });
+    const link = document.createElement("a");
+    link.href = URL.createObjectURL(new Blob([copy.outerHTML], { type: "image/svg+xml" }));
+    link.download = `${document.title} ${time.toFixed(2)} s.svg`;
+    link.click();
+    URL.revokeObjectURL(link.href);
+  });
   seek(time);
 })();

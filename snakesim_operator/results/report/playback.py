@@ -46,11 +46,11 @@ def playback(record: RunRecord) -> Playback | None:
         return None
     rows = posed[np.unique(np.linspace(0, len(posed) - 1, min(len(posed), FRAMES)).astype(int))]
     nodes = [_nodes(record, int(row)) for row in rows]
-    view = map_view(record, nodes, WIDTH)
     names = [joint.name for joint in record.description.joints]
     states = _latest(record, rows, record.control)
     worlds = _latest(record, rows, record.worlds)
     units = _units_per_n(states, worlds)
+    view = map_view(record, nodes, units, WIDTH)
     said: list[str] = []
     frames: list[list[Any]] = []
     for row, body_w, state, world in zip(rows, nodes, states, worlds, strict=True):
@@ -65,12 +65,11 @@ def playback(record: RunRecord) -> Playback | None:
         frames.append([round(time_s, 3), flat, propels, said.index(words), solved, felt])
     labels = Labels(view.width, view.height)
     snake = element("g", body(record, view, nodes[0], labels), class_="snake")
-    scaled = View(view.low_w, view.scale, units, view.width, view.height, view.upright, LONGEST_ARROW)
     picture = figure(
         view.width,
         view.height,
         "The snake on the map, moved by the slider",
-        ground(record, view, labels) + snake + '<g class="forces"></g>' + scales(scaled),
+        ground(record, view, labels) + snake + '<g class="forces"></g>' + scales(view),
     )
     data = {"frames": frames, "said": said, "joints": names, "end": round(end_s(record), 3)}
     return Playback(picture, data, any(frame[4] for frame in frames), any(frame[5] for frame in frames))

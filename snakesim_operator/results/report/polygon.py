@@ -10,7 +10,7 @@ from snakesim_operator.results.report.instants import Balance
 from snakesim_operator.results.report.labels import Labels
 from snakesim_operator.results.report.svg import Point, arrow, element, figure, points_text, round_below, scale_bar
 
-EDGE = 46.0
+EDGE, FOOT = 46.0, 16.0
 
 
 def units_per_n(balances: list[Balance], width: float, height: float, *, upright: bool = False) -> float:
@@ -21,21 +21,14 @@ def units_per_n(balances: list[Balance], width: float, height: float, *, upright
 
 
 def force_polygon(balance: Balance, width: float, height: float, scale: float, *, upright: bool = False) -> str:
-    """A drawing of its own, with its scale. upright: turned by a quarter, as the top view beside it."""
-    words = f"Force polygon of {len(balance.contacts)} contact forces; it closes to {balance.gap_n:.2g} N"
-    newtons = round_below(0.3 * width / scale)
-    bar = scale_bar(8, height - 8, newtons * scale, f"{newtons:g} N", "force-bar")
-    return figure(width, height, words, polygon_drawing(balance, width, height - 16, scale, upright=upright), bar)
-
-
-def polygon_drawing(balance: Balance, width: float, height: float, scale: float, *, upright: bool = False) -> str:
-    """Everything inside the drawing, in its middle. scale: units per newton."""
+    """A drawing. scale: units per newton; upright: turned by a quarter, as the top view beside it."""
     corners_n = _turned(balance, upright)
     middle = (corners_n.min(axis=0) + corners_n.max(axis=0)) / 2
     corners: list[Point] = [
-        (float(width / 2 + scale * (x - middle[0])), float(height / 2 - scale * (y - middle[1]))) for x, y in corners_n
+        (float(width / 2 + scale * (x - middle[0])), float((height - FOOT) / 2 - scale * (y - middle[1])))
+        for x, y in corners_n
     ]
-    labels = Labels(width, height)
+    labels = Labels(width, height - FOOT)
     for a, b in pairwise(corners):
         labels.keep_off_line(a, b, 5)
     ring = corners[:-1] if balance.gap_n * scale < 2 else corners
@@ -46,12 +39,15 @@ def polygon_drawing(balance: Balance, width: float, height: float, scale: float,
     parts.append(_resultant(corners, labels))
     names = ["F", *(pretty(f"f_{i + 1}") for i in range(len(balance.contacts)))]
     inside = (sum(x for x, _ in corners) / len(corners), sum(y for _, y in corners) / len(corners))
-    sizes = [float(np.hypot(*balance.tether_n)), *balance.size_n]
+    sizes = [balance.commanded_n, *balance.size_n]
     for name, size, a, b in zip(names, sizes, corners[:-1], corners[1:], strict=True):
         class_ = "halo commanded-text" if name == "F" else "halo solved-text"
         at = (a[0] + b[0]) / 2, (a[1] + b[1]) / 2
         parts.append(labels.put(at, f"{name} {size:.0f} N", class_, gaps=(5, 9, 14, 22), away_from=inside))
-    return "".join(parts)
+    newtons = round_below(0.3 * width / scale)
+    parts.append(scale_bar(8, height - 8, newtons * scale, f"{newtons:g} N", "force-bar"))
+    words = f"Force polygon of {len(balance.contacts)} contact forces; it closes to {balance.gap_n:.2g} N"
+    return figure(width, height, words, *parts)
 
 
 def _turned(balance: Balance, upright: bool) -> NDArray[np.float64]:

@@ -81,7 +81,7 @@ def arrow(tail: Point, tip: Point, class_: str, *, head: float = 9.0) -> str:
     )
 
 
-def figure(width: float, height: float, label: str, /, *children: str, **attributes: Attribute) -> str:
+def figure(width: float, height: float, label: str, *children: str) -> str:
     """A whole drawing. label: what it shows, for those who cannot see it."""
     return element(
         "svg",
@@ -91,7 +91,6 @@ def figure(width: float, height: float, label: str, /, *children: str, **attribu
         role="img",
         aria_label=label,
         style=f"max-width:{number(width)}px",
-        **attributes,
     )
 
 

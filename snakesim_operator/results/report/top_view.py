@@ -24,7 +24,7 @@ from snakesim_operator.results.report.svg import (
     text_width,
     title,
 )
-from snakesim_operator.results.report.view import EDGE, FELT_SHARE, FOOT, View, nodes_xy_w
+from snakesim_operator.results.report.view import EDGE, FELT_SHARE, FOOT, LONGEST_ARROW, View, nodes_xy_w
 
 Floats = NDArray[np.float64]
 UNIT_VECTOR = 24.0
@@ -109,7 +109,7 @@ def body(record: RunRecord, view: View, nodes: Floats, labels: Labels) -> str:
 def _felt(contact: WorldContact, view: View, labels: Labels) -> str:
     """A measured force, drawn beside the solved one; too long an arrow is cut, and says how long it would be."""
     size = math.hypot(*contact.force_w[:2])
-    cut = min(1.0, FELT_SHARE * view.longest / max(size * view.force_scale, 1e-9))
+    cut = min(1.0, FELT_SHARE * LONGEST_ARROW / max(size * view.force_scale, 1e-9))
     start = view.along(view.at(contact.position_w), contact.tangent_w, 7.0)
     tip = view.along(start, contact.force_w, cut * view.force_scale)
     labels.keep_off_line(start, tip, 3)
@@ -170,7 +170,7 @@ def scales(view: View) -> str:
     parts = [scale_bar(x, y, metres * view.scale, f"{metres * 100:g} cm" if metres < 1 else f"{metres:g} m")]
     x += metres * view.scale + text_width(f"{metres * 100:g} cm") + 34
     if view.force_scale > 0:
-        newtons = round_below(0.8 * view.longest / view.force_scale)
+        newtons = round_below(0.8 * LONGEST_ARROW / view.force_scale)
         parts.append(scale_bar(x, y, newtons * view.force_scale, f"{newtons:g} N", "force-bar"))
     corner = (view.width - 46, view.height - 8)
     for vector, name in (((1.0, 0.0), "x"), ((0.0, 1.0), "y")):

@@ -1,4 +1,4 @@
-"""What a run amounted to, in one sentence, and its key numbers."""
+"""What a run amounted to, in one sentence."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -19,9 +19,6 @@ RESTING_SHARE = 0.02  # of all its way: what is so near to the end of it has arr
 REST_SHARE, REST_S = 0.1, 5.0  # which is told from a rest by how long it takes: a tenth of the run, or so many seconds
 POOR_SHARE = 0.5  # a run that stood still for more of its time than this, up to its end, is no good one
 SHOWN_HANDOVERS = 8
-ALARMING_SHARE = 0.05  # of the ticks with a joint at its limit
-ANSWERED_SHARE = 0.999  # fewer ticks answered in time are news
-UNKNOWN = "–"
 Kind = Literal["good", "poor", "bad"]
 
 
@@ -31,16 +28,6 @@ class Verdict:
 
     kind: Kind
     words: str
-
-
-@dataclass(frozen=True)
-class Tile:
-    """A key number."""
-
-    name: str
-    value: str
-    unit: str = ""
-    alarming: bool = False
 
 
 def verdict(record: RunRecord, summary: RunSummary) -> Verdict:
@@ -77,27 +64,6 @@ def verdict(record: RunRecord, summary: RunSummary) -> Verdict:
     jam = "it jammed on the way; " if summary.jammed else ""
     good: Kind = "poor" if ending or distance < 0 else "good"
     return Verdict(good, f"{moved}; {_handed_over(record, summary)}{jam}{harm}.{stopped}{ending}")
-
-
-def tiles(record: RunRecord, summary: RunSummary) -> list[Tile]:
-    """The numbers to see first; of what can go wrong, only what did."""
-    limit = max(joint.torque_limit_nm for joint in record.description.joints)
-    saturated, answered = summary.torque_saturated_fraction or 0.0, summary.answered_fraction
-    along = "along the path" if summary.path_distance_m is not None else "net displacement"
-    found = [
-        Tile(along, shown_as(distance_m(summary), "{:.2f}"), "m"),
-        Tile("mean speed", shown_as(summary.mean_speed_m_s, "{:.3f}"), "m/s"),
-        Tile("time in which it moved as meant", shown_as(_percent(summary.locomoting_fraction), "{:.0f}"), "%"),
-        Tile(f"largest joint torque, of {limit:g} N·m", shown_as(summary.peak_joint_torque_nm, "{:.1f}"), "N·m"),
-        Tile("largest contact force", shown_as(summary.peak_contact_force_n, "{:.0f}"), "N"),
-        Tile("ticks with a joint at its torque limit", f"{100 * saturated:.1f}", "%", saturated > ALARMING_SHARE),
-        Tile("ticks answered in time", shown_as(_percent(answered), "{:.1f}"), "%", alarming=True),
-        Tile("commands refused", str(sum(summary.rejected_commands.values())), "", alarming=True),
-        Tile("faults", str(len(summary.faults) + summary.faults_left_out), "", alarming=True),
-    ]
-    late = answered is not None and answered < ANSWERED_SHARE
-    news = [True] * 5 + [saturated > 0, late, bool(sum(summary.rejected_commands.values())), bool(summary.faults)]
-    return [one for one, told in zip(found, news, strict=True) if told and one.value != UNKNOWN]
 
 
 def _harm(summary: RunSummary) -> str:
@@ -177,15 +143,3 @@ def stop_of(record: RunRecord, moved_m: float) -> Stop | None:
 def _sentence(words: str) -> str:
     words = words.strip().rstrip(".;")
     return f"{words}." if words else ""
-
-
-def _percent(share: float | None) -> float | None:
-    return None if share is None else 100 * share
-
-
-def shown_as(value: float | None, form: str) -> str:
-    """A number in a format, a dash when it is unknown."""
-    if value is None:
-        return UNKNOWN
-    text = form.format(value)
-    return text.removeprefix("-") if float(text) == 0 else text.replace("-", "−")

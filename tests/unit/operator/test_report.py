@@ -36,13 +36,10 @@ from snakesim_operator.results.page.charts import strongest, thinned
 from snakesim_operator.results.page.html import LIBRARY
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report import page as report_page
-from snakesim_operator.results.report import write_picture
 from snakesim_operator.results.report.events import drawn_instants, events
-from snakesim_operator.results.report.instants import balanced_instants, best_instant
+from snakesim_operator.results.report.instants import balanced_instants
 from snakesim_operator.results.report.page import ELSEWHERE
-from snakesim_operator.results.report.svg import element, number, text
 from snakesim_operator.results.report.timeline import (
-    commanded_torque_nm,
     propulsion_intervals,
     reference_rad,
     state_bands,
@@ -670,42 +667,6 @@ def test_a_snake_that_lies_upwards_is_turned(record: RunRecord) -> None:
     assert all(height < width for width, height in sizes)
 
 
-# --- the picture -----------------------------------------------------------------------------------------------
-
-
-def test_the_picture_stands_alone(record: RunRecord, tmp_path: Path) -> None:
-    write_picture(record, summarise(record, "complete"), tmp_path / "triplet.svg")
-    root = ET.fromstring((tmp_path / "triplet.svg").read_text(encoding="utf-8"))
-    assert root.tag == "{http://www.w3.org/2000/svg}svg"
-    drawing = ET.tostring(root, encoding="unicode")
-    assert "var(" not in drawing and "nan" not in drawing
-    assert {"solved shaft", "resultant shaft", "felt shaft", "route"} <= {item.get("class") for item in root.iter()}
-
-
-def test_the_picture_shows_the_instant_that_was_felt_most(record: RunRecord) -> None:
-    unfelt = [msgspec.structs.replace(world, contacts=[]) for world in record.worlds if world.stamp_ns < 7.37e9]
-    late = [
-        msgspec.structs.replace(
-            world,
-            contacts=[
-                msgspec.structs.replace(c, force_w=(2 * c.force_w[0], 2 * c.force_w[1], 0.0)) for c in world.contacts
-            ],
-        )
-        if 8.2e9 < world.stamp_ns < 8.7e9
-        else world
-        for world in record.worlds
-        if world.stamp_ns >= 7.37e9
-    ]
-    best = best_instant(changed(record, worlds=unfelt + late))
-    assert best is not None and 7.8 < best.time_s < 8.4
-
-
-def test_no_picture_of_a_run_that_nobody_saw(record: RunRecord, tmp_path: Path) -> None:
-    blind = changed(record, position_w=np.full_like(record.position_w, np.nan))
-    with pytest.raises(ValueError, match="pose sensor"):
-        write_picture(blind, summarise(blind, "complete"), tmp_path / "triplet.svg")
-
-
 # --- parts -----------------------------------------------------------------------------------------------------
 
 
@@ -726,22 +687,6 @@ def test_the_reference_is_the_target_in_position_mode_and_the_controllers_word_i
     assert np.array_equal(reference[~free], record.target[~free, 6])
     assert np.abs(reference[free] - record.target[free, 6]).max() > 1  # no torque is taken for an angle
     assert np.abs(np.diff(reference)).max() < 0.05  # one smooth line
-
-
-def test_a_commanded_torque_is_known_in_torque_mode_only(record: RunRecord) -> None:
-    asked, free = commanded_torque_nm(record, 6), record.mode[:, 6] == Mode.TORQUE
-    assert np.isnan(asked[~free]).all()
-    assert np.array_equal(asked[free], record.target[free, 6])
-
-
-def test_text_in_a_drawing_is_escaped() -> None:
-    assert "&lt;b&gt; &amp;" in text(0, 0, "<b> &")
-    assert element("g", class_='"><script>') == '<g class="&quot;&gt;&lt;script&gt;"/>'
-
-
-def test_a_coordinate_that_is_no_number_is_refused() -> None:
-    with pytest.raises(ValueError, match="nan"):
-        number(float("nan"))
 
 
 def test_thinning_keeps_extremes_and_gaps() -> None:
