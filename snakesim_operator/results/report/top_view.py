@@ -1,4 +1,4 @@
-"""The snake seen from above at one instant: body to scale, route, obstacles, contact frames, forces (Fig. 7-10)."""
+"""The snake seen from above at one instant: body to scale, route, obstacles, forces (Fig. 7-10)."""
 
 import math
 
@@ -9,10 +9,10 @@ from snakesim_hal.model.scenario import place_all
 from snakesim_hal.model.scene import Placed
 from snakesim_hal.wire.messages import Obstacle, WorldContact
 from snakesim_operator.results.record import RunRecord
-from snakesim_operator.results.report.instants import Instant
+from snakesim_operator.results.report.instants import Balance, Instant
 from snakesim_operator.results.report.labels import Labels
+from snakesim_operator.results.report.polygon import pretty
 from snakesim_operator.results.report.svg import (
-    Point,
     arrow,
     element,
     figure,
@@ -24,28 +24,31 @@ from snakesim_operator.results.report.svg import (
     text_width,
     title,
 )
-from snakesim_operator.results.report.view import EDGE, FELT_SHARE, FOOT, LONGEST_ARROW, View, nodes_xy_w
+from snakesim_operator.results.report.view import EDGE, FELT_SHARE, FOOT, LONGEST_ARROW, View, nodes_xy_w, reach_m
 
 Floats = NDArray[np.float64]
-UNIT_VECTOR = 24.0
+MOST_POINTS = 1500  # of the route
 
 
 def top_view(record: RunRecord, instant: Instant, view: View) -> str:
-    """The whole drawing of one instant."""
-    nodes = nodes_xy_w(record, instant)
-    joint = instant.propulsion_joint
-    what = f"Top view at {instant.time_s:.2f} s" + (f", joint {joint + 1} propels" if joint is not None else "")
-    return figure(view.width, view.height, what, drawing(record, instant, view, nodes))
-
-
-def drawing(record: RunRecord, instant: Instant, view: View, nodes: Floats) -> str:
-    """Everything inside the drawing."""
+    """The drawing of one instant."""
+    nodes, joint = nodes_xy_w(record, instant), instant.propulsion_joint
     labels = Labels(view.width, view.height - FOOT)
     parts = [ground(record, view, labels), body(record, view, nodes, labels)]
     parts += [_felt(contact, view, labels) for contact in instant.felt]
     parts.append(_solved(instant, view, labels))
-    parts.append(_names(record, instant, view, nodes, labels))
-    return "".join(parts) + scales(view)
+    what = f"Top view at {instant.time_s:.2f} s"
+    if joint is not None:
+        name, at = record.description.joints[joint].name, view.at(nodes[joint + 1])
+        what += f", {name} propels"
+        fill = f"fill:var(--joint-{joint})"
+        parts.append(element("circle", cx=at[0], cy=at[1], r=6.5, class_="propelling", style=fill))
+        parts.append(labels.put(at, name, "halo strong", gaps=(16, 22, 30, 40)))
+    if instant.balance is not None:
+        parts += [_push_point(i, instant.balance, view, labels) for i in range(len(instant.balance.contacts))]
+    for end, word in ((nodes[0], "tail"), (nodes[-1], "head")):
+        parts.append(labels.put(view.at(end), word, "halo soft", gaps=(16, 24, 34)))
+    return figure(view.width, view.height, what, *parts, scales(view))
 
 
 def ground(record: RunRecord, view: View, labels: Labels) -> str:
@@ -56,25 +59,15 @@ def ground(record: RunRecord, view: View, labels: Labels) -> str:
 def _route(record: RunRecord, view: View) -> str:
     if record.route is None:
         return ""
-    s = np.linspace(-0.2, record.route.length_m + 0.2, min(int(record.route.length_m * 50) + 20, 2000))
-    points = [view.at(point) for point in record.route.position_w(s)]
-    seen = [-60 < x < view.width + 60 and -60 < y < view.height + 60 for x, y in points]
-    lines: list[str] = []
-    stretch: list[Point] = []
-    for point, inside in zip([*points, (0.0, 0.0)], [*seen, False], strict=True):
-        if inside:
-            stretch.append(point)
-        elif stretch:
-            lines.append(polyline(stretch, "route"))
-            stretch = []
-    return "".join(lines)
+    s = np.linspace(-0.2, record.route.length_m + 0.2, min(int(record.route.length_m * 50) + 20, MOST_POINTS))
+    return polyline([view.at(point) for point in record.route.position_w(s)], "route")
 
 
 def _obstacle(item: Placed, view: View, labels: Labels) -> str:
     obstacle: Obstacle = item.obstacle
     x, y = view.at(obstacle.position_w)
     class_ = "step" if item.walkable else "peg"
-    reach = max(obstacle.radius_m, math.hypot(*obstacle.half_size_m[:2])) * view.scale
+    reach = reach_m(obstacle) * view.scale
     if not view.shows(obstacle):
         return ""
     labels.keep_off((x - reach, y - reach, x + reach, y + reach), 0.15)
@@ -118,19 +111,15 @@ def _felt(contact: WorldContact, view: View, labels: Labels) -> str:
 
 
 def _solved(instant: Instant, view: View, labels: Labels) -> str:
-    """Contact frames, solved forces and their resultant."""
+    """Solved forces and their resultant."""
     if instant.balance is None:
         return ""
     parts: list[str] = []
     for contact, force in zip(instant.balance.contacts, instant.balance.contact_n, strict=True):
         at = view.at(contact.position_w)
-        parts.append(arrow(view.along(at, contact.normal_w, -UNIT_VECTOR), at, "frame", head=7))
-        ahead = view.along(at, contact.tangent_w, UNIT_VECTOR)
-        parts.append(arrow(at, ahead, "frame", head=7))
         tip = view.along(at, force, view.force_scale)
         parts.append(arrow(at, tip, "solved", head=11))
         labels.keep_off_line(at, tip, 5)
-        labels.keep_off_line(at, ahead, 3)
     start = view.at(instant.balance.contacts[0].position_w)
     tip = view.along(start, instant.balance.resultant_n, view.force_scale)
     labels.keep_off_line(start, tip, 7, 2.0)
@@ -138,28 +127,13 @@ def _solved(instant: Instant, view: View, labels: Labels) -> str:
     return "".join(parts)
 
 
-def _names(record: RunRecord, instant: Instant, view: View, nodes: Floats, labels: Labels) -> str:
-    parts: list[str] = []
-    if instant.propulsion_joint is not None:
-        name = record.description.joints[instant.propulsion_joint].name
-        at = view.at(nodes[instant.propulsion_joint + 1])
-        fill = f"fill:var(--joint-{instant.propulsion_joint})"
-        parts.append(element("circle", cx=at[0], cy=at[1], r=6.5, class_="propelling", style=fill))
-        parts.append(labels.put(at, name, "halo strong", gaps=(16, 22, 30, 40)))
-    if instant.balance is not None:
-        for i, (contact, size) in enumerate(zip(instant.balance.contacts, instant.balance.size_n, strict=True)):
-            foot = view.at(contact.position_w)
-            tip = view.along(foot, contact.normal_w, size * view.force_scale)
-            parts.append(labels.put(tip, f"{size:.0f} N", "halo solved-text", gaps=(6, 10, 16), away_from=foot))
-            behind = view.along(foot, contact.normal_w, -18.0)
-            parts.append(labels.put(behind, f"o{_index(i + 1)}", "halo strong", away_from=foot))
-    parts.append(labels.put(view.at(nodes[0]), "tail", "halo soft", gaps=(16, 24, 34)))
-    parts.append(labels.put(view.at(nodes[-1]), "head", "halo soft", gaps=(16, 24, 34)))
-    return "".join(parts)
-
-
-def _index(number_: int) -> str:
-    return "".join(chr(ord("₀") + int(digit)) for digit in str(number_))
+def _push_point(i: int, balance: Balance, view: View, labels: Labels) -> str:
+    """Its name, and the size of the force there."""
+    contact, size = balance.contacts[i], balance.size_n[i]
+    foot = view.at(contact.position_w)
+    tip, behind = (view.along(foot, contact.normal_w, far) for far in (size * view.force_scale, -18.0))
+    force = labels.put(tip, f"{size:.0f} N", "halo solved-text", gaps=(6, 10, 16), away_from=foot)
+    return force + labels.put(behind, pretty(f"o_{i + 1}"), "halo strong", away_from=foot)
 
 
 def scales(view: View) -> str:

@@ -18,20 +18,12 @@ import pytest
 from snakesim_hal.host_process import HostRecord
 from snakesim_hal.model.kinematics import quaternion_from_yaw
 from snakesim_hal.model.robot import (
-    Chain,
-    ContactSensor,
-    Limits,
-    Module,
-    Motor,
-    PoseSensor,
-    RobotFile,
-    Sensors,
     describe,
 )
 from snakesim_hal.model.route import Route, lay_chain, sine_points
-from snakesim_hal.model.scenario import RunConfig, Service, Start
+from snakesim_hal.model.scenario import RunConfig, Start, load
 from snakesim_hal.model.scene import Cylinder, Ground, SceneFile, SineRoute, place, route_of
-from snakesim_hal.wire.messages import ControlState, Fault, Mode, World, WorldContact
+from snakesim_hal.wire.messages import ControlState, Description, Fault, Mode, World, WorldContact
 from snakesim_operator.results.page.charts import strongest, thinned
 from snakesim_operator.results.page.html import LIBRARY
 from snakesim_operator.results.record import RunRecord
@@ -73,35 +65,16 @@ def pegs() -> list[Cylinder]:
 
 
 def config() -> RunConfig:
-    robot = RobotFile(
-        name="planar13",
-        chain=Chain(modules=13, axes=["yaw"]),
-        module=Module(length_m=0.11, radius_m=RADIUS_M, mass_kg=0.3),
-        limits=Limits(angle_rad=1.57, speed_rad_s=7.5, acceleration_rad_s2=400, torque_nm=7.0, torque_rate_nm_s=200),
-        motor=Motor(
-            stiffness_nm_per_rad=60,
-            damping_nm_s_per_rad=1.5,
-            velocity_gain_nm_s_per_rad=1.5,
-            response_time_s=0.01,
-            armature_kg_m2=0.005,
-        ),
-        sensors=Sensors(contacts=ContactSensor(), pose=PoseSensor()),
-    )
     scene = SceneFile(
         name="sine",
         ground=Ground(friction=0.1),
         route=SineRoute(amplitude_m=0.05, wavelength_m=0.6, length_m=3.2),
         cylinder=pegs(),
     )
-    return RunConfig(
-        name="made_up",
-        title="Three push-points, made up",
-        robot=robot,
-        scene=scene,
-        controller="obstacle_triplet",
-        rate_hz=RATE_HZ,
-        duration_s=SECONDS,
-        services={"control": Service()},
+    shipped = load("triplet").config
+    title = "Three push-points, made up"
+    return msgspec.structs.replace(
+        shipped, name="made_up", title=title, scene=scene, start=Start(), rate_hz=RATE_HZ, duration_s=SECONDS
     )
 
 
@@ -626,24 +599,17 @@ def test_text_from_outside_is_escaped(record: RunRecord) -> None:
 
 def test_names_from_outside_are_escaped_and_turn_no_text_around(record: RunRecord) -> None:
     nasty = "</title><script>alert(1)\u202e\x9b31m\x1b[31m\u2028"
-    joints = [msgspec.structs.replace(joint, name=f"{nasty}{i}") for i, joint in enumerate(record.description.joints)]
-    old = [joint.name for joint in record.description.joints]
+    encoded = msgspec.json.encode(record.description).replace(b"joint_", msgspec.json.encode(nasty)[1:-1])
     told = [
-        msgspec.structs.replace(
-            state, propulsion_joint=None if (one := state.propulsion_joint) is None else joints[old.index(one)].name
-        )
-        for state in record.control
+        msgspec.structs.replace(one, propulsion_joint=one.propulsion_joint.replace("joint_", nasty))
+        if one.propulsion_joint
+        else one
+        for one in record.control
     ]
-    pegs_ = [
-        msgspec.structs.replace(peg, name=f"{nasty}{i}"[:64]) for i, peg in enumerate(record.config.scene.cylinder)
-    ]
+    pegs_ = [msgspec.structs.replace(peg, name=f"{nasty}{i}") for i, peg in enumerate(record.config.scene.cylinder)]
     scene = msgspec.structs.replace(record.config.scene, cylinder=pegs_)
-    hurt = changed(
-        record,
-        description=msgspec.structs.replace(record.description, joints=joints),
-        control=told,
-        config=msgspec.structs.replace(record.config, scene=scene),
-    )
+    config_ = msgspec.structs.replace(record.config, scene=scene)
+    hurt = changed(record, description=msgspec.json.decode(encoded, type=Description), control=told, config=config_)
     page = report_page(hurt, summarise(hurt, "complete"))
     assert propulsion_intervals(hurt) and "<script>alert" not in page and "&lt;script&gt;alert" in page
     assert not {"\u202e", "\x9b", "\x1b", "\u2028"} & set(page) and "\\u202e\\u009b31m" in page
