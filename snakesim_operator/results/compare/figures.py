@@ -17,10 +17,7 @@ def advance(difference: Difference, moved: Advance) -> list[Figure]:
     ahead_mm = 1000 * (
         np.interp(time_s, moved.b.time_s, moved.b.value) - np.interp(time_s, moved.a.time_s, moved.a.value)
     )
-    drawn = [
-        Line("A", moved.a.time_s, moved.a.value, A, width=3.5),
-        Line("B", moved.b.time_s, moved.b.value, B),
-    ]
+    drawn = [Line("A", moved.a.time_s, moved.a.value, A, width=3.5), Line("B", moved.b.time_s, moved.b.value, B)]
     gap = Line("B − A", time_s, ahead_mm)
     marks = parted(difference)
     return [

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from snakesim_operator.results.record import RunRecord
-from snakesim_operator.results.report.instants import Instant, balanced_instants, instant_at, saturated, unfelt
+from snakesim_operator.results.report.instants import Instant, balanced_instants, instant_at, unfelt
 from snakesim_operator.results.report.timeline import end_s, jam_bands, propulsion_intervals
 from snakesim_operator.results.report.verdict import distance_m, stop_of
 from snakesim_operator.results.report.view import nodes_xy_w
@@ -75,12 +75,15 @@ def drawn_instants(record: RunRecord, found: list[Event]) -> list[tuple[Event, I
 
 
 def _instant_of(record: RunRecord, event: Event, balanced: list[Instant]) -> Instant | None:
-    begin_s, end = event.time_s - AT_ONCE_S, event.time_s + (AT_ONCE_S if event.joint is None else SETTLED_S)
-    near = [one for one in balanced if begin_s <= one.time_s <= end]
-    if event.joint is not None:
-        near = [one for one in near if one.propulsion_joint == event.joint and one.time_s >= event.time_s]
-        return min(near, key=lambda one: (unfelt(one), saturated(one)), default=instant_at(record, event.time_s))
-    return min(near, key=lambda one: abs(one.time_s - event.time_s), default=instant_at(record, event.time_s))
+    """With the forces of just then; of a hand-over, with those that came soon after and were felt."""
+    if event.joint is None:
+        near = [one for one in balanced if abs(one.time_s - event.time_s) <= AT_ONCE_S]
+    else:
+        near = [one for one in balanced if one.propulsion_joint == event.joint]
+        near = [one for one in near if 0 <= one.time_s - event.time_s <= SETTLED_S]
+    return min(
+        near, key=lambda one: (unfelt(one), abs(one.time_s - event.time_s)), default=instant_at(record, event.time_s)
+    )
 
 
 def _look_alike(record: RunRecord, a: Instant, b: Instant) -> bool:

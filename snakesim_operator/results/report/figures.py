@@ -1,8 +1,10 @@
 """The charts of the report: what is drawn over time, and in which colour."""
 
+from typing import Any
+
 import numpy as np
 
-from snakesim_operator.results.page.charts import Bar, Figure, Line, Mark, bars, joint_map, lines
+from snakesim_operator.results.page.charts import Bar, Figure, Floats, Line, Mark, bars, joint_map, lines
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.timeline import (
     Propulsion,
@@ -33,8 +35,7 @@ def colour(joint: int) -> str:
 
 def advance(record: RunRecord, moved: Series) -> Figure:
     """How far it came."""
-    line = Line(moved.what, moved.time_s, moved.value)
-    return lines("Advance over time", "advance, m", [line], end_s(record), marks=faults(record))
+    return _lines(record, "Advance over time", "advance, m", [Line(moved.what, moved.time_s, moved.value)])
 
 
 def what_happened(record: RunRecord, intervals: list[Propulsion]) -> Figure:
@@ -53,44 +54,29 @@ def what_happened(record: RunRecord, intervals: list[Propulsion]) -> Figure:
 
 def joint_angle(record: RunRecord, joint: int, intervals: list[Propulsion]) -> Figure:
     """Measured angle against its reference (paper, Fig. 12)."""
-    time_s = record.time_s - zero_s(record)
-    name = record.description.joints[joint].name
     drawn = [
-        Line("measured", time_s, record.angle_rad[:, joint], colour(joint)),
-        Line("reference", time_s, reference_rad(record, joint), "--ink", "dot"),
+        _line(record, "measured", record.angle_rad[:, joint], colour(joint)),
+        _line(record, "reference", reference_rad(record, joint), "--ink", "dot"),
     ]
-    return lines(
-        f"Angle of {name} over time",
-        "angle, rad",
-        drawn,
-        end_s(record),
-        shades=_shades(intervals, joint),
-        marks=faults(record),
-    )
+    label = f"Angle of {record.description.joints[joint].name} over time"
+    return _lines(record, label, "angle, rad", drawn, shades=_shades(intervals, joint))
 
 
 def joint_torque(record: RunRecord, joint: int, intervals: list[Propulsion]) -> Figure:
     """Measured torque, what torque mode asked for, and the limits (paper, Fig. 13)."""
-    time_s = record.time_s - zero_s(record)
     limit = record.description.joints[joint].torque_limit_nm
     lowered = record.torque_limit_nm[:, joint]
     lowered = np.where(lowered < LOWERED * limit, lowered, np.nan)
     drawn = [
-        Line("measured", time_s, record.torque_nm[:, joint], colour(joint)),
-        Line("commanded", time_s, commanded_torque_nm(record, joint), "--ink", "dot"),
+        _line(record, "measured", record.torque_nm[:, joint], colour(joint)),
+        _line(record, "commanded", commanded_torque_nm(record, joint), "--ink", "dot"),
     ]
     if np.isfinite(lowered).any():
-        drawn += [Line(f"limit set by the controller, {sign}", time_s, values, "--faint", "dot", 1.0)
-                  for sign, values in (("+", lowered), ("−", -lowered))]  # fmt: skip
-    return lines(
-        f"Torque of {record.description.joints[joint].name} over time",
-        "torque, N·m",
-        drawn,
-        end_s(record),
-        levels=[(limit, "limit of the joint"), (-limit, "")],
-        shades=_shades(intervals, joint),
-        marks=faults(record),
-    )
+        for one in (lowered, -lowered):
+            drawn.append(_line(record, "limit set by the controller", one, "--faint", "dot", 1.0))
+    label = f"Torque of {record.description.joints[joint].name} over time"
+    levels = [(limit, "limit of the joint"), (-limit, "")]
+    return _lines(record, label, "torque, N·m", drawn, levels=levels, shades=_shades(intervals, joint))
 
 
 def torque_map(record: RunRecord, intervals: list[Propulsion]) -> Figure:
@@ -111,36 +97,32 @@ def full_colour_nm(record: RunRecord) -> float:
 
 def torque_use(record: RunRecord) -> Figure:
     """The hardest-worked joint's torque as a share of its limit; at the limit it is marked."""
-    time_s = record.time_s - zero_s(record)
     limits = np.array([joint.torque_limit_nm for joint in record.description.joints])
     share = 100 * np.fmax.reduce(np.abs(record.torque_nm) / limits, axis=1)
-    drawn = [Line("largest of any joint", time_s, share)]
-    at_limit = share >= 100 * SATURATED_FROM
+    drawn, at_limit = [_line(record, "largest of any joint", share)], share >= 100 * SATURATED_FROM
     if at_limit.any():
-        drawn.append(Line("at its limit", time_s, np.where(at_limit, share, np.nan), "--bad", width=3))
+        drawn.append(_line(record, "at its limit", np.where(at_limit, share, np.nan), "--bad", "solid", 3))
     label = "Largest torque of any joint as a share of its limit"
-    return lines(label, "of limit, %", drawn, end_s(record), levels=[(100, "limit")], marks=faults(record), height=190)
+    return _lines(record, label, "of limit, %", drawn, levels=[(100, "limit")], height=190)
 
 
 def contacts(record: RunRecord) -> list[Figure]:
     """The strongest contact, and how many obstacles are touched; three make a triplet."""
-    time_s = record.time_s - zero_s(record)
-    force = Line("strongest contact", time_s, record.contact_peak_n, "--measured")
-    count = Line("obstacles touched", time_s, record.contact_count, "--measured", shape="hv")
+    force = [_line(record, "strongest contact", record.contact_peak_n, "--measured")]
+    count = [_line(record, "obstacles touched", record.contact_count, "--measured", shape="hv")]
+    levels = [(3, "three carry it")]
     return [
-        lines(
-            "Strongest contact force over time", "force, N", [force], end_s(record), marks=faults(record), height=190
-        ),
-        lines(
-            "Obstacles touched over time",
-            "touched",
-            [count],
-            end_s(record),
-            levels=[(3, "three carry it")],
-            height=160,
-            from_zero=True,
-        ),
+        _lines(record, "Strongest contact force over time", "force, N", force, height=190),
+        _lines(record, "Obstacles touched over time", "touched", count, levels=levels, height=160, from_zero=True),
     ]
+
+
+def _line(record: RunRecord, name: str, values: Floats, *look: Any, **more: Any) -> Line:
+    return Line(name, record.time_s - zero_s(record), values, *look, **more)
+
+
+def _lines(record: RunRecord, label: str, axis: str, drawn: list[Line], **more: Any) -> Figure:
+    return lines(label, axis, drawn, end_s(record), marks=faults(record), **more)
 
 
 def _shades(intervals: list[Propulsion], joint: int) -> list[Bar]:

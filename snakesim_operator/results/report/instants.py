@@ -134,11 +134,6 @@ def _world_near(record: RunRecord, at_s: float, within_s: float) -> World | None
     return near if near is not None and abs(near.stamp_ns * 1e-9 - at_s) <= within_s else None
 
 
-def saturated(instant: Instant) -> bool:
-    """Whether the push was at its torque limit."""
-    return instant.state is not None and instant.state.saturated
-
-
 def unfelt(instant: Instant) -> int:
     """How many solved contacts no sensor felt."""
     if instant.balance is None:

@@ -11,7 +11,7 @@ from snakesim_hal.safety.fault_log import FIRST_KEPT
 from snakesim_operator.results.page.html import data, render, shown
 from snakesim_operator.results.record import CONFIG, RunRecord
 from snakesim_operator.results.report import figures
-from snakesim_operator.results.report.events import drawn_instants, events
+from snakesim_operator.results.report.events import Event, drawn_instants, events
 from snakesim_operator.results.report.instants import felt_along_n
 from snakesim_operator.results.report.playback import playback
 from snakesim_operator.results.report.polygon import force_polygon, pretty, units_per_n
@@ -50,7 +50,7 @@ def page(record: RunRecord, summary: RunSummary) -> str:
         film_picture=Markup(film.picture) if film else None,
         film_data=data(film.data) if film else None,
         events=found if len(found) <= EVENTS_SHOWN else [*found[: EVENTS_SHOWN - 2], *found[-2:]],
-        instants=_instants(record, summary),
+        instants=_instants(record, found),
         moved=moved,
         moved_m=distance_m(summary),
         limit_nm=max(joint.torque_limit_nm for joint in record.description.joints),
@@ -79,9 +79,9 @@ def page(record: RunRecord, summary: RunSummary) -> str:
     )
 
 
-def _instants(record: RunRecord, summary: RunSummary) -> list[dict[str, Any]]:
+def _instants(record: RunRecord, found: list[Event]) -> list[dict[str, Any]]:
     """The drawings of each event, and what stands beside them."""
-    chosen = drawn_instants(record, events(record, summary))
+    chosen = drawn_instants(record, found)
     balances = [instant.balance for _, instant in chosen if instant.balance is not None]
     cards: list[dict[str, Any]] = []
     windows = views(record, [instant for _, instant in chosen], VIEW_WIDTH)

@@ -32,8 +32,8 @@ def element(name: str, *children: str, **attributes: Attribute) -> str:
     return f"<{opening}>{''.join(children)}</{name}>" if children else f"<{opening}/>"
 
 
-def text(x: float, y: float, words: str, class_: str = "", *, anchor: str = "start", turn: float = 0) -> str:
-    """A line of text. anchor: start, middle or end; turn: degrees."""
+def text(x: float, y: float, words: str, class_: str = "", *, anchor: str = "start") -> str:
+    """A line of text. anchor: start, middle or end."""
     return element(
         "text",
         escape(printable(words), quote=False),
@@ -41,7 +41,6 @@ def text(x: float, y: float, words: str, class_: str = "", *, anchor: str = "sta
         y=y,
         class_=class_ or None,
         text_anchor=None if anchor == "start" else anchor,
-        transform=f"rotate({number(turn)} {number(x)} {number(y)})" if turn else None,
     )
 
 

@@ -17,9 +17,7 @@ import pytest
 
 from snakesim_hal.host_process import HostRecord
 from snakesim_hal.model.kinematics import quaternion_from_yaw
-from snakesim_hal.model.robot import (
-    describe,
-)
+from snakesim_hal.model.robot import describe
 from snakesim_hal.model.route import Route, lay_chain, sine_points
 from snakesim_hal.model.scenario import RunConfig, Start, load
 from snakesim_hal.model.scene import Cylinder, Ground, SceneFile, SineRoute, place, route_of
@@ -31,11 +29,7 @@ from snakesim_operator.results.report import page as report_page
 from snakesim_operator.results.report.events import drawn_instants, events
 from snakesim_operator.results.report.instants import balanced_instants
 from snakesim_operator.results.report.page import ELSEWHERE
-from snakesim_operator.results.report.timeline import (
-    propulsion_intervals,
-    reference_rad,
-    state_bands,
-)
+from snakesim_operator.results.report.timeline import propulsion_intervals, reference_rad, state_bands
 from snakesim_operator.results.report.verdict import Verdict, verdict
 from snakesim_operator.results.report.view import nodes_xy_w
 from snakesim_operator.results.summary import RunSummary, summarise
@@ -120,6 +114,24 @@ def solved(contacts: list[WorldContact]) -> list[float]:
     return np.linalg.solve(np.vstack([normals.T, moments]), -np.array([*tether, about])).tolist()
 
 
+def finished(ticks: int) -> HostRecord:
+    """What the host of a complete run leaves."""
+    return HostRecord(
+        ticks=ticks,
+        wall_s=2.5,
+        overruns=0,
+        answered_ticks=ticks - 1,
+        armed_ticks=ticks,
+        command_digest="0123456789abcdef" * 4,
+        state_to_command_us={"p50": 310.0, "p99": 905.5},
+        rejected_commands={"stale": 2},
+        limited_commands={"torque_rate": 41, "max_step": 7},
+        faults=[],
+        lifecycle="disarmed",
+        why="finished",
+    )
+
+
 def made_up(folder: Path) -> RunRecord:
     run = config()
     route = route_of(run.scene)
@@ -199,20 +211,7 @@ def made_up(folder: Path) -> RunRecord:
         folder=folder,
         config=run,
         description=describe(run.robot, backend="sim", period_ns=run.period_ns, lease_ns=run.lease_ns, config_hash="x"),
-        host=HostRecord(
-            ticks=count,
-            wall_s=2.5,
-            overruns=0,
-            answered_ticks=count - 1,
-            armed_ticks=count,
-            command_digest="0123456789abcdef" * 4,
-            state_to_command_us={"p50": 310.0, "p99": 905.5},
-            rejected_commands={"stale": 2},
-            limited_commands={"torque_rate": 41, "max_step": 7},
-            faults=[],
-            lifecycle="disarmed",
-            why="finished",
-        ),
+        host=finished(count),
         control=control,
         worlds=worlds,
         time_s=time_s,
@@ -511,7 +510,7 @@ def test_a_run_that_ended_by_a_fault(record: RunRecord) -> None:
     assert "Stopped by a fault after 5.0 s at joint_3: joint_3 at 1e9 rad/s." in page.text
     assert "diverged" in page.words
     marks = [shape for chart in page.charts.values() for shape in chart["layout"]["shapes"]]
-    assert [mark["line"].get("color") for mark in marks].count("--bad") == 2 + 8 + 2
+    assert [mark["line"].get("color") for mark in marks].count("--bad") == 2 + 8 + 3
 
 
 def test_a_run_that_jammed(record: RunRecord) -> None:
