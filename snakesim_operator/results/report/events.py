@@ -11,10 +11,10 @@ from snakesim_operator.results.report.verdict import distance_m, stop_of
 from snakesim_operator.results.report.view import nodes_xy_w
 from snakesim_operator.results.summary import RunSummary
 
-HAND_OVERS_DRAWN = 4
+HAND_OVERS_DRAWN, HAND_OVERS_LISTED = 4, 8
 SETTLED_S = 0.6  # so soon after a hand-over the forces are drawn that belong to it
 AT_ONCE_S = 0.06  # control tells its state twenty times a second
-SAME_M = 0.005  # a body that moved less looks the same
+SAME_M, SAME_S = 0.008, 0.1  # a body that moved less looks the same
 
 
 @dataclass(frozen=True)
@@ -49,16 +49,22 @@ def events(record: RunRecord, summary: RunSummary) -> list[Event]:
     return sorted(found, key=lambda one: one.time_s)
 
 
+def listed(found: list[Event]) -> list[Event]:
+    """All but hand-overs beyond a few: for buttons."""
+    turns = [one for one in found if one.joint is not None]
+    left_out = turns[HAND_OVERS_LISTED:-1]
+    return [one for one in found if one not in left_out]
+
+
 def drawn_instants(record: RunRecord, found: list[Event]) -> list[tuple[Event, Instant]]:
     """The events with the snake in each, of hand-overs a few; what looks the same is drawn once, under both names."""
-    balanced = balanced_instants(record)
     turns = [one for one in found if one.joint is not None]
     shown = {turns[i].time_s for i in np.linspace(0, len(turns) - 1, min(len(turns), HAND_OVERS_DRAWN)).astype(int)}
     chosen: list[tuple[Event, Instant]] = []
     for event in sorted(found, key=lambda one: one.joint is None):  # those with forces first
         if event.joint is not None and event.time_s not in shown:
             continue
-        instant = _instant_of(record, event, balanced)
+        instant = _instant_of(record, event)
         if instant is None:
             continue
         later_s = instant.time_s - event.time_s
@@ -74,17 +80,17 @@ def drawn_instants(record: RunRecord, found: list[Event]) -> list[tuple[Event, I
     return sorted(chosen, key=lambda pair: pair[1].time_s)
 
 
-def _instant_of(record: RunRecord, event: Event, balanced: list[Instant]) -> Instant | None:
+def _instant_of(record: RunRecord, event: Event) -> Instant | None:
     """With the forces of just then; of a hand-over, with those that came soon after and were felt."""
-    if event.joint is None:
-        near = [one for one in balanced if abs(one.time_s - event.time_s) <= AT_ONCE_S]
-    else:
-        near = [one for one in balanced if one.propulsion_joint == event.joint]
-        near = [one for one in near if 0 <= one.time_s - event.time_s <= SETTLED_S]
+    before_s, after_s = (AT_ONCE_S, AT_ONCE_S) if event.joint is None else (0.0, SETTLED_S)
+    near = balanced_instants(record, event.time_s - before_s, event.time_s + after_s)
     return min(
-        near, key=lambda one: (unfelt(one), abs(one.time_s - event.time_s)), default=instant_at(record, event.time_s)
+        [one for one in near if event.joint in (None, one.propulsion_joint)],
+        key=lambda one: (unfelt(one), abs(one.time_s - event.time_s)),
+        default=instant_at(record, event.time_s),
     )
 
 
 def _look_alike(record: RunRecord, a: Instant, b: Instant) -> bool:
-    return bool(np.abs(nodes_xy_w(record, a) - nodes_xy_w(record, b)).max() < SAME_M)
+    moved_m = np.abs(nodes_xy_w(record, a) - nodes_xy_w(record, b)).max()
+    return bool(moved_m < SAME_M or abs(a.time_s - b.time_s) < SAME_S)

@@ -5,6 +5,7 @@ model pulls the tail back along the tangent at o_1. So the contact forces add up
 propulsion force, points forward along the path at o_1. It also acts through o_1, because the moments balance too (11).
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -82,13 +83,13 @@ def balance_of(state: ControlState) -> Balance | None:
     return Balance(contacts, sizes, normals * np.array(sizes)[:, None], -state.propulsion_n * tangent / length)
 
 
-def balanced_instants(record: RunRecord) -> list[Instant]:
-    """Every moment of locomotion whose solved forces balance, in order of time."""
+def balanced_instants(record: RunRecord, begin_s: float = 0.0, end_s: float = math.inf) -> list[Instant]:
+    """Every moment of locomotion, of those told within a time, whose solved forces balance; in order of time."""
     if not len(record.time_s):
         return []
     found: list[Instant] = []
     for state in record.control:
-        balance = balance_of(state)
+        balance = balance_of(state) if begin_s <= told_at_s(record, state) <= end_s else None
         if balance is None or state.propulsion_joint is None or state.state != "Locomoting":
             continue
         if balance.gap_n > 0.05 * balance.commanded_n or min(balance.size_n) <= 0:

@@ -11,7 +11,7 @@ from snakesim_hal.safety.fault_log import FIRST_KEPT
 from snakesim_operator.results.page.html import data, render, shown
 from snakesim_operator.results.record import CONFIG, RunRecord
 from snakesim_operator.results.report import figures
-from snakesim_operator.results.report.events import Event, drawn_instants, events
+from snakesim_operator.results.report.events import Event, drawn_instants, events, listed
 from snakesim_operator.results.report.instants import felt_along_n
 from snakesim_operator.results.report.playback import playback
 from snakesim_operator.results.report.polygon import force_polygon, pretty, units_per_n
@@ -26,7 +26,6 @@ HERE = Path(__file__).parent
 VIEW_WIDTH = 500.0
 POLYGON = (236.0, 226.0)
 ELSEWHERE = ("config", "faults", "rejected_commands", "limited_commands")
-EVENTS_SHOWN = 14
 
 
 def page(record: RunRecord, summary: RunSummary) -> str:
@@ -49,7 +48,7 @@ def page(record: RunRecord, summary: RunSummary) -> str:
         film=film,
         film_picture=Markup(film.picture) if film else None,
         film_data=data(film.data) if film else None,
-        events=found if len(found) <= EVENTS_SHOWN else [*found[: EVENTS_SHOWN - 2], *found[-2:]],
+        events=listed(found),
         instants=_instants(record, found),
         moved=moved,
         moved_m=distance_m(summary),

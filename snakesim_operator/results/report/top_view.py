@@ -5,7 +5,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.model.scenario import place_all
 from snakesim_hal.model.scene import Placed
 from snakesim_hal.wire.messages import Obstacle, WorldContact
 from snakesim_operator.results.record import RunRecord
@@ -53,7 +52,7 @@ def top_view(record: RunRecord, instant: Instant, view: View) -> str:
 
 def ground(record: RunRecord, view: View, labels: Labels) -> str:
     """What stands still: route and obstacles."""
-    return _route(record, view) + "".join(_obstacle(item, view, labels) for item in place_all(record.config))
+    return _route(record, view) + "".join(_obstacle(item, view, labels) for item in record.placed)
 
 
 def _route(record: RunRecord, view: View) -> str:

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.model.scenario import place_all
 from snakesim_hal.wire.messages import Obstacle
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.instants import Instant
@@ -94,7 +93,7 @@ def _windows(record: RunRecord, shown: list[Floats], units_per_n: float, width: 
 
 def _with_obstacles(record: RunRecord, plain: View, low: Floats, high: Floats) -> tuple[Floats, Floats]:
     """A window that is grown until it cuts no obstacle but large ones."""
-    found = [item.obstacle for item in place_all(record.config)]
+    found = [item.obstacle for item in record.placed]
     large = LARGE * float((high - low).min())
     small = [(plain.turned(np.array(one.position_w[:2])), 1.1 * reach_m(one)) for one in found if reach_m(one) <= large]
     for _ in range(GROWN_AT_MOST):
