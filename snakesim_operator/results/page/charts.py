@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Figure = dict[str, Any]
-BUCKETS = 500  # of time; each keeps its smallest and its largest value
+BUCKETS = 400  # of time; each keeps its smallest and its largest value
 MAP_COLUMNS = 480
 ROW = 21  # height of a row of bars
+MOST_BARS = 2000
 NAMED_SHARE = 0.03  # of the time: a shorter bar has no room for words
 
 
@@ -93,7 +94,8 @@ def lines(
 
 
 def bars(label: str, rows: Sequence[str], drawn: Sequence[Bar], until_s: float, marks: Sequence[Mark] = ()) -> Figure:
-    """What held when, a row each, the first on top."""
+    """What held when, a row each, the first on top. Of very many the longest are drawn."""
+    drawn = sorted(drawn, key=lambda bar: bar.start_s - bar.end_s)[:MOST_BARS]
     trace = {
         "type": "bar",
         "orientation": "h",

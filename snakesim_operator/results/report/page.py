@@ -16,7 +16,15 @@ from snakesim_operator.results.report.instants import felt_along_n
 from snakesim_operator.results.report.playback import playback
 from snakesim_operator.results.report.polygon import force_polygon, pretty, units_per_n
 from snakesim_operator.results.report.svg import arrow
-from snakesim_operator.results.report.timeline import distance, in_words, most_used_joints, propulsion_intervals, zero_s
+from snakesim_operator.results.report.timeline import (
+    distance,
+    end_s,
+    in_words,
+    joined,
+    most_used_joints,
+    propulsion_intervals,
+    zero_s,
+)
 from snakesim_operator.results.report.top_view import top_view
 from snakesim_operator.results.report.verdict import distance_m, verdict
 from snakesim_operator.results.report.view import nodes_xy_w, views
@@ -24,6 +32,7 @@ from snakesim_operator.results.summary import RunSummary
 
 HERE = Path(__file__).parent
 VIEW_WIDTH = 500.0
+TURNS_SHOWN = 100  # of one joint in a chart
 POLYGON = (236.0, 226.0)
 ELSEWHERE = ("config", "faults", "rejected_commands", "limited_commands")
 
@@ -31,7 +40,8 @@ ELSEWHERE = ("config", "faults", "rejected_commands", "limited_commands")
 def page(record: RunRecord, summary: RunSummary) -> str:
     """The whole page."""
     ticks = len(record.time_s) > 0
-    found, intervals = events(record, summary), propulsion_intervals(record)
+    found, every = events(record, summary), propulsion_intervals(record)
+    intervals = joined(every, end_s(record) / TURNS_SHOWN)
     moved, film = distance(record) if ticks else None, playback(record)
     return render(
         HERE / "report.html",
@@ -59,7 +69,7 @@ def page(record: RunRecord, summary: RunSummary) -> str:
         joints=[
             {
                 "joint": joint,
-                "own": [one for one in intervals if one.joint == joint],
+                "own": [one for one in every if one.joint == joint],
                 "angle": figures.joint_angle(record, joint, intervals),
                 "torque": figures.joint_torque(record, joint, intervals),
             }

@@ -89,6 +89,20 @@ def propulsion_intervals(record: RunRecord) -> list[Propulsion]:
     return [Propulsion(b.start_s, b.end_s, joints[b.what]) for b in bands if b.what in joints]
 
 
+def joined(intervals: list[Propulsion], gap_s: float) -> list[Propulsion]:
+    """Turns of one joint with less than a gap between them are one: no chart could show them apart."""
+    found: list[Propulsion] = []
+    newest: dict[int, int] = {}
+    for one in intervals:
+        i = newest.get(one.joint)
+        if i is not None and one.start_s - found[i].end_s < gap_s:
+            found[i] = Propulsion(found[i].start_s, one.end_s, one.joint)
+        else:
+            newest[one.joint] = len(found)
+            found.append(one)
+    return found
+
+
 def most_used_joints(intervals: list[Propulsion], most: int = 6) -> list[int]:
     """The joints that propelled longest, head to tail as the hand-over goes."""
     spent: dict[int, float] = {}

@@ -449,6 +449,23 @@ def test_without_telemetry(record: RunRecord) -> None:
     assert len([title for title in page.titles if title.startswith("Top view")]) == 3  # the pose is known
 
 
+def test_the_page_of_a_long_run_is_no_larger(record: RunRecord) -> None:
+    """Ten runs a minute, for ten minutes."""
+    times = 60
+    long = {name: np.concatenate([one] * times) for name, one in vars(record).items() if isinstance(one, np.ndarray)}
+    long["time_s"] = 0.37 + np.arange(len(long["time_s"])) / RATE_HZ
+    later = [
+        [
+            msgspec.structs.replace(one, stamp_ns=one.stamp_ns + round(k * SECONDS * 1e9))
+            for k in range(times)
+            for one in told
+        ]
+        for told in (record.control, record.worlds)
+    ]
+    page = read(changed(record, control=later[0], worlds=later[1], **long))  # holds the size against the limit
+    assert len(page.film["frames"]) <= 300 and "handed over 239 times among 4 joints" in page.text
+
+
 def test_without_a_pose(record: RunRecord) -> None:
     count = len(record.time_s)
     blind = changed(record, position_w=np.full((count, 3), np.nan), orientation_wxyz=np.full((count, 4), np.nan))
