@@ -2,7 +2,6 @@
 
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -18,8 +17,7 @@ HAND_OVERS_SHOWN = 40
 def page(difference: Difference, asked: Within | None = None) -> str:
     """The whole page. asked: what `--within` asked for."""
     said = [*sentences(difference), *([f"{asked.words[:1].upper()}{asked.words[1:]}."] if asked is not None else [])]
-    moved, both = difference.advance, difference.hand_overs
-    turns = list(zip_longest(both.a, both.b))
+    turns = list(zip_longest(difference.hand_overs.a, difference.hand_overs.b))
     return render(
         Path(__file__).parent / "compare.html",
         len(difference.joints),
@@ -30,11 +28,9 @@ def page(difference: Difference, asked: Within | None = None) -> str:
         records=(difference.a, difference.b),
         kind="" if asked is None else "good" if asked.holds else "bad",
         said=" ".join(said),
-        advance=figures.advance(difference, moved) if moved else [],
         maps=[("Angles", difference.angle), ("Torques", difference.torque)],
-        gap_map=figures.gap_map,
+        figures=figures,
         worst=_worst(difference),
-        hand_overs=figures.hand_overs(difference) if turns else None,
         who_propelled=who_propelled(difference),
         turns=turns[:HAND_OVERS_SHOWN],
         more_turns=len(turns) - HAND_OVERS_SHOWN,
@@ -42,23 +38,14 @@ def page(difference: Difference, asked: Within | None = None) -> str:
     )
 
 
-def _worst(difference: Difference) -> list[dict[str, Any]]:
+def _worst(difference: Difference) -> list[tuple[int, str]]:
     """The joints that differ most, and why they are shown."""
     chosen: dict[int, list[str]] = {}
     for gap in (difference.angle, difference.torque):
         if gap.worst is not None and gap.worst.difference:
             words = f"worst {gap.what}, {_known(gap.worst.difference)} {gap.unit} at {gap.worst.time_s:.2f} s"
             chosen.setdefault(gap.worst.joint, []).append(words)
-    a, b = difference.aligned.a, difference.aligned.b
-    return [
-        {
-            "joint": joint,
-            "why": "; ".join(why),
-            "angle": figures.overlay(difference, difference.angle, a.angle_rad, b.angle_rad, joint),
-            "torque": figures.overlay(difference, difference.torque, a.torque_nm, b.torque_nm, joint),
-        }
-        for joint, why in chosen.items()
-    ]
+    return [(joint, "; ".join(why)) for joint, why in chosen.items()]
 
 
 def _known(value: float | None, unit: str = "") -> str:

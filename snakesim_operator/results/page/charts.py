@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Figure = dict[str, Any]
-BUCKETS = 400  # of time; each keeps its smallest and its largest value
+BUCKETS = 500  # of time; each keeps its smallest and its largest value
 MAP_COLUMNS = 480
 ROW = 21  # height of a row of bars
 MOST_BARS = 2000

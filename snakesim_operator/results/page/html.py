@@ -68,7 +68,7 @@ def _pages(folder: Path) -> jinja2.Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    pages.filters.update(chart=chart, shown=shown)
+    pages.filters.update(chart=chart, data=data, shown=shown)
     return pages
 
 

@@ -8,14 +8,13 @@ from markupsafe import Markup
 from msgspec import Meta
 
 from snakesim_hal.safety.fault_log import FIRST_KEPT
-from snakesim_operator.results.page.html import data, render, shown
+from snakesim_operator.results.page.html import render
 from snakesim_operator.results.record import CONFIG, RunRecord
 from snakesim_operator.results.report import figures
 from snakesim_operator.results.report.events import Event, drawn_instants, events, listed
 from snakesim_operator.results.report.instants import felt_along_n
 from snakesim_operator.results.report.playback import playback
 from snakesim_operator.results.report.polygon import force_polygon, pretty, units_per_n
-from snakesim_operator.results.report.svg import arrow
 from snakesim_operator.results.report.timeline import (
     distance,
     end_s,
@@ -39,10 +38,8 @@ ELSEWHERE = ("config", "faults", "rejected_commands", "limited_commands")
 
 def page(record: RunRecord, summary: RunSummary) -> str:
     """The whole page."""
-    ticks = len(record.time_s) > 0
     found, every = events(record, summary), propulsion_intervals(record)
     intervals = joined(every, end_s(record) / TURNS_SHOWN)
-    moved, film = distance(record) if ticks else None, playback(record)
     return render(
         HERE / "report.html",
         len(record.description.joints),
@@ -52,34 +49,18 @@ def page(record: RunRecord, summary: RunSummary) -> str:
         record=record,
         summary=summary,
         verdict=verdict(record, summary),
-        swatch=_swatch,
         pretty=pretty,
         in_words=in_words,
-        film=film,
-        film_picture=Markup(film.picture) if film else None,
-        film_data=data(film.data) if film else None,
+        film=playback(record),
         events=listed(found),
         instants=_instants(record, found),
-        moved=moved,
+        moved=distance(record) if len(record.time_s) else None,
         moved_m=distance_m(summary),
         limit_nm=max(joint.torque_limit_nm for joint in record.description.joints),
         intervals=intervals,
-        advance=figures.advance(record, moved) if moved else None,
-        happened=figures.what_happened(record, intervals),
-        joints=[
-            {
-                "joint": joint,
-                "own": [one for one in every if one.joint == joint],
-                "angle": figures.joint_angle(record, joint, intervals),
-                "torque": figures.joint_torque(record, joint, intervals),
-            }
-            for joint in most_used_joints(intervals)
-        ],
+        joints=[(joint, [one for one in every if one.joint == joint]) for joint in most_used_joints(intervals)],
         propelled=len({one.joint for one in intervals}),
-        full_colour_nm=figures.full_colour_nm(record),
-        torque_map=figures.torque_map(record, intervals) if ticks else None,
-        torque_use=figures.torque_use(record) if ticks else None,
-        contacts=figures.contacts(record) if record.config.robot.sensors.contacts is not None else [],
+        figures=figures,
         begin_s=zero_s(record),
         first_kept=FIRST_KEPT,
         numbers=_numbers(summary),
@@ -107,41 +88,21 @@ def _instants(record: RunRecord, found: list[Event]) -> list[dict[str, Any]]:
     return cards
 
 
-def _numbers(summary: RunSummary) -> list[list[str]]:
+def _numbers(summary: RunSummary) -> list[tuple[str, Any, str, str]]:
     """Every field with its unit and what it means, from the Struct itself."""
     hints = get_type_hints(RunSummary, include_extras=True)
-    rows: list[list[str]] = []
+    rows: list[tuple[str, Any, str, str]] = []
     for field in msgspec.structs.fields(RunSummary):
         if field.name in ELSEWHERE:
             continue
         notes = getattr(hints[field.name], "__metadata__", ())
         meta: Meta | None = next((note for note in notes if isinstance(note, Meta)), None)
         unit = ((meta.extra_json_schema or {}).get("unit", "") if meta else "").removeprefix("1")
-        rows.append([field.name, _said(getattr(summary, field.name)), unit, (meta.description or "") if meta else ""])
+        rows.append((field.name, getattr(summary, field.name), unit, (meta.description or "") if meta else ""))
     return rows
-
-
-def _said(value: Any) -> str:
-    """A value in words; what is unknown says so."""
-    if value is None:
-        return "not known"
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, float):
-        return shown(value)
-    if isinstance(value, dict):
-        return ", ".join(f"{key} {_said(inner)}" for key, inner in value.items()) or "none"
-    if isinstance(value, list):
-        return ", ".join(_said(inner) for inner in value) or "none"
-    return str(value)
 
 
 def _config_file(record: RunRecord) -> Path:
     here = Path.cwd()
     folder = record.folder.relative_to(here) if record.folder.is_relative_to(here) else record.folder
     return folder / CONFIG
-
-
-def _swatch(kind: str) -> Markup:
-    drawn = arrow((1, 7), (29, 7), kind, head=10)
-    return Markup(f'<svg class="figure swatch" viewBox="0 0 30 14">{drawn}</svg>')

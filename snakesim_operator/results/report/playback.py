@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
+from markupsafe import Markup
 from numpy.typing import NDArray
 
 from snakesim_hal.wire.messages import ControlState, World
@@ -33,7 +34,7 @@ TOLD_FOR_S = 0.3  # what is older is not shown: control and guidance tell their 
 class Playback:
     """The map as markup, and what moves on it as data."""
 
-    picture: str
+    picture: Markup
     data: dict[str, Any]
     with_solved: bool
     with_felt: bool
@@ -72,7 +73,7 @@ def playback(record: RunRecord) -> Playback | None:
         ground(record, view, labels) + snake + '<g class="forces"></g>' + scales(view),
     )
     data = {"frames": frames, "said": said, "joints": names, "end": round(end_s(record), 3)}
-    return Playback(picture, data, any(frame[4] for frame in frames), any(frame[5] for frame in frames))
+    return Playback(Markup(picture), data, any(frame[4] for frame in frames), any(frame[5] for frame in frames))
 
 
 def _nodes(record: RunRecord, row: int) -> Floats:
