@@ -207,17 +207,9 @@ def _figure(
 
 
 def _box(x0: float, x1: float, y0: float, y1: float, yref: str, **look: Any) -> Figure:
-    return {
-        "type": "rect",
-        "layer": "below" if yref == "paper" else "above",
-        "x0": x0,
-        "x1": x1,
-        "y0": y0,
-        "y1": y1,
-        "yref": yref,
-        "line": {"width": 0},
-        **look,
-    }
+    layer = "below" if yref == "paper" else "above"
+    at = {"x0": x0, "x1": x1, "y0": y0, "y1": y1, "yref": yref}
+    return {"type": "rect", "layer": layer, "line": {"width": 0}, **at, **look}
 
 
 def _stroke(colour: str, dash: str) -> Figure:

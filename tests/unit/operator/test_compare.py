@@ -24,7 +24,6 @@ from tests.unit.operator.test_report import finished
 
 JOINTS = 13
 SPEED_M_S = 0.1
-BY_JOINT = ("angle_rad", "velocity_rad_s", "torque_nm", "mode", "target")
 
 
 def configured(**changes: Any) -> RunConfig:

@@ -416,12 +416,11 @@ def drawn_edges(svg: str, kind: str) -> list[tuple[tuple[float, float], tuple[fl
 
 
 def test_a_polygon_that_does_not_close_is_no_instant(record: RunRecord) -> None:
-    wrong = [
-        msgspec.structs.replace(state, solved_force_n=[1.3 * f for f in state.solved_force_n])
-        for state in record.control
+    more = [
+        msgspec.structs.replace(one, solved_force_n=[1.3 * f for f in one.solved_force_n]) for one in record.control
     ]
-    assert balanced_instants(changed(record, control=wrong)) == []
-    assert "whose forces balance" in read(changed(record, control=wrong)).text
+    wrong = changed(record, control=more)
+    assert balanced_instants(wrong) == [] and "whose forces balance" in read(wrong).text
 
 
 def test_every_number_of_the_summary_stands_in_the_table_with_its_unit(record: RunRecord, page: Reader) -> None:
@@ -500,12 +499,8 @@ def test_without_a_contact_sensor(record: RunRecord) -> None:
 
 
 def test_a_controller_without_push_points(record: RunRecord) -> None:
-    plain = [
-        msgspec.structs.replace(
-            state, controller="hold", push_points=[], solved_force_n=[], propulsion_joint=None, propulsion_n=None
-        )
-        for state in record.control
-    ]
+    nothing = {"push_points": [], "solved_force_n": [], "propulsion_joint": None, "propulsion_n": None}
+    plain = [msgspec.structs.replace(state, controller="hold", **nothing) for state in record.control]
     config_ = msgspec.structs.replace(record.config, controller="hold")
     page = read(changed(record, control=plain, config=config_))
     assert "controller hold solved for no push-points" in page.text
@@ -532,9 +527,7 @@ def test_a_run_that_ended_by_a_fault(record: RunRecord) -> None:
 
 
 def test_a_run_that_jammed(record: RunRecord) -> None:
-    still = {name: np.repeat(getattr(record, name)[:1], len(record.time_s), axis=0) for name in MOVING}
-    stuck = [msgspec.structs.replace(state, jammed=True, reason="jammed at peg_2") for state in record.control]
-    page = read(changed(record, control=stuck, **still))
+    page = read(stopped_at(record, 0.0, jammed=True, reason="jammed at peg_2"))
     assert "Jammed: jammed at peg_2. Moved 0.00 m along the path in 10.0 s; no fault, 2 commands refused" in page.text
     assert "jam" in page.charts["States and propulsion joint over time"]["data"][0]["y"]
 
@@ -596,10 +589,10 @@ def test_who_says_nothing_more_is_not_known_to_move(record: RunRecord) -> None:
 
 
 def test_a_controller_that_says_it_moves_and_does_not(record: RunRecord) -> None:
-    still = {name: np.repeat(getattr(record, name)[:1], len(record.time_s), axis=0) for name in MOVING}
-    told = [msgspec.structs.replace(state, state="Locomoting", reason="moving") for state in record.control]
-    page = read(changed(record, control=told, **still))
-    assert "Did not locomote: the snake stayed where it was, although its controller reported Locomoting." in page.text
+    found = judged(stopped_at(record, 0.0, state="Locomoting", reason="moving"))
+    assert (
+        "Did not locomote: the snake stayed where it was, although its controller reported Locomoting." in found.words
+    )
 
 
 def test_text_from_outside_is_escaped(record: RunRecord) -> None:
