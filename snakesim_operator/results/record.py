@@ -15,8 +15,8 @@ from snakesim_hal.host.recorder import BLACK_BOX, DESCRIPTION, HOST_RECORD
 from snakesim_hal.host_process import HostRecord
 from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion
 from snakesim_hal.model.route import Route
-from snakesim_hal.model.scenario import RunConfig, read
-from snakesim_hal.model.scene import route_of
+from snakesim_hal.model.scenario import RunConfig, place_all, read
+from snakesim_hal.model.scene import Placed, route_of
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import ControlState, Description, World
@@ -38,7 +38,7 @@ class TelemetryLine(msgspec.Struct, frozen=True):
     message: msgspec.Raw
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RunRecord:
     """The record of a run. Every array has one row a tick."""
 
@@ -102,6 +102,11 @@ class RunRecord:
     def route(self) -> Route | None:
         """The route through the scene."""
         return route_of(self.config.scene)
+
+    @cached_property
+    def placed(self) -> list[Placed]:
+        """The obstacles where they stand."""
+        return place_all(self.config)
 
     def row_at(self, time_s: float) -> int:
         """The row whose time is nearest."""

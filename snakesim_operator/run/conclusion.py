@@ -16,7 +16,6 @@ from snakesim_hal.wire.messages import Description
 from snakesim_operator.results import last_run as lastrun
 from snakesim_operator.results.gaps import unwritten
 from snakesim_operator.results.record import REPORT, SUMMARY, RunRecord
-from snakesim_operator.results.report import page
 from snakesim_operator.results.summary import Restart, RunSummary, summarise
 from snakesim_operator.run.ending import Ending
 from snakesim_operator.run.run_files import RunFiles
@@ -96,6 +95,8 @@ def leave(
     summary = summarise(record, _ended(ending), outcome.restarts, outcome.hosts)
     files.put(SUMMARY, msgspec.json.format(msgspec.json.encode(summary), indent=2))
     if report:
+        from snakesim_operator.results.report import page  # templates take a while to import, which no start waits for
+
         files.put(REPORT, page(record, summary).encode())
     return record, summary
 

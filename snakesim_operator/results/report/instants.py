@@ -1,10 +1,11 @@
-"""Which instants of a run are drawn, and how the forces balance at each.
+"""What is known of one instant of a run, and how the forces balance in it.
 
 The balance is the paper's equation (10), f_s + f_1 + f_2 + f_3 = 0, with f_s = -F t_1: the tether of the static
 model pulls the tail back along the tangent at o_1. So the contact forces add up to -f_s, and that sum, the resultant
 propulsion force, points forward along the path at o_1. It also acts through o_1, because the moments balance too (11).
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +16,6 @@ from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.timeline import told_at_s
 
 Floats = NDArray[np.float64]
-HOW_MANY = 4
 NEEDED = 3
 WORLD_WITHIN_S = 0.021  # measured forces this far from the solved ones still count as simultaneous
 
@@ -27,7 +27,7 @@ class Balance:
     contacts: list[WorldContact]
     size_n: list[float]
     contact_n: Floats  # (k, 2)
-    tether_n: Floats  # (2,), f_s
+    tether_n: Floats  # (2,), f_s: the commanded force, the other way round
 
     @property
     def resultant_n(self) -> Floats:
@@ -35,9 +35,19 @@ class Balance:
         return self.contact_n.sum(axis=0)
 
     @property
+    def commanded_n(self) -> float:
+        """The force along the path that the controller aims at."""
+        return float(np.hypot(*self.tether_n))
+
+    @property
     def gap_n(self) -> float:
         """How far the polygon is from closing."""
         return float(np.hypot(*(self.resultant_n + self.tether_n)))
+
+    def felt_n(self, felt: list[WorldContact], index: int) -> float | None:
+        """The measured force at a push-point; None when none was felt there."""
+        there = [np.hypot(*one.force_w[:2]) for one in felt if one.obstacle == self.contacts[index].obstacle]
+        return float(sum(there)) if there else None
 
     @property
     def corners_n(self) -> Floats:
@@ -73,30 +83,16 @@ def balance_of(state: ControlState) -> Balance | None:
     return Balance(contacts, sizes, normals * np.array(sizes)[:, None], -state.propulsion_n * tangent / length)
 
 
-def pushing_instants(record: RunRecord) -> list[Instant]:
-    """Up to four moments spread over the time of propelling, each with solved forces that balance."""
-    return _spread(balanced_instants(record))
-
-
-def best_instant(record: RunRecord) -> Instant | None:
-    """The moment at which the push-points were felt and drove the snake hardest; else one from the middle."""
-    found = balanced_instants(record)
-    if not found:
-        plain = plain_instants(record)
-        return plain[len(plain) // 2] if plain else None
-    return min(found, key=lambda one: (unfelt(one), _saturated(one), -_drive_n(one)))
-
-
-def balanced_instants(record: RunRecord) -> list[Instant]:
-    """Every moment of locomotion whose solved forces balance, in order of time."""
+def balanced_instants(record: RunRecord, begin_s: float = 0.0, end_s: float = math.inf) -> list[Instant]:
+    """Every moment of locomotion, of those told within a time, whose solved forces balance; in order of time."""
     if not len(record.time_s):
         return []
     found: list[Instant] = []
     for state in record.control:
-        balance = balance_of(state)
+        balance = balance_of(state) if begin_s <= told_at_s(record, state) <= end_s else None
         if balance is None or state.propulsion_joint is None or state.state != "Locomoting":
             continue
-        if balance.gap_n > 0.05 * float(np.hypot(*balance.tether_n)) or min(balance.size_n) <= 0:
+        if balance.gap_n > 0.05 * balance.commanded_n or min(balance.size_n) <= 0:
             continue
         instant = _instant(record, told_at_s(record, state), state, balance)
         if record.nodes_w(instant.row) is not None:
@@ -104,17 +100,13 @@ def balanced_instants(record: RunRecord) -> list[Instant]:
     return found
 
 
-def plain_instants(record: RunRecord) -> list[Instant]:
-    """Up to four moments spread over the whole run, for a run without solved forces."""
-    count = len(record.time_s)
-    chosen: list[Instant] = []
-    for row in sorted({round(share * (count - 1)) for share in (0.05, 0.35, 0.65, 0.98)} if count else set()):
-        if record.nodes_w(row) is None:
-            continue
-        time_s = float(record.time_s[row] - record.time_s[0])
-        earlier = [state for state in record.control if told_at_s(record, state) <= time_s]
-        chosen.append(_instant(record, time_s, earlier[-1] if earlier else None, None))
-    return chosen
+def instant_at(record: RunRecord, time_s: float) -> Instant | None:
+    """A moment as it was, without solved forces; None when the pose is unknown then."""
+    row = record.row_at(float(record.time_s[0]) + time_s)
+    if record.nodes_w(row) is None:
+        return None
+    earlier = [state for state in record.control if told_at_s(record, state) <= time_s]
+    return _instant(record, time_s, earlier[-1] if earlier else None, None)
 
 
 def felt_along_n(instant: Instant, direction_w: Floats) -> float:
@@ -141,26 +133,6 @@ def _instant(record: RunRecord, time_s: float, state: ControlState | None, balan
 def _world_near(record: RunRecord, at_s: float, within_s: float) -> World | None:
     near = min(record.worlds, key=lambda world: abs(world.stamp_ns * 1e-9 - at_s), default=None)
     return near if near is not None and abs(near.stamp_ns * 1e-9 - at_s) <= within_s else None
-
-
-def _spread(found: list[Instant]) -> list[Instant]:
-    """The best of each quarter: every solved contact felt, the torque not at its limit, well inside the quarter."""
-    if len(found) <= HOW_MANY:
-        return found
-    chosen: list[Instant] = []
-    for quarter in np.array_split(np.arange(len(found)), HOW_MANY):
-        members = [found[i] for i in quarter]
-        middle = members[len(members) // 2].time_s
-        chosen.append(min(members, key=lambda one: (unfelt(one), _saturated(one), abs(one.time_s - middle))))
-    return chosen
-
-
-def _saturated(instant: Instant) -> bool:
-    return instant.state is not None and instant.state.saturated
-
-
-def _drive_n(instant: Instant) -> float:
-    return felt_along_n(instant, instant.balance.resultant_n) if instant.balance is not None else 0.0
 
 
 def unfelt(instant: Instant) -> int:

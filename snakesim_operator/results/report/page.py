@@ -1,213 +1,108 @@
-"""The page: header, instants, overview, joints, loads, numbers. A section with nothing to show says why."""
+"""The page: verdict, playback, advance, instants, joints, loads, numbers. A section with nothing to show says why."""
 
 from pathlib import Path
+from typing import Any, get_type_hints
 
 import msgspec
-import numpy as np
+from markupsafe import Markup
+from msgspec import Meta
 
+from snakesim_hal.safety.fault_log import FIRST_KEPT
+from snakesim_operator.results.page.html import render
 from snakesim_operator.results.record import CONFIG, RunRecord
-from snakesim_operator.results.report import figures, tables
-from snakesim_operator.results.report.cards import instants_section
-from snakesim_operator.results.report.html import absent, document, paragraph, responsive, section, shown, tile, words
-from snakesim_operator.results.report.palette import DARK, LIGHT, joint_class, variables
-from snakesim_operator.results.report.svg import line
+from snakesim_operator.results.report import figures
+from snakesim_operator.results.report.events import Event, drawn_instants, events, listed
+from snakesim_operator.results.report.instants import felt_along_n
+from snakesim_operator.results.report.playback import playback
+from snakesim_operator.results.report.polygon import force_polygon, pretty, units_per_n
 from snakesim_operator.results.report.timeline import (
-    Propulsion,
     distance,
     end_s,
+    in_words,
+    joined,
     most_used_joints,
     propulsion_intervals,
-    propulsion_phase_s,
     zero_s,
 )
-from snakesim_operator.results.report.torque_map import full_colour_nm, torque_map
-from snakesim_operator.results.report.verdict import tiles, verdict
+from snakesim_operator.results.report.top_view import top_view
+from snakesim_operator.results.report.verdict import distance_m, verdict
+from snakesim_operator.results.report.view import nodes_xy_w, views
 from snakesim_operator.results.summary import RunSummary
 
 HERE = Path(__file__).parent
-HALF_WIDTH = 500.0
-NO_TICKS = "The run has no ticks: the robot was never armed, so nothing was recorded."
+VIEW_WIDTH = 500.0
+TURNS_SHOWN = 100  # of one joint in a chart
+POLYGON = (236.0, 226.0)
+ELSEWHERE = ("config", "faults", "rejected_commands", "limited_commands")
 
 
 def page(record: RunRecord, summary: RunSummary) -> str:
     """The whole page."""
-    intervals = propulsion_intervals(record)
-    body = "".join(
-        [
-            _header(record, summary),
-            instants_section(record, summary),
-            _overview(record, summary, intervals),
-            _joints(record, summary, intervals),
-            _loads(record, summary, intervals),
-            _numbers(record, summary),
-            _again(record, summary),
-        ]
-    )
-    title = record.config.title or summary.scenario
-    return document(title, styles(), body, script())
-
-
-def styles() -> str:
-    """Colours of both themes, then the rules. Paper is always light."""
-    light, dark = variables(LIGHT), variables(DARK)
-    themes = f":root{{{light}}}@media screen and (prefers-color-scheme:dark){{:root{{{dark}}}}}"
-    return themes + "".join((HERE / name).read_text(encoding="utf-8") for name in ("figure.css", "report.css"))
-
-
-def script() -> str:
-    """One time cursor through all charts of a page."""
-    return (HERE / "report.js").read_text(encoding="utf-8")
-
-
-def _header(record: RunRecord, summary: RunSummary) -> str:
-    judged = verdict(record, summary)
-    facts = [
-        f"robot {summary.robot}, {len(record.description.joints)} joints",
-        f"scene {summary.scene}",
-        f"controller {summary.controller}",
-        f"backend {summary.backend}",
-        f"{summary.pace}, {summary.rate_hz:g} Hz",
-        f"seed {summary.seed}",
-    ]
-    lacks = paragraph(f"The record lacks something. {'. '.join(summary.lacks)}.", "lacks") if summary.lacks else ""
-    shown_tiles = "".join(tile(one.name, one.value, one.unit, alarming=one.alarming) for one in tiles(record, summary))
-    return (
-        f'<header id="header"><p class="kicker">SnakeSIM run report <span>{words(summary.scenario)}</span></p>'
-        f"<h1>{words(record.config.title or summary.scenario)}</h1>"
-        f'<p class="facts">{" · ".join(f"<span>{words(fact)}</span>" for fact in facts)}</p>'
-        f'<p class="verdict {judged.kind}">{words(judged.words)}</p>{lacks}'
-        f'<div class="tiles">{shown_tiles}</div></header>'
+    found, every = events(record, summary), propulsion_intervals(record)
+    intervals = joined(every, end_s(record) / TURNS_SHOWN)
+    return render(
+        HERE / "report.html",
+        len(record.description.joints),
+        styles=[HERE / "figure.css"],
+        scripts=[HERE / "playback.js"],
+        title=record.config.title or summary.scenario,
+        record=record,
+        summary=summary,
+        verdict=verdict(record, summary),
+        pretty=pretty,
+        in_words=in_words,
+        film=playback(record),
+        events=listed(found),
+        instants=_instants(record, found),
+        moved=distance(record) if len(record.time_s) else None,
+        moved_m=distance_m(summary),
+        limit_nm=max(joint.torque_limit_nm for joint in record.description.joints),
+        intervals=intervals,
+        joints=[(joint, [one for one in every if one.joint == joint]) for joint in most_used_joints(intervals)],
+        propelled=len({one.joint for one in intervals}),
+        figures=figures,
+        begin_s=zero_s(record),
+        first_kept=FIRST_KEPT,
+        numbers=_numbers(summary),
+        config_file=_config_file(record),
+        config=msgspec.json.format(msgspec.json.encode(summary.config), indent=2).decode(),
     )
 
 
-def _overview(record: RunRecord, summary: RunSummary, intervals: list[Propulsion]) -> str:
-    title = "Advance and hand-over"
-    if not len(record.time_s):
-        return section("overview", title, absent(NO_TICKS))
-    moved = distance(record)
-    parts: list[str] = []
-    if moved is None:
-        parts.append(absent("No distance: the robot has no pose sensor, and its controller told no place on the path."))
-    else:
-        lead = f"Line: {moved.what}. Bar on top: state of locomotion"
-        lead += ", red underneath while the controller reported a jam. " if summary.jammed else ". "
-        lead += "Coloured intervals: the joint that propelled." if intervals else ""
-        parts.append(paragraph(lead, "lead"))
-    if not record.control:
-        parts.append(absent("No states: the run's telemetry holds no message of the controller."))
-    elif not intervals:
-        parts.append(absent(f"No hand-over: controller {summary.controller} named no propulsion joint at any time."))
-    parts.append(responsive(lambda width: figures.overview(record, moved, intervals, width)))
-    return section("overview", title, *parts)
+def _instants(record: RunRecord, found: list[Event]) -> list[dict[str, Any]]:
+    """The drawings of each event, and what stands beside them."""
+    chosen = drawn_instants(record, found)
+    balances = [instant.balance for _, instant in chosen if instant.balance is not None]
+    cards: list[dict[str, Any]] = []
+    windows = views(record, [instant for _, instant in chosen], VIEW_WIDTH)
+    for (event, instant), view in zip(chosen, windows, strict=True):
+        nodes, polygon = nodes_xy_w(record, instant), None
+        ahead = nodes[-1] - nodes[0]
+        if instant.balance is not None:
+            scale = units_per_n(balances, *POLYGON, upright=view.upright)
+            polygon = Markup(force_polygon(instant.balance, *POLYGON, scale, upright=view.upright))
+            ahead = instant.balance.resultant_n
+        pushed_n = felt_along_n(instant, ahead)
+        drawn = Markup(top_view(record, instant, view))
+        cards.append({"event": event, "instant": instant, "view": drawn, "polygon": polygon, "pushed_n": pushed_n})
+    return cards
 
 
-def _joints(record: RunRecord, summary: RunSummary, intervals: list[Propulsion]) -> str:
-    title = "The joints that propelled"
-    if not intervals:
-        why = f"No joint propelled: controller {summary.controller} named no propulsion joint."
-        return section("joints", title, absent(why if len(record.time_s) else NO_TICKS))
-    joints = most_used_joints(intervals)
-    among = len({one.joint for one in intervals})
-    lead = (
-        f"The {len(joints)} of {among} that propelled longest. " if among > len(joints) else ""
-    ) + "Left the angle, right the torque; the two-sided arrows span the time in which the joint propelled."
-    phase_s = propulsion_phase_s(record, intervals)
-    if phase_s[1] - phase_s[0] < 0.99 * end_s(record):
-        lead += f" Shown is the propulsion phase, {phase_s[0]:.1f} to {phase_s[1]:.1f} s of the run."
-    blocks: list[str] = []
-    for joint in joints:
-        own = [one for one in intervals if one.joint == joint]
-        spans = ", ".join(f"{one.start_s:.2f}–{one.end_s:.2f} s" for one in own[:4])
-        spans += f" and {len(own) - 4} more times" if len(own) > 4 else ""
-        name = record.description.joints[joint].name
-        angle = figures.joint_angle(record, joint, intervals, phase_s, HALF_WIDTH)
-        torque = figures.joint_torque(record, joint, intervals, phase_s, HALF_WIDTH)
-        blocks.append(
-            f'<article class="joint-pair" data-joint="{words(name)}"><h3><i class="chip {joint_class(joint)}"></i>'
-            f"{words(name)} <small>propelled {words(spans)}</small></h3><div class='pair'>"
-            f'<div class="angle">{angle}</div>'
-            f'<div class="torque">{torque}</div></div></article>'
-        )
-    return section("joints", title, paragraph(lead, "lead"), _line_legend(record), *blocks)
+def _numbers(summary: RunSummary) -> list[tuple[str, Any, str, str]]:
+    """Every field with its unit and what it means, from the Struct itself."""
+    hints = get_type_hints(RunSummary, include_extras=True)
+    rows: list[tuple[str, Any, str, str]] = []
+    for field in msgspec.structs.fields(RunSummary):
+        if field.name in ELSEWHERE:
+            continue
+        notes = getattr(hints[field.name], "__metadata__", ())
+        meta: Meta | None = next((note for note in notes if isinstance(note, Meta)), None)
+        unit = ((meta.extra_json_schema or {}).get("unit", "") if meta else "").removeprefix("1")
+        rows.append((field.name, getattr(summary, field.name), unit, (meta.description or "") if meta else ""))
+    return rows
 
 
-def _line_legend(record: RunRecord) -> str:
-    entries = [
-        ("curve measured", "measured"),
-        ("curve reference", "reference angle; commanded torque while in torque mode"),
-        ("limit", "torque limit of the joint"),
-    ]
-    limits = [joint.torque_limit_nm for joint in record.description.joints]
-    if bool((record.torque_limit_nm < figures.LOWERED * np.array(limits)).any()):
-        entries.append(("curve lowered", "limit that the controller set below it"))
-    items = "".join(
-        f'<li><svg class="figure swatch" viewBox="0 0 30 14">{line((1, 7), (29, 7), class_)}</svg>{words(name)}</li>'
-        for class_, name in entries
-    )
-    return f'<ul class="legend">{items}</ul>'
-
-
-def _loads(record: RunRecord, summary: RunSummary, intervals: list[Propulsion]) -> str:
-    title = "Loads and limits"
-    if not len(record.time_s):
-        return section("loads", title, absent(NO_TICKS))
-    saturated = summary.torque_saturated_fraction or 0.0
-    parts = [
-        "<h3>Torque of every joint</h3>",
-        paragraph(
-            "A row a joint, head on top. Orange is positive, a yaw joint turning what is ahead of it to the left; blue "
-            f"is negative; full colour is {shown(full_colour_nm(record), 2)} N·m."
-            + (" Frames mark propulsion." if intervals else ""),
-            "lead",
-        ),
-        responsive(lambda width: torque_map(record, intervals, width)),
-        "<h3>Hardest-worked joint</h3>",
-        paragraph(
-            f"At a torque limit in {100 * saturated:.1f} % of the ticks; those are drawn in red."
-            if saturated
-            else "No joint was at its torque limit at any tick.",
-            "lead",
-        ),
-        responsive(lambda width: figures.torque_use(record, width)),
-        "<h3>Contacts</h3>",
-    ]
-    if record.config.robot.sensors.contacts is None:
-        parts.append(absent("No contact forces: the robot has no contact sensor."))
-    else:
-        parts.append(responsive(lambda width: figures.contact_force(record, width)))
-        parts.append(responsive(lambda width: figures.contact_count(record, width)))
-    limited = tables.counts(summary.limited_commands, "limit", "The gate changed no set-point.")
-    refused = tables.counts(summary.rejected_commands, "reason", "The gate refused no command.")
-    parts.append(
-        f'<div class="pair"><div><h3>Set-points limited by the gate</h3>{limited}</div>'
-        f"<div><h3>Commands refused</h3>{refused}</div></div>"
-    )
-    return section("loads", title, *parts)
-
-
-def _numbers(record: RunRecord, summary: RunSummary) -> str:
-    return section(
-        "numbers",
-        "Numbers",
-        f"<h3>Faults</h3>{tables.faults(summary, zero_s(record))}",
-        f"<h3>Summary</h3>{tables.all_numbers(summary)}",
-    )
-
-
-def _again(record: RunRecord, summary: RunSummary) -> str:
+def _config_file(record: RunRecord) -> Path:
     here = Path.cwd()
     folder = record.folder.relative_to(here) if record.folder.is_relative_to(here) else record.folder
-    command = f"snakesim run {folder / CONFIG} --backend {summary.backend} --seed {summary.seed}"
-    plain = msgspec.json.format(msgspec.json.encode(summary.config), indent=2).decode()
-    same = (
-        f"In lockstep it gives the same command digest, {summary.command_digest[:16]}…"
-        if summary.pace == "lockstep"
-        else f"The pace was {summary.pace}, so another run is alike but not identical."
-    )
-    return section(
-        "again",
-        "Repeat this run",
-        f"<pre><code>{words(command)}</code></pre>",
-        paragraph(same, "lead"),
-        f"<details><summary>Effective configuration</summary><pre>{words(plain)}</pre></details>",
-    )
+    return folder / CONFIG

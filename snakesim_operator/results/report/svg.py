@@ -1,4 +1,4 @@
-"""SVG by hand: elements with escaped text and finite numbers, arrows, and ticks at round numbers.
+"""SVG by hand, for the snake and its forces: elements with escaped text and finite numbers, and arrows.
 
 What it looks like stands in figure.css and palette.py; a figure only names classes.
 """
@@ -32,8 +32,8 @@ def element(name: str, *children: str, **attributes: Attribute) -> str:
     return f"<{opening}>{''.join(children)}</{name}>" if children else f"<{opening}/>"
 
 
-def text(x: float, y: float, words: str, class_: str = "", *, anchor: str = "start", turn: float = 0) -> str:
-    """A line of text. anchor: start, middle or end; turn: degrees."""
+def text(x: float, y: float, words: str, class_: str = "", *, anchor: str = "start") -> str:
+    """A line of text. anchor: start, middle or end."""
     return element(
         "text",
         escape(printable(words), quote=False),
@@ -41,7 +41,6 @@ def text(x: float, y: float, words: str, class_: str = "", *, anchor: str = "sta
         y=y,
         class_=class_ or None,
         text_anchor=None if anchor == "start" else anchor,
-        transform=f"rotate({number(turn)} {number(x)} {number(y)})" if turn else None,
     )
 
 
@@ -65,28 +64,23 @@ def polyline(points: list[Point], class_: str) -> str:
     return element("polyline", points=points_text(points), class_=class_)
 
 
-def arrow(tail: Point, tip: Point, class_: str, *, head: float = 9.0, both: bool = False) -> str:
-    """A shaft and a filled head; `both` puts a head at either end. Too short an arrow is a dot."""
+def arrow(tail: Point, tip: Point, class_: str, *, head: float = 9.0) -> str:
+    """A shaft and a filled head. Too short an arrow is a dot."""
     dx, dy = tip[0] - tail[0], tip[1] - tail[1]
     length = math.hypot(dx, dy)
     if length < 1.5:
         return element("circle", cx=tip[0], cy=tip[1], r=1.5, class_=f"{class_} head")
     ux, uy = dx / length, dy / length
-    size = min(head, length / (2.2 if both else 1.1))
-
-    def triangle(at: Point, sign: float) -> str:
-        back = (at[0] - sign * ux * size, at[1] - sign * uy * size)
-        wide = 0.38 * size
-        corners = [at, (back[0] - uy * wide, back[1] + ux * wide), (back[0] + uy * wide, back[1] - ux * wide)]
-        return element("polygon", points=points_text(corners), class_=f"{class_} head")
-
+    size = min(head, length / 1.1)
+    back, wide = (tip[0] - ux * size, tip[1] - uy * size), 0.38 * size
+    corners = [tip, (back[0] - uy * wide, back[1] + ux * wide), (back[0] + uy * wide, back[1] - ux * wide)]
     neck = (tip[0] - ux * size * 0.8, tip[1] - uy * size * 0.8)
-    start = (tail[0] + ux * size * 0.8, tail[1] + uy * size * 0.8) if both else tail
-    heads = triangle(tip, 1.0) + (triangle(tail, -1.0) if both else "")
-    return line(start, neck, f"{class_} shaft") + heads
+    return line(tail, neck, f"{class_} shaft") + element(
+        "polygon", points=points_text(corners), class_=f"{class_} head"
+    )
 
 
-def figure(width: float, height: float, label: str, /, *children: str, **attributes: Attribute) -> str:
+def figure(width: float, height: float, label: str, *children: str) -> str:
     """A whole drawing. label: what it shows, for those who cannot see it."""
     return element(
         "svg",
@@ -96,7 +90,6 @@ def figure(width: float, height: float, label: str, /, *children: str, **attribu
         role="img",
         aria_label=label,
         style=f"max-width:{number(width)}px",
-        **attributes,
     )
 
 
@@ -105,28 +98,13 @@ def text_width(words: str, size: float = 13.0) -> float:
     return 0.58 * size * len(words)
 
 
-def round_step(span: float, most: int) -> float:
-    """1, 2 or 5 times a power of ten, so that `span` holds at most `most` of them."""
-    rough = max(span, 1e-9) / max(most, 1)
-    power = 10.0 ** math.floor(math.log10(rough))
-    return next(factor * power for factor in (1, 2, 5, 10) if factor * power >= rough * (1 - 1e-9))
-
-
 def round_below(value: float) -> float:
     """The largest 1, 2 or 5 times a power of ten that is not above `value`."""
     power = 10.0 ** math.floor(math.log10(max(value, 1e-9)))
     return max(factor * power for factor in (1, 2, 5) if factor * power <= value * (1 + 1e-9))
 
 
-def ticks(low: float, high: float, most: int) -> list[float]:
-    """Round numbers within [low, high]."""
-    step = round_step(high - low, most)
-    first, last = math.ceil(low / step - 1e-6), math.floor(high / step + 1e-6)
-    return [k * step for k in range(first, last + 1)]
-
-
-def tick_text(value: float, step: float) -> str:
-    """A tick's number with as many decimals as its step needs."""
-    decimals = max(0, -math.floor(math.log10(step) + 1e-9))
-    shown = f"{value:.{decimals}f}"
-    return shown.replace("-", "−") if float(shown) else shown.replace("-", "")
+def scale_bar(x: float, y: float, length: float, words: str, class_: str = "bar") -> str:
+    """A bar of known length, with its meaning beside it."""
+    ends = line((x, y - 4), (x, y + 4), class_) + line((x + length, y - 4), (x + length, y + 4), class_)
+    return line((x, y), (x + length, y), class_) + ends + text(x + length + 7, y + 4.5, words, "small")

@@ -1,6 +1,7 @@
 """What a record tells over time: states, propulsion intervals, references, distance; all from the first tick on."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from snakesim_operator.results.summary import arc_position_m
 
 Floats = NDArray[np.float64]
 POSE_SAMPLES = 400
+STATES = {"Locomoting": "moving as meant", "NotLocomoting": "not moving", "Idle": "idle", "PowerOff": "power off"}
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,11 @@ class Series:
     time_s: Floats
     value: Floats
     what: str
+
+
+def in_words(state: str) -> str:
+    """A state of locomotion, for people."""
+    return STATES.get(state, state)
 
 
 def zero_s(record: RunRecord) -> float:
@@ -82,6 +89,20 @@ def propulsion_intervals(record: RunRecord) -> list[Propulsion]:
     return [Propulsion(b.start_s, b.end_s, joints[b.what]) for b in bands if b.what in joints]
 
 
+def joined(intervals: list[Propulsion], gap_s: float) -> list[Propulsion]:
+    """Turns of one joint with less than a gap between them are one: no chart could show them apart."""
+    found: list[Propulsion] = []
+    newest: dict[int, int] = {}
+    for one in intervals:
+        i = newest.get(one.joint)
+        if i is not None and one.start_s - found[i].end_s < gap_s:
+            found[i] = Propulsion(found[i].start_s, one.end_s, one.joint)
+        else:
+            newest[one.joint] = len(found)
+            found.append(one)
+    return found
+
+
 def most_used_joints(intervals: list[Propulsion], most: int = 6) -> list[int]:
     """The joints that propelled longest, head to tail as the hand-over goes."""
     spent: dict[int, float] = {}
@@ -89,16 +110,6 @@ def most_used_joints(intervals: list[Propulsion], most: int = 6) -> list[int]:
         spent[interval.joint] = spent.get(interval.joint, 0.0) + interval.length_s
     longest = sorted(spent, key=lambda joint: -spent[joint])[:most]
     return sorted(longest, reverse=True)
-
-
-def propulsion_phase_s(record: RunRecord, intervals: list[Propulsion]) -> tuple[float, float]:
-    """From a little before the first propulsion to a little after the last; the whole run when that is most of it."""
-    end = end_s(record)
-    first, last = min(one.start_s for one in intervals), max(one.end_s for one in intervals)
-    air = 0.15 * (last - first)
-    if last - first + 2 * air > 0.7 * end:
-        return 0.0, end
-    return max(first - air, 0.0), min(last + air, end)
 
 
 def reference_rad(record: RunRecord, joint: int) -> Floats:
@@ -118,6 +129,7 @@ def commanded_torque_nm(record: RunRecord, joint: int) -> Floats:
     return np.where(record.mode[:, joint] == Mode.TORQUE, record.target[:, joint], np.nan)
 
 
+@lru_cache(maxsize=2)  # verdict, events and chart ask for it
 def distance(record: RunRecord) -> Series | None:
     """Advance since the first tick: along the route, else of the tail as the controller knew it, else as it flies."""
     count = len(record.time_s)
@@ -151,24 +163,6 @@ def told_distance(record: RunRecord) -> Series | None:
     along = np.array([state.path_s_m for state in told], dtype=np.float64)
     stamps = np.array([told_at_s(record, state) for state in told])
     return Series(stamps, along - along[0], "advance of the tail along the path, as the controller knew it")
-
-
-def thinned(time_s: Floats, values: Floats, buckets: int = 400) -> list[list[tuple[float, float]]]:
-    """At most two points a bucket, its extremes, in pieces that are broken where a value is unknown."""
-    pieces: list[list[tuple[float, float]]] = []
-    known = np.isfinite(values)
-    edges = np.flatnonzero(np.diff(np.concatenate(([0], known.astype(np.int8), [0]))))
-    share = max(len(values) / buckets, 1.0)
-    for first, last in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-        parts = max(int(np.ceil((last - first) / share)), 1)
-        keep: set[int] = {first, last - 1}
-        for part in np.array_split(np.arange(first, last), parts):
-            if len(part) <= 2:
-                keep.update(part.tolist())
-            else:
-                keep.update((int(part[values[part].argmin()]), int(part[values[part].argmax()])))
-        pieces.append([(float(time_s[i]), float(values[i])) for i in sorted(keep)])
-    return pieces
 
 
 def _merged(record: RunRecord, told: list[str | None]) -> list[Band]:

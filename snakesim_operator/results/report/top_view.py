@@ -1,78 +1,73 @@
-"""The snake seen from above at one instant: body to scale, route, obstacles, contact frames, forces (Fig. 7-10)."""
+"""The snake seen from above at one instant: body to scale, route, obstacles, forces (Fig. 7-10)."""
 
 import math
 
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.model.scenario import place_all
 from snakesim_hal.model.scene import Placed
 from snakesim_hal.wire.messages import Obstacle, WorldContact
 from snakesim_operator.results.record import RunRecord
-from snakesim_operator.results.report.instants import Instant
+from snakesim_operator.results.report.instants import Balance, Instant
 from snakesim_operator.results.report.labels import Labels
-from snakesim_operator.results.report.palette import joint_class
+from snakesim_operator.results.report.polygon import pretty
 from snakesim_operator.results.report.svg import (
-    Point,
     arrow,
     element,
     figure,
-    line,
     points_text,
     polyline,
     round_below,
+    scale_bar,
     text,
     text_width,
     title,
 )
-from snakesim_operator.results.report.view import EDGE, FELT_SHARE, FOOT, View, nodes_xy_w
+from snakesim_operator.results.report.view import EDGE, FELT_SHARE, FOOT, LONGEST_ARROW, View, nodes_xy_w, reach_m
 
 Floats = NDArray[np.float64]
-UNIT_VECTOR = 24.0
+MOST_POINTS = 1500  # of the route
 
 
 def top_view(record: RunRecord, instant: Instant, view: View) -> str:
-    """The whole drawing of one instant."""
-    nodes = nodes_xy_w(record, instant)
-    joint = instant.propulsion_joint
-    what = f"Top view at {instant.time_s:.2f} s" + (f", joint {joint + 1} propels" if joint is not None else "")
-    return figure(view.width, view.height, what, drawing(record, instant, view, nodes))
-
-
-def drawing(record: RunRecord, instant: Instant, view: View, nodes: Floats) -> str:
-    """Everything inside the drawing."""
+    """The drawing of one instant."""
+    nodes, joint = nodes_xy_w(record, instant), instant.propulsion_joint
     labels = Labels(view.width, view.height - FOOT)
-    parts = [_route(record, view), *(_obstacle(item, view, labels) for item in place_all(record.config))]
-    parts.append(_body(record, instant, view, nodes, labels))
+    parts = [ground(record, view, labels), body(record, view, nodes, labels)]
     parts += [_felt(contact, view, labels) for contact in instant.felt]
     parts.append(_solved(instant, view, labels))
-    parts.append(_names(record, instant, view, nodes, labels))
-    return "".join(parts) + _scales(view)
+    what = f"Top view at {instant.time_s:.2f} s"
+    if joint is not None:
+        name, at = record.description.joints[joint].name, view.at(nodes[joint + 1])
+        what += f", {name} propels"
+        fill = f"fill:var(--joint-{joint})"
+        parts.append(element("circle", cx=at[0], cy=at[1], r=6.5, class_="propelling", style=fill))
+        parts.append(labels.put(at, name, "halo strong", gaps=(16, 22, 30, 40)))
+    if instant.balance is not None:
+        parts += [_push_point(i, instant.balance, view, labels) for i in range(len(instant.balance.contacts))]
+    for end, word in ((nodes[0], "tail"), (nodes[-1], "head")):
+        parts.append(labels.put(view.at(end), word, "halo soft", gaps=(16, 24, 34)))
+    return figure(view.width, view.height, what, *parts, scales(view))
+
+
+def ground(record: RunRecord, view: View, labels: Labels) -> str:
+    """What stands still: route and obstacles."""
+    return _route(record, view) + "".join(_obstacle(item, view, labels) for item in record.placed)
 
 
 def _route(record: RunRecord, view: View) -> str:
     if record.route is None:
         return ""
-    s = np.linspace(-0.2, record.route.length_m + 0.2, min(int(record.route.length_m * 50) + 20, 2000))
-    points = [view.at(point) for point in record.route.position_w(s)]
-    seen = [-60 < x < view.width + 60 and -60 < y < view.height + 60 for x, y in points]
-    lines: list[str] = []
-    stretch: list[Point] = []
-    for point, inside in zip([*points, (0.0, 0.0)], [*seen, False], strict=True):
-        if inside:
-            stretch.append(point)
-        elif stretch:
-            lines.append(polyline(stretch, "route"))
-            stretch = []
-    return "".join(lines)
+    s = np.linspace(-0.2, record.route.length_m + 0.2, min(int(record.route.length_m * 50) + 20, MOST_POINTS))
+    return polyline([view.at(point) for point in record.route.position_w(s)], "route")
 
 
 def _obstacle(item: Placed, view: View, labels: Labels) -> str:
     obstacle: Obstacle = item.obstacle
     x, y = view.at(obstacle.position_w)
     class_ = "step" if item.walkable else "peg"
-    reach = max(obstacle.radius_m, math.hypot(*obstacle.half_size_m[:2])) * view.scale
-    if not (-reach < x < view.width + reach and -reach < y < view.height - FOOT + reach):
+    reach = reach_m(obstacle) * view.scale
+    if not view.shows(obstacle):
         return ""
     labels.keep_off((x - reach, y - reach, x + reach, y + reach), 0.15)
     told = title(obstacle.name)
@@ -86,7 +81,7 @@ def _obstacle(item: Placed, view: View, labels: Labels) -> str:
     return element("polygon", told, points=points_text(corners), class_=class_)
 
 
-def _body(record: RunRecord, instant: Instant, view: View, nodes: Floats, labels: Labels) -> str:
+def body(record: RunRecord, view: View, nodes: Floats, labels: Labels) -> str:
     """Capsules, tail to head, so that every link shows its cap over the one behind; then the joints."""
     points = [view.at(node) for node in nodes]
     parts: list[str] = []
@@ -99,16 +94,14 @@ def _body(record: RunRecord, instant: Instant, view: View, nodes: Floats, labels
                 element("line", x1=a[0], y1=a[1], x2=b[0], y2=b[1], class_=class_, stroke_width=max(width, 1.0))
             )
         labels.keep_off_line(points[i], points[i + 1], wide / 2, 0.4)
-    for i, point in enumerate(points[1:-1]):
-        if i != instant.propulsion_joint:
-            parts.append(element("circle", cx=point[0], cy=point[1], r=2.4, class_="joint"))
+    parts += [element("circle", cx=x, cy=y, r=2.4, class_="joint") for x, y in points[1:-1]]
     return "".join(parts)
 
 
 def _felt(contact: WorldContact, view: View, labels: Labels) -> str:
     """A measured force, drawn beside the solved one; too long an arrow is cut, and says how long it would be."""
     size = math.hypot(*contact.force_w[:2])
-    cut = min(1.0, FELT_SHARE * view.longest / max(size * view.force_scale, 1e-9))
+    cut = min(1.0, FELT_SHARE * LONGEST_ARROW / max(size * view.force_scale, 1e-9))
     start = view.along(view.at(contact.position_w), contact.tangent_w, 7.0)
     tip = view.along(start, contact.force_w, cut * view.force_scale)
     labels.keep_off_line(start, tip, 3)
@@ -117,19 +110,15 @@ def _felt(contact: WorldContact, view: View, labels: Labels) -> str:
 
 
 def _solved(instant: Instant, view: View, labels: Labels) -> str:
-    """Contact frames, solved forces and their resultant."""
+    """Solved forces and their resultant."""
     if instant.balance is None:
         return ""
     parts: list[str] = []
     for contact, force in zip(instant.balance.contacts, instant.balance.contact_n, strict=True):
         at = view.at(contact.position_w)
-        parts.append(arrow(view.along(at, contact.normal_w, -UNIT_VECTOR), at, "frame", head=7))
-        ahead = view.along(at, contact.tangent_w, UNIT_VECTOR)
-        parts.append(arrow(at, ahead, "frame", head=7))
         tip = view.along(at, force, view.force_scale)
         parts.append(arrow(at, tip, "solved", head=11))
         labels.keep_off_line(at, tip, 5)
-        labels.keep_off_line(at, ahead, 3)
     start = view.at(instant.balance.contacts[0].position_w)
     tip = view.along(start, instant.balance.resultant_n, view.force_scale)
     labels.keep_off_line(start, tip, 7, 2.0)
@@ -137,40 +126,25 @@ def _solved(instant: Instant, view: View, labels: Labels) -> str:
     return "".join(parts)
 
 
-def _names(record: RunRecord, instant: Instant, view: View, nodes: Floats, labels: Labels) -> str:
-    parts: list[str] = []
-    if instant.propulsion_joint is not None:
-        name = record.description.joints[instant.propulsion_joint].name
-        at = view.at(nodes[instant.propulsion_joint + 1])
-        colour = joint_class(instant.propulsion_joint)
-        parts.append(element("circle", cx=at[0], cy=at[1], r=6.5, class_=f"propelling {colour}"))
-        parts.append(labels.put(at, name, "halo strong", gaps=(16, 22, 30, 40)))
-    if instant.balance is not None:
-        for i, (contact, size) in enumerate(zip(instant.balance.contacts, instant.balance.size_n, strict=True)):
-            foot = view.at(contact.position_w)
-            tip = view.along(foot, contact.normal_w, size * view.force_scale)
-            parts.append(labels.put(tip, f"{size:.0f} N", "halo solved-text", gaps=(6, 10, 16), away_from=foot))
-            behind = view.along(foot, contact.normal_w, -18.0)
-            parts.append(labels.put(behind, f"o{_index(i + 1)}", "halo strong", away_from=foot))
-    parts.append(labels.put(view.at(nodes[0]), "tail", "halo soft", gaps=(16, 24, 34)))
-    parts.append(labels.put(view.at(nodes[-1]), "head", "halo soft", gaps=(16, 24, 34)))
-    return "".join(parts)
+def _push_point(i: int, balance: Balance, view: View, labels: Labels) -> str:
+    """Its name, and the size of the force there."""
+    contact, size = balance.contacts[i], balance.size_n[i]
+    foot = view.at(contact.position_w)
+    tip, behind = (view.along(foot, contact.normal_w, far) for far in (size * view.force_scale, -18.0))
+    force = labels.put(tip, f"{size:.0f} N", "halo solved-text", gaps=(6, 10, 16), away_from=foot)
+    return force + labels.put(behind, pretty(f"o_{i + 1}"), "halo strong", away_from=foot)
 
 
-def _index(number_: int) -> str:
-    return "".join(chr(ord("₀") + int(digit)) for digit in str(number_))
-
-
-def _scales(view: View) -> str:
+def scales(view: View) -> str:
     """Bars of length and of force, and which way the axes point."""
     y = view.height - 10
     metres = round_below(0.25 * (view.width - 2 * EDGE) / view.scale)
     x = EDGE
-    parts = [_bar(x, y, metres * view.scale, f"{metres * 100:g} cm" if metres < 1 else f"{metres:g} m")]
+    parts = [scale_bar(x, y, metres * view.scale, f"{metres * 100:g} cm" if metres < 1 else f"{metres:g} m")]
     x += metres * view.scale + text_width(f"{metres * 100:g} cm") + 34
     if view.force_scale > 0:
-        newtons = round_below(0.8 * view.longest / view.force_scale)
-        parts.append(_bar(x, y, newtons * view.force_scale, f"{newtons:g} N", "force-bar"))
+        newtons = round_below(0.8 * LONGEST_ARROW / view.force_scale)
+        parts.append(scale_bar(x, y, newtons * view.force_scale, f"{newtons:g} N", "force-bar"))
     corner = (view.width - 46, view.height - 8)
     for vector, name in (((1.0, 0.0), "x"), ((0.0, 1.0), "y")):
         tip = view.along(corner, vector, 20)
@@ -178,8 +152,3 @@ def _scales(view: View) -> str:
         beyond = view.along(corner, vector, 28)
         parts.append(text(beyond[0], beyond[1] + 4, name, "small soft", anchor="middle"))
     return "".join(parts)
-
-
-def _bar(x: float, y: float, length: float, words: str, class_: str = "bar") -> str:
-    ends = line((x, y - 4), (x, y + 4), class_) + line((x + length, y - 4), (x + length, y + 4), class_)
-    return line((x, y), (x + length, y), class_) + ends + text(x + length + 7, y + 4.5, words, "small")

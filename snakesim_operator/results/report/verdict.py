@@ -1,4 +1,4 @@
-"""What a run amounted to, in one sentence, and its key numbers."""
+"""What a run amounted to, in one sentence."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -30,16 +30,6 @@ class Verdict:
     words: str
 
 
-@dataclass(frozen=True)
-class Tile:
-    """A key number."""
-
-    name: str
-    value: str
-    unit: str = ""
-    alarming: bool = False
-
-
 def verdict(record: RunRecord, summary: RunSummary) -> Verdict:
     """The run in plain words."""
     if summary.ticks == 0 and len(record.time_s) == 0 and not summary.faults:
@@ -52,10 +42,11 @@ def verdict(record: RunRecord, summary: RunSummary) -> Verdict:
         joint = f" at {fault.joint}" if fault.joint else ""
         what = f"Stopped by a fault after {max(at_s, 0.0):.1f} s{joint}: {_sentence(fault.cause)}"
         said = _control_said(record, at_s)
-        return Verdict("bad", f"{what}{said} Before that: {moved[0].lower()}{moved[1:]}.")
+        before = ", ".join([moved[0].lower() + moved[1:], *_refused(summary)])
+        return Verdict("bad", f"{what}{said} Before that: {before}.")
     harm = _harm(summary)
     ending = "" if summary.ended == "complete" else f" The run ended early: {_sentence(summary.ended)}"
-    distance = _distance_m(summary)
+    distance = distance_m(summary)
     if distance is None:
         return Verdict("poor", f"{moved}; {_handed_over(record, summary)}{harm}.{ending}")
     if abs(distance) < MOVED_M or summary.locomoting_fraction == 0:
@@ -64,7 +55,7 @@ def verdict(record: RunRecord, summary: RunSummary) -> Verdict:
             why = "the snake stayed where it was, although its controller reported Locomoting"
         kind = "Jammed" if summary.jammed else "Did not locomote"
         return Verdict("poor", f"{kind}: {_sentence(why)} {moved}; {harm}.{ending}")
-    stop = _stop(record, abs(distance))
+    stop = stop_of(record, abs(distance))
     stopped = "" if stop is None else f" Locomotion ended at {stop.at_s:.1f} s of {end_s(record):.1f} s: {stop.why}"
     if stop is not None and not stop.on_purpose and (summary.jammed or stop.share > POOR_SHARE):
         kind = "Jammed" if summary.jammed else "Stopped"
@@ -75,34 +66,24 @@ def verdict(record: RunRecord, summary: RunSummary) -> Verdict:
     return Verdict(good, f"{moved}; {_handed_over(record, summary)}{jam}{harm}.{stopped}{ending}")
 
 
-def tiles(record: RunRecord, summary: RunSummary) -> list[Tile]:
-    """The numbers to see first."""
-    limit = max(joint.torque_limit_nm for joint in record.description.joints)
-    saturated = summary.torque_saturated_fraction
-    along = summary.path_distance_m is not None
-    distance = _distance_m(summary)
-    rejected = sum(summary.rejected_commands.values())
-    return [
-        Tile("along the path" if along else "net displacement", _shown(distance, "{:.2f}"), "m"),
-        Tile("mean speed", _shown(summary.mean_speed_m_s, "{:.3f}"), "m/s"),
-        Tile("robot time", f"{summary.duration_s:.1f}", "s"),
-        Tile("time locomoting", _shown(_percent(summary.locomoting_fraction), "{:.0f}"), "%"),
-        Tile(f"peak joint torque (limit {limit:g})", _shown(summary.peak_joint_torque_nm, "{:.1f}"), "N·m"),
-        Tile("ticks at a torque limit", _shown(_percent(saturated), "{:.1f}"), "%", (saturated or 0) > 0.05),
-        Tile("peak contact force", _shown(summary.peak_contact_force_n, "{:.0f}"), "N"),
-        Tile("ticks answered in time", _shown(_percent(summary.answered_fraction), "{:.1f}"), "%"),
-        Tile("commands refused", str(rejected)),
-        Tile("faults", str(len(summary.faults)), "", bool(summary.faults)),
-    ]
-
-
 def _harm(summary: RunSummary) -> str:
-    """What went wrong, and stopped nothing."""
+    """What went wrong, and stopped nothing: joints lost, other faults, commands refused."""
     lost = list(dict.fromkeys(fault.joint for fault in summary.faults if fault.joint is not None))
-    return f"went on without {', '.join(lost)}" if lost else "no fault"
+    others = [fault for fault in summary.faults if fault.joint is None]
+    said = [f"went on without {', '.join(lost)}"] if lost else []
+    if others:
+        said.append(f"{'a fault' if len(others) == 1 else f'{len(others)} faults'} ({_sentence(others[0].cause)[:-1]})")
+    return ", ".join([*(said or ["no fault"]), *_refused(summary)])
 
 
-def _distance_m(summary: RunSummary) -> float | None:
+def _refused(summary: RunSummary) -> list[str]:
+    reasons = {reason: count for reason, count in summary.rejected_commands.items() if count}
+    count = sum(reasons.values())
+    return [f"{count} {'command' if count == 1 else 'commands'} refused ({', '.join(reasons)})"] if reasons else []
+
+
+def distance_m(summary: RunSummary) -> float | None:
+    """Along the path, else as the crow flies."""
     return summary.path_distance_m if summary.path_distance_m is not None else summary.net_displacement_m
 
 
@@ -136,7 +117,7 @@ def _control_said(record: RunRecord, at_s: float) -> str:
 
 
 @dataclass(frozen=True)
-class _Stop:
+class Stop:
     """The end of locomotion, before that of the run."""
 
     at_s: float
@@ -145,7 +126,7 @@ class _Stop:
     on_purpose: bool
 
 
-def _stop(record: RunRecord, moved_m: float) -> _Stop | None:
+def stop_of(record: RunRecord, moved_m: float) -> Stop | None:
     """When and why it came to rest, by what control told and by what was measured; None when it did not."""
     bands, end = state_bands(record), end_s(record)
     at_s = bands[-1].start_s if len(bands) > 1 and bands[-1].what != "Locomoting" else end
@@ -156,20 +137,9 @@ def _stop(record: RunRecord, moved_m: float) -> _Stop | None:
         return None
     after = [state for state in record.control if told_at_s(record, state) >= at_s and state.state != "Locomoting"]
     why = after[0].reason if after else "its controller reported Locomoting all the same"
-    return _Stop(at_s, (end - at_s) / end, _sentence(why), bool(after) and after[-1].state == "Idle")
+    return Stop(at_s, (end - at_s) / end, _sentence(why), bool(after) and after[-1].state == "Idle")
 
 
 def _sentence(words: str) -> str:
     words = words.strip().rstrip(".;")
     return f"{words}." if words else ""
-
-
-def _percent(share: float | None) -> float | None:
-    return None if share is None else 100 * share
-
-
-def _shown(value: float | None, form: str) -> str:
-    if value is None:
-        return "–"
-    text = form.format(value)
-    return text.removeprefix("-") if float(text) == 0 else text.replace("-", "−")

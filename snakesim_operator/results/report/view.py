@@ -6,14 +6,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesim_hal.wire.messages import Obstacle
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.instants import Instant
 from snakesim_operator.results.report.svg import Point
 
 Floats = NDArray[np.float64]
-LONGEST_ARROW = 92.0  # of the strongest force, in units of the drawing
-FELT_SHARE = 1.4  # of the longest arrow: a longer measured force is cut, so that one impact does not dwarf the rest
+LONGEST_ARROW = 72.0  # of the strongest force, in units of the drawing
+FELT_SHARE = 1.1  # of the longest arrow: a longer measured force is cut, so that one impact does not dwarf the rest
 EDGE = 22.0
+AIR = 80.0  # round the body
+TALLEST = 1.1  # of the width
+LARGE = 0.5  # of the window: an obstacle that reaches further, a wall, is cut at the edge
+GROWN_AT_MOST = 4
 FOOT = 30.0  # under the drawing, for the scales
 
 
@@ -27,7 +32,6 @@ class View:
     width: float
     height: float
     upright: bool  # the snake lies along y: the ground is turned by a quarter
-    longest: float  # arrow of the strongest solved force
 
     def turned(self, vectors_w: Floats) -> Floats:
         """World vectors (..., 2) in the frame of the drawing, y still up."""
@@ -43,66 +47,64 @@ class View:
         x, y = self.turned(np.asarray(vector_w, dtype=np.float64)[:2])
         return float(start[0] + units * x), float(start[1] - units * y)
 
+    def shows(self, obstacle: Obstacle) -> bool:
+        """Whether an obstacle is drawn: as a whole, unless it is too large for that."""
+        (x, y), reach = self.at(obstacle.position_w), self.scale * reach_m(obstacle)
+        across, tall = self.width, self.height - FOOT
+        if reach > LARGE * min(across, tall):
+            return -reach < x < across + reach and -reach < y < tall + reach
+        return reach <= x <= across - reach and reach <= y <= tall - reach
+
+
+def reach_m(obstacle: Obstacle) -> float:
+    """How far an obstacle reaches from its middle, on the ground."""
+    return max(obstacle.radius_m, math.hypot(*obstacle.half_size_m[:2]))
+
+
+def views(record: RunRecord, instants: list[Instant], width: float) -> list[View]:
+    """A window for each instant, all of one size and at one scale: round the body, with room for the arrows."""
+    bodies = [nodes_xy_w(record, one) for one in instants]
+    balances = [one.balance for one in instants if one.balance is not None]
+    sizes = [size for one in balances for size in (*one.size_n, float(np.hypot(*one.resultant_n)))]
+    sizes = sizes or [math.hypot(*contact.force_w[:2]) for one in instants for contact in one.felt]
+    units_per_n = LONGEST_ARROW / max(sizes) if sizes and max(sizes) > 0 else 0.0
+    return _windows(record, bodies, units_per_n, width) if bodies else []
+
+
+def map_view(record: RunRecord, nodes: list[Floats], units_per_n: float, width: float) -> View:
+    """One window for a whole run. nodes: the body at some of its instants, (k, 2) each."""
+    return _windows(record, [np.vstack(nodes)], units_per_n, width)[0]
+
+
+def _windows(record: RunRecord, shown: list[Floats], units_per_n: float, width: float) -> list[View]:
+    """One for each of some sets of points, (k, 2)."""
+    spans = np.ptp(shown[0], axis=0)
+    upright = bool(spans[1] > 1.3 * spans[0])
+    plain = View(np.zeros(2), 1.0, units_per_n, 0.0, 0.0, upright)
+    turned = [plain.turned(points) for points in shown]
+    air_m = AIR * max(float(np.ptp(points[:, 0])) for points in turned) / (width - 2 * AIR)
+    boxes = [_with_obstacles(record, plain, p.min(axis=0) - air_m, p.max(axis=0) + air_m) for p in turned]
+    across, tall = np.max([high - low for low, high in boxes], axis=0)
+    scale = width / float(across)
+    height = min(float(tall) * scale, TALLEST * width)
+    half = np.array([width, height]) / (2 * scale)
+    return [View((low + high) / 2 - half, scale, units_per_n, width, height + FOOT, upright) for low, high in boxes]
+
+
+def _with_obstacles(record: RunRecord, plain: View, low: Floats, high: Floats) -> tuple[Floats, Floats]:
+    """A window that is grown until it cuts no obstacle but large ones."""
+    found = [item.obstacle for item in record.placed]
+    large = LARGE * float((high - low).min())
+    small = [(plain.turned(np.array(one.position_w[:2])), 1.1 * reach_m(one)) for one in found if reach_m(one) <= large]
+    for _ in range(GROWN_AT_MOST):
+        cut = [(at, r) for at, r in small if (at + r > low).all() and (at - r < high).all()]
+        low = np.min([low, *(at - r for at, r in cut)], axis=0)
+        high = np.max([high, *(at + r for at, r in cut)], axis=0)
+    return low, high
+
 
 def nodes_xy_w(record: RunRecord, instant: Instant) -> Floats:
     """Tail end, joints and head end on the ground, (joints + 2, 2)."""
     nodes = record.nodes_w(instant.row)
     assert nodes is not None, "instants without a pose are not chosen"
     return nodes[:, :2]
-
-
-def views(record: RunRecord, instants: list[Instant], width: float, longest: float = LONGEST_ARROW) -> list[View]:
-    """A view for each instant: one window for all when the snake stays within it, else one that goes along."""
-    if not instants:
-        return []
-    bodies = [nodes_xy_w(record, one) for one in instants]
-    ends = bodies[0][-1] - bodies[0][0]
-    upright = bool(abs(ends[1]) > 1.3 * abs(ends[0]))
-    plain = View(np.zeros(2), 1.0, _force_scale(instants, longest), 0.0, 0.0, upright, longest)
-    body_m = max(float(np.ptp(plain.turned(body), axis=0)[0]) for body in bodies)
-    metres_per_unit = body_m / (width - 2 * EDGE)  # near enough to find out how far the arrows reach
-    reached = [plain.turned(_reached_w(record, one, plain.force_scale * metres_per_unit)) for one in instants]
-    lows, highs = np.array([r.min(axis=0) for r in reached]), np.array([r.max(axis=0) for r in reached])
-    across, tall = (highs - lows).max(axis=0)
-    union = highs.max(axis=0) - lows.min(axis=0)
-    fixed = bool(union[0] < 1.5 * across)
-    if fixed:
-        across, tall = union
-        lows, highs = np.broadcast_to(lows.min(axis=0), lows.shape), np.broadcast_to(highs.max(axis=0), highs.shape)
-    scale = (width - 2 * EDGE) / float(across)
-    height = min(float(tall) * scale + 2 * EDGE, 1.1 * width) + FOOT
-    corners = (lows + highs) / 2 - np.array([width, height - FOOT]) / (2 * scale)
-    return [View(corner, scale, plain.force_scale, width, height, upright, longest) for corner in corners]
-
-
-def _force_scale(instants: list[Instant], longest: float) -> float:
-    solved = [0.0]
-    for one in instants:
-        if one.balance is not None:
-            solved += [*one.balance.size_n, float(np.hypot(*one.balance.resultant_n))]
-    strongest = max(solved) or max((math.hypot(*c.force_w[:2]) for one in instants for c in one.felt), default=0.0)
-    return longest / strongest if strongest > 0 else 0.0
-
-
-def _reached_w(record: RunRecord, instant: Instant, metres_per_n: float) -> Floats:
-    """Points on the ground, (k, 2), that the drawing of an instant must hold: the body, pegs pushed at, arrow tips."""
-    nodes = nodes_xy_w(record, instant)
-    radius = max(link.radius_m for link in record.description.links)
-    points: list[Floats] = [nodes - radius, nodes + radius]
-    pushes = [(contact, np.array(contact.force_w[:2])) for contact in instant.felt]
-    if instant.balance is not None:
-        pushes += list(zip(instant.balance.contacts, instant.balance.contact_n, strict=True))
-        start = np.array(instant.balance.contacts[0].position_w[:2])
-        points.append((start + metres_per_n * instant.balance.resultant_n)[None])
-    longest = FELT_SHARE * _longest_n(instant)
-    for contact, force in pushes:
-        at, normal = np.array(contact.position_w[:2]), np.array(contact.normal_w[:2])
-        cut = min(1.0, longest / max(float(np.hypot(*force)), 1e-9))
-        points += [(at - 0.05 * normal)[None], (at + cut * metres_per_n * force)[None]]
-    return np.vstack(points)
-
-
-def _longest_n(instant: Instant) -> float:
-    if instant.balance is not None:
-        return max(*instant.balance.size_n, float(np.hypot(*instant.balance.resultant_n)))
-    return max((math.hypot(*c.force_w[:2]) for c in instant.felt), default=0.0)

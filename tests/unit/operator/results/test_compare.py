@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.host_process import HostRecord
 from snakesim_hal.model.robot import Chain, describe
 from snakesim_hal.model.scenario import RunConfig, load, parse_set, write
 from snakesim_hal.wire.messages import ControlState, Mode
@@ -21,10 +20,10 @@ from snakesim_operator.results.compare.page import page
 from snakesim_operator.results.compare.table import table
 from snakesim_operator.results.compare.verdict import within
 from snakesim_operator.results.record import RunRecord
+from tests.unit.operator.results.test_report import finished
 
 JOINTS = 13
 SPEED_M_S = 0.1
-BY_JOINT = ("angle_rad", "velocity_rad_s", "torque_nm", "mode", "target")
 
 
 def configured(**changes: Any) -> RunConfig:
@@ -61,20 +60,7 @@ def made_up(
         folder=Path("made-up"),
         config=run,
         description=describe_of(run),
-        host=HostRecord(
-            ticks=count,
-            wall_s=1.0,
-            overruns=0,
-            answered_ticks=count,
-            armed_ticks=count,
-            command_digest="0123456789abcdef" * 4,
-            state_to_command_us={},
-            rejected_commands={},
-            limited_commands={},
-            faults=[],
-            lifecycle="disarmed",
-            why="finished",
-        ),
+        host=finished(count),
         control=control,
         worlds=[],
         time_s=start_s + since_s,

@@ -1,9 +1,9 @@
 """Colours, light and dark, told apart by people with any kind of colour vision (after Okabe and Ito).
 
-A joint has the colour of its place along the body, so it looks the same in every figure of every report.
+A joint has one colour of its own, the same in every figure of every report.
 """
 
-import re
+import colorsys
 
 LIGHT: dict[str, str] = {
     "page": "#fbfbf9",
@@ -23,6 +23,7 @@ LIGHT: dict[str, str] = {
     "reference": "#c8321f",
     "felt": "#0067b0",
     "frame": "#00795c",
+    "commanded": "#7a3fa8",
     "bad": "#b3261e",
     "locomoting": "#bfe0cd",
     "notlocomoting": "#f6d9a8",
@@ -30,13 +31,6 @@ LIGHT: dict[str, str] = {
     "poweroff": "#c4c9cf",
     "negative": "#0067b0",
     "positive": "#d2691e",
-    "joint-0": "#0072b2",
-    "joint-1": "#d55e00",
-    "joint-2": "#009e73",
-    "joint-3": "#b8559a",
-    "joint-4": "#b98500",
-    "joint-5": "#3f9fd8",
-    "joint-6": "#6b5bb5",
 }
 
 DARK: dict[str, str] = {
@@ -57,6 +51,7 @@ DARK: dict[str, str] = {
     "reference": "#ff7b66",
     "felt": "#5cb3f2",
     "frame": "#3ccba0",
+    "commanded": "#c79bf0",
     "bad": "#ff8a80",
     "locomoting": "#24553d",
     "notlocomoting": "#69501d",
@@ -64,28 +59,29 @@ DARK: dict[str, str] = {
     "poweroff": "#4a5159",
     "negative": "#5cb3f2",
     "positive": "#f39a4d",
-    "joint-0": "#4aa8e8",
-    "joint-1": "#f0894a",
-    "joint-2": "#35c79d",
-    "joint-3": "#e08cc4",
-    "joint-4": "#e0b03a",
-    "joint-5": "#8accf5",
-    "joint-6": "#a99bf0",
 }
 
-JOINT_COLOURS = 7
+GOLDEN = 0.381966  # of a turn of hue: neighbours are far apart, and no hue comes twice
 
 
-def joint_class(joint: int) -> str:
-    """The class that gives an element its joint's colour."""
-    return f"joint-{joint % JOINT_COLOURS}"
+def joint_colours(count: int, *, dark: bool) -> dict[str, str]:
+    """A colour for every joint, tail to head."""
+    found: dict[str, str] = {}
+    for joint in range(count):
+        light = (0.66, 0.76)[joint % 2] if dark else (0.45, 0.34)[joint % 2]
+        rgb = colorsys.hls_to_rgb((0.56 + GOLDEN * joint) % 1, light, 0.72)
+        found[f"joint-{joint}"] = "#" + "".join(f"{round(255 * part):02x}" for part in rgb)
+    return found
 
 
-def variables(colours: dict[str, str]) -> str:
-    """Declarations of the colours as CSS variables."""
+def themes(joints: int) -> str:
+    """The colours of both themes as CSS variables. Paper is always light."""
+    light, dark = LIGHT | joint_colours(joints, dark=False), DARK | joint_colours(joints, dark=True)
+    return (
+        f":root{{{_variables(light)}}}@media screen and (prefers-color-scheme:dark)"
+        f"{{:root:not(.paper){{{_variables(dark)}}}}}"
+    )
+
+
+def _variables(colours: dict[str, str]) -> str:
     return "".join(f"--{name}:{value};" for name, value in colours.items())
-
-
-def baked(css: str, colours: dict[str, str]) -> str:
-    """The style sheet with every variable replaced, for viewers of pictures that know no variables."""
-    return re.sub(r"var\(--([a-z0-9-]+)\)", lambda found: colours[found[1]], css)

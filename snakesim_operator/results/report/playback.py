@@ -1,0 +1,122 @@
+"""The whole run as a film: a map that stands still, and for each of some hundred instants the snake and its forces.
+
+`playback.js` moves what `body` has drawn. All coordinates are those of the drawing.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+from markupsafe import Markup
+from numpy.typing import NDArray
+
+from snakesim_hal.wire.messages import ControlState, World
+from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.report.instants import balance_of
+from snakesim_operator.results.report.labels import Labels
+from snakesim_operator.results.report.svg import Point, element, figure
+from snakesim_operator.results.report.timeline import end_s, in_words, zero_s
+from snakesim_operator.results.report.top_view import body, ground, scales
+from snakesim_operator.results.report.view import FELT_SHARE, LONGEST_ARROW, View, map_view
+
+Floats = NDArray[np.float64]
+Told = TypeVar("Told", ControlState, World)
+FRAMES = 300
+WIDTH = 1040.0
+SAME_TICK_S = 1e-6
+USUAL_SHARE = 0.9  # of all forces are drawn in full; the strongest are cut
+TOLD_FOR_S = 0.3  # what is older is not shown: control and guidance tell their state many times a second
+
+
+@dataclass(frozen=True)
+class Playback:
+    """The map as markup, and what moves on it as data."""
+
+    picture: Markup
+    data: dict[str, Any]
+    with_solved: bool
+    with_felt: bool
+
+
+def playback(record: RunRecord) -> Playback | None:
+    """None when the pose is never known."""
+    posed = np.flatnonzero(record.posed)
+    if not len(posed):
+        return None
+    rows = posed[np.unique(np.linspace(0, len(posed) - 1, min(len(posed), FRAMES)).astype(int))]
+    nodes = [_nodes(record, int(row)) for row in rows]
+    names = [joint.name for joint in record.description.joints]
+    states = _latest(record, rows, record.control)
+    worlds = _latest(record, rows, record.worlds)
+    units = _units_per_n(states, worlds)
+    view = map_view(record, nodes, units, WIDTH)
+    said: list[str] = []
+    frames: list[list[Any]] = []
+    for row, body_w, state, world in zip(rows, nodes, states, worlds, strict=True):
+        joint = state.propulsion_joint if state is not None else None
+        solved, felt = _solved(view, state, units), _felt(view, world, units)
+        words = f"{in_words(state.state)}: {state.reason}" if state is not None else "the controller says nothing"
+        if words not in said:
+            said.append(words)
+        time_s = float(record.time_s[row]) - zero_s(record)
+        flat = [round(part, 1) for node in body_w for part in view.at(node)]
+        propels = names.index(joint) if joint in names else -1
+        frames.append([round(time_s, 3), flat, propels, said.index(words), solved, felt])
+    labels = Labels(view.width, view.height)
+    snake = element("g", body(record, view, nodes[0], labels), class_="snake")
+    picture = figure(
+        view.width,
+        view.height,
+        "The snake on the map, moved by the slider",
+        ground(record, view, labels) + snake + '<g class="forces"></g>' + scales(view),
+    )
+    data = {"frames": frames, "said": said, "joints": names, "end": round(end_s(record), 3)}
+    return Playback(Markup(picture), data, any(frame[4] for frame in frames), any(frame[5] for frame in frames))
+
+
+def _nodes(record: RunRecord, row: int) -> Floats:
+    nodes = record.nodes_w(row)
+    assert nodes is not None, "rows without a pose are not drawn"
+    return nodes[:, :2]
+
+
+def _latest(record: RunRecord, rows: NDArray[np.intp], told: Sequence[Told]) -> list[Told | None]:
+    """What was said last before each row, unless that is long ago."""
+    stamps = np.array([one.stamp_ns * 1e-9 for one in told])
+    before = np.searchsorted(stamps, record.time_s[rows] + SAME_TICK_S, side="right") - 1
+    fresh = [i >= 0 and t - stamps[i] < TOLD_FOR_S for i, t in zip(before, record.time_s[rows], strict=True)]
+    return [told[i] if is_fresh else None for i, is_fresh in zip(before.tolist(), fresh, strict=True)]
+
+
+def _units_per_n(states: Sequence[ControlState | None], worlds: Sequence[World | None]) -> float:
+    balances = [balance for state in states if state is not None and (balance := balance_of(state)) is not None]
+    sizes = [size for balance in balances for size in (*balance.size_n, float(np.hypot(*balance.resultant_n)))]
+    felt = [math.hypot(*contact.force_w[:2]) for world in worlds if world is not None for contact in world.contacts]
+    usual = float(np.quantile(sizes or felt or [0.0], USUAL_SHARE))
+    return LONGEST_ARROW / usual if usual > 0 else 0.0
+
+
+def _solved(view: View, state: ControlState | None, units: float) -> list[float]:
+    """The solved forces, and last their resultant: four numbers each, from where to where."""
+    balance = balance_of(state) if state is not None else None
+    if balance is None:
+        return []
+    feet = [view.at(contact.position_w) for contact in balance.contacts]
+    pairs = list(zip([*feet, feet[0]], [*balance.contact_n, balance.resultant_n], strict=True))
+    return _arrows(view, pairs, units)
+
+
+def _felt(view: View, world: World | None, units: float) -> list[float]:
+    contacts = world.contacts if world is not None else []
+    return _arrows(view, [(view.at(one.position_w), np.array(one.force_w[:2])) for one in contacts], units)
+
+
+def _arrows(view: View, forces: list[tuple[Point, Floats]], units: float) -> list[float]:
+    """From where to where each arrow goes. Too long a one is cut, so that one impact does not dwarf the rest."""
+    found: list[float] = []
+    for foot, force in forces:
+        cut = min(1.0, FELT_SHARE * LONGEST_ARROW / max(units * math.hypot(*force), 1e-9))
+        found += [*foot, *view.along(foot, force, cut * units)]
+    return [round(part, 1) for part in found]
