@@ -137,7 +137,7 @@ class ProcessFaults:
             )
 
     def _begin(self, injection: Injection) -> None:
-        self._say(f"fault on request: {injection.kind}:{injection.target}")
+        self._say(f"injected fault: {injection.kind}:{injection.target}")
         if injection.target_type != "process":
             step_s = injection.amount or 0.0
             step_wall_clock(step_s)

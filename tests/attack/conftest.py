@@ -8,14 +8,14 @@ import pytest
 from tests.attack.robot import Robot, Victim
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def victim(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Victim]:
     kept = Victim(tmp_path_factory.mktemp("victim"))
     yield kept
     kept.close()
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def victim_behind_a_router(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Victim]:
     kept = Victim(tmp_path_factory.mktemp("routed"), "--with-router")
     yield kept

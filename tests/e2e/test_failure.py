@@ -84,7 +84,7 @@ WRONG_ANSWERS = {
 }
 
 
-@pytest.mark.parametrize("pace", ["lockstep", "realtime"])
+@pytest.mark.parametrize("pace", ["realtime", pytest.param("lockstep", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("wrong", WRONG_ANSWERS)
 def test_a_controller_that_answers_wrongly_is_named_at_once(tmp_path: Path, wrong: str, pace: str) -> None:
     answer, words = WRONG_ANSWERS[wrong]

@@ -151,7 +151,7 @@ def test_a_busy_interpreter_loses_the_lease_although_it_is_alive(tmp_path: Path)
         (["run", "triplet", "--fault", "mute:joint_14@1"], "--fault mute:joint_14@1: `faults[0]`: "),
         (["run", "triplet", "--fault", "mute:joint_1@1", "--fault", "drop:a/b@1"], "`faults[1]`: 'a/b': no part"),
         (["run", "triplet", "--fault", "leak:joint_1@1"], "backend 'sim' cannot do leak to joint_1"),
-        (["fault", "mute"], "give a target to"),
+        (["fault", "mute"], "give a target"),
         (["fault", "mote", "joint_1"], "knows no 'mote'"),
         (["fault", "reboot", "joint_1", "--for", "2"], "happens once and has no end"),
     ],

@@ -9,6 +9,7 @@ from tests.fuzz import network
 pytestmark = pytest.mark.e2e
 
 
+@pytest.mark.slow
 def test_a_running_robot_takes_no_harm_from_bad_payloads(tmp_path: Path) -> None:
     # As slow as a robot may be, so that its lease is long: this is about what arrives, not about a busy machine.
     request = network.Request(payloads=6000, rate=2000.0, quiet_s=3.0, robot_hz=20.0)

@@ -84,6 +84,7 @@ def test_nobody_there(tmp_path: Path) -> None:
         assert ended.code == 1 and "no robot on tcp/127.0.0.1:9" in ended.err + ended.out
 
 
+@pytest.mark.slow
 def test_several_robots_on_one_network(tmp_path: Path) -> None:
     with running(tmp_path / "one", *ARGUMENTS, "--with-router") as one:
         one.wait_for("network:")  # its router is there

@@ -219,6 +219,7 @@ def test_a_fault_outranks_a_full_disk(tmp_path: Path) -> None:
     assert "joint_3" in ended.out.partition("\nfault: ")[2].partition("\n")[0]
 
 
+@pytest.mark.slow
 def test_a_full_disk_disturbs_no_tick_in_real_time(tmp_path: Path) -> None:
     arguments = [*LONG, "--duration", "5"]
     ended, left = in_a_file_system(tmp_path, "size=100k", "", *arguments)

@@ -142,7 +142,14 @@ INTERRUPTED = (
 )
 
 
-@pytest.mark.parametrize("command", INTERRUPTED, ids=lambda command: command[0])
+@pytest.mark.parametrize(
+    "command",
+    [
+        command if command[0] in ("run", "status") else pytest.param(command, marks=pytest.mark.slow)
+        for command in INTERRUPTED
+    ],
+    ids=lambda command: command[0],
+)
 def test_ctrl_c_at_any_moment_leaves_no_traceback(command: list[str], tmp_path: Path) -> None:
     """From the first line of ours on; what comes before is the interpreter's own start."""
     on_network = command[0] in ("echo", "status", "arm", "run")

@@ -174,7 +174,7 @@ def test_a_child_is_told_what_goes_wrong_as_in_a_terminal(tmp_path: Path, monkey
         time.sleep(0.01)
     assert heard.read_text() == "mute joint_3\nmute joint_3 off\n"
     twins.stop()
-    with pytest.raises(BackendError, match=r"do not take leak:joint_1@0"):
+    with pytest.raises(BackendError, match=r"do not accept leak:joint_1@0"):
         for _ in range(100):  # until the pipe is known to be broken
             twins.inject(Injection("leak", "joint_1"), begins=True)
 
