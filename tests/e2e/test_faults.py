@@ -22,11 +22,11 @@ def host_record(out: Path) -> HostRecord:
 @pytest.mark.parametrize(
     ("backend", "fault", "what"),
     [
-        ("sim", "mute:joint_3@1", "state_invalid"),
-        ("sim", "nan:joint_3@1", "state_invalid"),
+        pytest.param("sim", "mute:joint_3@1", "state_invalid", marks=pytest.mark.slow),
+        pytest.param("sim", "nan:joint_3@1", "state_invalid", marks=pytest.mark.slow),
         ("sim", "diverge:simulator@1", "backend_failed"),
         ("can", "mute:joint_3@1", "module_silent"),
-        ("can", "leak:joint_3@1", "module_leak"),
+        pytest.param("can", "leak:joint_3@1", "module_leak", marks=pytest.mark.slow),
         ("can", "cut:bus_1@1-1.3", "interface_down"),
     ],
 )
@@ -41,7 +41,10 @@ def test_a_planned_fault_happens_at_its_tick_and_ends_the_run_as_it_should(
     nothing_left(tmp_path / "run")
 
 
-@pytest.mark.parametrize(("backend", "pace"), [("sim", "lockstep"), ("can", "lockstep"), ("sim", "realtime")])
+@pytest.mark.parametrize(
+    ("backend", "pace"),
+    [("can", "lockstep"), pytest.param("sim", "lockstep", marks=pytest.mark.slow), ("sim", "realtime")],
+)
 def test_a_fault_that_is_no_danger_disturbs_nothing(tmp_path: Path, backend: str, pace: str) -> None:
     """Messages that come twice are what networks do; a simulator that takes its time is no reason to stop."""
     faults = ["duplicate:actuator/joints@0.5-1.5", "duplicate:sensor/joints@0.5-1.5", "slow:simulator@1-1.2=0.5"]

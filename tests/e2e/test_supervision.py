@@ -80,7 +80,7 @@ def interrupt(run: Running) -> RunSummary:
     return msgspec.json.decode((run.out / SUMMARY).read_bytes(), type=RunSummary)
 
 
-@pytest.mark.parametrize("pace", ["lockstep", "realtime"])
+@pytest.mark.parametrize("pace", ["realtime", pytest.param("lockstep", marks=pytest.mark.slow)])
 def test_a_killed_host_is_started_again_and_not_armed(tmp_path: Path, pace: str) -> None:
     with running(tmp_path / "run", *LONG, "--pace", pace, "--stay") as run:
         run.wait_for(" s  ")
