@@ -10,6 +10,7 @@ import os
 import re
 import stat
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -73,14 +74,7 @@ def _check_plain(path: Path, mode: int) -> None:
 
 def parse_json(text: str, source: str) -> Any:
     """A JSON text. Raises ConfigError."""
-    try:
-        value = json.loads(text)
-    except RecursionError:
-        raise ConfigError(f"{source}: not valid JSON: nested deeper than {MAX_DEPTH} levels") from None
-    except ValueError as error:  # JSONDecodeError; or a number of thousands of digits
-        raise ConfigError(f"{source}: not valid JSON: {error}") from None
-    _check_depth(value, source)
-    return value
+    return _parsed(text, source, json.loads, "JSON")
 
 
 def parse_toml(text: str, source: str) -> dict[str, Any]:
@@ -89,12 +83,16 @@ def parse_toml(text: str, source: str) -> dict[str, Any]:
         raise ConfigError(f"{source}: is larger than {MAX_TOML // MB} MB; make it smaller, or write it as JSON")
     if deep := _DEEP_KEY.search(text):
         raise ConfigError(f"{source}: key `{deep[0][:40]}...` has more than {MAX_DEPTH} parts")
+    return _parsed(text, source, tomllib.loads, "TOML")
+
+
+def _parsed(text: str, source: str, parse: Callable[[str], Any], language: str) -> Any:
     try:
-        value = tomllib.loads(text)
+        value = parse(text)
     except RecursionError:
-        raise ConfigError(f"{source}: not valid TOML: nested deeper than {MAX_DEPTH} levels") from None
-    except ValueError as error:  # TOMLDecodeError; or a number of thousands of digits
-        raise ConfigError(f"{source}: not valid TOML: {error}") from None
+        raise ConfigError(f"{source}: not valid {language}: nested deeper than {MAX_DEPTH} levels") from None
+    except ValueError as error:  # the parser's own; or a number of thousands of digits
+        raise ConfigError(f"{source}: not valid {language}: {error}") from None
     _check_depth(value, source)
     return value
 

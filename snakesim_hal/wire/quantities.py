@@ -55,7 +55,6 @@ Tick = Annotated[int, Meta(ge=0, le=MAX_COUNT), about("number of a control perio
 Nanoseconds = Annotated[int, Meta(ge=0, le=MAX_COUNT, extra_json_schema={"unit": "ns"})]
 Stamp = Annotated[Nanoseconds, about("robot time: as in hal/clock, from 0 at the start of the host")]
 LinkIndex = Annotated[int, Meta(ge=0, le=MAX_JOINTS)]
-JointIndex = Annotated[int, Meta(ge=0, lt=MAX_JOINTS)]
 Name = Annotated[str, Meta(min_length=1, max_length=64)]
 Reason = Annotated[str, Meta(max_length=500)]
 

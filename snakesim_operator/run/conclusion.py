@@ -13,7 +13,7 @@ from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.local_registry import robot_folder
 from snakesim_hal.terminal import say
 from snakesim_hal.wire.messages import Description
-from snakesim_operator.results import last_run as lastrun
+from snakesim_operator.results import last_run
 from snakesim_operator.results.gaps import unwritten
 from snakesim_operator.results.record import REPORT, SUMMARY, RunRecord
 from snakesim_operator.results.summary import Restart, RunSummary, summarise
@@ -47,7 +47,7 @@ def conclude(config: RunConfig, files: RunFiles, ending: Ending, outcome: Outcom
     lost = files.close()
     lacks += [lost] if lost and lost not in lacks else []
     _print_end(files, ending, outcome, lacks)
-    lastrun.remember(str(files.folder or "no folder"), _ended(ending))
+    last_run.remember(str(files.folder or "no folder"), _ended(ending))
     if ending.interrupted:
         return INTERRUPTED
     if host is None or ending.reason is not None:

@@ -15,7 +15,7 @@ from snakesim_hal.terminal import Say, say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import Status
-from snakesim_operator.results import last_run as lastrun
+from snakesim_operator.results import last_run
 from snakesim_operator.tools.targets import Where, namespace_of
 
 STATUS_WAIT_S = 1.0
@@ -37,7 +37,7 @@ def show_status(where: Where, say: Say = say) -> int:
     for robot in silent:
         say(f"{robot.namespace}: NO ANSWER on {robot.endpoint}; its run is process {robot.pid}")
     if not found and not silent:
-        noted = lastrun.recall()
+        noted = last_run.recall()
         last = f"; the last run on this computer ended so: {noted[1]} ({noted[0]})" if noted is not None else ""
         say(f"no robot answers on {', '.join(where.endpoints())}{last}")
         return 1

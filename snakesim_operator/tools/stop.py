@@ -20,7 +20,6 @@ from snakesim_operator.tools.targets import CONNECT_S, Where, namespace_of, robo
 
 LIMIT_S = 5.0
 ASK_S = 1.0
-UNCONFIRMED = "a stop port reports it, but nothing on the network confirms it"
 
 
 @dataclass(frozen=True)

@@ -182,14 +182,6 @@ class Observer:
         self.until(found, "a fault in the status", 3.0)
         return found()[0]
 
-    def tick_at(self, at_ns: int) -> float:
-        """The host's tick at a time, from the last clock before it."""
-        before = [h for h in self.clocks if h.at_ns <= at_ns]
-        if not before:
-            raise TrialError("no clock was heard before the injection")
-        last = before[-1]
-        return last.message.tick + (at_ns - last.at_ns) / last.message.period_ns
-
     # --- the operator -----------------------------------------------------------------------------------------
 
     def ask(self, key: str, request: Message) -> Answer:

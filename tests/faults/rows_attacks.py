@@ -5,7 +5,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 
 from snakesim_hal.wire import keys
@@ -28,18 +28,12 @@ def _flooding(kind: str, amount: int, processes: int) -> Flood:
     return lambda made: flood(made.folder, kind, made.endpoint, amount, processes)
 
 
-@contextmanager
-def _wrong_datagrams(made: Robot) -> Iterator[None]:
-    with datagrams.flood(made.endpoint) as _:
-        yield
-
-
 FLOODS: dict[str, Flood] = {
     "half_open": lambda made: half_open(made.endpoint, HALF_OPEN),
     "idle": _flooding("idle", IDLE // 4, 4),
     "lease": _flooding("lease", QUERIES, 2),
     "garbage": _flooding("garbage", SAMPLES, 1),
-    "datagrams": _wrong_datagrams,
+    "datagrams": lambda made: datagrams.flood(made.endpoint),
 }
 
 

@@ -34,7 +34,6 @@ AMOUNTS: Mapping[str, tuple[float, ...]] = {
     "slow": (0.3, 0.7),
 }
 LASTS_S = (0.2, 0.5, 1.0, 2.0)
-STOPPED_BY = {"kill", "freeze", "hang", "stop"}  # of control: nobody commands any more
 LONG_FREEZE_S = 0.5  # beyond any doubt longer than a lease
 
 
