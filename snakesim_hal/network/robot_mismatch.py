@@ -21,8 +21,7 @@ def mismatch(message: Message, robot: Description) -> str | None:
     joints, links = len(robot.joints), len(robot.links)
     match message:
         case JointState():
-            lists = (message.angle_rad, message.velocity_rad_s, message.torque_nm, message.valid, message.age_ns)
-            fits = {len(values) for values in lists} == {joints}
+            fits = message.is_of(joints)
         case Power():
             volts = (message.voltage_v, message.current_a, message.motor_c, message.board_c, message.leak)
             fits = {len(values) for values in (*volts, message.valid)} == {joints}

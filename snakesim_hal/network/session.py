@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic
 
+import msgspec
 import zenoh
 from zenoh import ext, handlers  # pyright: ignore[reportMissingModuleSource]
 
@@ -50,8 +51,7 @@ class Link:
     listen: bool = False  # True: listen on the endpoint; False: connect to it
 
 
-@dataclass(frozen=True)
-class Arrival:
+class Arrival(msgspec.Struct, frozen=True):
     """A received sample, not decoded yet."""
 
     key: str

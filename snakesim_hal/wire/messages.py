@@ -65,6 +65,16 @@ class JointState(Message, frozen=True, kw_only=True):
     valid: Annotated[q.Flags, about("false: its numbers are outdated, and must not be used")]
     age_ns: Annotated[q.Ages, about("how long before `stamp_ns` each joint was measured")]
 
+    def is_of(self, joints: int) -> bool:
+        """Whether it has this many joints, in every list."""
+        return (
+            len(self.angle_rad) == joints
+            and len(self.velocity_rad_s) == joints
+            and len(self.torque_nm) == joints
+            and len(self.valid) == joints
+            and len(self.age_ns) == joints
+        )
+
 
 class Contact(Message, frozen=True, kw_only=True):
     """One contact of a link with an obstacle (not the ground); all vectors in the link's frame."""
