@@ -76,6 +76,7 @@ def parser() -> argparse.ArgumentParser:
     )
     run.add_argument("--out", type=Path, help="folder for the run's record (default: runs/NAME-TIME)")
     _add_network(run)
+    _add_insecure(run)
     run.set_defaults(act=_run)
 
     compare = commands.add_parser("compare", help="compare two runs, as a table and as a page with plots")
@@ -137,6 +138,7 @@ def parser() -> argparse.ArgumentParser:
 
     router = commands.add_parser("router", help="run a Zenoh router from a JSON5 file")
     router.add_argument("config", type=Path, nargs="?", help=f"JSON5 file (default: {str(ROUTER).replace('%', '%%')})")
+    _add_insecure(router)
     router.set_defaults(act=_router)
 
     schemas = commands.add_parser("schemas", help="print where the JSON Schemas, the key space and the DBC file are")
@@ -173,6 +175,12 @@ def _add_network(parser: argparse.ArgumentParser) -> None:
         "--router", metavar="ENDPOINT", help="connect to a lab's Zenoh router instead, such as tcp/10.0.0.1:7447"
     )
     parser.add_argument("--namespace", help="namespace of the robot (default: the robot's name)")
+
+
+def _add_insecure(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--insecure", action="store_true", help="listen even where anybody on the network can command the robot"
+    )
 
 
 def _check_network(arguments: argparse.Namespace) -> None:
@@ -218,6 +226,7 @@ def _run(arguments: argparse.Namespace) -> int:
             namespace=arguments.namespace,
             stay=arguments.stay,
             with_router=arguments.with_router,
+            insecure=arguments.insecure,
         )
     )
 
@@ -323,7 +332,7 @@ def _where(arguments: argparse.Namespace):
 def _router(arguments: argparse.Namespace) -> int:
     from snakesim_operator.tools.status import run_router
 
-    return run_router(arguments.config)
+    return run_router(arguments.config, insecure=arguments.insecure)
 
 
 def _schemas(arguments: argparse.Namespace) -> int:

@@ -22,6 +22,7 @@ from zenoh import ext, handlers  # pyright: ignore[reportMissingModuleSource]
 from snakesim_hal.errors import ConfigError, NotConnectedError, WireError
 from snakesim_hal.model.files import short
 from snakesim_hal.model.textfiles import check_brackets, read_text
+from snakesim_hal.network.endpoint import check_guarded
 from snakesim_hal.process import raise_open_files
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES, Decoder, MessageT, encode, encoding_of
@@ -49,6 +50,7 @@ class Link:
     endpoint: str = DEFAULT_ENDPOINT
     namespace: str | None = None  # None: the whole network, for tools that search for robots
     listen: bool = False  # True: listen on the endpoint; False: connect to it
+    insecure: bool = False  # True: listen even where other machines can connect
 
 
 class Arrival(msgspec.Struct, frozen=True):
@@ -347,6 +349,7 @@ def intersects(pattern: str, key: str) -> bool:
 def open_session(link: Link, connect_timeout_s: float = 5.0) -> Iterator[Session]:
     """Connect to the network. Raises NotConnectedError when the endpoint does not answer or cannot be listened on."""
     if link.listen:
+        check_guarded(link.endpoint, "endpoint", insecure=link.insecure)
         raise_open_files(MAX_OPEN_FILES)
         os.environ.setdefault(*RUNTIME)
     session = Session(_open(_settings(link, connect_timeout_s), link))
@@ -405,15 +408,32 @@ def router_settings(config: Path) -> zenoh.Config:
     return settings
 
 
+def _listened_on(settings: zenoh.Config) -> list[str]:
+    """A router's endpoints; for every mode, or for routers alone."""
+    endpoints = json.loads(settings.get_json("listen/endpoints"))
+    return endpoints if isinstance(endpoints, list) else endpoints.get("router", [])
+
+
+def _denies_by_default(settings: zenoh.Config) -> bool:
+    rules = json.loads(settings.get_json("access_control"))
+    return bool(rules["enabled"]) and rules["default_permission"] == "deny"
+
+
 def _refused_by_zenoh(config: Path, error: zenoh.ZError) -> ConfigError:
     return ConfigError(f"{config}: Zenoh refuses it: {short(' '.join(str(error).split()), 500)}")  # it quotes the file
 
 
 @contextmanager
-def open_router(config: Path) -> Iterator[None]:
-    """Run a Zenoh router from a JSON5 file for as long as the context lives. Raises ConfigError."""
+def open_router(config: Path, *, insecure: bool = False) -> Iterator[None]:
+    """Run a Zenoh router from a JSON5 file for as long as the context lives. Raises ConfigError.
+
+    insecure: also one that other machines can connect to, and that does not deny what its rules do not allow.
+    """
     zenoh.init_log_from_env_or("error")
     settings = router_settings(config)
+    for endpoint in _listened_on(settings):
+        guarded = _denies_by_default(settings)
+        check_guarded(endpoint, f"{config}: `listen.endpoints`:", access_control=guarded, insecure=insecure)
     try:
         session = zenoh.open(settings)
     except zenoh.ZError as error:
