@@ -20,6 +20,7 @@ from snakesim_hal.wire.messages import (
     Clock,
     Contact,
     Contacts,
+    DepthImage,
     Description,
     Imu,
     Intent,
@@ -32,6 +33,7 @@ from snakesim_hal.wire.messages import (
     World,
     WorldContact,
 )
+from snakesim_hal.wire.quantities import Quaternion
 from tests.unit.hal.local_network import LagBackend, free_endpoint, wait_until
 from tests.unit.hal.rig import description, run_config, state
 
@@ -96,6 +98,26 @@ def trajectory(*path: tuple[float, float]) -> Trajectory:
     return Trajectory(tick=0, stamp_ns=0, path_id=1, path_w=list(path), speed_m_s=0.1, push_points=[], finished=False)
 
 
+def image(depth: bytes, link: int = 3, turned: Quaternion = UPRIGHT) -> DepthImage:
+    return DepthImage(
+        tick=0,
+        stamp_ns=0,
+        link=link,
+        position_l=X,
+        orientation_l_wxyz=turned,
+        width=3,
+        height=2,
+        fx_px=2.0,
+        fy_px=2.0,
+        cx_px=1.0,
+        cy_px=0.5,
+        range_min_m=0.1,
+        range_max_m=3.0,
+        scale_m=0.001,
+        depth=depth,
+    )
+
+
 @pytest.mark.parametrize(
     ("message", "why"),
     [
@@ -116,6 +138,10 @@ def trajectory(*path: tuple[float, float]) -> Trajectory:
         (pose(0.6, 0.0, 0.0, 0.8), None),
         (pose(0.0, 0.0, 0.0, 0.0), "no_rotation"),
         (pose(1.0, 1.0, 1.0, 1.0), "no_rotation"),
+        (image(bytes(12)), None),
+        (image(bytes(11)), "wrong_length"),
+        (image(bytes(12), link=4), "wrong_length"),
+        (image(bytes(12), turned=(0.0, 0.0, 0.0, 0.0)), "no_rotation"),
         (trajectory((0.0, 0.0), (1.0, 0.0)), None),
         (trajectory((0.0, 0.0), (1.0, 0.0), (1.0, 0.0)), "no_path"),
         (Intent(stamp_ns=0, who="operator"), None),

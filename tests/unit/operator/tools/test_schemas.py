@@ -3,6 +3,7 @@
 import json
 import math
 import re
+from base64 import b64encode
 from pathlib import Path
 from typing import Any
 
@@ -79,13 +80,15 @@ def mismatches(  # noqa: C901 - one branch a keyword
     value: Any, schema: dict[str, Any], root: dict[str, Any], at: str = "$"
 ) -> list[str]:
     """Where a JSON value does not fit a JSON Schema; knows the keywords that msgspec writes, and no others."""
-    known = {"$ref", "$schema", "$defs", "encoding", "title", "description", "default", "unit"} | {
+    known = {"$ref", "$schema", "$defs", "encoding", "title", "description", "default", "unit", "contentEncoding"} | {
         *("type", "enum", "const", "anyOf", "properties", "required", "additionalProperties", "items", "prefixItems"),
         *("minItems", "maxItems", "minLength", "maxLength", "pattern", "minProperties", "maxProperties"),
         *("minimum", "maximum", "exclusiveMinimum", "exclusiveMaximum", "propertyNames", "discriminator"),
     }
     assert set(schema) <= known, f"{at}: the check does not know {set(schema) - known}"
     wrong: list[str] = []
+    if isinstance(value, bytes) and schema.get("contentEncoding") == "base64":
+        value = b64encode(value).decode()
     if "$ref" in schema:
         target: Any = root
         for step in schema["$ref"].removeprefix("#/").split("/"):
