@@ -208,6 +208,14 @@ def parse_set(text: str) -> Override:
 
 def load(scenario: str, overrides: Sequence[Override] = ()) -> Loaded:
     """Read a scenario (shipped name or path), its robot and scene, and the flags. Raises ConfigError."""
+    table = compose(scenario, overrides)
+    config = decode(table, RunConfig)
+    check(config)
+    return Loaded(config, table)
+
+
+def compose(scenario: str, overrides: Sequence[Override] = ()) -> Table:
+    """All values of a scenario, not checked yet. Raises ConfigError for files that cannot be read."""
     path = find(scenario, "scenarios")
     table = read_table(path)
     table.values.setdefault("name", path.stem)
@@ -232,9 +240,7 @@ def load(scenario: str, overrides: Sequence[Override] = ()) -> Loaded:
                 chosen = str(table.values.get(choice, "sim")).rpartition(":")[2]
                 key = f"{section}.{chosen}.{key.removeprefix(alias)}"
         table.put(key, override.value, override.flag)
-    config = decode(table, RunConfig)
-    check(config)
-    return Loaded(config, table)
+    return table
 
 
 def check(config: RunConfig) -> None:
