@@ -37,28 +37,29 @@ class Request:
 
 
 def optimise(request: Request) -> int:
-    """Go on until so many trials are in the file. Returns 0, or 1 when no trial had a result."""
+    """Go on until so many trials have a result, or have been tried. Returns 0, or 1 when none has a result."""
     space: dict[str, BaseDistribution] = {key: _span(key, given) for key, given in request.vary.items()}
     if request.goal not in RunSummary.__struct_fields__:
         raise ConfigError(f"--goal {request.goal}: no number of a summary, such as path_distance_m or advance_m_s")
     for end in ("low", "high"):  # before anything is started
         _cases(request, {key: getattr(one, end) for key, one in space.items()})
     study = _study(request)
-    begun = len(study.get_trials(states=(TrialState.COMPLETE, TrialState.FAIL)))
-    if begun:
-        say(f"{request.storage} holds {begun} trials already")
-    if begun < request.trials:
+    have = len(study.get_trials(states=(TrialState.COMPLETE,)))
+    if have:
+        say(f"{request.storage} holds {have} trials already")
+    if left := max(request.trials - have, 0):
         with workers(request.cluster, request.workers) as client:
-            while (left := request.trials - begun) > 0:
-                at_once = min(left, size(client))
-                _trials(request, study, [study.ask(space) for _ in range(at_once)], client)
-                begun += at_once
+            while left > 0:
+                asked = [study.ask(space) for _ in range(min(left, size(client)))]
+                _trials(request, study, asked, client)
+                left -= len(asked)
     return _conclude(request, study)
 
 
 def _study(request: Request) -> Study:
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     try:
+        request.storage.parent.mkdir(parents=True, exist_ok=True)
         study = optuna.create_study(
             storage=f"sqlite:///{request.storage}",
             study_name=f"{request.scenario} {request.goal}",
@@ -68,8 +69,7 @@ def _study(request: Request) -> Study:
     except Exception as error:  # noqa: BLE001 - of SQLite and SQLAlchemy, for a file of another kind, a folder, a full disk
         why = str(error).splitlines()[0][:200]
         raise ConfigError(f"--storage {request.storage}: {why}; choose another file") from None
-    done = study.get_trials(states=(TrialState.COMPLETE, TrialState.FAIL))
-    study.sampler = optuna.samplers.TPESampler(seed=request.seed + len(done), constant_liar=True)
+    study.sampler = optuna.samplers.TPESampler(seed=request.seed + len(study.trials), constant_liar=True)
     for trial in study.get_trials(states=(TrialState.RUNNING,)):  # of a process that was killed
         study.tell(trial.number, state=TrialState.FAIL)
         study.enqueue_trial(trial.params)

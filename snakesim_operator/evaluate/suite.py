@@ -12,8 +12,9 @@
     "scene.ground.friction" = "0.05:0.4:3"          # from, to, how many
 
     [[row]]                                         # or rows by name; with [vary], each in every combination
-    name = "free start"
-    set = { start.on_route = false }
+    name = "no pose sensor"
+    set.robot.safety.action = "hold"
+    unset = ["robot.sensors.pose"]                  # what the file may leave out, left out
 
 A field is a number: the run's seed, and that of every random field in the scene.
 """
@@ -42,6 +43,7 @@ class Row(FileStruct, frozen=True, kw_only=True):
 
     name: Annotated[str, Meta(min_length=1, max_length=80)]
     set: dict[str, Any] = {}
+    unset: list[str] = []
 
 
 class Suite(FileStruct, frozen=True, kw_only=True):
@@ -52,6 +54,7 @@ class Suite(FileStruct, frozen=True, kw_only=True):
     fields: Count = 20
     controllers: list[str] = []
     set: dict[str, Any] = {}
+    unset: list[str] = []
     vary: dict[str, list[Any] | str] = {}
     row: list[Row] = []
 
@@ -73,12 +76,13 @@ def read_suite(name: str) -> tuple[Suite, str]:
 
 def settings_of(suite: Suite, source: str) -> list[Setting]:
     """The rows of the table in order. Raises ConfigError."""
-    always = list(_overrides(suite.set, f"{source}: [set]"))
+    always = [*_overrides(suite.set, f"{source}: [set]"), *_left_out(suite.unset, f"{source}: `unset`")]
     varied = {key: _values(key, given, source) for key, given in suite.vary.items()}
     words = _short_names(list(varied))
     found: list[Setting] = []
     for row in suite.row or [None]:
-        own = list(_overrides(row.set, f"{source}: row {row.name!r}")) if row is not None else []
+        where = f"{source}: row {row.name!r}" if row is not None else source
+        own = [*_overrides(row.set, where), *_left_out(row.unset, where)] if row is not None else []
         for values in itertools.product(*varied.values()):
             told = [f"{words[key]} {_shown(value)}" for key, value in zip(varied, values, strict=True)]
             name = ", ".join([*([row.name] if row is not None else []), *told]) or "as it is"
@@ -109,8 +113,7 @@ def cases_of(suite: Suite, source: str, controllers: Sequence[str], fields: int,
             for field in range(seed, seed + fields):
                 config = _on_field(table, field)
                 if field == seed:
-                    check(config)
-                    check_plugins(config, table)
+                    _check(config, table, f"{source}, row {number} ({setting.name}), field {field}")
                 whole = written(config)
                 found.append(Case(case_id(config), number, setting.name, config.commander, field, whole, setting.value))
     return found
@@ -129,6 +132,14 @@ def parse_vary(text: str) -> tuple[str, list[Any] | str]:
         raise ConfigError(f"--vary {short(text)}: {short(given)} is no list; write it as in TOML, [1, 2]") from None
 
 
+def _check(config: RunConfig, table: Table, where: str) -> None:
+    try:
+        check(config)
+        check_plugins(config, table)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from None
+
+
 def _on_field(table: Table, field: int) -> RunConfig:
     table.put("seed", field, "--seed")
     scene = table.values.get("scene")
@@ -145,6 +156,10 @@ def _overrides(given: dict[str, Any], origin: str, prefix: str = "") -> Iterator
             yield from _overrides(value, origin, f"{prefix}{key}.")
         else:
             yield Override(prefix + key, value, origin)
+
+
+def _left_out(keys: Sequence[str], origin: str) -> Iterator[Override]:
+    yield from (Override(key, None, origin) for key in keys)
 
 
 def _values(key: str, given: list[Any] | str, source: str) -> list[Any]:

@@ -37,9 +37,9 @@ class Line:
 
     @property
     def crossed(self) -> int | None:
-        """Of all runs; None when none had a goal."""
-        told = [one.numbers.get("crossed") for one in self.outcomes]
-        return None if all(one is None for one in told) else sum(one is True for one in told)
+        """Of all runs, also those that could not begin; None when they had no goal."""
+        told = [one.numbers.get("crossed") for one in self.outcomes if one.error is None]
+        return None if told and all(one is None for one in told) else sum(one is True for one in told)
 
     def values(self, name: str, *, of_crossed: bool = False) -> list[float]:
         """The known values of one number; of_crossed: of the runs that reached their goal, where there is one."""
