@@ -14,6 +14,7 @@ from snakesim_hal.model.plugins import COMMANDS, find_plugin, in_file, installed
 from snakesim_hal.model.scenario import Loaded, Override, RunConfig, load, parse_set
 from snakesim_hal.network.endpoint import check_endpoint, check_namespace
 from snakesim_hal.terminal import complain, complain_of, say
+from snakesim_operator.evaluate.command import add_commands
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
 
@@ -90,11 +91,13 @@ def parser() -> argparse.ArgumentParser:
     )
     compare.set_defaults(act=_compare)
 
+    add_commands(commands)
+
     config = commands.add_parser("config", help="show every effective value, and the file or flag it came from")
     _add_scenario(config)
     config.set_defaults(act=_config)
 
-    scenarios = commands.add_parser("scenarios", help="list the shipped scenarios, robots and scenes")
+    scenarios = commands.add_parser("scenarios", help="list the shipped scenarios, robots, scenes and suites")
     scenarios.set_defaults(act=_scenarios)
 
     echo = commands.add_parser("echo", help="print what is published on a key, one JSON object a line")
@@ -271,7 +274,7 @@ def _shown(value: object) -> str:
 
 
 def _scenarios(_arguments: argparse.Namespace) -> int:
-    for kind, about in (("scenarios", "title"), ("robots", "about"), ("scenes", "about")):
+    for kind, about in (("scenarios", "title"), ("robots", "about"), ("scenes", "about"), ("suites", "title")):
         say(f"{kind}:")
         for name in shipped(kind):
             table = read_part(name, kind)
