@@ -149,7 +149,17 @@ EQUIVALENT: dict[tuple[str, str, str], str] = {
         "_Health.due_ns",
         "at_ns > now_ns -> at_ns >= now_ns in `return min((at_ns for at_ns in (silent_ns, low_ns) if at_ns > now_ns), default=math.inf)`",
     ): _A_SHORTCUT,
-    ("plausibility.py", "_JumpDetector.settled", "if not strayed.any(): -> (removed)"): _A_SHORTCUT,
+    ("plausibility.py", "PlausibilityCheck.take", "if not np.count_nonzero(~good | frozen): -> (removed)"): _A_SHORTCUT,
+    ("plausibility.py", "PlausibilityCheck.take", "return None -> (removed)"): _A_SHORTCUT,
+    ("plausibility.py", "_JumpDetector.settled", "if not np.count_nonzero(strayed): -> (removed)"): _A_SHORTCUT,
+    ("plausibility.py", "_FrozenDetector.look", "if not np.count_nonzero(same): -> (removed)"): _A_SHORTCUT,
+    ("plausibility.py", "_FrozenDetector.look", "return same -> (removed)"): _A_SHORTCUT,
+    (
+        "plausibility.py",
+        "_FrozenDetector.__init__",
+        "self._low_rad, self._high_rad = (np.zeros(count), np.zeros(count)) -> (removed)",
+    ): _NOT_READ_YET,
+    ("plausibility.py", "_FrozenDetector.__init__", "self._far_since_s = self._never_s -> (removed)"): _NOT_READ_YET,
     ("plausibility.py", "_JumpDetector.settled", "return strayed -> (removed)"): _A_SHORTCUT,
     (
         "derating.py",
@@ -246,7 +256,7 @@ EQUIVALENT: dict[tuple[str, str, str], str] = {
     (
         "plausibility.py",
         "_FrozenDetector.look",
-        "np.minimum(self._far_since_s, taken_s) -> np.minimum(taken_s, self._far_since_s) in `self._far_since_s = np.where(far, np.minimum(self._far_since_s, taken_s), np.inf)`",
+        "np.minimum(self._far_since_s, taken_s) -> np.minimum(taken_s, self._far_since_s) in `self._far_since_s = np.where(far, np.minimum(self._far_since_s, taken_s), self._never_s)`",
     ): _IN_ANY_ORDER,
     (
         "plausibility.py",
