@@ -8,7 +8,7 @@ from typing import Any
 
 import msgspec.msgpack
 
-SCHEMAS = Path(__file__).parents[2] / "schemas"
+SCHEMAS = Path(__file__).parents[3] / "schemas"
 PASSIVE, POSITION, VELOCITY, TORQUE = range(4)  # modes of a joint
 
 _ROW = re.compile(r"^\| `(?P<key>[^`]+)` \|(?P<rest>.*)\|$")

@@ -1,4 +1,4 @@
-"""`python -m tests.attack.look ENDPOINT`: the lifecycle of every robot that shows a status there, as a JSON list."""
+"""`python -m tests.attack.means.look ENDPOINT`: the lifecycle of every robot that shows a status, as a JSON list."""
 
 import json
 import sys
@@ -7,7 +7,7 @@ import time
 import zenoh
 from zenoh import ext  # pyright: ignore[reportMissingModuleSource]
 
-from tests.attack import wire
+from tests.attack.means import wire
 from tests.attack.stranger import settings
 
 LOOK_S = 0.6  # a status comes a few times a second

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import EstopRequest, LifecycleRequest, Mode
-from tests.attack import datagrams
-from tests.attack.floods import flood, half_open
+from tests.attack.means import datagrams
+from tests.attack.means.floods import flood, half_open
 from tests.faults.observer import Observer, TrialError
 from tests.faults.robot import Robot, recovered, robot
 from tests.faults.row import Measure, Request, Trial

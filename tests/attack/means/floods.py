@@ -11,13 +11,13 @@ from pathlib import Path
 from tests.attack.command import address
 from tests.attack.stranger import until
 
-REPOSITORY = Path(__file__).parents[2]
+REPOSITORY = Path(__file__).parents[3]
 READY_S = 30.0
 
 
 @contextmanager
 def flood(folder: Path, kind: str, endpoint: str, amount: int, processes: int = 1) -> Iterator[list["Flooder"]]:
-    """So many processes of one kind of `tests.attack.flooder`, ready; killed at the end."""
+    """So many processes of one kind of `tests.attack.means.flooder`, ready; killed at the end."""
     started = [Flooder(folder / f"{kind}-{i}.said", kind, endpoint, amount) for i in range(processes)]
     try:
         for flooder in started:
@@ -35,7 +35,7 @@ class Flooder:
         self._said = said
         with said.open("wb") as output:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "tests.attack.flooder", kind, endpoint, str(amount)],
+                [sys.executable, "-m", "tests.attack.means.flooder", kind, endpoint, str(amount)],
                 cwd=REPOSITORY,
                 stdin=subprocess.PIPE,
                 stdout=output,

@@ -8,9 +8,7 @@ import pytest
 from snakesim_hal.wire import keys
 from snakesim_operator.results.record import REPORT, TELEMETRY, RunRecord
 from snakesim_operator.results.summary import summarise
-from tests.e2e.command import nothing_left, run_to_summary
-
-pytestmark = pytest.mark.e2e
+from tests.runs.command import run_to_summary
 
 STILL = (
     "from snakesim_gnc.control.controller import Action, positions\n"
@@ -31,7 +29,6 @@ def test_a_controller_that_says_nothing_and_stands_still_does_not_locomote(tmp_p
     )
     assert "locomoting            0 %" in ended.out
     assert "Did not locomote: standing still: less than 5 mm in 1 s." in (tmp_path / "run" / REPORT).read_text()
-    nothing_left(tmp_path / "run")
 
 
 @pytest.mark.parametrize("controller", ["obstacle_triplet", "path_following"])

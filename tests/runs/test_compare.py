@@ -11,16 +11,14 @@ import pytest
 from snakesim_hal.errors import ConfigError
 from snakesim_operator.results.compare.command import compare
 from snakesim_operator.results.page.html import LIBRARY
-from tests.e2e.command import run_to_summary, snakesim
-
-pytestmark = pytest.mark.e2e
+from tests.runs.command import run_to_summary, snakesim
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs")
     for name, more in (("a", []), ("again", []), ("slow", ["--set", "rate_hz=50"]), ("hold", ["--controller", "hold"])):
-        ended, _ = run_to_summary(folder / name, "triplet", "--duration", "1.5", "--pace", "lockstep", *more)
+        ended, _ = run_to_summary(folder / name, "triplet", "--duration", "1.5", *more)
         assert ended.code == 0, ended.out + ended.err
     return folder
 
@@ -85,11 +83,11 @@ def test_pages_are_written_to_files_only(runs: Path, tmp_path: Path) -> None:
     (tmp_path / "link.html").symlink_to(tmp_path / "elsewhere")
     os.mkfifo(tmp_path / "pipe.html")
     for name, words in (("link.html", "is a symbolic link"), ("pipe.html", "is a pipe")):
-        ended = snakesim("compare", str(runs / "a"), str(runs / "a"), "--out", name, cwd=tmp_path, limit_s=30)
+        ended = snakesim("compare", str(runs / "a"), str(runs / "a"), "--out", name, cwd=tmp_path)
         assert ended.code == 2 and words in ended.err and ended.err.count("\n") == 1, ended.err
     assert (tmp_path / "elsewhere").read_text() == "precious"
     for name in ("pipe.html", "/dev/zero", "nowhere"):
-        ended = snakesim("compare", str(runs / "a"), name, cwd=tmp_path, limit_s=30)
+        ended = snakesim("compare", str(runs / "a"), name, cwd=tmp_path)
         assert ended.code == 2 and "folder" in ended.err and ended.err.count("\n") == 1, ended.err
 
 

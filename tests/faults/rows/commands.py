@@ -58,7 +58,9 @@ def wrong_in_itself(request: Request) -> Iterator[Trial]:
         }
 
     yield from _among_good_ones(request, kinds)
-    request.note("finite targets beyond a joint's limits are clamped and counted (tests/unit/hal/safety/test_gate.py)")
+    request.note(
+        "finite targets beyond a joint's limits are clamped and counted (tests/unit/hal/safety/test_gate_limits.py)"
+    )
 
 
 def _among_good_ones(request: Request, make: Callable[[Stranger], Kinds]) -> Iterator[Trial]:

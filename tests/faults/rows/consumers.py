@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from tests.attack.floods import flood
+from tests.attack.means.floods import flood
 from tests.faults.consumer import STUCK
 from tests.faults.observer import Observer, TrialError
 from tests.faults.robot import robot

@@ -1,4 +1,4 @@
-"""What floods or occupies a robot's network, as a process: `python -m tests.attack.flooder KIND ENDPOINT AMOUNT`.
+"""What floods or occupies a robot's network, as a process: `python -m tests.attack.means.flooder KIND ENDPOINT AMOUNT`.
 
 It prints "ready" when it is at work, and goes on until it is killed or its standard input closes.
 """
@@ -14,7 +14,7 @@ from typing import Any
 import zenoh
 from zenoh import handlers  # pyright: ignore[reportMissingModuleSource]
 
-from tests.attack import wire
+from tests.attack.means import wire
 from tests.attack.stranger import NAMESPACE, settings
 
 

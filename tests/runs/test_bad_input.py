@@ -5,9 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.e2e.command import snakesim
-
-pytestmark = pytest.mark.e2e
+from tests.runs.command import snakesim
 
 ROBOT = Path("snakesim_hal/shipped/robots/planar13.toml").resolve()
 SCENE = Path("snakesim_hal/shipped/scenes/triplet.toml").resolve()
