@@ -80,7 +80,9 @@ class InProcessRun:
         ticks = round(config.duration_s * config.rate_hz)
         session = self.network.session()
         opened.callback(session.close)
-        self.host = Host(config, backend, session, max_ticks=ticks, end_after_fault_s=AFTER_FAULT_S)
+        self.host = Host(
+            config, backend, session, max_ticks=ticks, end_after_fault_s=AFTER_FAULT_S, pace_after_fault="free"
+        )
         self.network.answer = self.host.take_in
         for name in config.services:
             part = self._parts[name] = opened.enter_context(ExitStack())

@@ -62,7 +62,7 @@ def run_one(request: Request, only: str) -> int:
     """One case again, in this process, with the whole folder of a run. Exit code: of `snakesim run`."""
     case = choose(_cases(request), only)
     say(f"{case.setting}, {case.controller}, field {case.field}")
-    return run_in_process(msgspec.json.decode(case.config, type=RunConfig), request.out)
+    return run_in_process(msgspec.json.decode(case.config, type=RunConfig), request.out, until_goal=True)
 
 
 def choose(cases: Sequence[Case], only: str) -> Case:
