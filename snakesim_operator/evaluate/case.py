@@ -65,7 +65,7 @@ def run_case(config: bytes, code: str) -> Outcome:
         try:
             asked = msgspec.json.decode(config, type=RunConfig)
             check(asked)
-            return Outcome(numbers=plain_numbers(simulate(asked).summary))
+            return Outcome(numbers=plain_numbers(simulate(asked, until_goal=True).summary))
         except SnakesimError as error:
             return Outcome(error=str(error))
 

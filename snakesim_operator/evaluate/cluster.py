@@ -2,6 +2,7 @@
 
 import logging
 import os
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 
@@ -10,6 +11,7 @@ from distributed import Client, Future, LocalCluster, as_completed
 from distributed.scheduler import KilledWorker
 
 from snakesim_hal.errors import ConfigError, NotConnectedError
+from snakesim_hal.model.files import short
 from snakesim_operator.evaluate.case import Case, Outcome, code_digest, run_case
 
 DEATHS, RETRIES = 4, 2  # of the workers that run a case, and of the case, until it is given up
@@ -45,12 +47,12 @@ def workers(cluster: str | None, count: int | None = None, *, dashboard: bool = 
 
 @contextmanager
 def _remote(address: str) -> Iterator[Client]:
+    if not re.fullmatch(r"(tcp|tls)://[^\s/]+:\d{1,5}", address):
+        raise ConfigError(f"--cluster {short(address)}: give the scheduler as tcp://HOST:PORT")
     try:
         client = Client(address, timeout=MEET_S, set_as_default=False)
     except (OSError, TimeoutError):
         raise NotConnectedError(f"--cluster {address}: no Dask scheduler answers within {MEET_S:g} s") from None
-    except ValueError as error:
-        raise ConfigError(f"--cluster {address}: {error}; give tcp://HOST:PORT") from None
     with client:
         try:
             client.wait_for_workers(1, timeout=MEET_S)

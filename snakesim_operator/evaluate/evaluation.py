@@ -1,5 +1,6 @@
 """Runs the cases of a suite, keeps what is done, prints the table and draws the page."""
 
+import re
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,6 +9,7 @@ from pathlib import Path
 import msgspec
 
 from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.files import short
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.textfiles import write_text
 from snakesim_hal.terminal import say
@@ -17,7 +19,7 @@ from snakesim_operator.evaluate.cluster import size, solve, workers
 from snakesim_operator.evaluate.page import page
 from snakesim_operator.evaluate.progress import Progress
 from snakesim_operator.evaluate.suite import Suite, cases_of
-from snakesim_operator.evaluate.table import lines_of, table, worst
+from snakesim_operator.evaluate.table import best_of, lines_of, table, worst
 from snakesim_operator.run.folder import named_after
 from snakesim_operator.run.in_process import run_in_process
 
@@ -60,24 +62,22 @@ def evaluate(request: Request) -> int:
 
 def run_one(request: Request, only: str) -> int:
     """One case again, in this process, with the whole folder of a run. Exit code: of `snakesim run`."""
-    case = choose(_cases(request), only)
+    case = choose(request.suite, request.source, only)
     say(f"{case.setting}, {case.controller}, field {case.field}")
-    return run_in_process(msgspec.json.decode(case.config, type=RunConfig), request.out)
+    return run_in_process(msgspec.json.decode(case.config, type=RunConfig), request.out, until_goal=True)
 
 
-def choose(cases: Sequence[Case], only: str) -> Case:
-    """The case of CONTROLLER:FIELD or CONTROLLER:FIELD:ROW. Raises ConfigError."""
-    fitting = [case for case in cases if only in (f"{case.controller}:{case.field}", name_of(case))]
+def choose(suite: Suite, source: str, only: str) -> Case:
+    """The case of CONTROLLER:FIELD:ROW, or of CONTROLLER:FIELD if there is one row. Raises ConfigError."""
+    named = re.fullmatch(r"(?P<controller>.+?):(?P<field>\d{1,10})(:(?P<row>\d{1,6}))?", only)
+    if named is None:
+        raise ConfigError(f"--only {short(only)}: give CONTROLLER:FIELD or CONTROLLER:FIELD:ROW, such as hold:3:1")
+    cases = cases_of(suite, source, [named["controller"]], 1, int(named["field"]))
+    fitting = [case for case in cases if named["row"] is None or case.row == int(named["row"])]
     if len(fitting) == 1:
         return fitting[0]
-    if fitting:
-        rows = ", ".join(f"{case.row} ({case.setting})" for case in fitting[:12])
-        raise ConfigError(f"--only {only}: add the row, as in {name_of(fitting[0])}; the rows are {rows}")
-    controllers = ", ".join(dict.fromkeys(case.controller for case in cases))
-    raise ConfigError(
-        f"--only {only}: no such case; give CONTROLLER:FIELD or CONTROLLER:FIELD:ROW with controllers {controllers}, "
-        f"fields {cases[0].field} to {cases[-1].field}, rows 1 to {cases[-1].row}"
-    )
+    rows = ", ".join(f"{case.row} ({case.setting})" for case in cases[:12])
+    raise ConfigError(f"--only {only}: add one of the rows, as in {name_of(cases[0])}; there are {rows}")
 
 
 def name_of(case: Case) -> str:
@@ -101,12 +101,14 @@ def _run(request: Request, todo: Sequence[Case], kept: store.Store, out: Path) -
 
 
 def _finish(request: Request, cases: Sequence[Case], done: store.Results, out: Path) -> None:
-    lines, failed = lines_of(cases, done), worst(cases, done)
+    lines = lines_of(cases, done)
+    best = best_of(lines)
+    failed = worst([case for case in cases if case.controller == best], done)
     for text in table(lines):
         say(text)
     again = [(f"{case.setting}, {name_of(case)}", why, _command(request, case)) for case, why in failed]
     if again:
-        say(f"the worst {len(again)}:" if len(again) > 1 else "the worst:")
+        say(f"the worst {len(again)} of {best}:" if len(again) > 1 else f"the worst of {best}:")
     for name, why, command in again:
         for text in (f"  {name}: {why}", f"    {command}"):
             say(text)

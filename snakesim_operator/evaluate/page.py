@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from snakesim_operator.evaluate.table import HEAD, Line, wilson
+from snakesim_operator.evaluate.table import HEAD, Line, best_of, wilson
 from snakesim_operator.results.page.charts import Figure
 from snakesim_operator.results.page.html import render
 
@@ -35,6 +35,7 @@ def page(title: str, about: str, lines: Sequence[Line], worst: Sequence[tuple[st
         head=HEAD,
         rows=[line.cells for line in lines],
         worst=worst,
+        best=best_of(lines),
     )
 
 

@@ -1,6 +1,7 @@
 """The table of an evaluation: for each setting and controller, how many fields were crossed, and how."""
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -87,6 +88,14 @@ def table(lines: Sequence[Line]) -> list[str]:
         cells = [row[i].ljust(width) if i < 2 else row[i].rjust(width) for i, width in zip(keep, widths, strict=True)]
         told.append("  ".join(cells).rstrip())
     return told
+
+
+def best_of(lines: Sequence[Line]) -> str:
+    """The controller that crossed most: its failures are worth a look."""
+    crossed: Counter[str] = Counter()
+    for line in lines:
+        crossed[line.controller] += line.crossed or 0
+    return max(crossed, key=lambda name: crossed[name], default="")
 
 
 def worst(cases: Sequence[Case], done: Results, most: int = WORST) -> list[tuple[Case, str]]:

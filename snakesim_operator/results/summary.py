@@ -8,7 +8,7 @@ import numpy as np
 from msgspec import Meta
 
 from snakesim_hal.wire.messages import Fault, Mode, Pace
-from snakesim_operator.results.advance import Advance, energy_j, work_j
+from snakesim_operator.results.advance import Advance, energy_j, energy_j_per_m, work_j
 from snakesim_operator.results.record import RunRecord
 
 SATURATED_FROM = 0.99  # of a joint's torque limit
@@ -141,7 +141,7 @@ def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), h
         crossed_s=advance.crossed_s if advance else None,
         advance_m=advance.reached_m if advance else None,
         advance_m_s=advance.reached_m / advance.until_s if advance and advance.until_s > 0 else None,
-        energy_j_per_m=advance.energy_j_per_m if advance and has_power else None,
+        energy_j_per_m=energy_j_per_m(record, advance) if advance and has_power else None,
         stalled_s=advance.stalled_s if advance else None,
         state_to_command_us=host.state_to_command_us,
         rejected_commands=host.rejected_commands,

@@ -103,7 +103,6 @@ def test_the_table_tells_what_was_crossed(undisturbed: tuple[Ended, Path]) -> No
     ended, out = undisturbed
     rows = [line.split() for line in table_of(ended).splitlines()[1:5]]
     assert [row[2:4] for row in rows] == [["path_following", "2/2"], ["hold", "0/2"]] * 2
-    assert all("hold" in line for line in ended.out.splitlines() if line.startswith("  friction"))
     assert done(out) == CASES and all((out / name).is_file() for name in TABLES)
 
 

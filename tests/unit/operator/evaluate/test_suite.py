@@ -113,7 +113,9 @@ def test_a_wrong_suite_is_told_what_and_where(
     [
         (["evaluate", "nothing"], ["no suite called 'nothing'", "clutter"]),
         (["evaluate", "clutter", "--resume"], ["--resume", "--out"]),
-        (["evaluate", "clutter", "--fields", "1", "--only", "hold:1"], ["no such case", "path_following"]),
+        (["evaluate", "clutter", "--only", "hold"], ["--only hold", "CONTROLLER:FIELD"]),
+        (["evaluate", "clutter", "--only", "hold:1"], ["--only hold:1", "hold:1:1", "4 (5 per m²)"]),
+        (["evaluate", "clutter", "--only", "hold:1:99"], ["--only hold:1:99", "hold:1:1"]),
         (["evaluate", "clutter", "--fields", "1", "--seed", "-1"], ["--seed", "seed` = -1", ">= 0"]),
         (["evaluate", "clutter", "--fields", "1", "--out", "/dev/null/x"], ["--out /dev/null/x"]),
         (["evaluate", "clutter", "--fields", "1", "--cluster", "nowhere"], ["--cluster nowhere"]),

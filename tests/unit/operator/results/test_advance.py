@@ -79,3 +79,11 @@ def test_the_work_of_torque_joints_is_told_apart() -> None:
     assert followed.torque_joints_j == 0 and followed.position_joints_j
     assert pushed.torque_joints_j is not None and pushed.torque_joints_j > 1
     assert pushed.energy_j is not None and pushed.energy_j > pushed.torque_joints_j
+
+
+def test_a_run_may_end_at_its_goal_with_the_same_numbers() -> None:
+    whole = ran("path_following", goal="heading")
+    short = simulate(whole.record.config, until_goal=True)
+    assert short.summary.ended == "complete" and len(short.record.time_s) < len(whole.record.time_s)
+    for name in ("crossed_s", "advance_m", "energy_j_per_m", "stalled_s"):
+        assert getattr(short.summary, name) == getattr(whole.summary, name), name
