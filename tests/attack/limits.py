@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from tests.attack.wire import PASSIVE, POSITION, TORQUE, VELOCITY
+from tests.attack.means.wire import PASSIVE, POSITION, TORQUE, VELOCITY
 
 ROUNDING = 1e-6
 

@@ -33,7 +33,7 @@ class Machine:
     def lifecycles(self, endpoint: str) -> list[str]:
         """Of every robot that shows a status at an endpoint."""
         looked = subprocess.run(
-            [*self.prefix, sys.executable, "-m", "tests.attack.look", endpoint],
+            [*self.prefix, sys.executable, "-m", "tests.attack.means.look", endpoint],
             cwd=REPOSITORY,
             capture_output=True,
             timeout=30,

@@ -12,7 +12,7 @@ from typing import Any
 import zenoh
 from zenoh import ext  # pyright: ignore[reportMissingModuleSource]
 
-from tests.attack import wire
+from tests.attack.means import wire
 
 KEPT = 2000
 LONG_S = 20.0

@@ -7,9 +7,9 @@ import pytest
 
 from tests.attack.effort import effort
 from tests.attack.limits import beyond_limits
+from tests.attack.means.wire import POSITION
 from tests.attack.robot import Robot
 from tests.attack.stranger import FIRST, Stranger
-from tests.attack.wire import POSITION
 
 TIMES = range(effort(1, 20))
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from tests.attack import wire
 from tests.attack.command import STANDING, running
+from tests.attack.means import wire
 from tests.attack.robot import Robot, joined
 from tests.attack.stranger import Stranger
 

@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from tests.attack import wire
 from tests.attack.effort import FULL, effort
 from tests.attack.limits import beyond_limits
+from tests.attack.means import wire
 from tests.attack.robot import Robot, standing
 from tests.attack.stranger import Stranger
 

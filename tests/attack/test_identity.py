@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 import zenoh
 
-from tests.attack import datagrams
 from tests.attack.command import STANDING, free_endpoint, running, snakesim
 from tests.attack.effort import FULL, effort
+from tests.attack.means import datagrams
 from tests.attack.robot import Robot, joined
 from tests.attack.stranger import Stranger, settings
 
@@ -91,9 +91,9 @@ def test_a2_nobody_disarms_by_a_forged_answer_and_a_forged_status(robot: Robot) 
     ("tool", "key", "lies", "word"),
     [
         ("estop", "hal/estop", lie("estop", "emergency stop by root; clear it to go on"), "planar13: stopped"),
-        ("disarm", "hal/lifecycle", lie("disarmed", "disarmed on request"), "planar13: disarmed"),
+        *[("disarm", "hal/lifecycle", lie("disarmed", "disarmed on request"), "planar13: disarmed")] * FULL,
     ],
-    ids=["estop", "disarm"],
+    ids=["estop", "disarm"][: 1 + FULL],
 )
 def test_a2_a_frozen_host_is_not_stopped_by_whoever_answers_for_it(
     routed: Robot, tool: str, key: str, lies: dict[str, Any], word: str, _time: int
@@ -103,7 +103,7 @@ def test_a2_a_frozen_host_is_not_stopped_by_whoever_answers_for_it(
     assert ended.code == 1 and word not in ended.said, f"exit code {ended.code}: {ended.said}"
 
 
-@pytest.mark.parametrize("how", ["impostor_and_frozen_host", "false_stop_port_and_frozen_host", *["impostor"] * FULL])
+@pytest.mark.parametrize("how", ["false_stop_port_and_frozen_host", *["impostor", "impostor_and_frozen_host"] * FULL])
 def test_a2_a_stop_through_a_labs_router_is_confirmed_by_the_robot_alone(tmp_path: Path, how: str) -> None:
     """The command is typed on another computer: all that it knows is the router's address, where anybody may answer."""
     endpoint = free_endpoint()

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.attack import wire
 from tests.attack.command import STANDING, running
+from tests.attack.means import wire
 from tests.attack.robot import Robot, joined
 from tests.attack.stranger import Stranger
 
@@ -53,7 +53,7 @@ def test_a13_a_stop_outlives_its_run_and_its_folder_until_it_is_cleared(tmp_path
         assert run.interrupt() == 130
     with running(tmp_path, *STANDING, name="two") as run, joined(run) as operator:
         with pytest.raises(AssertionError, match="not within"):
-            operator.until(lambda: operator.lifecycle() == "armed", "armed", 4.0)
+            operator.until(lambda: operator.lifecycle() == "armed", "armed", 2.0)
         status = operator.next("hal/status")
         assert status["lifecycle"] == "estop", status["why"]
         operator.recover()  # cleared and armed by a person, it moves

@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 import zenoh
 
-from tests.attack import wire
 from tests.attack.command import CONTROL_CHARACTERS, free_endpoint, running
 from tests.attack.effort import effort
+from tests.attack.means import wire
 from tests.attack.robot import Robot, joined
 from tests.attack.stranger import NAMESPACE, Stranger
 

@@ -41,6 +41,7 @@ def test_a1_a_second_run_at_the_same_endpoint_does_not_arm_the_robot_there(robot
     stays_disarmed(robot.operator, tmp_path, "--endpoint", robot.endpoint)
 
 
+@pytest.mark.slow
 def test_a1_a_second_run_at_the_endpoint_of_a_router_does_not_arm_the_robot_there(tmp_path: Path) -> None:
     """Nobody holds the router's UDP port, so only that somebody listens there can tell the second run."""
     endpoint = free_endpoint()
@@ -86,21 +87,21 @@ def test_a14_a_stop_without_arguments_names_every_robot_of_the_machine_stopped_o
     with (
         machine_of_its_own() as machine,
         running(tmp_path, *STANDING, name="one", endpoint=None, inside=machine.prefix) as one,
+        running(tmp_path, *STANDING, name="two", endpoint=None, inside=machine.prefix) as two,
     ):
         is_armed(machine, one)
-        with running(tmp_path, *STANDING, name="two", endpoint=None, inside=machine.prefix) as two:
-            is_armed(machine, two)
-            machine.freeze(two.part("host"))
-            stopped = snakesim(tmp_path, "estop", inside=machine.prefix)
-            assert machine.lifecycles(one.endpoint) == ["estop"], stopped.said
-            assert stopped.code == 1 and named(one, stopped.said) and named(two, stopped.said), stopped.said
-            machine.thaw()
-            stopped = snakesim(tmp_path, "estop", inside=machine.prefix)
-            assert [machine.lifecycles(run.endpoint) for run in (one, two)] == [["estop"], ["estop"]], stopped.said
-            assert stopped.code == 0 and stopped.said.count("stopped") == 2, stopped.said
-            assert named(one, stopped.said) and named(two, stopped.said), stopped.said
-            status = snakesim(tmp_path, "status", inside=machine.prefix)
-            assert status.said.count("planar13: estop") == 2, status.said
+        is_armed(machine, two)
+        machine.freeze(two.part("host"))
+        stopped = snakesim(tmp_path, "estop", inside=machine.prefix)
+        assert machine.lifecycles(one.endpoint) == ["estop"], stopped.said
+        assert stopped.code == 1 and named(one, stopped.said) and named(two, stopped.said), stopped.said
+        machine.thaw()
+        stopped = snakesim(tmp_path, "estop", inside=machine.prefix)
+        assert [machine.lifecycles(run.endpoint) for run in (one, two)] == [["estop"], ["estop"]], stopped.said
+        assert stopped.code == 0 and stopped.said.count("stopped") == 2, stopped.said
+        assert named(one, stopped.said) and named(two, stopped.said), stopped.said
+        status = snakesim(tmp_path, "status", inside=machine.prefix)
+        assert status.said.count("planar13: estop") == 2, status.said
 
 
 def named(run: Run, said: str) -> bool:

@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from tests.attack import wire
 from tests.attack.limits import beyond_limits
+from tests.attack.means import wire
 from tests.attack.robot import Robot
 from tests.attack.stranger import Stranger
 

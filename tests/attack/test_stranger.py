@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from tests.attack import wire
+from tests.attack.means import wire
 
 HERE = Path(__file__).parent
-FILES = sorted(HERE.glob("*.py"))
+FILES = sorted([*HERE.glob("*.py"), *HERE.glob("means/*.py")])
 ALLOWED = {"zenoh", "msgspec.msgpack", "pytest"}
 
 

@@ -22,9 +22,10 @@ EXTERNAL = ("triplet", "--set", "services.control.external=true", "--set", "rate
 DEPTH = 8192
 
 
-@pytest.fixture(params=["realtime", "lockstep"])
-def run(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Running]:
-    with running(tmp_path / "run", *EXTERNAL, "--pace", request.param) as started:
+@pytest.fixture(scope="module", params=["realtime", "lockstep"])
+def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
+    """One for both clients: it ends in an emergency stop."""
+    with running(tmp_path_factory.mktemp("client") / "run", *EXTERNAL, "--pace", request.param) as started:
         started.wait_for("whoever takes the lease")
         yield started
 

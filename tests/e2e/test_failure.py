@@ -18,7 +18,7 @@ pytestmark = pytest.mark.e2e
 LONG = ["triplet", "--controller", "hold", "--duration", "600"]
 
 
-@pytest.mark.parametrize("pace", ["lockstep", "realtime"])
+@pytest.mark.parametrize("pace", [pytest.param("lockstep", marks=pytest.mark.slow), "realtime"])
 def test_killed_controller_means_safe_joints_a_reason_and_a_failed_run(tmp_path: Path, pace: str) -> None:
     with running(tmp_path / "run", *LONG, "--pace", pace) as run:
         run.wait_for("network:")
@@ -45,15 +45,6 @@ def test_killed_controller_means_safe_joints_a_reason_and_a_failed_run(tmp_path:
     assert told_later.code == 1 and "lease of control expired" in told_later.out
 
 
-def test_killed_host_is_a_failed_run(tmp_path: Path) -> None:
-    with running(tmp_path / "run", *LONG) as run:
-        run.wait_for(" s  ")
-        os.kill(run.part("host"), signal.SIGKILL)
-        assert run.end() == 1
-        assert "host was ended by SIGKILL" in run.said()
-    nothing_left(tmp_path / "run")
-
-
 def test_ctrl_c_ends_in_order_and_leaves_the_record(tmp_path: Path) -> None:
     with running(tmp_path / "run", *LONG) as run:
         run.wait_for(" s  ")
@@ -65,29 +56,9 @@ def test_ctrl_c_ends_in_order_and_leaves_the_record(tmp_path: Path) -> None:
     assert summary.ended == "interrupted" and summary.faults == [] and summary.ticks > 0
 
 
-def test_killed_supervisor_leaves_nothing_running(tmp_path: Path) -> None:
-    with running(tmp_path / "run", *LONG) as run:
-        run.wait_for(" s  ")
-        assert run.part("host") and run.part("guidance") and run.part("navigation") and run.part("control")
-        os.kill(run.process.pid, signal.SIGKILL)
-        run.end()
-        nothing_left(tmp_path / "run")
-
-
-WRONG_ANSWERS = {
-    "length": ("angles[:-1]", "SetPoints.mode has 12 values, must have 13: one a joint, joint_1 to joint_13"),
-    "nan": (
-        "[*angles[:3], float('nan'), *angles[4:]]",
-        "SetPoints.target[3] (joint_4) is nan, must be a finite number",
-    ),
-    "raises": ("1 / 0", "update() raised ZeroDivisionError: division by zero (wave.py line 11)"),
-}
-
-
 @pytest.mark.parametrize("pace", ["realtime", pytest.param("lockstep", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("wrong", WRONG_ANSWERS)
-def test_a_controller_that_answers_wrongly_is_named_at_once(tmp_path: Path, wrong: str, pace: str) -> None:
-    answer, words = WRONG_ANSWERS[wrong]
+def test_a_controller_that_answers_wrongly_is_named_at_once(tmp_path: Path, pace: str) -> None:
+    """What else is a wrong answer: tests/unit/gnc/test_guarded.py."""
     (tmp_path / "wave.py").write_text(
         "from snakesim_gnc.control.controller import Action, SetPoints\n"
         "from snakesim_gnc.control.hold import Hold\n"
@@ -96,13 +67,15 @@ def test_a_controller_that_answers_wrongly_is_named_at_once(tmp_path: Path, wron
         "    def update(self, view):\n"
         "        if view.time_s < 0.5:\n"
         "            return super().update(view)\n"
-        "        angles = list(view.joints.angle_rad)\n"
-        f"        angles = {answer}\n"
+        "        angles = list(view.joints.angle_rad)[:-1]\n"
         "        return Action(SetPoints([Mode.POSITION] * len(angles), angles, [7.0] * 13))\n"
     )
     flags = ["--controller", "./wave.py:Wave", "--pace", pace, "--duration", "60"]
     ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
-    said = f"controller ./wave.py:Wave (class Wave): {words}"
+    said = (
+        "controller ./wave.py:Wave (class Wave): SetPoints.mode has 12 values, must have 13: one a joint, "
+        "joint_1 to joint_13"
+    )
     assert ended.code == 1 and summary.duration_s < 5.0  # not after the time that a stalled service is given
     assert summary.ended.startswith(f"control ended with exit code 1: {said}")
     assert f"fault: control ended with exit code 1: {said}" in ended.out

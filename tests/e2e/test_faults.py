@@ -4,13 +4,12 @@ import os
 import signal
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from snakesim_hal.host_process import HostRecord
-from snakesim_hal.wire.messages import Mode
 from snakesim_operator.results.record import RunRecord
 from tests.e2e.command import Running, nothing_left, run_to_summary, running, snakesim, wait_until
+from tests.runs import command
 
 pytestmark = pytest.mark.e2e
 
@@ -20,30 +19,7 @@ def host_record(out: Path) -> HostRecord:
 
 
 @pytest.mark.parametrize(
-    ("backend", "fault", "what"),
-    [
-        pytest.param("sim", "mute:joint_3@1", "state_invalid", marks=pytest.mark.slow),
-        pytest.param("sim", "nan:joint_3@1", "state_invalid", marks=pytest.mark.slow),
-        ("sim", "diverge:simulator@1", "backend_failed"),
-        ("can", "mute:joint_3@1", "module_silent"),
-        pytest.param("can", "leak:joint_3@1", "module_leak", marks=pytest.mark.slow),
-        ("can", "cut:bus_1@1-1.3", "interface_down"),
-    ],
-)
-def test_a_planned_fault_happens_at_its_tick_and_ends_the_run_as_it_should(
-    tmp_path: Path, backend: str, fault: str, what: str
-) -> None:
-    ended, summary = run_to_summary(tmp_path / "run", "triplet", "--backend", backend, "--fault", fault)
-    record = host_record(tmp_path / "run")
-    assert ended.code == 1 and summary.faults[0].what == what
-    assert record.injected[0].startswith(f"tick 100: {fault} ") and 100 <= record.faults[0].tick <= 104
-    assert record.lifecycle == "fault"
-    nothing_left(tmp_path / "run")
-
-
-@pytest.mark.parametrize(
-    ("backend", "pace"),
-    [("can", "lockstep"), pytest.param("sim", "lockstep", marks=pytest.mark.slow), ("sim", "realtime")],
+    ("backend", "pace"), [pytest.param("can", "lockstep", marks=pytest.mark.slow), ("sim", "realtime")]
 )
 def test_a_fault_that_is_no_danger_disturbs_nothing(tmp_path: Path, backend: str, pace: str) -> None:
     """Messages that come twice are what networks do; a simulator that takes its time is no reason to stop."""
@@ -65,7 +41,7 @@ def test_a_fault_that_is_no_danger_disturbs_nothing(tmp_path: Path, backend: str
 
 
 def ask(run: Running, *words: str):
-    return snakesim("fault", *words, "--endpoint", run.endpoint, cwd=run.out.parent)
+    return command.snakesim("fault", *words, "--endpoint", run.endpoint, cwd=run.out.parent)
 
 
 @pytest.mark.parametrize("backend", ["can", pytest.param("sim", marks=pytest.mark.slow)])
@@ -93,25 +69,10 @@ def test_a_fault_is_asked_for_with_a_command(tmp_path: Path, backend: str) -> No
 MAY_LOSE_ONE = ("--set", "robot.safety.may_lose_joints=1")
 
 
-@pytest.mark.parametrize("backend", ["sim", "can"])
-def test_a_joint_that_may_be_lost_is_passive_and_the_run_goes_on(tmp_path: Path, backend: str) -> None:
-    flags = ["--backend", backend, *MAY_LOSE_ONE, "--fault", "mute:joint_5@1", "--duration", "3"]
-    ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
-    assert ended.code == 0 and summary.ended == "complete" and summary.duration_s == 3.0, ended.out
-    assert summary.isolated == ["joint_5"] and summary.faults[0].joint == "joint_5"
-    assert "isolated              joint_5: failed, and passive since" in ended.out
-    left = RunRecord.load(tmp_path / "run")
-    modes, limits = left.mode, left.torque_limit_nm
-    before, after = slice(50, 95), slice(106, 300)
-    assert (modes[before, 4] == Mode.POSITION).all() and (modes[after, 4] == Mode.PASSIVE).all()
-    assert (limits[after, 4] == 0.0).all() and (np.delete(modes, 4, axis=1)[after] != Mode.PASSIVE).all()
-    nothing_left(tmp_path / "run")
-
-
 @pytest.mark.slow
 def test_an_operator_takes_back_a_joint_that_was_lost(tmp_path: Path) -> None:
     def operator(*words: str):
-        return snakesim(*words, "--endpoint", run.endpoint, cwd=tmp_path)
+        return command.snakesim(*words, "--endpoint", run.endpoint, cwd=tmp_path)
 
     def told(what: str) -> None:
         wait_until(lambda: what in operator("status").out, f"{what!r} in the status")
@@ -146,30 +107,6 @@ def test_a_busy_interpreter_loses_the_lease_although_it_is_alive(tmp_path: Path)
     assert ended.code == 1 and [fault.what for fault in summary.faults] == ["lease_expired"]
     assert "hang:control@1 begins" in (tmp_path / "run" / "control.log").read_text()
     nothing_left(tmp_path / "run")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["run", "triplet", "--fault", "mute:joint_14@1"], "--fault mute:joint_14@1: `faults[0]`: "),
-        (["run", "triplet", "--fault", "mute:joint_1@1", "--fault", "drop:a/b@1"], "`faults[1]`: 'a/b': no part"),
-        (["run", "triplet", "--fault", "leak:joint_1@1"], "backend 'sim' cannot do leak to joint_1"),
-        (["fault", "mute"], "give a target"),
-        (["fault", "mote", "joint_1"], "knows no 'mote'"),
-        (["fault", "reboot", "joint_1", "--for", "2"], "happens once and has no end"),
-    ],
-)
-def test_what_cannot_be_is_refused_before_anything_starts(tmp_path: Path, arguments: list[str], words: str) -> None:
-    ended = snakesim(*arguments, cwd=tmp_path)
-    assert ended.code == 2 and words in ended.err
-    assert not list(tmp_path.iterdir())
-
-
-def test_without_a_robot_there_is_nothing_to_ask_and_the_list_is_there_anyway(tmp_path: Path) -> None:
-    ended = snakesim("fault", "mute", "joint_1", "--endpoint", "tcp/127.0.0.1:9", cwd=tmp_path)
-    assert ended.code == 1 and ended.err.startswith("snakesim: ")
-    ended = snakesim("fault", "list", cwd=tmp_path)
-    assert ended.code == 0 and "undervoltage" in ended.out
 
 
 def test_where_something_real_moves_faults_are_not_allowed(tmp_path: Path) -> None:

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.host.latch import ESTOP
-from tests.e2e.command import Ended, Running, nothing_left, running, snakesim, wait_until
+from tests.e2e.command import Ended, Running, nothing_left, running, wait_until
+from tests.runs import command
 
 pytestmark = pytest.mark.e2e
 
@@ -38,7 +39,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
 
 
 def tell(run: Running, *arguments: str) -> Ended:
-    return snakesim(*arguments, "--endpoint", run.endpoint, cwd=run.out.parent)
+    return command.snakesim(*arguments, "--endpoint", run.endpoint, cwd=run.out.parent)
 
 
 def until_armed(run: Running) -> None:
@@ -80,7 +81,7 @@ def test_a_stop_is_latched_and_outlives_the_host(run: Running) -> None:
 
 def test_nobody_there(tmp_path: Path) -> None:
     for arguments in (["estop"], ["clear"], ["arm", "planar13", "sim"]):
-        ended = snakesim(*arguments, "--endpoint", "tcp/127.0.0.1:9", cwd=tmp_path)
+        ended = command.snakesim(*arguments, "--endpoint", "tcp/127.0.0.1:9", cwd=tmp_path)
         assert ended.code == 1 and "no robot on tcp/127.0.0.1:9" in ended.err + ended.out
 
 

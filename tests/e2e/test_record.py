@@ -27,6 +27,7 @@ from tests.e2e.command import (
     snakesim,
     wait_until,
 )
+from tests.runs import command
 
 pytestmark = pytest.mark.e2e
 
@@ -53,7 +54,7 @@ def test_a_killed_host_leaves_all_but_the_last_second_and_a_report(tmp_path: Pat
     with running(tmp_path / "run", *LONG) as run:
         run.wait_for(" s  ")
         with open_session(Link(run.endpoint, "planar13")) as session:
-            wait_until(lambda: newest_status(session).tick > 150, "three seconds")
+            wait_until(lambda: newest_status(session).tick > 100, "two seconds")
             host, tick = run.part("host"), newest_status(session).tick
         os.kill(host, signal.SIGKILL)
         assert run.end() == 1, run.said()
@@ -72,16 +73,16 @@ def test_a_killed_supervisor_leaves_a_record_too(tmp_path: Path) -> None:
     with running(tmp_path / "run", *LONG) as run:
         run.wait_for(" s  ")
         with open_session(Link(run.endpoint, "planar13")) as session:
-            wait_until(lambda: newest_status(session).tick > 100, "two seconds")
+            wait_until(lambda: newest_status(session).tick > 75, "one and a half seconds")
             tick = newest_status(session).tick
         os.kill(run.process.pid, signal.SIGKILL)
         run.end()
     nothing_left(tmp_path / "run")
     record = RunRecord.load(tmp_path / "run")
     assert round(record.time_s[-1] * RATE_HZ) > tick - RATE_HZ and record.host.ended == "running" and record.control
-    told = snakesim("compare", "run", "run", cwd=tmp_path)
+    told = command.snakesim("compare", "run", "run", cwd=tmp_path)
     assert told.code == 0 and "last second may be missing" in told.out
-    ended, _ = run_to_summary(tmp_path / "run", *SHORT)  # and its folder can be used again
+    ended, _ = command.run_to_summary(tmp_path / "run", *SHORT)  # and its folder can be used again
     assert ended.code == 0 and "held an earlier run: moved to" in ended.out
 
 
@@ -113,13 +114,13 @@ def test_a_run_that_somebody_finishes_early_is_no_complete_run(tmp_path: Path) -
 
 
 def test_time_in_which_the_robot_was_not_armed_does_not_count(tmp_path: Path) -> None:
-    with running(tmp_path / "run", *LONG, "--duration", "3") as run:
+    with running(tmp_path / "run", *LONG, "--duration", "2") as run:
         run.wait_for(" s  ")
-        told = snakesim("disarm", "--endpoint", run.endpoint, cwd=tmp_path)
+        told = command.snakesim("disarm", "--endpoint", run.endpoint, cwd=tmp_path)
         assert told.code == 0, told.err
         assert run.end() == 1, run.said()
     ended = summary_of(tmp_path / "run").ended
-    assert "of 3 s" in ended and "the time was over before the requested armed time was reached" in ended
+    assert "of 2 s" in ended and "the time was over before the requested armed time was reached" in ended
 
 
 # --- one folder, two runs --------------------------------------------------------------------------------------
@@ -141,9 +142,8 @@ def test_a_second_run_in_the_folder_is_refused_and_the_first_keeps_its_stop(tmp_
     nothing_left(tmp_path / "run")
 
 
-@pytest.mark.slow
 def test_an_earlier_run_is_moved_aside_and_both_can_be_compared(tmp_path: Path) -> None:
-    runs = [run_to_summary(tmp_path / "run", *SHORT) for _ in range(3)]
+    runs = [command.run_to_summary(tmp_path / "run", *SHORT) for _ in range(3)]
     assert all(ended.code == 0 for ended, _ in runs) and not (tmp_path / "run" / "run.lock").exists()
     ended, summary = runs[-1]
     assert ended.out.startswith(f"{tmp_path / 'run'} held an earlier run: moved to {tmp_path / 'run'}.")
@@ -165,9 +165,10 @@ def in_a_file_system(tmp_path: Path, options: str, prepare: str, *arguments: str
         'disk=$1; left=$2; options=$3; prepare=$4; shift 4; mount -t tmpfs -o "$options" tmpfs "$disk" || exit 99; '
         'cd "$disk" && eval "$prepare"; cd "$left/.."; "$@"; code=$?; cp -a "$disk" "$left"; exit $code'
     )
-    command = [*SNAKESIM, "run", *arguments, "--out", str(disk / "run"), "--endpoint", free_endpoint()]
+    network = [] if "--in-process" in arguments else ["--endpoint", free_endpoint()]
+    typed = [*SNAKESIM, "run", *arguments, "--out", str(disk / "run"), *network]
     done = subprocess.run(
-        ["unshare", "-rm", "sh", "-c", script, "sh", str(disk), str(left), options, prepare, *command],
+        ["unshare", "-rm", "sh", "-c", script, "sh", str(disk), str(left), options, prepare, *typed],
         env=environment(tmp_path),
         capture_output=True,
         text=True,
@@ -192,21 +193,23 @@ def orderly(ended: Ended, left: Path, *, code: int, warning: str) -> None:
 
 @pytest.fixture(scope="module")
 def digest(tmp_path_factory: pytest.TempPathFactory) -> str:
-    return run_to_summary(tmp_path_factory.mktemp("good") / "run", *SHORT)[1].command_digest
+    return command.run_to_summary(tmp_path_factory.mktemp("good") / "run", *SHORT)[1].command_digest
 
 
 @pytest.mark.parametrize(
-    ("options", "prepare"),
+    ("options", "prepare", "more"),
     [
-        ("size=1M", "cat /dev/zero > ballast 2> /dev/null"),
-        ("size=48k", ""),  # room for the configuration and little else
-        ("size=100k", ""),
-        ("size=400k", ""),
-        ("size=1M,nr_inodes=5", ""),
+        ("size=1M", "cat /dev/zero > ballast 2> /dev/null", ["--in-process"]),
+        ("size=48k", "", ["--in-process"]),  # room for the configuration and little else
+        ("size=100k", "", ["--in-process"]),
+        ("size=400k", "", []),
+        ("size=1M,nr_inodes=5", "", ["--in-process"]),
     ],
 )
-def test_a_full_disk_neither_ends_nor_changes_a_run(tmp_path: Path, digest: str, options: str, prepare: str) -> None:
-    ended, left = in_a_file_system(tmp_path, options, prepare, *SHORT)
+def test_a_full_disk_neither_ends_nor_changes_a_run(
+    tmp_path: Path, digest: str, options: str, prepare: str, more: list[str]
+) -> None:
+    ended, left = in_a_file_system(tmp_path, options, prepare, *SHORT, *more)
     orderly(ended, left, code=3, warning="No space left on device; the run goes on")
     assert f"command digest        {digest[:16]}" in ended.out and not (left / SUMMARY).is_file()
     if (left / "blackbox.rows").is_file():
@@ -214,7 +217,7 @@ def test_a_full_disk_neither_ends_nor_changes_a_run(tmp_path: Path, digest: str,
 
 
 def test_a_fault_outranks_a_full_disk(tmp_path: Path) -> None:
-    ended, left = in_a_file_system(tmp_path, "size=100k", "", *SHORT, "--fault", "mute:joint_3@1")
+    ended, left = in_a_file_system(tmp_path, "size=100k", "", *SHORT, "--in-process", "--fault", "mute:joint_3@1")
     orderly(ended, left, code=1, warning="No space left on device")
     assert "joint_3" in ended.out.partition("\nfault: ")[2].partition("\n")[0]
 
@@ -229,14 +232,15 @@ def test_a_full_disk_disturbs_no_tick_in_real_time(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("prepare", ["true", "mkdir run", "mkdir run; echo '{}' > run/config.json"])
 def test_a_read_only_folder_neither_ends_nor_changes_a_run(tmp_path: Path, digest: str, prepare: str) -> None:
-    ended, left = in_a_file_system(tmp_path, "size=1M", f"{prepare}; mount -o remount,ro .", *SHORT)
+    more = [] if prepare == "true" else ["--in-process"]
+    ended, left = in_a_file_system(tmp_path, "size=1M", f"{prepare}; mount -o remount,ro .", *SHORT, *more)
     orderly(ended, left, code=3, warning="Read-only file system; the run goes on, but nothing of it is recorded")
     assert f"command digest        {digest[:16]}" in ended.out
 
 
 def test_a_limit_on_the_size_of_files_is_as_good_as_a_full_disk(tmp_path: Path, digest: str) -> None:
-    command = [*SNAKESIM, "run", *SHORT, "--out", "run", "--endpoint", free_endpoint()]
-    limited = ["sh", "-c", 'ulimit -f 100; exec "$@"', "sh", *command]  # blocks of 512 bytes
+    typed = [*SNAKESIM, "run", *SHORT, "--out", "run", "--endpoint", free_endpoint()]
+    limited = ["sh", "-c", 'ulimit -f 100; exec "$@"', "sh", *typed]  # blocks of 512 bytes
     done = subprocess.run(
         limited, cwd=tmp_path, env=environment(tmp_path), capture_output=True, text=True, timeout=90, check=False
     )

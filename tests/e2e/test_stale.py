@@ -30,7 +30,7 @@ def test_without_joints_the_robot_stops_and_the_reason_is_told(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("key", "limit_s"),
     [
-        ("sensor/pose", 0.24),
+        pytest.param("sensor/pose", 0.24, marks=pytest.mark.slow),
         pytest.param("sensor/contacts", 0.24, marks=pytest.mark.slow),
         ("guidance/world", 0.22),
         pytest.param("navigation/trajectory", 0.84, marks=pytest.mark.slow),

@@ -6,16 +6,15 @@ import re
 import signal
 import subprocess
 import time
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from snakesim_hal.model.files import find
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import EstopRequest
+from snakesim_operator.results.record import RunRecord
 from tests.e2e.command import (
     SNAKESIM,
     Running,
@@ -27,6 +26,7 @@ from tests.e2e.command import (
     snakesim,
     wait_until,
 )
+from tests.runs import command
 
 pytestmark = pytest.mark.e2e
 
@@ -34,38 +34,13 @@ TUTORIAL = Path("docs/tutorial.md").resolve()
 ROUTER = Path("snakesim_hal/shipped/router.json5").resolve()
 
 
-def test_config_tells_where_each_value_came_from(tmp_path: Path) -> None:
-    ended = snakesim("config", "triplet", "--seed", "5", "--set", "control.propulsion_n=20", cwd=tmp_path)
-    assert ended.code == 0, ended.err
-    line = {row.split()[0]: row for row in ended.out.splitlines()}
-    assert line["seed"].endswith("--seed 5")
-    assert line["controllers.obstacle_triplet.propulsion_n"].endswith("--set control.propulsion_n=20")
-    assert line["robot.module.length_m"].endswith("robots/planar13.toml")
-    assert line["scene.ground.friction"].endswith("scenes/triplet.toml")
-    assert line["stall_limit_s"].endswith("default")
-
-
-def test_scenarios_lists_what_is_shipped(tmp_path: Path) -> None:
-    ended = snakesim("scenarios", cwd=tmp_path)
-    assert ended.code == 0
-    for name in ("triplet", "peg_row", "jam", "planar13", "mamba"):
-        assert name in ended.out
-
-
 def echoed(run: Running, folder: Path, key: str, count: int, *more: str) -> list[dict[str, Any]]:
     """What `snakesim echo` prints, each line read as JSON."""
-    ended = snakesim("echo", key, "--count", str(count), "--endpoint", run.endpoint, *more, cwd=folder)
+    ended = command.snakesim("echo", key, "--count", str(count), "--endpoint", run.endpoint, *more, cwd=folder)
     assert ended.code == 0 and ended.err == "", ended.err
     lines = [json.loads(line) for line in ended.out.splitlines()]
     assert len(lines) == count and all(set(line) in ({"key", "message"}, {"key", "error"}) for line in lines)
     return lines
-
-
-def test_echo_without_a_key_lists_the_keys(tmp_path: Path) -> None:
-    ended = snakesim("echo", cwd=tmp_path)
-    assert ended.code == 0, ended.err
-    listed = [line.split()[0] for line in ended.out.splitlines()]
-    assert listed == [row.key for row in keys.SPACE if row.kind in ("stream", "latched")]
 
 
 NASTY = "\x1b[2J\x9b31mroot\u202e\r\nplanar13: disarmed\x07"
@@ -79,9 +54,9 @@ def test_nothing_from_the_network_steers_the_terminal(tmp_path: Path) -> None:
         with open_session(Link(run.endpoint, "planar13")) as session:
             session.ask(keys.ESTOP, EstopRequest(who=NASTY[:64]))
         run.wait_for("estop")
-        status = snakesim("status", "--endpoint", run.endpoint, cwd=tmp_path)
+        status = command.snakesim("status", "--endpoint", run.endpoint, cwd=tmp_path)
         assert "root" in status.out and "planar13: estop" in status.out
-        echo = snakesim("echo", "hal/status", "--count", "1", "--endpoint", run.endpoint, cwd=tmp_path)
+        echo = command.snakesim("echo", "hal/status", "--count", "1", "--endpoint", run.endpoint, cwd=tmp_path)
         assert "\x9b31mroot\u202e\r\n" in json.loads(echo.out)["message"]["why"]
         os.kill(run.process.pid, signal.SIGINT)
         assert run.end() == 130
@@ -89,29 +64,6 @@ def test_nothing_from_the_network_steers_the_terminal(tmp_path: Path) -> None:
             steering = [char for char in text if not char.isprintable() and char not in "\n"]
             assert steering == [] and "\nplanar13: disarmed" not in text, text
     nothing_left(tmp_path / "run")
-
-
-def test_version(tmp_path: Path) -> None:
-    ended = snakesim("--version", cwd=tmp_path)
-    assert ended.code == 0 and ended.out == f"snakesim {version('snakesim')}\n"
-
-
-def test_config_runs_no_code_of_a_file(tmp_path: Path) -> None:
-    (tmp_path / "wave.py").write_text("open('mark', 'w')\nclass Wave: ...\n")
-    for flags in (["--controller", "./wave.py:Wave"], ["--backend", "./wave.py:Wave"]):
-        ended = snakesim("config", "triplet", *flags, "--set", "controllers.Wave.gain=1", cwd=tmp_path)
-        assert ended.code == 0, ended.err
-        assert "ers.Wave: not checked" in ended.out or "ends.Wave: not checked" in ended.out
-    ended = snakesim("config", "triplet", "--controller", "./wave.py", cwd=tmp_path)
-    assert ended.code == 2 and "the classes in it are Wave" in ended.err
-    assert not (tmp_path / "mark").exists()
-
-
-def test_a_scenario_with_a_byte_order_mark(tmp_path: Path) -> None:
-    text = find("triplet", "scenarios").read_text(encoding="utf-8")
-    (tmp_path / "mine.toml").write_text(text, encoding="utf-8-sig")
-    ended = snakesim("config", "./mine.toml", cwd=tmp_path)
-    assert ended.code == 0 and "'mine'" in ended.out, ended.err
 
 
 def test_output_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
@@ -143,20 +95,17 @@ INTERRUPTED = (
 
 
 @pytest.mark.parametrize(
-    "command",
-    [
-        command if command[0] in ("run", "status") else pytest.param(command, marks=pytest.mark.slow)
-        for command in INTERRUPTED
-    ],
-    ids=lambda command: command[0],
+    "words",
+    [words if words[0] == "run" else pytest.param(words, marks=pytest.mark.slow) for words in INTERRUPTED],
+    ids=lambda words: words[0],
 )
-def test_ctrl_c_at_any_moment_leaves_no_traceback(command: list[str], tmp_path: Path) -> None:
+def test_ctrl_c_at_any_moment_leaves_no_traceback(words: list[str], tmp_path: Path) -> None:
     """From the first line of ours on; what comes before is the interpreter's own start."""
-    on_network = command[0] in ("echo", "status", "arm", "run")
+    on_network = words[0] in ("echo", "status", "arm", "run")
     endpoint = ["--endpoint", free_endpoint()] if on_network else []
     for moment in range(14):
         process = subprocess.Popen(
-            [*SNAKESIM, *command, *endpoint],
+            [*SNAKESIM, *words, *endpoint],
             cwd=tmp_path,
             env=environment(tmp_path),
             stdout=subprocess.PIPE,
@@ -186,10 +135,12 @@ def test_echo_and_status_of_a_running_robot(tmp_path: Path) -> None:
     arguments = ["triplet", "--controller", "hold", "--duration", "600", "--pace", "realtime"]
     with running(tmp_path / "run", *arguments) as run:
         run.wait_for(" s  ")
-        rate = snakesim("echo", "sensor/joints", "--hz", "--count", "2", "--endpoint", run.endpoint, cwd=tmp_path)
+        rate = command.snakesim(
+            "echo", "sensor/joints", "--hz", "--count", "2", "--endpoint", run.endpoint, cwd=tmp_path
+        )
         found = re.findall(r"planar13/sensor/joints: ([\d.]+) Hz", rate.out)
         assert found and float(found[-1]) == pytest.approx(100, rel=0.1), rate.out + rate.err
-        one = snakesim("echo", "hal/description", "--count", "1", "--endpoint", run.endpoint, cwd=tmp_path)
+        one = command.snakesim("echo", "hal/description", "--count", "1", "--endpoint", run.endpoint, cwd=tmp_path)
         told = json.loads(one.out)
         assert told["key"] == "planar13/hal/description" and told["message"]["joints"][12]["name"] == "joint_13"
         found = echoed(run, tmp_path, "sensor/**", 40)
@@ -199,11 +150,11 @@ def test_echo_and_status_of_a_running_robot(tmp_path: Path) -> None:
         assert {"planar13/hal/description", "planar13/hal/clock", "planar13/hal/done/guidance"} <= everything
         named = echoed(run, tmp_path, "*/joints", 3, "--namespace", "planar13")
         assert {line["key"] for line in named} <= {"sensor/joints", "actuator/joints"}
-        unknown = snakesim("echo", "sensor/smell", "--endpoint", run.endpoint, cwd=tmp_path)
+        unknown = command.snakesim("echo", "sensor/smell", "--endpoint", run.endpoint, cwd=tmp_path)
         assert unknown.code == 2 and "sensor/contacts" in unknown.err
-        wrong = snakesim("echo", "sensor/***", "--endpoint", run.endpoint, cwd=tmp_path)
+        wrong = command.snakesim("echo", "sensor/***", "--endpoint", run.endpoint, cwd=tmp_path)
         assert wrong.code == 2 and "is not a key" in wrong.err and wrong.err.count("\n") == 1
-        status = snakesim("status", "--endpoint", run.endpoint, cwd=tmp_path)
+        status = command.snakesim("status", "--endpoint", run.endpoint, cwd=tmp_path)
         assert status.code == 0 and "planar13: armed" in status.out and "control, guidance, navigation" in status.out
         os.kill(run.process.pid, signal.SIGINT)
         assert run.end() == 130
@@ -211,7 +162,7 @@ def test_echo_and_status_of_a_running_robot(tmp_path: Path) -> None:
 
 
 def test_status_without_a_robot(tmp_path: Path) -> None:
-    ended = snakesim("status", "--endpoint", free_endpoint(), cwd=tmp_path)
+    ended = command.snakesim("status", "--endpoint", free_endpoint(), cwd=tmp_path)
     assert ended.code == 1 and "no robot answers" in ended.out
 
 
@@ -237,6 +188,25 @@ def test_run_over_a_router_of_ones_own(tmp_path: Path) -> None:
         assert router.wait(10) == -signal.SIGINT  # which a shell shows as 130
 
 
+@pytest.mark.skipif(os.geteuid() != 0, reason="makes a network namespace, which needs root")
+def test_a_run_that_accepts_the_risk_listens_on_every_address(tmp_path: Path) -> None:
+    """In a network namespace of its own, which has nothing but loopback."""
+    run = "ip link set lo up && exec " + " ".join(
+        [*SNAKESIM, "run", "triplet", "--controller", "hold", "--duration", "1", "--out", "run"]
+    )
+    for flags, code in (("", 2), (" --insecure", 0), (" --insecure --with-router", 0)):
+        ended = subprocess.run(
+            ["unshare", "--net", "sh", "-c", f"{run} --endpoint tcp/0.0.0.0:7461{flags}"],
+            cwd=tmp_path,
+            env=environment(tmp_path),
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=120,
+        )
+        assert ended.returncode == code, ended.stdout + ended.stderr
+
+
 def test_a_router_file_that_zenoh_refuses(tmp_path: Path) -> None:
     (tmp_path / "router.json5").write_text('{ mode: "peer" }')
     ended = snakesim("router", "router.json5", cwd=tmp_path)
@@ -248,7 +218,8 @@ def test_the_controller_of_the_tutorial(tmp_path: Path) -> None:
     example = next(block for block in blocks if "class Wave" in block)
     assert len([line for line in example.splitlines() if line.strip()]) <= 24
     (tmp_path / "wave.py").write_text(example, encoding="utf-8")
-    ended, summary = run_to_summary(tmp_path / "run", "triplet", "--controller", "./wave.py:Wave", "--duration", "2")
+    flags = ("--duration", "2", "--in-process")
+    ended, summary = command.run_to_summary(tmp_path / "run", "triplet", "--controller", "./wave.py:Wave", *flags[:2])
     assert ended.code == 0, ended.out + ended.err
     assert summary.controller == "./wave.py:Wave" and summary.energy_j is not None and summary.energy_j > 0.1
 
@@ -258,10 +229,8 @@ def test_the_controller_of_the_tutorial(tmp_path: Path) -> None:
     (package / "METADATA").write_text("Metadata-Version: 2.1\nName: waves\nVersion: 1.0\n")
     (package / "entry_points.txt").write_text("[snakesim.controllers]\nwave = wave:Wave\n")
     (tmp_path / "site" / "wave.py").write_text(example, encoding="utf-8")
-    ended, again = run_to_summary(
-        tmp_path / "again",
-        *("triplet", "--controller", "wave", "--duration", "2"),
-        PYTHONPATH=os.pathsep.join([str(tmp_path / "site"), os.environ.get("PYTHONPATH", "")]),
-    )
+    path = os.pathsep.join([str(tmp_path / "site"), os.environ.get("PYTHONPATH", "")])
+    typed = ("run", "triplet", "--controller", "wave", *flags, "--out", "again")
+    ended = snakesim(*typed, cwd=tmp_path, more={"PYTHONPATH": path})
     assert ended.code == 0, ended.out + ended.err
-    assert again.command_digest == summary.command_digest
+    assert RunRecord.load(tmp_path / "again").host.command_digest == summary.command_digest

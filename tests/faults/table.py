@@ -5,19 +5,19 @@ from dataclasses import dataclass
 
 from snakesim_hal.model.injection import KINDS
 from snakesim_hal.wire import keys
-from tests.faults import (
-    rows_attacks,
-    rows_commands,
-    rows_consumers,
-    rows_controller,
-    rows_guest,
-    rows_isolation,
-    rows_modules,
-    rows_network,
-    rows_simulator,
-    rows_streams,
-)
 from tests.faults.row import Backend, Measure, Place, Row
+from tests.faults.rows import (
+    attacks,
+    commands,
+    consumers,
+    controller,
+    guest,
+    isolation,
+    modules,
+    network,
+    simulator,
+    streams,
+)
 
 LEASE_MS, PERIOD_MS = 50.0, 10.0
 WITHIN_LEASE = "lease, 50 ms after the last good command, and acted on within the period (10 ms)"
@@ -25,7 +25,7 @@ ROUTERS = 50  # times that it dies
 NO_BUS = "a simulator has no bus"
 NO_MODULES = "a simulator has no modules; what its sensors can do is in the rows by a whole robot"
 NO_MODULES_LEFT = "the simulator is in the host's process: without a host nothing is there that could move"
-IN_GUEST_MS = 100.0 + 1000.0 / rows_guest.RATE_HZ  # where heartbeats tell the module's time
+IN_GUEST_MS = 100.0 + 1000.0 / guest.RATE_HZ  # where heartbeats tell the module's time
 STOP_MS = 200.0
 WITHOUT_IT = "2 more in a window than in the worst one before it came: as many are missed without it, now and then"
 PASSED = "messages got through"
@@ -88,7 +88,7 @@ def joint_row(name: str, kind: str, what: str) -> Row:
         "50 ms from right after the module's last good answer to the safe action on the bus",
         50.0,
         "ms",
-        {"sim": NO_MODULES, "can": rows_modules.at_host(kind, what)},
+        {"sim": NO_MODULES, "can": modules.at_host(kind, what)},
     )
 
 
@@ -101,13 +101,13 @@ def asked_row(name: str, fault: str, expected: str, measure: Measure) -> Row:
 def sensor_row(name: str, fault: str, kind: str) -> Row:
     """What any backend's sensors can do."""
     expected = "fault names the joint, group to safe stop, latched"
-    return asked_row(name, fault, expected, rows_modules.through_robot(kind))
+    return asked_row(name, fault, expected, modules.through_robot(kind))
 
 
 def isolated_row(name: str, fault: str, kind: str) -> Row:
     """One joint fails, and the robot may lose one."""
     expected = "fault names the joint, it alone is let go; the others go on; a clear takes it back"
-    return asked_row(name, fault, expected, rows_isolation.set_aside(kind))
+    return asked_row(name, fault, expected, isolation.set_aside(kind))
 
 
 def bus_row(name: str, fault: str, kind: str, what: str, limit_ms: float = 3 * PERIOD_MS) -> Row:
@@ -119,7 +119,7 @@ def bus_row(name: str, fault: str, kind: str, what: str, limit_ms: float = 3 * P
         f"{limit_ms:.0f} ms to the safe action on the bus",
         limit_ms,
         "ms",
-        {"sim": NO_BUS, "can": rows_modules.at_host(kind, what)},
+        {"sim": NO_BUS, "can": modules.at_host(kind, what)},
     )
 
 
@@ -138,7 +138,7 @@ def stream_row(name: str, key: str, oldest_ms: float) -> Row:
         f"{oldest_ms:.0f} ms, which is how old it may be, and a tick (10 ms) of injector, control and host",
         oldest_ms + 3 * PERIOD_MS,
         "ms",
-        both(rows_streams.withheld(key)),
+        both(streams.withheld(key)),
     )
 
 
@@ -154,12 +154,12 @@ HEADINGS: tuple[Heading, ...] = (
         "safe stop, lease freed, latched",
         "lease",
         (
-            lease_row("controller_killed", "control: SIGKILL", rows_controller.killed),
-            lease_row("controller_frozen", "control: SIGSTOP", rows_controller.frozen),
+            lease_row("controller_killed", "control: SIGKILL", controller.killed),
+            lease_row("controller_frozen", "control: SIGSTOP", controller.frozen),
             lease_row(
                 "controller_hung",
                 "control: interpreter busy, by the injector (which takes the request at the controller's next tick)",
-                rows_controller.hung,
+                controller.hung,
                 more_ms=PERIOD_MS,
             ),
         ),
@@ -169,30 +169,22 @@ HEADINGS: tuple[Heading, ...] = (
         "modules' own watchdog",
         "100 ms",
         (
-            watchdog_row("host_silent", "the host says nothing any more, at one module", rows_guest.watchdog, 100.0),
-            watchdog_row("host_killed", "host: SIGKILL", rows_guest.host_gone(signal.SIGKILL), IN_GUEST_MS, "guest"),
-            watchdog_row("host_frozen", "host: SIGSTOP", rows_guest.host_gone(signal.SIGSTOP), IN_GUEST_MS, "guest"),
+            watchdog_row("host_silent", "the host says nothing any more, at one module", guest.watchdog, 100.0),
+            watchdog_row("host_killed", "host: SIGKILL", guest.host_gone(signal.SIGKILL), IN_GUEST_MS, "guest"),
+            watchdog_row("host_frozen", "host: SIGSTOP", guest.host_gone(signal.SIGSTOP), IN_GUEST_MS, "guest"),
         ),
     ),
     Heading(
         "router dies, restarts, 50 times",
         "safe stop if the stream stops; reconnects; no re-arm",
         "lease; 5 s to reconnect",
-        (
-            lease_row(
-                "router_restarts", "router: SIGKILL, 0.4 s later a new one", rows_network.router_restarts, ROUTERS
-            ),
-        ),
+        (lease_row("router_restarts", "router: SIGKILL, 0.4 s later a new one", network.router_restarts, ROUTERS),),
     ),
     Heading(
         "network cut between controller and robot (namespaces with a veth pair, link down)",
         "safe stop on the robot side",
         "lease",
-        (
-            lease_row(
-                "network_cut", "link down between host and services", rows_network.network_cut, place="namespaces"
-            ),
-        ),
+        (lease_row("network_cut", "link down between host and services", network.network_cut, place="namespaces"),),
     ),
     Heading(
         "two controllers",
@@ -206,7 +198,7 @@ HEADINGS: tuple[Heading, ...] = (
                 "at once: with the call",
                 0.0,
                 "frames from the second",
-                {"both": rows_commands.interleaved},
+                {"both": commands.interleaved},
             ),
             Row(
                 "second_controller",
@@ -215,7 +207,7 @@ HEADINGS: tuple[Heading, ...] = (
                 "at once: none applied",
                 0.0,
                 "frames from the second",
-                both(rows_commands.second_controller),
+                both(commands.second_controller),
             ),
         ),
     ),
@@ -231,7 +223,7 @@ HEADINGS: tuple[Heading, ...] = (
                 "one message: none applied",
                 0.0,
                 PASSED,
-                both(rows_commands.out_of_time),
+                both(commands.out_of_time),
             ),
         ),
     ),
@@ -247,7 +239,7 @@ HEADINGS: tuple[Heading, ...] = (
                 "one message: none applied",
                 0.0,
                 PASSED,
-                both(rows_commands.wrong_in_itself),
+                both(commands.wrong_in_itself),
             ),
         ),
     ),
@@ -279,7 +271,7 @@ HEADINGS: tuple[Heading, ...] = (
                 "30 ms that a state may be old, the lease (50 ms), and a tick (10 ms) of injector, control and host",
                 30.0 + LEASE_MS + 3 * PERIOD_MS,
                 "ms",
-                both(rows_streams.no_joints),
+                both(streams.no_joints),
             ),
             stream_row("stream_pose", keys.POSE, 240.0),
             stream_row("stream_contacts", keys.CONTACTS, 240.0),
@@ -317,7 +309,7 @@ HEADINGS: tuple[Heading, ...] = (
                 "before anything is enabled",
                 0.0,
                 "modules enabled",
-                {"sim": NO_BUS, "can": rows_modules.twice_at_start},
+                {"sim": NO_BUS, "can": modules.twice_at_start},
             ),
         ),
     ),
@@ -333,7 +325,7 @@ HEADINGS: tuple[Heading, ...] = (
                 "-",
                 0.0,
                 "faults and stops",
-                both(rows_guest.clock_step),
+                both(guest.clock_step),
                 "guest",
             ),
         ),
@@ -350,7 +342,7 @@ HEADINGS: tuple[Heading, ...] = (
                 "-",
                 0.0,
                 "stops and faults",
-                both(rows_simulator.slow),
+                both(simulator.slow),
             ),
         ),
     ),
@@ -366,7 +358,7 @@ HEADINGS: tuple[Heading, ...] = (
                 "one step",
                 1.0,
                 "steps",
-                {"sim": rows_simulator.diverges, "can": "modules on a bus are no simulation that could diverge"},
+                {"sim": simulator.diverges, "can": "modules on a bus are no simulation that could diverge"},
             ),
         ),
     ),
@@ -378,13 +370,13 @@ HEADINGS: tuple[Heading, ...] = (
             consumer_row(
                 "consumer_sleeps",
                 "a consumer's callback sleeps for 0.5 s at every sample",
-                rows_consumers.cannot_keep_up("sleep"),
+                consumers.cannot_keep_up("sleep"),
             ),
             consumer_row(
-                "consumer_disk_full", "a consumer writes to a disk that is full", rows_consumers.cannot_keep_up("disk")
+                "consumer_disk_full", "a consumer writes to a disk that is full", consumers.cannot_keep_up("disk")
             ),
             consumer_row(
-                "consumer_frozen", "four readers of everything are frozen (SIGSTOP)", rows_consumers.frozen_readers
+                "consumer_frozen", "four readers of everything are frozen (SIGSTOP)", consumers.frozen_readers
             ),
         ),
     ),
@@ -393,27 +385,23 @@ HEADINGS: tuple[Heading, ...] = (
         "stopped at once, whatever else goes on",
         f"{STOP_MS:.0f} ms",
         (
-            stop_row("stop_half_open", "300 half-open connections", rows_attacks.stopped_under("half_open")),
-            stop_row(
-                "stop_idle", "1000 sessions that do nothing, or as many as get in", rows_attacks.stopped_under("idle")
-            ),
-            stop_row(
-                "stop_lease_flood", "lease queries, as many as two processes can", rows_attacks.stopped_under("lease")
-            ),
+            stop_row("stop_half_open", "300 half-open connections", attacks.stopped_under("half_open")),
+            stop_row("stop_idle", "1000 sessions that do nothing, or as many as get in", attacks.stopped_under("idle")),
+            stop_row("stop_lease_flood", "lease queries, as many as two processes can", attacks.stopped_under("lease")),
             stop_row(
                 "stop_sample_flood",
                 "10,000 samples of noise a second on every key",
-                rows_attacks.stopped_under("garbage"),
+                attacks.stopped_under("garbage"),
             ),
             stop_row(
                 "stop_datagram_flood",
                 "wrong datagrams at the stop port, as many as a thread can",
-                rows_attacks.stopped_under("datagrams"),
+                attacks.stopped_under("datagrams"),
             ),
             stop_row(
                 "stop_readers_leave",
                 "300 readers of everything leave at once",
-                rows_attacks.stopped_while_readers_leave,
+                attacks.stopped_while_readers_leave,
             ),
         ),
     ),
@@ -429,7 +417,7 @@ HEADINGS: tuple[Heading, ...] = (
                 "-",
                 0.0,
                 "set-points not passive",
-                both(rows_attacks.second_run),
+                both(attacks.second_run),
             ),
         ),
     ),
@@ -445,7 +433,7 @@ HEADINGS: tuple[Heading, ...] = (
                 "before the first set-points: none but passive ones until armed",
                 0.0,
                 "set-points not passive",
-                both(rows_controller.host_restarts),
+                both(controller.host_restarts),
             ),
         ),
     ),

@@ -3,5 +3,5 @@
     python -m tests.mutation [--files gate.py ...] [--workers 2] [--time-limit 120]
 
 A mutant lives only in the memory of a forked process, which imports it in place of the real module: nothing is ever
-written to the working tree. Mutants that no test can tell from the original stand in `equivalent.py`, with the reason.
+written to the working tree. Mutants that no test can tell from the original stand in `equivalent.toml`, with reasons.
 """

@@ -5,15 +5,16 @@ import multiprocessing
 import os
 import tempfile
 import time
+import tomllib
 from collections.abc import Iterator
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 from tests.mutation import trial
-from tests.mutation.equivalent import EQUIVALENT
 from tests.mutation.mutants import Mutant, mutants_of
 
+EQUIVALENT = Path(__file__).with_name("equivalent.toml")
 FORK = multiprocessing.get_context("fork")
 
 
@@ -36,22 +37,24 @@ def main() -> int:
             return 2
     tried = killed = late = 0
     unexplained: list[Mutant] = []
-    explained: set[tuple[str, str, str]] = set()
+    reasons = tomllib.loads(EQUIVALENT.read_text(encoding="utf-8"))
+    equivalent = {mutant for mutants in reasons.values() for mutant in mutants}
+    explained: set[str] = set()
     every = (mutant for file, source in sources.items() for mutant in mutants_of(file, source))
     for mutant, outcome in outcomes(every, asked.workers, asked.time_limit):
         tried += 1
-        key = (mutant.file, mutant.where, mutant.change)
+        key = f"{mutant.file} in {mutant.where}: {mutant.change}"
         if outcome != trial.SURVIVED:
             killed += 1
             late += outcome is None
-        elif key in EQUIVALENT:
+        elif key in equivalent:
             explained.add(key)
         else:
             unexplained.append(mutant)
             print(f"survived: {mutant}", flush=True)
-    stale = {key for key in EQUIVALENT if key[0] in sources} - explained
-    for file, where, change in sorted(stale):
-        print(f"explained as equivalent, but there is no such survivor any more: {file} in {where}: {change}")
+    stale = {key for key in equivalent if key.partition(" ")[0] in sources} - explained
+    for key in sorted(stale):
+        print(f"explained as equivalent, but there is no such survivor any more: {key}")
     print(
         f"{tried} mutants: {killed} killed ({late} by the time limit), {tried - killed - len(unexplained)} equivalent, "
         f"{len(unexplained)} survived; {time.monotonic() - started:.0f} s"

@@ -1,61 +1,13 @@
 """Each finding: its word, its joint, where it sends a person; told once, and again when it is still there."""
 
-from collections.abc import Callable
-
 import pytest
 
-from snakesim_can_backend.bus.bus_errors import BusError, Kind
 from snakesim_can_backend.driver.module_monitor import ARM_GRACE, CLEAR_GRACE, CONCERNS_ALL, MAX_FRAMES, Finding, Watch
 from snakesim_can_backend.driver.reports import Reading
-from snakesim_can_backend.protocol.codec import codec
-from snakesim_can_backend.protocol.commands import command
-from snakesim_can_backend.protocol.definitions import Action, Frame, LastStop, ModuleState, Opcode, frame_id
+from snakesim_can_backend.protocol.definitions import LastStop, ModuleState
 from snakesim_hal.wire.messages import LifecycleState
+from tests.unit.can_backend.driver.watch_rig import PERIOD_S, WHO, Bench, Speak, faulty, quiet, said
 from tests.unit.can_backend.frames import answer, begin, heartbeat, joint_state, spoilt
-
-JOINTS = 3
-EVERYBODY = (1, 2, 3)
-PERIOD_S = 0.01
-WHO = "joint_2 (node 2 on can0) "
-Speak = Callable[[Reading], None]
-
-
-def quiet(_reading: Reading) -> None:
-    """Nothing comes of node 2."""
-
-
-class Bench:
-    """Ticks of a robot whose joint_2 does what a test wants; the others are well."""
-
-    def __init__(self, lifecycle: LifecycleState = "disarmed") -> None:
-        self.reading = Reading(JOINTS)
-        self.watch = Watch(["joint_1", "joint_2", "joint_3"], ["can0", "can0", "can1"], PERIOD_S)
-        self.lifecycle: LifecycleState = lifecycle
-        self.state = ModuleState.DISARMED
-        self.isolated: set[int] = set()
-        self.ticks(3)
-
-    def tick(
-        self, speak: Speak | None = None, troubles: list[BusError] | None = None, unsent: str = ""
-    ) -> list[Finding]:
-        """One Sync and its look. speak: what comes of node 2, instead of an answer."""
-        begin(self.reading)
-        answer(self.reading, EVERYBODY if speak is None else (1, 3), state=self.state)
-        if speak is not None:
-            speak(self.reading)
-        unsent_on = [unsent] if unsent else []
-        return self.watch.look(self.reading, self.lifecycle, troubles or (), unsent_on, isolated=self.isolated)
-
-    def ticks(self, count: int, speak: Speak | None = None) -> list[Finding]:
-        return [found for _ in range(count) for found in self.tick(speak)]
-
-    def clear(self) -> None:
-        self.watch.forget(self.reading.sync)
-
-
-def said(found: list[Finding]) -> list[tuple[str, int | None]]:
-    return [(finding.what, finding.joint) for finding in found]
-
 
 # --- what one module can do wrong --------------------------------------------------------------------------
 
@@ -88,12 +40,7 @@ WRONGS = [
     (frozen(), 3, "module_frozen", "is frozen: it repeats its answer number 2 to every Sync"),
     (miscounting, 3, "wrong_counter", "answers Syncs that were not sent: 3 wrong counters in a row"),
     (corrupt, 3, "bad_checksum", "sends corrupt states: 3 wrong checksums in a row"),
-    (
-        doubled,
-        3,
-        "duplicate_node",
-        "is duplicated: every Sync is answered twice; give each module its own node id",
-    ),
+    (doubled, 3, "duplicate_node", "is duplicated: every Sync is answered twice; give each module its own node id"),
     (babbling, 1, "module_babbling", f"floods the bus: {MAX_FRAMES + 1} frames within one period"),
 ]
 each_wrong = pytest.mark.parametrize(("speak", "after", "what", "cause"), WRONGS, ids=[row[2] for row in WRONGS])
@@ -228,14 +175,6 @@ def test_after_one_doubled_frame_a_restart_is_still_seen() -> None:
     assert said(restarting(bench) + bench.ticks(10)) == [("module_restarted", 1)]
 
 
-# --- faults of modules -------------------------------------------------------------------------------------
-
-
-def faulty(reading: Reading) -> None:
-    answer(reading, [2], state=ModuleState.FAULT)
-    reading.take(heartbeat(2, 1.0, ModuleState.FAULT, last_stop=LastStop.OVERHEAT, fault_overheat=1, fault_leak=1))
-
-
 def test_a_modules_fault_is_told_with_all_reasons() -> None:
     bench = Bench()
     reason = "reports overheat, leak; it stopped because of overheat"
@@ -315,9 +254,7 @@ def test_a_module_that_does_not_arm_is_told_after_its_grace() -> None:
     found = [bench.tick(refuses) for _ in range(20)]
     first = next(i for i, told in enumerate(found) if told)
     assert ARM_GRACE < first <= ARM_GRACE + 3
-    assert [f for told in found for f in told] == [
-        Finding("module_not_armed", WHO + "does not arm: it is disarmed", 1),
-    ]
+    assert [f for told in found for f in told] == [Finding("module_not_armed", WHO + "does not arm: it is disarmed", 1)]
 
 
 def test_who_arms_within_the_grace_or_misses_a_moment_is_let_be() -> None:
@@ -346,140 +283,3 @@ def test_the_grace_begins_with_every_arming() -> None:
     assert bench.ticks(20) == [], "disarmed modules of a disarmed robot"
     bench.lifecycle = "armed"
     assert bench.ticks(ARM_GRACE) == []
-
-
-# --- the bus -----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("kind", "advice"),
-    [
-        ("bus_off", "look for a short, a wrong bit rate, a missing terminator"),
-        ("error_passive", "look at cables, terminators and bit rate"),
-        ("interface_down", "bring it up again, then clear and arm"),
-        ("restarted", "clear and arm when the bus is in order"),
-        ("receive_overflow", "states may be missing"),
-    ],
-)
-def test_a_bus_that_fails_is_a_fault_of_no_joint(kind: Kind, advice: str) -> None:
-    bench = Bench()
-    trouble = BusError(kind, "can0", "transmit errors 200, receive errors 3")
-    (found,) = bench.tick(troubles=[trouble, trouble][:1])
-    assert (found.what, found.joint) == (kind, None)
-    assert found.cause.startswith("can0: transmit errors 200, receive errors 3; ") and advice in found.cause
-    assert bench.tick(troubles=[trouble]) == []
-    assert [f.cause[:5] for f in bench.tick(troubles=[BusError(kind, "can1", "")])] == ["can1:"], "the other bus is new"
-    bench.clear()
-    assert said(bench.tick(troubles=[trouble])) == [(kind, None)]
-
-
-@pytest.mark.parametrize("kind", ["error_warning", "not_acknowledged", "queue_full", "error_frames", "interface_up"])
-def test_lesser_troubles_are_only_counted(kind: Kind) -> None:
-    bench = Bench()
-    for _ in range(2):
-        assert bench.tick(troubles=[BusError(kind, "can0", "")]) == []
-    assert bench.watch.seen == {kind: 2}
-
-
-def test_a_bus_that_takes_nothing_for_three_periods_is_stuck() -> None:
-    bench = Bench()
-    for _ in range(2):
-        assert bench.tick(unsent="can1") == []
-    (found,) = bench.tick(unsent="can1")
-    assert (found.what, found.joint) == ("bus_stuck", None)
-    for words in ("can1: ", "no frames sent for 30 ms", "no node acknowledges", "txqueuelen is below 64"):
-        assert words in found.cause
-    assert bench.tick(unsent="can1") == []
-
-
-def test_a_bus_that_takes_something_again_is_not_stuck() -> None:
-    bench = Bench()
-    for _ in range(5):
-        for _ in range(2):
-            assert bench.tick(unsent="can1") == []
-        assert bench.tick() == []
-
-
-# --- who should not be there -------------------------------------------------------------------------------
-
-
-def stranger(reading: Reading) -> None:
-    answer(reading, [2])
-    reading.take(joint_state(9, reading.sync))
-
-
-def test_a_stranger_that_answers_every_sync_is_found() -> None:
-    bench = Bench()
-    assert bench.ticks(2, stranger) == []
-    (found,) = bench.tick(stranger)
-    assert found == Finding("unknown_node", "node 9 is on the bus, but is not a joint of this robot")
-    assert bench.ticks(5, stranger) == []
-
-
-def test_a_stray_frame_now_and_then_is_none() -> None:
-    bench = Bench()
-    for _ in range(10):
-        assert bench.ticks(2, stranger) == [] and bench.tick() == []
-
-
-@pytest.mark.parametrize(
-    ("frame", "what", "words"),
-    [
-        (codec()[Opcode.SYNC].frame(0), "second_host", "another program commands the modules"),
-        (codec()[Opcode.SET_POINT].frame(2), "second_host", "end one of the two"),
-        (codec()[Opcode.COMMAND].frame(2, action=Action.STOP), "second_host", "another program"),
-        (Frame(frame_id(Opcode.EMERGENCY, 0), b"\x01"), "emergency", "a node on the bus sent an Emergency"),
-    ],
-)
-def test_another_host_is_told(frame: Frame, what: str, words: str) -> None:
-    def speak(reading: Reading) -> None:
-        answer(reading, [2])
-        reading.take(frame)
-
-    bench = Bench()
-    (found,) = bench.tick(speak)
-    assert (found.what, found.joint) == (what, None) and words in found.cause
-    assert bench.tick(speak) == []
-    bench.clear()
-    assert bench.tick() == [], "it was there once and is no more"
-    assert said(bench.tick(speak)) == [(what, None)]
-
-
-def test_what_another_host_may_have_changed_is_written_anew() -> None:
-    bench = Bench()
-    bench.reading.take(codec()[Opcode.PARAMETER_REQUEST].frame(2, index=1, operation=1))
-    assert said(bench.tick()) == [("second_host", None)]
-    assert bench.watch.take_changed() == {0, 1, 2}
-
-
-def test_who_asks_who_is_there_is_no_second_host() -> None:
-    bench = Bench()
-    bench.reading.take(command(Action.IDENTIFY))
-    assert bench.tick() == [] and bench.watch.take_changed() == set()
-
-
-def test_a_module_is_not_silent_that_was_not_asked() -> None:
-    bench = Bench()
-    for i in range(10):
-        assert said(bench.tick(quiet, unsent="can0")) == ([("bus_stuck", None)] if i == 2 else [])
-    assert bench.ticks(2, quiet) == []
-    assert said(bench.tick(quiet)) == [("module_silent", 1)]
-
-
-def test_a_bus_whose_interface_is_down_is_not_called_stuck_too() -> None:
-    bench = Bench()
-    down, up = (BusError(kind, "can1", "") for kind in ("interface_down", "interface_up"))
-    assert said(bench.tick(troubles=[down], unsent="can1")) == [("interface_down", None)]
-    for _ in range(10):
-        assert bench.tick(unsent="can1") == []
-    bench.tick(troubles=[up], unsent="can1")
-    found = [f for _ in range(3) for f in bench.tick(unsent="can1")]
-    assert said(found) == [("bus_stuck", None)]
-
-
-def test_a_module_that_was_armed_and_is_not_any_more_is_told_at_once() -> None:
-    bench = Bench()
-    bench.lifecycle, bench.state = "armed", ModuleState.ARMED
-    bench.ticks(2)
-    found = bench.ticks(3, lambda reading: answer(reading, [2], state=ModuleState.DISARMED))
-    assert said(found) == [("module_not_armed", 1)]

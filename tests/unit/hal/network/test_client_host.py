@@ -12,23 +12,20 @@ import pytest
 import zenoh
 
 from snakesim_hal.backend import SetPoints
-from snakesim_hal.errors import StalledError
 from snakesim_hal.host.host import Host
 from snakesim_hal.host.inbox import LIMITS, SAMPLES
-from snakesim_hal.network.client import Client, Commander, Feed
+from snakesim_hal.network.client import Client
 from snakesim_hal.network.session import Arrival, Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import ENCODING_PREFIX, Decoder, encode, encoding_of
 from snakesim_hal.wire.messages import (
     Answer,
     AppliedCommand,
-    Clock,
     Description,
     Done,
     EstopRequest,
     Fault,
     JointCommand,
-    JointState,
     LeaseRequest,
     Mode,
     Pose,
@@ -274,10 +271,7 @@ def test_a_strangers_command_neither_moves_the_robot_nor_passes_for_the_holders_
 def test_a_flood_of_commands_does_not_keep_an_estop_out() -> None:
     endpoint, limit = free_endpoint(), LIMITS[SAMPLES] or 0
     config = run_config(pace="realtime")
-    with (
-        open_session(Link(endpoint, "worm", listen=True)) as own,
-        open_session(Link(endpoint, "worm")) as stranger,
-    ):
+    with open_session(Link(endpoint, "worm", listen=True)) as own, open_session(Link(endpoint, "worm")) as stranger:
         host = Host(config, LagBackend(config), own)
         publisher = stranger.publisher(keys.JOINT_COMMAND, JointCommand, lossless=True)
         for sequence in range(limit + 500):
@@ -352,100 +346,3 @@ def test_somebody_who_comes_late_gets_description_status_and_what_is_applied() -
             seen: list[Pose] = []
             wait_until(lambda: seen.extend(poses.drain()) or seen, "a pose")
             assert all(pose.tick % 5 == 0 for pose in seen)
-
-
-# --- the client alone ------------------------------------------------------------------------------------------
-
-
-class Listing:
-    """A reader that has what the test puts in."""
-
-    def __init__(self) -> None:
-        self.arrived: list[JointState] = []
-
-    def drain(self) -> list[JointState]:
-        taken, self.arrived = self.arrived, []
-        return taken
-
-
-def test_a_feed_finds_samples_by_their_tick_and_forgets_old_ones() -> None:
-    robot, reader = description(), Listing()
-    feed: Feed[JointState] = Feed(reader, keys.JOINTS)  # pyright: ignore[reportArgumentType]
-    assert feed.newest() is None and feed.at(0) is None
-    reader.arrived = [state(robot, 0.1 * tick, tick=tick) for tick in range(100)]
-    feed.take_in()
-    newest, kept = feed.newest(), feed.at(99)
-    assert newest is not None and newest.tick == 99 and kept is newest
-    assert feed.at(50) is None and feed.at(90) is not None
-    reader.arrived = [state(robot, 0.0, tick=90)]  # shown again: it came last
-    feed.take_in()
-    newest = feed.newest()
-    assert newest is not None and newest.tick == 90
-    feed.clear()
-    assert feed.newest() is None
-
-
-def clock(tick: int, lifecycle: Any = "armed", **newest: int) -> Clock:
-    return Clock(
-        tick=tick,
-        stamp_ns=tick * 10_000_000,
-        period_ns=10_000_000,
-        pace="lockstep",
-        lifecycle=lifecycle,
-        arming=1,
-        lease_epoch=1,
-        newest={key.replace("__", "/"): value for key, value in newest.items()},
-    )
-
-
-def test_a_client_reads_what_the_clock_names_waits_for_it_and_reports_what_never_comes(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    endpoint, robot = free_endpoint(), description()
-    monkeypatch.setattr("snakesim_hal.network.client.MISSING_LIMIT_S", 0.1)
-    with open_session(Link(endpoint, "worm", listen=True)) as hal, open_session(Link(endpoint, "worm")) as session:
-        client = Client(session, "control")
-        feed = client.subscribe(keys.JOINTS, JointState)
-        clocks = hal.publisher(keys.CLOCK, Clock, lossless=True)
-        joints = hal.publisher(keys.JOINTS, JointState, lossless=True)
-        wait_until(lambda: clocks.heard() and joints.heard(), "the client's subscriptions")
-        ticks = iter(client.ticks(silence_s=5.0))
-        for tick in (3, 4):
-            joints.put(state(robot, tick=tick))
-        clocks.put(clock(5, sensor__joints=3))
-        assert client.read(feed) is None  # no clock yet
-        assert next(ticks) == clock(5, sensor__joints=3)
-        found = client.read(feed)
-        assert found is not None and found.tick == 3  # what is named, not what is newest
-        clocks.put(clock(6, sensor__joints=6))
-        next(ticks)
-        late = threading.Timer(0.03, lambda: joints.put(state(robot, tick=6)))
-        late.start()
-        found = client.read(feed)
-        assert found is not None and found.tick == 6
-        clocks.put(clock(7, sensor__joints=7))
-        next(ticks)
-        with pytest.raises(StalledError, match="joints of tick 7 was named by the clock of tick 7 and never came"):
-            client.read(feed)
-        hal._zenoh.put(keys.CLOCK, b"garbage", encoding="zenoh/bytes")
-        clocks.put(clock(0, "disarmed", sensor__joints=0))  # the HAL started over
-        again = next(ticks)
-        assert again is not None and again.tick == 0 and client.read(feed) is None
-        wait_until(lambda: session.rejected == {"unknown_message": 1}, "the garbage counted")
-
-
-def test_a_commander_asks_for_a_free_lease_and_gives_up_one_that_passed_on() -> None:
-    with running(run_config(pace="realtime", services={})) as run, open_session(run.link) as session:
-        client = Client(session, "pilot")
-        commander = Commander(client, client.description())
-        other = LeaseRequest(action="acquire", holder="teleop", priority=200)
-        assert run.ask(keys.LEASE, other).ok
-        ticks = (found for found in client.ticks(silence_s=1.0) if found is not None)
-        held = [commander.holds(next(ticks)) for _ in range(2)]
-        assert held[0] is False and commander.refusal is not None and "held by teleop" in commander.refusal
-        deadline = time.monotonic() + 10.0
-        while not commander.holds(next(ticks)):  # teleop's lease runs out
-            assert time.monotonic() < deadline
-        assert commander.refusal is None and run.host.authority.lease.holder == "pilot"
-        assert run.ask(keys.LEASE, other).ok
-        wait_until(lambda: not commander.holds(next(ticks)), "the lease seen to have passed on")

@@ -20,7 +20,7 @@ from snakesim_operator.results.compare.page import page
 from snakesim_operator.results.compare.table import table
 from snakesim_operator.results.compare.verdict import within
 from snakesim_operator.results.record import RunRecord
-from tests.unit.operator.results.test_report import finished
+from tests.unit.operator.results.recorded import finished
 
 JOINTS = 13
 SPEED_M_S = 0.1

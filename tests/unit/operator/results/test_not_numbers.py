@@ -24,7 +24,7 @@ from snakesim_operator.results.compare.table import table
 from snakesim_operator.results.record import CONFIG, TELEMETRY, RunRecord
 from snakesim_operator.results.report import page
 from snakesim_operator.results.summary import RunSummary, summarise
-from tests.unit.operator.results.test_report import Reader, made_up
+from tests.unit.operator.results.recorded import Reader, triplet
 
 FIRST, LAST = 240, 330  # rows of the made-up run that are kept: two joints propel in them
 FIRST_TICK = 37 + FIRST
@@ -64,7 +64,7 @@ def put_down(folder: Path, record: RunRecord) -> None:
 @pytest.fixture(scope="module")
 def base(tmp_path_factory: pytest.TempPathFactory) -> RunRecord:
     folder = tmp_path_factory.mktemp("base")
-    whole = made_up(folder)
+    whole = triplet()
     kept = {name: value[FIRST:LAST] for name, value in vars(whole).items() if isinstance(value, np.ndarray)}
     begin_ns, end_ns = (round(kept["time_s"][i] * 1e9) for i in (0, -1))
     record = dataclasses.replace(
@@ -119,7 +119,7 @@ def spoilt_cells(draw: st.DrawFn) -> list[tuple[str, slice, int, float]]:
 
 
 @given(cells=spoilt_cells())
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_a_black_box_with_numbers_that_are_none(base: RunRecord, tmp_path: Path, cells: Any) -> None:
     spoilt = {name: np.array(getattr(base, name)) for name in SIGNALS}
     for signal, rows, column, value in cells:
@@ -151,7 +151,7 @@ def leaves(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 
 
 @given(data=st.data())
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_telemetry_with_numbers_that_are_none(base: RunRecord, tmp_path: Path, data: st.DataObject) -> None:
     put_down(tmp_path, base)
     lines = (tmp_path / TELEMETRY).read_bytes().splitlines(keepends=True)

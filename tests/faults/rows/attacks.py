@@ -1,0 +1,135 @@
+"""Somebody attacks the network: an emergency stop comes through all the same, and a second run arms nothing."""
+
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack
+from pathlib import Path
+
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import EstopRequest, LifecycleRequest, Mode
+from tests.attack.means import datagrams
+from tests.attack.means.floods import flood, half_open
+from tests.faults.observer import Observer, TrialError
+from tests.faults.robot import Robot, recovered, robot
+from tests.faults.row import Measure, Request, Trial
+
+HALF_OPEN, IDLE, READERS, QUERIES, SAMPLES = 300, 1000, 300, 10_000, 10_000
+ANSWER_S = 10.0
+TRIES = 20  # to find the robot armed under a flood before it is stopped
+STANDING = {"controller": "hold", "rate_hz": 50}
+
+Flood = Callable[[Robot], AbstractContextManager[object]]
+
+
+def _flooding(kind: str, amount: int, processes: int) -> Flood:
+    return lambda made: flood(made.folder, kind, made.endpoint, amount, processes)
+
+
+FLOODS: dict[str, Flood] = {
+    "half_open": lambda made: half_open(made.endpoint, HALF_OPEN),
+    "idle": _flooding("idle", IDLE // 4, 4),
+    "lease": _flooding("lease", QUERIES, 2),
+    "garbage": _flooding("garbage", SAMPLES, 1),
+    "datagrams": lambda made: datagrams.flood(made.endpoint),
+}
+
+
+def stopped_under(name: str) -> Measure:
+    """The value: from the stop that is asked for to the set-points of the stop, by the host's private channel."""
+
+    def measure(request: Request) -> Iterator[Trial]:
+        with robot(request, **STANDING) as (made, observer), FLOODS[name](made):
+            for number in range(request.trials):
+                yield _stopped(request, made, observer, by_datagram=number % 2 == 1)
+        _explain(request)
+
+    return measure
+
+
+def stopped_while_readers_leave(request: Request) -> Iterator[Trial]:
+    """The same, with many readers of everything that leave together just before."""
+    with robot(request, **STANDING) as (made, observer):
+        for number in range(request.trials):
+            with flood(made.folder, "readers", made.endpoint, READERS) as (readers,):
+                yield _stopped(request, made, observer, by_datagram=number % 2 == 1, before=readers.kill)
+    _explain(request)
+
+
+def _explain(request: Request) -> None:
+    request.note(
+        "asked for in turn by a query on a session that was there before, and by a datagram; 50 Hz, controller `hold`; "
+        "told over the host's private channel, and a period (20 ms) added, in which the set-points go out"
+    )
+
+
+def _stopped(
+    request: Request, made: Robot, observer: Observer, *, by_datagram: bool, before: Callable[[], None] | None = None
+) -> Trial:
+    for _ in range(TRIES):
+        if observer.state() != "armed":
+            observer.arm(60.0)
+        observer.watch(0.1 + made.random.random() * 0.02)
+        if made.host.lifecycle() == "armed":
+            break
+        request.retry()
+    else:
+        raise TrialError(f"the robot was not seen armed under the flood: {observer.in_words()}")
+    if before is not None:
+        before()
+    asked_ns = time.monotonic_ns()
+    answers: list[object] = []
+
+    def ask() -> None:
+        if by_datagram:
+            answers.append(datagrams.ask(made.endpoint, datagrams.stop("operator"), ANSWER_S))
+        else:
+            answers.append(observer.ask(keys.ESTOP, EstopRequest(who="operator")).ok)
+
+    asking = threading.Thread(target=ask, daemon=True)
+    asking.start()
+    stop = made.host.first(lambda status: status.lifecycle != "armed", asked_ns, "a stop")
+    made.host.first(lambda status: status.lifecycle == "estop", asked_ns, "the emergency stop")
+    asking.join(ANSWER_S)
+    period_ns = observer.description().period_ns
+    trouble = "" if answers and answers[0] else "the stop was not confirmed to who asked for it"
+    return recovered(observer, (stop.at_ns - asked_ns + period_ns) / 1e6, trouble)
+
+
+# --- a second run --------------------------------------------------------------------------------------------------
+
+
+def second_run(request: Request) -> Iterator[Trial]:
+    """A person disarmed the robot; a second `snakesim run` starts on its network. The value: set-points that move."""
+    command = [sys.executable, "-m", "snakesim_operator", "run", "triplet", "--pace", "realtime", "--duration", "1"]
+    with robot(request) as (made, observer):
+        for number in range(request.trials):
+            if observer.state() != "armed":
+                observer.arm()
+            observer.ask(keys.LIFECYCLE, LifecycleRequest(action="disarm", who="bench"))
+            observer.until(lambda: observer.state() == "disarmed", "disarmed")
+            observer.watch(0.1)
+            observer.forget()
+            where = ["--router" if number % 2 else "--endpoint", made.endpoint]
+            with ExitStack() as stack:
+                said = stack.enter_context((made.folder / "second.said").open("w+"))
+                code = subprocess.run(
+                    [*command, *where, "--out", str(Path(made.folder, f"second{number}"))],
+                    stdout=said,
+                    stderr=subprocess.STDOUT,
+                    check=False,
+                    timeout=60,
+                ).returncode
+                said.seek(0)
+                words = said.read()
+            observer.listen()
+            troubles: list[str] = []
+            if code not in (1, 2) or made.config.robot.name not in words:
+                troubles.append(f"the second run ended with {code}: {words[-300:]}")
+            moving = sum(any(mode is not Mode.PASSIVE for mode in h.message.mode) for h in observer.applied)
+            if observer.state() != "disarmed":
+                troubles.append(f"the robot is {observer.in_words()}")
+            yield Trial(value=float(moving), trouble="; ".join(troubles))
+        request.note("in turn on the robot's network (`--router`) and at its endpoint (`--endpoint`)")

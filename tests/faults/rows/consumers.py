@@ -1,0 +1,109 @@
+"""Somebody else listens, and cannot keep up: only he may suffer."""
+
+import itertools
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+from tests.attack.means.floods import flood
+from tests.faults.consumer import STUCK
+from tests.faults.observer import Observer, TrialError
+from tests.faults.robot import robot
+from tests.faults.row import Measure, Request, Trial
+
+WINDOW_S = 0.5
+DISK_BYTES = 64 * 1024
+FROZEN, FROZEN_WINDOW_S = 4, 1.0  # 20 such windows outlast Zenoh's lease of a link
+FROZEN_HZ = {"sim": 200.0, "can": 100.0}  # what one bus carries
+
+
+def cannot_keep_up(kind: str) -> Measure:
+    """kind: `sleep` in the callback, or `disk` that is full.
+
+    A cycle is missed when the set-points of a tick are those of the tick before: no command had come for it. The value:
+    how many more are missed in half a second than in the worst such window before the consumer came.
+    """
+
+    def measure(request: Request) -> Iterator[Trial]:
+        with robot(request) as (made, observer):
+            before, with_it = [_missed(observer) for _ in range(request.trials)], list[int]()
+            with _consumer(kind, made.endpoint, made.config.robot.name, request.folder) as process:
+                for _ in range(request.trials):
+                    with_it.append(_missed(observer))
+                    trouble = ""
+                    if observer.state() != "armed":
+                        trouble = f"the robot stopped: {observer.in_words()}"
+                        observer.arm()
+                    elif process.poll() is not None:
+                        trouble = "the consumer has ended"
+                    yield Trial(value=float(max(with_it[-1] - max(before), 0)), trouble=trouble)
+            request.note(
+                f"in {request.trials} windows of {WINDOW_S:g} s: {sum(before)} cycles missed without the consumer, "
+                f"worst {max(before)}; {sum(with_it)} with it, worst {max(with_it)}"
+            )
+
+    return measure
+
+
+def frozen_readers(request: Request) -> Iterator[Trial]:
+    """Readers of everything whose processes are stopped, and stay. The value: as above, in windows of a second.
+
+    Their buffers are small and full at once, so whoever waits for them stands still.
+    """
+    rate_hz = FROZEN_HZ[request.backend]
+    with robot(request, rate_hz=rate_hz, controller="hold") as (made, observer), ExitStack() as stack:
+        before, with_them = [_missed(observer, FROZEN_WINDOW_S) for _ in range(5)], list[int]()
+        for reader in stack.enter_context(flood(request.folder, "everything", made.endpoint, 0, FROZEN)):
+            stack.callback(reader.process.send_signal, signal.SIGCONT)
+            reader.process.send_signal(signal.SIGSTOP)
+        if observer.state() != "armed":
+            observer.arm()
+        for _ in range(request.trials):
+            with_them.append(_missed(observer, FROZEN_WINDOW_S))
+            trouble = ""
+            if observer.state() != "armed":
+                trouble = f"the robot stopped: {observer.in_words()}"
+                observer.arm()
+            yield Trial(value=float(max(with_them[-1] - max(before), 0)), trouble=trouble)
+        request.note(
+            f"{FROZEN} readers at {rate_hz:g} Hz for {request.trials * FROZEN_WINDOW_S:g} s: {sum(before)} cycles "
+            f"missed in {len(before)} windows of {FROZEN_WINDOW_S:g} s without them, {sum(with_them)} in "
+            f"{request.trials} with them, worst {max(with_them)}"
+        )
+
+
+def _missed(observer: Observer, window_s: float = WINDOW_S) -> int:
+    observer.forget()
+    observer.watch(window_s)
+    rows = [heard.message for heard in observer.applied]
+    return sum(a.sequence == b.sequence for a, b in itertools.pairwise(rows) if b.sequence is not None)
+
+
+@contextmanager
+def _consumer(kind: str, endpoint: str, namespace: str, folder: Path) -> Iterator[subprocess.Popen[str]]:
+    """In a mount namespace of its own, with a small disk; once it is stuck."""
+    disk = folder / "disk"
+    disk.mkdir()
+    mount = f'mount -t tmpfs -o size={DISK_BYTES} none {disk} && exec "$@"'
+    command = [sys.executable, "-m", "tests.faults.consumer", kind, endpoint, namespace, str(disk)]
+    log = folder / "consumer.log"
+    with log.open("w") as said:
+        process = subprocess.Popen(
+            ["unshare", "--mount", "sh", "-c", mount, "sh", *command], stdout=said, stderr=subprocess.STDOUT, text=True
+        )
+    try:
+        waited = 0
+        while STUCK not in log.read_text():
+            try:
+                process.wait(0.1)
+            except subprocess.TimeoutExpired:
+                waited += 1
+            if process.returncode is not None or waited > 200:
+                raise TrialError(f"the consumer did not get stuck: {log.read_text()[-500:]}")
+        yield process
+    finally:
+        process.kill()
+        process.wait()

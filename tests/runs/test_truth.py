@@ -1,0 +1,52 @@
+"""What a run says of itself is what happened: who stands still does not locomote, and a run that ended has an end."""
+
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from snakesim_hal.wire import keys
+from snakesim_operator.results.record import REPORT, TELEMETRY, RunRecord
+from snakesim_operator.results.summary import summarise
+from tests.runs.command import run_to_summary
+
+STILL = (
+    "from snakesim_gnc.control.controller import Action, positions\n"
+    "from snakesim_gnc.control.hold import Hold\n\n\n"
+    "class Still(Hold):\n"
+    "    def update(self, view):\n"
+    "        return Action(super().update(view).set_points)\n"
+)
+
+
+def test_a_controller_that_says_nothing_and_stands_still_does_not_locomote(tmp_path: Path) -> None:
+    (tmp_path / "still.py").write_text(STILL)
+    ended, summary = run_to_summary(tmp_path / "run", "triplet", "--controller", "./still.py:Still", "--duration", "3")
+    assert ended.code == 0 and summary.locomoting_fraction == 0.0
+    assert (summary.last_state, summary.last_reason) == (
+        "NotLocomoting",
+        "standing still: less than 5 mm in 1 s",
+    )
+    assert "locomoting            0 %" in ended.out
+    assert "Did not locomote: standing still: less than 5 mm in 1 s." in (tmp_path / "run" / REPORT).read_text()
+
+
+@pytest.mark.parametrize("controller", ["obstacle_triplet", "path_following"])
+def test_a_snake_that_moves_locomotes_from_when_it_is_seen_to_move(tmp_path: Path, controller: str) -> None:
+    flags = ["--controller", controller, "--duration", "4"]
+    ended, summary = run_to_summary(tmp_path / "run", "peg_row", *flags)
+    assert ended.code == 0 and summary.path_distance_m is not None and summary.path_distance_m > 0.5
+    assert summary.locomoting_fraction is not None and 0.85 < summary.locomoting_fraction < 1.0
+    states = [state.state for state in RunRecord.load(tmp_path / "run").control if state.state != "Idle"]
+    assert states[0] == "NotLocomoting" and states[-1] == "Locomoting"
+
+
+def test_that_the_clock_is_gone_is_no_news_of_a_run_that_has_ended(tmp_path: Path) -> None:
+    _, summary = run_to_summary(tmp_path / "run", "triplet", "--duration", "1")
+    assert summary.last_state not in (None, "PowerOff")
+    last = RunRecord.load(tmp_path / "run").control[-1]
+    gone = msgspec.structs.replace(last, state="PowerOff", reason="no clock from the HAL")
+    with (tmp_path / "run" / TELEMETRY).open("ab") as file:  # as control tells it while a host writes a long record
+        file.write(msgspec.json.encode({"key": keys.CONTROL_STATE, "message": gone}) + b"\n")
+    again = summarise(RunRecord.load(tmp_path / "run"), "complete")
+    assert (again.last_state, again.last_reason) == (summary.last_state, summary.last_reason)

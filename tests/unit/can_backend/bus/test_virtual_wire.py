@@ -1,0 +1,162 @@
+"""Virtual buses within the process, and how one waits for frames."""
+
+import contextlib
+import math
+import socket
+import time
+import uuid
+from collections.abc import Iterator
+
+import pytest
+
+from snakesim_can_backend.bus import bus as wire_module
+from snakesim_can_backend.bus.bus import VirtualWire, wait
+from snakesim_can_backend.protocol.definitions import Frame
+from snakesim_hal.errors import BackendError
+from snakesim_hal.model.injection import Injection
+from tests.unit.can_backend.bus.test_wire import can_frame
+
+# --- virtual buses, and waiting ----------------------------------------------------------------------------
+
+
+class End:
+    """Another end that says when it wants to run again."""
+
+    def __init__(self, pause_s: float | None, then_send: VirtualWire | None = None) -> None:
+        self.pause_s, self.then_send = pause_s, then_send
+        self.ran = 0
+        self.closed = False
+
+    def __call__(self) -> float | None:
+        self.ran += 1
+        if self.then_send is not None:
+            self.then_send.send(Frame(0x101, b"\x01"))
+        return self.pause_s
+
+    def inject(self, injection: Injection, *, begins: bool) -> None:
+        raise AssertionError(f"nobody asked for {injection}")
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class Readable:
+    """A wire whose file may be ready."""
+
+    def __init__(self, file: socket.socket) -> None:
+        self.file = file
+
+    def fileno(self) -> int | None:
+        return self.file.fileno()
+
+    def idle(self) -> float | None:
+        return math.inf
+
+
+@pytest.fixture
+def pair() -> Iterator[tuple[VirtualWire, VirtualWire]]:
+    name = f"wire-{uuid.uuid4().hex[:8]}"
+    made = VirtualWire(name), VirtualWire(name)
+    yield made
+    for wire in made:
+        wire.close()
+
+
+def took_s(began: float) -> float:
+    return time.monotonic() - began
+
+
+def test_two_ends_of_a_virtual_bus_hear_each_other_and_not_themselves(pair: tuple[VirtualWire, VirtualWire]) -> None:
+    near, far = pair
+    frames = [Frame(0x105, b"\x01\x02"), Frame(0x7FF, b""), Frame(0, bytes(8))]
+    assert all(near.send(frame) for frame in frames)
+    assert far.receive() == frames and far.receive() == [] and near.receive() == []
+    assert near.fileno() is None and near.troubles() == []
+
+
+def test_a_virtual_bus_says_when_something_may_come(pair: tuple[VirtualWire, VirtualWire]) -> None:
+    near, far = pair
+    assert near.idle() == math.inf
+    near.other_end = End(0.25)
+    assert near.idle() == 0.25
+    near.other_end = End(None)
+    assert near.idle() is None
+    far.send(Frame(1, b""))
+    assert near.idle() == 0.0
+
+
+def test_closing_one_end_closes_what_lives_on_the_other() -> None:
+    end = End(None)
+    VirtualWire(f"wire-{uuid.uuid4().hex[:8]}", end).close()
+    assert end.closed
+
+
+def test_wait_does_not_sleep_when_a_frame_is_there(pair: tuple[VirtualWire, VirtualWire]) -> None:
+    near, far = pair
+    near.other_end = End(5.0, then_send=far)
+    began = time.monotonic()
+    assert wait([near], 5.0) and took_s(began) < 1.0
+    assert near.other_end.ran == 1
+
+
+def test_wait_sleeps_as_long_as_nobody_wants_to_run(pair: tuple[VirtualWire, VirtualWire]) -> None:
+    near, other = pair
+    near.other_end = End(0.05)
+    began = time.monotonic()
+    assert wait([near, other], 5.0) and 0.045 < took_s(began) < 1.0
+    near.other_end = End(5.0)
+    began = time.monotonic()
+    assert wait([near], 0.05) and 0.045 < took_s(began) < 1.0, "and no longer than asked for"
+    assert wait([near], -1.0), "time that is over is no error"
+
+
+def test_wait_says_when_nothing_can_come(pair: tuple[VirtualWire, VirtualWire]) -> None:
+    near, _ = pair
+    near.other_end = End(None)
+    began = time.monotonic()
+    assert not wait([near], 5.0) and took_s(began) < 1.0
+
+
+def test_wait_wakes_up_for_a_socket() -> None:
+    near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with near, far, contextlib.ExitStack():
+        wires: list[wire_module.Wire] = [Readable(near)]  # pyright: ignore[reportAssignmentType]
+        began = time.monotonic()
+        assert wait(wires, 0.05) and took_s(began) > 0.045
+        far.send(can_frame(1, b""))
+        began = time.monotonic()
+        assert wait(wires, 5.0) and took_s(began) < 1.0
+
+
+# --- what breaks -------------------------------------------------------------------------------------------
+
+
+def test_a_virtual_bus_that_is_gone_is_an_error_of_the_backend() -> None:
+    wire = VirtualWire(f"gone-{uuid.uuid4().hex}")
+    wire._bus.shutdown()
+    with pytest.raises(BackendError, match=r"gone-\w+: cannot send: "):
+        wire.send(Frame(0x80, b"12345"))
+    with pytest.raises(BackendError, match=r"gone-\w+: cannot receive: "):
+        wire.receive()
+
+
+class OnSocket(VirtualWire):
+    """A bus that is waited for by a socket, as a kernel interface is."""
+
+    def __init__(self, source: socket.socket) -> None:
+        super().__init__(f"waits-{uuid.uuid4().hex}")
+        self.source = source
+
+    def fileno(self) -> int | None:
+        return self.source.fileno()
+
+
+def test_a_socket_that_cannot_be_waited_for_is_an_error_of_the_backend() -> None:
+    ours, other = socket.socketpair()
+    with other:
+        wire = OnSocket(ours)
+        assert wait([wire], 0.0)
+        ours.close()
+        with pytest.raises(BackendError, match=r"waits-\w+: cannot be waited for: "):
+            wait([wire], 0.0)
+        wire.close()

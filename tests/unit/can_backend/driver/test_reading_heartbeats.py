@@ -1,0 +1,223 @@
+"""What the reading keeps of forces, IMUs, heartbeats, strangers and noise."""
+
+import copy
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.commands import command
+from snakesim_can_backend.protocol.definitions import (
+    LAST_NODE,
+    Action,
+    Frame,
+    LastStop,
+    ModuleState,
+    Opcode,
+    frame_id,
+    intact,
+    node_of,
+    opcode_of,
+)
+from tests.unit.can_backend.driver.test_reading import JOINTS, angles, reading
+from tests.unit.can_backend.frames import accelerometer, begin, contact, gyro, health, heartbeat, joint_state, syncs
+
+# --- forces, IMUs, health ----------------------------------------------------------------------------------
+
+
+def test_forces_belong_to_the_link_in_front_and_the_tails_own_to_link_0() -> None:
+    made = reading()
+    begin(made, contacts=True, tail=True)
+    made.take(contact(1, made.sync, tail=True, force_x=1.0))
+    made.take(contact(1, made.sync, force_y=2.0, along=0.05))
+    made.take(contact(2, made.sync, touched=False, force_z=3.0))
+    made.take(contact(3, made.sync, force_z=4.0, bearing=0.0))
+    touched = made.links_touched()
+    assert [link for link, _ in touched] == [0, 1, 3]
+    assert [list(raw) for _, raw in touched] == [[20, 0, 0, 0, 0], [0, 40, 0, 100, 0], [0, 0, 80, 0, 0]]
+
+
+def test_forces_of_another_sync_do_not_count_and_old_ones_are_forgotten() -> None:
+    made = reading()
+    begin(made, contacts=True)
+    made.take(contact(2, made.sync - 1, force_x=9.0))
+    assert made.links_touched() == [] and made.contacts_missing == JOINTS
+    made.take(contact(2, made.sync, force_x=1.0))
+    made.take(contact(2, made.sync, force_x=5.0))
+    assert [raw[0] for _, raw in made.links_touched()] == [20], "the first counts"
+    assert made.contacts_missing == JOINTS - 1
+    begin(made, contacts=False)
+    assert len(made.links_touched()) == 1
+    begin(made, contacts=True)
+    assert made.links_touched() == []
+
+
+def test_an_imu_is_told_once_and_whole() -> None:
+    made = reading()
+    made.take(gyro(2, 7, 1.0))
+    assert made.imus() == []
+    made.take(accelerometer(2, 7, 9.81))
+    assert [(link, list(rates), list(force)) for link, rates, force in made.imus()] == [(2, [1000, 0, 0], [0, 0, 981])]
+    assert made.imus() == []
+
+
+def test_an_imus_halves_are_of_one_sync() -> None:
+    made = reading()
+    made.take(gyro(2, 7, 1.0))
+    made.take(accelerometer(2, 27, 9.81))  # between them two frames were lost
+    assert made.imus() == []
+    made.take(gyro(2, 47, 2.0))
+    made.take(accelerometer(2, 47, 9.81))
+    assert [list(rates) for _, rates, _ in made.imus()] == [[2000, 0, 0]]
+
+
+def test_health_and_shaft_load_are_kept() -> None:
+    made = reading()
+    made.take(health(3, voltage=24.0, current=-1.0, motor_temperature=50, board_temperature=30, leak=1))
+    made.take(codec()[Opcode.SHAFT_LOAD].frame(2, torque=-1.5))
+    assert made.health() == [None, None, (24000, -1000, 90, 70, 1)]
+    assert made.shaft_raw == [None, -1500, None]
+
+
+# --- heartbeats --------------------------------------------------------------------------------------------
+
+
+def test_an_uptime_that_goes_back_and_on_from_there_is_a_restart() -> None:
+    made = reading()
+    for uptime_s, restarts in (
+        (5.0, 0),
+        (5.1, 0),
+        (5.1, 0),
+        (0.1, 0),
+        (0.2, 1),
+        (0.3, 1),
+        (0.1, 1),
+        (0.1, 2),
+        (0.2, 2),
+    ):
+        made.take(heartbeat(2, uptime_s))
+        assert made.modules[1].restarts == restarts, uptime_s
+        assert made.modules[1].uptime_ms == round(uptime_s * 1000)
+    assert made.modules[0].restarts == 0
+
+
+def test_two_clocks_in_turn_are_two_modules_and_no_restart() -> None:
+    made = reading()
+    for i in range(20):
+        made.take(heartbeat(2, 50.0 + 0.1 * i))
+        made.take(heartbeat(2, 0.1 * i))
+    assert made.modules[1].restarts == 0
+
+
+def test_a_heartbeat_that_comes_late_is_no_restart() -> None:
+    made = reading()
+    for uptime_s in (5.0, 5.2, 5.1, 5.3, 5.4):
+        made.take(heartbeat(2, uptime_s))
+    assert made.modules[1].restarts == 0
+
+
+def test_a_heartbeat_tells_state_faults_and_reason() -> None:
+    made = reading()
+    made.take(heartbeat(2, 1.0, ModuleState.FAULT, last_stop=LastStop.LEAK, fault_leak=1, fault_voltage=1))
+    module = made.modules[1]
+    assert (module.state, module.last_stop) == (ModuleState.FAULT, LastStop.LEAK)
+    assert module.fault_names() == ["leak", "voltage"] and module.needs_clearing
+    assert module.heartbeat_sync == made.sync
+    made.take(heartbeat(2, 1.1))
+    assert module.fault_names() == [] and not module.needs_clearing
+
+
+@pytest.mark.parametrize("state", [ModuleState.FAULT, ModuleState.EMERGENCY])
+def test_a_latched_state_without_a_reason_needs_clearing_after_three_syncs(state: ModuleState) -> None:
+    made = reading()
+    for needed in (False, False, True):
+        syncs(made, 1, state=state)
+        assert made.modules[0].needs_clearing is needed
+    syncs(made, 1, state=ModuleState.DISARMED)
+    assert not made.modules[0].needs_clearing
+
+
+# --- others ------------------------------------------------------------------------------------------------
+
+
+def test_frames_of_another_length_are_counted_and_change_nothing() -> None:
+    made = reading()
+    before = copy.deepcopy(made.modules)
+    good = [joint_state(2, made.sync), heartbeat(2, 0.0), contact(2, 0), gyro(2, 0, 0.0), health(2)]
+    for i, frame in enumerate(good):
+        made.take(Frame(frame.id, frame.data[:-1]))
+        made.take(Frame(frame.id, b""))
+        assert made.malformed == 2 * (i + 1)
+    before[1].frames = made.modules[1].frames
+    assert made.modules == before and made.health() == [None] * JOINTS
+
+
+def test_frames_are_counted_for_each_module_and_tick() -> None:
+    made = reading()
+    begin(made)
+    identity = codec()[Opcode.IDENTITY].frame(2, serial=1)
+    for frame in (joint_state(2, made.sync), heartbeat(2, 1.0), identity, Frame(heartbeat(2, 0.0).id, b"")):
+        made.take(frame)
+    assert [module.frames for module in made.modules] == [0, 4, 0]
+    begin(made)
+    assert made.modules[1].frames == 0
+
+
+def test_strangers_are_counted_by_node() -> None:
+    made = reading()
+    for node in (4, 4, LAST_NODE, 0):
+        made.take(Frame(frame_id(Opcode.HEARTBEAT, node), bytes(8)))
+    assert made.strangers == {4: 2, LAST_NODE: 1, 0: 1} and not made.from_other_host
+
+
+def test_another_host_is_noticed_and_is_no_stranger() -> None:
+    made = reading()
+    made.take(codec()[Opcode.SYNC].frame(0, count=3))
+    made.take(codec()[Opcode.SET_POINT].frame(2))
+    made.take(codec()[Opcode.SET_POINT].frame(40))
+    made.take(Frame(frame_id(Opcode.EMERGENCY, 0), b""))
+    for node in (0, 2, 40):
+        made.take(command(Action.IDENTIFY, node))  # who merely asks who is there, commands nothing
+    assert made.from_other_host == {Opcode.SYNC: 1, Opcode.SET_POINT: 2, Opcode.EMERGENCY: 1} and not made.strangers
+    made.take(command(Action.STOP, 2))
+    assert made.from_other_host[Opcode.COMMAND] == 1
+
+
+# --- whatever comes ----------------------------------------------------------------------------------------
+
+any_frame = st.builds(Frame, st.integers(0, 0x7FF), st.binary(max_size=8))
+ours = st.builds(
+    lambda opcode, node, data: Frame(frame_id(opcode, node), data[: codec()[opcode].length]),
+    st.sampled_from(list(Opcode)),
+    st.integers(1, JOINTS),
+    st.binary(min_size=8, max_size=8),
+)
+
+
+@given(st.lists(any_frame | ours, max_size=40), st.lists(st.booleans(), min_size=40, max_size=40))
+@example([Frame(frame_id(Opcode.JOINT_STATE, 2), b"")], [False] * 40)
+def test_whatever_comes_nothing_raises_and_only_intact_states_move_a_joint(
+    frames: list[Frame], sync_before: list[bool]
+) -> None:
+    made = reading()
+    for frame, contacts in zip(frames, sync_before, strict=False):
+        if contacts:
+            begin(made, contacts=True, tail=True)
+        before = made.joints()
+        made.take(frame)
+        is_state = opcode_of(frame.id) == Opcode.JOINT_STATE and len(frame.data) == 8 and intact(frame)
+        changed = np.flatnonzero((made.joints() != before).any(axis=0)).tolist()
+        assert changed in ([], [node_of(frame.id) - 1] if is_state else [])
+        assert made.complete in (True, False)
+        assert made.links_touched() is not None and made.imus() is not None and len(made.health()) == JOINTS
+
+
+@given(st.integers(1, JOINTS), st.integers(0, 63))
+def test_no_single_wrong_bit_moves_a_joint(node: int, bit: int) -> None:
+    made = reading()
+    begin(made)
+    whole = int.from_bytes(joint_state(node, made.sync, 0.9).data, "little") ^ 1 << bit
+    made.take(Frame(frame_id(Opcode.JOINT_STATE, node), whole.to_bytes(8, "little")))
+    assert angles(made) == pytest.approx([0.1] * JOINTS) and made.modules[node - 1].corrupt == 1

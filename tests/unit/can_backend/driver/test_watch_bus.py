@@ -1,0 +1,148 @@
+"""What the watch tells of buses, and of who should not be there."""
+
+import pytest
+
+from snakesim_can_backend.bus.bus_errors import BusError, Kind
+from snakesim_can_backend.driver.module_monitor import Finding
+from snakesim_can_backend.driver.reports import Reading
+from snakesim_can_backend.protocol.codec import codec
+from snakesim_can_backend.protocol.commands import command
+from snakesim_can_backend.protocol.definitions import Action, Frame, ModuleState, Opcode, frame_id
+from tests.unit.can_backend.driver.watch_rig import Bench, quiet, said
+from tests.unit.can_backend.frames import answer, joint_state
+
+# --- the bus -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "advice"),
+    [
+        ("bus_off", "look for a short, a wrong bit rate, a missing terminator"),
+        ("error_passive", "look at cables, terminators and bit rate"),
+        ("interface_down", "bring it up again, then clear and arm"),
+        ("restarted", "clear and arm when the bus is in order"),
+        ("receive_overflow", "states may be missing"),
+    ],
+)
+def test_a_bus_that_fails_is_a_fault_of_no_joint(kind: Kind, advice: str) -> None:
+    bench = Bench()
+    trouble = BusError(kind, "can0", "transmit errors 200, receive errors 3")
+    (found,) = bench.tick(troubles=[trouble, trouble][:1])
+    assert (found.what, found.joint) == (kind, None)
+    assert found.cause.startswith("can0: transmit errors 200, receive errors 3; ") and advice in found.cause
+    assert bench.tick(troubles=[trouble]) == []
+    assert [f.cause[:5] for f in bench.tick(troubles=[BusError(kind, "can1", "")])] == ["can1:"], "the other bus is new"
+    bench.clear()
+    assert said(bench.tick(troubles=[trouble])) == [(kind, None)]
+
+
+@pytest.mark.parametrize("kind", ["error_warning", "not_acknowledged", "queue_full", "error_frames", "interface_up"])
+def test_lesser_troubles_are_only_counted(kind: Kind) -> None:
+    bench = Bench()
+    for _ in range(2):
+        assert bench.tick(troubles=[BusError(kind, "can0", "")]) == []
+    assert bench.watch.seen == {kind: 2}
+
+
+def test_a_bus_that_takes_nothing_for_three_periods_is_stuck() -> None:
+    bench = Bench()
+    for _ in range(2):
+        assert bench.tick(unsent="can1") == []
+    (found,) = bench.tick(unsent="can1")
+    assert (found.what, found.joint) == ("bus_stuck", None)
+    for words in ("can1: ", "no frames sent for 30 ms", "no node acknowledges", "txqueuelen is below 64"):
+        assert words in found.cause
+    assert bench.tick(unsent="can1") == []
+
+
+def test_a_bus_that_takes_something_again_is_not_stuck() -> None:
+    bench = Bench()
+    for _ in range(5):
+        for _ in range(2):
+            assert bench.tick(unsent="can1") == []
+        assert bench.tick() == []
+
+
+# --- who should not be there -------------------------------------------------------------------------------
+
+
+def stranger(reading: Reading) -> None:
+    answer(reading, [2])
+    reading.take(joint_state(9, reading.sync))
+
+
+def test_a_stranger_that_answers_every_sync_is_found() -> None:
+    bench = Bench()
+    assert bench.ticks(2, stranger) == []
+    (found,) = bench.tick(stranger)
+    assert found == Finding("unknown_node", "node 9 is on the bus, but is not a joint of this robot")
+    assert bench.ticks(5, stranger) == []
+
+
+def test_a_stray_frame_now_and_then_is_none() -> None:
+    bench = Bench()
+    for _ in range(10):
+        assert bench.ticks(2, stranger) == [] and bench.tick() == []
+
+
+@pytest.mark.parametrize(
+    ("frame", "what", "words"),
+    [
+        (codec()[Opcode.SYNC].frame(0), "second_host", "another program commands the modules"),
+        (codec()[Opcode.SET_POINT].frame(2), "second_host", "end one of the two"),
+        (codec()[Opcode.COMMAND].frame(2, action=Action.STOP), "second_host", "another program"),
+        (Frame(frame_id(Opcode.EMERGENCY, 0), b"\x01"), "emergency", "a node on the bus sent an Emergency"),
+    ],
+)
+def test_another_host_is_told(frame: Frame, what: str, words: str) -> None:
+    def speak(reading: Reading) -> None:
+        answer(reading, [2])
+        reading.take(frame)
+
+    bench = Bench()
+    (found,) = bench.tick(speak)
+    assert (found.what, found.joint) == (what, None) and words in found.cause
+    assert bench.tick(speak) == []
+    bench.clear()
+    assert bench.tick() == [], "it was there once and is no more"
+    assert said(bench.tick(speak)) == [(what, None)]
+
+
+def test_what_another_host_may_have_changed_is_written_anew() -> None:
+    bench = Bench()
+    bench.reading.take(codec()[Opcode.PARAMETER_REQUEST].frame(2, index=1, operation=1))
+    assert said(bench.tick()) == [("second_host", None)]
+    assert bench.watch.take_changed() == {0, 1, 2}
+
+
+def test_who_asks_who_is_there_is_no_second_host() -> None:
+    bench = Bench()
+    bench.reading.take(command(Action.IDENTIFY))
+    assert bench.tick() == [] and bench.watch.take_changed() == set()
+
+
+def test_a_module_is_not_silent_that_was_not_asked() -> None:
+    bench = Bench()
+    for i in range(10):
+        assert said(bench.tick(quiet, unsent="can0")) == ([("bus_stuck", None)] if i == 2 else [])
+    assert bench.ticks(2, quiet) == []
+    assert said(bench.tick(quiet)) == [("module_silent", 1)]
+
+
+def test_a_bus_whose_interface_is_down_is_not_called_stuck_too() -> None:
+    bench = Bench()
+    down, up = (BusError(kind, "can1", "") for kind in ("interface_down", "interface_up"))
+    assert said(bench.tick(troubles=[down], unsent="can1")) == [("interface_down", None)]
+    for _ in range(10):
+        assert bench.tick(unsent="can1") == []
+    bench.tick(troubles=[up], unsent="can1")
+    found = [f for _ in range(3) for f in bench.tick(unsent="can1")]
+    assert said(found) == [("bus_stuck", None)]
+
+
+def test_a_module_that_was_armed_and_is_not_any_more_is_told_at_once() -> None:
+    bench = Bench()
+    bench.lifecycle, bench.state = "armed", ModuleState.ARMED
+    bench.ticks(2)
+    found = bench.ticks(3, lambda reading: answer(reading, [2], state=ModuleState.DISARMED))
+    assert said(found) == [("module_not_armed", 1)]

@@ -1,0 +1,12 @@
+"""Every driver of this folder opens recorded wires."""
+
+import pytest
+
+from snakesim_can_backend.driver import backend as backend_module
+from tests.unit.can_backend.driver.whole.recorded import WIRES, RecordedWire
+
+
+@pytest.fixture(autouse=True)
+def recorded(monkeypatch: pytest.MonkeyPatch) -> None:
+    WIRES.clear()
+    monkeypatch.setattr(backend_module, "VirtualWire", RecordedWire)

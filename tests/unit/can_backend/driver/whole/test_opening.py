@@ -1,0 +1,208 @@
+"""The whole driver on virtual buses with module twins: opening it, and a period."""
+
+import numpy as np
+import pytest
+
+from snakesim_can_backend.bus.bus import OtherEnd, VirtualWire
+from snakesim_can_backend.bus.load import Reports
+from snakesim_can_backend.driver import backend as backend_module
+from snakesim_can_backend.driver.backend import CanBackend, _answer_time_s
+from snakesim_can_backend.driver.bring_up import Bus
+from snakesim_can_backend.protocol.definitions import (
+    BROADCAST,
+    Action,
+    LastStop,
+    ModuleFault,
+    ModuleState,
+    Opcode,
+    Parameter,
+    node_of,
+    opcode_of,
+)
+from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.twin.firmware import Module
+from snakesim_can_backend.twin.server import Here, here
+from snakesim_hal.backend import SetPoints
+from snakesim_hal.errors import BackendError, ConfigError
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.wire.messages import Mode
+from tests.unit.can_backend.driver.whole.recorded import (
+    DISARMED,
+    EMERGENCY,
+    WIRES,
+    RecordedWire,
+    go,
+    is_action,
+    is_set_point,
+    module_of,
+    words,
+)
+from tests.unit.can_backend.loop import JOINTS, config, loop
+from tests.unit.can_backend.twin import rig
+
+# --- opening -----------------------------------------------------------------------------------------------
+
+
+def test_bring_up_enables_nothing() -> None:
+    with loop() as run:
+        sent = WIRES[0].sent
+        assert {opcode_of(frame.id) for frame in sent} == {Opcode.COMMAND, Opcode.PARAMETER_REQUEST, Opcode.SYNC}
+        assert all(is_action(f, Action.IDENTIFY, Action.DISARM) for f in sent if opcode_of(f.id) == Opcode.COMMAND)
+        disarm = next(i for i, frame in enumerate(sent) if is_action(frame, Action.DISARM))
+        written = next(i for i, frame in enumerate(sent) if opcode_of(frame.id) == Opcode.PARAMETER_REQUEST)
+        assert disarm < written and node_of(sent[disarm].id) == BROADCAST
+        assert run.states() == [DISARMED] * JOINTS
+        assert not any(is_set_point(frame) for frame in go(run, "disarmed", 30))
+        assert run.faults == [] and run.true_speed_rad_s == [0.0] * 30
+
+
+def test_who_does_not_answer_syncs_is_told_and_everything_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Deaf(RecordedWire):
+        def __init__(self, channel: str, other_end: OtherEnd | None = None) -> None:
+            super().__init__(channel, other_end)
+            self.deaf_to = lambda frame: opcode_of(frame.id) == Opcode.JOINT_STATE and node_of(frame.id) == 2
+
+    monkeypatch.setattr(backend_module, "VirtualWire", Deaf)
+    with pytest.raises(BackendError, match="joint_2 did not answer 20 Syncs; nothing was enabled"), loop():
+        pass
+    (wire,) = WIRES
+    assert wire.closed == 1 and words(wire.sent)[-1] == "disarm" and not any(map(is_set_point, wire.sent))
+
+
+def left_behind(module: Module, kind: str) -> None:
+    """What a module is like whose driver was killed, or worse."""
+    if kind == "emergency":
+        module.hear(rig.emergency(), 0.0)
+        return
+    module.hear(rig.command(Action.ARM), 0.0)
+    module._fail(ModuleFault.STREAM if kind == "stream" else ModuleFault.WATCHDOG, 0.0)
+    if kind == "leak":  # after the watchdog had stopped it, water came, and went
+        module.inside.leak = True
+        module.poll(0.0)
+        module.inside.leak = False
+        assert module.last_stop == LastStop.WATCHDOG
+
+
+@pytest.mark.parametrize(
+    ("kind", "state"),
+    [("watchdog", DISARMED), ("stream", DISARMED), ("leak", ModuleState.FAULT), ("emergency", EMERGENCY)],
+)
+def test_what_a_killed_driver_left_is_cleared_and_nothing_else(
+    kind: str, state: ModuleState, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def twins(run: RunConfig, settings: Settings, channel: str, pose: str | None, *, stepped: bool) -> Here:
+        end = here(run, settings, channel, pose, stepped=stepped)
+        left_behind(end.server.chain.slots[1].module, kind)
+        return end
+
+    monkeypatch.setattr(backend_module, "twins_here", twins)
+    with loop() as run:
+        go(run, "disarmed", 2)
+        assert run.states() == [DISARMED, state, DISARMED, DISARMED]
+        assert words(WIRES[0].sent).count("clear 2") == (state == DISARMED)
+        found = [fault for _ in range(3) for fault in (go(run, "disarmed"), *run.faults)[1:]]
+        assert {fault.joint for fault in found} == (set() if state == DISARMED else {"joint_2"})
+
+
+def test_a_module_that_is_too_weak_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    def twins(run: RunConfig, settings: Settings, channel: str, pose: str | None, *, stepped: bool) -> Here:
+        end = here(run, settings, channel, pose, stepped=stepped)
+        end.server.chain.slots[2].module.parameters.values[Parameter.RATED_TORQUE] = 1.0
+        return end
+
+    monkeypatch.setattr(backend_module, "twins_here", twins)
+    with pytest.raises(BackendError, match=r"joint_3 is rated for 1 N·m"), loop():
+        pass
+
+
+def test_paces_and_what_is_checked_before_anything_is_opened(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert CanBackend.check(config(), Settings()) == ("lockstep", "realtime")
+    with pytest.raises(ConfigError, match="channel 'nocan7'"):
+        CanBackend.check(config(), Settings(channels=["nocan7"]))
+    asked: list[str] = []
+    monkeypatch.setattr(backend_module, "check_interface", asked.append)
+    assert CanBackend.check(config(), Settings(channels=["can0", "can1"])) == ("realtime",)
+    assert CanBackend.check(config(), Settings(channels=["vcan0"], twins="process")) == ("lockstep", "realtime")
+    assert asked == ["can0", "can1", "vcan0"]
+    for settings, text in ((Settings(twins="none"), "needs a bus"), (Settings(faults=["mute:joint_9@1"]), "joint_9")):
+        with pytest.raises(ConfigError, match=text):
+            CanBackend.check(config(), settings)
+    with pytest.raises(ConfigError, match="do not fit"):
+        CanBackend.check(config(robot__chain__modules=40, rate_hz=200), Settings())
+    with pytest.raises(ConfigError, match="hold"):
+        CanBackend.check(config(robot__safety__action="hold"), Settings())
+    assert WIRES == []
+
+
+def test_it_describes_robot_and_sensors_and_delivers_them() -> None:
+    sensors = {
+        "robot__sensors__contacts__rate_hz": 50.0,
+        "robot__sensors__imu__rate_hz": 50.0,
+        "robot__sensors__pose__rate_hz": 50.0,
+    }
+    with loop(config(**sensors), plant="mujoco") as run:
+        description = run.backend.describe()
+        assert description.backend == "can"
+        assert [joint.name for joint in description.joints] == ["joint_1", "joint_2", "joint_3", "joint_4"]
+        go(run, "disarmed", 60)
+        delivered = {"sensor/joints"}.union(*(samples.others for samples in run.samples))
+        assert delivered == {sensor.key for sensor in description.sensors}
+
+
+def test_answers_are_waited_for_as_long_as_the_fullest_bus_takes() -> None:
+    wire = VirtualWire("answers")
+    buses = [Bus(wire, range(1, 14)), Bus(wire, range(14, 20))]
+    wire.close()
+    assert _answer_time_s(buses, Reports(100.0)) == pytest.approx(1.25 * 27 * 135e-6 + 0.002)
+    assert _answer_time_s(buses, Reports(100.0, 0, tail=False)) == pytest.approx(1.25 * 13 * 135e-6 + 0.002)
+
+
+# --- a period ----------------------------------------------------------------------------------------------
+
+
+def test_a_command_acts_exactly_one_period_after_the_state_that_it_answers() -> None:
+    change_at = 15
+    speeds = []
+    for torque_nm in (0.0, 1.0):
+        with loop() as run:
+            run.wanted = SetPoints([Mode.TORQUE] * JOINTS, [0.0] * JOINTS, [4.0] * JOINTS)
+            run.arm()
+
+            def wish(tick: int, torque_nm: float = torque_nm) -> SetPoints:
+                return SetPoints([Mode.TORQUE] * JOINTS, [torque_nm * (tick == change_at)] * JOINTS, [4.0] * JOINTS)
+
+            run.run(change_at + 5 - run.tick, wish)
+            speeds.append(np.array([samples.joints.velocity_rad_s for samples in run.samples]))
+    moved = (np.abs(speeds[1] - speeds[0]) > 1e-9).any(axis=1)
+    assert not moved[: change_at + 2].any(), "it waits for the next Sync"
+    assert moved[change_at + 2 :].all(), "and acts from then on"
+
+
+def test_every_joint_may_be_in_its_own_mode() -> None:
+    modes = [Mode.POSITION, Mode.VELOCITY, Mode.TORQUE, Mode.PASSIVE]
+    targets = [0.2, -0.5, 0.3, 0.0]
+    with loop() as run:
+        run.arm()
+        run.run(3, lambda _tick: SetPoints(modes, targets, [4.0, 3.0, 2.0, 0.0]))
+        demands = [module_of(run, node).demand for node in (1, 2, 3, 4)]
+        assert [demand.mode for demand in demands] == modes
+        assert [demand.target for demand in demands] == pytest.approx(targets)
+        assert [demand.torque_limit_nm for demand in demands] == pytest.approx([4.0, 3.0, 2.0, 0.0])
+        run.run(60, lambda _tick: SetPoints(modes, targets, [4.0, 3.0, 2.0, 0.0]))
+        joints = run.samples[-1].joints
+        assert joints.angle_rad[0] == pytest.approx(0.2, abs=0.02)
+        assert joints.velocity_rad_s[1] == pytest.approx(-0.5, abs=0.15)
+        assert run.faults == []
+
+
+def test_a_period_has_one_sync_and_one_set_point_for_each_module() -> None:
+    with loop() as run:
+        run.arm()
+        for _ in range(20):
+            sent = go(run, "armed")
+            assert [opcode_of(frame.id) for frame in sent] == [Opcode.SYNC, *[Opcode.SET_POINT] * JOINTS]
+            assert [node_of(frame.id) for frame in sent[1:]] == [1, 2, 3, 4]
+        counts = [rig.read(f)["count"] for f in WIRES[0].sent if opcode_of(f.id) == Opcode.SYNC]
+        assert counts == [i % 256 for i in range(len(counts))]
+        times = [rig.read(f)["time"] for f in WIRES[0].sent if opcode_of(f.id) == Opcode.SYNC]
+        assert np.diff(times[-20:]).tolist() == [10_000] * 19

@@ -1,0 +1,76 @@
+"""An authority with a clock, and the requests that its tests make."""
+
+from typing import Any
+
+from snakesim_hal.safety.authority import Authority, Decision
+from snakesim_hal.wire.messages import Answer, EstopRequest, LeaseRequest, LifecycleRequest, Mode, Power
+from tests.unit.hal.rig import PERIOD_NS, command, description, state
+
+ROBOT = description()
+JOINTS = len(ROBOT.joints)
+ARM = LifecycleRequest(action="arm", robot="worm", backend="lag", config_hash=ROBOT.config_hash)
+DISARM, CLEAR, FINISH = (LifecycleRequest(action=action) for action in ("disarm", "clear", "finish"))
+ESTOP = EstopRequest(who="a person")
+
+
+class Rig:
+    """An authority with a clock; every step is one a host would take."""
+
+    def __init__(self, **robot: Any) -> None:
+        self.robot = description(**robot)
+        self.authority = Authority(self.robot)
+        self.now_ns = 0
+        self.tick = 0
+        self.sequence = 0
+        self.stamp_ns = 0
+
+    def observe(self, *values: Any, **other: Any) -> None:
+        """A state so much later than the one before that the joints may have come from anywhere."""
+        self.stamp_ns += 10**9
+        self.authority.observe(state(self.robot, *values, stamp_ns=self.stamp_ns, **other))
+
+    def acquire(self, holder: str = "control", priority: int = 100) -> Answer:
+        return self.authority.on_lease(LeaseRequest(action="acquire", holder=holder, priority=priority), self.now_ns)
+
+    def send(self, target: Any = 0.0, mode: Any = Mode.POSITION, **other: Any) -> str | None:
+        self.sequence += 1
+        authority = self.authority
+        values = {"sequence": self.sequence, "lease_epoch": authority.lease.epoch, "arming": authority.arming, **other}
+        values = {"tick": self.tick, **values}
+        asked = command(self.robot, target, mode, **values)
+        return self.authority.offer(asked, now_ns=self.now_ns, tick=self.tick, age_ns=0)
+
+    def arm(self) -> Answer:
+        return self.authority.on_lifecycle(ARM, self.now_ns)
+
+    def pass_tick(self, periods: int = 1) -> Decision:
+        self.now_ns += periods * PERIOD_NS
+        self.tick += periods
+        self.authority.expire(self.now_ns, self.tick)
+        return self.authority.decide()
+
+
+def armed(**robot: Any) -> Rig:
+    rig = Rig(**robot)
+    rig.observe(0.1)
+    assert rig.acquire().ok and rig.send(0.1) is None
+    assert rig.arm().ok
+    return rig
+
+
+def modes(decision: Decision) -> set[Mode]:
+    return set(decision.set_points.mode)
+
+
+def hear(rig: Rig, motor_c: list[float], volts: float = 24.0, valid: list[bool] | None = None) -> None:
+    power = Power(
+        tick=rig.tick,
+        stamp_ns=0,
+        voltage_v=[volts] * JOINTS,
+        current_a=[0.0] * JOINTS,
+        motor_c=motor_c,
+        board_c=[20.0] * JOINTS,
+        leak=[False] * JOINTS,
+        valid=valid or [True] * JOINTS,
+    )
+    rig.authority.observe_power(power, rig.now_ns)

@@ -1,0 +1,263 @@
+"""Who may move the robot: what stops it, and what a stop leaves."""
+
+import pytest
+
+from snakesim_hal.safety.authority import COMMANDS_KEPT
+from snakesim_hal.safety.fault_log import MAX_FAULTS_KEPT
+from snakesim_hal.wire.messages import Fault, JointCommand, LifecycleState, Mode
+from tests.unit.hal.rig import PERIOD_NS, command, state
+from tests.unit.hal.safety.authority_rig import CLEAR, DISARM, ESTOP, FINISH, JOINTS, Rig, armed, hear, modes
+
+# --- stops -----------------------------------------------------------------------------------------------------
+
+
+def test_an_estop_is_latched_and_only_clear_and_arm_lead_back() -> None:
+    rig = armed()
+    rig.send(0.2)
+    rig.pass_tick()
+    assert rig.authority.on_estop(ESTOP, rig.tick).ok
+    for _ in range(3):
+        rig.send(0.2)
+        decision = rig.pass_tick()
+        assert modes(decision) == {Mode.PASSIVE} and decision.sequence is None
+    assert not rig.arm().ok and not rig.authority.on_lifecycle(DISARM, rig.now_ns).ok
+    assert rig.authority.on_lifecycle(CLEAR, rig.now_ns).ok
+    rig.send(0.2)
+    assert modes(rig.pass_tick()) == {Mode.PASSIVE}
+    assert rig.arm().ok
+    assert rig.pass_tick().set_points.target == [0.1] * JOINTS  # resumes from the measured pose
+
+
+@pytest.mark.parametrize(
+    ("action", "mode", "target"),
+    [("passive", Mode.PASSIVE, 0.0), ("damp", Mode.VELOCITY, 0.0), ("hold", Mode.POSITION, 0.4)],
+)
+def test_a_fault_takes_the_robots_safe_action(action: str, mode: Mode, target: float) -> None:
+    rig = armed(safety__action=action)
+    rig.observe(0.4)
+    rig.authority.fault(Fault(tick=1, what="hot", cause="joint_2 is hot"))
+    for angle in (0.4, 0.6, 0.9):  # what the joint does afterwards does not move the pose that is held
+        rig.observe(angle)
+        decision = rig.pass_tick()
+        assert modes(decision) == {mode} and decision.set_points.target == [target] * JOINTS
+    assert rig.authority.lease.holder is None
+    assert rig.acquire("control").lifecycle != "armed" and not rig.arm().ok
+
+
+@pytest.mark.parametrize("action", ["passive", "damp", "hold"])
+def test_a_fault_while_disarmed_switches_no_motor_on(action: str) -> None:
+    rig = Rig(safety__action=action)
+    rig.observe(0.7)
+    rig.authority.fault(Fault(tick=1, what="hot", cause="joint_2 is hot"))
+    assert set(rig.pass_tick().set_points.mode) == {Mode.PASSIVE}
+
+
+def test_a_fault_is_held_where_the_joints_were_when_it_came() -> None:
+    rig = armed(safety__action="hold")
+    rig.observe(0.7)
+    rig.authority.fault(Fault(tick=1, what="hot", cause="joint_2 is hot"))
+    rig.observe(0.2)
+    assert rig.pass_tick().set_points.target == [0.7] * JOINTS
+
+
+def test_a_held_pose_stays_inside_the_angle_limits() -> None:
+    rig = armed(safety__action="hold")
+    rig.observe(1.9)
+    rig.authority.fault(Fault(tick=1, what="hot", cause="hot"))
+    assert rig.pass_tick().set_points.target == [1.5] * JOINTS
+
+
+def test_a_fault_does_not_turn_an_estop_into_something_milder() -> None:
+    rig = armed()
+    rig.authority.on_estop(ESTOP, 1)
+    rig.authority.fault(Fault(tick=2, what="hot", cause="hot"))
+    assert rig.authority.state == "estop" and "a person" in rig.authority.why
+    assert [fault.what for fault in rig.authority.faults] == ["estop", "hot"]
+
+
+def test_faults_are_kept_up_to_a_limit_the_first_and_the_newest() -> None:
+    rig = Rig()
+    for i in range(100):
+        rig.authority.fault(Fault(tick=i, what="hot", cause="hot"))
+    assert [fault.tick for fault in rig.authority.faults] == [*range(16), *range(84, 100)]
+    assert rig.authority.since_clear.left_out == rig.authority.since_start.left_out == 68
+    assert (MAX_FAULTS_KEPT, COMMANDS_KEPT) == (32, 1024)  # a status holds 64 faults
+    rig.authority.on_lifecycle(CLEAR, 0)
+    assert rig.authority.faults == [] and rig.authority.since_clear.left_out == 0
+    assert len(rig.authority.since_start.kept) == MAX_FAULTS_KEPT and rig.authority.since_start.left_out == 68
+
+
+def test_a_fault_is_explained_in_as_many_words_as_a_message_holds() -> None:
+    rig = armed()
+    rig.authority.fault(Fault(tick=1, what="hot", cause="x" * 501))
+    assert rig.authority.why == rig.authority.faults[0].cause == "x" * 500
+    rig = armed()
+    rig = armed()
+    rig.authority.fault(Fault(tick=1, what="hot", cause=""))
+    assert rig.authority.why == "hot"
+    rig.authority.fault(Fault(tick=2, what="cold", cause="what follows from it explains nothing"))
+    assert rig.authority.why == "hot" and len(rig.authority.faults) == 2
+
+
+def test_the_first_fault_is_why_and_what_it_brings_about_is_listed() -> None:
+    rig = armed()
+    for what in ("bus_off", *["watchdog"] * 40):
+        rig.authority.fault(Fault(tick=1, what=what, cause=f"because of {what}"))
+    assert rig.authority.why == rig.authority.faults[0].cause == "because of bus_off"
+    assert rig.authority.faults[1].cause == "because of watchdog"
+
+
+def test_a_note_stops_nothing() -> None:
+    rig = armed()
+    rig.authority.note(Fault(tick=1, what="service_lost", cause="guidance is gone"))
+    assert rig.authority.state == "armed" and len(rig.authority.faults) == 1
+
+
+@pytest.mark.parametrize(("state_", "ok"), [("disarmed", True), ("armed", False), ("fault", True), ("estop", True)])
+def test_clear(state_: LifecycleState, ok: bool) -> None:
+    rig = armed()
+    if state_ == "disarmed":
+        rig.authority.on_lifecycle(DISARM, 0)
+    elif state_ == "fault":
+        rig.authority.fault(Fault(tick=1, what="hot", cause="hot"))
+    elif state_ == "estop":
+        rig.authority.on_estop(ESTOP, 1)
+    answer = rig.authority.on_lifecycle(CLEAR, 0)
+    assert answer.ok == ok and answer.lifecycle == ("disarmed" if ok else "armed")
+    assert not rig.authority.faults
+
+
+def test_finishing_disarms_and_hides_no_fault() -> None:
+    rig = armed()
+    assert rig.authority.on_lifecycle(FINISH, 0).lifecycle == "disarmed"
+    rig.authority.fault(Fault(tick=1, what="hot", cause="hot"))
+    assert rig.authority.on_lifecycle(FINISH, 0).lifecycle == "fault"
+
+
+def test_what_the_gate_changes_is_counted_by_limit() -> None:
+    rig = armed()
+    rig.observe(0.1)
+    rig.pass_tick()
+    rig.send([0.1, 1.0, 2.0])
+    decision = rig.pass_tick()
+    assert decision.limited == {1: "angle_rate", 2: "angle"}
+    assert rig.authority.limited == {"angle_rate": 1, "angle": 1}
+
+
+def test_a_lease_epoch_is_never_accepted_twice() -> None:
+    """Old commands of an earlier holder stay void, however often the lease changes hands."""
+    rig = Rig()
+    rig.observe()
+    old: list[JointCommand] = []
+    for _ in range(5):
+        assert rig.acquire().ok
+        epoch = rig.authority.lease.epoch
+        assert all(rig.authority.offer(c, now_ns=rig.now_ns, tick=rig.tick, age_ns=0) == "wrong_epoch" for c in old)
+        old.append(command(rig.robot, sequence=10**6, lease_epoch=epoch))
+        rig.pass_tick(10)
+
+
+# --- what is not believed --------------------------------------------------------------------------------------
+
+
+def test_a_glitch_of_an_encoder_moves_no_motor_and_stops_the_robot() -> None:
+    rig = armed(safety__action="hold")
+    rig.observe(0.1)
+    rig.send(0.1)
+    rig.pass_tick()
+    rig.stamp_ns += PERIOD_NS - 10**9
+    rig.observe([0.1, 0.9, 0.1])
+    rig.send([0.1, 0.9, 0.1])
+    decision = rig.pass_tick()
+    (fault,) = rig.authority.faults
+    assert (fault.what, fault.joint, fault.tick) == ("state_invalid", "joint_2", rig.tick)
+    assert "joint_2 by +0.80 rad" in fault.cause
+    assert decision.set_points.target == pytest.approx([0.1] * JOINTS)
+
+
+def test_a_glitch_stands_against_arming() -> None:
+    rig = Rig()
+    rig.observe(0.1)
+    rig.acquire()
+    rig.send(0.1)
+    rig.stamp_ns += PERIOD_NS - 10**9
+    rig.observe([0.1, 0.9, 0.1])
+    assert "joint_2 by +0.80 rad" in rig.arm().reason
+    rig.observe(0.1)
+    assert rig.arm().ok
+
+
+def test_time_that_the_host_knows_of_counts() -> None:
+    rig = armed()
+    rig.authority.observe(state(rig.robot, 0.9, stamp_ns=rig.stamp_ns), rig.stamp_ns + 10**9)
+    rig.pass_tick()
+    assert rig.authority.state == "armed"
+
+
+def test_a_frozen_joint_stops_an_armed_robot() -> None:
+    rig = armed()
+    for k in range(12):
+        rig.stamp_ns += PERIOD_NS - 10**9
+        rig.observe(0.1, 0.0, [0.1, 0.5, 0.1 * k])
+        rig.send([0.1, 0.1 + 0.02 * k, 0.1 + 0.02 * k])
+        rig.pass_tick()
+    assert [(fault.what, fault.joint) for fault in rig.authority.faults] == [("joint_frozen", "joint_2")]
+
+
+# --- heat, supply and leaks ------------------------------------------------------------------------------------
+
+
+def test_heat_derates_then_stops_and_must_be_gone_before_the_next_arming() -> None:
+    rig = armed()
+    hear(rig, [20.0, 92.5, 20.0])
+    rig.send(0.1)
+    decision = rig.pass_tick()
+    assert decision.set_points.torque_limit_nm == pytest.approx([4.0, 2.4, 4.0])
+    assert decision.limited == {1: "thermal"} and rig.authority.limited == {"thermal": 1}
+    assert rig.authority.derated == {"joint_2": pytest.approx(0.6)}
+    hear(rig, [20.0, 110.0, 20.0])
+    decision = rig.pass_tick()
+    assert [(fault.what, fault.joint) for fault in rig.authority.faults] == [("overheated", "joint_2")]
+    assert decision.set_points.torque_limit_nm == pytest.approx([4.0, 0.8, 4.0])  # also of the safe action
+    rig.authority.on_lifecycle(CLEAR, rig.now_ns)
+    rig.acquire()
+    rig.send(0.1)
+    rig.pass_tick()
+    answer = rig.arm()
+    assert rig.authority.state == "disarmed" and answer.refusal == "not_ready" and "joint_2 is at 110" in answer.reason
+    hear(rig, [20.0, 70.0, 20.0])
+    rig.pass_tick()
+    rig.send(0.1)
+    assert rig.arm().ok and rig.authority.derated == {}
+
+
+def test_who_tells_nothing_of_its_health_is_noted() -> None:
+    rig = Rig()
+    hear(rig, [20.0] * JOINTS)
+    rig.pass_tick(301)
+    assert [fault.what for fault in rig.authority.faults] == ["power_unknown"] and rig.authority.state == "disarmed"
+
+
+def test_a_weak_supply_stops_an_armed_robot_within_50_ms() -> None:
+    rig = armed()
+    hear(rig, [20.0] * JOINTS, volts=12.0)
+    for _ in range(5):
+        assert rig.authority.state == "armed"
+        rig.send(0.1)
+        rig.pass_tick()
+    assert {fault.what for fault in rig.authority.faults} == {"undervoltage"}
+
+
+# --- what is told ----------------------------------------------------------------------------------------------
+
+
+def test_what_never_became_a_command_is_counted_by_reason() -> None:
+    rig = armed()
+    rig.authority.reject("malformed")
+    assert rig.authority.rejected == {"malformed": 1} and rig.authority.state == "armed"
+
+
+def test_what_is_published_of_a_joint_without_a_number_is_its_last_good_state() -> None:
+    rig = armed()
+    told = rig.authority.readable(state(rig.robot, [0.2, float("nan"), 0.2]))
+    assert told.angle_rad == [0.2, 0.1, 0.2] and told.valid == [True, False, True]

@@ -1,0 +1,369 @@
+"""Nothing beyond a limit ever comes out of the gate, also at the ends of a joint and when modes change."""
+
+import dataclasses
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from snakesim_hal.safety.gate import (
+    Applied,
+    JointLimits,
+    Measured,
+    bounds_at_ends,
+    bumpless_target,
+    limit,
+    stoppable_speed,
+    why_limited,
+)
+from snakesim_hal.wire.messages import JointCommand, Mode
+from tests.unit.hal.rig import command
+from tests.unit.hal.safety.gate_rig import (
+    ANGLE_STEP,
+    COOL,
+    JOINTS,
+    LIMITS,
+    ROBOT,
+    SPEED_STEP,
+    TINY,
+    TORQUE_STEP,
+    applied_for,
+    bumpless,
+)
+
+
+def ends(mode: Mode, measured: Measured, i: int) -> tuple[float, float]:
+    angle, velocity = float(measured.angle_rad[i]), float(measured.velocity_rad_s[i])
+    return bounds_at_ends(ROBOT.joints[i], mode, angle, velocity, LIMITS.period_s)
+
+
+def at_a_bound(target: float, most: float, low: float, high: float) -> bool:
+    """The speed, torque and angle limits outrank the rate."""
+    return abs(target) == most or target in (low, high)
+
+
+HUGE = st.floats(-1e5, 1e5)
+ANY_ANGLE = st.floats(-3, 3) | st.floats(-1e4, 1e4)
+
+
+def per_joint(values: st.SearchStrategy[Any]) -> st.SearchStrategy[list[Any]]:
+    return st.lists(values, min_size=JOINTS, max_size=JOINTS)
+
+
+@st.composite
+def situations(draw: st.DrawFn) -> tuple[JointCommand, Measured, Applied]:
+    """Any command that passes the refusals, any state, and any set-points that were applied before."""
+    any_target = st.floats(-2, 2) | HUGE
+    torque_limit = draw(st.none() | per_joint(st.sampled_from([0.0, 1e-12, 2.0, 4.0, 1e5]) | st.floats(0, 10)))
+    modes = draw(per_joint(st.sampled_from(list(Mode))))
+    asked = command(ROBOT, draw(per_joint(any_target)), modes, torque_limit_nm=torque_limit)
+    measured = Measured(
+        np.array(draw(per_joint(ANY_ANGLE))),
+        np.array(draw(per_joint(st.floats(-10, 10) | HUGE))),
+        np.array(draw(per_joint(st.floats(-5, 5) | HUGE))),
+    )
+    last = Applied(
+        np.array(draw(per_joint(st.sampled_from([0, 1, 2, 3])))),
+        np.array(draw(per_joint(any_target))),
+        LIMITS.torque_nm,
+    )
+    return asked, measured, last
+
+
+@given(situations())
+@settings(max_examples=300)
+def test_whatever_is_asked_what_is_applied_is_inside_every_limit(case: tuple[JointCommand, Measured, Applied]) -> None:
+    asked, measured, last = case
+    applied = limit(asked, measured=measured, last=last, limits=LIMITS, share=COOL)
+    assert np.isfinite(applied.target).all() and np.isfinite(applied.torque_limit_nm).all()
+    assert (applied.torque_limit_nm >= 0).all() and (applied.torque_limit_nm <= LIMITS.torque_nm).all()
+    if asked.torque_limit_nm is not None:
+        assert (applied.torque_limit_nm <= np.array(asked.torque_limit_nm)).all()
+    start = np.where(applied.mode == last.mode, last.target, bumpless(asked.mode, measured))
+    for i in range(JOINTS):
+        target, moved = applied.target[i], abs(applied.target[i] - start[i])
+        assert applied.mode[i] == asked.mode[i]
+        match asked.mode[i]:
+            case Mode.PASSIVE:
+                assert target == 0.0
+            case Mode.POSITION:
+                assert LIMITS.angle_min_rad[i] <= target <= LIMITS.angle_max_rad[i]
+                near = abs(target - measured.angle_rad[i])
+                inside = abs(measured.angle_rad[i]) <= 1.5 + 0.3
+                assert not inside or near <= 0.3 + TINY
+                if not inside:  # pushed beyond its end: straight back to the end, no further
+                    assert target == np.clip(measured.angle_rad[i], -1.5, 1.5)
+                # Only where staying near the measured angle, or inside the limits, leaves no choice:
+                edges = np.clip(measured.angle_rad[i] + np.array([-0.3, 0.3]), -1.5, 1.5)
+                assert moved <= ANGLE_STEP + TINY * abs(start[i]) + TINY or np.abs(edges - target).min() < TINY
+            case Mode.VELOCITY:
+                low, high = ends(asked.mode[i], measured, i)
+                assert abs(target) <= 5.0 and low - TINY <= target <= high + TINY
+                assert moved <= SPEED_STEP + TINY * abs(start[i]) + TINY or at_a_bound(target, 5.0, low, high)
+            case Mode.TORQUE:
+                low, high = ends(asked.mode[i], measured, i)
+                most = applied.torque_limit_nm[i]
+                assert abs(target) <= most and target <= max(high, -most) and target >= min(low, most)
+                assert moved <= TORQUE_STEP + TINY * abs(start[i]) + TINY or at_a_bound(target, most, low, high)
+
+
+@given(situations())
+def test_what_needs_no_change_is_not_changed_and_what_was_changed_is_named(
+    case: tuple[JointCommand, Measured, Applied],
+) -> None:
+    asked, measured, last = case
+    applied = limit(asked, measured=measured, last=last, limits=LIMITS, share=COOL)
+    words = why_limited(asked, applied, measured=measured, limits=LIMITS, share=COOL)
+    changed = {i for i in range(JOINTS) if asked.mode[i] != Mode.PASSIVE and applied.target[i] != asked.target[i]}
+    assert set(words) == changed
+    again = limit(
+        msgspec.structs.replace(asked, target=applied.target.tolist()),
+        measured=measured,
+        last=applied,
+        limits=LIMITS,
+        share=COOL,
+    )
+    assert (again.target == applied.target).all()  # what came out once passes unchanged
+
+
+@given(st.lists(per_joint(st.floats(-1.5, 1.5)), min_size=2, max_size=30))
+def test_a_stream_of_wild_targets_never_moves_faster_than_the_limit(stream: list[list[float]]) -> None:
+    """A joint that follows at once, so that nearness to the measured angle never overrides the rate."""
+    zero = np.zeros(JOINTS)
+    last = Applied(np.full(JOINTS, int(Mode.POSITION)), zero, LIMITS.torque_nm)
+    for target in stream:
+        measured = Measured(last.target, zero, zero)
+        applied = limit(command(ROBOT, target), measured=measured, last=last, limits=LIMITS, share=COOL)
+        assert np.abs(applied.target - last.target).max() <= ANGLE_STEP + TINY
+        last = applied
+
+
+def test_a_target_that_waits_is_reached() -> None:
+    zero = np.zeros(JOINTS)
+    for mode, wanted, step in (
+        (Mode.POSITION, 0.2, ANGLE_STEP),
+        (Mode.VELOCITY, 4.0, SPEED_STEP),
+        (Mode.TORQUE, 3.0, TORQUE_STEP),
+    ):
+        last = Applied(np.full(JOINTS, int(mode)), zero, LIMITS.torque_nm)
+        measured = Measured(zero, zero, zero)
+        steps = int(np.ceil(wanted / step - 1e-9))
+        for k in range(1, steps + 1):
+            last = limit(command(ROBOT, wanted, mode), measured=measured, last=last, limits=LIMITS, share=COOL)
+            assert last.target[0] == pytest.approx(min(k * step, wanted))
+
+
+@pytest.mark.parametrize("angle", [1.6, 1.8, 2.5, 1e4])
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_joint_beyond_its_end_is_only_ever_sent_back_inside(angle: float, side: int) -> None:
+    for wanted in (-1e4, -1.5, 0.0, 1.5, 1e4):
+        target = applied_for(command(ROBOT, wanted), angle=side * angle).target
+        assert (np.abs(target) <= 1.5).all()
+        assert (side * target >= min(angle - 0.3, 1.5) - TINY).all()  # and not past what is near
+
+
+def test_with_no_torque_allowed_there_is_none() -> None:
+    none = [0.0] * JOINTS
+    for mode in Mode:
+        applied = applied_for(command(ROBOT, 1.0, mode, torque_limit_nm=none), torque=3.0)
+        assert (applied.torque_limit_nm == 0).all()
+    assert (applied_for(command(ROBOT, 1.0, Mode.TORQUE, torque_limit_nm=none), torque=3.0).target == 0).all()
+
+
+def test_a_negative_torque_limit_is_none_at_all() -> None:
+    assert applied_for(command(ROBOT, 0.0, torque_limit_nm=[-0.5] * JOINTS)).torque_limit_nm.tolist() == [0.0] * JOINTS
+
+
+@pytest.mark.parametrize("held", [LIMITS, Measured(*np.zeros((3, 1))), Applied(*np.zeros((3, 1)))])  # pyright: ignore[reportArgumentType]
+def test_what_was_decided_stays(held: Any) -> None:
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        held.torque_nm = 1.0
+
+
+def test_a_torque_limit_never_raises_the_robots_own() -> None:
+    applied = applied_for(command(ROBOT, 0.0, torque_limit_nm=[1e5, 4.0, 1.0]))
+    assert applied.torque_limit_nm.tolist() == [4.0, 4.0, 1.0]
+    assert applied_for(command(ROBOT, 0.0)).torque_limit_nm.tolist() == [4.0] * JOINTS
+
+
+def test_modes_may_differ_from_joint_to_joint() -> None:
+    mixed = command(ROBOT, 9.0, [Mode.POSITION, Mode.VELOCITY, Mode.TORQUE])
+    assert applied_for(mixed).target == pytest.approx([ANGLE_STEP, SPEED_STEP, TORQUE_STEP])
+
+
+# --- bumpless --------------------------------------------------------------------------------------------------
+
+
+def motor_torque(mode: int, target: float, angle: float, velocity: float) -> float:
+    """What a joint's motor does with a target in position and torque mode, by the description's gains."""
+    return 40.0 * (target - angle) - 1.0 * velocity if mode == Mode.POSITION else target
+
+
+@given(
+    angle=st.floats(-1.0, 1.0),
+    velocity=st.floats(-2, 2),
+    torque=st.floats(-4, 4),
+    wanted=st.floats(-10, 10),
+    before=st.sampled_from([Mode.PASSIVE, Mode.VELOCITY, Mode.TORQUE]),
+)
+def test_a_switch_to_position_mode_goes_on_with_the_torque_that_is_there(
+    angle: float, velocity: float, torque: float, wanted: float, before: Mode
+) -> None:
+    applied = applied_for(command(ROBOT, wanted), angle, velocity, torque, before)
+    implied = motor_torque(Mode.POSITION, applied.target[0], angle, velocity)
+    assert abs(implied - torque) <= 40.0 * ANGLE_STEP + 1e-6
+
+
+@given(
+    torque=st.floats(-4, 4),
+    wanted=st.floats(-10, 10),
+    before=st.sampled_from([Mode.PASSIVE, Mode.POSITION, Mode.VELOCITY]),
+)
+def test_a_switch_to_torque_mode_goes_on_with_the_torque_that_is_there(
+    torque: float, wanted: float, before: Mode
+) -> None:
+    applied = applied_for(command(ROBOT, wanted, Mode.TORQUE), 0.3, 1.0, torque, before)
+    assert abs(applied.target[0] - torque) <= TORQUE_STEP + TINY
+
+
+@given(velocity=st.floats(-5, 5), wanted=st.floats(-10, 10))
+def test_a_switch_to_velocity_mode_goes_on_with_the_torque_that_is_there(velocity: float, wanted: float) -> None:
+    applied = applied_for(command(ROBOT, wanted, Mode.VELOCITY), 0.3, velocity, 1.0, Mode.POSITION)
+    joint = ROBOT.joints[0]
+    bumpless_rad_s = velocity + 1.0 / joint.velocity_gain_nm_s_per_rad
+    top = joint.speed_limit_rad_s
+    assert min(max(bumpless_rad_s - SPEED_STEP, -top), top) - TINY <= applied.target[0]
+    assert applied.target[0] <= max(min(bumpless_rad_s + SPEED_STEP, top), -top) + TINY
+
+
+def test_a_torque_limit_rises_no_faster_than_a_torque() -> None:
+    before = Applied(np.zeros(JOINTS, dtype=np.int64), np.zeros(JOINTS), np.zeros(JOINTS))
+    measured = Measured(np.zeros(JOINTS), np.zeros(JOINTS), np.zeros(JOINTS))
+    applied = limit(command(ROBOT, 0.3, Mode.POSITION), measured=measured, last=before, limits=LIMITS, share=COOL)
+    assert applied.torque_limit_nm == pytest.approx(np.full(JOINTS, TORQUE_STEP))
+
+
+def test_a_switch_asked_to_stay_changes_nothing_at_all() -> None:
+    measured = Measured(np.array([0.1, -0.2, 0.3]), np.array([0.5, 0.0, -0.5]), np.array([1.0, -2.0, 0.0]))
+    hold = bumpless([Mode.POSITION] * JOINTS, measured)
+    implied = [motor_torque(1, *row) for row in zip(hold, measured.angle_rad, measured.velocity_rad_s, strict=True)]
+    assert implied == pytest.approx(measured.torque_nm.tolist())
+    assert bumpless([Mode.TORQUE] * JOINTS, measured) == measured.torque_nm.tolist()
+
+
+def test_a_switch_to_velocity_mode_reckons_with_the_gain() -> None:
+    joint = msgspec.structs.replace(ROBOT.joints[0], velocity_gain_nm_s_per_rad=2.0)
+    assert bumpless_target(joint, Mode.VELOCITY, 0.3, 1.0, 3.0) == 2.5
+    assert bumpless_target(joint, Mode.PASSIVE, 0.3, 1.0, 3.0) == 0.0
+
+
+def test_a_joint_without_stiffness_gives_a_finite_target() -> None:
+    limp = msgspec.structs.replace(ROBOT.joints[0], stiffness_nm_per_rad=0.0)
+    assert bumpless_target(limp, Mode.POSITION, 0.0, 0.0, 1.0) == pytest.approx(1e9)
+    joints = [msgspec.structs.replace(joint, stiffness_nm_per_rad=0.0) for joint in ROBOT.joints]
+    soft = JointLimits.of(msgspec.structs.replace(ROBOT, joints=joints))
+    measured = Measured(np.zeros(JOINTS), np.zeros(JOINTS), np.full(JOINTS, 4.0))
+    last = Applied(np.zeros(JOINTS, dtype=np.int64), np.zeros(JOINTS), LIMITS.torque_nm)
+    applied = limit(command(ROBOT, 0.0), measured=measured, last=last, limits=soft, share=COOL)
+    assert np.abs(applied.target).max() <= 0.3
+
+
+# --- near the ends ---------------------------------------------------------------------------------------------
+
+
+def test_a_joint_can_stop_before_its_end() -> None:
+    """Four periods on at that speed, then braked by the acceleration limit, it comes to rest at the very end."""
+    for distance in (1e-6, 0.01, 0.3, 3.0):
+        speed = stoppable_speed(distance, 100.0, 0.01)
+        assert speed * 0.04 + speed**2 / 200.0 == pytest.approx(distance)
+        assert speed < np.sqrt(2 * 100.0 * distance)
+    assert stoppable_speed(0.0, 100.0, 0.01) == stoppable_speed(-1.0, 100.0, 0.01) == 0.0
+
+
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize("delay", [1, 2])
+def test_a_joint_that_is_driven_at_its_end_by_velocity_stops_before_it(side: int, delay: int) -> None:
+    """A joint that turns as it is told, one or two periods later."""
+    angle, told = 0.0, [0.0] * delay
+    last = Applied(np.full(JOINTS, int(Mode.VELOCITY)), np.zeros(JOINTS), LIMITS.torque_nm)
+    speeds: list[float] = []
+    for _ in range(400):
+        measured = Measured(np.full(JOINTS, angle), np.full(JOINTS, told[0]), np.zeros(JOINTS))
+        last = limit(command(ROBOT, side * 5.0, Mode.VELOCITY), measured=measured, last=last, limits=LIMITS, share=COOL)
+        told = [*told[1:], float(last.target[0])]
+        angle += told[0] * 0.01
+        speeds.append(abs(told[0]))
+        assert abs(angle) <= 1.5
+    assert max(speeds) == 5.0 and abs(angle) > 1.49
+    assert max(np.abs(np.diff(speeds))) <= SPEED_STEP + TINY  # what outranks the rate limit hardly needs to
+
+
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize("mode", [Mode.VELOCITY, Mode.TORQUE])
+@pytest.mark.parametrize("beyond", [0.0, 0.2])
+def test_at_the_end_nothing_drives_outwards(side: int, mode: Mode, beyond: float) -> None:
+    for velocity in (-50.0, -1.0, 0.0, 1.0, 50.0):
+        for before in (mode, Mode.POSITION):
+            last = Applied(np.full(JOINTS, int(before)), np.full(JOINTS, side * 3.0), LIMITS.torque_nm)
+            measured = Measured(np.full(JOINTS, side * (1.5 + beyond)), np.full(JOINTS, velocity), np.zeros(JOINTS))
+            for wanted in (-9.0, 9.0):
+                asked = command(ROBOT, wanted, mode)
+                applied = limit(asked, measured=measured, last=last, limits=LIMITS, share=COOL)
+                assert (side * applied.target <= 0.0).all()
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_joint_that_comes_too_fast_is_braked_in_torque_mode(side: int) -> None:
+    last = Applied(np.full(JOINTS, int(Mode.TORQUE)), np.full(JOINTS, side * 4.0), LIMITS.torque_nm)
+    measured = Measured(np.full(JOINTS, side * 1.4), np.full(JOINTS, side * 5.0), np.zeros(JOINTS))
+    asked = command(ROBOT, side * 4.0, Mode.TORQUE)
+    applied = limit(asked, measured=measured, last=last, limits=LIMITS, share=COOL)
+    allowed = stoppable_speed(0.1, 100.0, 0.01)
+    assert applied.target == pytest.approx(np.full(JOINTS, side * (allowed - 5.0)))  # gain 1 N·m·s/rad
+    assert why_limited(asked, applied, measured=measured, limits=LIMITS, share=COOL) == dict.fromkeys(
+        range(JOINTS), "angle"
+    )
+
+
+def test_a_weak_velocity_mode_leaves_torque_mode_its_torque() -> None:
+    weak = msgspec.structs.replace(ROBOT.joints[0], velocity_gain_nm_s_per_rad=1e-3)
+    low, high = bounds_at_ends(weak, Mode.TORQUE, 0.0, 0.0, 0.01)
+    assert high == -low == pytest.approx(4.0 / 5.0 * stoppable_speed(1.5, 100.0, 0.01)) and high > 4.0
+    slow = msgspec.structs.replace(weak, speed_limit_rad_s=0.5)
+    low, high = bounds_at_ends(slow, Mode.TORQUE, 0.0, 0.0, 0.01)
+    assert high == -low == pytest.approx(4.0 / 0.5 * stoppable_speed(1.5, 100.0, 0.01))
+    still = msgspec.structs.replace(weak, speed_limit_rad_s=0.0)
+    low, high = bounds_at_ends(still, Mode.TORQUE, 0.0, 0.0, 0.01)
+    assert high == -low > 4.0
+
+
+def test_a_joint_near_its_end_is_said_to_be_bound_by_its_angle() -> None:
+    asked = command(ROBOT, 5.0, Mode.VELOCITY)
+    measured = Measured(np.full(JOINTS, 1.45), np.zeros(JOINTS), np.zeros(JOINTS))
+    last = Applied(np.full(JOINTS, int(Mode.VELOCITY)), np.full(JOINTS, 5.0), np.full(JOINTS, 4.0))
+    applied = limit(asked, measured=measured, last=last, limits=LIMITS, share=COOL)
+    words = why_limited(asked, applied, measured=measured, limits=LIMITS, share=COOL)
+    assert words == dict.fromkeys(range(JOINTS), "angle")
+    elsewhere = Measured(np.zeros(JOINTS), np.full(JOINTS, 1.45), np.zeros(JOINTS))
+    words = why_limited(asked, applied, measured=elsewhere, limits=LIMITS, share=COOL)
+    assert words == dict.fromkeys(range(JOINTS), "acceleration")
+
+
+@pytest.mark.parametrize("velocity", [-3.0, 0.0, 3.0])
+def test_at_its_end_a_joint_needs_no_torque_to_stay_or_to_leave(velocity: float) -> None:
+    """Outwards nothing, and inwards only what brakes a joint that still goes outwards."""
+    joint = ROBOT.joints[0]
+    _, most = bounds_at_ends(joint, Mode.TORQUE, joint.angle_max_rad, velocity, 0.01)
+    least, _ = bounds_at_ends(joint, Mode.TORQUE, joint.angle_min_rad, velocity, 0.01)
+    assert most == (0.0 if velocity <= 0.0 else -velocity)  # gain 1 N·m·s/rad
+    assert least == (0.0 if velocity >= 0.0 else -velocity)
+
+
+def test_a_range_without_width_leaves_no_torque() -> None:
+    stuck = msgspec.structs.replace(ROBOT.joints[0], angle_min_rad=0.0, angle_max_rad=0.0)
+    for velocity in (-3.0, 0.0, 3.0):
+        low, high = bounds_at_ends(stuck, Mode.TORQUE, 0.0, velocity, 0.01)
+        assert low <= 0.0 >= high and low <= high

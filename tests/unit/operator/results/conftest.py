@@ -1,0 +1,11 @@
+"""One run for all tests of results."""
+
+import pytest
+
+from snakesim_operator.results.record import RunRecord
+from tests.unit.operator.results.recorded import triplet
+
+
+@pytest.fixture(scope="session")
+def record() -> RunRecord:
+    return triplet()

@@ -1,0 +1,228 @@
+"""The report of runs that lack something, ended early, jammed, or hold names from outside."""
+
+import dataclasses
+import math
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from snakesim_hal.model.kinematics import quaternion_from_yaw
+from snakesim_hal.model.scenario import Start
+from snakesim_hal.wire.messages import Description, Fault
+from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.report import page as report_page
+from snakesim_operator.results.report.timeline import propulsion_intervals
+from snakesim_operator.results.report.verdict import Verdict, verdict
+from snakesim_operator.results.summary import summarise
+from tests.unit.operator.results.recorded import ARMED_S, LOST, RATE_HZ, SECONDS, Reader, changed, read
+
+MOVING = ("position_w", "orientation_wxyz", "angle_rad")
+
+
+# --- runs with something missing -------------------------------------------------------------------------------
+
+
+def test_without_telemetry(record: RunRecord) -> None:
+    page = read(changed(record, control=[], worlds=[]))
+    assert "telemetry holds no message of the controller" in page.text
+    assert "No joint propelled" in page.text
+    assert len([title for title in page.titles if title.startswith("Top view")]) == 3  # the pose is known
+
+
+def test_the_page_of_a_long_run_is_no_larger(record: RunRecord) -> None:
+    """Ten runs a minute, for ten minutes."""
+    times = 60
+    told = {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
+    long = {name: np.concatenate([one] * times) for name, one in told.items() if isinstance(one, np.ndarray)}
+    long["time_s"] = ARMED_S + np.arange(len(long["time_s"])) / RATE_HZ
+    later = [
+        [
+            msgspec.structs.replace(one, stamp_ns=one.stamp_ns + round(k * SECONDS * 1e9))
+            for k in range(times)
+            for one in told
+        ]
+        for told in (record.control, record.worlds)
+    ]
+    page = read(changed(record, control=later[0], worlds=later[1], **long))  # holds the size against the limit
+    assert len(page.film["frames"]) <= 300 and "handed over 419 times among 7 joints" in page.text
+
+
+def test_without_a_pose(record: RunRecord) -> None:
+    count = len(record.time_s)
+    blind = changed(record, position_w=np.full((count, 3), np.nan), orientation_wxyz=np.full((count, 4), np.nan))
+    page = read(blind)
+    assert "it has no pose sensor" in page.text
+    assert not [title for title in page.titles if title.startswith("Top view")]
+    assert "as the controller knew it" in page.text  # distance from the controller's own place on the path
+
+
+def test_without_a_route(record: RunRecord) -> None:
+    scene = msgspec.structs.replace(record.config.scene, route=None, pegs_along_route=[])
+    start = Start(on_route=False, position_m=(-5.0, 0.0))
+    page = read(changed(record, config=msgspec.structs.replace(record.config, scene=scene, start=start)))
+    assert "distance of the tail end" in page.text
+    assert "net displacement" in page.text
+
+
+def test_without_ticks(record: RunRecord) -> None:
+    fields = [field.name for field in dataclasses.fields(record)]
+    empty = {name: getattr(record, name)[:0] for name in fields if isinstance(getattr(record, name), np.ndarray)}
+    host = msgspec.structs.replace(record.host, ticks=0, armed_ticks=0, answered_ticks=0)
+    page = read(changed(record, control=[], worlds=[], host=host, **empty), "the host never became ready")
+    assert "Nothing was recorded: the robot was never armed (the host never became ready)." in page.text
+
+
+def test_without_a_contact_sensor(record: RunRecord) -> None:
+    sensors = msgspec.structs.replace(record.config.robot.sensors, contacts=None)
+    robot = msgspec.structs.replace(record.config.robot, sensors=sensors)
+    page = read(changed(record, config=msgspec.structs.replace(record.config, robot=robot)))
+    assert "No contact forces: the robot has no contact sensor." in page.text
+
+
+def test_a_controller_without_push_points(record: RunRecord) -> None:
+    nothing = {"push_points": [], "solved_force_n": [], "propulsion_joint": None, "propulsion_n": None}
+    plain = [msgspec.structs.replace(state, controller="hold", **nothing) for state in record.control]
+    config_ = msgspec.structs.replace(record.config, controller="hold")
+    page = read(changed(record, control=plain, config=config_))
+    assert "controller hold solved for no push-points" in page.text
+    assert "controller hold named no propulsion joint" in page.text
+    assert "measured contacts, in sum" in page.text
+
+
+def test_a_run_that_went_on_without_a_joint(record: RunRecord) -> None:
+    lost = Fault(tick=537, what="joint_frozen", cause="joint_3 repeats itself", joint="joint_3", reach="joint")
+    page = read(changed(record, host=msgspec.structs.replace(record.host, faults=[lost], isolated=["joint_3"])))
+    assert "went on without joint_3, 2 commands refused" in page.text and "Stopped by a fault" not in page.text
+    stop = Fault(tick=600, what="leak", cause="joint_4 reports water inside", joint="joint_4")
+    page = read(changed(record, host=msgspec.structs.replace(record.host, faults=[lost, stop])), stop.cause)
+    assert "Stopped by a fault" in page.text and "at joint_4: joint_4 reports water inside." in page.text
+
+
+def test_a_run_that_ended_by_a_fault(record: RunRecord) -> None:
+    fault = Fault(tick=537, what="diverged", cause="joint_3 at 1e9 rad/s", joint="joint_3")
+    page = read(changed(record, host=msgspec.structs.replace(record.host, faults=[fault])), fault.cause)
+    assert "Stopped by a fault after 5.0 s at joint_3: joint_3 at 1e9 rad/s." in page.text
+    assert "diverged" in page.words
+    marks = [shape for chart in page.charts.values() for shape in chart["layout"]["shapes"]]
+    assert [mark["line"].get("color") for mark in marks].count("--bad") == 2 + 12 + 3
+
+
+def test_a_run_that_jammed(record: RunRecord) -> None:
+    page = read(stopped_at(record, 0.0, jammed=True, reason="jammed at peg_2"))
+    assert "Jammed: jammed at peg_2. Moved 0.00 m along the path in 10.0 s; no fault, 2 commands refused" in page.text
+    assert "jam" in page.charts["States and propulsion joint over time"]["data"][0]["y"]
+
+
+def test_a_run_that_moved_and_then_jammed_is_called_jammed(record: RunRecord) -> None:
+    stuck = [
+        msgspec.structs.replace(state, jammed=True, reason="jammed: wedged")
+        if state.stamp_ns > (ARMED_S + 6.3) * 1e9
+        else state
+        for state in record.control
+    ]
+    page = read(changed(record, control=stuck))
+    assert "Jammed at 6.3 s of 10.0 s: wedged. Moved 0.63 m along the path" in page.text
+
+
+def stopped_at(record: RunRecord, at_s: float, **state: Any) -> RunRecord:
+    """The same run, in which nothing moves any more from a time on, and control tells this."""
+    row = record.row_at(float(record.time_s[0]) + at_s)
+    held = {name: getattr(record, name).copy() for name in MOVING}
+    for column in held.values():
+        column[row:] = column[row]
+    since_ns = (float(record.time_s[0]) + at_s) * 1e9
+    control = [msgspec.structs.replace(one, **state) if one.stamp_ns > since_ns else one for one in record.control]
+    return changed(record, control=control, **held)
+
+
+def judged(record: RunRecord) -> Verdict:
+    return verdict(record, summarise(record, "complete"))
+
+
+def test_a_run_that_stood_still_for_most_of_its_time_is_no_good_one(record: RunRecord) -> None:
+    assert judged(record).kind == "good"
+    lost = judged(stopped_at(record, 4.0, state="NotLocomoting", reason=LOST))
+    assert lost.kind == "poor"
+    assert lost.words.startswith(f"Stopped at 4.0 s of 10.0 s: {LOST}. Moved 0.")
+    late = judged(stopped_at(record, 5.5, state="NotLocomoting", reason=LOST))
+    assert late.kind == "good" and f"Locomotion ended at 5.5 s of 10.0 s: {LOST}" in late.words
+
+
+def test_a_jam_is_one_whatever_control_told_at_the_very_end(record: RunRecord) -> None:
+    """A controller that tries again and again, and each time says for a moment that it moves."""
+    stuck = stopped_at(record, 6.0, state="NotLocomoting", reason="jammed: wedged", jammed=True)
+    trying = [*stuck.control[:-1], msgspec.structs.replace(stuck.control[-1], state="Locomoting", reason="pushing")]
+    found = judged(changed(stuck, control=trying))
+    assert found.kind == "poor" and found.words.startswith("Jammed at 5.9 s of 10.0 s: wedged. Moved")
+    claims = judged(stopped_at(record, 4.0, state="Locomoting", reason="pushing"))
+    assert claims.kind == "poor" and "its controller reported Locomoting all the same" in claims.words
+
+
+def test_a_run_that_rests_at_the_end_of_its_path_has_not_failed(record: RunRecord) -> None:
+    rests = judged(stopped_at(record, 4.0, state="Idle", reason="no motion intended: the path is finished"))
+    assert rests.kind == "good" and "Locomotion ended at 4.0 s" in rests.words
+
+
+def test_who_says_nothing_more_is_not_known_to_move(record: RunRecord) -> None:
+    silent = [state for state in record.control if state.stamp_ns < (ARMED_S + 4.0) * 1e9]
+    assert silent[-1].state == "Locomoting"
+    told = summarise(changed(record, control=silent), "complete").locomoting_fraction
+    whole = summarise(record, "complete").locomoting_fraction
+    assert told == pytest.approx((4.0 - 0.26 + 0.5) / 10.0, abs=0.06) and whole == pytest.approx(0.61, abs=0.01)
+
+
+def test_a_controller_that_says_it_moves_and_does_not(record: RunRecord) -> None:
+    found = judged(stopped_at(record, 0.0, state="Locomoting", reason="moving"))
+    assert (
+        "Did not locomote: the snake stayed where it was, although its controller reported Locomoting." in found.words
+    )
+
+
+def test_text_from_outside_is_escaped(record: RunRecord) -> None:
+    nasty = '<script>alert("x")</script>&'
+    config_ = msgspec.structs.replace(record.config, title=nasty)
+    told = [msgspec.structs.replace(state, reason=nasty, state="NotLocomoting") for state in record.control]
+    host = msgspec.structs.replace(record.host, faults=[Fault(tick=90, what=nasty, cause=nasty)])
+    hurt = changed(record, config=config_, control=told, host=host)
+    page = report_page(hurt, summarise(hurt, nasty))
+    assert "<script>alert" not in page
+    assert page.count("&lt;script&gt;alert") >= 5
+    assert nasty in Reader(page).text
+
+
+def test_names_from_outside_are_escaped_and_turn_no_text_around(record: RunRecord) -> None:
+    nasty = "</title><script>alert(1)\u202e\x9b31m\x1b[31m\u2028"
+    encoded = msgspec.json.encode(record.description).replace(b"joint_", msgspec.json.encode(nasty)[1:-1])
+    told = [
+        msgspec.structs.replace(one, propulsion_joint=one.propulsion_joint.replace("joint_", nasty))
+        if one.propulsion_joint
+        else one
+        for one in record.control
+    ]
+    pegs_ = [msgspec.structs.replace(peg, name=f"{nasty}{i}") for i, peg in enumerate(record.config.scene.cylinder)]
+    scene = msgspec.structs.replace(record.config.scene, cylinder=pegs_)
+    config_ = msgspec.structs.replace(record.config, scene=scene)
+    hurt = changed(record, description=msgspec.json.decode(encoded, type=Description), control=told, config=config_)
+    page = report_page(hurt, summarise(hurt, "complete"))
+    assert propulsion_intervals(hurt) and "<script>alert" not in page and "&lt;script&gt;alert" in page
+    assert not {"\u202e", "\x9b", "\x1b", "\u2028"} & set(page) and "\\u202e\\u009b31m" in page
+
+
+def test_a_snake_that_lies_upwards_is_turned(record: RunRecord) -> None:
+    count = len(record.time_s)
+    up = changed(
+        record,
+        position_w=record.position_w[:, [1, 0, 2]] * np.array([-1.0, 1.0, 1.0]),
+        orientation_wxyz=np.tile(quaternion_from_yaw(math.pi / 2 + 0.4), (count, 1)),
+        worlds=[],
+        control=[],
+    )
+    sizes = [
+        [float(n) for n in value.split()][2:]
+        for _, name, value in read(up).attributes
+        if name == "viewbox" and value and value.startswith("0 0 500 ")
+    ]
+    assert len(sizes) == 3
+    assert all(height < width for width, height in sizes)
