@@ -1,0 +1,76 @@
+"""Faults on request in runs of one process: planned with a flag, and refused."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from snakesim_hal.host_process import HostRecord
+from snakesim_hal.wire.messages import Mode
+from snakesim_operator.results.record import RunRecord
+from tests.runs.command import run_to_summary, snakesim
+
+MAY_LOSE_ONE = "robot.safety.may_lose_joints=1"
+
+
+def host_record(out: Path) -> HostRecord:
+    return RunRecord.load(out).host
+
+
+@pytest.mark.parametrize(
+    ("backend", "fault", "what"),
+    [
+        ("sim", "mute:joint_3@1", "state_invalid"),
+        ("sim", "nan:joint_3@1", "state_invalid"),
+        ("sim", "diverge:simulator@1", "backend_failed"),
+        ("can", "mute:joint_3@1", "module_silent"),
+        ("can", "leak:joint_3@1", "module_leak"),
+        ("can", "cut:bus_1@1-1.3", "interface_down"),
+    ],
+)
+def test_a_planned_fault_happens_at_its_tick_and_ends_the_run_as_it_should(
+    tmp_path: Path, backend: str, fault: str, what: str
+) -> None:
+    ended, summary = run_to_summary(tmp_path / "run", "triplet", "--backend", backend, "--fault", fault)
+    record = host_record(tmp_path / "run")
+    assert ended.code == 1 and summary.faults[0].what == what
+    assert record.injected[0].startswith(f"tick 100: {fault} ") and 100 <= record.faults[0].tick <= 104
+    assert record.lifecycle == "fault"
+
+
+@pytest.mark.parametrize("backend", ["sim", "can"])
+def test_a_joint_that_may_be_lost_is_passive_and_the_run_goes_on(tmp_path: Path, backend: str) -> None:
+    flags = ["--backend", backend, "--fault", "mute:joint_5@1", "--duration", "3", "--set", MAY_LOSE_ONE]
+    ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
+    assert ended.code == 0 and summary.ended == "complete" and summary.duration_s == 3.0, ended.out
+    assert summary.isolated == ["joint_5"] and summary.faults[0].joint == "joint_5"
+    assert "isolated              joint_5: failed, and passive since" in ended.out
+    left = RunRecord.load(tmp_path / "run")
+    modes, limits = left.mode, left.torque_limit_nm
+    before, after = slice(50, 95), slice(106, 300)
+    assert (modes[before, 4] == Mode.POSITION).all() and (modes[after, 4] == Mode.PASSIVE).all()
+    assert (limits[after, 4] == 0.0).all() and (np.delete(modes, 4, axis=1)[after] != Mode.PASSIVE).all()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["run", "triplet", "--fault", "mute:joint_14@1"], "--fault mute:joint_14@1: `faults[0]`: "),
+        (["run", "triplet", "--fault", "mute:joint_1@1", "--fault", "drop:a/b@1"], "`faults[1]`: 'a/b': no part"),
+        (["run", "triplet", "--fault", "leak:joint_1@1"], "backend 'sim' cannot do leak to joint_1"),
+        (["fault", "mute"], "give a target"),
+        (["fault", "mote", "joint_1"], "knows no 'mote'"),
+        (["fault", "reboot", "joint_1", "--for", "2"], "happens once and has no end"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_anything_starts(tmp_path: Path, arguments: list[str], words: str) -> None:
+    ended = snakesim(*arguments, cwd=tmp_path)
+    assert ended.code == 2 and words in ended.err
+    assert not list(tmp_path.iterdir())
+
+
+def test_without_a_robot_there_is_nothing_to_ask_and_the_list_is_there_anyway(tmp_path: Path) -> None:
+    ended = snakesim("fault", "mute", "joint_1", "--endpoint", "tcp/127.0.0.1:9", cwd=tmp_path)
+    assert ended.code == 1 and ended.err.startswith("snakesim: ")
+    ended = snakesim("fault", "list", cwd=tmp_path)
+    assert ended.code == 0 and "undervoltage" in ended.out

@@ -1,0 +1,68 @@
+"""What `simulate` and `snakesim run --in-process` leave, and what they refuse."""
+
+from pathlib import Path
+
+import pytest
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.scenario import Override, load, parse_set
+from snakesim_operator.results.record import BLACK_BOX, CONFIG, DESCRIPTION, HOST_RECORD, REPORT, SUMMARY, TELEMETRY
+from snakesim_operator.run.in_process import WORDS, simulate
+from tests.runs.command import snakesim
+
+LEFT = {BLACK_BOX, CONFIG, DESCRIPTION, HOST_RECORD, REPORT, SUMMARY, TELEMETRY}
+
+
+def test_the_command_leaves_the_folder_of_a_run(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    ended = snakesim("run", "triplet", "--in-process", "--duration", "1", "--out", str(out), cwd=tmp_path)
+    assert ended.code == 0, ended.out + ended.err
+    assert {path.name for path in out.iterdir()} == LEFT | {WORDS}
+    assert "in one process" in ended.out and str(out / REPORT) in ended.out and not ended.err
+
+
+def test_a_program_may_have_the_folder_too(tmp_path: Path) -> None:
+    config = load("triplet", [parse_set("duration_s=0.5")]).config
+    simulate(config, tmp_path / "run")
+    assert {path.name for path in (tmp_path / "run").iterdir()} == LEFT | {WORDS}
+
+
+FAILING = """
+from snakesim_gnc.control.hold import Hold
+
+
+class Failing(Hold):
+    def update(self, view):
+        if view.tick == 20:
+            raise ValueError("no idea")
+        return super().update(view)
+"""
+
+
+def test_a_controller_that_fails_ends_the_run_in_a_safe_stop(tmp_path: Path) -> None:
+    (tmp_path / "failing.py").write_text(FAILING)
+    result = simulate(load("triplet", [Override("controller", f"{tmp_path}/failing.py:Failing", "the test")]).config)
+    assert "control ended: controller" in result.summary.ended and "no idea" in result.summary.ended
+    assert [fault.what for fault in result.summary.faults] == ["service_lost", "lease_expired"]
+    assert result.record.host.lifecycle == "fault"
+
+
+@pytest.mark.parametrize(
+    ("sets", "words"),
+    [
+        (["pace=realtime"], "pace is 'realtime', must be 'lockstep'; add --pace lockstep"),
+        (["services.control.external=true"], "it needs a control service that is not external"),
+        (["services.guidance.external=true"], "services.guidance is external, and there is no network to meet it"),
+        (['faults=["kill:control@1"]'], "fault 'kill:control@1' needs processes of their own"),
+    ],
+)
+def test_what_needs_processes_or_a_network_is_refused(sets: list[str], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        simulate(load("triplet", [parse_set(text) for text in sets]).config)
+
+
+def test_the_command_refuses_what_needs_a_network(tmp_path: Path) -> None:
+    for flags in (["--stay"], ["--endpoint", "tcp/127.0.0.1:7500"], ["--namespace", "lab"], ["--with-router"]):
+        ended = snakesim("run", "triplet", "--in-process", *flags, cwd=tmp_path)
+        assert ended.code == 2 and f"--in-process and {flags[0]}: there is no network" in ended.err
+    assert not (tmp_path / "runs").exists()

@@ -1,0 +1,68 @@
+"""Whole runs: a snake that moves can be told apart from one that does not, whatever its size, world and files."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.runs.command import run_to_summary, snakesim
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--controller", "hold"], ["--set", "control.propulsion_n=2"]], ids=["hold", "below-drag"]
+)
+def test_control_experiments_stay_where_they_are(tmp_path: Path, arguments: list[str]) -> None:
+    ended, summary = run_to_summary(tmp_path / "run", "triplet", "--duration", "10", *arguments)
+    assert ended.code == 0, ended.out + ended.err
+    assert summary.path_distance_m is not None and abs(summary.path_distance_m) < 0.02
+    assert summary.net_displacement_m is not None and summary.net_displacement_m < 0.02
+
+
+def test_one_seed_one_digest(tmp_path: Path) -> None:
+    def digest(name: str, seed: int) -> str:
+        return run_to_summary(tmp_path / name, "triplet", "--duration", "1", "--seed", str(seed))[1].command_digest
+
+    assert digest("a", 1) == digest("again", 1) != digest("b", 2)
+
+
+def test_a_run_repeats_from_the_configuration_that_it_left(tmp_path: Path) -> None:
+    _, first = run_to_summary(tmp_path / "first", "triplet", "--duration", "2", "--set", "scene.ground.friction=0.08")
+    _, again = run_to_summary(tmp_path / "again", str(tmp_path / "first" / "config.json"))
+    assert again.command_digest == first.command_digest
+    assert again.config == first.config
+
+
+@pytest.mark.parametrize("modules", [8, 13, pytest.param(30, marks=pytest.mark.slow)])
+def test_any_number_of_modules_without_a_code_change(tmp_path: Path, modules: int) -> None:
+    ended, summary = run_to_summary(
+        tmp_path / "run", "peg_row", "--duration", "6", "--set", f"robot.chain.modules={modules}"
+    )
+    assert ended.code == 0, ended.out + ended.err
+    assert summary.path_distance_m is not None and summary.path_distance_m > 0.4
+    assert summary.propulsion_joints
+
+
+def test_a_jam_is_reported_as_such(tmp_path: Path) -> None:
+    ended, summary = run_to_summary(tmp_path / "run", "jam")
+    assert ended.code == 0, ended.out + ended.err
+    assert summary.jammed
+    assert "jam" in ended.out.lower()
+
+
+def test_another_robot_in_another_world(tmp_path: Path) -> None:
+    ended, summary = run_to_summary(tmp_path / "run", "clutter")
+    assert ended.code == 0, ended.out + ended.err
+    assert summary.robot == "mamba" and summary.path_distance_m is not None and summary.path_distance_m > 0.3
+
+
+def test_run_from_a_file_of_ones_own_in_another_folder(tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_text(
+        'title = "mine"\nrobot = "planar13"\nscene = "./my_scene.toml"\ncontroller = "path_following"\n'
+        "duration_s = 1\n[services.guidance]\n[services.navigation]\n[services.control]\n"
+    )
+    (tmp_path / "my_scene.toml").write_text(
+        'name = "mine"\n[ground]\nfriction = 0.3\n[route]\nkind = "sine"\namplitude_m = 0.05\nwavelength_m = 0.8\n'
+        "length_m = 4.0\n[[box]]\nposition_m = [0.5, 0.6]\nsize_m = [0.2, 0.1, 0.2]\n"
+    )
+    ended = snakesim("run", "./mine.toml", "--in-process", "--out", "out", cwd=tmp_path)
+    assert ended.code == 0, ended.out + ended.err
+    assert (tmp_path / "out" / "report.html").is_file()
