@@ -8,7 +8,7 @@ from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.scenario import Override, load, parse_set
 from snakesim_operator.results.record import BLACK_BOX, CONFIG, DESCRIPTION, HOST_RECORD, REPORT, SUMMARY, TELEMETRY
 from snakesim_operator.run.in_process import WORDS, simulate
-from tests.runs.command import snakesim
+from tests.whole.command import snakesim
 
 LEFT = {BLACK_BOX, CONFIG, DESCRIPTION, HOST_RECORD, REPORT, SUMMARY, TELEMETRY}
 

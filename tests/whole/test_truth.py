@@ -8,7 +8,7 @@ import pytest
 from snakesim_hal.wire import keys
 from snakesim_operator.results.record import REPORT, TELEMETRY, RunRecord
 from snakesim_operator.results.summary import summarise
-from tests.runs.command import run_to_summary
+from tests.whole.command import run_to_summary
 
 STILL = (
     "from snakesim_gnc.control.controller import Action, positions\n"
