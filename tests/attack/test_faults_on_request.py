@@ -12,6 +12,7 @@ import pytest
 
 from tests.attack.command import STANDING, running
 from tests.attack.means import wire
+from tests.attack.means.meanwhile import meanwhile
 from tests.attack.robot import Robot, joined
 from tests.attack.stranger import Stranger
 
@@ -47,20 +48,15 @@ def real(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Robot, Stra
 
 @contextmanager
 def forging(stranger: Stranger, about: dict[str, Any]) -> Iterator[None]:
-    publisher, over = stranger.latch("hal/description", about), threading.Event()
+    publisher = stranger.latch("hal/description", about)
 
-    def repeat() -> None:
+    def repeat(over: threading.Event) -> None:
         while not over.wait(EVERY_S):
             stranger.put("hal/description", about)
             publisher.put(wire.encode(about))
 
-    thread = threading.Thread(target=repeat, daemon=True)
-    thread.start()
-    try:
+    with meanwhile(repeat):
         yield
-    finally:
-        over.set()
-        thread.join()
 
 
 @pytest.mark.parametrize(("key", "request_"), ASKED, ids=[f"{key}-{asked['kind']}" for key, asked in ASKED])

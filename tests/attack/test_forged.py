@@ -13,6 +13,7 @@ import pytest
 from tests.attack.effort import FULL, effort
 from tests.attack.limits import beyond_limits
 from tests.attack.means import wire
+from tests.attack.means.meanwhile import meanwhile
 from tests.attack.robot import Robot, standing
 from tests.attack.stranger import Stranger
 
@@ -37,20 +38,14 @@ def repeating(
     messages: Callable[[], list[tuple[str, Any]]],
 ) -> Iterator[None]:
     """Say something again and again, faster than who should say it."""
-    over = threading.Event()
 
-    def repeat() -> None:
+    def repeat(over: threading.Event) -> None:
         while not over.wait(0.005):
             for key, message in messages():
                 stranger.put(key, message)
 
-    thread = threading.Thread(target=repeat, daemon=True)
-    thread.start()
-    try:
+    with meanwhile(repeat):
         yield
-    finally:
-        over.set()
-        thread.join()
 
 
 def holds(robot: Robot, key: str, variants: dict[str, dict[str, Any]], each_s: float = FORGED_S) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 
 from tests.attack.limits import beyond_limits
 from tests.attack.means import wire
+from tests.attack.means.meanwhile import meanwhile
 from tests.attack.robot import Robot
 from tests.attack.stranger import Stranger
 
@@ -40,9 +41,8 @@ def test_anybody_may_stop_clear_and_disarm(robot: Robot) -> None:
 @contextmanager
 def commanding(stranger: Stranger, epoch: int, target: float) -> Iterator[None]:
     """A controller of his own: it answers every tick, as schemas/ tells."""
-    over = threading.Event()
 
-    def stream() -> None:
+    def stream(over: threading.Event) -> None:
         sequence = 0
         while not over.is_set():
             clock = stranger.next("hal/clock")
@@ -52,13 +52,8 @@ def commanding(stranger: Stranger, epoch: int, target: float) -> Iterator[None]:
             forged = stranger.command(clock, sequence=sequence, lease_epoch=epoch, target=wanted)
             stranger.put("actuator/joints", forged)
 
-    thread = threading.Thread(target=stream, daemon=True)
-    thread.start()
-    try:
+    with meanwhile(stream):
         yield
-    finally:
-        over.set()
-        thread.join()
 
 
 def test_anybody_may_take_the_lease_which_disarms_and_arm_and_move_within_the_limits(robot: Robot) -> None:

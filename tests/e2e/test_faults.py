@@ -9,7 +9,7 @@ import pytest
 from snakesim_hal.host_process import HostRecord
 from snakesim_operator.results.record import RunRecord
 from tests.e2e.command import Running, nothing_left, run_to_summary, running, snakesim, wait_until
-from tests.runs import command
+from tests.whole import command
 
 pytestmark = pytest.mark.e2e
 

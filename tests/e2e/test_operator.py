@@ -9,7 +9,7 @@ import pytest
 
 from snakesim_hal.host.latch import ESTOP
 from tests.e2e.command import Ended, Running, nothing_left, running, wait_until
-from tests.runs import command
+from tests.whole import command
 
 pytestmark = pytest.mark.e2e
 

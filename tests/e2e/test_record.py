@@ -27,7 +27,7 @@ from tests.e2e.command import (
     snakesim,
     wait_until,
 )
-from tests.runs import command
+from tests.whole import command
 
 pytestmark = pytest.mark.e2e
 

@@ -10,7 +10,7 @@ import pytest
 
 from snakesim_operator.results.record import REPORT
 from tests.e2e.command import nothing_left, run_to_summary, snakesim
-from tests.runs import command
+from tests.whole import command
 
 pytestmark = pytest.mark.e2e
 
@@ -72,7 +72,7 @@ def test_other_paces_complete(tmp_path: Path, pace: str) -> None:
 
 
 def test_wrong_input_starts_nothing(tmp_path: Path) -> None:
-    """Case by case in tests/runs/test_bad_input.py."""
+    """Case by case in tests/whole/test_bad_input.py."""
     ended = snakesim("run", "triplet", "--set", "robot.module.length_m=-0.1", "--out", "run", cwd=tmp_path)
     assert ended.code == 2 and ended.out == "" and ended.err.startswith("snakesim: ") and ended.err.count("\n") == 1
     assert not (tmp_path / "run").exists()

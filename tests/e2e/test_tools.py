@@ -26,7 +26,7 @@ from tests.e2e.command import (
     snakesim,
     wait_until,
 )
-from tests.runs import command
+from tests.whole import command
 
 pytestmark = pytest.mark.e2e
 
@@ -73,10 +73,7 @@ def test_output_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
         )
     assert done.returncode == 1 and done.stderr.startswith("snakesim: ") and done.stderr.count("\n") == 1
     seen = subprocess.run(
-        ["sh", "-c", f"{' '.join(SNAKESIM)} config triplet | head -1"],
-        cwd=tmp_path,
-        capture_output=True,
-        check=False,
+        ["sh", "-c", f"{' '.join(SNAKESIM)} config triplet | head -1"], cwd=tmp_path, capture_output=True, check=False
     )
     assert seen.stderr == b"" and seen.stdout.count(b"\n") == 1
 

@@ -389,9 +389,7 @@ HEADINGS: tuple[Heading, ...] = (
             stop_row("stop_idle", "1000 sessions that do nothing, or as many as get in", attacks.stopped_under("idle")),
             stop_row("stop_lease_flood", "lease queries, as many as two processes can", attacks.stopped_under("lease")),
             stop_row(
-                "stop_sample_flood",
-                "10,000 samples of noise a second on every key",
-                attacks.stopped_under("garbage"),
+                "stop_sample_flood", "10,000 samples of noise a second on every key", attacks.stopped_under("garbage")
             ),
             stop_row(
                 "stop_datagram_flood",
@@ -399,9 +397,7 @@ HEADINGS: tuple[Heading, ...] = (
                 attacks.stopped_under("datagrams"),
             ),
             stop_row(
-                "stop_readers_leave",
-                "300 readers of everything leave at once",
-                attacks.stopped_while_readers_leave,
+                "stop_readers_leave", "300 readers of everything leave at once", attacks.stopped_while_readers_leave
             ),
         ),
     ),

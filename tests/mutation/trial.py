@@ -19,6 +19,7 @@ TRIED_BY = {
     "lease.py": ("test_lease.py", *AUTHORITY, "test_authority_machine.py"),
     "lifecycle.py": ("test_lifecycle.py", "test_arming.py", *AUTHORITY, "test_authority_machine.py"),
     "authority.py": (*AUTHORITY, "test_isolation.py", "test_authority_machine.py"),
+    "fault_log.py": ("test_authority_stops.py", "test_authority_machine.py"),
     "isolation.py": ("test_isolation.py", "test_authority_machine.py"),
     "plausibility.py": ("test_plausibility.py", "test_isolation.py", "test_authority_machine.py"),
     "stop_ramp.py": ("test_stop_ramp.py", "test_authority_machine.py"),

@@ -10,7 +10,7 @@ from snakesim_hal.wire.messages import AppliedCommand, Description, Fault, Mode,
 from tests.soak.faults import Dice
 from tests.soak.watch import Watch
 from tests.unit.hal.local_network import free_endpoint, wait_until
-from tests.unit.hal.rig import description, state
+from tests.unit.hal.rig import description, state, status
 
 ROBOT = description()  # 5 rad/s at 100 Hz, and 0.3 rad from the measured angle at most
 
@@ -26,28 +26,8 @@ def applied(tick: int, target: float) -> AppliedCommand:
     )
 
 
-def status(why: str, *causes: str) -> Status:
-    return Status(
-        tick=1,
-        stamp_ns=0,
-        robot="worm",
-        backend="lag",
-        pace="realtime",
-        rate_hz=100.0,
-        lifecycle="fault",
-        why=why,
-        lease_holder=None,
-        lease_epoch=0,
-        commands_accepted=0,
-        commands_standby=0,
-        commands_rejected={},
-        commands_limited={},
-        faults=[Fault(tick=1, what="hot", cause=cause) for cause in causes],
-        alive=[],
-        waiting_for=[],
-        overruns=0,
-        ready_to_arm=False,
-    )
+def stopped(why: str, *causes: str) -> Status:
+    return status(tick=1, lifecycle="fault", why=why, faults=[Fault(tick=1, what="hot", cause=c) for c in causes])
 
 
 @pytest.mark.parametrize(
@@ -74,7 +54,7 @@ def test_a_fault_that_is_not_explained_is_found() -> None:
     endpoint = free_endpoint()
     with open_session(Link(endpoint, "worm", listen=True)) as hal, open_session(Link(endpoint, "worm")) as session:
         watch, teller = Watch(session), hal.latched_publisher(keys.STATUS, Status)
-        for told in (status("too hot", "too hot"), status("too hot"), status("", "too hot")):
+        for told in (stopped("too hot", "too hot"), stopped("too hot"), stopped("", "too hot")):
             watch.status = None
             teller.put(told)
             wait_until(lambda: watch.listen() or watch.status is not None, "the status")

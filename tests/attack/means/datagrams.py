@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from tests.attack.command import address
+from tests.attack.means.meanwhile import meanwhile
 
 ASK, DONE = b"SNAKSTOP", b"SNAKDONE"
 AGAIN_S = 0.05
@@ -43,29 +44,22 @@ def false_port(endpoint: str, *, knows_nonce: bool = True) -> Iterator[None]:
     wire = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     wire.bind(address(endpoint))
     wire.settimeout(0.1)
-    over = threading.Event()
 
-    def answer() -> None:
+    def answer(over: threading.Event) -> None:
         while not over.is_set():
             with contextlib.suppress(TimeoutError):
                 asked, sender = wire.recvfrom(2048)
                 nonce = asked[8:24] if knows_nonce else bytes(16)
                 wire.sendto(DONE + nonce + b"planar13\nstopped", sender)
 
-    thread = threading.Thread(target=answer, daemon=True)
-    thread.start()
-    try:
+    with wire, meanwhile(answer):
         yield
-    finally:
-        over.set()
-        thread.join()
-        wire.close()
 
 
 @contextmanager
 def flood(endpoint: str) -> Iterator[list[int]]:
     """Noise, truncated and oversized stops, as fast as one thread can send."""
-    dice, sent, over = random.Random(1), [0], threading.Event()
+    dice, sent = random.Random(1), [0]
     nonce = bytes(16)
     shots = [
         *(dice.randbytes(size) for size in (0, 1, 8, 24, 100, 1400, 60_000)),
@@ -76,17 +70,11 @@ def flood(endpoint: str) -> Iterator[list[int]]:
     ]
     wire = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 
-    def send() -> None:
+    def send(over: threading.Event) -> None:
         while not over.is_set():
             with contextlib.suppress(OSError):
                 wire.sendto(dice.choice(shots), address(endpoint))
                 sent[0] += 1
 
-    thread = threading.Thread(target=send, daemon=True)
-    thread.start()
-    try:
+    with wire, meanwhile(send):
         yield sent
-    finally:
-        over.set()
-        thread.join()
-        wire.close()

@@ -119,9 +119,5 @@ def _back(observer: Observer, key: str, value: float | None, troubles: list[str]
     back_ms.append((pushing()[0] - began_ns) / 1e6)
     steps = observer.steps()
     return Trial(
-        value=value,
-        trouble="; ".join(troubles),
-        recovered=True,
-        step_rad=steps.within_rad,
-        first_rad=steps.first_rad,
+        value=value, trouble="; ".join(troubles), recovered=True, step_rad=steps.within_rad, first_rad=steps.first_rad
     )

@@ -8,7 +8,7 @@ import msgspec
 
 from snakesim_hal.model.robot import RobotFile, describe
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.wire.messages import Description, JointCommand, JointState, Mode
+from snakesim_hal.wire.messages import Description, JointCommand, JointState, Mode, Status
 
 PERIOD_NS = 10_000_000
 LEASE_NS = 50_000_000
@@ -162,3 +162,29 @@ def write_files(
     (folder / "bend.toml").write_text(scene)
     (folder / "crawl.toml").write_text(scenario)
     return str(folder / "crawl.toml")
+
+
+def status(**told: Any) -> Status:
+    """What a host of the worm tells, with these values."""
+    values: dict[str, Any] = {
+        "tick": 0,
+        "stamp_ns": 0,
+        "robot": "worm",
+        "backend": "lag",
+        "pace": "realtime",
+        "rate_hz": 100.0,
+        "lifecycle": "armed",
+        "why": "armed",
+        "lease_holder": None,
+        "lease_epoch": 0,
+        "overruns": 0,
+        "commands_accepted": 0,
+        "commands_standby": 0,
+        "commands_rejected": {},
+        "commands_limited": {},
+        "faults": [],
+        "alive": [],
+        "waiting_for": [],
+        "ready_to_arm": False,
+    }
+    return Status(**{**values, **told})

@@ -202,6 +202,27 @@ def test_what_is_sent_for_another_arming_neither_moves_the_robot_nor_keeps_the_l
     assert (rig.authority.accepted, rig.authority.standby) == (1, 1)
 
 
+def test_after_a_disarm_arming_needs_a_new_command() -> None:
+    rig = armed()
+    rig.send(0.1)
+    rig.pass_tick()
+    rig.authority.on_lifecycle(DISARM, rig.now_ns)
+    rig.authority.decide()
+    assert rig.arm().reason == "no commands from control yet"
+    rig.send(0.1)
+    assert rig.arm().ok
+
+
+def test_a_new_holder_of_the_lease_must_command_itself_from_sequence_0_on() -> None:
+    rig = Rig()
+    rig.observe(0.1)
+    rig.acquire()
+    rig.send(0.1)
+    assert rig.acquire("teleop", 200).ok
+    assert rig.arm().reason == "no commands from teleop yet"
+    assert rig.send(0.1, sequence=0) is None and rig.arm().ok
+
+
 def test_while_disarmed_it_does_not_matter_which_arming_a_command_names() -> None:
     rig = armed()
     rig.authority.on_lifecycle(DISARM, rig.now_ns)

@@ -60,6 +60,23 @@ def test_a_fault_is_held_where_the_joints_were_when_it_came() -> None:
     assert rig.pass_tick().set_points.target == [0.7] * JOINTS
 
 
+def test_a_joint_that_moves_when_a_fault_comes_is_slowed_down_over_some_periods() -> None:
+    """At 3 rad/s and 100 rad/s2: in three periods."""
+    rig = armed(safety__action="hold")
+    rig.observe(0.4, 3.0)
+    rig.authority.fault(Fault(tick=1, what="hot", cause="joint_2 is hot"))
+    held = [rig.pass_tick().set_points.target[0] for _ in range(5)]
+    assert held == pytest.approx([0.425, 0.44, 0.445, 0.445, 0.445])
+
+
+def test_all_joints_that_are_hot_are_named() -> None:
+    rig = armed()
+    hear(rig, [90.0] * JOINTS)
+    rig.pass_tick()
+    rig.send(0.1, torque_limit_nm=[4.0] * JOINTS)
+    assert rig.pass_tick().limited == dict.fromkeys(range(JOINTS), "thermal")
+
+
 def test_a_held_pose_stays_inside_the_angle_limits() -> None:
     rig = armed(safety__action="hold")
     rig.observe(1.9)
@@ -85,6 +102,21 @@ def test_faults_are_kept_up_to_a_limit_the_first_and_the_newest() -> None:
     rig.authority.on_lifecycle(CLEAR, 0)
     assert rig.authority.faults == [] and rig.authority.since_clear.left_out == 0
     assert len(rig.authority.since_start.kept) == MAX_FAULTS_KEPT and rig.authority.since_start.left_out == 68
+
+
+@pytest.mark.parametrize("by", ["fault", "estop"])
+def test_what_stopped_the_robot_is_kept_however_much_comes_after_it(by: str) -> None:
+    rig = armed()
+    for i in range(16):
+        rig.authority.note(Fault(tick=i, what="late", cause="late"))
+    if by == "fault":
+        rig.authority.fault(Fault(tick=16, what="hot", cause="hot"))
+    else:
+        rig.authority.on_estop(ESTOP, 16)
+        rig.authority.on_estop(ESTOP, 17)  # it is stopped already
+    for i in range(18, 100):
+        rig.authority.note(Fault(tick=i, what="late", cause="late"))
+    assert [fault.tick for fault in rig.authority.faults] == [*range(17), *range(85, 100)]
 
 
 def test_a_fault_is_explained_in_as_many_words_as_a_message_holds() -> None:

@@ -4,31 +4,11 @@ import pytest
 
 from snakesim_hal.wire.messages import LifecycleState, Status
 from snakesim_operator.run.progress import Progress
-from tests.unit.hal.rig import run_config
+from tests.unit.hal.rig import run_config, status
 
 
-def status(tick: int, lifecycle: LifecycleState = "armed") -> Status:
-    return Status(
-        tick=tick,
-        stamp_ns=tick * 10**7,
-        robot="worm",
-        backend="lag",
-        pace="realtime",
-        rate_hz=100.0,
-        lifecycle=lifecycle,
-        why=lifecycle,
-        lease_holder=None,
-        lease_epoch=0,
-        commands_accepted=0,
-        commands_standby=0,
-        commands_rejected={},
-        commands_limited={},
-        faults=[],
-        alive=[],
-        waiting_for=[],
-        overruns=0,
-        ready_to_arm=False,
-    )
+def at(tick: int, lifecycle: LifecycleState = "armed") -> Status:
+    return status(tick=tick, stamp_ns=tick * 10**7, lifecycle=lifecycle, why=lifecycle)
 
 
 def shown(progress: Progress, found: Status, capsys: pytest.CaptureFixture[str]) -> str:
@@ -41,20 +21,20 @@ def test_only_armed_time_counts_and_never_more_than_all(capsys: pytest.CaptureFi
     """With --stay a run goes on until it was armed for its duration."""
     progress, line = Progress(run_config(duration_s=3.0)), ""
     for tick in range(100, 301, 20):
-        line = shown(progress, status(tick), capsys)
+        line = shown(progress, at(tick), capsys)
     assert line.startswith("2.00 of 3 s")
     for tick in range(320, 2001, 20):  # seventeen seconds in which a person looks at the fault
-        line = shown(progress, status(tick, "fault"), capsys)
+        line = shown(progress, at(tick, "fault"), capsys)
     assert line.startswith("2.20 of 3 s") and "fault: fault" in line
     for tick in range(2020, 2200, 20):
-        line = shown(progress, status(tick), capsys)
+        line = shown(progress, at(tick), capsys)
     assert line.startswith("3.00 of 3 s")
 
 
 def test_a_new_host_begins_anew(capsys: pytest.CaptureFixture[str]) -> None:
     progress = Progress(run_config(duration_s=3.0))
     for tick in (100, 200):
-        shown(progress, status(tick), capsys)
+        shown(progress, at(tick), capsys)
     progress.start_over()
-    shown(progress, status(0), capsys)
-    assert shown(progress, status(50), capsys).startswith("0.50 of 3 s")
+    shown(progress, at(0), capsys)
+    assert shown(progress, at(50), capsys).startswith("0.50 of 3 s")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from snakesim_hal.model.files import find
 from snakesim_hal.wire import keys
-from tests.runs.command import snakesim
+from tests.whole.command import snakesim
 
 
 def test_config_tells_where_each_value_came_from(tmp_path: Path) -> None:

@@ -8,10 +8,9 @@ from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.scenario import Override, load, parse_set
 from snakesim_operator.results.record import BLACK_BOX, CONFIG, DESCRIPTION, HOST_RECORD, REPORT, SUMMARY, TELEMETRY
 from snakesim_operator.run.in_process import WORDS, simulate
-from tests.runs.command import snakesim
+from tests.whole.command import snakesim
 
 LEFT = {BLACK_BOX, CONFIG, DESCRIPTION, HOST_RECORD, REPORT, SUMMARY, TELEMETRY}
-
 
 
 def test_the_command_leaves_the_folder_of_a_run(tmp_path: Path) -> None:

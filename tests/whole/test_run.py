@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.runs.command import run_to_summary, snakesim
+from tests.whole.command import run_to_summary, snakesim
 
 
 @pytest.mark.parametrize(

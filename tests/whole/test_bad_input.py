@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.runs.command import snakesim
+from tests.whole.command import snakesim
 
 ROBOT = Path("snakesim_hal/shipped/robots/planar13.toml").resolve()
 SCENE = Path("snakesim_hal/shipped/scenes/triplet.toml").resolve()

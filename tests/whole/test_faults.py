@@ -8,7 +8,7 @@ import pytest
 from snakesim_hal.host_process import HostRecord
 from snakesim_hal.wire.messages import Mode
 from snakesim_operator.results.record import RunRecord
-from tests.runs.command import run_to_summary, snakesim
+from tests.whole.command import run_to_summary, snakesim
 
 MAY_LOSE_ONE = "robot.safety.may_lose_joints=1"
 

@@ -8,7 +8,7 @@ import pytest
 from snakesim_hal.wire import keys
 from snakesim_operator.results.record import REPORT, TELEMETRY, RunRecord
 from snakesim_operator.results.summary import summarise
-from tests.runs.command import run_to_summary
+from tests.whole.command import run_to_summary
 
 STILL = (
     "from snakesim_gnc.control.controller import Action, positions\n"
@@ -23,10 +23,7 @@ def test_a_controller_that_says_nothing_and_stands_still_does_not_locomote(tmp_p
     (tmp_path / "still.py").write_text(STILL)
     ended, summary = run_to_summary(tmp_path / "run", "triplet", "--controller", "./still.py:Still", "--duration", "3")
     assert ended.code == 0 and summary.locomoting_fraction == 0.0
-    assert (summary.last_state, summary.last_reason) == (
-        "NotLocomoting",
-        "standing still: less than 5 mm in 1 s",
-    )
+    assert (summary.last_state, summary.last_reason) == ("NotLocomoting", "standing still: less than 5 mm in 1 s")
     assert "locomoting            0 %" in ended.out
     assert "Did not locomote: standing still: less than 5 mm in 1 s." in (tmp_path / "run" / REPORT).read_text()
 

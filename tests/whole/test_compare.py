@@ -11,7 +11,7 @@ import pytest
 from snakesim_hal.errors import ConfigError
 from snakesim_operator.results.compare.command import compare
 from snakesim_operator.results.page.html import LIBRARY
-from tests.runs.command import run_to_summary, snakesim
+from tests.whole.command import run_to_summary, snakesim
 
 
 @pytest.fixture(scope="module")
