@@ -291,7 +291,7 @@ class JointDescription(Message, frozen=True, kw_only=True):
     velocity_gain_nm_s_per_rad: Annotated[float, Meta(gt=0, le=1e6), about("of velocity mode")]
     rotor_kg_m2: Annotated[
         float,
-        Meta(ge=0, le=1e3),
+        q.from_zero(1e3, "kg·m²"),
         about("inertia that `torque_nm` turns besides the links; 0: measured beyond the rotor"),
     ] = 0.0
     derate_from_c: Annotated[q.Temperature, about("of the winding: above it torque is derated")] = 80.0
