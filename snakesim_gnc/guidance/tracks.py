@@ -1,0 +1,133 @@
+"""One obstacle of the map: its surface, its shape with covariance, and whether to believe in it. Pure.
+
+The shape is fitted anew whenever the surface has changed: circle or box, whichever explains it with fewer parameters
+(Bayesian information criterion). So what began as a short arc becomes the box that it turns out to be.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_gnc.guidance.box_fit import fit_boxes
+from snakesim_gnc.guidance.circle_fit import RADIUS_M, fit_circles
+from snakesim_gnc.guidance.surfaces import Surface, batched
+from snakesim_hal.wire.messages import Obstacle
+
+Floats = NDArray[np.float64]
+BOX_FROM = 5  # cells; fewer are a circle
+ROUND_LIMIT_M = 0.16  # rounder things are boxes
+LOYALTY = 4.0  # by which another shape must be better than the present one
+HIT, MISS, TOUCH = 0.5, -0.8, 3.0  # log odds
+SUREST = 5.0
+BELIEVED = 0.4  # from here on it is told: seen twice, or felt
+GONE = -1.0
+MEMORY_S = 60.0  # belief in what is not seen again falls to 1/e
+UNKNOWN_HEIGHT_M = 0.2
+
+
+@dataclass
+class Track:
+    """An obstacle under observation."""
+
+    number: int
+    surface: Surface = field(default_factory=Surface)
+    felt: bool = False
+    log_odds: float = 0.0
+    last_seen_ns: int = 0
+    top_m: float = 0.0
+    drift_m2: float = 0.0  # of the robot's position, when the surface was last brought up to date
+    shape: Literal["cylinder", "box"] = "cylinder"
+    centre_w: Floats = field(default_factory=lambda: np.zeros(2))
+    yaw_rad: float = 0.0
+    radius_m: float = RADIUS_M
+    half_m: Floats = field(default_factory=lambda: np.zeros(2))
+    position_sd_m: float = math.inf
+    size_sd_m: float = math.inf
+    cost: float = math.inf  # misfit and parameters of the shape
+
+    @property
+    def name(self) -> str:
+        """As it is told."""
+        return f"{'felt' if self.felt else 'seen'}_{self.number}"
+
+    def believe(self, by: float) -> None:
+        """More or less than before."""
+        self.log_odds = min(self.log_odds + by, SUREST)
+
+    def believed(self, now_ns: int) -> float:
+        """Log odds that it is there, now."""
+        return self.log_odds * math.exp(-max(now_ns - self.last_seen_ns, 0) * 1e-9 / MEMORY_S)
+
+    def told(self, now_ns: int, ground_z_m: float) -> Obstacle:
+        """As a message."""
+        height = max(self.top_m, UNKNOWN_HEIGHT_M)
+        x, y = self.centre_w.tolist()
+        boxy = self.shape == "box"
+        return Obstacle(
+            name=self.name,
+            shape=self.shape,
+            position_w=(x, y, ground_z_m + height / 2),
+            yaw_rad=self.yaw_rad if boxy else 0.0,
+            radius_m=0.0 if boxy else self.radius_m,
+            half_size_m=(float(self.half_m[0]), float(self.half_m[1]), height / 2) if boxy else (0.0, 0.0, 0.0),
+            height_m=height,
+            confidence=1.0 / (1.0 + math.exp(-self.believed(now_ns))),
+            position_sd_m=min(self.position_sd_m, 10.0),
+            size_sd_m=min(self.size_sd_m, 10.0),
+            last_seen_ns=self.last_seen_ns,
+            felt=self.felt,
+        )
+
+
+def fit(tracks: Sequence[Track]) -> None:
+    """Fit the shapes of tracks to their surfaces, all at once."""
+    if not tracks:
+        return
+    points, weight, outward, normal = batched([track.surface for track in tracks])
+    circles, boxes = fit_circles(points, weight, outward, normal), fit_boxes(points, weight, outward)
+    cells = np.array([len(track.surface) for track in tracks])
+    per = np.log(np.maximum(cells, 2))
+    as_circle = circles.misfit + 3 * per + np.where(circles.radius_m > ROUND_LIMIT_M, 1e3, 0.0)
+    as_box = boxes.misfit + np.where(boxes.faces > 1, 5, 4) * per + np.where(cells < BOX_FROM, 1e6, 0.0)
+    for i, track in enumerate(tracks):
+        loyalty = 0.0 if math.isinf(track.cost) else LOYALTY if track.shape == "cylinder" else -LOYALTY
+        if as_circle[i] <= as_box[i] + loyalty:
+            track.shape, track.cost = "cylinder", float(as_circle[i])
+            track.centre_w, track.radius_m = circles.centre_w[i], float(circles.radius_m[i])
+            spread = circles.covariance[i]
+            track.position_sd_m = math.sqrt(float(np.linalg.eigvalsh(spread[:2, :2])[-1]))
+            track.size_sd_m = math.sqrt(float(spread[2, 2]))
+        else:
+            track.shape, track.cost = "box", float(as_box[i])
+            track.centre_w, track.half_m, track.yaw_rad = boxes.centre_w[i], boxes.half_m[i], float(boxes.yaw_rad[i])
+            track.position_sd_m = float(boxes.centre_sd_m[i].max())
+            track.size_sd_m = float(boxes.half_sd_m[i].max())
+
+
+class Outlines:
+    """Shapes of some tracks as arrays, for distances to all of them."""
+
+    def __init__(self, tracks: Sequence[Track]) -> None:
+        self.tracks = list(tracks)
+        self.centre_w = np.array([t.centre_w for t in tracks]).reshape(-1, 2)
+        self.round = np.array([t.shape == "cylinder" for t in tracks], dtype=bool)
+        self.radius_m = np.array([t.radius_m if t.shape == "cylinder" else 0.0 for t in tracks])
+        self.half_m = np.array([t.half_m if t.shape == "box" else np.zeros(2) for t in tracks]).reshape(-1, 2)
+        yaw = np.array([t.yaw_rad if t.shape == "box" else 0.0 for t in tracks])
+        self._c, self._s = np.cos(yaw), np.sin(yaw)
+        self.reach_m = np.where(self.round, self.radius_m, np.hypot(self.half_m[:, 0], self.half_m[:, 1]))
+        self.sd_m = np.array([t.position_sd_m for t in tracks])
+
+    def distance_m(self, points_w: Floats) -> Floats:
+        """Signed distances of points (n, 2) from every outline, (n, tracks); negative inside."""
+        x = points_w[:, None, 0] - self.centre_w[:, 0]
+        y = points_w[:, None, 1] - self.centre_w[:, 1]
+        beyond_x = np.abs(self._c * x + self._s * y) - self.half_m[:, 0]
+        beyond_y = np.abs(self._c * y - self._s * x) - self.half_m[:, 1]
+        outside = np.hypot(np.maximum(beyond_x, 0.0), np.maximum(beyond_y, 0.0))
+        inside = np.minimum(np.maximum(beyond_x, beyond_y), 0.0)
+        return np.where(self.round, np.hypot(x, y) - self.radius_m, outside + inside)
