@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 RADIUS_M, RADIUS_SD_M = 0.05, 0.03  # prior: what stands around, before it was looked at
 SMALLEST_M, LARGEST_M = 0.01, 0.5
-STEPS = 6
+STEPS = 5
 OUTLIER_SD = 3.0
 MODEL_SD_M = 0.0015  # of real surfaces from a circle or box, and of points that are means over a cell
 
@@ -27,12 +27,17 @@ class Circles:
     misfit: Floats  # (b,) sum of squared, weighted, limited distances
 
 
-def fit_circles(points: Floats, weight: Floats, outward: Floats, normal_weight: Floats) -> Circles:
-    """points (b, p, 2), weight (b, p), outward (b, p, 2), normal_weight (b, p), as of `batched`."""
+def fit_circles(points: Floats, weight: Floats, outward: Floats, normal_weight: Floats, began_w: Floats) -> Circles:
+    """points (b, p, 2), weight (b, p), outward (b, p, 2), normal_weight (b, p), as of `batched`.
+
+    began_w: (b, 2) centres of earlier fits; NaN: none.
+    """
     weight = softened(weight)
     share = weight / weight.sum(axis=1, keepdims=True)
-    centre = np.einsum("bp,bpk->bk", share, points - RADIUS_M * outward)
-    radius = np.full(len(points), RADIUS_M)
+    centre = np.where(np.isnan(began_w), np.einsum("bp,bpk->bk", share, points - RADIUS_M * outward), began_w)
+    radius = np.einsum(
+        "bp,bp->b", share, np.hypot(points[..., 0] - centre[:, None, 0], points[..., 1] - centre[:, None, 1])
+    )
     information = np.zeros((len(points), 3, 3))
     for _ in range(STEPS):
         offset = points - centre[:, None]

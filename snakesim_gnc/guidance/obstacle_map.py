@@ -16,7 +16,8 @@ from snakesim_gnc.guidance.circle_fit import RADIUS_M, RADIUS_SD_M
 from snakesim_gnc.guidance.clusters import clusters_of
 from snakesim_gnc.guidance.scan import MAX_RANGE_M, Scan
 from snakesim_gnc.guidance.surfaces import MAX_DOUBTS
-from snakesim_gnc.guidance.tracks import BELIEVED, GONE, HIT, MISS, TOUCH, Outlines, Track, fit
+from snakesim_gnc.guidance.tracks import BELIEVED, GONE, HIT, MISS, TOUCH, Track, fit, outlines_of, position_sd_m
+from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Obstacle
 
 Floats = NDArray[np.float64]
@@ -51,11 +52,11 @@ class ObstacleMap:
     def take_scan(self, scan: Scan, sd_m: float = 0.0) -> None:
         """Take in a look. sd_m: of the sensor's position against the map."""
         near = [t for t in self.tracks if math.hypot(*(t.centre_w - scan.origin_w)) < MAX_RANGE_M + 1.0]
-        outlines = Outlines(near)
+        outlines = outlines_of(near)
         shares: dict[int, tuple[Track, list[Indices]]] = {}
         together: list[tuple[Track, Track]] = []
         for cluster in clusters_of(scan):
-            owners = self._owners(cluster, scan, outlines, sd_m)
+            owners = self._owners(cluster, scan, near, outlines, sd_m)
             for track, points in owners:
                 shares.setdefault(track.number, (track, []))[1].append(points)
             together += [(a, b) for (a, _), (b, _) in pairwise(owners) if a is not b]
@@ -91,17 +92,16 @@ class ObstacleMap:
         """The obstacle whose outline is at a point (2,), within its uncertainty."""
         if not self.tracks:
             return None
-        outlines = Outlines(self.tracks)
-        off = np.abs(outlines.distance_m(position_w[None])[0])
-        best = int(np.argmin(off - np.minimum(outlines.sd_m, 0.02)))
-        return self.tracks[best] if off[best] < min(GATE_M + 2 * outlines.sd_m[best], WIDEST_GATE_M) else None
+        off, sd = np.abs(outlines_of(self.tracks).distance_m(position_w)), position_sd_m(self.tracks)
+        best = int(np.argmin(off - np.minimum(sd, 0.02)))
+        return self.tracks[best] if off[best] < min(GATE_M + 2 * sd[best], WIDEST_GATE_M) else None
 
     def take_body(self, axis_w: Floats, radius_m: float, sd_m: float = 0.0) -> None:
         """Carve by the body: where it is nothing else can be. axis_w: (n, 2) points along it, closer than a radius."""
         near = [t for t in self.tracks if len(t.surface)]
         if not near:
             return
-        outlines = Outlines(near)
+        outlines = outlines_of(near)
         gaps = outlines.distance_m(axis_w)  # (n, tracks)
         allowed = radius_m - SUNK_M - 2 * sd_m
         changed: list[Track] = []
@@ -130,13 +130,15 @@ class ObstacleMap:
         kept.sort(key=lambda t: -t.log_odds)
         self.tracks = sorted(kept[:MAX_TRACKS], key=lambda t: t.number)
 
-    def _owners(self, cluster: Indices, scan: Scan, outlines: Outlines, sd_m: float) -> list[tuple[Track, Indices]]:
+    def _owners(
+        self, cluster: Indices, scan: Scan, near: Sequence[Track], outlines: Outlines, sd_m: float
+    ) -> list[tuple[Track, Indices]]:
         """Which track gets which bins of a cluster, in order of azimuth; new tracks are made as needed."""
         points = scan.points_w[cluster]
-        if not outlines.tracks:
+        if not near:
             return [(self._new(), cluster)] if len(cluster) >= min(LEAST_POINTS, len(scan.range_m)) else []
         off = np.abs(outlines.distance_m(points))
-        gate = np.minimum(GATE_M + 2 * outlines.sd_m + sd_m, WIDEST_GATE_M) + 2 * scan.sd_m[cluster][:, None]
+        gate = np.minimum(GATE_M + 2 * position_sd_m(near) + sd_m, WIDEST_GATE_M) + 2 * scan.sd_m[cluster][:, None]
         nearest = off.argmin(axis=1)
         fits = off[np.arange(len(cluster)), nearest] < gate[np.arange(len(cluster)), nearest]
         counts = Counter(nearest[fits].tolist())
@@ -146,10 +148,10 @@ class ObstacleMap:
         best = np.array(owners)[off[:, owners].argmin(axis=1)]
         others = np.zeros(len(cluster), dtype=bool)
         for k in owners:
-            track = outlines.tracks[k]
+            track = near[k]
             if track.shape == "cylinder" and track.position_sd_m < 0.01 and len(track.surface) > 6:
                 others |= (best == k) & (off[:, k] > gate[:, k] + APART_M)
-        found = [(outlines.tracks[k], cluster[(best == k) & ~others]) for k in owners]
+        found = [(near[k], cluster[(best == k) & ~others]) for k in owners]
         if np.count_nonzero(others) > LEAST_POINTS:
             found.append((self._new(), cluster[others]))
         found = [(track, bins) for track, bins in found if len(bins)]
@@ -173,13 +175,13 @@ class ObstacleMap:
         """Merge duplicates: of two that overlap, or that one shape explains as well as two."""
         pairs = [(a, b, False) for a, b in together]
         if seen:
-            outlines = Outlines(self.tracks)
+            outlines = outlines_of(self.tracks)
             for a in seen:
                 apart = np.hypot(*(outlines.centre_w - a.centre_w).T) - outlines.reach_m
                 for k in np.flatnonzero(apart < max(a.radius_m, float(a.half_m.max())) + GATE_M):
                     b = self.tracks[k]
                     if b is not a:
-                        inside = Outlines([b]).distance_m(a.surface.points_w)[:, 0] < 0.01
+                        inside = outlines_of([b]).distance_m(a.surface.points_w)[:, 0] < 0.01
                         if np.count_nonzero(inside) > 0.4 * len(inside):
                             pairs.append((a, b, True))
         gone: set[int] = set()

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_gnc.guidance.scan import Scan
-from snakesim_gnc.guidance.tracks import Outlines, Track
+from snakesim_gnc.guidance.tracks import Track, outlines_of, position_sd_m
 
 Floats = NDArray[np.float64]
 GATE_M = 0.05
@@ -36,7 +36,7 @@ def matched(scan: Scan, tracks: Sequence[Track], base_w: Floats) -> Match | None
     hits = np.flatnonzero(np.isfinite(scan.range_m))
     if not known or len(hits) < LEAST_POINTS:
         return None
-    outlines = Outlines(known)
+    outlines, sd = outlines_of(known), position_sd_m(known)
     arm = scan.points_w[hits] - base_w[:2]
     by = np.zeros(3)
     information = np.zeros((3, 3))
@@ -52,7 +52,7 @@ def matched(scan: Scan, tracks: Sequence[Track], base_w: Floats) -> Match | None
             [(outlines.distance_m(points + PROBE_M * axis)[rows, nearest] - off) / PROBE_M for axis in np.eye(2)],
             axis=1,
         )
-        spread = np.hypot(np.hypot(scan.sd_m[hits], outlines.sd_m[nearest]), 0.003)
+        spread = np.hypot(np.hypot(scan.sd_m[hits], sd[nearest]), 0.003)
         ours = np.abs(off) < GATE_M
         if np.count_nonzero(ours) < LEAST_POINTS:
             return None

@@ -15,12 +15,15 @@ from numpy.typing import NDArray
 from snakesim_gnc.guidance.box_fit import fit_boxes
 from snakesim_gnc.guidance.circle_fit import RADIUS_M, fit_circles
 from snakesim_gnc.guidance.surfaces import Surface, batched
+from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Obstacle
 
 Floats = NDArray[np.float64]
 BOX_FROM = 5  # cells; fewer are a circle
 ROUND_LIMIT_M = 0.16  # rounder things are boxes
+ROUND_MISFIT = 0.8  # a cell: what a circle explains this well need not be tried as a box
 LOYALTY = 4.0  # by which another shape must be better than the present one
+LOST = np.full(2, np.nan)
 HIT, MISS, TOUCH = 0.5, -0.8, 3.0  # log odds
 SUREST = 5.0
 BELIEVED = 0.4  # from here on it is told: seen twice, or felt
@@ -48,6 +51,11 @@ class Track:
     position_sd_m: float = math.inf
     size_sd_m: float = math.inf
     cost: float = math.inf  # misfit and parameters of the shape
+
+    @property
+    def fitted(self) -> bool:
+        """Whether the shape has been fitted to the surface."""
+        return math.isfinite(self.cost)
 
     @property
     def name(self) -> str:
@@ -88,46 +96,48 @@ def fit(tracks: Sequence[Track]) -> None:
     if not tracks:
         return
     points, weight, outward, normal = batched([track.surface for track in tracks])
-    circles, boxes = fit_circles(points, weight, outward, normal), fit_boxes(points, weight, outward)
+    began = np.array([track.centre_w if track.shape == "cylinder" and track.fitted else LOST for track in tracks])
+    circles = fit_circles(points, weight, outward, normal, began)
     cells = np.array([len(track.surface) for track in tracks])
-    per = np.log(np.maximum(cells, 2))
-    as_circle = circles.misfit + 3 * per + np.where(circles.radius_m > ROUND_LIMIT_M, 1e3, 0.0)
-    as_box = boxes.misfit + np.where(boxes.faces > 1, 5, 4) * per + np.where(cells < BOX_FROM, 1e6, 0.0)
+    as_circle = circles.misfit + 3 * np.log(np.maximum(cells, 2))
+    as_circle[circles.radius_m > ROUND_LIMIT_M] += 1e3
+    as_box, boxes, row = np.full(len(tracks), np.inf), None, {}
+    doubtful = np.flatnonzero((cells >= BOX_FROM) & (circles.misfit > ROUND_MISFIT * cells))
+    if len(doubtful):
+        most = int(cells[doubtful].max())
+        boxes = fit_boxes(points[doubtful, :most], weight[doubtful, :most], outward[doubtful, :most])
+        per = np.log(np.maximum(cells[doubtful], 2))
+        as_box[doubtful] = boxes.misfit + np.where(boxes.faces > 1, 5, 4) * per
+        row = {int(i): k for k, i in enumerate(doubtful)}
     for i, track in enumerate(tracks):
-        loyalty = 0.0 if math.isinf(track.cost) else LOYALTY if track.shape == "cylinder" else -LOYALTY
-        if as_circle[i] <= as_box[i] + loyalty:
+        loyalty = LOYALTY * (track.shape == "cylinder" or -1) if track.fitted else 0.0
+        if boxes is None or as_circle[i] <= as_box[i] + loyalty:
             track.shape, track.cost = "cylinder", float(as_circle[i])
             track.centre_w, track.radius_m = circles.centre_w[i], float(circles.radius_m[i])
             spread = circles.covariance[i]
             track.position_sd_m = math.sqrt(float(np.linalg.eigvalsh(spread[:2, :2])[-1]))
             track.size_sd_m = math.sqrt(float(spread[2, 2]))
         else:
+            k = row[i]
             track.shape, track.cost = "box", float(as_box[i])
-            track.centre_w, track.half_m, track.yaw_rad = boxes.centre_w[i], boxes.half_m[i], float(boxes.yaw_rad[i])
-            track.position_sd_m = float(boxes.centre_sd_m[i].max())
-            track.size_sd_m = float(boxes.half_sd_m[i].max())
+            track.centre_w, track.half_m, track.yaw_rad = boxes.centre_w[k], boxes.half_m[k], float(boxes.yaw_rad[k])
+            track.position_sd_m = float(boxes.centre_sd_m[k].max())
+            track.size_sd_m = float(boxes.half_sd_m[k].max())
 
 
-class Outlines:
-    """Shapes of some tracks as arrays, for distances to all of them."""
+def outlines_of(tracks: Sequence[Track]) -> Outlines:
+    """The shapes of tracks, for distances to all of them."""
+    boxy = np.array([t.shape == "box" for t in tracks], dtype=bool)
+    yaw = np.array([t.yaw_rad for t in tracks], dtype=np.float64)
+    half = np.array([t.half_m for t in tracks], dtype=np.float64).reshape(-1, 2)
+    return Outlines(
+        centre_w=np.array([t.centre_w for t in tracks], dtype=np.float64).reshape(-1, 2),
+        turn=np.column_stack([np.cos(yaw), np.sin(yaw)]),
+        half_m=np.where(boxy[:, None], half, 0.0),
+        rounding_m=np.where(boxy, 0.0, [t.radius_m for t in tracks]),
+    )
 
-    def __init__(self, tracks: Sequence[Track]) -> None:
-        self.tracks = list(tracks)
-        self.centre_w = np.array([t.centre_w for t in tracks]).reshape(-1, 2)
-        self.round = np.array([t.shape == "cylinder" for t in tracks], dtype=bool)
-        self.radius_m = np.array([t.radius_m if t.shape == "cylinder" else 0.0 for t in tracks])
-        self.half_m = np.array([t.half_m if t.shape == "box" else np.zeros(2) for t in tracks]).reshape(-1, 2)
-        yaw = np.array([t.yaw_rad if t.shape == "box" else 0.0 for t in tracks])
-        self._c, self._s = np.cos(yaw), np.sin(yaw)
-        self.reach_m = np.where(self.round, self.radius_m, np.hypot(self.half_m[:, 0], self.half_m[:, 1]))
-        self.sd_m = np.array([t.position_sd_m for t in tracks])
 
-    def distance_m(self, points_w: Floats) -> Floats:
-        """Signed distances of points (n, 2) from every outline, (n, tracks); negative inside."""
-        x = points_w[:, None, 0] - self.centre_w[:, 0]
-        y = points_w[:, None, 1] - self.centre_w[:, 1]
-        beyond_x = np.abs(self._c * x + self._s * y) - self.half_m[:, 0]
-        beyond_y = np.abs(self._c * y - self._s * x) - self.half_m[:, 1]
-        outside = np.hypot(np.maximum(beyond_x, 0.0), np.maximum(beyond_y, 0.0))
-        inside = np.minimum(np.maximum(beyond_x, beyond_y), 0.0)
-        return np.where(self.round, np.hypot(x, y) - self.radius_m, outside + inside)
+def position_sd_m(tracks: Sequence[Track]) -> Floats:
+    """Of each, (n,)."""
+    return np.array([t.position_sd_m for t in tracks], dtype=np.float64)
