@@ -23,6 +23,7 @@ from snakesim_hal.process import (
 )
 from snakesim_hal.service import START_LIMIT_S, Service, ServiceLoop
 from snakesim_hal.terminal import complain, complain_of
+from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,8 @@ def process_options(
     if parsed.parent is not None:
         die_with_parent(parsed.parent)
     config = read(parsed.config)
-    link = Link(parsed.endpoint, parsed.namespace or config.robot.name, listen)
+    largest_bytes = max(MAX_PAYLOAD_BYTES, config.robot.sensors.largest_image_bytes)
+    link = Link(parsed.endpoint, parsed.namespace or config.robot.name, listen, largest_bytes)
     return ProcessOptions(config, link, parsed.out, parsed)
 
 

@@ -8,7 +8,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from snakesim_hal.errors import ConfigError, SnakesimError
-from snakesim_hal.model.files import ROUTER, find, read_table, shipped, short
+from snakesim_hal.model.files import ROUTER, read_part, shipped, short
 from snakesim_hal.model.injection import explain
 from snakesim_hal.model.plugins import COMMANDS, find_plugin, in_file, installed
 from snakesim_hal.model.scenario import Loaded, Override, RunConfig, load, parse_set
@@ -265,7 +265,7 @@ def _scenarios(_arguments: argparse.Namespace) -> int:
     for kind, about in (("scenarios", "title"), ("robots", "about"), ("scenes", "about")):
         say(f"{kind}:")
         for name in shipped(kind):
-            table = read_table(find(name, kind))
+            table = read_part(name, kind)
             say(f"  {name:<18}{table.values.get(about, '')}")
     return OK
 

@@ -17,7 +17,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.files import FileStruct, Table, decode, find, leaves, read_table, short
+from snakesim_hal.model.files import FileStruct, Table, decode, find, leaves, read_part, read_table, short
 from snakesim_hal.model.injection import CONTROL
 from snakesim_hal.model.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
 from snakesim_hal.model.outlines import Capsule, Heading, Point, Size
@@ -218,7 +218,7 @@ def load(scenario: str, overrides: Sequence[Override] = ()) -> Loaded:
         named = table.values.get(part)
         if isinstance(named, str):
             from_flag = any(o.key == part for o in picks)
-            inner = read_table(find(named, kind, None if from_flag else path.parent))
+            inner = read_part(named, kind, None if from_flag else path.parent)
             table.put(part, inner.values, inner.source)
     for override in sorted(overrides, key=lambda o: o.key.startswith(CHOSEN)):
         if override in picks:

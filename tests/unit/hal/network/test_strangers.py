@@ -227,6 +227,23 @@ def test_what_is_longer_than_any_message_never_arrives_and_the_link_stays() -> N
         assert sorted(heard) == [1, 1, MAX_PAYLOAD_BYTES, MAX_PAYLOAD_BYTES]
 
 
+def test_large_images_arrive_where_they_are_expected() -> None:
+    """A robot's own processes know its cameras; to everybody else more than a MiB is too long."""
+    endpoint, largest = free_endpoint(), 2 * 1280 * 960
+    with (
+        open_session(Link(endpoint, "worm", listen=True, largest_bytes=largest)) as hal,
+        open_session(Link(endpoint, "worm", largest_bytes=largest)) as session,
+        open_session(Link(endpoint, "worm")) as small,
+    ):
+        readers = [each.reader(keys.depth("head"), DepthImage) for each in (session, small)]
+        publisher = hal.publisher(keys.depth("head"), DepthImage, lossless=True)
+        wait_until(publisher.heard, "somebody listening")
+        sent = msgspec.structs.replace(image(bytes(largest)), width=1280, height=960)
+        publisher.put(sent)
+        wait_until(lambda: readers[0].drain() == [sent], "the image")
+        assert readers[1].drain() == []
+
+
 def test_a_lease_that_has_run_out_is_a_fault_even_when_somebody_asks_for_it_at_that_moment() -> None:
     config, answers = run_config(pace="realtime", services={}), list[Answer]()
     with open_session(Link(free_endpoint(), "worm", listen=True)) as session:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from msgspec import inspect
 
 from snakesim_hal.errors import WireError
-from snakesim_hal.model.files import find, read_table, shipped
+from snakesim_hal.model.files import read_part, shipped
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig, load
 from snakesim_hal.model.scene import SceneFile
@@ -219,7 +219,7 @@ def test_something_is_shipped() -> None:
 @pytest.mark.parametrize(("kind", "schema"), [("robots", "robot"), ("scenes", "scene")])
 def test_every_shipped_file_fits_its_schema_and_names_itself(kind: str, schema: str) -> None:
     for name in shipped(kind):
-        values = read_table(find(name, kind)).values
+        values = read_part(name, kind).values
         published = schema_of(f"files/{schema}.json")
         assert mismatches(values, published, published) == [], name
         assert values["name"] == name
@@ -236,5 +236,5 @@ def test_every_shipped_scenario_loads_and_fits_the_schema_of_a_run(name: str) ->
 @pytest.mark.parametrize("robot", shipped("robots"))
 @pytest.mark.parametrize("scene", shipped("scenes"))
 def test_every_shipped_robot_and_scene_decodes(robot: str, scene: str) -> None:
-    msgspec.convert(read_table(find(robot, "robots")).values, RobotFile)
-    msgspec.convert(read_table(find(scene, "scenes")).values, SceneFile)
+    msgspec.convert(read_part(robot, "robots").values, RobotFile)
+    msgspec.convert(read_part(scene, "scenes").values, SceneFile)
