@@ -23,6 +23,7 @@ JUMP_S = 0.3  # a pose that is refused for longer than this was right: the robot
 LEAST_SD = np.array([0.0005, 0.0005, 0.001])  # of a pose sensor, m and rad
 START_SD = np.array([0.01, 0.01, 0.02])  # of the start pose, by which a robot without a pose sensor begins
 LEVEL_S = 0.5  # over which accelerations are averaged to tell what is level
+LEAST_OWN = 0.05  # share of the variance that is the robot's own, not the map's
 FRESH_NS = 60_000_000  # contacts and gyros count for steps within this of them
 
 
@@ -94,14 +95,19 @@ class Localiser:
         self.base = Base(self.base.planar_w, pose.position_w[2], about_z(-yaw) @ rotation)
         self.correct(then, measured, np.diag(self._measured))
 
-    def correct(self, then: Base, measured: Floats, spread: Floats) -> None:
-        """A measurement (3,) of x, y and heading of the base at some time, with its covariance (3, 3)."""
+    def correct(self, then: Base, measured: Floats, spread: Floats, common_m2: float = 0.0) -> None:
+        """A measurement (3,) of x, y and heading of the base at some time, with its covariance (3, 3).
+
+        common_m2: variance of the position of what it was measured against, which no number of measurements lowers.
+        """
+        mean_m2 = 0.5 * float(np.trace(self.covariance[:2, :2]))
+        own = self.covariance * max(1.0 - common_m2 / max(mean_m2, 1e-12), LEAST_OWN)
         error = measured - then.planar_w
         error[2] = wrapped(error[2])
-        gain = self.covariance @ np.linalg.inv(self.covariance + spread)
+        gain = own @ np.linalg.inv(own + spread)
         by = gain @ error
         left = np.eye(3) - gain
-        self.covariance = left @ self.covariance @ left.T + gain @ spread @ gain.T
+        self.covariance = left @ own @ left.T + gain @ spread @ gain.T + np.diag([common_m2, common_m2, 0.0])
         around = then.planar_w[:2]
         now = self.base.planar_w
         moved = around + (about_z(by[2])[:2, :2] @ (now[:2] - around)) + by[:2]

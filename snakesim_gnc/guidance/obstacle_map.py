@@ -38,6 +38,7 @@ class ObstacleMap:
 
     def __init__(self) -> None:
         self.tracks: list[Track] = []
+        self.here_m2 = 0.0  # variance of the robot's position now
         self._count = 0
         self._drift_m2 = 0.0
 
@@ -189,7 +190,7 @@ class ObstacleMap:
             if a.number in gone or b.number in gone or a is b:
                 continue
             old, new = (a, b) if a.number < b.number else (b, a)
-            both = Track(number=old.number)
+            both = Track(old.number, old.name)
             self._refresh(old)
             self._refresh(new)
             both.surface.take(old.surface)
@@ -215,7 +216,8 @@ class ObstacleMap:
 
     def _new(self, position_w: Floats | None = None, normal_w: Floats | None = None) -> Track:
         self._count += 1
-        track = Track(number=self._count, drift_m2=self._drift_m2)
+        name = f"{'seen' if position_w is None else 'felt'}_{self._count}"
+        track = Track(self._count, name, born_m2=self.here_m2, drift_m2=self._drift_m2)
         if position_w is not None and normal_w is not None:  # where the next touch of the same looks for it
             track.centre_w, track.position_sd_m = position_w - RADIUS_M * normal_w, RADIUS_SD_M
         self.tracks.append(track)

@@ -7,7 +7,7 @@ contacts   a body that slides along an obstacle does not move along the normal (
 links      they slide along themselves rather than sideways, the less so the faster the joints turn
 all        without joint speed a snake does not move
 
-Weighted least squares gives the step and its covariance. Slip is not white: its errors last about half a second.
+Weighted least squares gives the step and its covariance. Slip is not white: its errors last for seconds.
 """
 
 from collections.abc import Sequence
@@ -21,12 +21,12 @@ from snakesim_hal.wire.messages import Contact, Contacts, Description, Imu, Join
 
 Floats = NDArray[np.float64]
 ALONG_NORMAL_M_S = 0.005
-SIDEWAYS_M_S = 0.01  # at rest,
-SIDEWAYS_PER_RAD_S = 0.03  # and for each rad/s of the joints
-ANY_M_S, ANY_PER_RAD_S = 0.002, 0.2
+SIDEWAYS_M_S = 0.02  # at rest,
+SIDEWAYS_PER_RAD_S = 0.02  # and for each rad/s of the joints
+ANY_M_S, ANY_PER_RAD_S = 0.005, 1.0
 GYRO_RAD_S = 0.01
 TURN_RAD_S = 1.0  # without a gyro
-LASTING_S = 0.5
+LASTING_S = 2.0
 LONGEST_S = 0.2  # between two joint states; a step over a longer gap is only uncertain
 
 
@@ -92,7 +92,7 @@ class Odometry:
         sideways = rotations[:, :2, 1]
         sideways = sideways / np.maximum(np.hypot(*sideways.T), 1e-6)[:, None]
         moved = (middles - were)[:, :2]  # by the joints alone
-        return _rows(sideways, middles[:, :2]), -np.einsum("ij,ij->i", sideways, moved), np.full(len(moved), 2.0)
+        return _rows(sideways, middles[:, :2]), -np.einsum("ij,ij->i", sideways, moved), np.ones(len(moved))
 
     def _touching(
         self, before: tuple[int, Floats, Floats], origins: Floats, rotations: Floats, contacts: Sequence[Contact]

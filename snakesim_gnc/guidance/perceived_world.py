@@ -42,13 +42,12 @@ TRUSTED_NS = 300_000_000  # a pose newer than this needs no help from the map
 class PerceivedWorld:
     """Sensor samples in, World out."""
 
-    def __init__(self, robot: Description, start: Base, pose_noise: PoseNoise, noise: Noise) -> None:
-        """start: where the robot is laid down. noise: of ranges."""
+    def __init__(self, robot: Description, start: Base, pose_noise: PoseNoise) -> None:
+        """start: where the robot is laid down. pose_noise: of the pose sensor."""
         self.map = ObstacleMap()
         self.localiser = Localiser(robot, start, pose_noise)
         self.refused: Counter[str] = Counter()  # samples that could not be used, by reason
-        self._noise = noise
-        self._scanners: dict[Lens, DepthScanner] = {}
+        self._scanners: dict[tuple[Lens, Noise], DepthScanner] = {}
         lengths = np.array([link.length_m for link in robot.links])
         masses = np.array([link.mass_kg for link in robot.links])
         self._half_m, self._shares = 0.5 * lengths, masses / masses.sum()
@@ -94,27 +93,27 @@ class PerceivedWorld:
                 touches.append((position[:2], normal[:2] / math.hypot(*normal[:2])))
         self.map.take_touches(touches, contacts.stamp_ns)
 
-    def take_depth(self, image: DepthImage) -> None:
-        """A depth image, of any camera."""
+    def take_depth(self, image: DepthImage, noise: Noise) -> None:
+        """A depth image, of any camera. noise: of its distances."""
         body = self._body_of(image.stamp_ns, "image")
         if body is None or image.link >= len(body.origins_w):
             return
-        lens = Lens.of(image)
-        scanner = self._scanners.get(lens)
+        kind = (Lens.of(image), noise)
+        scanner = self._scanners.get(kind)
         if scanner is None:
-            scanner = self._scanners[lens] = DepthScanner(lens, self._noise)
+            scanner = self._scanners[kind] = DepthScanner(*kind)
         position, rotation = _mount(body, image)
         plane = plane_under(self._bottoms(body), position[:2])
         self._take(scanner.scan(metres_of(image), image.stamp_ns, position, rotation, plane), body)
 
-    def take_ranges(self, ranges: Ranges) -> None:
+    def take_ranges(self, ranges: Ranges, noise: Noise) -> None:
         """Beams of a lidar or a range finder."""
         body = self._body_of(ranges.stamp_ns, "ranges")
         if body is None or ranges.link >= len(body.origins_w):
             return
         position, rotation = _mount(body, ranges)
         ground_z_m = float(plane_under(self._bottoms(body), position[:2])[0])
-        self._take(scan_of_ranges(ranges, position, rotation, ground_z_m, self._noise), body)
+        self._take(scan_of_ranges(ranges, position, rotation, ground_z_m, noise), body)
 
     def world(self, tick: int, now_ns: int) -> World | None:
         """The world now; None before the first joint state. tick, now_ns: of the clock."""
@@ -174,12 +173,13 @@ class PerceivedWorld:
         here = self.localiser
         variance = 0.5 * float(np.trace(here.covariance[:2, :2]))
         self.map.drift(max(variance - self._variance_m2, 0.0))
+        self.map.here_m2 = variance
         pose_ns = here.pose_stamp_ns
         if pose_ns is None or scan.stamp_ns - pose_ns > TRUSTED_NS:
             then = here.history.base_at(scan.stamp_ns)
             found = None if then is None else matched(scan, self.map.tracks, then.planar_w)
             if then is not None and found is not None:
-                here.correct(then, found.planar_w, found.covariance)
+                here.correct(then, found.planar_w, found.covariance, found.map_m2)
                 scan = scan.moved(then.planar_w, found.planar_w)
         self.depth_stamp_ns = scan.stamp_ns
         self.map.take_scan(scan, min(here.position_sd_m, 0.02))

@@ -27,7 +27,8 @@ class Match:
     """A measurement of the base's pose at the scan's stamp."""
 
     planar_w: Floats  # (3,) x, y, heading
-    covariance: Floats  # (3, 3)
+    covariance: Floats  # (3, 3) against the map
+    map_m2: float  # variance of the map's own place in the world
 
 
 def matched(scan: Scan, tracks: Sequence[Track], base_w: Floats) -> Match | None:
@@ -39,7 +40,7 @@ def matched(scan: Scan, tracks: Sequence[Track], base_w: Floats) -> Match | None
     outlines, sd = outlines_of(known), position_sd_m(known)
     arm = scan.points_w[hits] - base_w[:2]
     by = np.zeros(3)
-    information = np.zeros((3, 3))
+    information, weight, nearest = np.zeros((3, 3)), np.zeros(len(hits)), np.zeros(len(hits), dtype=np.intp)
     for _ in range(STEPS):
         c, s = np.cos(by[2]), np.sin(by[2])
         turned = arm @ np.array([[c, s], [-s, c]])
@@ -64,4 +65,5 @@ def matched(scan: Scan, tracks: Sequence[Track], base_w: Floats) -> Match | None
     if np.hypot(by[0], by[1]) > GATE_M or abs(by[2]) > 0.1:
         return None
     covariance = np.asarray(np.linalg.inv(SHARE * information + np.eye(3)), dtype=np.float64)
-    return Match(base_w + by, covariance)
+    map_m2 = float(np.average([known[k].born_m2 for k in nearest], weights=weight))
+    return Match(base_w + by, covariance, map_m2)

@@ -10,7 +10,8 @@ from snakesim_gnc.guidance.localisation import PoseNoise
 from snakesim_gnc.guidance.perceived_world import PerceivedWorld
 from snakesim_gnc.guidance.scan import Noise
 from snakesim_hal.model.scenario import RunConfig, place_all, start_of
-from snakesim_hal.network.client import Client, Feed
+from snakesim_hal.model.sensors import DepthCamera, RangeSensor
+from snakesim_hal.network.client import Client
 from snakesim_hal.service import Service
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (
@@ -26,6 +27,8 @@ from snakesim_hal.wire.messages import (
     Ranges,
     World,
 )
+
+LEAST_NOISE_M = 0.001
 
 
 class Guidance(Service):
@@ -83,14 +86,14 @@ class _Perceived:
         self._contacts = client.subscribe(keys.CONTACTS, Contacts)
         self._imu = client.subscribe(keys.IMU, Imu)
         self._pose = client.subscribe(keys.POSE, Pose)
-        self._depth: list[Feed[DepthImage]] = []
-        self._ranges: list[Feed[Ranges]] = []
+        self._depth = [(client.subscribe(keys.depth(c.name), DepthImage), _noise(c)) for c in robot.sensors.depth]
+        self._ranges = [(client.subscribe(keys.ranges(r.name), Ranges), _noise(r)) for r in robot.sensors.range]
         self._client = client
         self._model: PerceivedWorld | None = None
         self._taken: dict[str, int] = {}  # stamp of the newest sample used, by key
 
     def meet(self, robot: Description) -> None:
-        self._model = PerceivedWorld(robot, self._start, self._noise, Noise())
+        self._model = PerceivedWorld(robot, self._start, self._noise)
         self._taken.clear()
 
     def world(self, clock: Clock) -> World | None:
@@ -105,17 +108,23 @@ class _Perceived:
             model.take_pose(pose)
         if contacts is not None and self._is_new(keys.CONTACTS, contacts.stamp_ns):
             model.take_contacts(contacts)
-        for feed in self._depth:
+        for feed, noise in self._depth:
             image = read(feed)
             if image is not None and self._is_new(feed.key, image.stamp_ns):
-                model.take_depth(image)
-        for feed in self._ranges:
+                model.take_depth(image, noise)
+        for feed, noise in self._ranges:
             ranges = read(feed)
             if ranges is not None and self._is_new(feed.key, ranges.stamp_ns):
-                model.take_ranges(ranges)
+                model.take_ranges(ranges, noise)
         return model.world(clock.tick, clock.stamp_ns)
 
     def _is_new(self, key: str, stamp_ns: int) -> bool:
         new = self._taken.get(key) != stamp_ns
         self._taken[key] = stamp_ns
         return new
+
+
+def _noise(sensor: DepthCamera | RangeSensor) -> Noise:
+    """As the robot's file has it. One without noise is not trusted without end."""
+    per_m2 = sensor.noise_m_per_m2 if isinstance(sensor, DepthCamera) else 0.0
+    return Noise(max(sensor.noise_m, LEAST_NOISE_M), per_m2)

@@ -37,11 +37,13 @@ class Track:
     """An obstacle under observation."""
 
     number: int
+    name: str  # stays, also when it turns out to be something else
     surface: Surface = field(default_factory=Surface)
     felt: bool = False
     log_odds: float = 0.0
     last_seen_ns: int = 0
     top_m: float = 0.0
+    born_m2: float = 0.0  # variance of the robot's position when it was first seen: the map is no better than that
     drift_m2: float = 0.0  # of the robot's position, when the surface was last brought up to date
     shape: Literal["cylinder", "box"] = "cylinder"
     centre_w: Floats = field(default_factory=lambda: np.zeros(2))
@@ -56,11 +58,6 @@ class Track:
     def fitted(self) -> bool:
         """Whether the shape has been fitted to the surface."""
         return math.isfinite(self.cost)
-
-    @property
-    def name(self) -> str:
-        """As it is told."""
-        return f"{'felt' if self.felt else 'seen'}_{self.number}"
 
     def believe(self, by: float) -> None:
         """More or less than before."""
