@@ -29,6 +29,7 @@ APART_M = 0.03  # from the outline of a well known circle: what is further off i
 LOOKED_PAST_M = 0.03  # further than a cell: it was looked through
 TOUCH_SD_M, NORMAL_SD_RAD = 0.003, 0.2
 SUNK_M = 0.008  # deeper than this in the body nothing can be
+SKIN_SD_M = 0.004
 MAX_TRACKS = 1024
 KEPT_M = 4.0  # from the body; what is further away is forgotten
 
@@ -48,7 +49,7 @@ class ObstacleMap:
 
     def told(self, now_ns: int, ground_z_m: float) -> list[Obstacle]:
         """Obstacles that are believed in."""
-        return [t.told(now_ns, ground_z_m) for t in self.tracks if t.believed(now_ns) > BELIEVED * 0.5]
+        return [t.told(now_ns, ground_z_m) for t in self.tracks if t.believed(now_ns) > BELIEVED]
 
     def take_scan(self, scan: Scan, sd_m: float = 0.0) -> None:
         """Take in a look. sd_m: of the sensor's position against the map."""
@@ -105,25 +106,25 @@ class ObstacleMap:
         outlines = outlines_of(near)
         gaps = outlines.distance_m(axis_w)  # (n, tracks)
         allowed = radius_m - SUNK_M - 2 * sd_m
+        across = np.gradient(axis_w, axis=0) @ np.array([[0.0, 1.0], [-1.0, 0.0]])  # to the left of the body
+        across = across / np.maximum(np.hypot(*across.T), 1e-9)[:, None]
         changed: list[Track] = []
-        for k in np.flatnonzero(gaps.min(axis=0) < radius_m):
-            track, deepest = near[k], int(np.argmin(gaps[:, k]))
-            to_cells = track.surface.points_w[:, None] - axis_w
-            clear = np.hypot(to_cells[..., 0], to_cells[..., 1]).min(axis=1) > allowed
-            sunk = allowed - float(gaps[deepest, k])
-            if clear.all() and sunk <= 0:
-                continue
-            track.surface.keep(clear)
-            if gaps[deepest, k] < -0.5 * outlines.reach_m[k] or not len(track.surface):
+        for k in np.flatnonzero(gaps.min(axis=0) < allowed):
+            track, cells = near[k], len(near[k].surface)
+            offset = track.surface.points_w[:, None] - axis_w
+            apart = np.hypot(offset[..., 0], offset[..., 1])
+            nearest = apart.argmin(axis=1)
+            left = (offset[np.arange(cells), nearest] * across[nearest]).sum(axis=1) > 0
+            track.surface.keep(apart.min(axis=1) > allowed)
+            if len(track.surface) < cells or 0.2 < np.mean(left) < 0.8:  # it goes right through
                 track.believe(MISS)
-                continue
-            inwards = outlines.centre_w[k] - axis_w[deepest]
-            inwards = inwards / max(math.hypot(*inwards), 1e-6)
-            skin = axis_w[deepest] + radius_m * inwards  # its surface is at the body's, at the nearest
-            track.surface.add(skin[None], np.array([0.004]), -inwards[None])
+            else:
+                sunk = np.flatnonzero(gaps[:, k] < allowed)
+                towards = across[sunk] if left[0] else -across[sunk]  # to its surface, which is at the body's skin
+                track.surface.add(axis_w[sunk] + radius_m * towards, np.full(len(sunk), SKIN_SD_M), -towards)
             changed.append(track)
-        fit(changed)
         self._drop()
+        fit([track for track in changed if len(track.surface)])
 
     def forget(self, axis_w: Floats) -> None:
         """Forget what is far from the body, and the least believed when there is too much."""

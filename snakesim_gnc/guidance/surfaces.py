@@ -13,6 +13,7 @@ Floats = NDArray[np.float64]
 CELL_M = 0.01
 MAX_CELLS = 48
 MOST_INFORMATION = 1.0 / 0.0015**2  # errors of pose and mount are common to all points, and do not average out
+SPREAD = 0.05  # share of one measurement's variance that a cell's mean keeps, however many: it is but a slice of them
 MAX_DOUBTS = 3  # times that a cell was looked through before it is dropped
 
 
@@ -28,6 +29,7 @@ class Surface:
     weight: Floats = field(default_factory=lambda: _none(0))  # information, 1 / m²
     outward_w: Floats = field(default_factory=lambda: _none(0, 2))  # towards who saw it; of a touch, the normal
     normal_weight: Floats = field(default_factory=lambda: _none(0))  # information of that as a normal; 0: only seen
+    count: Floats = field(default_factory=lambda: _none(0))  # measurements in it, as far as its weight counts them
     doubts: Floats = field(default_factory=lambda: _none(0))
     cell_m: float = CELL_M
 
@@ -41,21 +43,19 @@ class Surface:
         weight = np.concatenate([self.weight, 1.0 / np.square(sd_m)])
         outward = np.vstack([self.outward_w, outward_w])
         normal = np.concatenate([self.normal_weight, new])
+        count = np.concatenate([self.count, np.ones(len(new))])
         doubts = np.concatenate([self.doubts, np.zeros(len(new))])
-        self._fuse(points, weight, outward, normal, doubts)
+        self._fuse(points, weight, outward, normal, count, doubts)
         while len(self) > MAX_CELLS:
             self.cell_m *= 1.5
-            self._fuse(self.points_w, self.weight, self.outward_w, self.normal_weight, self.doubts)
+            self._fuse(self.points_w, self.weight, self.outward_w, self.normal_weight, self.count, self.doubts)
 
     def keep(self, kept: NDArray[np.bool_]) -> None:
         """Drop the other cells."""
         if not kept.all():
             self.points_w, self.outward_w = self.points_w[kept], self.outward_w[kept]
-            self.weight, self.normal_weight, self.doubts = (
-                self.weight[kept],
-                self.normal_weight[kept],
-                self.doubts[kept],
-            )
+            self.weight, self.normal_weight = self.weight[kept], self.normal_weight[kept]
+            self.count, self.doubts = self.count[kept], self.doubts[kept]
 
     def drift(self, variance_m2: float) -> None:
         """The robot's own position has become less certain by this since the cells were measured."""
@@ -65,7 +65,9 @@ class Surface:
         """Merge another surface into this one."""
         self.add(other.points_w, 1.0 / np.sqrt(other.weight), other.outward_w, other.normal_weight)
 
-    def _fuse(self, points: Floats, weight: Floats, outward: Floats, normal: Floats, doubts: Floats) -> None:
+    def _fuse(
+        self, points: Floats, weight: Floats, outward: Floats, normal: Floats, count: Floats, doubts: Floats
+    ) -> None:
         keys = np.floor(points / self.cell_m).astype(np.int64) @ np.array([1 << 31, 1])
         _, cell = np.unique(keys, return_inverse=True)
         total = np.bincount(cell, weight)
@@ -77,6 +79,7 @@ class Surface:
         away = np.stack([mean(outward[:, 0]), mean(outward[:, 1])], axis=1)
         self.outward_w = away / np.maximum(np.hypot(away[:, 0], away[:, 1]), 1e-9)[:, None]
         self.weight = np.minimum(total, MOST_INFORMATION)
+        self.count = np.bincount(cell, count) * self.weight / total
         felt = np.bincount(cell, np.where(normal > 0, weight, 0.0))
         self.normal_weight = np.minimum(np.bincount(cell, normal), 1e5) * (felt > 0.2 * total)
         fresh = np.full(len(total), np.inf)
@@ -93,5 +96,5 @@ def batched(surfaces: list[Surface]) -> tuple[Floats, Floats, Floats, Floats]:
         n = len(surface)
         points[i, :n], outward[i, :n] = surface.points_w, surface.outward_w
         points[i, n:] = surface.points_w[0] if n else 0.0
-        weight[i, :n], normal[i, :n] = surface.weight, surface.normal_weight
+        weight[i, :n], normal[i, :n] = surface.weight / (1.0 + SPREAD * surface.count), surface.normal_weight
     return points, weight, outward, normal
