@@ -154,6 +154,7 @@ def describe(
             stiffness_nm_per_rad=robot.motor.stiffness_nm_per_rad,
             damping_nm_s_per_rad=robot.motor.damping_nm_s_per_rad,
             velocity_gain_nm_s_per_rad=robot.motor.velocity_gain_nm_s_per_rad,
+            rotor_kg_m2=robot.motor.armature_kg_m2,
             derate_from_c=robot.limits.derate_from_c,
             stop_at_c=robot.limits.stop_at_c,
             least_voltage_v=robot.limits.least_voltage_v,

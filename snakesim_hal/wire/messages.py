@@ -279,6 +279,11 @@ class JointDescription(Message, frozen=True, kw_only=True):
     stiffness_nm_per_rad: Annotated[float, Meta(ge=0, le=1e6), about("of position mode")]
     damping_nm_s_per_rad: Annotated[float, Meta(ge=0, le=1e6), about("of position mode")]
     velocity_gain_nm_s_per_rad: Annotated[float, Meta(gt=0, le=1e6), about("of velocity mode")]
+    rotor_kg_m2: Annotated[
+        float,
+        Meta(ge=0, le=1e3),
+        about("inertia that `torque_nm` turns besides the links; 0: measured beyond the rotor"),
+    ] = 0.0
     derate_from_c: Annotated[q.Temperature, about("of the winding: above it torque is derated")] = 80.0
     stop_at_c: Annotated[q.Temperature, about("of the winding: at it the robot is stopped")] = 105.0
     least_voltage_v: Annotated[q.Voltage, about("below it the robot is stopped")] = 18.0

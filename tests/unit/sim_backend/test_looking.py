@@ -2,6 +2,7 @@
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ def looking(scene=None, *, kind="depth", **sensor):
     return Run(make_config({"sensors": {kind: [{**base, **sensor}]}}, scene or {}))
 
 
-def seen(run, key=HEAD):
+def seen(run, key=HEAD) -> Any:
     """What the sensor measured at this tick; it arrives with the next."""
     run.sample()
     run.go()
@@ -101,7 +102,7 @@ def test_the_robot_sees_its_own_body_but_not_the_link_that_carries_the_camera():
 
 def test_what_is_too_near_or_too_far_is_not_measured():
     for change in ({"range_min_m": 1.1}, {"range_max_m": 0.9}):
-        assert np.isnan(metres(seen(looking(POST, **change)))[60, 80])
+        assert np.isnan(metres(seen(looking(POST, kind="depth", **change)))[60, 80])
 
 
 def test_a_lidar_measures_along_each_beam_from_right_to_left():
