@@ -515,6 +515,15 @@ class World(Message, frozen=True, kw_only=True):
         q.Stamp | None, about("of the contacts in it; null: no sample yet, or no such sensor")
     ] = None
     centre_w: Annotated[q.Vector | None, about("centre of mass of the body; null: unknown")] = None
+    base_position_sd_m: Annotated[
+        q.Distance | None, about("standard deviation of `base_position_w`, horizontally; null: not estimated")
+    ] = None
+    base_yaw_sd_rad: Annotated[
+        q.Angle | None, about("standard deviation of the base's heading; null: not estimated")
+    ] = None
+    depth_stamp_ns: Annotated[
+        q.Stamp | None, about("of the newest image or ranges in `obstacles`; null: none, or a map that is known")
+    ] = None
 
 
 class Trajectory(Message, frozen=True, kw_only=True):
