@@ -1,6 +1,7 @@
 """Arguments of `snakesim evaluate`, `sweep` and `optimise`. Importable without the extra that they need."""
 
 import argparse
+import dataclasses
 import shlex
 import sys
 from pathlib import Path
@@ -22,7 +23,6 @@ def add_commands(commands: Any) -> None:
     tried.add_argument("suite", help="name of a shipped suite, or path of a suite file")
     tried.add_argument("--controllers", metavar="A,B,...", help="installed controllers, or ./file.py:Class")
     tried.add_argument("--fields", type=_count, metavar="N", help="fields for each row and controller")
-    tried.add_argument("--only", metavar="CONTROLLER:FIELD[:ROW]", help="run one case, with its folder and report")
     _add_shared(tried)
     tried.set_defaults(act=_evaluate)
 
@@ -32,7 +32,6 @@ def add_commands(commands: Any) -> None:
         "--vary", action="append", required=True, metavar="KEY=LOW:HIGH:COUNT", help="or KEY=[A, B]; may be repeated"
     )
     swept.add_argument("--seeds", type=_count, default=1, metavar="N", help="runs for each value (1)")
-    swept.add_argument("--only", metavar="CONTROLLER:FIELD[:ROW]", help="run one case, with its folder and report")
     _add_set(swept)
     _add_shared(swept)
     swept.set_defaults(act=_sweep)
@@ -55,6 +54,7 @@ def _add_set(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_shared(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--only", metavar="CONTROLLER:FIELD[:ROW]", help="run one case, with its folder and report")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the results (default: runs/NAME-TIME)")
     parser.add_argument("--resume", action="store_true", help="go on with what is in --out")
     parser.add_argument(
@@ -73,74 +73,41 @@ def _add_workers(parser: argparse.ArgumentParser) -> None:
 
 def _evaluate(arguments: argparse.Namespace) -> int:
     _check_extra()
-    from snakesim_operator.evaluate.evaluation import Request
+    from snakesim_operator.evaluate.evaluation import Request, go
     from snakesim_operator.evaluate.suite import read_suite
 
     suite, source = read_suite(arguments.suite)
     controllers = [name.strip() for name in (arguments.controllers or "").split(",") if name.strip()]
-    again = ["evaluate", arguments.suite]
-    again += ["--controllers", ",".join(controllers)] if controllers else []
-    again += ["--fields", str(arguments.fields)] if arguments.fields else []
-    return _go(
-        arguments,
-        lambda shared: Request(
-            suite, source, Path(arguments.suite).stem, shared.pop("again"), controllers, arguments.fields, **shared
-        ),
-        again,
-    )
+    again = ["evaluate", arguments.suite, *(["--controllers", ",".join(controllers)] if controllers else [])]
+    fields = arguments.fields or suite.fields
+    chosen = controllers or suite.controllers
+    return go(Request(suite, source, Path(arguments.suite).stem, chosen, fields, **_shared(arguments, again)))
 
 
 def _sweep(arguments: argparse.Namespace) -> int:
     _check_extra()
-    from snakesim_operator.evaluate.evaluation import Request
+    from snakesim_operator.evaluate.evaluation import Request, go
     from snakesim_operator.evaluate.suite import Suite, parse_vary
 
-    always = {override.key: override.value for override in map(parse_set, arguments.set)}
-    suite = Suite(
-        title=f"{Path(arguments.scenario).stem}: {', '.join(arguments.vary)}"[:200],
-        scenario=arguments.scenario,
-        fields=arguments.seeds,
-        set=always,
-        vary=dict(map(parse_vary, arguments.vary)),
-    )
-    again = ["sweep", arguments.scenario, "--seeds", str(arguments.seeds)]
+    title = f"{Path(arguments.scenario).stem}: {', '.join(arguments.vary)}"[:200]
+    vary, always = dict(map(parse_vary, arguments.vary)), {one.key: one.value for one in map(parse_set, arguments.set)}
+    suite = Suite(title=title, scenario=arguments.scenario, set=always, vary=vary)
+    again = ["sweep", arguments.scenario]
     for flag, values in (("--vary", arguments.vary), ("--set", arguments.set)):
         again += [word for value in values for word in (flag, value)]
-    return _go(arguments, lambda shared: Request(suite, "sweep", "sweep", shared.pop("again"), **shared), again)
+    return go(Request(suite, "sweep", "sweep", [], arguments.seeds, **_shared(arguments, again)))
 
 
-def _go(arguments: argparse.Namespace, request: Any, again: list[str]) -> int:
-    from snakesim_operator.evaluate.evaluation import evaluate, run_one
-
-    shared = {name: getattr(arguments, name) for name in ("seed", "out", "resume", "cluster", "workers", "dashboard")}
-    shared["again"] = shlex.join(["snakesim", *again, "--seed", str(arguments.seed)])
-    asked = request(shared)
-    return run_one(asked, arguments.only) if arguments.only else evaluate(asked)
+def _shared(arguments: argparse.Namespace, again: list[str]) -> dict[str, Any]:
+    names = ("seed", "only", "out", "resume", "cluster", "workers", "dashboard")
+    return {"again": shlex.join(["snakesim", *again]), **{name: getattr(arguments, name) for name in names}}
 
 
 def _optimise(arguments: argparse.Namespace) -> int:
     _check_extra()
     from snakesim_operator.evaluate.optimise import Request, optimise
 
-    vary: dict[str, str] = {}
-    for text in arguments.vary:
-        key, _, span = text.partition("=")
-        vary[key.strip()] = span.strip()
-    return optimise(
-        Request(
-            scenario=arguments.scenario,
-            vary=vary,
-            set={override.key: override.value for override in map(parse_set, arguments.set)},
-            goal=arguments.goal,
-            minimise=arguments.minimise,
-            trials=arguments.trials,
-            fields=arguments.seeds,
-            seed=arguments.seed,
-            storage=arguments.storage,
-            cluster=arguments.cluster,
-            workers=arguments.workers,
-        )
-    )
+    return optimise(Request(**{one.name: getattr(arguments, one.name) for one in dataclasses.fields(Request)}))
 
 
 def _check_extra() -> None:

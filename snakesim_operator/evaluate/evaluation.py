@@ -33,10 +33,11 @@ class Request:
     suite: Suite
     source: str  # the suite's file, or the command that stands for one
     name: str
-    again: str  # the command without its options for folder and cluster
-    controllers: Sequence[str] = ()
-    fields: int | None = None
+    controllers: Sequence[str]  # none: the scenario's
+    fields: int
+    again: str  # the command for one case, but for `--only`
     seed: int = 1
+    only: str | None = None
     out: Path | None = None
     resume: bool = False
     cluster: str | None = None
@@ -44,11 +45,13 @@ class Request:
     dashboard: bool = False
 
 
-def evaluate(request: Request) -> int:
-    """Run all cases that are not done yet. Returns 0, or 1 when a case could not run at all."""
+def go(request: Request) -> int:
+    """Run all cases that are not done yet, or one as a run of its own. Returns 0, or 1 when a case could not run."""
+    if request.only is not None:
+        return _run_one(request, request.only)
     if request.resume and request.out is None:
         raise ConfigError("--resume: name the folder of the evaluation with --out")
-    cases = _cases(request)
+    cases = cases_of(request.suite, request.source, request.controllers, request.fields, request.seed)
     out = request.out or named_after(request.name)
     with store.opened(out, resume=request.resume) as kept:
         todo = list({case.id: case for case in cases if case.id not in kept.done}.values())
@@ -60,7 +63,7 @@ def evaluate(request: Request) -> int:
         return 1 if any(kept.done[case.id].error is not None for case in cases) else 0
 
 
-def run_one(request: Request, only: str) -> int:
+def _run_one(request: Request, only: str) -> int:
     """One case again, in this process, with the whole folder of a run. Exit code: of `snakesim run`."""
     case = choose(request.suite, request.source, only)
     say(f"{case.setting}, {case.controller}, field {case.field}")
@@ -85,11 +88,6 @@ def name_of(case: Case) -> str:
     return f"{case.controller}:{case.field}:{case.row}"
 
 
-def _cases(request: Request) -> list[Case]:
-    suite, controllers = request.suite, request.controllers or request.suite.controllers
-    return cases_of(suite, request.source, controllers, request.fields or suite.fields, request.seed)
-
-
 def _run(request: Request, todo: Sequence[Case], kept: store.Store, out: Path) -> None:
     with workers(request.cluster, request.workers, dashboard=request.dashboard) as client, Progress(len(todo)) as shown:
         where = request.cluster or "on this computer"
@@ -108,7 +106,10 @@ def _finish(request: Request, cases: Sequence[Case], done: store.Results, out: P
         say(text)
     if broken := [(case, why) for case in cases if (why := done[case.id].error) is not None]:
         say(f"{len(broken)} could not run, the first: {name_of(broken[0][0])}: {broken[0][1]}")
-    again = [(f"{case.setting}, {name_of(case)}", why, _command(request, case)) for case, why in failed]
+    again = [
+        (f"{case.setting}, {name_of(case)}", why, f"{request.again} --only {shlex.quote(name_of(case))}")
+        for case, why in failed
+    ]
     if again:
         say(f"the worst {len(again)} of {best}:" if len(again) > 1 else f"the worst of {best}:")
     for name, why, command in again:
@@ -118,7 +119,3 @@ def _finish(request: Request, cases: Sequence[Case], done: store.Results, out: P
     write_text(out / PAGE, page(request.suite.title or request.name, request.source, lines, again))
     for path in (*paths, out / PAGE):
         say(f"written: {path}")
-
-
-def _command(request: Request, case: Case) -> str:
-    return f"{request.again} --only {shlex.quote(name_of(case))}"

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import optuna
@@ -12,6 +13,8 @@ from optuna.study import Study
 from optuna.trial import Trial, TrialState
 
 from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.files import short
+from snakesim_hal.model.scenario import parse_set
 from snakesim_hal.terminal import say
 from snakesim_operator.evaluate.case import Case, Outcome
 from snakesim_operator.evaluate.cluster import size, solve, workers
@@ -24,12 +27,12 @@ class Request:
     """What the command line asks for."""
 
     scenario: str
-    vary: dict[str, str]  # key: low:high
-    set: dict[str, object]
+    vary: Sequence[str]  # key=low:high
+    set: Sequence[str]  # key=value
     goal: str
     minimise: bool
     trials: int
-    fields: int
+    seeds: int
     seed: int
     storage: Path
     cluster: str | None = None
@@ -38,7 +41,7 @@ class Request:
 
 def optimise(request: Request) -> int:
     """Go on until so many trials have a result, or have been tried. Returns 0, or 1 when none has a result."""
-    space: dict[str, BaseDistribution] = {key: _span(key, given) for key, given in request.vary.items()}
+    space: dict[str, BaseDistribution] = dict(map(_span, request.vary))
     if request.goal not in RunSummary.__struct_fields__:
         raise ConfigError(f"--goal {request.goal}: no number of a summary, such as path_distance_m or advance_m_s")
     for end in ("low", "high"):  # before anything is started
@@ -105,16 +108,18 @@ def _conclude(request: Request, study: Study) -> int:
     return 0
 
 
-def _cases(request: Request, params: dict[str, object]) -> list[Case]:
-    suite = Suite(scenario=request.scenario, set={**request.set, **params})
-    return cases_of(suite, "optimise", [], request.fields, request.seed)
+def _cases(request: Request, params: dict[str, Any]) -> list[Case]:
+    always = {one.key: one.value for one in map(parse_set, request.set)}
+    suite = Suite(scenario=request.scenario, set={**always, **params})
+    return cases_of(suite, "optimise", [], request.seeds, request.seed)
 
 
-def _span(key: str, given: str) -> FloatDistribution | IntDistribution:
-    """low:high; whole numbers where both are."""
+def _span(text: str) -> tuple[str, FloatDistribution | IntDistribution]:
+    """key=low:high; whole numbers where both are."""
+    key, _, given = (part.strip() for part in text.partition("="))
     try:
         low, high = given.split(":")
         whole = low.strip("-").isdecimal() and high.strip("-").isdecimal()
-        return IntDistribution(int(low), int(high)) if whole else FloatDistribution(float(low), float(high))
+        return key, IntDistribution(int(low), int(high)) if whole else FloatDistribution(float(low), float(high))
     except ValueError:
-        raise ConfigError(f"--vary {key}={given}: give low:high, such as {key}=0.05:0.2") from None
+        raise ConfigError(f"--vary {short(text)}: give key=low:high, such as control.propulsion_n=5:40") from None

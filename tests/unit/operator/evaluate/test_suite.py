@@ -121,7 +121,7 @@ def test_a_wrong_suite_is_told_what_and_where(
         (["evaluate", "clutter", "--fields", "1", "--cluster", "nowhere"], ["--cluster nowhere"]),
         (["sweep", "jam", "--vary", "rate_hz"], ["--vary rate_hz", "low:high:count"]),
         (["sweep", "jam", "--vary", "rate_hz=[1"], ["--vary rate_hz=[1", "TOML"]),
-        (["optimise", "jam", "--vary", "rate_hz=1", "--goal", "advance_m", "--storage", "x"], ["give low:high"]),
+        (["optimise", "jam", "--vary", "rate_hz=1", "--goal", "advance_m", "--storage", "x"], ["give key=low:high"]),
         (["optimise", "jam", "--vary", "rate_hz=50:60", "--goal", "speed", "--storage", "x"], ["--goal speed"]),
         (["optimise", "jam", "--vary", "rate_hz=5:60", "--goal", "advance_m", "--storage", "x"], ["`rate_hz` = 5"]),
         (["optimise", "jam", "--vary", "rate_hz=50:60", "--goal", "advance_m", "--storage", "."], ["--storage ."]),
