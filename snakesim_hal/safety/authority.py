@@ -203,11 +203,14 @@ class Authority:
         return self._answer(None)
 
     def fault(self, fault: Fault, joints: Mask | None = None) -> None:
-        """Latch a fault: the joints take the safe action until a clear.
+        """Latch a fault: the joints take the safe action until a clear. One that reaches nothing is only noted.
 
         A fault that concerns only some joints isolates them instead, if the robot file allows that. joints: which;
         None: the one that the fault names.
         """
+        if fault.reach == "none":
+            self.note(fault)
+            return
         joints = self._isolation.mask(fault.joint) if joints is None else joints
         if fault.reach == "joint" and self._set_aside(fault, joints):
             return

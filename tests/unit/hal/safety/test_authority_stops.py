@@ -44,6 +44,13 @@ def test_a_fault_takes_the_robots_safe_action(action: str, mode: Mode, target: f
     assert rig.acquire("control").lifecycle != "armed" and not rig.arm().ok
 
 
+def test_a_fault_that_reaches_nothing_is_listed_and_stops_nothing() -> None:
+    rig = armed()
+    rig.authority.fault(Fault(tick=1, what="sample_late", cause="sensor/depth/head", reach="none"))
+    assert rig.authority.state == "armed" and rig.authority.lease.holder is not None
+    assert [(fault.what, fault.reach) for fault in rig.authority.faults] == [("sample_late", "none")]
+
+
 @pytest.mark.parametrize("action", ["passive", "damp", "hold"])
 def test_a_fault_while_disarmed_switches_no_motor_on(action: str) -> None:
     rig = Rig(safety__action=action)
