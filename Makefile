@@ -24,7 +24,7 @@ packages := $(wildcard snakesim_*)
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test test-all test-here test-vcan attack faults mutation fuzz soak kills check bench schemas docs lock clean FORCE
+.PHONY: help setup demo test test-all test-here test-vcan attack faults mutation fuzz soak kills check bench bench-peers schemas docs lock clean FORCE
 
 help: ## List these targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' Makefile
@@ -81,6 +81,9 @@ check: $(stamp) ## Lint, format, types and import rules, without changing anythi
 
 bench: $(stamp) ## Measure the ratios in benchmarks/
 	$(bin)/python -m benchmarks $(ARGS)
+
+bench-peers: $(stamp) ## Measure the loop beside raw Zenoh, dora-rs and rospy (installs them: build/peers, Debian)
+	$(bin)/python -m benchmarks.peers $(ARGS)
 
 schemas: $(stamp) ## Write anew what is made from the code: JSON Schemas, key space, table of faults
 	$(bin)/snakesim schemas --write schemas

@@ -6,6 +6,7 @@ import statistics
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 
 import zenoh
 
@@ -33,13 +34,20 @@ def _publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:
 
 def echo_us(request: bytes, reply: bytes, rounds: int = 2000, period_s: float = 0.0) -> float:
     """Median round trip of `request` one way and `reply` back, in microseconds; one every `period_s`."""
+    return statistics.median(echo_times_us(request, reply, rounds, period_s))
+
+
+def echo_times_us(
+    request: bytes, reply: bytes, rounds: int, period_s: float, prefix: Sequence[str] = ()
+) -> list[float]:
+    """Every round trip. prefix: of the command that starts the other process."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
     with zenoh.open(_config(endpoint, listen=True)) as session:
         publisher = _publisher(session, REQUEST)
         replies = session.declare_subscriber(REPLY, zenoh.handlers.RingChannel(4))
-        other = subprocess.Popen([sys.executable, "-m", "benchmarks.echo", endpoint, str(len(reply))])
+        other = subprocess.Popen([*prefix, sys.executable, "-m", "benchmarks.echo", endpoint, str(len(reply))])
         try:
             deadline = time.monotonic() + 20
             while replies.try_recv() is None:  # until the other side answers
@@ -60,7 +68,7 @@ def echo_us(request: bytes, reply: bytes, rounds: int = 2000, period_s: float = 
         finally:
             other.kill()
             other.wait()
-    return statistics.median(times)
+    return times
 
 
 def _answer(endpoint: str, reply_bytes: int) -> None:

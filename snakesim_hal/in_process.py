@@ -27,7 +27,7 @@ from snakesim_hal.terminal import complain_of
 from snakesim_hal.wire.messages import LifecycleRequest
 
 AFTER_FAULT_S = 1.5
-ARM_LIMIT_S = 10.0
+ARM_LIMIT_S, ARM_LIMIT_TURNS = 10.0, 100  # both: planning, or a busy computer, may take long for a turn
 WHO = "run in one process"
 
 
@@ -80,7 +80,9 @@ class InProcessRun:
         ticks = round(config.duration_s * config.rate_hz)
         session = self.network.session()
         opened.callback(session.close)
-        self.host = Host(config, backend, session, max_ticks=ticks, end_after_fault_s=AFTER_FAULT_S)
+        self.host = Host(
+            config, backend, session, max_ticks=ticks, end_after_fault_s=AFTER_FAULT_S, pace_after_fault="free"
+        )
         self.network.answer = self.host.take_in
         for name in config.services:
             part = self._parts[name] = opened.enter_context(ExitStack())
@@ -96,14 +98,14 @@ class InProcessRun:
         """
         joined, give_up = False, time.monotonic() + ARM_LIMIT_S
         with closing(self.host.turns()) as turns:
-            for _ in turns:
+            for turn, _ in enumerate(turns):
                 if not joined:
                     for loop in self._loops.values():
                         loop.join()
                     joined = True
                 self._let_act()
                 if not self.host.authority.arming and not self.failed:
-                    self._arm(give_up)
+                    self._arm(too_late=turn > ARM_LIMIT_TURNS and time.monotonic() > give_up)
                 yield
 
     def stop(self) -> None:
@@ -120,9 +122,9 @@ class InProcessRun:
                 del self._loops[name]
                 self._parts[name].close()
 
-    def _arm(self, give_up: float) -> None:
+    def _arm(self, *, too_late: bool) -> None:
         status, robot = self.host.status(), self.host.description
-        if time.monotonic() > give_up:
+        if too_late:
             raise RefusedError(f"not ready to arm within {ARM_LIMIT_S:g} s: {status.why}")
         if status.ready_to_arm:
             request = LifecycleRequest(

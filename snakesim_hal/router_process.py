@@ -3,9 +3,10 @@
 import sys
 import threading
 from collections.abc import Sequence
+from dataclasses import replace
 
 from snakesim_hal.errors import SnakesimError
-from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.network.session import open_session
 from snakesim_hal.process import on_stop_signal
 from snakesim_hal.serve import arguments, process_options
 from snakesim_hal.terminal import complain_of
@@ -13,11 +14,11 @@ from snakesim_hal.terminal import complain_of
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Forward between all connected sessions, until a stop signal."""
-    given = process_options(arguments("Run a Zenoh router on a run's endpoint."), argv)
+    given = process_options(arguments("Run a Zenoh router on a run's endpoint."), argv, listen=True)
     stopped = threading.Event()
     on_stop_signal(stopped.set)
     try:
-        with open_session(Link(given.link.endpoint, listen=True)):
+        with open_session(replace(given.link, namespace=None)):
             stopped.wait()
     except SnakesimError as error:
         complain_of(error, "snakesim router")

@@ -23,6 +23,7 @@ from snakesim_hal.process import (
 )
 from snakesim_hal.service import START_LIMIT_S, Service, ServiceLoop
 from snakesim_hal.terminal import complain, complain_of
+from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,7 @@ def arguments(about: str) -> argparse.ArgumentParser:
     parser.add_argument("--endpoint", default=DEFAULT_ENDPOINT, help="Zenoh endpoint of the robot")
     parser.add_argument("--namespace", help="Zenoh namespace of the robot (default: the robot's name)")
     parser.add_argument("--out", type=Path, help="folder for the process's output files")
+    parser.add_argument("--insecure", action="store_true", help="listen even where other machines can connect")
     parser.add_argument("--parent", type=int, help="process id of the parent; this process dies with it")
     return parser
 
@@ -56,7 +58,8 @@ def process_options(
     if parsed.parent is not None:
         die_with_parent(parsed.parent)
     config = read(parsed.config)
-    link = Link(parsed.endpoint, parsed.namespace or config.robot.name, listen)
+    largest_bytes = max(MAX_PAYLOAD_BYTES, config.robot.sensors.largest_image_bytes)
+    link = Link(parsed.endpoint, parsed.namespace or config.robot.name, listen, parsed.insecure, largest_bytes)
     return ProcessOptions(config, link, parsed.out, parsed)
 
 

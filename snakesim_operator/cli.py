@@ -8,12 +8,13 @@ from importlib.metadata import version
 from pathlib import Path
 
 from snakesim_hal.errors import ConfigError, SnakesimError
-from snakesim_hal.model.files import ROUTER, find, read_table, shipped, short
+from snakesim_hal.model.files import ROUTER, read_part, shipped, short
 from snakesim_hal.model.injection import explain
 from snakesim_hal.model.plugins import COMMANDS, find_plugin, in_file, installed
 from snakesim_hal.model.scenario import Loaded, Override, RunConfig, load, parse_set
 from snakesim_hal.network.endpoint import check_endpoint, check_namespace
 from snakesim_hal.terminal import complain, complain_of, say
+from snakesim_operator.evaluate.command import add_commands
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
 
@@ -76,6 +77,7 @@ def parser() -> argparse.ArgumentParser:
     )
     run.add_argument("--out", type=Path, help="folder for the run's record (default: runs/NAME-TIME)")
     _add_network(run)
+    _add_insecure(run)
     run.set_defaults(act=_run)
 
     compare = commands.add_parser("compare", help="compare two runs, as a table and as a page with plots")
@@ -89,11 +91,13 @@ def parser() -> argparse.ArgumentParser:
     )
     compare.set_defaults(act=_compare)
 
+    add_commands(commands)
+
     config = commands.add_parser("config", help="show every effective value, and the file or flag it came from")
     _add_scenario(config)
     config.set_defaults(act=_config)
 
-    scenarios = commands.add_parser("scenarios", help="list the shipped scenarios, robots and scenes")
+    scenarios = commands.add_parser("scenarios", help="list the shipped scenarios, robots, scenes and suites")
     scenarios.set_defaults(act=_scenarios)
 
     echo = commands.add_parser("echo", help="print what is published on a key, one JSON object a line")
@@ -137,6 +141,7 @@ def parser() -> argparse.ArgumentParser:
 
     router = commands.add_parser("router", help="run a Zenoh router from a JSON5 file")
     router.add_argument("config", type=Path, nargs="?", help=f"JSON5 file (default: {str(ROUTER).replace('%', '%%')})")
+    _add_insecure(router)
     router.set_defaults(act=_router)
 
     schemas = commands.add_parser("schemas", help="print where the JSON Schemas, the key space and the DBC file are")
@@ -173,6 +178,12 @@ def _add_network(parser: argparse.ArgumentParser) -> None:
         "--router", metavar="ENDPOINT", help="connect to a lab's Zenoh router instead, such as tcp/10.0.0.1:7447"
     )
     parser.add_argument("--namespace", help="namespace of the robot (default: the robot's name)")
+
+
+def _add_insecure(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--insecure", action="store_true", help="listen even where anybody on the network can command the robot"
+    )
 
 
 def _check_network(arguments: argparse.Namespace) -> None:
@@ -218,6 +229,7 @@ def _run(arguments: argparse.Namespace) -> int:
             namespace=arguments.namespace,
             stay=arguments.stay,
             with_router=arguments.with_router,
+            insecure=arguments.insecure,
         )
     )
 
@@ -262,10 +274,10 @@ def _shown(value: object) -> str:
 
 
 def _scenarios(_arguments: argparse.Namespace) -> int:
-    for kind, about in (("scenarios", "title"), ("robots", "about"), ("scenes", "about")):
+    for kind, about in (("scenarios", "title"), ("robots", "about"), ("scenes", "about"), ("suites", "title")):
         say(f"{kind}:")
         for name in shipped(kind):
-            table = read_table(find(name, kind))
+            table = read_part(name, kind)
             say(f"  {name:<18}{table.values.get(about, '')}")
     return OK
 
@@ -323,7 +335,7 @@ def _where(arguments: argparse.Namespace):
 def _router(arguments: argparse.Namespace) -> int:
     from snakesim_operator.tools.status import run_router
 
-    return run_router(arguments.config)
+    return run_router(arguments.config, insecure=arguments.insecure)
 
 
 def _schemas(arguments: argparse.Namespace) -> int:

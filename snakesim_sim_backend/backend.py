@@ -18,7 +18,9 @@ from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.contacts import TouchReader
 from snakesim_sim_backend.divergence import MAX_SPEED, DivergenceWatch, log_warnings
 from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS, SimModel, build
-from snakesim_sim_backend.sensors import Sensors, rotate
+from snakesim_sim_backend.sensors.frames import rotate
+from snakesim_sim_backend.sensors.registry import check_models
+from snakesim_sim_backend.sensors.suite import Sensors
 from snakesim_sim_backend.settings import Settings
 from snakesim_sim_backend.start import lay_down
 from snakesim_sim_backend.tether import Rope
@@ -37,6 +39,7 @@ class SimBackend:
     def check(config: RunConfig, _settings: Settings) -> tuple[Pace, ...]:
         """Simulated time supports all paces. Raises ConfigError."""
         check_gains(config.robot)
+        check_models(config.robot)
         does, because = ["diverge"], "the simulator has neither modules nor buses"
         if config.robot.sensors.power is not None:
             does.append("overheat")
@@ -119,8 +122,12 @@ class SimBackend:
         mujoco.mj_step(model, data, self._read_steps)
 
     def faults(self) -> list[Fault]:
-        """A simulated robot has no faults of its own: a divergence is raised by `advance`."""
-        return []
+        """Samples that came too late in real time; they stop nothing. A divergence is raised by `advance`."""
+        if not self._sensors.late:
+            return []
+        return [
+            Fault(tick=self._tick, what="sample_late", cause=cause, reach="none") for cause in self._sensors.lateness()
+        ]
 
     def inject(self, injection: Injection, *, begins: bool) -> bool:
         """`diverge`: the base becomes impossibly fast, as in a divergence. `overheat`: a winding is hot."""
@@ -138,6 +145,7 @@ class SimBackend:
         """Switch the motors off; nothing moves any more. `true_state` stays readable."""
         if self._open:
             self._motors.switch_off()
+            self._sensors.close()
             self._open = False
 
     # --- for tests, benchmarks and reports; not available to GNC --------------------------------------------

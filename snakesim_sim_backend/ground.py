@@ -12,6 +12,8 @@ Floats = NDArray[np.float64]
 
 GROUND, HILLS = "ground", "hills"
 GROUND_GROUP = 1  # MuJoCo geom group of everything that the snake may lie on, including steps
+PLANE_GROUP = 4  # of the plane: rays meet it by a formula of our own, see sensors/rays.py
+SAND = [0.76, 0.70, 0.58, 1.0]  # colour
 SAMPLES_PER_WAVE = 12
 MAX_SAMPLES = 500  # along an edge
 WAVES = 40
@@ -22,7 +24,7 @@ def add_ground(spec: mujoco.MjSpec, ground: Ground) -> list[str]:
     """Add the ground to a model. Returns the names of its geoms, which have no contacts until they are paired."""
     uneven = ground.uneven
     lowest = 0.0 if uneven is None else -uneven.height_m / 2
-    _add(spec, GROUND, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=[0, 0, lowest])
+    _add(spec, GROUND, PLANE_GROUP, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=[0, 0, lowest])
     if uneven is None:
         return [GROUND]
     heights = hills(uneven)
@@ -34,12 +36,12 @@ def add_ground(spec: mujoco.MjSpec, ground: Ground) -> list[str]:
         size=[uneven.area_m / 2, uneven.area_m / 2, uneven.height_m, DEPTH_M],
         userdata=((heights - lowest) / uneven.height_m).ravel().tolist(),
     )
-    _add(spec, HILLS, type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname=HILLS, pos=[0, 0, lowest])
+    _add(spec, HILLS, GROUND_GROUP, type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname=HILLS, pos=[0, 0, lowest])
     return [GROUND, HILLS]  # the plane below catches what leaves the hills
 
 
-def _add(spec: mujoco.MjSpec, name: str, **shape: Any) -> None:
-    spec.worldbody.add_geom(name=name, contype=0, conaffinity=0, group=GROUND_GROUP, **shape)
+def _add(spec: mujoco.MjSpec, name: str, group: int, **shape: Any) -> None:
+    spec.worldbody.add_geom(name=name, contype=0, conaffinity=0, group=group, rgba=SAND, **shape)
 
 
 def hills(uneven: Uneven) -> Floats:

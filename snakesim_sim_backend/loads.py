@@ -7,7 +7,7 @@ import mujoco
 from snakesim_hal.model.plant import LinkLoad
 from snakesim_sim_backend.contacts import TouchReader
 from snakesim_sim_backend.model import SimModel
-from snakesim_sim_backend.sensors import into
+from snakesim_sim_backend.sensors.frames import into
 
 Sums = tuple[float, float, float, float, float, float, float]
 

@@ -25,6 +25,8 @@ from snakesim_sim_backend.tether import add_tether
 
 FREE_QPOS = 7  # of the base: position and quaternion
 FREE_DOFS = 6
+FOOT_GROUP = 3  # MuJoCo geom group of the feet, which are inside of the links' capsules
+ORANGE = [0.87, 0.45, 0.12, 1.0]  # colour of the robot
 AXES: dict[Axis, list[float]] = {"yaw": [0.0, 0.0, 1.0], "pitch": [0.0, 1.0, 0.0]}
 
 
@@ -130,6 +132,7 @@ def _add_snake(spec: mujoco.MjSpec, robot: RobotFile, settings: Settings) -> Non
             size=[robot.module.radius_m, 0.0, 0.0],
             fromto=[0.0, 0.0, 0.0, length, 0.0, 0.0],
             mass=mass,
+            rgba=ORANGE,
             **skin,
         )
         _add_foot(body, f"foot_{i}", 0.0, robot)
@@ -144,7 +147,9 @@ def _add_foot(body: mujoco.MjsBody, name: str, along_m: float, robot: RobotFile)
     """A massless sphere of the body's radius, at a joint or an end."""
     ball = mujoco.mjtGeom.mjGEOM_SPHERE
     size = [robot.module.radius_m, 0.0, 0.0]
-    body.add_geom(name=name, type=ball, size=size, pos=[along_m, 0.0, 0.0], mass=0.0, contype=0, conaffinity=0)
+    body.add_geom(
+        name=name, type=ball, size=size, pos=[along_m, 0.0, 0.0], mass=0.0, contype=0, conaffinity=0, group=FOOT_GROUP
+    )
 
 
 def _add_joint(body: mujoco.MjsBody, name: str, axis: Axis, robot: RobotFile) -> None:

@@ -7,13 +7,14 @@ import mujoco
 from snakesim_hal.model.kinematics import quaternion_from_yaw
 from snakesim_hal.model.scene import Placed
 from snakesim_hal.wire.messages import Obstacle
-from snakesim_sim_backend.ground import GROUND_GROUP
+from snakesim_sim_backend.ground import GROUND_GROUP, SAND
 from snakesim_sim_backend.settings import Settings
 from snakesim_sim_backend.surface import frictionless_skin
 
 OBSTACLE = "obstacle:"
 STEP = "step:"
 OBSTACLE_GROUP = 2
+BLUE = [0.24, 0.42, 0.60, 1.0]  # colour
 
 
 class Shape(TypedDict):
@@ -36,11 +37,11 @@ def add_obstacle(
     """
     shape = _shape(placed.obstacle, body_radius_m, hills_m)
     name = f"{STEP if placed.walkable else OBSTACLE}{placed.obstacle.name}"
-    group = GROUND_GROUP if placed.walkable else OBSTACLE_GROUP
+    group, rgba = (GROUND_GROUP, SAND) if placed.walkable else (OBSTACLE_GROUP, BLUE)
     if placed.walkable or placed.friction > 0:
-        spec.worldbody.add_geom(name=name, contype=0, conaffinity=0, group=group, **shape)
+        spec.worldbody.add_geom(name=name, contype=0, conaffinity=0, group=group, rgba=rgba, **shape)
         return name
-    spec.worldbody.add_geom(name=name, group=group, **shape, **frictionless_skin(settings))
+    spec.worldbody.add_geom(name=name, group=group, rgba=rgba, **shape, **frictionless_skin(settings))
     return None
 
 

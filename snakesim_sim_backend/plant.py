@@ -11,14 +11,15 @@ from numpy.typing import NDArray
 
 from snakesim_hal.errors import BackendError
 from snakesim_hal.model.plant import LinkLoad
-from snakesim_hal.model.robot import ImuSensor, PoseSensor
 from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.model.sensors import ImuSensor, PoseSensor
 from snakesim_hal.wire.messages import Imu, Pose
 from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.divergence import MAX_ACCELERATION, DivergenceWatch, log_warnings
 from snakesim_sim_backend.loads import LoadReader
 from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS, SimModel, build
-from snakesim_sim_backend.sensors import ImuReader, PoseReader
+from snakesim_sim_backend.sensors.imu import ImuReader
+from snakesim_sim_backend.sensors.pose import PoseReader
 from snakesim_sim_backend.settings import PlantSettings, Settings
 from snakesim_sim_backend.start import lay_down
 from snakesim_sim_backend.tether import Rope

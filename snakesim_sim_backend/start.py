@@ -8,7 +8,7 @@ from snakesim_hal.model.kinematics import link_frames, quaternion_from_yaw, rota
 from snakesim_hal.model.scenario import RunConfig, StartPose, start_of
 from snakesim_hal.wire.messages import Mode
 from snakesim_sim_backend.actuators import Motors
-from snakesim_sim_backend.ground import GROUND_GROUP
+from snakesim_sim_backend.ground import GROUND_GROUP, PLANE_GROUP
 from snakesim_sim_backend.model import FREE_QPOS, SimModel
 
 REST = 1e-3  # m/s and rad/s: slower is at rest
@@ -50,7 +50,7 @@ def highest_ground_m(model: mujoco.MjModel, data: mujoco.MjData, config: RunConf
         (*pose.position_w, 0.0), rotation, pose.angles_rad, robot.axes, robot.link_lengths_m
     )
     only_ground = np.zeros(mujoco.mjNGROUP, dtype=np.uint8)
-    only_ground[GROUND_GROUP] = 1
+    only_ground[[GROUND_GROUP, PLANE_GROUP]] = 1
     above, down, hit = 100.0, np.array([0.0, 0.0, -1.0]), np.zeros(1, dtype=np.int32)
     highest = -np.inf
     for origin, frame, length in zip(origins, rotations, robot.link_lengths_m, strict=True):

@@ -24,7 +24,8 @@ from snakesim_can_backend.twin.reports import (
     touch,
 )
 from snakesim_hal.model.plant import LinkLoad, Plant
-from snakesim_hal.model.robot import PoseSensor, RobotFile
+from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.sensors import PoseSensor
 
 Floats = NDArray[np.float64]
 

@@ -70,6 +70,7 @@ class Host:
         *,
         max_ticks: int | None = None,
         end_after_fault_s: float | None = None,
+        pace_after_fault: Pace = "realtime",
         stay: bool = False,
         latch: EstopLatch | None = None,
         starter: HostEnd | None = None,
@@ -77,7 +78,8 @@ class Host:
     ) -> None:
         """max_ticks: end this many ticks after the first arming; None: go on until asked to finish.
 
-        end_after_fault_s: end this long after a fault; None: stay, so that a person can clear it.
+        end_after_fault_s: end after so much robot time in a fault; None: stay, so that a person can clear it.
+        pace_after_fault: of ticks that wait for no service.
         stay: count only armed ticks, and record little in between; else count all ticks from the first arming.
         latch: stores an emergency stop for later hosts.
         starter: the private channel to the process that started this host.
@@ -95,6 +97,7 @@ class Host:
         self._backend = self.faults.backend
         self._max_ticks = max_ticks
         self._end_after_fault_s = end_after_fault_s
+        self._pace_after_fault: Pace = pace_after_fault
         self._stay = stay
         self._latch = latch or EstopLatch(None)
         self._starter = starter or HostEnd(None)
@@ -116,7 +119,7 @@ class Host:
         self.ended_why = ""
         self._armed_at_ns: int | None = None
         self._ended_ns = 0
-        self._faulted_at_ns: int | None = None
+        self._faulted_at: int | None = None  # tick
         self._status_due_ns = 0
         self._status_shown: Any = None
         if (found := self._latch.found) is not None:
@@ -130,6 +133,10 @@ class Host:
     def stop(self) -> None:
         """End the run in order; may be called from a signal handler."""
         self._end("stopped", "by a signal")
+
+    def complete(self) -> None:
+        """End the run as after all of its time: what was to be done is done."""
+        self._end("complete")
 
     def _end(self, ended: Ending, why: str = "") -> None:
         """End the run in order. The first reason is kept."""
@@ -465,13 +472,13 @@ class Host:
     def _watch_fault(self) -> None:
         """After a fault the host stops waiting for services, goes on in real time, and may end the run."""
         if self.authority.state not in ("fault", "estop"):
-            if self._faulted_at_ns is not None:
+            if self._faulted_at is not None:
                 self._pace = self._config.pace
-            self._faulted_at_ns = None
-        elif self._faulted_at_ns is None:
-            self._faulted_at_ns = time.monotonic_ns()
+            self._faulted_at = None
+        elif self._faulted_at is None:
+            self._faulted_at = self._tick
             if self._pace != "realtime":
-                self._pace = "realtime"
+                self._pace = self._pace_after_fault
                 self._deadlines.begin(self._tick)
 
     def _over(self) -> bool:
@@ -486,6 +493,6 @@ class Host:
         return self._stopping
 
     def _settled_after_fault(self) -> bool:
-        if self._faulted_at_ns is None or self._end_after_fault_s is None:
+        if self._faulted_at is None or self._end_after_fault_s is None:
             return False
-        return time.monotonic_ns() - self._faulted_at_ns > self._end_after_fault_s * 1e9
+        return (self._tick - self._faulted_at) * self._period_ns > self._end_after_fault_s * 1e9

@@ -15,17 +15,19 @@ from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.session import Publisher, Question, Session
 from snakesim_hal.terminal import complain
 from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import IMAGES
 from snakesim_hal.wire.messages import Answer, AppliedCommand, Description, Message, Status
 
 WAITING_LIMIT = 256  # queued messages; beyond that the oldest are dropped
+IMAGES_WAITING_LIMIT = 8
 FLUSH_S = 1.0  # how long queued messages are still sent at the end
 
 
 class Sender:
     """A thread that runs actions one after another."""
 
-    def __init__(self, name: str) -> None:
-        self._waiting: Mailbox[Callable[[], None] | None] = Mailbox((WAITING_LIMIT,))
+    def __init__(self, name: str, waiting_limit: int = WAITING_LIMIT) -> None:
+        self._waiting: Mailbox[Callable[[], None] | None] = Mailbox((waiting_limit,))
         self._closing = False
         self._since_ns = 0  # when the present action began; 0: idle
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
@@ -66,6 +68,8 @@ class Outbox:
         self._publishers: dict[str, Publisher[Any]] = {keys.STATUS: session.latched_publisher(keys.STATUS, Status)}
         self._streams = Sender("streams")
         self._answers = Sender("answers")
+        has_camera = any(keys.message_at(sensor.key) in IMAGES for sensor in description.sensors)
+        self._images = Sender("images", IMAGES_WAITING_LIMIT) if has_camera else self._streams
         self.applied_heard = False  # whether hal/applied has a subscriber
         session.latched_publisher(keys.DESCRIPTION, Description).put(description)
         session.declare_alive(HAL)
@@ -77,7 +81,8 @@ class Outbox:
         if self._lockstep:
             self._publisher(key, type(message)).put(message)
         else:
-            self._streams.do(lambda: self._publisher(key, type(message)).put(message))
+            sender = self._images if isinstance(message, IMAGES) else self._streams
+            sender.do(lambda: self._publisher(key, type(message)).put(message))
 
     def put_status(self, status: Status) -> None:
         """Publish the status, and check for subscribers."""
@@ -102,8 +107,8 @@ class Outbox:
 
     def close(self) -> None:
         """Send queued messages for at most FLUSH_S."""
-        self._answers.close()
-        self._streams.close()
+        for sender in dict.fromkeys((self._answers, self._images, self._streams)):
+            sender.close()
 
     def _publisher(self, key: str, message: type[Message]) -> Publisher[Any]:
         publisher = self._publishers.get(key)

@@ -133,6 +133,30 @@ def find(name: str, kind: str, beside: Path | None = None) -> Path:
     return SHIPPED / kind / f"{name}.toml"
 
 
+def read_part(name: str, kind: str, beside: Path | None = None) -> Table:
+    """Read a robot or a scene. With `extends = "planar13"` its file says only what differs from another one's."""
+    path = find(name, kind, beside)
+    table = read_table(path)
+    base = table.values.pop("extends", None)
+    if base is None:
+        return table
+    if not isinstance(base, str):
+        raise ConfigError(f"{path}: `extends` = {short(repr(base))} must be the name or the path of another file")
+    whole = read_table(find(base, kind, path.parent))
+    for dotted, value in _settings(table.values):
+        whole.put(dotted, value, str(path))
+    return whole
+
+
+def _settings(section: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Every value in a section and those in it; a list is one value."""
+    for key, value in section.items():
+        if isinstance(value, dict):
+            yield from _settings(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
 def expanded(name: str) -> Path:
     """A path, with `~` for the home folder. Raises ConfigError when there is no such home."""
     try:

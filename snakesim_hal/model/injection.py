@@ -186,15 +186,11 @@ def target_type(target: str) -> TargetType:
 
 def writer_of(key: str) -> str:
     """The part that writes a key. Raises ConfigError for a key that no part of a run writes."""
-    for row in keys.SPACE:
-        if row.kind not in ("stream", "latched"):
-            continue
-        if row.key == key:
-            writer = {"HAL": HAL, "lease holder": CONTROL}.get(row.writer, row.writer)
-            if writer != "operator":
-                return writer
-    if keys.message_at(key) is not None and key.startswith(keys.done("")):
-        return keys.service_of(key)
+    row = keys.row_at(key)
+    if row is not None and row.kind in ("stream", "latched") and row.writer != "operator":
+        if row.key == keys.DONE_ALL:
+            return keys.service_of(key)
+        return {"HAL": HAL, "lease holder": CONTROL}.get(row.writer, row.writer)
     streams = [row.key for row in keys.SPACE if row.kind in ("stream", "latched") and row.writer != "operator"]
     raise ConfigError(f"{key!r}: no part of a run writes this key; those with a writer are {', '.join(streams)}")
 

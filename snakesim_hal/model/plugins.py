@@ -23,6 +23,7 @@ BACKENDS = "snakesim.backends"
 COMMANDS = "snakesim.commands"
 CONTROLLERS = "snakesim.controllers"
 PLANTS = "snakesim.plants"
+SENSORS = "snakesim.sensors"
 SERVICES = "snakesim.services"
 _offered: dict[tuple[str, str], Any] = {}
 

@@ -10,6 +10,7 @@ from typing import Annotated
 from msgspec import Meta
 
 from snakesim_hal.model.files import FileStruct
+from snakesim_hal.model.sensors import LinkName, Mounted, Sensors
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (
     Axis,
@@ -78,60 +79,6 @@ class Safety(FileStruct, frozen=True, kw_only=True):
     may_lose_joints: Annotated[int, Meta(ge=0, le=MAX_JOINTS)] = 0  # isolated, before the robot stops
 
 
-class JointSensor(FileStruct, frozen=True, kw_only=True):
-    """Angle, velocity and torque of every joint. No rate: a sample every tick."""
-
-    delay_s: Annotated[float, from_zero(1, "s")] = 0.0
-    angle_noise_rad: Annotated[float, from_zero(1, "rad")] = 0.0  # standard deviation, as all noise here
-    velocity_noise_rad_s: Annotated[float, from_zero(10, "rad/s")] = 0.0
-    torque_noise_nm: Annotated[float, from_zero(100, "N·m")] = 0.0
-
-
-class ContactSensor(FileStruct, frozen=True, kw_only=True):
-    """Contacts of the links with obstacles."""
-
-    rate_hz: Annotated[float, above(1e4, "Hz")] = 100.0
-    delay_s: Annotated[float, from_zero(1, "s")] = 0.0
-    position_noise_m: Annotated[float, from_zero(1, "m")] = 0.0
-    force_noise_n: Annotated[float, from_zero(100, "N")] = 0.0
-    threshold_n: Annotated[float, from_zero(100, "N")] = 0.0  # weaker contacts are not detected
-
-
-class ImuSensor(FileStruct, frozen=True, kw_only=True):
-    """Angular velocity and acceleration (gravity included) of every link."""
-
-    rate_hz: Annotated[float, above(1e4, "Hz")] = 100.0
-    delay_s: Annotated[float, from_zero(1, "s")] = 0.0
-    angular_velocity_noise_rad_s: Annotated[float, from_zero(10, "rad/s")] = 0.0
-    acceleration_noise_m_s2: Annotated[float, from_zero(100, "m/s²")] = 0.0
-
-
-class PoseSensor(FileStruct, frozen=True, kw_only=True):
-    """Pose of the base, from motion capture."""
-
-    rate_hz: Annotated[float, above(1e4, "Hz")] = 100.0
-    delay_s: Annotated[float, from_zero(1, "s")] = 0.0
-    position_noise_m: Annotated[float, from_zero(1, "m")] = 0.0
-    angle_noise_rad: Annotated[float, from_zero(1, "rad")] = 0.0
-
-
-class PowerSensor(FileStruct, frozen=True, kw_only=True):
-    """Supply, temperatures and leaks of every joint module. Modules on a bus report them at their own rate."""
-
-    rate_hz: Annotated[float, above(1e4, "Hz")] = 2.0
-    delay_s: Annotated[float, from_zero(1, "s")] = 0.0
-
-
-class Sensors(FileStruct, frozen=True, kw_only=True):
-    """The sensors of the robot; without its section a sensor is absent."""
-
-    joints: JointSensor = JointSensor()
-    contacts: ContactSensor | None = None
-    imu: ImuSensor | None = None
-    pose: PoseSensor | None = None
-    power: PowerSensor | None = None
-
-
 class RobotFile(FileStruct, frozen=True, kw_only=True):
     """A whole robot file."""
 
@@ -143,6 +90,25 @@ class RobotFile(FileStruct, frozen=True, kw_only=True):
     motor: Motor
     safety: Safety = Safety()
     sensors: Sensors = Sensors()
+
+    def __post_init__(self) -> None:
+        """Sensors must sit on links that the robot has, and not inside of them. Raises ValueError."""
+        last = self.chain.modules
+        for sensor in (*self.sensors.depth, *self.sensors.range):
+            link = self.link_index(sensor.link)
+            if link > last:
+                raise ValueError(
+                    f"sensor {sensor.name!r} is on link {link}, and the links are 0 (tail) to {last} (head)"
+                )
+            if sensor.position_m is None and link != last:
+                raise ValueError(
+                    f"sensor {sensor.name!r} is on link {link}: give `position_m`; only the tip of the head "
+                    f"is the default"
+                )
+
+    def link_index(self, link: LinkName) -> int:
+        """The number of a link, from 0 at the tail."""
+        return {"tail": 0, "head": self.chain.modules}[link] if isinstance(link, str) else link
 
     @property
     def axes(self) -> list[Axis]:
@@ -188,6 +154,7 @@ def describe(
             stiffness_nm_per_rad=robot.motor.stiffness_nm_per_rad,
             damping_nm_s_per_rad=robot.motor.damping_nm_s_per_rad,
             velocity_gain_nm_s_per_rad=robot.motor.velocity_gain_nm_s_per_rad,
+            rotor_kg_m2=robot.motor.armature_kg_m2,
             derate_from_c=robot.limits.derate_from_c,
             stop_at_c=robot.limits.stop_at_c,
             least_voltage_v=robot.limits.least_voltage_v,
@@ -200,14 +167,9 @@ def describe(
     ]
     rate_hz = 1e9 / period_ns
     sensors = [SensorDescription(key=keys.JOINTS, rate_hz=rate_hz, delay_s=robot.sensors.joints.delay_s)]
-    for key, sensor in (
-        (keys.CONTACTS, robot.sensors.contacts),
-        (keys.IMU, robot.sensors.imu),
-        (keys.POSE, robot.sensors.pose),
-        (keys.POWER, robot.sensors.power),
-    ):
-        if sensor is not None:
-            sensors.append(SensorDescription(key=key, rate_hz=min(sensor.rate_hz, rate_hz), delay_s=sensor.delay_s))
+    for key, sensor in robot.sensors.published():
+        delay_s = max(sensor.delay_s, period_ns * 1e-9) if isinstance(sensor, Mounted) else sensor.delay_s
+        sensors.append(SensorDescription(key=key, rate_hz=min(sensor.rate_hz, rate_hz), delay_s=delay_s))
     return Description(
         robot=robot.name,
         backend=backend,

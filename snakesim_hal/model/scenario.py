@@ -9,7 +9,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -17,12 +17,13 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.files import FileStruct, Table, decode, find, leaves, read_table, short
+from snakesim_hal.model.files import FileStruct, Table, decode, find, leaves, read_part, read_table, short
 from snakesim_hal.model.injection import CONTROL
 from snakesim_hal.model.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
+from snakesim_hal.model.outlines import Capsule, Heading, Point, Size
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.route import chain_angles, lay_chain, yaw_segments_m
-from snakesim_hal.model.scene import Capsule, Heading, Placed, Point, SceneFile, check_clear, place, route_of
+from snakesim_hal.model.scene import Placed, SceneFile, check_clear, place, route_of
 from snakesim_hal.model.textfiles import parse_toml
 from snakesim_hal.model.whole_file import write_whole
 from snakesim_hal.wire.messages import Pace
@@ -43,10 +44,26 @@ class Start(FileStruct, frozen=True, kw_only=True):
     yaw_rad: Heading = 0.0
 
 
+class HeadingGoal(FileStruct, frozen=True, kw_only=True, tag="heading", tag_field="kind"):
+    """Advance the whole body in one direction."""
+
+    heading_rad: Heading = 0.0
+    distance_m: Size = 3.0  # from where it starts
+
+
+class WaypointGoal(FileStruct, frozen=True, kw_only=True, tag="waypoints", tag_field="kind"):
+    """Take the head from point to point."""
+
+    points_m: Annotated[list[Point], Meta(min_length=1, max_length=1000)]
+    within_m: Size = 0.2  # a point this near counts as reached
+
+
 class Mission(FileStruct, frozen=True, kw_only=True):
-    """The goal of navigation."""
+    """The goal of navigation: the end of the scene's route, or with `goal` a path that it plans itself."""
 
     speed_m_s: Annotated[float, Meta(ge=0, le=10, extra_json_schema={"unit": "m/s"})] = 0.2
+    goal: HeadingGoal | WaypointGoal | None = None
+    map: Literal["known", "perceived"] = "known"  # the scene's obstacles as from a survey, or only what sensors tell
 
 
 class Service(FileStruct, frozen=True, kw_only=True):
@@ -191,6 +208,14 @@ def parse_set(text: str) -> Override:
 
 def load(scenario: str, overrides: Sequence[Override] = ()) -> Loaded:
     """Read a scenario (shipped name or path), its robot and scene, and the flags. Raises ConfigError."""
+    table = compose(scenario, overrides)
+    config = decode(table, RunConfig)
+    check(config)
+    return Loaded(config, table)
+
+
+def compose(scenario: str, overrides: Sequence[Override] = ()) -> Table:
+    """All values of a scenario, not checked yet. Raises ConfigError for files that cannot be read."""
     path = find(scenario, "scenarios")
     table = read_table(path)
     table.values.setdefault("name", path.stem)
@@ -201,7 +226,7 @@ def load(scenario: str, overrides: Sequence[Override] = ()) -> Loaded:
         named = table.values.get(part)
         if isinstance(named, str):
             from_flag = any(o.key == part for o in picks)
-            inner = read_table(find(named, kind, None if from_flag else path.parent))
+            inner = read_part(named, kind, None if from_flag else path.parent)
             table.put(part, inner.values, inner.source)
     for override in sorted(overrides, key=lambda o: o.key.startswith(CHOSEN)):
         if override in picks:
@@ -215,9 +240,7 @@ def load(scenario: str, overrides: Sequence[Override] = ()) -> Loaded:
                 chosen = str(table.values.get(choice, "sim")).rpartition(":")[2]
                 key = f"{section}.{chosen}.{key.removeprefix(alias)}"
         table.put(key, override.value, override.flag)
-    config = decode(table, RunConfig)
-    check(config)
-    return Loaded(config, table)
+    return table
 
 
 def check(config: RunConfig) -> None:

@@ -14,6 +14,17 @@ from numpy.typing import NDArray
 
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.files import FileStruct
+from snakesim_hal.model.outlines import (
+    Capsule,
+    Coordinate,
+    Friction,
+    Heading,
+    Point,
+    Size,
+    metres,
+    outline_distance_m,
+)
+from snakesim_hal.model.random_field import MAX_STREWN, RandomField, strew
 from snakesim_hal.model.route import Route, sine_points
 from snakesim_hal.wire.messages import Obstacle
 from snakesim_hal.wire.quantities import Name
@@ -21,26 +32,12 @@ from snakesim_hal.wire.quantities import Name
 Floats = NDArray[np.float64]
 
 
-def _length(low: float | None = None, high: float = 1000.0) -> Meta:
-    if low is None:
-        return Meta(ge=-high, le=high, extra_json_schema={"unit": "m"})
-    return Meta(gt=low, le=high, extra_json_schema={"unit": "m"})
-
-
-Coordinate = Annotated[float, _length()]
-Size = Annotated[float, _length(0)]
-Clearance = Annotated[float, Meta(ge=0, le=100, extra_json_schema={"unit": "m"})]
-Friction = Annotated[float, Meta(ge=0, le=5, extra_json_schema={"unit": "1 (Coulomb coefficient)"})]
-Heading = Annotated[float, Meta(ge=-6.3, le=6.3, extra_json_schema={"unit": "rad"})]
-Point = tuple[Coordinate, Coordinate]
-
-
 class Uneven(FileStruct, frozen=True, kw_only=True):
     """Smooth random hills."""
 
-    height_m: Annotated[float, _length(0, 1)]  # from lowest to highest point
-    wavelength_m: Annotated[float, _length(0, 100)]  # typical distance between two hills
-    area_m: Annotated[float, _length(0, 200)] = 20.0  # edge of the square around the origin
+    height_m: Annotated[float, metres(0, 1)]  # from lowest to highest point
+    wavelength_m: Annotated[float, metres(0, 100)]  # typical distance between two hills
+    area_m: Annotated[float, metres(0, 200)] = 20.0  # edge of the square around the origin
     seed: Annotated[int, Meta(ge=0, le=2**31)] = 0
 
 
@@ -111,7 +108,7 @@ class Step(FileStruct, frozen=True, kw_only=True):
 
     position_m: Point
     size_m: tuple[Size, Size]
-    height_m: Annotated[float, _length(0, 2)]
+    height_m: Annotated[float, metres(0, 2)]
     yaw_rad: Heading = 0.0
     friction: Friction = 0.5
     name: Name | None = None
@@ -132,21 +129,6 @@ class PegsAlongRoute(FileStruct, frozen=True, kw_only=True):
     friction: Friction = 0.0
 
 
-class RandomField(FileStruct, frozen=True, kw_only=True):
-    """Randomly placed pegs, the same for the same seed."""
-
-    seed: Annotated[int, Meta(ge=0, le=2**31)]
-    low_m: Point
-    high_m: Point
-    density_per_m2: Annotated[float, Meta(gt=0, le=200, extra_json_schema={"unit": "1/m²"})]
-    radius_m: tuple[Size, Size]  # smallest and largest
-    clearance_m: Clearance  # least gap between two pegs
-    route_clearance_m: Clearance | None = None  # least gap between the route and a peg's surface
-    height_m: Size = 0.2
-    friction: Friction = 0.0
-
-
-MAX_STREWN = 1000
 MAX_OBSTACLES = 4096  # bound of the message World
 
 
@@ -188,7 +170,7 @@ class Placed(FileStruct, frozen=True, kw_only=True):
     walkable: bool = False  # a step is part of the ground: contacts with it are not for pushing off
 
 
-def place(scene: SceneFile, keep_clear: "list[Capsule] | None" = None) -> list[Placed]:
+def place(scene: SceneFile, keep_clear: list[Capsule] | None = None) -> list[Placed]:
     """All obstacles of a scene, expanded, each with a unique name.
 
     keep_clear: capsules (the snake at its start) that random fields stay away from.
@@ -223,7 +205,9 @@ def place(scene: SceneFile, keep_clear: "list[Capsule] | None" = None) -> list[P
     for i, row in enumerate(scene.pegs_along_route):
         placed.extend(_pegs_along(scene, i, row, route))
     for i, field in enumerate(scene.random_field):
-        placed.extend(_strewn(scene, i, field, route, placed, keep_clear or []))
+        standing = [p.obstacle for p in placed if not p.walkable]
+        strewn = strew(field, f"scene {scene.name!r}: `random_field.{i}`", i, route, standing, keep_clear or [])
+        placed.extend(Placed(obstacle=obstacle, friction=field.friction) for obstacle in strewn)
     names = Counter(p.obstacle.name for p in placed)
     twice = sorted(name for name, count in names.items() if count > 1)
     if twice:
@@ -234,14 +218,9 @@ def place(scene: SceneFile, keep_clear: "list[Capsule] | None" = None) -> list[P
 def _check_count(scene: SceneFile) -> None:
     given = (scene.cylinder, scene.box, scene.sphere, scene.wall, scene.step)
     count = sum(len(kind) for kind in given) + sum(row.count for row in scene.pegs_along_route)
-    count += sum(min(_wanted(field), MAX_STREWN) for field in scene.random_field)
+    count += sum(min(field.wanted, MAX_STREWN) for field in scene.random_field)
     if count > MAX_OBSTACLES:
         raise ConfigError(f"scene {scene.name!r}: has {count} obstacles; at most {MAX_OBSTACLES} are allowed")
-
-
-def _wanted(field: RandomField) -> int:
-    """Number of pegs of a random field."""
-    return round(field.density_per_m2 * math.prod(np.subtract(field.high_m, field.low_m).tolist()))
 
 
 def _peg(name: str, position: Point, radius: float, height: float, friction: float) -> Placed:
@@ -291,83 +270,6 @@ def _pegs_along(scene: SceneFile, index: int, row: PegsAlongRoute, route: Route 
         name = f"peg_{index}_{row.first + k}"
         pegs.append(_peg(name, (float(centre[0]), float(centre[1])), row.radius_m, row.height_m, row.friction))
     return pegs
-
-
-def _strewn(
-    scene: SceneFile,
-    index: int,
-    field: RandomField,
-    route: Route | None,
-    others: list[Placed],
-    keep_clear: "list[Capsule]",
-) -> list[Placed]:
-    where = f"scene {scene.name!r}: `random_field.{index}`"
-    low, high = np.array(field.low_m), np.array(field.high_m)
-    if not np.all(high > low):
-        raise ConfigError(f"{where}: `high_m` = {field.high_m} must exceed `low_m` = {field.low_m} in x and y")
-    if field.radius_m[1] < field.radius_m[0]:
-        raise ConfigError(f"{where}: `radius_m` = {field.radius_m}: smallest first, then largest")
-    if field.route_clearance_m is not None and route is None:
-        raise ConfigError(f"{where}: `route_clearance_m` is set but the scene has no route; add a [route] section")
-    wanted = _wanted(field)
-    if wanted > MAX_STREWN:
-        raise ConfigError(
-            f"{where}: `density_per_m2` = {field.density_per_m2} asks for {wanted} pegs on this area; at most "
-            f"{MAX_STREWN}"
-        )
-    random = np.random.default_rng([field.seed, index])
-    strewn: list[Placed] = []
-    fixed = [p.obstacle for p in others if not p.walkable]
-    for _ in range(200 * wanted):
-        if len(strewn) == wanted:
-            return strewn
-        centre = random.uniform(low, high)
-        radius = float(random.uniform(*field.radius_m))
-        standing = fixed + [p.obstacle for p in strewn]
-        if any(outline_distance_m(o, centre) < radius + field.clearance_m for o in standing):
-            continue
-        if any(c.distance_m(centre) < radius + field.clearance_m for c in keep_clear):
-            continue
-        if route is not None and field.route_clearance_m is not None:
-            nearest = route.position_w(float(np.clip(route.project(centre), 0, route.length_m)))
-            if np.hypot(*(nearest - centre)) < radius + field.route_clearance_m:
-                continue
-        name = f"random_{index}_{len(strewn)}"
-        spot = (float(centre[0]), float(centre[1]))
-        strewn.append(_peg(name, spot, radius, field.height_m, field.friction))
-    if len(strewn) < wanted:
-        raise ConfigError(
-            f"{where}: only {len(strewn)} of {wanted} pegs fit; lower `density_per_m2` = {field.density_per_m2} or "
-            f"`clearance_m` = {field.clearance_m}"
-        )
-    return strewn
-
-
-class Capsule(FileStruct, frozen=True, kw_only=True):
-    """Outline of a link on the ground, from above."""
-
-    name: str
-    rear_m: tuple[float, float]
-    front_m: tuple[float, float]
-    radius_m: float
-
-    def distance_m(self, point: Floats) -> float:
-        """Distance from a point to the capsule's surface; negative inside."""
-        rear, front = np.array(self.rear_m), np.array(self.front_m)
-        axis = front - rear
-        along = float(np.clip((point - rear) @ axis / max(float(axis @ axis), 1e-12), 0.0, 1.0))
-        return float(np.hypot(*(point - rear - along * axis))) - self.radius_m
-
-
-def outline_distance_m(obstacle: Obstacle, point: Floats) -> float:
-    """Distance from a point on the ground to an obstacle's outline from above; negative inside."""
-    offset = np.asarray(point, dtype=np.float64) - np.array(obstacle.position_w[:2])
-    if obstacle.shape != "box":
-        return float(np.hypot(*offset)) - obstacle.radius_m
-    c, s = math.cos(obstacle.yaw_rad), math.sin(obstacle.yaw_rad)
-    local = np.abs([c * offset[0] + s * offset[1], c * offset[1] - s * offset[0]])
-    beyond = local - np.array(obstacle.half_size_m[:2])
-    return float(np.hypot(*np.maximum(beyond, 0.0)) + min(float(beyond.max()), 0.0))
 
 
 def check_clear(scene: SceneFile, placed: list[Placed], snake: list[Capsule]) -> None:

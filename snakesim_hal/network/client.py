@@ -54,6 +54,8 @@ class Feed(Generic[MessageT]):
         if newest_only:
             newest = self._reader.newest(self._fits)
             fitting = [] if newest is None else [newest]
+            if fitting:
+                self._kept.clear()
         else:
             fitting = [message for message in self._reader.drain() if self._fits(message)]
         for message in fitting:

@@ -1,6 +1,7 @@
 """Checks of endpoints and namespaces that people type, because Zenoh's own error messages are terse."""
 
 import re
+from ipaddress import ip_address
 
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.files import short
@@ -25,6 +26,29 @@ def check_endpoint(text: str, origin: str) -> str:
     if not 1 <= int(parts["port"]) <= 65535:
         raise ConfigError(f"{given}: the port is a number from 1 to 65535; give an endpoint {VALID}")
     return text
+
+
+def check_guarded(endpoint: str, origin: str, *, access_control: bool = False, insecure: bool = False) -> None:
+    """Refuse to listen where others could reach a robot and nothing says who may command it. Raises ConfigError."""
+    if access_control or insecure or not is_exposed(endpoint):
+        return
+    raise ConfigError(
+        f"{origin} {short(endpoint)}: whoever reaches this address could command the robot, because nothing there asks "
+        f"who they are. Listen on loopback, let the robot join a router with access control (`snakesim router FILE`, "
+        f"`snakesim run --router ENDPOINT`), or accept it with --insecure"
+    )
+
+
+def is_exposed(endpoint: str) -> bool:
+    """Whether other machines may reach what listens on an endpoint: it is not on loopback."""
+    parts = _parts.fullmatch(endpoint)
+    if parts is None:
+        return not endpoint.startswith("unixsock-stream/")
+    host = parts["host"].strip("[]")
+    try:
+        return not ip_address(host).is_loopback
+    except ValueError:
+        return host != "localhost"
 
 
 def check_namespace(text: str, origin: str) -> str:

@@ -20,6 +20,7 @@ from snakesim_hal.network.session import (
     Question,
     Reader,
     Session,
+    depth_of,
     intersects,
 )
 from snakesim_hal.wire import keys
@@ -136,9 +137,9 @@ class LocalSession(Session):
 
         return self._routed(key, Publisher(message, send, lambda: bool(network.takers(key))))
 
-    def reader(self, key: str, message: type[MessageT], *, depth: int = READER_DEPTH) -> Reader[MessageT]:
+    def reader(self, key: str, message: type[MessageT], *, depth: int | None = None) -> Reader[MessageT]:
         """The newest `depth` samples of a stream."""
-        kept: deque[Arrival] = deque(maxlen=depth)
+        kept: deque[Arrival] = deque(maxlen=depth or depth_of(message))
         return LocalReader(self._subscribe(key, kept.append), kept, message, self.rejected)
 
     def latched_reader(self, key: str, message: type[MessageT]) -> Reader[MessageT]:

@@ -31,8 +31,9 @@ class Mailbox(Generic[ItemT]):
     def put(self, item: ItemT, lane: int = 0) -> None:
         """Add an item; never waits."""
         self._lanes[lane].append(item)
-        with contextlib.suppress(RuntimeError):  # already released
-            self._bell.release()
+        if self._bell.locked():
+            with contextlib.suppress(RuntimeError):  # another thread has just released it
+                self._bell.release()
 
     def full(self, lane: int = 0) -> bool:
         """Whether one more item would displace the oldest."""

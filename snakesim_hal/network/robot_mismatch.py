@@ -10,7 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.model.route import is_line
-from snakesim_hal.wire.messages import Contacts, Description, Imu, JointState, Message, Pose, Power, Trajectory, World
+from snakesim_hal.wire.messages import (
+    ColourImage,
+    Contacts,
+    DepthImage,
+    Description,
+    Imu,
+    JointState,
+    Message,
+    Pose,
+    Power,
+    Ranges,
+    Trajectory,
+    World,
+)
 
 MAX_PATH_M = 1e5
 UNIT_NORM_ERROR = 0.1  # of a rotation; rounding errors are far smaller
@@ -21,8 +34,7 @@ def mismatch(message: Message, robot: Description) -> str | None:
     joints, links = len(robot.joints), len(robot.links)
     match message:
         case JointState():
-            lists = (message.angle_rad, message.velocity_rad_s, message.torque_nm, message.valid, message.age_ns)
-            fits = {len(values) for values in lists} == {joints}
+            fits = message.is_of(joints)
         case Power():
             volts = (message.voltage_v, message.current_a, message.motor_c, message.board_c, message.leak)
             fits = {len(values) for values in (*volts, message.valid)} == {joints}
@@ -31,6 +43,16 @@ def mismatch(message: Message, robot: Description) -> str | None:
             fits = alike and max(message.link, default=0) < links
         case Contacts():
             fits = all(contact.link < links for contact in message.contacts)
+        case DepthImage() | ColourImage():
+            pixels = message.width * message.height
+            fits = (
+                len(message.depth) == 2 * pixels if isinstance(message, DepthImage) else len(message.rgb) == 3 * pixels
+            )
+            if not fits or message.link >= links:
+                return "wrong_length"
+            return _no_rotation(message.orientation_l_wxyz)
+        case Ranges():
+            return "wrong_length" if message.link >= links else _no_rotation(message.orientation_l_wxyz)
         case World():
             if not all(contact.link < links for contact in message.contacts):
                 return "wrong_length"

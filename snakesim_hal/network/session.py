@@ -15,20 +15,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic
 
+import msgspec
 import zenoh
 from zenoh import ext, handlers  # pyright: ignore[reportMissingModuleSource]
 
 from snakesim_hal.errors import ConfigError, NotConnectedError, WireError
 from snakesim_hal.model.files import short
 from snakesim_hal.model.textfiles import check_brackets, read_text
+from snakesim_hal.network.endpoint import check_guarded
 from snakesim_hal.process import raise_open_files
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES, Decoder, MessageT, encode, encoding_of
+from snakesim_hal.wire.codec import IMAGES, MAX_PAYLOAD_BYTES, Decoder, MessageT, encode, encoding_of
 from snakesim_hal.wire.messages import Answer, Message
 
 DEFAULT_PORT = 7447
 DEFAULT_ENDPOINT = f"tcp/127.0.0.1:{DEFAULT_PORT}"
-MAX_MESSAGE_BYTES = MAX_PAYLOAD_BYTES + 4096  # with key and encoding; longer messages cost neither memory nor time
+ENVELOPE_BYTES = 4096  # around a payload: key, encoding, and the numbers of an image
 # Connections that stay silent are closed after a second, and many of them are allowed.
 UNICAST = {"accept_timeout": 1000, "accept_pending": 1000, "max_sessions": 4000}
 # A subscriber that does not read loses samples after 0.1 ms (Zenoh's default is 1 ms), so that ten of them hardly delay
@@ -39,6 +41,7 @@ TX = {"lease": 2000, "queue": {"congestion_control": {"drop": {"wait_before_drop
 RUNTIME = ("ZENOH_RUNTIME", "(rx: (worker_threads: 16))")
 MAX_OPEN_FILES = 16384  # each connection takes one, and the default limit of a process is 1024
 READER_DEPTH = 256  # so that a burst of noise on a key does not displace the valid sample
+IMAGES_DEPTH = 32  # of images, which take much memory; in lockstep a reader may lag by that many
 
 
 @dataclass(frozen=True)
@@ -48,10 +51,11 @@ class Link:
     endpoint: str = DEFAULT_ENDPOINT
     namespace: str | None = None  # None: the whole network, for tools that search for robots
     listen: bool = False  # True: listen on the endpoint; False: connect to it
+    insecure: bool = False  # True: listen even where other machines can connect
+    largest_bytes: int = MAX_PAYLOAD_BYTES  # of a payload; longer ones cost neither memory nor time
 
 
-@dataclass(frozen=True)
-class Arrival:
+class Arrival(msgspec.Struct, frozen=True):
     """A received sample, not decoded yet."""
 
     key: str
@@ -149,11 +153,12 @@ class Session:
         command = key == keys.JOINT_COMMAND
         # The last message of a tick is sent at once, batched with those put just before it: one packet instead of five.
         ends_a_tick = command or key == keys.CLOCK or key.startswith(keys.done(""))
+        priority = zenoh.Priority.REAL_TIME if command else zenoh.Priority.DATA_HIGH
         publisher = self._zenoh.declare_publisher(
             key,
             encoding=encoding_of(message),
             congestion_control=zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP,
-            priority=zenoh.Priority.REAL_TIME if command else zenoh.Priority.DATA_HIGH,
+            priority=zenoh.Priority.DATA_LOW if message in IMAGES else priority,
             express=ends_a_tick,
         )
         return self._published(key, publisher, message)
@@ -192,9 +197,9 @@ class Session:
         """Send raw bytes on a key that this session publishes on, bypassing any reroute."""
         self._publishers[key].send(payload)
 
-    def reader(self, key: str, message: type[MessageT], *, depth: int = READER_DEPTH) -> Reader[MessageT]:
+    def reader(self, key: str, message: type[MessageT], *, depth: int | None = None) -> Reader[MessageT]:
         """The newest `depth` samples of a stream; older ones are dropped, nothing ever blocks."""
-        subscriber = self._zenoh.declare_subscriber(key, handlers.RingChannel(depth))
+        subscriber = self._zenoh.declare_subscriber(key, handlers.RingChannel(depth or depth_of(message)))
         self._declared.append(subscriber)
         return Reader(subscriber, message, self.rejected)
 
@@ -315,6 +320,11 @@ class Session:
         self._zenoh.close()
 
 
+def depth_of(message: type[Message]) -> int:
+    """How many samples of a stream a reader keeps."""
+    return IMAGES_DEPTH if message in IMAGES else READER_DEPTH
+
+
 def _last_value() -> ext.HistoryConfig:
     """History of a latched key: the last value, also of a publisher that appears later."""
     return ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
@@ -347,6 +357,7 @@ def intersects(pattern: str, key: str) -> bool:
 def open_session(link: Link, connect_timeout_s: float = 5.0) -> Iterator[Session]:
     """Connect to the network. Raises NotConnectedError when the endpoint does not answer or cannot be listened on."""
     if link.listen:
+        check_guarded(link.endpoint, "endpoint", insecure=link.insecure)
         raise_open_files(MAX_OPEN_FILES)
         os.environ.setdefault(*RUNTIME)
     session = Session(_open(_settings(link, connect_timeout_s), link))
@@ -363,7 +374,7 @@ def _settings(link: Link, connect_timeout_s: float) -> dict[str, Any]:
         "timestamping": {"enabled": {"router": True, "peer": True, "client": True}},
         "transport": {
             "unicast": UNICAST,
-            "link": {"tx": TX, "rx": {"max_message_size": MAX_MESSAGE_BYTES}},
+            "link": {"tx": TX, "rx": {"max_message_size": link.largest_bytes + ENVELOPE_BYTES}},
             "shared_memory": {"enabled": False},
         },
         "listen": {"endpoints": [link.endpoint] if link.listen else [], "exit_on_failure": True},
@@ -405,15 +416,32 @@ def router_settings(config: Path) -> zenoh.Config:
     return settings
 
 
+def _listened_on(settings: zenoh.Config) -> list[str]:
+    """A router's endpoints; for every mode, or for routers alone."""
+    endpoints = json.loads(settings.get_json("listen/endpoints"))
+    return endpoints if isinstance(endpoints, list) else endpoints.get("router", [])
+
+
+def _denies_by_default(settings: zenoh.Config) -> bool:
+    rules = json.loads(settings.get_json("access_control"))
+    return bool(rules["enabled"]) and rules["default_permission"] == "deny"
+
+
 def _refused_by_zenoh(config: Path, error: zenoh.ZError) -> ConfigError:
     return ConfigError(f"{config}: Zenoh refuses it: {short(' '.join(str(error).split()), 500)}")  # it quotes the file
 
 
 @contextmanager
-def open_router(config: Path) -> Iterator[None]:
-    """Run a Zenoh router from a JSON5 file for as long as the context lives. Raises ConfigError."""
+def open_router(config: Path, *, insecure: bool = False) -> Iterator[None]:
+    """Run a Zenoh router from a JSON5 file for as long as the context lives. Raises ConfigError.
+
+    insecure: also one that other machines can connect to, and that does not deny what its rules do not allow.
+    """
     zenoh.init_log_from_env_or("error")
     settings = router_settings(config)
+    for endpoint in _listened_on(settings):
+        guarded = _denies_by_default(settings)
+        check_guarded(endpoint, f"{config}: `listen.endpoints`:", access_control=guarded, insecure=insecure)
     try:
         session = zenoh.open(settings)
     except zenoh.ZError as error:

@@ -276,9 +276,9 @@ class Authority:
             applied = self._uniform(Mode.POSITION, self.limits.inside(self._hold_at))
         else:
             measured, share = self._measured, self._derating.share
-            applied, asked = gate.limit(command, measured=measured, last=self._applied, limits=self.limits, share=share)
+            applied = gate.limit(command, measured=measured, last=self._applied, limits=self.limits, share=share)
             sequence, self._counting = command.sequence, command
-            if (applied.target != asked).any() or (share < 1.0).any():
+            if applied.target.tolist() != command.target or min(share.tolist()) < 1.0:
                 limited = gate.why_limited(command, applied, measured=measured, limits=self.limits, share=share)
             limited |= self._isolation.overruled(command)
             self.limited.update(limited.values())

@@ -148,10 +148,8 @@ def refuse(
     return None
 
 
-def limit(
-    command: JointCommand, *, measured: Measured, last: Applied, limits: JointLimits, share: Floats
-) -> tuple[Applied, Floats]:
-    """Limit an accepted command. Returns the applied set-points, and the commanded targets (n_joints,).
+def limit(command: JointCommand, *, measured: Measured, last: Applied, limits: JointLimits, share: Floats) -> Applied:
+    """Limit an accepted command.
 
     share: of its torque limit that is left to each joint after derating, (n_joints,), from 0 to 1.
     """
@@ -188,8 +186,7 @@ def limit(
             low, high = _within(low, -most_of_it, most_of_it), _within(high, -most_of_it, most_of_it)
         step *= period_s
         targets.append(_within(_within(wanted, start - step, start + step), low, high))
-    applied = Applied(np.array(command.mode, dtype=np.int64), np.array(targets), np.array(torque_limits))
-    return applied, np.array(command.target, dtype=np.float64)
+    return Applied(np.array(command.mode, dtype=np.int64), np.array(targets), np.array(torque_limits))
 
 
 def bounds_at_ends(

@@ -63,13 +63,12 @@ class PlausibilityCheck:
         aside: isolated joints.
         """
         count = len(self._known)
-        lists = (joints.angle_rad, joints.velocity_rad_s, joints.torque_nm, joints.valid, joints.age_ns)
-        if {len(values) for values in lists} != {count}:
+        if not joints.is_of(count):
             cause = f"no joint state of {count} joints"
             return Doubt(Fault(tick=joints.tick, what="state_invalid", cause=cause), np.ones_like(self._known))
         ages_ns = np.array(joints.age_ns, dtype=np.float64)
         taken_s = (np.array([[joints.stamp_ns], [now_ns]], dtype=np.float64) - ages_ns) * 1e-9
-        columns = np.array(lists[:3])
+        columns = np.array((joints.angle_rad, joints.velocity_rad_s, joints.torque_nm))
         fresh = ages_ns <= self._limits.oldest_state_ns
         sound: Mask = np.isfinite(columns).all(axis=0) & fresh & np.array(joints.valid)
         elapsed_s = (taken_s - self._good_s).max(axis=0)
@@ -83,6 +82,8 @@ class PlausibilityCheck:
         self._good_s = np.where(good, taken_s, self._good_s)
         self._known |= good
         frozen = self._frozen.look(columns, taken_s[0], applied)
+        if not np.count_nonzero(~good | frozen):
+            return None
         unknown, jumped, frozen = ~sound & ~aside, jumped & ~aside, frozen & ~aside
         if unknown.any():
             return self._doubt(joints.tick, "state_invalid", "no valid and fresh state of ", unknown)
@@ -110,9 +111,7 @@ def readable(joints: JointState, good: Measured) -> JointState:
     The last good value replaces it, marked invalid. A state of another number of joints is unchanged.
     """
     columns = (joints.angle_rad, joints.velocity_rad_s, joints.torque_nm)
-    if all(math.isfinite(value) for column in columns for value in column):
-        return joints
-    if {len(values) for values in (*columns, joints.valid)} != {len(good.angle_rad)}:
+    if all(all(map(math.isfinite, column)) for column in columns) or not joints.is_of(len(good.angle_rad)):
         return joints
     kept = (good.angle_rad.tolist(), good.velocity_rad_s.tolist(), good.torque_nm.tolist())
     sound = [all(map(math.isfinite, values)) for values in zip(*columns, strict=True)]
@@ -139,7 +138,7 @@ class _JumpDetector:
 
     def settled(self, strayed: Mask, angle_rad: Floats, taken_s: Floats) -> Mask:
         """Take the newest angles, of which some have jumped; returns which of those have settled at a new place."""
-        if not strayed.any():
+        if not np.count_nonzero(strayed):
             self._in_a_row[:] = 0
             return strayed
         elapsed_s = taken_s - self._taken_s
@@ -161,7 +160,8 @@ class _FrozenDetector:
         self._columns = np.full((3, count), np.nan)
         self._followed: Mask = np.zeros(count, dtype=np.bool_)  # whether the joint had a position target before
         self._low_rad, self._high_rad = np.zeros(count), np.zeros(count)
-        self._far_since_s = np.full(count, np.inf)  # since when a target has been far from where it was at the start
+        self._never_s = np.full(count, np.inf)
+        self._far_since_s = self._never_s  # since when a target has been far from where it was at the start
 
     def look(self, columns: Floats, taken_s: Floats, applied: Applied | None) -> Mask:
         """Take the newest states, (3, n_joints), and what was applied; returns which joints are frozen."""
@@ -171,10 +171,14 @@ class _FrozenDetector:
         if applied is None:
             return same
         target = applied.target
+        if not np.count_nonzero(same):
+            self._low_rad = self._high_rad = target
+            self._far_since_s = self._never_s
+            return same
         self._low_rad = np.where(same, np.minimum(self._low_rad, target), target)
         self._high_rad = np.where(same, np.maximum(self._high_rad, target), target)
         far = same & (self._high_rad - self._low_rad > self._far_rad)
-        self._far_since_s = np.where(far, np.minimum(self._far_since_s, taken_s), np.inf)
+        self._far_since_s = np.where(far, np.minimum(self._far_since_s, taken_s), self._never_s)
         long = taken_s - self._far_since_s > self._lease_s
         free = np.abs(columns[2]) < AT_LIMIT * applied.torque_limit_nm
         return far & long & free

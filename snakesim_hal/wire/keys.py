@@ -9,6 +9,9 @@ CONTACTS = "sensor/contacts"
 IMU = "sensor/imu"
 POSE = "sensor/pose"
 POWER = "sensor/power"
+DEPTH_ALL = "sensor/depth/*"
+COLOUR_ALL = "sensor/colour/*"
+RANGE_ALL = "sensor/range/*"
 JOINT_COMMAND = "actuator/joints"
 DESCRIPTION = "hal/description"
 STATUS = "hal/status"
@@ -52,6 +55,9 @@ SPACE: tuple[Row, ...] = (
     Row(IMU, m.Imu, "HAL", "stream", _SENSOR, "angular velocity and acceleration of the links"),
     Row(POSE, m.Pose, "HAL", "stream", _SENSOR, "base pose from motion capture"),
     Row(POWER, m.Power, "HAL", "stream", _SENSOR, "supply, temperatures and leaks of the joint modules"),
+    Row(DEPTH_ALL, m.DepthImage, "HAL", "stream", _SENSOR, "distances that a camera sees"),
+    Row(COLOUR_ALL, m.ColourImage, "HAL", "stream", _SENSOR, "what a camera sees, in colour"),
+    Row(RANGE_ALL, m.Ranges, "HAL", "stream", _SENSOR, "distances along the beams of a lidar or a range finder"),
     Row(JOINT_COMMAND, m.JointCommand, "lease holder", "stream", _TICK, "mode and set-point of every joint"),
     Row(DESCRIPTION, m.Description, "HAL", "latched", "once", "joints, order, limits, geometry, sensors"),
     Row(STATUS, m.Status, "HAL", "latched", "on a change, and 5 Hz", "lifecycle, reason, holder, faults, counters"),
@@ -70,7 +76,22 @@ SPACE: tuple[Row, ...] = (
     Row(HOST_ALL, None, "HAL", "liveliness", _LIVES, "one for each HAL host process; a robot must have only one"),
 )
 
-MESSAGE_AT: dict[str, type[m.Message]] = {row.key: row.message for row in SPACE if row.message is not None}
+ROW_AT: dict[str, Row] = {row.key: row for row in SPACE if row.message is not None}
+
+
+def depth(camera: str) -> str:
+    """Key of the depth images of a camera."""
+    return f"sensor/depth/{camera}"
+
+
+def colour(camera: str) -> str:
+    """Key of the colour images of a camera."""
+    return f"sensor/colour/{camera}"
+
+
+def ranges(sensor: str) -> str:
+    """Key of a lidar or a range finder."""
+    return f"sensor/range/{sensor}"
 
 
 def done(service: str) -> str:
@@ -98,15 +119,16 @@ def service_of(key: str) -> str:
     return key.rpartition("/")[2]
 
 
+def row_at(key: str) -> Row | None:
+    """The line of the key space that a key with a message belongs to; None for other keys."""
+    start, _, name = key.rpartition("/")
+    return ROW_AT.get(key) or (ROW_AT.get(f"{start}/*") if name else None)
+
+
 def message_at(key: str) -> type[m.Message] | None:
     """The message at `key`, or None when the key space has no such key."""
-    if key in MESSAGE_AT:
-        return MESSAGE_AT[key]
-    if key.startswith("hal/done/") and key.count("/") == 2:
-        return m.Done
-    if key.startswith("fault/") and key.count("/") == 1:
-        return m.FaultRequest
-    return None
+    row = row_at(key)
+    return None if row is None else row.message
 
 
 def split_namespace(full_key: str) -> tuple[str, str] | None:

@@ -65,6 +65,16 @@ class JointState(Message, frozen=True, kw_only=True):
     valid: Annotated[q.Flags, about("false: its numbers are outdated, and must not be used")]
     age_ns: Annotated[q.Ages, about("how long before `stamp_ns` each joint was measured")]
 
+    def is_of(self, joints: int) -> bool:
+        """Whether it has this many joints, in every list."""
+        return (
+            len(self.angle_rad) == joints
+            and len(self.velocity_rad_s) == joints
+            and len(self.torque_nm) == joints
+            and len(self.valid) == joints
+            and len(self.age_ns) == joints
+        )
+
 
 class Contact(Message, frozen=True, kw_only=True):
     """One contact of a link with an obstacle (not the ground); all vectors in the link's frame."""
@@ -121,6 +131,79 @@ class Power(Message, frozen=True, kw_only=True):
     board_c: Annotated[list[q.Temperature], Meta(max_length=q.MAX_JOINTS), about("of the electronics")]
     leak: Annotated[q.Flags, about("true: water inside")]
     valid: Annotated[q.Flags, about("false: the state of this module is unknown")]
+
+
+class DepthImage(Message, frozen=True, kw_only=True):
+    """`sensor/depth/<name>`: distances to the surfaces that a camera sees.
+
+    Camera frame: x forward along the optical axis, y to the left, z upwards. The ray through pixel (u, v), u to the
+    right and v downwards from the middle of the top left one, is (1, -(u - cx_px) / fx_px, -(v - cy_px) / fy_px).
+    """
+
+    tick: q.Tick
+    stamp_ns: Annotated[q.Stamp, about("of the exposure; `tick` is later by the delay")]
+    link: Annotated[q.LinkIndex, about("that carries the camera, from 0 at the tail")]
+    position_l: Annotated[q.Vector, about("of the camera")]
+    orientation_l_wxyz: Annotated[q.Quaternion, about("of the camera frame in that of the link")]
+    width: Annotated[int, Meta(ge=1, le=q.MAX_IMAGE_WIDTH), about("pixels in a row")]
+    height: Annotated[int, Meta(ge=1, le=q.MAX_IMAGE_HEIGHT), about("rows")]
+    fx_px: q.FocalLength
+    fy_px: q.FocalLength
+    cx_px: q.Pixels
+    cy_px: q.Pixels
+    range_min_m: Annotated[q.Distance, about("along the optical axis; what is nearer is 0 in `depth`")]
+    range_max_m: Annotated[q.Distance, about("along the optical axis; what is further is 0 in `depth`")]
+    scale_m: Annotated[float, Meta(gt=0, le=1), about("metres of one count of `depth`")]
+    depth: Annotated[
+        bytes,
+        Meta(max_length=2 * q.MAX_PIXELS),
+        about(
+            "uint16, little endian, row by row from the top: distance along the optical axis in counts; "
+            "0: nothing within range, or the pixel dropped out"
+        ),
+    ]
+
+
+class ColourImage(Message, frozen=True, kw_only=True):
+    """`sensor/colour/<name>`: what a camera sees, in colour. Frame and pixels are as in DepthImage."""
+
+    tick: q.Tick
+    stamp_ns: Annotated[q.Stamp, about("of the exposure; `tick` is later by the delay")]
+    link: Annotated[q.LinkIndex, about("that carries the camera, from 0 at the tail")]
+    position_l: Annotated[q.Vector, about("of the camera")]
+    orientation_l_wxyz: Annotated[q.Quaternion, about("of the camera frame in that of the link")]
+    width: Annotated[int, Meta(ge=1, le=q.MAX_IMAGE_WIDTH), about("pixels in a row")]
+    height: Annotated[int, Meta(ge=1, le=q.MAX_IMAGE_HEIGHT), about("rows")]
+    fx_px: q.FocalLength
+    fy_px: q.FocalLength
+    cx_px: q.Pixels
+    cy_px: q.Pixels
+    rgb: Annotated[
+        bytes, Meta(max_length=3 * q.MAX_PIXELS), about("red, green and blue of each pixel, row by row from the top")
+    ]
+
+
+class Ranges(Message, frozen=True, kw_only=True):
+    """`sensor/range/<name>`: distances along the beams of a 2-D lidar, or along the one of a range finder.
+
+    Beams lie in the xy plane of the sensor's frame; beam i is turned by `angle_min_rad` + i x `angle_step_rad` from x,
+    positive to the left.
+    """
+
+    tick: q.Tick
+    stamp_ns: Annotated[q.Stamp, about("of the measurement; `tick` is later by the delay")]
+    link: Annotated[q.LinkIndex, about("that carries the sensor, from 0 at the tail")]
+    position_l: Annotated[q.Vector, about("of the sensor")]
+    orientation_l_wxyz: Annotated[q.Quaternion, about("of the sensor's frame in that of the link")]
+    angle_min_rad: Annotated[q.Angle, about("of the first beam")]
+    angle_step_rad: Annotated[q.Angle, about("from one beam to the next")]
+    range_min_m: Annotated[q.Distance, about("along the beam; what is nearer is null")]
+    range_max_m: Annotated[q.Distance, about("along the beam; what is further is null")]
+    range_m: Annotated[
+        list[q.Distance | None],
+        Meta(min_length=1, max_length=q.MAX_BEAMS),
+        about("one entry a beam; null: nothing within range, or the beam dropped out"),
+    ]
 
 
 # --- actuators -------------------------------------------------------------------------------------------------
@@ -206,6 +289,11 @@ class JointDescription(Message, frozen=True, kw_only=True):
     stiffness_nm_per_rad: Annotated[float, Meta(ge=0, le=1e6), about("of position mode")]
     damping_nm_s_per_rad: Annotated[float, Meta(ge=0, le=1e6), about("of position mode")]
     velocity_gain_nm_s_per_rad: Annotated[float, Meta(gt=0, le=1e6), about("of velocity mode")]
+    rotor_kg_m2: Annotated[
+        float,
+        Meta(ge=0, le=1e3),
+        about("inertia that `torque_nm` turns besides the links; 0: measured beyond the rotor"),
+    ] = 0.0
     derate_from_c: Annotated[q.Temperature, about("of the winding: above it torque is derated")] = 80.0
     stop_at_c: Annotated[q.Temperature, about("of the winding: at it the robot is stopped")] = 105.0
     least_voltage_v: Annotated[q.Voltage, about("below it the robot is stopped")] = 18.0
@@ -391,6 +479,12 @@ class Obstacle(Message, frozen=True, kw_only=True):
     half_size_m: Annotated[q.Vector, about("of a box")] = (0.0, 0.0, 0.0)
     height_m: q.Length = 0.0
     confidence: q.Fraction = 1.0
+    position_sd_m: Annotated[q.Distance, about("standard deviation of `position_w`, horizontally; 0: exact")] = 0.0
+    size_sd_m: Annotated[q.Distance, about("standard deviation of `radius_m` or `half_size_m`; 0: exact")] = 0.0
+    last_seen_ns: Annotated[
+        q.Stamp | None, about("stamp of the newest measurement of it; null: from a map, not from a sensor")
+    ] = None
+    felt: Annotated[bool, about("the body has touched it")] = False
 
 
 class WorldContact(Message, frozen=True, kw_only=True):
@@ -484,6 +578,9 @@ VERSIONS: dict[type[Message], int] = dict.fromkeys(
         Imu,
         Pose,
         Power,
+        DepthImage,
+        ColourImage,
+        Ranges,
         JointCommand,
         AppliedCommand,
         Clock,

@@ -11,6 +11,9 @@ from msgspec import Meta
 MAX_COUNT = 2**62
 MAX_JOINTS = 256
 MAX_CONTACTS = 512
+MAX_IMAGE_WIDTH, MAX_IMAGE_HEIGHT = 1280, 960
+MAX_PIXELS = MAX_IMAGE_WIDTH * MAX_IMAGE_HEIGHT
+MAX_BEAMS = 4096
 MAX_TARGET = 1e5  # of a set-point or a torque limit, in the unit of its mode
 
 
@@ -45,6 +48,9 @@ Current = Annotated[float, _bounded(-1e4, 1e4, "A")]
 Temperature = Annotated[float, _bounded(-273.15, 1e4, "°C")]
 Unit = Annotated[float, _bounded(-1.001, 1.001, "1")]
 Scalar = Annotated[float, _bounded(-1e12, 1e12, "1")]
+Pixels = Annotated[float, _bounded(-1e5, 1e5, "px")]
+FocalLength = Annotated[float, above(1e5, "px")]
+Distance = Annotated[float, from_zero(1e4, "m")]
 Fraction = Annotated[float, _bounded(0.0, 1.0, "1")]
 
 Target = Annotated[float, _bounded(-MAX_TARGET, MAX_TARGET, "rad, rad/s or N·m, as the joint's mode says")]

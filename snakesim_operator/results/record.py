@@ -122,11 +122,15 @@ class RunRecord:
         """Tail end, joints and head end in the world, (joints + 2, 3); None when the pose is unknown."""
         if len(self.time_s) == 0 or not self.posed[row]:
             return None
-        lengths = [link.length_m for link in self.description.links]
-        rotation = rotation_from_quaternion(self.orientation_wxyz[row])
-        axes = [joint.axis for joint in self.description.joints]
-        origins, rotations = link_frames(self.position_w[row], rotation, self.angle_rad[row], axes, lengths)
-        return np.vstack([origins, origins[-1] + lengths[-1] * rotations[-1][:, 0]])
+        return nodes_w(self.description, self.position_w[row], self.orientation_wxyz[row], self.angle_rad[row])
+
+
+def nodes_w(robot: Description, position_w: Floats, orientation_wxyz: Floats, angle_rad: Floats) -> Floats:
+    """Tail end, joints and head end in the world, (joints + 2, 3), of one pose."""
+    lengths = [link.length_m for link in robot.links]
+    rotation = rotation_from_quaternion(orientation_wxyz)
+    origins, rotations = link_frames(position_w, rotation, angle_rad, [joint.axis for joint in robot.joints], lengths)
+    return np.vstack([origins, origins[-1] + lengths[-1] * rotations[-1][:, 0]])
 
 
 def _read_telemetry(path: Path, control: list[ControlState], worlds: list[World]) -> Counter[str]:

@@ -7,7 +7,8 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from snakesim_hal.wire.messages import Fault, Pace
+from snakesim_hal.wire.messages import Fault, Mode, Pace
+from snakesim_operator.results.advance import Advance, energy_j, energy_j_per_m, work_j
 from snakesim_operator.results.record import RunRecord
 
 SATURATED_FROM = 0.99  # of a joint's torque limit
@@ -59,6 +60,25 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     torque_saturated_fraction: Annotated[float | None, _number("1", "ticks with a joint at its torque limit")]
     peak_contact_force_n: Annotated[float | None, _number("N", "largest force of one contact")]
     energy_j: Annotated[float | None, _number("J", "sum over joints of |torque x velocity| over time")]
+    torque_joints_j: Annotated[
+        float | None, _number("J", "work of the joints in torque mode on the body, less what they took")
+    ] = None
+    position_joints_j: Annotated[float | None, _number("J", "the same of the joints in position mode")] = None
+    goal_m: Annotated[float | None, _number("m", "distance from the start to the mission's goal; null without one")] = (
+        None
+    )
+    crossed: Annotated[bool | None, Meta(description="whether the goal was reached; null without one")] = None
+    crossed_s: Annotated[float | None, _number("s", "from the first arming until the goal was reached")] = None
+    advance_m: Annotated[
+        float | None, _number("m", "largest advance towards the goal; without one, along the body's first heading")
+    ] = None
+    advance_m_s: Annotated[
+        float | None, _number("m/s", "that, over the time until the goal was reached or the end")
+    ] = None
+    energy_j_per_m: Annotated[float | None, _number("J/m", "energy until then over the advance")] = None
+    stalled_s: Annotated[
+        float | None, _number("s", "time until then in which the centre of mass moved less than 2 cm within a second")
+    ] = None
     state_to_command_us: Annotated[dict[str, float | None], _number("µs", "state published to command received")]
     rejected_commands: Annotated[dict[str, int], Meta(description="by reason")]
     limited_commands: Annotated[dict[str, int], Meta(description="joint set-points changed by the gate, by limit")]
@@ -82,7 +102,8 @@ def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), h
     has_contacts = config.robot.sensors.contacts is not None and count > 0
     last = record.control[-1] if record.control else None
     limits = np.array([joint.torque_limit_nm for joint in record.description.joints])
-    power = np.abs(record.torque_nm * record.velocity_rad_s)
+    has_power = bool(np.isfinite(record.torque_nm * record.velocity_rad_s).any())
+    advance = Advance.of(record)
     return RunSummary(
         scenario=config.name,
         robot=config.robot.name,
@@ -112,7 +133,16 @@ def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), h
         if count
         else None,
         peak_contact_force_n=largest(record.contact_peak_n) if has_contacts else None,
-        energy_j=float(np.nansum(power) * config.period_ns * 1e-9) if np.isfinite(power).any() else None,
+        energy_j=energy_j(record) if has_power else None,
+        torque_joints_j=work_j(record, Mode.TORQUE) if has_power else None,
+        position_joints_j=work_j(record, Mode.POSITION) if has_power else None,
+        goal_m=advance.goal_m if advance else None,
+        crossed=advance.crossed_s is not None if advance and advance.goal_m is not None else None,
+        crossed_s=advance.crossed_s if advance else None,
+        advance_m=advance.reached_m if advance else None,
+        advance_m_s=advance.reached_m / advance.until_s if advance and advance.until_s > 0 else None,
+        energy_j_per_m=energy_j_per_m(record, advance) if advance and has_power else None,
+        stalled_s=advance.stalled_s if advance else None,
         state_to_command_us=host.state_to_command_us,
         rejected_commands=host.rejected_commands,
         limited_commands=host.limited_commands,

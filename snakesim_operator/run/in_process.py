@@ -22,6 +22,7 @@ from snakesim_hal.host_process import record_of
 from snakesim_hal.in_process import InProcessRun, check
 from snakesim_hal.model.scenario import RunConfig, write
 from snakesim_hal.terminal import complain, say
+from snakesim_operator.results.advance import GoalWatch
 from snakesim_operator.results.record import CONFIG, RunRecord
 from snakesim_operator.results.summary import RunSummary
 from snakesim_operator.run.conclusion import Outcome, conclude, explain, leave
@@ -43,9 +44,10 @@ class Result:
     summary: RunSummary
 
 
-def simulate(config: RunConfig, out: Path | None = None) -> Result:
+def simulate(config: RunConfig, out: Path | None = None, *, until_goal: bool = False) -> Result:
     """Run a configuration. out: folder for what a run leaves, the report too; None keeps nothing.
 
+    until_goal: a run whose mission has a goal is complete soon after that is reached.
     Raises SnakesimError when it cannot begin. A run that ends early is a result like others.
     """
     config, ending = check_plugins(config), Ending()
@@ -59,19 +61,19 @@ def simulate(config: RunConfig, out: Path | None = None) -> Result:
         if files.folder is None:
             raise ConfigError(f"{out} cannot be written to; choose another folder")
         opened.callback(files.close)
-        run = _go(config, files, ending, None)
+        run = _go(config, files, ending, None, until_goal=until_goal)
         explain(ending, record_of(run.host), config)
         return Result(*leave(files, files.folder, ending, _outcome(run), report=out is not None))
 
 
-def run_in_process(config: RunConfig, out: Path | None) -> int:
-    """`snakesim run --in-process`. Exit code: as of a run in processes."""
+def run_in_process(config: RunConfig, out: Path | None, *, until_goal: bool = False) -> int:
+    """`snakesim run --in-process`. Exit code: as of a run in processes. until_goal: as of `simulate`."""
     check(config)
     ending = Ending()
     with opened_files(config, out) as (files, _):
         say(f"{config.name}: {config.robot.name} in {config.scene.name}, {config.commander}, in one process")
         with interruptible(ending), Progress(config) as progress:
-            run = _go(config, files, ending, progress)
+            run = _go(config, files, ending, progress, until_goal=until_goal)
         return conclude(config, files, ending, _outcome(run))
 
 
@@ -79,16 +81,21 @@ def _outcome(run: InProcessRun) -> Outcome:
     return Outcome(record_of(run.host), run.host.description)
 
 
-def _go(config: RunConfig, files: RunFiles, ending: Ending, progress: Progress | None) -> InProcessRun:
+def _go(
+    config: RunConfig, files: RunFiles, ending: Ending, progress: Progress | None, *, until_goal: bool
+) -> InProcessRun:
     words = _Words(files)
     with contextlib.redirect_stderr(words), InProcessRun(config) as run:
         host, telemetry = run.host, Telemetry(run.network.session(), files)
+        watch = GoalWatch(config, host.description)
         with Recorder(host.black_box, host.description, partial(record_of, host), files.folder):
             for turn, _ in enumerate(run.turns()):
                 if turn % TAKEN_EVERY == 0:
                     telemetry.take_in()
                     if progress is not None:
                         progress.show(host.status(), telemetry.latest, armed=host.authority.arming > 0)
+                    if until_goal and watch.reached(host.black_box):
+                        host.complete()
                 if ending.interrupted:
                     run.stop()
             telemetry.take_in()

@@ -20,6 +20,7 @@ from snakesim_hal.model.injection import ROUTER
 from snakesim_hal.model.plugins import BACKENDS, CONTROLLERS, SERVICES, find_installed, find_plugin, plugin_settings
 from snakesim_hal.model.scenario import RunConfig, written
 from snakesim_hal.model.whole_file import write_whole
+from snakesim_hal.network.endpoint import check_guarded
 from snakesim_hal.network.local_registry import registered
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.service import START_LIMIT_S
@@ -47,6 +48,7 @@ class RunRequest:
     namespace: str | None = None
     stay: bool = False  # a fault ends nothing: processes are started again, a person clears and arms
     with_router: bool = False  # the run's parts meet at a router of its own
+    insecure: bool = False  # listen even where other machines can connect
 
     @property
     def network_name(self) -> str:
@@ -85,6 +87,8 @@ def run(request: RunRequest) -> int:
     """Run it. Returns 0, 1 on a fault or an early end, 3 when the record lacks something, 130 when interrupted."""
     request = replace(request, config=check_plugins(request.config))
     _check_router(request)
+    if request.endpoint is not None:
+        check_guarded(request.endpoint, "--endpoint", insecure=request.insecure)
     refuse_second_robot(request.endpoint, request.router, request.network_name)
     endpoint, stop_port = meeting_point(request.endpoint, request.router)
     ending = Ending()
@@ -147,16 +151,17 @@ def _conduct(
 ) -> None:
     config, namespace = request.config, request.network_name
     common = ["--config", str(config_file), "--endpoint", endpoint, "--namespace", namespace]
+    listening = ["--insecure"] if request.insecure else []
     ticks = round(config.duration_s * config.rate_hz)
     host_arguments = [
-        *("snakesim_hal.host_process", *common, "--max-ticks", str(ticks), "--memory", supervisor.memory),
+        *("snakesim_hal.host_process", *common, *listening, "--max-ticks", str(ticks), "--memory", supervisor.memory),
         *(["--out", str(files.folder)] if files.folder else []),
         *(["--stay"] if request.stay else ["--end-after-fault", str(AFTER_FAULT_S)]),
         *(["--router"] if request.router or request.with_router else []),
     ]
     try:
         if request.with_router:
-            supervisor.start(ROUTER, ["snakesim_hal.router_process", *common])
+            supervisor.start(ROUTER, ["snakesim_hal.router_process", *common, *listening])
         supervisor.start(HOST, host_arguments)
         for name, service in config.own_services.items():
             supervisor.start(name, ["snakesim_hal.serve", name, *common], may_restart=service.restart)

@@ -19,6 +19,7 @@ from snakesim_hal.wire import keys
 KNOWN: dict[str, Callable[[], list[str]]] = {  # values of arguments, by the argument's name in any command
     "scenario": lambda: shipped("scenarios"),
     "robot": lambda: shipped("robots"),
+    "suite": lambda: shipped("suites"),
     "backend": lambda: installed(BACKENDS),
     "controller": lambda: installed(CONTROLLERS),
     "kind": lambda: sorted({kind for kinds in KINDS.values() for kind in kinds}),

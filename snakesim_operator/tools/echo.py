@@ -19,7 +19,7 @@ from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.session import Arrival, Link, Session, intersects, key_expression, open_session
 from snakesim_hal.terminal import Say, complain, say
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import Decoder
+from snakesim_hal.wire.codec import MAX_IMAGE_BYTES, Decoder
 from snakesim_operator.tools.targets import CONNECT_S, Where
 
 RATE_PERIOD_S = 1.0
@@ -67,7 +67,8 @@ def _sessions(where: Where, stack: contextlib.ExitStack) -> list[Session]:
     found: list[Session] = []
     for endpoint in where.endpoints():
         with contextlib.suppress(NotConnectedError):
-            found.append(stack.enter_context(open_session(Link(endpoint, where.namespace), CONNECT_S)))
+            link = Link(endpoint, where.namespace, largest_bytes=MAX_IMAGE_BYTES)
+            found.append(stack.enter_context(open_session(link, CONNECT_S)))
     if not found:
         raise NotConnectedError(
             f"nothing listens on {', '.join(where.endpoints())}; start a run or a router there first"

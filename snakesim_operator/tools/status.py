@@ -118,12 +118,12 @@ def _what_to_type(link: Link, status: Status) -> list[str]:
     return [f"  next: {arm}"] if status.ready_to_arm else []
 
 
-def run_router(config: Path | None) -> int:
+def run_router(config: Path | None, *, insecure: bool = False) -> int:
     """Run a router until Ctrl-C."""
     from snakesim_hal.network.session import open_router
 
     path = config or ROUTER
-    with open_router(path):
+    with open_router(path, insecure=insecure):
         say(f"router running from {path}; Ctrl-C ends it")
         threading.Event().wait()
     return 0

@@ -106,7 +106,8 @@ def clone(folder: Path) -> None:
     lent = sysconfig.get_path("purelib")
     (library / "lent.pth").write_text(f"import site; site.addsitedir({lent!r})\n")
     command = venv / "bin" / "snakesim"
-    entry = "import sys\nfrom snakesim_operator.__main__ import main\nsys.exit(main())\n"
+    entry = "import sys\nfrom snakesim_operator.__main__ import main\n"
+    entry += "if __name__ == '__main__':\n    sys.exit(main())\n"
     command.write_text(f"#!{venv}/bin/python\n{entry}")
     command.chmod(0o755)
     (venv / ".setup").write_text(f"{folder}\n\n")

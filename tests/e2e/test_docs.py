@@ -1,4 +1,4 @@
-"""Everything that the tutorial and the README ask a reader to type is typed here, as printed.
+"""Everything that the tutorial, the guide to evaluations and the README ask a reader to type is typed here, as printed.
 
 Of docs/hil.md only what needs no CAN; `make test-vcan` runs the rest of it with commands of its own.
 """
@@ -20,6 +20,7 @@ pytestmark = [pytest.mark.e2e, pytest.mark.timeout(600)]
 
 TUTORIAL = [section for section in sections(REPOSITORY / "docs" / "tutorial.md") if section.has_commands]
 HIL = [section for section in sections(REPOSITORY / "docs" / "hil.md") if section.title == "1. Anywhere"]  # no CAN
+EVALUATION = [section for section in sections(REPOSITORY / "docs" / "evaluation.md") if section.has_commands]
 README = [section for section in sections(REPOSITORY / "README.md") if section.has_commands]
 UV = REPOSITORY / ".tools" / "bin" / "uv"
 LIMIT_S = 500.0
@@ -60,7 +61,9 @@ def typed(script: str, cwd: Path, prefix: list[str]) -> str:
 
 @needs_uv
 @pytest.mark.slow
-@pytest.mark.parametrize("section", [*TUTORIAL, *HIL], ids=lambda section: re.sub(r"\W+", "-", section.title).lower())
+@pytest.mark.parametrize(
+    "section", [*TUTORIAL, *HIL, *EVALUATION], ids=lambda section: re.sub(r"\W+", "-", section.title).lower()
+)
 def test_a_section_as_printed(section: Section, tmp_path: Path) -> None:
     folder = tmp_path / "snakesim"
     documents.clone(folder)
@@ -84,8 +87,8 @@ def test_the_readme_as_printed(section: Section, tmp_path: Path) -> None:
 
 
 def test_the_documents_ask_for_something() -> None:
-    assert len(TUTORIAL) >= 5 and len(README) >= 1 and len(HIL) == 1
-    every = [info for section in [*TUTORIAL, *README] for info, _ in section.blocks]
+    assert len(TUTORIAL) >= 5 and len(EVALUATION) >= 6 and len(README) >= 1 and len(HIL) == 1
+    every = [info for section in [*TUTORIAL, *EVALUATION, *README] for info, _ in section.blocks]
     assert {info.split()[0] for info in every if info} <= {"sh", "python", "toml", "text"}
     commands = "\n".join(content for section in TUTORIAL for info, content in section.blocks if info.startswith("sh"))
     assert not re.search(r"\bpip\b(?! install --python)|pgrep|kill -9|killall|pkill|step:clock", commands)

@@ -5,8 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from snakesim_hal.in_process import InProcessRun
 from snakesim_hal.model.files import shipped
-from snakesim_hal.model.scenario import read
+from snakesim_hal.model.scenario import load, parse_set, read
+from snakesim_hal.network.client import Client
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import DepthImage
 from snakesim_operator.results.record import CONFIG
 from snakesim_operator.results.record import RunRecord as Record
 from snakesim_operator.run.in_process import Result, simulate
@@ -40,6 +44,24 @@ def test_processes_and_one_process_drive_the_motors_alike(tmp_path: Path) -> Non
 @pytest.mark.parametrize("scenario", shipped("scenarios"))
 def test_so_they_do_in_every_shipped_scenario(scenario: str, tmp_path: Path) -> None:
     same_both_ways(tmp_path / "run", scenario)
+
+
+def test_so_does_a_robot_with_a_camera_like_the_robot_without(tmp_path: Path) -> None:
+    """An image of the camera is named by the clock, and is there for whoever reads it at that tick."""
+    seeing = same_both_ways(tmp_path / "run", "peg_row", "--duration", "1", "--set", "robot=planar13_camera")
+    blind = simulate(load("peg_row", [parse_set("duration_s=1")]).config)
+    assert seeing.summary.command_digest == blind.summary.command_digest
+    config = load("peg_row", [parse_set("duration_s=0.5"), parse_set("robot=planar13_camera")]).config
+    with InProcessRun(config) as run:
+        client = Client(run.network.session(), "onlooker")
+        images, client_ticks = client.subscribe(keys.depth("head"), DepthImage), client.ticks(0.0)
+        read: list[tuple[int, int]] = []
+        for _ in run.turns():
+            while (clock := next(client_ticks)) is not None:
+                image = client.read(images)
+                if image is not None and clock.newest[keys.depth("head")] == clock.tick:
+                    read.append((clock.tick, image.tick))
+    assert len(read) == 10 and all(tick == of for tick, of in read)
 
 
 def test_so_do_joint_modules_behind_their_bus(tmp_path: Path) -> None:

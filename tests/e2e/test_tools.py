@@ -185,6 +185,25 @@ def test_run_over_a_router_of_ones_own(tmp_path: Path) -> None:
         assert router.wait(10) == -signal.SIGINT  # which a shell shows as 130
 
 
+@pytest.mark.skipif(os.geteuid() != 0, reason="makes a network namespace, which needs root")
+def test_a_run_that_accepts_the_risk_listens_on_every_address(tmp_path: Path) -> None:
+    """In a network namespace of its own, which has nothing but loopback."""
+    run = "ip link set lo up && exec " + " ".join(
+        [*SNAKESIM, "run", "triplet", "--controller", "hold", "--duration", "1", "--out", "run"]
+    )
+    for flags, code in (("", 2), (" --insecure", 0), (" --insecure --with-router", 0)):
+        ended = subprocess.run(
+            ["unshare", "--net", "sh", "-c", f"{run} --endpoint tcp/0.0.0.0:7461{flags}"],
+            cwd=tmp_path,
+            env=environment(tmp_path),
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=120,
+        )
+        assert ended.returncode == code, ended.stdout + ended.stderr
+
+
 def test_a_router_file_that_zenoh_refuses(tmp_path: Path) -> None:
     (tmp_path / "router.json5").write_text('{ mode: "peer" }')
     ended = snakesim("router", "router.json5", cwd=tmp_path)

@@ -153,9 +153,11 @@ class Stranger:
         if rng.random() < ELSEWHERE:
             key = rng.choice([*ODD_KEYS, *STREAMS])
         else:
-            key = rng.choice([key for key, m in keys.MESSAGE_AT.items() if m is message] or STREAMS)
+            key = rng.choice([row.key for row in keys.SPACE if row.message is message] or STREAMS)
         if key == keys.FAULT_ALL:
             return keys.fault(rng.choice((injection.RUN, injection.HAL, *SERVICES)))
+        if key in (keys.DEPTH_ALL, keys.COLOUR_ALL, keys.RANGE_ALL):
+            return key.replace("*", "head")
         return keys.done(rng.choice(SERVICES)) if key == keys.DONE_ALL else key
 
 

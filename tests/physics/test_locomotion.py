@@ -191,7 +191,7 @@ def test_any_number_of_modules_moves_with_the_same_code(modules, least_m):
 
 
 def test_a_robot_with_pitch_joints_moves_on_hills_among_random_pegs():
-    whole = run(configure("clutter", "controller=obstacle_triplet"))
+    whole = run(configure("mamba_hills", "controller=obstacle_triplet"))
     assert whole.moved_m >= 0.3
     axes = [joint.axis for joint in whole.record.description.joints]
     assert {axes[turn] for turn in propelled(whole)} == {"yaw"}

@@ -46,6 +46,7 @@ WRONG = {
     "port 0": (["triplet", "--endpoint", "tcp/127.0.0.1:0"], ["from 1 to 65535", "such as tcp/127.0.0.1:7447"]),
     "port 70000": (["triplet", "--router", "tcp/127.0.0.1:70000"], ["--router", "from 1 to 65535"]),
     "no locator": (["triplet", "--endpoint", "127.0.0.1:7447"], ["such as tcp/127.0.0.1:7447"]),
+    "open to everybody": (["triplet", "--endpoint", "tcp/0.0.0.0:7461"], ["could command the robot", "--insecure"]),
     "namespace": (["triplet", "--namespace", "a/*"], ["--namespace 'a/*'", "such as planar13"]),
     "scenario that is a pipe": (["./pipe.toml"], ["pipe.toml: is a pipe"]),
     "scenario without an end": (["./endless.toml"], ["endless.toml: is a device"]),

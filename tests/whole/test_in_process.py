@@ -66,3 +66,10 @@ def test_the_command_refuses_what_needs_a_network(tmp_path: Path) -> None:
         ended = snakesim("run", "triplet", "--in-process", *flags, cwd=tmp_path)
         assert ended.code == 2 and f"--in-process and {flags[0]}: there is no network" in ended.err
     assert not (tmp_path / "runs").exists()
+
+
+def test_a_run_that_ends_in_a_fault_is_the_same_each_time() -> None:
+    config = load("peg_row", [parse_set("duration_s=3"), parse_set('faults=["mute:joint_3@0.5"]')]).config
+    first, second = (simulate(config).summary for _ in range(2))
+    assert "joint_3" in first.ended
+    assert (first.ticks, first.command_digest) == (second.ticks, second.command_digest)

@@ -49,7 +49,7 @@ def test_a_jam_is_reported_as_such(tmp_path: Path) -> None:
 
 
 def test_another_robot_in_another_world(tmp_path: Path) -> None:
-    ended, summary = run_to_summary(tmp_path / "run", "clutter")
+    ended, summary = run_to_summary(tmp_path / "run", "mamba_hills")
     assert ended.code == 0, ended.out + ended.err
     assert summary.robot == "mamba" and summary.path_distance_m is not None and summary.path_distance_m > 0.3
 

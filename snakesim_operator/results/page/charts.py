@@ -200,7 +200,8 @@ def _figure(
         shapes.append({"type": "line", "line": _stroke(mark.colour, "dash"), **at})
         if mark.words:
             note = {"x": mark.time_s, "yref": "paper", "y": 1, "yanchor": "top", "showarrow": False, "text": mark.words}
-            notes.append({**note, "xanchor": "left" if mark.time_s < until_s / 2 else "right"})
+            right_of_it = mark.time_s < until_s / 2
+            notes.append({**note, "xanchor": "left" if right_of_it else "right", "xshift": 4 if right_of_it else -4})
     time_axis = {"range": [0, round(until_s, 4)], "title": {"text": "time, s"}}
     layout = {**layout, "height": height, "xaxis": time_axis, "shapes": shapes, "annotations": notes}
     return {"label": label, "data": traces, "layout": layout}

@@ -30,6 +30,8 @@ def _strategy(info: inspect.Type) -> st.SearchStrategy[Any]:  # noqa: C901 - one
             return st.integers(lowest(info), highest(info))
         case inspect.StrType():
             return st.text(NAMES, min_size=info.min_length or 0, max_size=min(info.max_length or 20, 20))
+        case inspect.BytesType():
+            return st.binary(max_size=20)
         case inspect.BoolType():
             return st.booleans()
         case inspect.NoneType():
@@ -78,6 +80,8 @@ def _example(info: inspect.Type) -> Any:  # noqa: C901 - one case a type
             return lowest(info) or 0
         case inspect.StrType():
             return "a"
+        case inspect.BytesType():
+            return b"a"
         case inspect.BoolType():
             return True
         case inspect.NoneType():
@@ -157,6 +161,8 @@ def poisons(info: inspect.Type) -> list[Any]:
             bad += [] if info.max_length is None else ["a" * (info.max_length + 1)]
             bad += [""] if info.min_length else []
             return bad
+        case inspect.BytesType():
+            return [1, [1], *([] if info.max_length is None else [bytes(info.max_length + 1)])]
         case inspect.BoolType():
             return [0, 1, "true"]
         case inspect.LiteralType():

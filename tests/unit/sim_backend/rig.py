@@ -5,7 +5,7 @@ from typing import Any
 import msgspec
 
 from snakesim_hal.backend import Samples, SetPoints
-from snakesim_hal.model.files import find, read_table
+from snakesim_hal.model.files import read_part
 from snakesim_hal.model.scenario import RunConfig, check
 from snakesim_hal.wire.messages import Mode
 from snakesim_sim_backend.backend import SimBackend
@@ -41,7 +41,7 @@ def make_config(
     **top: Any,
 ) -> RunConfig:
     """A run of a straight, noiseless robot at the origin, heading along x, on flat ground of friction 0.3."""
-    quiet = merged(read_table(find(base_robot, "robots")).values, {"sensors!": QUIET})
+    quiet = merged(read_part(base_robot, "robots").values, {"sensors!": QUIET})
     table = {
         "name": "test",
         "controller": "hold",

@@ -10,7 +10,7 @@ from snakesim_hal.model.scenario import load
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder, encode, encoding_of
 from snakesim_hal.wire.messages import Contacts, Imu, Mode, Pose
-from snakesim_sim_backend.sensor_timing import Due
+from snakesim_sim_backend.sensors.timing import Due
 from tests.unit.sim_backend.rig import G, Run, make_config
 
 CORNER = {

@@ -11,7 +11,7 @@ from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.definitions import PARAMETERS, Opcode, Parameter, SafeMotion
 from snakesim_can_backend.settings import Settings
 from snakesim_hal.errors import BackendError, ConfigError
-from snakesim_hal.model.files import decode, find, read_table, shipped
+from snakesim_hal.model.files import decode, read_part, shipped
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import load
 
@@ -30,7 +30,7 @@ def rated(torque_nm: float, speed_rad_s: float) -> dict[int, dict[Parameter, flo
 
 @pytest.mark.parametrize("name", shipped("robots"))
 def test_every_module_is_told_everything_but_its_ratings_and_within_the_ranges(name: str) -> None:
-    robot = decode(read_table(find(name, "robots")), RobotFile)
+    robot = decode(read_part(name, "robots"), RobotFile)
     wanted = parameters_of(robot, Settings(), Reports(100.0))
     assert list(wanted) == list(range(1, robot.chain.modules + 1))
     for values in wanted.values():

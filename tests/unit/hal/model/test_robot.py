@@ -1,5 +1,7 @@
 """The robot file: numbers in, a description out that says the same."""
 
+from pathlib import Path
+
 import msgspec
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.files import Table, decode, find, read_table, shipped
+from snakesim_hal.model.files import Table, decode, read_part, shipped
 from snakesim_hal.model.robot import RobotFile, describe, layout_hash
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder, encode, encoding_of
@@ -17,7 +19,7 @@ from tests.unit.hal.rig import LEASE_NS, PERIOD_NS, ROBOT, changed, description,
 
 @pytest.mark.parametrize("name", shipped("robots"))
 def test_every_shipped_robot_can_be_published(name: str) -> None:
-    robot = decode(read_table(find(name, "robots")), RobotFile)
+    robot = decode(read_part(name, "robots"), RobotFile)
     described = describe(robot, backend="sim", period_ns=PERIOD_NS, lease_ns=LEASE_NS, config_hash="0")
     assert Decoder(Description).decode(encode(described), encoding_of(Description)) == described
     assert len(described.joints) == robot.chain.modules == len(described.links) - 1
@@ -63,6 +65,38 @@ def test_only_the_sensors_that_a_robot_has_are_described_and_none_is_faster_than
     assert {sensor.key: sensor.delay_s for sensor in rich.sensors}[keys.IMU] == 0.1
 
 
+def test_cameras_and_lidars_are_described_by_their_names_and_arrive_a_period_late_at_least() -> None:
+    depth = [
+        {"name": "head", "delay_s": 0.0, "colour": True},
+        {"name": "back", "link": 2, "position_m": [0.0, 0.0, 0.1]},
+    ]
+    rich = description(sensors={"depth": depth, "range": [{"name": "front", "rate_hz": 500.0, "delay_s": 0.04}]})
+    found = {sensor.key: (sensor.rate_hz, sensor.delay_s) for sensor in rich.sensors}
+    del found[keys.JOINTS]
+    assert found == {
+        keys.depth("head"): (20.0, 0.01),
+        keys.colour("head"): (20.0, 0.01),
+        keys.depth("back"): (20.0, 0.03),
+        keys.ranges("front"): (100.0, 0.04),
+    }
+
+
+def test_a_robot_may_extend_another_and_say_only_what_differs(tmp_path: Path) -> None:
+    file = tmp_path / "worm.toml"
+    file.write_text(
+        'extends = "planar13"\nname = "worm"\n[limits]\ntorque_nm = 3.0\n[[sensors.range]]\nname = "front"\n'
+    )
+    table, plain = read_part(str(file), "robots"), decode(read_part("planar13", "robots"), RobotFile)
+    robot = decode(table, RobotFile)
+    assert (robot.name, robot.limits.torque_nm, robot.sensors.range[0].name) == ("worm", 3.0, "front")
+    assert robot.chain == plain.chain and robot.sensors.imu == plain.sensors.imu
+    assert table.origin_of("limits.torque_nm") == str(file)
+    assert table.origin_of("limits.angle_rad").endswith("planar13.toml")
+    file.write_text("extends = 13")
+    with pytest.raises(ConfigError, match="`extends` = 13 must be the name or the path of another file"):
+        read_part(str(file), "robots")
+
+
 def test_the_layout_tells_robots_apart_that_take_other_vectors() -> None:
     three, four = description(), description(chain__modules=4)
     mixed = description(chain__axes=["yaw", "pitch"])
@@ -83,7 +117,38 @@ WRONG = {
     "negative friction": ({"motor__friction_nm": -1}, ["`motor.friction_nm` = -1 N·m", ">= 0"]),
     "unknown safe action": ({"safety__action": "freeze"}, ["`safety.action` = 'freeze'", "'damp'", "'hold'"]),
     "typo": ({"motor__dampign_nm_s_per_rad": 1}, ["unknown field `motor.dampign_nm_s_per_rad`", "did you mean"]),
-    "unknown sensor": ({"sensors__camera": {}}, ["unknown field `sensors.camera`", "contacts, imu, joints, pose"]),
+    "unknown sensor": (
+        {"sensors__camera": {}},
+        ["unknown field `sensors.camera`", "contacts, depth, imu, joints, pose"],
+    ),
+    "two cameras of a name": (
+        {"sensors__depth": [{"name": "head"}, {"name": "head"}]},
+        ["`sensors`", "two entries of [[sensors.depth]] have the name 'head'"],
+    ),
+    "a camera on no link": (
+        {"sensors__depth": [{"name": "head", "link": 4, "position_m": [0.0, 0.0, 0.0]}]},
+        ["sensor 'head' is on link 4, and the links are 0 (tail) to 3 (head)"],
+    ),
+    "a camera inside of the body": (
+        {"sensors__depth": [{"name": "head", "link": 2}]},
+        ["sensor 'head' is on link 2: give `position_m`"],
+    ),
+    "a range that is none": (
+        {"sensors__depth": [{"name": "head", "range_min_m": 5.0}]},
+        ["`sensors.depth.0`", "`range_min_m` = 5 m must be below `range_max_m` = 5 m"],
+    ),
+    "beams all the same way": (
+        {"sensors__range": [{"name": "front", "beams": 8}]},
+        ["`sensors.range.0`", "8 beams over 0 rad"],
+    ),
+    "too many pixels": (
+        {"sensors__depth": [{"name": "head", "width": 4000}]},
+        ["`sensors.depth.0.width` = 4000", "<= 1280"],
+    ),
+    "degrees of view": (
+        {"sensors__depth": [{"name": "head", "view_rad": 90}]},
+        ["`sensors.depth.0.view_rad` = 90 rad"],
+    ),
     "negative noise": ({"sensors__joints__angle_noise_rad": -1e-3}, ["`sensors.joints.angle_noise_rad` = -0.001 rad"]),
     "name with a space": ({"name": "my worm"}, ["`name` = 'my worm'"]),
     "name with a slash": ({"name": "lab/worm"}, ["`name` = 'lab/worm'"]),

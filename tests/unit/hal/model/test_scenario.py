@@ -19,6 +19,7 @@ from snakesim_hal.model.scenario import (
     Loaded,
     Override,
     Service,
+    WaypointGoal,
     capsules_at_start,
     config_hash,
     load,
@@ -46,6 +47,15 @@ def test_a_scenario_is_put_together_from_its_files(tmp_path: Path) -> None:
     assert config.robot.sensors.pose is not None and config.robot.sensors.contacts is None
     assert (config.pace, config.seed, config.start.tail_s_m) == ("lockstep", 1, 0.1)
     assert config.period_ns == 10_000_000
+
+
+def test_a_flag_makes_another_field_or_another_goal() -> None:
+    first, other = with_flags("clutter"), with_flags("clutter", "scene.random_field.0.seed=7")
+    assert place_all(first.config) != place_all(other.config)
+    points = with_flags("clutter", 'mission.goal={kind="waypoints", points_m=[[3, 0], [5, 0.5]]}')
+    assert points.config.mission.goal == WaypointGoal(points_m=[(3.0, 0.0), (5.0, 0.5)])
+    with pytest.raises(ConfigError, match=r"mission\.map"):
+        with_flags("clutter", "mission.map=guessed")
 
 
 def test_parts_stand_beside_the_scenario_or_are_shipped_and_flags_name_them_from_here(tmp_path: Path) -> None:

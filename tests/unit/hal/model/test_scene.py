@@ -148,6 +148,26 @@ def test_a_random_field_keeps_its_clearances(seed: int, clearance_m: float, rout
         assert np.hypot(*(dense - centre).T).min() - peg.radius_m >= route_clearance_m - 1e-5
 
 
+@given(seed=st.integers(0, 2**31))
+@settings(max_examples=4)
+def test_blocks_keep_their_clearances_from_everything(seed: int) -> None:
+    field = {**FIELD, "seed": seed, "density_per_m2": 8.0, "box_share": 0.6, "clearance_m": 0.1}
+    placed = [item.obstacle for item in place(scene(random_field=[field]), SNAKE)]
+    assert {o.shape for o in placed} == {"cylinder", "box"}
+    around = np.linspace(-1.0, 1.0, 41)
+    square = np.concatenate([[(x, y), (y, x)] for x in around for y in (-1.0, 1.0)])
+    for one in placed:
+        c, s = np.cos(one.yaw_rad), np.sin(one.yaw_rad)
+        if one.shape == "cylinder":
+            rim = one.radius_m * np.column_stack([np.cos(around * np.pi), np.sin(around * np.pi)])
+        else:
+            rim = square * one.half_size_m[:2] @ np.array([[c, s], [-s, c]])
+            assert all(0.06 <= 2 * half <= 0.18 for half in one.half_size_m[:2])
+        for point in np.array(one.position_w[:2]) + rim:
+            assert min((outline_distance_m(o, point) for o in placed if o is not one), default=1.0) >= 0.1 - 1e-9
+            assert min(link.distance_m(point) for link in SNAKE) >= 0.1 - 1e-9
+
+
 def test_the_same_seed_gives_the_same_pegs_and_another_seed_others() -> None:
     first, again = (place(scene(random_field=[FIELD])) for _ in range(2))
     assert first == again
@@ -161,6 +181,7 @@ def test_the_same_seed_gives_the_same_pegs_and_another_seed_others() -> None:
 IMPOSSIBLE = {
     "too dense": ({"density_per_m2": 60.0, "radius_m": [0.1, 0.1]}, ["pegs fit", "`density_per_m2` = 60.0", "only"]),
     "empty area": ({"high_m": [0.0, 1.0]}, ["`high_m` = (0.0, 1.0) must exceed `low_m` = (0.0, -1.0)"]),
+    "sizes swapped": ({"box_size_m": [0.2, 0.1]}, ["`box_size_m` = (0.2, 0.1)", "smallest first"]),
     "radii swapped": ({"radius_m": [0.05, 0.02]}, ["`radius_m` = (0.05, 0.02)", "smallest first"]),
     "route that is not there": ({"route_clearance_m": 0.1}, ["`route_clearance_m` is set", "no route"]),
 }

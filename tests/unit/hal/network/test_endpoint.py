@@ -3,7 +3,7 @@
 import pytest
 
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.network.endpoint import check_endpoint, check_namespace
+from snakesim_hal.network.endpoint import check_endpoint, check_guarded, check_namespace
 
 GOOD = [
     *("tcp/127.0.0.1:7447", "tcp/localhost:1", "tls/lab-router.example:65535"),
@@ -37,6 +37,32 @@ def test_a_wrong_endpoint_says_what_a_valid_one_looks_like(text: str) -> None:
         check_endpoint(text, "--router")
     said = str(caught.value)
     assert said.startswith("--router ") and WRONG[text] in said and "tcp/127.0.0.1:7447" in said and len(said) < 400
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "exposed"),
+    [
+        ("tcp/127.0.0.1:7447", False),
+        ("tcp/127.8.0.1:7447", False),
+        ("tcp/localhost:7447", False),
+        ("tcp/[::1]:7447", False),
+        ("unixsock-stream/tmp/robot", False),
+        ("tcp/0.0.0.0:7447", True),
+        ("tcp/[::]:7447", True),
+        ("tls/192.168.1.5:7447#iface=eth0", True),
+        ("udp/robot.lab:7447", True),
+    ],
+)
+def test_what_other_machines_may_reach_is_listened_on_only_with_access_control_or_on_request(
+    endpoint: str, exposed: bool
+) -> None:
+    check_guarded(endpoint, "--endpoint", insecure=True)
+    check_guarded(endpoint, "--endpoint", access_control=True)
+    if exposed:
+        with pytest.raises(ConfigError, match=r"--endpoint .* could command the robot.* --insecure"):
+            check_guarded(endpoint, "--endpoint")
+    else:
+        check_guarded(endpoint, "--endpoint")
 
 
 def test_namespaces() -> None:

@@ -207,6 +207,9 @@ def test_a_router_wants_a_file_that_says_so(tmp_path: Path) -> None:
         path.write_text(text)
         with pytest.raises(ConfigError, match=words), open_router(path):
             pass
+    path.write_text('{mode: "router"}')  # Zenoh's default is every interface
+    with pytest.raises(ConfigError, match=r"could command the robot"), open_router(path):
+        pass
     endpoint = free_endpoint()
     path.write_text(
         f'{{mode: "router", listen: {{endpoints: ["{endpoint}"]}}, scouting: {{multicast: {{enabled: false}}}}}}'

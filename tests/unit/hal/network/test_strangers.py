@@ -20,6 +20,7 @@ from snakesim_hal.wire.messages import (
     Clock,
     Contact,
     Contacts,
+    DepthImage,
     Description,
     Imu,
     Intent,
@@ -32,6 +33,7 @@ from snakesim_hal.wire.messages import (
     World,
     WorldContact,
 )
+from snakesim_hal.wire.quantities import Quaternion
 from tests.unit.hal.local_network import LagBackend, free_endpoint, wait_until
 from tests.unit.hal.rig import description, run_config, state
 
@@ -96,6 +98,26 @@ def trajectory(*path: tuple[float, float]) -> Trajectory:
     return Trajectory(tick=0, stamp_ns=0, path_id=1, path_w=list(path), speed_m_s=0.1, push_points=[], finished=False)
 
 
+def image(depth: bytes, link: int = 3, turned: Quaternion = UPRIGHT) -> DepthImage:
+    return DepthImage(
+        tick=0,
+        stamp_ns=0,
+        link=link,
+        position_l=X,
+        orientation_l_wxyz=turned,
+        width=3,
+        height=2,
+        fx_px=2.0,
+        fy_px=2.0,
+        cx_px=1.0,
+        cy_px=0.5,
+        range_min_m=0.1,
+        range_max_m=3.0,
+        scale_m=0.001,
+        depth=depth,
+    )
+
+
 @pytest.mark.parametrize(
     ("message", "why"),
     [
@@ -116,6 +138,10 @@ def trajectory(*path: tuple[float, float]) -> Trajectory:
         (pose(0.6, 0.0, 0.0, 0.8), None),
         (pose(0.0, 0.0, 0.0, 0.0), "no_rotation"),
         (pose(1.0, 1.0, 1.0, 1.0), "no_rotation"),
+        (image(bytes(12)), None),
+        (image(bytes(11)), "wrong_length"),
+        (image(bytes(12), link=4), "wrong_length"),
+        (image(bytes(12), turned=(0.0, 0.0, 0.0, 0.0)), "no_rotation"),
         (trajectory((0.0, 0.0), (1.0, 0.0)), None),
         (trajectory((0.0, 0.0), (1.0, 0.0), (1.0, 0.0)), "no_path"),
         (Intent(stamp_ns=0, who="operator"), None),
@@ -199,6 +225,23 @@ def test_what_is_longer_than_any_message_never_arrives_and_the_link_stays() -> N
             put(keys.JOINTS, bytes(length), congestion_control=zenoh.CongestionControl.BLOCK)
         wait_until(lambda: heard.count(1) >= 2, "the last one everywhere")
         assert sorted(heard) == [1, 1, MAX_PAYLOAD_BYTES, MAX_PAYLOAD_BYTES]
+
+
+def test_large_images_arrive_where_they_are_expected() -> None:
+    """A robot's own processes know its cameras; to everybody else more than a MiB is too long."""
+    endpoint, largest = free_endpoint(), 2 * 1280 * 960
+    with (
+        open_session(Link(endpoint, "worm", listen=True, largest_bytes=largest)) as hal,
+        open_session(Link(endpoint, "worm", largest_bytes=largest)) as session,
+        open_session(Link(endpoint, "worm")) as small,
+    ):
+        readers = [each.reader(keys.depth("head"), DepthImage) for each in (session, small)]
+        publisher = hal.publisher(keys.depth("head"), DepthImage, lossless=True)
+        wait_until(publisher.heard, "somebody listening")
+        sent = msgspec.structs.replace(image(bytes(largest)), width=1280, height=960)
+        publisher.put(sent)
+        wait_until(lambda: readers[0].drain() == [sent], "the image")
+        assert readers[1].drain() == []
 
 
 def test_a_lease_that_has_run_out_is_a_fault_even_when_somebody_asks_for_it_at_that_moment() -> None:

@@ -29,4 +29,4 @@ def applied_for(
     """What is applied when every joint is in the same situation; the target before was 1."""
     measured = Measured(np.full(JOINTS, angle), np.full(JOINTS, velocity), np.full(JOINTS, torque))
     last = Applied(np.full(JOINTS, int(before)), np.ones(JOINTS), LIMITS.torque_nm)
-    return limit(asked, measured=measured, last=last, limits=LIMITS, share=COOL)[0]
+    return limit(asked, measured=measured, last=last, limits=LIMITS, share=COOL)

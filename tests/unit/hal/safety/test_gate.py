@@ -99,7 +99,7 @@ def test_heat_bounds_the_torque_limit_and_is_named() -> None:
     still = Measured(*np.zeros((3, JOINTS)))
 
     def words(asked: JointCommand) -> tuple[list[float], dict[int, str]]:
-        applied, _ = limit(asked, measured=still, last=last, limits=LIMITS, share=share)
+        applied = limit(asked, measured=still, last=last, limits=LIMITS, share=share)
         named = why_limited(asked, applied, measured=still, limits=LIMITS, share=share)
         return applied.torque_limit_nm.tolist(), named
 
@@ -140,7 +140,7 @@ def test_a_changed_target_is_named_by_its_limit(mode: Mode, wanted: float, word:
     asked = command(ROBOT, [0.0, wanted, 0.0], mode)
     last = Applied(np.full(JOINTS, int(mode)), zero, LIMITS.torque_nm)
     measured = Measured(zero, zero, zero)
-    applied, _ = limit(asked, measured=measured, last=last, limits=LIMITS, share=COOL)
+    applied = limit(asked, measured=measured, last=last, limits=LIMITS, share=COOL)
     words = why_limited(asked, applied, measured=measured, limits=LIMITS, share=COOL)
     assert words == ({} if word is None else {1: word})
 

@@ -294,6 +294,13 @@ def test_a_mode_between_begins_anew() -> None:
         assert bench.see(0.0, 0.0, 0.5, applied=told(9.0, Mode.VELOCITY)) is None
 
 
+def test_a_joint_that_came_to_life_again_has_a_whole_lease_before_it_is_frozen() -> None:
+    bench = Bench(torque=0.5)
+    assert stuck(bench, FAR_PERIODS + LEASE_PERIODS) is None  # far for nearly a lease
+    assert bench.see(1e-9, 0.0, 0.5, applied=told(0.2)) is None  # every joint moves
+    assert [bench.see(1e-9, 0.0, 0.5, applied=told(0.4)) for _ in range(LEASE_PERIODS)] == [None] * LEASE_PERIODS
+
+
 @pytest.mark.parametrize("column", [0, 1, 2])
 def test_whatever_still_changes_is_alive(column: int) -> None:
     bench = Bench()

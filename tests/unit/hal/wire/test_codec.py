@@ -10,7 +10,16 @@ from msgspec import inspect
 
 from snakesim_hal.errors import WireError
 from snakesim_hal.wire.codec import ENCODING_PREFIX, MAX_PAYLOAD_BYTES, Decoder, encode, encoding_of
-from snakesim_hal.wire.messages import VERSIONS, Clock, JointCommand, JointState, Message, Mode
+from snakesim_hal.wire.messages import (
+    VERSIONS,
+    Clock,
+    ColourImage,
+    DepthImage,
+    JointCommand,
+    JointState,
+    Message,
+    Mode,
+)
 from tests.unit.hal.strategies import messages_of, places, plain_example, poisons, replaced
 
 ALL = list(VERSIONS)
@@ -199,6 +208,15 @@ def test_a_payload_above_the_size_limit_is_refused_unread() -> None:
     too_large = encode({**valid, "other": b"x" * MAX_PAYLOAD_BYTES})
     with pytest.raises(WireError, match=str(MAX_PAYLOAD_BYTES)):
         DECODERS[JointState].decode(too_large, encoding_of(JointState))
+
+
+def test_the_largest_images_are_taken_and_nothing_else_of_their_size() -> None:
+    for message, field, pixel in ((DepthImage, "depth", b"\1\2"), (ColourImage, "rgb", b"\1\2\3")):
+        largest = {**plain_example(message), "width": 1280, "height": 960, field: pixel * (1280 * 960)}
+        taken = take(message, encode(largest))
+        assert taken is not None and getattr(taken, field) == largest[field]
+        assert take(message, encode({**largest, field: largest[field] + b"\1"})) is None
+        assert take(JointState, encode({**plain_example(JointState), "other": largest[field]})) is None
 
 
 def test_invalid_utf8_is_refused() -> None:

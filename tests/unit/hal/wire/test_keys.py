@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Done
+from snakesim_hal.wire.messages import ColourImage, DepthImage, Done, Ranges
 
 CHUNK = st.text(st.characters(categories=("L", "N"), include_characters="_-"), min_size=1, max_size=12)
 NAMESPACE = st.lists(CHUNK, min_size=1, max_size=3).map("/".join)
@@ -43,6 +43,13 @@ def test_services_are_found_in_their_keys(service: str) -> None:
     assert keys.message_at(keys.done(service)) is Done
 
 
+@given(name=CHUNK)
+def test_cameras_and_lidars_have_keys_of_their_own(name: str) -> None:
+    assert keys.message_at(keys.depth(name)) is DepthImage
+    assert keys.message_at(keys.colour(name)) is ColourImage
+    assert keys.message_at(keys.ranges(name)) is Ranges
+
+
 @given(namespace=NAMESPACE, row=st.sampled_from(keys.SPACE))
 def test_namespaces_split_off(namespace: str, row: keys.Row) -> None:
     key = concrete(row.key)
@@ -50,7 +57,20 @@ def test_namespaces_split_off(namespace: str, row: keys.Row) -> None:
 
 
 @pytest.mark.parametrize(
-    "key", ["", "sensor", "sensor/joint", "sensor/joints/0", "hal/done", "hal/done/a/b", "alive", "planar13"]
+    "key",
+    [
+        "",
+        "sensor",
+        "sensor/joint",
+        "sensor/joints/0",
+        "sensor/depth",
+        "sensor/depth/",
+        "sensor/depth/head/left",
+        "hal/done",
+        "hal/done/a/b",
+        "alive",
+        "planar13",
+    ],
 )
 def test_keys_outside_the_space_parse_to_nothing(key: str) -> None:
     assert keys.message_at(key) is None

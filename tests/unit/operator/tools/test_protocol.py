@@ -15,7 +15,7 @@ from snakesim_hal.network.session import DEFAULT_ENDPOINT, Link, open_session
 from snakesim_hal.safety import gate, lifecycle
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode
-from snakesim_hal.wire.messages import Description, Done, JointCommand, JointState, Mode
+from snakesim_hal.wire.messages import DepthImage, Description, Done, JointCommand, JointState, Mode
 from snakesim_operator.tools.schemas import contract
 from tests.unit.hal.local_network import free_endpoint, wait_until
 from tests.unit.hal.rig import description
@@ -89,6 +89,7 @@ def test_the_endpoint_is_the_default() -> None:
 ROWS = {
     "`actuator/joints`": (keys.JOINT_COMMAND, JointCommand),
     "`hal/clock`, `hal/done/*`": (keys.done("control"), Done),
+    "`sensor/depth/*`, `sensor/colour/*`": (keys.depth("head"), DepthImage),
     "other streams": (keys.JOINTS, JointState),
     "`hal/description`, `hal/status`": (keys.DESCRIPTION, Description),
 }

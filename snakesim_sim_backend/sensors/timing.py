@@ -1,13 +1,10 @@
 """When a sensor is due, and the delay of its samples."""
 
 from collections import deque
-from typing import Generic, TypeVar
 
 import msgspec
 
-from snakesim_hal.wire.messages import Contacts, Imu, Pose, Power
-
-SampleT = TypeVar("SampleT", bound=Contacts | Imu | Pose | Power)
+from snakesim_hal.wire.messages import Message
 
 
 class Due:
@@ -32,19 +29,19 @@ def ticks_of(delay_s: float, period_ns: int) -> int:
     return round(delay_s * 1e9 / period_ns)
 
 
-class DelayLine(Generic[SampleT]):
+class DelayLine:
     """Delays samples. Their stamp stays that of sampling; their tick becomes that of delivery."""
 
     def __init__(self, ticks: int) -> None:
         self._ticks = ticks
-        self._under_way: deque[SampleT] = deque()
+        self._under_way: deque[tuple[int, Message]] = deque()  # with the tick of arrival
 
-    def pass_on(self, tick: int, taken: SampleT | None) -> SampleT | None:
+    def pass_on(self, tick: int, taken: Message | None) -> Message | None:
         """Put in the sample of this tick, if any; returns the one that arrives at it, if any."""
         if not self._ticks:
             return taken
         if taken is not None:
-            self._under_way.append(taken)
-        if not self._under_way or self._under_way[0].tick + self._ticks > tick:
+            self._under_way.append((tick + self._ticks, taken))
+        if not self._under_way or self._under_way[0][0] > tick:
             return None
-        return msgspec.structs.replace(self._under_way.popleft(), tick=tick)
+        return msgspec.structs.replace(self._under_way.popleft()[1], tick=tick)

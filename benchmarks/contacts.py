@@ -1,0 +1,132 @@
+"""`python -m benchmarks.contacts [SCENARIO[,KEY=VALUE...]...]`: the contact estimate against the simulator's truth.
+
+True contacts of one side within 8 cm are one push, because the estimate cannot tell them apart.
+"""
+
+import sys
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from snakesim_gnc.guidance.contact_estimate import FeltContact, estimate
+from snakesim_hal.backend import Samples
+from snakesim_hal.in_process import InProcessRun
+from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion
+from snakesim_hal.model.plugins import BACKENDS, offered
+from snakesim_hal.model.scenario import load, parse_set
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Description, Imu, Pose
+from snakesim_sim_backend.backend import SimBackend
+from snakesim_sim_backend.truth import TrueState
+
+SCENARIOS = ("triplet", "peg_row", "jam", "clutter")
+NEAR_M, LEAST_N = 0.08, 2.0
+FROM_TICK, EVERY = 30, 2
+Push = tuple[float, int, float]  # place along the body in m, side (1: left), force in N
+
+
+@dataclass
+class Score:
+    """Errors over a run, for true pushes of at least LEAST_N."""
+
+    true_n: list[float] = field(default_factory=list[float])
+    share: list[float] = field(default_factory=list[float])  # error / true force; 1 where nothing was found
+    place_m: list[float] = field(default_factory=list[float])  # of those found
+    ghosts: int = 0  # found, at least LEAST_N, and nothing there
+
+    def add(self, true: list[Push], felt: list[Push]) -> None:
+        """One tick."""
+        left = list(felt)
+        for place, side, force in true:
+            mine = [push for push in left if push[1] == side and abs(push[0] - place) < NEAR_M]
+            left = [push for push in left if push not in mine]
+            if force < LEAST_N:
+                continue
+            found = sum(push[2] for push in mine)
+            self.true_n.append(force)
+            self.share.append(abs(found - force) / force)
+            if mine:
+                self.place_m.append(abs(sum(push[0] * push[2] for push in mine) / found - place))
+        self.ghosts += sum(push[2] >= LEAST_N for push in left)
+
+    def row(self, name: str) -> str:
+        """A line of the table."""
+        share, force = np.array(self.share), np.array(self.true_n)
+        return (
+            f"| {name} | {len(share)} | {np.median(share):.1%} | {np.percentile(share, 75):.0%} | "
+            f"{np.median(share[force >= 10]) if (force >= 10).any() else np.nan:.1%} | "
+            f"{(len(share) - len(self.place_m)) / len(share):.0%} | {self.ghosts} | "
+            f"{1e3 * np.median(self.place_m):.0f} mm |"
+        )
+
+
+def score(scenario: str, *settings: str, seconds: float = 5.0, with_pose: bool = True) -> Score:
+    """Run a scenario in the simulator, and estimate as it goes."""
+    result, seen = Score(), list[tuple[Samples, TrueState]]()
+
+    class Watched(SimBackend):
+        """The simulator, with a look at its truth."""
+
+        def sample(self, tick: int, stamp_ns: int) -> Samples:
+            samples = super().sample(tick, stamp_ns)
+            if tick >= FROM_TICK and tick % EVERY == 0:
+                seen.append((samples, self.true_state()))
+            return samples
+
+    config = load(scenario, [parse_set(text) for text in (f"duration_s={seconds}", *settings)]).config
+    with offered(BACKENDS, "sim", Watched), InProcessRun(config) as run:
+        for _ in run.turns():
+            pass
+        robot = run.host.description
+    for samples, truth in seen:
+        imu, pose = samples.others[keys.IMU], samples.others[keys.POSE]
+        assert isinstance(imu, Imu) and isinstance(pose, Pose)
+        told = samples.joints
+        felt = estimate(robot, told.angle_rad, told.velocity_rad_s, told.torque_nm, imu, pose if with_pose else None)
+        result.add(true_pushes(robot, truth), pushes(robot, felt))
+    return result
+
+
+def pushes(robot: Description, felt: list[FeltContact]) -> list[Push]:
+    """Where along the body."""
+    starts = np.append(0.0, np.cumsum([link.length_m for link in robot.links]))
+    return [(starts[c.link] + c.along_m, -int(np.sign(c.normal_l[1])), c.force_n) for c in felt]
+
+
+def true_pushes(robot: Description, truth: TrueState) -> list[Push]:
+    """The simulator's contacts, tail to head; neighbours on one side are added up."""
+    lengths = [link.length_m for link in robot.links]
+    starts = np.append(0.0, np.cumsum(lengths))
+    base = rotation_from_quaternion(truth.base_orientation_wxyz)
+    axes = [joint.axis for joint in robot.joints]
+    rear_w, frames = link_frames(truth.base_position_w, base, truth.angles_rad, axes, lengths)
+    found: list[Any] = []
+    for contact in truth.contacts:
+        force_n = float(np.linalg.norm(contact.force_w))
+        along, across = (frames[contact.link].T @ (contact.position_w - rear_w[contact.link]))[:2]
+        found.append([starts[contact.link] + along, 1 if across > 0 else -1, force_n])
+    merged: list[Any] = []
+    for place, side, force in sorted(found):
+        same = [push for push in merged if push[1] == side and place - push[0] < NEAR_M]
+        if same and force + same[-1][2] > 0:
+            total = same[-1][2] + force
+            same[-1][0], same[-1][2] = (same[-1][0] * same[-1][2] + place * force) / total, total
+        else:
+            merged.append([place, side, force])
+    return [(place, side, force) for place, side, force in merged]
+
+
+def main() -> int:
+    """Print a table."""
+    print(f"| run | pushes >= {LEAST_N:g} N | median error | 75 % below | of >= 10 N | missed | ghosts | place |")
+    print("|---|---|---|---|---|---|---|---|")
+    for given in sys.argv[1:] or SCENARIOS:
+        scenario, *settings = given.split(",")
+        print(score(scenario, *settings).row(given), flush=True)
+        print(score(scenario, *settings, with_pose=False).row(f"{given}, no pose"), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""The same loop over other middleware: `make bench-peers`."""

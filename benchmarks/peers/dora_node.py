@@ -1,0 +1,37 @@
+"""Both nodes of a dora-rs dataflow: `robot` sends the state and waits for the command, `controller` answers."""
+
+import sys
+
+import pyarrow as pa
+from dora import Node
+
+sys.path.insert(0, __file__.rpartition("/")[0])
+from loop import measure, sizes, tell
+
+state_bytes, command_bytes, rounds, period_s = sizes()
+node = Node()
+
+
+def heard() -> bool:
+    """Waits for one input; False when the dataflow ends."""
+    while True:
+        event = node.next()
+        if event is None or event["type"] == "STOP":
+            return False
+        if event["type"] == "INPUT":
+            event["value"].to_numpy()
+            return True
+
+
+if sys.argv[1] == "controller":
+    command = pa.array(bytearray(command_bytes), type=pa.uint8())
+    while heard():
+        node.send_output("command", command)
+else:
+    state = bytearray(state_bytes)
+
+    def exchange() -> None:
+        node.send_output("state", pa.array(state, type=pa.uint8()))
+        heard()
+
+    tell(measure(exchange, rounds, period_s))

@@ -1,0 +1,55 @@
+"""A sensor model of one's own: a sonar that hears the nearest surface in a cone. See sensors.md.
+
+[[sensors.range]]
+name = "sonar"
+model = "./docs/sonar.py:Sonar"
+range_max_m = 2.0
+settings = { cone_rad = 0.5 }
+"""
+
+import math
+
+import numpy as np
+
+from snakesim_hal.model.files import FileStruct
+from snakesim_hal.wire.messages import Ranges
+from snakesim_sim_backend.sensors.mount import Mount
+from snakesim_sim_backend.sensors.rays import Rays
+
+RAYS = 200
+
+
+class Sonar:
+    class Settings(FileStruct, frozen=True):
+        cone_rad: float = 0.5  # from edge to edge
+
+    message = Ranges
+
+    def __init__(self, sensor, scope, settings):
+        self._sensor, self._noise = sensor, scope.noise
+        self._mount = Mount(sensor, scope)
+        # Sunflower spiral over the cone's cap.
+        off = settings.cone_rad / 2 * np.sqrt((np.arange(RAYS) + 0.5) / RAYS)
+        turn = math.pi * (3 - math.sqrt(5)) * np.arange(RAYS)
+        cone = np.stack([np.cos(off), np.sin(off) * np.cos(turn), np.sin(off) * np.sin(turn)], -1)
+        self._rays = Rays(self._mount, scope, cone, sensor.range_max_m)
+
+    def read(self, tick, stamp_ns):
+        sensor = self._sensor
+        echoes = self._rays.cast()
+        echoes = echoes[(echoes >= sensor.range_min_m) & (echoes <= sensor.range_max_m)]
+        nearest = None
+        if len(echoes):
+            nearest = max(float(echoes.min() + sensor.noise_m * self._noise.standard_normal()), 0.0)
+        return Ranges(
+            tick=tick,
+            stamp_ns=stamp_ns,
+            link=self._mount.link,
+            position_l=self._mount.position_l,
+            orientation_l_wxyz=self._mount.orientation_l_wxyz,
+            angle_min_rad=0.0,
+            angle_step_rad=0.0,
+            range_min_m=sensor.range_min_m,
+            range_max_m=sensor.range_max_m,
+            range_m=[nearest],
+        )

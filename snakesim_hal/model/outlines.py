@@ -1,0 +1,131 @@
+"""Obstacles and links as seen from above: their outlines, and distances to them. Pure geometry.
+
+Every outline is a rounded box: points within `rounding_m` of a rectangle. A cylinder's rectangle is its centre. Spheres
+count with their radius.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Self
+
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from snakesim_hal.model.files import FileStruct
+from snakesim_hal.wire.messages import Obstacle
+
+Floats = NDArray[np.float64]
+
+CORNERS = np.array([(1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1), (0, 1)], dtype=np.float64)
+
+
+def metres(low: float | None = None, high: float = 1000.0) -> Meta:
+    """Bounds of a length in a file: above `low`, or of either sign."""
+    if low is None:
+        return Meta(ge=-high, le=high, extra_json_schema={"unit": "m"})
+    return Meta(gt=low, le=high, extra_json_schema={"unit": "m"})
+
+
+Coordinate = Annotated[float, metres()]
+Size = Annotated[float, metres(0)]
+Clearance = Annotated[float, Meta(ge=0, le=100, extra_json_schema={"unit": "m"})]
+Friction = Annotated[float, Meta(ge=0, le=5, extra_json_schema={"unit": "1 (Coulomb coefficient)"})]
+Heading = Annotated[float, Meta(ge=-6.3, le=6.3, extra_json_schema={"unit": "rad"})]
+Point = tuple[Coordinate, Coordinate]
+
+
+@dataclass(frozen=True)
+class Outlines:
+    """The outlines of many obstacles, for distances by the batch."""
+
+    centre_w: Floats  # (m, 2)
+    turn: Floats  # (m, 2): cosine and sine of the rectangle's yaw
+    half_m: Floats  # (m, 2): half its length and width
+    rounding_m: Floats  # (m,)
+
+    @classmethod
+    def of(cls, obstacles: Sequence[Obstacle]) -> Self:
+        """Of obstacles, in their order."""
+        boxes = np.array([o.shape == "box" for o in obstacles], dtype=bool)
+        yaw = np.array([o.yaw_rad for o in obstacles], dtype=np.float64)
+        half = np.array([o.half_size_m[:2] for o in obstacles], dtype=np.float64).reshape(-1, 2)
+        return cls(
+            centre_w=np.array([o.position_w[:2] for o in obstacles], dtype=np.float64).reshape(-1, 2),
+            turn=np.column_stack([np.cos(yaw), np.sin(yaw)]),
+            half_m=np.where(boxes[:, None], half, 0.0),
+            rounding_m=np.where(boxes, 0.0, [o.radius_m for o in obstacles]),
+        )
+
+    @classmethod
+    def of_segments(cls, from_w: Floats, to_w: Floats, rounding_m: float = 0.0) -> Self:
+        """Of straight segments (m, 2) to (m, 2), as thick as twice the rounding."""
+        run = to_w - from_w
+        length = np.hypot(*run.T)
+        ahead = np.where(length[:, None] > 0, run / np.maximum(length, 1e-12)[:, None], [1.0, 0.0])
+        half = np.column_stack([0.5 * length, np.zeros_like(length)])
+        return cls(0.5 * (from_w + to_w), ahead, half, np.full(len(run), rounding_m))
+
+    def __len__(self) -> int:
+        return len(self.centre_w)
+
+    @property
+    def reach_m(self) -> Floats:
+        """(m,): the farthest that an outline gets from its centre."""
+        return np.hypot(*self.half_m.T) + self.rounding_m
+
+    @property
+    def rims_w(self) -> Floats:
+        """(m, 8, 2): corners and middles of the edges of the rectangles."""
+        local = CORNERS * self.half_m[:, None, :]
+        c, s = self.turn[:, None, 0], self.turn[:, None, 1]
+        x, y = local[..., 0], local[..., 1]
+        return self.centre_w[:, None, :] + np.stack([c * x - s * y, s * x + c * y], axis=-1)
+
+    def distance_m(self, points_w: Floats) -> Floats:
+        """Distances from points (..., 2) to every outline, (..., m); negative inside."""
+        x, y = self._local(points_w)
+        over_x, over_y = np.abs(x) - self.half_m[:, 0], np.abs(y) - self.half_m[:, 1]
+        outside = np.hypot(np.maximum(over_x, 0.0), np.maximum(over_y, 0.0))
+        return outside + np.minimum(np.maximum(over_x, over_y), 0.0) - self.rounding_m
+
+    def _local(self, points_w: Floats) -> tuple[Floats, Floats]:
+        offset_x = points_w[..., None, 0] - self.centre_w[:, 0]
+        offset_y = points_w[..., None, 1] - self.centre_w[:, 1]
+        c, s = self.turn[:, 0], self.turn[:, 1]
+        return c * offset_x + s * offset_y, c * offset_y - s * offset_x
+
+
+def gaps_m(one: Outlines, others: Outlines) -> Floats:
+    """Gaps (m,) between one outline and each of the others; exact while they do not overlap."""
+    from_one = others.distance_m(one.rims_w[0]).min(axis=0) - one.rounding_m[0]
+    from_others = one.distance_m(others.rims_w)[..., 0].min(axis=1) - others.rounding_m
+    return np.minimum(from_one, from_others)
+
+
+class Capsule(FileStruct, frozen=True, kw_only=True):
+    """Outline of a link on the ground, from above."""
+
+    name: str
+    rear_m: tuple[float, float]
+    front_m: tuple[float, float]
+    radius_m: float
+
+    def distance_m(self, point: Floats) -> float:
+        """Distance from a point to the capsule's surface; negative inside."""
+        rear, front = np.array(self.rear_m), np.array(self.front_m)
+        axis = front - rear
+        along = float(np.clip((point - rear) @ axis / max(float(axis @ axis), 1e-12), 0.0, 1.0))
+        return float(np.hypot(*(point - rear - along * axis))) - self.radius_m
+
+
+def outline_distance_m(obstacle: Obstacle, point: Floats) -> float:
+    """Distance from a point on the ground to an obstacle's outline from above; negative inside."""
+    offset = np.asarray(point, dtype=np.float64) - np.array(obstacle.position_w[:2])
+    if obstacle.shape != "box":
+        return float(np.hypot(*offset)) - obstacle.radius_m
+    c, s = math.cos(obstacle.yaw_rad), math.sin(obstacle.yaw_rad)
+    local = np.abs([c * offset[0] + s * offset[1], c * offset[1] - s * offset[0]])
+    beyond = local - np.array(obstacle.half_size_m[:2])
+    return float(np.hypot(*np.maximum(beyond, 0.0)) + min(float(beyond.max()), 0.0))

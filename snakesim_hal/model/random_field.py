@@ -1,0 +1,118 @@
+"""Obstacles strewn by chance: upright pegs and blocks with a least gap between any two, the same for the same seed."""
+
+import math
+from collections.abc import Sequence
+from typing import Annotated
+
+import numpy as np
+from msgspec import Meta
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.files import FileStruct
+from snakesim_hal.model.outlines import Capsule, Clearance, Friction, Outlines, Point, Size, gaps_m
+from snakesim_hal.model.route import Route
+from snakesim_hal.wire.messages import Obstacle
+
+Floats = NDArray[np.float64]
+
+MAX_STREWN = 1000
+TRIES = 200  # for each obstacle that is wanted
+
+
+class RandomField(FileStruct, frozen=True, kw_only=True):
+    """Randomly placed pegs and blocks, the same for the same seed."""
+
+    seed: Annotated[int, Meta(ge=0, le=2**31)]
+    low_m: Point  # corners of the area in which their centres are
+    high_m: Point
+    density_per_m2: Annotated[float, Meta(gt=0, le=200, extra_json_schema={"unit": "1/m²"})]
+    radius_m: tuple[Size, Size]  # of a peg, smallest and largest
+    box_share: Annotated[float, Meta(ge=0, le=1)] = 0.0  # of all obstacles, on average; the others are pegs
+    box_size_m: tuple[Size, Size] = (0.06, 0.18)  # length and width of a block, smallest and largest
+    clearance_m: Clearance  # least gap between the surfaces of any two
+    route_clearance_m: Clearance | None = None  # least gap between the route and a surface
+    height_m: Size = 0.2
+    friction: Friction = 0.0
+
+    @property
+    def wanted(self) -> int:
+        """Number of obstacles."""
+        return round(self.density_per_m2 * math.prod(np.subtract(self.high_m, self.low_m).tolist()))
+
+
+def strew(
+    field: RandomField,
+    where: str,
+    index: int,
+    route: Route | None,
+    standing: Sequence[Obstacle],
+    keep_clear: Sequence[Capsule],
+) -> list[Obstacle]:
+    """The obstacles of a field. where: the field, for errors; index: its number in the scene, which also seeds it.
+
+    standing: obstacles that are there already; keep_clear: the snake at its start.
+    """
+    _check(field, where, route)
+    random = np.random.default_rng([field.seed, index])
+    kept = [_snake(keep_clear, field.clearance_m)] if keep_clear else []
+    if route is not None and field.route_clearance_m is not None:
+        kept.append(Outlines.of_segments(route.points_w[:-1], route.points_w[1:], field.route_clearance_m))
+    strewn: list[Obstacle] = []
+    others = Outlines.of(standing)
+    for _ in range(TRIES * field.wanted):
+        if len(strewn) == field.wanted:
+            return strewn
+        tried = _draw(field, random, f"random_{index}_{len(strewn)}")
+        outline = Outlines.of([tried])
+        if len(others) and gaps_m(outline, others).min() < field.clearance_m:
+            continue
+        if any(gaps_m(outline, free).min() < 0.0 for free in kept):
+            continue
+        strewn.append(tried)
+        others = Outlines.of([*standing, *strewn])
+    if len(strewn) < field.wanted:
+        raise ConfigError(
+            f"{where}: only {len(strewn)} of {field.wanted} pegs fit; lower `density_per_m2` = "
+            f"{field.density_per_m2} or `clearance_m` = {field.clearance_m}"
+        )
+    return strewn
+
+
+def _snake(links: Sequence[Capsule], clearance_m: float) -> Outlines:
+    from_w, to_w = np.array([c.rear_m for c in links]), np.array([c.front_m for c in links])
+    return Outlines.of_segments(from_w, to_w, max(c.radius_m for c in links) + clearance_m)
+
+
+def _check(field: RandomField, where: str, route: Route | None) -> None:
+    if not np.all(np.array(field.high_m) > np.array(field.low_m)):
+        raise ConfigError(f"{where}: `high_m` = {field.high_m} must exceed `low_m` = {field.low_m} in x and y")
+    for name in ("radius_m", "box_size_m"):
+        sizes = getattr(field, name)
+        if sizes[1] < sizes[0]:
+            raise ConfigError(f"{where}: `{name}` = {sizes}: smallest first, then largest")
+    if field.route_clearance_m is not None and route is None:
+        raise ConfigError(f"{where}: `route_clearance_m` is set but the scene has no route; add a [route] section")
+    if field.wanted > MAX_STREWN:
+        raise ConfigError(
+            f"{where}: `density_per_m2` = {field.density_per_m2} asks for {field.wanted} pegs on this area; at most "
+            f"{MAX_STREWN}"
+        )
+
+
+def _draw(field: RandomField, random: Generator, name: str) -> Obstacle:
+    x, y = random.uniform(field.low_m, field.high_m).tolist()
+    radius_m = float(random.uniform(*field.radius_m))
+    centre = (x, y, field.height_m / 2)
+    if field.box_share == 0 or random.uniform() >= field.box_share:
+        return Obstacle(name=name, shape="cylinder", position_w=centre, radius_m=radius_m, height_m=field.height_m)
+    length_m, width_m = random.uniform(*field.box_size_m, size=2).tolist()
+    return Obstacle(
+        name=name,
+        shape="box",
+        position_w=centre,
+        yaw_rad=float(random.uniform(0.0, math.pi)),
+        half_size_m=(length_m / 2, width_m / 2, field.height_m / 2),
+        height_m=field.height_m,
+    )

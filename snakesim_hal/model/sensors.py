@@ -1,0 +1,171 @@
+"""The sensors in a robot file. What they publish, and how they are simulated, is told in docs/sensors.md."""
+
+import math
+from collections.abc import Iterator
+from typing import Annotated, Any, Literal
+
+from msgspec import Meta
+
+from snakesim_hal.model.files import FileStruct
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.quantities import MAX_BEAMS, MAX_IMAGE_HEIGHT, MAX_IMAGE_WIDTH, MAX_JOINTS, above, from_zero
+
+MAX_MOUNTED = 8  # cameras, and as many lidars and range finders: a description has room for 32 keys
+Angle = Annotated[float, Meta(ge=-math.pi, le=math.pi, extra_json_schema={"unit": "rad"})]
+Offset = Annotated[float, Meta(ge=-10, le=10, extra_json_schema={"unit": "m"})]
+LinkName = Literal["head", "tail"] | Annotated[int, Meta(ge=0, le=MAX_JOINTS)]
+
+
+class JointSensor(FileStruct, frozen=True, kw_only=True):
+    """Angle, velocity and torque of every joint. No rate: a sample every tick."""
+
+    delay_s: Annotated[float, from_zero(1, "s")] = 0.0
+    angle_noise_rad: Annotated[float, from_zero(1, "rad")] = 0.0  # standard deviation, as all noise here
+    velocity_noise_rad_s: Annotated[float, from_zero(10, "rad/s")] = 0.0
+    torque_noise_nm: Annotated[float, from_zero(100, "N·m")] = 0.0
+
+
+class ContactSensor(FileStruct, frozen=True, kw_only=True):
+    """Contacts of the links with obstacles."""
+
+    rate_hz: Annotated[float, above(1e4, "Hz")] = 100.0
+    delay_s: Annotated[float, from_zero(1, "s")] = 0.0
+    position_noise_m: Annotated[float, from_zero(1, "m")] = 0.0
+    force_noise_n: Annotated[float, from_zero(100, "N")] = 0.0
+    threshold_n: Annotated[float, from_zero(100, "N")] = 0.0  # weaker contacts are not detected
+
+
+class ImuSensor(FileStruct, frozen=True, kw_only=True):
+    """Angular velocity and acceleration (gravity included) of every link."""
+
+    rate_hz: Annotated[float, above(1e4, "Hz")] = 100.0
+    delay_s: Annotated[float, from_zero(1, "s")] = 0.0
+    angular_velocity_noise_rad_s: Annotated[float, from_zero(10, "rad/s")] = 0.0
+    acceleration_noise_m_s2: Annotated[float, from_zero(100, "m/s²")] = 0.0
+
+
+class PoseSensor(FileStruct, frozen=True, kw_only=True):
+    """Pose of the base, from motion capture."""
+
+    rate_hz: Annotated[float, above(1e4, "Hz")] = 100.0
+    delay_s: Annotated[float, from_zero(1, "s")] = 0.0
+    position_noise_m: Annotated[float, from_zero(1, "m")] = 0.0
+    angle_noise_rad: Annotated[float, from_zero(1, "rad")] = 0.0
+
+
+class PowerSensor(FileStruct, frozen=True, kw_only=True):
+    """Supply, temperatures and leaks of every joint module. Modules on a bus report them at their own rate."""
+
+    rate_hz: Annotated[float, above(1e4, "Hz")] = 2.0
+    delay_s: Annotated[float, from_zero(1, "s")] = 0.0
+
+
+class Mounted(FileStruct, frozen=True, kw_only=True):
+    """A sensor that looks from a place on a link. Several of a kind are told apart by their names.
+
+    What it measures arrives after `delay_s`, and at least a period later.
+    """
+
+    name: Annotated[str, Meta(min_length=1, max_length=40, pattern="^[A-Za-z0-9_-]+$")]
+    link: LinkName = "head"
+    position_m: tuple[Offset, Offset, Offset] | None = None  # in the link's frame; none: at the tip of the head
+    yaw_rad: Angle = 0.0  # of its viewing direction from the link's x axis: first about z, positive to the left,
+    pitch_rad: Angle = 0.0  # then about y, positive downwards
+    rate_hz: Annotated[float, above(1000, "Hz")] = 20.0
+    delay_s: Annotated[float, from_zero(1, "s")] = 0.03
+    noise_m: Annotated[float, from_zero(1, "m")] = 0.0
+    dropout: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "1"})] = 0.0  # share that measures nothing
+    model: Annotated[str, Meta(min_length=1, max_length=500)] = "rays"  # by which the simulator makes its samples
+    settings: dict[str, Any] = {}  # of that model, checked by it
+
+
+class DepthCamera(Mounted, frozen=True, kw_only=True):
+    """Distances along the optical axis, in an image of square pixels without distortion."""
+
+    width: Annotated[int, Meta(ge=1, le=MAX_IMAGE_WIDTH)] = 160
+    height: Annotated[int, Meta(ge=1, le=MAX_IMAGE_HEIGHT)] = 120
+    view_rad: Annotated[float, above(3, "rad")] = 1.5708  # from the left edge to the right one
+    range_min_m: Annotated[float, from_zero(60, "m")] = 0.1
+    range_max_m: Annotated[float, above(60, "m")] = 5.0
+    noise_m_per_m2: Annotated[float, from_zero(1, "m/m²")] = 0.0  # more noise, times the square of the distance
+    colour: bool = False  # also a colour image, which the simulator renders by OpenGL
+
+    def __post_init__(self) -> None:
+        """Raises ValueError, which the file reader explains."""
+        _check_range(self.range_min_m, self.range_max_m)
+
+    @property
+    def focal_px(self) -> float:
+        """Focal length, of both axes."""
+        return self.width / 2 / math.tan(self.view_rad / 2)
+
+
+class RangeSensor(Mounted, frozen=True, kw_only=True):
+    """Distances along beams in a plane: a 2-D lidar; or with one beam a range finder."""
+
+    beams: Annotated[int, Meta(ge=1, le=MAX_BEAMS)] = 1
+    view_rad: Annotated[float, from_zero(6.2832, "rad")] = 0.0  # from the first beam, on the right, to the last one
+    range_min_m: Annotated[float, from_zero(1000, "m")] = 0.02
+    range_max_m: Annotated[float, above(1000, "m")] = 5.0
+
+    def __post_init__(self) -> None:
+        """Raises ValueError, which the file reader explains."""
+        _check_range(self.range_min_m, self.range_max_m)
+        if (self.beams > 1) != (self.view_rad > 0):
+            raise ValueError(
+                f"{self.beams} beams over {self.view_rad:g} rad: one beam has `view_rad` = 0, several have more"
+            )
+
+
+def _check_range(least_m: float, most_m: float) -> None:
+    if least_m >= most_m:
+        raise ValueError(f"`range_min_m` = {least_m:g} m must be below `range_max_m` = {most_m:g} m")
+
+
+AnySensor = ContactSensor | ImuSensor | PoseSensor | PowerSensor | DepthCamera | RangeSensor
+
+
+class Sensors(FileStruct, frozen=True, kw_only=True):
+    """The sensors of the robot; without its section a sensor is absent."""
+
+    joints: JointSensor = JointSensor()
+    contacts: ContactSensor | None = None
+    imu: ImuSensor | None = None
+    pose: PoseSensor | None = None
+    power: PowerSensor | None = None
+    depth: Annotated[list[DepthCamera], Meta(max_length=MAX_MOUNTED)] = []
+    range: Annotated[list[RangeSensor], Meta(max_length=MAX_MOUNTED)] = []
+
+    def __post_init__(self) -> None:
+        """Names must tell sensors apart. Raises ValueError, which the file reader explains."""
+        for kind, sensors in (("depth", self.depth), ("range", self.range)):
+            names = [sensor.name for sensor in sensors]
+            for name in names:
+                if names.count(name) > 1:
+                    raise ValueError(f"two entries of [[sensors.{kind}]] have the name {name!r}; give each its own")
+
+    def published(self) -> Iterator[tuple[str, AnySensor]]:
+        """Every sensor but the joints, with its key."""
+        for key, sensor in (
+            (keys.CONTACTS, self.contacts),
+            (keys.IMU, self.imu),
+            (keys.POSE, self.pose),
+            (keys.POWER, self.power),
+        ):
+            if sensor is not None:
+                yield key, sensor
+        yield from self.mounted()
+
+    def mounted(self) -> Iterator[tuple[str, DepthCamera | RangeSensor]]:
+        """The sensors that look around, with their keys. A camera with colour is there twice."""
+        for camera in self.depth:
+            yield keys.depth(camera.name), camera
+            if camera.colour:
+                yield keys.colour(camera.name), camera
+        for sensor in self.range:
+            yield keys.ranges(sensor.name), sensor
+
+    @property
+    def largest_image_bytes(self) -> int:
+        """Of the pixels of the largest image; 0 without cameras."""
+        return max((camera.width * camera.height * (3 if camera.colour else 2) for camera in self.depth), default=0)

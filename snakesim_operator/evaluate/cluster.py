@@ -1,0 +1,87 @@
+"""Workers of Dask: processes on this computer, or a lab's cluster, to which the same cases are sent."""
+
+import logging
+import os
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+
+import dask.config
+from distributed import Client, Future, LocalCluster, as_completed
+from distributed.scheduler import KilledWorker
+
+from snakesim_hal.errors import ConfigError, NotConnectedError
+from snakesim_hal.model.files import short
+from snakesim_operator.evaluate.case import Case, Outcome, code_digest, run_case
+
+DEATHS, RETRIES = 4, 2  # of the workers that run a case, and of the case, until it is given up
+MEET_S = 20.0
+LOOPBACK = "127.0.0.1"
+
+
+@contextmanager
+def workers(cluster: str | None, count: int | None = None, *, dashboard: bool = False) -> Iterator[Client]:
+    """Connect to a cluster, or start one here: a process a core, reachable from this computer only.
+
+    Raises NotConnectedError when nobody answers, ConfigError for what is no address.
+    """
+    with ExitStack() as opened:
+        if cluster is not None:
+            yield opened.enter_context(_remote(cluster))
+            return
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)
+        settings = {"distributed.scheduler.allowed-failures": DEATHS, "distributed.comm.timeouts.connect": "60s"}
+        opened.enter_context(dask.config.set(settings))
+        here = LocalCluster(
+            n_workers=count or len(os.sched_getaffinity(0)),
+            threads_per_worker=1,
+            host=LOOPBACK,
+            dashboard_address=f"{LOOPBACK}:8787" if dashboard else f"{LOOPBACK}:0",
+            worker_dashboard_address=f"{LOOPBACK}:0",
+            silence_logs=logging.CRITICAL,
+            preload=["snakesim_operator.evaluate.worker"],
+        )
+        opened.enter_context(here)
+        yield opened.enter_context(Client(here, set_as_default=False))
+
+
+@contextmanager
+def _remote(address: str) -> Iterator[Client]:
+    if not re.fullmatch(r"(tcp|tls)://[^\s/]+:\d{1,5}", address):
+        raise ConfigError(f"--cluster {short(address)}: give the scheduler as tcp://HOST:PORT")
+    try:
+        client = Client(address, timeout=MEET_S, set_as_default=False)
+    except (OSError, TimeoutError):
+        raise NotConnectedError(f"--cluster {address}: no Dask scheduler answers within {MEET_S:g} s") from None
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=MEET_S)
+        except TimeoutError:
+            raise NotConnectedError(
+                f"--cluster {address}: no worker within {MEET_S:g} s; start some: dask worker {address} --nthreads 1"
+            ) from None
+        yield client
+
+
+def size(client: Client) -> int:
+    """How many workers there are now."""
+    return max(len(client.scheduler_info(n_workers=-1)["workers"]), 1)
+
+
+def solve(client: Client, cases: Sequence[Case]) -> Iterator[tuple[Case, Outcome]]:
+    """Run all cases; each with its outcome as it is done, in any order. No two may have one id."""
+    submitted = {
+        client.submit(run_case, case.config, code_digest(), key=case.id, retries=RETRIES): case for case in cases
+    }
+    for future in as_completed(submitted, loop=client.loop):
+        yield submitted[future], _outcome(future)
+        future.release()
+
+
+def _outcome(future: Future) -> Outcome:
+    try:
+        return future.result()
+    except KilledWorker:
+        return Outcome(error=f"its worker process died, {DEATHS + 1} times; its memory may not suffice")
+    except Exception as error:  # noqa: BLE001 - whatever a controller raised; the other cases go on
+        return Outcome(error=f"{type(error).__name__}: {error}"[:300])

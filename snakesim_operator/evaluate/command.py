@@ -1,0 +1,160 @@
+"""Arguments of `snakesim evaluate`, `sweep` and `optimise`. Importable without the extra that they need."""
+
+import argparse
+import shlex
+import sys
+from pathlib import Path
+from typing import Any
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.scenario import parse_set
+
+EXTRA = ("distributed", "optuna", "pyarrow")
+
+
+def add_commands(commands: Any) -> None:
+    """Add the three to the parser of `snakesim`."""
+    tried = commands.add_parser(
+        "evaluate",
+        help="run controllers on many fields; a table with confidence intervals, and a page",
+        epilog="Exit code: 0 all cases ran, whatever came of them; 1 some could not; 2 wrong input, nothing was run.",
+    )
+    tried.add_argument("suite", help="name of a shipped suite, or path of a suite file")
+    tried.add_argument("--controllers", metavar="A,B,...", help="installed controllers, or ./file.py:Class")
+    tried.add_argument("--fields", type=_count, metavar="N", help="fields for each row and controller")
+    tried.add_argument("--only", metavar="CONTROLLER:FIELD[:ROW]", help="run one case, with its folder and report")
+    _add_shared(tried)
+    tried.set_defaults(act=_evaluate)
+
+    swept = commands.add_parser("sweep", help="run a scenario with different values of any setting")
+    swept.add_argument("scenario", help="name of a shipped scenario, or path of a scenario file")
+    swept.add_argument(
+        "--vary", action="append", required=True, metavar="KEY=LOW:HIGH:COUNT", help="or KEY=[A, B]; may be repeated"
+    )
+    swept.add_argument("--seeds", type=_count, default=1, metavar="N", help="runs for each value (1)")
+    swept.add_argument("--only", metavar="CONTROLLER:FIELD[:ROW]", help="run one case, with its folder and report")
+    _add_set(swept)
+    _add_shared(swept)
+    swept.set_defaults(act=_sweep)
+
+    searched = commands.add_parser("optimise", help="search settings for the best mean of a number of the summary")
+    searched.add_argument("scenario", help="name of a shipped scenario, or path of a scenario file")
+    searched.add_argument("--vary", action="append", required=True, metavar="KEY=LOW:HIGH", help="may be repeated")
+    searched.add_argument("--goal", required=True, metavar="NAME", help="such as path_distance_m or energy_j_per_m")
+    searched.add_argument("--minimise", action="store_true", help="search the smallest instead of the largest")
+    searched.add_argument("--trials", type=_count, default=50, metavar="N", help="in the file at the end (50)")
+    searched.add_argument("--seeds", type=_count, default=1, metavar="N", help="runs for each trial (1)")
+    searched.add_argument("--storage", type=Path, required=True, metavar="FILE", help="SQLite file; an old one goes on")
+    _add_set(searched)
+    _add_workers(searched)
+    searched.set_defaults(act=_optimise)
+
+
+def _add_set(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="in all runs; may be repeated")
+
+
+def _add_shared(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the results (default: runs/NAME-TIME)")
+    parser.add_argument("--resume", action="store_true", help="go on with what is in --out")
+    parser.add_argument(
+        "--dashboard", action="store_true", help="Dask's dashboard on 127.0.0.1:8787, if bokeh is there"
+    )
+    _add_workers(parser)
+
+
+def _add_workers(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--seed", type=int, default=1, metavar="S", help="the first field; the next is S + 1 (1)")
+    parser.add_argument(
+        "--cluster", metavar="tcp://HOST:PORT", help="scheduler of a Dask cluster (default: this computer)"
+    )
+    parser.add_argument("--workers", type=_count, metavar="N", help="processes on this computer (one a core)")
+
+
+def _evaluate(arguments: argparse.Namespace) -> int:
+    _check_extra()
+    from snakesim_operator.evaluate.evaluation import Request
+    from snakesim_operator.evaluate.suite import read_suite
+
+    suite, source = read_suite(arguments.suite)
+    controllers = [name.strip() for name in (arguments.controllers or "").split(",") if name.strip()]
+    again = ["evaluate", arguments.suite]
+    again += ["--controllers", ",".join(controllers)] if controllers else []
+    again += ["--fields", str(arguments.fields)] if arguments.fields else []
+    return _go(
+        arguments,
+        lambda shared: Request(
+            suite, source, Path(arguments.suite).stem, shared.pop("again"), controllers, arguments.fields, **shared
+        ),
+        again,
+    )
+
+
+def _sweep(arguments: argparse.Namespace) -> int:
+    _check_extra()
+    from snakesim_operator.evaluate.evaluation import Request
+    from snakesim_operator.evaluate.suite import Suite, parse_vary
+
+    always = {override.key: override.value for override in map(parse_set, arguments.set)}
+    suite = Suite(
+        title=f"{Path(arguments.scenario).stem}: {', '.join(arguments.vary)}"[:200],
+        scenario=arguments.scenario,
+        fields=arguments.seeds,
+        set=always,
+        vary=dict(map(parse_vary, arguments.vary)),
+    )
+    again = ["sweep", arguments.scenario, "--seeds", str(arguments.seeds)]
+    for flag, values in (("--vary", arguments.vary), ("--set", arguments.set)):
+        again += [word for value in values for word in (flag, value)]
+    return _go(arguments, lambda shared: Request(suite, "sweep", "sweep", shared.pop("again"), **shared), again)
+
+
+def _go(arguments: argparse.Namespace, request: Any, again: list[str]) -> int:
+    from snakesim_operator.evaluate.evaluation import evaluate, run_one
+
+    shared = {name: getattr(arguments, name) for name in ("seed", "out", "resume", "cluster", "workers", "dashboard")}
+    shared["again"] = shlex.join(["snakesim", *again, "--seed", str(arguments.seed)])
+    asked = request(shared)
+    return run_one(asked, arguments.only) if arguments.only else evaluate(asked)
+
+
+def _optimise(arguments: argparse.Namespace) -> int:
+    _check_extra()
+    from snakesim_operator.evaluate.optimise import Request, optimise
+
+    vary: dict[str, str] = {}
+    for text in arguments.vary:
+        key, _, span = text.partition("=")
+        vary[key.strip()] = span.strip()
+    return optimise(
+        Request(
+            scenario=arguments.scenario,
+            vary=vary,
+            set={override.key: override.value for override in map(parse_set, arguments.set)},
+            goal=arguments.goal,
+            minimise=arguments.minimise,
+            trials=arguments.trials,
+            fields=arguments.seeds,
+            seed=arguments.seed,
+            storage=arguments.storage,
+            cluster=arguments.cluster,
+            workers=arguments.workers,
+        )
+    )
+
+
+def _check_extra() -> None:
+    from importlib.util import find_spec
+
+    missing = [name for name in EXTRA if find_spec(name) is None]
+    if missing:
+        raise ConfigError(
+            f"this command needs {', '.join(missing)}, which a plain install leaves out; install it with: "
+            f"{sys.executable} -m pip install 'snakesim[evaluate]'"
+        )
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or not 1 <= int(text) <= 100_000:
+        raise argparse.ArgumentTypeError(f"{text[:40]!r}: give a whole number from 1 to 100000")
+    return int(text)

@@ -1,0 +1,122 @@
+"""Runs the cases of a suite, keeps what is done, prints the table and draws the page."""
+
+import re
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.files import short
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.model.textfiles import write_text
+from snakesim_hal.terminal import say
+from snakesim_operator.evaluate import store
+from snakesim_operator.evaluate.case import Case
+from snakesim_operator.evaluate.cluster import size, solve, workers
+from snakesim_operator.evaluate.page import page
+from snakesim_operator.evaluate.progress import Progress
+from snakesim_operator.evaluate.suite import Suite, cases_of
+from snakesim_operator.evaluate.table import best_of, lines_of, table, worst
+from snakesim_operator.run.folder import named_after
+from snakesim_operator.run.in_process import run_in_process
+
+PAGE = "evaluation.html"
+
+
+@dataclass(frozen=True)
+class Request:
+    """What the command line asks for."""
+
+    suite: Suite
+    source: str  # the suite's file, or the command that stands for one
+    name: str
+    again: str  # the command without its options for folder and cluster
+    controllers: Sequence[str] = ()
+    fields: int | None = None
+    seed: int = 1
+    out: Path | None = None
+    resume: bool = False
+    cluster: str | None = None
+    workers: int | None = None
+    dashboard: bool = False
+
+
+def evaluate(request: Request) -> int:
+    """Run all cases that are not done yet. Returns 0, or 1 when a case could not run at all."""
+    if request.resume and request.out is None:
+        raise ConfigError("--resume: name the folder of the evaluation with --out")
+    cases = _cases(request)
+    out = request.out or named_after(request.name)
+    with store.opened(out, resume=request.resume) as kept:
+        todo = list({case.id: case for case in cases if case.id not in kept.done}.values())
+        if request.resume:
+            say(f"{len(cases) - len(todo)} of {len(cases)} cases are done already")
+        if todo:
+            _run(request, todo, kept, out)
+        _finish(request, cases, kept.done, out)
+        return 1 if any(kept.done[case.id].error is not None for case in cases) else 0
+
+
+def run_one(request: Request, only: str) -> int:
+    """One case again, in this process, with the whole folder of a run. Exit code: of `snakesim run`."""
+    case = choose(request.suite, request.source, only)
+    say(f"{case.setting}, {case.controller}, field {case.field}")
+    return run_in_process(msgspec.json.decode(case.config, type=RunConfig), request.out, until_goal=True)
+
+
+def choose(suite: Suite, source: str, only: str) -> Case:
+    """The case of CONTROLLER:FIELD:ROW, or of CONTROLLER:FIELD if there is one row. Raises ConfigError."""
+    named = re.fullmatch(r"(?P<controller>.+?):(?P<field>\d{1,10})(:(?P<row>\d{1,6}))?", only)
+    if named is None:
+        raise ConfigError(f"--only {short(only)}: give CONTROLLER:FIELD or CONTROLLER:FIELD:ROW, such as hold:3:1")
+    cases = cases_of(suite, source, [named["controller"]], 1, int(named["field"]))
+    fitting = [case for case in cases if named["row"] is None or case.row == int(named["row"])]
+    if len(fitting) == 1:
+        return fitting[0]
+    rows = ", ".join(f"{case.row} ({case.setting})" for case in cases[:12])
+    raise ConfigError(f"--only {only}: add one of the rows, as in {name_of(cases[0])}; there are {rows}")
+
+
+def name_of(case: Case) -> str:
+    """As `--only` takes it."""
+    return f"{case.controller}:{case.field}:{case.row}"
+
+
+def _cases(request: Request) -> list[Case]:
+    suite, controllers = request.suite, request.controllers or request.suite.controllers
+    return cases_of(suite, request.source, controllers, request.fields or suite.fields, request.seed)
+
+
+def _run(request: Request, todo: Sequence[Case], kept: store.Store, out: Path) -> None:
+    with workers(request.cluster, request.workers, dashboard=request.dashboard) as client, Progress(len(todo)) as shown:
+        where = request.cluster or "on this computer"
+        say(f"{len(todo)} cases on {size(client)} workers, {where}")
+        say(f"results: {out}; if this ends early, --resume --out {out} goes on")
+        for case, outcome in solve(client, todo):
+            kept.add(case, outcome)
+            shown.done(outcome)
+
+
+def _finish(request: Request, cases: Sequence[Case], done: store.Results, out: Path) -> None:
+    lines = lines_of(cases, done)
+    best = best_of(lines)
+    failed = worst([case for case in cases if case.controller == best], done)
+    for text in table(lines):
+        say(text)
+    again = [(f"{case.setting}, {name_of(case)}", why, _command(request, case)) for case, why in failed]
+    if again:
+        say(f"the worst {len(again)} of {best}:" if len(again) > 1 else f"the worst of {best}:")
+    for name, why, command in again:
+        for text in (f"  {name}: {why}", f"    {command}"):
+            say(text)
+    paths = store.write_tables(out, cases, done)
+    write_text(out / PAGE, page(request.suite.title or request.name, request.source, lines, again))
+    for path in (*paths, out / PAGE):
+        say(f"written: {path}")
+
+
+def _command(request: Request, case: Case) -> str:
+    return f"{request.again} --only {shlex.quote(name_of(case))}"

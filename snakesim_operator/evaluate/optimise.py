@@ -1,0 +1,120 @@
+"""`snakesim optimise`: searches settings for the best mean of a number, with Optuna; a file keeps all trials."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import optuna
+from distributed import Client
+from optuna.distributions import BaseDistribution, FloatDistribution, IntDistribution
+from optuna.study import Study
+from optuna.trial import Trial, TrialState
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.terminal import say
+from snakesim_operator.evaluate.case import Case, Outcome
+from snakesim_operator.evaluate.cluster import size, solve, workers
+from snakesim_operator.evaluate.suite import Suite, cases_of
+from snakesim_operator.results.summary import RunSummary
+
+
+@dataclass(frozen=True)
+class Request:
+    """What the command line asks for."""
+
+    scenario: str
+    vary: dict[str, str]  # key: low:high
+    set: dict[str, object]
+    goal: str
+    minimise: bool
+    trials: int
+    fields: int
+    seed: int
+    storage: Path
+    cluster: str | None = None
+    workers: int | None = None
+
+
+def optimise(request: Request) -> int:
+    """Go on until so many trials have a result, or have been tried. Returns 0, or 1 when none has a result."""
+    space: dict[str, BaseDistribution] = {key: _span(key, given) for key, given in request.vary.items()}
+    if request.goal not in RunSummary.__struct_fields__:
+        raise ConfigError(f"--goal {request.goal}: no number of a summary, such as path_distance_m or advance_m_s")
+    for end in ("low", "high"):  # before anything is started
+        _cases(request, {key: getattr(one, end) for key, one in space.items()})
+    study = _study(request)
+    have = len(study.get_trials(states=(TrialState.COMPLETE,)))
+    if have:
+        say(f"{request.storage} holds {have} trials already")
+    if left := max(request.trials - have, 0):
+        with workers(request.cluster, request.workers) as client:
+            while left > 0:
+                asked = [study.ask(space) for _ in range(min(left, size(client)))]
+                _trials(request, study, asked, client)
+                left -= len(asked)
+    return _conclude(request, study)
+
+
+def _study(request: Request) -> Study:
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    try:
+        request.storage.parent.mkdir(parents=True, exist_ok=True)
+        study = optuna.create_study(
+            storage=f"sqlite:///{request.storage}",
+            study_name=f"{request.scenario} {request.goal}",
+            direction="minimize" if request.minimise else "maximize",
+            load_if_exists=True,
+        )
+    except Exception as error:  # noqa: BLE001 - of SQLite and SQLAlchemy, for a file of another kind, a folder, a full disk
+        why = str(error).splitlines()[0][:200]
+        raise ConfigError(f"--storage {request.storage}: {why}; choose another file") from None
+    study.sampler = optuna.samplers.TPESampler(seed=request.seed + len(study.trials), constant_liar=True)
+    for trial in study.get_trials(states=(TrialState.RUNNING,)):  # of a process that was killed
+        study.tell(trial.number, state=TrialState.FAIL)
+        study.enqueue_trial(trial.params)
+    return study
+
+
+def _trials(request: Request, study: Study, asked: Sequence[Trial], client: Client) -> None:
+    cases = {trial.number: _cases(request, trial.params) for trial in asked}
+    outcomes: dict[str, Outcome] = {}
+    for case, outcome in solve(client, list({case.id: case for own in cases.values() for case in own}.values())):
+        outcomes[case.id] = outcome
+    for trial in asked:
+        values = [outcomes[case.id].numbers.get(request.goal) for case in cases[trial.number]]
+        known = [float(value) for value in values if isinstance(value, int | float)]
+        words = ", ".join(f"{key} {value:.4g}" for key, value in trial.params.items())
+        if len(known) < len(values):
+            why = next((outcomes[case.id].error for case in cases[trial.number] if outcomes[case.id].error), "unknown")
+            study.tell(trial, state=TrialState.FAIL)
+            say(f"trial {trial.number}: {words}: no {request.goal}: {why}")
+        else:
+            study.tell(trial, float(np.mean(known)))
+            say(f"trial {trial.number}: {words}: {np.mean(known):.4g}")
+
+
+def _conclude(request: Request, study: Study) -> int:
+    if not study.get_trials(states=(TrialState.COMPLETE,)):
+        say(f"no trial had a {request.goal}")
+        return 1
+    best = study.best_trial
+    say(f"best {request.goal}: {best.value:.4g}, trial {best.number}")
+    flags = " ".join(f"--set {key}={value:.6g}" for key, value in best.params.items())
+    say(f"  snakesim run {request.scenario} {flags}")
+    return 0
+
+
+def _cases(request: Request, params: dict[str, object]) -> list[Case]:
+    suite = Suite(scenario=request.scenario, set={**request.set, **params})
+    return cases_of(suite, "optimise", [], request.fields, request.seed)
+
+
+def _span(key: str, given: str) -> FloatDistribution | IntDistribution:
+    """low:high; whole numbers where both are."""
+    try:
+        low, high = given.split(":")
+        whole = low.strip("-").isdecimal() and high.strip("-").isdecimal()
+        return IntDistribution(int(low), int(high)) if whole else FloatDistribution(float(low), float(high))
+    except ValueError:
+        raise ConfigError(f"--vary {key}={given}: give low:high, such as {key}=0.05:0.2") from None

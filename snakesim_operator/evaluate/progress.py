@@ -1,0 +1,56 @@
+"""The progress line of an evaluation, with the remaining time: rewritten in place on a terminal."""
+
+import sys
+import time
+from types import TracebackType
+from typing import Self
+
+from snakesim_hal.terminal import say, say_again
+from snakesim_operator.evaluate.case import Outcome
+
+PLAIN_PERIOD_S = 10.0
+
+
+class Progress:
+    """Counts what is done."""
+
+    def __init__(self, total: int) -> None:
+        self._total = total
+        self._done = self._crossed = self._errors = self._shown = 0
+        self._began = time.monotonic()
+        self._next = self._began + PLAIN_PERIOD_S
+        self._terminal = sys.stdout.isatty()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._shown:
+            say("")
+
+    def done(self, outcome: Outcome) -> None:
+        """One more."""
+        self._done += 1
+        self._crossed += outcome.numbers.get("crossed") is True
+        self._errors += outcome.error is not None
+        now = time.monotonic()
+        if self._terminal:
+            self._shown = say_again(self._text(now), 118, self._shown)
+        elif now >= self._next or self._done == self._total:
+            self._next = now + PLAIN_PERIOD_S
+            say(self._text(now))
+
+    def _text(self, now: float) -> str:
+        passed_s = now - self._began
+        left_s = passed_s / self._done * (self._total - self._done)
+        parts = [f"{self._done} of {self._total} cases", f"{self._crossed} crossed"]
+        if self._errors:
+            parts.append(f"{self._errors} could not run")
+        return "  ".join([*parts, f"{_clock(passed_s)} passed, about {_clock(left_s)} left"])
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}" if minutes >= 60 else f"{minutes}:{rest:02d}"

@@ -1,0 +1,146 @@
+"""The table of an evaluation: for each setting and controller, how many fields were crossed, and how."""
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from snakesim_operator.evaluate.case import Case, Outcome
+from snakesim_operator.evaluate.store import Results
+
+Z95 = 1.959964
+UNKNOWN = "–"
+HEAD = ("setting", "controller", "crossed", "95 %", "m", "m/s", "J/m", "stood s", "time s", "errors")
+WORST = 5
+
+
+@dataclass(frozen=True)
+class Line:
+    """One setting with one controller."""
+
+    row: int
+    setting: str
+    controller: str
+    value: float | None  # of the setting, where that is one number
+    outcomes: list[Outcome]
+
+    @property
+    def runs(self) -> int:
+        """With those that could not begin."""
+        return len(self.outcomes)
+
+    @property
+    def errors(self) -> int:
+        """Cases without a run."""
+        return sum(one.error is not None for one in self.outcomes)
+
+    @property
+    def crossed(self) -> int | None:
+        """Of all runs, also those that could not begin; None when they had no goal."""
+        told = [one.numbers.get("crossed") for one in self.outcomes if one.error is None]
+        return None if told and all(one is None for one in told) else sum(one is True for one in told)
+
+    def values(self, name: str, *, of_crossed: bool = False) -> list[float]:
+        """The known values of one number; of_crossed: of the runs that reached their goal, where there is one."""
+        chosen = [one for one in self.outcomes if not of_crossed or one.numbers.get("crossed") in (True, None)]
+        found = [one.numbers.get(name) for one in chosen]
+        return [float(value) for value in found if isinstance(value, int | float)]
+
+    @property
+    def cells(self) -> list[str]:
+        """As in the table, below HEAD."""
+        crossed = self.crossed
+        low, high = wilson(crossed or 0, self.runs)
+        return [
+            self.setting,
+            self.controller,
+            UNKNOWN if crossed is None else f"{crossed}/{self.runs}",
+            UNKNOWN if crossed is None else f"{100 * low:.0f}-{100 * high:.0f}",
+            _median(self.values("advance_m"), 2),
+            _median(self.values("advance_m_s", of_crossed=True), 3),
+            _median(self.values("energy_j_per_m", of_crossed=True), 1),
+            _median(self.values("stalled_s"), 1),
+            _median(self.values("crossed_s" if crossed else "duration_s", of_crossed=True), 1),
+            str(self.errors or ""),
+        ]
+
+
+def lines_of(cases: Sequence[Case], done: Results) -> list[Line]:
+    """One for each setting and controller that has results, in the order of the cases."""
+    found: dict[tuple[int, str], Line] = {}
+    for case in cases:
+        if case.id in done:
+            key = (case.row, case.controller)
+            line = found.setdefault(key, Line(case.row, case.setting, case.controller, case.value, []))
+            line.outcomes.append(done[case.id])
+    return list(found.values())
+
+
+def table(lines: Sequence[Line]) -> list[str]:
+    """For a terminal. Speed, energy and time are medians of the runs that crossed, the others of all runs."""
+    rows = [list(HEAD), *(line.cells for line in lines)]
+    keep = [i for i in range(len(HEAD)) if i < 2 or any(row[i].strip(UNKNOWN) for row in rows[1:])]
+    widths = [max(len(row[i]) for row in rows) for i in keep]
+    told: list[str] = []
+    for row in rows:
+        cells = [row[i].ljust(width) if i < 2 else row[i].rjust(width) for i, width in zip(keep, widths, strict=True)]
+        told.append("  ".join(cells).rstrip())
+    return told
+
+
+def best_of(lines: Sequence[Line]) -> str:
+    """The controller that crossed most: its failures are worth a look."""
+    crossed: Counter[str] = Counter()
+    for line in lines:
+        crossed[line.controller] += line.crossed or 0
+    return max(crossed, key=lambda name: crossed[name], default="")
+
+
+def worst(cases: Sequence[Case], done: Results, most: int = WORST) -> list[tuple[Case, str]]:
+    """The cases that came least far, and why they ended, as far as it is known."""
+    failed = [case for case in cases if case.id in done and not _well(done[case.id])]
+    failed.sort(key=lambda case: _share(done[case.id]))
+    return [(case, _why(done[case.id])) for case in failed[:most]]
+
+
+def wilson(successes: int, trials: int) -> tuple[float, float]:
+    """95 % confidence interval of a share (Wilson 1927)."""
+    if trials == 0:
+        return 0.0, 1.0
+    share, z2 = successes / trials, Z95**2 / trials
+    middle = (share + z2 / 2) / (1 + z2)
+    half = Z95 * math.sqrt(share * (1 - share) / trials + z2 / (4 * trials)) / (1 + z2)
+    return max(middle - half, 0.0), min(middle + half, 1.0)
+
+
+def _median(values: list[float], digits: int) -> str:
+    return f"{np.median(values):.{digits}f}" if values else UNKNOWN
+
+
+def _well(outcome: Outcome) -> bool:
+    crossed = outcome.numbers.get("crossed")
+    return outcome.error is None and (
+        crossed is True or (crossed is None and outcome.numbers.get("ended") == "complete")
+    )
+
+
+def _share(outcome: Outcome) -> float:
+    """Of the way to the goal; without a run less than nothing."""
+    way, goal = outcome.numbers.get("advance_m"), outcome.numbers.get("goal_m")
+    if outcome.error is not None or not isinstance(way, float):
+        return -1.0
+    return way / goal if isinstance(goal, float) and goal > 0 else way
+
+
+def _why(outcome: Outcome) -> str:
+    if outcome.error is not None:
+        return outcome.error
+    told = outcome.numbers
+    way, goal = told.get("advance_m"), told.get("goal_m")
+    far = f"{way:.2f} m" if isinstance(way, float) else "unknown"
+    of = f" of {goal:g} m" if isinstance(goal, float) else ""
+    last = f"{told.get('last_state')}: {told.get('last_reason')}" if told.get("last_reason") else told.get("last_state")
+    ended = "" if told.get("ended") == "complete" else f"; {told.get('ended')}"
+    return f"{far}{of}; {last or 'controller said nothing'}{ended}"

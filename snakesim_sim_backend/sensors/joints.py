@@ -1,0 +1,50 @@
+"""Angle, velocity and torque of every joint."""
+
+from collections import deque
+
+import mujoco
+import numpy as np
+
+from snakesim_hal.model.sensors import JointSensor
+from snakesim_hal.wire.messages import JointState
+from snakesim_sim_backend.actuators import Motors
+from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS
+from snakesim_sim_backend.sensors.scope import Normal
+from snakesim_sim_backend.sensors.timing import ticks_of
+
+
+class JointReader:
+    """Angle, velocity and torque of every joint, every tick.
+
+    A delayed reading has the stamp of its tick, and its age is the delay. Until the first one has arrived the
+    reading of the start is used.
+    """
+
+    def __init__(self, data: mujoco.MjData, sensor: JointSensor, motors: Motors, noise: Normal, period_ns: int) -> None:
+        count = motors.count
+        self._count = count
+        self._angles, self._velocities = data.qpos[FREE_QPOS:], data.qvel[FREE_DOFS:]
+        self._torques = motors.applied_nm()
+        sigma = [sensor.angle_noise_rad, sensor.velocity_noise_rad_s, sensor.torque_noise_nm]
+        self._sigma = np.repeat(sigma, count)
+        self._noise = noise if any(sigma) else None
+        self._all_valid = [True] * count
+        self._under_way: deque[tuple[int, list[float]]] = deque(maxlen=1 + ticks_of(sensor.delay_s, period_ns))
+
+    def read(self, tick: int, stamp_ns: int) -> JointState:
+        """The reading that arrives at this tick."""
+        values = np.concatenate((self._angles, self._velocities, self._torques))
+        count = self._count
+        if self._noise is not None:
+            values += self._sigma * self._noise(3 * count)
+        self._under_way.append((stamp_ns, values.tolist()))
+        taken_ns, numbers = self._under_way[0]
+        return JointState(
+            tick=tick,
+            stamp_ns=stamp_ns,
+            angle_rad=numbers[:count],
+            velocity_rad_s=numbers[count : 2 * count],
+            torque_nm=numbers[2 * count :],
+            valid=self._all_valid,
+            age_ns=[stamp_ns - taken_ns] * count,
+        )

@@ -1,0 +1,34 @@
+"""Where a sensor sits on its link."""
+
+import math
+
+from snakesim_hal.model.kinematics import rotation_from_quaternion
+from snakesim_hal.model.sensors import Mounted
+from snakesim_hal.wire.quantities import Quaternion, Vector
+from snakesim_sim_backend.sensors.scope import Floats, Scope
+
+
+class Mount:
+    """The fixed place of a sensor on a link, and its place in the world as the link moves."""
+
+    def __init__(self, sensor: Mounted, scope: Scope) -> None:
+        robot = scope.config.robot
+        self.link = robot.link_index(sensor.link)
+        self.body = scope.sim.first_link_body + self.link
+        nose_m = robot.link_lengths_m[self.link] + robot.module.radius_m
+        self.position_l: Vector = sensor.position_m or (nose_m, 0.0, 0.0)
+        self.orientation_l_wxyz = _turned(sensor.yaw_rad, sensor.pitch_rad)
+        self.link_from_sensor: Floats = rotation_from_quaternion(self.orientation_l_wxyz)
+        self._origin, self._rotation = scope.data.xpos[self.body], scope.data.xmat[self.body]
+
+    def place(self) -> tuple[Floats, Floats]:
+        """Position of the sensor, (3,), and world_from_sensor, (3, 3)."""
+        rotation = self._rotation.reshape(3, 3)
+        return self._origin + rotation @ self.position_l, rotation @ self.link_from_sensor
+
+
+def _turned(yaw_rad: float, pitch_rad: float) -> Quaternion:
+    """Yaw about z, then pitch about the new y."""
+    cy, sy = math.cos(yaw_rad / 2), math.sin(yaw_rad / 2)
+    cp, sp = math.cos(pitch_rad / 2), math.sin(pitch_rad / 2)
+    return (cy * cp, -sy * sp, cy * sp, sy * cp)

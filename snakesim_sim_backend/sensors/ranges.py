@@ -1,0 +1,48 @@
+"""A 2-D lidar, or with one beam a range finder, by ray casting."""
+
+import numpy as np
+
+from snakesim_hal.model.sensors import RangeSensor
+from snakesim_hal.wire.messages import Ranges
+from snakesim_sim_backend.sensors.mount import Mount
+from snakesim_sim_backend.sensors.rays import Rays
+from snakesim_sim_backend.sensors.scope import NoSettings, Scope
+
+
+class RayBeams:
+    """Distances along beams without width, all measured at once."""
+
+    Settings, message = NoSettings, Ranges
+
+    def __init__(self, sensor: RangeSensor, scope: Scope, _settings: NoSettings) -> None:
+        self._sensor, self._noise = sensor, scope.noise
+        self._mount = Mount(sensor, scope)
+        self._first_rad = -sensor.view_rad / 2
+        self._step_rad = sensor.view_rad / max(sensor.beams - 1, 1)
+        angles = self._first_rad + self._step_rad * np.arange(sensor.beams)
+        rays_s = np.stack([np.cos(angles), np.sin(angles), np.zeros(sensor.beams)], -1)
+        self._rays = Rays(self._mount, scope, rays_s, sensor.range_max_m)
+
+    def read(self, tick: int, stamp_ns: int) -> Ranges:
+        """A scan from where the link is now."""
+        sensor = self._sensor
+        found_m = self._rays.cast()
+        seen = (found_m >= sensor.range_min_m) & (found_m <= sensor.range_max_m)
+        if sensor.noise_m:
+            found_m = np.maximum(found_m + sensor.noise_m * self._noise.standard_normal(sensor.beams), 0.0)
+        if sensor.dropout:
+            seen &= self._noise.random(sensor.beams) >= sensor.dropout
+        return Ranges(
+            tick=tick,
+            stamp_ns=stamp_ns,
+            link=self._mount.link,
+            position_l=self._mount.position_l,
+            orientation_l_wxyz=self._mount.orientation_l_wxyz,
+            angle_min_rad=self._first_rad,
+            angle_step_rad=self._step_rad,
+            range_min_m=sensor.range_min_m,
+            range_max_m=sensor.range_max_m,
+            range_m=[
+                distance_m if hit else None for distance_m, hit in zip(found_m.tolist(), seen.tolist(), strict=True)
+            ],
+        )

@@ -1,0 +1,71 @@
+"""Which reader makes which message. A new type of sensor is a file with a reader, and a line here or an entry point.
+
+Sensors that look around may have several models, of which the robot file chooses one: `model = "rays"`, the name of an
+entry point in the group `snakesim.sensors`, or `./sonar.py:Sonar`. See docs/sensors.md.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.plugins import SENSORS, find_installed, find_plugin, plugin_settings
+from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.sensors import DepthCamera, RangeSensor
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import ColourImage, Contacts, DepthImage, Imu, Message, Pose, Power, Ranges
+from snakesim_sim_backend.sensors.contacts import ContactReader
+from snakesim_sim_backend.sensors.depth import RayCamera
+from snakesim_sim_backend.sensors.imu import ImuReader
+from snakesim_sim_backend.sensors.pose import PoseReader
+from snakesim_sim_backend.sensors.power import PowerReader
+from snakesim_sim_backend.sensors.ranges import RayBeams
+from snakesim_sim_backend.sensors.rendered import RenderedColour, RenderedDepth
+from snakesim_sim_backend.sensors.scope import Reader, Scope
+
+WITHIN_TICK: dict[type[Message], Callable[[Any, Scope], Reader]] = {
+    Contacts: lambda sensor, at: ContactReader(at.sim, at.data, sensor, at.noise.standard_normal),
+    Imu: lambda sensor, at: ImuReader(at.data, sensor, at.config.robot.chain.modules + 1, at.noise.standard_normal),
+    Pose: lambda sensor, at: PoseReader(at.data, sensor, at.noise.standard_normal),
+    Power: lambda _, at: PowerReader(at.data, at.motors, at.windings, at.config.robot.limits.torque_nm),
+}
+BESIDE_TICK: dict[tuple[type[Message], str], Any] = {
+    (DepthImage, "rays"): RayCamera,
+    (DepthImage, "rendered"): RenderedDepth,
+    (ColourImage, "rendered"): RenderedColour,
+    (Ranges, "rays"): RayBeams,
+}
+
+
+def check_models(robot: RobotFile) -> None:
+    """Whether all sensors that look around can be made. Runs no file of a plugin. Raises ConfigError."""
+    for key, sensor in robot.sensors.mounted():
+        model, settings = _model(key, sensor, find_installed)
+        if model is not None:
+            _settings_of(model, settings, key, sensor)
+
+
+def mounted_reader(key: str, sensor: DepthCamera | RangeSensor, scope: Scope) -> Reader:
+    """The reader of a sensor that looks around. Raises ConfigError."""
+    model, settings = _model(key, sensor, find_plugin)
+    return model(sensor, scope, _settings_of(model, settings, key, sensor))
+
+
+def _model(key: str, sensor: DepthCamera | RangeSensor, find: Callable[[str, str], Any]) -> tuple[Any, dict[str, Any]]:
+    """Its class, and its settings as the file has them."""
+    message = keys.message_at(key)
+    if message is ColourImage:
+        return RenderedColour, {}
+    assert message is not None
+    own = BESIDE_TICK.get((message, sensor.model))
+    return own or find(SENSORS, sensor.model), sensor.settings
+
+
+def _settings_of(model: Any, settings: dict[str, Any], key: str, sensor: DepthCamera | RangeSensor) -> Any:
+    message = keys.message_at(key)
+    if getattr(model, "message", None) is not message:
+        wanted = "DepthImage" if message is DepthImage else "Ranges"
+        raise ConfigError(
+            f"sensor {sensor.name!r}: model {sensor.model!r} does not make a {wanted}, which is what {key} carries; "
+            f"its class says in `message` what it makes"
+        )
+    return plugin_settings(model, settings, f"sensor {sensor.name!r} of the robot file", "settings")

@@ -1,0 +1,43 @@
+"""What a sensor's reader gets, and what it must do."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_hal.model.files import FileStruct
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.model.thermal import Thermal
+from snakesim_hal.wire.messages import Message
+from snakesim_sim_backend.actuators import Motors
+from snakesim_sim_backend.model import SimModel
+
+Floats = NDArray[np.float64]
+Normal = Callable[[int], Floats]  # n -> (n,) standard normal numbers
+
+
+@dataclass(frozen=True)
+class Scope:
+    """The simulation, as sensors see it."""
+
+    config: RunConfig
+    sim: SimModel
+    data: mujoco.MjData  # a sensor that looks around gets a copy of its own, with the places of all bodies and no more
+    noise: np.random.Generator
+    motors: Motors
+    windings: Thermal
+
+
+class Reader(Protocol):
+    """Makes the samples of one sensor."""
+
+    def read(self, tick: int, stamp_ns: int) -> Message:
+        """The sample of this tick, without rate and delay."""
+        ...
+
+
+class NoSettings(FileStruct, frozen=True):
+    """For a model of a sensor that has none."""

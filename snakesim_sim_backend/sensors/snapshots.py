@@ -1,0 +1,45 @@
+"""A thread that looks: it makes the samples of cameras and lidars from copies of the state, beside the ticks."""
+
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TypeVar
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_hal.wire.messages import Message
+
+ResultT = TypeVar("ResultT")
+
+
+class Snapshots:
+    """One thread, and the state that it works on."""
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        """The thread is started here: one that a host starts later would have the host's real-time priority."""
+        self.data = mujoco.MjData(model)
+        self._model = model
+        self._thread = ThreadPoolExecutor(1, "sensors")
+        self.do(lambda: None)
+
+    def do(self, work: Callable[[], ResultT]) -> ResultT:
+        """Have the thread do something, and wait for it. What belongs to OpenGL must all be done in one thread."""
+        return self._thread.submit(work).result()
+
+    def begin(
+        self, read: Callable[[int, int], Message], tick: int, stamp_ns: int, qpos: NDArray[np.float64]
+    ) -> Future[Message]:
+        """Make a sample of the state `qpos`, which is copied, in the order of these calls."""
+        return self._thread.submit(self._read, read, tick, stamp_ns, qpos.copy())
+
+    def close(self) -> None:
+        """Begin nothing more."""
+        self._thread.shutdown(wait=True, cancel_futures=True)
+
+    def _read(
+        self, read: Callable[[int, int], Message], tick: int, stamp_ns: int, qpos: NDArray[np.float64]
+    ) -> Message:
+        self.data.qpos[:] = qpos
+        mujoco.mj_kinematics(self._model, self.data)
+        return read(tick, stamp_ns)

@@ -1,0 +1,209 @@
+"""Evaluations in real worker processes: the same table however often, wherever, and whatever was killed on the way."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from snakesim_hal.host.recorder import HOST_RECORD
+from snakesim_operator.results.record import REPORT
+from tests.e2e.command import SNAKESIM, Ended, environment, free_endpoint, snakesim, wait_until
+
+pytestmark = pytest.mark.e2e
+
+SUITE = """
+title = "A quick one"
+scenario = "peg_row"
+controllers = ["path_following", "hold"]
+fields = 2
+
+[set]
+duration_s = 0.6
+mission.goal = { kind = "heading", distance_m = 0.06 }
+
+[vary]
+"scene.ground.friction" = [0.1, 0.2]
+"""
+CASES = 8
+TABLES = ("results.csv", "results.parquet", "evaluation.html")
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("evaluate")
+    (folder / "quick.toml").write_text(SUITE)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def undisturbed(home: Path) -> tuple[Ended, Path]:
+    """An evaluation to compare others with."""
+    ended = evaluate(home, "undisturbed", "--workers", "2")
+    assert ended.code == 0 and not ended.err, ended.out + ended.err
+    return ended, home / "undisturbed"
+
+
+def evaluate(home: Path, out: str, *arguments: str) -> Ended:
+    return snakesim("evaluate", "./quick.toml", "--out", out, *arguments, cwd=home)
+
+
+def table_of(ended: Ended) -> str:
+    return ended.out[ended.out.index("setting ") : ended.out.index("written:")]
+
+
+def done(out: Path) -> int:
+    path = out / "cases.jsonl"
+    return path.read_bytes().count(b"\n") if path.is_file() else 0
+
+
+def children(pid: int) -> list[int]:
+    told = Path(f"/proc/{pid}/task").glob("*/children")
+    return [int(child) for path in told for child in path.read_text().split()]
+
+
+def lives(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def listening(pids: list[int]) -> set[str]:
+    """Addresses on which processes take connections, as the kernel writes them."""
+    own = {str(fd.readlink()) for pid in pids for fd in Path(f"/proc/{pid}/fd").iterdir() if fd.is_symlink()}
+    found: set[str] = set()
+    for table in ("tcp", "tcp6"):
+        for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
+            fields = line.split()
+            if fields[3] == "0A" and f"socket:[{fields[9]}]" in own:
+                found.add(fields[1].partition(":")[0])
+    return found
+
+
+@contextmanager
+def background(*command: str, home: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """A command in a process of its own, killed at the end if it is still there."""
+    process = subprocess.Popen(
+        command, cwd=home, env=environment(home), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait(10)
+
+
+def test_the_table_tells_what_was_crossed(undisturbed: tuple[Ended, Path]) -> None:
+    ended, out = undisturbed
+    rows = [line.split() for line in table_of(ended).splitlines()[1:5]]
+    assert [row[2:4] for row in rows] == [["path_following", "2/2"], ["hold", "0/2"]] * 2
+    assert done(out) == CASES and all((out / name).is_file() for name in TABLES)
+
+
+def test_it_can_be_repeated(home: Path, undisturbed: tuple[Ended, Path]) -> None:
+    again = evaluate(home, "again", "--workers", "1")
+    assert table_of(again) == table_of(undisturbed[0])
+    for name in TABLES:
+        assert (home / "again" / name).read_bytes() == (undisturbed[1] / name).read_bytes(), name
+
+
+def test_killed_it_leaves_nobody_behind_and_goes_on(home: Path, undisturbed: tuple[Ended, Path]) -> None:
+    out = home / "killed"
+    command = [*SNAKESIM, "evaluate", "./quick.toml", "--workers", "2", "--out", str(out)]
+    with background(*command, home=home) as process:
+        wait_until(lambda: done(out) >= 2, "two cases done")
+        left = children(process.pid)
+        assert len(left) >= 2
+        assert listening([process.pid, *left]) == {"0100007F"}  # 127.0.0.1
+        os.kill(left[-1], signal.SIGSTOP)  # it cannot see that its parent dies
+    wait_until(lambda: not any(map(lives, left)), "no process left", 10)
+    before = done(out)
+    assert 2 <= before < CASES
+    with (out / "cases.jsonl").open("a") as file:
+        file.write('{"id": "cut')
+    refused = evaluate(home, "killed")
+    assert refused.code == 2 and "--resume" in refused.err
+    ended = evaluate(home, "killed", "--resume")
+    assert f"{before} of {CASES} cases are done already" in ended.out, ended.out + ended.err
+    assert table_of(ended) == table_of(undisturbed[0])
+    for name in TABLES:
+        assert (out / name).read_bytes() == (undisturbed[1] / name).read_bytes(), name
+
+
+def test_a_cluster_that_loses_a_worker_gives_the_same_table(home: Path, undisturbed: tuple[Ended, Path]) -> None:
+    port, out = free_endpoint().rpartition(":")[2], home / "cluster"
+    address = f"tcp://127.0.0.1:{port}"
+    dask = (sys.executable, "-m", "dask")
+    worker = (*dask, "worker", address, "--nthreads", "1", "--no-nanny", "--no-dashboard", "--host", "127.0.0.1")
+    scheduler = (*dask, "scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard")
+    with (
+        background(*scheduler, home=home),
+        background(*worker, home=home) as lost,
+        background(*worker, home=home),
+        background(
+            *(*SNAKESIM, "evaluate", "./quick.toml", "--cluster", address, "--out", str(out)), home=home
+        ) as process,
+    ):
+        wait_until(lambda: done(out) >= 2, "two cases done")
+        lost.kill()
+        assert process.wait(90) == 0
+    for name in TABLES:
+        assert (out / name).read_bytes() == (undisturbed[1] / name).read_bytes(), name
+
+
+def test_one_case_again_as_a_whole_run(home: Path, undisturbed: tuple[Ended, Path]) -> None:
+    ended = evaluate(home, "one", "--only", "path_following:2:2")
+    assert ended.code == 0 and (home / "one" / REPORT).is_file(), ended.out + ended.err
+    digest = json.loads((home / "one" / HOST_RECORD).read_bytes())["command_digest"]
+    rows = [line.split(",") for line in (undisturbed[1] / "results.csv").read_text().splitlines()]
+    names = rows[0]
+    chosen = [row for row in rows if row[0] == "2" and row[2:4] == ["path_following", "2"]]
+    assert [row[names.index("command_digest")] for row in chosen] == [digest]
+    unclear = evaluate(home, "none", "--only", "path_following:2")
+    assert unclear.code == 2 and "path_following:2:1" in unclear.err
+
+
+DEADLY = """
+import os
+from snakesim_gnc.control.hold import Hold
+
+
+class Deadly(Hold):
+    def update(self, view):
+        if view.tick > 20:
+            os._exit(1)
+        return super().update(view)
+"""
+
+
+@pytest.mark.slow
+def test_a_case_that_kills_its_workers_costs_no_other(home: Path, undisturbed: tuple[Ended, Path]) -> None:
+    (home / "deadly.py").write_text(DEADLY)
+    ended = evaluate(home, "deadly", "--controllers", "path_following,./deadly.py:Deadly", "--fields", "1")
+    assert ended.code == 1 and "its worker process died" in ended.out, ended.out + ended.err
+    rows = [line.split() for line in table_of(ended).splitlines()[1:5]]
+    assert [row[3] for row in rows] == ["1/1", "0/1"] * 2
+
+
+def test_a_sweep_runs_every_value(home: Path) -> None:
+    span = "controllers.path_following.look_ahead_m=0.02:0.06:3"
+    given = ["--vary", span, "--set", "duration_s=0.5", "--seeds", "2", "--set", "controller=path_following"]
+    ended = snakesim("sweep", "peg_row", *given, "--out", "sweep", cwd=home)
+    assert ended.code == 0, ended.out + ended.err
+    assert [line.split()[1] for line in table_of(ended).splitlines()[1:4]] == ["0.02", "0.04", "0.06"]
+
+
+def test_a_search_goes_on_where_it_ended(home: Path) -> None:
+    given = ["optimise", "peg_row", "--set", "duration_s=0.5", "--vary", "control.propulsion_n=5:40"]
+    given += ["--goal", "path_distance_m", "--storage", "search.db", "--workers", "2"]
+    first = snakesim(*given, "--trials", "2", cwd=home)
+    assert first.code == 0 and first.out.count("trial ") >= 3, first.out + first.err
+    more = snakesim(*given, "--trials", "4", cwd=home)
+    assert "holds 2 trials already" in more.out and "trial 3:" in more.out, more.out + more.err
+    assert "snakesim run peg_row --set control.propulsion_n=" in more.out

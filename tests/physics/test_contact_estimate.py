@@ -1,0 +1,17 @@
+"""The contact estimate against the simulator's truth, on runs that push off pegs."""
+
+import numpy as np
+import pytest
+
+from benchmarks.contacts import score
+
+
+@pytest.mark.parametrize("scenario", ["triplet", "peg_row"])
+@pytest.mark.parametrize("with_pose", [True, False])
+def test_the_median_error_of_a_push_is_below_15_percent(scenario: str, with_pose: bool) -> None:
+    found = score(scenario, seconds=3.0, with_pose=with_pose)
+    assert len(found.share) > 100
+    assert np.median(found.share) < 0.15
+    assert len(found.place_m) > 0.95 * len(found.share)  # so few are missed
+    assert found.ghosts < 0.1 * len(found.share)
+    assert np.median(found.place_m) < 0.04

@@ -1,0 +1,101 @@
+"""The contact estimate finds pushes that are known, where they are, and none where there are none."""
+
+import numpy as np
+import pytest
+
+from snakesim_gnc.guidance.contact_estimate import FeltContact, G, estimate
+from snakesim_hal.model.kinematics import link_frames
+from snakesim_hal.wire.messages import Imu, Pose
+from tests.unit.gnc.stage import make_robot
+
+ROBOT = make_robot()
+COUNT = len(ROBOT.joints)
+LENGTHS = [link.length_m for link in ROBOT.links]
+STARTS_M = np.append(0.0, np.cumsum(LENGTHS))  # along the body
+MASS_KG = sum(link.mass_kg for link in ROBOT.links)
+SHAPE = 0.35 * np.sin(0.9 * np.arange(COUNT))
+
+
+def readings(pushes, shape=SHAPE, *, friction=0.0, acceleration=(0.0, 0.0)):
+    """Torques and IMU of a body that is pushed as told, (link, side, along_m, force_n) each, and slides along x.
+
+    By d'Alembert: forces, and inertia against the common acceleration, are carried by the joints. Also returns what is
+    left over of force and moment, which is zero if that acceleration is true.
+    """
+    rear, frames = link_frames((0, 0, 0), np.eye(3), shape, ["yaw"] * COUNT, LENGTHS)
+    middles = rear + frames[:, :, 0] * np.array(LENGTHS)[:, None] / 2
+    masses = np.array([link.mass_kg for link in ROBOT.links])
+    loads = [
+        (k, middles[k], masses[k] * (np.array([-friction * G, 0, 0]) - [*acceleration, 0])) for k in range(COUNT + 1)
+    ]
+    for link, side, along_m, force_n in pushes:
+        outward = side * frames[link][:, 1] if side else frames[link][:, 0]
+        point = rear[link] + along_m * frames[link][:, 0] + ROBOT.links[link].radius_m * outward
+        loads.append((link, point, -force_n * outward))
+    torques = [-sum(np.cross(at - rear[i + 1], load)[2] for k, at, load in loads if k > i) for i in range(COUNT)]
+    felt = [tuple(frame.T @ [*acceleration, G]) for frame in frames]
+    still = [(0.0, 0.0, 0.0)] * (COUNT + 1)
+    imu = Imu(tick=0, stamp_ns=0, link=list(range(COUNT + 1)), angular_velocity_rad_s=still, acceleration_m_s2=felt)
+    centre = masses @ middles / masses.sum()
+    turning_nm = sum(np.cross(at - centre, load)[2] for _, at, load in loads)
+    return torques, imu, np.sum([load for _, _, load in loads], axis=0), turning_nm
+
+
+def estimated(torques, imu, shape=SHAPE, pose: Pose | None = None) -> list[FeltContact]:
+    return estimate(ROBOT, shape.tolist(), [0.0] * COUNT, torques, imu, pose)
+
+
+def test_nothing_is_felt_where_nothing_pushes():
+    torques, imu, *_ = readings([])
+    assert estimated(torques, imu) == []
+
+
+def test_friction_of_the_ground_is_no_contact():
+    pose = Pose(
+        tick=0,
+        stamp_ns=0,
+        position_w=(0, 0, 0),
+        orientation_wxyz=(1, 0, 0, 0),
+        velocity_w=(0.3, 0.0, 0.0),
+        angular_velocity_w=(0, 0, 0),
+    )
+    torques, imu, *_ = readings([], friction=0.3, acceleration=(-0.3 * G, 0.0))
+    assert estimated(torques, imu, pose=pose) == []
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_pushes_that_accelerate_the_body_are_found_with_their_place_side_and_force(side):
+    """The last one is as strong as it must be for the body not to turn."""
+
+    def pushes(last_n):
+        return [(2, side, 0.05, 12.0), (7, -side, 0.08, 20.0), (11, side, 0.03, last_n)]
+
+    turning = [readings(pushes(force_n))[3] for force_n in (0.0, 1.0)]
+    wanted = pushes(turning[0] / (turning[0] - turning[1]))
+    sum_n = readings(wanted)[2]
+    torques, imu, left_n, left_nm = readings(wanted, acceleration=tuple(sum_n[:2] / MASS_KG))
+    assert np.abs(left_n).max() < 1e-9 and abs(left_nm) < 1e-9
+    found = estimated(torques, imu)
+    for link, side_of_it, along_m, force_n in wanted:
+        place_m = STARTS_M[link] + along_m
+        near = [
+            c
+            for c in found
+            if c.normal_l == (0.0, -side_of_it, 0.0) and abs(STARTS_M[c.link] + c.along_m - place_m) < 0.08
+        ]
+        assert sum(c.force_n for c in near) == pytest.approx(force_n, rel=0.1), found
+        middle_m = sum((STARTS_M[c.link] + c.along_m) * c.force_n for c in near) / sum(c.force_n for c in near)
+        assert middle_m == pytest.approx(place_m, abs=0.02)
+        assert all(0.5 < c.confidence <= 1.0 for c in near)
+
+
+def test_a_robot_that_sends_no_imu_readings_is_taken_at_its_torques():
+    imu = Imu(tick=0, stamp_ns=0, link=[], angular_velocity_rad_s=[], acceleration_m_s2=[])
+    assert estimated([0.0] * COUNT, imu) == []
+
+
+def test_pitch_joints_give_no_equation_and_break_nothing():
+    mixed = make_robot(axes=("yaw", "pitch"))
+    torques, imu, *_ = readings([])
+    torques = [3.0 if joint.axis == "pitch" else torque for joint, torque in zip(mixed.joints, torques, strict=True)]
+    assert estimate(mixed, [0.0] * COUNT, [0.0] * COUNT, torques, imu, None) == []

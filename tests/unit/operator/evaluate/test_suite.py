@@ -1,0 +1,154 @@
+"""Suite files: rows and cases that they stand for, and what a wrong one is told."""
+
+import sys
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.files import shipped
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_operator.cli import main
+from snakesim_operator.evaluate.case import Case
+from snakesim_operator.evaluate.suite import Suite, cases_of, read_suite, settings_of, spaced
+
+ROWS = """
+scenario = "clutter"
+[set]
+duration_s = 20
+[vary]
+"scene.random_field.0.density_per_m2" = [4, 8]
+"scene.ground.friction" = "0.1:0.3:3"
+[[row]]
+name = "as shipped"
+[[row]]
+name = "pegs only"
+[row.set.scene]
+random_field = [
+    { low_m = [2, -1], high_m = [3, 1], density_per_m2 = 1, radius_m = [0.03, 0.03], clearance_m = 0.1, seed = 1 },
+]
+"""
+
+
+def read(folder: Path, text: str) -> tuple[Suite, str]:
+    path = folder / "mine.toml"
+    path.write_text(text)
+    return read_suite(str(path))
+
+
+def config(case: Case) -> RunConfig:
+    return msgspec.json.decode(case.config, type=RunConfig)
+
+
+def test_every_row_in_every_combination(tmp_path: Path) -> None:
+    suite, source = read(tmp_path, ROWS)
+    names = [setting.name for setting in settings_of(suite, source)]
+    assert len(names) == 12 and names[0] == "as shipped, density_per_m2 4, friction 0.1"
+    assert names[-1] == "pegs only, density_per_m2 8, friction 0.3"
+    cases = cases_of(suite, source, ["hold", "path_following"], 2, seed=7)
+    assert len(cases) == 12 * 2 * 2
+    assert len({case.id for case in cases}) == len(cases)
+    last = config(cases[-1])
+    assert last.duration_s == 20 and last.pace == "lockstep" and last.controller == "path_following"
+    assert last.scene.ground.friction == pytest.approx(0.3)
+    assert (last.seed, last.scene.random_field[0].seed) == (8, 8)
+    assert last.scene.random_field[0].density_per_m2 == 8 and last.scene.random_field[0].box_share == 0
+
+
+def test_a_case_is_known_again_by_what_it_runs(tmp_path: Path) -> None:
+    suite, source = read(tmp_path, ROWS)
+    few, more = (cases_of(suite, source, ["hold"], fields, seed) for fields, seed in ((1, 8), (3, 7)))
+    assert {case.id for case in few} < {case.id for case in more}
+    renamed = msgspec.structs.replace(suite, title="another", row=[])
+    assert {case.id for case in cases_of(renamed, "elsewhere", ["hold"], 1, 8)} < {case.id for case in few}
+
+
+@pytest.mark.parametrize("name", shipped("suites"))
+def test_shipped_suites_can_be_run(name: str) -> None:
+    suite, source = read_suite(name)
+    assert suite.title
+    assert len(cases_of(suite, source, suite.controllers, 1, seed=1)) >= 2
+
+
+def test_a_range_has_both_its_ends() -> None:
+    assert spaced("0.05:0.2:4", "--vary") == [0.05, 0.1, 0.15, 0.2]
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("", ["mine.toml", "scenario", "missing"]),
+        ('scenario = "nowhere"', ["no scenario called 'nowhere'", "triplet"]),
+        ('scenario = "jam"\nfield = 3', ["mine.toml", "`field`", "did you mean `fields`"]),
+        ('scenario = "jam"\nfields = 0', ["mine.toml", "`fields` = 0", ">= 1"]),
+        ('scenario = "jam"\ncontrollers = ["wave"]', ["no controller called 'wave'", "obstacle_triplet"]),
+        ('scenario = "jam"\n[set]\nscene.ground.frictoin = 1', ["mine.toml: [set]", "did you mean `friction`"]),
+        ('scenario = "jam"\n[set]\nscene.ground.friction = 9', ["[set]: `scene.ground.friction` = 9", "<= 5"]),
+        ('scenario = "jam"\n[vary]\nseed = []', ["mine.toml", "`vary.seed` is empty"]),
+        ('scenario = "jam"\n[vary]\nrate_hz = "1:2"', ["`vary.rate_hz` = '1:2'", "low:high:count"]),
+        ('scenario = "jam"\n[vary]\nrate_hz = "1:2:1"', ["`vary.rate_hz` = '1:2:1'", "count of 2 to 1000"]),
+        ('scenario = "jam"\n[vary]\nrate_hz = [100, 1]', ["mine.toml: [vary]", "`rate_hz` = 1", "Hz", ">= 20"]),
+        ('scenario = "jam"\n[[row]]\nname = "a"\n[[row]]\nname = "a"', ["two rows are called 'a'"]),
+        (
+            'scenario = "jam"\n[set]\nscene.random_field.0.density_per_m2 = 3',
+            ["[set]", "`scene.random_field`", "expected a list"],
+        ),
+        ('scenario = "clutter"\n[set]\nscene.random_field.0.density_per_m2 = 150', ["row 1", "1380 pegs"]),
+        ('scenario = "jam"\n[set]\nbackend = "nobody"', ["no backend called 'nobody'"]),
+    ],
+)
+def test_a_wrong_suite_is_told_what_and_where(
+    text: str, told: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mine.toml").write_text(text)
+    assert main(["evaluate", str(tmp_path / "mine.toml"), "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert all(part in said for part in told), said
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["evaluate", "nothing"], ["no suite called 'nothing'", "clutter"]),
+        (["evaluate", "clutter", "--resume"], ["--resume", "--out"]),
+        (["evaluate", "clutter", "--only", "hold"], ["--only hold", "CONTROLLER:FIELD"]),
+        (["evaluate", "clutter", "--only", "hold:1"], ["--only hold:1", "hold:1:1", "4 (5 per m²)"]),
+        (["evaluate", "clutter", "--only", "hold:1:99"], ["--only hold:1:99", "hold:1:1"]),
+        (["evaluate", "clutter", "--fields", "1", "--seed", "-1"], ["--seed", "seed` = -1", ">= 0"]),
+        (["evaluate", "clutter", "--fields", "1", "--out", "/dev/null/x"], ["--out /dev/null/x"]),
+        (["evaluate", "clutter", "--fields", "1", "--cluster", "nowhere"], ["--cluster nowhere"]),
+        (["sweep", "jam", "--vary", "rate_hz"], ["--vary rate_hz", "low:high:count"]),
+        (["sweep", "jam", "--vary", "rate_hz=[1"], ["--vary rate_hz=[1", "TOML"]),
+        (["optimise", "jam", "--vary", "rate_hz=1", "--goal", "advance_m", "--storage", "x"], ["give low:high"]),
+        (["optimise", "jam", "--vary", "rate_hz=50:60", "--goal", "speed", "--storage", "x"], ["--goal speed"]),
+        (["optimise", "jam", "--vary", "rate_hz=5:60", "--goal", "advance_m", "--storage", "x"], ["`rate_hz` = 5"]),
+        (["optimise", "jam", "--vary", "rate_hz=50:60", "--goal", "advance_m", "--storage", "."], ["--storage ."]),
+    ],
+)
+def test_a_wrong_command_starts_nothing(
+    arguments: list[str],
+    told: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) in (1, 2)
+    said = capsys.readouterr().err
+    assert all(part in said for part in told), said
+
+
+def test_without_the_extra_it_tells_how_to_install_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    assert main(["evaluate", "clutter"]) == 2
+    assert "pip install 'snakesim[evaluate]'" in capsys.readouterr().err
+
+
+def test_there_is_a_limit_of_cases(tmp_path: Path) -> None:
+    suite, source = read(tmp_path, 'scenario = "jam"\n[vary]\nseed = "1:1000:1000"')
+    with pytest.raises(ConfigError, match="300000 cases"):
+        cases_of(suite, source, [], 300, 1)

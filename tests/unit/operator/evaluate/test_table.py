@@ -1,0 +1,45 @@
+"""The table: intervals, medians of what crossed, and the worst failures first."""
+
+import pytest
+
+from snakesim_operator.evaluate.case import Case, Outcome
+from snakesim_operator.evaluate.table import lines_of, table, wilson, worst
+
+
+def case(field: int, controller: str = "poal", row: int = 1) -> Case:
+    return Case(f"{controller}-{row}-{field}", row, f"density {row}", controller, field, b"{}")
+
+
+def outcome(advance_m: float, speed_m_s: float = 0.1) -> Outcome:
+    told = {"goal_m": 3.0, "advance_m": advance_m, "crossed": advance_m >= 3, "ended": "complete"}
+    return Outcome(numbers={**told, "advance_m_s": speed_m_s, "last_state": "NotLocomoting", "last_reason": "stuck"})
+
+
+@pytest.mark.parametrize(
+    ("successes", "trials", "low", "high"), [(8, 10, 0.490, 0.943), (0, 20, 0.0, 0.161), (100, 100, 0.963, 1.0)]
+)
+def test_wilson_as_tabulated(successes: int, trials: int, low: float, high: float) -> None:
+    assert wilson(successes, trials) == (pytest.approx(low, abs=5e-4), pytest.approx(high, abs=5e-4))
+
+
+def test_speed_is_of_the_runs_that_crossed() -> None:
+    cases = [case(1), case(2), case(3), case(1, "hold")]
+    done = {"poal-1-1": outcome(3.0, 0.2), "poal-1-2": outcome(1.0, 0.02), "poal-1-3": Outcome(error="no room")}
+    lines = lines_of(cases, done)
+    assert [line.controller for line in lines] == ["poal"]  # of hold nothing is known yet
+    head, row = table(lines)
+    assert head.split()[:3] == ["setting", "controller", "crossed"]
+    assert "1/3" in row and "0.200" in row and row.endswith(" 1")
+
+
+def test_the_worst_come_first() -> None:
+    cases = [case(field) for field in (1, 2, 3, 4)]
+    done = {"poal-1-1": outcome(2.0), "poal-1-2": outcome(3.0), "poal-1-3": Outcome(error="no room")}
+    done["poal-1-4"] = outcome(0.5)
+    told = worst(cases, done)
+    assert [one.field for one, _ in told] == [3, 4, 1]
+    assert [why for _, why in told] == [
+        "no room",
+        "0.50 m of 3 m; NotLocomoting: stuck",
+        "2.00 m of 3 m; NotLocomoting: stuck",
+    ]

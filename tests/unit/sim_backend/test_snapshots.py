@@ -1,0 +1,178 @@
+"""Sensors that look around work beside the tick: they arrive when they should, or not at all, and delay nothing."""
+
+import threading
+import time
+
+import msgspec
+import numpy as np
+import pytest
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.scenario import Override, load
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import encode
+from snakesim_hal.wire.messages import DepthImage, Mode
+from snakesim_sim_backend.backend import SimBackend
+from snakesim_sim_backend.settings import Settings
+from tests.unit.sim_backend.rig import Run, make_config
+
+HEAD = keys.depth("head")
+CAMERA = {"name": "head", "width": 40, "height": 30, "rate_hz": 20.0}
+WALL = {"ground": {"friction": 0.0}, "box": [{"position_m": [4.0, 0.0], "size_m": [0.5, 9.0, 3.0]}]}
+SLOW = """
+import time
+from snakesim_sim_backend.sensors.depth import RayCamera
+from snakesim_sim_backend.sensors.scope import NoSettings
+
+class Slow(RayCamera):
+    def read(self, tick, stamp_ns):
+        time.sleep({sleep_s})
+        return super().read(tick, stamp_ns)
+
+class Broken(RayCamera):
+    def read(self, tick, stamp_ns):
+        raise OSError("lens cap on")
+
+class Mute:
+    Settings = NoSettings
+"""
+
+
+def run_with(camera=None, **top):
+    return Run(make_config({"sensors": {"depth": [{**CAMERA, **(camera or {})}]}}, WALL, **top))
+
+
+def arrivals(run, ticks):
+    """(tick, image) of everything that came, and how long the longest call took."""
+    found, longest_s = [], 0.0
+    for _ in range(ticks):
+        began = time.perf_counter()
+        samples = run.sample()
+        longest_s = max(longest_s, time.perf_counter() - began)
+        if HEAD in samples.others:
+            found.append((run.tick, samples.others[HEAD]))
+        run.go()
+    run.sim.close()
+    return found, longest_s
+
+
+@pytest.mark.parametrize(("delay_s", "ticks"), [(0.0, 1), (0.01, 1), (0.03, 3), (0.12, 12)])
+def test_an_image_shows_what_was_there_and_arrives_after_the_delay_but_never_at_once(delay_s, ticks):
+    run = run_with({"delay_s": delay_s})
+    run.sim.data.qvel[0] = 1.0  # slides towards the wall on ice
+    (sensor,) = (s for s in run.sim.describe().sensors if s.key == HEAD)
+    assert sensor.rate_hz == 20.0 and sensor.delay_s == pytest.approx(ticks * 0.01)
+    noses_m = []
+    found = []
+    for tick in range(30):
+        noses_m.append(float(run.sim.data.qpos[0]) + 13 * 0.11 + 0.04)
+        others = run.sample().others
+        if HEAD in others:
+            found.append((tick, others[HEAD]))
+        run.go()
+    run.sim.close()
+    assert [tick for tick, _ in found] == [tick + ticks for tick in range(0, 30, 5) if tick + ticks < 30]
+    for tick, image in found:
+        assert isinstance(image, DepthImage)
+        taken = tick - ticks
+        assert (image.tick, image.stamp_ns) == (tick, taken * 10_000_000)
+        middle_m = np.frombuffer(image.depth, "<u2").reshape(30, 40)[10, 20] * image.scale_m
+        assert middle_m == pytest.approx(3.75 - noses_m[taken], abs=0.001)
+
+
+def bytes_of_a_run(robot, seed=3):
+    config = load("peg_row", [Override("robot", robot, "--robot")]).config
+    run = Run(msgspec.structs.replace(config, seed=seed))
+    told = {}
+    for tick in range(40):
+        samples = run.sample()
+        for key, message in (("joints", samples.joints), *samples.others.items()):
+            told[key] = told.get(key, b"") + encode(message)
+        run.command([Mode.POSITION] * 13, [0.5 * np.sin(0.1 * tick + 0.6 * i) for i in range(13)])
+        run.go()
+    run.sim.close()
+    return told
+
+
+def test_the_same_seed_gives_the_same_images_and_a_camera_changes_nothing_else():
+    first, again, other = (bytes_of_a_run("planar13_camera", seed) for seed in (3, 3, 4))
+    assert first == again
+    image = first.pop(HEAD)
+    assert image and image != other[HEAD]
+    assert first == bytes_of_a_run("planar13")
+
+
+def test_a_robot_that_does_not_look_around_has_no_thread_for_it():
+    def looking():
+        return [thread.name for thread in threading.enumerate() if thread.name.startswith("sensors")]
+
+    before = looking()
+    plain = Run(make_config())
+    assert looking() == before
+    seeing = run_with()
+    assert len(looking()) == len(before) + 1
+    seeing.sim.close()
+    assert looking() == before
+    plain.sim.close()
+
+
+def slow(tmp_path, sleep_s, name="Slow"):
+    path = tmp_path / f"slow_{name}.py"
+    path.write_text(SLOW.replace("{sleep_s}", str(sleep_s)))
+    return {"model": f"{path}:{name}"}
+
+
+def test_in_real_time_a_late_image_is_dropped_and_counted_and_never_waited_for(tmp_path):
+    run = run_with({**slow(tmp_path, 0.3), "delay_s": 0.01}, pace="realtime")
+    found, longest_s = arrivals(run, 20)
+    assert found == []
+    assert longest_s < 0.1
+    assert run.sim.faults() != []
+    told = run.sim.faults()
+    assert told == []  # once for the same number
+    assert sum(run.sim._sensors.late.values()) == 4  # pyright: ignore[reportPrivateUsage]
+
+
+def test_what_is_told_of_late_images_stops_nothing_and_becomes_rarer(tmp_path):
+    run = run_with({**slow(tmp_path, 1.0), "delay_s": 0.01, "rate_hz": 100.0}, pace="realtime")
+    told = []
+    for _ in range(40):
+        run.sample()
+        told += run.sim.faults()
+        run.go()
+    run.sim.close()
+    assert {(fault.what, fault.reach) for fault in told} == {("sample_late", "none")}
+    assert [int(fault.cause.split()[1]) for fault in told] == [1, 2, 4, 8, 16, 32]
+
+
+def test_in_lockstep_a_late_image_is_waited_for(tmp_path):
+    run = run_with({**slow(tmp_path, 0.05), "delay_s": 0.01})
+    found, longest_s = arrivals(run, 10)
+    assert [tick for tick, _ in found] == [1, 6]
+    assert longest_s > 0.03
+
+
+def test_a_model_that_breaks_is_an_error_of_the_backend(tmp_path):
+    run = run_with(slow(tmp_path, 0, "Broken"))
+    with pytest.raises(OSError, match="lens cap on"):
+        arrivals(run, 10)
+    run.sim.close()
+
+
+@pytest.mark.parametrize(
+    ("camera", "why"),
+    [
+        ({"model": "radar"}, r"no sensor called 'radar' is installed.*snakesim\.sensors"),
+        ({"model": "./nothing.py:Radar"}, r"sensor './nothing.py:Radar' cannot be loaded"),
+        ({"settings": {"gain": 2}}, r"sensor 'head' of the robot file: unknown field `settings.gain`"),
+    ],
+)
+def test_a_model_that_cannot_be_is_refused_before_anything_is_opened(camera, why):
+    config = make_config({"sensors": {"depth": [{**CAMERA, **camera}]}})
+    with pytest.raises(ConfigError, match=why):
+        SimBackend.check(config, Settings())
+
+
+def test_a_model_that_makes_something_else_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match=r"does not make a DepthImage, which is what sensor/depth/head carries"):
+        run_with(slow(tmp_path, 0, "Mute"))
