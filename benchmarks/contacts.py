@@ -1,6 +1,7 @@
 """`python -m benchmarks.contacts [SCENARIO[,KEY=VALUE...]...]`: the contact estimate against the simulator's truth.
 
-True contacts of one side within 8 cm are one push, because the estimate cannot tell them apart.
+True contacts of one side within 8 cm are one push, because the estimate cannot tell them apart. With `backend=can` it
+is held against the force sensors of the emulated modules, and gets the IMU readings of the tick.
 """
 
 import sys
@@ -13,10 +14,10 @@ from snakesim_gnc.guidance.contact_estimate import FeltContact, estimate
 from snakesim_hal.backend import Samples
 from snakesim_hal.in_process import InProcessRun
 from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion
-from snakesim_hal.model.plugins import BACKENDS, offered
+from snakesim_hal.model.plugins import BACKENDS, find_plugin, offered
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Description, Imu, Pose
+from snakesim_hal.wire.messages import Contacts, Description, Imu, Pose
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.truth import TrueState
 
@@ -63,28 +64,35 @@ class Score:
 
 def score(scenario: str, *settings: str, seconds: float = 5.0, with_pose: bool = True) -> Score:
     """Run a scenario in the simulator, and estimate as it goes."""
-    result, seen = Score(), list[tuple[Samples, TrueState]]()
+    config = load(scenario, [parse_set(text) for text in (f"duration_s={seconds}", *settings)]).config
+    factory, result, seen = find_plugin(BACKENDS, config.backend), Score(), list[tuple[Samples, list[Push]]]()
 
-    class Watched(SimBackend):
-        """The simulator, with a look at its truth."""
+    class Watched(factory):
+        """The backend, with a look at what is true."""
 
         def sample(self, tick: int, stamp_ns: int) -> Samples:
             samples = super().sample(tick, stamp_ns)
             if tick >= FROM_TICK and tick % EVERY == 0:
-                seen.append((samples, self.true_state()))
+                seen.append((samples, self.truth(samples)))
             return samples
 
-    config = load(scenario, [parse_set(text) for text in (f"duration_s={seconds}", *settings)]).config
-    with offered(BACKENDS, "sim", Watched), InProcessRun(config) as run:
+        def truth(self, samples: Samples) -> list[Push]:
+            if isinstance(self, SimBackend):
+                return true_pushes(self.describe(), self.true_state())
+            touched = samples.others[keys.CONTACTS]
+            assert isinstance(touched, Contacts)
+            return felt_pushes(self.describe(), touched)
+
+    with offered(BACKENDS, config.backend, Watched), InProcessRun(config) as run:
         for _ in run.turns():
             pass
         robot = run.host.description
-    for samples, truth in seen:
-        imu, pose = samples.others[keys.IMU], samples.others[keys.POSE]
-        assert isinstance(imu, Imu) and isinstance(pose, Pose)
-        told = samples.joints
+    nothing = Imu(tick=0, stamp_ns=0, link=[], angular_velocity_rad_s=[], acceleration_m_s2=[])
+    for samples, true in seen:
+        imu, pose, told = samples.others.get(keys.IMU, nothing), samples.others.get(keys.POSE), samples.joints
+        assert isinstance(imu, Imu) and isinstance(pose, Pose | None)
         felt = estimate(robot, told.angle_rad, told.velocity_rad_s, told.torque_nm, imu, pose if with_pose else None)
-        result.add(true_pushes(robot, truth), pushes(robot, felt))
+        result.add(true, pushes(robot, felt))
     return result
 
 
@@ -95,17 +103,33 @@ def pushes(robot: Description, felt: list[FeltContact]) -> list[Push]:
 
 
 def true_pushes(robot: Description, truth: TrueState) -> list[Push]:
-    """The simulator's contacts, tail to head; neighbours on one side are added up."""
+    """The simulator's contacts, tail to head."""
     lengths = [link.length_m for link in robot.links]
     starts = np.append(0.0, np.cumsum(lengths))
     base = rotation_from_quaternion(truth.base_orientation_wxyz)
     axes = [joint.axis for joint in robot.joints]
     rear_w, frames = link_frames(truth.base_position_w, base, truth.angles_rad, axes, lengths)
-    found: list[Any] = []
+    found: list[Push] = []
     for contact in truth.contacts:
         force_n = float(np.linalg.norm(contact.force_w))
         along, across = (frames[contact.link].T @ (contact.position_w - rear_w[contact.link]))[:2]
-        found.append([starts[contact.link] + along, 1 if across > 0 else -1, force_n])
+        found.append((float(starts[contact.link] + along), 1 if across > 0 else -1, force_n))
+    return together(found)
+
+
+def felt_pushes(robot: Description, told: Contacts) -> list[Push]:
+    """The contacts that sensors tell of."""
+    starts = np.append(0.0, np.cumsum([link.length_m for link in robot.links]))
+    return together(
+        [
+            (float(starts[c.link]) + c.position_l[0], 1 if c.position_l[1] > 0 else -1, float(np.hypot(*c.force_l[:2])))
+            for c in told.contacts
+        ]
+    )
+
+
+def together(found: list[Push]) -> list[Push]:
+    """Neighbours on one side are added up."""
     merged: list[Any] = []
     for place, side, force in sorted(found):
         same = [push for push in merged if push[1] == side and place - push[0] < NEAR_M]
@@ -119,7 +143,7 @@ def true_pushes(robot: Description, truth: TrueState) -> list[Push]:
 
 def main() -> int:
     """Print a table."""
-    print(f"| run | pushes >= {LEAST_N:g} N | median error | 75 % below | of >= 10 N | missed | ghosts | place |")
+    print(f"| run | pushes >= {LEAST_N:g} N | median error | 75 % below | >= 10 N | missed | ghosts | place |")
     print("|---|---|---|---|---|---|---|---|")
     for given in sys.argv[1:] or SCENARIOS:
         scenario, *settings = given.split(",")

@@ -5,7 +5,8 @@
 `settings`   the schema of the physics settings
 `model`      robot file + scene -> compiled MuJoCo model; `ground` and `obstacles` are its parts
 `start`      lays the snake on the ground and lets it come to rest
-`actuators`  the motors' modes; `sensors`, `contacts`, `loads` and `pace` what is sampled, and when it is due
+`actuators`  the motors' modes; `contacts` and `loads` what touches the links
+`sensors/`   everything that the robot senses; `looking_service` its cameras in a process of their own, for CAN
 `tether`, `truth`, `divergence`  the rope of the static checks, the state without noise, detection of divergence
 
 Imports the HAL and MuJoCo, never guidance, navigation, control or Zenoh. Nothing heavy is imported here.
@@ -13,6 +14,6 @@ Imports the HAL and MuJoCo, never guidance, navigation, control or Zenoh. Nothin
 
 import os
 
-# Nothing is rendered here. Otherwise MuJoCo would start another Python process to search for a window library: 0.1 s at
-# every start, and a traceback if interrupted by Ctrl-C.
+# Nothing is shown on a screen. Otherwise MuJoCo would start another Python process to search for a window library:
+# 0.1 s at every start, and a traceback if interrupted by Ctrl-C. Cameras that render open what they need themselves.
 os.environ.setdefault("MUJOCO_GL", "off")

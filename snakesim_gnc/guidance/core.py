@@ -5,17 +5,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from snakesim_gnc.guidance.contacts_w import contact_w
 from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion
 from snakesim_hal.model.scene import outline_distance_m
 from snakesim_hal.wire.messages import (
-    Contact,
     Contacts,
     Description,
     JointState,
     Obstacle,
     Pose,
     World,
-    WorldContact,
 )
 
 POSE_MEMORY_S = 0.5  # confidence in a pose falls to 1/e after this long without a new one
@@ -51,26 +50,15 @@ class WorldModel:
             base_position_w=pose.position_w,
             base_orientation_wxyz=pose.orientation_wxyz,
             base_confidence=math.exp(-age_s / POSE_MEMORY_S),
-            contacts=[self._in_world(c, origins, rotations) for c in felt if c.link < len(origins)],
+            contacts=[
+                contact_w(c, origins, rotations, self._rear_s, lambda at, c=c: c.obstacle or self._touching(at))
+                for c in felt
+                if c.link < len(origins)
+            ],
             obstacles=self._near(origins),
             pose_stamp_ns=pose.stamp_ns,
             contacts_stamp_ns=None if contacts is None else contacts.stamp_ns,
             centre_w=(x, y, z),
-        )
-
-    def _in_world(self, contact: Contact, origins: np.ndarray, rotations: np.ndarray) -> WorldContact:
-        rotation = rotations[contact.link]
-        local = np.array([contact.position_l, contact.normal_l, contact.tangent_1_l, contact.force_l])
-        position, normal, tangent, force = local @ rotation.T
-        position = position + origins[contact.link]
-        return WorldContact(
-            link=contact.link,
-            obstacle=contact.obstacle or self._touching(position),
-            body_s_m=float(self._rear_s[contact.link]) + contact.position_l[0],
-            position_w=tuple(position.tolist()),
-            normal_w=tuple(normal.tolist()),
-            tangent_w=tuple(tangent.tolist()),
-            force_w=tuple(force.tolist()),
         )
 
     def _touching(self, position_w: np.ndarray) -> str | None:

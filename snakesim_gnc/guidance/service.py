@@ -1,11 +1,34 @@
 """The guidance process: sensors in, `guidance/world` out."""
 
+from collections.abc import Sequence
+
+import numpy as np
+
+from snakesim_gnc.guidance.body_history import Base
 from snakesim_gnc.guidance.core import WorldModel
-from snakesim_hal.model.scenario import RunConfig, place_all
+from snakesim_gnc.guidance.localisation import PoseNoise
+from snakesim_gnc.guidance.perceived_world import PerceivedWorld
+from snakesim_gnc.guidance.scan import Noise
+from snakesim_hal.model.scenario import RunConfig, place_all, start_of
+from snakesim_hal.model.sensors import DepthCamera, RangeSensor
 from snakesim_hal.network.client import Client
 from snakesim_hal.service import Service
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Clock, Contacts, Description, JointState, Message, Pose
+from snakesim_hal.wire.messages import (
+    Clock,
+    Contacts,
+    DepthImage,
+    Description,
+    Imu,
+    JointState,
+    Message,
+    Obstacle,
+    Pose,
+    Ranges,
+    World,
+)
+
+LEAST_NOISE_M = 0.001
 
 
 class Guidance(Service):
@@ -14,8 +37,25 @@ class Guidance(Service):
     name = "guidance"
 
     def __init__(self, client: Client, config: RunConfig) -> None:
-        """The obstacles of the scene file are known beforehand, as from a survey."""
-        self._known = [placed.obstacle for placed in place_all(config) if not placed.walkable]
+        """With `map = "known"` the scene's obstacles are known as from a survey; else they are never looked at."""
+        perceived = config.mission.map == "perceived"
+        self._view = _Perceived(client, config) if perceived else _Surveyed(client, config)
+
+    def meet(self, robot: Description) -> None:
+        """Create the model for this robot."""
+        self._view.meet(robot)
+
+    def outputs(self, clock: Clock) -> list[tuple[str, Message]] | None:
+        """The world at this tick; None while it cannot be told."""
+        world = self._view.world(clock)
+        return None if world is None else [(keys.WORLD, world)]
+
+
+class _Surveyed:
+    """The map is the scene's, the pose that of the sensor."""
+
+    def __init__(self, client: Client, config: RunConfig) -> None:
+        self._known: Sequence[Obstacle] = [placed.obstacle for placed in place_all(config) if not placed.walkable]
         self._joints = client.subscribe(keys.JOINTS, JointState)
         self._contacts = client.subscribe(keys.CONTACTS, Contacts)
         self._pose = client.subscribe(keys.POSE, Pose)
@@ -23,13 +63,68 @@ class Guidance(Service):
         self._model: WorldModel | None = None
 
     def meet(self, robot: Description) -> None:
-        """Create the model for this robot."""
         self._model = WorldModel(robot, self._known)
 
-    def outputs(self, clock: Clock) -> list[tuple[str, Message]] | None:
-        """The world at this tick; None while the joints or the pose are unknown."""
+    def world(self, clock: Clock) -> World | None:
         joints, pose = self._client.read(self._joints), self._client.read(self._pose)
         if self._model is None or joints is None or pose is None:
             return None
         contacts = self._client.read(self._contacts)
-        return [(keys.WORLD, self._model.update(clock.tick, clock.stamp_ns, joints, contacts, pose))]
+        return self._model.update(clock.tick, clock.stamp_ns, joints, contacts, pose)
+
+
+class _Perceived:
+    """Map and pose are what the sensors tell. Of the scene only the place where the snake is laid down is used."""
+
+    def __init__(self, client: Client, config: RunConfig) -> None:
+        start, robot = start_of(config), config.robot
+        planar = np.array([*start.position_w, start.yaw_rad])
+        self._start = Base(planar, robot.module.radius_m, np.eye(3))
+        sensed = robot.sensors.pose
+        self._noise = PoseNoise() if sensed is None else PoseNoise(sensed.position_noise_m, sensed.angle_noise_rad)
+        self._joints = client.subscribe(keys.JOINTS, JointState)
+        self._contacts = client.subscribe(keys.CONTACTS, Contacts)
+        self._imu = client.subscribe(keys.IMU, Imu)
+        self._pose = client.subscribe(keys.POSE, Pose)
+        self._depth = [(client.subscribe(keys.depth(c.name), DepthImage), _noise(c)) for c in robot.sensors.depth]
+        self._ranges = [(client.subscribe(keys.ranges(r.name), Ranges), _noise(r)) for r in robot.sensors.range]
+        self._client = client
+        self._model: PerceivedWorld | None = None
+        self._taken: dict[str, int] = {}  # stamp of the newest sample used, by key
+
+    def meet(self, robot: Description) -> None:
+        self._model = PerceivedWorld(robot, self._start, self._noise)
+        self._taken.clear()
+
+    def world(self, clock: Clock) -> World | None:
+        read, model = self._client.read, self._model
+        joints = read(self._joints)
+        if model is None or joints is None:
+            return None
+        contacts = read(self._contacts)
+        model.take_joints(joints, contacts, read(self._imu))
+        pose = read(self._pose)
+        if pose is not None:
+            model.take_pose(pose)
+        if contacts is not None and self._is_new(keys.CONTACTS, contacts.stamp_ns):
+            model.take_contacts(contacts)
+        for feed, noise in self._depth:
+            image = read(feed)
+            if image is not None and self._is_new(feed.key, image.stamp_ns):
+                model.take_depth(image, noise)
+        for feed, noise in self._ranges:
+            ranges = read(feed)
+            if ranges is not None and self._is_new(feed.key, ranges.stamp_ns):
+                model.take_ranges(ranges, noise)
+        return model.world(clock.tick, clock.stamp_ns)
+
+    def _is_new(self, key: str, stamp_ns: int) -> bool:
+        new = self._taken.get(key) != stamp_ns
+        self._taken[key] = stamp_ns
+        return new
+
+
+def _noise(sensor: DepthCamera | RangeSensor) -> Noise:
+    """As the robot's file has it. One without noise is not trusted without end."""
+    per_m2 = sensor.noise_m_per_m2 if isinstance(sensor, DepthCamera) else 0.0
+    return Noise(max(sensor.noise_m, LEAST_NOISE_M), per_m2)

@@ -7,9 +7,10 @@ import numpy as np
 
 from snakesim_hal.conformance import tolerances as t
 from snakesim_hal.conformance.rig import Record, Rig
+from snakesim_hal.network.robot_mismatch import mismatch
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder, encode, encoding_of
-from snakesim_hal.wire.messages import Message
+from snakesim_hal.wire.messages import DepthImage, Message, Ranges
 
 COLUMNS = ("angle_rad", "velocity_rad_s", "torque_nm", "valid", "age_ns")
 
@@ -52,6 +53,30 @@ def test_every_sample_survives_the_wire(healthy: Record) -> None:
             decoder = Decoder(type(message))
             assert decoder.decode(encode(message), encoding_of(type(message))) == message
         assert all(math.isfinite(number) for name in COLUMNS[:3] for number in getattr(sample.joints, name))
+
+
+def test_every_sample_fits_the_robot(rig: Rig, healthy: Record) -> None:
+    """Links and joints are those of the description, rotations are rotations, an image has all of its pixels."""
+    for sample in healthy.samples:
+        for key, message in sample.others.items():
+            assert (why := mismatch(message, rig.robot)) is None, f"{key}: {why}"
+
+
+def test_what_is_measured_ahead_is_within_the_stated_range(healthy: Record) -> None:
+    """Distances of cameras and lidars, with some room for noise; what is not measured is 0 or null."""
+    for sample in healthy.samples:
+        for key, message in sample.others.items():
+            if isinstance(message, DepthImage):
+                counts = np.frombuffer(message.depth, "<u2")
+                found_m = counts[counts > 0] * message.scale_m
+            elif isinstance(message, Ranges):
+                found_m = np.array([distance for distance in message.range_m if distance is not None])
+            else:
+                continue
+            slack_m = t.RANGE_SHARE * message.range_max_m
+            assert message.range_min_m < message.range_max_m, key
+            assert (found_m >= message.range_min_m - slack_m).all(), f"{key}: {found_m.min()} m"
+            assert (found_m <= message.range_max_m + slack_m).all(), f"{key}: {found_m.max()} m"
 
 
 def test_every_joint_is_valid_and_fresh_at_every_tick(rig: Rig, healthy: Record) -> None:

@@ -291,7 +291,7 @@ class JointDescription(Message, frozen=True, kw_only=True):
     velocity_gain_nm_s_per_rad: Annotated[float, Meta(gt=0, le=1e6), about("of velocity mode")]
     rotor_kg_m2: Annotated[
         float,
-        Meta(ge=0, le=1e3),
+        q.from_zero(1e3, "kg·m²"),
         about("inertia that `torque_nm` turns besides the links; 0: measured beyond the rotor"),
     ] = 0.0
     derate_from_c: Annotated[q.Temperature, about("of the winding: above it torque is derated")] = 80.0
@@ -515,6 +515,15 @@ class World(Message, frozen=True, kw_only=True):
         q.Stamp | None, about("of the contacts in it; null: no sample yet, or no such sensor")
     ] = None
     centre_w: Annotated[q.Vector | None, about("centre of mass of the body; null: unknown")] = None
+    base_position_sd_m: Annotated[
+        q.Distance | None, about("standard deviation of `base_position_w`, horizontally; null: not estimated")
+    ] = None
+    base_yaw_sd_rad: Annotated[
+        q.Angle | None, about("standard deviation of the base's heading; null: not estimated")
+    ] = None
+    depth_stamp_ns: Annotated[
+        q.Stamp | None, about("of the newest image or ranges in `obstacles`; null: none, or a map that is known")
+    ] = None
 
 
 class Trajectory(Message, frozen=True, kw_only=True):

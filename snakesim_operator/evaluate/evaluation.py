@@ -106,6 +106,8 @@ def _finish(request: Request, cases: Sequence[Case], done: store.Results, out: P
     failed = worst([case for case in cases if case.controller == best], done)
     for text in table(lines):
         say(text)
+    if broken := [(case, why) for case in cases if (why := done[case.id].error) is not None]:
+        say(f"{len(broken)} could not run, the first: {name_of(broken[0][0])}: {broken[0][1]}")
     again = [(f"{case.setting}, {name_of(case)}", why, _command(request, case)) for case, why in failed]
     if again:
         say(f"the worst {len(again)} of {best}:" if len(again) > 1 else f"the worst of {best}:")

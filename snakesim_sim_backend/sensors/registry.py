@@ -6,6 +6,9 @@ entry point in the group `snakesim.sensors`, or `./sonar.py:Sonar`. See docs/sen
 
 from collections.abc import Callable
 from typing import Any
+from zlib import crc32
+
+import numpy as np
 
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.plugins import SENSORS, find_installed, find_plugin, plugin_settings
@@ -19,10 +22,11 @@ from snakesim_sim_backend.sensors.imu import ImuReader
 from snakesim_sim_backend.sensors.pose import PoseReader
 from snakesim_sim_backend.sensors.power import PowerReader
 from snakesim_sim_backend.sensors.ranges import RayBeams
+from snakesim_sim_backend.sensors.recorded import Recorded
 from snakesim_sim_backend.sensors.rendered import RenderedColour, RenderedDepth
-from snakesim_sim_backend.sensors.scope import Reader, Scope
+from snakesim_sim_backend.sensors.scope import BodyScope, Reader, Scope
 
-WITHIN_TICK: dict[type[Message], Callable[[Any, Scope], Reader]] = {
+WITHIN_TICK: dict[type[Message], Callable[[Any, BodyScope], Reader]] = {
     Contacts: lambda sensor, at: ContactReader(at.sim, at.data, sensor, at.noise.standard_normal),
     Imu: lambda sensor, at: ImuReader(at.data, sensor, at.config.robot.chain.modules + 1, at.noise.standard_normal),
     Pose: lambda sensor, at: PoseReader(at.data, sensor, at.noise.standard_normal),
@@ -31,9 +35,15 @@ WITHIN_TICK: dict[type[Message], Callable[[Any, Scope], Reader]] = {
 BESIDE_TICK: dict[tuple[type[Message], str], Any] = {
     (DepthImage, "rays"): RayCamera,
     (DepthImage, "rendered"): RenderedDepth,
+    (DepthImage, "recorded"): Recorded,
     (ColourImage, "rendered"): RenderedColour,
     (Ranges, "rays"): RayBeams,
 }
+
+
+def own_noise(key: str, seed: int) -> np.random.Generator:
+    """The noise of one sensor that looks around."""
+    return np.random.default_rng((seed, crc32(key.encode())))
 
 
 def check_models(robot: RobotFile) -> None:

@@ -21,12 +21,18 @@ Normal = Callable[[int], Floats]  # n -> (n,) standard normal numbers
 
 @dataclass(frozen=True)
 class Scope:
-    """The simulation, as sensors see it."""
+    """What a sensor that looks around gets."""
 
     config: RunConfig
     sim: SimModel
-    data: mujoco.MjData  # a sensor that looks around gets a copy of its own, with the places of all bodies and no more
-    noise: np.random.Generator
+    data: mujoco.MjData  # a copy of the state, with the places of all bodies and no more
+    noise: np.random.Generator  # of its own
+
+
+@dataclass(frozen=True)
+class BodyScope(Scope):
+    """What a sensor of the body gets: the state itself, and the noise that they all share."""
+
     motors: Motors
     windings: Thermal
 

@@ -2,9 +2,7 @@
 
 from collections import Counter, deque
 from concurrent.futures import Future
-from dataclasses import replace
 from typing import Protocol
-from zlib import crc32
 
 import msgspec
 import mujoco
@@ -19,8 +17,8 @@ from snakesim_hal.wire.messages import Message
 from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.model import SimModel
 from snakesim_sim_backend.sensors.joints import JointReader
-from snakesim_sim_backend.sensors.registry import WITHIN_TICK, mounted_reader
-from snakesim_sim_backend.sensors.scope import Reader, Scope
+from snakesim_sim_backend.sensors.registry import WITHIN_TICK, mounted_reader, own_noise
+from snakesim_sim_backend.sensors.scope import BodyScope, Reader, Scope
 from snakesim_sim_backend.sensors.snapshots import Snapshots
 from snakesim_sim_backend.sensors.timing import DelayLine, Due, ticks_of
 
@@ -44,7 +42,7 @@ class Sensors:
         self, sim: SimModel, data: mujoco.MjData, config: RunConfig, motors: Motors, windings: Thermal
     ) -> None:
         """Raises ConfigError when a sensor cannot be made."""
-        scope = Scope(config, sim, data, np.random.default_rng(config.seed), motors, windings)
+        scope = BodyScope(config, sim, data, np.random.default_rng(config.seed), motors, windings)
         has = config.robot.sensors
         self._joints = JointReader(data, has.joints, motors, scope.noise.standard_normal, config.period_ns)
         self.late: Counter[str] = Counter()  # samples that were dropped because they were not ready in time, by key
@@ -84,8 +82,7 @@ class Sensors:
     def _beside_the_tick(self, key: str, sensor: DepthCamera | RangeSensor, scope: Scope) -> "BesideTick":
         snapshots = self._snapshots
         assert snapshots is not None
-        noise = np.random.default_rng((scope.config.seed, crc32(key.encode())))
-        own = replace(scope, data=snapshots.data, noise=noise)
+        own = Scope(scope.config, scope.sim, snapshots.data, own_noise(key, scope.config.seed))
         reader = snapshots.do(lambda: mounted_reader(key, sensor, own))
         return BesideTick(key, reader, sensor, scope, snapshots, self.late)
 

@@ -17,19 +17,31 @@ IN_AN_EMULATED_MACHINE = (  # an opening takes half a minute there: `-m ""` runs
     "falls_silent",
     "a_closed_backend",
 )
+OF_SENSORS = ("sensor", "sample", "measured_ahead", "listed")  # clauses that a camera may concern
+LOOKS_AHEAD = (
+    'robot.sensors.depth=[{name="head", width=32, height=24, pitch_rad=0.4}]',
+    'robot.sensors.range=[{name="front", beams=9, view_rad=2.0}]',
+)
 ON_VCAN = ('backend.channels=["vcan0"]', 'backend.twins="process"')
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_snakesim_benches() -> list[Bench]:
-    """Simulator, CAN on a bus inside the process, CAN on the kernel's virtual bus with modules as processes."""
+    """Simulator, also with a camera; CAN on a bus inside the process, or on the kernel's with modules as processes."""
     if os.environ.get(VCAN):  # `make test-vcan`
         return [Bench("can-vcan", "can", sets=ON_VCAN, mute=cut_off)]
-    return [Bench("sim", "sim"), Bench("can-virtual", "can", mute=cut_off)]
+    return [
+        Bench("sim", "sim"),
+        Bench("sim-camera", "sim", sets=LOOKS_AHEAD),
+        Bench("can-virtual", "can", mute=cut_off),
+    ]
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Of the contract on the kernel's bus, what depends on that bus; the whole of it is for `make test-all`."""
+    """Only clauses that depend on what the bench is for: the camera, the bus. All are for `make test-all`."""
+    for item in items:
+        if "sim-camera" in item.name and not any(words in item.name for words in OF_SENSORS):
+            item.add_marker(pytest.mark.slow)
     if os.environ.get(VCAN) != "guest":
         return
     for item in items:

@@ -16,7 +16,7 @@ from snakesim_hal.backend import Samples, SetPoints
 from snakesim_hal.conformance.bench import Bench
 from snakesim_hal.errors import BackendError
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Description, Fault, JointState, Mode, Pose, SensorDescription
+from snakesim_hal.wire.messages import Description, Fault, JointState, Mode, Pose, Ranges, SensorDescription
 from tests.contract.workbench import Workbench, mute
 
 
@@ -186,6 +186,42 @@ class FromTheFuture(WithPose):
         super().__init__(config, settings)
         pose = SensorDescription(key=keys.POSE, rate_hz=50, delay_s=0)
         self.description = replace(self.description, sensors=[*self.description.sensors, pose])
+
+
+class WithSonar(Workbench):
+    """Sends a range every tick."""
+
+    link, found_m = 0, 1.0
+
+    def __init__(self, config, settings):
+        super().__init__(config, settings)
+        sonar = SensorDescription(key=keys.ranges("sonar"), rate_hz=50, delay_s=0)
+        self.description = replace(self.description, sensors=[*self.description.sensors, sonar])
+
+    def sample(self, tick, stamp_ns):
+        sonar = Ranges(
+            tick=tick,
+            stamp_ns=stamp_ns,
+            link=self.link,
+            position_l=(0.0, 0.0, 0.0),
+            orientation_l_wxyz=(1.0, 0.0, 0.0, 0.0),
+            angle_min_rad=0.0,
+            angle_step_rad=0.0,
+            range_min_m=0.1,
+            range_max_m=2.0,
+            range_m=[self.found_m],
+        )
+        return Samples(super().sample(tick, stamp_ns).joints, {keys.ranges("sonar"): sonar})
+
+
+@breaks("every_sample_fits_the_robot")
+class OnNoLink(WithSonar):
+    link = 99
+
+
+@breaks("what_is_measured_ahead_is_within_the_stated_range")
+class SaysTheFurthestForNothing(WithSonar):
+    found_m = 65.535
 
 
 # --- modes and units -------------------------------------------------------------------------------------------

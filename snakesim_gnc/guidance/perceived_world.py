@@ -1,0 +1,227 @@
+"""The world as the sensors tell it: pose, contacts, and a map that begins empty. Pure.
+
+Each sample is taken in once, with the body as it was at the sample's own stamp. Nothing is invented: without images the
+map stays as it is and fades, without contacts none are told, without poses the covariance grows.
+"""
+
+import math
+from collections import Counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_gnc.guidance.body_history import Base, Body
+from snakesim_gnc.guidance.contacts_w import contact_w
+from snakesim_gnc.guidance.depth_scan import DepthScanner, Lens, metres_of
+from snakesim_gnc.guidance.ground import plane_under
+from snakesim_gnc.guidance.localisation import Localiser, PoseNoise
+from snakesim_gnc.guidance.obstacle_map import ObstacleMap
+from snakesim_gnc.guidance.scan import Noise, Scan, scan_of_ranges
+from snakesim_gnc.guidance.scan_match import matched
+from snakesim_hal.model.kinematics import rotation_from_quaternion
+from snakesim_hal.wire.messages import (
+    Contacts,
+    DepthImage,
+    Description,
+    Imu,
+    JointState,
+    Pose,
+    Ranges,
+    World,
+)
+from snakesim_hal.wire.quantities import MAX_CONTACTS, Vector
+
+Floats = NDArray[np.float64]
+TOUCH_EVERY_NS = 50_000_000  # the body slides a few millimetres meanwhile
+OWN_BODY_M = 0.01  # beyond its radius
+SURE_SD_M = 0.05  # of the position, at which the confidence in it is one half
+UPRIGHT = 0.7  # a normal with more than this upwards is of something that the body lies on
+TRUSTED_NS = 300_000_000  # a pose newer than this needs no help from the map
+
+
+class PerceivedWorld:
+    """Sensor samples in, World out."""
+
+    def __init__(self, robot: Description, start: Base, pose_noise: PoseNoise) -> None:
+        """start: where the robot is laid down. pose_noise: of the pose sensor."""
+        self.map = ObstacleMap()
+        self.localiser = Localiser(robot, start, pose_noise)
+        self.refused: Counter[str] = Counter()  # samples that could not be used, by reason
+        self._scanners: dict[tuple[Lens, Noise], DepthScanner] = {}
+        lengths = np.array([link.length_m for link in robot.links])
+        masses = np.array([link.mass_kg for link in robot.links])
+        self._half_m, self._shares = 0.5 * lengths, masses / masses.sum()
+        self._rear_s = np.concatenate(([0.0], np.cumsum(lengths)))[:-1]
+        self._radius_m = max(link.radius_m for link in robot.links)
+        self._joints: JointState | None = None
+        self._contacts: Contacts | None = None
+        self._body: Body | None = None
+        self._touched_ns = self._variance_m2 = 0
+        self.depth_stamp_ns: int | None = None  # of the newest image or ranges in the map
+
+    def take_joints(self, joints: JointState, contacts: Contacts | None, imu: Imu | None) -> None:
+        """The newest joint state moves the body. contacts, imu: the newest, for dead reckoning."""
+        if self._joints is not None and joints.stamp_ns <= self._joints.stamp_ns:
+            return
+        self._joints = joints
+        self.localiser.move(joints, contacts, imu)
+
+    def take_pose(self, pose: Pose) -> None:
+        """A sample of the pose sensor."""
+        self.localiser.take_pose(pose)
+        if self.localiser.carried_m:
+            self.map.drift(self.localiser.carried_m**2)
+
+    def take_contacts(self, contacts: Contacts) -> None:
+        """Touches, and the body's own way: where it is, nothing else is."""
+        self._contacts = contacts
+        if contacts.stamp_ns - self._touched_ns < TOUCH_EVERY_NS and self._touched_ns:
+            return
+        body = self.localiser.history.body_at(contacts.stamp_ns)
+        if body is None:
+            self.refused["contacts without a joint state of their time"] += 1
+            return
+        self._touched_ns = contacts.stamp_ns
+        touches: list[tuple[Floats, Floats]] = []
+        for contact in contacts.contacts:
+            if contact.link >= len(body.origins_w):
+                continue
+            rotation = body.rotations[contact.link]
+            normal = rotation @ np.array(contact.normal_l)
+            if abs(normal[2]) < UPRIGHT:
+                position = body.origins_w[contact.link] + rotation @ np.array(contact.position_l)
+                touches.append((position[:2], normal[:2] / math.hypot(*normal[:2])))
+        self.map.take_touches(touches, contacts.stamp_ns)
+
+    def take_depth(self, image: DepthImage, noise: Noise) -> None:
+        """A depth image, of any camera. noise: of its distances."""
+        body = self._body_of(image.stamp_ns, "image")
+        if body is None or image.link >= len(body.origins_w):
+            return
+        kind = (Lens.of(image), noise)
+        scanner = self._scanners.get(kind)
+        if scanner is None:
+            scanner = self._scanners[kind] = DepthScanner(*kind)
+        position, rotation = _mount(body, image)
+        plane = plane_under(self._bottoms(body), position[:2])
+        self._take(scanner.scan(metres_of(image), image.stamp_ns, position, rotation, plane), body)
+
+    def take_ranges(self, ranges: Ranges, noise: Noise) -> None:
+        """Beams of a lidar or a range finder."""
+        body = self._body_of(ranges.stamp_ns, "ranges")
+        if body is None or ranges.link >= len(body.origins_w):
+            return
+        position, rotation = _mount(body, ranges)
+        ground_z_m = float(plane_under(self._bottoms(body), position[:2])[0])
+        self._take(scan_of_ranges(ranges, position, rotation, ground_z_m, noise), body)
+
+    def world(self, tick: int, now_ns: int) -> World | None:
+        """The world now; None before the first joint state. tick, now_ns: of the clock."""
+        joints = self._joints
+        if joints is None:
+            return None
+        here = self.localiser
+        base = here.base
+        body = self._body = here.history.lay(base, np.asarray(joints.angle_rad))
+        self.map.take_body(body.axis_w(), self._radius_m, min(here.position_sd_m, 0.01))
+        self.map.forget(body.axis_w())
+        middles = body.origins_w + self._half_m[:, None] * body.rotations[:, :, 0]
+        x, y, z = (self._shares @ middles).tolist()
+        contacts = self._contacts
+        felt = [] if contacts is None else [c for c in contacts.contacts if c.link < len(body.origins_w)]
+        then = body if contacts is None else here.history.body_at(contacts.stamp_ns) or body
+        told = [contact_w(c, then.origins_w, then.rotations, self._rear_s, self._name_at) for c in felt[:MAX_CONTACTS]]
+        return World(
+            tick=tick,
+            stamp_ns=joints.stamp_ns,
+            base_position_w=_vector(base.position_w),
+            base_orientation_wxyz=quaternion_of(base.rotation),
+            base_confidence=1.0 / (1.0 + (here.position_sd_m / SURE_SD_M) ** 2),
+            contacts=told,
+            obstacles=self.map.told(now_ns, base.z_m - self._radius_m),
+            pose_stamp_ns=here.pose_stamp_ns,
+            contacts_stamp_ns=None if contacts is None else contacts.stamp_ns,
+            centre_w=(x, y, z),
+            base_position_sd_m=min(here.position_sd_m, 1e3),
+            base_yaw_sd_rad=min(here.yaw_sd_rad, 10.0),
+            depth_stamp_ns=self.depth_stamp_ns,
+        )
+
+    def start_over(self) -> None:
+        """Robot time has started over: nothing that was known holds."""
+        self.localiser.start_over()
+        self.map = ObstacleMap()
+        self._joints = self._contacts = self._body = self.depth_stamp_ns = None
+        self._touched_ns = 0
+
+    def _body_of(self, stamp_ns: int, what: str) -> Body | None:
+        """The body at a sample's stamp; None when it is unknown, which is counted."""
+        if self._joints is None or not all(self._joints.valid):
+            self.refused[f"{what} while a joint's angle is unknown"] += 1
+            return None
+        if self.depth_stamp_ns is not None and stamp_ns < self.depth_stamp_ns:
+            self.refused[f"{what} older than one before"] += 1
+            return None
+        body = self.localiser.history.body_at(stamp_ns)
+        if body is None:
+            self.refused[f"{what} without a joint state of its time"] += 1
+        return body
+
+    def _take(self, scan: Scan, body: Body) -> None:
+        offset = scan.points_w[:, None] - body.axis_w()
+        scan = scan.without(np.hypot(offset[..., 0], offset[..., 1]).min(axis=1) < self._radius_m + OWN_BODY_M)
+        here = self.localiser
+        variance = 0.5 * float(np.trace(here.covariance[:2, :2]))
+        self.map.drift(max(variance - self._variance_m2, 0.0))
+        self.map.here_m2 = variance
+        pose_ns = here.pose_stamp_ns
+        if pose_ns is None or scan.stamp_ns - pose_ns > TRUSTED_NS:
+            then = here.history.base_at(scan.stamp_ns)
+            found = None if then is None else matched(scan, self.map.tracks, then.planar_w)
+            if then is not None and found is not None:
+                here.correct(then, found.planar_w, found.covariance, found.map_m2)
+                scan = scan.moved(then.planar_w, found.planar_w)
+        self.depth_stamp_ns = scan.stamp_ns
+        self.map.take_scan(scan, min(here.position_sd_m, 0.02))
+        self._variance_m2 = 0.5 * float(np.trace(here.covariance[:2, :2]))
+
+    def _bottoms(self, body: Body) -> Floats:
+        return np.vstack([body.origins_w, body.head_w]) - [0.0, 0.0, self._radius_m]
+
+    def _name_at(self, position_w: Floats) -> str | None:
+        track = self.map.at(position_w[:2])
+        return None if track is None else track.name
+
+
+def quaternion_of(rotation: Floats) -> tuple[float, float, float, float]:
+    """Unit quaternion wxyz of a rotation matrix (3, 3)."""
+    m = rotation
+    four = np.array(
+        [
+            1 + m[0, 0] + m[1, 1] + m[2, 2],
+            1 + m[0, 0] - m[1, 1] - m[2, 2],
+            1 - m[0, 0] + m[1, 1] - m[2, 2],
+            1 - m[0, 0] - m[1, 1] + m[2, 2],
+        ]
+    )
+    k = int(np.argmax(four))
+    off = {
+        0: (four[0], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]),
+        1: (m[2, 1] - m[1, 2], four[1], m[1, 0] + m[0, 1], m[0, 2] + m[2, 0]),
+        2: (m[0, 2] - m[2, 0], m[1, 0] + m[0, 1], four[2], m[2, 1] + m[1, 2]),
+        3: (m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[2, 1] + m[1, 2], four[3]),
+    }[k]
+    w, x, y, z = (np.array(off) / np.linalg.norm(off)).tolist()
+    return (w, x, y, z)
+
+
+def _mount(body: Body, sensor: DepthImage | Ranges) -> tuple[Floats, Floats]:
+    """Position (3,) and rotation (3, 3) world_from_sensor."""
+    rotation = body.rotations[sensor.link]
+    position = body.origins_w[sensor.link] + rotation @ np.array(sensor.position_l)
+    return position, rotation @ rotation_from_quaternion(sensor.orientation_l_wxyz)
+
+
+def _vector(values: Floats) -> Vector:
+    x, y, z = values.tolist()
+    return (x, y, z)

@@ -1,0 +1,63 @@
+"""With `map = "perceived"` guidance knows nothing of the scene's obstacles: the file may lie, and changes nothing."""
+
+from typing import ClassVar
+
+import msgspec
+import numpy as np
+import pytest
+
+from snakesim_gnc.guidance.service import Guidance
+from snakesim_hal.model.outlines import outline_distance_m
+from snakesim_hal.model.plugins import SERVICES, offered
+from snakesim_hal.model.scenario import RunConfig, load, parse_set
+from snakesim_hal.model.scene import Cylinder
+from snakesim_hal.network.client import Client
+from snakesim_hal.wire.messages import World
+from snakesim_operator.results.map_score import score
+from snakesim_operator.run.in_process import simulate
+
+pytestmark = pytest.mark.e2e
+LIES = [Cylinder(position_m=(1.75 + 0.3 * k, 0.55 * (-1) ** k), radius_m=0.07, name=f"lie_{k}") for k in range(12)]
+HOW = ("robot=planar13_camera", "controller=path_following", "control.look_ahead_m=0.1", "duration_s=2.5")
+
+
+class Deceived(Guidance):
+    """Guidance whose configuration has another scene than the simulator's."""
+
+    seen: ClassVar[list[World]] = []
+
+    def __init__(self, client: Client, config: RunConfig) -> None:
+        scene = msgspec.structs.replace(config.scene, cylinder=LIES, pegs_along_route=[], random_field=[])
+        super().__init__(client, msgspec.structs.replace(config, scene=scene))
+
+
+def worlds(map_: str, *, deceived: bool) -> tuple[list[World], RunConfig]:
+    """What guidance told in a run on a row of pegs."""
+    config = load("peg_row", [parse_set(text) for text in (*HOW, f'mission.map="{map_}"')]).config
+    with offered(SERVICES, "guidance", Deceived if deceived else Guidance):
+        result = simulate(config)
+    assert result.summary.ended == "complete" and (result.summary.path_distance_m or 0) > 0.3
+    record, last = result.record, result.record.worlds[-1]
+    nodes = record.nodes_w(record.row_at(last.stamp_ns * 1e-9))
+    assert nodes is not None
+    truth, along = [placed.obstacle for placed in record.placed], nodes[-1] - nodes[-2]
+    found = score(last.obstacles, truth, nodes[-1], float(np.arctan2(along[1], along[0])))
+    if map_ == "perceived":
+        assert len(found.position_m) >= 4 and not found.ghosts and not found.misses
+        assert np.median(found.position_m) < 0.02
+    return record.worlds, config
+
+
+def test_perceived_is_the_true_map_and_to_the_bit_the_same_whatever_the_scene_file_says():
+    honest, _ = worlds("perceived", deceived=False)
+    deceived, _ = worlds("perceived", deceived=True)
+    common = min(len(honest), len(deceived))
+    assert common > 20 and honest[1:common] == deceived[1:common]  # how often tick 0 is shown is chance
+
+
+def test_known_is_what_the_scene_file_says():
+    told, _ = worlds("known", deceived=True)
+    obstacles = [o for world in told for o in world.obstacles]
+    assert obstacles and all(o.name.startswith("lie_") for o in obstacles)
+    assert all(o.last_seen_ns is None for o in obstacles)
+    assert outline_distance_m(obstacles[0], np.array(LIES[0].position_m)) < 0

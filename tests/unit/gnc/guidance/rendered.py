@@ -1,0 +1,166 @@
+"""What ranging sensors would see of upright shapes on a ground, computed exactly: the truth for guidance."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_gnc.guidance.depth_scan import Lens
+from snakesim_hal.wire.messages import DepthImage, Obstacle, Ranges
+
+Floats = NDArray[np.float64]
+Ground = Callable[[Floats, Floats], Floats]
+LENS = Lens(width=160, height=120, fx_px=90.0, fy_px=90.0, cx_px=79.5, cy_px=59.5)
+RANGE_M = (0.05, 3.0)
+SCALE_M = 0.001
+
+
+def cylinder(name: str, x: float, y: float, radius_m: float = 0.05, height_m: float = 0.2) -> Obstacle:
+    """An upright peg."""
+    return Obstacle(name=name, shape="cylinder", position_w=(x, y, height_m / 2), radius_m=radius_m, height_m=height_m)
+
+
+def box(name: str, x: float, y: float, size_m: tuple[float, float], yaw_rad: float = 0.0) -> Obstacle:
+    """An upright block."""
+    half = (size_m[0] / 2, size_m[1] / 2, 0.1)
+    return Obstacle(name=name, shape="box", position_w=(x, y, 0.1), yaw_rad=yaw_rad, half_size_m=half, height_m=0.2)
+
+
+def flat(x: Floats, _y: Floats) -> Floats:
+    """A ground without hills."""
+    return np.zeros_like(x)
+
+
+def hills(height_m: float = 0.02, wavelength_m: float = 1.5) -> Ground:
+    """Smooth hills, from lowest to highest `height_m`."""
+    k = 2 * math.pi / wavelength_m
+    return lambda x, y: 0.25 * height_m * (np.sin(k * x + 0.7) + np.sin(k * y + 2.0))
+
+
+@dataclass
+class Eye:
+    """A sensor's errors: noise floor + per m², share of pixels that drop out."""
+
+    floor_m: float = 0.0
+    per_m2: float = 0.0
+    dropout: float = 0.0
+    random: np.random.Generator = field(default_factory=lambda: np.random.default_rng(1))
+
+    def through(self, distance_m: Floats) -> Floats:
+        """Distances with errors; infinite where nothing is seen."""
+        with np.errstate(invalid="ignore"):
+            noise = (self.floor_m + self.per_m2 * distance_m**2) * self.random.standard_normal(distance_m.shape)
+            seen = np.where(self.random.random(distance_m.shape) < self.dropout, np.inf, distance_m + noise)
+        return np.where(np.isfinite(distance_m), seen, np.inf)
+
+
+def distance_along(origin: Floats, rays: Floats, obstacles: Sequence[Obstacle], ground: Ground = flat) -> Floats:
+    """Multiple of each ray (n, 3) at which it meets something first; infinite: nowhere."""
+    nearest = np.full(len(rays), np.inf)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = np.where(rays[:, 2] < 0, -origin[2] / rays[:, 2], np.inf)
+        t = np.minimum(t, 50.0)
+        for _ in range(8):  # towards the hills
+            at = origin + t[:, None] * rays
+            t = np.where(rays[:, 2] < -1e-3, t - (at[:, 2] - ground(at[:, 0], at[:, 1])) / rays[:, 2], np.inf)
+            t = np.clip(t, 0.0, 50.0)
+        nearest = np.where(t < 50.0, t, nearest)
+        for o in obstacles:
+            t = _on_sphere(origin, rays, o) if o.shape == "sphere" else _on_upright(origin, rays, o)
+            nearest = np.minimum(nearest, np.where(t > 0, t, np.inf))
+    return nearest
+
+
+def _on_sphere(origin: Floats, rays: Floats, o: Obstacle) -> Floats:
+    to = origin - np.array(o.position_w)
+    a, b, c = (rays**2).sum(1), rays @ to, to @ to - o.radius_m**2
+    root = b * b - a * c
+    return np.where(root >= 0, (-b - np.sqrt(root)) / a, np.inf)
+
+
+def _on_upright(origin: Floats, rays: Floats, o: Obstacle) -> Floats:
+    to = origin[:2] - np.array(o.position_w[:2])
+    if o.shape == "cylinder":
+        flat_rays = rays[:, :2]
+        a, b, c = (flat_rays**2).sum(1), flat_rays @ to, to @ to - o.radius_m**2
+        root = b * b - a * c
+        t = np.where(root >= 0, (-b - np.sqrt(root)) / a, np.inf)
+    else:
+        cos, sin = math.cos(o.yaw_rad), math.sin(o.yaw_rad)
+        turn = np.array([[cos, sin], [-sin, cos]])
+        local, along = turn @ to, rays[:, :2] @ turn.T
+        one, two = (-np.array(o.half_size_m[:2]) - local) / along, (np.array(o.half_size_m[:2]) - local) / along
+        enter, leave = np.minimum(one, two).max(1), np.maximum(one, two).min(1)
+        t = np.where(enter <= leave, enter, np.inf)
+    height = origin[2] + t * rays[:, 2]
+    middle, half = o.position_w[2], o.height_m / 2
+    return np.where((height >= middle - half) & (height <= middle + half), t, np.inf)
+
+
+def depth_image(
+    obstacles: Sequence[Obstacle],
+    position_w: Floats,
+    rotation: Floats,
+    *,
+    ground: Ground = flat,
+    eye: Eye | None = None,
+    stamp_ns: int = 0,
+    tick: int = 0,
+    link: int = 0,
+    position_l: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    orientation_l_wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0),
+    lens: Lens = LENS,
+) -> DepthImage:
+    """An image from a camera at a pose in the world (rotation: world_from_camera); the mount is only told."""
+    rays = lens.rays().astype(np.float64) @ rotation.T
+    depth = (eye or Eye()).through(distance_along(position_w, rays, obstacles, ground))
+    counts = np.where(np.isfinite(depth) & (depth < RANGE_M[1]) & (depth > RANGE_M[0]), depth / SCALE_M, 0.0)
+    return DepthImage(
+        tick=tick,
+        stamp_ns=stamp_ns,
+        link=link,
+        position_l=position_l,
+        orientation_l_wxyz=orientation_l_wxyz,
+        width=lens.width,
+        height=lens.height,
+        fx_px=lens.fx_px,
+        fy_px=lens.fy_px,
+        cx_px=lens.cx_px,
+        cy_px=lens.cy_px,
+        range_min_m=RANGE_M[0],
+        range_max_m=RANGE_M[1],
+        scale_m=SCALE_M,
+        depth=np.round(counts).astype("<u2").tobytes(),
+    )
+
+
+def lidar(
+    obstacles: Sequence[Obstacle], position_w: Floats, rotation: Floats, *, beams: int = 181, stamp_ns: int = 0
+) -> Ranges:
+    """A planar lidar that sees half a turn, without errors."""
+    angles = np.linspace(-math.pi / 2, math.pi / 2, beams)
+    rays = np.stack([np.cos(angles), np.sin(angles), np.zeros(beams)], axis=1) @ rotation.T
+    found = distance_along(position_w, rays, obstacles)
+    return Ranges(
+        tick=0,
+        stamp_ns=stamp_ns,
+        link=0,
+        position_l=(0.0, 0.0, 0.0),
+        orientation_l_wxyz=(1.0, 0.0, 0.0, 0.0),
+        angle_min_rad=-math.pi / 2,
+        angle_step_rad=float(angles[1] - angles[0]) if beams > 1 else 0.01,
+        range_min_m=0.02,
+        range_max_m=4.0,
+        range_m=[float(r) if r < 4.0 else None for r in found],
+    )
+
+
+def turned(yaw_rad: float, pitch_rad: float = 0.0, roll_rad: float = 0.0) -> Floats:
+    """World_from_sensor, from yaw, then pitch (downwards), then roll."""
+    cy, sy, cp, sp, cr, sr = (f(a) for a in (yaw_rad, pitch_rad, roll_rad) for f in (math.cos, math.sin))
+    about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    return about_z @ about_y @ about_x

@@ -1,0 +1,110 @@
+"""Depth images and ranges to scans: what stands is found, the ground and its hills are not, latency and dropouts do."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from snakesim_gnc.guidance.depth_scan import DepthScanner, metres_of
+from snakesim_gnc.guidance.ground import plane_under, refined
+from snakesim_gnc.guidance.scan import Noise, Scan, scan_of_ranges
+from snakesim_hal.model.outlines import outline_distance_m
+from tests.unit.gnc.guidance.rendered import LENS, Eye, box, cylinder, depth_image, flat, hills, lidar, turned
+
+EYE_M = 0.06  # height of the camera
+SCENE = [cylinder("near", 0.6, 0.1, 0.04), cylinder("far", 1.2, -0.3, 0.06), box("block", 0.8, 0.4, (0.12, 0.08), 0.5)]
+
+
+def look(obstacles, rotation, *, ground=flat, eye=None, at=(0.0, 0.0)) -> Scan:
+    z = EYE_M + float(ground(np.array(at[0]), np.array(at[1])))
+    position = np.array([*at, z])
+    image = depth_image(obstacles, position, rotation, ground=ground, eye=eye)
+    scanner = DepthScanner(LENS, Noise(0.002, 0.003))
+    return scanner.scan(metres_of(image), 0, position, rotation, np.array([z - EYE_M, 0.0, 0.0]))
+
+
+def errors_m(scan, obstacles) -> np.ndarray:
+    points = scan.points_w[np.isfinite(scan.range_m)]
+    return np.array([min(abs(outline_distance_m(o, p)) for o in obstacles) for p in points])
+
+
+def test_points_lie_on_what_stands_there():
+    scan = look(SCENE, turned(0.1))
+    off = errors_m(scan, SCENE)
+    assert len(off) > 20 and np.median(off) < 0.001 and off.max() < 0.006
+
+
+@given(st.floats(-0.6, 0.6), st.floats(-0.1, 0.15), st.floats(-0.15, 0.15))
+def test_so_they_do_with_a_head_turned_tilted_and_rolled(yaw, pitch, roll):
+    scan = look(SCENE, turned(yaw, pitch, roll))
+    off = errors_m(scan, SCENE)
+    assert len(off) == 0 or (np.median(off) < 0.004 and off.max() < 0.02)
+
+
+def test_noise_averages_out_over_a_column_and_dropouts_leave_no_gap():
+    scan = look(SCENE, turned(0.0), eye=Eye(0.004, 0.004, 0.1))
+    off = errors_m(scan, SCENE)
+    assert len(off) > 20 and np.median(off) < 0.003
+    hits = np.flatnonzero(np.isfinite(scan.range_m) & (scan.range_m < 0.7))
+    assert set(np.diff(hits)) == {1}
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_hills_are_ground(seed):
+    ground = hills(0.02 + 0.01 * seed, 1.5)
+    at = (0.7 * seed, 0.3 * seed)
+    scan = look([], turned(0.4 * seed), ground=ground, eye=Eye(0.002, 0.003, 0.01, np.random.default_rng(seed)), at=at)
+    assert not np.isfinite(scan.range_m).any()
+    assert np.median(scan.free_m) > 0.5  # which one can see along
+
+
+def test_an_obstacle_on_hills_is_found_where_it_is():
+    ground = hills(0.02, 1.5)
+    scan = look(SCENE, turned(0.0), ground=ground, eye=Eye(0.002, 0.003, 0.01))
+    off = errors_m(scan, SCENE)
+    assert len(off) > 20 and np.median(off) < 0.004 and off.max() < 0.02
+
+
+def test_free_space_ends_at_the_first_obstacle():
+    scan = look(SCENE, turned(0.0))
+    bins, ranges = scan.bins_of(np.array([[0.5, 0.083], [2.0, 0.333]]))  # before and behind the near one
+    assert bins[0] == bins[1] >= 0
+    assert ranges[0] < scan.clear_m()[bins[0]] < ranges[1]
+    assert scan.bins_of(np.array([-1.0, 0.0]))[0] == -1
+
+
+def test_nothing_seen_is_nothing_known():
+    dark = look(SCENE, turned(0.0), eye=Eye(dropout=1.0))
+    assert not np.isfinite(dark.range_m).any() and not dark.free_m.any()
+
+
+def test_a_lidar_sees_the_same_shapes_all_around():
+    position, rotation = np.array([0.0, 0.0, 0.05]), turned(0.3)
+    around = [*SCENE, cylinder("left", 0.1, 0.5)]
+    scan = scan_of_ranges(lidar(around, position, rotation), position, rotation, 0.0, Noise())
+    off = errors_m(scan, around)
+    assert len(off) > 30 and off.max() < 1e-6
+    names = {min(around, key=lambda o: abs(outline_distance_m(o, p))).name for p in scan.points_w if np.isfinite(p[0])}
+    assert names == {"near", "far", "block", "left"}
+
+
+def test_a_beam_into_the_ground_is_no_obstacle():
+    position, rotation = np.array([0.0, 0.0, 0.05]), turned(0.0, 0.1)
+    ranges = lidar([], position, rotation, beams=1)
+    scan = scan_of_ranges(ranges, position, rotation, 0.0, Noise())
+    assert not np.isfinite(scan.range_m).any()
+
+
+def test_the_plane_follows_a_slope_and_not_what_stands_on_it():
+    bottoms = np.column_stack([np.linspace(-1.4, 0, 14), np.zeros(14), 0.05 * np.linspace(-1.4, 0, 14)])
+    plane = plane_under(bottoms, np.zeros(2))
+    assert plane == pytest.approx([0.0, 0.05, 0.0], abs=0.01)
+    random = np.random.default_rng(0)
+    x, y = random.uniform(0, 1, 400), random.uniform(-0.5, 0.5, 400)
+    ground = np.column_stack([x, y, 0.05 * x - 0.03 * y])
+    peg = np.column_stack([np.full(80, 0.5), np.full(80, 0.1), random.uniform(0, 0.2, 80)])
+    found = refined(plane, np.vstack([ground, peg]))
+    assert found == pytest.approx([0.0, 0.05, -0.03], abs=0.005)
+    assert math.isclose(refined(plane, ground[:5])[1], plane[1])  # too few points to say

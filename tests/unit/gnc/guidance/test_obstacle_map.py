@@ -1,0 +1,154 @@
+"""The map over time: touches, what is passed through, ghosts, duplicates, drift, and bounds."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from snakesim_gnc.guidance.obstacle_map import KEPT_M, MAX_TRACKS, ObstacleMap
+from snakesim_gnc.guidance.scan import Noise, Scan, scan_of_ranges
+from snakesim_hal.model.outlines import outline_distance_m
+from snakesim_hal.wire.codec import Decoder, encode, encoding_of
+from snakesim_hal.wire.messages import Obstacle, World
+from tests.unit.gnc.guidance.rendered import box, cylinder, lidar, turned
+
+S = 1_000_000_000
+BODY_M = 0.04
+
+
+def scan_of(*obstacles, at=(0.0, 0.0), stamp_ns=0) -> Scan:
+    position = np.array([*at, 0.05])
+    ranges = lidar(obstacles, position, turned(0.0), stamp_ns=stamp_ns, beams=361)
+    return scan_of_ranges(ranges, position, turned(0.0), 0.0, Noise(0.002, 0.0))
+
+
+def mapped(*obstacles, looks=4) -> ObstacleMap:
+    map_ = ObstacleMap()
+    for k in range(looks):
+        map_.take_scan(scan_of(*obstacles, stamp_ns=k * S // 20))
+    return map_
+
+
+def touch(map_, centre, radius_m, angle_rad, stamp_ns=0) -> None:
+    """A contact with a round thing, from outside."""
+    normal = np.array([math.cos(angle_rad), math.sin(angle_rad)])
+    map_.take_touches([(np.array(centre) + radius_m * normal, normal)], stamp_ns)
+
+
+def only(map_, now_ns=0) -> Obstacle:
+    (told,) = map_.told(now_ns, 0.0)
+    return told
+
+
+def test_what_is_seen_again_and_again_is_believed_more():
+    once, often = mapped(cylinder("a", 0.8, 0.0), looks=1), mapped(cylinder("a", 0.8, 0.0), looks=6)
+    told = only(often)
+    assert only(once).confidence < 0.65
+    assert told.confidence > 0.9 and told.last_seen_ns == 5 * S // 20 and not told.felt
+    assert only(often, now_ns=120 * S).confidence < told.confidence  # belief fades
+
+
+def test_the_message_holds_what_is_told():
+    told = mapped(cylinder("a", 0.8, 0.3), box("b", 0.9, -0.3, (0.2, 0.1))).told(0, 0.0)
+    world = World(
+        tick=0,
+        stamp_ns=0,
+        base_position_w=(0, 0, 0),
+        base_orientation_wxyz=(1, 0, 0, 0),
+        base_confidence=1.0,
+        contacts=[],
+        obstacles=told,
+    )
+    assert Decoder(World).decode(encode(world), encoding_of(World)) == world
+
+
+@given(st.floats(0.03, 0.07), st.lists(st.floats(-1.0, 1.0), min_size=3, max_size=12))
+@settings(max_examples=40)
+def test_touches_all_around_find_a_thing_that_was_never_seen(radius, angles):
+    map_ = ObstacleMap()
+    for angle in angles:
+        touch(map_, (0.5, 0.2), radius, angle)
+    told = only(map_)
+    assert told.felt and told.name.startswith("felt") and told.shape == "cylinder"
+    off = math.dist(told.position_w[:2], (0.5, 0.2))
+    assert off < 3 * told.position_sd_m + 0.005
+
+
+def test_a_touch_of_what_is_seen_makes_no_second_one_and_keeps_its_name():
+    map_ = mapped(cylinder("a", 0.8, 0.0))
+    name = only(map_).name
+    touch(map_, (0.8, 0.0), 0.05, 3.0)
+    told = only(map_)
+    assert told.felt and told.name == name
+    assert map_.at(np.array([0.75, 0.0])) is map_.tracks[0] and map_.at(np.array([0.5, 0.5])) is None
+
+
+def test_an_unexplained_touch_is_something_new():
+    map_ = mapped(cylinder("a", 0.8, 0.0))
+    touch(map_, (0.8, 0.4), 0.05, 3.0)
+    assert len(map_.told(0, 0.0)) == 2
+
+
+def test_what_one_can_see_through_is_dropped():
+    map_ = mapped(cylinder("ghost", 0.6, 0.0), cylinder("real", 0.8, 0.4))
+    for k in range(8):
+        map_.take_scan(scan_of(cylinder("real", 0.8, 0.4), box("behind", 2.0, 0.0, (0.1, 1.5)), stamp_ns=k))
+    assert all(math.dist(o.position_w[:2], (0.6, 0.0)) > 0.3 for o in map_.told(0, 0.0))
+    assert any(math.dist(o.position_w[:2], (0.8, 0.4)) < 0.01 for o in map_.told(0, 0.0))
+
+
+def test_what_is_hidden_or_out_of_view_is_kept():
+    map_ = mapped(cylinder("a", 1.2, 0.0))
+    for k in range(20):
+        map_.take_scan(scan_of(box("screen", 0.5, 0.0, (0.05, 0.8)), stamp_ns=k))
+    assert any(math.dist(o.position_w[:2], (1.2, 0.0)) < 0.01 for o in map_.told(0, 0.0))
+    for k in range(20):
+        map_.take_scan(scan_of(at=(2.0, 0.0), stamp_ns=k))
+    assert any(math.dist(o.position_w[:2], (1.2, 0.0)) < 0.01 for o in map_.told(0, 0.0))
+
+
+def test_what_the_body_passes_through_does_not_exist():
+    map_ = mapped(cylinder("smoke", 0.6, 0.0), cylinder("beside", 0.6, 0.3))
+    for k in range(40):
+        axis = np.column_stack([np.linspace(0, 0.02 * k, 50), np.zeros(50)])
+        map_.take_body(axis, BODY_M)
+    told = map_.told(0, 0.0)
+    assert len(told) == 1 and math.dist(told[0].position_w[:2], (0.6, 0.3)) < 0.01
+
+
+def test_where_the_body_lies_nothing_reaches():
+    map_ = ObstacleMap()
+    for k in range(4):  # one face of a box: how deep it is, is a guess
+        map_.take_scan(scan_of(box("thin", 0.8, 0.0, (0.03, 0.3)), stamp_ns=k))
+    axis = np.column_stack([np.full(40, 0.8 + 0.015 + BODY_M + 0.002), np.linspace(-0.3, 0.3, 40)])
+    assert (outer := only(map_)).half_size_m and _depth_beyond(outer, axis) > 0.02
+    for _ in range(5):
+        map_.take_body(axis, BODY_M)
+    assert _depth_beyond(only(map_), axis) < 0.012
+
+
+def _depth_beyond(told: Obstacle, axis: np.ndarray) -> float:
+    """How far an obstacle reaches into the body."""
+    return BODY_M - min(outline_distance_m(told, p) for p in axis)
+
+
+def test_the_newest_look_counts_most_after_drift():
+    still, drifted = mapped(cylinder("a", 0.8, 0.0)), mapped(cylinder("a", 0.8, 0.0))
+    drifted.drift(0.02**2)
+    for map_ in (still, drifted):
+        map_.take_scan(scan_of(cylinder("a", 0.815, 0.0)))
+    assert only(drifted).position_w[0] == pytest.approx(0.815, abs=0.003)
+    assert only(still).position_w[0] < 0.812
+
+
+def test_far_things_are_forgotten_and_their_number_is_bounded():
+    map_ = mapped(cylinder("a", 0.8, 0.0))
+    map_.forget(np.array([[KEPT_M + 0.5, 0.0]]))
+    assert len(map_.tracks) == 1
+    map_.forget(np.array([[KEPT_M + 1.0, 0.0]]))
+    assert not map_.tracks
+    map_.take_touches([(np.array([0.2 * (k % 50), 0.2 * (k // 50)]), np.array([1.0, 0.0])) for k in range(1100)], 0)
+    map_.forget(np.array([[0.2 * k, 0.2 * j] for k in range(50) for j in range(25)]))
+    assert len(map_.tracks) == MAX_TRACKS

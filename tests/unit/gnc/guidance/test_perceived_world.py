@@ -1,0 +1,141 @@
+"""The whole of guidance on a snake that moves through a field it does not know, held against the field."""
+
+import msgspec
+import numpy as np
+
+from snakesim_gnc.guidance.localisation import PoseNoise
+from snakesim_gnc.guidance.perceived_world import PerceivedWorld
+from snakesim_hal.wire.messages import Contact, Contacts, World
+from snakesim_operator.results.map_score import MapScore, moved, score
+from tests.unit.gnc.guidance.drive import NOISE, STEP_NS, Drive, Place, random_field
+from tests.unit.gnc.guidance.rendered import cylinder, hills, lidar
+
+
+def told(drive: Drive) -> World:
+    world = drive.world.world(drive.turn, drive.turn * STEP_NS)
+    assert world is not None
+    return world
+
+
+def scored(drive: Drive, turns: int, *, pose: bool = True) -> MapScore:
+    """The map every half second, against the truth; without a pose sensor as the robot sees it."""
+    total = MapScore()
+    for here in drive.turns(turns, pose=pose):
+        if drive.turn % 25 == 0 and drive.turn > 25:
+            obstacles = told(drive).obstacles
+            if not pose:
+                obstacles = moved(obstacles, drive.world.localiser.base.planar_w.tolist(), here.base_w)
+            total.add(score(obstacles, drive.obstacles, here.head_w, here.headings_rad[-1]))
+    return total
+
+
+def test_a_field_is_mapped_to_millimetres():
+    total = scored(Drive(random_field(1)), 300)
+    assert len(total.position_m) > 60 and total.visible > 20
+    assert np.median(total.position_m) < 0.005 and np.median(total.surface_m) < 0.003
+    assert total.misses <= 0.05 * total.visible and total.ghosts <= 0.02 * total.told
+    assert np.median(total.in_sd) < 1.5 and np.percentile(total.in_sd, 90) < 3.5  # as sure as it may be
+
+
+def test_so_it_is_on_hills():
+    total = scored(Drive(random_field(2), ground=hills(0.02, 1.5)), 200)
+    assert np.median(total.position_m) < 0.008
+    assert total.misses <= 0.1 * total.visible and total.ghosts <= 0.05 * total.told
+
+
+def test_without_a_pose_sensor_it_is_right_as_the_robot_sees_it():
+    total = scored(Drive(random_field(3)), 300, pose=False)
+    assert np.median(total.position_m) < 0.02
+    assert total.ghosts <= 0.1 * total.told
+
+
+def test_an_image_counts_where_it_was_taken_not_where_it_arrives():
+    """At 0.4 m/s an image is 16 mm old, and the head turns meanwhile."""
+    drive = Drive(random_field(1), speed_m_s=0.4)
+    assert np.median(scored(drive, 150).position_m) < 0.006
+
+
+def test_samples_without_a_body_of_their_time_are_counted_and_not_used():
+    drive = Drive(random_field(1))
+    *_, here = drive.turns(100)
+    image, before = drive.image(here, 100 * STEP_NS), told(drive)
+    drive.world.take_depth(msgspec.structs.replace(image, stamp_ns=STEP_NS), NOISE)  # older than what is in the map
+    drive.world.take_depth(msgspec.structs.replace(image, stamp_ns=900 * STEP_NS), NOISE)  # of the future
+    joints = drive.joints(here, here)
+    broken = msgspec.structs.replace(joints, stamp_ns=joints.stamp_ns + STEP_NS, valid=[False] * len(joints.valid))
+    drive.world.take_joints(broken, None, None)
+    drive.world.take_depth(image, NOISE)
+    assert sum(drive.world.refused.values()) == 3 and len(drive.world.refused) == 3
+    after = told(drive)
+    assert after.depth_stamp_ns == before.depth_stamp_ns and len(after.obstacles) == len(before.obstacles)
+
+
+def test_when_the_streams_end_nothing_new_is_told_and_doubt_grows():
+    drive = Drive(random_field(1))
+    for _ in drive.turns(150):
+        pass
+    drive.under_way.clear()
+    before = told(drive)
+    for _ in drive.turns(100, pose=False, images=False, imu=False):
+        pass
+    after = told(drive)
+    assert after.pose_stamp_ns == before.pose_stamp_ns and after.depth_stamp_ns == before.depth_stamp_ns
+    assert after.base_confidence < before.base_confidence
+    assert (after.base_position_sd_m or 0) > 5 * (before.base_position_sd_m or 1)
+    seen = {o.name: o for o in before.obstacles}
+    assert {o.name for o in after.obstacles} <= set(seen)
+    assert all(o.confidence <= seen[o.name].confidence for o in after.obstacles)
+    assert all(o.last_seen_ns == seen[o.name].last_seen_ns for o in after.obstacles)
+
+
+def touching(here: Place, turn: int) -> Contacts:
+    """A peg, unseen, at the left side of the middle link; the sensor tells no name that is true."""
+    contact = Contact(
+        link=7,
+        obstacle="a name from the simulator",
+        position_l=(0.05, 0.04, 0.0),
+        normal_l=(0.0, -1.0, 0.0),
+        tangent_1_l=(1.0, 0.0, 0.0),
+        tangent_2_l=(0.0, 0.0, 1.0),
+        force_l=(0.0, -3.0, 0.0),
+        torque_l=(0.0, 0.0, 0.0),
+    )
+    return Contacts(tick=turn, stamp_ns=turn * STEP_NS, contacts=[contact])
+
+
+def test_a_touch_is_told_by_the_name_in_the_map_not_by_that_of_the_sensor():
+    drive = Drive([])
+    for here in drive.turns(10, images=False):
+        drive.world.take_contacts(touching(here, drive.turn))
+    world = drive.world.world(9, 9 * STEP_NS)
+    assert world is not None and world.contacts
+    assert {c.obstacle for c in world.contacts} <= {o.name for o in world.obstacles}
+    assert all(o.felt for o in world.obstacles) and "simulator" not in repr(world)
+
+
+def test_a_lidar_maps_as_a_camera_does():
+    drive = Drive([cylinder("a", 2.0, 0.3), cylinder("b", 2.2, -0.25)])
+    here = drive.place(0)
+    for here in drive.turns(60, images=False):
+        beams = lidar(drive.obstacles, here.origins_w[-1], here.rotations[-1], stamp_ns=drive.turn * STEP_NS)
+        drive.world.take_ranges(msgspec.structs.replace(beams, link=len(here.origins_w) - 1), NOISE)
+    total = score(told(drive).obstacles, drive.obstacles, here.head_w, here.headings_rad[-1])
+    assert len(total.position_m) == 2 and max(total.position_m) < 0.005 and not total.ghosts
+
+
+def test_it_starts_over_with_an_empty_map():
+    drive = Drive(random_field(1))
+    for _ in drive.turns(60):
+        pass
+    assert told(drive).obstacles
+    drive.world.start_over()
+    assert drive.world.world(0, 0) is None
+    for _ in Drive.turns(drive, 1, images=False):
+        pass
+    assert told(drive).obstacles == []
+
+
+def test_before_the_first_joint_state_there_is_no_world():
+    drive = Drive([])
+    world = PerceivedWorld(drive.robot, drive.world.localiser.base, PoseNoise())
+    assert world.world(0, 0) is None

@@ -1,0 +1,137 @@
+"""Clusters and shapes: what belongs together, circles and boxes from what of them is seen, and how sure that is."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from snakesim_gnc.guidance.clusters import clusters_of
+from snakesim_gnc.guidance.obstacle_map import ObstacleMap
+from snakesim_gnc.guidance.scan import Noise, scan_of_ranges
+from snakesim_gnc.guidance.surfaces import MAX_CELLS, MOST_INFORMATION, Surface
+from snakesim_gnc.guidance.tracks import Track, fit
+from snakesim_hal.model.outlines import outline_distance_m
+from tests.unit.gnc.guidance.rendered import box, cylinder, lidar, turned
+
+AT = np.array([0.0, 0.0, 0.05])
+NOISE_M = 0.002
+
+
+def scanned(*obstacles, beams=361, at=AT):
+    return scan_of_ranges(lidar(obstacles, at, turned(0.0), beams=beams), at, turned(0.0), 0.0, Noise(NOISE_M, 0.0))
+
+
+def seen(truth, *, random=None, views=((0.0, 0.0),), noise_m=NOISE_M) -> Track:
+    """A track of what a lidar saw of one obstacle, from some places."""
+    track = Track(1, "it")
+    for x, y in views:
+        scan = scanned(truth, at=np.array([x, y, 0.05]))
+        hits = np.flatnonzero(np.isfinite(scan.range_m))
+        towards = scan.origin_w - scan.points_w[hits]
+        towards = towards / np.hypot(*towards.T)[:, None]
+        points = scan.points_w[hits]
+        if random is not None:
+            points = points - towards * noise_m * random.standard_normal(len(points))[:, None]
+        track.surface.add(points, np.full(len(hits), noise_m), towards)
+    fit([track])
+    return track
+
+
+def test_things_apart_are_clusters_of_their_own():
+    things = [
+        cylinder("a", 0.8, 0.3),
+        cylinder("b", 0.8, 0.1),
+        cylinder("behind", 1.3, 0.33),
+        box("c", 0.7, -0.3, (0.1, 0.2)),
+    ]
+    scan = scanned(*things)
+    clusters = clusters_of(scan)
+    owners = [
+        {min(things, key=lambda o: abs(outline_distance_m(o, scan.points_w[i]))).name for i in c} for c in clusters
+    ]
+    assert all(len(names) == 1 for names in owners)
+    assert set.union(*owners) == {"a", "b", "behind", "c"}
+
+
+def test_a_concave_corner_is_two_things():
+    walls = [box("ahead", 1.0, 0.0, (0.05, 1.0)), box("beside", 0.5, 0.5, (1.0, 0.05))]
+    assert len(clusters_of(scanned(*walls))) >= 2
+    assert len(clusters_of(scanned(walls[0]))) == 1
+
+
+@given(st.floats(0.03, 0.08), st.floats(0.3, 1.2), st.floats(-0.5, 0.5), st.integers(0, 1000))
+@settings(max_examples=60)
+def test_a_cylinder_is_found_as_well_as_its_covariance_says(radius, x, y, seed):
+    track = seen(cylinder("it", x, y, radius), random=np.random.default_rng(seed))
+    off = math.dist(track.centre_w, (x, y))
+    assert off < 0.015 and off < 5 * track.position_sd_m
+    assert track.shape == "box" or abs(track.radius_m - radius) < 5 * track.size_sd_m
+
+
+@given(st.floats(0.08, 0.3), st.floats(0.08, 0.3), st.floats(0.35, 1.2), st.integers(0, 1000))
+@settings(max_examples=60)
+def test_a_box_seen_at_two_faces_is_found_whole(length, width, yaw, seed):
+    truth = box("it", 0.8, 0.1, (length, width), yaw)
+    track = seen(truth, random=np.random.default_rng(seed), views=((0.0, 0.0), (0.0, 0.5), (0.0, -0.3)))
+    assert track.shape == "box"
+    assert math.dist(track.centre_w, (0.8, 0.1)) < 0.025
+    assert sorted(2 * track.half_m) == pytest.approx(sorted((length, width)), abs=0.04)
+    turn = (track.yaw_rad - yaw + math.pi / 4) % (math.pi / 2) - math.pi / 4
+    assert abs(turn) < 0.15
+
+
+def test_behind_a_single_face_the_depth_is_a_guess_and_said_so():
+    one = seen(box("it", 0.8, 0.0, (0.1, 0.16)))
+    assert one.shape == "box" and one.position_sd_m > 0.015  # its back side is open
+    face = one.centre_w[0] - min(one.half_m)
+    assert abs(one.centre_w[1]) < 0.01 and (
+        abs(face - 0.75) < 0.01 or abs(one.centre_w[0] - max(one.half_m) - 0.75) < 0.01
+    )
+    around = seen(box("it", 0.8, 0.0, (0.1, 0.16)), views=((0.0, 0.0), (0.3, 0.6), (0.3, -0.6)))
+    assert around.position_sd_m < 0.01 and math.dist(around.centre_w, (0.8, 0.0)) < 0.01
+
+
+def test_a_long_face_is_a_thin_wall():
+    wall = seen(box("it", 0.8, 0.0, (0.04, 1.0)))
+    assert wall.shape == "box" and min(wall.half_m) < 0.04 and max(wall.half_m) == pytest.approx(0.5, abs=0.05)
+
+
+def test_a_short_arc_leaves_the_line_of_sight_uncertain():
+    whole, part = seen(cylinder("it", 0.8, 0.0)), Track(2, "part")
+    few = slice(len(whole.surface) // 2 - 2, len(whole.surface) // 2 + 2)
+    part.surface.add(whole.surface.points_w[few], np.full(4, NOISE_M), whole.surface.outward_w[few])
+    fit([part])
+    assert part.position_sd_m > 5 * whole.position_sd_m
+
+
+@given(st.lists(st.tuples(st.floats(-1, 1), st.floats(-1, 1)), min_size=1, max_size=300))
+def test_a_surface_is_bounded_and_never_surer_than_the_mount(places):
+    surface = Surface()
+    for _ in range(3):
+        surface.add(np.array(places), np.full(len(places), 0.001), np.tile([1.0, 0.0], (len(places), 1)))
+    assert 0 < len(surface) <= MAX_CELLS
+    assert surface.weight.max() <= MOST_INFORMATION
+
+
+def test_fusing_looks_lowers_the_scatter_and_the_told_error():
+    random, truth = np.random.default_rng(3), cylinder("it", 0.8, 0.1)
+
+    def scatter_m(looks: int) -> tuple[float, float]:
+        found = [seen(truth, random=random, views=((0.0, 0.0),) * looks, noise_m=0.005) for _ in range(30)]
+        return float(np.std([t.centre_w[0] for t in found])), float(np.median([t.position_sd_m for t in found]))
+
+    once, often = scatter_m(1), scatter_m(10)
+    assert often[0] < 0.5 * once[0] and often[1] < 0.7 * once[1]
+    assert often[1] > often[0]  # it is not thought better than it is
+
+
+def test_pieces_of_a_wall_become_one():
+    map_ = ObstacleMap()
+    hidden = [box("wall", 1.0, 0.0, (0.05, 1.6)), cylinder("post", 0.5, 0.0, 0.03)]
+    map_.take_scan(scanned(*hidden))
+    assert len(map_.tracks) == 3  # the post hides the middle of the wall
+    for _ in range(8):
+        map_.take_scan(scanned(hidden[0]))
+    assert [t.shape for t in map_.tracks if t.believed(0) > 0.4] == ["box"]
