@@ -124,6 +124,9 @@ def test_what_stopped_the_robot_is_kept_however_much_comes_after_it(by: str) -> 
     for i in range(18, 100):
         rig.authority.note(Fault(tick=i, what="late", cause="late"))
     assert [fault.tick for fault in rig.authority.faults] == [*range(17), *range(85, 100)]
+    for i in range(100):  # of one that was never stopped
+        (rig := rig if i else Rig()).authority.note(Fault(tick=i, what="late", cause="late"))
+    assert len(rig.authority.faults) == MAX_FAULTS_KEPT
 
 
 def test_a_fault_is_explained_in_as_many_words_as_a_message_holds() -> None:
