@@ -7,6 +7,7 @@ joints      as in the gate: three periods or 30 ms, and the sensor's delay; at m
 world       guidance's lag, and three of its turns missed, or 0.2 s
 pose,       the sensor's delay, guidance's turn and lag, and three samples missed, or 0.2 s
 contacts
+depth       as the pose, for the newest of all images and ranges, when the map is perceived
 trajectory  guidance's turn and lag, navigation's lag, and three of its turns missed, or 0.2 s
 
 A stamp that is further ahead of the clock than its limit is rejected as well: it is of another host, or forged.
@@ -20,6 +21,8 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, JointState, Trajectory, World
 
 MISSED = 3
+LOOKING = (keys.DEPTH_ALL.rstrip("*"), keys.RANGE_ALL.rstrip("*"))  # sensors that a map is made from
+DEPTH = "sensor/depth or sensor/range"
 MIN_MARGIN_S = 0.2  # guidance and navigation have no real-time priority: a busy computer delays them
 
 
@@ -47,6 +50,10 @@ class Limits:
             for sensor in robot.sensors
             if sensor.key in said
         }
+        looking = [sensor for sensor in robot.sensors if sensor.key.startswith(LOOKING)]
+        if looking and config.mission.map == "perceived":
+            ages_s = [sensor.delay_s + turn_s + lag_s + _margin_s(1.0 / sensor.rate_hz) for sensor in looking]
+            sensors_s[DEPTH] = own.depth_s or min(ages_s)
         return Limits(
             joints_s=own.joints_s or JointLimits.of(robot).oldest_state_ns * 1e-9,
             world_s=own.world_s or lag_s + _margin_s(turn_s),
@@ -63,7 +70,7 @@ class Limits:
         off = _off(keys.WORLD, world.stamp_ns, now_ns, self.world_s)
         if off:
             return off
-        stamps = {keys.POSE: world.pose_stamp_ns, keys.CONTACTS: world.contacts_stamp_ns}
+        stamps = {keys.POSE: world.pose_stamp_ns, keys.CONTACTS: world.contacts_stamp_ns, DEPTH: world.depth_stamp_ns}
         found = [_off(key, stamps[key], now_ns, limit_s) for key, limit_s in self.sensors_s.items()]
         return "; ".join(filter(None, found))
 

@@ -65,7 +65,9 @@ class Progress:
             self._path_id = trajectory.path_id
         body = self._body
         assert body is not None
-        pose_ns = world.stamp_ns if world.pose_stamp_ns is None else world.pose_stamp_ns
+        pose_ns = world.pose_stamp_ns
+        if pose_ns is None or world.base_position_sd_m is not None:  # dead-reckoned up to the world's own stamp
+            pose_ns = world.stamp_ns
         before_ns = self._measured_ns
         if before_ns is None or pose_ns > before_ns:
             self._measure(world, pose_ns)

@@ -92,12 +92,13 @@ class MaxAge(FileStruct, frozen=True, kw_only=True):
     """Maximum age of control's inputs, in robot time; the defaults follow from rates, delays and schedules.
 
     With older joint states control sends no command, so that the lease ends and the robot stops. With an older pose,
-    contacts, world or trajectory the controller holds, and resumes when the stream is back.
+    contacts, image, world or trajectory the controller holds, and resumes when the stream is back.
     """
 
     joints_s: Seconds | None = None
     pose_s: Seconds | None = None
     contacts_s: Seconds | None = None
+    depth_s: Seconds | None = None  # of the newest image or ranges in a perceived map
     world_s: Seconds | None = None
     trajectory_s: Seconds | None = None
 

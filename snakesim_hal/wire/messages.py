@@ -516,7 +516,11 @@ class World(Message, frozen=True, kw_only=True):
     ] = None
     centre_w: Annotated[q.Vector | None, about("centre of mass of the body; null: unknown")] = None
     base_position_sd_m: Annotated[
-        q.Distance | None, about("standard deviation of `base_position_w`, horizontally; null: not estimated")
+        q.Distance | None,
+        about(
+            "standard deviation of `base_position_w`, horizontally; null: not estimated. If it is, the base's pose is "
+            "of `stamp_ns`, by dead reckoning since `pose_stamp_ns`"
+        ),
     ] = None
     base_yaw_sd_rad: Annotated[
         q.Angle | None, about("standard deviation of the base's heading; null: not estimated")

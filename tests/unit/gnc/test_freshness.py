@@ -70,7 +70,9 @@ def test_the_scenario_may_say_otherwise() -> None:
     assert found.sensors_s == {"sensor/pose": 0.5, "sensor/contacts": 5.0}
 
 
-@pytest.mark.parametrize("wrong", [{"pose_s": 0.0}, {"pose_s": -1.0}, {"world_s": 61.0}, {"imu_s": 1.0}])
+@pytest.mark.parametrize(
+    "wrong", [{"pose_s": 0.0}, {"pose_s": -1.0}, {"world_s": 61.0}, {"depth_s": 0.0}, {"imu_s": 1.0}]
+)
 def test_what_a_scenario_may_not_say(wrong: dict[str, float]) -> None:
     with pytest.raises(msgspec.ValidationError):
         run_config(max_age=wrong)
@@ -95,6 +97,18 @@ def test_what_a_scenario_may_not_say(wrong: dict[str, float]) -> None:
 )
 def test_a_world_model_is_as_old_as_what_it_was_made_of(made: dict[str, Any], words: str) -> None:
     assert limits(pose=100.0, contacts=100.0).against_world(world(**made), NOW) == words
+
+
+def test_a_perceived_map_is_as_old_as_its_newest_image() -> None:
+    config = run_config(services=SCHEDULE, mission={"map": "perceived"})
+    sensors = [SensorDescription(key=f"sensor/{name}", rate_hz=20.0, delay_s=0.03) for name in ("depth/a", "range/b")]
+    seeing = msgspec.structs.replace(description(), sensors=sensors)
+    found, known = Limits.of(config, seeing), Limits.of(run_config(services=SCHEDULE), seeing)
+    assert found.against_world(world(depth_stamp_ns=NOW - 270_000_000), NOW) == ""
+    old = found.against_world(world(depth_stamp_ns=NOW - 400_000_000), NOW)
+    assert old == "sensor/depth or sensor/range is 0.4 s old, at most 0.27 s"
+    assert "was made without sensor/depth" in found.against_world(world(), NOW)
+    assert known.against_world(world(), NOW) == ""  # of the scene's file, which does not age
 
 
 def test_a_sensor_that_the_robot_lacks_cannot_be_stale() -> None:
