@@ -1,0 +1,92 @@
+"""Obstacle-aided propulsion with all joints: the shape at the measured arc length plus a look-ahead that is a force.
+
+A body that obstacles hold on its path has one freedom, its arc length s, and joint torques push it along the path with
+F = sum tau_i theta_i'(s) (virtual work; theta_i(s) are the angles of the chain on the path). Servos of stiffness k with a
+look-ahead l give tau_i = k (theta_i(s + l) - theta_i(s)), hence F = l k sum theta_i'^2: so look-ahead commands force. It
+comes from the error of the speed by a PI law, and is bounded. A negative speed backs the body out along its own path.
+"""
+
+from typing import Annotated
+
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from snakesim_gnc.control.bumpless import HandOver
+from snakesim_gnc.control.controller import Action, Report, View, positions
+from snakesim_gnc.control.planar_body import PlanarBody
+from snakesim_gnc.control.progress import Located, Progress
+from snakesim_hal.backend import SetPoints
+from snakesim_hal.model.files import FileStruct
+from snakesim_hal.wire.messages import Description
+
+Floats = NDArray[np.float64]
+
+SLOPE_M = 0.02  # over which theta' is taken
+
+
+class ObstacleAided:
+    """Speed along the path by look-ahead, with every joint."""
+
+    class Settings(FileStruct, frozen=True, kw_only=True):
+        """Look-ahead l = lead_s (v_wanted - v) + integral; its bound is the most that the body is pushed."""
+
+        lead_s: Annotated[float, Meta(ge=0, le=5, extra_json_schema={"unit": "s"})] = 0.2
+        integral_per_s: Annotated[float, Meta(ge=0, le=50, extra_json_schema={"unit": "1"})] = 0.4
+        largest_look_ahead_m: Annotated[float, Meta(gt=0, le=1, extra_json_schema={"unit": "m"})] = 0.25
+        fresh_look_ahead_m: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "m"})] = 0.05
+        blend_s: Annotated[float, Meta(gt=0, le=10, extra_json_schema={"unit": "s"})] = 0.3
+        speed_filter_s: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "s"})] = 0.05
+
+    def __init__(self, robot: Description, settings: Settings) -> None:
+        self._robot = robot
+        self._set = settings
+        self._body = PlanarBody(robot)
+        self._progress = Progress(self._body, speed_filter_s=settings.speed_filter_s)
+        self._hand_over = HandOver(robot)
+        self._stiffness = np.array([joint.stiffness_nm_per_rad for joint in robot.joints])
+        self._reference: Floats | None = None
+        self._integral_m = 0.0
+
+    def update(self, view: View) -> Action:
+        """Angles of the body further along the path, as far as the wanted speed needs it."""
+        located = self._progress.update(view)
+        if isinstance(located, str):
+            return self._wait(view, located)
+        ahead_m = self._look_ahead_m(located, view.period_s)
+        at = located.on_path.at
+        reference = self._body.all_angles(at(located.tail_s_m + ahead_m))
+        if self._reference is None:
+            self._hand_over.start(view.joints, reference)
+        elif located.anew:
+            self._integral_m = min(self._integral_m, self._set.fresh_look_ahead_m)
+            self._hand_over.shift(reference - self._reference)
+        self._reference = reference
+        self._hand_over.fade(view.period_s / self._set.blend_s)
+        slope = self._body.all_angles(at(located.tail_s_m + SLOPE_M)) - self._body.all_angles(at(located.tail_s_m))
+        force_n = ahead_m * float(self._stiffness @ slope**2) / SLOPE_M**2
+        report = Report(path_s_m=located.tail_s_m, reference_rad=reference.tolist(), propulsion_n=force_n)
+        return Action(self._towards(), report)
+
+    def _look_ahead_m(self, located: Located, period_s: float) -> float:
+        most = self._set.largest_look_ahead_m
+        wanted_m_s = located.trajectory.speed_m_s
+        if wanted_m_s == 0.0:
+            self._integral_m = 0.0
+            return 0.0
+        error_m_s = wanted_m_s - located.speed_m_s
+        self._integral_m += self._set.integral_per_s * error_m_s * period_s
+        self._integral_m = min(max(self._integral_m, -most), most)
+        return min(max(self._integral_m + self._set.lead_s * error_m_s, -most), most)
+
+    def _wait(self, view: View, why: str) -> Action:
+        """Without a known body pose every joint keeps its reference."""
+        if self._reference is None:
+            self._reference = np.array(view.joints.angle_rad)
+            self._hand_over.start(view.joints, self._reference)
+        self._hand_over.fade(view.period_s / self._set.blend_s)
+        return Action(self._towards(), Report(why=why, reference_rad=self._reference.tolist()))
+
+    def _towards(self) -> SetPoints:
+        assert self._reference is not None
+        return positions(self._robot, self._hand_over.positions_rad(self._reference).tolist())
