@@ -16,8 +16,10 @@ from snakesim_gnc.control.bumpless import HandOver
 from snakesim_gnc.control.controller import Action, Report, View, positions
 from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_gnc.control.progress import Located, Progress
+from snakesim_gnc.control.push import find_touches, push_forward
 from snakesim_hal.backend import SetPoints
 from snakesim_hal.model.files import FileStruct
+from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Description
 
 Floats = NDArray[np.float64]
@@ -33,7 +35,14 @@ class ObstacleAided:
 
         lead_s: Annotated[float, Meta(ge=0, le=5, extra_json_schema={"unit": "s"})] = 0.2
         integral_per_s: Annotated[float, Meta(ge=0, le=50, extra_json_schema={"unit": "1"})] = 0.4
-        largest_look_ahead_m: Annotated[float, Meta(gt=0, le=1, extra_json_schema={"unit": "m"})] = 0.25
+        largest_look_ahead_m: Annotated[float, Meta(gt=0, le=1, extra_json_schema={"unit": "m"})] = 0.12
+        largest_push_n: float = 40.0
+        push_per_s: float = 60.0
+        push_ns_m: float = 40.0
+        largest_torque_nm: float = 4.0
+        largest_contact_n: float = 60.0
+        reach_m: float = 0.03
+        loose_m: float = 0.005
         fresh_look_ahead_m: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "m"})] = 0.05
         blend_s: Annotated[float, Meta(gt=0, le=10, extra_json_schema={"unit": "s"})] = 0.3
         speed_filter_s: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "s"})] = 0.05
@@ -47,6 +56,11 @@ class ObstacleAided:
         self._stiffness = np.array([joint.stiffness_nm_per_rad for joint in robot.joints])
         self._reference: Floats | None = None
         self._integral_m = 0.0
+        self._push_n = 0.0
+        self._bends = self._body.bends
+        self._torques_nm = np.zeros(len(robot.joints))
+        self._unit_nm = np.zeros(len(robot.joints))
+        self._most_n = 0.0
 
     def update(self, view: View) -> Action:
         """Angles of the body further along the path, as far as the wanted speed needs it."""
@@ -56,6 +70,8 @@ class ObstacleAided:
         ahead_m = self._look_ahead_m(located, view.period_s)
         at = located.on_path.at
         reference = self._body.all_angles(at(located.tail_s_m + ahead_m))
+        torques = self._push_nm(located, view.period_s)
+        reference = reference + torques / self._stiffness
         if self._reference is None:
             self._hand_over.start(view.joints, reference)
         elif located.anew:
@@ -78,6 +94,31 @@ class ObstacleAided:
         self._integral_m += self._set.integral_per_s * error_m_s * period_s
         self._integral_m = min(max(self._integral_m, -most), most)
         return min(max(self._integral_m + self._set.lead_s * error_m_s, -most), most)
+
+    def _push_nm(self, located: Located, period_s: float) -> Floats:
+        """Torques of the wanted force along the path, by the contacts that the body has, (n_joints,)."""
+        config, wanted_m_s = self._set, located.trajectory.speed_m_s
+        if wanted_m_s <= 0.0 or config.largest_push_n == 0.0:
+            self._push_n = 0.0
+            return np.zeros(len(self._robot.joints))
+        error = wanted_m_s - located.speed_m_s
+        self._push_n += config.push_per_s * error * period_s
+        self._push_n = min(max(self._push_n, 0.0), config.largest_push_n)
+        force_n = min(max(self._push_n + config.push_ns_m * error, 0.0), config.largest_push_n)
+        if located.fresh:
+            outlines = Outlines.of(located.world.obstacles)
+            touches = find_touches(located.nodes_w, self._body.radius_m, outlines, reach_m=config.reach_m, friction=0.0)
+            push = push_forward(located.nodes_w, touches, loose_m=config.loose_m)
+            self._unit_nm = np.zeros(len(self._robot.joints))
+            if push.balanced:
+                self._unit_nm[self._bends] = push.torques_nm
+                most = float(np.abs(push.torques_nm).max(initial=0.0)) + 1e-9
+                self._most_n = min(config.largest_torque_nm / most, config.largest_contact_n / push.lambdas.max())
+        force_n = min(force_n, self._most_n)
+        keep = np.exp(-period_s / 0.1)
+        self._torques_nm = keep * self._torques_nm + (1 - keep) * force_n * self._unit_nm
+        bound = config.largest_torque_nm
+        return np.clip(self._torques_nm, -bound, bound)
 
     def _wait(self, view: View, why: str) -> Action:
         """Without a known body pose every joint keeps its reference."""

@@ -22,6 +22,7 @@ Ints = NDArray[np.intp]
 STEP_M = 0.05
 CONTACTS = 8  # of a body that are remembered, the newest
 CELL_M, CELL_RAD = 0.02, np.pi / 18
+FAILED_M = 0.025  # a path this far from one that failed is another path
 ALONG = 0.35  # |n.t| of a touch: beyond, it is the head that bumps
 
 
@@ -36,14 +37,20 @@ class Search:
     skin_m: float = 0.015  # nearer than this to an obstacle counts as a touch: `snap` will close the gap
     width: int = 300
     curvatures_per_m: tuple[float, ...] = (-5.5, -3.7, -1.8, 0.0, 1.8, 3.7, 5.5)
-    wanted_n: float = 10.0  # F_wanted
+    wanted_n: float = 40.0  # F_wanted
     reward: float = 1.2
     harm: float = 1.0
     weak: float = 1.5
     bend_m: float = 0.02
     progress: float = 1.2
+    grip: float = 4.0  # reward of a touch while the whole body is laid anew
+    weak_now: float = 15.0  # instead of `weak`, over the first `now_m` from where the body lies
+    now_m: float = 0.3
+    repeat: float = 1.0  # of a path that has failed
     move: float = 0.5  # of the body, sideways, as far as it may
     peg_friction: float = 0.0
+    loose_tail_m: float = 0.2  # touches this near to the ends of the body do not count for its margin
+    loose_head_m: float = 0.1
 
 
 @dataclass
@@ -104,10 +111,15 @@ class Beam:
         self._corridor = None
         return self._grow(self._lying(body_w), steps)
 
-    def whole(self, body_w: Floats, goal_rad: float, steps: int, reach_m: float) -> Found | None:
-        """The best path of the whole body, from the tail, and of a number of steps beyond: within reach of the body."""
+    def whole(
+        self, body_w: Floats, goal_rad: float, steps: int, reach_m: float, failed_w: Floats | None = None
+    ) -> Found | None:
+        """The best path of the whole body, from the tail, and of a number of steps beyond: within reach of the body.
+
+        failed_w: (k, 2) points of paths on which the body got stuck here; other ways round are preferred.
+        """
         self._aim(body_w[-1], goal_rad)
-        self._corridor, self._reach_m = _evenly(body_w, self._arcs), reach_m
+        self._corridor, self._reach_m, self._failed = _evenly(body_w, self._arcs), reach_m, failed_w
         return self._grow(self._at_tail(), self._arcs + steps)
 
     def _aim(self, origin: Floats, goal_rad: float) -> None:
@@ -189,7 +201,8 @@ class Beam:
         return np.where(touches, near.normal_w @ self._goal, 0.0)
 
     def _margins(self, nodes: Layer) -> Floats:
-        alive = nodes.touch_s >= nodes.s_m - self._set.body_length_m
+        tail_s = nodes.s_m - self._set.body_length_m + self._set.loose_tail_m
+        alive = (nodes.touch_s >= tail_s) & (nodes.touch_s <= nodes.s_m - self._set.loose_head_m)
         contacts = np.where(alive[..., None], nodes.push, 0.0)
         return margins_n(contacts, nodes.drag.sum(axis=1) / self._set.body_length_m)
 
@@ -212,6 +225,9 @@ class Beam:
         bend_change = np.abs(self._bends - layer.bend[:, None])
         progress = (x1 - x0) * self._goal[0] + (y1 - y0) * self._goal[1]
         cost = layer.cost[:, None] + STEP_M + config.bend_m * STEP_M * bend_change - config.progress * progress
+        if away is not None and self._failed is not None:
+            gaps = np.hypot(x1[..., None] - self._failed[:, 0], y1[..., None] - self._failed[:, 1]).min(axis=-1)
+            cost = cost + STEP_M * config.repeat * np.maximum(1.0 - gaps / FAILED_M, 0.0)
         if away is not None:
             cost = cost + STEP_M * config.move * (away / self._reach_m) ** 2
         rows = np.flatnonzero(free.ravel())
@@ -229,14 +245,17 @@ class Beam:
         at = nodes.heading - 0.5 * nodes.bend * STEP_M
         tangents = np.stack([np.cos(at), np.sin(at)], axis=-1)
         pushes = self._touch(nodes, middle, tangents, nodes.s_m - 0.5 * STEP_M)
-        nodes.cost += STEP_M * np.where(pushes > 0, -config.reward * pushes, -config.harm * pushes)
+        lying = lies is not None and nodes.s_m < config.body_length_m - 0.5 * STEP_M
+        reward = config.grip if lying else config.reward
+        nodes.cost += STEP_M * np.where(pushes > 0, -reward * pushes, -config.harm * pushes)
         nodes.drag = np.concatenate(
             [nodes.drag[:, 1:], STEP_M * wrenches(middle - self._origin, tangents)[:, None]], axis=1
         )
         nodes.margin_n = self._margins(nodes)
-        if lies is not None and nodes.s_m < config.body_length_m - 0.5 * STEP_M:
-            return nodes.take(np.argsort(nodes.cost, kind="stable")[: config.width])
-        nodes.cost += STEP_M * config.weak * np.clip(1.0 - nodes.margin_n / config.wanted_n, 0.0, 1.0)
+        if not lying:
+            weak = np.clip(1.0 - nodes.margin_n / config.wanted_n, 0.0, 1.0)
+            now = lies is not None and nodes.s_m < config.body_length_m + config.now_m
+            nodes.cost += STEP_M * (config.weak_now if now else config.weak) * weak
         return nodes.take(np.argsort(nodes.cost, kind="stable")[: config.width])
 
     def _fits(self, x: Floats, y: Floats, heading: Floats) -> NDArray[np.bool_]:
@@ -255,7 +274,9 @@ class Beam:
             rows.append(row)
             row = int(layer.parent[row])
         picked = zip(layers, reversed(rows), strict=True)
-        x, y, heading, bend, margin = np.array([(n.x[r], n.y[r], n.heading[r], n.bend[r], n.margin_n[r]) for n, r in picked]).T
+        x, y, heading, bend, margin = np.array(
+            [(n.x[r], n.y[r], n.heading[r], n.bend[r], n.margin_n[r]) for n, r in picked]
+        ).T
         return Found(np.stack([x, y], axis=-1), heading, bend[1:], margin, cost)
 
 

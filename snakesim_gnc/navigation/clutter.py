@@ -22,12 +22,17 @@ from snakesim_hal.wire.messages import Intent, Obstacle, Trajectory, World
 
 Floats = NDArray[np.float64]
 
-HORIZON_M = 4.0
+HORIZON_M = 4.4
 AGAIN_M = 2.0
-REACHES_M = (0.06, 0.1)
+REACHES_M = (0.05, 0.09)
 ENDS_SOON_M = 0.6
-OFF_PATH_M = 0.06
-STANDS_S = 1.0
+FORGET_M = 0.15  # beyond this from where it was stuck, what failed there is forgotten
+FAILURES = 4
+LEAST_AHEAD = 10  # arcs of a new path beyond the head
+BACK_EVERY = 3  # time at the same place: back out
+BACK_M, BACK_S = 0.1, 1.5
+TRAIL = 20  # points of the way behind the tail
+STANDS_S = 0.8
 STANDS_M = 0.01
 
 
@@ -66,7 +71,14 @@ class ClutterPlanner:
         self._path_id = 0
         self._start: Floats | None = None
         self._recent: deque[tuple[int, float]] = deque()
-        self._banned: list[Floats] = []
+        self._failed: list[Floats] = []  # paths on which the body got stuck near here
+        self._stuck_at = 0.0
+        self._stalls = 0
+        self._back_from_m: float | None = None  # arc length of the head where backing out began
+        self._back_by_m = 0.0
+        self._back_until_ns = 0
+        self._trail: list[Floats] = []
+        self._aim = np.zeros(2)
         self._finished = False
         self._next_point = 0
         self.replans: list[str] = []
@@ -80,7 +92,8 @@ class ClutterPlanner:
             return None
         body = resample(nodes_w)
         obstacles = self._known or ObstacleMap(world.obstacles)
-        goal = self._towards(body)
+        goal = self._aim = self._towards(body)
+        self._leave_trail(body[0])
         why = self._why_again(body, world.stamp_ns)
         if why:
             self._plan(body, obstacles, goal, why)
@@ -91,11 +104,14 @@ class ClutterPlanner:
             stamp_ns=world.stamp_ns,
             path_id=planned.path_id,
             path_w=[(float(x), float(y)) for x, y in planned.route.points_w],
-            speed_m_s=0.0 if self._finished else wish.speed_m_s,
+            speed_m_s=0.0 if self._finished else self._speed_m_s(wish.speed_m_s),
             push_points=[],
             finished=self._finished,
             reason="the goal is reached" if self._finished else wish.why[:500],
         )
+
+    def _speed_m_s(self, wanted_m_s: float) -> float:
+        return wanted_m_s if self._back_from_m is None else -0.5 * wanted_m_s
 
     def _towards(self, body: Floats) -> Floats:
         """Unit vector of the goal's direction; notes when it is reached."""
@@ -117,36 +133,52 @@ class ClutterPlanner:
         return ahead / max(float(np.hypot(*ahead)), 1e-9)
 
     def _why_again(self, body: Floats, now_ns: int) -> str:
+        """Why the path is to be planned anew; empty when it is not. Decides about backing out, too."""
         planned = self._planned
         if planned is None:
             return "start"
-        route = planned.route
-        head_s = route.project(body[-1])
+        head_s = planned.route.project(body[-1])
         recent = self._recent
         recent.append((now_ns, head_s))
         while now_ns - recent[0][0] > STANDS_S * 1e9:
             recent.popleft()
-        if route.length_m - head_s < ENDS_SOON_M:
+        moved, full = head_s - recent[0][1], now_ns - recent[0][0] > 0.8e9 * STANDS_S
+        if self._back_from_m is not None:
+            if self._back_from_m - head_s > self._back_by_m or now_ns > self._back_until_ns:
+                self._back_from_m = None
+                return "backed out"
+            return ""
+        if planned.route.length_m - head_s < ENDS_SOON_M:
             return "ends soon"
-        off = max(float(np.hypot(*(route.position_w(route.project(p)) - p))) for p in body[::10])
-        if off > OFF_PATH_M:
-            return f"off path {off * 1e3:.0f} mm"
-        if now_ns - recent[0][0] > 0.8e9 * STANDS_S and head_s - recent[0][1] < STANDS_M:
+        if full and moved < STANDS_M:
+            return self._stuck(planned, body, head_s, now_ns)
+        return ""
+
+    def _stuck(self, planned: Planned, body: Floats, head_s: float, now_ns: int) -> str:
+        """Remember the path; every third time at a place back out first."""
+        place = float(body.mean(axis=0) @ self._aim)
+        if self._failed and abs(place - self._stuck_at) > FORGET_M:
+            self._failed.clear()
+        if not self._failed:
+            self._stuck_at, self._stalls = place, 0
+        tail_s = planned.route.project(body[0])
+        self._failed.append(planned.route.position_w(np.arange(tail_s, head_s + 0.1, 0.025)))
+        self._failed = self._failed[-FAILURES:]
+        self._stalls += 1
+        if self._stalls % BACK_EVERY:
             return "stands"
+        self._back_from_m, self._back_by_m = head_s, BACK_M
+        self._back_until_ns = now_ns + round(BACK_S * 1e9)
         return ""
 
     def _plan(self, body: Floats, obstacles: ObstacleMap, goal: Floats, why: str) -> None:
         self.replans.append(f"{why} at {body[-1][0]:.2f}")
         beam, goal_rad = Beam(obstacles, self._search), float(np.arctan2(goal[1], goal[0]))
-        found, kept = None, 0
         if self._planned is None:
             found, kept = beam.ahead(body, goal_rad, round(HORIZON_M / STEP_M)), len(body) - 3
             points = body if found is None else np.concatenate([body, resample(found.points_w)[1:]])
         else:
-            for reach_m in REACHES_M:
-                found = beam.whole(body, goal_rad, round(AGAIN_M / STEP_M), reach_m)
-                if found is not None:
-                    break
+            found, kept = self._anew(beam, body, goal_rad), 0
             points = body if found is None else resample(found.points_w)
         if found is not None:
             points = snap(points, kept, obstacles, goal, self._fit)
@@ -155,4 +187,33 @@ class ClutterPlanner:
             points = np.concatenate([body, body[-1] + np.linspace(0.1, 1.0, 10)[:, None] * ahead / np.hypot(*ahead)])
         self._path_id += 1
         self._recent.clear()
+        behind = [place for place in self._trail if np.hypot(*(place - points[0])) > 0.04][-TRAIL:]
+        if behind:
+            points = np.concatenate([np.array(behind), points])
         self._planned = Planned(Route(points), self._path_id, SPACING_M * len(body), found)
+
+    def _anew(self, beam: Beam, body: Floats, goal_rad: float) -> Found | None:
+        """A path for the whole body: the least change of shape that can push well."""
+        failed = np.concatenate(self._failed) if self._failed else None
+        best: Found | None = None
+        for reach_m in REACHES_M:
+            found = beam.whole(body, goal_rad, round(AGAIN_M / STEP_M), reach_m, failed)
+            arcs = round(self._search.body_length_m / STEP_M)
+            if found is None or len(found.points_w) < arcs + LEAST_AHEAD:
+                continue
+            if best is None or found.cost < best.cost - 0.1:
+                best = found
+            if np.min(found.margins_n[arcs : arcs + 6]) > 0.5 * self._search.wanted_n:
+                break
+        return best
+
+    def _leave_trail(self, tail: Floats) -> None:
+        """Where the tail was: the way back."""
+        trail = self._trail
+        if not trail or np.hypot(*(trail[-1] - tail)) > 0.03:
+            ahead = len(trail) > 1 and float((tail - trail[-1]) @ (trail[-1] - trail[-2])) < 0
+            if ahead:
+                trail.pop()
+            else:
+                trail.append(tail)
+            del trail[: -2 * TRAIL]

@@ -52,7 +52,8 @@ class ObstacleMap:
             x = self._low[0] + CELL_M * np.arange(first[0], last[0])
             y = self._low[1] + CELL_M * np.arange(first[1], last[1])
             window = (slice(first[0], last[0]), slice(first[1], last[1]))
-            distance = self._distances(x[:, None], y[None, :], np.intp(i))[0]
+            cells = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
+            distance = outlines.towards(cells, np.full(cells.shape[:2], i))[0]
             nearer = distance < least[window]
             least[window][nearer] = distance[nearer]
             nearest[window][nearer] = i
@@ -68,22 +69,5 @@ class ObstacleMap:
         distance, normal = np.full(shape, REACH_M), np.zeros((*shape, 2))
         some = found >= 0
         if some.any():
-            distance[some], normal[some] = self._distances(x[some], y[some], found[some])
+            distance[some], normal[some] = self.outlines.towards(np.stack([x[some], y[some]], axis=-1), found[some])
         return Near(found, distance, normal)
-
-    def _distances(self, x: Floats, y: Floats, of: Ints | np.intp) -> tuple[Floats, Floats]:
-        """Distance to the surface of one obstacle each, and the normal (..., 2) from it."""
-        outlines = self.outlines
-        c, s = outlines.turn[of, 0], outlines.turn[of, 1]
-        dx, dy = x - outlines.centre_w[of, 0], y - outlines.centre_w[of, 1]
-        local_x, local_y = c * dx + s * dy, c * dy - s * dx
-        over_x, over_y = np.abs(local_x) - outlines.half_m[of, 0], np.abs(local_y) - outlines.half_m[of, 1]
-        out_x, out_y = np.maximum(over_x, 0.0), np.maximum(over_y, 0.0)
-        outside = np.hypot(out_x, out_y)
-        sunk = np.maximum(over_x, over_y)
-        distance = outside + np.minimum(sunk, 0.0) - outlines.rounding_m[of]
-        free = outside > 0
-        length = np.where(free, outside, 1.0)
-        nx = np.where(free, out_x / length, over_x >= over_y) * np.where(local_x < 0, -1.0, 1.0)
-        ny = np.where(free, out_y / length, over_x < over_y) * np.where(local_y < 0, -1.0, 1.0)
-        return distance, np.stack([c * nx - s * ny, s * nx + c * ny], axis=-1)

@@ -18,7 +18,7 @@ class Fit:
 
     radius_m: float
     segment_m: float
-    push_gap_m: float = 0.003  # between the body and what it pushes off
+    push_gap_m: float = -0.005  # between the body and what it pushes off
     brake_gap_m: float = 0.012
     least_gap_m: float = 0.004
     reach_m: float = 0.02  # a gap that is wider is left as it is
