@@ -1,9 +1,13 @@
-"""Obstacle-aided propulsion with all joints: the shape at the measured arc length plus a look-ahead that is a force.
+"""Obstacle-aided propulsion with all joints: forces on the obstacles, and the shape slightly further along the path.
 
-A body that obstacles hold on its path has one freedom, its arc length s, and joint torques push it along the path with
-F = sum tau_i theta_i'(s) (virtual work; theta_i(s) are the angles of the chain on the path). Servos of stiffness k with a
-look-ahead l give tau_i = k (theta_i(s + l) - theta_i(s)), hence F = l k sum theta_i'^2: so look-ahead commands force. It
-comes from the error of the speed by a PI law, and is bounded. A negative speed backs the body out along its own path.
+A body that obstacles hold on its path has one freedom, its arc length s. Two terms push it along, both under a PI law
+of the speed, both bounded:
+
+- forces on the obstacles that are near (`push.py`): the torques of those forces close gaps, and press where it pushes;
+- the shape at s plus a small look-ahead l: tau_i = k (theta_i(s + l) - theta_i(s)), hence by virtual work a force
+  F = l k sum theta_i'^2, also where no contacts can balance it.
+
+A negative speed backs the body out along its own path. See `docs/poal.md`.
 """
 
 from typing import Annotated
@@ -24,6 +28,7 @@ from snakesim_hal.wire.messages import Description
 
 Floats = NDArray[np.float64]
 
+ANOTHER_SHAPE_RAD = 0.1
 SLOPE_M = 0.02  # over which theta' is taken
 
 
@@ -34,16 +39,21 @@ class ObstacleAided:
         """Look-ahead l = lead_s (v_wanted - v) + integral; its bound is the most that the body is pushed."""
 
         lead_s: Annotated[float, Meta(ge=0, le=5, extra_json_schema={"unit": "s"})] = 0.2
-        integral_per_s: Annotated[float, Meta(ge=0, le=50, extra_json_schema={"unit": "1"})] = 0.4
-        largest_look_ahead_m: Annotated[float, Meta(gt=0, le=1, extra_json_schema={"unit": "m"})] = 0.12
-        largest_push_n: float = 40.0
-        push_per_s: float = 60.0
-        push_ns_m: float = 40.0
-        largest_torque_nm: float = 4.0
-        largest_contact_n: float = 60.0
-        reach_m: float = 0.03
-        loose_m: float = 0.005
-        fresh_look_ahead_m: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "m"})] = 0.05
+        integral_per_s: Annotated[float, Meta(ge=0, le=50, extra_json_schema={"unit": "1/s"})] = 0.4
+        largest_look_ahead_m: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "m"})] = 0.05
+        fresh_look_ahead_m: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "m"})] = 0.01  # on a new path
+        push_scale: Annotated[float, Meta(ge=-1, le=1)] = 1.0  # for control experiments: of both terms
+        push_ns_m: Annotated[float, Meta(ge=0, le=1000, extra_json_schema={"unit": "N*s/m"})] = 40.0
+        push_n_m: Annotated[float, Meta(ge=0, le=1000, extra_json_schema={"unit": "N/m"})] = 60.0
+        largest_push_n: Annotated[float, Meta(ge=0, le=1000, extra_json_schema={"unit": "N"})] = 60.0
+        largest_torque_nm: Annotated[float, Meta(ge=0, le=1000, extra_json_schema={"unit": "N*m"})] = 5.0
+        largest_contact_n: Annotated[float, Meta(gt=0, le=1000, extra_json_schema={"unit": "N"})] = 60.0
+        reach_m: Annotated[float, Meta(gt=0, le=1, extra_json_schema={"unit": "m"})] = (
+            0.03  # of the push, to an obstacle
+        )
+        loose_m: Annotated[float, Meta(gt=0, le=1, extra_json_schema={"unit": "m"})] = 0.005  # a gap that counts half
+        torque_filter_s: Annotated[float, Meta(gt=0, le=5, extra_json_schema={"unit": "s"})] = 0.1
+        peg_friction: Annotated[float, Meta(ge=0, le=5, extra_json_schema={"unit": "1 (Coulomb coefficient)"})] = 0.0
         blend_s: Annotated[float, Meta(gt=0, le=10, extra_json_schema={"unit": "s"})] = 0.3
         speed_filter_s: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "s"})] = 0.05
 
@@ -67,15 +77,16 @@ class ObstacleAided:
         located = self._progress.update(view)
         if isinstance(located, str):
             return self._wait(view, located)
-        ahead_m = self._look_ahead_m(located, view.period_s)
+        ahead_m = self._set.push_scale * self._look_ahead_m(located, view.period_s)
         at = located.on_path.at
         reference = self._body.all_angles(at(located.tail_s_m + ahead_m))
-        torques = self._push_nm(located, view.period_s)
+        torques = self._set.push_scale * self._push_nm(located, view.period_s)
         reference = reference + torques / self._stiffness
         if self._reference is None:
             self._hand_over.start(view.joints, reference)
         elif located.anew:
-            self._integral_m = min(self._integral_m, self._set.fresh_look_ahead_m)
+            if np.abs(reference - self._reference).max() > ANOTHER_SHAPE_RAD:
+                self._integral_m = min(self._integral_m, self._set.fresh_look_ahead_m)
             self._hand_over.shift(reference - self._reference)
         self._reference = reference
         self._hand_over.fade(view.period_s / self._set.blend_s)
@@ -102,12 +113,14 @@ class ObstacleAided:
             self._push_n = 0.0
             return np.zeros(len(self._robot.joints))
         error = wanted_m_s - located.speed_m_s
-        self._push_n += config.push_per_s * error * period_s
+        self._push_n += config.push_n_m * error * period_s
         self._push_n = min(max(self._push_n, 0.0), config.largest_push_n)
         force_n = min(max(self._push_n + config.push_ns_m * error, 0.0), config.largest_push_n)
         if located.fresh:
             outlines = Outlines.of(located.world.obstacles)
-            touches = find_touches(located.nodes_w, self._body.radius_m, outlines, reach_m=config.reach_m, friction=0.0)
+            touches = find_touches(
+                located.nodes_w, self._body.radius_m, outlines, reach_m=config.reach_m, friction=config.peg_friction
+            )
             push = push_forward(located.nodes_w, touches, loose_m=config.loose_m)
             self._unit_nm = np.zeros(len(self._robot.joints))
             if push.balanced:
@@ -115,7 +128,7 @@ class ObstacleAided:
                 most = float(np.abs(push.torques_nm).max(initial=0.0)) + 1e-9
                 self._most_n = min(config.largest_torque_nm / most, config.largest_contact_n / push.lambdas.max())
         force_n = min(force_n, self._most_n)
-        keep = np.exp(-period_s / 0.1)
+        keep = np.exp(-period_s / config.torque_filter_s)
         self._torques_nm = keep * self._torques_nm + (1 - keep) * force_n * self._unit_nm
         bound = config.largest_torque_nm
         return np.clip(self._torques_nm, -bound, bound)

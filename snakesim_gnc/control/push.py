@@ -1,7 +1,7 @@
 """Which forces on the obstacles push a body forward, and the joint torques that hold them. Pure.
 
-The body lies between obstacles; contact c can push it with lambda_c >= 0 along `d_c = n_c - mu t_c`. The forces that push
-with F along the body, and the torque of each joint i that goes with them:
+The body lies between obstacles; contact c can push it with lambda_c >= 0 along `d_c = n_c - mu t_c`. The forces that
+push with F along the body, and the torque of each joint i that goes with them:
 
     sum_c lambda_c [d_c ; o_c x d_c] = (F/L) integral [t ; gamma x t] d sigma
     tau_i = - sum_{c ahead of i} lambda_c (o_c - p_i) x d_c + (F/L) integral_{ahead of i} (gamma - p_i) x t d sigma
@@ -98,7 +98,7 @@ def push_forward(nodes_w: Floats, touches: Touches, *, loose_m: float) -> Push:
 
 
 def _least_squares(matrix: Floats, wanted: Floats) -> tuple[Floats, float]:
-    """Non-negative x of least squares with matrix x = wanted, and what is left over (Lawson and Hanson's active set)."""
+    """Non-negative least squares of matrix x = wanted by Lawson and Hanson's active set: x, and what is left over."""
     count = matrix.shape[1]
     if count == 0:
         return np.zeros(0), float(np.linalg.norm(wanted))

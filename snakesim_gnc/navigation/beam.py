@@ -73,8 +73,8 @@ class Layer:
 
     def take(self, rows: Ints) -> "Layer":
         """Some of the nodes."""
-        arrays = {k: v[rows] if isinstance(v, np.ndarray) else v for k, v in vars(self).items()}
-        return Layer(**arrays)
+        arrays = {name: values[rows] for name, values in vars(self).items() if name != "s_m"}
+        return Layer(**arrays, s_m=self.s_m)
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,14 @@
 """The planner through clutter: a path for the whole body, from where it lies to where the goal is. Pure.
 
-The path begins with the body's measured curve, from tail to head, so that the body is on its path by construction. Ahead
-of the head it is what the search finds. It is planned anew when it ends soon, when the body has left it, when the map has
-changed near it, or when the body stands still.
+The first path begins with the body's measured curve, from tail to head; ahead of the head it is what the search finds.
+When it ends soon, when the map has changed, or when the body stands still, the path of the whole body is planned anew,
+close to where the body lies, with touches that can push. Paths on which it got stuck are remembered and avoided. Every
+third time at one place it backs out first, along its own path and the trail of its tail.
 """
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,11 +27,15 @@ HORIZON_M = 4.4
 AGAIN_M = 2.0
 REACHES_M = (0.05, 0.09)
 ENDS_SOON_M = 0.6
+COMMITTED_M = 0.1  # of the path ahead of the head that is not changed any more
+SEEN_M, SAME_M = 1.5, 0.005  # obstacles within this distance of the head; a change that matters
+ENDS_SOON, MAP_CHANGED = "ends soon", "the map has changed"
 FORGET_M = 0.15  # beyond this from where it was stuck, what failed there is forgotten
 FAILURES = 4
 LEAST_AHEAD = 10  # arcs of a new path beyond the head
 BACK_EVERY = 3  # time at the same place: back out
 BACK_M, BACK_S = 0.1, 1.5
+ANEW_GAP_M = -0.012  # a body that has lost its contacts must press to get them back
 TRAIL = 20  # points of the way behind the tail
 STANDS_S = 0.8
 STANDS_M = 0.01
@@ -70,6 +75,7 @@ class ClutterPlanner:
         self._planned: Planned | None = None
         self._path_id = 0
         self._start: Floats | None = None
+        self._seen = np.empty((0, 5))
         self._recent: deque[tuple[int, float]] = deque()
         self._failed: list[Floats] = []  # paths on which the body got stuck near here
         self._stuck_at = 0.0
@@ -94,7 +100,7 @@ class ClutterPlanner:
         obstacles = self._known or ObstacleMap(world.obstacles)
         goal = self._aim = self._towards(body)
         self._leave_trail(body[0])
-        why = self._why_again(body, world.stamp_ns)
+        why = self._why_again(body, obstacles, world.stamp_ns)
         if why:
             self._plan(body, obstacles, goal, why)
         planned = self._planned
@@ -132,7 +138,7 @@ class ClutterPlanner:
         ahead = points[self._next_point] - body[-1]
         return ahead / max(float(np.hypot(*ahead)), 1e-9)
 
-    def _why_again(self, body: Floats, now_ns: int) -> str:
+    def _why_again(self, body: Floats, obstacles: ObstacleMap, now_ns: int) -> str:
         """Why the path is to be planned anew; empty when it is not. Decides about backing out, too."""
         planned = self._planned
         if planned is None:
@@ -149,10 +155,23 @@ class ClutterPlanner:
                 return "backed out"
             return ""
         if planned.route.length_m - head_s < ENDS_SOON_M:
-            return "ends soon"
+            return ENDS_SOON
+        if self._known is None and not self._failed and self._seen_anew(body[-1], obstacles):
+            return MAP_CHANGED
         if full and moved < STANDS_M:
             return self._stuck(planned, body, head_s, now_ns)
         return ""
+
+    def _seen_anew(self, head: Floats, obstacles: ObstacleMap) -> bool:
+        """Whether the map around the head is another than when it was planned."""
+        outlines = obstacles.outlines
+        near = np.hypot(*(outlines.centre_w - head).T) < SEEN_M
+        shapes = np.column_stack([outlines.centre_w, outlines.half_m, outlines.rounding_m])[near]
+        before, self._seen = self._seen, shapes
+        if len(before) == len(shapes) and (not len(shapes) or np.abs(before - shapes).max() < SAME_M):
+            self._seen = before
+            return False
+        return True
 
     def _stuck(self, planned: Planned, body: Floats, head_s: float, now_ns: int) -> str:
         """Remember the path; every third time at a place back out first."""
@@ -174,14 +193,17 @@ class ClutterPlanner:
     def _plan(self, body: Floats, obstacles: ObstacleMap, goal: Floats, why: str) -> None:
         self.replans.append(f"{why} at {body[-1][0]:.2f}")
         beam, goal_rad = Beam(obstacles, self._search), float(np.arctan2(goal[1], goal[0]))
-        if self._planned is None:
+        if why in (ENDS_SOON, MAP_CHANGED):
+            found, kept, points = self._onward(beam, body, goal_rad)
+        elif self._planned is None:
             found, kept = beam.ahead(body, goal_rad, round(HORIZON_M / STEP_M)), len(body) - 3
             points = body if found is None else np.concatenate([body, resample(found.points_w)[1:]])
         else:
             found, kept = self._anew(beam, body, goal_rad), 0
             points = body if found is None else resample(found.points_w)
         if found is not None:
-            points = snap(points, kept, obstacles, goal, self._fit)
+            fit = self._fit if kept else replace(self._fit, push_gap_m=ANEW_GAP_M)
+            points = snap(points, kept, obstacles, goal, fit)
         else:
             ahead = body[-1] - body[-4]
             points = np.concatenate([body, body[-1] + np.linspace(0.1, 1.0, 10)[:, None] * ahead / np.hypot(*ahead)])
@@ -191,6 +213,16 @@ class ClutterPlanner:
         if behind:
             points = np.concatenate([np.array(behind), points])
         self._planned = Planned(Route(points), self._path_id, SPACING_M * len(body), found)
+
+    def _onward(self, beam: Beam, body: Floats, goal_rad: float) -> tuple[Found | None, int, Floats]:
+        """The present path as far as the body lies on it and a little further, then another one."""
+        assert self._planned is not None
+        route = self._planned.route
+        tail_s, head_s = route.project(body[0]), route.project(body[-1])
+        lies = resample(route.position_w(np.arange(tail_s, head_s + COMMITTED_M, SPACING_M)))
+        found = beam.ahead(lies, goal_rad, round(AGAIN_M / STEP_M))
+        points = lies if found is None else np.concatenate([lies, resample(found.points_w)[1:]])
+        return found, len(lies) - 3, points
 
     def _anew(self, beam: Beam, body: Floats, goal_rad: float) -> Found | None:
         """A path for the whole body: the least change of shape that can push well."""

@@ -6,7 +6,7 @@ obstacle). The contacts push a body of length L forward along its curve gamma wi
     sum_c lambda_c [d_c ; o_c x d_c] = F (1/L) integral [t ; gamma x t] d sigma,   0 <= lambda_c <= lambda_max
 
 and the margin F* is the greatest such F. It is sought among all threes of contacts: three equations have a basic
-solution with three unknowns. More contacts could share the load, so this is a lower bound. `docs/poal.md` has the context.
+solution with three unknowns. More contacts could share the load, so this is a lower bound. See `docs/poal.md`.
 """
 
 from functools import cache

@@ -1,4 +1,4 @@
-"""Pulls a planned path to the obstacles that the body shall push off, away from those that brake, and smooths it. Pure."""
+"""Pulls a planned path to the obstacles to push off, away from those that brake, and smooths it. Pure."""
 
 from dataclasses import dataclass
 
@@ -40,7 +40,7 @@ def snap(points_w: Floats, kept: int, obstacles: ObstacleMap, goal: Floats, fit:
 
     goal: (2,) unit vector: a touch whose normal has a part along it pushes.
     """
-    path = points_w
+    path = np.asarray(points_w, dtype=np.float64)
     for _ in range(fit.rounds):
         tangent = np.gradient(path, axis=0)
         tangent /= np.maximum(np.hypot(*tangent.T), 1e-9)[:, None]
@@ -95,4 +95,4 @@ def _solve(path: Floats, left: Floats, shift: Floats, weight: Floats, fit: Fit) 
         bent = third * left[:, axis]
         matrix += stiff * bent.T @ bent
         right -= stiff * bent.T @ (third @ path[:, axis])
-    return np.linalg.solve(matrix, right)
+    return np.asarray(np.linalg.solve(matrix, right), dtype=np.float64)
