@@ -72,7 +72,7 @@ class Progress:
         if before_ns is None or pose_ns > before_ns:
             self._measure(world, pose_ns)
         if new_path:
-            self._s_m, self._speed_m_s = body.find(self._nodes), 0.0
+            self._s_m = body.find(self._nodes)  # the body is as fast as before
         elif before_ns is None:
             self._s_m, self._speed_m_s = body.fit(self._nodes, self._s_m, steps=AGAIN_STEPS), 0.0
         elif pose_ns > before_ns:

@@ -90,6 +90,21 @@ class Outlines:
         outside = np.hypot(np.maximum(over_x, 0.0), np.maximum(over_y, 0.0))
         return outside + np.minimum(np.maximum(over_x, over_y), 0.0) - self.rounding_m
 
+    def towards(self, points_w: Floats, which: NDArray[np.intp]) -> tuple[Floats, Floats]:
+        """Distances (...) of points (..., 2) from the outline `which` (...) of each, and normals (..., 2) out of it."""
+        c, s = self.turn[which, 0], self.turn[which, 1]
+        dx, dy = points_w[..., 0] - self.centre_w[which, 0], points_w[..., 1] - self.centre_w[which, 1]
+        local_x, local_y = c * dx + s * dy, c * dy - s * dx
+        over_x, over_y = np.abs(local_x) - self.half_m[which, 0], np.abs(local_y) - self.half_m[which, 1]
+        out_x, out_y = np.maximum(over_x, 0.0), np.maximum(over_y, 0.0)
+        outside = np.hypot(out_x, out_y)
+        distance = outside + np.minimum(np.maximum(over_x, over_y), 0.0) - self.rounding_m[which]
+        free = outside > 0
+        length = np.where(free, outside, 1.0)
+        nx = np.where(free, out_x / length, over_x >= over_y) * np.where(local_x < 0, -1.0, 1.0)
+        ny = np.where(free, out_y / length, over_x < over_y) * np.where(local_y < 0, -1.0, 1.0)
+        return distance, np.stack([c * nx - s * ny, s * nx + c * ny], axis=-1)
+
     def _local(self, points_w: Floats) -> tuple[Floats, Floats]:
         offset_x = points_w[..., None, 0] - self.centre_w[:, 0]
         offset_y = points_w[..., None, 1] - self.centre_w[:, 1]

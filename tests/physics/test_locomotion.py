@@ -229,3 +229,13 @@ def test_a_motor_that_is_too_weak_says_so():
     assert saturated
     assert all(known(report.torque_headroom_nm) < 0 for report in saturated)
     assert max(known(report.propulsion_n) for report in saturated) < 35.0
+
+
+# --- clutter --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", [10, pytest.param(14, marks=pytest.mark.slow)])
+def test_it_goes_through_a_random_field_that_nobody_laid_out(seed: int):
+    field = (f"scene.random_field.0.seed={seed}", "scene.random_field.0.density_per_m2=12")
+    whole = run(configure("clutter", *field), duration_s=13.0)
+    assert whole.moved_m > 1.5

@@ -1,0 +1,146 @@
+"""Obstacle-aided propulsion with all joints: forces on the obstacles, and the shape slightly further along the path.
+
+A body that obstacles hold on its path has one freedom, its arc length s. Two terms push it along, both under a PI law
+of the speed, both bounded:
+
+- forces on the obstacles that are near (`push.py`): the torques of those forces close gaps, and press where it pushes;
+- the shape at s plus a small look-ahead l: tau_i = k (theta_i(s + l) - theta_i(s)), hence by virtual work a force
+  F = l k sum theta_i'^2, also where no contacts can balance it.
+
+A negative speed backs the body out along its own path. See `docs/poal.md`.
+"""
+
+from typing import Annotated
+
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from snakesim_gnc.control.bumpless import HandOver
+from snakesim_gnc.control.controller import Action, Report, View, positions
+from snakesim_gnc.control.planar_body import PlanarBody
+from snakesim_gnc.control.progress import Located, Progress
+from snakesim_gnc.control.push import find_touches, push_forward
+from snakesim_hal.backend import SetPoints
+from snakesim_hal.model.files import FileStruct
+from snakesim_hal.model.outlines import Outlines
+from snakesim_hal.wire.messages import Description
+
+Floats = NDArray[np.float64]
+
+ANOTHER_SHAPE_RAD = 0.1
+SLOPE_M = 0.02  # over which theta' is taken
+
+
+class ObstacleAided:
+    """Speed along the path by look-ahead, with every joint."""
+
+    class Settings(FileStruct, frozen=True, kw_only=True):
+        """Look-ahead l = lead_s (v_wanted - v) + integral; its bound is the most that the body is pushed."""
+
+        lead_s: Annotated[float, Meta(ge=0, le=5, extra_json_schema={"unit": "s"})] = 0.2
+        integral_per_s: Annotated[float, Meta(ge=0, le=50, extra_json_schema={"unit": "1/s"})] = 0.4
+        largest_look_ahead_m: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "m"})] = 0.05
+        fresh_look_ahead_m: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "m"})] = 0.01  # on a new path
+        push_scale: Annotated[float, Meta(ge=-1, le=1)] = 1.0  # for control experiments: of both terms
+        push_ns_m: Annotated[float, Meta(ge=0, le=1000, extra_json_schema={"unit": "N*s/m"})] = 40.0
+        push_n_m: Annotated[float, Meta(ge=0, le=1000, extra_json_schema={"unit": "N/m"})] = 60.0
+        largest_push_n: Annotated[float, Meta(ge=0, le=1000, extra_json_schema={"unit": "N"})] = 60.0
+        largest_torque_nm: Annotated[float, Meta(ge=0, le=1000, extra_json_schema={"unit": "N*m"})] = 5.0
+        largest_contact_n: Annotated[float, Meta(gt=0, le=1000, extra_json_schema={"unit": "N"})] = 60.0
+        reach_m: Annotated[float, Meta(gt=0, le=1, extra_json_schema={"unit": "m"})] = (
+            0.03  # of the push, to an obstacle
+        )
+        loose_m: Annotated[float, Meta(gt=0, le=1, extra_json_schema={"unit": "m"})] = 0.005  # a gap that counts half
+        torque_filter_s: Annotated[float, Meta(gt=0, le=5, extra_json_schema={"unit": "s"})] = 0.1
+        peg_friction: Annotated[float, Meta(ge=0, le=5, extra_json_schema={"unit": "1 (Coulomb coefficient)"})] = 0.0
+        blend_s: Annotated[float, Meta(gt=0, le=10, extra_json_schema={"unit": "s"})] = 0.3
+        speed_filter_s: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "s"})] = 0.05
+
+    def __init__(self, robot: Description, settings: Settings) -> None:
+        self._robot = robot
+        self._set = settings
+        self._body = PlanarBody(robot)
+        self._progress = Progress(self._body, speed_filter_s=settings.speed_filter_s)
+        self._hand_over = HandOver(robot)
+        self._stiffness = np.array([joint.stiffness_nm_per_rad for joint in robot.joints])
+        self._reference: Floats | None = None
+        self._integral_m = 0.0
+        self._push_n = 0.0
+        self._bends = self._body.bends
+        self._torques_nm = np.zeros(len(robot.joints))
+        self._unit_nm = np.zeros(len(robot.joints))
+        self._most_n = 0.0
+
+    def update(self, view: View) -> Action:
+        """Angles of the body further along the path, as far as the wanted speed needs it."""
+        located = self._progress.update(view)
+        if isinstance(located, str):
+            return self._wait(view, located)
+        ahead_m = self._set.push_scale * self._look_ahead_m(located, view.period_s)
+        at = located.on_path.at
+        reference = self._body.all_angles(at(located.tail_s_m + ahead_m))
+        torques = self._set.push_scale * self._push_nm(located, view.period_s)
+        reference = reference + torques / self._stiffness
+        if self._reference is None:
+            self._hand_over.start(view.joints, reference)
+        elif located.anew:
+            if np.abs(reference - self._reference).max() > ANOTHER_SHAPE_RAD:
+                self._integral_m = min(self._integral_m, self._set.fresh_look_ahead_m)
+            self._hand_over.shift(reference - self._reference)
+        self._reference = reference
+        self._hand_over.fade(view.period_s / self._set.blend_s)
+        slope = self._body.all_angles(at(located.tail_s_m + SLOPE_M)) - self._body.all_angles(at(located.tail_s_m))
+        force_n = ahead_m * float(self._stiffness @ slope**2) / SLOPE_M**2
+        report = Report(path_s_m=located.tail_s_m, reference_rad=reference.tolist(), propulsion_n=force_n)
+        return Action(self._towards(), report)
+
+    def _look_ahead_m(self, located: Located, period_s: float) -> float:
+        most = self._set.largest_look_ahead_m
+        wanted_m_s = located.trajectory.speed_m_s
+        if wanted_m_s == 0.0:
+            self._integral_m = 0.0
+            return 0.0
+        error_m_s = wanted_m_s - located.speed_m_s
+        self._integral_m += self._set.integral_per_s * error_m_s * period_s
+        self._integral_m = min(max(self._integral_m, -most), most)
+        return min(max(self._integral_m + self._set.lead_s * error_m_s, -most), most)
+
+    def _push_nm(self, located: Located, period_s: float) -> Floats:
+        """Torques of the wanted force along the path, by the contacts that the body has, (n_joints,)."""
+        config, wanted_m_s = self._set, located.trajectory.speed_m_s
+        if wanted_m_s <= 0.0 or config.largest_push_n == 0.0:
+            self._push_n = 0.0
+            return np.zeros(len(self._robot.joints))
+        error = wanted_m_s - located.speed_m_s
+        self._push_n += config.push_n_m * error * period_s
+        self._push_n = min(max(self._push_n, 0.0), config.largest_push_n)
+        force_n = min(max(self._push_n + config.push_ns_m * error, 0.0), config.largest_push_n)
+        if located.fresh:
+            outlines = Outlines.of(located.world.obstacles)
+            touches = find_touches(
+                located.nodes_w, self._body.radius_m, outlines, reach_m=config.reach_m, friction=config.peg_friction
+            )
+            push = push_forward(located.nodes_w, touches, loose_m=config.loose_m)
+            self._unit_nm = np.zeros(len(self._robot.joints))
+            if push.balanced:
+                self._unit_nm[self._bends] = push.torques_nm
+                most = float(np.abs(push.torques_nm).max(initial=0.0)) + 1e-9
+                self._most_n = min(config.largest_torque_nm / most, config.largest_contact_n / push.lambdas.max())
+        force_n = min(force_n, self._most_n)
+        keep = np.exp(-period_s / config.torque_filter_s)
+        self._torques_nm = keep * self._torques_nm + (1 - keep) * force_n * self._unit_nm
+        bound = config.largest_torque_nm
+        return np.clip(self._torques_nm, -bound, bound)
+
+    def _wait(self, view: View, why: str) -> Action:
+        """Without a known body pose every joint keeps its reference."""
+        if self._reference is None:
+            self._reference = np.array(view.joints.angle_rad)
+            self._hand_over.start(view.joints, self._reference)
+        self._hand_over.fade(view.period_s / self._set.blend_s)
+        return Action(self._towards(), Report(why=why, reference_rad=self._reference.tolist()))
+
+    def _towards(self) -> SetPoints:
+        assert self._reference is not None
+        return positions(self._robot, self._hand_over.positions_rad(self._reference).tolist())

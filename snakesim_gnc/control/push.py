@@ -1,0 +1,133 @@
+"""Which forces on the obstacles push a body forward, and the joint torques that hold them. Pure.
+
+The body lies between obstacles; contact c can push it with lambda_c >= 0 along `d_c = n_c - mu t_c`. The forces that
+push with F along the body, and the torque of each joint i that goes with them:
+
+    sum_c lambda_c [d_c ; o_c x d_c] = (F/L) integral [t ; gamma x t] d sigma
+    tau_i = - sum_{c ahead of i} lambda_c (o_c - p_i) x d_c + (F/L) integral_{ahead of i} (gamma - p_i) x t d sigma
+
+Of all such forces those of least weighted squares are taken; the weight of a contact grows with its gap.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_hal.model.outlines import Outlines
+
+Floats = NDArray[np.float64]
+
+SAMPLES = 5  # of each link
+BUMP = 0.6  # |n.t| of a contact: beyond, something stands before the head
+BALANCED = 0.05  # of the force that is left over
+MOST_STEPS = 30
+
+
+@dataclass(frozen=True)
+class Touches:
+    """Where a body touches obstacles, or nearly; arrays with one row a contact."""
+
+    obstacle: NDArray[np.intp]
+    places_w: Floats  # (k, 2) on the body's surface
+    directions_w: Floats  # (k, 2) of the push, friction included
+    body_s_m: Floats  # (k,) arc length from the tail end
+    gap_m: Floats  # (k,)
+
+    def __len__(self) -> int:
+        return len(self.gap_m)
+
+
+@dataclass(frozen=True)
+class Push:
+    """Forces for 1 N along the body."""
+
+    lambdas: Floats  # (k,)
+    torques_nm: Floats  # (n_joints,), of the joints that bend
+    balanced: bool  # whether these contacts can push at all
+
+
+def find_touches(nodes_w: Floats, radius_m: float, outlines: Outlines, *, reach_m: float, friction: float) -> Touches:
+    """Contacts of a chain with nodes (2, n): for each obstacle within reach the point of the body nearest to it."""
+    if not len(outlines):
+        none = np.empty((0, 2))
+        return Touches(np.empty(0, dtype=np.intp), none, none, np.empty(0), np.empty(0))
+    rear, run = nodes_w[:, :-1].T, np.diff(nodes_w, axis=1).T
+    lengths = np.hypot(*run.T)
+    share = (np.arange(SAMPLES) + 0.5) / SAMPLES
+    points = (rear[:, None, :] + share[:, None] * run[:, None, :]).reshape(-1, 2)
+    s = (np.concatenate(([0.0], np.cumsum(lengths)[:-1]))[:, None] + share * lengths[:, None]).ravel()
+    gaps = outlines.distance_m(points) - radius_m
+    best = gaps.argmin(axis=0)
+    which = np.flatnonzero(gaps[best, np.arange(len(outlines))] < reach_m)
+    at = points[best[which]]
+    distance, normal = outlines.towards(at, which)
+    tangent = (run / lengths[:, None])[best[which] // SAMPLES]
+    beside = np.abs(np.einsum("ij,ij->i", normal, tangent)) < BUMP
+    keep = np.flatnonzero(beside)
+    direction = normal - friction * tangent
+    return Touches(
+        which[keep],
+        (at - radius_m * normal)[keep],
+        direction[keep],
+        s[best[which]][keep],
+        (distance - radius_m)[keep],
+    )
+
+
+def push_forward(nodes_w: Floats, touches: Touches, *, loose_m: float) -> Push:
+    """Forces and torques for 1 N along the chain. loose_m: a gap that makes a contact count half."""
+    rear, run = nodes_w[:, :-1].T, np.diff(nodes_w, axis=1).T
+    lengths = np.hypot(*run.T)
+    middles, tangents = rear + 0.5 * run, run / lengths[:, None]
+    share = lengths / lengths.sum()
+    centre = share @ middles
+    drag = np.array([*(share @ tangents), share @ _cross(middles - centre, tangents)])
+    arms = touches.places_w - centre
+    matrix = np.column_stack([touches.directions_w, _cross(arms, touches.directions_w)]).T
+    weight = 1.0 + np.maximum(touches.gap_m, 0.0) / loose_m
+    lambdas, rest = _least_squares(matrix / weight, drag)
+    lambdas = lambdas / weight
+    joints = nodes_w[:, 1:-1].T
+    ahead = touches.body_s_m[None, :] > np.cumsum(lengths)[:-1, None]
+    lever = _cross(touches.places_w[None] - joints[:, None], touches.directions_w[None])
+    later = np.triu(np.ones((len(joints), len(lengths)), dtype=bool), 1)
+    braked = _cross(middles[None] - joints[:, None], tangents[None])
+    torques = -(ahead * lever) @ lambdas + (later * braked) @ share
+    return Push(lambdas, torques, bool(rest < BALANCED))
+
+
+def _least_squares(matrix: Floats, wanted: Floats) -> tuple[Floats, float]:
+    """Non-negative least squares of matrix x = wanted by Lawson and Hanson's active set: x, and what is left over."""
+    count = matrix.shape[1]
+    if count == 0:
+        return np.zeros(0), float(np.linalg.norm(wanted))
+    small = 1e-3  # prefers small forces where many would do
+    full = np.vstack([matrix, small * np.eye(count)])
+    right = np.concatenate([wanted, np.zeros(count)])
+    x, used = np.zeros(count), np.zeros(count, dtype=bool)
+    for _ in range(MOST_STEPS):
+        gradient = full.T @ (right - full @ x)
+        gradient[used] = -np.inf
+        enters = int(np.argmax(gradient))
+        if gradient[enters] < 1e-9:
+            break
+        used[enters] = True
+        while True:
+            trial = np.zeros(count)
+            trial[used] = np.linalg.lstsq(full[:, used], right, rcond=None)[0]
+            if (trial[used] > 0).all():
+                x = trial
+                break
+            low = used & (trial <= 0)
+            step = float(np.min(x[low] / np.maximum(x[low] - trial[low], 1e-12)))
+            x = x + step * (trial - x)
+            used &= x > 1e-12
+            if not used.any():
+                x = np.zeros(count)
+                break
+    return x, float(np.linalg.norm(matrix @ x - wanted))
+
+
+def _cross(a: Floats, b: Floats) -> Floats:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]

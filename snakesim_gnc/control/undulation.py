@@ -1,0 +1,78 @@
+"""Baselines that use no map: waves that travel along the body, whatever stands around it.
+
+Lateral undulation is the serpenoid curve: every joint swings by `amplitude_rad`, a phase `lag_rad` behind the one ahead
+of it. Head-steered undulation adds a bend to all joints in proportion to the direction of the path, seen from the head.
+"""
+
+import math
+from typing import Annotated
+
+import numpy as np
+from msgspec import Meta
+
+from snakesim_gnc.control.body_on_path import chain_nodes, heading_of
+from snakesim_gnc.control.bumpless import HandOver
+from snakesim_gnc.control.controller import Action, Report, View, positions
+from snakesim_gnc.control.planar_body import PlanarBody
+from snakesim_hal.model.files import FileStruct
+from snakesim_hal.wire.messages import Description
+
+AIM_M = 1.0  # how far ahead on the path the head steers for
+
+
+class LateralUndulation:
+    """A wave of the yaw joints from head to tail."""
+
+    class Settings(FileStruct, frozen=True, kw_only=True):
+        """The wave, and how much it is bent towards the goal."""
+
+        amplitude_rad: Annotated[float, Meta(ge=0, le=2, extra_json_schema={"unit": "rad"})] = 0.5
+        period_s: Annotated[float, Meta(gt=0, le=100, extra_json_schema={"unit": "s"})] = 2.0
+        lag_rad: Annotated[float, Meta(ge=0, le=3.2, extra_json_schema={"unit": "rad"})] = 0.9
+        steering: Annotated[float, Meta(ge=0, le=2, extra_json_schema={"unit": "1"})] = 0.0
+        blend_s: Annotated[float, Meta(gt=0, le=10, extra_json_schema={"unit": "s"})] = 1.0
+
+    def __init__(self, robot: Description, settings: Settings) -> None:
+        self._robot, self._set, self._body = robot, settings, PlanarBody(robot)
+        self._hand_over = HandOver(robot)
+        self._phase_rad = 0.0
+        self._begun = False
+
+    def update(self, view: View) -> Action:
+        """The wave goes on while there is a path to go along."""
+        moving = view.trajectory is not None and view.trajectory.speed_m_s != 0.0 and view.world is not None
+        if moving:
+            self._phase_rad += math.tau * view.period_s / self._set.period_s
+        turns = np.arange(len(self._body.bends))[::-1]  # 0 at the head
+        reference = np.zeros(len(self._robot.joints))
+        swing = self._set.amplitude_rad * np.sin(self._phase_rad - self._set.lag_rad * turns)
+        reference[self._body.bends] = swing + self._bend_rad(view)
+        if not self._begun:
+            self._hand_over.start(view.joints, reference)
+            self._begun = True
+        self._hand_over.fade(view.period_s / self._set.blend_s)
+        targets = self._hand_over.positions_rad(reference).tolist()
+        return Action(positions(self._robot, targets), Report(reference_rad=reference.tolist()))
+
+    def _bend_rad(self, view: View) -> float:
+        """Bend of every joint that turns the body towards the path ahead."""
+        if self._set.steering == 0.0 or view.world is None or view.trajectory is None:
+            return 0.0
+        angles = [view.joints.angle_rad[i] for i in self._body.bends]
+        heading = heading_of(view.world.base_orientation_wxyz)
+        nodes = chain_nodes(view.world.base_position_w[:2], heading, angles, self._body.segments_m).T
+        path = np.array(view.trajectory.path_w)
+        ahead = path[np.argmin(np.hypot(*(path - nodes[-1]).T)) :]
+        aim = ahead[min(np.searchsorted(np.hypot(*(ahead - nodes[-1]).T), AIM_M), len(ahead) - 1)] - nodes[-1]
+        along = nodes[-1] - nodes[0]
+        off = math.remainder(math.atan2(aim[1], aim[0]) - math.atan2(along[1], along[0]), math.tau)
+        return self._set.steering * off / len(self._body.bends)
+
+
+class HeadSteeredUndulation(LateralUndulation):
+    """A wave that is bent towards where the path leads."""
+
+    class Settings(LateralUndulation.Settings, frozen=True, kw_only=True):
+        """As of lateral undulation, with steering."""
+
+        steering: Annotated[float, Meta(ge=0, le=2, extra_json_schema={"unit": "1"})] = 0.8

@@ -1,0 +1,298 @@
+"""The search for a path ahead of the head: layers of short arcs, all expanded at once, the best few kept. Pure.
+
+Each node knows what the whole body would touch with its head there: the last contacts as wrenches, and the integral of
+the drag's wrench, first along the measured body and then along the path. So every node has the propulsion margin of the
+body. Cost, per metre of path:
+
+    1 - reward n.g of a touch that pushes towards the goal, + harm |n.g| of one that pushes back
+      + weak max(0, 1 - F*/F_wanted) + bend |change of curvature| - progress along the goal's direction g
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_gnc.navigation.margin import margins_n, wrenches
+from snakesim_gnc.navigation.obstacle_map import NONE, ObstacleMap
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
+
+STEP_M = 0.05
+CONTACTS = 8  # of a body that are remembered, the newest
+CELL_M, CELL_RAD = 0.02, np.pi / 18
+FAILED_M = 0.025  # a path this far from one that failed is another path
+ALONG = 0.35  # |n.t| of a touch: beyond, it is the head that bumps
+
+
+@dataclass(frozen=True)
+class Search:
+    """What to look for; lengths in metres."""
+
+    body_length_m: float
+    radius_m: float
+    segment_m: float  # length of a link: straight links cut the corners of the path by segment^2 |curvature| / 8
+    clearance_m: float = 0.004
+    skin_m: float = 0.015  # nearer than this to an obstacle counts as a touch: `snap` will close the gap
+    width: int = 300
+    curvatures_per_m: tuple[float, ...] = (-5.5, -3.7, -1.8, 0.0, 1.8, 3.7, 5.5)
+    wanted_n: float = 40.0  # F_wanted
+    reward: float = 1.2
+    harm: float = 1.0
+    weak: float = 1.5
+    bend_m: float = 0.02
+    progress: float = 1.2
+    grip: float = 4.0  # reward of a touch while the whole body is laid anew
+    weak_now: float = 15.0  # instead of `weak`, over the first `now_m` from where the body lies
+    now_m: float = 0.3
+    repeat: float = 1.0  # of a path that has failed
+    move: float = 0.5  # of the body, sideways, as far as it may
+    peg_friction: float = 0.0
+    loose_tail_m: float = 0.2  # touches this near to the ends of the body do not count for its margin
+    loose_head_m: float = 0.1
+
+
+@dataclass
+class Layer:
+    """Nodes of one depth; arrays with one row a node."""
+
+    x: Floats
+    y: Floats
+    heading: Floats
+    bend: Floats  # curvature of the arc that led here
+    cost: Floats
+    parent: Ints
+    touched: Ints  # (n, CONTACTS) obstacle, NONE: empty slot; the newest last
+    touch_s: Floats  # (n, CONTACTS) arc length of the touch
+    touch_gap: Floats
+    push: Floats  # (n, CONTACTS, 3) wrench of a unit push
+    drag: Floats  # (n, arcs of a body, 3) wrench of the tangent over each arc, the newest last
+    margin_n: Floats
+    s_m: float
+
+    def take(self, rows: Ints) -> "Layer":
+        """Some of the nodes."""
+        arrays = {name: values[rows] for name, values in vars(self).items() if name != "s_m"}
+        return Layer(**arrays, s_m=self.s_m)
+
+
+@dataclass(frozen=True)
+class Found:
+    """A path ahead of the head."""
+
+    points_w: Floats  # (n + 1, 2) every STEP_M, the first is the head
+    headings_rad: Floats  # (n + 1,)
+    bends_per_m: Floats  # (n,)
+    margins_n: Floats  # (n + 1,) of the body with its head there
+    cost: float
+
+
+class Beam:
+    """Searches from a body's head towards a direction."""
+
+    def __init__(self, obstacles: ObstacleMap, search: Search) -> None:
+        self._map = obstacles
+        self._set = search
+        self._bends = np.array(search.curvatures_per_m)
+        self._arcs = round(search.body_length_m / STEP_M)
+        half = 0.5 * self._bends * STEP_M
+        chord = STEP_M * np.sinc(half / np.pi)
+        chord_mid = 0.5 * STEP_M * np.sinc(0.5 * half / np.pi)
+        self._end = np.stack([chord * np.cos(half), chord * np.sin(half)])
+        self._middle = np.stack([chord_mid * np.cos(0.5 * half), chord_mid * np.sin(0.5 * half)])
+
+    def ahead(self, body_w: Floats, goal_rad: float, steps: int) -> Found | None:
+        """The best path of a number of steps ahead of the head, or of as many as there is room for; None: none at all.
+
+        body_w: (n, 2) the body's curve, tail to head.
+        """
+        self._aim(body_w[-1], goal_rad)
+        self._corridor = None
+        return self._grow(self._lying(body_w), steps)
+
+    def whole(
+        self, body_w: Floats, goal_rad: float, steps: int, reach_m: float, failed_w: Floats | None = None
+    ) -> Found | None:
+        """The best path of the whole body, from the tail, and of a number of steps beyond: within reach of the body.
+
+        failed_w: (k, 2) points of paths on which the body got stuck here; other ways round are preferred.
+        """
+        self._aim(body_w[-1], goal_rad)
+        self._corridor, self._reach_m, self._failed = _evenly(body_w, self._arcs), reach_m, failed_w
+        return self._grow(self._at_tail(), self._arcs + steps)
+
+    def _aim(self, origin: Floats, goal_rad: float) -> None:
+        self._origin = origin
+        self._goal = np.array([np.cos(goal_rad), np.sin(goal_rad)])
+        self._goal_rad = goal_rad
+
+    def _grow(self, start: Layer, steps: int) -> Found | None:
+        layers = [start]
+        for _ in range(steps):
+            after = self._expand(layers[-1])
+            if after is None:
+                break
+            layers.append(after)
+        if len(layers) == 1:
+            return None
+        return self._trace(layers)
+
+    def _lying(self, body_w: Floats) -> Layer:
+        """The node of the body as it lies, with what it touches."""
+        at = _evenly(body_w, self._arcs)
+        chords = np.diff(at, axis=0)
+        tangents = chords / np.maximum(np.hypot(*chords.T), 1e-9)[:, None]
+        middles = 0.5 * (at[1:] + at[:-1])
+        node = self._blank(body_w[-1:], np.arctan2(*(body_w[-1:] - body_w[-2:-1]).T[::-1]))
+        node.drag = (STEP_M * wrenches(middles - self._origin, tangents))[None]
+        for k in range(self._arcs):
+            self._touch(node, middles[None, k], tangents[None, k], -STEP_M * (self._arcs - k - 0.5))
+        node.margin_n = self._margins(node)
+        return node
+
+    def _at_tail(self) -> Layer:
+        """Nodes around the tail end, of bodies that begin there."""
+        assert self._corridor is not None
+        tail, along = self._corridor[0], self._corridor[1] - self._corridor[0]
+        heading = float(np.arctan2(along[1], along[0]))
+        left = np.array([-np.sin(heading), np.cos(heading)])
+        places = np.concatenate([np.tile(tail + off * left, (5, 1)) for off in (-0.03, 0.0, 0.03)])
+        return self._blank(places, np.tile(heading + np.array([-0.4, -0.2, 0.0, 0.2, 0.4]), 3))
+
+    def _blank(self, places_w: Floats, headings: Floats) -> Layer:
+        count = len(places_w)
+        return Layer(
+            x=places_w[:, 0].copy(),
+            y=places_w[:, 1].copy(),
+            heading=headings,
+            bend=np.zeros(count),
+            cost=np.zeros(count),
+            parent=np.full(count, NONE),
+            touched=np.full((count, CONTACTS), NONE),
+            touch_s=np.full((count, CONTACTS), -np.inf),
+            touch_gap=np.full((count, CONTACTS), np.inf),
+            push=np.zeros((count, CONTACTS, 3)),
+            drag=np.zeros((count, self._arcs, 3)),
+            margin_n=np.zeros(count),
+            s_m=0.0,
+        )
+
+    def _touch(self, nodes: Layer, points_w: Floats, tangents: Floats, s_m: float) -> Floats:
+        """Remember what the body touches at a point; returns the push towards the goal, n.g, or 0 without a touch."""
+        near = self._map.near(points_w[:, 0], points_w[:, 1])
+        gap = near.distance_m - self._set.radius_m
+        along = np.abs(np.einsum("ij,ij->i", near.normal_w, tangents))
+        touches = (near.obstacle != NONE) & (gap < self._set.skin_m) & (along < ALONG)
+        places = points_w - near.normal_w * self._set.radius_m - self._origin
+        direction = near.normal_w - self._set.peg_friction * tangents
+        push = wrenches(places, direction)
+        again = touches & (nodes.touched[:, -1] == near.obstacle)
+        better = again & (gap < nodes.touch_gap[:, -1])
+        new = touches & ~again
+        for name, fresh in (("touched", near.obstacle), ("touch_gap", gap), ("push", push), ("touch_s", s_m)):
+            slots = getattr(nodes, name)
+            fresh_rows = fresh if isinstance(fresh, np.ndarray) else np.full(len(gap), fresh)
+            slots[new, :-1] = slots[new, 1:]
+            if name == "touch_s":
+                slots[touches, -1] = fresh_rows[touches]
+            else:
+                slots[new | better, -1] = fresh_rows[new | better]
+        return np.where(touches, near.normal_w @ self._goal, 0.0)
+
+    def _margins(self, nodes: Layer) -> Floats:
+        tail_s = nodes.s_m - self._set.body_length_m + self._set.loose_tail_m
+        alive = (nodes.touch_s >= tail_s) & (nodes.touch_s <= nodes.s_m - self._set.loose_head_m)
+        contacts = np.where(alive[..., None], nodes.push, 0.0)
+        return margins_n(contacts, nodes.drag.sum(axis=1) / self._set.body_length_m)
+
+    def _expand(self, layer: Layer) -> Layer | None:
+        """All children that do not collide, thinned out, with their cost."""
+        config, count = self._set, len(self._bends)
+        c, s = np.cos(layer.heading)[:, None], np.sin(layer.heading)[:, None]
+        x0, y0 = layer.x[:, None], layer.y[:, None]
+        xm, ym = x0 + c * self._middle[0] - s * self._middle[1], y0 + s * self._middle[0] + c * self._middle[1]
+        x1, y1 = x0 + c * self._end[0] - s * self._end[1], y0 + s * self._end[0] + c * self._end[1]
+        heading = layer.heading[:, None] + self._bends * STEP_M
+        free = self._fits(xm, ym, heading - 0.5 * self._bends * STEP_M) & self._fits(x1, y1, heading)
+        off = np.abs(np.remainder(heading - self._goal_rad + np.pi, 2 * np.pi) - np.pi)
+        free &= off < 1.75
+        lies = self._corridor
+        away = None
+        if lies is not None and (k := round(layer.s_m / STEP_M) + 1) < len(lies):
+            away = np.hypot(x1 - lies[k, 0], y1 - lies[k, 1])
+            free &= away < self._reach_m
+        bend_change = np.abs(self._bends - layer.bend[:, None])
+        progress = (x1 - x0) * self._goal[0] + (y1 - y0) * self._goal[1]
+        cost = layer.cost[:, None] + STEP_M + config.bend_m * STEP_M * bend_change - config.progress * progress
+        if away is not None and self._failed is not None:
+            gaps = np.hypot(x1[..., None] - self._failed[:, 0], y1[..., None] - self._failed[:, 1]).min(axis=-1)
+            cost = cost + STEP_M * config.repeat * np.maximum(1.0 - gaps / FAILED_M, 0.0)
+        if away is not None:
+            cost = cost + STEP_M * config.move * (away / self._reach_m) ** 2
+        rows = np.flatnonzero(free.ravel())
+        if not len(rows):
+            return None
+        rows = rows[_one_a_cell(x1.ravel()[rows], y1.ravel()[rows], heading.ravel()[rows], cost.ravel()[rows])]
+        rows = rows[np.argsort(cost.ravel()[rows], kind="stable")[: 3 * config.width]]
+        parents = rows // count
+        nodes = layer.take(parents)
+        nodes.parent = parents
+        nodes.x, nodes.y, nodes.heading = x1.ravel()[rows], y1.ravel()[rows], heading.ravel()[rows]
+        nodes.bend, nodes.cost = self._bends[rows % count], cost.ravel()[rows]
+        nodes.s_m = layer.s_m + STEP_M
+        middle = np.stack([xm.ravel()[rows], ym.ravel()[rows]], axis=-1)
+        at = nodes.heading - 0.5 * nodes.bend * STEP_M
+        tangents = np.stack([np.cos(at), np.sin(at)], axis=-1)
+        pushes = self._touch(nodes, middle, tangents, nodes.s_m - 0.5 * STEP_M)
+        lying = lies is not None and nodes.s_m < config.body_length_m - 0.5 * STEP_M
+        reward = config.grip if lying else config.reward
+        nodes.cost += STEP_M * np.where(pushes > 0, -reward * pushes, -config.harm * pushes)
+        nodes.drag = np.concatenate(
+            [nodes.drag[:, 1:], STEP_M * wrenches(middle - self._origin, tangents)[:, None]], axis=1
+        )
+        nodes.margin_n = self._margins(nodes)
+        if not lying:
+            weak = np.clip(1.0 - nodes.margin_n / config.wanted_n, 0.0, 1.0)
+            now = lies is not None and nodes.s_m < config.body_length_m + config.now_m
+            nodes.cost += STEP_M * (config.weak_now if now else config.weak) * weak
+        return nodes.take(np.argsort(nodes.cost, kind="stable")[: config.width])
+
+    def _fits(self, x: Floats, y: Floats, heading: Floats) -> NDArray[np.bool_]:
+        """Whether the body clears everything; x, y, heading: (n, curvatures)."""
+        near = self._map.near(x, y)
+        left = np.cos(heading) * near.normal_w[..., 1] - np.sin(heading) * near.normal_w[..., 0]
+        inner = left * np.sign(self._bends) < 0  # the obstacle is on the side towards which the path bends
+        cut = np.where(inner, self._set.segment_m**2 * np.abs(self._bends) / 8, 0.0)
+        return near.distance_m >= self._set.radius_m + self._set.clearance_m + cut
+
+    def _trace(self, layers: list[Layer]) -> Found:
+        row = int(np.argmin(layers[-1].cost))
+        cost = float(layers[-1].cost[row])
+        rows: list[int] = []
+        for layer in reversed(layers):
+            rows.append(row)
+            row = int(layer.parent[row])
+        picked = zip(layers, reversed(rows), strict=True)
+        x, y, heading, bend, margin = np.array(
+            [(n.x[r], n.y[r], n.heading[r], n.bend[r], n.margin_n[r]) for n, r in picked]
+        ).T
+        return Found(np.stack([x, y], axis=-1), heading, bend[1:], margin, cost)
+
+
+def _evenly(body_w: Floats, arcs: int) -> Floats:
+    """Points (arcs + 1, 2) along a body, STEP_M apart, the last at its head."""
+    s = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(body_w, axis=0).T))))
+    ends = s[-1] - STEP_M * np.arange(arcs, -1, -1.0)
+    return np.stack([np.interp(ends, s, body_w[:, k]) for k in (0, 1)], axis=-1)
+
+
+def _one_a_cell(x: Floats, y: Floats, heading: Floats, cost: Floats) -> Ints:
+    """The cheapest of those in the same cell of place and heading."""
+    a = np.floor(x / CELL_M).astype(np.int64)
+    b = np.floor(y / CELL_M).astype(np.int64)
+    c = np.floor(heading / CELL_RAD).astype(np.int64)
+    key = (a * 100_003 + b) * 1009 + c
+    order = np.lexsort((cost, key))
+    first = np.concatenate(([True], np.diff(key[order]) != 0))
+    return order[first]

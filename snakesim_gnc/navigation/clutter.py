@@ -1,0 +1,251 @@
+"""The planner through clutter: a path for the whole body, from where it lies to where the goal is. Pure.
+
+The first path begins with the body's measured curve, from tail to head; ahead of the head it is what the search finds.
+When it ends soon, when the map has changed, or when the body stands still, the path of the whole body is planned anew,
+close to where the body lies, with touches that can push. Paths on which it got stuck are remembered and avoided. Every
+third time at one place it backs out first, along its own path and the trail of its tail.
+"""
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_gnc.navigation.beam import STEP_M, Beam, Found, Search
+from snakesim_gnc.navigation.intents import Intents
+from snakesim_gnc.navigation.obstacle_map import ObstacleMap
+from snakesim_gnc.navigation.snap import SPACING_M, Fit, resample, snap
+from snakesim_hal.model.route import Route
+from snakesim_hal.model.scenario import HeadingGoal, WaypointGoal
+from snakesim_hal.wire.messages import Intent, Obstacle, Trajectory, World
+
+Floats = NDArray[np.float64]
+
+HORIZON_M = 4.4
+AGAIN_M = 2.0
+REACHES_M = (0.05, 0.09)
+ENDS_SOON_M = 0.6
+COMMITTED_M = 0.1  # of the path ahead of the head that is not changed any more
+SEEN_M, SAME_M = 1.5, 0.005  # obstacles within this distance of the head; a change that matters
+ENDS_SOON, MAP_CHANGED = "ends soon", "the map has changed"
+FORGET_M = 0.15  # beyond this from where it was stuck, what failed there is forgotten
+FAILURES = 4
+LEAST_AHEAD = 10  # arcs of a new path beyond the head
+BACK_EVERY = 3  # time at the same place: back out
+BACK_M, BACK_S = 0.1, 1.5
+ANEW_GAP_M = -0.012  # a body that has lost its contacts must press to get them back
+TRAIL = 20  # points of the way behind the tail
+STANDS_S = 0.8
+STANDS_M = 0.01
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A path, and what was thought of it."""
+
+    route: Route
+    path_id: int
+    body_m: float  # arc length of the head on it when it was planned
+    found: Found | None
+
+
+class ClutterPlanner:
+    """Plans towards a goal, again and again."""
+
+    def __init__(
+        self,
+        goal: HeadingGoal | WaypointGoal,
+        known: Sequence[Obstacle] | None,
+        *,
+        speed_m_s: float,
+        search: Search,
+    ) -> None:
+        """known: the surveyed obstacles; None: those of the world model."""
+        self._goal = goal
+        self._known = None if known is None else ObstacleMap(known)
+        self._intents = Intents(speed_m_s)
+        self._search = search
+        self._fit = Fit(radius_m=search.radius_m, segment_m=search.segment_m)
+        self.start_over()
+
+    def start_over(self) -> None:
+        """Another robot, or another start."""
+        self._planned: Planned | None = None
+        self._path_id = 0
+        self._start: Floats | None = None
+        self._seen = np.empty((0, 5))
+        self._recent: deque[tuple[int, float]] = deque()
+        self._failed: list[Floats] = []  # paths on which the body got stuck near here
+        self._stuck_at = 0.0
+        self._stalls = 0
+        self._back_from_m: float | None = None  # arc length of the head where backing out began
+        self._back_by_m = 0.0
+        self._back_until_ns = 0
+        self._trail: list[Floats] = []
+        self._aim = np.zeros(2)
+        self._finished = False
+        self._next_point = 0
+        self.replans: list[str] = []
+
+    def update(
+        self, tick: int, now_ns: int, world: World | None, nodes_w: Floats | None, intent: Intent | None
+    ) -> Trajectory | None:
+        """The trajectory; None until the body is known. nodes_w: (n, 2) tail end, joints, head end."""
+        wish = self._intents.wish(intent, now_ns)
+        if world is None or nodes_w is None:
+            return None
+        body = resample(nodes_w)
+        obstacles = self._known or ObstacleMap(world.obstacles)
+        goal = self._aim = self._towards(body)
+        self._leave_trail(body[0])
+        why = self._why_again(body, obstacles, world.stamp_ns)
+        if why:
+            self._plan(body, obstacles, goal, why)
+        planned = self._planned
+        assert planned is not None
+        return Trajectory(
+            tick=tick,
+            stamp_ns=world.stamp_ns,
+            path_id=planned.path_id,
+            path_w=[(float(x), float(y)) for x, y in planned.route.points_w],
+            speed_m_s=0.0 if self._finished else self._speed_m_s(wish.speed_m_s),
+            push_points=[],
+            finished=self._finished,
+            reason="the goal is reached" if self._finished else wish.why[:500],
+        )
+
+    def _speed_m_s(self, wanted_m_s: float) -> float:
+        return wanted_m_s if self._back_from_m is None else -0.5 * wanted_m_s
+
+    def _towards(self, body: Floats) -> Floats:
+        """Unit vector of the goal's direction; notes when it is reached."""
+        if isinstance(self._goal, HeadingGoal):
+            heading = self._goal.heading_rad
+            goal = np.array([np.cos(heading), np.sin(heading)])
+            middle = body.mean(axis=0)
+            if self._start is None:
+                self._start = middle
+            self._finished |= bool((middle - self._start) @ goal >= self._goal.distance_m)
+            return goal
+        points = np.array(self._goal.points_m)
+        while np.hypot(*(points[self._next_point] - body[-1])) < self._goal.within_m:
+            if self._next_point == len(points) - 1:
+                self._finished = True
+                break
+            self._next_point += 1
+        ahead = points[self._next_point] - body[-1]
+        return ahead / max(float(np.hypot(*ahead)), 1e-9)
+
+    def _why_again(self, body: Floats, obstacles: ObstacleMap, now_ns: int) -> str:
+        """Why the path is to be planned anew; empty when it is not. Decides about backing out, too."""
+        planned = self._planned
+        if planned is None:
+            return "start"
+        head_s = planned.route.project(body[-1])
+        recent = self._recent
+        recent.append((now_ns, head_s))
+        while now_ns - recent[0][0] > STANDS_S * 1e9:
+            recent.popleft()
+        moved, full = head_s - recent[0][1], now_ns - recent[0][0] > 0.8e9 * STANDS_S
+        if self._back_from_m is not None:
+            if self._back_from_m - head_s > self._back_by_m or now_ns > self._back_until_ns:
+                self._back_from_m = None
+                return "backed out"
+            return ""
+        if planned.route.length_m - head_s < ENDS_SOON_M:
+            return ENDS_SOON
+        if self._known is None and not self._failed and self._seen_anew(body[-1], obstacles):
+            return MAP_CHANGED
+        if full and moved < STANDS_M:
+            return self._stuck(planned, body, head_s, now_ns)
+        return ""
+
+    def _seen_anew(self, head: Floats, obstacles: ObstacleMap) -> bool:
+        """Whether the map around the head is another than when it was planned."""
+        outlines = obstacles.outlines
+        near = np.hypot(*(outlines.centre_w - head).T) < SEEN_M
+        shapes = np.column_stack([outlines.centre_w, outlines.half_m, outlines.rounding_m])[near]
+        before, self._seen = self._seen, shapes
+        if len(before) == len(shapes) and (not len(shapes) or np.abs(before - shapes).max() < SAME_M):
+            self._seen = before
+            return False
+        return True
+
+    def _stuck(self, planned: Planned, body: Floats, head_s: float, now_ns: int) -> str:
+        """Remember the path; every third time at a place back out first."""
+        place = float(body.mean(axis=0) @ self._aim)
+        if self._failed and abs(place - self._stuck_at) > FORGET_M:
+            self._failed.clear()
+        if not self._failed:
+            self._stuck_at, self._stalls = place, 0
+        tail_s = planned.route.project(body[0])
+        self._failed.append(planned.route.position_w(np.arange(tail_s, head_s + 0.1, 0.025)))
+        self._failed = self._failed[-FAILURES:]
+        self._stalls += 1
+        if self._stalls % BACK_EVERY:
+            return "stands"
+        self._back_from_m, self._back_by_m = head_s, BACK_M
+        self._back_until_ns = now_ns + round(BACK_S * 1e9)
+        return ""
+
+    def _plan(self, body: Floats, obstacles: ObstacleMap, goal: Floats, why: str) -> None:
+        self.replans.append(f"{why} at {body[-1][0]:.2f}")
+        beam, goal_rad = Beam(obstacles, self._search), float(np.arctan2(goal[1], goal[0]))
+        if why in (ENDS_SOON, MAP_CHANGED):
+            found, kept, points = self._onward(beam, body, goal_rad)
+        elif self._planned is None:
+            found, kept = beam.ahead(body, goal_rad, round(HORIZON_M / STEP_M)), len(body) - 3
+            points = body if found is None else np.concatenate([body, resample(found.points_w)[1:]])
+        else:
+            found, kept = self._anew(beam, body, goal_rad), 0
+            points = body if found is None else resample(found.points_w)
+        if found is not None:
+            fit = self._fit if kept else replace(self._fit, push_gap_m=ANEW_GAP_M)
+            points = snap(points, kept, obstacles, goal, fit)
+        else:
+            ahead = body[-1] - body[-4]
+            points = np.concatenate([body, body[-1] + np.linspace(0.1, 1.0, 10)[:, None] * ahead / np.hypot(*ahead)])
+        self._path_id += 1
+        self._recent.clear()
+        behind = [place for place in self._trail if np.hypot(*(place - points[0])) > 0.04][-TRAIL:]
+        if behind:
+            points = np.concatenate([np.array(behind), points])
+        self._planned = Planned(Route(points), self._path_id, SPACING_M * len(body), found)
+
+    def _onward(self, beam: Beam, body: Floats, goal_rad: float) -> tuple[Found | None, int, Floats]:
+        """The present path as far as the body lies on it and a little further, then another one."""
+        assert self._planned is not None
+        route = self._planned.route
+        tail_s, head_s = route.project(body[0]), route.project(body[-1])
+        lies = resample(route.position_w(np.arange(tail_s, head_s + COMMITTED_M, SPACING_M)))
+        found = beam.ahead(lies, goal_rad, round(AGAIN_M / STEP_M))
+        points = lies if found is None else np.concatenate([lies, resample(found.points_w)[1:]])
+        return found, len(lies) - 3, points
+
+    def _anew(self, beam: Beam, body: Floats, goal_rad: float) -> Found | None:
+        """A path for the whole body: the least change of shape that can push well."""
+        failed = np.concatenate(self._failed) if self._failed else None
+        best: Found | None = None
+        for reach_m in REACHES_M:
+            found = beam.whole(body, goal_rad, round(AGAIN_M / STEP_M), reach_m, failed)
+            arcs = round(self._search.body_length_m / STEP_M)
+            if found is None or len(found.points_w) < arcs + LEAST_AHEAD:
+                continue
+            if best is None or found.cost < best.cost - 0.1:
+                best = found
+            if np.min(found.margins_n[arcs : arcs + 6]) > 0.5 * self._search.wanted_n:
+                break
+        return best
+
+    def _leave_trail(self, tail: Floats) -> None:
+        """Where the tail was: the way back."""
+        trail = self._trail
+        if not trail or np.hypot(*(trail[-1] - tail)) > 0.03:
+            ahead = len(trail) > 1 and float((tail - trail[-1]) @ (trail[-1] - trail[-2])) < 0
+            if ahead:
+                trail.pop()
+            else:
+                trail.append(tail)
+            del trail[: -2 * TRAIL]

@@ -1,0 +1,64 @@
+"""The propulsion margin: how hard a body can push itself along its own curve with the contacts that it has. Pure.
+
+Sliding forward, contact c pushes with lambda_c >= 0 along `d_c = n_c - mu t_c` (its normal, less friction on the
+obstacle). The contacts push a body of length L forward along its curve gamma with force F when
+
+    sum_c lambda_c [d_c ; o_c x d_c] = F (1/L) integral [t ; gamma x t] d sigma,   0 <= lambda_c <= lambda_max
+
+and the margin F* is the greatest such F. It is sought among all threes of contacts: three equations have a basic
+solution with three unknowns. More contacts could share the load, so this is a lower bound. See `docs/poal.md`.
+"""
+
+from functools import cache
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+LARGEST_N = 80.0  # lambda_max: force on one contact
+SINGULAR = 1e-4  # of a determinant of three unit wrenches, with moments over half a metre
+
+
+@cache
+def _threes(count: int) -> tuple[NDArray[np.intp], ...]:
+    indices = np.array(list(combinations(range(count), 3)), dtype=np.intp).reshape(-1, 3)
+    return indices[:, 0], indices[:, 1], indices[:, 2]
+
+
+def wrenches(points_w: Floats, directions_w: Floats) -> Floats:
+    """Unit forces (..., 2) at points (..., 2) as (force x, force y, moment about the origin), (..., 3)."""
+    moment = points_w[..., 0] * directions_w[..., 1] - points_w[..., 1] * directions_w[..., 0]
+    return np.concatenate([directions_w, moment[..., None]], axis=-1)
+
+
+def margins_n(contacts: Floats, drag: Floats, largest_n: float = LARGEST_N) -> Floats:
+    """F* of n bodies, (n,); zero where no three contacts can push.
+
+    contacts: (n, k, 3) wrenches of the contacts' unit pushes, zero where a body has fewer; drag: (n, 3) mean wrench of
+    the tangent, the right-hand side for 1 N. All moments about one point near the bodies.
+    """
+    if contacts.shape[1] < 3:
+        return np.zeros(len(contacts))
+    first, second, third = _threes(contacts.shape[1])
+    scaled = contacts * (1.0, 1.0, 2.0)  # moments over half a metre
+    wanted = drag * (1.0, 1.0, 2.0)
+    a, b, c = (scaled[:, k].transpose(2, 0, 1) for k in (first, second, third))
+    d = wanted.T[:, :, None]
+    cross_bc = _cross(b, c)
+    volume = _dot(a, cross_bc)
+    regular = np.abs(volume) > SINGULAR
+    inverse = 1.0 / np.where(regular, volume, 1.0)
+    cross_da = _cross(d, a)
+    forces = np.stack([_dot(d, cross_bc) * inverse, -_dot(c, cross_da) * inverse, _dot(b, cross_da) * inverse])
+    pushes = regular & (forces.min(axis=0) >= 0.0)
+    return largest_n / np.where(pushes, np.maximum(forces.max(axis=0), 1e-9), np.inf).min(axis=1)
+
+
+def _cross(a: Floats, b: Floats) -> Floats:
+    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+def _dot(a: Floats, b: Floats) -> Floats:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

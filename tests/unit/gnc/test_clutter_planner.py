@@ -1,0 +1,130 @@
+"""The planner through clutter: what it plans is free, pushes, is the same again, and changes when it must."""
+
+import numpy as np
+import pytest
+
+from snakesim_gnc.control.body_on_path import chain_nodes
+from snakesim_gnc.navigation.beam import Beam, Search
+from snakesim_gnc.navigation.clutter import ClutterPlanner
+from snakesim_gnc.navigation.obstacle_map import NONE, REACH_M, ObstacleMap
+from snakesim_hal.model.kinematics import quaternion_from_yaw
+from snakesim_hal.model.outlines import outline_distance_m
+from snakesim_hal.model.route import yaw_segments_m
+from snakesim_hal.model.scenario import HeadingGoal, RunConfig, WaypointGoal, load, parse_set, place_all, start_of
+from snakesim_hal.wire.messages import Obstacle, World
+
+SECOND = 10**9
+SEARCH = Search(body_length_m=1.54, radius_m=0.04, segment_m=0.11)
+
+
+def field(seed: int = 1, density: float = 8.0) -> RunConfig:
+    flags = (f"scene.random_field.0.seed={seed}", f"scene.random_field.0.density_per_m2={density}")
+    return load("clutter", [parse_set(flag) for flag in flags]).config
+
+
+def obstacles_of(config: RunConfig) -> list[Obstacle]:
+    return [placed.obstacle for placed in place_all(config)]
+
+
+def body_of(config: RunConfig) -> np.ndarray:
+    start = start_of(config)
+    segments = yaw_segments_m(config.robot.axes, config.robot.link_lengths_m)
+    return chain_nodes(start.position_w, start.yaw_rad, start.angles_rad.tolist(), segments).T
+
+
+def world(at_s: float, obstacles: list[Obstacle]) -> World:
+    return World(
+        tick=round(100 * at_s),
+        stamp_ns=round(at_s * SECOND),
+        base_position_w=(0.0, 0.0, 0.04),
+        base_orientation_wxyz=quaternion_from_yaw(0.0),
+        base_confidence=1.0,
+        contacts=[],
+        obstacles=obstacles,
+    )
+
+
+def planner(known: list[Obstacle] | None, goal: HeadingGoal | WaypointGoal | None = None) -> ClutterPlanner:
+    return ClutterPlanner(goal or HeadingGoal(), known, speed_m_s=0.2, search=SEARCH)
+
+
+def planned(made: ClutterPlanner, body: np.ndarray, at_s: float = 0.0, seen: list[Obstacle] | None = None):
+    found = made.update(round(100 * at_s), round(at_s * SECOND), world(at_s, seen or []), body, None)
+    assert found is not None
+    return found
+
+
+def test_the_map_knows_the_nearest_obstacle_and_its_distance() -> None:
+    obstacles = obstacles_of(field())
+    made, random = ObstacleMap(obstacles), np.random.default_rng(0)
+    points = random.uniform((0.0, -1.2), (6.5, 1.2), (300, 2))
+    near = made.near(points[:, 0], points[:, 1])
+    for k, point in enumerate(points):
+        least = min(outline_distance_m(o, point) for o in obstacles)
+        assert near.distance_m[k] == pytest.approx(min(least, REACH_M), abs=0.011)
+        if near.obstacle[k] != NONE and near.distance_m[k] > 1e-6:
+            assert np.hypot(*near.normal_w[k]) == pytest.approx(1.0)
+            moved = point + 1e-4 * near.normal_w[k]
+            grown = outline_distance_m(obstacles[near.obstacle[k]], moved) - near.distance_m[k]
+            assert grown == pytest.approx(1e-4, rel=1e-3)
+
+
+@pytest.mark.parametrize("density", [8.0, 12.0])
+def test_a_path_runs_through_no_obstacle_and_its_body_can_push(density: float) -> None:
+    config = field(density=density)
+    body, made = body_of(config), ObstacleMap(obstacles_of(config))
+    found = Beam(made, SEARCH).ahead(body, 0.0, 60)
+    assert found is not None and len(found.points_w) == 61
+    near = made.near(found.points_w[1:, 0], found.points_w[1:, 1])
+    assert near.distance_m.min() >= SEARCH.radius_m + SEARCH.clearance_m
+    assert found.points_w[-1, 0] - found.points_w[0, 0] > 2.0
+    assert np.median(found.margins_n) > 20.0
+    smooth = planned(planner(obstacles_of(config)), body)
+    points = np.array(smooth.path_w)
+    assert made.near(points[:, 0], points[:, 1]).distance_m.min() > SEARCH.radius_m - 0.012  # pressed, not through
+    assert points[0] == pytest.approx(body[0], abs=0.01)
+
+
+def test_the_same_field_gives_the_same_path() -> None:
+    config = field()
+    first, again = (planned(planner(obstacles_of(config)), body_of(config)) for _ in range(2))
+    assert first == again
+
+
+def test_a_body_that_stands_still_gets_another_path_and_then_backs_out() -> None:
+    config = field()
+    made, body = planner(obstacles_of(config)), body_of(config)
+    seen = [planned(made, body, at_s) for at_s in np.arange(0.0, 6.0, 0.2).tolist()]
+    assert len({one.path_id for one in seen}) >= 3
+    assert any(one.speed_m_s < 0 for one in seen)
+    assert seen[0].speed_m_s == 0.2
+
+
+def test_only_what_is_seen_is_planned_around() -> None:
+    config = field()
+    made, body = planner(None), body_of(config)
+    blind = planned(made, body)
+    wall = Obstacle(name="wall", shape="box", position_w=(2.2, 0.0, 0.1), half_size_m=(0.05, 0.4, 0.1), height_m=0.2)
+    points = np.array(blind.path_w)
+    assert min(outline_distance_m(wall, p) for p in points) < 0.0  # it does not know yet
+    seen = planned(made, body, 0.2, [wall])
+    assert seen.path_id != blind.path_id
+    assert min(outline_distance_m(wall, p) for p in np.array(seen.path_w)) > 0.03
+
+
+def test_a_goal_is_reached() -> None:
+    config = field()
+    made, body = planner(obstacles_of(config), HeadingGoal(distance_m=0.5)), body_of(config)
+    assert not planned(made, body).finished
+    there = planned(made, body + np.array([0.6, 0.0]), 1.0)
+    assert there.finished and there.speed_m_s == 0.0 and there.reason == "the goal is reached"
+    head = body[-1]
+    points = [(float(head[0]) + 0.1, float(head[1])), (float(head[0]) + 1.0, float(head[1]))]
+    made = planner(obstacles_of(config), WaypointGoal(points_m=points, within_m=0.2))
+    assert not planned(made, body).finished
+    assert planned(made, body + np.array([0.95, 0.0]), 1.0).finished
+
+
+def test_without_a_body_there_is_no_plan() -> None:
+    made = planner([])
+    assert made.update(0, 0, None, None, None) is None

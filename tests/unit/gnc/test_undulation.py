@@ -1,0 +1,73 @@
+"""The baselines: a wave that travels to the tail, and bends towards the goal."""
+
+import numpy as np
+
+from snakesim_gnc.control.obstacle_aided import ObstacleAided
+from snakesim_gnc.control.undulation import HeadSteeredUndulation, LateralUndulation
+from snakesim_hal.model.route import Route
+from tests.unit.gnc.stage import make_stage
+
+TAIL_S_M = 0.3
+
+
+def references(controller, stage, ticks: int) -> np.ndarray:
+    return np.array([controller.update(stage.view(t, TAIL_S_M)).report.reference_rad for t in range(ticks)])
+
+
+def test_the_wave_travels_from_head_to_tail() -> None:
+    stage = make_stage()
+    angles = references(LateralUndulation(stage.robot, LateralUndulation.Settings()), stage, 200)
+    peaks = angles.argmax(axis=0)
+    assert peaks[11] < peaks[10] < peaks[9]
+
+
+def test_it_rests_without_a_path() -> None:
+    stage = make_stage()
+    controller = LateralUndulation(stage.robot, LateralUndulation.Settings())
+    held = [controller.update(stage.view(t, TAIL_S_M, without="trajectory")).report.reference_rad for t in range(20)]
+    assert all(one == held[0] for one in held)
+
+
+def test_the_head_steers_towards_the_path() -> None:
+    stage = make_stage()
+    route = Route([(0.0, 0.0), (2.0, 0.0), (2.0, 3.0)])
+    straight = references(LateralUndulation(stage.robot, LateralUndulation.Settings()), stage, 1)
+    turned = make_stage()
+    steered = HeadSteeredUndulation(stage.robot, HeadSteeredUndulation.Settings())
+    view = turned.view(0, TAIL_S_M)
+    assert view.trajectory is not None
+    path = [(float(x), float(y)) for x, y in route.position_w(np.arange(0.0, 5.0, 0.02))]
+    view = type(view)(
+        **{
+            **vars(view),
+            "trajectory": type(view.trajectory)(
+                **{
+                    **{name: getattr(view.trajectory, name) for name in view.trajectory.__struct_fields__},
+                    "path_w": path,
+                }
+            ),
+        }
+    )
+    assert np.mean(steered.update(view).report.reference_rad) > np.mean(straight[0]) + 0.01
+
+
+def test_a_body_that_stands_is_pushed_harder_and_no_harder_than_allowed() -> None:
+    stage = make_stage()
+    controller = ObstacleAided(stage.robot, ObstacleAided.Settings(largest_torque_nm=2.0))
+    first = controller.update(stage.view(0, TAIL_S_M))
+    start = np.array(first.set_points.target)
+    last = first
+    for tick in range(1, 400):
+        last = controller.update(stage.view(tick, TAIL_S_M))
+    pushed = np.abs(np.array(last.set_points.target) - start)
+    assert 0.01 < pushed.max() < 2.0 / 60.0 + 0.25  # of the torque, and of the largest look-ahead
+    assert last.report.propulsion_n is not None and first.report.propulsion_n is not None
+    assert last.report.propulsion_n > first.report.propulsion_n
+
+
+def test_a_scaled_push_is_turned_round() -> None:
+    stage = make_stage()
+    ways = [ObstacleAided(stage.robot, ObstacleAided.Settings(push_scale=scale)) for scale in (1.0, -1.0, 0.0)]
+    still = references(ways[2], stage, 300)
+    forward, back = (references(way, stage, 300)[-1] - still[-1] for way in ways[:2])
+    assert forward @ back < 0 and np.abs(still[-1] - still[0]).max() < 1e-6
