@@ -4,6 +4,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -19,13 +20,20 @@ from snakesim_hal.model.scenario import RunConfig, place_all, read
 from snakesim_hal.model.scene import Placed, route_of
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
-from snakesim_hal.wire.messages import ControlState, Description, World
+from snakesim_hal.wire.messages import ControlState, Description, Message, Trajectory, World
 from snakesim_operator.results.gaps import cleaned, unread, unwritten
 
 CONFIG = "config.json"
 TELEMETRY = "telemetry.jsonl"
 SUMMARY = "summary.json"
 REPORT = "report.html"
+
+TOLD: dict[str, type[Message]] = {
+    keys.CONTROL_STATE: ControlState,
+    keys.WORLD: World,
+    keys.TRAJECTORY: Trajectory,
+}
+"""What telemetry keeps."""
 
 DAMAGED = (*UNDECODABLE, OSError, MemoryError)
 Floats = NDArray[np.float64]
@@ -48,6 +56,7 @@ class RunRecord:
     host: HostRecord
     control: list[ControlState]  # in time order, a few a second and at every change
     worlds: list[World]  # in time order, a few a second
+    trajectories: list[Trajectory]  # in time order, one for each path
     time_s: Floats  # (n,) robot time
     angle_rad: Floats  # (n, joints)
     velocity_rad_s: Floats
@@ -90,13 +99,14 @@ class RunRecord:
         if host.ended == "running":
             host = msgspec.structs.replace(host, ticks=len(columns["tick"]), command_digest=digest_of(columns))
         known, lacks = cleaned(columns, description, has_pose=config.robot.sensors.pose is not None)
-        control: list[ControlState] = []
-        worlds: list[World] = []
-        lacks += unwritten(host) + unread(_read_telemetry(folder / TELEMETRY, control, worlds))
+        told: dict[str, list[Any]] = {key: [] for key in TOLD}
+        lacks += unwritten(host) + unread(_read_telemetry(folder / TELEMETRY, told))
+        control = told[keys.CONTROL_STATE]
         while control and control[-1].state == "PowerOff":  # the host has ended, so its clock is expected to stop
             control.pop()
         known = {name: column for name, column in known.items() if name != "tick"}
-        return RunRecord(folder, config, description, host, control, worlds, **known, lacks=lacks)
+        worlds, trajectories = told[keys.WORLD], told[keys.TRAJECTORY]
+        return RunRecord(folder, config, description, host, control, worlds, trajectories, **known, lacks=lacks)
 
     @cached_property
     def route(self) -> Route | None:
@@ -133,7 +143,7 @@ def nodes_w(robot: Description, position_w: Floats, orientation_wxyz: Floats, an
     return np.vstack([origins, origins[-1] + lengths[-1] * rotations[-1][:, 0]])
 
 
-def _read_telemetry(path: Path, control: list[ControlState], worlds: list[World]) -> Counter[str]:
+def _read_telemetry(path: Path, told: dict[str, list[Any]]) -> Counter[str]:
     """Read the decodable lines; returns counts of the others. An incomplete last line means a killed process."""
     refused: Counter[str] = Counter()
     decoder = msgspec.json.Decoder(TelemetryLine)
@@ -143,10 +153,8 @@ def _read_telemetry(path: Path, control: list[ControlState], worlds: list[World]
         try:
             line = decoder.decode(text)
             key = line.key
-            if key == keys.CONTROL_STATE:
-                control.append(msgspec.json.decode(line.message, type=ControlState))
-            elif key == keys.WORLD:
-                worlds.append(msgspec.json.decode(line.message, type=World))
+            if key in told:
+                told[key].append(msgspec.json.decode(line.message, type=TOLD[key]))
         except UNDECODABLE as error:
             refused[f"{key}: {error}"[:200]] += 1
     return refused

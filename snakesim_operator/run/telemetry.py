@@ -1,4 +1,4 @@
-"""Telemetry of control and guidance during a run, written as it arrives."""
+"""Telemetry of control, guidance and navigation during a run, written as it arrives."""
 
 from pathlib import PurePath
 
@@ -6,21 +6,25 @@ import msgspec
 
 from snakesim_hal.network.session import Session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import ControlState, Message, World
+from snakesim_hal.wire.messages import ControlState, Message, Trajectory, World
 from snakesim_operator.results.record import TELEMETRY
 from snakesim_operator.run.run_files import RunFiles
 
 DEPTH = 8192
+MAX_PATHS = 20_000  # more than a planner makes in an hour
 WORLDS_PER_S = 20.0  # as often as control publishes its state
 
 
 class Telemetry:
-    """Writes control states and worlds, decoded once."""
+    """Writes control states, worlds, and each new path, decoded once."""
 
     def __init__(self, session: Session, files: RunFiles) -> None:
         self.latest: ControlState | None = None
         self._control = session.reader(keys.CONTROL_STATE, ControlState, depth=DEPTH)
         self._world = session.reader(keys.WORLD, World, depth=DEPTH)
+        self._trajectory = session.reader(keys.TRAJECTORY, Trajectory, depth=DEPTH)
+        self._path: tuple[int, int] | None = None
+        self._paths = 0
         self._files = files
         self._next_world_ns = 0
         self._hosts = 0
@@ -49,6 +53,11 @@ class Telemetry:
             if world.stamp_ns >= self._next_world_ns:
                 self._next_world_ns = world.stamp_ns + round(1e9 / WORLDS_PER_S)
                 self._write(keys.WORLD, world)
+        for trajectory in self._trajectory.drain():
+            path = (self._hosts, trajectory.path_id)
+            if path != self._path and self._paths < MAX_PATHS:
+                self._path, self._paths = path, self._paths + 1
+                self._write(keys.TRAJECTORY, trajectory)
 
     def _write(self, key: str, message: Message) -> None:
         self._files.append(TELEMETRY, msgspec.json.encode({"key": key, "message": message}) + b"\n")

@@ -4,6 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from snakesim_hal.model.scenario import load, parse_set
+from snakesim_operator.results.report.playback import playback
+from snakesim_operator.run.in_process import simulate
 from tests.whole.command import run_to_summary, snakesim
 
 
@@ -66,3 +69,12 @@ def test_run_from_a_file_of_ones_own_in_another_folder(tmp_path: Path) -> None:
     ended = snakesim("run", "./mine.toml", "--in-process", "--out", "out", cwd=tmp_path)
     assert ended.code == 0, ended.out + ended.err
     assert (tmp_path / "out" / "report.html").is_file()
+
+
+def test_the_report_shows_a_perceived_map_and_the_planned_paths_beside_the_truth(tmp_path: Path) -> None:
+    sets = [parse_set("robot=planar13_camera"), parse_set("mission.map=perceived"), parse_set("duration_s=1")]
+    film = playback(simulate(load("clutter", sets).config, tmp_path / "run").record)
+    assert film is not None and film.with_map and film.with_path
+    maps, paths, last = film.data["maps"], film.data["paths"], film.data["frames"][-1]
+    assert len(maps[last[6]]) >= 6 and len(paths[last[7]]) >= 20  # the launch row, and what lies ahead
+    assert "as guidance perceived it" in (tmp_path / "run" / "report.html").read_text()

@@ -2,11 +2,11 @@
 (() => {
   const player = document.querySelector(".player");
   if (!player) return;
-  const { frames, said, joints, end } = JSON.parse(player.querySelector("script").textContent);
+  const { frames, said, joints, end, maps, paths } = JSON.parse(player.querySelector("script").textContent);
   const find = (what) => player.querySelector(what);
   const slider = find("input"), button = find(".play"), speed = find("select"), words = find("output");
   const links = [...player.querySelectorAll(".snake line")], dots = [...player.querySelectorAll(".snake circle")];
-  const forces = find(".forces");
+  const forces = find(".forces"), told = find(".told");
   const set = (node, values) => { for (const [key, value] of Object.entries(values)) node.setAttribute(key, value); };
 
   const arrow = ([x1, y1, x2, y2], kind) => {
@@ -23,7 +23,7 @@
   const show = () => {
     let i = frames.findIndex((frame) => frame[0] > time);
     i = i < 0 ? frames.length - 1 : Math.max(i - 1, 0);
-    const [t, nodes, propels, what, solved, felt] = frames[i];
+    const [t, nodes, propels, what, solved, felt, map, path] = frames[i];
     const [later, ahead] = frames[Math.min(i + 1, frames.length - 1)];
     const share = later > t ? Math.min(Math.max((time - t) / (later - t), 0), 1) : 0;
     const at = nodes.map((value, k) => value + share * (ahead[k] - value));
@@ -36,6 +36,8 @@
       set(dot, { cx: at[2 * k + 2], cy: at[2 * k + 3], r: on ? 8 : 2.4, class: on ? "propelling" : "joint",
         style: on ? `fill:var(--joint-${k})` : "" });
     });
+    told.innerHTML = (maps[map] ?? []).map((outline) => `<polygon class="seen" points="${outline}"/>`).join("")
+      + (paths[path] ? `<polyline class="planned" points="${paths[path]}"/>` : "");
     const last = solved.length - 4;
     forces.innerHTML = pieces(felt).map((one) => arrow(one, "felt")).join("")
       + pieces(solved.slice(0, Math.max(last, 0))).map((one) => arrow(one, "solved")).join("")

@@ -18,12 +18,13 @@ from snakesim_operator.results.report.instants import balance_of
 from snakesim_operator.results.report.labels import Labels
 from snakesim_operator.results.report.svg import Point, element, figure
 from snakesim_operator.results.report.timeline import end_s, in_words, zero_s
-from snakesim_operator.results.report.top_view import body, ground, scales
+from snakesim_operator.results.report.top_view import body, ground, outline_w, scales
 from snakesim_operator.results.report.view import FELT_SHARE, LONGEST_ARROW, View, map_view
 
 Floats = NDArray[np.float64]
 Told = TypeVar("Told", ControlState, World)
 FRAMES = 300
+MAPS, PATH_POINTS = 80, 60  # of a whole run; of a path
 WIDTH = 1040.0
 SAME_TICK_S = 1e-6
 USUAL_SHARE = 0.9  # of all forces are drawn in full; the strongest are cut
@@ -38,6 +39,8 @@ class Playback:
     data: dict[str, Any]
     with_solved: bool
     with_felt: bool
+    with_map: bool  # obstacles as guidance perceived them
+    with_path: bool  # paths as navigation planned them
 
 
 def playback(record: RunRecord) -> Playback | None:
@@ -53,8 +56,10 @@ def playback(record: RunRecord) -> Playback | None:
     units = _units_per_n(states, worlds)
     view = map_view(record, nodes, units, WIDTH)
     said: list[str] = []
+    maps, map_of = _perceived(record, view, rows)
+    paths, path_of = _planned(record, view, rows)
     frames: list[list[Any]] = []
-    for row, body_w, state, world in zip(rows, nodes, states, worlds, strict=True):
+    for i, (row, body_w, state, world) in enumerate(zip(rows, nodes, states, worlds, strict=True)):
         joint = state.propulsion_joint if state is not None else None
         solved, felt = _solved(view, state, units), _felt(view, world, units)
         words = f"{in_words(state.state)}: {state.reason}" if state is not None else "the controller says nothing"
@@ -63,17 +68,46 @@ def playback(record: RunRecord) -> Playback | None:
         time_s = float(record.time_s[row]) - zero_s(record)
         flat = [round(part, 1) for node in body_w for part in view.at(node)]
         propels = names.index(joint) if joint in names else -1
-        frames.append([round(time_s, 3), flat, propels, said.index(words), solved, felt])
+        frames.append([round(time_s, 3), flat, propels, said.index(words), solved, felt, map_of[i], path_of[i]])
     labels = Labels(view.width, view.height)
     snake = element("g", body(record, view, nodes[0], labels), class_="snake")
     picture = figure(
         view.width,
         view.height,
         "The snake on the map, moved by the slider",
-        ground(record, view, labels) + snake + '<g class="forces"></g>' + scales(view),
+        ground(record, view, labels) + '<g class="told"></g>' + snake + '<g class="forces"></g>' + scales(view),
     )
     data = {"frames": frames, "said": said, "joints": names, "end": round(end_s(record), 3)}
-    return Playback(Markup(picture), data, any(frame[4] for frame in frames), any(frame[5] for frame in frames))
+    data |= {"maps": maps, "paths": paths}
+    with_solved, with_felt = (any(frame[k] for frame in frames) for k in (4, 5))
+    return Playback(Markup(picture), data, with_solved, with_felt, with_map=bool(maps), with_path=bool(paths))
+
+
+def _perceived(record: RunRecord, view: View, rows: NDArray[np.intp]) -> tuple[list[list[list[float]]], list[int]]:
+    """Some of the maps that guidance told, each obstacle as its outline; and for each row which one, or -1."""
+    if record.config.mission.map != "perceived" or not record.worlds:
+        return [], [-1] * len(rows)
+    some = record.worlds[:: max(len(record.worlds) // MAPS, 1)]
+    told = [[_flat(view, outline_w(one)) for one in world.obstacles if view.shows(one)] for world in some]
+    return told, _last_before(record, rows, [world.stamp_ns for world in some])
+
+
+def _planned(record: RunRecord, view: View, rows: NDArray[np.intp]) -> tuple[list[list[float]], list[int]]:
+    """The paths that navigation planned, and for each row which one, or -1. Without them a scene's route is drawn."""
+    planned = [one for one in record.trajectories if one.stamp_ns is not None]
+    if len({one.path_id for one in planned}) < 2:
+        return [], [-1] * len(rows)
+    told = [_flat(view, np.array(one.path_w)[:: max(len(one.path_w) // PATH_POINTS, 1)]) for one in planned]
+    return told, _last_before(record, rows, [one.stamp_ns or 0 for one in planned])
+
+
+def _flat(view: View, points_w: Floats) -> list[float]:
+    return [round(part, 1) for point in points_w for part in view.at(point)]
+
+
+def _last_before(record: RunRecord, rows: NDArray[np.intp], stamps_ns: Sequence[int]) -> list[int]:
+    stamps_s = np.array(stamps_ns) * 1e-9
+    return (np.searchsorted(stamps_s, record.time_s[rows] + SAME_TICK_S, side="right") - 1).tolist()
 
 
 def _nodes(record: RunRecord, row: int) -> Floats:

@@ -27,6 +27,7 @@ from snakesim_operator.results.report.view import EDGE, FELT_SHARE, FOOT, LONGES
 
 Floats = NDArray[np.float64]
 MOST_POINTS = 1500  # of the route
+ROUND = 12  # corners of a circle
 
 
 def top_view(record: RunRecord, instant: Instant, view: View) -> str:
@@ -73,12 +74,19 @@ def _obstacle(item: Placed, view: View, labels: Labels) -> str:
     told = title(obstacle.name)
     if obstacle.shape != "box":
         return element("circle", told, cx=x, cy=y, r=obstacle.radius_m * view.scale, class_=class_)
+    corners = [view.at(corner) for corner in outline_w(obstacle)]
+    return element("polygon", told, points=points_text(corners), class_=class_)
+
+
+def outline_w(obstacle: Obstacle) -> Floats:
+    """Points around an obstacle, (n, 2)."""
+    centre = np.array(obstacle.position_w[:2])
+    if obstacle.shape != "box":
+        around = np.linspace(0, 2 * np.pi, ROUND, endpoint=False)
+        return centre + obstacle.radius_m * np.stack([np.cos(around), np.sin(around)], axis=-1)
     c, s = math.cos(obstacle.yaw_rad), math.sin(obstacle.yaw_rad)
     a, b = obstacle.half_size_m[:2]
-    centre = np.array(obstacle.position_w[:2])
-    around = [(a, b), (-a, b), (-a, -b), (a, -b)]
-    corners = [view.at(centre + np.array([c * u - s * v, s * u + c * v])) for u, v in around]
-    return element("polygon", told, points=points_text(corners), class_=class_)
+    return centre + np.array([(a, b), (-a, b), (-a, -b), (a, -b)]) @ np.array([(c, s), (-s, c)])
 
 
 def body(record: RunRecord, view: View, nodes: Floats, labels: Labels) -> str:

@@ -63,6 +63,7 @@ def made_up(
         host=finished(count),
         control=control,
         worlds=[],
+        trajectories=[],
         time_s=start_s + since_s,
         angle_rad=0.3 * np.sin(phase),
         velocity_rad_s=0.6 * math.pi * np.cos(phase),

@@ -50,8 +50,9 @@ def test_playback_moves_the_snake_over_a_map(record: RunRecord, page: Reader) ->
     assert all(len(nodes) == 2 * 15 for _, nodes, *_ in frames)
     propels = {joint for _, _, joint, *_ in frames}
     assert propels == {-1, *INTERVALS_S}
-    solved, felt = ([len(frame[k]) for frame in frames] for k in (-2, -1))
+    solved, felt = ([len(frame[k]) for frame in frames] for k in (4, 5))
     assert set(solved) == {0, 16} and set(felt) <= set(range(0, 24, 4)) and max(felt) >= 12
+    assert not page.film["maps"] and not page.film["paths"]  # its map is known, its route is the scene's
     assert page.film["said"][frames[-1][3]].startswith(f"not moving: {LOST}")
 
 
