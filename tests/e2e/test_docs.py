@@ -20,6 +20,7 @@ pytestmark = [pytest.mark.e2e, pytest.mark.timeout(600)]
 
 TUTORIAL = [section for section in sections(REPOSITORY / "docs" / "tutorial.md") if section.has_commands]
 HIL = [section for section in sections(REPOSITORY / "docs" / "hil.md") if section.title == "1. Anywhere"]  # no CAN
+CONTROLLERS = [section for section in sections(REPOSITORY / "docs" / "controllers.md") if section.has_commands]
 README = [section for section in sections(REPOSITORY / "README.md") if section.has_commands]
 UV = REPOSITORY / ".tools" / "bin" / "uv"
 LIMIT_S = 500.0
@@ -60,7 +61,7 @@ def typed(script: str, cwd: Path, prefix: list[str]) -> str:
 
 @needs_uv
 @pytest.mark.slow
-@pytest.mark.parametrize("section", [*TUTORIAL, *HIL], ids=lambda section: re.sub(r"\W+", "-", section.title).lower())
+@pytest.mark.parametrize("section", [*TUTORIAL, *HIL, *CONTROLLERS], ids=lambda section: re.sub(r"\W+", "-", section.title).lower())
 def test_a_section_as_printed(section: Section, tmp_path: Path) -> None:
     folder = tmp_path / "snakesim"
     documents.clone(folder)
@@ -84,7 +85,7 @@ def test_the_readme_as_printed(section: Section, tmp_path: Path) -> None:
 
 
 def test_the_documents_ask_for_something() -> None:
-    assert len(TUTORIAL) >= 5 and len(README) >= 1 and len(HIL) == 1
+    assert len(TUTORIAL) >= 5 and len(README) >= 1 and len(HIL) == 1 and len(CONTROLLERS) == 1
     every = [info for section in [*TUTORIAL, *README] for info, _ in section.blocks]
     assert {info.split()[0] for info in every if info} <= {"sh", "python", "toml", "text"}
     commands = "\n".join(content for section in TUTORIAL for info, content in section.blocks if info.startswith("sh"))
