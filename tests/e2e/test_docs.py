@@ -27,6 +27,11 @@ LIMIT_S = 500.0
 needs_uv = pytest.mark.skipif(not UV.is_file(), reason="`make setup` has put no uv into .tools")
 
 
+def named(section: Section) -> str:
+    """A test's name."""
+    return re.sub(r"\W+", "-", section.title).lower()
+
+
 def apart() -> list[str]:
     """A network of the script's own, in which the default port is free; nothing where the kernel grants none."""
     command = ["unshare", "--net"] if os.geteuid() == 0 else ["unshare", "--net", "--map-root-user"]
@@ -61,7 +66,7 @@ def typed(script: str, cwd: Path, prefix: list[str]) -> str:
 
 @needs_uv
 @pytest.mark.slow
-@pytest.mark.parametrize("section", [*TUTORIAL, *HIL, *CONTROLLERS], ids=lambda section: re.sub(r"\W+", "-", section.title).lower())
+@pytest.mark.parametrize("section", [*TUTORIAL, *HIL, *CONTROLLERS], ids=named)
 def test_a_section_as_printed(section: Section, tmp_path: Path) -> None:
     folder = tmp_path / "snakesim"
     documents.clone(folder)
@@ -72,7 +77,7 @@ def test_a_section_as_printed(section: Section, tmp_path: Path) -> None:
 
 
 @needs_uv
-@pytest.mark.parametrize("section", README, ids=lambda section: re.sub(r"\W+", "-", section.title).lower())
+@pytest.mark.parametrize("section", README, ids=named)
 def test_the_readme_as_printed(section: Section, tmp_path: Path) -> None:
     """A clone, and an environment of its own from the lock; what is downloaded for it is in uv's cache, as a rule."""
     git = ["git", "-C", str(tmp_path / "origin"), "-c", "user.name=x", "-c", "user.email=x@example.org"]
