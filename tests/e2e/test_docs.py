@@ -21,10 +21,16 @@ pytestmark = [pytest.mark.e2e, pytest.mark.timeout(600)]
 TUTORIAL = [section for section in sections(REPOSITORY / "docs" / "tutorial.md") if section.has_commands]
 HIL = [section for section in sections(REPOSITORY / "docs" / "hil.md") if section.title == "1. Anywhere"]  # no CAN
 EVALUATION = [section for section in sections(REPOSITORY / "docs" / "evaluation.md") if section.has_commands]
+CONTROLLERS = [section for section in sections(REPOSITORY / "docs" / "controllers.md") if section.has_commands]
 README = [section for section in sections(REPOSITORY / "README.md") if section.has_commands]
 UV = REPOSITORY / ".tools" / "bin" / "uv"
 LIMIT_S = 500.0
 needs_uv = pytest.mark.skipif(not UV.is_file(), reason="`make setup` has put no uv into .tools")
+
+
+def named(section: Section) -> str:
+    """A test's name."""
+    return re.sub(r"\W+", "-", section.title).lower()
 
 
 def apart() -> list[str]:
@@ -61,9 +67,7 @@ def typed(script: str, cwd: Path, prefix: list[str]) -> str:
 
 @needs_uv
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "section", [*TUTORIAL, *HIL, *EVALUATION], ids=lambda section: re.sub(r"\W+", "-", section.title).lower()
-)
+@pytest.mark.parametrize("section", [*TUTORIAL, *HIL, *EVALUATION, *CONTROLLERS], ids=named)
 def test_a_section_as_printed(section: Section, tmp_path: Path) -> None:
     folder = tmp_path / "snakesim"
     documents.clone(folder)
@@ -74,7 +78,7 @@ def test_a_section_as_printed(section: Section, tmp_path: Path) -> None:
 
 
 @needs_uv
-@pytest.mark.parametrize("section", README, ids=lambda section: re.sub(r"\W+", "-", section.title).lower())
+@pytest.mark.parametrize("section", README, ids=named)
 def test_the_readme_as_printed(section: Section, tmp_path: Path) -> None:
     """A clone, and an environment of its own from the lock; what is downloaded for it is in uv's cache, as a rule."""
     git = ["git", "-C", str(tmp_path / "origin"), "-c", "user.name=x", "-c", "user.email=x@example.org"]
@@ -87,7 +91,7 @@ def test_the_readme_as_printed(section: Section, tmp_path: Path) -> None:
 
 
 def test_the_documents_ask_for_something() -> None:
-    assert len(TUTORIAL) >= 5 and len(EVALUATION) >= 6 and len(README) >= 1 and len(HIL) == 1
+    assert len(TUTORIAL) >= 5 and len(EVALUATION) >= 6 and len(README) >= 1 and len(HIL) == 1 and len(CONTROLLERS) == 1
     every = [info for section in [*TUTORIAL, *EVALUATION, *README] for info, _ in section.blocks]
     assert {info.split()[0] for info in every if info} <= {"sh", "python", "toml", "text"}
     commands = "\n".join(content for section in TUTORIAL for info, content in section.blocks if info.startswith("sh"))
