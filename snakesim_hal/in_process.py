@@ -15,6 +15,8 @@ from contextlib import ExitStack, closing
 from types import TracebackType
 from typing import Self
 
+from threadpoolctl import threadpool_limits
+
 from snakesim_hal.errors import ConfigError, RefusedError, SnakesimError
 from snakesim_hal.host.host import Host
 from snakesim_hal.host_process import open_backend
@@ -73,6 +75,8 @@ class InProcessRun:
 
     def _open(self, opened: ExitStack) -> None:
         config = self.config
+        # As in processes of their own: sums of several threads are rounded otherwise, and the digest would differ.
+        opened.enter_context(threadpool_limits(1))
         backend = open_backend(find_plugin(BACKENDS, config.backend), config)
         opened.callback(backend.close)
         if not backend.describe().emulated:

@@ -9,6 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from threadpoolctl import threadpool_limits
+
 from snakesim_hal.errors import ConfigError, SnakesimError
 from snakesim_hal.model.plugins import SERVICES, find_plugin
 from snakesim_hal.model.scenario import RunConfig, read
@@ -69,6 +71,7 @@ def serve(service_type: type[Service], argv: Sequence[str] | None = None) -> int
     given = process_options(arguments(f"Run the {name} service of a robot."), argv)
     try:
         accept_interrupts()
+        threadpool_limits(1)  # so that one seed gives one digest, however many cores there are
         if service_type.urgent and given.config.pace == "realtime":
             hurry(SERVICE_PRIORITY)
             calm_down_after(given.config.lease_ns * 1e-9)

@@ -71,12 +71,15 @@ class ObstacleAided:
         self._torques_nm = np.zeros(len(robot.joints))
         self._unit_nm = np.zeros(len(robot.joints))
         self._most_n = 0.0
+        self._waits = False
 
     def update(self, view: View) -> Action:
         """Angles of the body further along the path, as far as the wanted speed needs it."""
         located = self._progress.update(view)
         if isinstance(located, str):
             return self._wait(view, located)
+        if located.trajectory.speed_m_s == 0.0:  # whatever path is planned meanwhile
+            return self._rest(view)
         ahead_m = self._set.push_scale * self._look_ahead_m(located, view.period_s)
         at = located.on_path.at
         reference = self._body.all_angles(at(located.tail_s_m + ahead_m))
@@ -84,11 +87,11 @@ class ObstacleAided:
         reference = reference + torques / self._stiffness
         if self._reference is None:
             self._hand_over.start(view.joints, reference)
-        elif located.anew:
+        elif located.anew or self._waits:
             if np.abs(reference - self._reference).max() > ANOTHER_SHAPE_RAD:
                 self._integral_m = min(self._integral_m, self._set.fresh_look_ahead_m)
             self._hand_over.shift(reference - self._reference)
-        self._reference = reference
+        self._reference, self._waits = reference, False
         self._hand_over.fade(view.period_s / self._set.blend_s)
         slope = self._body.all_angles(at(located.tail_s_m + SLOPE_M)) - self._body.all_angles(at(located.tail_s_m))
         force_n = ahead_m * float(self._stiffness @ slope**2) / SLOPE_M**2
@@ -98,9 +101,6 @@ class ObstacleAided:
     def _look_ahead_m(self, located: Located, period_s: float) -> float:
         most = self._set.largest_look_ahead_m
         wanted_m_s = located.trajectory.speed_m_s
-        if wanted_m_s == 0.0:
-            self._integral_m = 0.0
-            return 0.0
         error_m_s = wanted_m_s - located.speed_m_s
         self._integral_m += self._set.integral_per_s * error_m_s * period_s
         self._integral_m = min(max(self._integral_m, -most), most)
@@ -133,8 +133,19 @@ class ObstacleAided:
         bound = config.largest_torque_nm
         return np.clip(self._torques_nm, -bound, bound)
 
+    def _rest(self, view: View) -> Action:
+        """At speed 0 every joint stays where it is, and nothing pushes."""
+        if not self._waits and self._reference is not None:
+            measured = np.array(view.joints.angle_rad)
+            self._hand_over.shift(measured - self._reference)
+            self._reference = measured
+        self._integral_m = self._push_n = 0.0
+        self._torques_nm[:] = 0.0
+        return self._wait(view, "")
+
     def _wait(self, view: View, why: str) -> Action:
         """Without a known body pose every joint keeps its reference."""
+        self._waits = True
         if self._reference is None:
             self._reference = np.array(view.joints.angle_rad)
             self._hand_over.start(view.joints, self._reference)

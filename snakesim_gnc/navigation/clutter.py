@@ -100,8 +100,10 @@ class ClutterPlanner:
         obstacles = self._known or ObstacleMap(world.obstacles)
         goal = self._aim = self._towards(body)
         self._leave_trail(body[0])
-        why = self._why_again(body, obstacles, world.stamp_ns)
-        if why:
+        resting = self._planned is not None and (self._finished or wish.speed_m_s == 0.0)
+        if resting:
+            self._recent.clear()  # who is to stand still is not stuck
+        elif why := self._why_again(body, obstacles, world.stamp_ns):
             self._plan(body, obstacles, goal, why)
         planned = self._planned
         assert planned is not None

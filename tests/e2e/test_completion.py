@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.model.files import shipped
+from snakesim_hal.model.plugins import CONTROLLERS, installed
 from tests.e2e.command import snakesim
 
 pytestmark = pytest.mark.e2e
@@ -20,7 +21,7 @@ TYPED: dict[str, tuple[list[str], set[str]]] = {
     "scenario": (["run", ""], set(shipped("scenarios"))),
     "flag": (["run", "triplet", "--pa"], {"--pace"}),
     "value of a flag": (["run", "triplet", "--pace", "l"], {"lockstep"}),
-    "controller": (["run", "--controller", ""], {"hold", "obstacle_triplet", "path_following"}),
+    "controller": (["run", "--controller", ""], set(installed(CONTROLLERS))),
     "free value": (["run", "--duration", ""], set()),
     "after a free value": (["run", "--duration", "3", "pe"], {"peg_row"}),
     "of an installed package": (["can", ""], {"load", "scan", "expand"}),
