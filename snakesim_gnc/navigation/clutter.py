@@ -76,7 +76,7 @@ class ClutterPlanner:
         self._path_id = 0
         self._start: Floats | None = None
         self._seen = np.empty((0, 5))
-        self._recent: deque[tuple[int, float]] = deque()
+        self._recent: deque[tuple[int, Floats]] = deque()
         self._failed: list[Floats] = []  # paths on which the body got stuck near here
         self._stuck_at = 0.0
         self._stalls = 0
@@ -146,11 +146,11 @@ class ClutterPlanner:
         if planned is None:
             return "start"
         head_s = planned.route.project(body[-1])
-        recent = self._recent
-        recent.append((now_ns, head_s))
+        recent, middle = self._recent, body.mean(axis=0)
+        recent.append((now_ns, middle))
         while now_ns - recent[0][0] > STANDS_S * 1e9:
             recent.popleft()
-        moved, full = head_s - recent[0][1], now_ns - recent[0][0] > 0.8e9 * STANDS_S
+        moved, full = float(np.hypot(*(middle - recent[0][1]))), now_ns - recent[0][0] > 0.8e9 * STANDS_S
         if self._back_from_m is not None:
             if self._back_from_m - head_s > self._back_by_m or now_ns > self._back_until_ns:
                 self._back_from_m = None
@@ -158,10 +158,10 @@ class ClutterPlanner:
             return ""
         if planned.route.length_m - head_s < ENDS_SOON_M:
             return ENDS_SOON
-        if self._known is None and not self._failed and self._seen_anew(body[-1], obstacles):
-            return MAP_CHANGED
         if full and moved < STANDS_M:
             return self._stuck(planned, body, head_s, now_ns)
+        if self._known is None and not self._failed and self._seen_anew(body[-1], obstacles):
+            return MAP_CHANGED
         return ""
 
     def _seen_anew(self, head: Floats, obstacles: ObstacleMap) -> bool:
@@ -210,7 +210,8 @@ class ClutterPlanner:
             ahead = body[-1] - body[-4]
             points = np.concatenate([body, body[-1] + np.linspace(0.1, 1.0, 10)[:, None] * ahead / np.hypot(*ahead)])
         self._path_id += 1
-        self._recent.clear()
+        if why != MAP_CHANGED:  # a map that keeps changing must not hide that the body stands
+            self._recent.clear()
         behind = [place for place in self._trail if np.hypot(*(place - points[0])) > 0.04][-TRAIL:]
         if behind:
             points = np.concatenate([np.array(behind), points])
@@ -220,8 +221,11 @@ class ClutterPlanner:
         """The present path as far as the body lies on it and a little further, then another one."""
         assert self._planned is not None
         route = self._planned.route
-        tail_s, head_s = route.project(body[0]), route.project(body[-1])
-        lies = resample(route.position_w(np.arange(tail_s, head_s + COMMITTED_M, SPACING_M)))
+        tail_s = route.project(body[0])
+        head_s = route.project(body[-1], tail_s + self._search.body_length_m)
+        lies = body  # where a path that crosses itself does not tell the order of tail and head
+        if head_s - tail_s > 0.5 * self._search.body_length_m:
+            lies = resample(route.position_w(np.arange(tail_s, head_s + COMMITTED_M, SPACING_M)))
         found = beam.ahead(lies, goal_rad, round(AGAIN_M / STEP_M))
         points = lies if found is None else np.concatenate([lies, resample(found.points_w)[1:]])
         return found, len(lies) - 3, points

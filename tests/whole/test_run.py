@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from snakesim_hal.model.scenario import load, parse_set
@@ -69,6 +70,17 @@ def test_run_from_a_file_of_ones_own_in_another_folder(tmp_path: Path) -> None:
     ended = snakesim("run", "./mine.toml", "--in-process", "--out", "out", cwd=tmp_path)
     assert ended.code == 0, ended.out + ended.err
     assert (tmp_path / "out" / "report.html").is_file()
+
+
+def test_at_its_goal_the_snake_stands_still_whatever_it_touches() -> None:
+    record = simulate(
+        load("clutter", [parse_set("mission.goal.distance_m=0.4"), parse_set("duration_s=6")]).config
+    ).record
+    reached_s = next(state.stamp_ns * 1e-9 for state in record.control if "the goal is reached" in state.reason)
+    assert 1.0 < reached_s < 4.0
+    after = record.position_w[record.time_s > reached_s + 0.5, :2]
+    assert np.ptp(after, axis=0).max() < 0.005
+    assert np.abs(record.torque_nm[-1]).max() < 0.5
 
 
 def test_the_report_shows_a_perceived_map_and_the_planned_paths_beside_the_truth(tmp_path: Path) -> None:
