@@ -37,7 +37,7 @@ def same_both_ways(out: Path, scenario: str, *arguments: str) -> Result:
 
 
 def test_processes_and_one_process_drive_the_motors_alike(tmp_path: Path) -> None:
-    same_both_ways(tmp_path / "run", "clutter", "--duration", "1")
+    same_both_ways(tmp_path / "run", "clutter", "--duration", "1")  # camera, map and planner too
 
 
 @pytest.mark.slow

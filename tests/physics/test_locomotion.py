@@ -237,5 +237,5 @@ def test_a_motor_that_is_too_weak_says_so():
 @pytest.mark.parametrize("seed", [10, pytest.param(14, marks=pytest.mark.slow)])
 def test_it_goes_through_a_random_field_that_nobody_laid_out(seed: int):
     field = (f"scene.random_field.0.seed={seed}", "scene.random_field.0.density_per_m2=12")
-    whole = run(configure("clutter", *field), duration_s=13.0)
+    whole = run(configure("surveyed_clutter", *field), duration_s=13.0)
     assert whole.moved_m > 1.5

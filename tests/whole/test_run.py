@@ -74,7 +74,7 @@ def test_run_from_a_file_of_ones_own_in_another_folder(tmp_path: Path) -> None:
 
 def test_at_its_goal_the_snake_stands_still_whatever_it_touches() -> None:
     record = simulate(
-        load("clutter", [parse_set("mission.goal.distance_m=0.4"), parse_set("duration_s=6")]).config
+        load("surveyed_clutter", [parse_set("mission.goal.distance_m=0.4"), parse_set("duration_s=6")]).config
     ).record
     reached_s = next(state.stamp_ns * 1e-9 for state in record.control if "the goal is reached" in state.reason)
     assert 1.0 < reached_s < 4.0
@@ -84,8 +84,7 @@ def test_at_its_goal_the_snake_stands_still_whatever_it_touches() -> None:
 
 
 def test_the_report_shows_a_perceived_map_and_the_planned_paths_beside_the_truth(tmp_path: Path) -> None:
-    sets = [parse_set("robot=planar13_camera"), parse_set("mission.map=perceived"), parse_set("duration_s=1")]
-    film = playback(simulate(load("clutter", sets).config, tmp_path / "run").record)
+    film = playback(simulate(load("clutter", [parse_set("duration_s=1")]).config, tmp_path / "run").record)
     assert film is not None and film.with_map and film.with_path
     maps, paths, last = film.data["maps"], film.data["paths"], film.data["frames"][-1]
     assert len(maps[last[6]]) >= 6 and len(paths[last[7]]) >= 20  # the launch row, and what lies ahead

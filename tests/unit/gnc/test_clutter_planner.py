@@ -19,7 +19,7 @@ SEARCH = Search(body_length_m=1.54, radius_m=0.04, segment_m=0.11)
 
 def field(seed: int = 1, density: float = 8.0) -> RunConfig:
     flags = (f"scene.random_field.0.seed={seed}", f"scene.random_field.0.density_per_m2={density}")
-    return load("clutter", [parse_set(flag) for flag in flags]).config
+    return load("surveyed_clutter", [parse_set(flag) for flag in flags]).config
 
 
 def obstacles_of(config: RunConfig) -> list[Obstacle]:

@@ -3,12 +3,13 @@
 from collections.abc import Iterator
 from contextlib import ExitStack
 
+import msgspec
 import pytest
 
 from snakesim_hal.network.client import Client
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Clock, Done, Pace
+from snakesim_hal.wire.messages import Clock, Done, Pace, Pose
 from tests.e2e.command import free_endpoint, wait_until
 
 
@@ -53,6 +54,34 @@ def test_in_lockstep_a_tick_that_was_shown_many_times_is_answered_once_as_it_is_
         *((0, 1), (1, 1), (2, 1)),
         None,
     ]
+
+
+def test_in_lockstep_a_sample_of_a_later_tick_is_not_read_although_it_is_here(
+    sessions: tuple[Session, Session],
+) -> None:
+    """A delayed sensor has nothing at the first ticks, and a host that is ahead has already sent what comes then."""
+    host, service = sessions
+    client = Client(service, "guidance")
+    feed, ticks = client.subscribe(keys.POSE, Pose), client.ticks(5.0)
+    poses, clocks = (host.publisher(key, kind, lossless=True) for key, kind in ((keys.POSE, Pose), (keys.CLOCK, Clock)))
+    wait_until(lambda: poses.heard() and clocks.heard(), "the service listens", 5.0)
+    poses.put(
+        Pose(
+            tick=3,
+            stamp_ns=0,
+            position_w=(0.0, 0.0, 0.0),
+            orientation_wxyz=(1.0, 0.0, 0.0, 0.0),
+            velocity_w=(0.0, 0.0, 0.0),
+            angular_velocity_w=(0.0, 0.0, 0.0),
+        )
+    )
+    seen: list[int | None] = []
+    for at in (clock(2, arming=1), msgspec.structs.replace(clock(3, arming=1), newest={keys.POSE: 3})):
+        clocks.put(at)
+        assert next(ticks) is not None
+        pose = client.read(feed)
+        seen.append(None if pose is None else pose.tick)
+    assert seen == [None, 3]
 
 
 def test_in_real_time_only_the_newest_counts(sessions: tuple[Session, Session]) -> None:

@@ -14,7 +14,7 @@ from snakesim_operator.evaluate.case import Case
 from snakesim_operator.evaluate.suite import Suite, cases_of, read_suite, settings_of, spaced
 
 ROWS = """
-scenario = "clutter"
+scenario = "surveyed_clutter"
 [set]
 duration_s = 20
 [vary]
@@ -94,7 +94,7 @@ def test_a_range_has_both_its_ends() -> None:
             'scenario = "jam"\n[set]\nscene.random_field.0.density_per_m2 = 3',
             ["[set]", "`scene.random_field`", "expected a list"],
         ),
-        ('scenario = "clutter"\n[set]\nscene.random_field.0.density_per_m2 = 150', ["row 1", "1380 pegs"]),
+        ('scenario = "surveyed_clutter"\n[set]\nscene.random_field.0.density_per_m2 = 150', ["row 1", "1380 pegs"]),
         ('scenario = "jam"\n[set]\nbackend = "nobody"', ["no backend called 'nobody'"]),
     ],
 )
