@@ -6,6 +6,9 @@ bidirectional overrides. They are printed as JSON escapes instead, so that print
 
 import sys
 from collections.abc import Callable
+from typing import Any
+
+import msgspec
 
 from snakesim_hal.errors import SnakesimError
 
@@ -27,6 +30,11 @@ def _escaped(char: str) -> str:
 def say(line: str) -> None:
     """Print one line, at once."""
     print(printable(line), flush=True)
+
+
+def say_json(value: Any, say: Say = say) -> None:
+    """Print a value, such as a Struct, as one line of JSON: for scripts. NaN and infinity become null."""
+    say(msgspec.json.encode(value).decode())
 
 
 def complain(line: str) -> None:

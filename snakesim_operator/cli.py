@@ -113,6 +113,11 @@ def parser() -> argparse.ArgumentParser:
     _add_network(status)
     status.set_defaults(act=_status)
 
+    doctor = commands.add_parser("doctor", help="check this computer, and print what mends what it lacks")
+    _add_network(doctor)
+    _add_json(doctor)
+    doctor.set_defaults(act=_doctor)
+
     arm = commands.add_parser("arm", help="allow a robot to move; names robot and backend, to avoid mix-ups")
     arm.add_argument("robot", metavar="ROBOT", help="name of the robot, as printed by `snakesim status`")
     arm.add_argument("backend", metavar="BACKEND", help="its backend: sim, can, ...")
@@ -203,6 +208,10 @@ def _add_network(parser: argparse.ArgumentParser) -> None:
         "--router", metavar="ENDPOINT", help="connect to a lab's Zenoh router instead, such as tcp/10.0.0.1:7447"
     )
     parser.add_argument("--namespace", help="namespace of the robot (default: the robot's name)")
+
+
+def _add_json(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--json", action="store_true", help="print one line of JSON instead, for scripts")
 
 
 def _add_insecure(parser: argparse.ArgumentParser) -> None:
@@ -331,6 +340,12 @@ def _status(arguments: argparse.Namespace) -> int:
     from snakesim_operator.tools.status import show_status
 
     return show_status(_where(arguments))
+
+
+def _doctor(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.doctor import doctor
+
+    return doctor(_where(arguments), as_json=arguments.json)
 
 
 def _arm(arguments: argparse.Namespace) -> int:
