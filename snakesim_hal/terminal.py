@@ -4,6 +4,7 @@ A robot's name, the reason of an answer, a field of a file may hold escape seque
 bidirectional overrides. They are printed as JSON escapes instead, so that printed JSON stays valid.
 """
 
+import shutil
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -53,4 +54,16 @@ def say_again(line: str, most: int, before: int) -> int:
     """Print a line, cut to `most` characters, over the previous one of `before` characters; returns its length."""
     shown = printable(line)[:most]
     print("\r" + shown.ljust(before), end="", flush=True)
+    return len(shown)
+
+
+def say_over(lines: list[str], before: int) -> int:
+    """Print lines over the `before` lines printed last, cut to the terminal's size; returns how many they are.
+
+    Also where the terminal is in raw mode, as for single keys.
+    """
+    size = shutil.get_terminal_size()
+    shown = [printable(line)[: size.columns - 1] for line in lines[: size.lines - 1]]
+    up = f"\x1b[{before}A" if before else ""
+    print(up + "".join(f"\r\x1b[K{line}\r\n" for line in shown) + "\x1b[J", end="", flush=True)
     return len(shown)

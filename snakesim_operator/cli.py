@@ -113,6 +113,12 @@ def parser() -> argparse.ArgumentParser:
     _add_network(status)
     status.set_defaults(act=_status)
 
+    top = commands.add_parser("top", help="show rate, jitter, size and age of every key, and commands' latency")
+    top.add_argument("--once", action="store_true", help="listen for two seconds, print one table, and end")
+    _add_network(top)
+    _add_json(top)
+    top.set_defaults(act=_top)
+
     doctor = commands.add_parser("doctor", help="check this computer, and print what mends what it lacks")
     _add_network(doctor)
     _add_json(doctor)
@@ -340,6 +346,12 @@ def _status(arguments: argparse.Namespace) -> int:
     from snakesim_operator.tools.status import show_status
 
     return show_status(_where(arguments))
+
+
+def _top(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.top import TopRequest, top
+
+    return top(TopRequest(arguments.once, arguments.json), _where(arguments))
 
 
 def _doctor(arguments: argparse.Namespace) -> int:
