@@ -7,6 +7,7 @@ on its side, so that only the rules of the other side decide.
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from typing import Any
 
 import pytest
 import zenoh
@@ -152,7 +153,7 @@ def passing(
     session: zenoh.Session,
     witness: zenoh.Session,
     get: Callable[..., Iterator[zenoh.Reply]],
-    declare: Callable[..., object],
+    declare: Callable[..., Any],
 ) -> set[str]:
     """The keys at which `get` finds what `declare` offers on the other side."""
     offers = [declare(f"{OWN}/{place}", answer) for place in PLACES]
