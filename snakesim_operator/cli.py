@@ -23,6 +23,7 @@ from snakesim_hal.model.plugins import COMMANDS, find_plugin, in_file, installed
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.terminal import complain, complain_of, say
 from snakesim_operator.evaluate.command import add_commands
+from snakesim_operator.lab.command import add_commands as add_lab_commands
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
 
@@ -118,6 +119,7 @@ def parser() -> argparse.ArgumentParser:
     compare.set_defaults(act=_compare)
 
     add_commands(commands)
+    add_lab_commands(commands)
 
     config = commands.add_parser("config", help="show every effective value, and the file or flag it came from")
     add_scenario(config)
