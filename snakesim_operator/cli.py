@@ -128,6 +128,8 @@ def parser() -> argparse.ArgumentParser:
     scenarios = commands.add_parser("scenarios", help="list the shipped scenarios, robots, scenes and suites")
     scenarios.set_defaults(act=_scenarios)
 
+    _add_robot(commands.add_parser("robot", help="make a robot file from a URDF, or a URDF from a robot file"))
+
     echo = commands.add_parser("echo", help="print what is published on a key, one JSON object a line")
     echo.add_argument("key", nargs="?", help="such as sensor/joints or sensor/*; without it, list the keys")
     echo.add_argument("--hz", action="store_true", help="print only rate and jitter")
@@ -180,6 +182,29 @@ def parser() -> argparse.ArgumentParser:
     completion.add_argument("shell", choices=["bash", "zsh"])
     completion.set_defaults(act=_completion)
     return parser
+
+
+def _add_robot(parser: argparse.ArgumentParser) -> None:
+    commands = parser.add_subparsers(dest="robot_command", required=True, metavar="import|export")
+    into = commands.add_parser("import", help="a robot file from a URDF; reports what cannot be carried over")
+    into.add_argument("file", type=Path, metavar="FILE.urdf")
+    into.add_argument("--out", type=Path, metavar="FILE.toml", help="robot file to write (default: NAME.toml)")
+    into.add_argument("--tail", metavar="LINK", help="a link at the tail end (default: the root link)")
+    into.add_argument(
+        "--up", choices=["x", "y", "z", "-x", "-y", "-z"], default="z", help="of the root link (default: z)"
+    )
+    into.add_argument("--scale", type=float, default=1.0, metavar="M", help="metres per unit of length; 0.001 for mm")
+    into.add_argument(
+        "--like",
+        default="planar13",
+        metavar="ROBOT",
+        help="robot file with the motor gains and other values that URDF lacks",
+    )
+    into.set_defaults(act=_robot_import)
+    out = commands.add_parser("export", help="a URDF from any robot file")
+    out.add_argument("robot", metavar="ROBOT", help="name of a shipped robot, or path of a robot file")
+    out.add_argument("--out", type=Path, metavar="FILE.urdf", help="URDF to write (default: NAME.urdf)")
+    out.set_defaults(act=_robot_export)
 
 
 def _run(arguments: argparse.Namespace) -> int:
@@ -258,6 +283,20 @@ def _scenarios(_arguments: argparse.Namespace) -> int:
             table = read_part(name, kind)
             say(f"  {name:<18}{table.values.get(about, '')}")
     return OK
+
+
+def _robot_import(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.robots.command import import_robot
+    from snakesim_operator.robots.imported import Order
+
+    order = Order(arguments.tail, arguments.up, arguments.scale, arguments.like)
+    return import_robot(arguments.file, order, arguments.out)
+
+
+def _robot_export(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.robots.command import export_robot
+
+    return export_robot(arguments.robot, arguments.out)
 
 
 def _echo(arguments: argparse.Namespace) -> int:
