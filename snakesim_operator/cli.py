@@ -15,6 +15,7 @@ from snakesim_hal.model.scenario import Loaded, Override, RunConfig, load, parse
 from snakesim_hal.network.endpoint import check_endpoint, check_namespace
 from snakesim_hal.terminal import complain, complain_of, say
 from snakesim_operator.evaluate.command import add_commands
+from snakesim_operator.ros2.command import add_command as add_ros2
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
 
@@ -138,6 +139,10 @@ def parser() -> argparse.ArgumentParser:
     fault.add_argument("--end", action="store_true", help="end it")
     _add_network(fault)
     fault.set_defaults(act=_fault)
+
+    ros2 = add_ros2(commands)
+    _add_network(ros2)
+    ros2.set_defaults(act=_ros2)
 
     router = commands.add_parser("router", help="run a Zenoh router from a JSON5 file")
     router.add_argument("config", type=Path, nargs="?", help=f"JSON5 file (default: {str(ROUTER).replace('%', '%%')})")
@@ -330,6 +335,12 @@ def _where(arguments: argparse.Namespace):
 
     _check_network(arguments)
     return Where(arguments.router or arguments.endpoint, arguments.namespace)
+
+
+def _ros2(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.ros2.join import join
+
+    return join(arguments, _where(arguments))
 
 
 def _router(arguments: argparse.Namespace) -> int:

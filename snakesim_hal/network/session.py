@@ -360,7 +360,7 @@ def open_session(link: Link, connect_timeout_s: float = 5.0) -> Iterator[Session
         check_guarded(link.endpoint, "endpoint", insecure=link.insecure)
         raise_open_files(MAX_OPEN_FILES)
         os.environ.setdefault(*RUNTIME)
-    session = Session(_open(_settings(link, connect_timeout_s), link))
+    session = Session(open_zenoh(link, connect_timeout_s))
     try:
         yield session
     finally:
@@ -390,10 +390,11 @@ def _settings(link: Link, connect_timeout_s: float) -> dict[str, Any]:
     return settings
 
 
-def _open(settings: dict[str, Any], link: Link) -> zenoh.Session:
+def open_zenoh(link: Link, connect_timeout_s: float) -> zenoh.Session:
+    """The session under a `Session`. Raises NotConnectedError."""
     zenoh.init_log_from_env_or("off")
     try:
-        return zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
+        return zenoh.open(zenoh.Config.from_json5(json.dumps(_settings(link, connect_timeout_s))))
     except zenoh.ZError as error:
         if link.listen:
             raise NotConnectedError(
