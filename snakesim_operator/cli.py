@@ -24,6 +24,7 @@ from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.terminal import complain, complain_of, say
 from snakesim_operator.evaluate.command import add_commands
 from snakesim_operator.lab.command import add_commands as add_lab_commands
+from snakesim_operator.ros2.command import add_command as add_ros2
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
 
@@ -168,6 +169,10 @@ def parser() -> argparse.ArgumentParser:
     fault.add_argument("--end", action="store_true", help="end it")
     add_network(fault)
     fault.set_defaults(act=_fault)
+
+    ros2 = add_ros2(commands)
+    add_network(ros2)
+    ros2.set_defaults(act=_ros2)
 
     router = commands.add_parser("router", help="run a Zenoh router from a JSON5 file")
     router.add_argument("config", type=Path, nargs="?", help=f"JSON5 file (default: {str(ROUTER).replace('%', '%%')})")
@@ -350,6 +355,12 @@ def _where(arguments: argparse.Namespace):
     if session is not None:
         return Where(session.endpoints[0], session.namespace_for(arguments.namespace), session)
     return Where(arguments.router or arguments.endpoint, arguments.namespace)
+
+
+def _ros2(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.ros2.join import join
+
+    return join(arguments, _where(arguments))
 
 
 def _router(arguments: argparse.Namespace) -> int:
