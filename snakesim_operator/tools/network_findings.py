@@ -3,10 +3,11 @@
 import socket
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 
 from snakesim_hal.errors import SnakesimError
 from snakesim_hal.network.local_registry import local_robots
-from snakesim_hal.network.session import DEFAULT_ENDPOINT, Link, open_session
+from snakesim_hal.network.session import DEFAULT_ENDPOINT, open_session
 from snakesim_operator.tools.computer import Finding
 from snakesim_operator.tools.targets import CONNECT_S, Where, robots_on
 
@@ -36,15 +37,15 @@ def ports() -> Iterator[Finding]:
 
 def routers(where: Where) -> Iterator[Finding]:
     """Every endpoint that was given, or has a robot of this computer."""
-    endpoints = [where.endpoint] if where.endpoint else sorted({robot.endpoint for robot in local_robots()})
-    for endpoint in endpoints:
+    links = where.networks() if where.endpoint or local_robots() else []
+    for link in links:
         began = time.monotonic()
         try:
-            with open_session(Link(endpoint), CONNECT_S) as session:
+            with open_session(replace(link, namespace=None), CONNECT_S) as session:
                 took_s = time.monotonic() - began
                 robots = ", ".join(robots_on(session)) or "no robot"
         except SnakesimError as error:
             fix = ["snakesim router    # there; and is a firewall between?"]
-            yield Finding(what="endpoint", state="fail", told=f"{endpoint}: {error}", fix=fix)
+            yield Finding(what="endpoint", state="fail", told=f"{link.endpoint}: {error}", fix=fix)
             continue
-        yield Finding(what="endpoint", state="ok", told=f"{endpoint} answers in {took_s * 1e3:.0f} ms: {robots}")
+        yield Finding(what="endpoint", state="ok", told=f"{link.endpoint} answers in {took_s * 1e3:.0f} ms: {robots}")

@@ -3,7 +3,7 @@
 import contextlib
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import msgspec
 
@@ -32,7 +32,7 @@ class TopRequest:
 def top(request: TopRequest, where: Where, say: Say = say) -> int:
     """Until Ctrl-C. Returns 1 when nothing was heard, 0 otherwise. Raises NotConnectedError."""
     with contextlib.ExitStack() as stack:
-        heard = [_listen(endpoint, where, stack) for endpoint in where.endpoints()]
+        heard = [_listen(link, stack) for link in where.networks()]
         traffics = [traffic for traffic in heard if traffic is not None]
         if not traffics:
             raise NotConnectedError(
@@ -59,14 +59,13 @@ def top(request: TopRequest, where: Where, say: Say = say) -> int:
                 return 0 if lines else 1
 
 
-def _listen(endpoint: str, where: Where, stack: contextlib.ExitStack) -> Traffic | None:
-    """Subscribe to everything at an endpoint; None when nobody answers there."""
+def _listen(link: Link, stack: contextlib.ExitStack) -> Traffic | None:
+    """Subscribe to everything on a network; None when nobody answers there."""
     try:
-        link = Link(endpoint, where.namespace, largest_bytes=MAX_IMAGE_BYTES)
-        session: Session = stack.enter_context(open_session(link, CONNECT_S))
+        session: Session = stack.enter_context(open_session(replace(link, largest_bytes=MAX_IMAGE_BYTES), CONNECT_S))
     except NotConnectedError:
         return None
-    traffic = Traffic(where.namespace)
+    traffic = Traffic(link.namespace)
     suffixes = tuple(f"/{key}" for key in LATCHED)
 
     def unless_latched(arrival: Arrival) -> None:
@@ -74,7 +73,7 @@ def _listen(endpoint: str, where: Where, stack: contextlib.ExitStack) -> Traffic
             traffic.take(arrival)
 
     for key in LATCHED:  # their last value, too: a plain subscriber hears only the next one
-        session.on_latched_arrival(key if where.namespace is not None else f"**/{key}", traffic.take)
+        session.on_latched_arrival(key if link.namespace is not None else f"**/{key}", traffic.take)
     session.on_arrival("**", unless_latched)
     return traffic
 
