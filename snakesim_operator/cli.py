@@ -21,7 +21,7 @@ from snakesim_hal.model.files import ROUTER, read_part, shipped
 from snakesim_hal.model.injection import explain
 from snakesim_hal.model.plugins import COMMANDS, find_plugin, in_file, installed
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.terminal import complain, complain_of, say
+from snakesim_hal.terminal import complain, complain_of, say, say_json
 from snakesim_operator.evaluate.command import add_commands
 from snakesim_operator.lab.command import add_commands as add_lab_commands
 from snakesim_operator.robots.arguments import add_commands as add_robot_commands
@@ -118,6 +118,7 @@ def parser() -> argparse.ArgumentParser:
     compare.add_argument(
         "--within", type=float, metavar="PERCENT", help="exit with 1 when the distances moved differ by more"
     )
+    _add_json(compare)
     compare.set_defaults(act=_compare)
 
     add_commands(commands)
@@ -125,9 +126,11 @@ def parser() -> argparse.ArgumentParser:
 
     config = commands.add_parser("config", help="show every effective value, and the file or flag it came from")
     add_scenario(config)
+    _add_json(config)
     config.set_defaults(act=_config)
 
     scenarios = commands.add_parser("scenarios", help="list the shipped scenarios, robots, scenes and suites")
+    _add_json(scenarios)
     scenarios.set_defaults(act=_scenarios)
 
     add_robot_commands(commands)
@@ -141,6 +144,7 @@ def parser() -> argparse.ArgumentParser:
 
     status = commands.add_parser("status", help="print the state of the robots on the network, and its reason")
     add_network(status)
+    _add_json(status)
     status.set_defaults(act=_status)
 
     top = commands.add_parser("top", help="show rate, jitter, size and age of every key, and commands' latency")
@@ -247,7 +251,7 @@ def _host(arguments: argparse.Namespace) -> int:
 def _compare(arguments: argparse.Namespace) -> int:
     from snakesim_operator.results.compare import compare
 
-    return compare(arguments.run_a, arguments.run_b, arguments.out, arguments.within)
+    return compare(arguments.run_a, arguments.run_b, arguments.out, arguments.within, as_json=arguments.json)
 
 
 def _config(arguments: argparse.Namespace) -> int:
@@ -255,6 +259,9 @@ def _config(arguments: argparse.Namespace) -> int:
 
     loaded = load_scenario(arguments)
     check_plugins(loaded.config, loaded.table, run_files=False)
+    if arguments.json:
+        say_json({key: {"value": value, "origin": origin} for key, value, origin in loaded.explain()})
+        return OK
     rows = [(key, _shown(value), origin) for key, value, origin in loaded.explain()]
     key_width = max(len(key) for key, _, _ in rows)
     value_width = min(max(len(value) for _, value, _ in rows), 48)
@@ -274,7 +281,13 @@ def _shown(value: object) -> str:
     return text if len(text) <= 120 else text[:117] + "..."
 
 
-def _scenarios(_arguments: argparse.Namespace) -> int:
+def _scenarios(arguments: argparse.Namespace) -> int:
+    if arguments.json:
+        kinds = {"scenarios": "title", "robots": "about", "scenes": "about", "suites": "title"}
+        say_json(
+            {k: {name: read_part(name, k).values.get(about, "") for name in shipped(k)} for k, about in kinds.items()}
+        )
+        return OK
     for kind, about in (("scenarios", "title"), ("robots", "about"), ("scenes", "about"), ("suites", "title")):
         say(f"{kind}:")
         for name in shipped(kind):
@@ -292,7 +305,7 @@ def _echo(arguments: argparse.Namespace) -> int:
 def _status(arguments: argparse.Namespace) -> int:
     from snakesim_operator.tools.status import show_status
 
-    return show_status(_where(arguments))
+    return show_status(_where(arguments), as_json=arguments.json)
 
 
 def _top(arguments: argparse.Namespace) -> int:
