@@ -11,22 +11,22 @@ import mcap.exceptions
 import zstandard
 from mcap.records import Channel, Chunk, DataEnd, Message, Metadata
 from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
+from mcap.writer import MCAP0_MAGIC
 
 from snakesim_hal.errors import ConfigError
 from snakesim_operator.recording.recording import ABOUT
 
 RECORDING = "recording.mcap"
 LARGEST_RECORD = 256 * 1024 * 1024
-ENDS_THERE = (
+DAMAGED = (
     mcap.exceptions.McapError,
     zstandard.ZstdError,
     CRCValidationError,
-    struct.error,
     UnicodeDecodeError,
     OverflowError,
     MemoryError,
 )
-"""What a file raises that ends in the middle, or is damaged from there on."""
+"""What the library raises where a file is damaged."""
 
 
 @dataclass(frozen=True)
@@ -53,10 +53,11 @@ class RecordingReader:
         """Messages at these keys of the robot, or at all. Raises ConfigError for a file that is no recording."""
         try:
             with self.path.open("rb") as file:
+                if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+                    raise ConfigError(f"{self.path} is not a recording: it does not begin as an MCAP file")
+                file.seek(0)
                 reader = StreamReader(file, emit_chunks=True, record_size_limit=LARGEST_RECORD)
                 yield from self._read(reader, keys)
-        except mcap.exceptions.InvalidMagic:
-            raise ConfigError(f"{self.path} is not a recording: it does not begin as an MCAP file") from None
         except OSError as error:
             raise ConfigError(f"{self.path} cannot be read: {error.strerror}") from None
 
@@ -67,13 +68,9 @@ class RecordingReader:
             try:
                 record = next(records)
                 inside = breakup_chunk(record, validate_crc=True) if isinstance(record, Chunk) else [record]
-            except mcap.exceptions.InvalidMagic:
-                if channels:
-                    return
-                raise
-            except (StopIteration, mcap.exceptions.EndOfFile):
-                return
-            except ENDS_THERE as error:
+            except (StopIteration, mcap.exceptions.EndOfFile, mcap.exceptions.InvalidMagic, struct.error):
+                return  # cut off there
+            except DAMAGED as error:
                 self.trouble = f"{type(error).__name__}: {error}"[:200]
                 return
             for found in inside:

@@ -86,6 +86,8 @@ class RunRecord:
             host = msgspec.json.decode((folder / HOST_RECORD).read_bytes(), type=HostRecord)
         if host.ended == "running":
             host = msgspec.structs.replace(host, ticks=len(columns["tick"]), command_digest=digest_of(columns))
+        lost = max(host.lost_ticks, host.ticks - len(columns["tick"]))
+        host = msgspec.structs.replace(host, lost_ticks=lost)
         known, lacks = cleaned(columns, description, has_pose=config.robot.sensors.pose is not None)
         lacks += unwritten(host)
         path = folder / RECORDING

@@ -80,11 +80,12 @@ def _leave(files: RunFiles, ending: Ending, outcome: Outcome, host: HostRecord) 
         _print_host(host)
         return ["nothing was recorded"]
     try:
-        _print_summary(leave(files, files.folder, ending, outcome)[1])
+        record, summary = leave(files, files.folder, ending, outcome)
+        _print_summary(summary)
     except ConfigError as error:
         _print_host(host)
         return [*unwritten(host), str(error)]
-    return unwritten(host)
+    return unwritten(record.host)
 
 
 def leave(
