@@ -24,6 +24,7 @@ from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.terminal import complain, complain_of, say
 from snakesim_operator.evaluate.command import add_commands
 from snakesim_operator.lab.command import add_commands as add_lab_commands
+from snakesim_operator.playback.command import add_commands as add_playback_commands
 from snakesim_operator.ros2.command import add_command as add_ros2
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
@@ -85,6 +86,7 @@ def parser() -> argparse.ArgumentParser:
         action="store_true",
         help="run in one process, without a network: lockstep, and faster; nothing can connect, arm or stop it",
     )
+    run.add_argument("--no-record", action="store_true", help="keep no recording of the messages")
     run.add_argument("--out", type=Path, help="folder for the run's record (default: runs/NAME-TIME)")
     add_network(run, "")
     add_insecure(run)
@@ -121,6 +123,13 @@ def parser() -> argparse.ArgumentParser:
 
     add_commands(commands)
     add_lab_commands(commands)
+
+    record = commands.add_parser("record", help="record everything that a robot publishes into an MCAP file")
+    record.add_argument("--out", type=Path, metavar="FILE.mcap", help="the file (default: NAMESPACE-TIME.mcap)")
+    record.add_argument("--duration", type=float, metavar="S", help="end after this time by the wall clock")
+    add_network(record)
+    record.set_defaults(act=_record)
+    add_playback_commands(commands)
 
     config = commands.add_parser("config", help="show every effective value, and the file or flag it came from")
     add_scenario(config)
@@ -232,6 +241,7 @@ def _run(arguments: argparse.Namespace) -> int:
             stay=arguments.stay,
             with_router=arguments.with_router,
             insecure=arguments.insecure,
+            record=not arguments.no_record,
         )
     )
 
@@ -242,7 +252,7 @@ def _run_in_process(config: RunConfig, arguments: argparse.Namespace) -> int:
     for flag in ("endpoint", "router", "session", "namespace", "stay", "with_router"):
         if getattr(arguments, flag):
             raise ConfigError(f"--in-process and --{flag.replace('_', '-')}: there is no network; leave one out")
-    return run_in_process(config, arguments.out)
+    return run_in_process(config, arguments.out, record=not arguments.no_record)
 
 
 def _host(arguments: argparse.Namespace) -> int:
@@ -308,6 +318,12 @@ def _echo(arguments: argparse.Namespace) -> int:
     from snakesim_operator.tools.echo import EchoRequest, echo
 
     return echo(EchoRequest(arguments.key, arguments.hz, arguments.count), _where(arguments))
+
+
+def _record(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.record import record_robot
+
+    return record_robot(_where(arguments), arguments.out, arguments.duration)
 
 
 def _status(arguments: argparse.Namespace) -> int:
