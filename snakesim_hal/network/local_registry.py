@@ -23,6 +23,7 @@ class LocalRobot(msgspec.Struct, frozen=True, kw_only=True):
     endpoint: str  # Zenoh endpoint
     stop_host: str  # of its stop port
     stop_port: int
+    config: str | None = None  # file with the effective configuration of its run, if that is known
     pid: int  # of the responsible process: `snakesim run`, or a host that was started on its own
 
 

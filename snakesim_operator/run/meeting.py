@@ -3,6 +3,7 @@
 import contextlib
 import os
 import socket
+from pathlib import Path
 
 from snakesim_hal.errors import NotConnectedError, RefusedError
 from snakesim_hal.model.scenario import RunConfig
@@ -58,7 +59,9 @@ def refuse_second_robot(endpoint: str | None, router: str | None, namespace: str
             )
 
 
-def local_robot(config: RunConfig, namespace: str, endpoint: str, stop_port: socket.socket) -> LocalRobot:
+def local_robot(
+    config: RunConfig, config_file: Path, namespace: str, endpoint: str, stop_port: socket.socket
+) -> LocalRobot:
     """The run's entry in the local registry."""
     stop_host, port = stop_port.getsockname()[:2]
     return LocalRobot(
@@ -68,6 +71,7 @@ def local_robot(config: RunConfig, namespace: str, endpoint: str, stop_port: soc
         endpoint=endpoint,
         stop_host=stop_host,
         stop_port=port,
+        config=str(config_file.absolute()),
         pid=os.getpid(),
     )
 

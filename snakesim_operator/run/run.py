@@ -26,6 +26,7 @@ from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.service import START_LIMIT_S
 from snakesim_hal.terminal import say
 from snakesim_operator.results.record import CONFIG
+from snakesim_operator.run.console_child import check_console, console_beside
 from snakesim_operator.run.ending import Ending, interruptible
 from snakesim_operator.run.folder import claimed, named_after
 from snakesim_operator.run.meeting import local_robot, meeting_point, refuse_second_robot
@@ -49,6 +50,7 @@ class RunRequest:
     stay: bool = False  # a fault ends nothing: processes are started again, a person clears and arms
     with_router: bool = False  # the run's parts meet at a router of its own
     insecure: bool = False  # listen even where other machines can connect
+    console: bool = False  # show it in the browser
 
     @property
     def network_name(self) -> str:
@@ -87,6 +89,8 @@ def run(request: RunRequest) -> int:
     """Run it. Returns 0, 1 on a fault or an early end, 3 when the record lacks something, 130 when interrupted."""
     request = replace(request, config=check_plugins(request.config))
     _check_router(request)
+    if request.console:
+        check_console()
     if request.endpoint is not None:
         check_guarded(request.endpoint, "--endpoint", insecure=request.insecure)
     refuse_second_robot(request.endpoint, request.router, request.network_name)
@@ -96,7 +100,7 @@ def run(request: RunRequest) -> int:
         supervisor = Supervisor(files, ending, say, stop_port, stay=request.stay)
         with (
             interruptible(ending),
-            registered(local_robot(request.config, request.network_name, endpoint, stop_port)) as trouble,
+            registered(local_robot(request.config, config_file, request.network_name, endpoint, stop_port)) as trouble,
         ):
             if trouble is not None:
                 say(trouble)
@@ -165,7 +169,10 @@ def _conduct(
         supervisor.start(HOST, host_arguments)
         for name, service in config.own_services.items():
             supervisor.start(name, ["snakesim_hal.serve", name, *common], may_restart=service.restart)
-        with _joined(Link(endpoint, namespace), supervisor, ending) as session:
+        with (
+            console_beside(common, files, say) if request.console else contextlib.nullcontext(),
+            _joined(Link(endpoint, namespace), supervisor, ending) as session,
+        ):
             say(f"{config.name}: {config.robot.name} in {config.scene.name}, {config.commander}, {config.pace}")
             say(f"network: {endpoint}, namespace {namespace}")
             if not config.has_own_control:
