@@ -5,12 +5,13 @@ import threading
 from collections.abc import Sequence
 from pathlib import Path
 
+from snakesim_hal.arguments import add_network, add_scenario
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.scenario import read
 from snakesim_hal.network.local_registry import local_robots
 from snakesim_hal.network.session import Link
 from snakesim_hal.process import on_stop_signal
-from snakesim_hal.serve import arguments, process_options
+from snakesim_hal.serve import add_parent, process_options
 from snakesim_hal.terminal import Say, say
 from snakesim_operator.tools.targets import Where, the_one
 
@@ -64,12 +65,14 @@ def _until_signal() -> threading.Event:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The console of a run, as a child that dies with it."""
-    parser: argparse.ArgumentParser = arguments("Show a run in the browser.")
-    parser.add_argument("--port", type=int, help="port on the loopback interface")
-    given = process_options(parser, argv)
+    parser = argparse.ArgumentParser(prog="snakesim_operator.console", description="Show a run in the browser.")
+    add_scenario(parser)
+    add_network(parser, "")
+    add_parent(parser)
+    given = process_options(parser.parse_args(argv))
     _check_installed()
     from snakesim_operator.console.console import show_live
     from snakesim_operator.console.drawing import Surroundings
 
-    show_live(given.link, Surroundings(given.config), given.arguments.port, _until_signal(), say)
+    show_live(given.link, Surroundings(given.config), None, _until_signal(), say)
     return 0

@@ -3,6 +3,7 @@
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 from snakesim_hal.network.session import Link, open_session
@@ -30,7 +31,7 @@ def show_live(link: Link, around: Surroundings | None, port: int | None, stop: t
         page = Page(server, around, Operations(link, log), log)
         say(f"console: {address}")
         page.show(None)
-        whole = Link(link.endpoint, link.namespace, largest_bytes=MAX_IMAGE_BYTES)
+        whole = replace(link, largest_bytes=MAX_IMAGE_BYTES)
         with open_session(whole, START_LIMIT_S) as session:
             watch, changes = Watch(session), Changes(log)
             for _ in frames(stop):

@@ -44,7 +44,7 @@ class Operations:
     """The robot at a link, as far as one can act on it."""
 
     def __init__(self, link: Link, log: Log) -> None:
-        self._where = Where(link.endpoint, link.namespace)
+        self._where = Where(link.endpoint, link.namespace, link.session)
         self._log = log
 
     def estop(self, who: str) -> str:
