@@ -87,6 +87,12 @@ def parser() -> argparse.ArgumentParser:
         help="run in one process, without a network: lockstep, and faster; nothing can connect, arm or stop it",
     )
     run.add_argument("--no-record", action="store_true", help="keep no recording of the messages")
+    run.add_argument(
+        "--console",
+        action=argparse.BooleanOptionalAction,
+        default=False,
+        help="show the run in the browser, and print the address",
+    )
     run.add_argument("--out", type=Path, help="folder for the run's record (default: runs/NAME-TIME)")
     add_network(run, "")
     add_insecure(run)
@@ -150,6 +156,14 @@ def parser() -> argparse.ArgumentParser:
     status = commands.add_parser("status", help="print the state of the robots on the network, and its reason")
     add_network(status)
     status.set_defaults(act=_status)
+
+    console = commands.add_parser(
+        "console", help="show a running robot in the browser, and command it from there; or show a recorded run"
+    )
+    console.add_argument("run", type=Path, nargs="?", metavar="RUN", help="folder of a recorded run")
+    console.add_argument("--port", type=int, help="port on the loopback interface (default: 8080, or any free one)")
+    add_network(console)
+    console.set_defaults(act=_console)
 
     arm = commands.add_parser("arm", help="allow a robot to move; names robot and backend, to avoid mix-ups")
     arm.add_argument("robot", metavar="ROBOT", help="name of the robot, as printed by `snakesim status`")
@@ -242,6 +256,7 @@ def _run(arguments: argparse.Namespace) -> int:
             with_router=arguments.with_router,
             insecure=arguments.insecure,
             record=not arguments.no_record,
+            console=arguments.console,
         )
     )
 
@@ -249,7 +264,7 @@ def _run(arguments: argparse.Namespace) -> int:
 def _run_in_process(config: RunConfig, arguments: argparse.Namespace) -> int:
     from snakesim_operator.run.in_process import run_in_process
 
-    for flag in ("endpoint", "router", "session", "namespace", "stay", "with_router"):
+    for flag in ("endpoint", "router", "session", "namespace", "stay", "with_router", "console"):
         if getattr(arguments, flag):
             raise ConfigError(f"--in-process and --{flag.replace('_', '-')}: there is no network; leave one out")
     return run_in_process(config, arguments.out, record=not arguments.no_record)
@@ -330,6 +345,14 @@ def _status(arguments: argparse.Namespace) -> int:
     from snakesim_operator.tools.status import show_status
 
     return show_status(_where(arguments))
+
+
+def _console(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.console.command import console, show_record
+
+    if arguments.run is not None:
+        return show_record(arguments.run, arguments.port)
+    return console(_where(arguments), arguments.port)
 
 
 def _arm(arguments: argparse.Namespace) -> int:

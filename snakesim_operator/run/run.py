@@ -25,6 +25,7 @@ from snakesim_hal.service import START_LIMIT_S
 from snakesim_hal.terminal import say
 from snakesim_operator.recording.process import RECORDER
 from snakesim_operator.results.record import CONFIG
+from snakesim_operator.run.console_child import check_console, console_beside
 from snakesim_operator.run.ending import Ending, interruptible
 from snakesim_operator.run.folder import claimed, named_after
 from snakesim_operator.run.meeting import local_robot, meeting_point, refuse_second_robot
@@ -50,6 +51,7 @@ class RunRequest:
     with_router: bool = False  # the run's parts meet at a router of its own
     insecure: bool = False  # listen even where other machines can connect
     record: bool = True  # every message, in recording.mcap
+    console: bool = False  # show it in the browser
 
     @property
     def network_name(self) -> str:
@@ -68,6 +70,8 @@ def run(request: RunRequest) -> int:
     """Run it. Returns 0, 1 on a fault or an early end, 3 when the record lacks something, 130 when interrupted."""
     request = replace(request, config=check_plugins(request.config))
     _check_router(request)
+    if request.console:
+        check_console()
     if request.endpoint is not None:
         check_guarded(request.endpoint, "--endpoint", insecure=request.insecure)
     refuse_second_robot(request.endpoint, request.lab)
@@ -77,7 +81,7 @@ def run(request: RunRequest) -> int:
         supervisor = Supervisor(files, ending, say, stop_port, stay=request.stay)
         with (
             interruptible(ending),
-            registered(local_robot(request.config, link, stop_port)) as trouble,
+            registered(local_robot(request.config, config_file, link, stop_port)) as trouble,
         ):
             if trouble is not None:
                 say(trouble)
@@ -152,7 +156,10 @@ def _conduct(
         if request.record and files.folder is not None:
             recorder = ["snakesim_operator.recording.process", *common, *meeting, "--out", str(files.folder)]
             supervisor.start(RECORDER, recorder, vital=False)
-        with _joined(link, supervisor, ending) as session:
+        with (
+            console_beside([*common, *meeting], files, say) if request.console else contextlib.nullcontext(),
+            _joined(link, supervisor, ending) as session,
+        ):
             say(f"{config.name}: {config.robot.name} in {config.scene.name}, {config.commander}, {config.pace}")
             say(f"network: {link.endpoint}, namespace {link.namespace}")
             if not config.has_own_control:
