@@ -88,3 +88,9 @@ def test_a_module_that_finds_something_wrong_inside_gives_up(kind: str):
         run.tick()
     run.chain.hear(0, command(Action.CLEAR))
     assert run.states()[1] == ModuleState.DISARMED
+
+
+def test_a_babbler_floods_the_bus():
+    run = host("babble:joint_2@0.05")
+    frames = run.ticks(8, 0.1)
+    assert 60 < len(of_node_2(frames, Opcode.HEARTBEAT)) < 80
