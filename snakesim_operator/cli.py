@@ -24,6 +24,7 @@ from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.terminal import complain, complain_of, say, say_json
 from snakesim_operator.evaluate.command import add_commands
 from snakesim_operator.lab.command import add_commands as add_lab_commands
+from snakesim_operator.playback.command import add_commands as add_playback_commands
 from snakesim_operator.robots.arguments import add_commands as add_robot_commands
 from snakesim_operator.ros2.command import add_command as add_ros2
 
@@ -86,6 +87,13 @@ def parser() -> argparse.ArgumentParser:
         action="store_true",
         help="run in one process, without a network: lockstep, and faster; nothing can connect, arm or stop it",
     )
+    run.add_argument("--no-record", action="store_true", help="keep no recording of the messages")
+    run.add_argument(
+        "--console",
+        action=argparse.BooleanOptionalAction,
+        default=False,
+        help="show the run in the browser, and print the address",
+    )
     run.add_argument("--out", type=Path, help="folder for the run's record (default: runs/NAME-TIME)")
     add_network(run, "")
     add_insecure(run)
@@ -124,6 +132,13 @@ def parser() -> argparse.ArgumentParser:
     add_commands(commands)
     add_lab_commands(commands)
 
+    record = commands.add_parser("record", help="record everything that a robot publishes into an MCAP file")
+    record.add_argument("--out", type=Path, metavar="FILE.mcap", help="the file (default: NAMESPACE-TIME.mcap)")
+    record.add_argument("--duration", type=float, metavar="S", help="end after this time by the wall clock")
+    add_network(record)
+    record.set_defaults(act=_record)
+    add_playback_commands(commands)
+
     config = commands.add_parser("config", help="show every effective value, and the file or flag it came from")
     add_scenario(config)
     _add_json(config)
@@ -147,6 +162,13 @@ def parser() -> argparse.ArgumentParser:
     _add_json(status)
     status.set_defaults(act=_status)
 
+    console = commands.add_parser(
+        "console", help="show a running robot in the browser, and command it from there; or show a recorded run"
+    )
+    console.add_argument("run", type=Path, nargs="?", metavar="RUN", help="folder of a recorded run")
+    console.add_argument("--port", type=int, help="port on the loopback interface (default: 8080, or any free one)")
+    add_network(console)
+    console.set_defaults(act=_console)
     top = commands.add_parser("top", help="show rate, jitter, size and age of every key, and commands' latency")
     top.add_argument("--once", action="store_true", help="listen for two seconds, print one table, and end")
     add_network(top)
@@ -242,6 +264,8 @@ def _run(arguments: argparse.Namespace) -> int:
             stay=arguments.stay,
             with_router=arguments.with_router,
             insecure=arguments.insecure,
+            record=not arguments.no_record,
+            console=arguments.console,
         )
     )
 
@@ -249,10 +273,10 @@ def _run(arguments: argparse.Namespace) -> int:
 def _run_in_process(config: RunConfig, arguments: argparse.Namespace) -> int:
     from snakesim_operator.run.in_process import run_in_process
 
-    for flag in ("endpoint", "router", "session", "namespace", "stay", "with_router"):
+    for flag in ("endpoint", "router", "session", "namespace", "stay", "with_router", "console"):
         if getattr(arguments, flag):
             raise ConfigError(f"--in-process and --{flag.replace('_', '-')}: there is no network; leave one out")
-    return run_in_process(config, arguments.out)
+    return run_in_process(config, arguments.out, record=not arguments.no_record)
 
 
 def _host(arguments: argparse.Namespace) -> int:
@@ -315,6 +339,12 @@ def _echo(arguments: argparse.Namespace) -> int:
     return echo(EchoRequest(arguments.key, arguments.hz, arguments.count), _where(arguments))
 
 
+def _record(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.record import record_robot
+
+    return record_robot(_where(arguments), arguments.out, arguments.duration)
+
+
 def _status(arguments: argparse.Namespace) -> int:
     from snakesim_operator.tools.status import show_status
 
@@ -339,6 +369,14 @@ def _doctor(arguments: argparse.Namespace) -> int:
     from snakesim_operator.tools.doctor import doctor
 
     return doctor(_where(arguments), as_json=arguments.json)
+
+
+def _console(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.console.command import console, show_record
+
+    if arguments.run is not None:
+        return show_record(arguments.run, arguments.port)
+    return console(_where(arguments), arguments.port)
 
 
 def _arm(arguments: argparse.Namespace) -> int:

@@ -27,7 +27,7 @@ def compare(
             f"--within {within_percent:g}: {run_a} and {run_b} have no common measure of the distance moved; "
             "give the robot a pose sensor, or leave --within away"
         )
-    path = out or run_b / PAGE
+    path = out or (run_b if run_b.is_dir() else run_b.parent) / PAGE
     try:
         write_text(path, page(difference, asked))
     except ConfigError as error:
@@ -45,7 +45,8 @@ def compare(
 
 
 def _load(folder: Path) -> RunRecord:
-    if not folder.is_dir():
-        what = "not a folder" if folder.exists() else "no such folder"
-        raise ConfigError(f"{folder}: {what}; give the folder that `snakesim run --out FOLDER` left")
+    if not folder.exists():
+        raise ConfigError(
+            f"{folder}: no such folder; give the folder that `snakesim run --out FOLDER` left, or a recording"
+        )
     return RunRecord.load(folder.resolve())

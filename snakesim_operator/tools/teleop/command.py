@@ -91,12 +91,13 @@ class Teleop:
             began = time.monotonic()
             self._read_operator()
             self._read_robot()
-            self._send()
+            if not self._ending:
+                self._send()
             if turn % SHOWN_EVERY == 0 and sys.stdout.isatty():
                 drawn = say_over(self._shown(), drawn)
             turn += 1
             time.sleep(max(PERIOD_S - (time.monotonic() - began), 0.0))
-        if self._steering.touched_s is not None and not self._stopped and not self._lost():
+        if self._steering.touched_s is not None and not self._stopped:  # sooner than by expiry
             self._steering.stop(time.monotonic())
             self._sent_ns = -1
             self._send()
