@@ -10,9 +10,8 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta
 
-from snakesim_gnc.control.body_on_path import chain_nodes, heading_of
-from snakesim_gnc.control.bumpless import HandOver
-from snakesim_gnc.control.controller import Action, Report, View, positions
+from snakesim_gnc.control.bumpless import Followed
+from snakesim_gnc.control.controller import Action, Report, View
 from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
@@ -34,9 +33,8 @@ class LateralUndulation:
 
     def __init__(self, robot: Description, settings: Settings) -> None:
         self._robot, self._set, self._body = robot, settings, PlanarBody(robot)
-        self._hand_over = HandOver(robot)
+        self._followed = Followed(robot, settings.blend_s)
         self._phase_rad = 0.0
-        self._begun = False
 
     def update(self, view: View) -> Action:
         """The wave goes on while there is a path to go along."""
@@ -47,20 +45,13 @@ class LateralUndulation:
         reference = np.zeros(len(self._robot.joints))
         swing = self._set.amplitude_rad * np.sin(self._phase_rad - self._set.lag_rad * turns)
         reference[self._body.bends] = swing + self._bend_rad(view)
-        if not self._begun:
-            self._hand_over.start(view.joints, reference)
-            self._begun = True
-        self._hand_over.fade(view.period_s / self._set.blend_s)
-        targets = self._hand_over.positions_rad(reference).tolist()
-        return Action(positions(self._robot, targets), Report(reference_rad=reference.tolist()))
+        return Action(self._followed.to(view, reference), Report(reference_rad=reference.tolist()))
 
     def _bend_rad(self, view: View) -> float:
         """Bend of every joint that turns the body towards the path ahead."""
         if self._set.steering == 0.0 or view.world is None or view.trajectory is None:
             return 0.0
-        angles = [view.joints.angle_rad[i] for i in self._body.bends]
-        heading = heading_of(view.world.base_orientation_wxyz)
-        nodes = chain_nodes(view.world.base_position_w[:2], heading, angles, self._body.segments_m).T
+        nodes = self._body.nodes_w(view.world, view.joints.angle_rad).T
         path = np.array(view.trajectory.path_w)
         ahead = path[np.argmin(np.hypot(*(path - nodes[-1]).T)) :]
         aim = ahead[min(np.searchsorted(np.hypot(*(ahead - nodes[-1]).T), AIM_M), len(ahead) - 1)] - nodes[-1]

@@ -6,6 +6,7 @@ close to where the body lies, with touches that can push. Paths on which it got 
 third time at one place it backs out first, along its own path and the trail of its tail.
 """
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,12 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_gnc.navigation.beam import STEP_M, Beam, Found, Search
-from snakesim_gnc.navigation.intents import Intents
+from snakesim_gnc.navigation.intents import Wish
+from snakesim_gnc.navigation.line import SPACING_M, evenly
 from snakesim_gnc.navigation.obstacle_map import ObstacleMap
-from snakesim_gnc.navigation.snap import SPACING_M, Fit, resample, snap
+from snakesim_gnc.navigation.snap import Fit, snap
+from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.model.route import Route
 from snakesim_hal.model.scenario import HeadingGoal, WaypointGoal
-from snakesim_hal.wire.messages import Intent, Obstacle, Trajectory, World
+from snakesim_hal.wire.messages import Obstacle, Trajectory, World
 
 Floats = NDArray[np.float64]
 
@@ -29,7 +32,9 @@ REACHES_M = (0.05, 0.09)
 ENDS_SOON_M = 0.6
 COMMITTED_M = 0.1  # of the path ahead of the head that is not changed any more
 SEEN_M, SAME_M = 1.5, 0.005  # obstacles within this distance of the head; a change that matters
-ENDS_SOON, MAP_CHANGED = "ends soon", "the map has changed"
+ENDS_SOON, MAP_CHANGED, TURNED = "ends soon", "the map has changed", "the direction has changed"
+TURNED_RAD = 0.35  # a change of direction that matters
+SHARPEST_RAD = 1.2  # a path begins with no greater turn from where the head points; further ones follow
 FORGET_M = 0.15  # beyond this from where it was stuck, what failed there is forgotten
 FAILURES = 4
 LEAST_AHEAD = 10  # arcs of a new path beyond the head
@@ -43,12 +48,10 @@ STANDS_M = 0.01
 
 @dataclass(frozen=True)
 class Planned:
-    """A path, and what was thought of it."""
+    """A path, and its number."""
 
     route: Route
     path_id: int
-    body_m: float  # arc length of the head on it when it was planned
-    found: Found | None
 
 
 class ClutterPlanner:
@@ -59,19 +62,13 @@ class ClutterPlanner:
         goal: HeadingGoal | WaypointGoal,
         known: Sequence[Obstacle] | None,
         *,
-        speed_m_s: float,
         search: Search,
     ) -> None:
-        """known: the surveyed obstacles; None: those of the world model."""
+        """goal: unless a heading is wished for. known: the surveyed obstacles; None: those of the world model."""
         self._goal = goal
         self._known = None if known is None else ObstacleMap(known)
-        self._intents = Intents(speed_m_s)
         self._search = search
         self._fit = Fit(radius_m=search.radius_m, segment_m=search.segment_m)
-        self.start_over()
-
-    def start_over(self) -> None:
-        """Another robot, or another start."""
         self._planned: Planned | None = None
         self._path_id = 0
         self._start: Floats | None = None
@@ -87,24 +84,22 @@ class ClutterPlanner:
         self._aim = np.zeros(2)
         self._finished = False
         self._next_point = 0
-        self.replans: list[str] = []
+        self._headed_rad = 0.0  # for which the present path was planned
 
-    def update(
-        self, tick: int, now_ns: int, world: World | None, nodes_w: Floats | None, intent: Intent | None
-    ) -> Trajectory | None:
-        """The trajectory; None until the body is known. nodes_w: (n, 2) tail end, joints, head end."""
-        wish = self._intents.wish(intent, now_ns)
-        if world is None or nodes_w is None:
-            return None
-        body = resample(nodes_w)
-        obstacles = self._known or ObstacleMap(world.obstacles)
-        goal = self._aim = self._towards(body)
+    def update(self, tick: int, world: World, nodes_w: Floats, wish: Wish) -> Trajectory:
+        """The trajectory. nodes_w: (n, 2) tail end, joints, head end."""
+        body = evenly(nodes_w)
+        if wish.heading_w_rad is None:
+            goal = self._aim = self._towards(body)
+        else:
+            goal = self._aim = np.array([np.cos(wish.heading_w_rad), np.sin(wish.heading_w_rad)])
+            self._finished = False
         self._leave_trail(body[0])
         resting = self._planned is not None and (self._finished or wish.speed_m_s == 0.0)
         if resting:
             self._recent.clear()  # who is to stand still is not stuck
-        elif why := self._why_again(body, obstacles, world.stamp_ns):
-            self._plan(body, obstacles, goal, why)
+        elif why := self._why_again(body, world):
+            self._plan(body, self._known or ObstacleMap(world.obstacles), goal, why)
         planned = self._planned
         assert planned is not None
         return Trajectory(
@@ -140,9 +135,9 @@ class ClutterPlanner:
         ahead = points[self._next_point] - body[-1]
         return ahead / max(float(np.hypot(*ahead)), 1e-9)
 
-    def _why_again(self, body: Floats, obstacles: ObstacleMap, now_ns: int) -> str:
+    def _why_again(self, body: Floats, world: World) -> str:
         """Why the path is to be planned anew; empty when it is not. Decides about backing out, too."""
-        planned = self._planned
+        planned, now_ns = self._planned, world.stamp_ns
         if planned is None:
             return "start"
         head_s = planned.route.project(body[-1])
@@ -160,13 +155,16 @@ class ClutterPlanner:
             return ENDS_SOON
         if full and moved < STANDS_M:
             return self._stuck(planned, body, head_s, now_ns)
-        if self._known is None and not self._failed and self._seen_anew(body[-1], obstacles):
+        turned_rad = math.remainder(_within_reach(body, self._aim) - self._headed_rad, math.tau)
+        if abs(turned_rad) > TURNED_RAD and not self._failed:
+            return TURNED
+        if self._known is None and not self._failed and self._seen_anew(body[-1], world.obstacles):
             return MAP_CHANGED
         return ""
 
-    def _seen_anew(self, head: Floats, obstacles: ObstacleMap) -> bool:
+    def _seen_anew(self, head: Floats, obstacles: Sequence[Obstacle]) -> bool:
         """Whether the map around the head is another than when it was planned."""
-        outlines = obstacles.outlines
+        outlines = Outlines.of(obstacles)
         near = np.hypot(*(outlines.centre_w - head).T) < SEEN_M
         shapes = np.column_stack([outlines.centre_w, outlines.half_m, outlines.rounding_m])[near]
         before, self._seen = self._seen, shapes
@@ -193,16 +191,16 @@ class ClutterPlanner:
         return ""
 
     def _plan(self, body: Floats, obstacles: ObstacleMap, goal: Floats, why: str) -> None:
-        self.replans.append(f"{why} at {body[-1][0]:.2f}")
-        beam, goal_rad = Beam(obstacles, self._search), float(np.arctan2(goal[1], goal[0]))
-        if why in (ENDS_SOON, MAP_CHANGED):
+        goal_rad = self._headed_rad = _within_reach(body, goal)
+        beam = Beam(obstacles, self._search)
+        if why in (ENDS_SOON, MAP_CHANGED, TURNED):
             found, kept, points = self._onward(beam, body, goal_rad)
         elif self._planned is None:
             found, kept = beam.ahead(body, goal_rad, round(HORIZON_M / STEP_M)), len(body) - 3
-            points = body if found is None else np.concatenate([body, resample(found.points_w)[1:]])
+            points = body if found is None else np.concatenate([body, evenly(found.points_w)[1:]])
         else:
             found, kept = self._anew(beam, body, goal_rad), 0
-            points = body if found is None else resample(found.points_w)
+            points = body if found is None else evenly(found.points_w)
         if found is not None:
             fit = self._fit if kept else replace(self._fit, push_gap_m=ANEW_GAP_M)
             points = snap(points, kept, obstacles, goal, fit)
@@ -215,7 +213,7 @@ class ClutterPlanner:
         behind = [place for place in self._trail if np.hypot(*(place - points[0])) > 0.04][-TRAIL:]
         if behind:
             points = np.concatenate([np.array(behind), points])
-        self._planned = Planned(Route(points), self._path_id, SPACING_M * len(body), found)
+        self._planned = Planned(Route(points), self._path_id)
 
     def _onward(self, beam: Beam, body: Floats, goal_rad: float) -> tuple[Found | None, int, Floats]:
         """The present path as far as the body lies on it and a little further, then another one."""
@@ -225,9 +223,9 @@ class ClutterPlanner:
         head_s = route.project(body[-1], tail_s + self._search.body_length_m)
         lies = body  # where a path that crosses itself does not tell the order of tail and head
         if head_s - tail_s > 0.5 * self._search.body_length_m:
-            lies = resample(route.position_w(np.arange(tail_s, head_s + COMMITTED_M, SPACING_M)))
+            lies = evenly(route.position_w(np.arange(tail_s, head_s + COMMITTED_M, SPACING_M)))
         found = beam.ahead(lies, goal_rad, round(AGAIN_M / STEP_M))
-        points = lies if found is None else np.concatenate([lies, resample(found.points_w)[1:]])
+        points = lies if found is None else np.concatenate([lies, evenly(found.points_w)[1:]])
         return found, len(lies) - 3, points
 
     def _anew(self, beam: Beam, body: Floats, goal_rad: float) -> Found | None:
@@ -255,3 +253,11 @@ class ClutterPlanner:
             else:
                 trail.append(tail)
             del trail[: -2 * TRAIL]
+
+
+def _within_reach(body: Floats, goal: Floats) -> float:
+    """Heading of a goal's direction, or as far towards it as the head can turn on one path."""
+    x, y = body[-1] - body[-4]
+    head_rad = math.atan2(y, x)
+    turn_rad = math.remainder(math.atan2(goal[1], goal[0]) - head_rad, math.tau)
+    return head_rad + min(max(turn_rad, -SHARPEST_RAD), SHARPEST_RAD)

@@ -573,7 +573,7 @@ class ControlState(Message, frozen=True, kw_only=True):
 
 
 class Intent(Message, frozen=True, kw_only=True):
-    """`operator/intent`: speed asked for by a person or a mission. Send it repeatedly: it expires.
+    """`operator/intent`: speed and direction asked for by a person or a mission. Send it repeatedly: it expires.
 
     When one that was followed has expired, the robot stops and waits for the next one; it does not return to its
     mission.
@@ -584,6 +584,9 @@ class Intent(Message, frozen=True, kw_only=True):
     speed_m_s: Annotated[q.Velocity | None, about("null: that of the mission")] = None
     go: Annotated[bool, about("false: stop")] = True
     valid_for_ns: Annotated[q.Nanoseconds, about("valid for this long from `stamp_ns`, at most 5 s")] = 1_000_000_000
+    heading_w_rad: Annotated[
+        q.Angle | None, about("direction of travel in the world, from its x axis; null: the mission's own goal")
+    ] = None
 
 
 VERSIONS: dict[type[Message], int] = dict.fromkeys(

@@ -3,6 +3,7 @@
 `python -m snakesim_operator.recording.process` is the child of `snakesim run`; `snakesim record` calls `record`.
 """
 
+import argparse
 import contextlib
 import os
 import sys
@@ -15,11 +16,12 @@ from pathlib import Path
 
 import msgspec
 
+from snakesim_hal.arguments import add_network, add_scenario
 from snakesim_hal.errors import ConfigError, SnakesimError
 from snakesim_hal.network.run_key import is_proven, own_run_key
 from snakesim_hal.network.session import Arrival, Link, open_session
 from snakesim_hal.process import on_stop_signal
-from snakesim_hal.serve import arguments, process_options
+from snakesim_hal.serve import add_parent, process_options
 from snakesim_hal.service import START_LIMIT_S
 from snakesim_hal.terminal import complain, complain_of
 from snakesim_hal.wire import keys
@@ -117,12 +119,17 @@ def _turn(tap: Tap, recorder: Recorder) -> None:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Record a run into its folder until told to end. Exit code 1 when it could not go on."""
-    given = process_options(arguments("Record a run."), argv)
+    parser = argparse.ArgumentParser(description="Record a run.")
+    parser.add_argument("--out", type=Path, default=Path(), help="folder of the run")
+    add_scenario(parser)
+    add_network(parser, "")
+    add_parent(parser)
+    given = process_options(parser.parse_args(argv))
     ended: list[bool] = []
     on_stop_signal(lambda: ended.append(True))
     os.nice(NICE)
     try:
-        recorder = record(given.link, (given.out or Path()) / RECORDING, lambda: not ended)
+        recorder = record(given.link, given.arguments.out / RECORDING, lambda: not ended)
     except SnakesimError as error:
         complain_of(error, f"snakesim {RECORDER}")
         return 1

@@ -22,6 +22,7 @@ from snakesim_hal.errors import ConfigError
 from snakesim_hal.host.recorder import Recorder
 from snakesim_hal.host_process import record_of
 from snakesim_hal.in_process import InProcessRun, check
+from snakesim_hal.model.plugin_check import check_plugins
 from snakesim_hal.model.scenario import RunConfig, write
 from snakesim_hal.network.session import Session
 from snakesim_hal.terminal import complain, say
@@ -36,7 +37,7 @@ from snakesim_operator.results.summary import RunSummary
 from snakesim_operator.run.conclusion import Outcome, conclude, explain, leave
 from snakesim_operator.run.ending import Ending, interruptible
 from snakesim_operator.run.progress import Progress
-from snakesim_operator.run.run import check_plugins, opened_files
+from snakesim_operator.run.run import opened_files
 from snakesim_operator.run.run_files import RunFiles
 
 WORDS = "run.log"  # what the parts of the run say

@@ -286,15 +286,6 @@ def test_settings_that_differ_are_named_with_both_values() -> None:
     assert not [key for key in found if key.startswith("description.")]
 
 
-def test_a_robot_that_was_described_otherwise_is_told() -> None:
-    a = made_up()
-    joints = [msgspec.structs.replace(joint, torque_limit_nm=3.5) for joint in a.description.joints]
-    b = dataclasses.replace(a, description=msgspec.structs.replace(a.description, joints=joints))
-    assert ("description.joints.0.torque_limit_nm", "7.0", "3.5") in [
-        (one.key, one.a, one.b) for one in differ(a, b).settings
-    ]
-
-
 def test_robots_with_other_joints_are_not_compared() -> None:
     a = made_up()
     short = msgspec.structs.replace(a.config.robot, chain=Chain(modules=8, axes=["yaw"]))
