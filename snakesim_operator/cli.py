@@ -175,6 +175,19 @@ def parser() -> argparse.ArgumentParser:
     _add_json(top)
     top.set_defaults(act=_top)
 
+    teleop = commands.add_parser("teleop", help="drive a robot by keys or with a joystick; letting go stops it")
+    teleop.add_argument(
+        "--joystick",
+        nargs="?",
+        type=Path,
+        const=Path(),
+        metavar="DEVICE",
+        help="such as /dev/input/event5; or the first",
+    )
+    teleop.add_argument("--fastest", type=float, default=0.3, metavar="M/S", help="highest speed (0.3)")
+    add_network(teleop)
+    teleop.set_defaults(act=_teleop)
+
     doctor = commands.add_parser("doctor", help="check this computer, and print what mends what it lacks")
     add_network(doctor)
     _add_json(doctor)
@@ -342,6 +355,14 @@ def _top(arguments: argparse.Namespace) -> int:
     from snakesim_operator.tools.top import TopRequest, top
 
     return top(TopRequest(arguments.once, arguments.json), _where(arguments))
+
+
+def _teleop(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.teleop.command import TeleopRequest, teleop
+
+    stick: Path | None = arguments.joystick
+    request = TeleopRequest(arguments.fastest, stick is not None, None if stick in (None, Path()) else stick)
+    return teleop(request, _where(arguments))
 
 
 def _doctor(arguments: argparse.Namespace) -> int:
