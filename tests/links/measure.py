@@ -37,7 +37,7 @@ class Condition:
     rate_hz: int = 100
 
 
-# Each way, so that a round trip takes twice as long, and is lost about twice as often. At 50 Hz a lease is twice as long.
+# Each way, so that a round trip takes twice as long, and is lost about twice as often. A lease is longer at 50 Hz.
 CONDITIONS = (
     Condition("good"),
     Condition("1 % of packets lost", loss=0.01),
