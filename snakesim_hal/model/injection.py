@@ -184,14 +184,17 @@ def target_type(target: str) -> TargetType:
     return "process"
 
 
+OUTSIDE = ("operator", "preview")  # writers that are no part of a run
+
+
 def writer_of(key: str) -> str:
     """The part that writes a key. Raises ConfigError for a key that no part of a run writes."""
     row = keys.row_at(key)
-    if row is not None and row.kind in ("stream", "latched") and row.writer != "operator":
+    if row is not None and row.kind in ("stream", "latched") and row.writer not in OUTSIDE:
         if row.key == keys.DONE_ALL:
             return keys.service_of(key)
         return {"HAL": HAL, "lease holder": CONTROL}.get(row.writer, row.writer)
-    streams = [row.key for row in keys.SPACE if row.kind in ("stream", "latched") and row.writer != "operator"]
+    streams = [row.key for row in keys.SPACE if row.kind in ("stream", "latched") and row.writer not in OUTSIDE]
     raise ConfigError(f"{key!r}: no part of a run writes this key; those with a writer are {', '.join(streams)}")
 
 
