@@ -366,7 +366,7 @@ def open_session(link: Link, connect_timeout_s: float = 5.0) -> Iterator[Session
         check_guarded(link.endpoint, "endpoint", insecure=link.insecure)
         raise_open_files(MAX_OPEN_FILES)
         os.environ.setdefault(*RUNTIME)
-    session = Session(_open(_config(link, connect_timeout_s), link))
+    session = Session(open_zenoh(link, connect_timeout_s))
     try:
         yield session
     finally:
@@ -417,10 +417,11 @@ def _unless_given(link: Link) -> dict[str, Any]:
     }
 
 
-def _open(config: zenoh.Config, link: Link) -> zenoh.Session:
+def open_zenoh(link: Link, connect_timeout_s: float) -> zenoh.Session:
+    """The session under a `Session`. Raises NotConnectedError."""
     zenoh.init_log_from_env_or("off")
     try:
-        return zenoh.open(config)
+        return zenoh.open(_config(link, connect_timeout_s))
     except zenoh.ZError as error:
         if link.listen:
             raise NotConnectedError(
