@@ -221,7 +221,8 @@ def checked(injection: Injection, said: str | None = None) -> Injection:
     sort = injection.target_type
     allowed = KINDS[sort]
     if injection.kind not in allowed:
-        also = [f"{other}s" for other in get_args(TargetType) if injection.kind in KINDS[other]]
+        others = [other for other in get_args(TargetType) if injection.kind in KINDS[other]]
+        also = ["processes" if other == "process" else f"{other}s" for other in others]
         hint = f"; {injection.kind} is for {' and '.join(also)}" if also else ""
         raise ConfigError(
             f"fault {text!r}: a {sort} such as {injection.target} knows no {injection.kind!r}, only "
