@@ -221,6 +221,14 @@ def parser() -> argparse.ArgumentParser:
     add_network(fault)
     fault.set_defaults(act=_fault)
 
+    preview = commands.add_parser(
+        "preview", help="publish small, compressed copies of a robot's images; beside its host"
+    )
+    preview.add_argument("--hz", type=float, default=2.0, metavar="HZ", help="most previews a second of a camera (2)")
+    preview.add_argument("--width", type=int, default=320, metavar="PIXELS", help="widest preview (320)")
+    add_network(preview)
+    preview.set_defaults(act=_preview)
+
     ros2 = add_ros2(commands)
     add_network(ros2)
     ros2.set_defaults(act=_ros2)
@@ -418,6 +426,12 @@ def _where(arguments: argparse.Namespace):
     if session is not None:
         return Where(session.endpoints[0], session.namespace_for(arguments.namespace), session)
     return Where(arguments.router or arguments.endpoint, arguments.namespace)
+
+
+def _preview(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.preview import preview
+
+    return preview(_where(arguments), arguments.hz, arguments.width)
 
 
 def _ros2(arguments: argparse.Namespace) -> int:
