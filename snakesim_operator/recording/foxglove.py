@@ -53,7 +53,7 @@ class Seen(msgspec.Struct, frozen=True):
     contacts: list[WorldContact]
 
 
-_decoders = {
+_decoders: dict[type[Any], Any] = {
     message: msgspec.msgpack.Decoder(message)
     for message in (JointState, Pose, Seen, World, Trajectory, DepthImage, ColourImage, Description, Configuration)
 }
