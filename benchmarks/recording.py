@@ -40,6 +40,11 @@ def _cpu_s() -> float:
     return used.ru_utime + used.ru_stime
 
 
+def tell(what: str, ours: list[float], theirs: list[float]) -> None:
+    """Print one line of the table."""
+    print(compare(what, "--no-record", ours, theirs, AIM).row(), flush=True)
+
+
 def main() -> int:
     """Print the table."""
     print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores\n{HEADER}", flush=True)
@@ -49,20 +54,15 @@ def main() -> int:
             typed = [scenario, "--pace", "lockstep", "--duration", "10", *flags]
             pairs = [(run(*typed), run(*typed, "--no-record")) for _ in range(PAIRS)]
             ours, theirs = ([one[i][0].wall_s / one[i][0].ticks * 1e6 for one in pairs] for i in (0, 1))
-            print(
-                compare(f"{scenario}, {what}: wall time of a tick", "--no-record", ours, theirs, AIM).row(), flush=True
-            )
+            tell(f"{scenario}, {what}: wall time of a tick", ours, theirs)
             ours, theirs = ([one[i][1] / one[i][0].ticks * 1e6 for one in pairs] for i in (0, 1))
-            print(
-                compare(f"{scenario}, {what}: CPU of the whole run", "--no-record", ours, theirs, AIM).row(), flush=True
-            )
+            tell(f"{scenario}, {what}: CPU of the whole run", ours, theirs)
         sizes.append(f"{scenario} {statistics.median(one[0][2] for one in pairs) * 360 / 1e6:.0f} MB")
     typed = ["triplet", "--pace", "realtime", "--duration", "10"]
     pairs = [(run(*typed), run(*typed, "--no-record")) for _ in range(PAIRS)]
     for name in ("p50", "p99"):
         ours, theirs = ([one[i][0].state_to_command_us[name] or 0.0 for one in pairs] for i in (0, 1))
-        what = f"triplet in real time: state to command, {name}"
-        print(compare(what, "--no-record", ours, theirs, AIM).row(), flush=True)
+        tell(f"triplet in real time: state to command, {name}", ours, theirs)
     print(f"\nAn hour of robot time on disk: {', '.join(sizes)}.")
     return 0
 

@@ -16,7 +16,6 @@ from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
-from google.protobuf.descriptor import FileDescriptor
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.message import Message as Protobuf
 
@@ -63,9 +62,9 @@ Made = tuple[str, Protobuf]
 
 def descriptor_set(message: Protobuf) -> bytes:
     """A message's schema as MCAP wants it: its file and all that it imports."""
-    files: dict[str, FileDescriptor] = {}
+    files: dict[str, Any] = {}
 
-    def add(file: FileDescriptor) -> None:
+    def add(file: Any) -> None:
         for needed in file.dependencies:
             add(needed)
         files.setdefault(file.name, file)
