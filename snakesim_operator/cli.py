@@ -7,15 +7,24 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 
+from snakesim_hal import host_process, serve
+from snakesim_hal.arguments import (
+    add_insecure,
+    add_network,
+    add_scenario,
+    check_network,
+    load_scenario,
+    session_given,
+)
 from snakesim_hal.errors import ConfigError, SnakesimError
-from snakesim_hal.model.files import ROUTER, read_part, shipped, short
+from snakesim_hal.model.files import ROUTER, read_part, shipped
 from snakesim_hal.model.injection import explain
 from snakesim_hal.model.plugins import COMMANDS, find_plugin, in_file, installed
-from snakesim_hal.model.scenario import Loaded, Override, RunConfig, load, parse_set
-from snakesim_hal.network.endpoint import check_endpoint, check_namespace
+from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.terminal import complain, complain_of, say
 from snakesim_operator.evaluate.command import add_commands
 from snakesim_operator.lab.command import add_commands as add_lab_commands
+from snakesim_operator.ros2.command import add_command as add_ros2
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
 
@@ -60,7 +69,7 @@ def parser() -> argparse.ArgumentParser:
         epilog="Exit code: 0 complete, armed for all of the requested time; 1 a fault, or ended before that; 2 wrong "
         "input, nothing was started; 3 complete, but the record has gaps; 130 interrupted. 1 and 130 take precedence.",
     )
-    _add_scenario(run)
+    add_scenario(run)
     run.add_argument(
         "--fault",
         action="append",
@@ -77,9 +86,27 @@ def parser() -> argparse.ArgumentParser:
         help="run in one process, without a network: lockstep, and faster; nothing can connect, arm or stop it",
     )
     run.add_argument("--out", type=Path, help="folder for the run's record (default: runs/NAME-TIME)")
-    _add_network(run)
-    _add_insecure(run)
+    add_network(run, "")
+    add_insecure(run)
     run.set_defaults(act=_run)
+
+    host = commands.add_parser(
+        "host",
+        parents=[host_process.parser()],
+        add_help=False,
+        help="run a robot's HAL host alone, for services on this or other machines",
+        epilog="It runs until Ctrl-C, and boots disarmed: `snakesim arm` arms it. Faults do not end it. Exit code: 0 "
+        "ended with --once and without a fault, 1 ended otherwise, 2 wrong input.",
+    )
+    host.set_defaults(act=_host)
+    service = commands.add_parser(
+        "service",
+        parents=[serve.parser()],
+        add_help=False,
+        help="run one service of a robot alone: guidance, navigation, control, ...",
+        epilog="It waits for the network and for the robot's host, and meets the next one after a restart.",
+    )
+    service.set_defaults(act=serve.run)
 
     compare = commands.add_parser("compare", help="compare two runs, as a table and as a page with plots")
     compare.add_argument("run_a", type=Path, metavar="RUN_A", help="folder of a run; percentages refer to this one")
@@ -96,21 +123,23 @@ def parser() -> argparse.ArgumentParser:
     add_lab_commands(commands)
 
     config = commands.add_parser("config", help="show every effective value, and the file or flag it came from")
-    _add_scenario(config)
+    add_scenario(config)
     config.set_defaults(act=_config)
 
     scenarios = commands.add_parser("scenarios", help="list the shipped scenarios, robots, scenes and suites")
     scenarios.set_defaults(act=_scenarios)
 
+    _add_robot(commands.add_parser("robot", help="make a robot file from a URDF, or a URDF from a robot file"))
+
     echo = commands.add_parser("echo", help="print what is published on a key, one JSON object a line")
     echo.add_argument("key", nargs="?", help="such as sensor/joints or sensor/*; without it, list the keys")
     echo.add_argument("--hz", action="store_true", help="print only rate and jitter")
     echo.add_argument("--count", type=int, help="end after this many messages")
-    _add_network(echo)
+    add_network(echo)
     echo.set_defaults(act=_echo)
 
     status = commands.add_parser("status", help="print the state of the robots on the network, and its reason")
-    _add_network(status)
+    add_network(status)
     status.set_defaults(act=_status)
 
     arm = commands.add_parser("arm", help="allow a robot to move; names robot and backend, to avoid mix-ups")
@@ -122,9 +151,9 @@ def parser() -> argparse.ArgumentParser:
         ("estop", _estop, "stop a robot now, or all on the network without --namespace"),
     ):
         told = commands.add_parser(name, help=about)
-        _add_network(told)
+        add_network(told)
         told.set_defaults(act=act)
-    _add_network(arm)
+    add_network(arm)
     arm.set_defaults(act=_arm)
 
     fault = commands.add_parser(
@@ -138,12 +167,16 @@ def parser() -> argparse.ArgumentParser:
     fault.add_argument("--for", dest="for_s", type=float, metavar="S", help="seconds of robot time until it ends")
     fault.add_argument("--amount", type=float, metavar="X", help="amount, for kinds that have one")
     fault.add_argument("--end", action="store_true", help="end it")
-    _add_network(fault)
+    add_network(fault)
     fault.set_defaults(act=_fault)
+
+    ros2 = add_ros2(commands)
+    add_network(ros2)
+    ros2.set_defaults(act=_ros2)
 
     router = commands.add_parser("router", help="run a Zenoh router from a JSON5 file")
     router.add_argument("config", type=Path, nargs="?", help=f"JSON5 file (default: {str(ROUTER).replace('%', '%%')})")
-    _add_insecure(router)
+    add_insecure(router)
     router.set_defaults(act=_router)
 
     schemas = commands.add_parser("schemas", help="print where the JSON Schemas, the key space and the DBC file are")
@@ -156,69 +189,35 @@ def parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _add_scenario(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "scenario", help="name of a shipped scenario, or path of a scenario file or a run's config.json"
+def _add_robot(parser: argparse.ArgumentParser) -> None:
+    commands = parser.add_subparsers(dest="robot_command", required=True, metavar="import|export")
+    into = commands.add_parser("import", help="a robot file from a URDF; reports what cannot be carried over")
+    into.add_argument("file", type=Path, metavar="FILE.urdf")
+    into.add_argument("--out", type=Path, metavar="FILE.toml", help="robot file to write (default: NAME.toml)")
+    into.add_argument("--tail", metavar="LINK", help="a link at the tail end (default: the root link)")
+    into.add_argument(
+        "--up", choices=["x", "y", "z", "-x", "-y", "-z"], default="z", help="of the root link (default: z)"
     )
-    parser.add_argument("--backend", help="sim or can")
-    parser.add_argument("--controller", help="installed controller, or ./file.py:Class")
-    parser.add_argument("--pace", choices=["realtime", "lockstep", "free"])
-    parser.add_argument("--duration", type=float, metavar="S", help="seconds of robot time")
-    parser.add_argument("--seed", type=int)
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="SECTION.KEY=VALUE",
-        help="change any value; may be repeated",
+    into.add_argument("--scale", type=float, default=1.0, metavar="M", help="metres per unit of length; 0.001 for mm")
+    into.add_argument(
+        "--like",
+        default="planar13",
+        metavar="ROBOT",
+        help="robot file with the motor gains and other values that URDF lacks",
     )
-
-
-def _add_network(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--endpoint", help="Zenoh endpoint of the robot (default: tcp/127.0.0.1:7447)")
-    parser.add_argument(
-        "--router", metavar="ENDPOINT", help="connect to a lab's Zenoh router instead, such as tcp/10.0.0.1:7447"
-    )
-    parser.add_argument("--namespace", help="namespace of the robot (default: the robot's name)")
-
-
-def _add_insecure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--insecure", action="store_true", help="listen even where anybody on the network can command the robot"
-    )
-
-
-def _check_network(arguments: argparse.Namespace) -> None:
-    for flag, given in (("--endpoint", arguments.endpoint), ("--router", arguments.router)):
-        if given is not None:
-            check_endpoint(given, flag)
-    if arguments.namespace is not None:
-        check_namespace(arguments.namespace, "--namespace")
-
-
-def _load(arguments: argparse.Namespace) -> Loaded:
-    flags = {
-        "backend": arguments.backend,
-        "controller": arguments.controller,
-        "pace": arguments.pace,
-        "duration_s": arguments.duration,
-        "seed": arguments.seed,
-    }
-    overrides = [parse_set(text) for text in arguments.set]
-    for key, value in flags.items():
-        if value is not None:
-            flag = f"--{key.removesuffix('_s')} {short(str(value))}"
-            overrides.append(Override(key, value, flag))
-    if faults := getattr(arguments, "fault", None):
-        overrides.append(Override("faults", faults, " ".join(f"--fault {text}" for text in faults)))
-    return load(arguments.scenario, overrides)
+    into.set_defaults(act=_robot_import)
+    out = commands.add_parser("export", help="a URDF from any robot file")
+    out.add_argument("robot", metavar="ROBOT", help="name of a shipped robot, or path of a robot file")
+    out.add_argument("--out", type=Path, metavar="FILE.urdf", help="URDF to write (default: NAME.urdf)")
+    out.set_defaults(act=_robot_export)
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.run.run import RunRequest, check_plugins, run
+    from snakesim_hal.model.plugin_check import check_plugins
+    from snakesim_operator.run.run import RunRequest, run
 
-    _check_network(arguments)
-    loaded = _load(arguments)
+    check_network(arguments)
+    loaded = load_scenario(arguments)
     config = check_plugins(loaded.config, loaded.table)  # here, because only the table knows which flag set what
     if arguments.in_process:
         return _run_in_process(config, arguments)
@@ -228,6 +227,7 @@ def _run(arguments: argparse.Namespace) -> int:
             out=arguments.out,
             endpoint=arguments.endpoint,
             router=arguments.router,
+            session=session_given(arguments),
             namespace=arguments.namespace,
             stay=arguments.stay,
             with_router=arguments.with_router,
@@ -239,10 +239,16 @@ def _run(arguments: argparse.Namespace) -> int:
 def _run_in_process(config: RunConfig, arguments: argparse.Namespace) -> int:
     from snakesim_operator.run.in_process import run_in_process
 
-    for flag in ("endpoint", "router", "namespace", "stay", "with_router"):
+    for flag in ("endpoint", "router", "session", "namespace", "stay", "with_router"):
         if getattr(arguments, flag):
             raise ConfigError(f"--in-process and --{flag.replace('_', '-')}: there is no network; leave one out")
     return run_in_process(config, arguments.out)
+
+
+def _host(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.run.host import run_host
+
+    return run_host(arguments)
 
 
 def _compare(arguments: argparse.Namespace) -> int:
@@ -252,9 +258,9 @@ def _compare(arguments: argparse.Namespace) -> int:
 
 
 def _config(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.run.run import check_plugins
+    from snakesim_hal.model.plugin_check import check_plugins
 
-    loaded = _load(arguments)
+    loaded = load_scenario(arguments)
     check_plugins(loaded.config, loaded.table, run_files=False)
     rows = [(key, _shown(value), origin) for key, value, origin in loaded.explain()]
     key_width = max(len(key) for key, _, _ in rows)
@@ -282,6 +288,20 @@ def _scenarios(_arguments: argparse.Namespace) -> int:
             table = read_part(name, kind)
             say(f"  {name:<18}{table.values.get(about, '')}")
     return OK
+
+
+def _robot_import(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.robots.command import import_robot
+    from snakesim_operator.robots.imported import Order
+
+    order = Order(arguments.tail, arguments.up, arguments.scale, arguments.like)
+    return import_robot(arguments.file, order, arguments.out)
+
+
+def _robot_export(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.robots.command import export_robot
+
+    return export_robot(arguments.robot, arguments.out)
 
 
 def _echo(arguments: argparse.Namespace) -> int:
@@ -330,8 +350,17 @@ def _fault(arguments: argparse.Namespace) -> int:
 def _where(arguments: argparse.Namespace):
     from snakesim_operator.tools.targets import Where
 
-    _check_network(arguments)
+    check_network(arguments)
+    session = session_given(arguments, or_environment=True)
+    if session is not None:
+        return Where(session.endpoints[0], session.namespace_for(arguments.namespace), session)
     return Where(arguments.router or arguments.endpoint, arguments.namespace)
+
+
+def _ros2(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.ros2.join import join
+
+    return join(arguments, _where(arguments))
 
 
 def _router(arguments: argparse.Namespace) -> int:

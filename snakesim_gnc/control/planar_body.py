@@ -1,17 +1,20 @@
 """The body model of controllers: a planar chain that bends at its yaw joints, computed once from the description."""
 
 from bisect import bisect_right
+from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_gnc.control.body_on_path import BodyPose
+from snakesim_gnc.control.body_on_path import BodyPose, chain_nodes, heading_of
 from snakesim_hal.model.route import yaw_segments_m
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import Description, World
 
 Floats = NDArray[np.float64]
 
 GRAVITY_M_S2 = 9.81
+TICKS_KEPT = 128
 
 
 class PlanarBody:
@@ -40,6 +43,12 @@ class PlanarBody:
         angles[self.bends] = body_pose.angles_rad
         return angles
 
+    def nodes_w(self, world: World, angles_rad: Sequence[float]) -> Floats:
+        """Nodes (2, n_nodes) of the measured body; angles_rad: of all joints, at the instant of the world's pose."""
+        bending = [angles_rad[i] for i in self.bends]
+        heading = heading_of(world.base_orientation_wxyz)
+        return chain_nodes(world.base_position_w[:2], heading, bending, self.segments_m)
+
     def joints_w(self, body_pose: BodyPose) -> Floats:
         """Places of all joints on the path, (n_joints, 2)."""
         x, y = body_pose.nodes_w
@@ -50,3 +59,29 @@ class PlanarBody:
     def link_at(self, body_s_m: float) -> int:
         """Index of the link at an arc length along the body."""
         return bisect_right(self._joint_s, body_s_m)
+
+
+class RecentAngles:
+    """Joint angles of the last ticks, for a pose that is some ticks old."""
+
+    def __init__(self) -> None:
+        self._kept: deque[tuple[int, list[float]]] = deque(maxlen=TICKS_KEPT)
+
+    def __bool__(self) -> bool:
+        return bool(self._kept)
+
+    def put(self, stamp_ns: int, angles_rad: list[float]) -> None:
+        """Those of the newest joint state, which may be the one before again."""
+        if not self._kept or stamp_ns > self._kept[-1][0]:
+            self._kept.append((stamp_ns, angles_rad))
+
+    def at(self, stamp_ns: int) -> list[float]:
+        """Those measured nearest to an instant."""
+        return min(self._kept, key=lambda held: abs(held[0] - stamp_ns))[1]
+
+
+def pose_instant_ns(world: World) -> int:
+    """When the body was at the world's base pose: that of the sensor, or dead-reckoned up to the world's own stamp."""
+    if world.pose_stamp_ns is None or world.base_position_sd_m is not None:
+        return world.stamp_ns
+    return world.pose_stamp_ns

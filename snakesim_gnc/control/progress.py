@@ -1,20 +1,18 @@
 """Present position and speed of the body along its path, from a world model that is some ticks old."""
 
-from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_gnc.control.body_on_path import BodyOnPath, chain_nodes, heading_of
+from snakesim_gnc.control.body_on_path import BodyOnPath
 from snakesim_gnc.control.controller import View
-from snakesim_gnc.control.planar_body import PlanarBody
+from snakesim_gnc.control.planar_body import PlanarBody, RecentAngles, pose_instant_ns
 from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import Trajectory, World
 
 Floats = NDArray[np.float64]
 
-TICKS_KEPT = 128
 AGAIN_STEPS = 8  # to localise a body again that may have slid meanwhile
 
 
@@ -43,7 +41,7 @@ class Progress:
     def __init__(self, body: PlanarBody, *, speed_filter_s: float) -> None:
         self._planar = body
         self._speed_filter_s = speed_filter_s
-        self._angles: deque[tuple[int, list[float]]] = deque(maxlen=TICKS_KEPT)  # stamp of the joint state, angles
+        self._angles = RecentAngles()
         self._body: BodyOnPath | None = None
         self._path_id: int | None = None
         self._world_tick: int | None = None
@@ -54,7 +52,7 @@ class Progress:
 
     def update(self, view: View) -> Located | str:
         """Position of the body at this tick, or why it is unknown."""
-        self._angles.append((view.joints.stamp_ns, view.joints.angle_rad))
+        self._angles.put(view.joints.stamp_ns, view.joints.angle_rad)
         world, trajectory = view.world, view.trajectory
         if world is None or trajectory is None:
             self._measured_ns = None
@@ -65,12 +63,10 @@ class Progress:
             self._path_id = trajectory.path_id
         body = self._body
         assert body is not None
-        pose_ns = world.pose_stamp_ns
-        if pose_ns is None or world.base_position_sd_m is not None:  # dead-reckoned up to the world's own stamp
-            pose_ns = world.stamp_ns
-        before_ns = self._measured_ns
+        pose_ns, before_ns = pose_instant_ns(world), self._measured_ns
         if before_ns is None or pose_ns > before_ns:
-            self._measure(world, pose_ns)
+            self._nodes = self._planar.nodes_w(world, self._angles.at(pose_ns))
+            self._measured_ns = pose_ns
         if new_path:
             self._s_m = body.find(self._nodes)  # the body is as fast as before
         elif before_ns is None:
@@ -82,13 +78,6 @@ class Progress:
         anew = new_path or before_ns is None
         fresh, self._world_tick = world.tick != self._world_tick, world.tick
         return Located(body, s, self._speed_m_s, self._nodes, fresh, anew, world, trajectory)
-
-    def _measure(self, world: World, pose_ns: int) -> None:
-        angles = next((a for stamp_ns, a in reversed(self._angles) if stamp_ns <= pose_ns), self._angles[0][1])
-        bending = [angles[i] for i in self._planar.bends]
-        heading = heading_of(world.base_orientation_wxyz)
-        self._nodes = chain_nodes(world.base_position_w[:2], heading, bending, self._planar.segments_m)
-        self._measured_ns = pose_ns
 
     def _filter(self, body: BodyOnPath, passed_s: float) -> None:
         """Critically damped alpha-beta filter with the time constant `speed_filter_s`."""

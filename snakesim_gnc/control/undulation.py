@@ -10,7 +10,6 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta
 
-from snakesim_gnc.control.body_on_path import chain_nodes, heading_of
 from snakesim_gnc.control.bumpless import HandOver
 from snakesim_gnc.control.controller import Action, Report, View, positions
 from snakesim_gnc.control.planar_body import PlanarBody
@@ -58,9 +57,7 @@ class LateralUndulation:
         """Bend of every joint that turns the body towards the path ahead."""
         if self._set.steering == 0.0 or view.world is None or view.trajectory is None:
             return 0.0
-        angles = [view.joints.angle_rad[i] for i in self._body.bends]
-        heading = heading_of(view.world.base_orientation_wxyz)
-        nodes = chain_nodes(view.world.base_position_w[:2], heading, angles, self._body.segments_m).T
+        nodes = self._body.nodes_w(view.world, view.joints.angle_rad).T
         path = np.array(view.trajectory.path_w)
         ahead = path[np.argmin(np.hypot(*(path - nodes[-1]).T)) :]
         aim = ahead[min(np.searchsorted(np.hypot(*(ahead - nodes[-1]).T), AIM_M), len(ahead) - 1)] - nodes[-1]

@@ -6,6 +6,7 @@ close to where the body lies, with touches that can push. Paths on which it got 
 third time at one place it backs out first, along its own path and the trail of its tail.
 """
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_gnc.navigation.beam import STEP_M, Beam, Found, Search
-from snakesim_gnc.navigation.intents import Intents
+from snakesim_gnc.navigation.intents import Wish
 from snakesim_gnc.navigation.obstacle_map import ObstacleMap
 from snakesim_gnc.navigation.snap import SPACING_M, Fit, resample, snap
 from snakesim_hal.model.route import Route
 from snakesim_hal.model.scenario import HeadingGoal, WaypointGoal
-from snakesim_hal.wire.messages import Intent, Obstacle, Trajectory, World
+from snakesim_hal.wire.messages import Obstacle, Trajectory, World
 
 Floats = NDArray[np.float64]
 
@@ -29,7 +30,9 @@ REACHES_M = (0.05, 0.09)
 ENDS_SOON_M = 0.6
 COMMITTED_M = 0.1  # of the path ahead of the head that is not changed any more
 SEEN_M, SAME_M = 1.5, 0.005  # obstacles within this distance of the head; a change that matters
-ENDS_SOON, MAP_CHANGED = "ends soon", "the map has changed"
+ENDS_SOON, MAP_CHANGED, TURNED = "ends soon", "the map has changed", "the direction has changed"
+TURNED_RAD = 0.35  # a change of direction that matters
+SHARPEST_RAD = 1.2  # a path begins with no greater turn from where the head points; further ones follow
 FORGET_M = 0.15  # beyond this from where it was stuck, what failed there is forgotten
 FAILURES = 4
 LEAST_AHEAD = 10  # arcs of a new path beyond the head
@@ -59,19 +62,13 @@ class ClutterPlanner:
         goal: HeadingGoal | WaypointGoal,
         known: Sequence[Obstacle] | None,
         *,
-        speed_m_s: float,
         search: Search,
     ) -> None:
-        """known: the surveyed obstacles; None: those of the world model."""
+        """goal: unless a heading is wished for. known: the surveyed obstacles; None: those of the world model."""
         self._goal = goal
         self._known = None if known is None else ObstacleMap(known)
-        self._intents = Intents(speed_m_s)
         self._search = search
         self._fit = Fit(radius_m=search.radius_m, segment_m=search.segment_m)
-        self.start_over()
-
-    def start_over(self) -> None:
-        """Another robot, or another start."""
         self._planned: Planned | None = None
         self._path_id = 0
         self._start: Floats | None = None
@@ -87,18 +84,17 @@ class ClutterPlanner:
         self._aim = np.zeros(2)
         self._finished = False
         self._next_point = 0
-        self.replans: list[str] = []
+        self._headed_rad = 0.0  # for which the present path was planned
 
-    def update(
-        self, tick: int, now_ns: int, world: World | None, nodes_w: Floats | None, intent: Intent | None
-    ) -> Trajectory | None:
-        """The trajectory; None until the body is known. nodes_w: (n, 2) tail end, joints, head end."""
-        wish = self._intents.wish(intent, now_ns)
-        if world is None or nodes_w is None:
-            return None
+    def update(self, tick: int, world: World, nodes_w: Floats, wish: Wish) -> Trajectory:
+        """The trajectory. nodes_w: (n, 2) tail end, joints, head end."""
         body = resample(nodes_w)
         obstacles = self._known or ObstacleMap(world.obstacles)
-        goal = self._aim = self._towards(body)
+        if wish.heading_w_rad is None:
+            goal = self._aim = self._towards(body)
+        else:
+            goal = self._aim = np.array([np.cos(wish.heading_w_rad), np.sin(wish.heading_w_rad)])
+            self._finished = False
         self._leave_trail(body[0])
         resting = self._planned is not None and (self._finished or wish.speed_m_s == 0.0)
         if resting:
@@ -160,6 +156,9 @@ class ClutterPlanner:
             return ENDS_SOON
         if full and moved < STANDS_M:
             return self._stuck(planned, body, head_s, now_ns)
+        turned_rad = math.remainder(_within_reach(body, self._aim) - self._headed_rad, math.tau)
+        if abs(turned_rad) > TURNED_RAD and not self._failed:
+            return TURNED
         if self._known is None and not self._failed and self._seen_anew(body[-1], obstacles):
             return MAP_CHANGED
         return ""
@@ -193,9 +192,9 @@ class ClutterPlanner:
         return ""
 
     def _plan(self, body: Floats, obstacles: ObstacleMap, goal: Floats, why: str) -> None:
-        self.replans.append(f"{why} at {body[-1][0]:.2f}")
-        beam, goal_rad = Beam(obstacles, self._search), float(np.arctan2(goal[1], goal[0]))
-        if why in (ENDS_SOON, MAP_CHANGED):
+        goal_rad = self._headed_rad = _within_reach(body, goal)
+        beam = Beam(obstacles, self._search)
+        if why in (ENDS_SOON, MAP_CHANGED, TURNED):
             found, kept, points = self._onward(beam, body, goal_rad)
         elif self._planned is None:
             found, kept = beam.ahead(body, goal_rad, round(HORIZON_M / STEP_M)), len(body) - 3
@@ -255,3 +254,11 @@ class ClutterPlanner:
             else:
                 trail.append(tail)
             del trail[: -2 * TRAIL]
+
+
+def _within_reach(body: Floats, goal: Floats) -> float:
+    """Heading of a goal's direction, or as far towards it as the head can turn on one path."""
+    x, y = body[-1] - body[-4]
+    head_rad = math.atan2(y, x)
+    turn_rad = math.remainder(math.atan2(goal[1], goal[0]) - head_rad, math.tau)
+    return head_rad + min(max(turn_rad, -SHARPEST_RAD), SHARPEST_RAD)

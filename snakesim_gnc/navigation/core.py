@@ -4,22 +4,21 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from snakesim_gnc.navigation.intents import Intents
+from snakesim_gnc.navigation.intents import Wish
 from snakesim_hal.model.route import Route
 from snakesim_hal.model.scene import outline_distance_m
-from snakesim_hal.wire.messages import Intent, Obstacle, Trajectory, World
+from snakesim_hal.wire.messages import Obstacle, Trajectory, World
 
 PUSH_REACH_M = 0.15  # an obstacle whose outline is nearer to the path than this can be pushed on
 PUSH_POINTS_AHEAD_M = 3.0
 
 
 class KnownPath:
-    """Follows one route at the mission's speed, or at the speed that an operator asks for."""
+    """Follows one route at the speed that is wished for."""
 
-    def __init__(self, route: Route, obstacles: Sequence[Obstacle], *, speed_m_s: float) -> None:
+    def __init__(self, route: Route, obstacles: Sequence[Obstacle]) -> None:
         self._route = route
         self._path = [(float(x), float(y)) for x, y in route.points_w]
-        self._intents = Intents(speed_m_s)
         found: list[tuple[float, str]] = []
         for obstacle in obstacles:
             s = route.project(np.array(obstacle.position_w[:2]))
@@ -28,21 +27,12 @@ class KnownPath:
         self._push_points = sorted(found)
         self._tail_s_m: float | None = None
 
-    def start_over(self) -> None:
-        """Another robot, or another start: the body may be anywhere, and robot time restarts."""
-        self._tail_s_m = None
-        self._intents.start_over()
-
-    def update(self, tick: int, now_ns: int, world: World | None, intent: Intent | None) -> Trajectory:
-        """The trajectory from where the body was by this world model; its stamp is the world model's.
-
-        tick, now_ns: of the clock. intent: the newest one, if any.
-        """
+    def update(self, tick: int, world: World | None, wish: Wish) -> Trajectory:
+        """The trajectory from where the body was by this world model; its stamp is the world model's."""
         if world is not None:
             tail = np.array(world.base_position_w[:2])
             self._tail_s_m = self._route.project(tail, self._tail_s_m)
         finished = self._tail_s_m is not None and self._tail_s_m >= self._route.length_m
-        wish = self._intents.wish(intent, now_ns)
         return Trajectory(
             tick=tick,
             stamp_ns=None if world is None else world.stamp_ns,

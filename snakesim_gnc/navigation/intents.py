@@ -1,4 +1,4 @@
-"""Whether an intent is valid now, and its speed. Pure except for its own state."""
+"""Whether an intent is valid now, and its speed and direction. Pure except for its own state."""
 
 from dataclasses import dataclass
 
@@ -15,6 +15,7 @@ class Wish:
 
     speed_m_s: float
     why: str = ""
+    heading_w_rad: float | None = None  # direction of travel; None: the mission's
 
 
 class Intents:
@@ -27,6 +28,7 @@ class Intents:
         self._mission_m_s = mission_m_s
         self._followed: Intent | None = None
         self._stopped = ""  # why it stands still, after an intent that was followed; empty before any was
+        self._heading_w_rad: float | None = None  # stays while it stands still: a stop plans no other path
 
     def start_over(self) -> None:
         """Robot time restarts: earlier stamps are void."""
@@ -40,15 +42,17 @@ class Intents:
             refused = _against(newest, now_ns)
             if not refused:
                 self._followed, self._stopped = newest, ""
+                if newest.go:
+                    self._heading_w_rad = newest.heading_w_rad
         if self._followed is not None and (why := _against(self._followed, now_ns)):
             self._stop(why)
-        followed = self._followed
+        followed, heading = self._followed, self._heading_w_rad
         if followed is None:
-            return Wish(0.0 if self._stopped else self._mission_m_s, refused or self._stopped)
+            return Wish(0.0 if self._stopped else self._mission_m_s, refused or self._stopped, heading)
         if not followed.go:
-            return Wish(0.0, f"{followed.who} wants it to stop")
+            return Wish(0.0, f"{followed.who} wants it to stop", heading)
         asked = followed.speed_m_s
-        return Wish(self._mission_m_s if asked is None else asked, f"as {followed.who} wants it")
+        return Wish(self._mission_m_s if asked is None else asked, f"as {followed.who} wants it", heading)
 
     def _stop(self, why: str) -> None:
         self._followed, self._stopped = None, f"{why}; send a new one to go on"

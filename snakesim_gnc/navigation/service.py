@@ -1,101 +1,73 @@
 """The navigation process: world model and intent in, `navigation/trajectory` out."""
 
-from collections import deque
-
 import numpy as np
 
-from snakesim_gnc.control.body_on_path import chain_nodes, heading_of
+from snakesim_gnc.control.planar_body import PlanarBody, RecentAngles, pose_instant_ns
 from snakesim_gnc.navigation.beam import Search
 from snakesim_gnc.navigation.clutter import ClutterPlanner
 from snakesim_gnc.navigation.core import KnownPath
-from snakesim_hal.model.route import Route, yaw_segments_m
-from snakesim_hal.model.scenario import RunConfig, place_all, start_of
+from snakesim_gnc.navigation.intents import Intents
+from snakesim_hal.model.route import Route
+from snakesim_hal.model.scenario import HeadingGoal, RunConfig, place_all, start_of
 from snakesim_hal.model.scene import route_of
 from snakesim_hal.network.client import Client
 from snakesim_hal.service import Service
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Clock, Description, Intent, JointState, Message, Trajectory, World
+from snakesim_hal.wire.messages import Clock, Description, Intent, JointState, Message, Obstacle, World
 
 NO_ROUTE_LENGTH_M = 100.0
 
 
 class Navigation(Service):
-    """Mission and intent to trajectory."""
+    """Mission and intent to trajectory.
+
+    Along the scene's route, or a straight line from where the snake starts. A mission with a goal, or an intent with a
+    heading, is for the planner, which finds a path of its own.
+    """
 
     name = "navigation"
 
     def __init__(self, client: Client, config: RunConfig) -> None:
-        """Without a goal it follows the scene's route, or a straight line from where the snake starts."""
+        """Subscribes."""
         self._config = config
-        self._known = [placed.obstacle for placed in place_all(config) if not placed.walkable]
         self._world = client.subscribe(keys.WORLD, World)
         self._intent = client.subscribe(keys.INTENT, Intent)
         self._joints = client.subscribe(keys.JOINTS, JointState)
         self._client = client
-        self._planner: KnownPath | Freely = self._along_route()
-
-    def _along_route(self) -> KnownPath:
-        config = self._config
-        route = route_of(config.scene)
-        if route is None:
-            start = start_of(config)
-            ahead = np.array([np.cos(start.yaw_rad), np.sin(start.yaw_rad)]) * NO_ROUTE_LENGTH_M
-            route = Route(np.array([start.position_w, start.position_w + ahead]))
-        return KnownPath(route, self._known, speed_m_s=config.mission.speed_m_s)
+        self._intents = Intents(config.mission.speed_m_s)
 
     def meet(self, robot: Description) -> None:
         """Works for any robot; its position is unknown again."""
-        if self._config.mission.goal is None:
-            self._planner.start_over()
-        else:
-            self._planner = Freely(self._config, robot, self._known)
+        config = self._config
+        self._intents.start_over()
+        self._body, self._recent = PlanarBody(robot), RecentAngles()
+        known = [placed.obstacle for placed in place_all(config) if not placed.walkable]
+        self._along = _along_route(config, known) if config.mission.goal is None else None
+        search = Search(
+            body_length_m=self._body.length_m, radius_m=self._body.radius_m, segment_m=max(self._body.segments_m)
+        )
+        self._planner = ClutterPlanner(
+            config.mission.goal or HeadingGoal(), known if config.mission.map == "known" else None, search=search
+        )
 
     def outputs(self, clock: Clock) -> list[tuple[str, Message]] | None:
         """The trajectory at this tick. An operator's intent is used as soon as it arrives."""
-        world, intent = self._client.read(self._world), self._intent.newest()
-        if isinstance(self._planner, KnownPath):
-            return [(keys.TRAJECTORY, self._planner.update(clock.tick, clock.stamp_ns, world, intent))]
-        told = self._planner.update(clock, world, self._client.read(self._joints), intent)
-        return None if told is None else [(keys.TRAJECTORY, told)]
+        world, joints = self._client.read(self._world), self._client.read(self._joints)
+        wish = self._intents.wish(self._intent.newest(), clock.stamp_ns)
+        if joints is not None:
+            self._recent.put(joints.stamp_ns, joints.angle_rad)
+        if self._along is not None and wish.heading_w_rad is None:
+            return [(keys.TRAJECTORY, self._along.update(clock.tick, world, wish))]
+        if world is None or not self._recent:
+            return None
+        nodes = self._body.nodes_w(world, self._recent.at(pose_instant_ns(world)))
+        return [(keys.TRAJECTORY, self._planner.update(clock.tick, world, nodes.T, wish))]
 
 
-class Freely:
-    """The planner through clutter, and the body's curve for it: pose and joint angles of one instant."""
-
-    def __init__(self, config: RunConfig, robot: Description, known: list) -> None:
-        axes = [joint.axis for joint in robot.joints]
-        self._bends = [i for i, axis in enumerate(axes) if axis == "yaw"]
-        self._segments_m = yaw_segments_m(axes, [link.length_m for link in robot.links])
-        self._recent: deque[JointState] = deque(maxlen=128)
-        goal = config.mission.goal
-        assert goal is not None
-        search = Search(
-            body_length_m=sum(self._segments_m),
-            radius_m=max(link.radius_m for link in robot.links),
-            segment_m=max(self._segments_m),
-        )
-        self._core = ClutterPlanner(
-            goal,
-            known if config.mission.map == "known" else None,
-            speed_m_s=config.mission.speed_m_s,
-            search=search,
-        )
-
-    def start_over(self) -> None:
-        """Another start."""
-        self._core.start_over()
-
-    def update(
-        self, clock: Clock, world: World | None, joints: JointState | None, intent: Intent | None
-    ) -> Trajectory | None:
-        """The trajectory at this tick."""
-        nodes = None
-        if joints is not None and (not self._recent or joints.stamp_ns > self._recent[-1].stamp_ns):
-            self._recent.append(joints)
-        if world is not None and self._recent:
-            pose_ns = world.stamp_ns if world.pose_stamp_ns is None else world.pose_stamp_ns
-            held = min(self._recent, key=lambda j: abs(j.stamp_ns - pose_ns))
-            bending = [held.angle_rad[i] for i in self._bends]
-            heading = heading_of(world.base_orientation_wxyz)
-            nodes = chain_nodes(world.base_position_w[:2], heading, bending, self._segments_m).T
-        return self._core.update(clock.tick, clock.stamp_ns, world, nodes, intent)
+def _along_route(config: RunConfig, known: list[Obstacle]) -> KnownPath:
+    route = route_of(config.scene)
+    if route is None:
+        start = start_of(config)
+        ahead = np.array([np.cos(start.yaw_rad), np.sin(start.yaw_rad)]) * NO_ROUTE_LENGTH_M
+        route = Route(np.array([start.position_w, start.position_w + ahead]))
+    return KnownPath(route, known)

@@ -71,7 +71,7 @@ SPACE: tuple[Row, ...] = (
     Row(WORLD, m.World, "guidance", "stream", _TURN, "body pose, contacts and obstacles in the world"),
     Row(TRAJECTORY, m.Trajectory, "navigation", "stream", _TURN, "path, speed, push-points ahead"),
     Row(CONTROL_STATE, m.ControlState, "control", "stream", "on a change, and 20 Hz", "state, reason, forces, torques"),
-    Row(INTENT, m.Intent, "operator", "stream", "before the last expires", "speed asked for by a person or a mission"),
+    Row(INTENT, m.Intent, "operator", "stream", "before the last expires", "speed and direction wanted by somebody"),
     Row(ALIVE_ALL, None, "each service", "liveliness", _LIVES, "present while the service's process is connected"),
     Row(HOST_ALL, None, "HAL", "liveliness", _LIVES, "one for each HAL host process; a robot must have only one"),
 )

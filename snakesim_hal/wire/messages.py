@@ -133,12 +133,8 @@ class Power(Message, frozen=True, kw_only=True):
     valid: Annotated[q.Flags, about("false: the state of this module is unknown")]
 
 
-class DepthImage(Message, frozen=True, kw_only=True):
-    """`sensor/depth/<name>`: distances to the surfaces that a camera sees.
-
-    Camera frame: x forward along the optical axis, y to the left, z upwards. The ray through pixel (u, v), u to the
-    right and v downwards from the middle of the top left one, is (1, -(u - cx_px) / fx_px, -(v - cy_px) / fy_px).
-    """
+class CameraImage(Message, frozen=True, kw_only=True):
+    """What every image says of its camera, a pinhole: see DepthImage."""
 
     tick: q.Tick
     stamp_ns: Annotated[q.Stamp, about("of the exposure; `tick` is later by the delay")]
@@ -151,6 +147,15 @@ class DepthImage(Message, frozen=True, kw_only=True):
     fy_px: q.FocalLength
     cx_px: q.Pixels
     cy_px: q.Pixels
+
+
+class DepthImage(CameraImage, frozen=True, kw_only=True):
+    """`sensor/depth/<name>`: distances to the surfaces that a camera sees.
+
+    Camera frame: x forward along the optical axis, y to the left, z upwards. The ray through pixel (u, v), u to the
+    right and v downwards from the middle of the top left one, is (1, -(u - cx_px) / fx_px, -(v - cy_px) / fy_px).
+    """
+
     range_min_m: Annotated[q.Distance, about("along the optical axis; what is nearer is 0 in `depth`")]
     range_max_m: Annotated[q.Distance, about("along the optical axis; what is further is 0 in `depth`")]
     scale_m: Annotated[float, Meta(gt=0, le=1), about("metres of one count of `depth`")]
@@ -164,20 +169,9 @@ class DepthImage(Message, frozen=True, kw_only=True):
     ]
 
 
-class ColourImage(Message, frozen=True, kw_only=True):
+class ColourImage(CameraImage, frozen=True, kw_only=True):
     """`sensor/colour/<name>`: what a camera sees, in colour. Frame and pixels are as in DepthImage."""
 
-    tick: q.Tick
-    stamp_ns: Annotated[q.Stamp, about("of the exposure; `tick` is later by the delay")]
-    link: Annotated[q.LinkIndex, about("that carries the camera, from 0 at the tail")]
-    position_l: Annotated[q.Vector, about("of the camera")]
-    orientation_l_wxyz: Annotated[q.Quaternion, about("of the camera frame in that of the link")]
-    width: Annotated[int, Meta(ge=1, le=q.MAX_IMAGE_WIDTH), about("pixels in a row")]
-    height: Annotated[int, Meta(ge=1, le=q.MAX_IMAGE_HEIGHT), about("rows")]
-    fx_px: q.FocalLength
-    fy_px: q.FocalLength
-    cx_px: q.Pixels
-    cy_px: q.Pixels
     rgb: Annotated[
         bytes, Meta(max_length=3 * q.MAX_PIXELS), about("red, green and blue of each pixel, row by row from the top")
     ]
@@ -571,7 +565,7 @@ class ControlState(Message, frozen=True, kw_only=True):
 
 
 class Intent(Message, frozen=True, kw_only=True):
-    """`operator/intent`: speed asked for by a person or a mission. Send it repeatedly: it expires.
+    """`operator/intent`: speed and direction asked for by a person or a mission. Send it repeatedly: it expires.
 
     When one that was followed has expired, the robot stops and waits for the next one; it does not return to its
     mission.
@@ -582,6 +576,9 @@ class Intent(Message, frozen=True, kw_only=True):
     speed_m_s: Annotated[q.Velocity | None, about("null: that of the mission")] = None
     go: Annotated[bool, about("false: stop")] = True
     valid_for_ns: Annotated[q.Nanoseconds, about("valid for this long from `stamp_ns`, at most 5 s")] = 1_000_000_000
+    heading_w_rad: Annotated[
+        q.Angle | None, about("direction of travel in the world, from its x axis; null: the mission's own goal")
+    ] = None
 
 
 VERSIONS: dict[type[Message], int] = dict.fromkeys(

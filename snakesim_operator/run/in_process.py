@@ -20,6 +20,7 @@ from snakesim_hal.errors import ConfigError
 from snakesim_hal.host.recorder import Recorder
 from snakesim_hal.host_process import record_of
 from snakesim_hal.in_process import InProcessRun, check
+from snakesim_hal.model.plugin_check import check_plugins
 from snakesim_hal.model.scenario import RunConfig, write
 from snakesim_hal.terminal import complain, say
 from snakesim_operator.results.advance import GoalWatch
@@ -28,7 +29,7 @@ from snakesim_operator.results.summary import RunSummary
 from snakesim_operator.run.conclusion import Outcome, conclude, explain, leave
 from snakesim_operator.run.ending import Ending, interruptible
 from snakesim_operator.run.progress import Progress
-from snakesim_operator.run.run import check_plugins, opened_files
+from snakesim_operator.run.run import opened_files
 from snakesim_operator.run.run_files import RunFiles
 from snakesim_operator.run.telemetry import Telemetry
 

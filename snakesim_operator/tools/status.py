@@ -10,13 +10,13 @@ from queue import Empty
 from snakesim_hal.errors import NotConnectedError, WireError
 from snakesim_hal.model.files import ROUTER
 from snakesim_hal.network.mailbox import Mailbox
-from snakesim_hal.network.session import DEFAULT_ENDPOINT, Arrival, Link, open_session
+from snakesim_hal.network.session import Arrival, Link, open_session
 from snakesim_hal.terminal import Say, say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import Status
 from snakesim_operator.results import last_run
-from snakesim_operator.tools.targets import Where, namespace_of
+from snakesim_operator.tools.targets import Where, flags_of, namespace_of
 
 STATUS_WAIT_S = 1.0
 CONNECT_S = 1.0
@@ -25,8 +25,7 @@ CONNECT_S = 1.0
 def show_status(where: Where, say: Say = say) -> int:
     """Print the state of every reachable robot. Returns 0 without faults, 1 otherwise."""
     found: list[tuple[Link, list[Status]]] = []
-    for endpoint in where.endpoints():
-        link = Link(endpoint, where.namespace)
+    for link in where.networks():
         with contextlib.suppress(NotConnectedError):
             found += _statuses(link)
     silent = [
@@ -107,8 +106,7 @@ def _in_words(link: Link, status: Status) -> list[str]:
 
 def _what_to_type(link: Link, status: Status) -> list[str]:
     """The next commands for a person; none while the robot moves, or cannot be armed yet."""
-    where = f" --endpoint {link.endpoint}" if link.endpoint != DEFAULT_ENDPOINT else ""
-    where += f" --namespace {link.namespace}" if link.namespace != status.robot else ""
+    where = flags_of(link, status.robot)
     arm = f"`snakesim arm {status.robot} {status.backend}{where}`"
     if status.lifecycle in ("fault", "estop"):
         return [f"  next: `snakesim clear{where}`, then {arm}"]

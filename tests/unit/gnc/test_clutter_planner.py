@@ -6,12 +6,13 @@ import pytest
 from snakesim_gnc.control.body_on_path import chain_nodes
 from snakesim_gnc.navigation.beam import Beam, Search
 from snakesim_gnc.navigation.clutter import ClutterPlanner
+from snakesim_gnc.navigation.intents import Wish
 from snakesim_gnc.navigation.obstacle_map import NONE, REACH_M, ObstacleMap
 from snakesim_hal.model.kinematics import quaternion_from_yaw
 from snakesim_hal.model.outlines import outline_distance_m
 from snakesim_hal.model.route import yaw_segments_m
 from snakesim_hal.model.scenario import HeadingGoal, RunConfig, WaypointGoal, load, parse_set, place_all, start_of
-from snakesim_hal.wire.messages import Obstacle, World
+from snakesim_hal.wire.messages import Obstacle, Trajectory, World
 
 SECOND = 10**9
 SEARCH = Search(body_length_m=1.54, radius_m=0.04, segment_m=0.11)
@@ -45,13 +46,17 @@ def world(at_s: float, obstacles: list[Obstacle]) -> World:
 
 
 def planner(known: list[Obstacle] | None, goal: HeadingGoal | WaypointGoal | None = None) -> ClutterPlanner:
-    return ClutterPlanner(goal or HeadingGoal(), known, speed_m_s=0.2, search=SEARCH)
+    return ClutterPlanner(goal or HeadingGoal(), known, search=SEARCH)
 
 
-def planned(made: ClutterPlanner, body: np.ndarray, at_s: float = 0.0, seen: list[Obstacle] | None = None):
-    found = made.update(round(100 * at_s), round(at_s * SECOND), world(at_s, seen or []), body, None)
-    assert found is not None
-    return found
+def planned(
+    made: ClutterPlanner,
+    body: np.ndarray,
+    at_s: float = 0.0,
+    seen: list[Obstacle] | None = None,
+    heading_rad: float | None = None,
+) -> Trajectory:
+    return made.update(round(100 * at_s), world(at_s, seen or []), body, Wish(0.2, heading_w_rad=heading_rad))
 
 
 def test_the_map_knows_the_nearest_obstacle_and_its_distance() -> None:
@@ -125,6 +130,16 @@ def test_a_goal_is_reached() -> None:
     assert planned(made, body + np.array([0.95, 0.0]), 1.0).finished
 
 
-def test_without_a_body_there_is_no_plan() -> None:
-    made = planner([])
-    assert made.update(0, 0, None, None, None) is None
+@pytest.mark.parametrize("heading_rad", [0.7, -0.7, 3.0])
+def test_a_heading_that_is_asked_for_counts_and_not_the_mission(heading_rad: float) -> None:
+    config = field()
+    made, body = planner(obstacles_of(config), HeadingGoal(distance_m=0.1)), body_of(config)
+    ahead = planned(made, body)
+    moved = body + np.array([0.3, 0.0])
+    turned = planned(made, moved, 0.2, heading_rad=heading_rad)
+    assert turned.path_id != ahead.path_id and not turned.finished
+    way = np.array(turned.path_w[-1]) - moved[-1]
+    reached = np.clip(heading_rad, -1.2, 1.2)  # one path turns the head by no more
+    assert np.arctan2(way[1], way[0]) == pytest.approx(reached, abs=0.35)
+    assert planned(made, moved, 0.4, heading_rad=heading_rad + 0.1).path_id == turned.path_id
+    assert planned(made, moved, 0.6).finished  # the mission again

@@ -5,11 +5,12 @@ from typing import Any
 import pytest
 
 from snakesim_gnc.navigation.core import KnownPath
-from snakesim_gnc.navigation.intents import LONGEST_NS, Intents
+from snakesim_gnc.navigation.intents import LONGEST_NS, Intents, Wish
 from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import Intent, Obstacle, World
 
 MISSION_M_S = 0.2
+MISSION = Wish(MISSION_M_S)
 SECOND = 10**9
 ROUTE = Route([(0.0, 0.0), (1.0, 0.0), (10.0, 0.0)])
 PEG = Obstacle(name="peg", shape="cylinder", position_w=(2.0, 0.1, 0.1), radius_m=0.05, height_m=0.2)
@@ -37,22 +38,18 @@ def wish(intents: Intents, newest: Intent | None, at_s: float) -> tuple[float, s
 
 
 def test_the_trajectory_is_as_old_as_the_world_model_that_it_was_planned_from() -> None:
-    planner = KnownPath(ROUTE, [PEG], speed_m_s=MISSION_M_S)
-    blind = planner.update(0, 0, None, None)
+    planner = KnownPath(ROUTE, [PEG])
+    blind = planner.update(0, None, MISSION)
     assert blind.stamp_ns is None and blind.push_points == [] and not blind.finished
-    seen = planner.update(20, 20 * 10**7, world(0.5, stamp_ns=18 * 10**7), None)
+    seen = planner.update(20, world(0.5, stamp_ns=18 * 10**7), MISSION)
     assert (seen.tick, seen.stamp_ns, seen.push_points) == (20, 18 * 10**7, ["peg"])
-    again = planner.update(40, 40 * 10**7, world(0.5, stamp_ns=18 * 10**7), None)
+    again = planner.update(40, world(0.5, stamp_ns=18 * 10**7), MISSION)
     assert again.stamp_ns == 18 * 10**7  # guidance has said nothing new: nor has the plan become new
 
 
-def test_the_path_ends_and_another_start_begins_it_anew() -> None:
-    planner = KnownPath(ROUTE, [], speed_m_s=MISSION_M_S)
-    there = planner.update(0, 0, world(10.0), None)
+def test_the_path_ends() -> None:
+    there = KnownPath(ROUTE, []).update(0, world(10.0), MISSION)
     assert there.finished and there.speed_m_s == 0.0 and there.reason == "the path is finished"
-    planner.start_over()
-    back = planner.update(0, 0, world(0.0), None)
-    assert not back.finished and back.speed_m_s == MISSION_M_S and back.reason == ""
 
 
 def test_an_intent_counts_for_as_long_as_it_says_and_then_the_robot_stops() -> None:
@@ -98,6 +95,15 @@ def test_a_clock_that_the_sender_heard_first_is_no_future() -> None:
 def test_nobody_goes_faster_than_a_mission_may(speed_m_s: float) -> None:
     speed, why = wish(Intents(MISSION_M_S), intent(1.0, speed_m_s=speed_m_s), 1.0)
     assert speed == MISSION_M_S and f"asks for {speed_m_s:g} m/s, at most 10 m/s" in why
+
+
+def test_a_direction_holds_while_the_robot_stands_and_until_somebody_wants_the_mission_again() -> None:
+    intents = Intents(MISSION_M_S)
+    assert intents.wish(intent(0.0, heading_w_rad=1.5), 0).heading_w_rad == 1.5
+    expired = intents.wish(None, 2 * SECOND)
+    assert (expired.speed_m_s, expired.heading_w_rad) == (0.0, 1.5)  # it stops on the path that it is on
+    assert intents.wish(intent(2.1, go=False), 2_100_000_000).heading_w_rad == 1.5
+    assert intents.wish(intent(2.2), 2_200_000_000).heading_w_rad is None
 
 
 def test_stop_is_a_wish_too() -> None:
