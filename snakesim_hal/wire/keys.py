@@ -28,6 +28,7 @@ CONTROL_STATE = "control/state"
 INTENT = "operator/intent"
 ALIVE_ALL = "alive/*"
 HOST_ALL = "hal/host/*"
+PROCESS_ALL = "process/*"
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,7 @@ SPACE: tuple[Row, ...] = (
     Row(CONTROL_STATE, m.ControlState, "control", "stream", "on a change, and 20 Hz", "state, reason, forces, torques"),
     Row(INTENT, m.Intent, "operator", "stream", "before the last expires", "speed and direction wanted by somebody"),
     Row(ALIVE_ALL, None, "each service", "liveliness", _LIVES, "present while the service's process is connected"),
+    Row(PROCESS_ALL, m.Process, "each process", "latched", "once", "its machine, version, settings; and its token"),
     Row(HOST_ALL, None, "HAL", "liveliness", _LIVES, "one for each HAL host process; a robot must have only one"),
 )
 
@@ -112,6 +114,11 @@ def alive(service: str) -> str:
 def host(host_id: str) -> str:
     """Liveliness key of one host process."""
     return f"hal/host/{host_id}"
+
+
+def process(name: str, process_id: str) -> str:
+    """Key of one process, and of its liveliness token."""
+    return f"process/{name}-{process_id}"
 
 
 def service_of(key: str) -> str:

@@ -459,6 +459,27 @@ class Done(Message, frozen=True, kw_only=True):
     tick: q.Tick
 
 
+class Process(Message, frozen=True, kw_only=True):
+    """`process/<name>-<id>`, latched: one process of the robot's network; valid while a token at the same key lives."""
+
+    name: Annotated[q.Name, about("its role: host, a service of the scenario, recorder, ...")]
+    machine: Annotated[q.Name, about("host name of its computer")]
+    user: Annotated[q.Name, about("who has started it")]
+    pid: Annotated[q.Count, about("its process id there")]
+    version: Annotated[q.Name, about("of SnakeSIM, or of the program that writes this")]
+    started_unix_s: Annotated[q.Count, about("when it started, by the wall clock of its machine")]
+    settings: Annotated[
+        dict[q.Name, q.Name],
+        Meta(max_length=32),
+        about("settings that host and services must share: values, and hashes of sections; empty: it uses none"),
+    ] = {}
+    messages: Annotated[
+        dict[q.Name, Annotated[q.Count, about("version of that message")]],
+        Meta(max_length=64),
+        about("messages that it knows; empty: unknown"),
+    ] = {}
+
+
 # --- guidance, navigation, control -----------------------------------------------------------------------------
 
 
@@ -602,6 +623,7 @@ VERSIONS: dict[type[Message], int] = dict.fromkeys(
         FaultRequest,
         Answer,
         Done,
+        Process,
         World,
         Trajectory,
         ControlState,
