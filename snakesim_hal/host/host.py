@@ -29,7 +29,7 @@ from snakesim_hal.host.participants import Participant, Participants
 from snakesim_hal.host.run_statistics import RunStatistics
 from snakesim_hal.host.status_messages import applied_message, status_message
 from snakesim_hal.host.timing import Deadlines, PublishTimes
-from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.model.scenario import RunConfig, written
 from snakesim_hal.network.private_channel import HostEnd, ToStarter
 from snakesim_hal.network.process_entries import HOST, ProcessEntries, own_entry, show_process
 from snakesim_hal.network.run_key import own_run_key, proven
@@ -125,7 +125,7 @@ class Host:
         self._status_shown: Any = None
         if (found := self._latch.found) is not None:
             self.authority.on_estop(EstopRequest(who=f"{found.who[:40]}, before this host"), max(found.tick, 0))
-        self._outbox = Outbox(session, self.description, lockstep=config.pace == "lockstep")
+        self._outbox = Outbox(session, self.description, written(config), lockstep=config.pace == "lockstep")
         self._entry = own_entry(HOST, config)
         show_process(session, self._entry)
         self._processes = ProcessEntries(session)
@@ -257,8 +257,7 @@ class Host:
         started = time.monotonic_ns()
         try:
             self._backend.enact(decision.set_points, self.authority.state)
-            if self._outbox.applied_heard:
-                self._outbox.put(keys.APPLIED, applied_message(self.description, self._tick, decision))
+            self._outbox.put(keys.APPLIED, applied_message(self.description, self._tick, decision))
             self._backend.advance()
             for fault in self._backend.faults():
                 self.authority.fault(fault)

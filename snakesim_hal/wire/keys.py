@@ -14,6 +14,7 @@ COLOUR_ALL = "sensor/colour/*"
 RANGE_ALL = "sensor/range/*"
 JOINT_COMMAND = "actuator/joints"
 DESCRIPTION = "hal/description"
+CONFIG = "hal/config"
 STATUS = "hal/status"
 CLOCK = "hal/clock"
 APPLIED = "hal/applied"
@@ -47,7 +48,6 @@ _TICK = "every tick"
 _SENSOR = "at its `rate_hz` in `Description.sensors`"
 _ASKED = "on request"
 _TURN = "every `every_ticks` of its service"
-_HEARD = f"{_TICK}, if there is a subscriber"
 _LIVES = "while connected"
 
 SPACE: tuple[Row, ...] = (
@@ -61,9 +61,10 @@ SPACE: tuple[Row, ...] = (
     Row(RANGE_ALL, m.Ranges, "HAL", "stream", _SENSOR, "distances along the beams of a lidar or a range finder"),
     Row(JOINT_COMMAND, m.JointCommand, "lease holder", "stream", _TICK, "mode and set-point of every joint"),
     Row(DESCRIPTION, m.Description, "HAL", "latched", "once", "joints, order, limits, geometry, sensors"),
+    Row(CONFIG, m.Configuration, "HAL", "latched", "once", "everything that the run was started with, as JSON"),
     Row(STATUS, m.Status, "HAL", "latched", "on a change, and 5 Hz", "lifecycle, reason, holder, faults, counters"),
     Row(CLOCK, m.Clock, "HAL", "stream", f"{_TICK}, last", "tick, time, and the newest sample at each key"),
-    Row(APPLIED, m.AppliedCommand, "HAL", "stream", _HEARD, "set-points that the motors got, and limits applied"),
+    Row(APPLIED, m.AppliedCommand, "HAL", "stream", _TICK, "set-points that the motors got, and limits applied"),
     Row(LEASE, m.LeaseRequest, "any", "query", _ASKED, "acquire, renew, release the right to command; replies Answer"),
     Row(LIFECYCLE, m.LifecycleRequest, "any", "query", _ASKED, "arm, disarm, clear, finish; replies Answer"),
     Row(ESTOP, m.EstopRequest, "any", "query", _ASKED, "stop now, needs no lease, latched; replies Answer"),

@@ -24,6 +24,7 @@ Reach = Literal["robot", "joint", "none"]
 Axis = Literal["yaw", "pitch"]
 
 A_JOINT = "one entry a joint"
+MAX_CONFIG = 500_000  # characters
 PACE = about("realtime: by the wall clock; lockstep: each tick waits for all services; free: without waiting")
 LIFECYCLE = about("motors follow commands only in armed; fault and estop stay until a clear")
 HOST = about("random id of the host process, new at each start; null: unknown")
@@ -341,6 +342,13 @@ class Description(Message, frozen=True, kw_only=True):
     sensors: Annotated[list[SensorDescription], Meta(max_length=32)]
 
 
+class Configuration(Message, frozen=True, kw_only=True):
+    """`hal/config`, latched: the effective configuration of the run, which explains a recording."""
+
+    config_hash: Annotated[q.Name, about("as in the description")]
+    content: Annotated[str, Meta(max_length=MAX_CONFIG), about("JSON, as `schemas/files/run.json` describes it")]
+
+
 class Fault(Message, frozen=True, kw_only=True):
     """One fault, and its location."""
 
@@ -616,6 +624,7 @@ VERSIONS: dict[type[Message], int] = dict.fromkeys(
         AppliedCommand,
         Clock,
         Description,
+        Configuration,
         Status,
         LeaseRequest,
         LifecycleRequest,

@@ -2,6 +2,7 @@
 
 import contextlib
 import socket
+from pathlib import Path
 
 from snakesim_hal.errors import NotConnectedError, RefusedError
 from snakesim_hal.model.scenario import RunConfig
@@ -58,9 +59,9 @@ def refuse_second_robot(endpoint: str | None, lab: Link | None) -> None:
             )
 
 
-def local_robot(config: RunConfig, link: Link, stop_port: socket.socket) -> LocalRobot:
+def local_robot(config: RunConfig, config_file: Path, link: Link, stop_port: socket.socket) -> LocalRobot:
     """The run's entry in the local registry."""
-    return LocalRobot.on(link, config.robot.name, config.backend, stop_port)
+    return LocalRobot.on(link, config.robot.name, config.backend, stop_port, str(config_file.absolute()))
 
 
 def _is_free(port: int) -> bool:

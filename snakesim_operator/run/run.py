@@ -23,7 +23,9 @@ from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.network.session_file import SessionFile
 from snakesim_hal.service import START_LIMIT_S
 from snakesim_hal.terminal import say
+from snakesim_operator.recording.process import RECORDER
 from snakesim_operator.results.record import CONFIG
+from snakesim_operator.run.console_child import check_console, console_beside
 from snakesim_operator.run.ending import Ending, interruptible
 from snakesim_operator.run.folder import claimed, named_after
 from snakesim_operator.run.meeting import local_robot, meeting_point, refuse_second_robot
@@ -48,6 +50,8 @@ class RunRequest:
     stay: bool = False  # a fault ends nothing: processes are started again, a person clears and arms
     with_router: bool = False  # the run's parts meet at a router of its own
     insecure: bool = False  # listen even where other machines can connect
+    record: bool = True  # every message, in recording.mcap
+    console: bool = False  # show it in the browser
 
     @property
     def network_name(self) -> str:
@@ -66,6 +70,8 @@ def run(request: RunRequest) -> int:
     """Run it. Returns 0, 1 on a fault or an early end, 3 when the record lacks something, 130 when interrupted."""
     request = replace(request, config=check_plugins(request.config))
     _check_router(request)
+    if request.console:
+        check_console()
     if request.endpoint is not None:
         check_guarded(request.endpoint, "--endpoint", insecure=request.insecure)
     refuse_second_robot(request.endpoint, request.lab)
@@ -75,14 +81,15 @@ def run(request: RunRequest) -> int:
         supervisor = Supervisor(files, ending, say, stop_port, stay=request.stay)
         with (
             interruptible(ending),
-            registered(local_robot(request.config, link, stop_port)) as trouble,
+            registered(local_robot(request.config, config_file, link, stop_port)) as trouble,
         ):
             if trouble is not None:
                 say(trouble)
             _conduct(request, supervisor, link, files, config_file, ending)
         from snakesim_operator.run.conclusion import Outcome, conclude
 
-        outcome = Outcome(supervisor.host_record(), supervisor.robot(), supervisor.restarts, supervisor.hosts)
+        lost = list(supervisor.lost.values())
+        outcome = Outcome(supervisor.host_record(), supervisor.robot(), supervisor.restarts, supervisor.hosts, lost)
         return conclude(request.config, files, ending, outcome, stay=request.stay)
 
 
@@ -146,12 +153,18 @@ def _conduct(
         supervisor.start(HOST, host_arguments)
         for name, service in config.own_services.items():
             supervisor.start(name, ["snakesim_hal.serve", name, *common, *meeting], may_restart=service.restart)
-        with _joined(link, supervisor, ending) as session:
+        if request.record and files.folder is not None:
+            recorder = ["snakesim_operator.recording.process", *common, *meeting, "--out", str(files.folder)]
+            supervisor.start(RECORDER, recorder, vital=False)
+        with (
+            console_beside([*common, *meeting], files, say) if request.console else contextlib.nullcontext(),
+            _joined(link, supervisor, ending) as session,
+        ):
             say(f"{config.name}: {config.robot.name} in {config.scene.name}, {config.commander}, {config.pace}")
             say(f"network: {link.endpoint}, namespace {link.namespace}")
             if not config.has_own_control:
                 say("whoever takes the lease commands the robot, and arms it")
-            RunMonitor(config, session, supervisor, files, ending, say, stay=request.stay).go()
+            RunMonitor(config, session, supervisor, ending, say, stay=request.stay).go()
     except SnakesimError as error:
         ending.because(str(error))
     finally:

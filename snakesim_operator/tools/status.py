@@ -14,7 +14,7 @@ from snakesim_hal.model.files import ROUTER
 from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.process_entries import HOST, differences
 from snakesim_hal.network.session import Arrival, Link, open_session
-from snakesim_hal.terminal import Say, say
+from snakesim_hal.terminal import Say, say, say_json
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import Process, Status
@@ -25,7 +25,7 @@ STATUS_WAIT_S = 1.0
 CONNECT_S = 1.0
 
 
-def show_status(where: Where, say: Say = say) -> int:
+def show_status(where: Where, say: Say = say, *, as_json: bool = False) -> int:
     """Print the state of every reachable robot. Returns 0 without faults, 1 otherwise."""
     found: list[tuple[Link, list[Status]]] = []
     processes: dict[tuple[str, str | None], list[Process]] = {}
@@ -37,6 +37,11 @@ def show_status(where: Where, say: Say = say) -> int:
         for robot in where.local()
         if not any(link.endpoint == robot.endpoint and link.namespace == robot.namespace for link, _ in found)
     ]
+    well = bool(found) and all(statuses[-1].lifecycle in ("armed", "disarmed") for _, statuses in found)
+    if as_json:
+        robots = [_for_scripts(link, said, processes) for link, said in found]
+        say_json({"robots": robots, "silent": silent}, say)
+        return 0 if well and not silent else 1
     for robot in silent:
         say(f"{robot.namespace}: NO ANSWER on {robot.endpoint}; its run is process {robot.pid}")
     if not found and not silent:
@@ -53,7 +58,6 @@ def show_status(where: Where, say: Say = say) -> int:
             say("  IMPOSTOR: more than one host publishes a status under this name; trust none of them")
         for line in _what_to_type(link, statuses[-1]):
             say(line)
-    well = all(statuses[-1].lifecycle in ("armed", "disarmed") for _, statuses in found)
     return 0 if well and not silent else 1
 
 
@@ -83,6 +87,17 @@ def _heard(link: Link, processes: dict[tuple[str, str | None], list[Process]]) -
             elif arrival.key in live:
                 processes.setdefault((link.endpoint, name), []).append(message)
     return [(replace(link, namespace=name), list(of_host.values())) for name, of_host in sorted(found.items())]
+
+
+def _for_scripts(link: Link, statuses: list[Status], processes: dict[tuple[str, str | None], list[Process]]):
+    """One robot, as JSON tells of it."""
+    return {
+        "namespace": link.namespace,
+        "endpoint": link.endpoint,
+        "impostor": len({status.host for status in statuses}) > 1,  # more than one host has this name
+        "processes": processes.get((link.endpoint, link.namespace), []),
+        "status": statuses[-1],
+    }
 
 
 def processes_in_words(processes: Sequence[Process]) -> list[str]:

@@ -203,7 +203,7 @@ def digest(tmp_path_factory: pytest.TempPathFactory) -> str:
         ("size=48k", "", ["--in-process"]),  # room for the configuration and little else
         ("size=100k", "", ["--in-process"]),
         ("size=400k", "", []),
-        ("size=1M,nr_inodes=5", "", ["--in-process"]),
+        ("size=1M,nr_inodes=4", "", ["--in-process"]),
     ],
 )
 def test_a_full_disk_neither_ends_nor_changes_a_run(

@@ -37,10 +37,6 @@ def running(readings: int = 20) -> Camera:
     return camera
 
 
-def test_nothing_read_says_nothing() -> None:
-    assert CaptureTimes().judge([], 0) == []
-
-
 @pytest.mark.parametrize("ahead_ns", [AHEAD_NS, -AHEAD_NS, 0])
 def test_stamps_in_their_order_count_whatever_zero_their_clock_has(ahead_ns: int) -> None:
     camera = Camera()

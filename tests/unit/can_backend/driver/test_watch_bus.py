@@ -7,7 +7,7 @@ from snakesim_can_backend.driver.module_monitor import Finding
 from snakesim_can_backend.driver.reports import Reading
 from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.commands import command
-from snakesim_can_backend.protocol.definitions import Action, Frame, ModuleState, Opcode, frame_id
+from snakesim_can_backend.protocol.definitions import Action, Frame, Opcode, frame_id
 from tests.unit.can_backend.driver.watch_rig import Bench, quiet, said
 from tests.unit.can_backend.frames import answer, joint_state
 
@@ -138,11 +138,3 @@ def test_a_bus_whose_interface_is_down_is_not_called_stuck_too() -> None:
     bench.tick(troubles=[up], unsent="can1")
     found = [f for _ in range(3) for f in bench.tick(unsent="can1")]
     assert said(found) == [("bus_stuck", None)]
-
-
-def test_a_module_that_was_armed_and_is_not_any_more_is_told_at_once() -> None:
-    bench = Bench()
-    bench.lifecycle, bench.state = "armed", ModuleState.ARMED
-    bench.ticks(2)
-    found = bench.ticks(3, lambda reading: answer(reading, [2], state=ModuleState.DISARMED))
-    assert said(found) == [("module_not_armed", 1)]

@@ -112,17 +112,6 @@ def test_a_box_on_disk_reads_back_without_its_torn_row(tmp_path: Path, torn: int
     assert (digest_of(columns) == box.command_digest) == (not torn)
 
 
-@pytest.mark.parametrize("joints", [1, 2, 13])
-def test_a_column_has_one_number_for_each_joint(tmp_path: Path, joints: int) -> None:
-    robot = description(chain__modules=joints)
-    box = BlackBox(robot)
-    told = Decision(SetPoints([Mode.TORQUE] * joints, [0.1] * joints, [4.0] * joints), 1, {})
-    box.record(7, 0, Samples(state(robot, 0.3)), told)
-    _, columns = read_black_box(on_disk(box, tmp_path / "box"))
-    assert columns["mode"].tolist() == [[3] * joints] and columns["angle_rad"].shape == (1, joints)
-    assert columns["tick"].tolist() == [7] and digest_of(columns) == box.command_digest
-
-
 def test_a_box_of_a_run_that_never_armed_is_empty(tmp_path: Path) -> None:
     _, columns = read_black_box(on_disk(BlackBox(ROBOT), tmp_path / "box"))
     assert columns["angle_rad"].shape == (0, 3) and digest_of(columns) == BlackBox(ROBOT).command_digest

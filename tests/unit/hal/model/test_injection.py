@@ -17,7 +17,6 @@ from snakesim_hal.model.injection import (
     explain,
     kinds_in_short,
     parse,
-    writer_of,
 )
 from snakesim_hal.wire import keys
 from tests.kinds_table import PAGE, with_table
@@ -100,11 +99,6 @@ def test_everything_has_a_part_that_carries_it_out(text: str, part: str) -> None
 def test_wrong_texts_are_told_what_is_allowed(text: str, words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         parse(text)
-
-
-def test_the_writers_are_those_of_the_key_space() -> None:
-    assert writer_of(keys.JOINT_COMMAND) == "control" and writer_of(keys.CLOCK) == "hal"
-    assert writer_of(keys.WORLD) == "guidance"
 
 
 @pytest.mark.parametrize(

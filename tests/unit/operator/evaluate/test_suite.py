@@ -68,7 +68,7 @@ def test_a_case_is_known_again_by_what_it_runs(tmp_path: Path) -> None:
 def test_shipped_suites_can_be_run(name: str) -> None:
     suite, source = read_suite(name)
     assert suite.title
-    assert len(cases_of(suite, source, suite.controllers, 1, seed=1)) >= 2
+    assert len(cases_of(suite, source, suite.controllers[:1], 1, seed=1)) >= 1
 
 
 def test_a_range_has_both_its_ends() -> None:
