@@ -105,6 +105,7 @@ def test_the_layout_tells_robots_apart_that_take_other_vectors() -> None:
 
 
 WRONG = {
+    "no axes": ({"chain__axes": []}, ["`chain.axes` = []", "a list"]),
     "unknown axis": ({"chain__axes": ["yaw", "roll"]}, ["`chain.axes.1` = 'roll'", "'pitch'", "'yaw'"]),
     "length in mm": ({"module__length_m": 110}, ["`module.length_m` = 110 m", "<= 2 in m"]),
     "angle in degrees": ({"limits__angle_rad": 90}, ["`limits.angle_rad` = 90 rad", "<= 3.14159 in rad"]),
