@@ -154,9 +154,9 @@ class LocalSession(Session):
         self._subscribe(key, take)
 
     def on_latched_arrival(self, key: str, take: Take) -> None:
-        """Like `on_arrival`, and it also gets the values that were latched before."""
-        for latched, arrival in self._network.latched.items():
-            if intersects(key, latched):
+        """Like `on_arrival`, and for the values that were latched before."""
+        for at, arrival in list(self._network.latched.items()):
+            if intersects(key, at):
                 take(arrival)
         self._subscribe(key, take)
 

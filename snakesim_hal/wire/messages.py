@@ -201,6 +201,21 @@ class Ranges(Message, frozen=True, kw_only=True):
     ]
 
 
+class Preview(Message, frozen=True, kw_only=True):
+    """`preview/depth/<camera>` or `preview/colour/<camera>`: a small, compressed copy of an image."""
+
+    tick: q.Tick
+    stamp_ns: Annotated[q.Stamp, about("of the image that it was made from")]
+    width: Annotated[int, Meta(ge=1, le=q.MAX_IMAGE_WIDTH), about("pixels in a row of this copy")]
+    height: Annotated[int, Meta(ge=1, le=q.MAX_IMAGE_HEIGHT), about("rows of this copy")]
+    format: Annotated[Literal["jpeg", "png"], about("of `data`: jpeg in colour, png of 16 bits for depth")]
+    scale_m: Annotated[
+        Annotated[float, Meta(gt=0, le=1)] | None,
+        about("metres of one count of depth, which is 0 for nothing within range; null: it is in colour"),
+    ] = None
+    data: Annotated[bytes, Meta(max_length=q.MAX_PREVIEW_BYTES), about("the file")]
+
+
 # --- actuators -------------------------------------------------------------------------------------------------
 
 
@@ -467,6 +482,27 @@ class Done(Message, frozen=True, kw_only=True):
     tick: q.Tick
 
 
+class Process(Message, frozen=True, kw_only=True):
+    """`process/<name>-<id>`, latched: one process of the robot's network; valid while a token at the same key lives."""
+
+    name: Annotated[q.Name, about("its role: host, a service of the scenario, recorder, ...")]
+    machine: Annotated[q.Name, about("host name of its computer")]
+    user: Annotated[q.Name, about("who has started it")]
+    pid: Annotated[q.Count, about("its process id there")]
+    version: Annotated[q.Name, about("of SnakeSIM, or of the program that writes this")]
+    started_unix_s: Annotated[q.Count, about("when it started, by the wall clock of its machine")]
+    settings: Annotated[
+        dict[q.Name, q.Name],
+        Meta(max_length=32),
+        about("settings that host and services must share: values, and hashes of sections; empty: it uses none"),
+    ] = {}
+    messages: Annotated[
+        dict[q.Name, Annotated[q.Count, about("version of that message")]],
+        Meta(max_length=64),
+        about("messages that it knows; empty: unknown"),
+    ] = {}
+
+
 # --- guidance, navigation, control -----------------------------------------------------------------------------
 
 
@@ -599,6 +635,7 @@ VERSIONS: dict[type[Message], int] = dict.fromkeys(
         DepthImage,
         ColourImage,
         Ranges,
+        Preview,
         JointCommand,
         AppliedCommand,
         Clock,
@@ -611,6 +648,7 @@ VERSIONS: dict[type[Message], int] = dict.fromkeys(
         FaultRequest,
         Answer,
         Done,
+        Process,
         World,
         Trajectory,
         ControlState,

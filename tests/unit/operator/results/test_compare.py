@@ -1,6 +1,7 @@
 """Comparing two runs: made-up records whose differences are known beforehand, and the words and pages on them."""
 
 import dataclasses
+import json
 import math
 import re
 from pathlib import Path
@@ -17,7 +18,7 @@ from snakesim_hal.wire.messages import ControlState, Mode
 from snakesim_operator.results.compare.command import compare
 from snakesim_operator.results.compare.difference import Difference, differ
 from snakesim_operator.results.compare.page import page
-from snakesim_operator.results.compare.table import table
+from snakesim_operator.results.compare.table import for_scripts, table
 from snakesim_operator.results.compare.verdict import within
 from snakesim_operator.results.record import RunRecord
 from tests.unit.operator.results.recorded import finished
@@ -83,7 +84,8 @@ def describe_of(run: RunConfig):
 
 
 def shown(difference: Difference) -> tuple[str, str]:
-    """Table and page; neither may show what is not a number."""
+    """Table and page; neither may show what is not a number. And for scripts, which get null."""
+    assert json.loads(msgspec.json.encode(for_scripts(difference)))["identical"] == difference.identical
     told = "\n".join(table(difference)), page(difference, within(difference, 5))
     for text in told:
         assert not re.search(
