@@ -175,6 +175,19 @@ def parser() -> argparse.ArgumentParser:
     _add_json(top)
     top.set_defaults(act=_top)
 
+    teleop = commands.add_parser("teleop", help="drive a robot by keys or with a joystick; letting go stops it")
+    teleop.add_argument(
+        "--joystick",
+        nargs="?",
+        type=Path,
+        const=Path(),
+        metavar="DEVICE",
+        help="such as /dev/input/event5; or the first",
+    )
+    teleop.add_argument("--fastest", type=float, default=0.3, metavar="M/S", help="highest speed (0.3)")
+    add_network(teleop)
+    teleop.set_defaults(act=_teleop)
+
     doctor = commands.add_parser("doctor", help="check this computer, and print what mends what it lacks")
     add_network(doctor)
     _add_json(doctor)
@@ -207,6 +220,14 @@ def parser() -> argparse.ArgumentParser:
     fault.add_argument("--end", action="store_true", help="end it")
     add_network(fault)
     fault.set_defaults(act=_fault)
+
+    preview = commands.add_parser(
+        "preview", help="publish small, compressed copies of a robot's images; beside its host"
+    )
+    preview.add_argument("--hz", type=float, default=2.0, metavar="HZ", help="most previews a second of a camera (2)")
+    preview.add_argument("--width", type=int, default=320, metavar="PIXELS", help="widest preview (320)")
+    add_network(preview)
+    preview.set_defaults(act=_preview)
 
     ros2 = add_ros2(commands)
     add_network(ros2)
@@ -344,6 +365,14 @@ def _top(arguments: argparse.Namespace) -> int:
     return top(TopRequest(arguments.once, arguments.json), _where(arguments))
 
 
+def _teleop(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.teleop.command import TeleopRequest, teleop
+
+    stick: Path | None = arguments.joystick
+    request = TeleopRequest(arguments.fastest, stick is not None, None if stick in (None, Path()) else stick)
+    return teleop(request, _where(arguments))
+
+
 def _doctor(arguments: argparse.Namespace) -> int:
     from snakesim_operator.tools.doctor import doctor
 
@@ -397,6 +426,12 @@ def _where(arguments: argparse.Namespace):
     if session is not None:
         return Where(session.endpoints[0], session.namespace_for(arguments.namespace), session)
     return Where(arguments.router or arguments.endpoint, arguments.namespace)
+
+
+def _preview(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.preview import preview
+
+    return preview(_where(arguments), arguments.hz, arguments.width)
 
 
 def _ros2(arguments: argparse.Namespace) -> int:

@@ -12,6 +12,8 @@ POWER = "sensor/power"
 DEPTH_ALL = "sensor/depth/*"
 COLOUR_ALL = "sensor/colour/*"
 RANGE_ALL = "sensor/range/*"
+PREVIEW_DEPTH_ALL = "preview/depth/*"
+PREVIEW_COLOUR_ALL = "preview/colour/*"
 JOINT_COMMAND = "actuator/joints"
 DESCRIPTION = "hal/description"
 CONFIG = "hal/config"
@@ -49,6 +51,7 @@ _SENSOR = "at its `rate_hz` in `Description.sensors`"
 _ASKED = "on request"
 _TURN = "every `every_ticks` of its service"
 _LIVES = "while connected"
+_LOOKED_AT = "2 Hz, if there is a subscriber"
 
 SPACE: tuple[Row, ...] = (
     Row(JOINTS, m.JointState, "HAL", "stream", _TICK, "angle, velocity, torque of every joint"),
@@ -59,6 +62,10 @@ SPACE: tuple[Row, ...] = (
     Row(DEPTH_ALL, m.DepthImage, "HAL", "stream", _SENSOR, "distances that a camera sees"),
     Row(COLOUR_ALL, m.ColourImage, "HAL", "stream", _SENSOR, "what a camera sees, in colour"),
     Row(RANGE_ALL, m.Ranges, "HAL", "stream", _SENSOR, "distances along the beams of a lidar or a range finder"),
+    Row(
+        PREVIEW_DEPTH_ALL, m.Preview, "preview", "stream", _LOOKED_AT, "small PNG of a depth image, for remote viewers"
+    ),
+    Row(PREVIEW_COLOUR_ALL, m.Preview, "preview", "stream", _LOOKED_AT, "small JPEG of a colour image"),
     Row(JOINT_COMMAND, m.JointCommand, "lease holder", "stream", _TICK, "mode and set-point of every joint"),
     Row(DESCRIPTION, m.Description, "HAL", "latched", "once", "joints, order, limits, geometry, sensors"),
     Row(CONFIG, m.Configuration, "HAL", "latched", "once", "everything that the run was started with, as JSON"),
@@ -95,6 +102,11 @@ def colour(camera: str) -> str:
 def ranges(sensor: str) -> str:
     """Key of a lidar or a range finder."""
     return f"sensor/range/{sensor}"
+
+
+def preview(image_key: str) -> str:
+    """Key of the preview of an image: `sensor/depth/head` -> `preview/depth/head`."""
+    return f"preview/{image_key.partition('/')[2]}"
 
 
 def done(service: str) -> str:

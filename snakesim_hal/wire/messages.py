@@ -201,6 +201,21 @@ class Ranges(Message, frozen=True, kw_only=True):
     ]
 
 
+class Preview(Message, frozen=True, kw_only=True):
+    """`preview/depth/<camera>` or `preview/colour/<camera>`: a small, compressed copy of an image."""
+
+    tick: q.Tick
+    stamp_ns: Annotated[q.Stamp, about("of the image that it was made from")]
+    width: Annotated[int, Meta(ge=1, le=q.MAX_IMAGE_WIDTH), about("pixels in a row of this copy")]
+    height: Annotated[int, Meta(ge=1, le=q.MAX_IMAGE_HEIGHT), about("rows of this copy")]
+    format: Annotated[Literal["jpeg", "png"], about("of `data`: jpeg in colour, png of 16 bits for depth")]
+    scale_m: Annotated[
+        Annotated[float, Meta(gt=0, le=1)] | None,
+        about("metres of one count of depth, which is 0 for nothing within range; null: it is in colour"),
+    ] = None
+    data: Annotated[bytes, Meta(max_length=q.MAX_PREVIEW_BYTES), about("the file")]
+
+
 # --- actuators -------------------------------------------------------------------------------------------------
 
 
@@ -620,6 +635,7 @@ VERSIONS: dict[type[Message], int] = dict.fromkeys(
         DepthImage,
         ColourImage,
         Ranges,
+        Preview,
         JointCommand,
         AppliedCommand,
         Clock,

@@ -10,6 +10,7 @@ import msgspec
 import pytest
 
 from snakesim_hal.host_process import HostRecord
+from snakesim_hal.network.session_file import read_session
 from tests.e2e.command import SNAKESIM, Ended, environment, free_endpoint, wait_until
 from tests.whole import command
 
@@ -94,8 +95,12 @@ def test_programs_in_any_order_move_the_robot_as_one_run_does_and_meet_the_next_
     assert record.command_digest == alone.command_digest
 
 
-def test_an_operator_reaches_no_robot_by_the_wrong_file(lab: Lab) -> None:
-    ended = lab.tell("arm", "planar13", "sim")
-    assert ended.code == 1 and "no robot on tcp/127.0.0.1" in ended.err
+def test_an_operator_names_the_network_once_by_flag_or_environment(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    (endpoint,) = read_session(lab.session).endpoints
+    monkeypatch.setenv("SNAKESIM_SESSION", str(lab.session))
+    for ended in (lab.tell("disarm"), command.snakesim("disarm", cwd=lab.folder)):
+        assert ended.code == 1 and f"no robot on {endpoint}" in ended.err
+    elsewhere = command.snakesim("disarm", "--endpoint", free_endpoint(), cwd=lab.folder)
+    assert elsewhere.code == 1 and endpoint not in elsewhere.err
     ended = lab.tell("estop", "--router", "tcp/127.0.0.1:7447")
     assert ended.code == 2 and "--router and --session" in ended.err, ended.err

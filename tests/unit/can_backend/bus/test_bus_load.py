@@ -143,6 +143,10 @@ def test_joints_are_shared_out_evenly_tail_first(joints: int, buses: int) -> Non
     assert max(found) - min(found) <= 1 and found == sorted(found, reverse=True)
 
 
+def test_given_shares_are_kept() -> None:
+    assert shares(run_of(13), Settings(channels=channels(2), joints_per_channel=[3, 10])) == [3, 10]
+
+
 @pytest.mark.parametrize(
     ("joints", "settings", "words"),
     [

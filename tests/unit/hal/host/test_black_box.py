@@ -13,8 +13,8 @@ from snakesim_hal.errors import ConfigError
 from snakesim_hal.host.black_box import BlackBox, digest_of, read_black_box
 from snakesim_hal.safety.authority import Decision
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Contact, Contacts, Mode, Pose
-from tests.unit.hal.rig import description, state
+from snakesim_hal.wire.messages import Contact, Contacts, Mode
+from tests.unit.hal.rig import description, pose, state
 
 ROBOT = description()
 STILL = (0.0, 0.0, 0.0)
@@ -54,10 +54,7 @@ def test_columns_hold_what_was_recorded_however_long_the_run() -> None:
     for tick in range(count):
         others: dict[str, Any] = {}
         if tick == 2:
-            others[keys.POSE] = Pose(
-                tick=tick, stamp_ns=0, position_w=(1.0, 2.0, 3.0), orientation_wxyz=(1.0, 0.0, 0.0, 0.0),
-                velocity_w=STILL, angular_velocity_w=STILL,
-            )  # fmt: skip
+            others[keys.POSE] = pose(tick, position_w=(1.0, 2.0, 3.0))
         if tick in (3, 6):
             touches = [contact("a", (3.0, 4.0, 0.0)), contact("a", STILL), contact("b", STILL)] if tick == 3 else []
             others[keys.CONTACTS] = Contacts(tick=tick, stamp_ns=0, contacts=touches)

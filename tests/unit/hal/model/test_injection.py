@@ -86,7 +86,7 @@ def test_everything_has_a_part_that_carries_it_out(text: str, part: str) -> None
         ("mute:joint_0@1", "knows no 'mute'"),
         ("mote:joint_1@1", "a joint such as joint_1 knows no 'mote', only mute, freeze"),
         ("mute:control@1", "mute is for joints"),
-        ("freeze:bus_1@1", "freeze is for processs? and joints"),
+        ("freeze:bus_1@1", "freeze is for processes and joints"),
         ("mute:joint_1@2-2", "must be later than its start, 2 s"),
         ("mute:joint_1@1.2.3", "are numbers"),
         ("mute:joint_1@1=2", "mute takes no amount; leave out =2"),
