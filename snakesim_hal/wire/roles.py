@@ -49,8 +49,12 @@ _ASKERS: dict[str, tuple[Role, ...]] = {
     keys.LIFECYCLE: _PERSONS,
     keys.ESTOP: (Role.GNC, Role.VIEWER, *_PERSONS),
     keys.FAULT_ALL: (Role.ADMINISTRATOR,),
+    keys.SETTINGS: _PERSONS,
 }
-_ANSWERERS: dict[str, tuple[Role, ...]] = {keys.FAULT_ALL: (Role.ROBOT, Role.GNC)}  # the others: the robot alone
+_ANSWERERS: dict[str, tuple[Role, ...]] = {
+    keys.FAULT_ALL: (Role.ROBOT, Role.GNC),
+    keys.SETTINGS: (Role.GNC,),
+}  # the others: the robot alone
 INJECTION = (keys.FAULT_ALL,)  # granted only for a robot whose lab file allows it
 
 
