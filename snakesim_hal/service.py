@@ -8,6 +8,7 @@ from snakesim_hal.faults.injector import Injector
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.scenario import Service as Schedule
 from snakesim_hal.network.client import Client
+from snakesim_hal.network.process_entries import own_entry, show_process
 from snakesim_hal.network.session import Session
 from snakesim_hal.wire.messages import Clock, Description, Message
 
@@ -63,12 +64,14 @@ class ServiceLoop:
         self._injector = Injector(name, config, session, newest=lambda: client.heard)
         self._injector.allow(emulated=robot.emulated, faults_allowed=config.faults_allowed)
         self._due = client.ticks(0.0)
+        self._session, self._entry = session, own_entry(name, config)
 
     def join(self) -> None:
         """Show that the service is here. From now on the robot may be armed, perhaps before the first tick here."""
         clock = self._client.hear(SILENCE_S)
         if clock is not None:
             self._injector.turn(clock.stamp_ns, clock.arming, clock.lifecycle)
+        show_process(self._session, self._entry)
         self._client.announce()
 
     def run(self) -> None:

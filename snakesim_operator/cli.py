@@ -5,6 +5,7 @@ import os
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
+from math import inf
 from pathlib import Path
 
 from snakesim_hal import host_process, serve
@@ -21,9 +22,11 @@ from snakesim_hal.model.files import ROUTER, read_part, shipped
 from snakesim_hal.model.injection import explain
 from snakesim_hal.model.plugins import COMMANDS, find_plugin, in_file, installed
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.terminal import complain, complain_of, say
+from snakesim_hal.terminal import complain, complain_of, say, say_json
 from snakesim_operator.evaluate.command import add_commands
 from snakesim_operator.lab.command import add_commands as add_lab_commands
+from snakesim_operator.playback.command import add_commands as add_playback_commands
+from snakesim_operator.robots.arguments import add_commands as add_robot_commands
 from snakesim_operator.ros2.command import add_command as add_ros2
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
@@ -85,6 +88,7 @@ def parser() -> argparse.ArgumentParser:
         action="store_true",
         help="run in one process, without a network: lockstep, and faster; nothing can connect, arm or stop it",
     )
+    run.add_argument("--no-record", action="store_true", help="keep no recording of the messages")
     run.add_argument(
         "--console",
         action=argparse.BooleanOptionalAction,
@@ -123,19 +127,29 @@ def parser() -> argparse.ArgumentParser:
     compare.add_argument(
         "--within", type=float, metavar="PERCENT", help="exit with 1 when the distances moved differ by more"
     )
+    _add_json(compare)
     compare.set_defaults(act=_compare)
 
     add_commands(commands)
     add_lab_commands(commands)
 
+    record = commands.add_parser("record", help="record everything that a robot publishes into an MCAP file")
+    record.add_argument("--out", type=Path, metavar="FILE.mcap", help="the file (default: NAMESPACE-TIME.mcap)")
+    record.add_argument("--duration", type=float, metavar="S", help="end after this time by the wall clock")
+    add_network(record)
+    record.set_defaults(act=_record)
+    add_playback_commands(commands)
+
     config = commands.add_parser("config", help="show every effective value, and the file or flag it came from")
     add_scenario(config)
+    _add_json(config)
     config.set_defaults(act=_config)
 
     scenarios = commands.add_parser("scenarios", help="list the shipped scenarios, robots, scenes and suites")
+    _add_json(scenarios)
     scenarios.set_defaults(act=_scenarios)
 
-    _add_robot(commands.add_parser("robot", help="make a robot file from a URDF, or a URDF from a robot file"))
+    add_robot_commands(commands)
 
     echo = commands.add_parser("echo", help="print what is published on a key, one JSON object a line")
     echo.add_argument("key", nargs="?", help="such as sensor/joints or sensor/*; without it, list the keys")
@@ -146,6 +160,7 @@ def parser() -> argparse.ArgumentParser:
 
     status = commands.add_parser("status", help="print the state of the robots on the network, and its reason")
     add_network(status)
+    _add_json(status)
     status.set_defaults(act=_status)
 
     console = commands.add_parser(
@@ -155,6 +170,40 @@ def parser() -> argparse.ArgumentParser:
     console.add_argument("--port", type=int, help="port on the loopback interface (default: 8080, or any free one)")
     add_network(console)
     console.set_defaults(act=_console)
+    top = commands.add_parser("top", help="show rate, jitter, size and age of every key, and commands' latency")
+    top.add_argument("--once", action="store_true", help="listen for two seconds, print one table, and end")
+    add_network(top)
+    _add_json(top)
+    top.set_defaults(act=_top)
+
+    teleop = commands.add_parser("teleop", help="drive a robot by keys or with a joystick; letting go stops it")
+    teleop.add_argument(
+        "--joystick",
+        nargs="?",
+        type=Path,
+        const=Path(),
+        metavar="DEVICE",
+        help="such as /dev/input/event5; or the first",
+    )
+    teleop.add_argument("--fastest", type=float, default=0.3, metavar="M/S", help="highest speed (0.3)")
+    add_network(teleop)
+    teleop.set_defaults(act=_teleop)
+
+    doctor = commands.add_parser("doctor", help="check this computer, and print what mends what it lacks")
+    add_network(doctor)
+    _add_json(doctor)
+    doctor.set_defaults(act=_doctor)
+
+    video = commands.add_parser("video", help="film a recorded run, as MP4 or GIF")
+    video.add_argument("run", type=Path, metavar="RUN", help="folder of a run, or a recording")
+    video.add_argument("--out", type=Path, required=True, metavar="FILE", help="FILE.mp4 or FILE.gif")
+    video.add_argument("--width", type=int, default=1280, help="pixels, an even number (default: 1280)")
+    video.add_argument("--height", type=int, default=720, help="pixels, an even number (default: 720)")
+    video.add_argument("--fps", type=float, default=30.0, help="pictures a second (default: 30)")
+    video.add_argument("--speed", type=float, default=1.0, metavar="X", help="2: twice as fast as it was (default: 1)")
+    video.add_argument("--from", dest="from_s", type=float, default=0.0, metavar="S", help="begin S seconds in")
+    video.add_argument("--to", dest="to_s", type=float, default=inf, metavar="S", help="end S seconds in")
+    video.set_defaults(act=_video)
 
     arm = commands.add_parser("arm", help="allow a robot to move; names robot and backend, to avoid mix-ups")
     arm.add_argument("robot", metavar="ROBOT", help="name of the robot, as printed by `snakesim status`")
@@ -184,6 +233,14 @@ def parser() -> argparse.ArgumentParser:
     add_network(fault)
     fault.set_defaults(act=_fault)
 
+    preview = commands.add_parser(
+        "preview", help="publish small, compressed copies of a robot's images; beside its host"
+    )
+    preview.add_argument("--hz", type=float, default=2.0, metavar="HZ", help="most previews a second of a camera (2)")
+    preview.add_argument("--width", type=int, default=320, metavar="PIXELS", help="widest preview (320)")
+    add_network(preview)
+    preview.set_defaults(act=_preview)
+
     ros2 = add_ros2(commands)
     add_network(ros2)
     ros2.set_defaults(act=_ros2)
@@ -203,27 +260,8 @@ def parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _add_robot(parser: argparse.ArgumentParser) -> None:
-    commands = parser.add_subparsers(dest="robot_command", required=True, metavar="import|export")
-    into = commands.add_parser("import", help="a robot file from a URDF; reports what cannot be carried over")
-    into.add_argument("file", type=Path, metavar="FILE.urdf")
-    into.add_argument("--out", type=Path, metavar="FILE.toml", help="robot file to write (default: NAME.toml)")
-    into.add_argument("--tail", metavar="LINK", help="a link at the tail end (default: the root link)")
-    into.add_argument(
-        "--up", choices=["x", "y", "z", "-x", "-y", "-z"], default="z", help="of the root link (default: z)"
-    )
-    into.add_argument("--scale", type=float, default=1.0, metavar="M", help="metres per unit of length; 0.001 for mm")
-    into.add_argument(
-        "--like",
-        default="planar13",
-        metavar="ROBOT",
-        help="robot file with the motor gains and other values that URDF lacks",
-    )
-    into.set_defaults(act=_robot_import)
-    out = commands.add_parser("export", help="a URDF from any robot file")
-    out.add_argument("robot", metavar="ROBOT", help="name of a shipped robot, or path of a robot file")
-    out.add_argument("--out", type=Path, metavar="FILE.urdf", help="URDF to write (default: NAME.urdf)")
-    out.set_defaults(act=_robot_export)
+def _add_json(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--json", action="store_true", help="print one line of JSON instead, for scripts")
 
 
 def _run(arguments: argparse.Namespace) -> int:
@@ -246,6 +284,7 @@ def _run(arguments: argparse.Namespace) -> int:
             stay=arguments.stay,
             with_router=arguments.with_router,
             insecure=arguments.insecure,
+            record=not arguments.no_record,
             console=arguments.console,
         )
     )
@@ -257,7 +296,7 @@ def _run_in_process(config: RunConfig, arguments: argparse.Namespace) -> int:
     for flag in ("endpoint", "router", "session", "namespace", "stay", "with_router", "console"):
         if getattr(arguments, flag):
             raise ConfigError(f"--in-process and --{flag.replace('_', '-')}: there is no network; leave one out")
-    return run_in_process(config, arguments.out)
+    return run_in_process(config, arguments.out, record=not arguments.no_record)
 
 
 def _host(arguments: argparse.Namespace) -> int:
@@ -269,7 +308,7 @@ def _host(arguments: argparse.Namespace) -> int:
 def _compare(arguments: argparse.Namespace) -> int:
     from snakesim_operator.results.compare import compare
 
-    return compare(arguments.run_a, arguments.run_b, arguments.out, arguments.within)
+    return compare(arguments.run_a, arguments.run_b, arguments.out, arguments.within, as_json=arguments.json)
 
 
 def _config(arguments: argparse.Namespace) -> int:
@@ -277,6 +316,9 @@ def _config(arguments: argparse.Namespace) -> int:
 
     loaded = load_scenario(arguments)
     check_plugins(loaded.config, loaded.table, run_files=False)
+    if arguments.json:
+        say_json({key: {"value": value, "origin": origin} for key, value, origin in loaded.explain()})
+        return OK
     rows = [(key, _shown(value), origin) for key, value, origin in loaded.explain()]
     key_width = max(len(key) for key, _, _ in rows)
     value_width = min(max(len(value) for _, value, _ in rows), 48)
@@ -296,7 +338,13 @@ def _shown(value: object) -> str:
     return text if len(text) <= 120 else text[:117] + "..."
 
 
-def _scenarios(_arguments: argparse.Namespace) -> int:
+def _scenarios(arguments: argparse.Namespace) -> int:
+    if arguments.json:
+        kinds = {"scenarios": "title", "robots": "about", "scenes": "about", "suites": "title"}
+        say_json(
+            {k: {name: read_part(name, k).values.get(about, "") for name in shipped(k)} for k, about in kinds.items()}
+        )
+        return OK
     for kind, about in (("scenarios", "title"), ("robots", "about"), ("scenes", "about"), ("suites", "title")):
         say(f"{kind}:")
         for name in shipped(kind):
@@ -305,30 +353,42 @@ def _scenarios(_arguments: argparse.Namespace) -> int:
     return OK
 
 
-def _robot_import(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.robots.command import import_robot
-    from snakesim_operator.robots.imported import Order
-
-    order = Order(arguments.tail, arguments.up, arguments.scale, arguments.like)
-    return import_robot(arguments.file, order, arguments.out)
-
-
-def _robot_export(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.robots.command import export_robot
-
-    return export_robot(arguments.robot, arguments.out)
-
-
 def _echo(arguments: argparse.Namespace) -> int:
     from snakesim_operator.tools.echo import EchoRequest, echo
 
     return echo(EchoRequest(arguments.key, arguments.hz, arguments.count), _where(arguments))
 
 
+def _record(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.record import record_robot
+
+    return record_robot(_where(arguments), arguments.out, arguments.duration)
+
+
 def _status(arguments: argparse.Namespace) -> int:
     from snakesim_operator.tools.status import show_status
 
-    return show_status(_where(arguments))
+    return show_status(_where(arguments), as_json=arguments.json)
+
+
+def _top(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.top import TopRequest, top
+
+    return top(TopRequest(arguments.once, arguments.json), _where(arguments))
+
+
+def _teleop(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.teleop.command import TeleopRequest, teleop
+
+    stick: Path | None = arguments.joystick
+    request = TeleopRequest(arguments.fastest, stick is not None, None if stick in (None, Path()) else stick)
+    return teleop(request, _where(arguments))
+
+
+def _doctor(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.doctor import doctor
+
+    return doctor(_where(arguments), as_json=arguments.json)
 
 
 def _console(arguments: argparse.Namespace) -> int:
@@ -337,6 +397,22 @@ def _console(arguments: argparse.Namespace) -> int:
     if arguments.run is not None:
         return show_record(arguments.run, arguments.port)
     return console(_where(arguments), arguments.port)
+
+
+def _video(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.video import video
+
+    size = (arguments.width, arguments.height)
+    for flag, value, low, high in (
+        ("--width", size[0], 16, 4096),
+        ("--height", size[1], 16, 4096),
+        ("--fps", arguments.fps, 1, 240),
+        ("--speed", arguments.speed, 0.01, 100),
+    ):
+        if not low <= value <= high or (flag in ("--width", "--height") and value % 2):
+            raise ConfigError(f"{flag} {value:g}: give a number from {low:g} to {high:g}; pixels must be even")
+    span_s = (arguments.from_s, arguments.to_s)
+    return video(arguments.run, arguments.out, size=size, fps=arguments.fps, speed=arguments.speed, span_s=span_s)
 
 
 def _arm(arguments: argparse.Namespace) -> int:
@@ -378,6 +454,12 @@ def _where(arguments: argparse.Namespace):
     if session is not None:
         return Where(session.endpoints[0], session.namespace_for(arguments.namespace), session)
     return Where(arguments.router or arguments.endpoint, arguments.namespace)
+
+
+def _preview(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.preview import preview
+
+    return preview(_where(arguments), arguments.hz, arguments.width)
 
 
 def _ros2(arguments: argparse.Namespace) -> int:

@@ -8,6 +8,8 @@ present torque, and the propulsion torque fades in. Both fades move by `fade` a 
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesim_gnc.control.controller import Action, Report, View, positions
+from snakesim_hal.backend import SetPoints
 from snakesim_hal.wire.messages import Description, JointState
 
 Floats = NDArray[np.float64]
@@ -59,3 +61,29 @@ class HandOver:
     def torque_nm(self, wanted_nm: float) -> float:
         """Target of the joint in torque mode."""
         return (1.0 - self._share) * self._torque_before_nm + self._share * wanted_nm
+
+
+class Followed:
+    """The reference of joints that are all in position mode, and set-points that follow it without a jump."""
+
+    def __init__(self, robot: Description, blend_s: float) -> None:
+        """blend_s: in which a jump of the reference fades out."""
+        self._robot = robot
+        self._blend_s = blend_s
+        self._hand_over = HandOver(robot)
+        self.reference_rad: Floats | None = None  # of the tick before; None before the first
+
+    def to(self, view: View, reference_rad: Floats, *, anew: bool = False) -> SetPoints:
+        """Follow a reference. anew: it may have jumped."""
+        if self.reference_rad is None:
+            self._hand_over.start(view.joints, reference_rad)
+        elif anew:
+            self._hand_over.shift(reference_rad - self.reference_rad)
+        self.reference_rad = reference_rad
+        self._hand_over.fade(view.period_s / self._blend_s)
+        return positions(self._robot, self._hand_over.positions_rad(reference_rad).tolist())
+
+    def hold(self, view: View, why: str) -> Action:
+        """Every joint keeps its reference, or its pose before there was one."""
+        reference = np.array(view.joints.angle_rad) if self.reference_rad is None else self.reference_rad
+        return Action(self.to(view, reference), Report(why=why, reference_rad=reference.tolist()))

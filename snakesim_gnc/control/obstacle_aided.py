@@ -16,12 +16,11 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from snakesim_gnc.control.bumpless import HandOver
-from snakesim_gnc.control.controller import Action, Report, View, positions
+from snakesim_gnc.control.bumpless import Followed
+from snakesim_gnc.control.controller import Action, Report, View
 from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_gnc.control.progress import Located, Progress
 from snakesim_gnc.control.push import find_touches, push_forward
-from snakesim_hal.backend import SetPoints
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Description
@@ -62,9 +61,8 @@ class ObstacleAided:
         self._set = settings
         self._body = PlanarBody(robot)
         self._progress = Progress(self._body, speed_filter_s=settings.speed_filter_s)
-        self._hand_over = HandOver(robot)
+        self._followed = Followed(robot, settings.blend_s)
         self._stiffness = np.array([joint.stiffness_nm_per_rad for joint in robot.joints])
-        self._reference: Floats | None = None
         self._integral_m = 0.0
         self._push_n = 0.0
         self._bends = self._body.bends
@@ -77,7 +75,8 @@ class ObstacleAided:
         """Angles of the body further along the path, as far as the wanted speed needs it."""
         located = self._progress.update(view)
         if isinstance(located, str):
-            return self._wait(view, located)
+            self._waits = True
+            return self._followed.hold(view, located)
         if located.trajectory.speed_m_s == 0.0:  # whatever path is planned meanwhile
             return self._rest(view)
         ahead_m = self._set.push_scale * self._look_ahead_m(located, view.period_s)
@@ -85,18 +84,14 @@ class ObstacleAided:
         reference = self._body.all_angles(at(located.tail_s_m + ahead_m))
         torques = self._set.push_scale * self._push_nm(located, view.period_s)
         reference = reference + torques / self._stiffness
-        if self._reference is None:
-            self._hand_over.start(view.joints, reference)
-        elif located.anew or self._waits:
-            if np.abs(reference - self._reference).max() > ANOTHER_SHAPE_RAD:
-                self._integral_m = min(self._integral_m, self._set.fresh_look_ahead_m)
-            self._hand_over.shift(reference - self._reference)
-        self._reference, self._waits = reference, False
-        self._hand_over.fade(view.period_s / self._set.blend_s)
+        anew, before = located.anew or self._waits, self._followed.reference_rad
+        if anew and before is not None and np.abs(reference - before).max() > ANOTHER_SHAPE_RAD:
+            self._integral_m = min(self._integral_m, self._set.fresh_look_ahead_m)
+        set_points, self._waits = self._followed.to(view, reference, anew=anew), False
         slope = self._body.all_angles(at(located.tail_s_m + SLOPE_M)) - self._body.all_angles(at(located.tail_s_m))
         force_n = ahead_m * float(self._stiffness @ slope**2) / SLOPE_M**2
         report = Report(path_s_m=located.tail_s_m, reference_rad=reference.tolist(), propulsion_n=force_n)
-        return Action(self._towards(), report)
+        return Action(set_points, report)
 
     def _look_ahead_m(self, located: Located, period_s: float) -> float:
         most = self._set.largest_look_ahead_m
@@ -135,23 +130,13 @@ class ObstacleAided:
 
     def _rest(self, view: View) -> Action:
         """At speed 0 every joint stays where it is, and nothing pushes."""
-        if not self._waits and self._reference is not None:
-            measured = np.array(view.joints.angle_rad)
-            self._hand_over.shift(measured - self._reference)
-            self._reference = measured
         self._integral_m = self._push_n = 0.0
         self._torques_nm[:] = 0.0
-        return self._wait(view, "")
-
-    def _wait(self, view: View, why: str) -> Action:
-        """Without a known body pose every joint keeps its reference."""
+        if self._waits or self._followed.reference_rad is None:
+            action = self._followed.hold(view, "")
+        else:
+            reference = np.array(view.joints.angle_rad)
+            set_points = self._followed.to(view, reference, anew=True)
+            action = Action(set_points, Report(reference_rad=reference.tolist()))
         self._waits = True
-        if self._reference is None:
-            self._reference = np.array(view.joints.angle_rad)
-            self._hand_over.start(view.joints, self._reference)
-        self._hand_over.fade(view.period_s / self._set.blend_s)
-        return Action(self._towards(), Report(why=why, reference_rad=self._reference.tolist()))
-
-    def _towards(self) -> SetPoints:
-        assert self._reference is not None
-        return positions(self._robot, self._hand_over.positions_rad(self._reference).tolist())
+        return action

@@ -6,19 +6,14 @@ The obstacles turn the change of shape into motion. The reference moves with the
 
 from typing import Annotated
 
-import numpy as np
 from msgspec import Meta
-from numpy.typing import NDArray
 
-from snakesim_gnc.control.bumpless import HandOver
-from snakesim_gnc.control.controller import Action, Report, View, positions
+from snakesim_gnc.control.bumpless import Followed
+from snakesim_gnc.control.controller import Action, Report, View
 from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_gnc.control.progress import Progress
-from snakesim_hal.backend import SetPoints
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
-
-Floats = NDArray[np.float64]
 
 
 class PathFollowing:
@@ -32,41 +27,22 @@ class PathFollowing:
         speed_filter_s: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "s"})] = 0.03
 
     def __init__(self, robot: Description, settings: Settings) -> None:
-        self._robot = robot
         self._set = settings
         self._body = PlanarBody(robot)
         self._progress = Progress(self._body, speed_filter_s=settings.speed_filter_s)
-        self._hand_over = HandOver(robot)
-        self._reference: Floats | None = None
+        self._followed = Followed(robot, settings.blend_s)
         self._ahead_s_m = 0.0
 
     def update(self, view: View) -> Action:
         """Angles of the body slightly further along the path."""
         located = self._progress.update(view)
         if isinstance(located, str):
-            return self._wait(view, located)
+            return self._followed.hold(view, located)
         tail_s_m = located.tail_s_m
         if located.anew:
             self._ahead_s_m = tail_s_m
         advanced = self._ahead_s_m + located.trajectory.speed_m_s * view.period_s
         self._ahead_s_m = min(max(advanced, tail_s_m), tail_s_m + self._set.look_ahead_m)
         reference = self._body.all_angles(located.on_path.at(self._ahead_s_m))
-        if self._reference is None:
-            self._hand_over.start(view.joints, reference)
-        elif located.anew:
-            self._hand_over.shift(reference - self._reference)
-        self._reference = reference
-        self._hand_over.fade(view.period_s / self._set.blend_s)
-        return Action(self._towards(), Report(path_s_m=tail_s_m, reference_rad=reference.tolist()))
-
-    def _wait(self, view: View, why: str) -> Action:
-        """Without a known body pose every joint keeps its reference."""
-        if self._reference is None:
-            self._reference = np.array(view.joints.angle_rad)
-            self._hand_over.start(view.joints, self._reference)
-        self._hand_over.fade(view.period_s / self._set.blend_s)
-        return Action(self._towards(), Report(why=why, reference_rad=self._reference.tolist()))
-
-    def _towards(self) -> SetPoints:
-        assert self._reference is not None
-        return positions(self._robot, self._hand_over.positions_rad(self._reference).tolist())
+        set_points = self._followed.to(view, reference, anew=located.anew)
+        return Action(set_points, Report(path_s_m=tail_s_m, reference_rad=reference.tolist()))

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesim_gnc.control.planar import cross
 from snakesim_hal.model.outlines import Outlines
 
 Floats = NDArray[np.float64]
@@ -82,17 +83,17 @@ def push_forward(nodes_w: Floats, touches: Touches, *, loose_m: float) -> Push:
     middles, tangents = rear + 0.5 * run, run / lengths[:, None]
     share = lengths / lengths.sum()
     centre = share @ middles
-    drag = np.array([*(share @ tangents), share @ _cross(middles - centre, tangents)])
+    drag = np.array([*(share @ tangents), share @ cross(middles - centre, tangents)])
     arms = touches.places_w - centre
-    matrix = np.column_stack([touches.directions_w, _cross(arms, touches.directions_w)]).T
+    matrix = np.column_stack([touches.directions_w, cross(arms, touches.directions_w)]).T
     weight = 1.0 + np.maximum(touches.gap_m, 0.0) / loose_m
     lambdas, rest = _least_squares(matrix / weight, drag)
     lambdas = lambdas / weight
     joints = nodes_w[:, 1:-1].T
     ahead = touches.body_s_m[None, :] > np.cumsum(lengths)[:-1, None]
-    lever = _cross(touches.places_w[None] - joints[:, None], touches.directions_w[None])
+    lever = cross(touches.places_w[None] - joints[:, None], touches.directions_w[None])
     later = np.triu(np.ones((len(joints), len(lengths)), dtype=bool), 1)
-    braked = _cross(middles[None] - joints[:, None], tangents[None])
+    braked = cross(middles[None] - joints[:, None], tangents[None])
     torques = -(ahead * lever) @ lambdas + (later * braked) @ share
     return Push(lambdas, torques, bool(rest < BALANCED))
 
@@ -127,7 +128,3 @@ def _least_squares(matrix: Floats, wanted: Floats) -> tuple[Floats, float]:
                 x = np.zeros(count)
                 break
     return x, float(np.linalg.norm(matrix @ x - wanted))
-
-
-def _cross(a: Floats, b: Floats) -> Floats:
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]

@@ -10,8 +10,8 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta
 
-from snakesim_gnc.control.bumpless import HandOver
-from snakesim_gnc.control.controller import Action, Report, View, positions
+from snakesim_gnc.control.bumpless import Followed
+from snakesim_gnc.control.controller import Action, Report, View
 from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
@@ -33,9 +33,8 @@ class LateralUndulation:
 
     def __init__(self, robot: Description, settings: Settings) -> None:
         self._robot, self._set, self._body = robot, settings, PlanarBody(robot)
-        self._hand_over = HandOver(robot)
+        self._followed = Followed(robot, settings.blend_s)
         self._phase_rad = 0.0
-        self._begun = False
 
     def update(self, view: View) -> Action:
         """The wave goes on while there is a path to go along."""
@@ -46,12 +45,7 @@ class LateralUndulation:
         reference = np.zeros(len(self._robot.joints))
         swing = self._set.amplitude_rad * np.sin(self._phase_rad - self._set.lag_rad * turns)
         reference[self._body.bends] = swing + self._bend_rad(view)
-        if not self._begun:
-            self._hand_over.start(view.joints, reference)
-            self._begun = True
-        self._hand_over.fade(view.period_s / self._set.blend_s)
-        targets = self._hand_over.positions_rad(reference).tolist()
-        return Action(positions(self._robot, targets), Report(reference_rad=reference.tolist()))
+        return Action(self._followed.to(view, reference), Report(reference_rad=reference.tolist()))
 
     def _bend_rad(self, view: View) -> float:
         """Bend of every joint that turns the body towards the path ahead."""

@@ -94,11 +94,6 @@ class BodyHistory:
             x, y = around_w[0] + c * dx - s * dy + by[0], around_w[1] + s * dx + c * dy + by[1]
             self._kept[i] = Base(np.array([x, y, base.planar_w[2] + by[2]]), base.z_m, base.tilt), angles
 
-    def clear(self) -> None:
-        """Robot time has started over."""
-        self._stamps.clear()
-        self._kept.clear()
-
     def _at(self, stamp_ns: int) -> tuple[Base, Floats] | None:
         if not self._stamps or not self._stamps[0] <= stamp_ns <= self._stamps[-1] + AHEAD_NS:
             return None

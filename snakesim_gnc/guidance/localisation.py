@@ -114,13 +114,6 @@ class Localiser:
         self.base = Base(np.array([*moved, wrapped(now[2] + by[2])]), self.base.z_m, self.base.tilt)
         self.history.move(around, by)
 
-    def start_over(self) -> None:
-        """Robot time has started over, and the robot lies at its start again."""
-        self.history.clear()
-        self._odometry.start_over()
-        self.base, self.covariance = self._start, np.diag(START_SD**2)
-        self.pose_stamp_ns = self._refused_since_ns = self._up_b = None
-
     def _plausible(self, error: Floats) -> bool:
         error = np.array([error[0], error[1], wrapped(error[2])])
         spread = self.covariance + np.diag(self._measured + np.square([0.005, 0.005, 0.01]))

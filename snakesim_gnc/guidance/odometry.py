@@ -82,10 +82,6 @@ class Odometry:
             covariance[2, :] = covariance[:, 2] = [0.0, 0.0, turn_sd**2]
         return Step(by, covariance)
 
-    def start_over(self) -> None:
-        """The body may be anywhere now."""
-        self._before = None
-
     def _sliding(self, were: Floats, origins: Floats, rotations: Floats) -> tuple[Floats, ...]:
         """No link's middle moves sideways: rows (n, 3), values (n,), and shares of a speed's sd (n,)."""
         middles = origins + self._half_m[:, None] * rotations[:, :, 0]

@@ -147,13 +147,6 @@ class PerceivedWorld:
             depth_stamp_ns=self.depth_stamp_ns,
         )
 
-    def start_over(self) -> None:
-        """Robot time has started over: nothing that was known holds."""
-        self.localiser.start_over()
-        self.map = ObstacleMap()
-        self._joints = self._contacts = self._body = self.depth_stamp_ns = None
-        self._touched_ns = 0
-
     def _body_of(self, stamp_ns: int, what: str) -> Body | None:
         """The body at a sample's stamp; None when it is unknown, which is counted."""
         if self._joints is None or not all(self._joints.valid):

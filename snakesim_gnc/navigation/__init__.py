@@ -3,5 +3,6 @@
 `core`, `intents`           along a given route; speed and direction, and whose wish they are
 `clutter`                   along a path of its own, planned again and again: `beam` searches, `margin` says whether a
                             body can push itself there, `snap` pulls the path to what it pushes off; `obstacle_map`
+                            and `line` are their geometry
 `service`                   the process
 """

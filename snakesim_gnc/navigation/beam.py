@@ -13,7 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_gnc.navigation.margin import margins_n, wrenches
+from snakesim_gnc.control.planar import wrenches
+from snakesim_gnc.navigation.line import back_from_end
+from snakesim_gnc.navigation.margin import margins_n
 from snakesim_gnc.navigation.obstacle_map import NONE, ObstacleMap
 
 Floats = NDArray[np.float64]
@@ -119,7 +121,7 @@ class Beam:
         failed_w: (k, 2) points of paths on which the body got stuck here; other ways round are preferred.
         """
         self._aim(body_w[-1], goal_rad)
-        self._corridor, self._reach_m, self._failed = _evenly(body_w, self._arcs), reach_m, failed_w
+        self._corridor, self._reach_m, self._failed = back_from_end(body_w, STEP_M, self._arcs), reach_m, failed_w
         return self._grow(self._at_tail(), self._arcs + steps)
 
     def _aim(self, origin: Floats, goal_rad: float) -> None:
@@ -140,7 +142,7 @@ class Beam:
 
     def _lying(self, body_w: Floats) -> Layer:
         """The node of the body as it lies, with what it touches."""
-        at = _evenly(body_w, self._arcs)
+        at = back_from_end(body_w, STEP_M, self._arcs)
         chords = np.diff(at, axis=0)
         tangents = chords / np.maximum(np.hypot(*chords.T), 1e-9)[:, None]
         middles = 0.5 * (at[1:] + at[:-1])
@@ -278,13 +280,6 @@ class Beam:
             [(n.x[r], n.y[r], n.heading[r], n.bend[r], n.margin_n[r]) for n, r in picked]
         ).T
         return Found(np.stack([x, y], axis=-1), heading, bend[1:], margin, cost)
-
-
-def _evenly(body_w: Floats, arcs: int) -> Floats:
-    """Points (arcs + 1, 2) along a body, STEP_M apart, the last at its head."""
-    s = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(body_w, axis=0).T))))
-    ends = s[-1] - STEP_M * np.arange(arcs, -1, -1.0)
-    return np.stack([np.interp(ends, s, body_w[:, k]) for k in (0, 1)], axis=-1)
 
 
 def _one_a_cell(x: Floats, y: Floats, heading: Floats, cost: Floats) -> Ints:

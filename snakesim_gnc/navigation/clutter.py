@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 
 from snakesim_gnc.navigation.beam import STEP_M, Beam, Found, Search
 from snakesim_gnc.navigation.intents import Wish
+from snakesim_gnc.navigation.line import SPACING_M, evenly
 from snakesim_gnc.navigation.obstacle_map import ObstacleMap
-from snakesim_gnc.navigation.snap import SPACING_M, Fit, resample, snap
+from snakesim_gnc.navigation.snap import Fit, snap
+from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.model.route import Route
 from snakesim_hal.model.scenario import HeadingGoal, WaypointGoal
 from snakesim_hal.wire.messages import Obstacle, Trajectory, World
@@ -46,12 +48,10 @@ STANDS_M = 0.01
 
 @dataclass(frozen=True)
 class Planned:
-    """A path, and what was thought of it."""
+    """A path, and its number."""
 
     route: Route
     path_id: int
-    body_m: float  # arc length of the head on it when it was planned
-    found: Found | None
 
 
 class ClutterPlanner:
@@ -88,8 +88,7 @@ class ClutterPlanner:
 
     def update(self, tick: int, world: World, nodes_w: Floats, wish: Wish) -> Trajectory:
         """The trajectory. nodes_w: (n, 2) tail end, joints, head end."""
-        body = resample(nodes_w)
-        obstacles = self._known or ObstacleMap(world.obstacles)
+        body = evenly(nodes_w)
         if wish.heading_w_rad is None:
             goal = self._aim = self._towards(body)
         else:
@@ -99,8 +98,8 @@ class ClutterPlanner:
         resting = self._planned is not None and (self._finished or wish.speed_m_s == 0.0)
         if resting:
             self._recent.clear()  # who is to stand still is not stuck
-        elif why := self._why_again(body, obstacles, world.stamp_ns):
-            self._plan(body, obstacles, goal, why)
+        elif why := self._why_again(body, world):
+            self._plan(body, self._known or ObstacleMap(world.obstacles), goal, why)
         planned = self._planned
         assert planned is not None
         return Trajectory(
@@ -136,9 +135,9 @@ class ClutterPlanner:
         ahead = points[self._next_point] - body[-1]
         return ahead / max(float(np.hypot(*ahead)), 1e-9)
 
-    def _why_again(self, body: Floats, obstacles: ObstacleMap, now_ns: int) -> str:
+    def _why_again(self, body: Floats, world: World) -> str:
         """Why the path is to be planned anew; empty when it is not. Decides about backing out, too."""
-        planned = self._planned
+        planned, now_ns = self._planned, world.stamp_ns
         if planned is None:
             return "start"
         head_s = planned.route.project(body[-1])
@@ -159,13 +158,13 @@ class ClutterPlanner:
         turned_rad = math.remainder(_within_reach(body, self._aim) - self._headed_rad, math.tau)
         if abs(turned_rad) > TURNED_RAD and not self._failed:
             return TURNED
-        if self._known is None and not self._failed and self._seen_anew(body[-1], obstacles):
+        if self._known is None and not self._failed and self._seen_anew(body[-1], world.obstacles):
             return MAP_CHANGED
         return ""
 
-    def _seen_anew(self, head: Floats, obstacles: ObstacleMap) -> bool:
+    def _seen_anew(self, head: Floats, obstacles: Sequence[Obstacle]) -> bool:
         """Whether the map around the head is another than when it was planned."""
-        outlines = obstacles.outlines
+        outlines = Outlines.of(obstacles)
         near = np.hypot(*(outlines.centre_w - head).T) < SEEN_M
         shapes = np.column_stack([outlines.centre_w, outlines.half_m, outlines.rounding_m])[near]
         before, self._seen = self._seen, shapes
@@ -198,10 +197,10 @@ class ClutterPlanner:
             found, kept, points = self._onward(beam, body, goal_rad)
         elif self._planned is None:
             found, kept = beam.ahead(body, goal_rad, round(HORIZON_M / STEP_M)), len(body) - 3
-            points = body if found is None else np.concatenate([body, resample(found.points_w)[1:]])
+            points = body if found is None else np.concatenate([body, evenly(found.points_w)[1:]])
         else:
             found, kept = self._anew(beam, body, goal_rad), 0
-            points = body if found is None else resample(found.points_w)
+            points = body if found is None else evenly(found.points_w)
         if found is not None:
             fit = self._fit if kept else replace(self._fit, push_gap_m=ANEW_GAP_M)
             points = snap(points, kept, obstacles, goal, fit)
@@ -214,7 +213,7 @@ class ClutterPlanner:
         behind = [place for place in self._trail if np.hypot(*(place - points[0])) > 0.04][-TRAIL:]
         if behind:
             points = np.concatenate([np.array(behind), points])
-        self._planned = Planned(Route(points), self._path_id, SPACING_M * len(body), found)
+        self._planned = Planned(Route(points), self._path_id)
 
     def _onward(self, beam: Beam, body: Floats, goal_rad: float) -> tuple[Found | None, int, Floats]:
         """The present path as far as the body lies on it and a little further, then another one."""
@@ -224,9 +223,9 @@ class ClutterPlanner:
         head_s = route.project(body[-1], tail_s + self._search.body_length_m)
         lies = body  # where a path that crosses itself does not tell the order of tail and head
         if head_s - tail_s > 0.5 * self._search.body_length_m:
-            lies = resample(route.position_w(np.arange(tail_s, head_s + COMMITTED_M, SPACING_M)))
+            lies = evenly(route.position_w(np.arange(tail_s, head_s + COMMITTED_M, SPACING_M)))
         found = beam.ahead(lies, goal_rad, round(AGAIN_M / STEP_M))
-        points = lies if found is None else np.concatenate([lies, resample(found.points_w)[1:]])
+        points = lies if found is None else np.concatenate([lies, evenly(found.points_w)[1:]])
         return found, len(lies) - 3, points
 
     def _anew(self, beam: Beam, body: Floats, goal_rad: float) -> Found | None:

@@ -27,12 +27,6 @@ def _threes(count: int) -> tuple[NDArray[np.intp], ...]:
     return indices[:, 0], indices[:, 1], indices[:, 2]
 
 
-def wrenches(points_w: Floats, directions_w: Floats) -> Floats:
-    """Unit forces (..., 2) at points (..., 2) as (force x, force y, moment about the origin), (..., 3)."""
-    moment = points_w[..., 0] * directions_w[..., 1] - points_w[..., 1] * directions_w[..., 0]
-    return np.concatenate([directions_w, moment[..., None]], axis=-1)
-
-
 def margins_n(contacts: Floats, drag: Floats, largest_n: float = LARGEST_N) -> Floats:
     """F* of n bodies, (n,); zero where no three contacts can push.
 

@@ -5,11 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesim_gnc.navigation.line import SPACING_M, evenly
 from snakesim_gnc.navigation.obstacle_map import NONE, ObstacleMap
 
 Floats = NDArray[np.float64]
-
-SPACING_M = 0.01
 
 
 @dataclass(frozen=True)
@@ -27,14 +26,6 @@ class Fit:
     rounds: int = 4
 
 
-def resample(points_w: Floats, spacing_m: float = SPACING_M) -> Floats:
-    """Points (n, 2) along a line, evenly spaced; the first and the last stay."""
-    steps = np.diff(points_w, axis=0)
-    s = np.concatenate(([0.0], np.cumsum(np.hypot(*steps.T))))
-    at = np.linspace(0.0, s[-1], max(round(s[-1] / spacing_m), 2) + 1)
-    return np.stack([np.interp(at, s, points_w[:, k]) for k in (0, 1)], axis=-1)
-
-
 def snap(points_w: Floats, kept: int, obstacles: ObstacleMap, goal: Floats, fit: Fit) -> Floats:
     """The path (n, 2), evenly spaced, moved sideways; its first `kept` points stay where they are.
 
@@ -48,7 +39,7 @@ def snap(points_w: Floats, kept: int, obstacles: ObstacleMap, goal: Floats, fit:
         shift, weight = _wanted(path, tangent, left, obstacles, goal, fit)
         weight[:kept], shift[:kept] = 1e4, 0.0
         path = path + _solve(path, left, shift, weight, fit)[:, None] * left
-        path = np.concatenate([path[:kept], resample(path[max(kept - 1, 0) :])[1 if kept else 0 :]])
+        path = np.concatenate([path[:kept], evenly(path[max(kept - 1, 0) :])[1 if kept else 0 :]])
     return path
 
 

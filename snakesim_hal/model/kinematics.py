@@ -96,11 +96,6 @@ def _yaw_only_frames(
     return origins, rotations
 
 
-def joint_positions_s_m(link_lengths_m: Sequence[float]) -> Floats:
-    """Arc length of every joint along the body from the tail end, (n_joints,)."""
-    return np.cumsum(np.asarray(link_lengths_m, dtype=np.float64))[:-1]
-
-
 def tangents(normal: Vector) -> tuple[Vector, Vector]:
     """Two unit tangents of a contact: the one closest to the link's x axis, and the cross product of normal and it."""
     x, y, z = normal

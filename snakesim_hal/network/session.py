@@ -25,7 +25,7 @@ from snakesim_hal.network.session_file import SessionFile, of_mode, read_zenoh_f
 from snakesim_hal.process import raise_open_files
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import IMAGES, MAX_PAYLOAD_BYTES, Decoder, MessageT, encode, encoding_of
-from snakesim_hal.wire.messages import Answer, Message
+from snakesim_hal.wire.messages import Answer, Message, Preview
 
 DEFAULT_PORT = 7447
 DEFAULT_ENDPOINT = f"tcp/127.0.0.1:{DEFAULT_PORT}"
@@ -160,11 +160,15 @@ class Session:
         # The last message of a tick is sent at once, batched with those put just before it: one packet instead of five.
         ends_a_tick = command or key == keys.CLOCK or key.startswith(keys.done(""))
         priority = zenoh.Priority.REAL_TIME if command else zenoh.Priority.DATA_HIGH
+        if message in IMAGES:
+            priority = zenoh.Priority.DATA_LOW
+        elif message is Preview:
+            priority = zenoh.Priority.BACKGROUND
         publisher = self._zenoh.declare_publisher(
             key,
             encoding=encoding_of(message),
             congestion_control=zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP,
-            priority=zenoh.Priority.DATA_LOW if message in IMAGES else priority,
+            priority=priority,
             express=ends_a_tick,
         )
         return self._published(key, publisher, message)

@@ -24,6 +24,7 @@ Reach = Literal["robot", "joint", "none"]
 Axis = Literal["yaw", "pitch"]
 
 A_JOINT = "one entry a joint"
+MAX_CONFIG = 500_000  # characters
 PACE = about("realtime: by the wall clock; lockstep: each tick waits for all services; free: without waiting")
 LIFECYCLE = about("motors follow commands only in armed; fault and estop stay until a clear")
 HOST = about("random id of the host process, new at each start; null: unknown")
@@ -200,6 +201,21 @@ class Ranges(Message, frozen=True, kw_only=True):
     ]
 
 
+class Preview(Message, frozen=True, kw_only=True):
+    """`preview/depth/<camera>` or `preview/colour/<camera>`: a small, compressed copy of an image."""
+
+    tick: q.Tick
+    stamp_ns: Annotated[q.Stamp, about("of the image that it was made from")]
+    width: Annotated[int, Meta(ge=1, le=q.MAX_IMAGE_WIDTH), about("pixels in a row of this copy")]
+    height: Annotated[int, Meta(ge=1, le=q.MAX_IMAGE_HEIGHT), about("rows of this copy")]
+    format: Annotated[Literal["jpeg", "png"], about("of `data`: jpeg in colour, png of 16 bits for depth")]
+    scale_m: Annotated[
+        Annotated[float, Meta(gt=0, le=1)] | None,
+        about("metres of one count of depth, which is 0 for nothing within range; null: it is in colour"),
+    ] = None
+    data: Annotated[bytes, Meta(max_length=q.MAX_PREVIEW_BYTES), about("the file")]
+
+
 # --- actuators -------------------------------------------------------------------------------------------------
 
 
@@ -341,6 +357,13 @@ class Description(Message, frozen=True, kw_only=True):
     sensors: Annotated[list[SensorDescription], Meta(max_length=32)]
 
 
+class Configuration(Message, frozen=True, kw_only=True):
+    """`hal/config`, latched: the effective configuration of the run, which explains a recording."""
+
+    config_hash: Annotated[q.Name, about("as in the description")]
+    content: Annotated[str, Meta(max_length=MAX_CONFIG), about("JSON, as `schemas/files/run.json` describes it")]
+
+
 class Fault(Message, frozen=True, kw_only=True):
     """One fault, and its location."""
 
@@ -457,6 +480,27 @@ class Done(Message, frozen=True, kw_only=True):
     """`hal/done/<service>`: a lockstep participant has published all its output for a tick."""
 
     tick: q.Tick
+
+
+class Process(Message, frozen=True, kw_only=True):
+    """`process/<name>-<id>`, latched: one process of the robot's network; valid while a token at the same key lives."""
+
+    name: Annotated[q.Name, about("its role: host, a service of the scenario, recorder, ...")]
+    machine: Annotated[q.Name, about("host name of its computer")]
+    user: Annotated[q.Name, about("who has started it")]
+    pid: Annotated[q.Count, about("its process id there")]
+    version: Annotated[q.Name, about("of SnakeSIM, or of the program that writes this")]
+    started_unix_s: Annotated[q.Count, about("when it started, by the wall clock of its machine")]
+    settings: Annotated[
+        dict[q.Name, q.Name],
+        Meta(max_length=32),
+        about("settings that host and services must share: values, and hashes of sections; empty: it uses none"),
+    ] = {}
+    messages: Annotated[
+        dict[q.Name, Annotated[q.Count, about("version of that message")]],
+        Meta(max_length=64),
+        about("messages that it knows; empty: unknown"),
+    ] = {}
 
 
 # --- guidance, navigation, control -----------------------------------------------------------------------------
@@ -613,10 +657,12 @@ VERSIONS: dict[type[Message], int] = dict.fromkeys(
         DepthImage,
         ColourImage,
         Ranges,
+        Preview,
         JointCommand,
         AppliedCommand,
         Clock,
         Description,
+        Configuration,
         Status,
         LeaseRequest,
         LifecycleRequest,
@@ -624,6 +670,7 @@ VERSIONS: dict[type[Message], int] = dict.fromkeys(
         FaultRequest,
         Answer,
         Done,
+        Process,
         World,
         Trajectory,
         ControlState,

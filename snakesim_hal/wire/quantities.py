@@ -15,6 +15,7 @@ MAX_IMAGE_WIDTH, MAX_IMAGE_HEIGHT = 1280, 960
 MAX_PIXELS = MAX_IMAGE_WIDTH * MAX_IMAGE_HEIGHT
 MAX_BEAMS = 4096
 MAX_SETTINGS, MAX_SCHEMA = 8192, 65536  # characters
+MAX_PREVIEW_BYTES = 128 * 1024
 MAX_TARGET = 1e5  # of a set-point or a torque limit, in the unit of its mode
 
 

@@ -37,6 +37,7 @@ _PERSONS = (Role.OPERATOR, Role.ADMINISTRATOR)
 # By the writer that the key space names. A writer that is missing here may write nothing, and a test fails.
 _WRITERS: dict[str, tuple[Role, ...]] = {
     "HAL": (Role.ROBOT,),
+    "preview": (Role.ROBOT,),
     "lease holder": (Role.GNC,),
     "guidance": (Role.GNC,),
     "navigation": (Role.GNC,),

@@ -5,8 +5,9 @@ from pathlib import Path
 
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.textfiles import read_text, write_text
-from snakesim_operator.lab.identities import Identity, identities
+from snakesim_operator.lab.identities import identities
 from snakesim_operator.lab.lab_file import Lab
+from snakesim_operator.lab.units import unit_files
 from snakesim_operator.lab.zenoh_files import as_json5, router_settings, session_settings
 
 WRITTEN = "rendered.txt"  # names of the files that were written, so that the next time leaves none of an earlier lab
@@ -39,10 +40,12 @@ def _written_before(place: Path) -> list[str]:
 def rendered(lab: Lab) -> Iterator[tuple[tuple[str, str], str]]:
     """Every file as ((machine, path in the machine's folder), text)."""
     for identity in identities(lab):
-        yield (identity.machine, f"{identity.label}.json5"), _zenoh_file(identity, lab)
+        settings = router_settings(identity, lab) if identity.role is None else session_settings(identity, lab)
+        yield (identity.machine, f"{identity.label}.json5"), as_json5(_origin(lab, identity.common_name), settings)
+    for machine in lab.file.machines:
+        for name, text in unit_files(lab, machine, _origin(lab, machine)):
+            yield (machine, name), text
 
 
-def _zenoh_file(identity: Identity, lab: Lab) -> str:
-    about = f"{identity.common_name}, of {lab.file.name}: made from {lab.path.name} by `snakesim deploy render`."
-    settings = router_settings(identity, lab) if identity.role is None else session_settings(identity, lab)
-    return as_json5(about, settings)
+def _origin(lab: Lab, what: str) -> str:
+    return f"{what}, of {lab.file.name}: made from {lab.path.name} by `snakesim deploy render`; change it there."

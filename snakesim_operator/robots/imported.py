@@ -5,6 +5,8 @@ from dataclasses import dataclass, field
 from snakesim_hal.model.files import Table, decode
 from snakesim_hal.model.robot import RobotFile
 
+UPS = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)}
+
 
 @dataclass(frozen=True)
 class Order:

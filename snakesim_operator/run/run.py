@@ -23,6 +23,7 @@ from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.network.session_file import SessionFile
 from snakesim_hal.service import START_LIMIT_S
 from snakesim_hal.terminal import say
+from snakesim_operator.recording.process import RECORDER
 from snakesim_operator.results.record import CONFIG
 from snakesim_operator.run.console_child import check_console, console_beside
 from snakesim_operator.run.ending import Ending, interruptible
@@ -49,6 +50,7 @@ class RunRequest:
     stay: bool = False  # a fault ends nothing: processes are started again, a person clears and arms
     with_router: bool = False  # the run's parts meet at a router of its own
     insecure: bool = False  # listen even where other machines can connect
+    record: bool = True  # every message, in recording.mcap
     console: bool = False  # show it in the browser
 
     @property
@@ -86,7 +88,8 @@ def run(request: RunRequest) -> int:
             _conduct(request, supervisor, link, files, config_file, ending)
         from snakesim_operator.run.conclusion import Outcome, conclude
 
-        outcome = Outcome(supervisor.host_record(), supervisor.robot(), supervisor.restarts, supervisor.hosts)
+        lost = list(supervisor.lost.values())
+        outcome = Outcome(supervisor.host_record(), supervisor.robot(), supervisor.restarts, supervisor.hosts, lost)
         return conclude(request.config, files, ending, outcome, stay=request.stay)
 
 
@@ -150,6 +153,9 @@ def _conduct(
         supervisor.start(HOST, host_arguments)
         for name, service in config.own_services.items():
             supervisor.start(name, ["snakesim_hal.serve", name, *common, *meeting], may_restart=service.restart)
+        if request.record and files.folder is not None:
+            recorder = ["snakesim_operator.recording.process", *common, *meeting, "--out", str(files.folder)]
+            supervisor.start(RECORDER, recorder, vital=False)
         with (
             console_beside([*common, *meeting], files, say) if request.console else contextlib.nullcontext(),
             _joined(link, supervisor, ending) as session,
@@ -158,7 +164,7 @@ def _conduct(
             say(f"network: {link.endpoint}, namespace {link.namespace}")
             if not config.has_own_control:
                 say("whoever takes the lease commands the robot, and arms it")
-            RunMonitor(config, session, supervisor, files, ending, say, stay=request.stay).go()
+            RunMonitor(config, session, supervisor, ending, say, stay=request.stay).go()
     except SnakesimError as error:
         ending.because(str(error))
     finally:

@@ -10,12 +10,13 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 from snakesim_hal.errors import NotConnectedError
+from snakesim_hal.network.process_entries import who
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.network.stop_port import ask_to_stop, stop_address
 from snakesim_hal.terminal import Say, say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, EstopRequest, Status
-from snakesim_operator.tools.command import judge, who
+from snakesim_operator.tools.command import judge
 from snakesim_operator.tools.targets import CONNECT_S, Where, namespace_of, robots_on
 
 LIMIT_S = 5.0

@@ -10,6 +10,7 @@ import msgspec
 import pytest
 
 from snakesim_hal.host_process import HostRecord
+from snakesim_hal.network.session_file import read_session
 from tests.e2e.command import SNAKESIM, Ended, environment, free_endpoint, wait_until
 from tests.whole import command
 
@@ -69,13 +70,21 @@ def lab(tmp_path: Path) -> Iterator[Lab]:
 
 
 def test_programs_in_any_order_move_the_robot_as_one_run_does_and_meet_the_next_host(lab: Lab) -> None:
-    for name in SERVICES:
+    for name in SERVICES[:2]:
         lab.service(name)
+    other_goal = lab.service("control", "--set", "mission.speed_m_s=0.3")
     first = lab.host("never-armed")
     waited = lab.folder / "service-control.log"
     wait_until(lambda: "control: waiting for the network" in waited.read_text(), "control waits")
     lab.start("router", str(lab.router_file))
+    wait_until(lambda: "DIFFERS: `mission` is " in lab.tell("status").out, "the difference")
+    refused = lab.tell("arm", "planar13", "sim").err
+    assert "not armed: " in refused and f"(control, process {other_goal.pid})" in refused, refused
+    other_goal.kill()
+    lab.service("control")
     wait_until(lambda: "next: `snakesim arm planar13 sim --session " in lab.tell("status").out, "ready to arm")
+    said = lab.tell("status").out
+    assert all(f"  process {name}: " in said for name in ("host", *SERVICES)) and "DIFFERS" not in said, said
     first.send_signal(signal.SIGKILL)  # at tick 0, where the next host begins as well
     first.wait()
     second = lab.host("second")
@@ -86,8 +95,12 @@ def test_programs_in_any_order_move_the_robot_as_one_run_does_and_meet_the_next_
     assert record.command_digest == alone.command_digest
 
 
-def test_an_operator_reaches_no_robot_by_the_wrong_file(lab: Lab) -> None:
-    ended = lab.tell("arm", "planar13", "sim")
-    assert ended.code == 1 and "no robot on tcp/127.0.0.1" in ended.err
+def test_an_operator_names_the_network_once_by_flag_or_environment(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    (endpoint,) = read_session(lab.session).endpoints
+    monkeypatch.setenv("SNAKESIM_SESSION", str(lab.session))
+    for ended in (lab.tell("disarm"), command.snakesim("disarm", cwd=lab.folder)):
+        assert ended.code == 1 and f"no robot on {endpoint}" in ended.err
+    elsewhere = command.snakesim("disarm", "--endpoint", free_endpoint(), cwd=lab.folder)
+    assert elsewhere.code == 1 and endpoint not in elsewhere.err
     ended = lab.tell("estop", "--router", "tcp/127.0.0.1:7447")
     assert ended.code == 2 and "--router and --session" in ended.err, ended.err

@@ -4,6 +4,7 @@ The ROS side is plain Zenoh with rmw_zenoh's keys, and rosbags for the messages;
 """
 
 import json
+import os
 import signal
 import subprocess
 import time
@@ -17,9 +18,9 @@ import zenoh
 from rosbags.typesys import Stores, get_typestore
 from zenoh import ext, handlers  # pyright: ignore[reportMissingModuleSource]
 
-from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.network.session import Link, Reader, open_session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Intent, Trajectory
+from snakesim_hal.wire.messages import Clock, Intent, Trajectory
 from tests.e2e.command import SNAKESIM, environment, free_endpoint, running, snakesim, wait_until
 
 pytestmark = pytest.mark.e2e
@@ -91,7 +92,7 @@ class RosSide:
 def test_a_robot_among_ros_nodes(tmp_path: Path) -> None:
     at = free_endpoint()
     (tmp_path / "ros.json5").write_text(ROUTER % at)
-    with running(tmp_path / "run", *RUN) as run, command(tmp_path, "router", "ros.json5"):
+    with running(tmp_path / "run", *RUN) as run, command(tmp_path, "router", "ros.json5") as router:
         run.wait_for(" s  ")
         refused = snakesim("ros2", "--endpoint", run.endpoint, "--ros-router", run.endpoint, cwd=tmp_path)
         assert refused.code == 2 and "itself is on this endpoint" in refused.err
@@ -99,6 +100,9 @@ def test_a_robot_among_ros_nodes(tmp_path: Path) -> None:
         with session_at(at) as session, command(tmp_path, *bridge):
             _sees(RosSide(session))
             _steers(RosSide(session), run.endpoint)
+            _outlasts_a_frozen_router(RosSide(session), router.pid, run.endpoint)
+            with session_at(at) as anew:
+                RosSide(anew).first("joint_states", "sensor_msgs/msg/JointState")
         with session_at(at) as session:
             wait_until(lambda: not RosSide(session).tokens(), "the node gone from the ROS graph", 10.0)
 
@@ -153,3 +157,26 @@ def _steers(ros: RosSide, endpoint: str) -> None:
             "standing still without /cmd_vel",
             30.0,
         )
+
+
+def _outlasts_a_frozen_router(ros: RosSide, router: int, endpoint: str) -> None:
+    """While nothing gets through to ROS the robot goes on, and afterwards so does the bridge."""
+    images = ros.session.declare_subscriber(
+        ros.key("head/depth/image_raw", "sensor_msgs/msg/Image"), handlers.RingChannel(1)
+    )
+    with open_session(Link(endpoint, "planar13_camera")) as robot:
+        clocks = robot.reader(keys.CLOCK, Clock)
+        os.kill(router, signal.SIGSTOP)
+        try:
+            (first, *_) = _within(3.0, clocks)
+            assert first.lifecycle == "armed"
+            (*_, last) = _within(1.0, clocks)
+            assert last.tick > first.tick and last.lifecycle == "armed"
+        finally:
+            os.kill(router, signal.SIGCONT)
+    images.undeclare()
+
+
+def _within(seconds: float, clocks: Reader[Clock]) -> list[Clock]:
+    time.sleep(seconds)
+    return clocks.drain()

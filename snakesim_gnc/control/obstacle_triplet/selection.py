@@ -19,8 +19,8 @@ from snakesim_gnc.control.obstacle_triplet.statics import (
     no_authority,
     torque_per_newton,
     unit_forces,
-    wrenches,
 )
+from snakesim_gnc.control.planar import wrenches
 
 Floats = NDArray[np.float64]
 Names = tuple[str, str, str]

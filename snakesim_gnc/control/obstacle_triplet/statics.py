@@ -18,6 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from snakesim_gnc.control.planar import cross, wrenches
+
 Floats = NDArray[np.float64]
 Planar = tuple[float, float] | Floats
 
@@ -95,12 +97,12 @@ def unit_forces(
     if span <= 0.0:
         return UnitForces(unknown, math.inf, "o_1 and o_3 are the same point")
     arms = (points_w - centre) / span
-    balance = np.vstack([normals_w.T, _cross(arms, normals_w)])
+    balance = np.vstack([normals_w.T, cross(arms, normals_w)])
     condition = float(np.linalg.cond(balance))
     if not condition <= condition_max:
         why = f"ill-conditioned: the three normals (nearly) meet in a point or are parallel (condition {condition:.3g})"
         return UnitForces(unknown, condition, why)
-    pull = np.append(tangent_1_w, _cross(arms[0], tangent_1_w))
+    pull = np.append(tangent_1_w, cross(arms[0], tangent_1_w))
     forces = np.asarray(np.linalg.solve(balance, pull), dtype=np.float64)
     pulling = [f"lambda_{i + 1} = {force:.3g} N/N" for i, force in enumerate(forces.tolist()) if force <= 0.0]
     reason = f"a contact would have to pull: {', '.join(pulling)}" if pulling else ""
@@ -132,15 +134,8 @@ def bending_torque_nm(
     left turn positive: the negative sum of the moments about the joint of all forces ahead of it. With forces in
     balance that is the sum of the moments of all forces behind it.
     """
-    return torque_under(
-        np.asarray(joints_w), np.asarray(joints_s_m), np.asarray(points_s_m), wrenches(points_w, forces_w)
-    )
-
-
-def wrenches(points_w: ArrayLike, forces_w: ArrayLike) -> Floats:
-    """Force and moment about the world's origin of each push, (k, 3): N, N, N·m."""
-    points, forces = np.asarray(points_w, dtype=np.float64), np.asarray(forces_w, dtype=np.float64)
-    return np.column_stack([forces, _cross(points, forces)])
+    pushes = wrenches(np.asarray(points_w), np.asarray(forces_w))
+    return torque_under(np.asarray(joints_w), np.asarray(joints_s_m), np.asarray(points_s_m), pushes)
 
 
 def torque_under(joints_w: Floats, joints_s_m: Floats, points_s_m: Floats, wrenches: Floats) -> Floats:
@@ -164,7 +159,3 @@ def _planar(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Floats:
     if not np.isfinite(array).all():
         raise ValueError(f"{name} must be finite: {array.tolist()}")
     return array
-
-
-def _cross(a: Floats, b: Floats) -> Floats:
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]

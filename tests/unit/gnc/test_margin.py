@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from snakesim_gnc.control.planar import wrenches
 from snakesim_gnc.control.push import find_touches, push_forward
-from snakesim_gnc.navigation.margin import LARGEST_N, margins_n, wrenches
+from snakesim_gnc.navigation.margin import LARGEST_N, margins_n
 from snakesim_hal.model.outlines import Outlines
 from tests.unit.gnc.stage import BODY_RADIUS_M, make_pegs, make_route, make_stage, nodes_of
 

@@ -123,18 +123,6 @@ def test_a_lidar_maps_as_a_camera_does():
     assert len(total.position_m) == 2 and max(total.position_m) < 0.005 and not total.ghosts
 
 
-def test_it_starts_over_with_an_empty_map():
-    drive = Drive(random_field(1))
-    for _ in drive.turns(60):
-        pass
-    assert told(drive).obstacles
-    drive.world.start_over()
-    assert drive.world.world(0, 0) is None
-    for _ in Drive.turns(drive, 1, images=False):
-        pass
-    assert told(drive).obstacles == []
-
-
 def test_before_the_first_joint_state_there_is_no_world():
     drive = Drive([])
     world = PerceivedWorld(drive.robot, drive.world.localiser.base, PoseNoise())

@@ -9,7 +9,7 @@ import zenoh
 from snakesim_hal.errors import ConfigError, NotConnectedError
 from snakesim_hal.network.session import Link, open_router, open_session
 from snakesim_hal.network.session_file import read_session
-from tests.e2e.command import free_endpoint
+from tests.e2e.command import free_endpoint, wait_until
 
 QUIET = "scouting: {multicast: {enabled: false}, gossip: {enabled: false}}"
 
@@ -31,8 +31,12 @@ def test_sessions_of_one_file_meet_at_its_router_and_stock_zenoh_reads_the_same_
         pass
     with open_router(router), open_session(link) as ours, zenoh.open(zenoh.Config.from_file(path)) as stock:
         ours.declare_alive("control")
-        tokens = [str(reply.ok.key_expr) for reply in stock.liveliness().get("**") if reply.ok is not None]
-        assert tokens == ["worm/alive/control"]
+        wait_until(lambda: tokens(stock) == ["worm/alive/control"], "the token of the one with the other", 20.0)
+
+
+def tokens(session: zenoh.Session) -> list[str]:
+    """The liveliness tokens that a session sees."""
+    return [str(reply.ok.key_expr) for reply in session.liveliness().get("**") if reply.ok is not None]
 
 
 @pytest.mark.parametrize(

@@ -41,12 +41,6 @@ def test_every_message_has_its_place_in_the_key_space_and_the_other_way_round() 
 
 
 @each_message
-def test_versions_are_whole_and_names_are_fit_for_an_encoding(message: type[Message]) -> None:
-    assert VERSIONS[message] >= 1
-    assert re.fullmatch("[A-Za-z]+", message.__name__)
-
-
-@each_message
 def test_messages_are_frozen_keyword_only_and_documented(message: type[Message]) -> None:
     value = msgspec.convert(plain_example(message), message)
     field = value.__struct_fields__[0]
