@@ -42,7 +42,7 @@ _WRITERS: dict[str, tuple[Role, ...]] = {
     "guidance": (Role.GNC,),
     "navigation": (Role.GNC,),
     "control": (Role.GNC,),
-    "each service": (Role.ROBOT, Role.GNC),
+    "each service": (Role.ROBOT, Role.GNC, Role.RECORDER),
     "each process": (Role.ROBOT, Role.GNC, Role.RECORDER),
     "operator": _PERSONS,
 }
