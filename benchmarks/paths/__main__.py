@@ -161,7 +161,7 @@ def slow_link(lab: Lab, seconds: float, repeats: int, folder: Path) -> list[str]
     """The loop over a slow link while somebody behind it watches the camera, against quiet: lines of a table."""
     lab.robot.run(*f"tc qdisc add dev robot root tbf rate {RATE_MBIT:g}mbit burst 16kb latency 50ms".split())
     rows: list[str] = []
-    for way in (lab.one_router(), lab.one_router(PIECE_BYTES), lab.little_under_way(lab.one_router(PIECE_BYTES))):
+    for way in (lab.one_router(), lab.one_router(PIECE_BYTES)):
         pairs: list[tuple[Percentiles, Percentiles]] = []
         stopped: list[str] = []
         shares: list[float] = []

@@ -69,13 +69,6 @@ class Lab:
             way.robot_file, way.host = path, ["--session", str(path)]
         return way
 
-    def little_under_way(self, way: Way) -> Way:
-        """The same, to a router that takes little at once from each connection."""
-        path = self._file("short", "router", listen=["tcp/0.0.0.0:7447#so_rcvbuf=4096"])
-        way.name += ", `so_rcvbuf` of the router 4096"
-        way.routers = [(self.first, path)]
-        return way
-
     def _direct(self) -> Way:
         endpoint = "tcp/10.78.5.1:7447"
         own = self._file("direct-robot", "router", listen=[endpoint])
