@@ -13,6 +13,7 @@ from snakesim_operator.run.in_process import simulate
 from tests.whole.command import snakesim
 
 DURATION_S = 0.4
+PLANNED = ("clutter", "surveyed_clutter")  # their planner takes seconds to begin; mamba_hills has all of the rest
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +23,9 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-@pytest.mark.parametrize("scenario", shipped("scenarios"))
+@pytest.mark.parametrize(
+    "scenario", [pytest.param(name, marks=pytest.mark.slow if name in PLANNED else ()) for name in shipped("scenarios")]
+)
 def test_every_shipped_scenario_replays_to_the_bit(tmp_path: Path, scenario: str) -> None:
     run = ["run", scenario, "--in-process", "--duration", str(DURATION_S), "--pace", "lockstep", "--out", "run"]
     ended = snakesim(*run, cwd=tmp_path)
