@@ -24,6 +24,8 @@ Ints = NDArray[np.intp]
 STEP_M = 0.05
 CONTACTS = 8  # of a body that are remembered, the newest
 CELL_M, CELL_RAD = 0.02, np.pi / 18
+WIDE_CELL_M, WIDE_CELL_RAD = 0.1, 0.6
+LEAST_PUSH = -0.1  # n.g of a touch that counts for the margin: `snap` takes the body away from those that brake more
 FAILED_M = 0.025  # a path this far from one that failed is another path
 ALONG = 0.35  # |n.t| of a touch: beyond, it is the head that bumps
 
@@ -36,13 +38,14 @@ class Search:
     radius_m: float
     segment_m: float  # length of a link: straight links cut the corners of the path by segment^2 |curvature| / 8
     clearance_m: float = 0.004
-    skin_m: float = 0.015  # nearer than this to an obstacle counts as a touch: `snap` will close the gap
-    width: int = 300
+    skin_m: float = 0.02  # nearer than this to an obstacle counts as a touch: `snap` will close the gap
+    width: int = 900
+    crowd: int = 16  # nodes that may stay in one wide cell: so other ways round stay in the search
     curvatures_per_m: tuple[float, ...] = (-5.5, -3.7, -1.8, 0.0, 1.8, 3.7, 5.5)
     wanted_n: float = 40.0  # F_wanted
-    reward: float = 1.2
+    reward: float = 2.4
     harm: float = 1.0
-    weak: float = 1.5
+    weak: float = 6.0
     bend_m: float = 0.02
     progress: float = 1.2
     grip: float = 4.0  # reward of a touch while the whole body is laid anew
@@ -185,7 +188,9 @@ class Beam:
         near = self._map.near(points_w[:, 0], points_w[:, 1])
         gap = near.distance_m - self._set.radius_m
         along = np.abs(np.einsum("ij,ij->i", near.normal_w, tangents))
-        touches = (near.obstacle != NONE) & (gap < self._set.skin_m) & (along < ALONG)
+        beside = (near.obstacle != NONE) & (gap < self._set.skin_m) & (along < ALONG)
+        towards = near.normal_w @ self._goal
+        touches = beside & (towards > LEAST_PUSH)
         places = points_w - near.normal_w * self._set.radius_m - self._origin
         direction = near.normal_w - self._set.peg_friction * tangents
         push = wrenches(places, direction)
@@ -200,7 +205,7 @@ class Beam:
                 slots[touches, -1] = fresh_rows[touches]
             else:
                 slots[new | better, -1] = fresh_rows[new | better]
-        return np.where(touches, near.normal_w @ self._goal, 0.0)
+        return np.where(beside, towards, 0.0)
 
     def _margins(self, nodes: Layer) -> Floats:
         tail_s = nodes.s_m - self._set.body_length_m + self._set.loose_tail_m
@@ -258,7 +263,9 @@ class Beam:
             weak = np.clip(1.0 - nodes.margin_n / config.wanted_n, 0.0, 1.0)
             now = lies is not None and nodes.s_m < config.body_length_m + config.now_m
             nodes.cost += STEP_M * (config.weak_now if now else config.weak) * weak
-        return nodes.take(np.argsort(nodes.cost, kind="stable")[: config.width])
+        order = np.argsort(nodes.cost, kind="stable")
+        places = _cells(nodes.x[order], nodes.y[order], nodes.heading[order], WIDE_CELL_M, WIDE_CELL_RAD)
+        return nodes.take(order[_rank(places) < config.crowd][: config.width])
 
     def _fits(self, x: Floats, y: Floats, heading: Floats) -> NDArray[np.bool_]:
         """Whether the body clears everything; x, y, heading: (n, curvatures)."""
@@ -284,10 +291,25 @@ class Beam:
 
 def _one_a_cell(x: Floats, y: Floats, heading: Floats, cost: Floats) -> Ints:
     """The cheapest of those in the same cell of place and heading."""
-    a = np.floor(x / CELL_M).astype(np.int64)
-    b = np.floor(y / CELL_M).astype(np.int64)
-    c = np.floor(heading / CELL_RAD).astype(np.int64)
-    key = (a * 100_003 + b) * 1009 + c
+    key = _cells(x, y, heading, CELL_M, CELL_RAD)
     order = np.lexsort((cost, key))
     first = np.concatenate(([True], np.diff(key[order]) != 0))
     return order[first]
+
+
+def _cells(x: Floats, y: Floats, heading: Floats, size_m: float, size_rad: float) -> NDArray[np.int64]:
+    """A number for each cell of place and heading."""
+    a = np.floor(x / size_m).astype(np.int64)
+    b = np.floor(y / size_m).astype(np.int64)
+    c = np.floor(heading / size_rad).astype(np.int64)
+    return (a * 100_003 + b) * 1009 + c
+
+
+def _rank(cells: NDArray[np.int64]) -> Ints:
+    """How many of the same cell come before each, (n,)."""
+    order = np.argsort(cells, kind="stable")
+    first = np.concatenate(([True], np.diff(cells[order]) != 0))
+    starts = np.flatnonzero(first)
+    rank = np.empty(len(order), dtype=np.intp)
+    rank[order] = np.arange(len(order)) - starts[np.cumsum(first) - 1]
+    return rank

@@ -42,7 +42,8 @@ _WRITERS: dict[str, tuple[Role, ...]] = {
     "guidance": (Role.GNC,),
     "navigation": (Role.GNC,),
     "control": (Role.GNC,),
-    "each service": (Role.ROBOT, Role.GNC),
+    "each service": (Role.ROBOT, Role.GNC, Role.RECORDER),
+    "each process": (Role.ROBOT, Role.GNC, Role.RECORDER),
     "operator": _PERSONS,
 }
 _ASKERS: dict[str, tuple[Role, ...]] = {
@@ -56,7 +57,13 @@ _ANSWERERS: dict[str, tuple[Role, ...]] = {
     keys.FAULT_ALL: (Role.ROBOT, Role.GNC),
     keys.SETTINGS: (Role.GNC,),
 }  # the others: the robot alone
+_NAMED = {keys.PROCESS_ALL: "-$*"}  # what follows the name of a service or a process at a key, if anything
+_WITH_TOKEN = (keys.PROCESS_ALL,)  # keys of samples that have a liveliness token, too
+RECORDER = "recorder"  # the name of its process
 INJECTION = (keys.FAULT_ALL,)  # granted only for a robot whose lab file allows it
+
+
+OWN_NAME_ONLY = ("publish", "declare", "answer")  # at `*`, for a gnc and a recorder
 
 
 class Permission(NamedTuple):
@@ -80,8 +87,14 @@ class Line:
         """What a role may do here, in words: publish, read, ask, answer, declare, watch."""
         if self.kind == "query":
             return ("ask",) * (role in self.writers) + ("answer",) * (role in self.answerers)
-        write, read = ("declare", "watch") if self.kind == "liveliness" else ("publish", "read")
-        return (write, read) if role in self.writers else (read,)
+        write = ("publish",) * (self.kind != "liveliness") + ("declare",) * self.has_token
+        read = ("read",) * (self.kind != "liveliness") + ("watch",) * self.has_token
+        return (*write, *read) if role in self.writers else read
+
+    @property
+    def has_token(self) -> bool:
+        """Whether there is a liveliness token at the key."""
+        return self.kind == "liveliness" or self.key in _WITH_TOKEN
 
 
 def _line(row: keys.Row) -> Line:
@@ -128,17 +141,19 @@ MESSAGES_OF_LATCHED: dict[str, tuple[tuple[str, str, str], ...]] = {
 def permissions(role: Role, services: Iterable[str] = (), *, faults: bool = False) -> Iterator[Permission]:
     """Everything that a router lets pass for a role of a robot.
 
-    services: of a `gnc`, the names that it may take in `alive/*`, `hal/done/*` and `fault/*`.
+    services: of a `gnc`, the names that it may take in `alive/*`, `hal/done/*`, `process/*` and `fault/*`.
     faults: whether faults may be injected into the robot.
     """
+    names = {Role.GNC: list(services), Role.RECORDER: [RECORDER]}.get(role)
     # A pattern may be wider than one key: what then is delivered is decided key by key.
     yield Permission("ingress", "declare_subscriber", "**")
     for line in TABLE:
         if line.key in INJECTION and not faults:
             continue
         for act in line.acts(role):
-            named = role is Role.GNC and line.key.endswith("/*") and act in ("publish", "declare", "answer")
-            places = [line.key[:-1] + name for name in services] if named else [line.key]
+            places = [line.key]
+            if names is not None and line.key.endswith("/*") and act in OWN_NAME_ONLY:
+                places = [line.key[:-1] + name + _NAMED.get(line.key, "") for name in names]
             more = MESSAGES_OF_LATCHED.get(act, ()) if line.kind == "latched" else ()
             for flow, message, after in (*MESSAGES[act], *more):
                 for place in places:

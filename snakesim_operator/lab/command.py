@@ -33,6 +33,14 @@ def add_commands(commands: Any) -> None:
     certs.add_argument("--rotate", action="store_true", help="make every certificate anew")
     certs.set_defaults(act=_certs)
 
+    live = parts.add_parser(
+        "check",
+        help="ask the lab as it runs: certificates, routers, processes, clocks, and what each role may do",
+        epilog="Exit code: 0 all is as the lab file says, 1 something is not, 2 wrong input. It moves nothing.",
+    )
+    _add_lab(live)
+    live.set_defaults(act=_check)
+
 
 def _add_lab(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("lab", type=Path, metavar="LAB.toml", help="the lab file")
@@ -63,6 +71,14 @@ def _certs(arguments: argparse.Namespace) -> int:
         say(f"{identity.common_name:<{width}}  {state:<7}  ends {until:%Y-%m-%d %H:%M} UTC")
     say(f"{authority}: keep this folder where nobody else reads it; it goes to no machine")
     return 0
+
+
+def _check(arguments: argparse.Namespace) -> int:
+    lab = load_lab(arguments.lab)
+    _need_extra()
+    from snakesim_operator.lab.check import check
+
+    return check(lab, arguments.out)
 
 
 def _need_extra() -> None:

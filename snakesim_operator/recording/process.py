@@ -18,6 +18,7 @@ import msgspec
 
 from snakesim_hal.arguments import add_network, add_scenario
 from snakesim_hal.errors import ConfigError, SnakesimError
+from snakesim_hal.network.process_entries import own_entry, show_process
 from snakesim_hal.network.run_key import is_proven, own_run_key
 from snakesim_hal.network.session import Arrival, Link, open_session
 from snakesim_hal.process import on_stop_signal
@@ -96,6 +97,7 @@ def record(link: Link, path: Path, goes_on: Callable[[], bool]) -> Recorder:
     with open_session(link, connect_timeout_s=START_LIMIT_S) as session:
         tap = Tap(session)
         session.declare_alive(RECORDER)
+        show_process(session, own_entry(RECORDER))
         while goes_on() and not recorder.recording.trouble:
             _turn(tap, recorder)
             time.sleep(TURN_S)

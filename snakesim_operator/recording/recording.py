@@ -10,12 +10,14 @@ import time
 from collections import Counter
 from pathlib import Path
 
+from google.protobuf.message import Message as Protobuf
 from mcap.writer import CompressionType, Writer
 
 from snakesim_hal.model.files import SCHEMAS
 from snakesim_hal.network.session import Arrival
 from snakesim_hal.wire import keys
 from snakesim_operator.recording.disk import GrowingFile
+from snakesim_operator.recording.foxglove import FoxgloveChannels, descriptor_set
 from snakesim_operator.recording.robot_time import RobotTime
 
 FLUSH_S = 0.5
@@ -33,6 +35,8 @@ class Recording:
         self.trouble = ""  # why nothing is written any more
         self.counts: Counter[str] = Counter()  # messages written, by key
         self.time = RobotTime()
+        self._foxglove = FoxgloveChannels()
+        self._shown: Counter[str] = Counter()  # messages made for Foxglove, by topic
         self._file = GrowingFile(path)
         self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)  # pyright: ignore[reportArgumentType]
         self._channels: dict[str, int] = {}
@@ -51,13 +55,15 @@ class Recording:
             return
         at_ns = self.time.of(arrival.key, arrival.payload)
         self.counts[arrival.key] += 1
-        self._writer.add_message(
-            channel,
-            log_time=at_ns,
-            data=arrival.payload,
-            publish_time=arrival.monotonic_ns + self._wall_ns,
-            sequence=self.counts[arrival.key] & 0xFFFFFFFF,
-        )
+        wall_ns = arrival.monotonic_ns + self._wall_ns
+        self._add(channel, at_ns, wall_ns, arrival.payload, self.counts[arrival.key])
+        for topic, message in self._foxglove.take(arrival.key, arrival.payload, at_ns):
+            self._shown[topic] += 1
+            channel = self._channels.get(topic) or self._open_shown(topic, message)
+            self._add(channel, at_ns, wall_ns, message.SerializeToString(), self._shown[topic])
+
+    def _add(self, channel: int, at_ns: int, wall_ns: int, data: bytes, number: int) -> None:
+        self._writer.add_message(channel, log_time=at_ns, data=data, publish_time=wall_ns, sequence=number & 0xFFFFFFFF)
 
     def flush_when_due(self) -> None:
         """Write what waits, a few times a second."""
@@ -82,6 +88,13 @@ class Recording:
             except OSError as error:
                 self.trouble = f"{self.path}: {error.strerror or error}"
         self._file.close()
+
+    def _open_shown(self, topic: str, message: Protobuf) -> int:
+        name = message.DESCRIPTOR.full_name
+        if name not in self._schemas:
+            self._schemas[name] = self._writer.register_schema(name, "protobuf", descriptor_set(message))
+        channel = self._channels[topic] = self._writer.register_channel(topic, "protobuf", self._schemas[name])
+        return channel
 
     def _open(self, arrival: Arrival) -> int | None:
         message = keys.message_at(arrival.key)

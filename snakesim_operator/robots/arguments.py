@@ -20,6 +20,7 @@ def add_commands(commands: Any) -> None:
     into.add_argument(
         "--like", default="planar13", metavar="ROBOT", help="robot file with what URDF has no words for (planar13)"
     )
+    into.add_argument("--json", action="store_true", help="print one line of JSON instead, for scripts")
     into.set_defaults(act=_import)
     out = both.add_parser("export", help="a URDF from any robot file")
     out.add_argument("robot", metavar="ROBOT", help="name of a shipped robot, or path of a robot file")
@@ -31,7 +32,7 @@ def _import(arguments: argparse.Namespace) -> int:
     from snakesim_operator.robots.command import import_robot
 
     order = Order(arguments.tail, arguments.up, arguments.scale, arguments.like)
-    return import_robot(arguments.file, order, arguments.out)
+    return import_robot(arguments.file, order, arguments.out, as_json=arguments.json)
 
 
 def _export(arguments: argparse.Namespace) -> int:

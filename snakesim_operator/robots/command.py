@@ -6,7 +6,7 @@ from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.files import decode, read_part
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.textfiles import write_text
-from snakesim_hal.terminal import printable, say
+from snakesim_hal.terminal import printable, say, say_json
 from snakesim_operator.robots.exporting import urdf_of
 from snakesim_operator.robots.imported import Imported, Order
 from snakesim_operator.robots.importing import robot_of
@@ -15,7 +15,7 @@ from snakesim_operator.robots.toml_text import toml_of
 HEADS = {"names": "names (ours: theirs)", "changed": "changed", "left_out": "left out"}
 
 
-def import_robot(file: Path, order: Order, out: Path | None) -> int:
+def import_robot(file: Path, order: Order, out: Path | None, *, as_json: bool = False) -> int:
     """Write a robot file from a URDF, and say what differs. Raises ConfigError."""
     found = robot_of(file, order)
     path = out or Path(f"{found.robot.name}.toml")
@@ -24,6 +24,9 @@ def import_robot(file: Path, order: Order, out: Path | None) -> int:
     for key, lines in _told(found).items():
         notes += ["", f"{HEADS[key]}:", *(f"  {line}" for line in lines)] if lines else []
     write_text(path, toml_of(found.table.values, [printable(note) for note in notes]))
+    if as_json:
+        say_json({"file": str(path), **_told(found)})
+        return 0
     for note in notes[1:]:
         say(note)
     robot = found.robot

@@ -129,7 +129,7 @@ def can() -> Iterator[Finding]:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
     except OSError as error:
         told = f"this kernel has none ({error.strerror}); needed for `--backend can` with channels, twins run without"
-        yield Finding(what="CAN", state="warn", told=told, fix=["sudo modprobe can_raw vcan", vm])
+        yield Finding(what="CAN", state="warn", told=told, fix=["sudo modprobe -a can_raw vcan", vm])
         return
     found = [
         path.parent.name for path in Path("/sys/class/net").glob("*/type") if path.read_text().strip() == CAN_DEVICE

@@ -13,7 +13,8 @@ no cell grants is denied: other keys, other robots, `delete`, a query where a st
 where no wildcard is granted. [docs/lab.md](../docs/lab.md) shows how a lab is set up.
 """
 NOTES = """\
-A `gnc` publishes, declares and answers at `*` only under the names of its own services, as the lab file lists them.
+A `gnc` publishes, declares and answers at `*` only under the names of its own services, as the lab file lists them, and
+a recorder under the name `recorder`; at `process/*` these names are followed by `-` and an id.
 Fault injection is granted only for a robot with `faults = true` in the lab file. An administrator may also query the
 routers' own state (`@/**`), read-only. Subscribing is granted for any pattern within the robot's namespace: what is
 then delivered is decided key by key.

@@ -38,8 +38,9 @@ def estop(where: Where, say: Say = say) -> int:
     """Stop them. Returns 0 when every known robot has confirmed that it is stopped."""
     local = {(robot.stop_host, robot.stop_port): Link(robot.endpoint, robot.namespace) for robot in where.local()}
     elsewhere: dict[tuple[str, int], Link] = {}
-    if where.endpoint is not None and not local and (address := stop_address(where.endpoint, listens=True))[1]:
-        elsewhere[address] = Link(where.endpoint, where.namespace)
+    if where.endpoint is not None and where.session is None and not local:  # at a session's endpoint is a router
+        address = stop_address(where.endpoint, listens=True)
+        elsewhere |= {address: Link(where.endpoint, where.namespace)} if address[1] else {}
     networks = where.networks()
     with ThreadPoolExecutor(len(local) + len(elsewhere) + len(networks)) as side_by_side:
         asked_here = [side_by_side.submit(_at_port, link, *address) for address, link in local.items()]
@@ -60,7 +61,10 @@ def estop(where: Where, say: Say = say) -> int:
 
 
 def _confirmed(there: list[Told], shown: list[Told]) -> list[Told]:
-    """Answers of stop ports of other computers, once the robot's network confirms them: such a port may be forged."""
+    """Answers of stop ports of other computers, once the robot's network confirms them: such a port may be forged.
+
+    A silent port counts for nothing when the network confirms the stop: at a router's address there may be none.
+    """
     return [
         told
         if not told.stopped or any(_same(told, other) and other.stopped for other in shown)
@@ -68,6 +72,7 @@ def _confirmed(there: list[Told], shown: list[Told]) -> list[Told]:
             told, stopped=False, text=f"its stop port reports it, but nothing on its network confirms it: {told.text}"
         )
         for told in there
+        if told.stopped or not any(_same(told, other) and other.stopped for other in shown)
     ]
 
 

@@ -17,7 +17,6 @@ from snakesim_operator.tools.traffic import KeyTraffic, Latency, Traffic
 
 PERIOD_S = 1.0
 ONCE_S = 2.0  # long enough for two samples of the slowest key that repeats itself
-LATCHED = (keys.DESCRIPTION, keys.STATUS)
 HEAD = f"{'key':<30}{'writer':<18}{'Hz':>8}{'jitter':>9}{'max gap':>9}{'bytes':>9}{'age':>9}{'heard':>9}"
 
 
@@ -66,15 +65,19 @@ def _listen(link: Link, stack: contextlib.ExitStack) -> Traffic | None:
     except NotConnectedError:
         return None
     traffic = Traffic(link.namespace)
-    suffixes = tuple(f"/{key}" for key in LATCHED)
 
-    def unless_latched(arrival: Arrival) -> None:
-        if not f"/{arrival.key}".endswith(suffixes):
+    def take_strange(arrival: Arrival) -> None:
+        if not traffic.is_known(arrival.key):
             traffic.take(arrival)
 
-    for key in LATCHED:  # their last value, too: a plain subscriber hears only the next one
-        session.on_latched_arrival(key if link.namespace is not None else f"**/{key}", traffic.take)
-    session.on_arrival("**", unless_latched)
+    # Key by key, because a lab's router may grant no wildcard; the last value of those that are latched, too.
+    for row in keys.SPACE:
+        key = row.key if link.namespace is not None else f"**/{row.key}"
+        if row.kind == "latched":
+            session.on_latched_arrival(key, traffic.take)
+        elif row.kind == "stream":
+            session.on_arrival(key, traffic.take)
+    session.on_arrival("**", take_strange)
     return traffic
 
 

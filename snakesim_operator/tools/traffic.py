@@ -94,7 +94,7 @@ class Traffic:
             robot, relative = self._split(key)
             row, said = keys.row_at(relative), content[key]
             writer = None if row is None else row.writer
-            if writer == "each service":
+            if writer is not None and writer.startswith("each "):
                 writer = keys.service_of(relative)
             if relative == keys.JOINT_COMMAND and holders.get(robot):
                 writer = f"{holders[robot]} (lease)"
@@ -145,6 +145,11 @@ class Traffic:
                     )
                 )
         return found
+
+    def is_known(self, key: str) -> bool:
+        """Whether a key is one of a robot's that are published."""
+        row = keys.row_at(self._split(key)[1])
+        return row is not None and row.kind in ("stream", "latched")
 
     def _split(self, key: str) -> tuple[str, str]:
         """Robot and key relative to it; for keys that belong to none, an empty name."""

@@ -1,7 +1,10 @@
 """Who has no certificate, a wrong one, or a right one and wrong intentions: nothing of theirs passes the router."""
 
+import itertools
 import socket
 import threading
+import time
+from contextlib import ExitStack
 from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
@@ -186,3 +189,30 @@ def relay(tap: socket.socket, router: tuple[str, int], sent: bytearray) -> None:
         while piece := client.recv(65536):
             sent += piece
             onward.sendall(piece)
+
+
+def test_a_renewed_certificate_goes_on_and_one_that_ends_is_out(lab: SmallLab, tmp_path: Path) -> None:
+    """A session with a short certificate connects again by itself when it is renewed on the disk; otherwise it ends."""
+    own, life = make_authority(lab.folder / "authority", lab.lab), timedelta(seconds=2)
+    heard: dict[str, list[float]] = {"renewed": [], "ended": []}
+    for name in heard:
+        (tmp_path / name).mkdir()
+    who = lab.who(Role.GNC, OWN)
+    settings = {name: with_certificate(lab, tmp_path / name, who, own, life) for name in heard}
+    with lab.session(lab.who(Role.ROBOT, OWN)) as robot, ExitStack() as held:
+        sessions = {name: held.enter_context(opened(settings[name])) for name in heard}
+        with_certificate(lab, tmp_path / "renewed", who, own, timedelta(days=1))
+
+        def take(sample: zenoh.Sample) -> None:
+            heard[sample.payload.to_string()].append(time.monotonic())
+
+        _kept = robot.declare_subscriber(COMMAND, take)
+        began = time.monotonic()
+        while time.monotonic() < began + 4.0:
+            for name, session in sessions.items():
+                session.put(COMMAND, name)
+            time.sleep(0.005)
+    assert heard["ended"][-1] < began + 2.5
+    assert heard["renewed"][-1] > began + 3.5
+    gaps = [after - before for before, after in itertools.pairwise(heard["renewed"])]
+    print(f"the longest gap of a session that connects again: {1e3 * max(gaps):.0f} ms")

@@ -12,12 +12,18 @@ from typing import Any
 import pytest
 import zenoh
 
-from snakesim_hal.wire.roles import TABLE, Role
+from snakesim_hal.wire.roles import OWN_NAME_ONLY, TABLE, Role
 from tests.lab.small_lab import OTHER, OWN, SmallLab
 
 # One key of each line; a gnc has only its own services' names, and `hal` is none of them.
-KEYS = {line.key: line.key.replace("*", "control") for line in TABLE}
-STRAYS = {"alive/hal": "alive/*", "hal/done/hal": "hal/done/*", "fault/run": "fault/*", "sensor/unknown": None}
+KEYS = {line.key: line.key.replace("*", "control") for line in TABLE} | {"process/*": "process/control-1a2b"}
+STRAYS = {
+    "alive/hal": "alive/*",
+    "hal/done/hal": "hal/done/*",
+    "fault/run": "fault/*",
+    "process/host-1a2b": "process/*",
+    "sensor/unknown": None,
+}
 PLACES = (*KEYS.values(), *STRAYS)
 KINDS = ("publish", "delete", "read", "ask", "answer", "declare", "watch")
 TO_ALL = "from the witness"
@@ -37,8 +43,9 @@ def expected(role: Role, robot: str) -> Seen:
     for line in TABLE if robot == OWN else ():
         strays = {stray for stray, key in STRAYS.items() if key == line.key}
         for act in line.acts(role):
-            own_name_only = role is Role.GNC and act in ("publish", "declare", "answer")
-            granted[act] |= {KEYS[line.key]} | (set() if own_name_only else strays)
+            own_name = "*" in line.key and act in OWN_NAME_ONLY
+            if not (own_name and role is Role.RECORDER):
+                granted[act] |= {KEYS[line.key]} | (set() if own_name and role is Role.GNC else strays)
     return granted
 
 

@@ -4,16 +4,17 @@ import os
 import shutil
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
 from tests.links.lab import Lab, lab
 
-# Root without these is a broken test machine, and fails.
 pytestmark = [
     pytest.mark.e2e,
     pytest.mark.skipif(os.geteuid() != 0, reason="makes network namespaces: needs root"),
     pytest.mark.skipif(not shutil.which("ip"), reason="makes network namespaces: needs iproute2"),
+    pytest.mark.skipif(not Path("/dev/net/tun").exists(), reason="makes links of TAP interfaces: needs /dev/net/tun"),
 ]
 STOP_LIMIT_S = 0.3  # 50 ms of the lease, a period, and a busy computer
 

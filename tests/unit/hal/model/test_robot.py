@@ -105,10 +105,19 @@ def test_the_layout_tells_robots_apart_that_take_other_vectors() -> None:
 
 
 WRONG = {
+    "no axes": ({"chain__axes": []}, ["`chain.axes` = []", "a list"]),
     "unknown axis": ({"chain__axes": ["yaw", "roll"]}, ["`chain.axes.1` = 'roll'", "'pitch'", "'yaw'"]),
     "length in mm": ({"module__length_m": 110}, ["`module.length_m` = 110 m", "<= 2 in m"]),
     "angle in degrees": ({"limits__angle_rad": 90}, ["`limits.angle_rad` = 90 rad", "<= 3.14159 in rad"]),
     "typo": ({"motor__dampign_nm_s_per_rad": 1}, ["unknown field `motor.dampign_nm_s_per_rad`", "did you mean"]),
+    "links left out": (
+        {"links": [{"length_m": 0.1, "mass_kg": 0.2}] * 3},
+        ["[[links]] has 3 entries, and 3 joints connect 4 links"],
+    ),
+    "an inertia that no body has": (
+        {"links": [{"length_m": 0.1, "mass_kg": 0.2, "inertia_kg_m2": [1e-4, 1e-4, 3e-4, 0.0, 0.0, 0.0]}] * 4},
+        ["`links.0`", "the principal moments 0.0001, 0.0001 and 0.0003 kg·m²"],
+    ),
     "unknown sensor": (
         {"sensors__camera": {}},
         ["unknown field `sensors.camera`", "contacts, depth, imu, joints, pose"],

@@ -1,5 +1,6 @@
 """Robot files to URDF and back, URDFs from elsewhere, and MuJoCo's own importer as an independent reader."""
 
+import json
 import re
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.files import decode, read_part, shipped
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import Override, RunConfig, load, parse_set
+from snakesim_operator.cli import main
 from snakesim_operator.robots.command import export_robot, import_robot
 from snakesim_operator.robots.exporting import urdf_of
 from snakesim_operator.robots.imported import Imported, Order
@@ -200,6 +202,13 @@ def test_a_urdf_that_is_no_snake_is_refused_with_the_place(case: str, tmp_path: 
     file.write_text(text)
     with pytest.raises(ConfigError, match=re.escape(words)):
         robot_of(file, Order())
+
+
+def test_the_report_for_scripts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["robot", "import", str(SLIDER), "--out", str(tmp_path / "a.toml"), "--tail", "seg08", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["file"] == str(tmp_path / "a.toml") and "joint_1: hinge08, yaw" in told["names"]
+    assert any("hinge01" in line for line in told["changed"]) and any("<gazebo>" in line for line in told["left_out"])
 
 
 def test_an_existing_robot_file_is_not_overwritten(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""A joystick, at the event layer: the kernels that run these tests have no uinput, so a pipe stands for the device."""
+"""A joystick, at the event layer: a pipe is the device. tests/vcan/test_joystick.py has one of the kernel."""
 
 import os
 from collections.abc import Iterator
