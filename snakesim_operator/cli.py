@@ -167,6 +167,7 @@ def parser() -> argparse.ArgumentParser:
         "console", help="show a running robot in the browser, and command it from there; or show a recorded run"
     )
     console.add_argument("run", type=Path, nargs="?", metavar="RUN", help="folder of a recorded run")
+    console.add_argument("--at", type=float, default=0.0, metavar="S", help="begin S seconds into the recording")
     console.add_argument("--port", type=int, help="port on the loopback interface (default: 8080, or any free one)")
     add_network(console)
     console.set_defaults(act=_console)
@@ -395,7 +396,7 @@ def _console(arguments: argparse.Namespace) -> int:
     from snakesim_operator.console.command import console, show_record
 
     if arguments.run is not None:
-        return show_record(arguments.run, arguments.port)
+        return show_record(arguments.run, arguments.at, arguments.port)
     return console(_where(arguments), arguments.port)
 
 

@@ -28,12 +28,12 @@ def console(where: Where, port: int | None, say: Say = say) -> int:
     return 0
 
 
-def show_record(folder: Path, port: int | None, say: Say = say) -> int:
+def show_record(folder: Path, at_s: float, port: int | None, say: Say = say) -> int:
     """Show a recorded run until Ctrl-C. Raises ConfigError when the folder is not one of a run."""
     _check_installed()
     from snakesim_operator.console.console import show_recorded
 
-    show_recorded(folder, port, _until_signal(), say)
+    show_recorded(folder, at_s, port, _until_signal(), say)
     return 0
 
 

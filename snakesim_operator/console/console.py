@@ -42,12 +42,12 @@ def show_live(link: Link, around: Surroundings | None, port: int | None, stop: t
                 page.show(moment)
 
 
-def show_recorded(folder: Path, port: int | None, stop: threading.Event, say: Say) -> None:
+def show_recorded(folder: Path, at_s: float, port: int | None, stop: threading.Event, say: Say) -> None:
     """Show a run's record until `stop` is set. Raises ConfigError when the folder has none."""
     recorded = Recorded(RunRecord.load(folder))
     with page_server(port) as (server, address):
         page = Page(server, Surroundings(recorded.record.config), None, Log(), recorded=folder.name)
-        player = Player(server, recorded.span_s)
+        player = Player(server, recorded.span_s, at_s)
         say(f"console: {address}")
         shown_s = None
         for _ in frames(stop):

@@ -6,13 +6,16 @@ from collections.abc import Callable
 import viser
 
 from snakesim_hal.errors import SnakesimError
+from snakesim_hal.model.injection import KINDS
 from snakesim_hal.wire.messages import ControlSettings
 from snakesim_operator.console.moment import Moment
 from snakesim_operator.console.operations import Operations
 from snakesim_operator.console.settings_form import SettingsForm
 from snakesim_operator.console.token import ControlToken
+from snakesim_operator.tools.fault import FaultOrder
 
 TOLD_S = 6.0
+KINDS_OF_FAULT = tuple(sorted({kind for kinds in KINDS.values() for kind in kinds}))
 DRIVE_HZ = 10.0
 FASTEST_M_S = 0.5
 
@@ -42,11 +45,17 @@ class Controls:
             self._heading = client.gui.add_slider("Heading, °", -180, 180, 5, 0)
             self._speed = client.gui.add_slider("Speed, m/s", 0.0, FASTEST_M_S, 0.01, 0.1)
             self._drive = client.gui.add_button("Hold to drive", icon=viser.Icon.STEERING_WHEEL, color="green")
+            self._faults = client.gui.add_folder("Inject a fault", expand_by_default=False)
+            with self._faults:
+                self._kind = client.gui.add_dropdown("Kind", KINDS_OF_FAULT)
+                self._target = client.gui.add_text("Target", "joint_3")
+                inject = client.gui.add_button_group("Fault", ("Inject", "End it"))
             self._dark = client.gui.add_checkbox("Dark page", initial_value=False)
         self._take.on_click(lambda _: self._take_or_release())
         self._lifecycle.on_click(lambda event: self._ask(event.target.value))
         with settings_tab:
             self._apply = client.gui.add_button("Apply", visible=False, order=0)
+        inject.on_click(lambda event: self._inject(end=event.target.value == "End it"))
         self._drive.on_hold(lambda _: self._go(), callback_hz=DRIVE_HZ)
         self._apply.on_click(lambda _: self._configure())
         self._dark.on_update(lambda _: dress(client.gui, dark=self._dark.value))
@@ -65,7 +74,7 @@ class Controls:
         self._take.disabled = holder is not None and not mine
         taken = holder not in (None, self.viewer)
         self._take.hint = f"{name_of(holder)} has control, and may release it" if taken else None
-        for one in (self._lifecycle, self._heading, self._speed, self._drive):
+        for one in (self._lifecycle, self._heading, self._speed, self._drive, self._faults):
             one.visible = mine
         self._apply.disabled = not mine
         if self._form is not None:
@@ -111,6 +120,11 @@ class Controls:
         if moment is not None and moment.time_s is not None and self._in_control():
             heading_rad = math.radians(self._heading.value)
             self._operations.drive(self.who, heading_rad, self._speed.value, round(moment.time_s * 1e9))
+
+    def _inject(self, *, end: bool) -> None:
+        if self._in_control():
+            order = FaultOrder(self._kind.value, self._target.value.strip(), end=end)
+            self.do("Fault", lambda: self._operations.inject(self.who, order))
 
     def _configure(self) -> None:
         form = self._form

@@ -13,15 +13,16 @@ SLIDER_EVERY_S = 0.1
 class Player:
     """Where in the recording the page is."""
 
-    def __init__(self, server: viser.ViserServer, span_s: tuple[float, float]) -> None:
+    def __init__(self, server: viser.ViserServer, span_s: tuple[float, float], at_s: float = 0.0) -> None:
+        """span_s: first and last instant; at_s: where to begin, seconds after the first."""
         self._begin_s, self._end_s = span_s
-        self.time_s = self._begin_s
+        self.time_s = min(max(self._begin_s + at_s, self._begin_s), self._end_s)
         self._now_s = self._shown_s = time.monotonic()
         self._moved = False
         gui = server.gui
         with gui.add_folder("Recording", order=2):
             last_s = max(self._end_s - self._begin_s, 0.01)
-            self._slider = gui.add_slider("Time, s", 0.0, round(last_s, 2), 0.01, 0.0)
+            self._slider = gui.add_slider("Time, s", 0.0, round(last_s, 2), 0.01, round(self.time_s - self._begin_s, 2))
             self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY)
             self._speed = gui.add_dropdown("Speed", SPEEDS, initial_value="1x")
             dark = gui.add_checkbox("Dark page", initial_value=False)
