@@ -31,8 +31,8 @@ help: ## List these targets
 
 setup: $(stamp) ## Make .venv from the hashed lock (PYTHON=python3.12 to choose)
 
-demo: $(stamp) ## Run the simulated snake through a triplet of obstacles, into runs/demo
-	$(bin)/snakesim run triplet --out runs/demo $(ARGS)
+demo: $(stamp) ## Run the simulated snake through a triplet of obstacles, into runs/demo, with a page to watch it
+	$(bin)/snakesim run triplet --console --out runs/demo $(ARGS)
 
 test: test-here test-vcan ## Run the tests, but for those that are slow
 

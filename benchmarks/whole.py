@@ -13,12 +13,12 @@ from snakesim_operator.results.summary import RunSummary
 RATES_HZ = (200, 300, 400, 500, 600, 700, 800, 900, 1000, 1200, 1500, 2000)
 
 
-def run(*arguments: str) -> RunSummary:
-    """One `snakesim run triplet`."""
+def run(*arguments: str, scenario: str = "triplet") -> RunSummary:
+    """One `snakesim run`."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
         subprocess.run(
-            [sys.executable, "-m", "snakesim_operator", "run", "triplet", "--out", str(out), *arguments],
+            [sys.executable, "-m", "snakesim_operator", "run", scenario, "--out", str(out), *arguments],
             check=True,
             stdout=subprocess.DEVNULL,
             timeout=300,

@@ -10,7 +10,7 @@ From the ground up:
 `faults`    carries out injected faults
 `host`      the process that owns a robot: its loop, and what it records
 `service`   what guidance, navigation and control are, and the loop around each
-`conformance`, and the entry points `host_process`, `router_process`, `serve`; `in_process` runs all in one process
+`conformance`, and the programs `host_process`, `router_process`, `serve`; `in_process` runs all in one process
 
 Each imports only those listed above it. No backend, no GNC, no MuJoCo and no CAN is imported here.
 """

@@ -1,5 +1,9 @@
-"""`python -m snakesim_hal.host_process`: opens a backend and runs the host until the run is over."""
+"""The HAL host as a program: `snakesim host SCENARIO`; `python -m snakesim_hal.host_process` for a run's own.
 
+It opens the backend, and runs until it is told to stop, or until the run is over whose part it is.
+"""
+
+import argparse
 import contextlib
 import os
 import socket
@@ -7,16 +11,19 @@ import sys
 import time
 from collections.abc import Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from snakesim_hal.arguments import add_insecure, add_network, add_scenario
 from snakesim_hal.backend import BackendFactory
-from snakesim_hal.errors import BackendError, RefusedError, SnakesimError
+from snakesim_hal.errors import BackendError, ConfigError, RefusedError, SnakesimError
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Ending, Host
 from snakesim_hal.host.latch import EstopLatch
 from snakesim_hal.host.recorder import Recorder
+from snakesim_hal.model.plugin_check import check_backend
 from snakesim_hal.model.plugins import BACKENDS, find_plugin, plugin_settings
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.local_registry import LocalRobot, registered, robot_folder
@@ -24,7 +31,7 @@ from snakesim_hal.network.private_channel import HostEnd
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.network.stop_port import open_stop_port, serve_stops, stop_address
 from snakesim_hal.process import HOST_PRIORITY, hurry, on_stop_signal, settle_for_timing
-from snakesim_hal.serve import ProcessOptions, arguments, process_options
+from snakesim_hal.serve import ProcessOptions, add_parent, joined, process_options
 from snakesim_hal.terminal import complain_of
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Fault
@@ -57,50 +64,70 @@ class HostRecord(msgspec.Struct, frozen=True, kw_only=True):
     isolated: list[str] = []  # joints that were isolated at the end
 
 
+def parser() -> argparse.ArgumentParser:
+    """The arguments of a host."""
+    parser = argparse.ArgumentParser(
+        prog="snakesim host", description="Run the HAL host of a robot, with its backend, until Ctrl-C."
+    )
+    add_scenario(parser)
+    add_network(parser, "")
+    add_insecure(parser)
+    parser.add_argument("--out", type=Path, help="folder for the record: black box, description, statistics")
+    parser.add_argument("--once", action="store_true", help="end when the robot was armed for the scenario's duration")
+    parser.add_argument("--end-after-fault", type=float, metavar="S", help="end so many seconds after a fault, too")
+    add_parent(parser)
+    for flag, kind in (("--memory", str), ("--channel", int), ("--stop-port", int)):
+        parser.add_argument(flag, type=kind, help=argparse.SUPPRESS)
+    return parser
+
+
 def main(argv: Sequence[str] | None = None) -> int:
-    """Exit code 0 when all ticks were done without a fault, 1 otherwise."""
-    parser = arguments("Run a robot's HAL host.")
-    parser.add_argument("--router", action="store_true", help="connect to a router instead of listening")
-    parser.add_argument("--max-ticks", type=int, help="end this many ticks after the first arming")
-    parser.add_argument("--end-after-fault", type=float, help="end this many seconds after a fault")
-    parser.add_argument("--stay", action="store_true", help="go on until that many ticks were armed")
-    parser.add_argument("--memory", metavar="PATH", help="in-memory file for the host's statistics")
-    parser.add_argument("--channel", type=int, metavar="FD", help="inherited socket to the parent process")
-    parser.add_argument("--stop-port", type=int, metavar="FD", help="inherited UDP socket for emergency stops")
-    listen = "--router" not in (sys.argv[1:] if argv is None else argv)
-    given = process_options(parser, argv, listen=listen)
+    """Exit code 0 when all ticks were done without a fault, 2 for wrong input, 1 otherwise.
+
+    What a run hands to its host: --memory, path of an in-memory file for the host's statistics; --channel, inherited
+    socket to the parent process; --stop-port, inherited UDP socket for emergency stops.
+    """
     try:
-        host = _run(given)
+        return host(process_options(parser().parse_args(argv), hosts=True))
+    except ConfigError as error:
+        complain_of(error, "snakesim host")
+        return 2
     except SnakesimError as error:
         complain_of(error, "snakesim host")
         return 1
+
+
+def host(given: ProcessOptions) -> int:
+    """Run a host to its end. Returns 0 when all ticks were done without a fault, 1 otherwise. Raises SnakesimError."""
+    host = _run(given, check_backend(given.config, given.loaded.table))
     stopped = any(fault.reach == "robot" for fault in host.authority.since_start.kept)
     return 1 if stopped or host.ended != "complete" else 0
 
 
-def _run(given: ProcessOptions) -> Host:
+def _run(given: ProcessOptions, config: RunConfig) -> Host:
     """Open everything, run the host to its end, close everything."""
-    config, wanted = given.config, given.arguments
+    wanted = given.arguments
     with contextlib.ExitStack() as opened:
         if wanted.stop_port is not None:
             stop_port = socket.socket(fileno=wanted.stop_port)
         else:
             stop_port = open_stop_port(*stop_address(given.link.endpoint, listens=given.link.listen))
-            opened.enter_context(registered(_entry(given, stop_port)))
+            entry = LocalRobot.on(given.link, config.robot.name, config.backend, stop_port)
+            opened.enter_context(registered(entry))
         opened.callback(stop_port.close)
         backend = open_backend(find_plugin(BACKENDS, config.backend), config)
         opened.callback(backend.close)
         realtime_warnings = hurry(HOST_PRIORITY) if config.pace == "realtime" else []
-        session = opened.enter_context(open_session(given.link))
+        session = opened.enter_context(open_session(given.link) if given.link.listen else joined(given.link, "host"))
         refuse_second_host(session, given.link)
         described = backend.describe()
         host = Host(
             config,
             backend,
             session,
-            max_ticks=wanted.max_ticks,
+            max_ticks=round(config.duration_s * config.rate_hz) if wanted.once else None,
             end_after_fault_s=wanted.end_after_fault,
-            stay=wanted.stay,
+            stay=wanted.end_after_fault is None,
             latch=EstopLatch(robot_folder(described.robot, described.backend, described.hardware)),
             starter=HostEnd.of(wanted.channel),
             realtime_warnings=realtime_warnings,
@@ -109,7 +136,7 @@ def _run(given: ProcessOptions) -> Host:
         on_stop_signal(host.stop)
         settle_for_timing()
         memory = wanted.memory and os.open(wanted.memory, os.O_WRONLY)
-        with Recorder(host.black_box, host.description, partial(record_of, host), given.out, memory):
+        with Recorder(host.black_box, host.description, partial(record_of, host), wanted.out, memory):
             host.run()
     return host
 
@@ -123,19 +150,6 @@ def refuse_second_host(session: Session, link: Link) -> None:
                 f"another HAL host is on {link.endpoint} as {link.namespace}: {keys.service_of(others[0])}. End it, or "
                 f"give this robot another --namespace"
             )
-
-
-def _entry(given: ProcessOptions, stop_port: socket.socket) -> LocalRobot:
-    stop_host, port = stop_port.getsockname()[:2]
-    return LocalRobot(
-        namespace=given.link.namespace or given.config.robot.name,
-        robot=given.config.robot.name,
-        backend=given.config.backend,
-        endpoint=given.link.endpoint,
-        stop_host=stop_host,
-        stop_port=port,
-        pid=os.getpid(),
-    )
 
 
 def open_backend(factory: BackendFactory, config: RunConfig) -> GuardedBackend:

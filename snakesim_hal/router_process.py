@@ -1,23 +1,30 @@
 """`python -m snakesim_hal.router_process`: a router for one run, for tests of router failures."""
 
+import argparse
 import sys
 import threading
 from collections.abc import Sequence
 from dataclasses import replace
 
+from snakesim_hal.arguments import add_insecure, add_network, add_scenario
 from snakesim_hal.errors import SnakesimError
 from snakesim_hal.network.session import open_session
 from snakesim_hal.process import on_stop_signal
-from snakesim_hal.serve import arguments, process_options
+from snakesim_hal.serve import add_parent, process_options
 from snakesim_hal.terminal import complain_of
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Forward between all connected sessions, until a stop signal."""
-    given = process_options(arguments("Run a Zenoh router on a run's endpoint."), argv, listen=True)
-    stopped = threading.Event()
-    on_stop_signal(stopped.set)
+    parser = argparse.ArgumentParser(description="Run a Zenoh router on a run's endpoint.")
+    add_scenario(parser)
+    add_network(parser)
+    add_insecure(parser)
+    add_parent(parser)
     try:
+        given = process_options(parser.parse_args(argv), hosts=True)
+        stopped = threading.Event()
+        on_stop_signal(stopped.set)
         with open_session(replace(given.link, namespace=None)):
             stopped.wait()
     except SnakesimError as error:

@@ -1,20 +1,23 @@
-"""Run one process of a robot from its effective configuration: shared arguments, and the process of a service.
+"""A service as a program: `snakesim service NAME SCENARIO`, and with the same arguments `python -m snakesim_hal.serve`.
 
-`python -m snakesim_hal.serve NAME ...` runs the service that an installed package registers under a name.
+It needs only the scenario, and how to reach the network. It waits for the network and for the robot, says so, and meets
+whatever host comes next: so services and hosts start in any order, on any machine, and again at will.
 """
 
 import argparse
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 
 from threadpoolctl import threadpool_limits
 
-from snakesim_hal.errors import ConfigError, SnakesimError
+from snakesim_hal.arguments import add_network, add_scenario, link_of, load_scenario
+from snakesim_hal.errors import ConfigError, NotConnectedError, SnakesimError
 from snakesim_hal.model.plugins import SERVICES, find_plugin
-from snakesim_hal.model.scenario import RunConfig, read
-from snakesim_hal.network.session import DEFAULT_ENDPOINT, Link, open_session
+from snakesim_hal.model.scenario import Loaded, RunConfig
+from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.process import (
     SERVICE_PRIORITY,
     accept_interrupts,
@@ -25,83 +28,117 @@ from snakesim_hal.process import (
 )
 from snakesim_hal.service import START_LIMIT_S, Service, ServiceLoop
 from snakesim_hal.terminal import complain, complain_of
-from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES
+
+TRY_S = 2.0  # to connect
+TELL_S = 20.0  # between two signs of life
 
 
 @dataclass(frozen=True)
 class ProcessOptions:
-    """The options of one process."""
+    """What one process of a robot was started with."""
 
-    config: RunConfig
+    loaded: Loaded
     link: Link
-    out: Path | None
     arguments: argparse.Namespace
 
+    @property
+    def config(self) -> RunConfig:
+        """The whole configuration."""
+        return self.loaded.config
 
-def arguments(about: str) -> argparse.ArgumentParser:
-    """The arguments that every process of a run takes."""
-    parser = argparse.ArgumentParser(description=about)
-    parser.add_argument(
-        "--config", type=Path, required=True, help="effective configuration, as `snakesim run` saves it"
-    )
-    parser.add_argument("--endpoint", default=DEFAULT_ENDPOINT, help="Zenoh endpoint of the robot")
-    parser.add_argument("--namespace", help="Zenoh namespace of the robot (default: the robot's name)")
-    parser.add_argument("--out", type=Path, help="folder for the process's output files")
-    parser.add_argument("--insecure", action="store_true", help="listen even where other machines can connect")
-    parser.add_argument("--parent", type=int, help="process id of the parent; this process dies with it")
+
+def add_parent(parser: argparse.ArgumentParser) -> None:
+    """For processes of `snakesim run`."""
+    parser.add_argument("--parent", type=int, help=argparse.SUPPRESS)  # process id: this process dies with it
+
+
+def process_options(arguments: argparse.Namespace, *, hosts: bool = False) -> ProcessOptions:
+    """Read the files that the arguments name, and tie this process to its parent if it has one. Raises ConfigError."""
+    if arguments.parent is not None:
+        die_with_parent(arguments.parent)
+    loaded = load_scenario(arguments)
+    return ProcessOptions(loaded, link_of(arguments, loaded.config, hosts=hosts), arguments)
+
+
+def parser() -> argparse.ArgumentParser:
+    """The arguments of a service."""
+    parser = argparse.ArgumentParser(prog="snakesim service", description="Run one service of a robot.")
+    parser.add_argument("name", metavar="NAME", help="guidance, navigation, control, or another one of the scenario")
+    add_scenario(parser)
+    add_network(parser, "")
+    add_parent(parser)
     return parser
 
 
-def process_options(
-    parser: argparse.ArgumentParser, argv: Sequence[str] | None, *, listen: bool = False
-) -> ProcessOptions:
-    """Parse, and tie this process to its parent when it has one."""
-    parsed = parser.parse_args(argv)
-    if parsed.parent is not None:
-        die_with_parent(parsed.parent)
-    config = read(parsed.config)
-    largest_bytes = max(MAX_PAYLOAD_BYTES, config.robot.sensors.largest_image_bytes)
-    link = Link(parsed.endpoint, parsed.namespace or config.robot.name, listen, parsed.insecure, largest_bytes)
-    return ProcessOptions(config, link, parsed.out, parsed)
+def main(argv: Sequence[str] | None = None) -> int:
+    """Exit code: 0 told to stop, 1 could not go on, 2 wrong input."""
+    return run(parser().parse_args(argv))
 
 
-def serve(service_type: type[Service], argv: Sequence[str] | None = None) -> int:
-    """Run a service process. Ends when it is told to stop; exit code 1 when it could not go on."""
-    name = service_type.name
-    given = process_options(arguments(f"Run the {name} service of a robot."), argv)
+def run(arguments: argparse.Namespace) -> int:
+    """Run the service that the arguments name. Returns the exit code."""
     try:
-        accept_interrupts()
-        threadpool_limits(1)  # so that one seed gives one digest, however many cores there are
-        if service_type.urgent and given.config.pace == "realtime":
-            hurry(SERVICE_PRIORITY)
-            calm_down_after(given.config.lease_ns * 1e-9)
-        with open_session(given.link, connect_timeout_s=START_LIMIT_S) as session:
-            loop = ServiceLoop(service_type, given.config, session)
-            loop.join()
-            settle_for_timing()
-            try:
-                loop.run()
-            finally:
-                loop.close()
+        serve(find_plugin(SERVICES, arguments.name), process_options(arguments))
+    except ConfigError as error:
+        complain_of(error, f"snakesim {arguments.name}")
+        return 2
     except SnakesimError as error:
-        complain_of(error, f"snakesim {name}")
+        complain_of(error, f"snakesim {arguments.name}")
         return 1
     except KeyboardInterrupt:
         return 0
     return 0
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Find the service, and run it."""
-    given = list(sys.argv[1:] if argv is None else argv)
-    if not given or given[0].startswith("-"):
-        complain("usage: python -m snakesim_hal.serve NAME [--help]")
-        return 2
-    try:
-        return serve(find_plugin(SERVICES, given[0]), given[1:])
-    except ConfigError as error:
-        complain_of(error, f"snakesim {given[0]}")
-        return 2
+def serve(service_type: type[Service], given: ProcessOptions) -> None:
+    """Run a service, as long as this process lives. Raises SnakesimError when it cannot go on."""
+    config, name = given.config, service_type.name
+    accept_interrupts()
+    threadpool_limits(1)  # so that one seed gives one digest, however many cores there are
+    if service_type.urgent and config.pace == "realtime":
+        hurry(SERVICE_PRIORITY)
+        calm_down_after(config.lease_ns * 1e-9)
+    with joined(given.link, name) as session:
+        waiting = Waiting(name, f"a HAL host of {given.link.namespace} on {given.link.endpoint}")
+        loop = ServiceLoop(service_type, config, session, waiting.goes_on)
+        loop.join()
+        settle_for_timing()
+        try:
+            loop.run()
+        finally:
+            loop.close()
+
+
+class Waiting:
+    """Waits for something that others start, and says so."""
+
+    def __init__(self, name: str, what: str) -> None:
+        self._name, self._what = name, what
+        self._began = time.monotonic()
+        self._told = self._began - TELL_S
+
+    def goes_on(self) -> bool:
+        """Whether to try again; call it after each try that failed."""
+        now = time.monotonic()
+        if now - self._told >= TELL_S:
+            self._told = now
+            complain(f"{self._name}: waiting for {self._what}")
+        return now - self._began < START_LIMIT_S
+
+
+@contextmanager
+def joined(link: Link, name: str) -> Iterator[Session]:
+    """A session, as soon as there is a network. Raises NotConnectedError when there is none in time."""
+    waiting = Waiting(name, f"the network: {link.endpoint}")
+    with ExitStack() as stack:
+        while True:
+            try:
+                session = stack.enter_context(open_session(link, connect_timeout_s=TRY_S))
+                break
+            except NotConnectedError:
+                if not waiting.goes_on():
+                    raise
+        yield session
 
 
 if __name__ == "__main__":

@@ -1,15 +1,19 @@
 """What a service is, and the loop around it: join, act on ticks, publish what the service says, report it done."""
 
+from collections.abc import Callable
 from typing import Protocol
 
+from snakesim_hal.errors import NotConnectedError
 from snakesim_hal.faults.injector import Injector
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.scenario import Service as Schedule
 from snakesim_hal.network.client import Client
+from snakesim_hal.network.process_entries import own_entry, show_process
 from snakesim_hal.network.session import Session
 from snakesim_hal.wire.messages import Clock, Description, Message
 
 SILENCE_S = 1.0
+TRY_S = 2.0  # to meet the robot
 START_LIMIT_S = 600.0  # until a part of a run is there: MuJoCo starts slowly in an emulated machine on a busy one
 
 
@@ -40,23 +44,34 @@ class Service(Protocol):
 class ServiceLoop:
     """One service of one robot, over one session."""
 
-    def __init__(self, service_type: type[Service], config: RunConfig, session: Session) -> None:
-        """Meets the robot. Raises NotConnectedError when there is none."""
+    def __init__(
+        self,
+        service_type: type[Service],
+        config: RunConfig,
+        session: Session,
+        goes_on: Callable[[], bool] = lambda: False,
+    ) -> None:
+        """Meets the robot. Raises NotConnectedError when there is none.
+
+        goes_on: called after each try that found no robot; whether to try again.
+        """
         name = service_type.name
         schedule = config.services.get(name, Schedule())
         self._client = client = Client(session, name, every_ticks=schedule.every_ticks, pace=config.pace)
         self.service = service_type(client, config)
-        robot = client.description(timeout_s=START_LIMIT_S)
+        robot = _met(client, goes_on)
         self.service.meet(robot)
         self._injector = Injector(name, config, session, newest=lambda: client.heard)
         self._injector.allow(emulated=robot.emulated, faults_allowed=config.faults_allowed)
         self._due = client.ticks(0.0)
+        self._session, self._entry = session, own_entry(name, config)
 
     def join(self) -> None:
         """Show that the service is here. From now on the robot may be armed, perhaps before the first tick here."""
         clock = self._client.hear(SILENCE_S)
         if clock is not None:
             self._injector.turn(clock.stamp_ns, clock.arming, clock.lifecycle)
+        show_process(self._session, self._entry)
         self._client.announce()
 
     def run(self) -> None:
@@ -90,3 +105,12 @@ class ServiceLoop:
         for key, message in outputs:
             self._client.put(key, message)
         self._client.done(clock.tick)
+
+
+def _met(client: Client, goes_on: Callable[[], bool]) -> Description:
+    while True:
+        try:
+            return client.description(TRY_S)
+        except NotConnectedError:
+            if not goes_on():
+                raise

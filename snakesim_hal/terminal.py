@@ -4,8 +4,12 @@ A robot's name, the reason of an answer, a field of a file may hold escape seque
 bidirectional overrides. They are printed as JSON escapes instead, so that printed JSON stays valid.
 """
 
+import shutil
 import sys
 from collections.abc import Callable
+from typing import Any
+
+import msgspec
 
 from snakesim_hal.errors import SnakesimError
 
@@ -29,6 +33,11 @@ def say(line: str) -> None:
     print(printable(line), flush=True)
 
 
+def say_json(value: Any, say: Say = say) -> None:
+    """Print a value, such as a Struct, as one line of JSON: for scripts. NaN and infinity become null."""
+    say(msgspec.json.encode(value).decode())
+
+
 def complain(line: str) -> None:
     """Print one line to stderr."""
     print(printable(line), file=sys.stderr, flush=True)
@@ -45,4 +54,16 @@ def say_again(line: str, most: int, before: int) -> int:
     """Print a line, cut to `most` characters, over the previous one of `before` characters; returns its length."""
     shown = printable(line)[:most]
     print("\r" + shown.ljust(before), end="", flush=True)
+    return len(shown)
+
+
+def say_over(lines: list[str], before: int) -> int:
+    """Print lines over the `before` lines printed last, cut to the terminal's size; returns how many they are.
+
+    Also where the terminal is in raw mode, as for single keys.
+    """
+    size = shutil.get_terminal_size()
+    shown = [printable(line)[: size.columns - 1] for line in lines[: size.lines - 1]]
+    up = f"\x1b[{before}A" if before else ""
+    print(up + "".join(f"\r\x1b[K{line}\r\n" for line in shown) + "\x1b[J", end="", flush=True)
     return len(shown)

@@ -7,14 +7,26 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 
+from snakesim_hal import host_process, serve
+from snakesim_hal.arguments import (
+    add_insecure,
+    add_network,
+    add_scenario,
+    check_network,
+    load_scenario,
+    session_given,
+)
 from snakesim_hal.errors import ConfigError, SnakesimError
-from snakesim_hal.model.files import ROUTER, read_part, shipped, short
+from snakesim_hal.model.files import ROUTER, read_part, shipped
 from snakesim_hal.model.injection import explain
 from snakesim_hal.model.plugins import COMMANDS, find_plugin, in_file, installed
-from snakesim_hal.model.scenario import Loaded, Override, RunConfig, load, parse_set
-from snakesim_hal.network.endpoint import check_endpoint, check_namespace
-from snakesim_hal.terminal import complain, complain_of, say
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.terminal import complain, complain_of, say, say_json
 from snakesim_operator.evaluate.command import add_commands
+from snakesim_operator.lab.command import add_commands as add_lab_commands
+from snakesim_operator.playback.command import add_commands as add_playback_commands
+from snakesim_operator.robots.arguments import add_commands as add_robot_commands
+from snakesim_operator.ros2.command import add_command as add_ros2
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
 
@@ -59,7 +71,7 @@ def parser() -> argparse.ArgumentParser:
         epilog="Exit code: 0 complete, armed for all of the requested time; 1 a fault, or ended before that; 2 wrong "
         "input, nothing was started; 3 complete, but the record has gaps; 130 interrupted. 1 and 130 take precedence.",
     )
-    _add_scenario(run)
+    add_scenario(run)
     run.add_argument(
         "--fault",
         action="append",
@@ -75,10 +87,35 @@ def parser() -> argparse.ArgumentParser:
         action="store_true",
         help="run in one process, without a network: lockstep, and faster; nothing can connect, arm or stop it",
     )
+    run.add_argument("--no-record", action="store_true", help="keep no recording of the messages")
+    run.add_argument(
+        "--console",
+        action=argparse.BooleanOptionalAction,
+        default=False,
+        help="show the run in the browser, and print the address",
+    )
     run.add_argument("--out", type=Path, help="folder for the run's record (default: runs/NAME-TIME)")
-    _add_network(run)
-    _add_insecure(run)
+    add_network(run, "")
+    add_insecure(run)
     run.set_defaults(act=_run)
+
+    host = commands.add_parser(
+        "host",
+        parents=[host_process.parser()],
+        add_help=False,
+        help="run a robot's HAL host alone, for services on this or other machines",
+        epilog="It runs until Ctrl-C, and boots disarmed: `snakesim arm` arms it. Faults do not end it. Exit code: 0 "
+        "ended with --once and without a fault, 1 ended otherwise, 2 wrong input.",
+    )
+    host.set_defaults(act=_host)
+    service = commands.add_parser(
+        "service",
+        parents=[serve.parser()],
+        add_help=False,
+        help="run one service of a robot alone: guidance, navigation, control, ...",
+        epilog="It waits for the network and for the robot's host, and meets the next one after a restart.",
+    )
+    service.set_defaults(act=serve.run)
 
     compare = commands.add_parser("compare", help="compare two runs, as a table and as a page with plots")
     compare.add_argument("run_a", type=Path, metavar="RUN_A", help="folder of a run; percentages refer to this one")
@@ -89,27 +126,72 @@ def parser() -> argparse.ArgumentParser:
     compare.add_argument(
         "--within", type=float, metavar="PERCENT", help="exit with 1 when the distances moved differ by more"
     )
+    _add_json(compare)
     compare.set_defaults(act=_compare)
 
     add_commands(commands)
+    add_lab_commands(commands)
+
+    record = commands.add_parser("record", help="record everything that a robot publishes into an MCAP file")
+    record.add_argument("--out", type=Path, metavar="FILE.mcap", help="the file (default: NAMESPACE-TIME.mcap)")
+    record.add_argument("--duration", type=float, metavar="S", help="end after this time by the wall clock")
+    add_network(record)
+    record.set_defaults(act=_record)
+    add_playback_commands(commands)
 
     config = commands.add_parser("config", help="show every effective value, and the file or flag it came from")
-    _add_scenario(config)
+    add_scenario(config)
+    _add_json(config)
     config.set_defaults(act=_config)
 
     scenarios = commands.add_parser("scenarios", help="list the shipped scenarios, robots, scenes and suites")
+    _add_json(scenarios)
     scenarios.set_defaults(act=_scenarios)
+
+    add_robot_commands(commands)
 
     echo = commands.add_parser("echo", help="print what is published on a key, one JSON object a line")
     echo.add_argument("key", nargs="?", help="such as sensor/joints or sensor/*; without it, list the keys")
     echo.add_argument("--hz", action="store_true", help="print only rate and jitter")
     echo.add_argument("--count", type=int, help="end after this many messages")
-    _add_network(echo)
+    add_network(echo)
     echo.set_defaults(act=_echo)
 
     status = commands.add_parser("status", help="print the state of the robots on the network, and its reason")
-    _add_network(status)
+    add_network(status)
+    _add_json(status)
     status.set_defaults(act=_status)
+
+    console = commands.add_parser(
+        "console", help="show a running robot in the browser, and command it from there; or show a recorded run"
+    )
+    console.add_argument("run", type=Path, nargs="?", metavar="RUN", help="folder of a recorded run")
+    console.add_argument("--port", type=int, help="port on the loopback interface (default: 8080, or any free one)")
+    add_network(console)
+    console.set_defaults(act=_console)
+    top = commands.add_parser("top", help="show rate, jitter, size and age of every key, and commands' latency")
+    top.add_argument("--once", action="store_true", help="listen for two seconds, print one table, and end")
+    add_network(top)
+    _add_json(top)
+    top.set_defaults(act=_top)
+
+    teleop = commands.add_parser("teleop", help="drive a robot by keys or with a joystick; letting go stops it")
+    teleop.add_argument(
+        "--joystick",
+        nargs="?",
+        type=Path,
+        const=Path(),
+        metavar="DEVICE",
+        help="such as /dev/input/event5; or the first",
+    )
+    teleop.add_argument("--fastest", type=float, default=0.3, metavar="M/S", help="highest speed (0.3)")
+    add_network(teleop)
+    teleop.set_defaults(act=_teleop)
+
+    doctor = commands.add_parser("doctor", help="check this computer, and print what mends what it lacks")
+    add_network(doctor)
+    _add_json(doctor)
+    doctor.set_defaults(act=_doctor)
 
     arm = commands.add_parser("arm", help="allow a robot to move; names robot and backend, to avoid mix-ups")
     arm.add_argument("robot", metavar="ROBOT", help="name of the robot, as printed by `snakesim status`")
@@ -120,9 +202,9 @@ def parser() -> argparse.ArgumentParser:
         ("estop", _estop, "stop a robot now, or all on the network without --namespace"),
     ):
         told = commands.add_parser(name, help=about)
-        _add_network(told)
+        add_network(told)
         told.set_defaults(act=act)
-    _add_network(arm)
+    add_network(arm)
     arm.set_defaults(act=_arm)
 
     fault = commands.add_parser(
@@ -136,12 +218,24 @@ def parser() -> argparse.ArgumentParser:
     fault.add_argument("--for", dest="for_s", type=float, metavar="S", help="seconds of robot time until it ends")
     fault.add_argument("--amount", type=float, metavar="X", help="amount, for kinds that have one")
     fault.add_argument("--end", action="store_true", help="end it")
-    _add_network(fault)
+    add_network(fault)
     fault.set_defaults(act=_fault)
+
+    preview = commands.add_parser(
+        "preview", help="publish small, compressed copies of a robot's images; beside its host"
+    )
+    preview.add_argument("--hz", type=float, default=2.0, metavar="HZ", help="most previews a second of a camera (2)")
+    preview.add_argument("--width", type=int, default=320, metavar="PIXELS", help="widest preview (320)")
+    add_network(preview)
+    preview.set_defaults(act=_preview)
+
+    ros2 = add_ros2(commands)
+    add_network(ros2)
+    ros2.set_defaults(act=_ros2)
 
     router = commands.add_parser("router", help="run a Zenoh router from a JSON5 file")
     router.add_argument("config", type=Path, nargs="?", help=f"JSON5 file (default: {str(ROUTER).replace('%', '%%')})")
-    _add_insecure(router)
+    add_insecure(router)
     router.set_defaults(act=_router)
 
     schemas = commands.add_parser("schemas", help="print where the JSON Schemas, the key space and the DBC file are")
@@ -154,69 +248,16 @@ def parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _add_scenario(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "scenario", help="name of a shipped scenario, or path of a scenario file or a run's config.json"
-    )
-    parser.add_argument("--backend", help="sim or can")
-    parser.add_argument("--controller", help="installed controller, or ./file.py:Class")
-    parser.add_argument("--pace", choices=["realtime", "lockstep", "free"])
-    parser.add_argument("--duration", type=float, metavar="S", help="seconds of robot time")
-    parser.add_argument("--seed", type=int)
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="SECTION.KEY=VALUE",
-        help="change any value; may be repeated",
-    )
-
-
-def _add_network(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--endpoint", help="Zenoh endpoint of the robot (default: tcp/127.0.0.1:7447)")
-    parser.add_argument(
-        "--router", metavar="ENDPOINT", help="connect to a lab's Zenoh router instead, such as tcp/10.0.0.1:7447"
-    )
-    parser.add_argument("--namespace", help="namespace of the robot (default: the robot's name)")
-
-
-def _add_insecure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--insecure", action="store_true", help="listen even where anybody on the network can command the robot"
-    )
-
-
-def _check_network(arguments: argparse.Namespace) -> None:
-    for flag, given in (("--endpoint", arguments.endpoint), ("--router", arguments.router)):
-        if given is not None:
-            check_endpoint(given, flag)
-    if arguments.namespace is not None:
-        check_namespace(arguments.namespace, "--namespace")
-
-
-def _load(arguments: argparse.Namespace) -> Loaded:
-    flags = {
-        "backend": arguments.backend,
-        "controller": arguments.controller,
-        "pace": arguments.pace,
-        "duration_s": arguments.duration,
-        "seed": arguments.seed,
-    }
-    overrides = [parse_set(text) for text in arguments.set]
-    for key, value in flags.items():
-        if value is not None:
-            flag = f"--{key.removesuffix('_s')} {short(str(value))}"
-            overrides.append(Override(key, value, flag))
-    if faults := getattr(arguments, "fault", None):
-        overrides.append(Override("faults", faults, " ".join(f"--fault {text}" for text in faults)))
-    return load(arguments.scenario, overrides)
+def _add_json(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--json", action="store_true", help="print one line of JSON instead, for scripts")
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.run.run import RunRequest, check_plugins, run
+    from snakesim_hal.model.plugin_check import check_plugins
+    from snakesim_operator.run.run import RunRequest, run
 
-    _check_network(arguments)
-    loaded = _load(arguments)
+    check_network(arguments)
+    loaded = load_scenario(arguments)
     config = check_plugins(loaded.config, loaded.table)  # here, because only the table knows which flag set what
     if arguments.in_process:
         return _run_in_process(config, arguments)
@@ -226,10 +267,13 @@ def _run(arguments: argparse.Namespace) -> int:
             out=arguments.out,
             endpoint=arguments.endpoint,
             router=arguments.router,
+            session=session_given(arguments),
             namespace=arguments.namespace,
             stay=arguments.stay,
             with_router=arguments.with_router,
             insecure=arguments.insecure,
+            record=not arguments.no_record,
+            console=arguments.console,
         )
     )
 
@@ -237,23 +281,32 @@ def _run(arguments: argparse.Namespace) -> int:
 def _run_in_process(config: RunConfig, arguments: argparse.Namespace) -> int:
     from snakesim_operator.run.in_process import run_in_process
 
-    for flag in ("endpoint", "router", "namespace", "stay", "with_router"):
+    for flag in ("endpoint", "router", "session", "namespace", "stay", "with_router", "console"):
         if getattr(arguments, flag):
             raise ConfigError(f"--in-process and --{flag.replace('_', '-')}: there is no network; leave one out")
-    return run_in_process(config, arguments.out)
+    return run_in_process(config, arguments.out, record=not arguments.no_record)
+
+
+def _host(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.run.host import run_host
+
+    return run_host(arguments)
 
 
 def _compare(arguments: argparse.Namespace) -> int:
     from snakesim_operator.results.compare import compare
 
-    return compare(arguments.run_a, arguments.run_b, arguments.out, arguments.within)
+    return compare(arguments.run_a, arguments.run_b, arguments.out, arguments.within, as_json=arguments.json)
 
 
 def _config(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.run.run import check_plugins
+    from snakesim_hal.model.plugin_check import check_plugins
 
-    loaded = _load(arguments)
+    loaded = load_scenario(arguments)
     check_plugins(loaded.config, loaded.table, run_files=False)
+    if arguments.json:
+        say_json({key: {"value": value, "origin": origin} for key, value, origin in loaded.explain()})
+        return OK
     rows = [(key, _shown(value), origin) for key, value, origin in loaded.explain()]
     key_width = max(len(key) for key, _, _ in rows)
     value_width = min(max(len(value) for _, value, _ in rows), 48)
@@ -273,7 +326,13 @@ def _shown(value: object) -> str:
     return text if len(text) <= 120 else text[:117] + "..."
 
 
-def _scenarios(_arguments: argparse.Namespace) -> int:
+def _scenarios(arguments: argparse.Namespace) -> int:
+    if arguments.json:
+        kinds = {"scenarios": "title", "robots": "about", "scenes": "about", "suites": "title"}
+        say_json(
+            {k: {name: read_part(name, k).values.get(about, "") for name in shipped(k)} for k, about in kinds.items()}
+        )
+        return OK
     for kind, about in (("scenarios", "title"), ("robots", "about"), ("scenes", "about"), ("suites", "title")):
         say(f"{kind}:")
         for name in shipped(kind):
@@ -288,10 +347,44 @@ def _echo(arguments: argparse.Namespace) -> int:
     return echo(EchoRequest(arguments.key, arguments.hz, arguments.count), _where(arguments))
 
 
+def _record(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.record import record_robot
+
+    return record_robot(_where(arguments), arguments.out, arguments.duration)
+
+
 def _status(arguments: argparse.Namespace) -> int:
     from snakesim_operator.tools.status import show_status
 
-    return show_status(_where(arguments))
+    return show_status(_where(arguments), as_json=arguments.json)
+
+
+def _top(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.top import TopRequest, top
+
+    return top(TopRequest(arguments.once, arguments.json), _where(arguments))
+
+
+def _teleop(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.teleop.command import TeleopRequest, teleop
+
+    stick: Path | None = arguments.joystick
+    request = TeleopRequest(arguments.fastest, stick is not None, None if stick in (None, Path()) else stick)
+    return teleop(request, _where(arguments))
+
+
+def _doctor(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.doctor import doctor
+
+    return doctor(_where(arguments), as_json=arguments.json)
+
+
+def _console(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.console.command import console, show_record
+
+    if arguments.run is not None:
+        return show_record(arguments.run, arguments.port)
+    return console(_where(arguments), arguments.port)
 
 
 def _arm(arguments: argparse.Namespace) -> int:
@@ -328,8 +421,23 @@ def _fault(arguments: argparse.Namespace) -> int:
 def _where(arguments: argparse.Namespace):
     from snakesim_operator.tools.targets import Where
 
-    _check_network(arguments)
+    check_network(arguments)
+    session = session_given(arguments, or_environment=True)
+    if session is not None:
+        return Where(session.endpoints[0], session.namespace_for(arguments.namespace), session)
     return Where(arguments.router or arguments.endpoint, arguments.namespace)
+
+
+def _preview(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.preview import preview
+
+    return preview(_where(arguments), arguments.hz, arguments.width)
+
+
+def _ros2(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.ros2.join import join
+
+    return join(arguments, _where(arguments))
 
 
 def _router(arguments: argparse.Namespace) -> int:

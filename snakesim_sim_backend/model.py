@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.links import Link
 from snakesim_hal.model.motor import check_gains
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig, place_all
@@ -126,6 +127,8 @@ def _add_snake(spec: mujoco.MjSpec, robot: RobotFile, settings: Settings) -> Non
             body.add_freejoint(name="base")
         else:
             _add_joint(body, f"joint_{i}", axes[i - 1], robot)
+        if robot.links and robot.links[i].has_inertia:
+            _set_inertia(body, robot.links[i], robot.module.radius_m)
         body.add_geom(
             name=f"link_{i}",
             type=mujoco.mjtGeom.mjGEOM_CAPSULE,
@@ -141,6 +144,14 @@ def _add_snake(spec: mujoco.MjSpec, robot: RobotFile, settings: Settings) -> Non
         for j in range(i + 2, len(lengths)):
             if sum(lengths[i + 1 : j]) < 2.05 * robot.module.radius_m:  # they would touch when the snake is straight
                 spec.add_exclude(bodyname1=f"link_{i}", bodyname2=f"link_{j}")
+
+
+def _set_inertia(body: mujoco.MjsBody, link: Link, radius_m: float) -> None:
+    """The robot file's, in place of the capsule's."""
+    body.explicitinertial = True
+    body.mass = link.mass_kg
+    body.ipos = list(link.center)
+    body.fullinertia = list(link.inertia(radius_m))
 
 
 def _add_foot(body: mujoco.MjsBody, name: str, along_m: float, robot: RobotFile) -> None:

@@ -25,9 +25,11 @@ from snakesim_hal.safety.authority import Authority
 
 HERE = Path(__file__).parent
 RESULTS = HERE.parent / "PEERS.md"
+LOOP = HERE / "loop.toml"  # host and control alone
 DORA = Path("build/peers")
 ROS_PYTHON = "/usr/bin/python3"
 ROS_PACKAGES = ("python3-rospy", "python3-rosmaster", "python3-sensor-msgs")
+WHOLE = "SnakeSIM, with guidance and navigation beside it"
 RATE_HZ, ROUNDS, REPEATS = 100, 500, 3
 PRIORITY = ("chrt", "--fifo", "19")  # as our own processes have it, where the system allows it
 ISOLATED = ("unshare", "--net", "--pid", "--fork", "--kill-child", "--mount-proc")
@@ -76,13 +78,15 @@ def _measure(*, write: bool) -> int:
     if _has_rospy():
         candidates["rospy, `sensor_msgs/JointState` both ways"] = lambda: _rospy(loop, prefix)
     ours: list[Percentiles] = []
+    whole: list[Percentiles] = []
     theirs: dict[str, list[Percentiles]] = {name: [] for name in candidates}
     for _ in range(REPEATS):
-        ours.append(_ours())
+        ours.append(_ours(str(LOOP)))
+        whole.append(_ours("triplet"))
         for name, times_us in candidates.items():
             p50, p99 = np.percentile(times_us(), (50, 99)).tolist()
             theirs[name].append((p50, p99))
-    lines = _table(ours, theirs, len(state), len(command))
+    lines = _table(ours, {WHOLE: whole} | theirs, len(state), len(command))
     print("\n".join(lines))
     if write:
         RESULTS.write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -102,19 +106,20 @@ def _table(
         "",
         f"Printed by `make bench-peers`: state ({state_bytes} bytes) to another process and a command ({command_bytes} "
         f"bytes) back, 13 joints, {RATE_HZ} Hz, {ROUNDS} rounds, medians of {REPEATS} turns. Read the ratios, not the "
-        "times. The others only echo. Ours is a run of the simulator: typed messages, a controller that holds the "
-        "pose, lease, gate and all checks.",
+        "times. The others only echo. Ours is a run of the simulator: typed messages, five sensors and a clock, a "
+        "controller that holds the pose, lease, gate and all checks.",
         "",
         "| loop | p50, µs | p99, µs | ours / this, p50 |",
         "|---|---|---|---|",
-        row("SnakeSIM, whole loop with safety", ours),
+        row("SnakeSIM, host and control with all safety", ours),
         *(row(name, found) for name, found in theirs.items()),
     ]
 
 
-def _ours() -> Percentiles:
+def _ours(scenario: str) -> Percentiles:
     """A run in real time: publishing to arrival of the command, and then its check and the decision."""
-    summary = run("--pace", "realtime", "--duration", str(ROUNDS / RATE_HZ), "--controller", "hold")
+    options = ("--pace", "realtime", "--duration", str(ROUNDS / RATE_HZ), "--controller", "hold")
+    summary = run(*options, scenario=scenario)
     p50, p99 = (summary.state_to_command_us[name] or 0.0 for name in ("p50", "p99"))
     decided_us = _deciding_us()
     return p50 + decided_us, p99 + decided_us

@@ -22,11 +22,12 @@ from deploy.vm.packages import PreparationError, kernel_packages, kernel_version
 # What init.sh itself needs, then what can be asked for. Their dependencies stand in the module files.
 BOOT_MODULES = ("9p", "9pnet_virtio", "virtio_pci", "virtio_console", "overlay")
 CAN_MODULES = ("can", "can_raw", "can_bcm", "vcan", "sch_tbf")  # the last one makes a vcan slow, in tests
+INPUT_MODULES = ("uinput", "evdev")  # a virtual joystick, in tests
 CONTROLLER_MODULES = ("kvaser_pci",)
 NETWORK_MODULES = ("virtio_net",)
 
 # Raise it when the contents of the cache change, so that an older one is not taken for a good one.
-LAYOUT = "1"
+LAYOUT = "2"
 PVH_ENTRY_NOTE = 18
 XZ, ZSTD = b"\xfd7zXZ\x00", b"\x28\xb5\x2f\xfd"
 
@@ -141,7 +142,7 @@ def _fetch(folder: Path) -> Path:
 def _collect(files: Mapping[str, Path]) -> dict[str, bytes]:
     """The modules that a guest may want, with all that they depend on."""
     modules: dict[str, bytes] = {}
-    waiting = [*BOOT_MODULES, *CAN_MODULES, *CONTROLLER_MODULES, *NETWORK_MODULES]
+    waiting = [*BOOT_MODULES, *CAN_MODULES, *INPUT_MODULES, *CONTROLLER_MODULES, *NETWORK_MODULES]
     while waiting:
         name = waiting.pop()
         if name in files and name not in modules:

@@ -22,7 +22,15 @@ from pathlib import Path
 from types import FrameType, TracebackType
 
 from deploy.vm import cpio
-from deploy.vm.kernel import BOOT_MODULES, CAN_MODULES, CONTROLLER_MODULES, NETWORK_MODULES, Kernel, load_order
+from deploy.vm.kernel import (
+    BOOT_MODULES,
+    CAN_MODULES,
+    CONTROLLER_MODULES,
+    INPUT_MODULES,
+    NETWORK_MODULES,
+    Kernel,
+    load_order,
+)
 from deploy.vm.packages import need_tool
 
 SCRIPTS = Path(__file__).parent
@@ -105,7 +113,7 @@ def first_files(request: Request, environment: Mapping[str, str]) -> bytes:
 
 def qemu_arguments(request: Request, kernel: Kernel, kvm: bool, initramfs: str, ports: Mapping[str, int]) -> list[str]:
     """QEMU's command line. `ports`: the number of an open socket for each of PORTS."""
-    modules = [*BOOT_MODULES, *CAN_MODULES]
+    modules = [*BOOT_MODULES, *CAN_MODULES, *INPUT_MODULES]
     shares = ["-fsdev", "local,id=root,path=/,security_model=none,readonly=on,multidevs=remap"]
     shares += ["-device", "virtio-9p-pci,fsdev=root,mount_tag=root"]
     for number, path in enumerate(request.writable):

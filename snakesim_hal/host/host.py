@@ -29,8 +29,9 @@ from snakesim_hal.host.participants import Participant, Participants
 from snakesim_hal.host.run_statistics import RunStatistics
 from snakesim_hal.host.status_messages import applied_message, status_message
 from snakesim_hal.host.timing import Deadlines, PublishTimes
-from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.model.scenario import RunConfig, written
 from snakesim_hal.network.private_channel import HostEnd, ToStarter
+from snakesim_hal.network.process_entries import HOST, ProcessEntries, own_entry, show_process
 from snakesim_hal.network.run_key import own_run_key, proven
 from snakesim_hal.network.session import Session
 from snakesim_hal.safety.authority import Authority
@@ -124,7 +125,10 @@ class Host:
         self._status_shown: Any = None
         if (found := self._latch.found) is not None:
             self.authority.on_estop(EstopRequest(who=f"{found.who[:40]}, before this host"), max(found.tick, 0))
-        self._outbox = Outbox(session, self.description, lockstep=config.pace == "lockstep")
+        self._outbox = Outbox(session, self.description, written(config), lockstep=config.pace == "lockstep")
+        self._entry = own_entry(HOST, config)
+        show_process(session, self._entry)
+        self._processes = ProcessEntries(session)
         self._inbox = Inbox(session, self, config.services, self._outbox.answer)
         session.on_alive(self._another_host, keys.HOST_ALL)
         self._starter.say(ToStarter(description=self.description))
@@ -253,8 +257,7 @@ class Host:
         started = time.monotonic_ns()
         try:
             self._backend.enact(decision.set_points, self.authority.state)
-            if self._outbox.applied_heard:
-                self._outbox.put(keys.APPLIED, applied_message(self.description, self._tick, decision))
+            self._outbox.put(keys.APPLIED, applied_message(self.description, self._tick, decision))
             self._backend.advance()
             for fault in self._backend.faults():
                 self.authority.fault(fault)
@@ -350,6 +353,10 @@ class Host:
         elif request.action == "arm" and (missing := self._missing()):
             waiting = f"waiting for {', '.join(missing)}"
             answer = Answer(ok=False, reason=waiting, refusal="not_ready", lifecycle=self.authority.state)
+        elif request.action == "arm" and (differing := self._differing()):
+            answer = Answer(
+                ok=False, reason="; ".join(differing)[:500], refusal="settings_differ", lifecycle=self.authority.state
+            )
         else:
             answer = self.authority.on_lifecycle(request, now_ns)
             if request.action == "arm" and answer.ok:
@@ -434,6 +441,7 @@ class Host:
             pace=self._pace,
             safety_now_ns=self._safety_now(),
             missing=self._missing(),
+            differing=self._differing(),
             overruns=self.statistics.overruns,
             realtime_warnings=self._realtime_warnings,
             injected=self.faults.on,
@@ -463,6 +471,10 @@ class Host:
     def _missing(self) -> list[str]:
         """Participants that are not connected, or in lockstep have not answered tick 0 yet."""
         return self.participants.missing(must_have_answered=self._config.pace == "lockstep")
+
+    def _differing(self) -> list[str]:
+        """How processes of the services that it waits for differ from this host, or that they have not said yet."""
+        return self._processes.against(self._entry, self.participants)
 
     def _backend_failed(self, error: BackendError) -> None:
         self.authority.fault(Fault(tick=self._tick, what="backend_failed", cause=str(error)[:500]))

@@ -16,7 +16,7 @@ from snakesim_hal.network.session import Publisher, Question, Session
 from snakesim_hal.terminal import complain
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import IMAGES
-from snakesim_hal.wire.messages import Answer, AppliedCommand, Description, Message, Status
+from snakesim_hal.wire.messages import MAX_CONFIG, Answer, Configuration, Description, Message, Status
 
 WAITING_LIMIT = 256  # queued messages; beyond that the oldest are dropped
 IMAGES_WAITING_LIMIT = 8
@@ -62,16 +62,18 @@ class Sender:
 class Outbox:
     """The output of one host."""
 
-    def __init__(self, session: Session, description: Description, *, lockstep: bool) -> None:
-        """Publishes the description, and declares the host's liveliness token."""
+    def __init__(self, session: Session, description: Description, config: bytes, *, lockstep: bool) -> None:
+        """Publishes the description and the effective configuration, and declares the host's liveliness token."""
         self._session, self._lockstep = session, lockstep
         self._publishers: dict[str, Publisher[Any]] = {keys.STATUS: session.latched_publisher(keys.STATUS, Status)}
         self._streams = Sender("streams")
         self._answers = Sender("answers")
         has_camera = any(keys.message_at(sensor.key) in IMAGES for sensor in description.sensors)
         self._images = Sender("images", IMAGES_WAITING_LIMIT) if has_camera else self._streams
-        self.applied_heard = False  # whether hal/applied has a subscriber
         session.latched_publisher(keys.DESCRIPTION, Description).put(description)
+        if len(config) <= MAX_CONFIG:
+            told = Configuration(config_hash=description.config_hash, content=config.decode())
+            session.latched_publisher(keys.CONFIG, Configuration).put(told)
         session.declare_alive(HAL)
         if description.host is not None:
             session.declare_token(keys.host(description.host))
@@ -85,13 +87,8 @@ class Outbox:
             sender.do(lambda: self._publisher(key, type(message)).put(message))
 
     def put_status(self, status: Status) -> None:
-        """Publish the status, and check for subscribers."""
-
-        def send() -> None:
-            self._publishers[keys.STATUS].put(status)
-            self.applied_heard = self._publisher(keys.APPLIED, AppliedCommand).heard()
-
-        self._streams.do(send)
+        """Publish the status."""
+        self._streams.do(lambda: self._publishers[keys.STATUS].put(status))
 
     def answer(self, question: Question, answer: Answer) -> None:
         """Answer a query. The requester may be slow."""

@@ -27,16 +27,17 @@ def status_message(
     pace: Pace,
     safety_now_ns: int,
     missing: list[str],
+    differing: list[str],
     overruns: int,
     realtime_warnings: list[str],
     injected: list[str],
 ) -> Status:
-    """The status of the robot. missing: the services that arming waits for."""
+    """The status of the robot. missing: the services that arming waits for; differing: how others are set up."""
     description = authority.description
     against = authority.against_arming(safety_now_ns)
     why = authority.why
-    if authority.state == "disarmed" and (against or missing):
-        why = "; ".join([why, *(f"waiting for {name}" for name in missing), *against])[:500]
+    if authority.state == "disarmed" and (against or missing or differing):
+        why = "; ".join([why, *differing, *(f"waiting for {name}" for name in missing), *against])[:500]
     return Status(
         tick=tick,
         stamp_ns=tick * description.period_ns,
@@ -59,7 +60,7 @@ def status_message(
         overruns=overruns,
         realtime_warnings=realtime_warnings,
         injected=injected,
-        ready_to_arm=not against and not missing,
+        ready_to_arm=not against and not missing and not differing,
         derated=authority.derated,
         isolated=authority.isolated,
         host=description.host,

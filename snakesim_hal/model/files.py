@@ -104,13 +104,10 @@ def leaves(value: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
         yield prefix, value
 
 
-def read_table(path: Path, suffix: str | None = None) -> Table:
-    """Read a TOML or JSON file. Raises ConfigError when it is missing or not valid.
-
-    suffix: selects the format; None: that of the path.
-    """
+def read_table(path: Path) -> Table:
+    """Read a TOML or JSON file. Raises ConfigError when it is missing or not valid."""
     text = read_text(path)
-    is_json = (path.suffix if suffix is None else suffix) == ".json"
+    is_json = path.suffix == ".json" or text.startswith("{")  # which no TOML does; a file in memory has no suffix
     values = parse_json(text, str(path)) if is_json else parse_toml(text, str(path))
     if not isinstance(values, dict):
         raise ConfigError(f"{path}: holds a {type(values).__name__}, not a table of settings")

@@ -184,14 +184,17 @@ def target_type(target: str) -> TargetType:
     return "process"
 
 
+OUTSIDE = ("operator", "preview")  # writers that are no part of a run
+
+
 def writer_of(key: str) -> str:
     """The part that writes a key. Raises ConfigError for a key that no part of a run writes."""
     row = keys.row_at(key)
-    if row is not None and row.kind in ("stream", "latched") and row.writer != "operator":
+    if row is not None and row.kind in ("stream", "latched") and row.writer not in OUTSIDE:
         if row.key == keys.DONE_ALL:
             return keys.service_of(key)
         return {"HAL": HAL, "lease holder": CONTROL}.get(row.writer, row.writer)
-    streams = [row.key for row in keys.SPACE if row.kind in ("stream", "latched") and row.writer != "operator"]
+    streams = [row.key for row in keys.SPACE if row.kind in ("stream", "latched") and row.writer not in OUTSIDE]
     raise ConfigError(f"{key!r}: no part of a run writes this key; those with a writer are {', '.join(streams)}")
 
 
@@ -218,7 +221,8 @@ def checked(injection: Injection, said: str | None = None) -> Injection:
     sort = injection.target_type
     allowed = KINDS[sort]
     if injection.kind not in allowed:
-        also = [f"{other}s" for other in get_args(TargetType) if injection.kind in KINDS[other]]
+        others = [other for other in get_args(TargetType) if injection.kind in KINDS[other]]
+        also = ["processes" if other == "process" else f"{other}s" for other in others]
         hint = f"; {injection.kind} is for {' and '.join(also)}" if also else ""
         raise ConfigError(
             f"fault {text!r}: a {sort} such as {injection.target} knows no {injection.kind!r}, only "

@@ -32,6 +32,21 @@ def quaternion_from_yaw(yaw_rad: float) -> tuple[float, float, float, float]:
     return (float(np.cos(yaw_rad / 2)), 0.0, 0.0, float(np.sin(yaw_rad / 2)))
 
 
+def quaternions_from_rotations(rotations: Floats) -> Floats:
+    """Unit quaternions wxyz (n, 4) of rotation matrices (n, 3, 3)."""
+    r = rotations
+    trace = r[:, 0, 0] + r[:, 1, 1] + r[:, 2, 2]
+    squares = np.stack([trace, *(2 * r[:, i, i] - trace for i in range(3))], axis=1)  # 4 q² - 1 of w, x, y, z
+    w, x, y, z = np.sqrt(np.maximum(1 + squares, 0)).T / 2
+    signed = np.stack([w, x, y, z], axis=1)
+    a, b, c = r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]  # 4 w x, 4 w y, 4 w z
+    d, e, f = r[:, 1, 0] + r[:, 0, 1], r[:, 0, 2] + r[:, 2, 0], r[:, 2, 1] + r[:, 1, 2]  # 4 x y, 4 x z, 4 y z
+    products = [(4 * w * w, a, b, c), (a, 4 * x * x, d, e), (b, d, 4 * y * y, f), (c, e, f, 4 * z * z)]
+    by_largest = np.stack([np.stack(row, axis=1) for row in products], axis=1)  # row i: 4 q_i q
+    found = by_largest[np.arange(len(r)), np.argmax(signed, axis=1)]
+    return found / np.linalg.norm(found, axis=1, keepdims=True)
+
+
 def yaw_of(rotation: Floats) -> float:
     """Heading of a frame's x axis on the ground."""
     return float(np.arctan2(rotation[1, 0], rotation[0, 0]))
@@ -79,11 +94,6 @@ def _yaw_only_frames(
     origins[0] = base_w
     origins[1:] = base_w + np.cumsum(forward[:-1] * np.asarray(link_lengths_m)[:-1, None], axis=0)
     return origins, rotations
-
-
-def joint_positions_s_m(link_lengths_m: Sequence[float]) -> Floats:
-    """Arc length of every joint along the body from the tail end, (n_joints,)."""
-    return np.cumsum(np.asarray(link_lengths_m, dtype=np.float64))[:-1]
 
 
 def tangents(normal: Vector) -> tuple[Vector, Vector]:

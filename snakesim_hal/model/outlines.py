@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 CORNERS = np.array([(1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1), (0, 1)], dtype=np.float64)
 
 
-def metres(low: float | None = None, high: float = 1000.0) -> Meta:
+def metres(low: float | None = None, high: float = 1000) -> Meta:
     """Bounds of a length in a file: above `low`, or of either sign."""
     if low is None:
         return Meta(ge=-high, le=high, extra_json_schema={"unit": "m"})

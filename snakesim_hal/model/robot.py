@@ -1,7 +1,7 @@
 """The robot file: the parameters of a chain of joint modules. A module is one joint with half a body on either side.
 
 Chained modules are bolted together, so n modules make n joints and n + 1 rigid links; tail and head link are half as
-long as the others.
+long as the others. A robot whose links differ otherwise lists them in `[[links]]`.
 """
 
 import hashlib
@@ -10,6 +10,7 @@ from typing import Annotated
 from msgspec import Meta
 
 from snakesim_hal.model.files import FileStruct
+from snakesim_hal.model.links import Link
 from snakesim_hal.model.sensors import LinkName, Mounted, Sensors
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (
@@ -86,14 +87,20 @@ class RobotFile(FileStruct, frozen=True, kw_only=True):
     about: str = ""
     chain: Chain
     module: Module
+    links: Annotated[list[Link], Meta(max_length=MAX_JOINTS + 1)] = []  # tail to head; none: made of the modules
     limits: Limits
     motor: Motor
     safety: Safety = Safety()
     sensors: Sensors = Sensors()
 
     def __post_init__(self) -> None:
-        """Sensors must sit on links that the robot has, and not inside of them. Raises ValueError."""
+        """Links must be as many as there are; sensors must sit on one, and not inside of it. Raises ValueError."""
         last = self.chain.modules
+        if self.links and len(self.links) != last + 1:
+            raise ValueError(
+                f"[[links]] has {len(self.links)} entries, and {last} joints connect {last + 1} links; list each, "
+                f"tail to head, or none"
+            )
         for sensor in (*self.sensors.depth, *self.sensors.range):
             link = self.link_index(sensor.link)
             if link > last:
@@ -119,16 +126,22 @@ class RobotFile(FileStruct, frozen=True, kw_only=True):
     @property
     def link_lengths_m(self) -> list[float]:
         """Length of every link, tail to head."""
+        if self.links:
+            return [link.length_m for link in self.links]
         return [self.module.length_m * share for share in self._shares]
 
     @property
     def link_masses_kg(self) -> list[float]:
         """Mass of every link, tail to head."""
+        if self.links:
+            return [link.mass_kg for link in self.links]
         return [self.module.mass_kg * share for share in self._shares]
 
     @property
     def length_m(self) -> float:
         """Length of the straight robot, without the caps of tail and head."""
+        if self.links:
+            return sum(self.link_lengths_m)
         return self.chain.modules * self.module.length_m
 
     @property

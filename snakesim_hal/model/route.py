@@ -69,11 +69,6 @@ class Route:
         heading = self.heading_rad(s_m)
         return np.array([np.cos(heading), np.sin(heading)])
 
-    def curvature_per_m(self, s_m: float) -> float:
-        """Signed curvature (left turn positive) at arc length `s_m`, over a window of 20 mm."""
-        turn = self.heading_rad(s_m + 0.01) - self.heading_rad(s_m - 0.01)
-        return float(np.arctan2(np.sin(turn), np.cos(turn)) / 0.02)
-
     def project(self, point_w: Floats, near_s_m: float | None = None, window_m: float = 0.5) -> float:
         """Arc length of the route's point nearest to `point_w`; with `near_s_m`, only within the window around it."""
         starts = self.points_w[:-1]

@@ -323,4 +323,4 @@ def write(config: RunConfig, path: Path) -> None:
 
 def read(path: Path) -> RunConfig:
     """Read back a file saved by `write`, whatever its name."""
-    return decode(read_table(path, ".json"), RunConfig)
+    return decode(read_table(path), RunConfig)

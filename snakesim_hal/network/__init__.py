@@ -5,5 +5,6 @@
 `client`          the interface of guidance, navigation and control; independent of the backend
 `robot_mismatch`  rejects messages that do not fit the robot
 `stop_port`       emergency stops by UDP, without Zenoh; `local_registry` finds the robots of this machine
+`neighbour`       raw bytes on the network of somebody else, such as that of ROS 2 nodes
 `private_channel` between a host and the process that started it
 """

@@ -100,8 +100,10 @@ class Client:
         self._clock: Clock | None = None
         self._ahead: Clock | None = None  # taken from the queue, but not due yet
         self._started_over = False
+        self._host_left = False
         self.commanded_tick = -1
         session.on_arrival(keys.CLOCK, self._take_clock)
+        session.on_alive(self._take_host, keys.HOST_ALL)
 
     def description(self, timeout_s: float = 10.0) -> Description:
         """The robot's description. Raises NotConnectedError when no HAL publishes one in time."""
@@ -165,10 +167,14 @@ class Client:
         return self.heard
 
     def met_anew(self) -> Description | None:
-        """The robot's description, if its HAL has restarted since the last call; else None."""
-        if not self._started_over:
+        """The robot's description, if it may have another HAL host than at the last call; else None.
+
+        Robot time that starts over shows it, and, when this service was cut off meanwhile, the token of the old host.
+        """
+        left = self._host_left and self._clock is not None and self._clock.lifecycle != "armed"
+        if not self._started_over and not left:
             return None
-        self._started_over = False
+        self._started_over = self._host_left = False
         self._robot = self._own_description(MISSING_LIMIT_S) or self._robot
         return self._robot
 
@@ -176,6 +182,11 @@ class Client:
         """The description of our own run's host; a forged one is ignored."""
         key = own_run_key()
         return self.session.latest(keys.DESCRIPTION, Description, timeout_s, lambda found: is_proven(found, key))
+
+    def _take_host(self, key: str, present: bool) -> None:
+        """In Zenoh's thread: a host has appeared or vanished; or the network has, and with it our view of the host."""
+        if not present and self._robot is not None and keys.service_of(key) == self._robot.host:
+            self._host_left = True
 
     def _take_clock(self, arrival: Arrival) -> None:
         """Runs in Zenoh's thread: wakes the service only for its due ticks."""

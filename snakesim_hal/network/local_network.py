@@ -153,6 +153,13 @@ class LocalSession(Session):
         """Call `take` for every sample."""
         self._subscribe(key, take)
 
+    def on_latched_arrival(self, key: str, take: Take) -> None:
+        """Like `on_arrival`, and for the values that were latched before."""
+        for at, arrival in list(self._network.latched.items()):
+            if intersects(key, at):
+                take(arrival)
+        self._subscribe(key, take)
+
     def on_question(self, key: str, take: Callable[[Question], None]) -> None:
         """Call `take` for every query."""
         row = key, take

@@ -6,11 +6,13 @@ Each run keeps a small file, locked for as long as its process lives; the kernel
 import contextlib
 import fcntl
 import os
+import socket
 from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
 
+from snakesim_hal.network.session import Link
 from snakesim_hal.wire.codec import UNDECODABLE
 
 
@@ -23,7 +25,25 @@ class LocalRobot(msgspec.Struct, frozen=True, kw_only=True):
     endpoint: str  # Zenoh endpoint
     stop_host: str  # of its stop port
     stop_port: int
+    config: str | None = None  # file with the effective configuration of its run, if that is known
     pid: int  # of the responsible process: `snakesim run`, or a host that was started on its own
+    session: str = ""  # path of the session file by which it has joined a lab; empty: without one
+
+    @staticmethod
+    def on(link: Link, robot: str, backend: str, stop_port: socket.socket, config: str | None = None) -> "LocalRobot":
+        """A robot for which this process is responsible."""
+        stop_host, port = stop_port.getsockname()[:2]
+        return LocalRobot(
+            namespace=link.namespace or robot,
+            robot=robot,
+            backend=backend,
+            endpoint=link.endpoint,
+            stop_host=stop_host,
+            stop_port=port,
+            pid=os.getpid(),
+            session=str(link.session.path) if link.session else "",
+            config=config,
+        )
 
 
 def state_folder() -> Path:

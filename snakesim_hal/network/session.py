@@ -20,13 +20,12 @@ import zenoh
 from zenoh import ext, handlers  # pyright: ignore[reportMissingModuleSource]
 
 from snakesim_hal.errors import ConfigError, NotConnectedError, WireError
-from snakesim_hal.model.files import short
-from snakesim_hal.model.textfiles import check_brackets, read_text
 from snakesim_hal.network.endpoint import check_guarded
+from snakesim_hal.network.session_file import SessionFile, of_mode, read_zenoh_file, refused_by_zenoh
 from snakesim_hal.process import raise_open_files
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import IMAGES, MAX_PAYLOAD_BYTES, Decoder, MessageT, encode, encoding_of
-from snakesim_hal.wire.messages import Answer, Message
+from snakesim_hal.wire.messages import Answer, Message, Preview
 
 DEFAULT_PORT = 7447
 DEFAULT_ENDPOINT = f"tcp/127.0.0.1:{DEFAULT_PORT}"
@@ -35,7 +34,8 @@ ENVELOPE_BYTES = 4096  # around a payload: key, encoding, and the numbers of an 
 UNICAST = {"accept_timeout": 1000, "accept_pending": 1000, "max_sessions": 4000}
 # A subscriber that does not read loses samples after 0.1 ms (Zenoh's default is 1 ms), so that ten of them hardly delay
 # a writer. With less, bursts to good subscribers are lost: at 0 ms, two thirds of six express messages in a row.
-TX = {"lease": 2000, "queue": {"congestion_control": {"drop": {"wait_before_drop": 100}}}}
+TX = {"lease": 2000, "queue/congestion_control/drop/wait_before_drop": 100}
+MAX_MESSAGE = "transport/link/rx/max_message_size"
 # Closing a frozen subscriber blocks a receiving thread of Zenoh, and by default it has two: three subscribers that
 # froze together blocked the controller's commands for long enough to end its lease.
 RUNTIME = ("ZENOH_RUNTIME", "(rx: (worker_threads: 16))")
@@ -53,6 +53,12 @@ class Link:
     listen: bool = False  # True: listen on the endpoint; False: connect to it
     insecure: bool = False  # True: listen even where other machines can connect
     largest_bytes: int = MAX_PAYLOAD_BYTES  # of a payload; longer ones cost neither memory nor time
+    session: SessionFile | None = None  # how to connect; `endpoint` is then the first one in it
+
+    @staticmethod
+    def of_file(session: SessionFile, namespace: str | None = None) -> "Link":
+        """As a session file says. Raises ConfigError when it is for another namespace."""
+        return Link(session.endpoints[0], session.namespace_for(namespace), session=session)
 
 
 class Arrival(msgspec.Struct, frozen=True):
@@ -154,11 +160,15 @@ class Session:
         # The last message of a tick is sent at once, batched with those put just before it: one packet instead of five.
         ends_a_tick = command or key == keys.CLOCK or key.startswith(keys.done(""))
         priority = zenoh.Priority.REAL_TIME if command else zenoh.Priority.DATA_HIGH
+        if message in IMAGES:
+            priority = zenoh.Priority.DATA_LOW
+        elif message is Preview:
+            priority = zenoh.Priority.BACKGROUND
         publisher = self._zenoh.declare_publisher(
             key,
             encoding=encoding_of(message),
             congestion_control=zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP,
-            priority=zenoh.Priority.DATA_LOW if message in IMAGES else priority,
+            priority=priority,
             express=ends_a_tick,
         )
         return self._published(key, publisher, message)
@@ -360,75 +370,87 @@ def open_session(link: Link, connect_timeout_s: float = 5.0) -> Iterator[Session
         check_guarded(link.endpoint, "endpoint", insecure=link.insecure)
         raise_open_files(MAX_OPEN_FILES)
         os.environ.setdefault(*RUNTIME)
-    session = Session(_open(_settings(link, connect_timeout_s), link))
+    session = Session(open_zenoh(link, connect_timeout_s))
     try:
         yield session
     finally:
         session.close()
 
 
-def _settings(link: Link, connect_timeout_s: float) -> dict[str, Any]:
+def _config(link: Link, connect_timeout_s: float) -> zenoh.Config:
+    """What Zenoh is opened with: a session file's settings if there is one, and ours on top."""
+    if link.session is not None:
+        config = zenoh.Config.from_json5(link.session.text)
+    else:
+        config = zenoh.Config()
+        config.insert_json5("mode", json.dumps("router" if link.listen else "client"))
+        for verb, does in (("listen", link.listen), ("connect", not link.listen)):
+            config.insert_json5(f"{verb}/endpoints", json.dumps([link.endpoint] if does else []))
+    for key, value in _ours(link, connect_timeout_s).items():
+        config.insert_json5(key, json.dumps(value))
+    untouched = zenoh.Config()
+    for key, value in _unless_given(link).items():
+        if config.get_json(key) == untouched.get_json(key):
+            config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def _ours(link: Link, connect_timeout_s: float) -> dict[str, Any]:
     settings: dict[str, Any] = {
-        "mode": "router" if link.listen else "client",
-        "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        "timestamping": {"enabled": {"router": True, "peer": True, "client": True}},
-        "transport": {
-            "unicast": UNICAST,
-            "link": {"tx": TX, "rx": {"max_message_size": link.largest_bytes + ENVELOPE_BYTES}},
-            "shared_memory": {"enabled": False},
-        },
-        "listen": {"endpoints": [link.endpoint] if link.listen else [], "exit_on_failure": True},
-        "connect": {
-            "endpoints": [] if link.listen else [link.endpoint],
-            "timeout_ms": round(connect_timeout_s * 1000),
-            "exit_on_failure": True,
-            "retry": {"period_init_ms": 50, "period_max_ms": 250, "period_increase_factor": 1.5},
-        },
+        "scouting/delay": 0,
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "timestamping/enabled": {"router": True, "peer": True, "client": True},
+        "transport/shared_memory/enabled": False,
+        "listen/exit_on_failure": True,
+        "connect/timeout_ms": round(connect_timeout_s * 1000),
+        "connect/exit_on_failure": True,
+        "connect/retry": {"period_init_ms": 50, "period_max_ms": 250, "period_increase_factor": 1.5},
     }
     if link.namespace is not None:
         settings["namespace"] = link.namespace
     return settings
 
 
-def _open(settings: dict[str, Any], link: Link) -> zenoh.Session:
+def _unless_given(link: Link) -> dict[str, Any]:
+    """Settings that a session file may have for its own network, such as a longer lease on a bad link."""
+    return {
+        **{f"transport/unicast/{key}": value for key, value in UNICAST.items()},
+        **{f"transport/link/tx/{key}": value for key, value in TX.items()},
+        MAX_MESSAGE: link.largest_bytes + ENVELOPE_BYTES,
+    }
+
+
+def open_zenoh(link: Link, connect_timeout_s: float) -> zenoh.Session:
+    """The session under a `Session`. Raises NotConnectedError."""
     zenoh.init_log_from_env_or("off")
     try:
-        return zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
+        return zenoh.open(_config(link, connect_timeout_s))
     except zenoh.ZError as error:
         if link.listen:
             raise NotConnectedError(
                 f"cannot listen on {link.endpoint}: {str(error).split(' at /')[0]}. Another run may hold the port; "
                 f"choose one with --endpoint tcp/127.0.0.1:PORT"
             ) from error
+        if link.session is not None:
+            raise NotConnectedError(
+                f"nothing on {', '.join(link.session.endpoints)} lets {link.session.path} in: no router runs there, or "
+                f"it does not accept the certificate; RUST_LOG=zenoh=warn says more"
+            ) from error
         raise NotConnectedError(f"nothing listens on {link.endpoint}; start a run or a router there first") from error
 
 
 def router_settings(config: Path) -> zenoh.Config:
     """The settings in a router's JSON5 file; opens nothing. Raises ConfigError."""
-    text = read_text(config)
-    check_brackets(text, str(config))
-    try:
-        settings = zenoh.Config.from_json5(text)
-    except zenoh.ZError as error:
-        raise _refused_by_zenoh(config, error) from error
+    _, settings = read_zenoh_file(config)
     if json.loads(settings.get_json("mode")) != "router":
         raise ConfigError(f'{config}: `mode` must be "router"')
     return settings
 
 
-def _listened_on(settings: zenoh.Config) -> list[str]:
-    """A router's endpoints; for every mode, or for routers alone."""
-    endpoints = json.loads(settings.get_json("listen/endpoints"))
-    return endpoints if isinstance(endpoints, list) else endpoints.get("router", [])
-
-
 def _denies_by_default(settings: zenoh.Config) -> bool:
     rules = json.loads(settings.get_json("access_control"))
     return bool(rules["enabled"]) and rules["default_permission"] == "deny"
-
-
-def _refused_by_zenoh(config: Path, error: zenoh.ZError) -> ConfigError:
-    return ConfigError(f"{config}: Zenoh refuses it: {short(' '.join(str(error).split()), 500)}")  # it quotes the file
 
 
 @contextmanager
@@ -439,13 +461,13 @@ def open_router(config: Path, *, insecure: bool = False) -> Iterator[None]:
     """
     zenoh.init_log_from_env_or("error")
     settings = router_settings(config)
-    for endpoint in _listened_on(settings):
+    for endpoint in of_mode(settings, "listen/endpoints", "router"):
         guarded = _denies_by_default(settings)
         check_guarded(endpoint, f"{config}: `listen.endpoints`:", access_control=guarded, insecure=insecure)
     try:
         session = zenoh.open(settings)
     except zenoh.ZError as error:
-        raise _refused_by_zenoh(config, error) from error
+        raise refused_by_zenoh(config, error) from error
     try:
         yield
     finally:

@@ -12,8 +12,11 @@ POWER = "sensor/power"
 DEPTH_ALL = "sensor/depth/*"
 COLOUR_ALL = "sensor/colour/*"
 RANGE_ALL = "sensor/range/*"
+PREVIEW_DEPTH_ALL = "preview/depth/*"
+PREVIEW_COLOUR_ALL = "preview/colour/*"
 JOINT_COMMAND = "actuator/joints"
 DESCRIPTION = "hal/description"
+CONFIG = "hal/config"
 STATUS = "hal/status"
 CLOCK = "hal/clock"
 APPLIED = "hal/applied"
@@ -28,6 +31,7 @@ CONTROL_STATE = "control/state"
 INTENT = "operator/intent"
 ALIVE_ALL = "alive/*"
 HOST_ALL = "hal/host/*"
+PROCESS_ALL = "process/*"
 
 
 @dataclass(frozen=True)
@@ -46,8 +50,8 @@ _TICK = "every tick"
 _SENSOR = "at its `rate_hz` in `Description.sensors`"
 _ASKED = "on request"
 _TURN = "every `every_ticks` of its service"
-_HEARD = f"{_TICK}, if there is a subscriber"
 _LIVES = "while connected"
+_LOOKED_AT = "2 Hz, if there is a subscriber"
 
 SPACE: tuple[Row, ...] = (
     Row(JOINTS, m.JointState, "HAL", "stream", _TICK, "angle, velocity, torque of every joint"),
@@ -58,11 +62,16 @@ SPACE: tuple[Row, ...] = (
     Row(DEPTH_ALL, m.DepthImage, "HAL", "stream", _SENSOR, "distances that a camera sees"),
     Row(COLOUR_ALL, m.ColourImage, "HAL", "stream", _SENSOR, "what a camera sees, in colour"),
     Row(RANGE_ALL, m.Ranges, "HAL", "stream", _SENSOR, "distances along the beams of a lidar or a range finder"),
+    Row(
+        PREVIEW_DEPTH_ALL, m.Preview, "preview", "stream", _LOOKED_AT, "small PNG of a depth image, for remote viewers"
+    ),
+    Row(PREVIEW_COLOUR_ALL, m.Preview, "preview", "stream", _LOOKED_AT, "small JPEG of a colour image"),
     Row(JOINT_COMMAND, m.JointCommand, "lease holder", "stream", _TICK, "mode and set-point of every joint"),
     Row(DESCRIPTION, m.Description, "HAL", "latched", "once", "joints, order, limits, geometry, sensors"),
+    Row(CONFIG, m.Configuration, "HAL", "latched", "once", "everything that the run was started with, as JSON"),
     Row(STATUS, m.Status, "HAL", "latched", "on a change, and 5 Hz", "lifecycle, reason, holder, faults, counters"),
     Row(CLOCK, m.Clock, "HAL", "stream", f"{_TICK}, last", "tick, time, and the newest sample at each key"),
-    Row(APPLIED, m.AppliedCommand, "HAL", "stream", _HEARD, "set-points that the motors got, and limits applied"),
+    Row(APPLIED, m.AppliedCommand, "HAL", "stream", _TICK, "set-points that the motors got, and limits applied"),
     Row(LEASE, m.LeaseRequest, "any", "query", _ASKED, "acquire, renew, release the right to command; replies Answer"),
     Row(LIFECYCLE, m.LifecycleRequest, "any", "query", _ASKED, "arm, disarm, clear, finish; replies Answer"),
     Row(ESTOP, m.EstopRequest, "any", "query", _ASKED, "stop now, needs no lease, latched; replies Answer"),
@@ -73,6 +82,7 @@ SPACE: tuple[Row, ...] = (
     Row(CONTROL_STATE, m.ControlState, "control", "stream", "on a change, and 20 Hz", "state, reason, forces, torques"),
     Row(INTENT, m.Intent, "operator", "stream", "before the last expires", "speed and direction wanted by somebody"),
     Row(ALIVE_ALL, None, "each service", "liveliness", _LIVES, "present while the service's process is connected"),
+    Row(PROCESS_ALL, m.Process, "each process", "latched", "once", "its machine, version, settings; and its token"),
     Row(HOST_ALL, None, "HAL", "liveliness", _LIVES, "one for each HAL host process; a robot must have only one"),
 )
 
@@ -94,6 +104,11 @@ def ranges(sensor: str) -> str:
     return f"sensor/range/{sensor}"
 
 
+def preview(image_key: str) -> str:
+    """Key of the preview of an image: `sensor/depth/head` -> `preview/depth/head`."""
+    return f"preview/{image_key.partition('/')[2]}"
+
+
 def done(service: str) -> str:
     """Key on which `service` reports a lockstep tick as done."""
     return f"hal/done/{service}"
@@ -112,6 +127,11 @@ def alive(service: str) -> str:
 def host(host_id: str) -> str:
     """Liveliness key of one host process."""
     return f"hal/host/{host_id}"
+
+
+def process(name: str, process_id: str) -> str:
+    """Key of one process, and of its liveliness token."""
+    return f"process/{name}-{process_id}"
 
 
 def service_of(key: str) -> str:

@@ -24,6 +24,7 @@ Reach = Literal["robot", "joint", "none"]
 Axis = Literal["yaw", "pitch"]
 
 A_JOINT = "one entry a joint"
+MAX_CONFIG = 500_000  # characters
 PACE = about("realtime: by the wall clock; lockstep: each tick waits for all services; free: without waiting")
 LIFECYCLE = about("motors follow commands only in armed; fault and estop stay until a clear")
 HOST = about("random id of the host process, new at each start; null: unknown")
@@ -133,12 +134,8 @@ class Power(Message, frozen=True, kw_only=True):
     valid: Annotated[q.Flags, about("false: the state of this module is unknown")]
 
 
-class DepthImage(Message, frozen=True, kw_only=True):
-    """`sensor/depth/<name>`: distances to the surfaces that a camera sees.
-
-    Camera frame: x forward along the optical axis, y to the left, z upwards. The ray through pixel (u, v), u to the
-    right and v downwards from the middle of the top left one, is (1, -(u - cx_px) / fx_px, -(v - cy_px) / fy_px).
-    """
+class CameraImage(Message, frozen=True, kw_only=True):
+    """What every image says of its camera, a pinhole: see DepthImage."""
 
     tick: q.Tick
     stamp_ns: Annotated[q.Stamp, about("of the exposure; `tick` is later by the delay")]
@@ -151,6 +148,15 @@ class DepthImage(Message, frozen=True, kw_only=True):
     fy_px: q.FocalLength
     cx_px: q.Pixels
     cy_px: q.Pixels
+
+
+class DepthImage(CameraImage, frozen=True, kw_only=True):
+    """`sensor/depth/<name>`: distances to the surfaces that a camera sees.
+
+    Camera frame: x forward along the optical axis, y to the left, z upwards. The ray through pixel (u, v), u to the
+    right and v downwards from the middle of the top left one, is (1, -(u - cx_px) / fx_px, -(v - cy_px) / fy_px).
+    """
+
     range_min_m: Annotated[q.Distance, about("along the optical axis; what is nearer is 0 in `depth`")]
     range_max_m: Annotated[q.Distance, about("along the optical axis; what is further is 0 in `depth`")]
     scale_m: Annotated[float, Meta(gt=0, le=1), about("metres of one count of `depth`")]
@@ -164,20 +170,9 @@ class DepthImage(Message, frozen=True, kw_only=True):
     ]
 
 
-class ColourImage(Message, frozen=True, kw_only=True):
+class ColourImage(CameraImage, frozen=True, kw_only=True):
     """`sensor/colour/<name>`: what a camera sees, in colour. Frame and pixels are as in DepthImage."""
 
-    tick: q.Tick
-    stamp_ns: Annotated[q.Stamp, about("of the exposure; `tick` is later by the delay")]
-    link: Annotated[q.LinkIndex, about("that carries the camera, from 0 at the tail")]
-    position_l: Annotated[q.Vector, about("of the camera")]
-    orientation_l_wxyz: Annotated[q.Quaternion, about("of the camera frame in that of the link")]
-    width: Annotated[int, Meta(ge=1, le=q.MAX_IMAGE_WIDTH), about("pixels in a row")]
-    height: Annotated[int, Meta(ge=1, le=q.MAX_IMAGE_HEIGHT), about("rows")]
-    fx_px: q.FocalLength
-    fy_px: q.FocalLength
-    cx_px: q.Pixels
-    cy_px: q.Pixels
     rgb: Annotated[
         bytes, Meta(max_length=3 * q.MAX_PIXELS), about("red, green and blue of each pixel, row by row from the top")
     ]
@@ -204,6 +199,21 @@ class Ranges(Message, frozen=True, kw_only=True):
         Meta(min_length=1, max_length=q.MAX_BEAMS),
         about("one entry a beam; null: nothing within range, or the beam dropped out"),
     ]
+
+
+class Preview(Message, frozen=True, kw_only=True):
+    """`preview/depth/<camera>` or `preview/colour/<camera>`: a small, compressed copy of an image."""
+
+    tick: q.Tick
+    stamp_ns: Annotated[q.Stamp, about("of the image that it was made from")]
+    width: Annotated[int, Meta(ge=1, le=q.MAX_IMAGE_WIDTH), about("pixels in a row of this copy")]
+    height: Annotated[int, Meta(ge=1, le=q.MAX_IMAGE_HEIGHT), about("rows of this copy")]
+    format: Annotated[Literal["jpeg", "png"], about("of `data`: jpeg in colour, png of 16 bits for depth")]
+    scale_m: Annotated[
+        Annotated[float, Meta(gt=0, le=1)] | None,
+        about("metres of one count of depth, which is 0 for nothing within range; null: it is in colour"),
+    ] = None
+    data: Annotated[bytes, Meta(max_length=q.MAX_PREVIEW_BYTES), about("the file")]
 
 
 # --- actuators -------------------------------------------------------------------------------------------------
@@ -347,6 +357,13 @@ class Description(Message, frozen=True, kw_only=True):
     sensors: Annotated[list[SensorDescription], Meta(max_length=32)]
 
 
+class Configuration(Message, frozen=True, kw_only=True):
+    """`hal/config`, latched: the effective configuration of the run, which explains a recording."""
+
+    config_hash: Annotated[q.Name, about("as in the description")]
+    content: Annotated[str, Meta(max_length=MAX_CONFIG), about("JSON, as `schemas/files/run.json` describes it")]
+
+
 class Fault(Message, frozen=True, kw_only=True):
     """One fault, and its location."""
 
@@ -463,6 +480,27 @@ class Done(Message, frozen=True, kw_only=True):
     """`hal/done/<service>`: a lockstep participant has published all its output for a tick."""
 
     tick: q.Tick
+
+
+class Process(Message, frozen=True, kw_only=True):
+    """`process/<name>-<id>`, latched: one process of the robot's network; valid while a token at the same key lives."""
+
+    name: Annotated[q.Name, about("its role: host, a service of the scenario, recorder, ...")]
+    machine: Annotated[q.Name, about("host name of its computer")]
+    user: Annotated[q.Name, about("who has started it")]
+    pid: Annotated[q.Count, about("its process id there")]
+    version: Annotated[q.Name, about("of SnakeSIM, or of the program that writes this")]
+    started_unix_s: Annotated[q.Count, about("when it started, by the wall clock of its machine")]
+    settings: Annotated[
+        dict[q.Name, q.Name],
+        Meta(max_length=32),
+        about("settings that host and services must share: values, and hashes of sections; empty: it uses none"),
+    ] = {}
+    messages: Annotated[
+        dict[q.Name, Annotated[q.Count, about("version of that message")]],
+        Meta(max_length=64),
+        about("messages that it knows; empty: unknown"),
+    ] = {}
 
 
 # --- guidance, navigation, control -----------------------------------------------------------------------------
@@ -597,10 +635,12 @@ VERSIONS: dict[type[Message], int] = dict.fromkeys(
         DepthImage,
         ColourImage,
         Ranges,
+        Preview,
         JointCommand,
         AppliedCommand,
         Clock,
         Description,
+        Configuration,
         Status,
         LeaseRequest,
         LifecycleRequest,
@@ -608,6 +648,7 @@ VERSIONS: dict[type[Message], int] = dict.fromkeys(
         FaultRequest,
         Answer,
         Done,
+        Process,
         World,
         Trajectory,
         ControlState,

@@ -1,5 +1,6 @@
 """`snakesim optimise`: searches settings for the best mean of a number, with Optuna; a file keeps all trials."""
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ from snakesim_operator.evaluate.case import Case, Outcome
 from snakesim_operator.evaluate.cluster import size, solve, workers
 from snakesim_operator.evaluate.suite import Suite, cases_of
 from snakesim_operator.results.summary import RunSummary
+from snakesim_operator.run.progress import in_minutes
 
 
 @dataclass(frozen=True)
@@ -51,11 +53,15 @@ def optimise(request: Request) -> int:
     if have:
         say(f"{request.storage} holds {have} trials already")
     if left := max(request.trials - have, 0):
+        began, todo = time.monotonic(), left
         with workers(request.cluster, request.workers) as client:
             while left > 0:
                 asked = [study.ask(space) for _ in range(min(left, size(client)))]
                 _trials(request, study, asked, client)
                 left -= len(asked)
+                passed_s = time.monotonic() - began
+                left_s = passed_s / (todo - left) * left
+                say(f"{todo - left} of {todo} trials, {in_minutes(passed_s)} passed, about {in_minutes(left_s)} left")
     return _conclude(request, study)
 
 

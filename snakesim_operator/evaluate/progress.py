@@ -7,6 +7,7 @@ from typing import Self
 
 from snakesim_hal.terminal import say, say_again
 from snakesim_operator.evaluate.case import Outcome
+from snakesim_operator.run.progress import in_minutes
 
 PLAIN_PERIOD_S = 10.0
 
@@ -48,9 +49,4 @@ class Progress:
         parts = [f"{self._done} of {self._total} cases", f"{self._crossed} crossed"]
         if self._errors:
             parts.append(f"{self._errors} could not run")
-        return "  ".join([*parts, f"{_clock(passed_s)} passed, about {_clock(left_s)} left"])
-
-
-def _clock(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}" if minutes >= 60 else f"{minutes}:{rest:02d}"
+        return "  ".join([*parts, f"{in_minutes(passed_s)} passed, about {in_minutes(left_s)} left"])

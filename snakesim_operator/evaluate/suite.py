@@ -29,10 +29,10 @@ from msgspec import Meta
 
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.files import FileStruct, Table, decode, find, read_table, short
+from snakesim_hal.model.plugin_check import check_plugins
 from snakesim_hal.model.scenario import Override, RunConfig, check, compose, written
 from snakesim_hal.model.textfiles import parse_toml
 from snakesim_operator.evaluate.case import Case, case_id
-from snakesim_operator.run.run import check_plugins
 
 MAX_CASES = 200_000
 Count = Annotated[int, Meta(ge=1, le=100_000)]

@@ -1,4 +1,4 @@
-"""Gaps of a record: invalid numbers, and lines that cannot be decoded. Reported, and marked as NaN. Pure."""
+"""Gaps of a record: invalid numbers, and messages that cannot be decoded. Reported, and marked as NaN. Pure."""
 
 from collections import Counter
 from typing import Any
@@ -54,8 +54,8 @@ def unwritten(host: HostRecord) -> list[str]:
 
 
 def unread(refused: Counter[str]) -> list[str]:
-    """refused: key and field of telemetry that could not be decoded -> how many lines."""
-    return [f"telemetry: {count} lines cannot be read, {what}" for what, count in sorted(refused.items())]
+    """refused: key and field of the recording that could not be decoded -> how many messages."""
+    return [f"recording: {count} messages cannot be read, {what}" for what, count in sorted(refused.items())]
 
 
 def _bad(values: NDArray[Any]) -> NDArray[np.bool_]:

@@ -1,6 +1,5 @@
-"""Reads a run's folder: configuration, description, black box, host's record, telemetry."""
+"""Reads a run's folder: configuration, description, black box, host's record, recording."""
 
-from collections import Counter
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -20,30 +19,17 @@ from snakesim_hal.model.scenario import RunConfig, place_all, read
 from snakesim_hal.model.scene import Placed, route_of
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
-from snakesim_hal.wire.messages import ControlState, Description, Message, Trajectory, World
-from snakesim_operator.results.gaps import cleaned, unread, unwritten
+from snakesim_hal.wire.messages import ControlState, Description, Trajectory, World
+from snakesim_operator.recording.reader import RECORDING
+from snakesim_operator.results.gaps import cleaned, unwritten
+from snakesim_operator.results.recorded import TOLD, Contents, read_recording
 
 CONFIG = "config.json"
-TELEMETRY = "telemetry.jsonl"
 SUMMARY = "summary.json"
 REPORT = "report.html"
 
-TOLD: dict[str, type[Message]] = {
-    keys.CONTROL_STATE: ControlState,
-    keys.WORLD: World,
-    keys.TRAJECTORY: Trajectory,
-}
-"""What telemetry keeps."""
-
 DAMAGED = (*UNDECODABLE, OSError, MemoryError)
 Floats = NDArray[np.float64]
-
-
-class TelemetryLine(msgspec.Struct, frozen=True):
-    """One line of the telemetry file."""
-
-    key: str
-    message: msgspec.Raw
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,10 +58,12 @@ class RunRecord:
 
     @staticmethod
     def load(folder: Path, host: HostRecord | None = None) -> "RunRecord":
-        """Read a run's folder, also of a run that was killed. Raises ConfigError for any other folder.
+        """Read a run's folder, also of a run that was killed, or a recording. Raises ConfigError for anything else.
 
         host: the host's statistics, if known from elsewhere; None: from the folder.
         """
+        if folder.is_file() or (not (folder / BLACK_BOX).exists() and (folder / RECORDING).is_file()):
+            return RunRecord._alone(folder if folder.is_file() else folder / RECORDING)
         for name in (CONFIG, BLACK_BOX, DESCRIPTION, *([] if host is not None else [HOST_RECORD])):
             if not (folder / name).is_file():
                 raise ConfigError(f"{folder} is not the folder of a run: {name} is missing")
@@ -98,15 +86,45 @@ class RunRecord:
             host = msgspec.json.decode((folder / HOST_RECORD).read_bytes(), type=HostRecord)
         if host.ended == "running":
             host = msgspec.structs.replace(host, ticks=len(columns["tick"]), command_digest=digest_of(columns))
+        lost = max(host.lost_ticks, host.ticks - len(columns["tick"]))
+        host = msgspec.structs.replace(host, lost_ticks=lost)
         known, lacks = cleaned(columns, description, has_pose=config.robot.sensors.pose is not None)
-        told: dict[str, list[Any]] = {key: [] for key in TOLD}
-        lacks += unwritten(host) + unread(_read_telemetry(folder / TELEMETRY, told))
-        control = told[keys.CONTROL_STATE]
+        lacks += unwritten(host)
+        path = folder / RECORDING
+        contents = read_recording(path, TOLD) if path.is_file() else Contents(path)
+        return RunRecord._of(folder, config, description, host, contents, known, lacks)
+
+    @staticmethod
+    def _alone(path: Path) -> "RunRecord":
+        """Of a recording without the run's other files."""
+        contents = read_recording(path)
+        description = contents.description
+        if description is None or contents.config is None:
+            raise ConfigError(f"{path}: holds no hal/description and hal/config; was it recorded beside a HAL host?")
+        try:
+            config = msgspec.json.decode(contents.config.content, type=RunConfig)
+        except UNDECODABLE as error:
+            raise ConfigError(f"{path}: its hal/config cannot be read: {str(error)[:200]}") from None
+        columns = contents.columns(description)
+        known, lacks = cleaned(columns, description, has_pose=config.robot.sensors.pose is not None)
+        return RunRecord._of(path, config, description, contents.host(columns), contents, known, lacks)
+
+    @staticmethod
+    def _of(
+        folder: Path,
+        config: RunConfig,
+        description: Description,
+        host: HostRecord,
+        contents: Contents,
+        columns: dict[str, NDArray[Any]],
+        lacks: list[str],
+    ) -> "RunRecord":
+        control = contents.told[keys.CONTROL_STATE]
         while control and control[-1].state == "PowerOff":  # the host has ended, so its clock is expected to stop
             control.pop()
-        known = {name: column for name, column in known.items() if name != "tick"}
-        worlds, trajectories = told[keys.WORLD], told[keys.TRAJECTORY]
-        return RunRecord(folder, config, description, host, control, worlds, trajectories, **known, lacks=lacks)
+        known = {name: column for name, column in columns.items() if name != "tick"}
+        told = (control, contents.told[keys.WORLD], contents.told[keys.TRAJECTORY])
+        return RunRecord(folder, config, description, host, *told, **known, lacks=lacks + contents.lacks)
 
     @cached_property
     def route(self) -> Route | None:
@@ -141,20 +159,3 @@ def nodes_w(robot: Description, position_w: Floats, orientation_wxyz: Floats, an
     rotation = rotation_from_quaternion(orientation_wxyz)
     origins, rotations = link_frames(position_w, rotation, angle_rad, [joint.axis for joint in robot.joints], lengths)
     return np.vstack([origins, origins[-1] + lengths[-1] * rotations[-1][:, 0]])
-
-
-def _read_telemetry(path: Path, told: dict[str, list[Any]]) -> Counter[str]:
-    """Read the decodable lines; returns counts of the others. An incomplete last line means a killed process."""
-    refused: Counter[str] = Counter()
-    decoder = msgspec.json.Decoder(TelemetryLine)
-    lines = path.read_bytes().split(b"\n")[:-1] if path.is_file() else []
-    for text in lines:
-        key = "no message"
-        try:
-            line = decoder.decode(text)
-            key = line.key
-            if key in told:
-                told[key].append(msgspec.json.decode(line.message, type=TOLD[key]))
-        except UNDECODABLE as error:
-            refused[f"{key}: {error}"[:200]] += 1
-    return refused

@@ -32,6 +32,7 @@ class Outcome:
     robot: Description | None
     restarts: Sequence[Restart] = ()
     hosts: int = 1
+    lost: Sequence[str] = ()  # why the recording lacks something
 
 
 def conclude(config: RunConfig, files: RunFiles, ending: Ending, outcome: Outcome, *, stay: bool = False) -> int:
@@ -45,7 +46,7 @@ def conclude(config: RunConfig, files: RunFiles, ending: Ending, outcome: Outcom
         explain(ending, host, config, stay=stay)
         lacks = _leave(files, ending, outcome, host)
     lost = files.close()
-    lacks += [lost] if lost and lost not in lacks else []
+    lacks += [lack for lack in (*outcome.lost, lost) if lack and lack not in lacks]
     _print_end(files, ending, outcome, lacks)
     last_run.remember(str(files.folder or "no folder"), _ended(ending))
     if ending.interrupted:
@@ -79,11 +80,12 @@ def _leave(files: RunFiles, ending: Ending, outcome: Outcome, host: HostRecord) 
         _print_host(host)
         return ["nothing was recorded"]
     try:
-        _print_summary(leave(files, files.folder, ending, outcome)[1])
+        record, summary = leave(files, files.folder, ending, outcome)
+        _print_summary(summary)
     except ConfigError as error:
         _print_host(host)
         return [*unwritten(host), str(error)]
-    return unwritten(host)
+    return unwritten(record.host)
 
 
 def leave(

@@ -11,10 +11,12 @@ from pathlib import Path
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.host.recorder import BLACK_BOX, HOST_RECORD
 from snakesim_hal.model.whole_file import PARTIAL
-from snakesim_operator.results.record import CONFIG, REPORT, SUMMARY, TELEMETRY
+from snakesim_operator.recording.reader import RECORDING
+from snakesim_operator.results.record import CONFIG, REPORT, SUMMARY
 
 LOCK = "run.lock"  # holds the process id of the run that is writing here
-LEFT = (CONFIG, HOST_RECORD, BLACK_BOX, TELEMETRY, SUMMARY, REPORT, "blackbox.npz")  # the last: of older versions
+OLDER = ("telemetry.jsonl", "blackbox.npz")  # of older versions
+LEFT = (CONFIG, HOST_RECORD, BLACK_BOX, RECORDING, SUMMARY, REPORT, *OLDER)
 TIME = "%Y%m%d-%H%M%S"
 
 

@@ -11,8 +11,10 @@ The run takes as long as its computing. Several at a time go into processes of t
 
 import contextlib
 import io
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -20,17 +22,23 @@ from snakesim_hal.errors import ConfigError
 from snakesim_hal.host.recorder import Recorder
 from snakesim_hal.host_process import record_of
 from snakesim_hal.in_process import InProcessRun, check
+from snakesim_hal.model.plugin_check import check_plugins
 from snakesim_hal.model.scenario import RunConfig, write
+from snakesim_hal.network.session import Session
 from snakesim_hal.terminal import complain, say
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import ControlState
+from snakesim_operator.recording.reader import RECORDING
+from snakesim_operator.recording.recording import Recording
 from snakesim_operator.results.advance import GoalWatch
 from snakesim_operator.results.record import CONFIG, RunRecord
+from snakesim_operator.results.recorded import TOLD
 from snakesim_operator.results.summary import RunSummary
 from snakesim_operator.run.conclusion import Outcome, conclude, explain, leave
 from snakesim_operator.run.ending import Ending, interruptible
 from snakesim_operator.run.progress import Progress
-from snakesim_operator.run.run import check_plugins, opened_files
+from snakesim_operator.run.run import opened_files
 from snakesim_operator.run.run_files import RunFiles
-from snakesim_operator.run.telemetry import Telemetry
 
 WORDS = "run.log"  # what the parts of the run say
 TAKEN_EVERY = 50  # turns
@@ -61,47 +69,78 @@ def simulate(config: RunConfig, out: Path | None = None, *, until_goal: bool = F
         if files.folder is None:
             raise ConfigError(f"{out} cannot be written to; choose another folder")
         opened.callback(files.close)
-        run = _go(config, files, ending, None, until_goal=until_goal)
+        recorded = TOLD if out is None else [row.key for row in keys.SPACE]
+        run, outcome = _go(config, files, ending, None, recorded, until_goal=until_goal)
         explain(ending, record_of(run.host), config)
-        return Result(*leave(files, files.folder, ending, _outcome(run), report=out is not None))
+        return Result(*leave(files, files.folder, ending, outcome, report=out is not None))
 
 
-def run_in_process(config: RunConfig, out: Path | None, *, until_goal: bool = False) -> int:
+def run_in_process(config: RunConfig, out: Path | None, *, until_goal: bool = False, record: bool = True) -> int:
     """`snakesim run --in-process`. Exit code: as of a run in processes. until_goal: as of `simulate`."""
     check(config)
     ending = Ending()
     with opened_files(config, out) as (files, _):
         say(f"{config.name}: {config.robot.name} in {config.scene.name}, {config.commander}, in one process")
         with interruptible(ending), Progress(config) as progress:
-            run = _go(config, files, ending, progress, until_goal=until_goal)
-        return conclude(config, files, ending, _outcome(run))
-
-
-def _outcome(run: InProcessRun) -> Outcome:
-    return Outcome(record_of(run.host), run.host.description)
+            recorded = [row.key for row in keys.SPACE] if record else []
+            _, outcome = _go(config, files, ending, progress, recorded, until_goal=until_goal)
+        return conclude(config, files, ending, outcome)
 
 
 def _go(
-    config: RunConfig, files: RunFiles, ending: Ending, progress: Progress | None, *, until_goal: bool
-) -> InProcessRun:
+    config: RunConfig,
+    files: RunFiles,
+    ending: Ending,
+    progress: Progress | None,
+    recorded: Iterable[str],
+    *,
+    until_goal: bool,
+) -> tuple[InProcessRun, Outcome]:
+    """recorded: keys, which may have wildcards."""
     words = _Words(files)
     with contextlib.redirect_stderr(words), InProcessRun(config) as run:
-        host, telemetry = run.host, Telemetry(run.network.session(), files)
+        host, session = run.host, run.network.session()
+        control = session.reader(keys.CONTROL_STATE, ControlState)
         watch = GoalWatch(config, host.description)
-        with Recorder(host.black_box, host.description, partial(record_of, host), files.folder):
+        with (
+            Recorder(host.black_box, host.description, partial(record_of, host), files.folder),
+            _recording(session, files, recorded) as recording,
+        ):
             for turn, _ in enumerate(run.turns()):
                 if turn % TAKEN_EVERY == 0:
-                    telemetry.take_in()
+                    if recording is not None:
+                        recording.flush_when_due()
                     if progress is not None:
-                        progress.show(host.status(), telemetry.latest, armed=host.authority.arming > 0)
+                        state = control.newest(lambda _state: True)
+                        progress.show(host.status(), state, armed=host.authority.arming > 0)
                     if until_goal and watch.reached(host.black_box):
                         host.complete()
                 if ending.interrupted:
                     run.stop()
-            telemetry.take_in()
     for failure in run.failed:
         ending.because(failure)
-    return run
+    lost = [] if recording is None or not recording.trouble else [recording.trouble]
+    return run, Outcome(record_of(run.host), run.host.description, lost=lost)
+
+
+@contextlib.contextmanager
+def _recording(session: Session, files: RunFiles, recorded: Iterable[str]) -> Iterator[Recording | None]:
+    """Record what is published at these keys; None when there are none, or no file can be made."""
+    recording = None
+    try:
+        if files.folder is not None and recorded:
+            recording = Recording(files.folder / RECORDING)
+            for key in recorded:
+                session.on_latched_arrival(key, recording.take)
+    except OSError as error:
+        files.warn(f"{files.folder}: {error.strerror}")
+    try:
+        yield recording
+    finally:
+        if recording is not None:
+            recording.close({"version": version("snakesim"), "dropped": {}})
+            if recording.trouble:
+                files.warn(recording.trouble)
 
 
 class _Words(io.TextIOBase):

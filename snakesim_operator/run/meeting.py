@@ -1,8 +1,8 @@
 """The endpoint of a run, which no other run can have, and its stop port."""
 
 import contextlib
-import os
 import socket
+from pathlib import Path
 
 from snakesim_hal.errors import NotConnectedError, RefusedError
 from snakesim_hal.model.scenario import RunConfig
@@ -17,37 +17,38 @@ LOOPBACK = "127.0.0.1"
 TRIES = 10
 
 
-def meeting_point(endpoint: str | None, router: str | None) -> tuple[str, socket.socket]:
-    """The run's endpoint and its stop port, which this process keeps bound until the run is over.
+def meeting_point(endpoint: str | None, lab: Link | None, namespace: str) -> tuple[Link, socket.socket]:
+    """Where the run's parts meet, and its stop port, which this process keeps bound until the run is over.
 
     Two runs that start at the same moment cannot get the same endpoint, because a port has one holder. Without
     `endpoint` it is the default port, or any other if that is in use. Raises NotConnectedError.
     """
-    if router is not None:
-        return router, open_stop_port(*stop_address(router, listens=False))
+    if lab is not None:
+        return lab, open_stop_port(*stop_address(lab.endpoint, listens=False))
     if endpoint is not None:
         stop_port = open_stop_port(*stop_address(endpoint, listens=True))
-        return endpoint, stop_port
+        return Link(endpoint, namespace), stop_port
     for wanted in (DEFAULT_PORT, *[0] * TRIES):
         with contextlib.suppress(NotConnectedError):
             stop_port = open_stop_port(LOOPBACK, wanted)
             port: int = stop_port.getsockname()[1]
             if _is_free(port):
-                return f"tcp/{LOOPBACK}:{port}", stop_port
+                return Link(f"tcp/{LOOPBACK}:{port}", namespace), stop_port
             stop_port.close()
     raise NotConnectedError("no free port on the loopback interface")
 
 
-def refuse_second_robot(endpoint: str | None, router: str | None, namespace: str) -> None:
+def refuse_second_robot(endpoint: str | None, lab: Link | None) -> None:
     """Raise RefusedError when there is a robot already: two would have one name, or share an endpoint.
 
     Raises NotConnectedError when there is no such router.
     """
-    if router is not None:
-        with open_session(Link(router, namespace), CONNECT_S) as session:
+    if lab is not None:
+        with open_session(lab, CONNECT_S) as session:
             if session.present(keys.alive("hal")) or session.present(keys.HOST_ALL):
                 raise RefusedError(
-                    f"{namespace} is on {router} already; end that run first, or give this one another --namespace"
+                    f"{lab.namespace} is on {lab.endpoint} already; end that run first, or give this one another "
+                    f"--namespace"
                 )
     elif endpoint is not None:
         with contextlib.suppress(NotConnectedError), open_session(Link(endpoint), CONNECT_S) as session:
@@ -58,18 +59,9 @@ def refuse_second_robot(endpoint: str | None, router: str | None, namespace: str
             )
 
 
-def local_robot(config: RunConfig, namespace: str, endpoint: str, stop_port: socket.socket) -> LocalRobot:
+def local_robot(config: RunConfig, config_file: Path, link: Link, stop_port: socket.socket) -> LocalRobot:
     """The run's entry in the local registry."""
-    stop_host, port = stop_port.getsockname()[:2]
-    return LocalRobot(
-        namespace=namespace,
-        robot=config.robot.name,
-        backend=config.backend,
-        endpoint=endpoint,
-        stop_host=stop_host,
-        stop_port=port,
-        pid=os.getpid(),
-    )
+    return LocalRobot.on(link, config.robot.name, config.backend, stop_port, str(config_file.absolute()))
 
 
 def _is_free(port: int) -> bool:

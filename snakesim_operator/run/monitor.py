@@ -1,4 +1,4 @@
-"""Monitors a running run: arms once, writes telemetry, shows progress, and notices faults."""
+"""Monitors a running run: arms once, shows progress, and notices faults."""
 
 import time
 from collections.abc import Callable
@@ -7,13 +7,13 @@ from snakesim_hal.errors import NotConnectedError, RefusedError
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Session
 from snakesim_hal.service import START_LIMIT_S
-from snakesim_hal.wire.messages import Description, LifecycleRequest, Status
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import ControlState, Description, LifecycleRequest, Status
+from snakesim_operator.recording.process import RECORDER
 from snakesim_operator.run.ending import Ending
 from snakesim_operator.run.process_faults import ProcessFaults
 from snakesim_operator.run.progress import Progress
-from snakesim_operator.run.run_files import RunFiles
 from snakesim_operator.run.supervisor import Supervisor
-from snakesim_operator.run.telemetry import Telemetry
 
 AFTER_FAULT_S = 1.5
 POLL_S = 0.05
@@ -29,7 +29,6 @@ class RunMonitor:
         config: RunConfig,
         session: Session,
         supervisor: Supervisor,
-        files: RunFiles,
         ending: Ending,
         say: Callable[[str], None],
         *,
@@ -38,7 +37,10 @@ class RunMonitor:
         """stay: a fault does not end the run; a person clears it and arms again."""
         self._session, self._supervisor = session, supervisor
         self._ending, self._say, self._stay = ending, say, stay
-        self._telemetry = Telemetry(session, files)
+        self._control = session.reader(keys.CONTROL_STATE, ControlState)
+        self._state: ControlState | None = None
+        self._recorder_is_there = RECORDER not in supervisor.names
+        session.on_alive(self._recorder_came, keys.alive(RECORDER))
         self._faults = ProcessFaults(config, session, supervisor, say)
         self._progress = Progress(config)
         self._status: Status | None = None
@@ -70,22 +72,20 @@ class RunMonitor:
                     self._let_it_settle()
             finally:
                 self._faults.undo()
-                self._telemetry.take_in()
 
     def _take_in(self) -> None:
         """Process arrived messages."""
         if self._hosts != self._supervisor.hosts:
             self._hosts = self._supervisor.hosts
             self._may_arm = False
-            self._telemetry.expect_new_host()
             self._progress.start_over()
             self._asked_at = None
         host = self._supervisor.host
         if host is not None:
             host.take_in()
         self._status, self._robot = (None, None) if host is None else (host.status, host.description)
-        self._telemetry.take_in()
-        self._progress.show(self._status, self._telemetry.latest, armed=self._armed)
+        self._state = self._control.newest(lambda _state: True) or self._state
+        self._progress.show(self._status, self._state, armed=self._armed)
 
     def _see_to_faults(self) -> None:
         """Carry out injected faults, and detect real ones."""
@@ -124,7 +124,13 @@ class RunMonitor:
             self._supervisor.came_up = True
         if self._armed or not self._may_arm or not status.ready_to_arm or self._robot is None:
             return
+        if not self._recorder_is_there and RECORDER not in self._supervisor.lost:
+            return
         self._ask_to_arm(status, self._robot)
+
+    def _recorder_came(self, _key: str, present: bool) -> None:
+        """In Zenoh's thread: it misses nothing from now on."""
+        self._recorder_is_there |= present
 
     def _ask_to_arm(self, status: Status, robot: Description) -> None:
         """Over the private channel, which reaches only the host that this run has started."""

@@ -71,7 +71,11 @@ class Progress:
         passed_s, wall_s = time_s - self._origin[1], now - self._origin[0]
         parts = [f"{min(self._armed_s, self._duration_s):6.2f} of {self._duration_s:g} s"]
         if wall_s > 0.3:
-            parts.append(f"{passed_s / wall_s:.1f}x real time")
+            speed = passed_s / wall_s
+            parts.append(f"{speed:.1f}x real time")
+            left_s = max(self._duration_s - self._armed_s, 0.0)
+            if speed > 0 and status.lifecycle == "armed" and left_s > 0:
+                parts.append(f"about {in_minutes(left_s / speed)} left")
         if status.lifecycle != "armed":
             parts.append(f"{status.lifecycle}: {status.why}")
         elif control is not None:
@@ -83,3 +87,9 @@ class Progress:
             if control.path_s_m is not None:
                 parts.append(f"tail at {control.path_s_m:.2f} m")
         return "  ".join(parts)
+
+
+def in_minutes(seconds: float) -> str:
+    """As 4:05, or 1:04:05."""
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}" if minutes >= 60 else f"{minutes}:{rest:02d}"

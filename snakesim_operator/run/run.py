@@ -11,21 +11,21 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import msgspec
-
 from snakesim_hal.errors import ConfigError, NotConnectedError, SnakesimError
-from snakesim_hal.model.fault_plan import check_planned, planned
-from snakesim_hal.model.files import Table
+from snakesim_hal.model.fault_plan import planned
 from snakesim_hal.model.injection import ROUTER
-from snakesim_hal.model.plugins import BACKENDS, CONTROLLERS, SERVICES, find_installed, find_plugin, plugin_settings
+from snakesim_hal.model.plugin_check import check_plugins
 from snakesim_hal.model.scenario import RunConfig, written
 from snakesim_hal.model.whole_file import write_whole
 from snakesim_hal.network.endpoint import check_guarded
 from snakesim_hal.network.local_registry import registered
 from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.session_file import SessionFile
 from snakesim_hal.service import START_LIMIT_S
 from snakesim_hal.terminal import say
+from snakesim_operator.recording.process import RECORDER
 from snakesim_operator.results.record import CONFIG
+from snakesim_operator.run.console_child import check_console, console_beside
 from snakesim_operator.run.ending import Ending, interruptible
 from snakesim_operator.run.folder import claimed, named_after
 from snakesim_operator.run.meeting import local_robot, meeting_point, refuse_second_robot
@@ -45,65 +45,51 @@ class RunRequest:
     out: Path | None = None
     endpoint: str | None = None
     router: str | None = None
+    session: SessionFile | None = None  # how to connect to a lab's router
     namespace: str | None = None
     stay: bool = False  # a fault ends nothing: processes are started again, a person clears and arms
     with_router: bool = False  # the run's parts meet at a router of its own
     insecure: bool = False  # listen even where other machines can connect
+    record: bool = True  # every message, in recording.mcap
+    console: bool = False  # show it in the browser
 
     @property
     def network_name(self) -> str:
         """The robot's namespace."""
-        return self.namespace or self.config.robot.name
+        return self.namespace or (self.session and self.session.namespace) or self.config.robot.name
 
-
-def check_plugins(config: RunConfig, table: Table | None = None, *, run_files: bool = True) -> RunConfig:
-    """Everything that a run needs is installed and agrees with its settings. Raises ConfigError.
-
-    Returns the configuration, with a pace that the backend can keep: a scenario is written for any backend.
-    run_files: False runs no code of a `./file.py:Class`, so that its settings and its pace are not checked.
-    """
-    source = table.source if table is not None else f"scenario {config.name!r}"
-    origin = table.origin if table is not None else None
-    find = find_plugin if run_files else find_installed
-    backend, controller = find(BACKENDS, config.backend), find(CONTROLLERS, config.controller)
-    if controller is not None:
-        plugin_settings(controller, config.control_settings, source, config.control_section, origin)
-    for service in config.own_services:
-        find(SERVICES, service)
-    check_planned(config, table)
-    if backend is None:
-        return config
-    settings = plugin_settings(backend, config.backend_settings, source, config.backend_section, origin)
-    paces = backend.check(config, settings)
-    if config.pace in paces:
-        return config
-    asked_by = table.origin_of("pace") if table is not None else source
-    if asked_by.startswith("--"):
-        raise ConfigError(f"{asked_by}: backend {config.backend!r} cannot keep this pace, only {' or '.join(paces)}")
-    return msgspec.structs.replace(config, pace=paces[0])
+    @property
+    def lab(self) -> Link | None:
+        """How to reach the router that the run joins; None when its parts meet on this computer."""
+        if self.session is not None:
+            return Link.of_file(self.session, self.network_name)
+        return None if self.router is None else Link(self.router, self.network_name)
 
 
 def run(request: RunRequest) -> int:
     """Run it. Returns 0, 1 on a fault or an early end, 3 when the record lacks something, 130 when interrupted."""
     request = replace(request, config=check_plugins(request.config))
     _check_router(request)
+    if request.console:
+        check_console()
     if request.endpoint is not None:
         check_guarded(request.endpoint, "--endpoint", insecure=request.insecure)
-    refuse_second_robot(request.endpoint, request.router, request.network_name)
-    endpoint, stop_port = meeting_point(request.endpoint, request.router)
+    refuse_second_robot(request.endpoint, request.lab)
+    link, stop_port = meeting_point(request.endpoint, request.lab, request.network_name)
     ending = Ending()
     with contextlib.closing(stop_port), opened_files(request.config, request.out) as (files, config_file):
         supervisor = Supervisor(files, ending, say, stop_port, stay=request.stay)
         with (
             interruptible(ending),
-            registered(local_robot(request.config, request.network_name, endpoint, stop_port)) as trouble,
+            registered(local_robot(request.config, config_file, link, stop_port)) as trouble,
         ):
             if trouble is not None:
                 say(trouble)
-            _conduct(request, supervisor, endpoint, files, config_file, ending)
+            _conduct(request, supervisor, link, files, config_file, ending)
         from snakesim_operator.run.conclusion import Outcome, conclude
 
-        outcome = Outcome(supervisor.host_record(), supervisor.robot(), supervisor.restarts, supervisor.hosts)
+        lost = list(supervisor.lost.values())
+        outcome = Outcome(supervisor.host_record(), supervisor.robot(), supervisor.restarts, supervisor.hosts, lost)
         return conclude(request.config, files, ending, outcome, stay=request.stay)
 
 
@@ -136,9 +122,9 @@ def _warn(trouble: str) -> None:
 
 def _check_router(request: RunRequest) -> None:
     if request.with_router:
-        if request.router is not None:
+        if request.lab is not None:
             raise ConfigError(
-                "--with-router starts a router of the run's own, --router joins another: give one of them"
+                "--with-router starts a router of the run's own, --router and --session join another: give one of them"
             )
         return
     wanted = [injection for injection in planned(request.config) if injection.target == ROUTER]
@@ -147,30 +133,38 @@ def _check_router(request: RunRequest) -> None:
 
 
 def _conduct(
-    request: RunRequest, supervisor: Supervisor, endpoint: str, files: RunFiles, config_file: Path, ending: Ending
+    request: RunRequest, supervisor: Supervisor, link: Link, files: RunFiles, config_file: Path, ending: Ending
 ) -> None:
-    config, namespace = request.config, request.network_name
-    common = ["--config", str(config_file), "--endpoint", endpoint, "--namespace", namespace]
+    """Start the programs `snakesim host` and `snakesim service` as children, and see the run through."""
+    config = request.config
+    common = [str(config_file), "--namespace", request.network_name]
+    meeting = ["--session", str(link.session.path)] if link.session else ["--endpoint", link.endpoint]
     listening = ["--insecure"] if request.insecure else []
-    ticks = round(config.duration_s * config.rate_hz)
+    joins = request.router is not None or request.with_router
     host_arguments = [
-        *("snakesim_hal.host_process", *common, *listening, "--max-ticks", str(ticks), "--memory", supervisor.memory),
+        *("snakesim_hal.host_process", *common, *listening, "--once", "--memory", supervisor.memory),
+        *(["--router", link.endpoint] if joins else meeting),
         *(["--out", str(files.folder)] if files.folder else []),
-        *(["--stay"] if request.stay else ["--end-after-fault", str(AFTER_FAULT_S)]),
-        *(["--router"] if request.router or request.with_router else []),
+        *([] if request.stay else ["--end-after-fault", str(AFTER_FAULT_S)]),
     ]
     try:
         if request.with_router:
-            supervisor.start(ROUTER, ["snakesim_hal.router_process", *common, *listening])
+            supervisor.start(ROUTER, ["snakesim_hal.router_process", *common, *meeting, *listening])
         supervisor.start(HOST, host_arguments)
         for name, service in config.own_services.items():
-            supervisor.start(name, ["snakesim_hal.serve", name, *common], may_restart=service.restart)
-        with _joined(Link(endpoint, namespace), supervisor, ending) as session:
+            supervisor.start(name, ["snakesim_hal.serve", name, *common, *meeting], may_restart=service.restart)
+        if request.record and files.folder is not None:
+            recorder = ["snakesim_operator.recording.process", *common, *meeting, "--out", str(files.folder)]
+            supervisor.start(RECORDER, recorder, vital=False)
+        with (
+            console_beside([*common, *meeting], files, say) if request.console else contextlib.nullcontext(),
+            _joined(link, supervisor, ending) as session,
+        ):
             say(f"{config.name}: {config.robot.name} in {config.scene.name}, {config.commander}, {config.pace}")
-            say(f"network: {endpoint}, namespace {namespace}")
+            say(f"network: {link.endpoint}, namespace {link.namespace}")
             if not config.has_own_control:
                 say("whoever takes the lease commands the robot, and arms it")
-            RunMonitor(config, session, supervisor, files, ending, say, stay=request.stay).go()
+            RunMonitor(config, session, supervisor, ending, say, stay=request.stay).go()
     except SnakesimError as error:
         ending.because(str(error))
     finally:

@@ -64,6 +64,12 @@ class RunFiles:
         """Rename an appended file; later appends begin a new one."""
         self._ask(_Task("rename", name, to.encode()))
 
+    def warn(self, trouble: str) -> None:
+        """Warn once that something cannot be written, by whomever."""
+        if not self._warned:
+            self._warned = True
+            self._warn(trouble)
+
     def settle(self) -> None:
         """Wait until everything is written, or the disk is found to be full or to hang."""
         with self._changed:
@@ -102,9 +108,8 @@ class RunFiles:
                 task = self._tasks[0]
             before = len(task.content)
             self._trouble = self._attempt(task)
-            if self._trouble and not self._warned:
-                self._warned = True
-                self._warn(self._trouble)
+            if self._trouble:
+                self.warn(self._trouble)
             with self._changed:
                 if not self._trouble or self._closing:
                     self._tasks.popleft()

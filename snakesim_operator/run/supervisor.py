@@ -38,6 +38,7 @@ class Part:
     arguments: Sequence[str]
     may_restart: bool
     child: Child
+    vital: bool = True  # whether the run ends with it
     started_s: float = field(default_factory=time.monotonic)
     delay_s: float = FIRST_DELAY_S
     again_s: float | None = None  # time of its restart; None while it runs
@@ -77,6 +78,7 @@ class Supervisor:
         stay: processes that end are restarted, once the run has started up.
         """
         self.restarts: list[Restart] = []
+        self.lost: dict[str, str] = {}  # parts that ended and were not vital, and how
         self.came_up = False  # until then a restart would not help a process that ends
         self._files = files
         self._memory = os.memfd_create("snakesim-host")
@@ -89,9 +91,9 @@ class Supervisor:
         self.host: StarterEnd | None = None  # the private channel to the newest host
         self._begun_s = time.monotonic()
 
-    def start(self, name: str, arguments: Sequence[str], *, may_restart: bool = True) -> None:
-        """Start a Python module as a part of the run."""
-        self._parts[name] = Part(name, arguments, may_restart, self._launch(name, arguments))
+    def start(self, name: str, arguments: Sequence[str], *, may_restart: bool = True, vital: bool = True) -> None:
+        """Start a Python module as a part of the run. vital: whether the run ends when this part does."""
+        self._parts[name] = Part(name, arguments, may_restart, self._launch(name, arguments), vital)
 
     def _launch(self, name: str, arguments: Sequence[str]) -> Child:
         keep = partial(self._files.append, f"{name}.log")
@@ -142,7 +144,8 @@ class Supervisor:
 
     def first_ended(self) -> str | None:
         """How the first process that ended did so; None while all run."""
-        return next((how for part in self._parts.values() if (how := part.child.how_it_ended()) is not None), None)
+        vital = [part for part in self._parts.values() if part.vital]
+        return next((how for part in vital if (how := part.child.how_it_ended()) is not None), None)
 
     def goes_on(self) -> bool:
         """Restart ended processes where allowed; False when the run is over, regularly or not."""
@@ -152,6 +155,8 @@ class Supervisor:
                 if part.is_due():
                     part.child = self._launch(part.name, part.arguments)
                     part.again_s, part.started_s = None, time.monotonic()
+            elif not part.vital:
+                self._go_on_without(part, how)
             elif part.name == HOST and self._host_is_done():
                 return False
             elif self._stay and self.came_up and part.may_restart:
@@ -160,6 +165,11 @@ class Supervisor:
                 self._ending.because(how, first=True)
                 return False
         return True
+
+    def _go_on_without(self, part: Part, how: str) -> None:
+        if part.name not in self.lost:
+            self.lost[part.name] = (part.child.last_words() or [how])[-1]
+            self._files.warn(self.lost[part.name])
 
     def _put_off(self, part: Part, how: str) -> None:
         delay_s = part.put_off()
@@ -190,9 +200,12 @@ class Supervisor:
                 self._ending.because(how)
         for part in self._parts.values():
             how = part.ended()
-            if part.name != HOST and how is not None:
+            if part.name != HOST and part.vital and how is not None:
                 self._ending.because(how, first=True)  # before any fault that the host has noted since
         children.stop_all(running)
+        for part in self._parts.values():
+            if not part.vital and part.child.process.returncode:
+                self._go_on_without(part, part.child.how_it_ended() or "")
         self._print_last_words()
 
     def _print_last_words(self) -> None:

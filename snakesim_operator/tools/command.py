@@ -4,12 +4,12 @@ A name is not an identity: any client on the network can answer in a robot's nam
 are an error, and an answer is accepted once the robot's host publishes the new state itself.
 """
 
-import getpass
 import time
 from collections.abc import Sequence
 
 from snakesim_hal.errors import NotConnectedError, RefusedError
 from snakesim_hal.host.latch import forget_stop, stops_kept
+from snakesim_hal.network.process_entries import who
 from snakesim_hal.network.session import Link, Reader, Session, open_session
 from snakesim_hal.terminal import Say, say
 from snakesim_hal.wire import keys
@@ -73,14 +73,6 @@ def clear(where: Where, say: Say = say) -> int:
         return 0
     with open_session(link, CONNECT_S) as session:
         return _ask(session, LifecycleRequest(action="clear", who=who()), "cleared", link, say)
-
-
-def who() -> str:
-    """The user's name."""
-    try:
-        return getpass.getuser()[:64]
-    except (KeyError, OSError):
-        return "operator"
 
 
 def _ask(session: Session, request: LifecycleRequest, done: str, link: Link, say: Say) -> int:

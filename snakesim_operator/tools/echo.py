@@ -7,7 +7,7 @@ import statistics
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from queue import Empty
 from typing import Any
@@ -16,7 +16,7 @@ import msgspec
 
 from snakesim_hal.errors import ConfigError, NotConnectedError, WireError
 from snakesim_hal.network.mailbox import Mailbox
-from snakesim_hal.network.session import Arrival, Link, Session, intersects, key_expression, open_session
+from snakesim_hal.network.session import Arrival, Session, intersects, key_expression, open_session
 from snakesim_hal.terminal import Say, complain, say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES, Decoder
@@ -65,10 +65,9 @@ def echo(request: EchoRequest, where: Where, say: Say = say) -> int:
 def _sessions(where: Where, stack: contextlib.ExitStack) -> list[Session]:
     """One on every network that answers."""
     found: list[Session] = []
-    for endpoint in where.endpoints():
+    for link in where.networks():
         with contextlib.suppress(NotConnectedError):
-            link = Link(endpoint, where.namespace, largest_bytes=MAX_IMAGE_BYTES)
-            found.append(stack.enter_context(open_session(link, CONNECT_S)))
+            found.append(stack.enter_context(open_session(replace(link, largest_bytes=MAX_IMAGE_BYTES), CONNECT_S)))
     if not found:
         raise NotConnectedError(
             f"nothing listens on {', '.join(where.endpoints())}; start a run or a router there first"

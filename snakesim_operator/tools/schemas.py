@@ -19,6 +19,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encoding_of
 from snakesim_hal.wire.messages import VERSIONS
 from snakesim_operator.results.summary import RunSummary
+from snakesim_operator.tools.roles_page import roles_page
 
 KEYS, TITLE = "keys.md", "# Key space"
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
@@ -52,6 +53,7 @@ def _is_contract(folder: Path) -> bool:
 def contract() -> Iterator[tuple[str, str]]:
     """Every file of the contract as (relative path, text)."""
     yield KEYS, _key_space()
+    yield "roles.md", roles_page()
     for message in VERSIONS:
         extra = {"encoding": encoding_of(message)}
         yield f"messages/{message.__name__}.json", _schema(message, extra)

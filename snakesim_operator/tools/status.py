@@ -3,37 +3,45 @@
 import contextlib
 import threading
 import time
+from collections.abc import Sequence
 from dataclasses import replace
+from datetime import timedelta
 from pathlib import Path
 from queue import Empty
 
 from snakesim_hal.errors import NotConnectedError, WireError
 from snakesim_hal.model.files import ROUTER
 from snakesim_hal.network.mailbox import Mailbox
-from snakesim_hal.network.session import DEFAULT_ENDPOINT, Arrival, Link, open_session
-from snakesim_hal.terminal import Say, say
+from snakesim_hal.network.process_entries import HOST, differences
+from snakesim_hal.network.session import Arrival, Link, open_session
+from snakesim_hal.terminal import Say, say, say_json
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
-from snakesim_hal.wire.messages import Status
+from snakesim_hal.wire.messages import Process, Status
 from snakesim_operator.results import last_run
-from snakesim_operator.tools.targets import Where, namespace_of
+from snakesim_operator.tools.targets import Where, flags_of, namespace_of
 
 STATUS_WAIT_S = 1.0
 CONNECT_S = 1.0
 
 
-def show_status(where: Where, say: Say = say) -> int:
+def show_status(where: Where, say: Say = say, *, as_json: bool = False) -> int:
     """Print the state of every reachable robot. Returns 0 without faults, 1 otherwise."""
     found: list[tuple[Link, list[Status]]] = []
-    for endpoint in where.endpoints():
-        link = Link(endpoint, where.namespace)
+    processes: dict[tuple[str, str | None], list[Process]] = {}
+    for link in where.networks():
         with contextlib.suppress(NotConnectedError):
-            found += _statuses(link)
+            found += _heard(link, processes)
     silent = [
         robot
         for robot in where.local()
         if not any(link.endpoint == robot.endpoint and link.namespace == robot.namespace for link, _ in found)
     ]
+    well = bool(found) and all(statuses[-1].lifecycle in ("armed", "disarmed") for _, statuses in found)
+    if as_json:
+        robots = [_for_scripts(link, said, processes) for link, said in found]
+        say_json({"robots": robots, "silent": silent}, say)
+        return 0 if well and not silent else 1
     for robot in silent:
         say(f"{robot.namespace}: NO ANSWER on {robot.endpoint}; its run is process {robot.pid}")
     if not found and not silent:
@@ -44,34 +52,66 @@ def show_status(where: Where, say: Say = say) -> int:
     for link, statuses in found:
         for line in _in_words(link, statuses[-1]):
             say(line)
+        for line in processes_in_words(processes.get((link.endpoint, link.namespace), [])):
+            say(line)
         if len({status.host for status in statuses}) > 1:
             say("  IMPOSTOR: more than one host publishes a status under this name; trust none of them")
         for line in _what_to_type(link, statuses[-1]):
             say(line)
-    well = all(statuses[-1].lifecycle in ("armed", "disarmed") for _, statuses in found)
     return 0 if well and not silent else 1
 
 
-def _statuses(link: Link) -> list[tuple[Link, list[Status]]]:
-    """The newest status of each host of each robot on a network."""
+def _heard(link: Link, processes: dict[tuple[str, str | None], list[Process]]) -> list[tuple[Link, list[Status]]]:
+    """The newest status of each host of each robot on a network; and its live processes, put into `processes`."""
     arrivals: Mailbox[Arrival] = Mailbox()
-    decoder = Decoder(Status)
+    decoders = {keys.STATUS: Decoder(Status), keys.PROCESS_ALL: Decoder(Process)}
     found: dict[str, dict[str | None, Status]] = {}
+    prefix = "" if link.namespace is not None else "**/"
     with open_session(link, CONNECT_S) as session:
-        key = keys.STATUS if link.namespace is not None else f"**/{keys.STATUS}"
-        session.on_latched_arrival(key, arrivals.put)
+        for key in decoders:
+            session.on_latched_arrival(f"{prefix}{key}", arrivals.put)
+        live = set(session.present(f"{prefix}{keys.PROCESS_ALL}"))
         until = time.monotonic() + STATUS_WAIT_S
         while (left := until - time.monotonic()) > 0:
             try:
                 arrival = arrivals.get(timeout=left)
-                status = decoder.decode(arrival.payload, arrival.encoding)
+                at = keys.STATUS if arrival.key.endswith(keys.STATUS) else keys.PROCESS_ALL
+                message = decoders[at].decode(arrival.payload, arrival.encoding)
             except Empty:
                 break
             except WireError:
                 continue
             name = link.namespace or namespace_of(arrival.key)
-            found.setdefault(name, {})[status.host] = status
+            if isinstance(message, Status):
+                found.setdefault(name, {})[message.host] = message
+            elif arrival.key in live:
+                processes.setdefault((link.endpoint, name), []).append(message)
     return [(replace(link, namespace=name), list(of_host.values())) for name, of_host in sorted(found.items())]
+
+
+def _for_scripts(link: Link, statuses: list[Status], processes: dict[tuple[str, str | None], list[Process]]):
+    """One robot, as JSON tells of it."""
+    return {
+        "namespace": link.namespace,
+        "endpoint": link.endpoint,
+        "impostor": len({status.host for status in statuses}) > 1,  # more than one host has this name
+        "processes": processes.get((link.endpoint, link.namespace), []),
+        "status": statuses[-1],
+    }
+
+
+def processes_in_words(processes: Sequence[Process]) -> list[str]:
+    """One line for each process: machine, version, age, and what is set up differently from the host."""
+    host = next((entry for entry in processes if entry.name == HOST), None)
+    lines: list[str] = []
+    for entry in sorted(processes, key=lambda entry: (entry.name != HOST, entry.name, entry.machine, entry.pid)):
+        age_s = time.time() - entry.started_unix_s
+        since = f"for {timedelta(seconds=round(age_s))}" if age_s >= 0 else "its clock is ahead of this one's"
+        lines.append(
+            f"  process {entry.name}: {entry.machine}, {entry.pid} of {entry.user}, snakesim {entry.version}, {since}"
+        )
+        lines += [f"    DIFFERS: {what}" for what in (differences(entry, host) if host is not None else [])]
+    return lines
 
 
 def _in_words(link: Link, status: Status) -> list[str]:
@@ -107,8 +147,7 @@ def _in_words(link: Link, status: Status) -> list[str]:
 
 def _what_to_type(link: Link, status: Status) -> list[str]:
     """The next commands for a person; none while the robot moves, or cannot be armed yet."""
-    where = f" --endpoint {link.endpoint}" if link.endpoint != DEFAULT_ENDPOINT else ""
-    where += f" --namespace {link.namespace}" if link.namespace != status.robot else ""
+    where = flags_of(link, status.robot)
     arm = f"`snakesim arm {status.robot} {status.backend}{where}`"
     if status.lifecycle in ("fault", "estop"):
         return [f"  next: `snakesim clear{where}`, then {arm}"]

@@ -10,12 +10,13 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 from snakesim_hal.errors import NotConnectedError
+from snakesim_hal.network.process_entries import who
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.network.stop_port import ask_to_stop, stop_address
 from snakesim_hal.terminal import Say, say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, EstopRequest, Status
-from snakesim_operator.tools.command import judge, who
+from snakesim_operator.tools.command import judge
 from snakesim_operator.tools.targets import CONNECT_S, Where, namespace_of, robots_on
 
 LIMIT_S = 5.0
@@ -39,11 +40,11 @@ def estop(where: Where, say: Say = say) -> int:
     elsewhere: dict[tuple[str, int], Link] = {}
     if where.endpoint is not None and not local and (address := stop_address(where.endpoint, listens=True))[1]:
         elsewhere[address] = Link(where.endpoint, where.namespace)
-    networks = where.endpoints()
+    networks = where.networks()
     with ThreadPoolExecutor(len(local) + len(elsewhere) + len(networks)) as side_by_side:
         asked_here = [side_by_side.submit(_at_port, link, *address) for address, link in local.items()]
         asked_there = [side_by_side.submit(_at_port, link, *address) for address, link in elsewhere.items()]
-        asked_all = [side_by_side.submit(_on_network, Link(at, where.namespace)) for at in networks]
+        asked_all = [side_by_side.submit(_on_network, link) for link in networks]
         here = [told for future in asked_here if (told := future.result()) is not None]
         there = [told for future in asked_there if (told := future.result()) is not None]
         shown = [told for future in asked_all for told in future.result()]
@@ -54,7 +55,7 @@ def estop(where: Where, say: Say = say) -> int:
         if robot.in_doubt and any(_same(robot, other) for other in here):
             say(f"{robot.name}: WARNING: {robot.text} ({robot.endpoint})")
     if not told:
-        say(f"no robot on {', '.join(networks)}, and none that this user runs on this computer")
+        say(f"no robot on {', '.join(where.endpoints())}, and none that this user runs on this computer")
     return 0 if told and all(robot.stopped for robot in told) else 1
 
 

@@ -1,10 +1,13 @@
 """Which robots a command addresses: those on the given endpoint, else all that run on this computer."""
 
-from dataclasses import dataclass
+import shlex
+from dataclasses import dataclass, replace
+from pathlib import Path
 
-from snakesim_hal.errors import NotConnectedError, RefusedError
+from snakesim_hal.errors import ConfigError, NotConnectedError, RefusedError
 from snakesim_hal.network.local_registry import LocalRobot, local_robots
 from snakesim_hal.network.session import DEFAULT_ENDPOINT, Link, Session, open_session
+from snakesim_hal.network.session_file import SessionFile, read_session
 from snakesim_hal.wire import keys
 
 CONNECT_S = 1.0
@@ -17,6 +20,7 @@ class Where:
 
     endpoint: str | None = None  # None: every network of a robot on this computer, and the default endpoint
     namespace: str | None = None  # None: every robot there
+    session: SessionFile | None = None  # how to connect to `endpoint`, which is its first one then
 
     def local(self) -> list[LocalRobot]:
         """Addressed robots on this computer."""
@@ -28,9 +32,32 @@ class Where:
 
     def endpoints(self) -> list[str]:
         """Endpoints of all networks to search."""
+        return [link.endpoint for link in self.networks()]
+
+    def networks(self) -> list[Link]:
+        """Every network to search, for the addressed namespace."""
         if self.endpoint is not None:
-            return [self.endpoint]
-        return list(dict.fromkeys([*(robot.endpoint for robot in self.local()), DEFAULT_ENDPOINT]))
+            return [Link(self.endpoint, self.namespace, session=self.session)]
+        found = {robot.endpoint: _link_to(robot, self.namespace) for robot in self.local()}
+        return list({**found, DEFAULT_ENDPOINT: found.get(DEFAULT_ENDPOINT, Link(namespace=self.namespace))}.values())
+
+
+def _link_to(robot: LocalRobot, namespace: str | None) -> Link:
+    """How a robot on this computer has joined its network, if this user may read that file."""
+    if robot.session:
+        try:
+            return Link.of_file(read_session(Path(robot.session)), namespace)
+        except ConfigError:
+            pass
+    return Link(robot.endpoint, namespace)
+
+
+def flags_of(link: Link, robot: str | None) -> str:
+    """What to type after a command to address a robot; nothing for a default. robot: its own name."""
+    where = f" --endpoint {link.endpoint}" if link.endpoint != DEFAULT_ENDPOINT else ""
+    if link.session is not None:
+        where = f" --session {shlex.quote(str(link.session.path))}"
+    return where + (f" --namespace {link.namespace}" if link.namespace != robot else "")
 
 
 def robots_on(session: Session) -> list[str]:
@@ -47,13 +74,15 @@ def namespace_of(key: str) -> str:
 def find_robots(where: Where) -> list[Link]:
     """Every addressed robot that can be reached."""
     found: list[Link] = []
-    for endpoint in where.endpoints():
+    for link in where.networks():
         try:
-            with open_session(Link(endpoint), CONNECT_S) as session:
-                names = robots_on(session)
+            with open_session(link, CONNECT_S) as session:
+                if link.namespace is not None:
+                    found += [link] if session.present(keys.alive("hal")) else []
+                else:
+                    found += [replace(link, namespace=name) for name in robots_on(session)]
         except NotConnectedError:
             continue
-        found += [Link(endpoint, name) for name in names if where.namespace in (None, name)]
     return found
 
 
@@ -66,6 +95,6 @@ def the_one(where: Where, command: str) -> Link:
             f"no robot{named} on {', '.join(where.endpoints())}; start a run there, or give --endpoint"
         )
     if len(found) > 1:
-        choices = [f"  snakesim {command} --endpoint {link.endpoint} --namespace {link.namespace}" for link in found]
+        choices = [f"  snakesim {command}{flags_of(link, None)}" for link in found]
         raise RefusedError("several robots found; choose one:", *choices)
     return found[0]

@@ -36,17 +36,9 @@ def depth_image(
 ) -> DepthImage:
     """The message. depth_m: (height * width,) along the optical axis, row by row, without noise."""
     return DepthImage(
+        **mount.seen_by(camera),
         tick=tick,
         stamp_ns=stamp_ns,
-        link=mount.link,
-        position_l=mount.position_l,
-        orientation_l_wxyz=mount.orientation_l_wxyz,
-        width=camera.width,
-        height=camera.height,
-        fx_px=camera.focal_px,
-        fy_px=camera.focal_px,
-        cx_px=(camera.width - 1) / 2,
-        cy_px=(camera.height - 1) / 2,
         range_min_m=camera.range_min_m,
         range_max_m=camera.range_max_m,
         scale_m=SCALE_M,

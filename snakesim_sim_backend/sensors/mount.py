@@ -1,9 +1,10 @@
 """Where a sensor sits on its link."""
 
 import math
+from typing import Any
 
 from snakesim_hal.model.kinematics import rotation_from_quaternion
-from snakesim_hal.model.sensors import Mounted
+from snakesim_hal.model.sensors import DepthCamera, Mounted
 from snakesim_hal.wire.quantities import Quaternion, Vector
 from snakesim_sim_backend.sensors.scope import Floats, Scope
 
@@ -25,6 +26,20 @@ class Mount:
         """Position of the sensor, (3,), and world_from_sensor, (3, 3)."""
         rotation = self._rotation.reshape(3, 3)
         return self._origin + rotation @ self.position_l, rotation @ self.link_from_sensor
+
+    def seen_by(self, camera: DepthCamera) -> dict[str, Any]:
+        """The fields of a CameraImage that do not change with time."""
+        return {
+            "link": self.link,
+            "position_l": self.position_l,
+            "orientation_l_wxyz": self.orientation_l_wxyz,
+            "width": camera.width,
+            "height": camera.height,
+            "fx_px": camera.focal_px,
+            "fy_px": camera.focal_px,
+            "cx_px": (camera.width - 1) / 2,
+            "cy_px": (camera.height - 1) / 2,
+        }
 
 
 def _turned(yaw_rad: float, pitch_rad: float) -> Quaternion:

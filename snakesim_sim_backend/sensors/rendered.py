@@ -49,21 +49,8 @@ class RenderedColour:
 
     def read(self, tick: int, stamp_ns: int) -> ColourImage:
         """An image from where the link is now."""
-        camera, mount = self._camera, self._view.mount
-        return ColourImage(
-            tick=tick,
-            stamp_ns=stamp_ns,
-            link=mount.link,
-            position_l=mount.position_l,
-            orientation_l_wxyz=mount.orientation_l_wxyz,
-            width=camera.width,
-            height=camera.height,
-            fx_px=camera.focal_px,
-            fy_px=camera.focal_px,
-            cx_px=(camera.width - 1) / 2,
-            cy_px=(camera.height - 1) / 2,
-            rgb=self._view.draw()[0].tobytes(),
-        )
+        fixed = self._view.mount.seen_by(self._camera)
+        return ColourImage(**fixed, tick=tick, stamp_ns=stamp_ns, rgb=self._view.draw()[0].tobytes())
 
 
 class View:

@@ -16,8 +16,9 @@ from snakesim_hal.backend import Samples, SetPoints
 from snakesim_hal.conformance.bench import Bench
 from snakesim_hal.errors import BackendError
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Description, Fault, JointState, Mode, Pose, Ranges, SensorDescription
+from snakesim_hal.wire.messages import Description, Fault, JointState, Mode, Ranges, SensorDescription
 from tests.contract.workbench import Workbench, mute
+from tests.unit.hal.rig import pose
 
 
 @dataclass(frozen=True)
@@ -161,16 +162,8 @@ class WithPose(Workbench):
     ahead_ns = 0
 
     def sample(self, tick, stamp_ns):
-        still = (0.0, 0.0, 0.0)
-        pose = Pose(
-            tick=tick,
-            stamp_ns=stamp_ns + self.ahead_ns,
-            position_w=still,
-            orientation_wxyz=(1.0, 0.0, 0.0, 0.0),
-            velocity_w=still,
-            angular_velocity_w=still,
-        )
-        return Samples(super().sample(tick, stamp_ns).joints, {keys.POSE: pose})
+        seen = pose(tick, stamp_ns + self.ahead_ns)
+        return Samples(super().sample(tick, stamp_ns).joints, {keys.POSE: seen})
 
 
 @breaks("nothing_comes_that_is_not_listed")

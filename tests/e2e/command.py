@@ -77,7 +77,11 @@ class Running:
 
     def part(self, name: str) -> int:
         """Process id of one of its parts: `host`, `control`, ..."""
-        own = {"host": "snakesim_hal.host_process", "router": "snakesim_hal.router_process"}
+        own = {
+            "host": "snakesim_hal.host_process",
+            "router": "snakesim_hal.router_process",
+            "recorder": "snakesim_operator.recording.process",
+        }
         wanted = own.get(name, f"snakesim_hal.serve\0{name}\0")
         return next(pid for pid, line in processes_of(self.out) if wanted in line)
 

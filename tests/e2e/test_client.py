@@ -17,7 +17,7 @@ from tests.e2e.command import Ended, Running, running, wait_until
 pytestmark = pytest.mark.e2e
 
 DOCS = Path(__file__).parents[2] / "docs"
-CLIENT, STOP = DOCS / "client.py", DOCS / "stop.py"
+CLIENT, STEER, STOP = DOCS / "client.py", DOCS / "steer.py", DOCS / "stop.py"
 EXTERNAL = ("triplet", "--set", "services.control.external=true", "--set", "rate_hz=50", "--duration", "600", "--stay")
 DEPTH = 8192
 
@@ -49,7 +49,9 @@ def status(session: Session) -> Status:
     return found
 
 
-@pytest.mark.parametrize(("script", "known"), [(CLIENT, {"msgpack", "zenoh"}), (STOP, set[str]())])
+@pytest.mark.parametrize(
+    ("script", "known"), [(CLIENT, {"msgpack", "zenoh"}), (STEER, {"msgpack", "zenoh"}), (STOP, set[str]())]
+)
 def test_a_client_needs_nothing_of_ours(script: Path, known: set[str]) -> None:
     tree = ast.parse(script.read_text(encoding="utf-8"))
     assert not [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]

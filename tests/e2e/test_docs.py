@@ -22,6 +22,7 @@ TUTORIAL = [section for section in sections(REPOSITORY / "docs" / "tutorial.md")
 HIL = [section for section in sections(REPOSITORY / "docs" / "hil.md") if section.title == "1. Anywhere"]  # no CAN
 EVALUATION = [section for section in sections(REPOSITORY / "docs" / "evaluation.md") if section.has_commands]
 CONTROLLERS = [section for section in sections(REPOSITORY / "docs" / "controllers.md") if section.has_commands]
+ROBOTS = [section for section in sections(REPOSITORY / "docs" / "robots.md") if section.has_commands]
 README = [section for section in sections(REPOSITORY / "README.md") if section.has_commands]
 UV = REPOSITORY / ".tools" / "bin" / "uv"
 LIMIT_S = 500.0
@@ -67,7 +68,7 @@ def typed(script: str, cwd: Path, prefix: list[str]) -> str:
 
 @needs_uv
 @pytest.mark.slow
-@pytest.mark.parametrize("section", [*TUTORIAL, *HIL, *EVALUATION, *CONTROLLERS], ids=named)
+@pytest.mark.parametrize("section", [*TUTORIAL, *HIL, *EVALUATION, *CONTROLLERS, *ROBOTS], ids=named)
 def test_a_section_as_printed(section: Section, tmp_path: Path) -> None:
     folder = tmp_path / "snakesim"
     documents.clone(folder)

@@ -98,7 +98,7 @@ def test_a_killed_host_is_started_again_and_not_armed(tmp_path: Path, pace: str)
             wait_until(lambda: robot.status().commands_accepted > 20, "commands to the new host")
         summary = interrupt(run)
     assert summary.hosts == 2 and [restart.name for restart in summary.restarts] == ["host"]
-    assert (tmp_path / "run" / "telemetry-1.jsonl").is_file()
+    assert (tmp_path / "run" / "recording-1.mcap").is_file()
     assert summary.ticks > 0 and "host was ended by SIGKILL; restart in 0.5 s" in run.said()
 
 

@@ -59,11 +59,11 @@ class Robot:
 
     def start(self, name: str) -> Child:
         """Start one of its processes."""
-        common = ["--config", str(self.folder / "config.json"), "--endpoint", self.endpoint]
+        common = [str(self.folder / "config.json"), "--endpoint", self.endpoint]
         inherits: list[int] = []
         if name == "host":
             module = ["snakesim_hal.host_process", *common, "--out", str(self.folder)]
-            module += ["--router"] if self.router else []
+            module += ["--router", self.endpoint] if self.router else []
             inherits = [self.host.inherited.fileno()]
             module += ["--channel", str(inherits[0])]
         elif name == "router":

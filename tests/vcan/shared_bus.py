@@ -34,11 +34,10 @@ class SharedWire(SocketCanWire):
         self.now_ns = 0
         self.until_ns = inf  # the modules' clock stops here
         self.sent: list[Frame] = []
-        self.refused: list[Frame] = []
 
     def send(self, frame: Frame) -> bool:
         taken = super().send(frame)
-        (self.sent if taken else self.refused).append(frame)
+        self.sent += [frame] * taken
         return taken
 
     def idle(self) -> float | None:

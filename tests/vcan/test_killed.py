@@ -160,7 +160,7 @@ class Bench:
 
     @property
     def _network(self) -> Sequence[str]:
-        return ("--config", self._saved, "--endpoint", self.endpoint)
+        return (self._saved, "--endpoint", self.endpoint)
 
     def said(self, name: str) -> str:
         return (self.folder / f"{name}.log").read_text()

@@ -6,11 +6,11 @@ import pytest
 
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.scenario import Override, load, parse_set
-from snakesim_operator.results.record import BLACK_BOX, CONFIG, DESCRIPTION, HOST_RECORD, REPORT, SUMMARY, TELEMETRY
+from snakesim_operator.results.record import BLACK_BOX, CONFIG, DESCRIPTION, HOST_RECORD, RECORDING, REPORT, SUMMARY
 from snakesim_operator.run.in_process import WORDS, simulate
 from tests.whole.command import snakesim
 
-LEFT = {BLACK_BOX, CONFIG, DESCRIPTION, HOST_RECORD, REPORT, SUMMARY, TELEMETRY}
+LEFT = {BLACK_BOX, CONFIG, DESCRIPTION, HOST_RECORD, RECORDING, REPORT, SUMMARY}
 
 
 def test_the_command_leaves_the_folder_of_a_run(tmp_path: Path) -> None:

@@ -5,8 +5,13 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from snakesim_hal.network.session import Arrival
 from snakesim_hal.wire import keys
-from snakesim_operator.results.record import REPORT, TELEMETRY, RunRecord
+from snakesim_hal.wire.codec import encode, encoding_of
+from snakesim_hal.wire.messages import ControlState
+from snakesim_operator.recording.reader import RecordingReader
+from snakesim_operator.recording.recording import Recording
+from snakesim_operator.results.record import RECORDING, REPORT, RunRecord
 from snakesim_operator.results.summary import summarise
 from tests.whole.command import run_to_summary
 
@@ -43,7 +48,13 @@ def test_that_the_clock_is_gone_is_no_news_of_a_run_that_has_ended(tmp_path: Pat
     assert summary.last_state not in (None, "PowerOff")
     last = RunRecord.load(tmp_path / "run").control[-1]
     gone = msgspec.structs.replace(last, state="PowerOff", reason="no clock from the HAL")
-    with (tmp_path / "run" / TELEMETRY).open("ab") as file:  # as control tells it while a host writes a long record
-        file.write(msgspec.json.encode({"key": keys.CONTROL_STATE, "message": gone}) + b"\n")
+    before = list(RecordingReader(tmp_path / "run" / RECORDING).messages())
+    (tmp_path / "run" / RECORDING).unlink()
+    recording = Recording(tmp_path / "run" / RECORDING)
+    for told in before:
+        recording.take(Arrival(told.key, told.payload, told.encoding, told.wall_ns))
+    told = Arrival(keys.CONTROL_STATE, encode(gone), encoding_of(ControlState), 0)
+    recording.take(told)  # as control tells it while a host writes a long record
+    recording.close({})
     again = summarise(RunRecord.load(tmp_path / "run"), "complete")
     assert (again.last_state, again.last_reason) == (summary.last_state, summary.last_reason)

@@ -4,17 +4,19 @@ from pathlib import Path
 
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.textfiles import write_text
-from snakesim_hal.terminal import say
+from snakesim_hal.terminal import say, say_json
 from snakesim_operator.results.compare.difference import differ
 from snakesim_operator.results.compare.page import page
-from snakesim_operator.results.compare.table import table
+from snakesim_operator.results.compare.table import for_scripts, table
 from snakesim_operator.results.compare.verdict import within
 from snakesim_operator.results.record import RunRecord
 
 PAGE = "compare.html"
 
 
-def compare(run_a: Path, run_b: Path, out: Path | None = None, within_percent: float | None = None) -> int:
+def compare(
+    run_a: Path, run_b: Path, out: Path | None = None, within_percent: float | None = None, *, as_json: bool = False
+) -> int:
     """Returns 0; 1 when the distances differ by more than `within_percent`. Raises ConfigError on wrong input."""
     if within_percent is not None and not 0 <= within_percent < float("inf"):
         raise ConfigError(f"--within {within_percent:g}: give a percentage that is not negative, such as --within 10")
@@ -25,11 +27,14 @@ def compare(run_a: Path, run_b: Path, out: Path | None = None, within_percent: f
             f"--within {within_percent:g}: {run_a} and {run_b} have no common measure of the distance moved; "
             "give the robot a pose sensor, or leave --within away"
         )
-    path = out or run_b / PAGE
+    path = out or (run_b if run_b.is_dir() else run_b.parent) / PAGE
     try:
         write_text(path, page(difference, asked))
     except ConfigError as error:
         raise ConfigError(f"{error}; name another file with --out FILE.html") from None
+    if as_json:
+        say_json({**for_scripts(difference), "page": str(path), "within": asked})
+        return 0 if asked is None or asked.holds else 1
     for line in table(difference):
         say(line)
     say(f"page: {path}")
@@ -40,7 +45,8 @@ def compare(run_a: Path, run_b: Path, out: Path | None = None, within_percent: f
 
 
 def _load(folder: Path) -> RunRecord:
-    if not folder.is_dir():
-        what = "not a folder" if folder.exists() else "no such folder"
-        raise ConfigError(f"{folder}: {what}; give the folder that `snakesim run --out FOLDER` left")
+    if not folder.exists():
+        raise ConfigError(
+            f"{folder}: no such folder; give the folder that `snakesim run --out FOLDER` left, or a recording"
+        )
     return RunRecord.load(folder.resolve())

@@ -1,5 +1,7 @@
 """The comparison as text, for a terminal."""
 
+from typing import Any
+
 from snakesim_operator.results.compare.difference import Difference, Gap, order
 from snakesim_operator.results.compare.settings import Setting
 from snakesim_operator.results.compare.verdict import SAME, relation, sentences
@@ -28,6 +30,34 @@ def table(difference: Difference) -> list[str]:
         *sentences(difference),
     ]
     return [line.rstrip() for line in lines]
+
+
+def for_scripts(difference: Difference) -> dict[str, Any]:
+    """The same numbers as plain values. Unknown is None."""
+    advance, names, parted = difference.advance, difference.joints, difference.parted
+    return {
+        "identical": difference.identical,
+        "command_digest": {"a": difference.a.host.command_digest, "b": difference.b.host.command_digest},
+        "settings": {one.key: {"a": one.a, "b": one.b} for one in difference.settings},
+        "time_s": float(difference.aligned.time_s[-1]),
+        "moved_m": None if advance is None else {"a": advance.a_m, "b": advance.b_m, "percent": advance.percent},
+        "gaps": [
+            {
+                "what": gap.what,
+                "unit": gap.unit,
+                "rms": gap.rms,
+                "worst": None if gap.worst is None else gap.worst.difference,
+                "joint": None if gap.worst is None else names[gap.worst.joint],
+                "time_s": None if gap.worst is None else gap.worst.time_s,
+            }
+            for gap in difference.gaps
+        ],
+        "parted": None if parted is None else {"joint": names[parted.joint], "time_s": parted.time_s},
+        "hand_overs": {
+            run: [{"joint": names[one.joint], "time_s": one.time_s} for one in order_of]
+            for run, order_of in (("a", difference.hand_overs.a), ("b", difference.hand_overs.b))
+        },
+    }
 
 
 def _row(name: str, a: str, b: str, note: str = "") -> str:

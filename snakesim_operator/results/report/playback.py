@@ -66,9 +66,10 @@ def playback(record: RunRecord) -> Playback | None:
         if words not in said:
             said.append(words)
         time_s = float(record.time_s[row]) - zero_s(record)
-        flat = [round(part, 1) for node in body_w for part in view.at(node)]
         propels = names.index(joint) if joint in names else -1
-        frames.append([round(time_s, 3), flat, propels, said.index(words), solved, felt, map_of[i], path_of[i]])
+        frames.append(
+            [round(time_s, 3), _flat(view, body_w), propels, said.index(words), solved, felt, map_of[i], path_of[i]]
+        )
     labels = Labels(view.width, view.height)
     snake = element("g", body(record, view, nodes[0], labels), class_="snake")
     picture = figure(
@@ -118,10 +119,13 @@ def _nodes(record: RunRecord, row: int) -> Floats:
 
 def _latest(record: RunRecord, rows: NDArray[np.intp], told: Sequence[Told]) -> list[Told | None]:
     """What was said last before each row, unless that is long ago."""
-    stamps = np.array([one.stamp_ns * 1e-9 for one in told])
-    before = np.searchsorted(stamps, record.time_s[rows] + SAME_TICK_S, side="right") - 1
-    fresh = [i >= 0 and t - stamps[i] < TOLD_FOR_S for i, t in zip(before, record.time_s[rows], strict=True)]
-    return [told[i] if is_fresh else None for i, is_fresh in zip(before.tolist(), fresh, strict=True)]
+    before = _last_before(record, rows, [one.stamp_ns for one in told])
+    newest = [told[i] if i >= 0 else None for i in before]
+    times_s = record.time_s[rows].tolist()
+    return [
+        one if one is not None and time_s - one.stamp_ns * 1e-9 < TOLD_FOR_S else None
+        for one, time_s in zip(newest, times_s, strict=True)
+    ]
 
 
 def _units_per_n(states: Sequence[ControlState | None], worlds: Sequence[World | None]) -> float:

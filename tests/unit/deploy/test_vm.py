@@ -19,6 +19,8 @@ KERNEL = kernel.Kernel(
     depends={
         **{name: [] for name in (*kernel.BOOT_MODULES, "can", "can_dev", "sja1000", "sch_tbf")},
         "can_raw": ["can"],
+        "uinput": [],
+        "evdev": [],
         "can_bcm": ["can"],
         "vcan": ["can_dev"],
         "kvaser_pci": ["sja1000", "can_dev"],

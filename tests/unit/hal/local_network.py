@@ -29,9 +29,9 @@ from snakesim_hal.wire.messages import (
     LifecycleState,
     Message,
     Mode,
-    Pose,
     Status,
 )
+from tests.unit.hal.rig import pose
 
 LIMIT_S = 20.0
 
@@ -94,16 +94,7 @@ class LagBackend:
         )
         if tick % 5:
             return Samples(joints)
-        still = (0.0, 0.0, 0.0)
-        pose = Pose(
-            tick=tick,
-            stamp_ns=stamp_ns,
-            position_w=(0.001 * tick, 0.0, 0.0),
-            orientation_wxyz=(1.0, 0.0, 0.0, 0.0),
-            velocity_w=still,
-            angular_velocity_w=still,
-        )
-        return Samples(joints, {keys.POSE: pose})
+        return Samples(joints, {keys.POSE: pose(tick, stamp_ns, position_w=(0.001 * tick, 0.0, 0.0))})
 
     def enact(self, set_points: SetPoints, lifecycle: LifecycleState) -> None:
         """From now on."""

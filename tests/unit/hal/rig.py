@@ -8,7 +8,7 @@ import msgspec
 
 from snakesim_hal.model.robot import RobotFile, describe
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.wire.messages import Description, JointCommand, JointState, Mode, Status
+from snakesim_hal.wire.messages import Clock, Description, JointCommand, JointState, Mode, Pose, Power, Status
 
 PERIOD_NS = 10_000_000
 LEASE_NS = 50_000_000
@@ -152,6 +152,33 @@ def command(robot: Description, target: Any = 0.0, mode: Any = Mode.POSITION, **
         **other,
     }
     return JointCommand(**values)
+
+
+def power(
+    motor_c: Any = 20.0, voltage_v: Any = 24.0, leak: Any = False, valid: Any = True, *, joints: int = 3, **other: Any
+) -> Power:
+    """What modules tell of their health; a single value stands for all joints."""
+
+    def column(value: Any) -> list[Any]:
+        return value if isinstance(value, list) else [value] * joints
+
+    values: dict[str, Any] = {"motor_c": motor_c, "voltage_v": voltage_v, "leak": leak, "valid": valid, **other}
+    columns = {name: column(value) for name, value in values.items()}
+    return Power(tick=0, stamp_ns=0, current_a=column(0.0), board_c=column(20.0), **columns)
+
+
+def pose(tick: int = 0, stamp_ns: int = 0, **other: Any) -> Pose:
+    """A body at rest at the origin, unless told otherwise."""
+    still = (0.0, 0.0, 0.0)
+    values = {"position_w": still, "orientation_wxyz": (1.0, 0.0, 0.0, 0.0)}
+    values |= {"velocity_w": still, "angular_velocity_w": still, **other}
+    return Pose(tick=tick, stamp_ns=stamp_ns, **values)
+
+
+def clock(tick: int, *, arming: int = 0, **other: Any) -> Clock:
+    """A clock of 100 Hz in lockstep, armed if it names an arming."""
+    values = {"pace": "lockstep", "lifecycle": "armed" if arming else "disarmed", "lease_epoch": 1, "newest": {}}
+    return Clock(tick=tick, stamp_ns=tick * PERIOD_NS, period_ns=PERIOD_NS, arming=arming, **{**values, **other})
 
 
 def write_files(

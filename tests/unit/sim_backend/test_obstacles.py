@@ -67,18 +67,6 @@ def test_steps_and_ground_and_the_snake_itself_are_no_contacts():
     assert run.sim.true_state().contacts == []
 
 
-def test_pegs_along_the_route_are_all_there():
-    scene = {
-        "route": {"kind": "sine", "amplitude_m": 0.1, "wavelength_m": 0.8, "length_m": 4.0},
-        "pegs_along_route": [{"radius_m": 0.05, "corridor_m": 0.045, "count": 7}],
-    }
-    config = make_config(scene=scene, start={"on_route": True})
-    run = Run(config)
-    names = [name for name in run.sim.sim.obstacle_of_geom if name]
-    assert names == [placed.obstacle.name for placed in place_all(config)]
-    assert len(names) == 7
-
-
 def test_an_obstacle_may_be_called_as_a_link_or_the_ground():
     pegs = [
         {"position_m": [2.0 + i, 1.0], "radius_m": 0.05, "name": name} for i, name in enumerate(["ground", "link_3"])

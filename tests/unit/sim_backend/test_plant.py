@@ -107,11 +107,9 @@ def test_a_step_is_a_whole_part_of_a_period_and_one_advance_is_one_step(rate_hz,
     [
         make_config(),
         load("triplet").config,
-        load("mamba_hills").config,
-        make_config(scene={**HILLS, **CURVE}, start={"on_route": True}),
         make_config(scene={**HILLS, **CURVE}, base_robot="mamba", start={"on_route": True}),
     ],
-    ids=["flat", "triplet", "mamba_hills", "hills", "hills_mamba"],
+    ids=["flat", "triplet", "hills_mamba"],
 )
 def test_it_starts_as_the_simulated_robot_does(config):
     plant, state = make_plant(config), Run(config).sim.true_state()

@@ -8,7 +8,7 @@ import pytest
 from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion
 from snakesim_hal.model.scenario import load
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import Decoder, encode, encoding_of
+from snakesim_hal.wire.codec import encode
 from snakesim_hal.wire.messages import Contacts, Imu, Mode, Pose
 from snakesim_sim_backend.sensors.timing import Due
 from tests.unit.sim_backend.rig import G, Run, make_config
@@ -251,12 +251,3 @@ def bytes_of_a_run(seed):
 def test_the_same_seed_and_commands_give_the_same_bytes():
     assert bytes_of_a_run(3) == bytes_of_a_run(3)
     assert bytes_of_a_run(3) != bytes_of_a_run(4)
-
-
-def test_what_is_published_can_be_decoded():
-    run = pushed({"joints": {"angle_noise_rad": 0.01}})
-    run.go(0.3)
-    samples = run.sample()
-    for message in (samples.joints, *samples.others.values()):
-        kind = type(message)
-        assert Decoder(kind).decode(encode(message), encoding_of(kind)) == message

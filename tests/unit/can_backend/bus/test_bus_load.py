@@ -10,7 +10,6 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from snakesim_can_backend.bus.load import (
-    BIT_RATE,
     MAX_EVERY,
     MAX_LOAD,
     Reports,
@@ -25,15 +24,14 @@ from snakesim_can_backend.bus.load import (
     streams,
     worst_bits,
 )
-from snakesim_can_backend.protocol.codec import codec
-from snakesim_can_backend.protocol.definitions import LAST_NODE, Opcode, frame_id
+from snakesim_can_backend.protocol.definitions import LAST_NODE, Opcode
 from snakesim_can_backend.settings import Settings
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.scenario import load as load_scenario
 
 TRIPLET = load_scenario("triplet").config
-BEST_OF_8, WORST_OF_8 = 111, 135
+WORST_OF_8 = 135
 
 
 def run_of(joints: int, rate_hz: float = 100.0) -> RunConfig:
@@ -77,26 +75,6 @@ def frame_bits(identifier: int, data: bytes) -> int:
     return len(stuffed(bits_of(identifier, data))) + delimiters_acknowledge_end_and_gap
 
 
-def test_the_crc_is_that_of_can() -> None:
-    bits = bits_of(0x123, b"\x01\x02\x03")
-    remainder = 0
-    for bit in bits:  # a frame with its own CRC leaves nothing
-        remainder = (remainder << 1 ^ (0x4599 if bit ^ remainder >> 14 else 0)) & 0x7FFF
-    assert remainder == 0
-
-
-def test_stuffing() -> None:
-    assert stuffed([0] * 5) == [0, 0, 0, 0, 0, 1]
-    assert stuffed([0] * 5 + [1] * 4 + [0]) == [0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 0, 0]
-    assert stuffed([1, 0] * 10) == [1, 0] * 10
-
-
-def test_eight_bytes_take_111_bits_at_best_and_135_at_worst() -> None:
-    assert worst_bits(8) == WORST_OF_8
-    assert BEST_OF_8 == 47 + 8 * 8
-    assert BIT_RATE // BEST_OF_8 == 9009 and BIT_RATE // WORST_OF_8 == 7407
-
-
 @given(st.integers(0, 0x7FF), st.binary(max_size=8))
 @example(0, bytes(8))
 @example(0x7FF, b"\xff" * 8)
@@ -107,30 +85,12 @@ def test_no_frame_is_ever_longer_than_the_worst_case(identifier: int, data: byte
     assert 47 + 8 * len(data) <= frame_bits(identifier, data) <= worst_bits(len(data))
 
 
-@given(st.sampled_from(list(Opcode)), st.integers(1, LAST_NODE), st.data())
-def test_nor_is_a_frame_of_ours(opcode: Opcode, node: int, data: st.DataObject) -> None:
-    length = codec()[opcode].length
-    nibbles = data.draw(st.lists(st.sampled_from((0x0F, 0xF0, 0x3C, 0xC3, 0x87, 0x78, 0, 255)), min_size=8, max_size=8))
-    assert frame_bits(frame_id(opcode, node), bytes(nibbles[:length])) <= worst_bits(length)
-
-
 def test_the_worst_case_is_nearly_met() -> None:
     frames = [(i, bytes([b]) * 8) for i in range(0, 0x800, 8) for b in (0, 255, 0x0F, 0xF0, 0x87, 0x78, 0x3C, 0xC3)]
     assert max(frame_bits(*frame) for frame in frames) >= WORST_OF_8 - 4
 
 
 # --- the sum -----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("joints", "rate_hz", "percent"),
-    [(13, 100, 53), (18, 100, 73), (18, 200, 146)],
-)
-def test_commands_states_and_forces_at_eight_bytes_are_what_everybody_reckons(
-    joints: int, rate_hz: int, percent: int
-) -> None:
-    """Three 8-byte frames a joint and period; ours are shorter for commands, and there are more kinds of them."""
-    assert round(100 * joints * rate_hz * 3 * worst_bits(8) / BIT_RATE) == percent
 
 
 def test_the_sum_is_that_of_its_streams_by_hand() -> None:

@@ -1,7 +1,4 @@
-"""Every fault of a module, from its first moment to the rest of the joints: what the driver said, and how soon.
-
-`pytest -rP tests/unit/can_backend/driver/test_faults_seen.py` prints a row for each.
-"""
+"""Every fault of a module, from its first moment to the rest of the joints: what the driver said, and how soon."""
 
 import numpy as np
 import pytest
@@ -38,7 +35,6 @@ def test_a_fault_of_a_module_is_named_with_its_joint_and_everything_comes_to_res
         run.run(within, run.waving)
         assert run.faults, f"{kind} was not seen within {within} periods"
         fault = run.faults[0]
-        seen_after = fault.tick - START_TICK
         run.run(30)
         stopped = max(tick for tick in range(START_TICK, run.tick) if run.true_speed_rad_s[tick] > AT_REST_RAD_S) + 1
         healthy = [i for i in range(4) if i != 2]
@@ -47,21 +43,11 @@ def test_a_fault_of_a_module_is_named_with_its_joint_and_everything_comes_to_res
         assert what in [f.what for f in run.faults]
         assert stopped < run.tick - 5, "everything comes to rest"
         assert all(run.states()[i] == ModuleState.DISARMED for i in healthy), run.states()
-        print(
-            f"| {kind} | {fault.what} | {max(seen_after, 0) * 10} ms | all joints below 0.05 rad/s "
-            f"{(stopped - START_TICK) * 10} ms after its start | {fault.cause} |"
-        )
 
 
 def test_a_module_that_is_there_twice_is_found_before_anything_is_enabled() -> None:
     words = r"joint_3 .* answers 2 times, serials .*give each module its own node id"
     with pytest.raises(BackendError, match=words), loop(faults=["duplicate:joint_3@0"]):
-        pass
-
-
-def test_a_module_that_is_not_there_is_found_before_anything_is_enabled() -> None:
-    silent = loop(faults=["mute:joint_2@0"], bring_up_limit_s=0.3)
-    with pytest.raises(BackendError, match=r"joint_2 .* does not answer"), silent:
         pass
 
 
@@ -86,17 +72,3 @@ def test_a_fault_that_persists_is_told_again_after_clearing() -> None:
         run.lifecycle = "disarmed"
         run.run(10)
         assert [fault.what for fault in run.faults] == ["module_leak", "module_leak"]
-
-
-def test_a_module_that_restarted_gets_its_parameters_again_when_somebody_clears() -> None:
-    with loop(faults=["reboot:joint_2@0.3"]) as run:
-        run.arm()
-        run.run(60, run.waving)
-        assert "module_restarted" in [fault.what for fault in run.faults]
-        run.lifecycle = "disarmed"
-        run.run(10)
-        run.wanted = None
-        run.arm()
-        run.run(100, run.waving)
-        angles = np.array([samples.joints.angle_rad for samples in run.samples[-50:]])
-        assert np.allclose(angles[:, 1], angles[:, 0], atol=0.01), "joint_2 moves as its neighbours do"

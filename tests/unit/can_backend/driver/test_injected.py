@@ -14,11 +14,9 @@ from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.protocol.definitions import Frame, ModuleState
 from snakesim_can_backend.settings import Settings
 from snakesim_can_backend.twin.faults import ABOUT
-from snakesim_hal.backend import Injectable
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.faults.faulty_backend import FaultyBackend
 from snakesim_hal.model.injection import parse
-from tests.unit.can_backend.driver.test_faults_seen import MODULE_FAULTS
 from tests.unit.can_backend.loop import Loop, armed, cleared_and_armed_again, config, loop
 
 PERIOD_MS, LEASE_MS = 10, 50
@@ -29,28 +27,6 @@ def inject(run: Loop, text: str, *, begins: bool = True) -> None:
 
 
 # --- modules -------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("kind", "what", "within"), MODULE_FAULTS, ids=[row[0] for row in MODULE_FAULTS])
-def test_a_fault_of_a_module_is_injected_while_it_runs(kind: str, what: str, within: int) -> None:
-    with loop() as run:
-        assert isinstance(run.backend, Injectable)
-        armed(run).run(40, run.waving)
-        inject(run, f"{kind}:joint_3")
-        run.run(within + 1, run.waving)
-        assert run.faults and run.faults[0].joint == "joint_3", f"{kind} was not seen within {within + 1} periods"
-        run.run(20)
-        assert what in [fault.what for fault in run.faults]
-
-
-def test_a_module_that_is_no_longer_mute_can_be_cleared() -> None:
-    with loop() as run:
-        armed(run)
-        inject(run, "mute:joint_2")
-        run.run(5, run.waving)
-        assert run.faults[0].what == "module_silent"
-        inject(run, "mute:joint_2", begins=False)
-        cleared_and_armed_again(run)
 
 
 def test_every_module_may_fall_silent_and_come_back() -> None:

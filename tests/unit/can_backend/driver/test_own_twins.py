@@ -39,19 +39,6 @@ def test_twins_that_cannot_be_are_refused(settings: Settings, words: str) -> Non
         check_twins(RUN, settings)
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [
-        Settings(),
-        Settings(faults=["mute:joint_4@1"]),
-        Settings(channels=VCAN),
-        Settings(channels=VCAN, twins="process", faults=["mute:joint_4@1"]),
-    ],
-)
-def test_those_that_can_are_not(settings: Settings) -> None:
-    check_twins(RUN, settings)
-
-
 def test_twins_here_are_at_the_other_end_of_the_named_bus() -> None:
     end = twins_here(RUN, Settings(plant="inertia"), "own-twins-test", None, stepped=True)
     try:

@@ -75,6 +75,7 @@ def test_what_was_never_heard_is_not_valid() -> None:
     syncs(reading, 1, [1, 2, 4])
     joints = sensors.sample(0, 0).joints
     assert joints.valid == [True, True, False, True] and joints.age_ns[2] == LONG_AGO_NS
+    assert joints.angle_rad == pytest.approx([0.1, 0.1, 0.0, 0.1]), "a zero that nobody may believe"
 
 
 # --- forces ------------------------------------------------------------------------------------------------

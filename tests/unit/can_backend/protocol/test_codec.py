@@ -4,10 +4,10 @@ import math
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from snakesim_can_backend.protocol.codec import CodecError, Layout, Signal, codec, dbc_path, load_database
+from snakesim_can_backend.protocol.codec import CodecError, Layout, Signal, codec, load_database
 from snakesim_can_backend.protocol.definitions import (
     LAST_NODE,
     WITH_CHECKSUM,
@@ -30,7 +30,10 @@ EVERY_SIGNAL = [
 each_signal = pytest.mark.parametrize(
     ("layout", "signal"), EVERY_SIGNAL, ids=[f"{m.name}.{s.name}" for m, s in EVERY_SIGNAL]
 )
-each_layout = pytest.mark.parametrize("layout", list(codec().layouts.values()), ids=lambda layout: layout.name)
+LAYOUTS = list(codec().layouts.values())
+each_layout = pytest.mark.parametrize("layout", LAYOUTS, ids=lambda layout: layout.name)
+any_layout, any_signal = st.sampled_from(LAYOUTS), st.sampled_from(EVERY_SIGNAL)
+often = settings(max_examples=400)
 nodes = st.integers(1, LAST_NODE)
 
 
@@ -68,16 +71,14 @@ def by_cantools(layout: Layout, data: bytes) -> dict[str, Any]:
 # --- signals -----------------------------------------------------------------------------------------------
 
 
-@each_signal
-@given(data=st.data(), node=nodes)
-def test_every_value_comes_back_within_half_a_step(
-    layout: Layout, signal: Signal, data: st.DataObject, node: int
-) -> None:
+@given(any_signal, st.data(), nodes)
+@often
+def test_every_value_comes_back_within_half_a_step(of: tuple[Layout, Signal], data: st.DataObject, node: int) -> None:
+    layout, signal = of
     value = data.draw(st.floats(signal.low, signal.high))
     frame = layout.frame(node, **{signal.name: value})
     assert (opcode_of(frame.id), node_of(frame.id), len(frame.data)) == (layout.opcode, node, layout.length)
-    back = layout.values(frame.data)[signal.name]
-    assert abs(back - value) <= slack(signal, value)
+    assert abs(layout.values(frame.data)[signal.name] - value) <= slack(signal, value)
 
 
 @each_signal
@@ -101,11 +102,10 @@ def test_what_does_not_fit_is_refused_in_words(layout: Layout, signal: Signal, w
         assert part in str(caught.value)
 
 
-@each_signal
-@given(data=st.data())
-def test_a_raw_number_means_one_value_and_the_value_that_number(
-    layout: Layout, signal: Signal, data: st.DataObject
-) -> None:
+@given(any_signal, st.data())
+@often
+def test_a_raw_number_means_one_value_and_the_value_that_number(of: tuple[Layout, Signal], data: st.DataObject) -> None:
+    signal = of[1]
     raw = data.draw(raw_numbers(signal))
     value = signal.value(raw)
     held = min(max(value, signal.low), signal.high)  # 32767 x 0.001 is a hair more than 32.767
@@ -115,8 +115,8 @@ def test_a_raw_number_means_one_value_and_the_value_that_number(
 # --- against cantools --------------------------------------------------------------------------------------
 
 
-@each_layout
-@given(data=st.data(), node=nodes)
+@given(any_layout, st.data(), nodes)
+@often
 def test_cantools_writes_the_same_bytes_and_reads_them_alike(layout: Layout, data: st.DataObject, node: int) -> None:
     numbers = data.draw(contents(layout))
     values = {n: min(max(s.value(numbers[n]), s.low), s.high) for n, s in layout.signals.items() if n in numbers}
@@ -131,8 +131,8 @@ def test_cantools_writes_the_same_bytes_and_reads_them_alike(layout: Layout, dat
     assert set(read) == set(theirs)
 
 
-@each_layout
-@given(data=st.data())
+@given(any_layout, st.data())
+@often
 def test_any_bytes_are_read_as_cantools_reads_them(layout: Layout, data: st.DataObject) -> None:
     content = data.draw(st.binary(min_size=layout.length, max_size=layout.length))
     if layout.opcode == Opcode.SET_POINT:
@@ -145,8 +145,8 @@ def test_any_bytes_are_read_as_cantools_reads_them(layout: Layout, data: st.Data
 # --- frames ------------------------------------------------------------------------------------------------
 
 
-@each_layout
-@given(data=st.data(), node=nodes)
+@given(any_layout, st.data(), nodes)
+@often
 def test_a_writer_writes_what_a_reader_reads(layout: Layout, data: st.DataObject, node: int) -> None:
     numbers = data.draw(contents(layout))
     names = data.draw(st.permutations(list(numbers)))
@@ -177,8 +177,3 @@ def test_a_set_point_carries_the_target_of_its_mode_in_one_place() -> None:
     for mode in (Mode.POSITION, Mode.VELOCITY, Mode.TORQUE):
         signal = next(s for s in message.signals if s.name == mode.name.lower())
         assert signal.multiplexer_ids == [int(mode)]
-
-
-def test_the_layouts_come_from_the_published_file() -> None:
-    assert dbc_path().parts[-3:] == ("schemas", "can", "snakesim.dbc")
-    assert set(codec().layouts) == set(Opcode)

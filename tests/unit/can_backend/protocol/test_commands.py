@@ -14,7 +14,6 @@ from snakesim_can_backend.protocol.definitions import (
     COMMAND_KEY,
     COUNTS,
     Action,
-    EmergencyReason,
     Frame,
     ModuleState,
     Opcode,
@@ -147,14 +146,6 @@ def test_a_command_has_key_and_checksum(action: Action, node: int) -> None:
     assert (opcode_of(frame.id), node_of(frame.id)) == (Opcode.COMMAND, node) and intact(frame)
     read = values(frame)
     assert (read["action"], read["key"]) == (action, COMMAND_KEY)
-
-
-def test_arming_node_5_is_as_in_the_document() -> None:
-    assert commands.command(Action.ARM, 5) == Frame(0x045, bytes.fromhex("01AE5AC7"))
-
-
-def test_an_emergency_is_for_all() -> None:
-    assert commands.emergency() == Frame(0x000, bytes((EmergencyReason.HOST,)))
 
 
 @given(st.integers(0, 2**40), st.integers(0, 2**50))

@@ -3,7 +3,6 @@
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -21,7 +20,6 @@ from snakesim_can_backend.protocol.definitions import (
     Frame,
     ModuleState,
     Opcode,
-    Parameter,
 )
 from snakesim_can_backend.settings import Settings
 from snakesim_can_backend.twin.firmware import BOOT_US, Module
@@ -242,13 +240,6 @@ def test_the_firmware_of_the_twins_does_what_the_table_says(event: str, state: M
     assert module.state == (state if expected is None else expected)
 
 
-def test_only_armed_and_stopping_modules_drive_their_motor() -> None:
-    driving = {state.name for state, cell in zip(ModuleState, table_of_states()["motor"], strict=True) if cell != "off"}
-    assert driving == {"ARMED", "STOPPING"}
-    for state in ModuleState:
-        assert module_in(state).demand.mode == 0 or state.name in driving
-
-
 # --- pictures and neighbours -------------------------------------------------------------------------------
 
 
@@ -258,26 +249,8 @@ def test_pictures_and_files_that_are_named_are_there() -> None:
         assert (here / target).exists(), target
 
 
-def test_the_picture_of_a_cycle_is_in_proportion() -> None:
-    picture = (Path(__file__).parents[4] / "docs" / "can-cycle.svg").read_text(encoding="utf-8")
-    bars: list[dict[str, Any]] = [
-        dict(re.findall(r'([\w-]+)="([^"]*)"', bar)) for bar in re.findall(r"<rect [^>]*data-bits[^>]*>", picture)
-    ]
-    kinds = {name: sum(bar["data-of"] == name for bar in bars) for name in {bar["data-of"] for bar in bars}}
-    assert kinds == {"Sync": 2, "JointState": 13, "Contact": 13, "TailContact": 1, "SetPoint": 13}
-    names = {layout.name: layout for layout in codec().layouts.values()}
-    wide = {round(float(bar["width"]) / worst_bits(names[bar["data-of"]].length), 4) for bar in bars}
-    assert len(wide) == 1, "bars are as wide as frames are long"
-    syncs = sorted(float(bar["x"]) for bar in bars if bar["data-of"] == "Sync")
-    assert (syncs[1] - syncs[0]) / wide.pop() == pytest.approx(10_000), "10 ms of 1 Mbit/s"
-
-
 def test_what_is_no_frame_of_ours_is_not_in_the_examples() -> None:
     lengths = {int(opcode): codec()[opcode].length for opcode in Opcode}
     for identifier, data in re.findall(r"\b([0-9A-F]{3})#([0-9A-F]*)", TEXT):
         frame = Frame(int(identifier, 16), bytes.fromhex(data))
         assert lengths[frame.id >> NODE_BITS] == len(frame.data)
-
-
-def test_parameters_are_described_by_those_of_the_protocol() -> None:
-    assert {int(row[0]) for row in rows("Parameters")} == {int(parameter) for parameter in Parameter}

@@ -78,10 +78,6 @@ def test_fault_bits_stand_in_the_heartbeat_in_their_order() -> None:
     assert found == {f"fault_{fault.name.lower()}": int(fault) for fault in ModuleFault}
 
 
-def test_a_fault_is_also_a_reason_to_have_stopped() -> None:
-    assert {fault.name for fault in ModuleFault} <= {reason.name for reason in LastStop}
-
-
 def test_directions() -> None:
     for message in DATABASE.messages:
         host = Opcode(message.frame_id >> NODE_BITS) in FROM_HOST

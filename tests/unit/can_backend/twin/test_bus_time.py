@@ -77,14 +77,14 @@ def test_a_babbler_fills_what_the_others_leave():
     assert bus.released(110_000.0) == []
 
 
-@pytest.mark.parametrize(("joints", "rate_hz"), [(13, 50), (13, 100), (18, 50), (18, 100), (30, 50)])
+@pytest.mark.parametrize(("joints", "rate_hz"), [(13, 50), (18, 100), (30, 50)])
 def test_measured_load_is_the_computed_one_and_every_answer_comes_in_its_period(joints: int, rate_hz: int):
     late, before, after, _ = run_at(joints, rate_hz)
     assert after.load_since(before) == pytest.approx(load(joints, Reports(rate_hz)), rel=0.05)
     assert set(late) == {0} and after.replaced == 0
 
 
-@pytest.mark.parametrize(("joints", "rate_hz"), [(13, 200), (18, 200), (30, 100), (30, 200)])
+@pytest.mark.parametrize(("joints", "rate_hz"), [(13, 200), (30, 200)])
 def test_too_much_traffic_is_late_and_the_backlog_is_bounded(joints: int, rate_hz: int):
     _, before, after, backlog = run_at(joints, rate_hz)
     computed = load(joints, Reports(rate_hz))

@@ -11,18 +11,12 @@ from snakesim_can_backend.protocol.mocap_sample import MocapSample
 from snakesim_can_backend.twin.chain import MAX_AT_ONCE_US
 from snakesim_can_backend.twin.reports import ALONG, ANGLE, FORCE
 from snakesim_hal.model.plant import LinkLoad
-from snakesim_hal.wire.messages import Imu, Mode, Pose
+from snakesim_hal.wire.messages import Imu, Mode
 from tests.unit.can_backend.twin.rig import Host, chain, command, config, only, set_point, sync
+from tests.unit.hal.rig import pose
 
 G = 9.81
-POSE = Pose(
-    tick=0,
-    stamp_ns=0,
-    position_w=(1.0, 2.0, 0.1),
-    orientation_wxyz=(1.0, 0.0, 0.0, 0.0),
-    velocity_w=(0.1, 0.0, 0.0),
-    angular_velocity_w=(0.0, 0.0, 0.5),
-)
+POSE = pose(position_w=(1.0, 2.0, 0.1), velocity_w=(0.1, 0.0, 0.0), angular_velocity_w=(0.0, 0.0, 0.5))
 
 
 class Pushed:

@@ -49,14 +49,6 @@ def test_a_fault_that_is_asked_for_is_on_until_it_is_ended_and_the_status_shows_
         assert all(text.startswith("tick ") for text in run.host.faults.noted)
 
 
-def test_a_fault_ends_by_itself_after_its_time() -> None:
-    with running(run_config(**ALLOWED)) as run:
-        assert ask(run, "mute", "joint_1", for_s=0.1).ok
-        wait_until(lambda: len(run.host.faults.noted) == 2, "begin and end")
-        begin, end = (int(text.split()[1].rstrip(":")) for text in run.host.faults.noted)
-        assert end - begin == 10
-
-
 def test_what_was_planned_comes_at_its_tick_after_the_first_arming_in_every_run() -> None:
     config = run_config(faults=["mute:joint_1@0.1-0.12"], faults_allowed=True)
     for _ in range(2):

@@ -13,8 +13,8 @@ from snakesim_hal.errors import ConfigError
 from snakesim_hal.host.black_box import BlackBox, digest_of, read_black_box
 from snakesim_hal.safety.authority import Decision
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Contact, Contacts, Mode, Pose
-from tests.unit.hal.rig import description, state
+from snakesim_hal.wire.messages import Contact, Contacts, Mode
+from tests.unit.hal.rig import description, pose, state
 
 ROBOT = description()
 STILL = (0.0, 0.0, 0.0)
@@ -54,10 +54,7 @@ def test_columns_hold_what_was_recorded_however_long_the_run() -> None:
     for tick in range(count):
         others: dict[str, Any] = {}
         if tick == 2:
-            others[keys.POSE] = Pose(
-                tick=tick, stamp_ns=0, position_w=(1.0, 2.0, 3.0), orientation_wxyz=(1.0, 0.0, 0.0, 0.0),
-                velocity_w=STILL, angular_velocity_w=STILL,
-            )  # fmt: skip
+            others[keys.POSE] = pose(tick, position_w=(1.0, 2.0, 3.0))
         if tick in (3, 6):
             touches = [contact("a", (3.0, 4.0, 0.0)), contact("a", STILL), contact("b", STILL)] if tick == 3 else []
             others[keys.CONTACTS] = Contacts(tick=tick, stamp_ns=0, contacts=touches)
@@ -110,17 +107,6 @@ def test_a_box_on_disk_reads_back_without_its_torn_row(tmp_path: Path, torn: int
     for name, column in columns.items():
         assert np.array_equal(column, whole[name][: len(column)], equal_nan=True), name
     assert (digest_of(columns) == box.command_digest) == (not torn)
-
-
-@pytest.mark.parametrize("joints", [1, 2, 13])
-def test_a_column_has_one_number_for_each_joint(tmp_path: Path, joints: int) -> None:
-    robot = description(chain__modules=joints)
-    box = BlackBox(robot)
-    told = Decision(SetPoints([Mode.TORQUE] * joints, [0.1] * joints, [4.0] * joints), 1, {})
-    box.record(7, 0, Samples(state(robot, 0.3)), told)
-    _, columns = read_black_box(on_disk(box, tmp_path / "box"))
-    assert columns["mode"].tolist() == [[3] * joints] and columns["angle_rad"].shape == (1, joints)
-    assert columns["tick"].tolist() == [7] and digest_of(columns) == box.command_digest
 
 
 def test_a_box_of_a_run_that_never_armed_is_empty(tmp_path: Path) -> None:

@@ -56,11 +56,6 @@ def test_a_stop_that_cannot_be_kept_says_so(tmp_path: Path) -> None:
     assert trouble is not None and "will not outlive this host" in trouble
 
 
-def test_without_a_folder_nothing_is_kept() -> None:
-    latch = EstopLatch(None)
-    assert latch.found is None and asked(latch, "engage") is None and asked(latch, "release") is None
-
-
 def test_a_host_that_finds_one_begins_in_estop(tmp_path: Path) -> None:
     with running(run_config(), latch=EstopLatch(tmp_path)) as run:
         answer = run.ask(keys.ESTOP, EstopRequest(who="anna"))

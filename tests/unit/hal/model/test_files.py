@@ -204,12 +204,9 @@ def test_any_values_decode_or_end_in_a_config_error(values: dict[str, Any]) -> N
     [
         ("a.toml", b"robot = \n", ["not valid TOML", "line 1"]),
         ("a.toml", b"a = 1\na = 2\n", ["not valid TOML"]),
-        ("a.toml", b"\xff\xfe\x00", ["UTF-16", "UTF-8"]),
         ("a.json", b"", ["not valid JSON"]),
         ("a.json", b"[1, 2]", ["holds a list"]),
         ("a.json", b"{", ["not valid JSON"]),
-        ("a.json", b"[" * 100_000, ["not valid JSON"]),
-        ("a.toml", b"a = " + b"[" * 100_000, ["not valid TOML"]),
     ],
 )
 def test_a_file_that_is_none_is_refused(tmp_path: Path, name: str, content: bytes, words: list[str]) -> None:
@@ -226,12 +223,6 @@ def test_absent_files_and_folders_are_refused(tmp_path: Path) -> None:
         read_table(tmp_path / "a.toml")
     with pytest.raises(ConfigError, match="is a folder, not a file"):
         read_table(tmp_path)
-
-
-def test_an_empty_file_lacks_its_fields(tmp_path: Path) -> None:
-    (tmp_path / "a.toml").write_text("")
-    with pytest.raises(ConfigError, match=r"a\.toml: field `part` is missing"):
-        decode(read_table(tmp_path / "a.toml"), Whole)
 
 
 def test_find_takes_names_and_paths(tmp_path: Path) -> None:

@@ -17,7 +17,6 @@ from snakesim_hal.model.injection import (
     explain,
     kinds_in_short,
     parse,
-    writer_of,
 )
 from snakesim_hal.wire import keys
 from tests.kinds_table import PAGE, with_table
@@ -87,7 +86,7 @@ def test_everything_has_a_part_that_carries_it_out(text: str, part: str) -> None
         ("mute:joint_0@1", "knows no 'mute'"),
         ("mote:joint_1@1", "a joint such as joint_1 knows no 'mote', only mute, freeze"),
         ("mute:control@1", "mute is for joints"),
-        ("freeze:bus_1@1", "freeze is for processs? and joints"),
+        ("freeze:bus_1@1", "freeze is for processes and joints"),
         ("mute:joint_1@2-2", "must be later than its start, 2 s"),
         ("mute:joint_1@1.2.3", "are numbers"),
         ("mute:joint_1@1=2", "mute takes no amount; leave out =2"),
@@ -100,11 +99,6 @@ def test_everything_has_a_part_that_carries_it_out(text: str, part: str) -> None
 def test_wrong_texts_are_told_what_is_allowed(text: str, words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         parse(text)
-
-
-def test_the_writers_are_those_of_the_key_space() -> None:
-    assert writer_of(keys.JOINT_COMMAND) == "control" and writer_of(keys.CLOCK) == "hal"
-    assert writer_of(keys.WORLD) == "guidance"
 
 
 @pytest.mark.parametrize(

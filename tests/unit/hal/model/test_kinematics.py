@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from snakesim_hal.model.kinematics import (
-    joint_positions_s_m,
     joint_rotation,
     link_frames,
     quaternion_from_yaw,
@@ -117,7 +116,3 @@ def test_yaw_there_and_back(yaw: float) -> None:
     rotation = rotation_from_quaternion(quaternion_from_yaw(yaw))
     assert yaw_of(rotation) == pytest.approx(yaw, abs=1e-9)
     assert rotation == pytest.approx(joint_rotation("yaw", yaw), abs=1e-9)
-
-
-def test_joints_along_the_body() -> None:
-    assert joint_positions_s_m([0.05, 0.1, 0.1, 0.05]).tolist() == pytest.approx([0.05, 0.15, 0.25])

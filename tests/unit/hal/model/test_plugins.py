@@ -122,11 +122,6 @@ def test_a_program_may_offer_what_a_name_stands_for() -> None:
         find_plugin(CONTROLLERS, "mine")
 
 
-def test_an_absent_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"none\.py: no such file"):
-        find_plugin(BACKENDS, f"{tmp_path}/none.py:None")
-
-
 class Plugin:
     class Settings(FileStruct, frozen=True):
         gain: float = 1.0
@@ -172,12 +167,6 @@ def copy_of_the_packages(tmp_path_factory: pytest.TempPathFactory) -> Path:
         if package.is_dir():
             shutil.copytree(package, folder / package.name, ignore=shutil.ignore_patterns("__pycache__"))
     return folder
-
-
-@needs_linter
-def test_the_packages_keep_the_import_rules(copy_of_the_packages: Path) -> None:
-    done = lint(copy_of_the_packages)
-    assert done.returncode == 0, done.stdout + done.stderr
 
 
 NEIGHBOURS = "Everything stands on the HAL"

@@ -54,20 +54,11 @@ def test_no_chord_is_longer_than_its_arc_and_short_ones_are_nearly_as_long(
     assert 0.9 * step_m <= chord <= step_m * (1 + 1e-9)
 
 
-def test_heading_and_curvature_of_a_circle() -> None:
+def test_heading_of_a_circle() -> None:
     route = circle(0.7, 3.0)
     for s in (0.1, 1.0, 2.0):
         assert route.heading_rad(s) == pytest.approx(s / 0.7, abs=1e-3)
         assert route.tangent_w(s) == pytest.approx([math.cos(s / 0.7), math.sin(s / 0.7)], abs=1e-3)
-        assert route.curvature_per_m(s) == pytest.approx(1 / 0.7, rel=1e-2)
-    left = Route(circle(0.7, 3.0).points_w * [1, -1])
-    assert left.curvature_per_m(1.0) == pytest.approx(-1 / 0.7, rel=1e-2)
-
-
-def test_curvature_does_not_jump_where_the_heading_passes_half_a_turn() -> None:
-    route = circle(0.5, 6.0)
-    around = [route.curvature_per_m(float(s)) for s in np.linspace(0.2, 2.8, 60)]
-    assert around == pytest.approx([2.0] * 60, rel=2e-2)
 
 
 # --- projection ------------------------------------------------------------------------------------------------
@@ -80,11 +71,6 @@ def test_projection_is_the_nearest_point(route: Route, x: float, y: float) -> No
     found = math.dist(route.at(s), (x, y))
     tried = route.position_w(np.arange(-1.0, route.length_m + 1.0, 0.004))
     assert found <= float(np.hypot(*(tried - [x, y]).T).min()) + 1e-9
-
-
-@given(route=gentle(), s_m=st.floats(-0.5, 7))
-def test_a_point_on_the_route_projects_onto_itself(route: Route, s_m: float) -> None:
-    assert math.dist(route.at(route.project(np.array(route.at(s_m)))), route.at(s_m)) < 1e-7
 
 
 def test_projection_near_a_place_stays_on_its_branch() -> None:

@@ -9,21 +9,9 @@ import pytest
 from snakesim_hal.network.client import Client
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Clock, Done, Pace, Pose
+from snakesim_hal.wire.messages import Clock, Done, Pose
 from tests.e2e.command import free_endpoint, wait_until
-
-
-def clock(tick: int, *, arming: int = 0, pace: Pace = "lockstep") -> Clock:
-    return Clock(
-        tick=tick,
-        stamp_ns=tick * 10**7,
-        period_ns=10**7,
-        pace=pace,
-        lifecycle="armed" if arming else "disarmed",
-        arming=arming,
-        lease_epoch=1,
-        newest={},
-    )
+from tests.unit.hal.rig import clock, pose
 
 
 @pytest.fixture
@@ -65,22 +53,13 @@ def test_in_lockstep_a_sample_of_a_later_tick_is_not_read_although_it_is_here(
     feed, ticks = client.subscribe(keys.POSE, Pose), client.ticks(5.0)
     poses, clocks = (host.publisher(key, kind, lossless=True) for key, kind in ((keys.POSE, Pose), (keys.CLOCK, Clock)))
     wait_until(lambda: poses.heard() and clocks.heard(), "the service listens", 5.0)
-    poses.put(
-        Pose(
-            tick=3,
-            stamp_ns=0,
-            position_w=(0.0, 0.0, 0.0),
-            orientation_wxyz=(1.0, 0.0, 0.0, 0.0),
-            velocity_w=(0.0, 0.0, 0.0),
-            angular_velocity_w=(0.0, 0.0, 0.0),
-        )
-    )
+    poses.put(pose(3))
     seen: list[int | None] = []
     for at in (clock(2, arming=1), msgspec.structs.replace(clock(3, arming=1), newest={keys.POSE: 3})):
         clocks.put(at)
         assert next(ticks) is not None
-        pose = client.read(feed)
-        seen.append(None if pose is None else pose.tick)
+        found = client.read(feed)
+        seen.append(None if found is None else found.tick)
     assert seen == [None, 3]
 
 

@@ -2,7 +2,6 @@
 
 import threading
 import time
-from typing import Any
 
 import pytest
 
@@ -12,7 +11,7 @@ from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, JointState, LeaseRequest
 from tests.unit.hal.local_network import free_endpoint, running, wait_until
-from tests.unit.hal.rig import description, run_config, state
+from tests.unit.hal.rig import clock, description, run_config, state
 
 # --- the client alone ------------------------------------------------------------------------------------------
 
@@ -45,17 +44,8 @@ def test_a_feed_finds_samples_by_their_tick_and_forgets_old_ones() -> None:
     assert feed.newest() is None
 
 
-def clock(tick: int, lifecycle: Any = "armed", **newest: int) -> Clock:
-    return Clock(
-        tick=tick,
-        stamp_ns=tick * 10_000_000,
-        period_ns=10_000_000,
-        pace="lockstep",
-        lifecycle=lifecycle,
-        arming=1,
-        lease_epoch=1,
-        newest={key.replace("__", "/"): value for key, value in newest.items()},
-    )
+def naming(tick: int, joints_tick: int, arming: int = 1) -> Clock:
+    return clock(tick, arming=arming, newest={keys.JOINTS: joints_tick})
 
 
 def test_a_client_reads_what_the_clock_names_waits_for_it_and_reports_what_never_comes(
@@ -72,23 +62,23 @@ def test_a_client_reads_what_the_clock_names_waits_for_it_and_reports_what_never
         ticks = iter(client.ticks(silence_s=5.0))
         for tick in (3, 4):
             joints.put(state(robot, tick=tick))
-        clocks.put(clock(5, sensor__joints=3))
+        clocks.put(naming(5, 3))
         assert client.read(feed) is None  # no clock yet
-        assert next(ticks) == clock(5, sensor__joints=3)
+        assert next(ticks) == naming(5, 3)
         found = client.read(feed)
         assert found is not None and found.tick == 3  # what is named, not what is newest
-        clocks.put(clock(6, sensor__joints=6))
+        clocks.put(naming(6, 6))
         next(ticks)
         late = threading.Timer(0.03, lambda: joints.put(state(robot, tick=6)))
         late.start()
         found = client.read(feed)
         assert found is not None and found.tick == 6
-        clocks.put(clock(7, sensor__joints=7))
+        clocks.put(naming(7, 7))
         next(ticks)
         with pytest.raises(StalledError, match="joints of tick 7 was named by the clock of tick 7 and never came"):
             client.read(feed)
         hal._zenoh.put(keys.CLOCK, b"garbage", encoding="zenoh/bytes")
-        clocks.put(clock(0, "disarmed", sensor__joints=0))  # the HAL started over
+        clocks.put(naming(0, 0, arming=0))  # the HAL started over
         again = next(ticks)
         assert again is not None and again.tick == 0 and client.read(feed) is None
         wait_until(lambda: session.rejected == {"unknown_message": 1}, "the garbage counted")

@@ -143,11 +143,11 @@ def test_one_robot_is_one_folder_whatever_its_name(tmp_path: Path, monkeypatch: 
 def test_of_two_runs_that_start_at_once_each_has_an_endpoint_of_its_own() -> None:
     from snakesim_operator.run.meeting import meeting_point
 
-    first, its_port = meeting_point(None, None)
-    second, other_port = meeting_point(None, None)
+    first, its_port = meeting_point(None, None, "worm")
+    second, other_port = meeting_point(None, None, "worm")
     with its_port, other_port:
         assert first != second
         with pytest.raises(NotConnectedError, match="Another run may hold the port"):
-            meeting_point(first, None)
+            meeting_point(first.endpoint, None, "worm")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", int(first.rpartition(":")[2])))
+        free.bind(("127.0.0.1", int(first.endpoint.rpartition(":")[2])))

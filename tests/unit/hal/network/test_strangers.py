@@ -27,28 +27,17 @@ from snakesim_hal.wire.messages import (
     JointState,
     LeaseRequest,
     Message,
-    Pose,
-    Power,
     Trajectory,
     World,
     WorldContact,
 )
 from snakesim_hal.wire.quantities import Quaternion
 from tests.unit.hal.local_network import LagBackend, free_endpoint, wait_until
-from tests.unit.hal.rig import description, run_config, state
+from tests.unit.hal.rig import clock, description, pose, power, run_config, state
 
 ROBOT = description()  # three joints, four links
 X, UPRIGHT = (1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
-CLOCK = Clock(
-    tick=3,
-    stamp_ns=0,
-    period_ns=10_000_000,
-    pace="realtime",
-    lifecycle="disarmed",
-    arming=0,
-    lease_epoch=0,
-    newest={},
-)
+CLOCK = clock(3, pace="realtime")
 
 
 def contacts(link: int) -> Contacts:
@@ -71,27 +60,8 @@ def world(link: int = 0, orientation: tuple[float, float, float, float] = UPRIGH
     )
 
 
-def pose(*orientation: float) -> Pose:
-    wxyz: Any = orientation
-    return Pose(tick=0, stamp_ns=0, position_w=X, orientation_wxyz=wxyz, velocity_w=X, angular_velocity_w=X)
-
-
 def imu(link: list[int], rates: int) -> Imu:
     return Imu(tick=0, stamp_ns=0, link=link, angular_velocity_rad_s=[X] * rates, acceleration_m_s2=[X] * len(link))
-
-
-def power(joints: int) -> Power:
-    numbers, flags = [1.0] * joints, [True] * joints
-    return Power(
-        tick=0,
-        stamp_ns=0,
-        voltage_v=numbers,
-        current_a=numbers,
-        motor_c=numbers,
-        board_c=numbers,
-        leak=flags,
-        valid=flags,
-    )
 
 
 def trajectory(*path: tuple[float, float]) -> Trajectory:
@@ -124,8 +94,8 @@ def image(depth: bytes, link: int = 3, turned: Quaternion = UPRIGHT) -> DepthIma
         (state(ROBOT, 0.1), None),
         (msgspec.structs.replace(state(ROBOT, 0.1), angle_rad=[0.0] * 13), "wrong_length"),
         (msgspec.structs.replace(state(ROBOT, 0.1), valid=[]), "wrong_length"),
-        (power(3), None),
-        (power(4), "wrong_length"),
+        (power(), None),
+        (power(joints=4), "wrong_length"),
         (imu([0, 3], 2), None),
         (imu([], 0), None),
         (imu([0, 4], 2), "wrong_length"),
@@ -135,9 +105,9 @@ def image(depth: bytes, link: int = 3, turned: Quaternion = UPRIGHT) -> DepthIma
         (world(3), None),
         (world(4), "wrong_length"),
         (world(0, (0.0, 0.0, 0.0, 0.0)), "no_rotation"),
-        (pose(0.6, 0.0, 0.0, 0.8), None),
-        (pose(0.0, 0.0, 0.0, 0.0), "no_rotation"),
-        (pose(1.0, 1.0, 1.0, 1.0), "no_rotation"),
+        (pose(orientation_wxyz=(0.6, 0.0, 0.0, 0.8)), None),
+        (pose(orientation_wxyz=(0.0, 0.0, 0.0, 0.0)), "no_rotation"),
+        (pose(orientation_wxyz=(1.0, 1.0, 1.0, 1.0)), "no_rotation"),
         (image(bytes(12)), None),
         (image(bytes(11)), "wrong_length"),
         (image(bytes(12), link=4), "wrong_length"),

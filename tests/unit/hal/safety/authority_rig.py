@@ -3,8 +3,8 @@
 from typing import Any
 
 from snakesim_hal.safety.authority import Authority, Decision
-from snakesim_hal.wire.messages import Answer, EstopRequest, LeaseRequest, LifecycleRequest, Mode, Power
-from tests.unit.hal.rig import PERIOD_NS, command, description, state
+from snakesim_hal.wire.messages import Answer, EstopRequest, LeaseRequest, LifecycleRequest, Mode
+from tests.unit.hal.rig import PERIOD_NS, command, description, power, state
 
 ROBOT = description()
 JOINTS = len(ROBOT.joints)
@@ -63,14 +63,4 @@ def modes(decision: Decision) -> set[Mode]:
 
 
 def hear(rig: Rig, motor_c: list[float], volts: float = 24.0, valid: list[bool] | None = None) -> None:
-    power = Power(
-        tick=rig.tick,
-        stamp_ns=0,
-        voltage_v=[volts] * JOINTS,
-        current_a=[0.0] * JOINTS,
-        motor_c=motor_c,
-        board_c=[20.0] * JOINTS,
-        leak=[False] * JOINTS,
-        valid=valid or [True] * JOINTS,
-    )
-    rig.authority.observe_power(power, rig.now_ns)
+    rig.authority.observe_power(power(motor_c, volts, valid=valid or True), rig.now_ns)

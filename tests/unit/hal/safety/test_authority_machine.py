@@ -18,8 +18,8 @@ from snakesim_hal.safety.authority import Authority
 from snakesim_hal.safety.fault_log import MAX_FAULTS_KEPT
 from snakesim_hal.safety.gate import FRESH_NS
 from snakesim_hal.safety.lease import Lease
-from snakesim_hal.wire.messages import EstopRequest, Fault, JointCommand, LeaseRequest, LifecycleRequest, Mode, Power
-from tests.unit.hal.rig import LEASE_NS, PERIOD_NS, command, description, state
+from snakesim_hal.wire.messages import EstopRequest, Fault, JointCommand, LeaseRequest, LifecycleRequest, Mode
+from tests.unit.hal.rig import LEASE_NS, PERIOD_NS, command, description, power, state
 from tests.unit.hal.safety.authority_model import (
     ALL,
     ANGLE,
@@ -168,17 +168,7 @@ class Everything(Model):
     ) -> None:
         leaks, valid = [i == leak for i in range(JOINTS)], [i != silent for i in range(JOINTS)]
         told = [NAN, *celsius[1:]] if trouble == "nan" else celsius[1:] if trouble == "short" else celsius
-        power = Power(
-            tick=self.tick,
-            stamp_ns=0,
-            voltage_v=volts,
-            current_a=[0.0] * JOINTS,
-            motor_c=told,
-            board_c=[20.0] * JOINTS,
-            leak=leaks,
-            valid=valid,
-        )
-        self.authority.observe_power(power, self.now_ns)
+        self.authority.observe_power(power(told, volts, leaks, valid), self.now_ns)
         for i, health in enumerate(self.healths if trouble != "short" else ()):
             if i == silent or not math.isfinite(told[i]):
                 continue

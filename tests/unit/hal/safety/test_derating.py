@@ -7,22 +7,13 @@ import pytest
 
 from snakesim_hal.safety.derating import Derating
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Fault, Power, SensorDescription
-from tests.unit.hal.rig import description
+from snakesim_hal.wire.messages import Fault, SensorDescription
+from tests.unit.hal.rig import description, power
 
 ROBOT = description()
 JOINTS = len(ROBOT.joints)
 MS = 1_000_000
 S = 1000 * MS
-
-
-def power(motor_c: Any = 20.0, voltage_v: Any = 24.0, leak: Any = False, valid: Any = True, **other: Any) -> Power:
-    def column(value: Any) -> list[Any]:
-        return value if isinstance(value, list) else [value] * JOINTS
-
-    values: dict[str, Any] = {"motor_c": motor_c, "voltage_v": voltage_v, "leak": leak, "valid": valid, **other}
-    columns = {name: column(value) for name, value in values.items()}
-    return Power(tick=0, stamp_ns=0, current_a=column(0.0), board_c=column(20.0), **columns)
 
 
 class Bench:

@@ -58,7 +58,7 @@ def test_every_row_in_every_combination(tmp_path: Path) -> None:
 
 def test_a_case_is_known_again_by_what_it_runs(tmp_path: Path) -> None:
     suite, source = read(tmp_path, ROWS)
-    few, more = (cases_of(suite, source, ["hold"], fields, seed) for fields, seed in ((1, 8), (3, 7)))
+    few, more = (cases_of(suite, source, ["hold"], fields, seed) for fields, seed in ((1, 8), (2, 7)))
     assert {case.id for case in few} < {case.id for case in more}
     renamed = msgspec.structs.replace(suite, title="another", row=[])
     assert {case.id for case in cases_of(renamed, "elsewhere", ["hold"], 1, 8)} < {case.id for case in few}
@@ -68,7 +68,7 @@ def test_a_case_is_known_again_by_what_it_runs(tmp_path: Path) -> None:
 def test_shipped_suites_can_be_run(name: str) -> None:
     suite, source = read_suite(name)
     assert suite.title
-    assert len(cases_of(suite, source, suite.controllers, 1, seed=1)) >= 2
+    assert len(cases_of(suite, source, suite.controllers[:1], 1, seed=1)) >= 1
 
 
 def test_a_range_has_both_its_ends() -> None:
@@ -116,9 +116,9 @@ def test_a_wrong_suite_is_told_what_and_where(
         (["evaluate", "clutter", "--only", "hold"], ["--only hold", "CONTROLLER:FIELD"]),
         (["evaluate", "clutter", "--only", "hold:1"], ["--only hold:1", "hold:1:1", "4 (5 per m²)"]),
         (["evaluate", "clutter", "--only", "hold:1:99"], ["--only hold:1:99", "hold:1:1"]),
-        (["evaluate", "clutter", "--fields", "1", "--seed", "-1"], ["--seed", "seed` = -1", ">= 0"]),
-        (["evaluate", "clutter", "--fields", "1", "--out", "/dev/null/x"], ["--out /dev/null/x"]),
-        (["evaluate", "clutter", "--fields", "1", "--cluster", "nowhere"], ["--cluster nowhere"]),
+        (["evaluate", "sensors", "--fields", "1", "--seed", "-1"], ["--seed", "seed` = -1", ">= 0"]),
+        (["evaluate", "sensors", "--fields", "1", "--out", "/dev/null/x"], ["--out /dev/null/x"]),
+        (["evaluate", "sensors", "--fields", "1", "--cluster", "nowhere"], ["--cluster nowhere"]),
         (["sweep", "jam", "--vary", "rate_hz"], ["--vary rate_hz", "low:high:count"]),
         (["sweep", "jam", "--vary", "rate_hz=[1"], ["--vary rate_hz=[1", "TOML"]),
         (["optimise", "jam", "--vary", "rate_hz=1", "--goal", "advance_m", "--storage", "x"], ["give key=low:high"]),

@@ -1,7 +1,6 @@
 """NaN, infinity and noise anywhere in the samples of a run: the report is still made, and says what is not known."""
 
 import dataclasses
-import json
 import math
 import re
 import warnings
@@ -17,11 +16,15 @@ from hypothesis import strategies as st
 from snakesim_hal.host.black_box import Layout
 from snakesim_hal.host.recorder import BLACK_BOX, DESCRIPTION, HOST_RECORD
 from snakesim_hal.model.scenario import write
+from snakesim_hal.network.session import Arrival
 from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import encoding_of
+from snakesim_operator.recording.reader import RECORDING
+from snakesim_operator.recording.recording import Recording
 from snakesim_operator.results.compare import page as compare_page
 from snakesim_operator.results.compare.difference import differ
 from snakesim_operator.results.compare.table import table
-from snakesim_operator.results.record import CONFIG, TELEMETRY, RunRecord
+from snakesim_operator.results.record import CONFIG, RunRecord
 from snakesim_operator.results.report import page
 from snakesim_operator.results.summary import RunSummary, summarise
 from tests.unit.operator.results.recorded import Reader, triplet
@@ -45,7 +48,8 @@ MAY_BE_NULL = {
     *("path_s_m", "propulsion_n", "propulsion_torque_nm", "torque_headroom_nm", "condition"),
     *("pose_stamp_ns", "contacts_stamp_ns", "last_seen_ns"),
 }
-WRONG = st.sampled_from([math.nan, math.inf, -math.inf, 1e300])
+WRONG_NUMBERS = [math.nan, math.inf, -math.inf, 1e300]
+WRONG = st.sampled_from(WRONG_NUMBERS)
 
 
 def put_down(folder: Path, record: RunRecord) -> None:
@@ -54,8 +58,7 @@ def put_down(folder: Path, record: RunRecord) -> None:
     (folder / DESCRIPTION).write_bytes(msgspec.json.encode(record.description))
     (folder / HOST_RECORD).write_bytes(msgspec.json.encode(record.host))
     told = [(keys.CONTROL_STATE, state) for state in record.control] + [(keys.WORLD, world) for world in record.worlds]
-    lines = [msgspec.json.encode({"key": key, "message": message}, enc_hook=float) + b"\n" for key, message in told]
-    (folder / TELEMETRY).write_bytes(b"".join(lines))
+    record_messages(folder, [(key, msgspec.msgpack.encode(message, enc_hook=float)) for key, message in told])
     layout, count = Layout.of(record.description), len(record.time_s)
     rows = bytearray(count * layout.row_bytes)
     columns = layout.arrays(rows)  # pyright: ignore[reportArgumentType]
@@ -63,6 +66,17 @@ def put_down(folder: Path, record: RunRecord) -> None:
     for column in layout.columns[1:]:
         columns[column.name][:] = getattr(record, column.name)
     (folder / BLACK_BOX).write_bytes(layout.header() + rows)
+
+
+def record_messages(folder: Path, payloads: list[tuple[str, bytes]]) -> None:
+    """A recording with these messages alone."""
+    (folder / RECORDING).unlink(missing_ok=True)
+    recording = Recording(folder / RECORDING)
+    for key, payload in payloads:
+        message = keys.message_at(key)
+        assert message is not None
+        recording.take(Arrival(key, payload, encoding_of(message), 0))
+    recording.close({})
 
 
 @pytest.fixture(scope="module")
@@ -156,26 +170,27 @@ def leaves(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 
 @given(data=st.data())
 @settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_telemetry_with_numbers_that_are_none(base: RunRecord, tmp_path: Path, data: st.DataObject) -> None:
+def test_a_recording_with_numbers_that_are_none(base: RunRecord, tmp_path: Path, data: st.DataObject) -> None:
     put_down(tmp_path, base)
-    lines = (tmp_path / TELEMETRY).read_bytes().splitlines(keepends=True)
+    told = [(keys.CONTROL_STATE, state) for state in base.control] + [(keys.WORLD, world) for world in base.worlds]
+    payloads = [(key, msgspec.msgpack.encode(message)) for key, message in told]
     refused = 0
-    for number in data.draw(st.sets(st.integers(0, len(lines) - 1), min_size=1, max_size=8)):
-        line = json.loads(lines[number])
-        place = data.draw(st.sampled_from(leaves(line["message"])))
-        message = line["message"]
-        for key in place[:-1]:
-            message = message[key]
-        message[place[-1]] = "HERE"
-        wrong = data.draw(st.sampled_from(["null", "NaN", "Infinity", "-Infinity", "1e400", "-1e400", '"no"', "{", ""]))
-        lines[number] = json.dumps(line).replace('"HERE"', wrong).encode() + b"\n"
-        may_be_unknown = wrong == "null" and place[-1] in MAY_BE_NULL
+    for number in data.draw(st.sets(st.integers(0, len(payloads) - 1), min_size=1, max_size=8)):
+        key, payload = payloads[number]
+        whole = message = msgspec.msgpack.decode(payload)
+        place = data.draw(st.sampled_from(leaves(message)))
+        nulls = [None] if place[-1] in MAY_BE_NULL else []
+        for part in place[:-1]:
+            message = message[part]
+        wrong = message[place[-1]] = data.draw(st.sampled_from([*WRONG_NUMBERS, "no", *nulls]))
+        torn = data.draw(st.booleans())
+        payloads[number] = key, msgspec.msgpack.encode(whole)[: -1 if torn else None]
+        may_be_unknown = wrong is None and not torn
         refused += not may_be_unknown
-    torn = data.draw(st.integers(0, 20))
-    (tmp_path / TELEMETRY).write_bytes(b"".join(lines) + lines[0][:torn].rstrip(b"\n"))
+    record_messages(tmp_path, payloads)
     record = RunRecord.load(tmp_path)
-    assert len(record.control) + len(record.worlds) == len(lines) - refused
-    told = [re.match(r"telemetry: (\d+) lines? cannot be read, (control/state|guidance/world|no message)", lack)
+    assert len(record.control) + len(record.worlds) == len(payloads) - refused
+    told = [re.match(r"recording: (\d+) messages? cannot be read, (control/state|guidance/world)", lack)
             for lack in record.lacks]  # fmt: skip
     assert sum(int(found[1]) for found in told if found) == refused and all(told)
     _, reader = reported(record)

@@ -24,9 +24,9 @@ MOVING = ("position_w", "orientation_wxyz", "angle_rad")
 # --- runs with something missing -------------------------------------------------------------------------------
 
 
-def test_without_telemetry(record: RunRecord) -> None:
+def test_without_a_recording(record: RunRecord) -> None:
     page = read(changed(record, control=[], worlds=[]))
-    assert "telemetry holds no message of the controller" in page.text
+    assert "recording holds no message of the controller" in page.text
     assert "No joint propelled" in page.text
     assert len([title for title in page.titles if title.startswith("Top view")]) == 3  # the pose is known
 

@@ -55,7 +55,10 @@ def test_an_earlier_run_is_moved_aside_every_time(tmp_path: Path) -> None:
     assert said == [f"{out} held an earlier run: moved to {aside}" for aside in asides]
 
 
-@pytest.mark.parametrize("name", ["host.json", "blackbox.rows", "telemetry.jsonl", "blackbox.npz", "report.html"])
+OLD = ["host.json", "blackbox.rows", "recording.mcap", "telemetry.jsonl", "blackbox.npz", "report.html"]
+
+
+@pytest.mark.parametrize("name", OLD)
 def test_a_run_that_was_killed_is_an_earlier_run_too(tmp_path: Path, name: str) -> None:
     leave(tmp_path / "run", **{name.replace(".", "_"): "x"})
     with claimed(tmp_path / "run", lambda _: None) as out:

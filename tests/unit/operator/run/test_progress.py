@@ -38,3 +38,15 @@ def test_a_new_host_begins_anew(capsys: pytest.CaptureFixture[str]) -> None:
     progress.start_over()
     shown(progress, at(0), capsys)
     assert shown(progress, at(50), capsys).startswith("0.50 of 3 s")
+
+
+def test_the_time_that_is_left_follows_from_the_speed(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: now_s[0])
+    progress = Progress(run_config(duration_s=300.0))
+    shown(progress, at(0), capsys)
+    now_s[0] += 10.0
+    assert "2.0x real time  about 2:20 left" in shown(progress, at(2000), capsys)
+    assert "left" not in shown(progress, at(2000, "fault"), capsys), "nobody knows when it goes on"

@@ -143,19 +143,6 @@ def test_a_set_point_that_is_refused_is_replaced_and_never_sent_later() -> None:
         assert run.faults == [] and run.states() == [ARMED] * JOINTS
 
 
-def test_a_bus_that_stays_full_is_told_after_three_periods() -> None:
-    with loop() as run:
-        run.arm()
-        WIRES[0].refuses = is_set_point
-        run.run(2)
-        assert run.faults == []
-        run.run(2)
-        (fault,) = [fault for fault in run.faults if fault.what == "bus_stuck"]
-        assert fault.joint is None and WIRES[0].channel in fault.cause
-        WIRES[0].refuses = none
-        assert not any(map(is_set_point, go(run, "fault", 20))), "nothing was kept for later"
-
-
 def test_a_bus_that_takes_no_sync_is_told_even_when_nothing_is_armed() -> None:
     with loop() as run:
         run.run(2)

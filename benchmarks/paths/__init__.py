@@ -1,0 +1,1 @@
+"""`python -m benchmarks.paths`: the loop over every way through a lab's network, beside raw Zenoh on the same way."""

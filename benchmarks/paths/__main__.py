@@ -1,0 +1,201 @@
+"""`python -m benchmarks.paths [--write]`: latency of the loop over each way through a lab; needs root.
+
+Ours is the time from the publishing of a state to the arrival of the command that answers it, in a host that runs in
+real time at 100 Hz with a controller that holds. Raw is the round trip of as many bytes with bare Zenoh between the
+same machines, at the same rate and priority. Both in turn, the median of the ratios counts.
+"""
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import subprocess
+import tempfile
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from datetime import date
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from benchmarks.paths.ways import Lab, Way
+from benchmarks.physics import config_of, wire_bytes
+from snakesim_hal.host_process import HostRecord
+from snakesim_hal.network.private_channel import StarterEnd, socket_pair
+from snakesim_hal.wire.messages import LifecycleRequest
+
+LOOP = Path(__file__).parents[1] / "peers" / "loop.toml"
+RESULTS = Path(__file__).parents[1] / "PATHS.md"
+PERIOD_S = 0.01
+START_LIMIT_S = 60.0
+CAMERA = (str(LOOP), "--set", "robot=planar13_camera")
+IMAGES = "planar13_camera/sensor/depth/*"
+RATE_MBIT = 6.0
+SHORT_BUFFER = 16384
+AIM, AIM_SATURATED = 1.5, 1.3
+
+Percentiles = tuple[float, float]  # p50, p99 in microseconds
+
+
+def ours(way: Way, seconds: float, folder: Path, scenario: Sequence[str] = (str(LOOP),)) -> Percentiles:
+    """One run of host and controller."""
+    with ExitStack() as stack:
+        routers(way, stack, folder)
+        log = str(folder / "ours.log")
+        flags = [*scenario, "--duration", str(seconds)]
+        service = way.workstation.start("snakesim_hal.serve", "control", *flags, *way.service, log=log)
+        stack.callback(_end, service)
+        mine, its = socket_pair()
+        with its:
+            out = ["--once", "--end-after-fault", "1", "--out", str(folder), "--channel", str(its.fileno())]
+            host = way.robot.start(
+                "snakesim_hal.host_process", *flags, *way.host, *out, log=log, inherits=[its.fileno()]
+            )
+        stack.callback(_end, host)
+        arm(StarterEnd(mine), host, seconds)
+        record = msgspec.json.decode((folder / "host.json").read_bytes(), type=HostRecord)
+    p50, p99 = (record.state_to_command_us[name] for name in ("p50", "p99"))
+    if record.ended != "complete" or p50 is None or p99 is None:
+        raise RuntimeError(f"{way.name}: {record.ended} {record.ended_why} {record.faults[:1]}")
+    return p50, p99
+
+
+def arm(channel: StarterEnd, host: subprocess.Popen[bytes], seconds: float) -> None:
+    """Arm it once, and wait for its end."""
+    asked, deadline = False, time.monotonic() + START_LIMIT_S + seconds
+    while host.poll() is None:
+        channel.take_in()
+        robot, status = channel.description, channel.status
+        if robot is not None and status is not None and status.ready_to_arm and not asked:
+            named = {"robot": robot.robot, "backend": robot.backend, "config_hash": robot.config_hash}
+            channel.ask(LifecycleRequest(action="arm", who="paths", host=robot.host, **named))
+            asked = True
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"not done: {status and status.why}")
+        time.sleep(0.02)
+    channel.close()
+
+
+def raw(way: Way, seconds: float, folder: Path, state: bytes, command: bytes) -> Percentiles:
+    """The same with bare Zenoh."""
+    with ExitStack() as stack:
+        routers(way, stack, folder)
+        log, out = str(folder / "raw.log"), folder / "times.json"
+        sizes = ("--bytes", str(len(state)), "--rounds", str(round(seconds / PERIOD_S)), "--out", str(out))
+        ask = way.robot.start(_RAW, "ask", str(way.robot_file), *sizes, log=log)
+        stack.callback(_end, ask)
+        time.sleep(0.5)  # direct: it listens
+        answer = way.workstation.start(_RAW, "answer", str(way.workstation_file), "--bytes", str(len(command)), log=log)
+        stack.callback(_end, answer)
+        if ask.wait(START_LIMIT_S + 2 * seconds) != 0:
+            raise RuntimeError(f"{way.name}: {(folder / 'raw.log').read_text()[-300:]}")
+        times = json.loads(out.read_text())
+    return float(np.percentile(times, 50)), float(np.percentile(times, 99))
+
+
+_RAW = "benchmarks.paths.raw"
+
+
+def routers(way: Way, stack: ExitStack, folder: Path) -> None:
+    """Start the routers of a way."""
+    for machine, path in way.routers:
+        router = machine.start(_RAW, "router", str(path), log=str(folder / "router.log"))
+        stack.callback(_end, router)
+    time.sleep(1.0 if way.routers else 0.0)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.kill()
+    process.wait(10)
+
+
+def main() -> None:
+    """Print every line as soon as it is known."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--write", action="store_true", help=f"keep the table in {RESULTS.name}")
+    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--only-slow", action="store_true", help="only the slow link")
+    wanted = parser.parse_args()
+    state, command = wire_bytes(config_of())
+    lines = [
+        "# The loop through a lab's network",
+        "",
+        f"Printed by `python -m benchmarks.paths --write --seconds {wanted.seconds:g} --repeats {wanted.repeats}` on "
+        f"{date.today()}, {os.cpu_count()} cores, Python {platform.python_version()}, load {os.getloadavg()[1]:.1f}.",
+        "Network namespaces on one computer; state to command at 100 Hz beside a raw Zenoh round trip of",
+        f"{len(state)} and {len(command)} bytes on the same way, in turn; medians of {wanted.repeats}.",
+        "",
+        "| way | ours p50 / p99, µs | raw p50 / p99, µs | ratio p50 | ratio p99 | aim |",
+        "|---|---|---|---|---|---|",
+    ]
+    print("\n".join(lines), flush=True)
+    with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
+        folder = Path(name)
+        os.environ["XDG_STATE_HOME"] = name
+        lab = Lab(folder, stack)
+        for way in () if wanted.only_slow else lab.ways():
+            pairs = [
+                (ours(way, wanted.seconds, folder), raw(way, wanted.seconds, folder, state, command))
+                for _ in range(wanted.repeats)
+            ]
+            lines.append(row(way.name, pairs))
+            print(lines[-1], flush=True)
+        slow = [
+            "",
+            f"With a camera whose images somebody reads over a link of {RATE_MBIT:g} Mbit/s (`tbf`), against quiet.",
+            "",
+            "| way | watched p50 / p99, µs | quiet p50 / p99, µs | ratio p50 | ratio p99 | aim | images, Mbit/s |",
+            "|---|---|---|---|---|---|---|",
+        ]
+        print("\n".join(slow), flush=True)
+        lines += slow + slow_link(lab, wanted.seconds, wanted.repeats, folder)
+    if wanted.write:
+        RESULTS.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def slow_link(lab: Lab, seconds: float, repeats: int, folder: Path) -> list[str]:
+    """The loop over a slow link while somebody behind it watches the camera, against quiet: lines of a table."""
+    lab.robot.run(*f"tc qdisc add dev robot root tbf rate {RATE_MBIT:g}mbit burst 16kb latency 10ms".split())
+    rows: list[str] = []
+    for way in (lab.one_router(), lab.one_router(SHORT_BUFFER)):
+        pairs: list[tuple[Percentiles, Percentiles]] = []
+        shares: list[float] = []
+        for _ in range(repeats):
+            try:
+                quiet = ours(way, seconds, folder, CAMERA)
+                with ExitStack() as stack:
+                    seen = folder / "seen.json"
+                    reading = ("--key", IMAGES, "--out", str(seen))
+                    viewer = way.workstation.start(_RAW, "read", str(way.workstation_file), *reading, log="/dev/null")
+                    stack.callback(_end, viewer)
+                    busy = ours(way, seconds, folder, CAMERA)
+                    images, size = json.loads(seen.read_text())
+            except RuntimeError as error:
+                rows.append(f"| {way.name} | {error} | | | |")
+                break
+            pairs.append((busy, quiet))
+            shares.append(size * 8e-6 / seconds)
+            assert images
+        if pairs:
+            rows.append(row(way.name, pairs, AIM_SATURATED) + f" {statistics.median(shares):.1f} |")
+        print(rows[-1], flush=True)
+    return rows
+
+
+def row(name: str, pairs: Sequence[tuple[Percentiles, Percentiles]], aim: float = AIM) -> str:
+    """A line of the table."""
+    mine, bare = ([statistics.median(one[i] for one in side) for i in (0, 1)] for side in zip(*pairs, strict=True))
+    ratios = [statistics.median(one[i] / other[i] for one, other in pairs) for i in (0, 1)]
+    met = "met" if max(ratios) <= aim else "**missed**"
+    return (
+        f"| {name} | {mine[0]:.0f} / {mine[1]:.0f} | {bare[0]:.0f} / {bare[1]:.0f} | {ratios[0]:.2f} | {ratios[1]:.2f} "
+        f"| <= {aim:g} {met} |"
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,93 @@
+"""One process of the raw echo, or a router, on a machine of the lab: `python -m benchmarks.paths.raw PART FILE ...`."""
+
+import argparse
+import json
+import sys
+import threading
+import time
+from pathlib import Path
+from queue import Empty, SimpleQueue
+
+import zenoh
+
+from snakesim_hal.process import SERVICE_PRIORITY, die_with_parent, take_priority
+
+REQUEST, REPLY = "bench/request", "bench/reply"
+WARM_UP = 100
+LOST_S = 1.0
+
+
+def main() -> None:
+    """Ends by itself only when it asks."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("part", choices=["router", "answer", "ask", "read"])
+    parser.add_argument("file", type=Path)
+    parser.add_argument("--parent", type=int, required=True)
+    parser.add_argument("--bytes", type=int, default=0)
+    parser.add_argument("--rounds", type=int, default=0)
+    parser.add_argument("--period-s", type=float, default=0.01)
+    parser.add_argument("--key", default="")
+    parser.add_argument("--out", type=Path)
+    given = parser.parse_args()
+    die_with_parent(given.parent)
+    if given.part != "read":
+        take_priority(SERVICE_PRIORITY)
+    zenoh.init_log_from_env_or("error")
+    sys.setswitchinterval(0.0005)
+    with zenoh.open(zenoh.Config.from_file(given.file)) as session:
+        if given.part == "answer":
+            _answer(session, bytes(given.bytes))
+        elif given.part == "ask":
+            times = _ask(session, bytes(given.bytes), given.rounds, given.period_s)
+            given.out.write_text(json.dumps(times))
+        elif given.part == "read":
+            _read(session, given.key, given.out)
+        else:
+            threading.Event().wait()
+
+
+def _publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:
+    return session.declare_publisher(
+        key, express=True, priority=zenoh.Priority.REAL_TIME, congestion_control=zenoh.CongestionControl.DROP
+    )
+
+
+def _answer(session: zenoh.Session, reply: bytes) -> None:
+    publisher = _publisher(session, REPLY)
+    for _ in session.declare_subscriber(REQUEST, zenoh.handlers.FifoChannel(16)):
+        publisher.put(reply)
+
+
+def _ask(session: zenoh.Session, request: bytes, rounds: int, period_s: float) -> list[float]:
+    """Every round trip in microseconds, one every `period_s`; a lost one counts as a second."""
+    publisher = _publisher(session, REQUEST)
+    replies: SimpleQueue[zenoh.Sample] = SimpleQueue()
+    _kept = session.declare_subscriber(REPLY, replies.put)
+    times: list[float] = []
+    while len(times) < WARM_UP + rounds:
+        began = time.perf_counter()
+        publisher.put(request)
+        answered = True
+        try:
+            replies.get(timeout=LOST_S)
+        except Empty:
+            answered = False
+        if answered or times:  # until the other side is there
+            times.append((time.perf_counter() - began) * 1e6)
+        time.sleep(max(began + period_s - time.perf_counter(), 0.0))
+    return times[WARM_UP:]
+
+
+def _read(session: zenoh.Session, key: str, out: Path) -> None:
+    """Count what comes: twice a second the number of samples and of bytes."""
+    count = size = 0
+    shown = time.monotonic()
+    for sample in session.declare_subscriber(key, zenoh.handlers.RingChannel(256)):
+        count, size = count + 1, size + len(sample.payload)
+        if time.monotonic() - shown > 0.5:
+            shown = time.monotonic()
+            out.write_text(json.dumps([count, size]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,118 @@
+"""Command-line arguments that several commands and processes share: a scenario, and how to reach the network."""
+
+import argparse
+import os
+from pathlib import Path
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.files import short
+from snakesim_hal.model.scenario import Loaded, Override, RunConfig, load, parse_set
+from snakesim_hal.network.endpoint import check_endpoint, check_namespace
+from snakesim_hal.network.session import DEFAULT_ENDPOINT, Link
+from snakesim_hal.network.session_file import SessionFile, read_session
+from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES
+
+SESSION = "SNAKESIM_SESSION"  # environment variable: the session file of an operator's tools
+
+
+def add_scenario(parser: argparse.ArgumentParser) -> None:
+    """A scenario, and flags that change it."""
+    parser.add_argument(
+        "scenario", help="name of a shipped scenario, or path of a scenario file or a run's config.json"
+    )
+    parser.add_argument("--backend", help="sim or can")
+    parser.add_argument("--controller", help="installed controller, or ./file.py:Class")
+    parser.add_argument("--pace", choices=["realtime", "lockstep", "free"])
+    parser.add_argument("--duration", type=float, metavar="S", help="seconds of robot time")
+    parser.add_argument("--seed", type=int)
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="SECTION.KEY=VALUE",
+        help="change any value; may be repeated",
+    )
+
+
+def load_scenario(arguments: argparse.Namespace) -> Loaded:
+    """The configuration that `add_scenario`'s arguments ask for. Raises ConfigError."""
+    flags = {
+        "backend": arguments.backend,
+        "controller": arguments.controller,
+        "pace": arguments.pace,
+        "duration_s": arguments.duration,
+        "seed": arguments.seed,
+    }
+    overrides = [parse_set(text) for text in arguments.set]
+    for key, value in flags.items():
+        if value is not None:
+            flag = f"--{key.removesuffix('_s')} {short(str(value))}"
+            overrides.append(Override(key, value, flag))
+    if faults := getattr(arguments, "fault", None):
+        overrides.append(Override("faults", faults, " ".join(f"--fault {text}" for text in faults)))
+    return load(arguments.scenario, overrides)
+
+
+def add_network(parser: argparse.ArgumentParser, session: str = f"(default: ${SESSION})") -> None:
+    """How to reach the network. session: what is said of that option's default."""
+    parser.add_argument("--endpoint", help=f"Zenoh endpoint of the robot (default: {DEFAULT_ENDPOINT})")
+    parser.add_argument(
+        "--router", metavar="ENDPOINT", help="connect to a lab's Zenoh router instead, such as tcp/10.0.0.1:7447"
+    )
+    parser.add_argument(
+        "--session",
+        type=Path,
+        metavar="FILE",
+        help=f"connect as a Zenoh session file says (JSON5: router, certificates) {session}".rstrip(),
+    )
+    parser.add_argument("--namespace", help="namespace of the robot (default: the robot's name)")
+
+
+def add_insecure(parser: argparse.ArgumentParser) -> None:
+    """Consent to listen without access control."""
+    parser.add_argument(
+        "--insecure", action="store_true", help="listen even where anybody on the network can command the robot"
+    )
+
+
+def check_network(arguments: argparse.Namespace) -> None:
+    """The arguments of `add_network` are valid, and do not contradict each other. Raises ConfigError."""
+    for flag, given in (("--endpoint", arguments.endpoint), ("--router", arguments.router)):
+        if given is not None:
+            check_endpoint(given, flag)
+            if arguments.session is not None:
+                raise ConfigError(f"{flag} and --session: the session file names the endpoint; leave one out")
+    if arguments.namespace is not None:
+        check_namespace(arguments.namespace, "--namespace")
+
+
+def session_given(arguments: argparse.Namespace, *, or_environment: bool = False) -> SessionFile | None:
+    """The session file, if one is given. Raises ConfigError.
+
+    or_environment: for operator's tools, that of SNAKESIM_SESSION, unless an endpoint is given. What moves a robot, or
+    pretends to be one, is only where the command line puts it.
+    """
+    path = arguments.session
+    if path is None and or_environment and arguments.endpoint is None and arguments.router is None:
+        path = os.environ.get(SESSION) and Path(os.environ[SESSION])
+    return None if not path else read_session(path.expanduser())
+
+
+def link_of(arguments: argparse.Namespace, config: RunConfig, *, hosts: bool = False) -> Link:
+    """How a process of a robot joins its network. Raises ConfigError.
+
+    hosts: without a router the others connect to this process, so that it listens.
+    """
+    check_network(arguments)
+    session = session_given(arguments)
+    largest_bytes = max(MAX_PAYLOAD_BYTES, config.robot.sensors.largest_image_bytes)
+    if session is not None:
+        namespace = session.namespace_for(arguments.namespace) or config.robot.name
+        return Link(session.endpoints[0], namespace, largest_bytes=largest_bytes, session=session)
+    return Link(
+        endpoint=arguments.router or arguments.endpoint or DEFAULT_ENDPOINT,
+        namespace=arguments.namespace or config.robot.name,
+        listen=hosts and arguments.router is None,
+        insecure=getattr(arguments, "insecure", False),
+        largest_bytes=largest_bytes,
+    )

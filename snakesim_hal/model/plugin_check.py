@@ -1,0 +1,44 @@
+"""Everything that a configuration names is installed, and its settings are valid."""
+
+import msgspec
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.fault_plan import check_planned
+from snakesim_hal.model.files import Table
+from snakesim_hal.model.plugins import BACKENDS, CONTROLLERS, SERVICES, find_installed, find_plugin, plugin_settings
+from snakesim_hal.model.scenario import RunConfig
+
+
+def check_plugins(config: RunConfig, table: Table | None = None, *, run_files: bool = True) -> RunConfig:
+    """Everything that a run needs is installed and agrees with its settings. Raises ConfigError.
+
+    Returns the configuration, with a pace that the backend can keep: a scenario is written for any backend.
+    run_files: False runs no code of a `./file.py:Class`, so that its settings and its pace are not checked.
+    """
+    source = table.source if table is not None else f"scenario {config.name!r}"
+    find = find_plugin if run_files else find_installed
+    controller = find(CONTROLLERS, config.controller)
+    if controller is not None:
+        origin = table.origin if table is not None else None
+        plugin_settings(controller, config.control_settings, source, config.control_section, origin)
+    for service in config.own_services:
+        find(SERVICES, service)
+    check_planned(config, table)
+    return check_backend(config, table, run_files=run_files)
+
+
+def check_backend(config: RunConfig, table: Table | None = None, *, run_files: bool = True) -> RunConfig:
+    """What of it concerns the backend: enough for a computer with nothing but that. Raises ConfigError."""
+    backend = (find_plugin if run_files else find_installed)(BACKENDS, config.backend)
+    if backend is None:
+        return config
+    source = table.source if table is not None else f"scenario {config.name!r}"
+    origin = table.origin if table is not None else None
+    settings = plugin_settings(backend, config.backend_settings, source, config.backend_section, origin)
+    paces = backend.check(config, settings)
+    if config.pace in paces:
+        return config
+    asked_by = table.origin_of("pace") if table is not None else source
+    if asked_by.startswith("--"):
+        raise ConfigError(f"{asked_by}: backend {config.backend!r} cannot keep this pace, only {' or '.join(paces)}")
+    return msgspec.structs.replace(config, pace=paces[0])

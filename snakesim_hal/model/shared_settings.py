@@ -1,0 +1,37 @@
+"""The settings that the host and the services of a robot must share, in short: for comparing them between machines.
+
+Each process reads a scenario of its own, perhaps from another checkout. What only one of them uses may differ: the
+backend, how long a run lasts, injected faults, who starts which service.
+"""
+
+import hashlib
+import json
+from typing import Any
+
+import msgspec
+
+from snakesim_hal.model.scenario import RunConfig
+
+HASH_DIGITS = 12
+
+
+def shared_settings(config: RunConfig) -> dict[str, str]:
+    """Field -> its value, or a hash of a section."""
+    schedules = {name: (service.every_ticks, service.lag_ticks) for name, service in config.services.items()}
+    return {
+        "robot": f"{config.robot.name[:40]} {_hash(config.robot)}",
+        "scene": f"{config.scene.name[:40]} {_hash(config.scene)}",
+        "pace": config.pace,
+        "rate_hz": f"{config.rate_hz:g}",
+        "seed": str(config.seed),
+        "start": _hash(config.start),
+        "mission": _hash(config.mission),
+        "services": _hash(schedules),
+        "max_age": _hash(config.max_age),
+        "controller": f"{config.controller.rpartition(':')[2][:40]} {_hash(config.control_settings)}",
+    }
+
+
+def _hash(section: Any) -> str:
+    plain = json.dumps(msgspec.to_builtins(section), sort_keys=True)
+    return hashlib.sha256(plain.encode()).hexdigest()[:HASH_DIGITS]

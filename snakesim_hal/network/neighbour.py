@@ -1,0 +1,91 @@
+"""A second Zenoh network, with keys and payloads that are not ours: raw bytes with attachments, no namespace.
+
+A bridge joins it as a client of an explicit endpoint. Nothing that happens there can hold up the robot's own network:
+it is another session, samples are dropped rather than waited for, and only the newest of each key is kept.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import zenoh
+from zenoh import ext, handlers  # pyright: ignore[reportMissingModuleSource]
+
+from snakesim_hal.network.session import Link, open_zenoh
+
+
+@dataclass(frozen=True)
+class RawPublisher:
+    """Puts bytes on one key."""
+
+    _publisher: Any
+
+    def put(self, payload: bytes, attachment: bytes) -> None:
+        """Send it; dropped when the network is too slow for it."""
+        self._publisher.put(payload, attachment=attachment)
+
+    def heard(self) -> bool:
+        """Whether anybody subscribes to it now."""
+        return bool(self._publisher.matching_status.matching)
+
+
+@dataclass(frozen=True)
+class RawReader:
+    """The newest payload of one key."""
+
+    _subscriber: Any
+
+    def newest(self) -> bytes | None:
+        """What has arrived since the last call; None: nothing."""
+        sample = self._subscriber.try_recv()
+        return None if sample is None else sample.payload.to_bytes()
+
+
+class Neighbour:
+    """A session on a network of somebody else. Open one with `open_neighbour`."""
+
+    def __init__(self, zenoh_session: zenoh.Session) -> None:
+        self._zenoh = zenoh_session
+        self._declared: list[Any] = []
+        self.id = str(zenoh_session.zid())
+
+    def publisher(self, key: str, *, latched: bool = False, background: bool = False) -> RawPublisher:
+        """latched: later subscribers get the last value; background: after everything else, for images."""
+        priority = zenoh.Priority.BACKGROUND if background else zenoh.Priority.DATA
+        if latched:
+            made: Any = ext.declare_advanced_publisher(
+                self._zenoh, key, cache=ext.CacheConfig(1), publisher_detection=True, priority=priority
+            )
+        else:
+            drop = zenoh.CongestionControl.DROP
+            made = self._zenoh.declare_publisher(key, congestion_control=drop, priority=priority)
+        self._declared.append(made)
+        return RawPublisher(made)
+
+    def reader(self, key: str) -> RawReader:
+        """The newest payload of a key."""
+        subscriber = self._zenoh.declare_subscriber(key, handlers.RingChannel(1))
+        self._declared.append(subscriber)
+        return RawReader(subscriber)
+
+    def declare_token(self, key: str) -> None:
+        """Declare a liveliness token for as long as the session lives."""
+        self._declared.append(self._zenoh.liveliness().declare_token(key))
+
+    def close(self) -> None:
+        """Undeclare everything, then close."""
+        for declared in reversed(self._declared):
+            declared.undeclare()
+        self._declared.clear()
+        self._zenoh.close()
+
+
+@contextmanager
+def open_neighbour(endpoint: str, *, largest_bytes: int, connect_timeout_s: float = 5.0) -> Iterator[Neighbour]:
+    """Connect to a router. largest_bytes: of a payload from there. Raises NotConnectedError."""
+    session = Neighbour(open_zenoh(Link(endpoint, largest_bytes=largest_bytes), connect_timeout_s))
+    try:
+        yield session
+    finally:
+        session.close()

@@ -1,0 +1,112 @@
+"""Who is on a robot's network: every process shows an entry, and the host compares them before anything is armed."""
+
+import getpass
+import os
+import secrets
+import socket
+import time
+from collections.abc import Collection
+from importlib.metadata import version
+
+from snakesim_hal.errors import WireError
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.model.shared_settings import shared_settings
+from snakesim_hal.network.session import Arrival, Session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import Decoder
+from snakesim_hal.wire.messages import VERSIONS, Process
+
+HOST = "host"
+MAX_ENTRIES = 256
+
+
+def own_entry(name: str, config: RunConfig | None = None) -> Process:
+    """The entry of this process. config: None for one that uses none."""
+    return Process(
+        name=name,
+        machine=socket.gethostname()[:64] or "unnamed",
+        user=who(),
+        pid=os.getpid(),
+        version=version("snakesim"),
+        started_unix_s=round(time.time()),
+        settings={} if config is None else shared_settings(config),
+        messages={message.__name__: number for message, number in VERSIONS.items()},
+    )
+
+
+def show_process(session: Session, entry: Process) -> None:
+    """Show an entry for as long as the session lives. The token comes first, so that a host waits for the entry."""
+    key = keys.process(entry.name, secrets.token_hex(4))
+    session.declare_token(key)
+    session.latched_publisher(key, Process).put(entry)
+
+
+def who() -> str:
+    """The user's name."""
+    try:
+        return getpass.getuser()[:64]
+    except (KeyError, OSError):
+        return "operator"
+
+
+def differences(one: Process, other: Process) -> list[str]:
+    """How two processes of one robot are set up differently; values in the order of the arguments."""
+    found = [
+        f"`{field}` is {one.settings[field]} on {place(one)}, {other.settings[field]} on {place(other)}"
+        for field in one.settings
+        if field in other.settings and one.settings[field] != other.settings[field]
+    ]
+    found += [
+        f"message {name} has version {one.messages[name]} on {place(one)}, {other.messages[name]} on {place(other)}"
+        for name in one.messages
+        if name in other.messages and one.messages[name] != other.messages[name]
+    ]
+    return found
+
+
+def place(entry: Process) -> str:
+    """Where a process runs."""
+    return f"{entry.machine} ({entry.name}, process {entry.pid})"
+
+
+class ProcessEntries:
+    """The entries of all processes that are present now. Filled in Zenoh's threads, read in the host's."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._decoder = Decoder(Process)
+        self._entries: dict[str, Process] = {}
+        self._alive: set[str] = set()
+        session.on_alive(self._take_token, keys.PROCESS_ALL)
+        session.on_latched_arrival(keys.PROCESS_ALL, self._take_entry)
+
+    def against(self, own: Process, names: Collection[str]) -> list[str]:
+        """What speaks against working together with the processes of these names, as texts."""
+        found: list[str] = []
+        for key in sorted(self._alive.copy()):
+            name = keys.service_of(key).rpartition("-")[0]
+            if name not in names:
+                continue
+            entry = self._entries.get(key)
+            if entry is None or entry.name != name:
+                found.append(f"{keys.service_of(key)} has not told its settings yet")
+            else:
+                found += differences(entry, own)
+        return found
+
+    def _take_token(self, key: str, present: bool) -> None:
+        if present and len(self._alive) < MAX_ENTRIES:
+            self._alive.add(key)
+        elif not present:
+            self._alive.discard(key)  # the entry stays: if only the link was cut, it is not sent again
+
+    def _take_entry(self, arrival: Arrival) -> None:
+        if len(self._entries) >= MAX_ENTRIES and arrival.key not in self._entries:
+            for key in self._entries.keys() - self._alive:
+                self._entries.pop(key, None)
+            if len(self._entries) >= MAX_ENTRIES:
+                return
+        try:
+            self._entries[arrival.key] = self._decoder.decode(arrival.payload, arrival.encoding)
+        except WireError as error:
+            self._session.rejected[error.reason] += 1

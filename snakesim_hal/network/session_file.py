@@ -1,0 +1,85 @@
+"""A Zenoh session file: how a machine joins its lab's network. Stock Zenoh reads it too; nothing of ours is in it.
+
+It names the router, and the certificates if there are any. What every session of SnakeSIM needs is set on top; a file
+that says otherwise is refused, because the same file would behave differently in another program.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.files import short
+from snakesim_hal.model.textfiles import check_brackets, read_text
+from snakesim_hal.network.endpoint import check_endpoint, check_namespace
+
+# Values that a file may leave out, except the mode, which is `peer` when left out.
+REQUIRED: dict[str, Any] = {
+    "mode": "client",
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/enabled": False,
+}
+
+
+@dataclass(frozen=True)
+class SessionFile:
+    """A checked session file."""
+
+    path: Path
+    text: str  # JSON5
+    endpoints: tuple[str, ...]  # of routers: the first that answers is used
+    namespace: str | None  # of the only robot that this session can see; None: the file names none
+
+    def namespace_for(self, wanted: str | None) -> str | None:
+        """The namespace of a session that should have the wanted one. Raises ConfigError when the file has another."""
+        if self.namespace is not None and wanted not in (None, self.namespace):
+            raise ConfigError(
+                f"{self.path}: `namespace` is {short(self.namespace)!r}, not {wanted!r}; use the session file of that "
+                "robot, or another --namespace"
+            )
+        return wanted or self.namespace
+
+
+def read_session(path: Path) -> SessionFile:
+    """Read and check a session file; connects to nothing. Raises ConfigError."""
+    text, settings = read_zenoh_file(path)
+    for key, wanted in REQUIRED.items():
+        given = json.loads(settings.get_json(key))
+        if given != wanted and (given is not None or key == "mode"):
+            dotted, is_now = key.replace("/", "."), "missing" if given is None else f"{json.dumps(given)}"
+            raise ConfigError(f"{path}: `{dotted}` is {is_now}, must be {json.dumps(wanted)}")
+    if of_mode(settings, "listen/endpoints", "client"):
+        raise ConfigError(f"{path}: `listen.endpoints`: a session only connects; leave it out")
+    endpoints = of_mode(settings, "connect/endpoints", "client")
+    if not endpoints:
+        raise ConfigError(f"{path}: `connect.endpoints` is empty: name the router's, such as tls/robot-lab:7447")
+    for endpoint in endpoints:
+        check_endpoint(endpoint, f"{path}: `connect.endpoints`:")
+    namespace = json.loads(settings.get_json("namespace"))
+    if namespace is not None:
+        check_namespace(namespace, f"{path}: `namespace`:")
+    return SessionFile(path.absolute(), text, tuple(endpoints), namespace)
+
+
+def read_zenoh_file(path: Path) -> tuple[str, zenoh.Config]:
+    """A JSON5 file, as text and as Zenoh reads it. Raises ConfigError."""
+    text = read_text(path)
+    check_brackets(text, str(path))
+    try:
+        return text, zenoh.Config.from_json5(text)
+    except zenoh.ZError as error:
+        raise refused_by_zenoh(path, error) from error
+
+
+def refused_by_zenoh(path: Path, error: zenoh.ZError) -> ConfigError:
+    """Zenoh's own words about a file."""
+    return ConfigError(f"{path}: Zenoh refuses it: {short(' '.join(str(error).split()), 500)}")  # it quotes the file
+
+
+def of_mode(settings: zenoh.Config, key: str, mode: str) -> list[str]:
+    """A list of endpoints; the file gives it for every mode, or for each one."""
+    given = json.loads(settings.get_json(key))
+    return given if isinstance(given, list) else given.get(mode, [])

@@ -1,0 +1,78 @@
+"""`snakesim console`, and the process that `snakesim run --console` starts."""
+
+import argparse
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+
+from snakesim_hal.arguments import add_network, add_scenario
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.scenario import read
+from snakesim_hal.network.local_registry import local_robots
+from snakesim_hal.network.session import Link
+from snakesim_hal.process import on_stop_signal
+from snakesim_hal.serve import add_parent, process_options
+from snakesim_hal.terminal import Say, say
+from snakesim_operator.tools.targets import Where, the_one
+
+NEEDS = "the console needs viser; install it with: pip install 'snakesim[console]'"
+
+
+def console(where: Where, port: int | None, say: Say = say) -> int:
+    """Show a running robot until Ctrl-C. Raises NotConnectedError when there is none."""
+    _check_installed()
+    from snakesim_operator.console.console import show_live
+
+    link = the_one(where, "console")
+    show_live(link, _surroundings(link), port, _until_signal(), say)
+    return 0
+
+
+def show_record(folder: Path, port: int | None, say: Say = say) -> int:
+    """Show a recorded run until Ctrl-C. Raises ConfigError when the folder is not one of a run."""
+    _check_installed()
+    from snakesim_operator.console.console import show_recorded
+
+    show_recorded(folder, port, _until_signal(), say)
+    return 0
+
+
+def _surroundings(link: Link):
+    """The true surroundings of a robot that runs on this computer, by its run's configuration; else None."""
+    from snakesim_operator.console.drawing import Surroundings
+
+    for robot in local_robots():
+        if (robot.endpoint, robot.namespace) == (link.endpoint, link.namespace) and robot.config is not None:
+            try:
+                return Surroundings(read(Path(robot.config)))
+            except (ConfigError, OSError):
+                return None
+    return None
+
+
+def _check_installed() -> None:
+    try:
+        import viser  # noqa: F401
+    except ModuleNotFoundError as error:
+        raise ConfigError(f"{NEEDS} ({error})") from error
+
+
+def _until_signal() -> threading.Event:
+    stop = threading.Event()
+    on_stop_signal(stop.set)
+    return stop
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The console of a run, as a child that dies with it."""
+    parser = argparse.ArgumentParser(prog="snakesim_operator.console", description="Show a run in the browser.")
+    add_scenario(parser)
+    add_network(parser, "")
+    add_parent(parser)
+    given = process_options(parser.parse_args(argv))
+    _check_installed()
+    from snakesim_operator.console.console import show_live
+    from snakesim_operator.console.drawing import Surroundings
+
+    show_live(given.link, Surroundings(given.config), None, _until_signal(), say)
+    return 0

@@ -1,0 +1,94 @@
+"""The loop: take in what has arrived, show it, wait for the next frame."""
+
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.service import START_LIMIT_S
+from snakesim_hal.terminal import Say
+from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
+from snakesim_hal.wire.messages import ControlState, Status
+from snakesim_operator.console.drawing import Surroundings
+from snakesim_operator.console.moment import Moment
+from snakesim_operator.console.operations import Log, Operations
+from snakesim_operator.console.page import Page
+from snakesim_operator.console.player import Player
+from snakesim_operator.console.recorded import Recorded
+from snakesim_operator.console.server import page_server
+from snakesim_operator.console.watch import Watch
+from snakesim_operator.results.record import RunRecord
+
+FRAMES_PER_S = 30.0
+
+
+def show_live(link: Link, around: Surroundings | None, port: int | None, stop: threading.Event, say: Say) -> None:
+    """Show a robot until `stop` is set. Raises NotConnectedError when the port is taken, or no network is there."""
+    log = Log()
+    with page_server(port) as (server, address):
+        page = Page(server, around, Operations(link, log), log)
+        say(f"console: {address}")
+        page.show(None)
+        whole = replace(link, largest_bytes=MAX_IMAGE_BYTES)
+        with open_session(whole, START_LIMIT_S) as session:
+            watch, changes = Watch(session), Changes(log)
+            for _ in frames(stop):
+                moment = watch.moment()
+                changes.note(moment)
+                page.show(moment)
+
+
+def show_recorded(folder: Path, port: int | None, stop: threading.Event, say: Say) -> None:
+    """Show a run's record until `stop` is set. Raises ConfigError when the folder has none."""
+    recorded = Recorded(RunRecord.load(folder))
+    with page_server(port) as (server, address):
+        page = Page(server, Surroundings(recorded.record.config), None, Log(), recorded=folder.name)
+        player = Player(server, recorded.span_s)
+        say(f"console: {address}")
+        shown_s = None
+        for _ in frames(stop):
+            time_s, jumped = player.turn()
+            if jumped:
+                page.forget()
+            if time_s != shown_s:
+                page.show(recorded.at(time_s))
+                shown_s = time_s
+
+
+def frames(stop: threading.Event) -> Iterator[None]:
+    """One turn a frame, until `stop` is set; a frame that takes too long delays the others."""
+    due_s = time.monotonic()
+    while not stop.is_set():
+        yield
+        due_s = max(due_s + 1 / FRAMES_PER_S, time.monotonic())
+        stop.wait(due_s - time.monotonic())
+
+
+class Changes:
+    """Writes into the log what has become of the robot."""
+
+    def __init__(self, log: Log) -> None:
+        self._log = log
+        self._status: Status | None = None
+        self._control: ControlState | None = None
+
+    def note(self, moment: Moment | None) -> None:
+        """Compare with the moment before."""
+        if moment is None:
+            return
+        status, before = moment.status, self._status
+        if status is not None:
+            if before is None or (status.lifecycle, status.why) != (before.lifecycle, before.why):
+                self._log.write(f"robot {status.lifecycle}: {status.why}")
+            known = () if before is None else before.faults
+            for fault in status.faults:
+                if fault not in known:
+                    self._log.write(f"fault {fault.what}{' at ' + fault.joint if fault.joint else ''}: {fault.cause}")
+            self._status = status
+        control = moment.control
+        if control is not None and control is not self._control:
+            if self._control is None or control.state != self._control.state:
+                self._log.write(f"control {control.state}: {control.reason}")
+            self._control = control

@@ -1,0 +1,79 @@
+"""What viewers can do to the robot: the commands of the command line, from a page.
+
+Each call takes as long as its command does, and returns what that would print, or raises its SnakesimError. So each
+command's checks hold here too: two answers are an attack, and a state counts once the host itself publishes it.
+"""
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from datetime import datetime
+
+from snakesim_hal.errors import SnakesimError
+from snakesim_hal.network.session import Link
+from snakesim_hal.wire.messages import Description
+from snakesim_operator.tools.command import arm, clear, disarm
+from snakesim_operator.tools.fault import FaultOrder, fault
+from snakesim_operator.tools.stop import estop
+from snakesim_operator.tools.targets import Where
+
+LOG_LINES = 200
+
+
+class Log:
+    """The newest lines of what viewers did and what became of the robot; newest first."""
+
+    def __init__(self) -> None:
+        self._lines: deque[str] = deque(maxlen=LOG_LINES)
+        self._lock = threading.Lock()
+        self.written = 0
+
+    def write(self, line: str) -> None:
+        """Add a line, with the time of day; from any thread."""
+        with self._lock:
+            self._lines.appendleft(f"{datetime.now():%H:%M:%S}  {line}")
+            self.written += 1
+
+    def lines(self) -> list[str]:
+        """All of them."""
+        with self._lock:
+            return list(self._lines)
+
+
+class Operations:
+    """The robot at a link, as far as one can act on it."""
+
+    def __init__(self, link: Link, log: Log) -> None:
+        self._where = Where(link.endpoint, link.namespace, link.session)
+        self._log = log
+
+    def estop(self, who: str) -> str:
+        """Emergency stop: over the stop port and over the network at once."""
+        return self._do(f"{who}: EMERGENCY STOP", lambda say: estop(self._where, say))
+
+    def arm(self, who: str, robot: Description) -> str:
+        """Arm the robot that the page shows, by its robot and backend."""
+        return self._do(f"{who}: arm", lambda say: arm(robot.robot, robot.backend, self._where, say))
+
+    def disarm(self, who: str) -> str:
+        """Make the joints passive."""
+        return self._do(f"{who}: disarm", lambda say: disarm(self._where, say))
+
+    def clear(self, who: str) -> str:
+        """Clear a fault or an emergency stop."""
+        return self._do(f"{who}: clear", lambda say: clear(self._where, say))
+
+    def inject(self, who: str, order: FaultOrder) -> str:
+        """Inject a fault, where the run allows it."""
+        return self._do(f"{who}: fault {order.kind}:{order.target}", lambda say: fault(order, self._where, say))
+
+    def _do(self, what: str, call: Callable[[Callable[[str], None]], int]) -> str:
+        lines: list[str] = []
+        try:
+            call(lines.append)
+        except SnakesimError as error:
+            self._log.write(f"{what}: {error}")
+            raise
+        said = "; ".join(lines)
+        self._log.write(f"{what}: {said}")
+        return said

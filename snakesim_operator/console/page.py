@@ -1,0 +1,204 @@
+"""The page: the scene in the middle, the state and the controls beside it; the same for every viewer but the controls.
+
+The loop hands over one moment a frame. viser sends each viewer the newest value of each thing, so a slow browser gets
+fewer frames, and never makes the loop wait.
+"""
+
+import contextlib
+import threading
+from functools import partial
+
+import viser
+
+from snakesim_hal.errors import SnakesimError
+from snakesim_hal.wire.messages import Description
+from snakesim_operator.console import stage, texts
+from snakesim_operator.console.charts import JointCharts
+from snakesim_operator.console.controls import Controls, dress, name_of
+from snakesim_operator.console.drawing import Surroundings, draw
+from snakesim_operator.console.moment import Moment
+from snakesim_operator.console.operations import Log, Operations
+from snakesim_operator.console.pictures import picture
+from snakesim_operator.console.stage import Stage
+from snakesim_operator.console.token import ControlToken
+
+TEXT_EVERY, CHARTS_EVERY, PICTURES_EVERY = 6, 5, 6  # frames
+VIEW_RAD = 0.75  # vertical angle of view
+LEGEND = (
+    ("obstacle", stage.PEG),
+    ("perceived", stage.SEEN),
+    ("pushed off", stage.PUSHED),
+    ("push-point ahead", stage.AHEAD),
+    ("contact force", stage.FELT),
+    ("solved force", stage.SOLVED),
+    ("resultant", stage.RESULTANT),
+    ("propulsion joint", stage.PUSHED),
+)
+
+
+class Page:
+    """Everything that viewers see."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        around: Surroundings | None,
+        operations: Operations | None,
+        log: Log,
+        recorded: str = "",
+    ) -> None:
+        """around: the true surroundings, if known; operations: None shows a recording, which `recorded` names."""
+        self._server, self._around, self._operations = server, around, operations
+        self._log, self._recorded = log, recorded
+        self._token = ControlToken()
+        self._controls: dict[int, Controls] = {}
+        self._lock = threading.Lock()
+        self._frames = 0
+        self._moment: Moment | None = None
+        self._stage: Stage | None = None
+        self._charts: JointCharts | None = None
+        self._shown_log = -1
+        self._pictures: dict[str, viser.GuiImageHandle] = {}
+        self._lay_out()
+        if operations is not None:
+            server.on_client_connect(self._came)
+            server.on_client_disconnect(self._went)
+
+    def _lay_out(self) -> None:
+        gui = self._server.gui
+        dress(gui, dark=False)
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(420)
+        self._header = gui.add_html(texts.header(None), order=0)
+        if self._operations is not None:
+            stop = gui.add_button("EMERGENCY STOP  (Esc)", color="red", icon=viser.Icon.HAND_STOP, order=1)
+            stop.on_click(lambda event: self._estop(event.client_id))
+            key = gui.add_command("Emergency stop", hotkey="escape")
+            key.on_trigger(lambda event: self._estop(event.client_id))
+            self._control_folder = gui.add_folder("Control", order=2)
+        tabs = gui.add_tab_group(order=4)
+        with tabs.add_tab("Joints"):
+            self._joints_tab = gui.add_folder(None)
+        with tabs.add_tab("State"):
+            self._state = gui.add_html("")
+            with gui.add_folder("Rates and ages", expand_by_default=False):
+                self._streams = gui.add_html("")
+        with tabs.add_tab("Cameras"):
+            self._cameras_tab = gui.add_folder(None)
+            with self._cameras_tab:
+                self._no_camera = gui.add_html("<div style='padding:.3em .6em;opacity:.7'>no image yet</div>")
+        with tabs.add_tab("Log"):
+            self._log_text = gui.add_html("")
+        gui.add_html(texts.legend(LEGEND), order=3)
+
+    # --- viewers ---------------------------------------------------------------------------------------------
+
+    def _came(self, client: viser.ClientHandle) -> None:
+        assert self._operations is not None
+        controls = Controls(
+            client, self._control_folder, self._token, self._operations, self._robot, self._control_changed
+        )
+        with self._lock:
+            self._controls[client.client_id] = controls
+        self._log.write(f"{name_of(client.client_id)} came")
+
+    def _went(self, client: viser.ClientHandle) -> None:
+        """Control returns with the page that had it."""
+        with self._lock:
+            self._controls.pop(client.client_id, None)
+        had = self._token.release(client.client_id)
+        self._log.write(f"{name_of(client.client_id)} left{', and with it control' if had else ''}")
+        self._control_changed()
+
+    def _control_changed(self) -> None:
+        with self._lock:
+            everybody = list(self._controls.values())
+        for controls in everybody:
+            controls.show()
+
+    def _estop(self, viewer: int | None) -> None:
+        assert self._operations is not None
+        with self._lock:
+            controls = None if viewer is None else self._controls.get(viewer)
+        call = partial(self._operations.estop, name_of(viewer))
+        if controls is not None:
+            controls.do("Emergency stop", call)
+        else:
+            with contextlib.suppress(SnakesimError):  # the log has it
+                call()
+
+    def _robot(self) -> Description | None:
+        return None if self._moment is None else self._moment.robot
+
+    def forget(self) -> None:
+        """The next moment is not the one after this: trail and charts begin anew."""
+        if self._stage is not None and self._charts is not None:
+            self._stage.forget()
+            self._charts.forget()
+        self._frames = 0
+
+    # --- each frame ------------------------------------------------------------------------------------------
+
+    def show(self, moment: Moment | None) -> None:
+        """Show a moment; None: there is no robot yet."""
+        before, self._moment = self._moment, moment
+        self._frames += 1
+        if moment is not None:
+            if self._stage is None or before is None or before.robot.layout != moment.robot.layout:
+                self._meet(moment.robot)
+            drawing = draw(moment, self._around)
+            assert self._stage is not None and self._charts is not None
+            if drawing is not None:
+                with self._server.atomic():
+                    self._stage.show(drawing)
+            self._charts.take(moment)
+            if self._frames % CHARTS_EVERY == 1:
+                self._charts.show(moment)
+            if self._frames % PICTURES_EVERY == 1:
+                self._show_pictures(moment)
+        if self._frames % TEXT_EVERY == 1 or _what(before) != _what(moment):
+            self._show_texts(moment)
+
+    def _meet(self, robot: Description) -> None:
+        """Another robot: scene and charts begin anew."""
+        self._server.scene.reset()
+        self._server.scene.set_up_direction("+z")
+        length_m = sum(link.length_m for link in robot.links)
+        camera = self._server.initial_camera
+        camera.position, camera.look_at = (-0.65 * length_m, -1.15 * length_m, 1.6 * length_m), (0.0, 0.0, 0.0)
+        camera.fov = VIEW_RAD
+        self._stage = Stage(self._server.scene, robot, self._around)
+        with self._joints_tab:
+            if self._charts is not None:
+                self._charts.remove()
+            self._charts = JointCharts(self._server.gui, robot)
+
+    def _show_texts(self, moment: Moment | None) -> None:
+        holder = self._token.holder
+        viewers = len(self._server.get_clients())
+        control = f"{name_of(holder)} has control; {viewers} viewer{'' if viewers == 1 else 's'}"
+        self._header.content = texts.header(moment, recorded=self._recorded, control=control)
+        if moment is not None:
+            self._state.content = texts.state_table(moment)
+            self._streams.content = texts.stream_table(moment)
+        if self._log.written != self._shown_log:
+            self._shown_log = self._log.written
+            self._log_text.content = texts.log(self._log.lines())
+
+    def _show_pictures(self, moment: Moment) -> None:
+        for key, image in moment.images.items():
+            handle = self._pictures.get(key)
+            if handle is None:
+                self._no_camera.visible = False
+                with self._cameras_tab:
+                    self._pictures[key] = self._server.gui.add_image(picture(image), label=key)
+            else:
+                handle.image = picture(image)
+
+
+def _what(moment: Moment | None) -> tuple[object, ...] | None:
+    """What viewers must see at once when it changes."""
+    if moment is None:
+        return None
+    status, control = moment.status, moment.control
+    return (None if status is None else (status.lifecycle, status.why), None if control is None else control.state)

@@ -1,0 +1,54 @@
+"""The time slider of a recording: play, pause, speed, and a place in time. One for all viewers."""
+
+import time
+
+import viser
+
+from snakesim_operator.console.controls import dress
+
+SPEEDS = ("0.1x", "0.25x", "0.5x", "1x", "2x", "4x")
+SLIDER_EVERY_S = 0.1
+
+
+class Player:
+    """Where in the recording the page is."""
+
+    def __init__(self, server: viser.ViserServer, span_s: tuple[float, float]) -> None:
+        self._begin_s, self._end_s = span_s
+        self.time_s = self._begin_s
+        self._now_s = self._shown_s = time.monotonic()
+        self._moved = False
+        gui = server.gui
+        with gui.add_folder("Recording", order=2):
+            last_s = max(self._end_s - self._begin_s, 0.01)
+            self._slider = gui.add_slider("Time, s", 0.0, round(last_s, 2), 0.01, 0.0)
+            self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY)
+            self._speed = gui.add_dropdown("Speed", SPEEDS, initial_value="1x")
+            dark = gui.add_checkbox("Dark page", initial_value=False)
+        self.playing = False
+        self._play.on_click(lambda _: self._toggle())
+        self._slider.on_update(lambda event: self._jump() if event.client is not None else None)
+        dark.on_update(lambda _: dress(gui, dark=dark.value))
+
+    def turn(self) -> tuple[float, bool]:
+        """The time to show now, and whether it has jumped."""
+        now_s = time.monotonic()
+        passed_s, self._now_s = now_s - self._now_s, now_s
+        if self.playing:
+            self.time_s = min(self.time_s + passed_s * float(self._speed.value[:-1]), self._end_s)
+            if now_s - self._shown_s > SLIDER_EVERY_S:
+                self._shown_s = now_s
+                self._slider.value = round(self.time_s - self._begin_s, 2)
+            if self.time_s >= self._end_s:
+                self._toggle()
+        moved, self._moved = self._moved, False
+        return self.time_s, moved
+
+    def _jump(self) -> None:
+        self.time_s, self._moved = self._begin_s + self._slider.value, True
+
+    def _toggle(self) -> None:
+        self.playing = not self.playing
+        if self.playing and self.time_s >= self._end_s:
+            self.time_s, self._moved = self._begin_s, True
+        self._play.label = "Pause" if self.playing else "Play"

@@ -1,0 +1,167 @@
+"""What the console says in words, as HTML. Everything that comes from the network is escaped. Pure."""
+
+from collections.abc import Iterable
+from html import escape
+
+from snakesim_hal.terminal import printable
+from snakesim_hal.wire.messages import Description, Status
+from snakesim_operator.console.moment import Moment
+
+SILENT_S = 1.0
+LIFECYCLE_COLOURS = {"disarmed": "#6b7683", "armed": "#1a7f4b", "fault": "#b3261e", "estop": "#b3261e"}
+STATE_COLOURS = {"Locomoting": "#1a7f4b", "NotLocomoting": "#b26a00", "Idle": "#6b7683", "PowerOff": "#59626d"}
+SIMULATED, EMULATED, REAL, RECORDED = "#0067b0", "#7a3fa8", "#b3261e", "#59626d"
+
+
+def plain(text: object) -> str:
+    """Text from anywhere, harmless in a page."""
+    return escape(printable(str(text)))
+
+
+def backend_in_words(robot: Description) -> tuple[str, str]:
+    """What moves, in large letters, and its colour."""
+    if robot.backend == "sim":
+        return "SIMULATOR", SIMULATED
+    kind = robot.backend.upper()[:12]
+    return (f"EMULATED ROBOT ON {kind}", EMULATED) if robot.emulated else (f"ROBOT ON {kind}", REAL)
+
+
+def header(moment: Moment | None, *, recorded: str = "", control: str = "") -> str:
+    """The top of the page: which backend, which state, and why. control: who has it."""
+    if moment is None:
+        return _bar("WAITING FOR THE ROBOT", RECORDED, "no host has described itself yet")
+    words, colour = backend_in_words(moment.robot)
+    where = f"{plain(moment.robot.robot)}{' · ' + plain(moment.robot.hardware) if moment.robot.hardware else ''}"
+    if recorded:
+        return _bar(f"RECORDING OF: {words}", RECORDED, f"{where} · {plain(recorded)}")
+    status = moment.status
+    lines = [_bar(words, colour, where)]
+    if len(moment.hosts) > 1:
+        lines.append(_warning("IMPOSTOR: more than one host publishes a status under this name. Trust none of them."))
+    if moment.silent_s > SILENT_S:
+        lines.append(_warning(f"NO ANSWER for {moment.silent_s:.0f} s. What is shown is old."))
+    if status is not None:
+        lines.append(
+            f"<div style='display:flex;gap:.5em;align-items:baseline;margin-top:.45em'>"
+            f"{badge(status.lifecycle.upper(), LIFECYCLE_COLOURS[status.lifecycle])}"
+            f"<span>{plain(status.why)}</span></div>"
+        )
+    if moment.control is not None:
+        state = moment.control
+        lines.append(
+            f"<div style='display:flex;gap:.5em;align-items:baseline;margin-top:.35em'>"
+            f"{badge(state.state, STATE_COLOURS[state.state])}<span>{plain(state.reason)}</span></div>"
+        )
+    if control:
+        lines.append(f"<div style='opacity:.75;font-size:.85em;margin-top:.35em'>{plain(control)}</div>")
+    return f"<div style='padding:0 .6em .2em;font-size:.9em;line-height:1.35'>{''.join(lines)}</div>"
+
+
+def badge(text: str, colour: str) -> str:
+    """A word on a colour."""
+    return (
+        f"<span style='background:{colour};color:#fff;border-radius:4px;padding:.05em .5em;font-weight:600;"
+        f"white-space:nowrap'>{plain(text)}</span>"
+    )
+
+
+def _bar(words: str, colour: str, below: str) -> str:
+    return (
+        f"<div style='background:{colour};color:#fff;border-radius:6px;padding:.35em .6em;margin:.3em .6em .3em .3em'>"
+        f"<div style='font-size:1.3em;font-weight:700;letter-spacing:.03em'>{plain(words)}</div>"
+        f"<div style='opacity:.9'>{below}</div></div>"
+    )
+
+
+def _warning(text: str) -> str:
+    return (
+        f"<div style='border:2px solid #b3261e;color:#b3261e;border-radius:6px;padding:.3em .6em;margin-top:.4em;"
+        f"font-weight:600'>{plain(text)}</div>"
+    )
+
+
+def state_table(moment: Moment) -> str:
+    """Lease, commands, faults, warnings, health."""
+    status = moment.status
+    rows: list[tuple[str, str]] = []
+    if status is not None:
+        time_s = "" if moment.time_s is None else f"{moment.time_s:.2f} s · "
+        rows = [
+            ("robot time", f"{time_s}tick {status.tick}, {status.pace} at {status.rate_hz:g} Hz"),
+            ("lease", f"{plain(status.lease_holder or 'free')} (epoch {status.lease_epoch})"),
+            ("alive", plain(", ".join(status.alive) or "none")),
+            ("commands", f"{status.commands_accepted} accepted, {status.commands_standby} in standby"),
+            ("rejected", _counts(status.commands_rejected)),
+            ("limited", _counts(status.commands_limited)),
+            ("overruns", f"{status.overruns}"),
+        ]
+        rows += [("waiting for", plain(", ".join(status.waiting_for)))] if status.waiting_for else []
+        rows += [("derated", plain(f"{joint}: {100 * share:.0f} %")) for joint, share in sorted(status.derated.items())]
+        rows += [("isolated", plain(", ".join(status.isolated)))] if status.isolated else []
+        rows += [("injected", plain(what)) for what in status.injected]
+        rows += [("real time", plain(what)) for what in status.realtime_warnings]
+    return _table([*rows, *_health(moment)]) + faults(status)
+
+
+def faults(status: Status | None) -> str:
+    """The faults since the last clear."""
+    if status is None or not status.faults:
+        return ""
+    items = [
+        f"<li><b>{plain(fault.what)}</b>{' at ' + plain(fault.joint) if fault.joint else ''}, tick {fault.tick}: "
+        f"{plain(fault.cause)}</li>"
+        for fault in status.faults
+    ]
+    more = f"<li>and {status.faults_left_out} more</li>" if status.faults_left_out else ""
+    return f"<div style='padding:0 .6em;font-size:.85em;color:#b3261e'>Faults<ul>{''.join(items)}{more}</ul></div>"
+
+
+def _health(moment: Moment) -> list[tuple[str, str]]:
+    power, joints = moment.power, moment.robot.joints
+    if power is None or not power.motor_c:
+        return []
+    hottest = max(range(len(joints)), key=lambda i: power.motor_c[i])
+    rows = [
+        ("hottest motor", f"{plain(joints[hottest].name)}: {power.motor_c[hottest]:.1f} °C"),
+        ("boards", f"up to {max(power.board_c):.1f} °C"),
+        ("supply", f"{min(power.voltage_v):.1f} V at least, {sum(power.current_a):.2f} A in sum"),
+    ]
+    wet = [joint.name for joint, leak in zip(joints, power.leak, strict=True) if leak]
+    return [*rows, ("WATER", plain(", ".join(wet)))] if wet else rows
+
+
+def stream_table(moment: Moment) -> str:
+    """Rates and ages of all keys."""
+    rows = [
+        (plain(key), f"{stream.rate_hz:.0f} Hz" + (f", {stream.age_s * 1e3:.0f} ms old" if stream.age_s else ""))
+        for key, stream in sorted(moment.streams.items())
+    ]
+    return _table(rows)
+
+
+def log(lines: Iterable[str]) -> str:
+    """The newest lines first."""
+    items = "".join(f"<div style='padding:.1em 0'>{plain(line)}</div>" for line in lines)
+    return f"<div style='padding:0 .6em;font-size:.82em;max-height:22em;overflow-y:auto'>{items}</div>"
+
+
+def legend(entries: Iterable[tuple[str, tuple[int, int, int]]]) -> str:
+    """What the colours of the scene mean."""
+    marks = "".join(
+        f"<span style='white-space:nowrap'><span style='color:rgb{colour}'>&#9632;</span> {plain(what)}</span> "
+        for what, colour in entries
+    )
+    return f"<div style='padding:.2em .6em;font-size:.82em;display:flex;flex-wrap:wrap;gap:.2em 1em'>{marks}</div>"
+
+
+def _counts(numbers: dict[str, int]) -> str:
+    return plain(", ".join(f"{word} {number}" for word, number in sorted(numbers.items())) or "none")
+
+
+def _table(rows: Iterable[tuple[str, str]]) -> str:
+    cells = "".join(
+        f"<tr><td style='opacity:.7;padding-right:.8em;white-space:nowrap;vertical-align:top'>{name}</td>"
+        f"<td style='overflow-wrap:anywhere'>{value}</td></tr>"
+        for name, value in rows
+    )
+    return f"<table style='font-size:.85em;margin:0 .6em;line-height:1.4'>{cells}</table>"

@@ -1,0 +1,208 @@
+"""The newest message of each key of one robot. Zenoh's threads only store; decoding happens at `moment`.
+
+Each key keeps a few arrivals, so that neither a slow page nor a flood costs memory, and noise on a key does not hide
+its good messages.
+"""
+
+import time
+from collections import Counter, deque
+from typing import Any, TypeVar, cast
+
+from snakesim_hal.errors import WireError
+from snakesim_hal.network.robot_mismatch import mismatch
+from snakesim_hal.network.session import Arrival, Session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import Decoder
+from snakesim_hal.wire.messages import (
+    AppliedCommand,
+    Clock,
+    ColourImage,
+    Contacts,
+    ControlState,
+    DepthImage,
+    Description,
+    JointState,
+    Message,
+    Pose,
+    Power,
+    Status,
+    Trajectory,
+    World,
+)
+from snakesim_operator.console.moment import Moment, Stream
+
+KEPT, IMAGES_KEPT = 64, 2  # arrivals of a key between two looks
+MAX_CAMERAS = 16
+BODIES_KEPT = 128  # joint states, to find that of the instant of a pose
+RATE_PERIOD_S = 1.0
+STATUS_LIMIT_S = 2.0  # a host that has been silent for longer is no impostor, only gone
+
+LATCHED: dict[str, type[Message]] = {keys.DESCRIPTION: Description, keys.STATUS: Status}
+STREAMS: dict[str, type[Message]] = {
+    keys.CLOCK: Clock,
+    keys.JOINTS: JointState,
+    keys.POSE: Pose,
+    keys.POWER: Power,
+    keys.CONTACTS: Contacts,
+    keys.APPLIED: AppliedCommand,
+    keys.WORLD: World,
+    keys.TRAJECTORY: Trajectory,
+    keys.CONTROL_STATE: ControlState,
+}
+IMAGES: dict[str, type[Message]] = {keys.DEPTH_ALL: DepthImage, keys.COLOUR_ALL: ColourImage}
+MessageT = TypeVar("MessageT", bound=Message)
+
+
+class Inlet:
+    """The arrivals of one key."""
+
+    def __init__(self, message: type[Message], kept: int) -> None:
+        self.arrivals: deque[Arrival] = deque(maxlen=kept)
+        self.count = 0
+        self._decoder: Decoder[Any] = Decoder(message)
+
+    def put(self, arrival: Arrival) -> None:
+        """Store one; in Zenoh's threads."""
+        self.count += 1
+        self.arrivals.append(arrival)
+
+    def take(self, rejected: Counter[str]) -> list[Any]:
+        """What has arrived since the last call and can be decoded, oldest first."""
+        found: list[Any] = []
+        while self.arrivals:
+            arrival = self.arrivals.popleft()
+            try:
+                found.append(self._decoder.decode(arrival.payload, arrival.encoding))
+            except WireError as error:
+                rejected[error.reason] += 1
+        return found
+
+
+class Watch:
+    """Everything that one robot publishes, as far as the console shows it."""
+
+    def __init__(self, session: Session) -> None:
+        self._inlets: dict[str, Inlet] = {}
+        self._newest: dict[str, Any] = {}
+        self._bodies: deque[JointState] = deque(maxlen=BODIES_KEPT)
+        self._hosts: dict[str, float] = {}
+        self._heard_s = time.monotonic()
+        self._rates: dict[str, float] = {}
+        self._counted: tuple[float, dict[str, int]] = (self._heard_s, {})
+        self.rejected = session.rejected
+        for key, message in LATCHED.items():
+            session.on_latched_arrival(key, self._inlet(key, message, KEPT).put)
+        for key, message in STREAMS.items():
+            session.on_arrival(key, self._inlet(key, message, KEPT).put)
+        for key in IMAGES:
+            session.on_arrival(key, self._take_image)
+
+    def _inlet(self, key: str, message: type[Message], kept: int) -> Inlet:
+        inlet = self._inlets[key] = Inlet(message, kept)
+        return inlet
+
+    def _take_image(self, arrival: Arrival) -> None:
+        """In Zenoh's threads: each camera has a key of its own."""
+        inlet = self._inlets.get(arrival.key)
+        if inlet is None:
+            message = keys.message_at(arrival.key)
+            if message is None or len(self._inlets) >= len(LATCHED) + len(STREAMS) + MAX_CAMERAS:
+                return
+            inlet = self._inlet(arrival.key, message, IMAGES_KEPT)
+        inlet.put(arrival)
+
+    @property
+    def robot(self) -> Description | None:
+        """The newest description."""
+        return self._newest.get(keys.DESCRIPTION)
+
+    def moment(self) -> Moment | None:
+        """What is known now; None before the robot has described itself."""
+        self._take_in()
+        robot = self.robot
+        if robot is None:
+            return None
+        now_s, clock = time.monotonic(), self._get(keys.CLOCK, Clock)
+        world, status = self._get(keys.WORLD, World), self._get(keys.STATUS, Status)
+        body, base = self._body(world)
+        return Moment(
+            robot=robot,
+            time_s=None if clock is None else clock.stamp_ns * 1e-9,
+            silent_s=now_s - self._heard_s,
+            status=status,
+            joints=self._get(keys.JOINTS, JointState),
+            body=body,
+            base=base,
+            world=world,
+            contacts=self._get(keys.CONTACTS, Contacts),
+            trajectory=self._get(keys.TRAJECTORY, Trajectory),
+            control=self._get(keys.CONTROL_STATE, ControlState),
+            applied=self._get(keys.APPLIED, AppliedCommand),
+            power=self._get(keys.POWER, Power),
+            images={key: found for key, found in self._newest.items() if isinstance(found, DepthImage | ColourImage)},
+            streams=self._streams(clock),
+            hosts=frozenset(host for host, at_s in self._hosts.items() if now_s - at_s < STATUS_LIMIT_S),
+        )
+
+    def _get(self, key: str, message: type[MessageT]) -> MessageT | None:
+        return cast(MessageT | None, self._newest.get(key))
+
+    def _take_in(self) -> None:
+        """Decode what has arrived; what does not fit the robot is counted and dropped."""
+        for key, inlet in list(self._inlets.items()):
+            for message in inlet.take(self.rejected):
+                if key == keys.DESCRIPTION:
+                    self._meet(message)
+                elif self.robot is not None and (wrong := mismatch(message, self.robot)) is not None:
+                    self.rejected[wrong] += 1
+                else:
+                    self._keep(key, message)
+        self._count()
+
+    def _keep(self, key: str, message: Any) -> None:
+        self._newest[key] = message
+        if key == keys.STATUS:
+            self._heard_s = time.monotonic()
+            self._hosts[message.host or ""] = self._heard_s
+        elif key == keys.JOINTS:
+            self._bodies.append(message)
+
+    def _meet(self, robot: Description) -> None:
+        """Another host: nothing of the one before is of this robot's time."""
+        if self.robot is not None and self.robot.host != robot.host:
+            self._newest.clear()
+            self._bodies.clear()
+            self._hosts.clear()
+        self._newest[keys.DESCRIPTION] = robot
+
+    def _body(self, world: World | None) -> tuple[JointState | None, Any]:
+        """The joint state of the instant of the pose, and the pose: by guidance, else by motion capture."""
+        pose = self._get(keys.POSE, Pose)
+        if world is not None:
+            of_ns = world.stamp_ns if world.base_position_sd_m is not None else world.pose_stamp_ns or world.stamp_ns
+            base = (world.base_position_w, world.base_orientation_wxyz)
+        elif pose is not None:
+            of_ns, base = pose.stamp_ns, (pose.position_w, pose.orientation_wxyz)
+        else:
+            return (self._bodies[-1] if self._bodies else None), None
+        return min(self._bodies, key=lambda joints: abs(joints.stamp_ns - of_ns), default=None), base
+
+    def _count(self) -> None:
+        now_s, (since_s, before) = time.monotonic(), self._counted
+        if now_s - since_s < RATE_PERIOD_S:
+            return
+        counts = {key: inlet.count for key, inlet in list(self._inlets.items())}
+        self._rates = {key: (count - before.get(key, 0)) / (now_s - since_s) for key, count in counts.items()}
+        self._counted = now_s, counts
+
+    def _streams(self, clock: Clock | None) -> dict[str, Stream]:
+        return {
+            key: Stream(self._rates.get(key, 0.0), _age_s(self._newest.get(key), clock))
+            for key in self._inlets
+            if key in self._newest and key not in LATCHED
+        }
+
+
+def _age_s(message: Any, clock: Clock | None) -> float | None:
+    stamp_ns = getattr(message, "stamp_ns", None)
+    return None if clock is None or stamp_ns is None else (clock.stamp_ns - stamp_ns) * 1e-9

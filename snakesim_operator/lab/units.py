@@ -1,0 +1,56 @@
+"""systemd units, CAN bring-up and a compose file for a lab's machines, from the templates beside this file."""
+
+from collections.abc import Iterator
+from ipaddress import ip_address
+from pathlib import Path
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from snakesim_operator.lab.lab_file import Lab
+from snakesim_operator.lab.programs import STATE, Program, programs
+
+REFUSALS = "info,zenoh::net::routing::interceptor::access_control=trace"
+CONTAINER_USER = "10001:10001"
+
+
+def unit_files(lab: Lab, machine: str, origin: str) -> Iterator[tuple[str, str]]:
+    """A machine's files as (path, text). origin: a line that says where they come from."""
+    templates = Environment(
+        loader=FileSystemLoader(Path(__file__).parent / "templates"),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        autoescape=False,
+    )
+    entry = lab.file.machines[machine]
+    found = list(programs(lab, machine))
+    given = {"machine": entry, "origin": origin, "state": STATE, "refusals": REFUSALS, "uid": CONTAINER_USER}
+    unit = templates.get_template("unit.j2")
+    for program in found:
+        text = unit.render(**given, program=program, command=_command_line(lab, program), addresses=_addresses(lab))
+        yield f"systemd/{program.name}.service", text
+    for robot in lab.file.robots.values():
+        for name in robot.can if robot.machine == machine else ():
+            text = templates.get_template("can.j2").render(
+                **given, name=name, virtual=name.startswith("v"), bitrate=robot.bitrate
+            )
+            yield f"systemd/snakesim-{name}.service", text
+    if found:
+        commands = [(program, ["snakesim", *program.arguments]) for program in found]
+        yield "compose.yaml", templates.get_template("compose.j2").render(**given, programs=commands)
+
+
+def _command_line(lab: Lab, program: Program) -> str:
+    """As systemd splits it: the file's types allow no quotes, `%`, `$` or backslashes."""
+    words = (lab.file.machines[program.identity.machine].program, *program.arguments)
+    return " ".join(f'"{word}"' if " " in word else word for word in words)
+
+
+def _addresses(lab: Lab) -> list[str]:
+    """Of the routers, if all of them are numbers."""
+    found = [lab.file.machines[router.machine].address or "" for router in lab.file.routers.values()]
+    try:
+        return sorted({str(ip_address(address)) for address in found})
+    except ValueError:
+        return []

@@ -1,0 +1,88 @@
+"""The commands for recordings: `snakesim info`, `report`, `replay`."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.scenario import parse_set
+from snakesim_hal.network.endpoint import check_endpoint, check_namespace
+from snakesim_hal.terminal import say
+
+
+def add_commands(commands: Any) -> None:
+    """Add them to the parser of `snakesim`."""
+    info = commands.add_parser("info", help="print what a recording holds: keys, rates, sizes, gaps")
+    _add_recording(info)
+    info.add_argument("--json", action="store_true", help="print one JSON object")
+    info.set_defaults(act=_info)
+
+    report = commands.add_parser("report", help="write the page of a run anew, also from a recording alone")
+    _add_recording(report)
+    report.add_argument("--out", type=Path, metavar="FILE.html", help="the page (default: beside the recording)")
+    report.set_defaults(act=_report)
+
+    replay = commands.add_parser(
+        "replay",
+        help="play a recording on Zenoh, or its sensors into guidance, navigation and control",
+        epilog="Exit code of --control: 0 the commands are the same to the bit, or a setting was changed; 1 otherwise.",
+    )
+    _add_recording(replay)
+    replay.add_argument("--rate", type=float, default=1.0, metavar="X", help="robot time over wall time (1)")
+    replay.add_argument("--step", action="store_true", help="play one tick at each Enter")
+    replay.add_argument("--endpoint", help="Zenoh endpoint to listen on (default: tcp/127.0.0.1:7447)")
+    replay.add_argument("--namespace", help="namespace to play in (default: the robot's name)")
+    replay.add_argument(
+        "--control", action="store_true", help="run the services on the recorded sensors, and compare their commands"
+    )
+    replay.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="with --control: change a setting; repeatable"
+    )
+    replay.add_argument("--out", type=Path, metavar="DIR", help="with --control: folder for a run that compare reads")
+    replay.set_defaults(act=_replay)
+
+
+def _add_recording(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("recording", type=Path, metavar="RUN", help="folder of a run, or an MCAP file")
+
+
+def _info(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.playback.info import show
+
+    return show(arguments.recording, say, as_json=arguments.json)
+
+
+def _report(arguments: argparse.Namespace) -> int:
+    from snakesim_hal.model.whole_file import write_whole
+    from snakesim_operator.results.record import REPORT, RunRecord
+    from snakesim_operator.results.report import page
+    from snakesim_operator.results.summary import summarise
+
+    given: Path = arguments.recording
+    record = RunRecord.load(given)
+    out = arguments.out or (given / REPORT if given.is_dir() else given.with_suffix(".html"))
+    write_whole(out, page(record, summarise(record, record.host.ended)).encode())
+    say(str(out))
+    return 0
+
+
+def _replay(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.playback.control import replay_control
+    from snakesim_operator.playback.info import recording_of
+    from snakesim_operator.playback.play import PlayRequest, play
+
+    path = recording_of(arguments.recording)
+    if arguments.control:
+        return replay_control(path, [parse_set(text) for text in arguments.set], arguments.out, say)
+    if arguments.set or arguments.out:
+        raise ConfigError("--set and --out are for --control, which runs the services; add it, or leave them out")
+    if arguments.endpoint is not None:
+        check_endpoint(arguments.endpoint, "--endpoint")
+    if arguments.namespace is not None:
+        check_namespace(arguments.namespace, "--namespace")
+    request = PlayRequest(path, arguments.endpoint, arguments.namespace, arguments.rate, arguments.step)
+    try:
+        return play(request, iter(sys.stdin), say)
+    except KeyboardInterrupt:
+        return 130

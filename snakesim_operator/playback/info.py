@@ -1,0 +1,151 @@
+"""`snakesim info`: what a recording holds, and what it lacks."""
+
+import json
+from array import array
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.terminal import Say
+from snakesim_hal.wire import keys
+from snakesim_operator.recording.reader import RECORDING, RecordingReader
+from snakesim_operator.results.recorded import ALL, Contents
+
+IRREGULAR = (
+    keys.CONTROL_STATE,
+    keys.STATUS,
+    keys.INTENT,
+)  # published on a change too, so that nothing is missing there
+
+
+@dataclass
+class KeyInfo:
+    """The messages at one key."""
+
+    time_ns: "array[int]" = field(default_factory=lambda: array("q"))  # robot time
+    bytes: int = 0
+
+    def gaps(self, key: str) -> int:
+        """How many messages are missing between the first and the last, by the usual step between them."""
+        steps = np.diff(np.unique(np.array(self.time_ns)))
+        if key in IRREGULAR or len(steps) < 2:
+            return 0
+        return int((np.round(steps / np.median(steps)) - 1).clip(0).sum())
+
+
+class RecordingInfo(msgspec.Struct, kw_only=True):
+    """What `--json` prints."""
+
+    file: str
+    size_bytes: int
+    finished: bool
+    trouble: str
+    robot: str | None
+    backend: str | None
+    scenario: str | None
+    controller: str | None
+    seed: int | None
+    pace: str | None
+    duration_s: float
+    ticks: int
+    command_digest: str | None
+    lifecycle: str | None
+    dropped: dict[str, int]
+    keys: dict[str, dict[str, float]]
+
+
+def recording_of(given: Path) -> Path:
+    """The recording of a run's folder, or the file itself. Raises ConfigError."""
+    path = given / RECORDING if given.is_dir() else given
+    if not path.is_file():
+        raise ConfigError(f"{path}: there is no such recording; give an MCAP file, or the folder of a run that has one")
+    return path
+
+
+def look_into(path: Path) -> RecordingInfo:
+    """Read a recording once. Raises ConfigError for a file that is none."""
+    reader, found, contents = RecordingReader(path), dict[str, KeyInfo](), Contents(path)
+    for recorded in reader.messages():
+        one = found.setdefault(recorded.key, KeyInfo())
+        one.time_ns.append(recorded.time_ns)
+        one.bytes += len(recorded.payload)
+        if recorded.key in ALL:
+            contents.take(recorded)
+    return _told(path, reader, found, contents)
+
+
+def _told(path: Path, reader: RecordingReader, found: dict[str, KeyInfo], contents: Contents) -> RecordingInfo:
+    robot, status = contents.description, contents.status
+    config: dict[str, Any] = json.loads(contents.config.content) if contents.config is not None else {}
+    times = [t for one in found.values() for t in (min(one.time_ns), max(one.time_ns))]
+    duration_s = (max(times) - min(times)) * 1e-9 if times else 0.0
+    host = contents.host(contents.columns(robot)) if robot is not None and status is not None else None
+    return RecordingInfo(
+        file=str(path),
+        size_bytes=path.stat().st_size,
+        finished=reader.finished,
+        trouble=reader.trouble,
+        robot=None if robot is None else robot.robot,
+        backend=None if robot is None else robot.backend,
+        scenario=config.get("name"),
+        controller=config.get("controller"),
+        seed=config.get("seed"),
+        pace=None if status is None else status.pace,
+        duration_s=duration_s,
+        ticks=0 if host is None else host.ticks,
+        command_digest=None if host is None or not host.ticks else host.command_digest,
+        lifecycle=None if status is None else f"{status.lifecycle}: {status.why}",
+        dropped=reader.about.get("dropped", {}),
+        keys={key: _numbers(key, one, duration_s) for key, one in sorted(found.items())},
+    )
+
+
+def _numbers(key: str, one: KeyInfo, duration_s: float) -> dict[str, float]:
+    count = len(one.time_ns)
+    lasted_s = (max(one.time_ns) - min(one.time_ns)) * 1e-9
+    return {
+        "count": count,
+        "rate_hz": (len(set(one.time_ns)) - 1) / lasted_s if lasted_s > 0 else 0.0,
+        "bytes": one.bytes,
+        "gaps": one.gaps(key),
+    }
+
+
+def show(given: Path, say: Say, *, as_json: bool = False) -> int:
+    """Print what a recording holds. Exit code 1 when it lacks something."""
+    info = look_into(recording_of(given))
+    lacks = lacking(info)
+    if as_json:
+        say(msgspec.json.encode(info).decode())
+        return 1 if lacks else 0
+    say(f"{info.file}: {info.size_bytes / 1e6:.2f} MB, {info.duration_s:.2f} s of robot time")
+    say(f"  robot     {info.robot or 'unknown'}, backend {info.backend or 'unknown'}, {info.pace or 'unknown pace'}")
+    say(f"  scenario  {info.scenario or 'unknown'}, controller {info.controller or 'none'}, seed {info.seed}")
+    say(f"  ended     {info.lifecycle or 'unknown'}")
+    say(f"  commands  {info.ticks} ticks applied, digest {(info.command_digest or 'none')[:16]}")
+    say(f"  {'key':<26}{'messages':>9}{'rate':>11}{'mean size':>12}{'gaps':>7}")
+    for key, one in info.keys.items():
+        mean = one["bytes"] / one["count"]
+        say(f"  {key:<26}{one['count']:>9.0f}{one['rate_hz']:>8.1f} Hz{mean:>10.0f} B{one['gaps']:>7.0f}")
+    for lack in lacks:
+        say(f"  lacks: {lack}")
+    return 1 if lacks else 0
+
+
+def lacking(info: RecordingInfo) -> list[str]:
+    """What a recording lacks, as text."""
+    found: list[str] = []
+    if info.trouble:
+        found.append(f"damaged from there on: {info.trouble}")
+    elif not info.finished:
+        found.append("its end: the recorder was killed or the disk was full, so the last second may be missing")
+    counts = Counter(info.dropped)
+    found += [f"{count} messages on {key}, dropped because the disk was too slow" for key, count in counts.items()]
+    gaps = {key: one["gaps"] for key, one in info.keys.items() if one["gaps"]}
+    found += [f"{gap:.0f} messages on {key}, between the first and the last" for key, gap in gaps.items()]
+    return found

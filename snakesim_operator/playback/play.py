@@ -1,0 +1,77 @@
+"""Plays a recording on a Zenoh network of its own, with its timing: for programs that read the robot's keys.
+
+It is no robot: no host answers, nothing can be armed. So it listens on an endpoint where nobody else is.
+"""
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.network.session import DEFAULT_ENDPOINT, Link, Publisher, Session, open_session
+from snakesim_hal.terminal import Say
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import MAX_IMAGE_BYTES, encoding_of
+from snakesim_operator.playback.order import in_robot_order
+from snakesim_operator.recording.reader import Recorded, RecordingReader
+from snakesim_operator.results.recorded import read_recording
+
+
+@dataclass(frozen=True)
+class PlayRequest:
+    """The command's options. rate: of robot time to wall time; step: one tick at each line of input."""
+
+    path: Path
+    endpoint: str | None = None
+    namespace: str | None = None
+    rate: float = 1.0
+    step: bool = False
+
+
+def play(request: PlayRequest, lines: Iterator[str], say: Say) -> int:
+    """Play it once. lines: what the user types. Raises ConfigError, NotConnectedError."""
+    if not request.rate > 0:
+        raise ConfigError(f"--rate {request.rate:g}: give a number above 0; 2 is twice as fast")
+    robot = read_recording(request.path, (keys.DESCRIPTION,)).description
+    namespace = request.namespace or (robot.robot if robot is not None else "recording")
+    link = Link(request.endpoint or DEFAULT_ENDPOINT, namespace, listen=True, largest_bytes=MAX_IMAGE_BYTES)
+    messages = in_robot_order(RecordingReader(request.path))
+    with open_session(link) as session:
+        how = "Enter plays a tick" if request.step else f"{request.rate:g} x real time"
+        say(f"playing {request.path} on {link.endpoint}, namespace {namespace}: {how}; Ctrl-C ends it")
+        player = _Player(session)
+        began: tuple[float, int] | None = None
+        for time_ns, together in groupby(messages, lambda recorded: recorded.time_ns):
+            if request.step:
+                say(f"{time_ns * 1e-9:.3f} s")
+                if next(lines, None) is None:
+                    break
+            else:
+                began = began or (time.monotonic(), time_ns)
+                time.sleep(max(began[0] + (time_ns - began[1]) * 1e-9 / request.rate - time.monotonic(), 0.0))
+            for recorded in together:
+                player.put(recorded)
+        say(f"{player.count} messages played")
+    return 0
+
+
+class _Player:
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._publishers: dict[str, Publisher[Any]] = {}
+        self.count = 0
+
+    def put(self, recorded: Recorded) -> None:
+        """Publish it as it was."""
+        row = keys.row_at(recorded.key)
+        if row is None or row.message is None or recorded.encoding != encoding_of(row.message):
+            return
+        publisher = self._publishers.get(recorded.key)
+        if publisher is None:
+            declare = self._session.latched_publisher if row.kind == "latched" else self._session.publisher
+            publisher = self._publishers[recorded.key] = declare(recorded.key, row.message)
+        publisher.send(recorded.payload)
+        self.count += 1

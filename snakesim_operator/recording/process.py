@@ -1,0 +1,140 @@
+"""The recorder: a process of its own beside a run, or beside any robot. A robot never waits for it in real time.
+
+`python -m snakesim_operator.recording.process` is the child of `snakesim run`; `snakesim record` calls `record`.
+"""
+
+import argparse
+import contextlib
+import os
+import sys
+import time
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
+from importlib.metadata import version
+from itertools import count
+from pathlib import Path
+
+import msgspec
+
+from snakesim_hal.arguments import add_network, add_scenario
+from snakesim_hal.errors import ConfigError, SnakesimError
+from snakesim_hal.network.run_key import is_proven, own_run_key
+from snakesim_hal.network.session import Arrival, Link, open_session
+from snakesim_hal.process import on_stop_signal
+from snakesim_hal.serve import add_parent, process_options
+from snakesim_hal.service import START_LIMIT_S
+from snakesim_hal.terminal import complain, complain_of
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import UNDECODABLE
+from snakesim_hal.wire.messages import Description
+from snakesim_operator.recording.reader import RECORDING
+from snakesim_operator.recording.recording import Recording
+from snakesim_operator.recording.tap import Tap
+
+RECORDER = "recorder"
+TURN_S = 0.02
+NICE = 10  # a robot's own processes come first
+MOST_HOSTS = 100  # files: one for each host that a robot had
+FULL = 4  # exit code: the disk took no more
+
+
+class Recorder:
+    """Writes what a tap takes; a file for each host that the robot has, one after the other."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises OSError when the file cannot be made."""
+        self.path = path
+        self.recording = Recording(path)
+        self._latched: dict[str, Arrival] = {}
+        self._host: str | None = None
+        self._new_host = False
+        self._began = datetime.now(UTC)
+        self._hosts = 1
+
+    def take(self, arrival: Arrival) -> None:
+        """Write one message."""
+        if arrival.key in (keys.DESCRIPTION, keys.CONFIG, keys.STATUS):
+            self._latched[arrival.key] = arrival
+            if arrival.key == keys.DESCRIPTION:
+                self._meet(arrival.payload)
+        self.recording.take(arrival)
+        if arrival.key == keys.CLOCK and self._new_host and self.recording.time.went_back:
+            self._start_over(arrival)
+
+    def close(self, dropped: dict[str, int]) -> str:
+        """Finish the file. Returns why it lacks something, or an empty text."""
+        about = {"version": version("snakesim"), "began": self._began.isoformat(), "dropped": dropped}
+        self.recording.close(about)
+        return self.recording.trouble
+
+    def _meet(self, payload: bytes) -> None:
+        with contextlib.suppress(*UNDECODABLE):
+            robot = msgspec.msgpack.decode(payload, type=Description)
+            if is_proven(robot, own_run_key()):
+                self._new_host = self._host not in (None, robot.host)
+                self._host = robot.host
+
+    def _start_over(self, clock: Arrival) -> None:
+        """Robot time began anew, with another host: what was before gets a file of its own."""
+        self._new_host = False
+        if self._hosts >= MOST_HOSTS:
+            return
+        self._hosts += 1
+        self.close({})
+        self.path.rename(next(p for n in count(1) if not (p := self.path.with_stem(f"{self.path.stem}-{n}")).exists()))
+        self.recording = Recording(self.path)
+        for arrival in (*self._latched.values(), clock):
+            self.recording.take(arrival)
+
+
+def record(link: Link, path: Path, goes_on: Callable[[], bool]) -> Recorder:
+    """Record a robot for as long as `goes_on` says. Raises NotConnectedError, ConfigError for a file that exists."""
+    try:
+        recorder = Recorder(path)
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}; choose another file") from error
+    with open_session(link, connect_timeout_s=START_LIMIT_S) as session:
+        tap = Tap(session)
+        session.declare_alive(RECORDER)
+        while goes_on() and not recorder.recording.trouble:
+            _turn(tap, recorder)
+            time.sleep(TURN_S)
+        _turn(tap, recorder)
+    for key, number in sorted(tap.dropped.items()):
+        complain(f"{number} messages on {key} were dropped: the disk was too slow")
+    trouble = recorder.close(dict(tap.dropped))
+    if trouble:
+        complain(f"recording ended: {trouble}")
+    return recorder
+
+
+def _turn(tap: Tap, recorder: Recorder) -> None:
+    for arrival in tap.take():
+        recorder.take(arrival)
+    clock = recorder.recording.time.clock
+    if clock is not None and not tap.dropped:
+        tap.lossless = clock.pace == "lockstep"
+    recorder.recording.flush_when_due()
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Record a run into its folder until told to end. Exit code 1 when it could not go on."""
+    parser = argparse.ArgumentParser(description="Record a run.")
+    parser.add_argument("--out", type=Path, default=Path(), help="folder of the run")
+    add_scenario(parser)
+    add_network(parser, "")
+    add_parent(parser)
+    given = process_options(parser.parse_args(argv))
+    ended: list[bool] = []
+    on_stop_signal(lambda: ended.append(True))
+    os.nice(NICE)
+    try:
+        recorder = record(given.link, given.arguments.out / RECORDING, lambda: not ended)
+    except SnakesimError as error:
+        complain_of(error, f"snakesim {RECORDER}")
+        return 1
+    return FULL if recorder.recording.trouble else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

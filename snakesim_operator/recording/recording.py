@@ -1,0 +1,111 @@
+"""One MCAP file: the wire bytes of every message with their schema, as they arrive.
+
+A channel is a key, its messages the payloads verbatim (encoding `msgpack`), its schema the published JSON Schema, its
+metadata the encoding on the wire. `log_time` is robot time, `publish_time` the wall clock at the recorder, `sequence`
+counts the arrivals at a key. A chunk is written at least every FLUSH_S, so that a killed recorder lacks no more.
+"""
+
+import json
+import time
+from collections import Counter
+from pathlib import Path
+
+from google.protobuf.message import Message as Protobuf
+from mcap.writer import CompressionType, Writer
+
+from snakesim_hal.model.files import SCHEMAS
+from snakesim_hal.network.session import Arrival
+from snakesim_hal.wire import keys
+from snakesim_operator.recording.disk import GrowingFile
+from snakesim_operator.recording.foxglove import FoxgloveChannels, descriptor_set
+from snakesim_operator.recording.robot_time import RobotTime
+
+FLUSH_S = 0.5
+CHUNK_BYTES = 1024 * 1024
+ABOUT = "snakesim"  # the name of the metadata record
+PROFILE = "snakesim"
+
+
+class Recording:
+    """A file that is written. A disk that takes no more ends it, and nothing else."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises OSError, FileExistsError when there is such a file."""
+        self.path = path
+        self.trouble = ""  # why nothing is written any more
+        self.counts: Counter[str] = Counter()  # messages written, by key
+        self.time = RobotTime()
+        self._foxglove = FoxgloveChannels()
+        self._shown: Counter[str] = Counter()  # messages made for Foxglove, by topic
+        self._file = GrowingFile(path)
+        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)  # pyright: ignore[reportArgumentType]
+        self._channels: dict[str, int] = {}
+        self._schemas: dict[str, int] = {}
+        self._flush_at = 0.0
+        self._wall_ns = time.time_ns() - time.monotonic_ns()
+        self._writer.start(PROFILE)
+        self.flush()
+
+    def take(self, arrival: Arrival) -> None:
+        """Write one message. Those that are not at a key of the key space are left out."""
+        if self.trouble:
+            return
+        channel = self._channels.get(arrival.key)
+        if channel is None and (channel := self._open(arrival)) is None:
+            return
+        at_ns = self.time.of(arrival.key, arrival.payload)
+        self.counts[arrival.key] += 1
+        wall_ns = arrival.monotonic_ns + self._wall_ns
+        self._add(channel, at_ns, wall_ns, arrival.payload, self.counts[arrival.key])
+        for topic, message in self._foxglove.take(arrival.key, arrival.payload, at_ns):
+            self._shown[topic] += 1
+            channel = self._channels.get(topic) or self._open_shown(topic, message)
+            self._add(channel, at_ns, wall_ns, message.SerializeToString(), self._shown[topic])
+
+    def _add(self, channel: int, at_ns: int, wall_ns: int, data: bytes, number: int) -> None:
+        self._writer.add_message(channel, log_time=at_ns, data=data, publish_time=wall_ns, sequence=number & 0xFFFFFFFF)
+
+    def flush_when_due(self) -> None:
+        """Write what waits, a few times a second."""
+        if not self.trouble and time.monotonic() >= self._flush_at:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write what waits."""
+        self._flush_at = time.monotonic() + FLUSH_S
+        try:
+            self._writer.flush()
+        except OSError as error:
+            self.trouble = f"{self.path}: {error.strerror or error}"
+
+    def close(self, about: dict[str, object]) -> None:
+        """Write index and metadata. about: of the recording itself, kept as JSON."""
+        if not self.trouble:
+            self._writer.add_metadata(ABOUT, {name: json.dumps(value) for name, value in about.items()})
+            self._writer.finish()
+            try:
+                self._file.flush()
+            except OSError as error:
+                self.trouble = f"{self.path}: {error.strerror or error}"
+        self._file.close()
+
+    def _open_shown(self, topic: str, message: Protobuf) -> int:
+        name = message.DESCRIPTOR.full_name
+        if name not in self._schemas:
+            self._schemas[name] = self._writer.register_schema(name, "protobuf", descriptor_set(message))
+        channel = self._channels[topic] = self._writer.register_channel(topic, "protobuf", self._schemas[name])
+        return channel
+
+    def _open(self, arrival: Arrival) -> int | None:
+        message = keys.message_at(arrival.key)
+        if message is None:
+            return None
+        name = message.__name__
+        if name not in self._schemas:
+            content = (SCHEMAS / "messages" / f"{name}.json").read_bytes()
+            self._schemas[name] = self._writer.register_schema(f"snakesim.{name}", "jsonschema", content)
+        channel = self._writer.register_channel(
+            arrival.key, "msgpack", self._schemas[name], {"encoding": arrival.encoding[:200]}
+        )
+        self._channels[arrival.key] = channel
+        return channel

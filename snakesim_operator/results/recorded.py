@@ -1,0 +1,175 @@
+"""What a recording holds of a run: a row for each tick, and what guidance, navigation and control told.
+
+The rows have the columns of the black box, made of the messages: joints of `sensor/joints`, set-points of
+`hal/applied`, pose and contacts as of their newest sample. They begin with the first arming that the recording saw.
+"""
+
+from collections import Counter
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_hal.errors import ConfigError, WireError
+from snakesim_hal.host.black_box import digest_of
+from snakesim_hal.host_process import HostRecord
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import Decoder
+from snakesim_hal.wire.messages import (
+    Clock,
+    Configuration,
+    ControlState,
+    Description,
+    Message,
+    Status,
+    Trajectory,
+    World,
+)
+from snakesim_operator.recording.reader import Recorded, RecordingReader
+from snakesim_operator.results.gaps import unread
+
+TOLD: dict[str, type[Message]] = {
+    keys.CONTROL_STATE: ControlState,
+    keys.WORLD: World,
+    keys.TRAJECTORY: Trajectory,
+}
+"""What guidance, navigation and control tell."""
+WORLDS_PER_S = 20.0  # as often as control publishes its state
+_TICKED = (keys.CLOCK, keys.JOINTS, keys.APPLIED, keys.POSE, keys.CONTACTS, keys.JOINT_COMMAND)
+ALL: tuple[str, ...] = (*TOLD, *_TICKED, keys.DESCRIPTION, keys.CONFIG, keys.STATUS)
+
+
+@dataclass
+class Contents:
+    """What was read of one recording."""
+
+    path: Path
+    description: Description | None = None
+    config: Configuration | None = None
+    status: Status | None = None  # the last one
+    told: dict[str, list[Any]] = field(default_factory=lambda: {key: [] for key in TOLD})
+    at: dict[str, dict[int, Any]] = field(
+        default_factory=lambda: {key: {} for key in _TICKED}
+    )  # key -> tick -> message
+    armed_wall_ns: list[int] = field(default_factory=list[int])  # wall clock at each clock since the first arming
+    refused: Counter[str] = field(default_factory=Counter[str])  # messages that cannot be decoded, by key and reason
+    lacks: list[str] = field(default_factory=list[str])
+    _decoders: dict[str, Decoder[Any]] = field(default_factory=dict[str, Decoder[Any]])
+
+    def take(self, recorded: Recorded) -> None:
+        """One message at a key of ALL, in the order of the file."""
+        message_type = keys.message_at(recorded.key)
+        if message_type is None:
+            return
+        decoder = self._decoders.get(recorded.key) or self._decoders.setdefault(recorded.key, Decoder(message_type))
+        try:
+            self._keep(recorded.key, decoder.decode(recorded.payload, recorded.encoding), recorded.wall_ns)
+        except WireError as error:
+            self.refused[f"{recorded.key}: {error}"[:200]] += 1
+
+    def _keep(self, key: str, message: Any, wall_ns: int) -> None:
+        match message:
+            case Description():
+                self.description = message
+            case Configuration():
+                self.config = message
+            case Status():
+                self.status = message
+            case World() | Trajectory() | ControlState():
+                told = self.told[key]
+                if not told or _is_news(told[-1], message):
+                    told.append(message)
+            case _:
+                self.at[key][message.tick] = message
+                if isinstance(message, Clock) and message.arming:
+                    self.armed_wall_ns.append(wall_ns)
+
+    def columns(self, robot: Description) -> dict[str, NDArray[Any]]:
+        """A row for each tick since the first arming, named as in the black box."""
+        joints, applied, clocks = (self.at[key] for key in (keys.JOINTS, keys.APPLIED, keys.CLOCK))
+        poses, contacts = self.at[keys.POSE], self.at[keys.CONTACTS]
+        count = len(robot.joints)
+        rows: list[tuple[Any, ...]] = []
+        pose, peak_n, touched = [np.nan] * 7, 0.0, 0
+        for tick in sorted(joints.keys() | poses.keys() | contacts.keys()):
+            if tick in poses:
+                pose = [*poses[tick].position_w, *poses[tick].orientation_wxyz]
+            if tick in contacts:
+                forces = [float(np.linalg.norm(one.force_l)) for one in contacts[tick].contacts]
+                peak_n, touched = max(forces, default=0.0), len({one.obstacle for one in contacts[tick].contacts})
+            state, points, clock = joints.get(tick), applied.get(tick), clocks.get(tick)
+            if state is None or points is None or clock is None or not clock.arming or not state.is_of(count):
+                continue
+            rows.append((tick, state, points, pose, peak_n, touched))
+        states, points = [row[1] for row in rows], [row[2] for row in rows]
+        ticks = np.array([row[0] for row in rows], dtype=np.int64)
+        placed = np.array([row[3] for row in rows]).reshape(len(rows), 7)
+        found: dict[str, NDArray[Any]] = {
+            "tick": ticks,
+            "time_s": ticks * robot.period_ns * 1e-9,
+            "position_w": placed[:, :3],
+            "orientation_wxyz": placed[:, 3:],
+            "contact_peak_n": np.array([row[4] for row in rows], dtype=float),
+            "contact_count": np.array([row[5] for row in rows], dtype=float),
+            "mode": np.array([point.mode for point in points], dtype=np.int8).reshape(len(rows), count),
+        }
+        for names, messages in (
+            (("angle_rad", "velocity_rad_s", "torque_nm"), states),
+            (("target", "torque_limit_nm"), points),
+        ):
+            for name in names:
+                values = [getattr(message, name) for message in messages]
+                found[name] = np.array(values, dtype=float).reshape(len(rows), count)
+        return found
+
+    def host(self, columns: dict[str, NDArray[Any]]) -> HostRecord:
+        """The host's statistics, as far as the recording tells."""
+        status, armed = self.status, {t for t, clock in self.at[keys.CLOCK].items() if clock.lifecycle == "armed"}
+        if status is None:
+            raise ConfigError(f"{self.path}: holds no hal/status, so it is not known what became of the run")
+        return HostRecord(
+            ticks=len(columns["tick"]),
+            wall_s=(self.armed_wall_ns[-1] - self.armed_wall_ns[0]) * 1e-9 if self.armed_wall_ns else 0.0,
+            overruns=status.overruns,
+            answered_ticks=len(armed & self.at[keys.JOINT_COMMAND].keys()),
+            armed_ticks=len(armed),
+            command_digest=digest_of(columns),
+            state_to_command_us={"p50": None, "p99": None},
+            rejected_commands=status.commands_rejected,
+            limited_commands=status.commands_limited,
+            faults=status.faults,
+            faults_left_out=status.faults_left_out,
+            lifecycle=status.lifecycle,
+            why=status.why,
+            ended="finished",
+            ended_why="as far as it was recorded",
+            isolated=status.isolated,
+        )
+
+
+def read_recording(path: Path, wanted: Collection[str] = ALL) -> Contents:
+    """Read a recording's messages at these keys. Raises ConfigError for a file that is none."""
+    contents, reader = Contents(path), RecordingReader(path)
+    for recorded in reader.messages(wanted):
+        contents.take(recorded)
+    contents.lacks += unread(contents.refused)
+    if reader.trouble:
+        contents.lacks.append(f"recording: damaged from there on: {reader.trouble}")
+    dropped = sum(reader.about.get("dropped", {}).values())
+    if dropped:
+        contents.lacks.append(f"recording: {dropped} messages were dropped, because the disk was too slow")
+    return contents
+
+
+def _is_news(before: Any, message: Any) -> bool:
+    """Worlds are thinned; a path is told once."""
+    match message:
+        case World():
+            return message.stamp_ns >= before.stamp_ns + round(1e9 / WORLDS_PER_S)
+        case Trajectory():
+            return message.path_id != before.path_id
+        case _:
+            return True

@@ -1,0 +1,190 @@
+"""A URDF's row of bodies -> chain, module and links: the line of the joints becomes x, `up` becomes z."""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.files import Table
+from snakesim_hal.model.links import capsule_inertia
+from snakesim_operator.robots.imported import UPS, Imported, Order
+from snakesim_operator.robots.urdf_tree import Body, Joint, Row
+from snakesim_operator.robots.xml_tree import Element
+
+Floats = NDArray[np.float64]
+
+DIGITS_M = 9  # lengths are rounded to a nanometre, which removes the noise of adding transforms
+OFF_LINE = 0.05  # of the mean distance between joints: a joint further beside the line is an error
+OBLIQUE = math.cos(math.radians(1.0))
+PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # ixx, iyy, izz, ixy, ixz, iyz
+LEAST_M, MOST_M, LEAST_KG = 0.001, 2, 0.001
+
+
+def _axes_of_body(row: Row, order: Order, urdf: Element) -> Floats:
+    """body_from_root (3, 3): x from tail to head, z up."""
+    along = row.joints[-1].origin - row.joints[0].origin
+    if np.linalg.norm(along) < 1e-9:
+        raise urdf.wrong("has its first and last joint at the same place, so that the chain has no direction")
+    x = along / np.linalg.norm(along)
+    up = np.array(UPS[order.up], dtype=np.float64)
+    z = up - (up @ x) * x
+    if np.linalg.norm(z) < 0.1:
+        others = [name for name in UPS if abs(np.array(UPS[name]) @ x) < 0.9 and "-" not in name]
+        raise urdf.wrong(f"lies along its {order.up} axis: say which one points up: --up {' or --up '.join(others)}")
+    z /= np.linalg.norm(z)
+    return np.vstack([x, np.cross(z, x), z])
+
+
+def put_body(found: Imported, row: Row, order: Order, urdf: Element) -> list[Floats]:
+    """Chain, module and links. Returns link_from_root, (4, 4) in m, of every link, tail to head."""
+    turn, scale = _axes_of_body(row, order, urdf), order.scale
+    places = np.array([turn @ joint.origin for joint in row.joints]) * scale
+    on_line = places - [0.0, *places[0][1:]]  # x as it is; y and z from the first joint
+    gap_m = float(np.mean(np.diff(on_line[:, 0])))
+    if gap_m > MOST_M:
+        raise urdf.wrong(f"has joints {gap_m:g} m apart, and a link has {MOST_M} m at most; in mm? Give --scale 0.001")
+    axes = [_axis(joint, turn @ joint.axis) for joint in row.joints]
+    for joint, axis, at in zip(row.joints, axes, on_line, strict=True):
+        beside = abs(at[1] if axis == "yaw" else at[2])  # a joint may be moved along its own axis
+        if beside > OFF_LINE * gap_m:
+            raise joint.element.wrong(
+                f"is {beside * 1e3:.1f} mm beside the line through the first and the last joint; a robot file has all "
+                f"joints on a line, at zero angles"
+            )
+        if beside > 1e-6:
+            found.changed.append(f"joint {joint.name!r} moved by {beside * 1e3:.2f} mm, onto the line of the others")
+    outlines = [_outline(body, turn, places[0], scale) for body in row.bodies]
+    radius_m = _radius(outlines, gap_m, found)
+    lengths = _lengths(on_line[:, 0], outlines, radius_m, found)
+    starts = [on_line[0, 0] - lengths[0], *on_line[:, 0]]
+    frames = [_link_from_root(turn, np.array([start, *places[0][1:]])) for start in starts]
+    links = [
+        _link(found, i, body, frame, length, radius_m, scale)
+        for i, (body, frame, length) in enumerate(zip(row.bodies, frames, lengths, strict=True))
+    ]
+    _put_links(found.table, links, axes, radius_m, urdf.source)
+    ours = [f"link_{i}" for i in range(len(links))], [f"joint_{i + 1}" for i in range(len(axes))]
+    for name, body in zip(ours[0], row.bodies, strict=True):
+        if body.links != [name]:
+            found.names.append(f"{name}: {', '.join(body.links)}")
+    for name, joint, axis in zip(ours[1], row.joints, axes, strict=True):
+        turned = float((turn @ joint.axis)[2 if axis == "yaw" else 1]) < 0
+        if joint.name != name or turned:
+            found.names.append(f"{name}: {joint.name}, {axis}{', its angle negated' if turned else ''}")
+    return frames
+
+
+def _link_from_root(turn: Floats, start_b: Floats) -> Floats:
+    frame = np.eye(4)
+    frame[:3, :3], frame[:3, 3] = turn, -start_b
+    return frame
+
+
+def _axis(joint: Joint, axis_b: Floats) -> str:
+    if abs(axis_b[2]) > OBLIQUE:
+        return "yaw"
+    if abs(axis_b[1]) > OBLIQUE:
+        return "pitch"
+    raise joint.element.wrong(
+        f"turns about ({axis_b[0]:.2f}, {axis_b[1]:.2f}, {axis_b[2]:.2f}), with x from tail to head and z up; a "
+        f"snake's joints turn about z or y, within 1°. Does another axis point up (--up)?"
+    )
+
+
+def _outline(body: Body, turn: Floats, line_b: Floats, scale: float) -> Floats | None:
+    """(n, 3): x along the body, y and z from the line through the joints; None when nothing is known of it."""
+    if not body.points:
+        return None
+    return np.vstack(body.points) @ turn.T * scale - [0.0, line_b[1], line_b[2]]
+
+
+def _radius(outlines: list[Floats | None], gap_m: float, found: Imported) -> float:
+    radii = [None if points is None else float(np.hypot(points[:, 1], points[:, 2]).max()) for points in outlines]
+    known = [radius for radius in radii if radius is not None]
+    if not known:
+        found.changed.append(
+            f"no link has geometry; its radius is taken as 0.35 of the joints' distance: {0.35 * gap_m:.3g} m"
+        )
+        return round(0.35 * gap_m, DIGITS_M)
+    widest = round(max(known), DIGITS_M)
+    lacking = [f"link_{i}" for i, radius in enumerate(radii) if radius is None]
+    narrow = [f"link_{i} ({r * 1e3:.1f} mm)" for i, r in enumerate(radii) if r is not None and r < widest * 0.99]
+    if lacking:
+        found.changed.append(f"{', '.join(lacking)}: no geometry; the radius is the others', {widest * 1e3:.1f} mm")
+    if narrow:
+        found.changed.append(
+            f"every link is a capsule of {widest * 1e3:.1f} mm, the widest; narrower: {', '.join(narrow)}"
+        )
+    return widest
+
+
+def _lengths(joints_x: Floats, outlines: list[Floats | None], radius_m: float, found: Imported) -> list[float]:
+    """Of every link, in m; the capsules' caps at both ends are not counted."""
+    gaps = [round(float(gap), DIGITS_M) for gap in np.diff(joints_x)]
+    if min(gaps) < 0:
+        raise ConfigError("the joints are not in order along the chain at zero angles: it is folded")
+    for i, gap in enumerate(gaps):
+        if gap < LEAST_M:
+            found.changed.append(
+                f"joint_{i + 1} and joint_{i + 2} are {gap * 1e3:.2f} mm apart; here {LEAST_M * 1e3:g} mm, the least"
+            )
+    middle = [max(gap, LEAST_M) for gap in gaps]
+    ends: list[float] = []
+    for i, joint_x, outward in ((0, joints_x[0], -1), (len(outlines) - 1, joints_x[-1], 1)):
+        outline = outlines[i]
+        if outline is None:
+            ends.append(round(float(np.mean(middle)) / 2, DIGITS_M))
+            found.changed.append(f"link_{i} has no geometry; its length is taken as half of the others'")
+            continue
+        reach = float((outward * (outline[:, 0] - joint_x)).max()) - radius_m
+        ends.append(max(round(reach, DIGITS_M), LEAST_M))
+    return [ends[0], *middle, ends[1]]
+
+
+def _link(
+    found: Imported, i: int, body: Body, frame: Floats, length_m: float, radius_m: float, scale: float
+) -> dict[str, Any]:
+    """As in [[links]]; without what is as in its capsule. frame: link_from_root, (4, 4) in m."""
+    if body.mass_kg < LEAST_KG:
+        found.changed.append(f"link_{i} has a mass of {body.mass_kg:g} kg; here {LEAST_KG:g} kg, evenly in its capsule")
+        return {"length_m": length_m, "mass_kg": LEAST_KG}
+    turn = frame[:3, :3]
+    center, inertia = turn @ body.center * scale + frame[:3, 3], turn @ body.inertia @ turn.T * scale**2
+    link: dict[str, Any] = {"length_m": length_m, "mass_kg": _digits(body.mass_kg)}
+    least, middle, most = np.linalg.eigvalsh(inertia).tolist()
+    capsule = np.array(capsule_inertia(length_m, radius_m, link["mass_kg"]))
+    dust = 1e-9 * np.abs(inertia).max()  # of turning it
+    moments = np.array([inertia[at] if abs(inertia[at]) > dust else 0.0 for at in PAIRS])
+    if least <= 0 or least + middle < most * (1 - 1e-6):
+        found.changed.append(f"link_{i} has an inertia that no body has; here that of its capsule")
+        moments = capsule
+    evenly = np.allclose(moments, capsule, rtol=1e-6, atol=1e-6 * capsule.max())
+    if not (evenly and np.allclose(center, [length_m / 2, 0, 0], atol=1e-8)):
+        link["center_m"] = [round(float(c), DIGITS_M) + 0.0 for c in center]
+    if not evenly:
+        link["inertia_kg_m2"] = [_digits(float(moment)) for moment in moments]
+    return link
+
+
+def _digits(value: float) -> float:
+    return float(f"{value:.10g}")
+
+
+def _put_links(table: Table, links: list[dict[str, Any]], axes: list[str], radius_m: float, source: str) -> None:
+    """As [module] alone where the links are a row of equal modules, else as [[links]] too."""
+    period = next(p for p in range(1, len(axes) + 1) if all(axes[i] == axes[i % p] for i in range(len(axes))))
+    middle = links[1:-1]
+    lengths, masses = [link["length_m"] for link in middle], [link["mass_kg"] for link in middle]
+    length_m, mass_kg = (v[0] if len(set(v)) == 1 else _digits(float(np.mean(v))) for v in (lengths, masses))
+    table.put("chain", {"modules": len(axes), "axes": axes[:period]}, source)
+    table.put("module", {"length_m": length_m, "radius_m": radius_m, "mass_kg": mass_kg}, source)
+    shares = [0.5] + [1.0] * len(middle) + [0.5]
+    if not all(_is_share(link, share, length_m, mass_kg) for link, share in zip(links, shares, strict=True)):
+        table.put("links", links, source)
+
+
+def _is_share(link: dict[str, Any], share: float, length_m: float, mass_kg: float) -> bool:
+    same = np.allclose([link["length_m"], link["mass_kg"]], [share * length_m, share * mass_kg], rtol=1e-9)
+    return same and len(link) == 2

@@ -1,0 +1,33 @@
+"""What an import of a URDF is asked for, and what it returns."""
+
+from dataclasses import dataclass, field
+
+from snakesim_hal.model.files import Table, decode
+from snakesim_hal.model.robot import RobotFile
+
+UPS = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)}
+
+
+@dataclass(frozen=True)
+class Order:
+    """How to read a URDF."""
+
+    tail: str | None = None  # a link at the tail; none: the root link
+    up: str = "z"  # axis of the root link's frame that points up
+    scale: float = 1.0  # metres per unit of length of the file
+    like: str = "planar13"  # the robot file with what URDF has no words for
+
+
+@dataclass
+class Imported:
+    """The values of a robot file, and what to know about them."""
+
+    table: Table
+    names: list[str] = field(default_factory=list[str])  # ours, and those of the URDF
+    changed: list[str] = field(default_factory=list[str])
+    left_out: list[str] = field(default_factory=list[str])
+
+    @property
+    def robot(self) -> RobotFile:
+        """Checked. Raises ConfigError."""
+        return decode(self.table, RobotFile)

@@ -1,0 +1,54 @@
+"""Arguments of `snakesim ros2`. Importable without the extra that it needs, and without Zenoh."""
+
+import argparse
+import re
+from importlib.util import find_spec
+from typing import Any
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.files import short
+from snakesim_hal.network.endpoint import check_endpoint
+
+ROS_ROUTER = "tcp/127.0.0.1:7447"  # where `ros2 run rmw_zenoh_cpp rmw_zenohd` listens
+LAST_DOMAIN = 232  # as with DDS
+MOST_HZ = 200.0
+
+
+def add_command(commands: Any) -> argparse.ArgumentParser:
+    """Add it to the parser of `snakesim`; the caller adds the robot's network options."""
+    made: argparse.ArgumentParser = commands.add_parser(
+        "ros2",
+        help="be a ROS 2 node for a robot, through the router of rmw_zenoh; needs no ROS",
+        epilog="Publishes joint states, transforms, markers, images, scans, the robot's URDF, diagnostics and /clock.",
+    )
+    made.add_argument("--domain", type=int, default=0, metavar="N", help="ROS_DOMAIN_ID (0)")
+    made.add_argument(
+        "--ros-router", default=ROS_ROUTER, metavar="ENDPOINT", help=f"router of the ROS nodes ({ROS_ROUTER})"
+    )
+    made.add_argument("--ros-namespace", metavar="NAME", help="of topics and frames, for several robots in one graph")
+    made.add_argument("--hz", type=float, default=50.0, metavar="HZ", help="most messages a second of a topic (50)")
+    made.add_argument("--image-hz", type=float, default=5.0, metavar="HZ", help="most images a second of a camera (5)")
+    made.add_argument("--cmd-vel", action="store_true", help="let ROS ask for speed and direction, on cmd_vel")
+    made.add_argument(
+        "--stamps",
+        choices=["robot", "wall"],
+        help="robot: robot time, with /clock; wall: wall-clock time (default: robot if nothing real moves, else wall)",
+    )
+    return made
+
+
+def check(arguments: argparse.Namespace) -> None:
+    """Raises ConfigError for what cannot be meant."""
+    if find_spec("xxhash") is None:
+        raise ConfigError("`snakesim ros2` needs packages that are not installed: pip install 'snakesim[ros2]'")
+    check_endpoint(arguments.ros_router, "--ros-router")
+    if not 0 <= arguments.domain <= LAST_DOMAIN:
+        raise ConfigError(f"--domain {arguments.domain}: a ROS domain is a number from 0 to {LAST_DOMAIN}")
+    for flag, hz in (("--hz", arguments.hz), ("--image-hz", arguments.image_hz)):
+        if not 0.1 <= hz <= MOST_HZ:
+            raise ConfigError(f"{flag} {hz:g}: give from 0.1 to {MOST_HZ:g} Hz")
+    name = arguments.ros_namespace
+    if name is not None and not re.fullmatch(r"[A-Za-z_]\w*(/[A-Za-z_]\w*)*", name, re.ASCII):
+        raise ConfigError(
+            f"--ros-namespace {short(name)!r}: give a name such as planar13 or lab/planar13: letters, digits, _"
+        )

@@ -1,0 +1,55 @@
+"""The bridge's two sessions: one on the robot's network, one on that of the ROS nodes."""
+
+import argparse
+import time
+from dataclasses import replace
+
+from snakesim_hal.errors import ConfigError, NotConnectedError
+from snakesim_hal.network.neighbour import open_neighbour
+from snakesim_hal.network.session import open_session
+from snakesim_hal.terminal import say
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
+from snakesim_hal.wire.messages import Description
+from snakesim_operator.ros2.bridge import Bridge, Options, adds_up
+from snakesim_operator.ros2.command import check
+from snakesim_operator.ros2.graph import Node, NodeName
+from snakesim_operator.tools.targets import Where, the_one
+
+MOST_IN_BYTES = 65536  # of a message from ROS; a Twist has 52
+DESCRIBED_S = 5.0
+
+
+def join(arguments: argparse.Namespace, where: Where) -> int:
+    """Run the bridge until Ctrl-C. Raises ConfigError, NotConnectedError."""
+    check(arguments)
+    link = the_one(where, "ros2")
+    if link.endpoint == arguments.ros_router:
+        raise ConfigError(
+            f"--ros-router {arguments.ros_router}: {link.namespace} itself is on this endpoint, and ROS nodes are not "
+            f"let into its network; start the router of ROS at another one, or the robot with --endpoint"
+        )
+    with open_session(replace(link, largest_bytes=MAX_IMAGE_BYTES)) as session:
+        robot = session.latest(keys.DESCRIPTION, Description, DESCRIBED_S, adds_up)
+        if robot is None:
+            raise NotConnectedError(f"{link.namespace} does not describe itself within {DESCRIBED_S:g} s")
+        wall_time = not robot.emulated if arguments.stamps is None else arguments.stamps == "wall"
+        options = Options(
+            namespace=arguments.ros_namespace or "",
+            hz=arguments.hz,
+            images_hz=arguments.image_hz,
+            cmd_vel=arguments.cmd_vel,
+            wall_time=wall_time,
+        )
+        with open_neighbour(arguments.ros_router, largest_bytes=MOST_IN_BYTES) as neighbour:
+            name = NodeName("snakesim", f"/{options.namespace}")
+            made = Bridge(session, Node(neighbour, arguments.domain, name), robot, options)
+            say(
+                f"{link.namespace} is in ROS domain {arguments.domain} through {arguments.ros_router}; stamps are "
+                f"{'wall-clock' if wall_time else 'robot'} time; Ctrl-C ends it"
+            )
+            due_s = time.monotonic()
+            while True:
+                made.turn()
+                due_s = max(due_s + 1.0 / arguments.hz, time.monotonic())
+                time.sleep(max(0.0, due_s - time.monotonic()))

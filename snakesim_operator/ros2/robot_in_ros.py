@@ -1,0 +1,110 @@
+"""What the robot says, as ROS messages: pure translation, with the frames of `frames.py`."""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from snakesim_hal.wire.messages import (
+    ColourImage,
+    DepthImage,
+    JointState,
+    Obstacle,
+    Ranges,
+    Status,
+    World,
+    WorldContact,
+)
+from snakesim_operator.ros2 import messages as ros
+from snakesim_operator.ros2.messages import Marker, Rgba, Triple
+
+METRES_PER_NEWTON = 0.01  # length of a force arrow
+ARROW_M: Triple = (0.008, 0.016, 0.02)  # diameter of shaft and head, length of the head
+CONTACT: Rgba = (0.85, 0.2, 0.1, 1.0)
+FELT: Rgba = (0.9, 0.55, 0.1, 1.0)
+SEEN: Rgba = (0.3, 0.5, 0.75, 1.0)
+MILLIMETRE = 0.001
+
+
+def joint_state(stamp_ns: int, names: list[str], joints: JointState) -> bytes:
+    """Joints that are not valid are left out: JointState may name any subset."""
+    kept = [i for i, valid in enumerate(joints.valid) if valid]
+    return ros.joint_state(
+        stamp_ns,
+        [names[i] for i in kept],
+        [joints.angle_rad[i] for i in kept],
+        [joints.velocity_rad_s[i] for i in kept],
+        [joints.torque_nm[i] for i in kept],
+    )
+
+
+def contact_markers(contacts: Iterable[WorldContact]) -> list[Marker]:
+    """An arrow for the force on the body at each contact."""
+    return [
+        Marker("contacts", ros.ARROW, ARROW_M, CONTACT, points_m=(contact.position_w, _tip(contact)))
+        for contact in contacts
+    ]
+
+
+def _tip(contact: WorldContact) -> Triple:
+    (x, y, z), (fx, fy, fz) = contact.position_w, contact.force_w
+    return (x + METRES_PER_NEWTON * fx, y + METRES_PER_NEWTON * fy, z + METRES_PER_NEWTON * fz)
+
+
+def obstacle_markers(world: World) -> list[Marker]:
+    """The obstacles that guidance knows; opaque ones are certain, those felt are orange."""
+    return [_obstacle(one) for one in world.obstacles]
+
+
+def _obstacle(one: Obstacle) -> Marker:
+    across = 2 * one.radius_m
+    shape, size = {
+        "cylinder": (ros.CYLINDER, (across, across, one.height_m)),
+        "sphere": (ros.SPHERE, (across, across, across)),
+        "box": (ros.CUBE, (2 * one.half_size_m[0], 2 * one.half_size_m[1], 2 * one.half_size_m[2])),
+    }[one.shape]
+    turned = (float(np.cos(one.yaw_rad / 2)), 0.0, 0.0, float(np.sin(one.yaw_rad / 2)))
+    red, green, blue, _ = FELT if one.felt else SEEN
+    opacity = 0.2 + 0.8 * one.confidence
+    return Marker("obstacles", shape, size, (red, green, blue, opacity), one.position_w, turned)
+
+
+def depth_image(stamp_ns: int, frame: str, seen: DepthImage) -> bytes:
+    """16UC1 in millimetres, 0 for nothing; of another scale 32FC1 in metres, NaN for nothing (REP 118)."""
+    if seen.scale_m == MILLIMETRE:
+        return ros.image(stamp_ns, frame, seen.width, seen.height, "16UC1", seen.depth)
+    counts = np.frombuffer(seen.depth, dtype="<u2")
+    metres = np.where(counts == 0, np.nan, counts * seen.scale_m).astype("<f4")
+    return ros.image(stamp_ns, frame, seen.width, seen.height, "32FC1", metres.tobytes())
+
+
+def colour_image(stamp_ns: int, frame: str, seen: ColourImage) -> bytes:
+    """As rgb8."""
+    return ros.image(stamp_ns, frame, seen.width, seen.height, "rgb8", seen.rgb)
+
+
+def camera_info(stamp_ns: int, frame: str, seen: DepthImage | ColourImage) -> bytes:
+    """The intrinsics of either image."""
+    return ros.camera_info(stamp_ns, frame, seen.width, seen.height, (seen.fx_px, seen.fy_px, seen.cx_px, seen.cy_px))
+
+
+def laser_scan(stamp_ns: int, frame: str, seen: Ranges) -> bytes:
+    """Beams without a return are infinite (REP 117)."""
+    metres = [float("inf") if range_m is None else range_m for range_m in seen.range_m]
+    limits = (seen.range_min_m, seen.range_max_m)
+    return ros.laser_scan(stamp_ns, frame, seen.angle_min_rad, seen.angle_step_rad, limits, metres)
+
+
+def diagnostics(stamp_ns: int, status: Status) -> bytes:
+    """The robot's state and its reason."""
+    stopped = status.lifecycle in ("fault", "estop")
+    level = ros.ERROR if stopped else ros.WARN if status.faults or status.isolated or status.derated else ros.OK
+    values = {
+        "lifecycle": status.lifecycle,
+        "backend": status.backend,
+        "lease holder": status.lease_holder or "free",
+        "rate_hz": f"{status.rate_hz:g}",
+        "overruns": str(status.overruns),
+        "isolated joints": ", ".join(status.isolated) or "none",
+        **{f"fault {i}": f"{fault.what}: {fault.cause}" for i, fault in enumerate(status.faults)},
+    }
+    return ros.diagnostics(stamp_ns, level, status.robot, f"{status.lifecycle}: {status.why}", values)

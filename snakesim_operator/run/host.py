@@ -1,0 +1,25 @@
+"""`snakesim host`: the HAL host of a robot alone, with its record. Services join it from this or other machines."""
+
+import argparse
+import contextlib
+
+from snakesim_hal.host_process import host
+from snakesim_hal.model.plugin_check import check_backend
+from snakesim_hal.model.scenario import write
+from snakesim_hal.serve import process_options
+from snakesim_hal.terminal import say
+from snakesim_operator.results.record import CONFIG
+from snakesim_operator.run.folder import claimed
+
+
+def run_host(arguments: argparse.Namespace) -> int:
+    """Run it to its end. Returns 0 when all ticks were done without a fault, 1 otherwise. Raises SnakesimError."""
+    given = process_options(arguments, hosts=True)
+    config = check_backend(given.config, given.loaded.table)
+    with contextlib.ExitStack() as held:
+        if arguments.out is not None:
+            arguments.out = held.enter_context(claimed(arguments.out, say))
+            write(config, arguments.out / CONFIG)
+        say(f"{given.link.namespace}: {config.robot.name} on backend {config.backend}, {config.pace}")
+        say(f"network: {given.link.endpoint}, namespace {given.link.namespace}; Ctrl-C ends it")
+        return host(given)

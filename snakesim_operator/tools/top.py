@@ -1,0 +1,120 @@
+"""`snakesim top`: every key of the robots on a network, as a table that is redrawn every second."""
+
+import contextlib
+import sys
+import time
+from dataclasses import dataclass, replace
+
+import msgspec
+
+from snakesim_hal.errors import NotConnectedError
+from snakesim_hal.network.session import Arrival, Link, Session, open_session
+from snakesim_hal.terminal import Say, say, say_json, say_over
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
+from snakesim_operator.tools.targets import CONNECT_S, Where
+from snakesim_operator.tools.traffic import KeyTraffic, Latency, Traffic
+
+PERIOD_S = 1.0
+ONCE_S = 2.0  # long enough for two samples of the slowest key that repeats itself
+HEAD = f"{'key':<30}{'writer':<18}{'Hz':>8}{'jitter':>9}{'max gap':>9}{'bytes':>9}{'age':>9}{'heard':>9}"
+
+
+@dataclass(frozen=True)
+class TopRequest:
+    """The command's options."""
+
+    once: bool = False  # listen for a moment, print one table, end
+    as_json: bool = False  # a line of JSON for each table
+
+
+def top(request: TopRequest, where: Where, say: Say = say) -> int:
+    """Until Ctrl-C. Returns 1 when nothing was heard, 0 otherwise. Raises NotConnectedError."""
+    with contextlib.ExitStack() as stack:
+        heard = [_listen(link, stack) for link in where.networks()]
+        traffics = [traffic for traffic in heard if traffic is not None]
+        if not traffics:
+            raise NotConnectedError(
+                f"nothing listens on {', '.join(where.endpoints())}; start a run or a router there first"
+            )
+        drawn = 0
+        while True:
+            time.sleep(ONCE_S if request.once else PERIOD_S)
+            now_ns = time.monotonic_ns()
+            lines = [line for traffic in traffics for line in traffic.lines(now_ns)]
+            latencies = [latency for traffic in traffics for latency in traffic.latencies()]
+            left_out = sum(traffic.keys_left_out for traffic in traffics)
+            if request.as_json:
+                told = {"keys": lines, "latencies": latencies, "left_out": left_out}
+                say_json(msgspec.to_builtins(told), say)
+            else:
+                table = table_of(lines, latencies, left_out)
+                if sys.stdout.isatty() and not request.once:
+                    drawn = say_over(table, drawn)
+                else:
+                    for line in table:
+                        say(line)
+            if request.once:
+                return 0 if lines else 1
+
+
+def _listen(link: Link, stack: contextlib.ExitStack) -> Traffic | None:
+    """Subscribe to everything on a network; None when nobody answers there."""
+    try:
+        session: Session = stack.enter_context(open_session(replace(link, largest_bytes=MAX_IMAGE_BYTES), CONNECT_S))
+    except NotConnectedError:
+        return None
+    traffic = Traffic(link.namespace)
+
+    def take_strange(arrival: Arrival) -> None:
+        if not traffic.is_known(arrival.key):
+            traffic.take(arrival)
+
+    # Key by key, because a lab's router may grant no wildcard; the last value of those that are latched, too.
+    for row in keys.SPACE:
+        key = row.key if link.namespace is not None else f"**/{row.key}"
+        if row.kind == "latched":
+            session.on_latched_arrival(key, traffic.take)
+        elif row.kind == "stream":
+            session.on_arrival(key, traffic.take)
+    session.on_arrival("**", take_strange)
+    return traffic
+
+
+def table_of(lines: list[KeyTraffic], latencies: list[Latency], left_out: int) -> list[str]:
+    """The table, as lines of text: robot by robot, what is not of the key space at the end of each."""
+    if not lines:
+        return ["nothing arrives"]
+    told: list[str] = []
+    for robot in dict.fromkeys(line.robot for line in lines):
+        told += ["", f"{robot or 'of no robot'}:", HEAD] if told else [f"{robot or 'of no robot'}:", HEAD]
+        told += [_row(line) for line in lines if line.robot == robot]
+        for latency in latencies:
+            if latency.robot == robot:
+                told.append(_latency(latency))
+    if left_out:
+        told.append(f"and {left_out} messages on still more keys: somebody floods this network")
+    return told
+
+
+def _latency(latency: Latency) -> str:
+    told = (
+        f"state to command, as heard here: {latency.heard_median_ms:.2f} ms in the median, "
+        f"{latency.heard_p99_ms:.2f} ms in 99 % of {latency.count}"
+    )
+    if latency.motors_median_ms is not None:
+        told += f"; to the motors, in robot time: {latency.motors_median_ms:.0f} and {latency.motors_p99_ms:.0f} ms"
+    return told
+
+
+def _row(line: KeyTraffic) -> str:
+    def number(value: float | None, form: str, unit: str) -> str:
+        return "-" if value is None else f"{value:{form}}{unit}"
+
+    writer = line.writer or "STRANGER"
+    trouble = f"  {line.trouble}" if line.trouble else ""
+    return (
+        f"{line.key[:29]:<30}{writer[:17]:<18}{number(line.rate_hz, '.1f', ''):>8}"
+        f"{number(line.jitter_ms, '.2f', ' ms'):>9}{number(line.gap_max_ms, '.1f', ' ms'):>9}{line.bytes:>9}"
+        f"{number(line.age_ms, '.0f', ' ms'):>9}{number(line.heard_ago_s, '.1f', ' s'):>9}{trouble}"
+    )

@@ -1,0 +1,162 @@
+"""A headless Chromium, driven over its DevTools protocol: no package is needed but websockets, which viser brings."""
+
+import base64
+import json
+import shutil
+import subprocess
+import tempfile
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from websockets.sync.client import ClientConnection, connect
+
+CHROMIUM = next(
+    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
+)
+MISSING = "needs a browser: install the Debian package chromium"
+FLAGS = (
+    "--headless=new",
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-dev-shm-usage",
+    "--disable-renderer-backgrounding",
+    "--disable-backgrounding-occluded-windows",
+    "--disable-background-timer-throttling",
+    "--remote-debugging-port=0",
+)
+WINDOW = {"url": "about:blank", "newWindow": True}
+START_S, ANSWER_S = 60.0, 60.0
+
+
+class Tab:
+    """One page."""
+
+    def __init__(self, socket: ClientConnection) -> None:
+        self._socket, self._number = socket, 0
+        self.errors: list[str] = []  # of the page's console
+        for domain in ("Page", "Runtime", "Log"):
+            self.send(f"{domain}.enable")
+        self.send("Emulation.setFocusEmulationEnabled", enabled=True)  # a page in the background draws nothing
+
+    def send(self, method: str, **parameters: Any) -> dict[str, Any]:
+        """A command of the protocol, and its result."""
+        self._number += 1
+        self._socket.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
+        while True:
+            answer = json.loads(self._socket.recv(timeout=ANSWER_S))
+            if answer.get("id") == self._number:
+                assert "error" not in answer, answer
+                return answer["result"]
+            self._note(answer)
+
+    def _note(self, event: dict[str, Any]) -> None:
+        kind, told = event.get("method"), event.get("params", {})
+        if kind == "Runtime.exceptionThrown":
+            self.errors.append(str(told["exceptionDetails"].get("exception", told["exceptionDetails"]))[:500])
+        elif kind == "Log.entryAdded" and told["entry"]["level"] == "error":
+            self.errors.append(f"{told['entry']['text']} {told['entry'].get('url', '')}"[:500])
+        elif kind == "Runtime.consoleAPICalled" and told["type"] == "error":
+            self.errors.append(" ".join(str(part.get("value", part.get("description"))) for part in told["args"])[:500])
+
+    def value(self, script: str) -> Any:
+        """The value of a JavaScript expression."""
+        return self.send("Runtime.evaluate", expression=script, returnByValue=True)["result"].get("value")
+
+    def text(self) -> str:
+        """All visible text."""
+        return self.value("document.body.innerText") or ""
+
+    def wait_for(self, text: str, limit_s: float = 60.0) -> float:
+        """Until the page shows a text; returns how long it took in seconds."""
+        began = time.monotonic()
+        while text not in self.text():
+            assert time.monotonic() - began < limit_s, f"{text!r} is not on the page:\n{self.text()[:3000]}"
+            time.sleep(0.02)
+        return time.monotonic() - began
+
+    def click(self, label: str) -> None:
+        """Click the button with a label. A disabled one does nothing, as for a person."""
+        found = self.value(
+            f"(() => {{ const b = [...document.querySelectorAll('button')].find(b => b.innerText.trim() === "
+            f"{json.dumps(label)}); if (!b) return false; b.click(); return true; }})()"
+        )
+        assert found, f"no button {label!r}"
+
+    def press(self, key: str, code: int) -> None:
+        """Press a key."""
+        for kind in ("keyDown", "keyUp"):
+            self.send("Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=code)
+
+    def size(self, width: int, height: int, *, scale: float = 1.0, mobile: bool = False) -> None:
+        """The size of the window."""
+        self.send(
+            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=scale, mobile=mobile
+        )
+
+    def picture(self, path: Path) -> None:
+        """Save what it shows, as a PNG."""
+        path.write_bytes(base64.b64decode(self.send("Page.captureScreenshot", format="png")["data"]))
+
+
+class Browser:
+    """A running Chromium."""
+
+    def __init__(self, port: int) -> None:
+        self._port = port
+        self._sockets: list[ClientConnection] = []
+
+    def open(self, address: str, width: int = 1440, height: int = 900, scale: float = 1.0) -> Tab:
+        """A new page; each is a viewer of its own."""
+        root = f"127.0.0.1:{self._port}/"
+        with urllib.request.urlopen(f"http://{root}json/version", timeout=ANSWER_S) as answer:
+            whole = self._connect(json.load(answer)["webSocketDebuggerUrl"])
+        whole.send(json.dumps({"id": 1, "method": "Target.createTarget", "params": WINDOW}))
+        made = json.loads(whole.recv(timeout=ANSWER_S))["result"]["targetId"]
+        socket = self._connect(f"ws://{root}devtools/page/{made}")
+        tab = Tab(socket)
+        tab.size(width, height, scale=scale)
+        tab.send("Page.navigate", url=address)
+        return tab
+
+    def _connect(self, address: str) -> ClientConnection:
+        socket = connect(address, max_size=None, ping_interval=None, proxy=None)
+        self._sockets.append(socket)
+        return socket
+
+    def close(self) -> None:
+        """End all connections."""
+        for socket in self._sockets:
+            socket.close()
+
+
+@contextmanager
+def chromium() -> Iterator[Browser]:
+    """A browser with a profile of its own, which ends with the context."""
+    assert CHROMIUM is not None, MISSING
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
+        process = subprocess.Popen(
+            [CHROMIUM, *FLAGS, f"--user-data-dir={profile}", "about:blank"],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        try:
+            port_file, deadline = Path(profile) / "DevToolsActivePort", time.monotonic() + START_S
+            while not port_file.is_file() or not port_file.read_text().strip():
+                assert process.poll() is None and time.monotonic() < deadline, "chromium did not start"
+                time.sleep(0.05)
+            browser = Browser(int(port_file.read_text().split()[0]))
+            try:
+                yield browser
+            finally:
+                browser.close()
+        finally:
+            process.terminate()
+            process.wait(10)

@@ -1,0 +1,76 @@
+"""The recorder as a process: beside a run and as part of it, killed, and what is played from its file."""
+
+import os
+import signal
+import subprocess
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Clock, Description
+from snakesim_operator.playback.play import PlayRequest, play
+from snakesim_operator.recording.reader import RECORDING, RecordingReader
+from snakesim_operator.results.record import RunRecord
+from tests.e2e.command import SNAKESIM, environment, free_endpoint, nothing_left, run_to_summary, running, wait_until
+from tests.whole import command
+
+pytestmark = pytest.mark.e2e
+
+LONG = ["triplet", "--controller", "hold", "--duration", "5", "--pace", "realtime", "--set", "rate_hz=50"]
+
+
+def test_in_lockstep_the_recording_has_every_tick(tmp_path: Path) -> None:
+    ended, summary = run_to_summary(tmp_path / "run", "triplet", "--duration", "2")
+    assert ended.code == 0, ended.out + ended.err
+    alone = RunRecord.load(tmp_path / "run" / RECORDING)
+    assert alone.host.command_digest == summary.command_digest and len(alone.time_s) == 200
+    info = command.snakesim("info", "run", cwd=tmp_path)
+    assert info.code == 0 and "lacks" not in info.out, info.out
+    replayed = command.snakesim("replay", "run", "--control", cwd=tmp_path)
+    assert replayed.out == "200 commands, the same to the bit\n", replayed.out + replayed.err
+
+
+def test_a_run_goes_on_without_its_recorder_and_another_records_beside_it(tmp_path: Path) -> None:
+    with running(tmp_path / "run", *LONG) as run:
+        run.wait_for(" s  ")
+        time.sleep(1.0)
+        os.kill(run.part("recorder"), signal.SIGKILL)
+        typed = [*SNAKESIM, "record", "--endpoint", run.endpoint, "--duration", "1.5", "--out", "beside.mcap"]
+        beside = subprocess.run(
+            typed, cwd=tmp_path, env=environment(tmp_path), capture_output=True, text=True, timeout=60, check=False
+        )
+        assert beside.returncode == 0 and "messages in" in beside.stdout, beside.stderr
+        assert run.end() == 3, run.said()  # complete, but the record lacks something
+    nothing_left(tmp_path / "run")
+    assert run.said().count("warning:") == 1 and "recorder was ended by SIGKILL" in run.said()
+    kept = list(RecordingReader(tmp_path / "run" / RECORDING).messages([keys.JOINTS]))
+    assert len(kept) > 10
+    alone = RunRecord.load(tmp_path / "beside.mcap")
+    assert alone.config.name == "triplet" and len(alone.time_s) > 40
+    assert command.snakesim("report", "beside.mcap", cwd=tmp_path).code == 0
+
+
+def test_a_recording_is_played_with_its_timing(tmp_path: Path) -> None:
+    ended = command.snakesim(
+        "run", "triplet", "--in-process", "--no-record", "--duration", "0.1", "--out", "bare", cwd=tmp_path
+    )
+    assert ended.code == 0 and not (tmp_path / "bare" / RECORDING).exists()
+    command.snakesim("run", "triplet", "--in-process", "--duration", "1", "--out", "run", cwd=tmp_path)
+    endpoint, said = free_endpoint(), list[str]()
+    request = PlayRequest(tmp_path / "run" / RECORDING, endpoint, "again", rate=0.5)
+    player = threading.Thread(target=play, args=(request, iter(()), said.append))
+    player.start()
+    wait_until(lambda: bool(said), "the player")
+    with open_session(Link(endpoint, "again"), 5.0) as session:
+        robots = session.latched_reader(keys.DESCRIPTION, Description)
+        clocks, began = session.reader(keys.CLOCK, Clock), time.monotonic()
+        found = list[Clock]()
+        wait_until(lambda: bool(found.extend(clocks.drain())) or bool(found and found[-1].tick == 99), "the last tick")
+        assert time.monotonic() - began > 1.0 and len(found) > 50
+        assert robots.drain()[-1].robot == "planar13"
+    player.join(10)
+    assert "messages played" in said[-1]

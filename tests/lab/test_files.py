@@ -1,0 +1,79 @@
+"""What `snakesim deploy render` writes is accepted by those who read it: Zenoh, systemd, and a container's compose."""
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+import zenoh
+
+from snakesim_operator.cli import main
+from snakesim_operator.lab.lab_file import EXAMPLE
+
+MOST_EXPOSED = 2.5  # of 10, as systemd-analyze rates it; below is "OK"
+MACHINE = re.compile(r"^\[machines\.\w+\]$", re.MULTILINE)
+needs_systemd = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd-analyze here")
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The example, with two routers, a simulated robot on vcan0, and the program where it is here."""
+    folder = tmp_path_factory.mktemp("rendered")
+    program = Path(sys.executable).with_name("snakesim")
+    text = MACHINE.sub(rf'\g<0>\nprogram = "{program}"', EXAMPLE.read_text())
+    text += '\n[routers.second]\nmachine = "hub"\nport = 7448\n'
+    text += '\n[robots.twin]\nmachine = "robot1"\nscenario = "triplet"\ncan = ["vcan0"]\nset = ["rate_hz=50"]\n'
+    (folder / "lab.toml").write_text(text)
+    assert main(["deploy", "render", str(folder / "lab.toml"), "--out", str(folder)]) == 0
+    return folder
+
+
+def test_zenoh_parses_every_file(rendered: Path) -> None:
+    files = sorted(rendered.rglob("*.json5"))
+    assert len(files) == 9
+    for path in files:
+        settings = zenoh.Config.from_file(str(path))
+        wanted = "router" if path.name.startswith("router.") else "client"
+        assert settings.get_json("mode") == f'"{wanted}"', path.name
+        assert '"enabled":true' not in settings.get_json("scouting").replace(" ", ""), path.name
+
+
+@needs_systemd
+def test_systemd_accepts_every_unit_and_finds_it_closed(rendered: Path) -> None:
+    units = sorted(rendered.rglob("*.service"))
+    assert len(units) == 10
+    done = subprocess.run(
+        ["systemd-analyze", "verify", "--man=no", *map(str, units)], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    for unit in units:
+        rated = subprocess.run(
+            ["systemd-analyze", "security", "--offline=true", "--no-pager", str(unit)],
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        score = re.search(r"exposure level for \S+: ([\d.]+)", rated.stdout)
+        assert score is not None and float(score[1]) <= MOST_EXPOSED, f"{unit.name}: {rated.stdout[-200:]}"
+
+
+def test_containers_run_what_the_units_run(rendered: Path) -> None:
+    for compose in rendered.rglob("compose.yaml"):
+        services = yaml.safe_load(compose.read_text())["services"]
+        units = [unit.read_text() for unit in (compose.parent / "systemd").glob("snakesim-[gr]*.service")]
+        ours = {" ".join(service["command"][1:]) for service in services.values()}
+        assert ours == {re.search(r"^ExecStart=\S+ (.*)$", unit, re.MULTILINE)[1] for unit in units}  # pyright: ignore[reportOptionalSubscript]
+
+
+def test_what_is_no_longer_in_the_lab_is_removed_and_what_is_not_ours_stays(tmp_path: Path) -> None:
+    lab = tmp_path / "lab.toml"
+    lab.write_text(EXAMPLE.read_text())
+    assert main(["deploy", "render", str(lab), "--out", str(tmp_path)]) == 0
+    (tmp_path / "laptop" / "notes.txt").write_text("mine")
+    lab.write_text(EXAMPLE.read_text().replace('role = "viewer"', 'role = "administrator"'))
+    assert main(["deploy", "render", str(lab), "--out", str(tmp_path)]) == 0
+    left = {path.name for path in (tmp_path / "laptop").iterdir()}
+    assert left == {"notes.txt", "rendered.txt", "operator.planar13.json5", "administrator.planar13.json5"}

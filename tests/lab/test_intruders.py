@@ -1,0 +1,188 @@
+"""Who has no certificate, a wrong one, or a right one and wrong intentions: nothing of theirs passes the router."""
+
+import socket
+import threading
+from dataclasses import replace
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+from cryptography import x509
+from cryptography.hazmat.primitives.serialization import load_pem_private_key
+
+from snakesim_hal.wire.roles import Role
+from snakesim_operator.lab.certificates import Issuer, issue, make_authority
+from snakesim_operator.lab.identities import Identity
+from tests.lab.small_lab import OWN, SmallLab, opened
+from tests.lab.test_matrix import settle
+
+COMMAND = f"{OWN}/actuator/joints"
+DECLARED = ("Declare/Undeclare Queryable (ingress) on {}/hal/lifecycle",)  # in the words of Zenoh's log
+
+
+def with_certificate(lab: SmallLab, folder: Path, who: Identity, issuer: Issuer, life: timedelta) -> dict[str, Any]:
+    """Settings of a session with a certificate that the lab did not make."""
+    certificate, key = issue(issuer, who, lab.lab, life)
+    (folder / "own.pem").write_bytes(certificate)
+    (folder / "own.key").write_bytes(key)
+    settings = lab.settings(who)
+    settings["transport"]["link"]["tls"].update(
+        connect_certificate=str(folder / "own.pem"), connect_private_key=str(folder / "own.key")
+    )
+    return settings
+
+
+REASONS = {  # in the words of the router's log
+    "another authority": "invalid peer certificate: BadSignature",
+    "signed by a role": "invalid peer certificate: UnknownIssuer",
+    "expired": "invalid peer certificate: certificate expired",
+    "none": "peer sent no certificates",
+    "plain tcp": "received corrupt message",
+}
+
+
+@pytest.mark.parametrize("flaw", REASONS)
+def test_without_a_valid_certificate_nobody_is_let_in(lab: SmallLab, tmp_path: Path, flaw: str) -> None:
+    who, day = lab.who(Role.GNC, OWN), timedelta(days=1)
+    own = make_authority(lab.folder / "authority", lab.lab)
+    if flaw == "another authority":
+        settings = with_certificate(lab, tmp_path, who, make_authority(tmp_path / "foreign", lab.lab), day)
+    elif flaw == "signed by a role":
+        settings = with_certificate(lab, tmp_path, who, role_as_issuer(lab, own), day)
+    elif flaw == "expired":
+        settings = with_certificate(lab, tmp_path, who, own, timedelta(seconds=-5))
+    else:
+        settings = lab.settings(who)
+        tls = settings["transport"]["link"]["tls"]
+        settings["transport"]["link"]["tls"] = {"root_ca_certificate": tls["root_ca_certificate"]}
+        if flaw == "plain tcp":
+            settings["transport"]["link"]["protocols"] = ["tcp"]
+            settings["connect"]["endpoints"] = [lab.lab.endpoints()[0].replace("tls/", "tcp/")]
+    settings["connect"]["timeout_ms"] = 400
+    with pytest.raises(zenoh.ZError):
+        opened(settings).close()
+    assert any(REASONS[flaw] in line for line in lab.said())
+
+
+def role_as_issuer(lab: SmallLab, own: Issuer) -> Issuer:
+    """Somebody who signs with the certificate of a role."""
+    certificate, key = issue(own, lab.who(Role.VIEWER, OWN), lab.lab)
+    private: Any = load_pem_private_key(key, None)
+    return Issuer(x509.load_pem_x509_certificate(certificate), private)
+
+
+def test_who_was_taken_out_of_the_lab_file_is_nobody(lab: SmallLab, tmp_path: Path) -> None:
+    """Their certificate is still valid, but no rule names it."""
+    own = make_authority(lab.folder / "authority", lab.lab)
+    former = replace(lab.who(Role.GNC, OWN), machine="laptop")
+    settings = with_certificate(lab, tmp_path, former, own, timedelta(days=1))
+    assert passed(lab, settings, "command") == []
+    assert any("did not match any configured ACL subject" in line for line in lab.said())
+
+
+@pytest.mark.parametrize("mode", ["peer", "router"])
+def test_a_peer_or_a_router_has_the_rights_of_its_certificate(lab: SmallLab, mode: str) -> None:
+    assert passed(lab, lab.settings(lab.who(Role.VIEWER, OWN), mode=mode), "command") == []
+    assert passed(lab, lab.settings(lab.who(Role.GNC, OWN), mode=mode), "command") == ["command"]
+
+
+def test_no_session_can_be_reached_around_the_router(lab: SmallLab) -> None:
+    """The robot's session listens nowhere, so nobody connects to it but through the router."""
+    before = listening()
+    with lab.session(lab.who(Role.ROBOT, OWN)):
+        assert listening() == before
+
+
+def test_a_longer_message_than_the_key_can_have_is_dropped(lab: SmallLab) -> None:
+    settings = lab.settings(lab.who(Role.GNC, OWN))
+    assert passed(lab, settings, "x" * 65536) == ["x" * 65536]
+    assert passed(lab, settings, "x" * 65537) == []
+
+
+def test_bytes_that_are_sent_again_command_nothing(lab: SmallLab) -> None:
+    """An eavesdropper repeats, byte by byte, what the controller sent to the router."""
+    host, port = lab.lab.endpoints()[0].removeprefix("tls/").split(":")
+    settings = lab.settings(lab.who(Role.GNC, OWN))
+    with socket.create_server(("127.0.0.1", 0)) as tap:
+        settings["connect"]["endpoints"] = [f"tls/127.0.0.1:{tap.getsockname()[1]}"]
+        sent = bytearray()
+        threading.Thread(target=relay, args=(tap, (host, int(port)), sent), daemon=True).start()
+        assert passed(lab, settings, "command") == ["command"]
+    assert len(sent) > 1000
+    with lab.session(lab.identity("router.spare.hub")) as witness:
+        heard: list[str] = []
+        _kept = witness.declare_subscriber("**", lambda sample: heard.append(sample.payload.to_string()))
+        settle(witness)
+        with socket.create_connection((host, int(port))) as again:
+            again.sendall(sent)
+            again.settimeout(1.0)
+            while again.recv(65536):  # until the router hangs up
+                pass
+        settle(witness)
+    assert heard == []
+
+
+def test_a_role_cannot_pose_as_the_router(lab: SmallLab) -> None:
+    """A viewer's certificate at the router's address: nobody gives it a command."""
+    viewer, gnc = lab.who(Role.VIEWER, OWN), lab.who(Role.GNC, OWN)
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tls/127.0.0.1:{probe.getsockname()[1]}"
+    settings = lab.settings(viewer, mode="router", listen={"endpoints": [endpoint]}, connect={"endpoints": []})
+    tls = settings["transport"]["link"]["tls"]
+    tls.update(listen_certificate=tls["connect_certificate"], listen_private_key=tls["connect_private_key"])
+    with opened(settings), pytest.raises(zenoh.ZError):
+        lab.session(gnc, connect={"endpoints": [endpoint], "timeout_ms": 400}).close()
+
+
+def test_the_routers_log_names_who_was_refused_what(lab: SmallLab) -> None:
+    who = lab.who(Role.VIEWER, OWN)
+    with lab.session(who) as session:
+        session.put(COMMAND, "x")
+        session.get(f"{OWN}/hal/lifecycle", timeout=0.2)
+        _kept = session.declare_queryable(f"{OWN}/hal/lifecycle")
+        settle(session)
+    said = [line for line in lab.said() if f"CertCommonName({who.common_name})" in line]
+    for what in ("Put (ingress) on {}/actuator/joints", "Query (ingress) on {}/hal/lifecycle", *DECLARED):
+        assert any(line.endswith(f"is unauthorized to {what.format(OWN)}") for line in said), what
+
+
+def passed(lab: SmallLab, settings: dict[str, Any], command: str) -> list[str]:
+    """What the robot hears when a session with these settings puts a command."""
+    heard: list[str] = []
+    with lab.session(lab.who(Role.ROBOT, OWN)) as robot:
+        _kept = robot.declare_subscriber(COMMAND, lambda sample: heard.append(sample.payload.to_string()))
+        settle(robot)
+        with opened(settings) as session:
+            settle(session)
+            session.put(COMMAND, command)
+            settle(session, robot)
+    return heard
+
+
+def listening() -> set[str]:
+    """The TCP sockets of this process on which somebody could connect."""
+    own = {path.readlink().name for path in Path("/proc/self/fd").iterdir() if path.is_symlink()}
+    rows = [
+        line.split() for name in ("tcp", "tcp6") for line in Path(f"/proc/self/net/{name}").read_text().splitlines()
+    ]
+    return {row[1] for row in rows if row[3] == "0A" and f"socket:[{row[9]}]" in own}
+
+
+def relay(tap: socket.socket, router: tuple[str, int], sent: bytearray) -> None:
+    """Pass one connection on, and keep what the client sent."""
+    client, _ = tap.accept()
+    onward = socket.create_connection(router)
+
+    def back() -> None:
+        with client:
+            while piece := onward.recv(65536):
+                client.sendall(piece)
+
+    threading.Thread(target=back, daemon=True).start()
+    with onward:
+        while piece := client.recv(65536):
+            sent += piece
+            onward.sendall(piece)

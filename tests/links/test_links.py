@@ -1,0 +1,60 @@
+"""A robot and its controller on machines of their own: what a broken link or a dead router does. Needs root."""
+
+import os
+import shutil
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from tests.links.lab import Lab, lab
+
+# Root without these is a broken test machine, and fails.
+pytestmark = [
+    pytest.mark.e2e,
+    pytest.mark.skipif(os.geteuid() != 0, reason="makes network namespaces: needs root"),
+    pytest.mark.skipif(not shutil.which("ip"), reason="makes network namespaces: needs iproute2"),
+]
+STOP_LIMIT_S = 0.3  # 50 ms of the lease, a period, and a busy computer
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
+    with lab(tmp_path_factory.mktemp("lab")) as made:
+        yield made
+
+
+def armed(made: Lab) -> None:
+    """Moving for a moment."""
+    made.arm()
+    time.sleep(0.3)
+
+
+def test_a_cut_link_stops_the_robot_and_a_mended_one_lets_it_be_armed(robot: Lab) -> None:
+    for broken_s in (0.2, 4.0):  # shorter and longer than the session between router and workstation lives
+        armed(robot)
+        robot.link.make(cut=True)
+        assert robot.until(lambda status: status.lifecycle == "fault", "stopped") < STOP_LIMIT_S
+        time.sleep(broken_s)
+        robot.link.make()
+        robot.arm()
+
+
+@pytest.mark.parametrize("times", [1, pytest.param(20, marks=[pytest.mark.slow, pytest.mark.timeout(600)])])
+def test_a_dead_router_stops_the_robot_and_a_new_one_lets_it_be_armed(robot: Lab, times: int) -> None:
+    for _ in range(times):
+        armed(robot)
+        robot.kill_router()
+        assert robot.until(lambda status: status.lifecycle == "fault", "stopped") < STOP_LIMIT_S
+        robot.start_router()
+        robot.arm()
+
+
+def test_a_link_with_some_delay_keeps_the_robot_armed(robot: Lab) -> None:
+    robot.link.make(delay_s=0.005)
+    try:
+        armed(robot)
+        time.sleep(1.0)
+        assert robot.status is not None and robot.status.lifecycle == "armed"
+    finally:
+        robot.link.make()

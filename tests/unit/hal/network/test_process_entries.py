@@ -1,0 +1,78 @@
+"""Processes of one robot that are set up differently do not arm it, and say where the difference is."""
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+
+import msgspec
+import pytest
+
+from snakesim_hal.model.scenario import RunConfig, load, parse_set
+from snakesim_hal.network.process_entries import ProcessEntries, own_entry, show_process
+from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Process
+from tests.e2e.command import free_endpoint, wait_until
+
+
+def config(*sets: str) -> RunConfig:
+    return load("triplet", [parse_set(text) for text in sets]).config
+
+
+@pytest.fixture
+def sessions() -> Iterator[tuple[Session, Session]]:
+    endpoint = free_endpoint()
+    with ExitStack() as stack:
+        here = stack.enter_context(open_session(Link(endpoint, "worm", listen=True)))
+        yield here, stack.enter_context(open_session(Link(endpoint, "worm")))
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ("robot.limits.speed_rad_s=3.0", "`robot` is planar13 "),
+        ("scene.ground.friction=0.2", "`scene` is triplet "),
+        ("rate_hz=50", "`rate_hz` is 50 on "),
+        ("pace=realtime", "`pace` is realtime on "),
+        ("services.control.lag_ticks=3", "`services` is "),
+        ("control.propulsion_n=30.0", "`controller` is obstacle_triplet "),
+        ("mission.speed_m_s=0.2", "`mission` is "),
+    ],
+)
+def test_a_difference_is_told_with_both_places(change: str, named: str, sessions: tuple[Session, Session]) -> None:
+    here, there = sessions
+    entries, own = ProcessEntries(here), own_entry("host", config())
+    show_process(there, own_entry("control", config(change)))
+    wait_until(lambda: bool(entries.against(own, ["control"])), "an entry", 5.0)
+    wait_until(lambda: named in entries.against(own, ["control"])[0], named, 5.0)
+    (told,) = entries.against(own, ["control"])
+    assert f"(control, process {own.pid})" in told and f"(host, process {own.pid})" in told
+    assert entries.against(own, ["guidance"]) == []
+
+
+def test_what_only_one_of_them_uses_may_differ(sessions: tuple[Session, Session]) -> None:
+    here, there = sessions
+    entries, own = ProcessEntries(here), own_entry("host", config())
+    service = own_entry(
+        "control", config("backend=can", "duration_s=3", "title=another", "services.control.restart=false")
+    )
+    show_process(there, service)
+    show_process(there, msgspec.structs.replace(service, name="recorder", settings={}, messages={}))
+    wait_until(lambda: len(here.present(keys.PROCESS_ALL)) == 2, "both", 5.0)
+    wait_until(lambda: entries.against(own, ["control", "recorder"]) == [], "no difference", 5.0)
+
+
+def test_another_version_of_a_message_is_told_and_the_entry_counts_as_long_as_its_process_lives(
+    sessions: tuple[Session, Session],
+) -> None:
+    here, there = sessions
+    entries, own = ProcessEntries(here), own_entry("host", config())
+    key = keys.process("control", "1")
+    there.declare_token(key)
+    wait_until(lambda: entries.against(own, ["control"]) == ["control-1 has not told its settings yet"], "a token", 5.0)
+    newer = msgspec.structs.replace(own, name="control", messages={**own.messages, "JointCommand": 2, "Leap": 1})
+    there.latched_publisher(key, Process).put(newer)
+    wait_until(
+        lambda: "message JointCommand has version 2 on " in "".join(entries.against(own, ["control"])), "told", 5.0
+    )
+    there.close()
+    wait_until(lambda: entries.against(own, ["control"]) == [], "gone", 5.0)

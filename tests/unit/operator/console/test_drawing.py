@@ -1,0 +1,96 @@
+"""What is drawn is where the robot's kinematics put it."""
+
+import math
+
+import numpy as np
+import pytest
+
+from snakesim_hal.model.kinematics import quaternion_from_yaw, quaternions_from_rotations, rotation_from_quaternion
+from snakesim_hal.wire.messages import ControlState, DepthImage, JointState, Obstacle, World, WorldContact
+from snakesim_operator.console.drawing import M_PER_N, draw
+from snakesim_operator.console.moment import Moment
+from tests.unit.hal.rig import description
+
+ROBOT = description()
+COUNT = len(ROBOT.joints)
+
+
+def joints(*angles_rad: float) -> JointState:
+    angles = [*angles_rad, *[0.0] * (COUNT - len(angles_rad))]
+    zero = [0.0] * COUNT
+    return JointState(
+        tick=1, stamp_ns=1, angle_rad=angles, velocity_rad_s=zero, torque_nm=zero, valid=[True] * COUNT,
+        age_ns=[0] * COUNT,
+    )  # fmt: skip
+
+
+def world(contacts: list[WorldContact], obstacles: list[Obstacle]) -> World:
+    return World(
+        tick=1, stamp_ns=1, base_position_w=(0.0, 0.0, 0.0), base_orientation_wxyz=(1.0, 0.0, 0.0, 0.0),
+        base_confidence=1.0, contacts=contacts, obstacles=obstacles,
+    )  # fmt: skip
+
+
+def test_links_and_hinges_follow_base_and_angles():
+    base = (1.0, 2.0, 0.1), quaternion_from_yaw(math.pi / 2)
+    drawing = draw(Moment(robot=ROBOT, body=joints(-math.pi / 2), base=base), None)
+    assert drawing is not None
+    first, second = ROBOT.links[0].length_m, ROBOT.links[1].length_m
+    assert drawing.links_w[0] == pytest.approx([1.0, 2.0 + first / 2, 0.1])
+    assert drawing.hinges_w[0] == pytest.approx([1.0, 2.0 + first, 0.1])
+    assert drawing.links_w[1] == pytest.approx([1.0 + second / 2, 2.0 + first, 0.1])
+    assert rotation_from_quaternion(drawing.links_wxyz[1])[:, 0] == pytest.approx([1.0, 0.0, 0.0])
+    axis = [0.0, 0.0, 1.0] if ROBOT.joints[0].axis == "yaw" else [0.0, 1.0, 0.0]
+    assert rotation_from_quaternion(drawing.hinges_wxyz[0])[:, 2] == pytest.approx(axis, abs=1e-9)
+
+
+def test_without_joints_there_is_nothing_to_draw():
+    assert draw(Moment(robot=ROBOT), None) is None
+
+
+def test_forces_and_their_resultant():
+    contact = WorldContact(
+        link=0, obstacle="peg", body_s_m=0.1, position_w=(0.1, 0.0, 0.0), normal_w=(0.0, 1.0, 0.0),
+        tangent_w=(1.0, 0.0, 0.0), force_w=(0.0, 10.0, 0.0),
+    )  # fmt: skip
+    control = ControlState(
+        tick=1, stamp_ns=1, controller="any", state="Locomoting", reason="", propulsion_joint=ROBOT.joints[-1].name,
+        push_points=[contact], solved_force_n=[20.0],
+    )  # fmt: skip
+    seen = world([contact, contact], [])
+    drawing = draw(Moment(robot=ROBOT, body=joints(), world=seen, control=control), None)
+    assert drawing is not None and drawing.pushing == COUNT - 1 and drawing.pushed == {"peg"}
+    spans = [arrows[:, 1] - arrows[:, 0] for arrows in (drawing.forces, drawing.resultant, drawing.solved)]
+    assert [len(span) for span in spans] == [2, 1, 1]
+    assert spans[0][0] == pytest.approx([0.0, 10 * M_PER_N, 0.0])
+    assert spans[1][0] == pytest.approx([0.0, 20 * M_PER_N, 0.0])
+    assert spans[2][0] == pytest.approx([0.0, 20 * M_PER_N, 0.0])
+
+
+def test_what_a_map_tells_is_not_drawn_as_perceived():
+    mapped = Obstacle(name="a", shape="sphere", position_w=(0.0, 0.0, 0.0))
+    found = Obstacle(name="b", shape="sphere", position_w=(0.0, 0.0, 0.0), last_seen_ns=1)
+    felt = Obstacle(name="c", shape="sphere", position_w=(0.0, 0.0, 0.0), felt=True)
+    drawing = draw(Moment(robot=ROBOT, body=joints(), world=world([], [mapped, found, felt])), None)
+    assert drawing is not None and [o.name for o in drawing.perceived] == ["b", "c"]
+
+
+def test_a_camera_that_looks_along_its_link_looks_along_x():
+    image = DepthImage(
+        tick=1, stamp_ns=1, link=0, position_l=(0.0, 0.0, 0.0), orientation_l_wxyz=(1.0, 0.0, 0.0, 0.0), width=4,
+        height=2, fx_px=1.0, fy_px=1.0, cx_px=2.0, cy_px=1.0, range_min_m=0.1, range_max_m=1.0, scale_m=0.001,
+        depth=bytes(16),
+    )  # fmt: skip
+    drawing = draw(Moment(robot=ROBOT, body=joints(), images={"sensor/depth/head": image}), None)
+    assert drawing is not None
+    looks = rotation_from_quaternion(drawing.cameras[0].wxyz)
+    assert looks[:, 2] == pytest.approx([1.0, 0.0, 0.0]) and looks[:, 1] == pytest.approx([0.0, 0.0, -1.0])
+    assert drawing.cameras[0].fov_rad == pytest.approx(math.pi / 2) and drawing.cameras[0].aspect == 2.0
+
+
+def test_quaternions_give_back_their_rotations():
+    random = np.random.default_rng(1)
+    wxyz = np.vstack([np.eye(4), random.normal(size=(50, 4))])
+    rotations = np.array([rotation_from_quaternion(q) for q in wxyz])
+    again = np.array([rotation_from_quaternion(q) for q in quaternions_from_rotations(rotations)])
+    assert again == pytest.approx(rotations, abs=1e-12)

@@ -1,0 +1,74 @@
+"""The console's page: who may open it, who may command, and what strangers can write on it."""
+
+import msgspec
+import pytest
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+from snakesim_hal.errors import NotConnectedError
+from snakesim_hal.wire.messages import Status
+from snakesim_operator.console import texts
+from snakesim_operator.console.moment import Moment
+from snakesim_operator.console.server import page_server
+from snakesim_operator.console.token import ControlToken
+from tests.unit.hal.rig import description
+
+
+def test_a_page_of_another_site_cannot_connect():
+    """Any site could open a connection to loopback from the operator's browser."""
+    with page_server(None) as (server, address):
+        socket = address.replace("http", "ws")
+        for theirs in (
+            "https://example.org",
+            "http://localhost.example.org",
+            f"http://example.org:{server.get_port()}",
+        ):
+            with pytest.raises(InvalidStatus) as refused:
+                connect(socket, origin=theirs, proxy=None)  # pyright: ignore[reportArgumentType]
+            assert refused.value.response.status_code == 403
+        for ours in (address, address.replace("127.0.0.1", "localhost"), "http://localhost:9000"):
+            connect(socket, origin=ours, proxy=None).close()  # pyright: ignore[reportArgumentType]
+
+
+def test_a_port_that_is_taken_is_an_error_and_no_other_port():
+    with page_server(None) as (server, _):
+        second = page_server(server.get_port())
+        with pytest.raises(NotConnectedError, match="another program listens"):
+            second.__enter__()
+
+
+def test_nobody_can_open_a_tunnel_to_the_internet():
+    with page_server(None) as (server, _):
+        assert server.request_share_url() is None
+
+
+def test_control_is_taken_while_free_and_never_taken_away():
+    token = ControlToken()
+    assert token.take(1) and token.take(1)
+    assert not token.take(2) and token.holder == 1
+    assert not token.release(2) and token.holder == 1
+    assert token.release(1) and token.holder is None
+    assert token.take(2) and token.holder == 2
+
+
+def test_text_from_the_network_is_no_markup():
+    evil = "<img src=x onerror=alert(1)>\x1b[2J"
+    robot = description()
+    status = Status(
+        tick=0, stamp_ns=0, robot="r", backend="sim", pace="realtime", rate_hz=100.0, lifecycle="fault", why=evil,
+        lease_holder=evil[:40], lease_epoch=1, commands_accepted=0, commands_standby=0,
+        commands_rejected={evil[:40]: 1}, commands_limited={}, faults=[],
+        alive=[evil[:40]], waiting_for=[evil[:40]], overruns=0, ready_to_arm=False,
+    )  # fmt: skip
+    moment = Moment(robot=robot, status=status)
+    shown = texts.header(moment) + texts.state_table(moment) + texts.log([evil])
+    assert "<img" not in shown and "&lt;img" in shown and "\x1b" not in shown
+
+
+@pytest.mark.parametrize(
+    ("backend", "emulated", "words"),
+    [("sim", True, "SIMULATOR"), ("can", True, "EMULATED ROBOT ON CAN"), ("can", False, "ROBOT ON CAN")],
+)
+def test_the_page_says_what_moves(backend: str, emulated: bool, words: str):
+    robot = msgspec.structs.replace(description(), backend=backend, emulated=emulated)
+    assert f">{words}<" in texts.header(Moment(robot=robot))

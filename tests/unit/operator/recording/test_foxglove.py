@@ -1,0 +1,90 @@
+"""What Foxglove shows of a recording, read with the library that reads its schemas: the snake is where it was."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+from snakesim_hal.model.scenario import load, parse_set
+from snakesim_operator.recording.reader import RECORDING
+from snakesim_operator.recording.recover import recover
+from snakesim_operator.results.record import RunRecord
+from snakesim_operator.run.in_process import simulate
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("shown") / "run"
+    simulate(load("triplet", [parse_set("robot=planar13_camera"), parse_set("duration_s=0.8")]).config, out)
+    return out
+
+
+def shown(path: Path) -> dict[str, list[tuple[int, Any]]]:
+    """Topic -> (robot time, message) of everything in protobuf."""
+    found: dict[str, list[tuple[int, Any]]] = {}
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        topics = [f"foxglove/{name}" for name in ("tf", "joints", "pose", "depth/head", "depth/head/calibration")]
+        scene = [f"foxglove/scene/{name}" for name in ("body", "obstacles", "map", "forces", "path")]
+        for _, channel, message, decoded in reader.iter_decoded_messages(topics=topics + scene):
+            found.setdefault(channel.topic, []).append((message.log_time, decoded))
+    assert sorted(found) == sorted(topics + scene)
+    return found
+
+
+def test_transforms_and_joints_are_those_of_the_robot(run: Path) -> None:
+    found, record = shown(run / RECORDING), RunRecord.load(run)
+    at_ns, update = found["foxglove/tf"][-1]
+    moving = [(at, one) for at, one in found["foxglove/tf"] if len(one.transforms) > 1]
+    at_ns, update = moving[-1]
+    row = record.row_at(at_ns * 1e-9)
+    nodes = record.nodes_w(row)
+    assert nodes is not None and len(update.transforms) == len(record.description.links)
+    told = np.array([[t.translation.x, t.translation.y, t.translation.z] for t in update.transforms])
+    assert np.allclose(told, nodes[:-1], atol=1e-9)
+    last = update.transforms[-1].rotation
+    forward = np.array([1 - 2 * (last.y**2 + last.z**2), 2 * (last.x * last.y + last.w * last.z)])
+    towards = (nodes[-1] - nodes[-2])[:2] / record.description.links[-1].length_m
+    assert np.allclose(forward, towards, atol=1e-6)
+    states = dict(found["foxglove/joints"])[at_ns]
+    assert [joint.position for joint in states.joints] == record.angle_rad[row].tolist()
+    assert [joint.name for joint in states.joints] == [joint.name for joint in record.description.joints]
+
+
+def test_the_scene_has_body_obstacles_map_forces_and_path(run: Path) -> None:
+    found, record = shown(run / RECORDING), RunRecord.load(run)
+    scene = {topic.rpartition("/")[2]: update.entities for topic, messages in found.items()
+             if "/scene/" in topic for _, update in messages[-1:]}  # fmt: skip
+    assert [entity.frame_id for entity in scene["body"]] == [link.name for link in record.description.links]
+    truth = scene["obstacles"][0]
+    assert len(truth.cylinders) + len(truth.cubes) + len(truth.spheres) == len(record.placed)
+    assert len(scene["path"][0].lines[0].points) in {len(told.path_w) for told in record.trajectories}
+    arrows = [arrow for _, update in found["foxglove/scene/forces"] for arrow in update.entities[0].arrows]
+    turns = [arrow.pose.orientation for arrow in arrows]
+    assert arrows and all(math.hypot(q.w, q.x, q.y, q.z) == pytest.approx(1.0) for q in turns)
+
+
+def test_images_come_with_their_camera(run: Path) -> None:
+    found = shown(run / RECORDING)
+    at_ns, image = found["foxglove/depth/head"][-1]
+    pinhole = dict(found["foxglove/depth/head/calibration"])[at_ns]
+    assert image.encoding == "16UC1" and len(image.data) == image.step * image.height == 2 * image.width * image.height
+    assert (pinhole.width, pinhole.height) == (image.width, image.height) and pinhole.K[0] == pinhole.P[0] > 0
+    mount = next(t for at, one in found["foxglove/tf"] if at == at_ns for t in one.transforms
+                 if t.child_frame_id == image.frame_id)  # fmt: skip
+    q = mount.rotation  # the camera looks along its z, which is nearly the link's x
+    assert 2 * (q.x * q.z + q.w * q.y) > 0.9 and mount.parent_frame_id == "link_13"
+
+
+def test_a_recording_that_was_cut_off_is_made_whole(run: Path, tmp_path: Path) -> None:
+    whole = (run / RECORDING).read_bytes()
+    (tmp_path / "torn.mcap").write_bytes(whole[: len(whole) * 9 // 10])
+    count = recover(tmp_path / "torn.mcap", tmp_path / "whole.mcap")
+    found = shown(tmp_path / "whole.mcap")
+    assert count > 500 and len(found["foxglove/tf"]) > 10
+    alone = RunRecord.load(tmp_path / "whole.mcap")
+    assert len(alone.time_s) > 20 and not alone.lacks

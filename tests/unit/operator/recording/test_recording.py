@@ -1,0 +1,174 @@
+"""A recording: what is in it is what was on the wire, whatever became of its recorder or its disk."""
+
+import contextlib
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.network.local_network import LocalNetwork
+from snakesim_hal.network.session import Arrival
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import encode, encoding_of
+from snakesim_hal.wire.messages import Clock, Done, Intent
+from snakesim_operator.recording import tap as tap_module
+from snakesim_operator.recording.reader import RecordingReader
+from snakesim_operator.recording.recording import Recording
+from snakesim_operator.recording.tap import Tap
+
+PERIOD_NS = 10_000_000
+
+
+def clock(tick: int) -> Arrival:
+    message = Clock(
+        tick=tick,
+        stamp_ns=tick * PERIOD_NS,
+        period_ns=PERIOD_NS,
+        pace="lockstep",
+        lifecycle="armed",
+        arming=1,
+        lease_epoch=1,
+        newest={},
+    )
+    return Arrival(keys.CLOCK, encode(message), encoding_of(Clock), time.monotonic_ns())
+
+
+def done(tick: int, service: str = "control") -> Arrival:
+    return Arrival(keys.done(service), encode(Done(tick=tick)), encoding_of(Done), time.monotonic_ns())
+
+
+def test_messages_are_kept_to_the_byte_in_robot_time(tmp_path: Path) -> None:
+    recording = Recording(tmp_path / "a.mcap")
+    intent = Arrival(keys.INTENT, encode(Intent(stamp_ns=5, who="anna")), encoding_of(Intent), time.monotonic_ns())
+    sent = [clock(7), done(8), done(2_000_000), intent, done(6, "guidance")]
+    for arrival in sent:
+        recording.take(arrival)
+    recording.close({"dropped": {}})
+    found = list((reader := RecordingReader(tmp_path / "a.mcap")).messages())
+    assert [(one.key, one.payload, one.encoding) for one in found] == [(a.key, a.payload, a.encoding) for a in sent]
+    # A tick that cannot be true, or none: the time of the newest clock.
+    assert [one.time_ns // PERIOD_NS for one in found] == [7, 8, 7, 7, 6]
+    assert all(abs(one.wall_ns - time.time_ns()) < 60e9 for one in found)
+    assert reader.finished and reader.about == {"dropped": {}} and not reader.trouble
+
+
+def test_the_stock_reader_gets_schemas_and_messages(tmp_path: Path) -> None:
+    recording = Recording(tmp_path / "a.mcap")
+    for tick in range(50):
+        recording.take(clock(tick))
+    recording.close({})
+    with (tmp_path / "a.mcap").open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        found = list(reader.iter_messages())
+        summary = reader.get_summary()
+    assert summary is not None and summary.statistics is not None and summary.statistics.message_count == 50
+    schema, channel, message = found[-1]
+    assert schema is not None and (schema.name, schema.encoding) == ("snakesim.Clock", "jsonschema")
+    assert (channel.topic, channel.message_encoding, message.log_time) == (keys.CLOCK, "msgpack", 49 * PERIOD_NS)
+
+
+KILLED = """
+import os, sys, time
+from pathlib import Path
+from snakesim_operator.recording.recording import Recording
+from tests.unit.operator.recording.test_recording import clock
+recording = Recording(Path(sys.argv[1]))
+for tick in range(10**9):
+    recording.take(clock(tick))
+    recording.flush_when_due()
+    print(time.monotonic(), tick, flush=True)
+    time.sleep(0.002)
+"""
+
+
+def test_a_killed_recorder_lacks_at_most_a_second(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    process = subprocess.Popen([sys.executable, "-c", KILLED, str(path)], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    ticks: list[tuple[float, int]] = []
+    while not ticks or ticks[-1][0] - ticks[0][0] < 1.2:
+        at, tick = process.stdout.readline().split()
+        ticks.append((float(at), int(tick)))
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait(10)
+    process.stdout.close()
+    reader = RecordingReader(path)
+    kept = len(list(reader.messages()))
+    a_second_before = [tick for at, tick in ticks if at < ticks[-1][0] - 1.0]
+    assert kept > a_second_before[-1] and not reader.finished and not reader.trouble
+    with path.open("rb") as file, contextlib.suppress(Exception):  # the stock reader, as far as it goes
+        stock = [message.log_time for _, _, message in make_reader(file).iter_messages(log_time_order=False)]
+        assert len(stock) == kept
+
+
+@pytest.mark.parametrize("cut", [1, 20, 3000])
+def test_a_file_that_ends_in_the_middle_is_read_up_to_there(tmp_path: Path, cut: int) -> None:
+    recording = Recording(tmp_path / "a.mcap")
+    for tick in range(100):
+        recording.take(clock(tick))
+        if tick % 10 == 9:
+            recording.flush()
+    recording.close({})
+    whole = (tmp_path / "a.mcap").read_bytes()
+    (tmp_path / "a.mcap").write_bytes(whole[:-cut])
+    ticks = [one.time_ns // PERIOD_NS for one in RecordingReader(tmp_path / "a.mcap").messages()]
+    assert ticks == list(range(len(ticks))) and len(ticks) >= (100 if cut < 100 else 40)
+
+
+def test_a_disk_that_is_full_ends_the_recording_where_it_can_be_read(tmp_path: Path) -> None:
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, before[1]))
+    try:
+        recording = Recording(tmp_path / "a.mcap")
+        for tick in range(5000):
+            recording.take(clock(tick))
+            if tick % 50 == 0:
+                recording.flush()
+        recording.close({})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, ignored)
+    assert "File too large" in recording.trouble
+    reader = RecordingReader(tmp_path / "a.mcap")
+    ticks = [one.time_ns // PERIOD_NS for one in reader.messages()]
+    assert len(ticks) > 200 and ticks == list(range(len(ticks))) and not reader.trouble and not reader.finished
+
+
+def test_what_is_no_recording_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.mcap").write_text("nothing of the kind")
+    with pytest.raises(ConfigError, match=r"a\.mcap is not a recording"):
+        list(RecordingReader(tmp_path / "a.mcap").messages())
+
+
+def test_a_flood_is_bounded_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tap_module, "MOST_BYTES", 1000)
+    network = LocalNetwork()
+    tap, publisher = Tap(network.session()), network.session().publisher(keys.done("control"), Done)
+    for tick in range(2000):
+        publisher.put(Done(tick=tick))
+    kept = tap.take()
+    assert sum(len(arrival.payload) for arrival in kept) <= 1000
+    assert len(kept) + tap.dropped[keys.done("control")] == 2000
+    publisher.put(Done(tick=1))
+    assert len(tap.take()) == 1
+
+
+def test_in_lockstep_a_slow_disk_is_waited_for_but_one_that_hangs_only_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tap_module, "MOST_BYTES", 100)
+    monkeypatch.setattr(tap_module, "LIMIT_S", 0.2)
+    network = LocalNetwork()
+    tap, publisher = Tap(network.session()), network.session().publisher(keys.done("control"), Done)
+    tap.lossless = True
+    began = time.monotonic()
+    for tick in range(200):
+        publisher.put(Done(tick=tick))
+    assert 0.2 <= time.monotonic() - began < 0.5
+    assert tap.dropped.total() + len(tap.take()) == 200

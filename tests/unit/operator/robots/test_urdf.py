@@ -1,0 +1,240 @@
+"""Robot files to URDF and back, URDFs from elsewhere, and MuJoCo's own importer as an independent reader."""
+
+import json
+import re
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.files import decode, read_part, shipped
+from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.scenario import Override, RunConfig, load, parse_set
+from snakesim_operator.cli import main
+from snakesim_operator.robots.command import export_robot, import_robot
+from snakesim_operator.robots.exporting import urdf_of
+from snakesim_operator.robots.imported import Imported, Order
+from snakesim_operator.robots.importing import robot_of
+from snakesim_operator.robots.meshes import vertices
+from snakesim_operator.robots.toml_text import toml_of
+from snakesim_operator.run.in_process import simulate
+from snakesim_sim_backend.model import build
+from snakesim_sim_backend.settings import Settings
+
+HERE = Path(__file__).parent / "urdf"
+SLIDER, HEXA = HERE / "slider8.urdf", HERE / "hexa_snake_mm.urdf"
+HEXA_ORDER = Order(scale=0.001, up="y")
+READ_ALL = '<mujoco><compiler fusestatic="false" discardvisual="false" strippath="true" meshdir="{}"/></mujoco></robot>'
+
+
+def config(scenario: str, robot: str, duration_s: float) -> RunConfig:
+    return load(scenario, [Override("robot", robot, "--set"), parse_set(f"duration_s={duration_s}")]).config
+
+
+def by_mujoco(text: str, meshes: Path = HERE) -> mujoco.MjModel:
+    """As MuJoCo's own importer reads a URDF."""
+    return mujoco.MjModel.from_xml_string(text.replace("</robot>", READ_ALL.format(meshes)))
+
+
+def hinge_inertia(model: mujoco.MjModel) -> np.ndarray:
+    """Inertia matrix of the hinges at zero angles, without rotors, (n_joints, n_joints)."""
+    model.dof_armature[:] = 0.0
+    data = mujoco.MjData(model)
+    data.qpos[:] = model.qpos0
+    mujoco.mj_forward(model, data)
+    full = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, full)
+    hinges = [model.jnt_dofadr[i] for i in range(model.njnt) if model.jnt_type[i] == mujoco.mjtJoint.mjJNT_HINGE]
+    return full[np.ix_(hinges, hinges)]
+
+
+def ours(found: Imported, tmp_path: Path) -> mujoco.MjModel:
+    (tmp_path / "robot.toml").write_text(toml_of(found.table.values, []))
+    return simulated(str(tmp_path / "robot.toml"))
+
+
+def simulated(robot: str) -> mujoco.MjModel:
+    """The simulator's model, the robot beside the obstacles."""
+    beside = [parse_set("start.on_route=false"), parse_set("start.position_m=[-9.0, 9.0]")]
+    return build(load("peg_row", [Override("robot", robot, "--set"), *beside]).config, Settings()).model
+
+
+@pytest.mark.parametrize("name", shipped("robots"))
+def test_every_shipped_robot_comes_back_as_it_was(name: str, tmp_path: Path) -> None:
+    file, back = tmp_path / "robot.urdf", tmp_path / "robot.toml"
+    export_robot(name, file)
+    import_robot(file, Order(), back)
+    assert decode(read_part(str(back), "robots"), RobotFile) == decode(read_part(name, "robots"), RobotFile)
+
+
+def test_a_robot_that_was_exported_and_imported_runs_to_the_same_digest(tmp_path: Path) -> None:
+    export_robot("planar13", tmp_path / "robot.urdf")
+    import_robot(tmp_path / "robot.urdf", Order(), tmp_path / "robot.toml")
+    digests = {
+        simulate(config("triplet", robot, 1.0)).summary.command_digest
+        for robot in ("planar13", str(tmp_path / "robot.toml"))
+    }
+    assert len(digests) == 1
+
+
+@pytest.mark.parametrize("name", shipped("robots"))
+def test_mujocos_own_importer_reads_the_same_bodies_joints_and_shapes(name: str) -> None:
+    robot = decode(read_part(name, "robots"), RobotFile)
+    theirs = by_mujoco(urdf_of(robot))
+    own = simulated(name)
+    np.testing.assert_allclose(hinge_inertia(theirs), hinge_inertia(own), rtol=1e-6, atol=1e-9)
+    for i in range(robot.chain.modules + 1):
+        a, b = theirs.body(f"link_{i}"), own.body(f"link_{i}")
+        np.testing.assert_allclose([a.mass[0], *np.sort(a.inertia)], [b.mass[0], *np.sort(b.inertia)], rtol=1e-6)
+        np.testing.assert_allclose(a.ipos, b.ipos, atol=1e-9)
+        sizes = [theirs.geom_size[g] for g in range(theirs.ngeom) if theirs.geom_bodyid[g] == a.id]
+        capsule = own.geom(f"link_{i}").size
+        assert {tuple(size[:1]) for size in sizes} == {(capsule[0],)}
+        assert max(size[1] for size in sizes) == pytest.approx(capsule[1])
+    for i, axis in enumerate(robot.axes):
+        joint = theirs.joint(f"joint_{i + 1}")
+        assert joint.axis.tolist() == ([0, 0, 1] if axis == "yaw" else [0, 1, 0])
+        assert joint.range == pytest.approx([-robot.limits.angle_rad, robot.limits.angle_rad])
+
+
+def test_a_planar_snake_from_elsewhere_has_the_inertia_that_mujoco_reads(tmp_path: Path) -> None:
+    found = robot_of(SLIDER, Order())
+    theirs = by_mujoco(SLIDER.read_text(), HERE / "meshes")
+    sign = np.array([-1.0 if "hinge0" in name and "negated" in name else 1.0 for name in found.names[9:]])
+    np.testing.assert_allclose(
+        hinge_inertia(ours(found, tmp_path)), hinge_inertia(theirs) * np.outer(sign, sign), rtol=1e-6
+    )
+    assert found.robot.module.radius_m == pytest.approx(np.hypot(0.015, 0.03)), "of the covers' boxes"
+
+
+def test_an_alternating_snake_in_millimetres_has_the_inertia_that_mujoco_reads(tmp_path: Path) -> None:
+    whole = HEXA.read_text().replace('ixx="0" iyy="0" izz="0"', 'ixx="110" iyy="120" izz="50"')
+    (tmp_path / "whole.urdf").write_text(whole)
+    found = robot_of(tmp_path / "whole.urdf", HEXA_ORDER)
+    assert found.robot.axes == ["yaw", "pitch"] * 3
+    sign = np.array([-1.0 if "negated" in name else 1.0 for name in found.names[7:]])
+    theirs = hinge_inertia(by_mujoco(whole)) * 1e-6 * np.outer(sign, sign)
+    np.testing.assert_allclose(hinge_inertia(ours(found, tmp_path)), theirs, rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("file", "order", "scenario", "controller"),
+    [
+        (SLIDER, Order(tail="seg08"), "peg_row", "obstacle_triplet"),
+        (HEXA, HEXA_ORDER, "mamba_hills", "lateral_undulation"),
+    ],
+)
+def test_snakes_from_elsewhere_run(file: Path, order: Order, scenario: str, controller: str, tmp_path: Path) -> None:
+    robot = tmp_path / "robot.toml"
+    import_robot(file, order, robot)
+    loaded = load(
+        scenario,
+        [Override("robot", str(robot), "--set"), parse_set(f"controller={controller}"), parse_set("duration_s=2")],
+    )
+    result = simulate(loaded.config)
+    assert result.summary.ended == "complete"
+    assert np.abs(np.diff(result.record.angle_rad, axis=0)).max() > 1e-3, "its joints move"
+    again, exported = tmp_path / "again.toml", tmp_path / "again.urdf"
+    export_robot(str(robot), exported)
+    import_robot(exported, Order(), again)
+    assert decode(read_part(str(again), "robots"), RobotFile) == loaded.config.robot
+
+
+def test_what_cannot_be_carried_over_is_named_with_its_lines() -> None:
+    slider, hexa = robot_of(SLIDER, Order()), robot_of(HEXA, HEXA_ORDER)
+    left_out, changed = "\n".join(slider.left_out + hexa.left_out), "\n".join(slider.changed + hexa.changed)
+    for words in (
+        "<transmission> left out: lines 26, 41",
+        "<gazebo><plugin>",
+        "<safety_controller>",
+        "sensor 'nose' is rolled",
+    ):
+        assert words in left_out
+    for words in (
+        "hinge02",
+        "continuous",
+        "'hinge01' 4.1",
+        "link_3 has an inertia that no body has",
+        "-1.6 to 1.4 rad",
+    ):
+        assert words in changed
+    assert (
+        hexa.robot.sensors.depth[0].position_m == pytest.approx((0.07, 0.0, 0.0)) and hexa.robot.sensors.imu is not None
+    )
+
+
+TURNS = '<axis xyz="0 0 1"/><limit lower="-1" upper="1"/>'
+TWO = f"""<robot name="two"><link name="a"/><link name="b"/><link name="c"/>
+<joint name="j1" type="revolute"><parent link="a"/><child link="b"/>{TURNS}</joint>
+<joint name="j2" type="revolute"><parent link="b"/><child link="c"/><origin xyz="0.1 0 0"/>{TURNS}</joint></robot>"""
+ROUND = '<link name="r"/><joint name="j3" type="fixed"><parent link="c"/><child link="a"/></joint></robot>'
+BAD = {
+    "entities": ('<!DOCTYPE r [<!ENTITY a "b">]><robot name="&a;"/>', "<!DOCTYPE>"),
+    "not XML": ("<robot>", "not valid XML"),
+    "xacro": ('<robot name="r" xmlns:xacro="x"><xacro:include filename="a"/></robot>', "is xacro; convert it"),
+    "deep": ("<a>" * 40 + "</a>" * 40, "nested deeper than 32"),
+    "SDF": ("<sdf/>", "outermost element is <robot>"),
+    "a slider": (TWO.replace('"revolute"', '"prismatic"', 1), "line 2: <joint name='j1'> has the type 'prismatic'"),
+    "a fork": (TWO.replace('link="b"/><child link="c"', 'link="a"/><child link="c"'), "amid the chain; say which end"),
+    "a circle": (TWO.replace("</robot>", ROUND), "in a circle: a, b, c"),
+    "no such link": (TWO.replace('child link="c"', 'child link="d"'), "has the child 'd', which is no link"),
+    "oblique": (TWO.replace('"0 0 1"', '"0 1 1"', 1), "turns about (0.00, 0.71, 0.71)"),
+    "mimic": (TWO.replace("<limit", '<mimic joint="j2"/><limit', 1), "mimics another joint"),
+    "no limits": (
+        TWO.replace('<limit lower="-1" upper="1"/>', "", 1),
+        "<joint name='j1'> is revolute and has no <limit>",
+    ),
+    "a stop at zero": (TWO.replace('lower="-1"', 'lower="0"', 1), "is 0 to 1 rad; a joint must be able to turn"),
+    "not a number": (TWO.replace('"0.1 0 0"', '"nan 0 0"'), "`xyz` = 'nan 0 0'; expected 3 finite numbers"),
+    "in millimetres": (
+        TWO.replace('"0.1 0 0"', '"110 0 0"'),
+        "has joints 110 m apart, and a link has 2 m at most; in mm? Give --scale 0.001",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_a_urdf_that_is_no_snake_is_refused_with_the_place(case: str, tmp_path: Path) -> None:
+    text, words = BAD[case]
+    file = tmp_path / "robot.urdf"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=re.escape(words)):
+        robot_of(file, Order())
+
+
+def test_the_report_for_scripts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["robot", "import", str(SLIDER), "--out", str(tmp_path / "a.toml"), "--tail", "seg08", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["file"] == str(tmp_path / "a.toml") and "joint_1: hinge08, yaw" in told["names"]
+    assert any("hinge01" in line for line in told["changed"]) and any("<gazebo>" in line for line in told["left_out"])
+
+
+def test_an_existing_robot_file_is_not_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "worm.toml").write_text("mine")
+    with pytest.raises(ConfigError, match="is there already"):
+        import_robot(SLIDER, Order(), tmp_path / "worm.toml")
+
+
+def test_a_mesh_may_be_text_or_binary_and_one_that_is_not_there_is_told(tmp_path: Path) -> None:
+    (tmp_path / "a.stl").write_text(
+        "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 2 0\n"
+    )
+    assert vertices(tmp_path / "a.stl").max(axis=0).tolist() == [1.0, 2.0, 0.0]
+    assert vertices(HERE / "meshes" / "segment.stl").max(axis=0) == pytest.approx([90.0, 32.0, 32.0])
+    (tmp_path / "b.stl").write_bytes(b"solid\nvertex a b c\n")
+    with pytest.raises(ConfigError, match="a vertex is not three numbers"):
+        vertices(tmp_path / "b.stl")
+    (tmp_path / "far.urdf").write_text(SLIDER.read_text())
+    assert "mesh 'package://slider_description/meshes/head.obj' left out: not on this computer" in "\n".join(
+        robot_of(tmp_path / "far.urdf", Order()).left_out
+    )
+
+
+def test_a_document_that_shows_a_robot_shows_one_that_runs(tmp_path: Path) -> None:
+    document = (Path(__file__).parents[4] / "docs" / "robots.md").read_text(encoding="utf-8")
+    robot = tmp_path / "eel.toml"
+    robot.write_text(document.partition("```toml eel.toml\n")[2].partition("```")[0])
+    result = simulate(config("peg_row", str(robot), 3.0))
+    assert result.summary.ended == "complete" and (result.summary.path_distance_m or 0.0) > 0.05

@@ -1,0 +1,43 @@
+"""What `snakesim ros2` refuses, and what time it is in ROS."""
+
+import time
+
+import pytest
+
+from snakesim_hal.errors import ConfigError
+from snakesim_operator.cli import parser
+from snakesim_operator.ros2.command import check
+from snakesim_operator.ros2.relay import Stamps
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (["--domain", "233"], "--domain 233: a ROS domain is a number from 0 to 232"),
+        (["--hz", "0"], "--hz 0: give from 0.1 to 200 Hz"),
+        (["--image-hz", "nan"], "--image-hz nan: give from 0.1 to 200 Hz"),
+        (["--ros-namespace", "/2nd robot"], "--ros-namespace '/2nd robot': give a name such as planar13"),
+        (["--ros-router", "localhost"], "--ros-router"),
+    ],
+)
+def test_bad_arguments_are_named(arguments: list[str], word: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        check(parser().parse_args(["ros2", *arguments]))
+    assert word in str(refused.value)
+
+
+def test_robot_time_is_taken_as_it_is() -> None:
+    stamps = Stamps(wall_time=False)
+    stamps.heard(5)
+    assert stamps.of(7) == 7
+
+
+def test_wall_time_is_that_of_the_quickest_clock() -> None:
+    stamps = Stamps(wall_time=True)
+    started_ns = time.time_ns()
+    for late_ns in (80_000_000, 0, 50_000_000):
+        stamps.heard(time.time_ns() - started_ns - late_ns)
+    assert abs(stamps.of(10_000_000) - started_ns - 10_000_000) < 30_000_000
+    stamps.start_over()
+    stamps.heard(0)
+    assert abs(stamps.of(0) - time.time_ns()) < 30_000_000

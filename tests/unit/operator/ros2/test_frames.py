@@ -1,0 +1,80 @@
+"""The tree of frames and the URDF, against our kinematics and MuJoCo's own URDF reader."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion, yaw_of
+from snakesim_hal.wire.messages import JointState, Pose
+from snakesim_operator.ros2.frames import OPTICAL_IN_CAMERA, Frames, ros_name
+from snakesim_operator.ros2.messages import Transform
+from snakesim_operator.ros2.urdf import urdf_of
+from tests.unit.operator.ros2.rig import of_robot, resting
+
+Pair = tuple[np.ndarray, np.ndarray]
+
+
+def walked(tree: list[Transform], to: str) -> Pair:
+    """Pose of a frame in the root: position and rotation."""
+    above = {one.child: one for one in tree}
+    position, rotation = np.zeros(3), np.eye(3)
+    while to in above:
+        one = above[to]
+        turn = rotation_from_quaternion(one.orientation_wxyz)
+        position, rotation = np.array(one.position_m) + turn @ position, turn @ rotation
+        to = one.parent
+    assert to == "map"
+    return position, rotation
+
+
+@pytest.mark.parametrize("name", ["planar13", "mamba"])
+def test_the_tree_is_our_kinematics(name: str) -> None:
+    robot = of_robot(name)
+    frames = Frames(robot, "lab/")
+    random = np.random.default_rng(3)
+    angles = random.uniform(-0.9, 0.9, len(robot.joints)).tolist()
+    joints: JointState = resting(robot, angles)
+    turned = (float(np.cos(0.3)), 0.0, 0.0, float(np.sin(0.3)))
+    pose = Pose(
+        tick=0,
+        stamp_ns=0,
+        position_w=(1.0, 2.0, 0.05),
+        orientation_wxyz=turned,
+        velocity_w=(0, 0, 0),
+        angular_velocity_w=(0, 0, 0),
+    )
+    tree = [*frames.fixed, frames.of_base(pose), *frames.of_joints(joints)]
+    origins, rotations = link_frames(
+        pose.position_w,
+        rotation_from_quaternion(turned),
+        angles,
+        [joint.axis for joint in robot.joints],
+        [link.length_m for link in robot.links],
+    )
+    for i in range(len(robot.links)):
+        position, rotation = walked(tree, f"lab/{robot.links[i].name}")
+        assert np.allclose(position, origins[i]) and np.allclose(rotation, rotations[i])
+
+
+def test_optical_frames_look_along_z() -> None:
+    optical = rotation_from_quaternion(OPTICAL_IN_CAMERA)
+    right, down, forward = optical.T
+    assert np.allclose(forward, [1, 0, 0]) and np.allclose(right, [0, -1, 0]) and np.allclose(down, [0, 0, -1])
+    assert yaw_of(np.eye(3)) == 0.0
+
+
+def test_names_that_ros_allows() -> None:
+    assert [ros_name(text) for text in ("head", "2d-front", "ö")] == ["head", "_2d_front", "_"]
+
+
+@pytest.mark.parametrize("name", ["planar13", "mamba"])
+def test_the_urdf_is_read_by_mujoco(name: str) -> None:
+    robot = of_robot(name)
+    model = mujoco.MjModel.from_xml_string(urdf_of(robot, "lab/"))
+    assert model.njnt == len(robot.joints)
+    for i, joint in enumerate(robot.joints):
+        assert model.joint(i).name == joint.name
+        assert model.joint(i).range.tolist() == pytest.approx([joint.angle_min_rad, joint.angle_max_rad])
+        assert model.joint(i).axis.tolist() == ([0, 0, 1] if joint.axis == "yaw" else [0, 1, 0])
+    moving = sum(link.mass_kg for link in robot.links[1:])  # the first is welded to the world there
+    assert model.body_mass.sum() == pytest.approx(moving)

@@ -1,0 +1,220 @@
+"""Every message of the bridge, read back field by field by rosbags, which knows nothing of our code."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_typestore
+
+from snakesim_hal.wire import messages as m
+from snakesim_operator.ros2 import messages as ros
+from snakesim_operator.ros2 import robot_in_ros
+from snakesim_operator.ros2.graph import RosType
+from snakesim_operator.ros2.messages import Marker, Transform
+from snakesim_operator.ros2.steering import Steering
+from tests.unit.hal.strategies import messages_of
+
+JAZZY = get_typestore(Stores.ROS2_JAZZY)
+STAMP_NS = 12_345_678_901
+FEW = settings(max_examples=25)
+
+
+def read(kind: RosType, payload: bytes) -> Any:
+    """As a ROS node reads it; all of the payload must be used up."""
+    found = JAZZY.deserialize_cdr(payload, kind.name)
+    assert bytes(JAZZY.serialize_cdr(found, kind.name)) == payload
+    return found
+
+
+def at(stamp: Any) -> int:
+    return stamp.sec * 10**9 + stamp.nanosec
+
+
+@pytest.mark.parametrize("store", [Stores.ROS2_JAZZY, Stores.ROS2_KILTED, Stores.ROS2_LYRICAL])
+def test_type_hashes_are_those_of_the_definitions(store: Stores) -> None:
+    for kind in ros.TYPES:
+        assert get_typestore(store).hash_rihs01(kind.name) == kind.type_hash
+
+
+@FEW
+@given(messages_of(m.JointState))
+def test_joint_states_without_invalid_joints(joints: m.JointState) -> None:
+    count = min(map(len, (joints.angle_rad, joints.velocity_rad_s, joints.torque_nm, joints.valid)))
+    joints = m.JointState(
+        tick=0,
+        stamp_ns=0,
+        angle_rad=joints.angle_rad[:count],
+        velocity_rad_s=joints.velocity_rad_s[:count],
+        torque_nm=joints.torque_nm[:count],
+        valid=joints.valid[:count],
+        age_ns=[0] * count,
+    )
+    names = [f"jöint_{'x' * i}{i}" for i in range(count)]
+    seen = read(ros.JOINT_STATE, robot_in_ros.joint_state(STAMP_NS, names, joints))
+    kept = np.array(joints.valid, dtype=bool)
+    assert at(seen.header.stamp) == STAMP_NS and seen.header.frame_id == ""
+    assert seen.name == [name for name, valid in zip(names, joints.valid, strict=True) if valid]
+    for ours, theirs in (("angle_rad", "position"), ("velocity_rad_s", "velocity"), ("torque_nm", "effort")):
+        assert np.array_equal(getattr(seen, theirs), np.array(getattr(joints, ours), dtype=float)[kept])
+
+
+def test_transforms() -> None:
+    sent = [
+        Transform("odom", "base_link", (1, 2, 3), (0.5, 0.1, 0.2, 0.3)),
+        Transform("a", "bc", (4, 5, 6), (1, 0, 0, 0)),
+    ]
+    seen = read(ros.TRANSFORMS, ros.transforms(STAMP_NS, sent)).transforms
+    for one, other in zip(sent, seen, strict=True):
+        place, turn = other.transform.translation, other.transform.rotation
+        assert (other.header.frame_id, other.child_frame_id) == (one.parent, one.child)
+        assert at(other.header.stamp) == STAMP_NS
+        assert (place.x, place.y, place.z) == one.position_m
+        assert (turn.w, turn.x, turn.y, turn.z) == one.orientation_wxyz
+
+
+@FEW
+@given(st.lists(messages_of(m.WorldContact), max_size=3))
+def test_contacts_are_arrows_along_their_forces(contacts: list[m.WorldContact]) -> None:
+    payload = ros.markers(STAMP_NS, "odom", robot_in_ros.contact_markers(contacts))
+    first, *arrows = read(ros.MARKERS, payload).markers
+    assert first.action == ros.DELETE_ALL
+    for number, (contact, arrow) in enumerate(zip(contacts, arrows, strict=True)):
+        assert (arrow.id, arrow.type, arrow.action) == (number, ros.ARROW, ros.ADD)
+        assert (arrow.ns, arrow.header.frame_id, at(arrow.header.stamp)) == ("contacts", "odom", STAMP_NS)
+        tail, tip = (np.array([point.x, point.y, point.z]) for point in arrow.points)
+        assert np.array_equal(tail, contact.position_w)
+        assert np.allclose(tip - tail, 0.01 * np.array(contact.force_w), rtol=1e-6, atol=1e-6)
+
+
+def test_obstacles_have_their_shapes() -> None:
+    known = [
+        m.Obstacle(name="c", shape="cylinder", position_w=(1, 2, 0.1), radius_m=0.05, height_m=0.2, confidence=0.5),
+        m.Obstacle(name="b", shape="box", position_w=(3, 4, 0.1), yaw_rad=np.pi / 2, half_size_m=(0.1, 0.2, 0.3)),
+        m.Obstacle(name="s", shape="sphere", position_w=(5, 6, 0.1), radius_m=0.07, felt=True),
+    ]
+    world = m.World(
+        tick=1,
+        stamp_ns=1,
+        base_position_w=(0, 0, 0),
+        base_orientation_wxyz=(1, 0, 0, 0),
+        base_confidence=1,
+        contacts=[],
+        obstacles=known,
+    )
+    _, *shapes = read(ros.MARKERS, ros.markers(STAMP_NS, "odom", robot_in_ros.obstacle_markers(world))).markers
+    assert [shape.type for shape in shapes] == [ros.CYLINDER, ros.CUBE, ros.SPHERE]
+    sizes = [(shape.scale.x, shape.scale.y, shape.scale.z) for shape in shapes]
+    assert sizes == [(0.1, 0.1, 0.2), (0.2, 0.4, 0.6), (0.14, 0.14, 0.14)]
+    assert [(shape.pose.position.x, shape.pose.position.y) for shape in shapes] == [(1, 2), (3, 4), (5, 6)]
+    assert shapes[1].pose.orientation.z == pytest.approx(np.sqrt(0.5)) and shapes[1].pose.orientation.x == 0
+    assert shapes[0].color.a == pytest.approx(0.6) and shapes[2].color.r > shapes[1].color.r
+
+
+def image(kind: type[Any], **more: Any) -> Any:
+    pixels = {"depth": np.arange(12, dtype="<u2").tobytes()} if kind is m.DepthImage else {"rgb": bytes(range(36))}
+    pose = {"position_l": (0.1, 0, 0), "orientation_l_wxyz": (1, 0, 0, 0)}
+    limits = {"range_min_m": 0.05, "range_max_m": 4.0, "scale_m": 0.001} if kind is m.DepthImage else {}
+    size = {"width": 4, "height": 3, "fx_px": 80.0, "fy_px": 81.0, "cx_px": 1.5, "cy_px": 1.0}
+    return kind(tick=0, stamp_ns=0, link=1, **{**pose, **limits, **size, **pixels, **more})
+
+
+def test_depth_in_millimetres_or_metres() -> None:
+    seen = read(ros.IMAGE, robot_in_ros.depth_image(STAMP_NS, "head_depth_optical_frame", image(m.DepthImage)))
+    assert (seen.width, seen.height, seen.step, seen.encoding, seen.is_bigendian) == (4, 3, 8, "16UC1", 0)
+    assert seen.header.frame_id == "head_depth_optical_frame" and at(seen.header.stamp) == STAMP_NS
+    assert np.array_equal(seen.data.tobytes(), np.arange(12, dtype="<u2").tobytes())
+    coarse = read(ros.IMAGE, robot_in_ros.depth_image(STAMP_NS, "f", image(m.DepthImage, scale_m=0.01)))
+    assert (coarse.encoding, coarse.step) == ("32FC1", 16)
+    metres = np.frombuffer(coarse.data.tobytes(), "<f4")
+    assert np.isnan(metres[0]) and np.allclose(metres[1:], 0.01 * np.arange(1, 12))
+
+
+def test_colour_and_intrinsics() -> None:
+    sent = image(m.ColourImage)
+    seen = read(ros.IMAGE, robot_in_ros.colour_image(STAMP_NS, "f", sent))
+    assert (seen.encoding, seen.step, seen.data.tobytes()) == ("rgb8", 12, sent.rgb)
+    info = read(ros.CAMERA_INFO, robot_in_ros.camera_info(STAMP_NS, "f", sent))
+    assert (info.width, info.height, info.distortion_model) == (4, 3, "plumb_bob")
+    assert info.k.tolist() == [80, 0, 1.5, 0, 81, 1, 0, 0, 1]
+    assert info.p.tolist() == [80, 0, 1.5, 0, 0, 81, 1, 0, 0, 0, 1, 0]
+    assert info.r.tolist() == [1, 0, 0, 0, 1, 0, 0, 0, 1] and info.d.tolist() == [0] * 5
+
+
+@FEW
+@given(messages_of(m.Ranges))
+def test_scans(sent: m.Ranges) -> None:
+    seen = read(ros.LASER_SCAN, robot_in_ros.laser_scan(STAMP_NS, "f", sent))
+    expected = [np.inf if range_m is None else np.float32(range_m) for range_m in sent.range_m]
+    assert seen.ranges.tolist() == expected and seen.intensities.size == 0
+    assert seen.angle_min == np.float32(sent.angle_min_rad) and seen.angle_increment == np.float32(sent.angle_step_rad)
+    assert seen.angle_max == np.float32(sent.angle_min_rad + sent.angle_step_rad * (len(expected) - 1))
+    assert (seen.range_min, seen.range_max) == (np.float32(sent.range_min_m), np.float32(sent.range_max_m))
+
+
+@FEW
+@given(messages_of(m.Status))
+def test_diagnostics(status: m.Status) -> None:
+    (seen,) = read(ros.DIAGNOSTICS, robot_in_ros.diagnostics(STAMP_NS, status)).status
+    assert (seen.level == ros.ERROR) == (status.lifecycle in ("fault", "estop"))
+    assert (seen.name, seen.message) == (status.robot, f"{status.lifecycle}: {status.why}")
+    assert {"lifecycle", "backend", "lease holder"} <= {value.key for value in seen.values}
+
+
+@given(st.integers(0, 2**62))
+def test_clock_of_any_robot_time(stamp_ns: int) -> None:
+    seen = read(ros.CLOCK, ros.clock(stamp_ns)).clock
+    assert at(seen) == stamp_ns or stamp_ns >= 2**31 * 10**9
+
+
+def test_text_and_marker_defaults() -> None:
+    assert read(ros.STRING, ros.string("<robot>ä</robot>")).data == "<robot>ä</robot>"
+    (_, plain) = read(ros.MARKERS, ros.markers(0, "map", [Marker("n", ros.CUBE, (1, 2, 3), (1, 0, 0, 1))])).markers
+    assert (plain.lifetime.sec, plain.frame_locked, plain.text, plain.mesh_resource) == (0, False, "", "")
+
+
+class TestSteering:
+    """What a Twist becomes; written by rosbags."""
+
+    def twist(self, x: float = 0.0, turn: float = 0.0) -> bytes:
+        kind = {name: JAZZY.types[f"geometry_msgs/msg/{name}"] for name in ("Twist", "Vector3")}
+        sent = kind["Twist"](kind["Vector3"](x, 0.0, 0.0), kind["Vector3"](0.0, 0.0, turn))
+        return bytes(JAZZY.serialize_cdr(sent, ros.TWIST.name))
+
+    def test_speed_and_direction(self) -> None:
+        steering = Steering()
+        first = steering.intent(self.twist(0.2, 1.0), 10**9, 0.5)
+        assert first is not None
+        assert (first.speed_m_s, first.heading_w_rad, first.go, first.valid_for_ns) == (0.2, 0.5, True, 500_000_000)
+        later = steering.intent(self.twist(0.2, 1.0), 1_100_000_000, 0.5)
+        assert later is not None and later.heading_w_rad == pytest.approx(0.6)
+        held = steering.intent(self.twist(0.2), 1_200_000_000, 0.55)
+        assert held is not None and held.heading_w_rad == pytest.approx(0.6)
+
+    def test_a_zero_twist_stops(self) -> None:
+        stop = Steering().intent(self.twist(), 1, None)
+        assert stop is not None and not stop.go and stop.heading_w_rad is None
+
+    def test_direction_does_not_run_away_from_the_body(self) -> None:
+        steering = Steering()
+        for i in range(200):
+            intent = steering.intent(self.twist(0.1, 2.0), i * 100_000_000, 3.0)
+            assert intent is not None and intent.heading_w_rad is not None
+            assert abs(intent.heading_w_rad - 3.0) <= np.pi / 2 + 1e-9
+
+    def test_after_a_silence_it_starts_from_the_body(self) -> None:
+        steering = Steering()
+        steering.intent(self.twist(0.1), 0, 1.0)
+        anew = steering.intent(self.twist(0.1, 1.0), 10**10, 2.0)
+        assert anew is not None and anew.heading_w_rad == 2.0
+
+    @pytest.mark.parametrize("bad", [b"", b"\0\1\0\0", b"\0\7\0\0" + bytes(48)])
+    def test_noise_is_counted(self, bad: bytes) -> None:
+        steering = Steering()
+        assert steering.intent(bad, 0, 0.0) is None and steering.rejected == 1
+
+    @pytest.mark.parametrize(("x", "turn"), [(np.nan, 0.0), (0.0, np.inf), (11.0, 0.0), (0.0, -11.0)])
+    def test_what_no_snake_does_is_rejected(self, x: float, turn: float) -> None:
+        steering = Steering()
+        assert steering.intent(self.twist(x, turn), 0, 0.0) is None and steering.rejected == 1

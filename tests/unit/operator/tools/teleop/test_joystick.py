@@ -1,0 +1,78 @@
+"""A joystick, at the event layer: a pipe is the device. tests/vcan/test_joystick.py has one of the kernel."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from snakesim_hal.errors import ConfigError
+from snakesim_operator.tools.teleop.joystick import (
+    ABS_X,
+    ABS_Y,
+    EV_ABS,
+    EV_KEY,
+    EV_SYN,
+    EVENT,
+    SYN_DROPPED,
+    Axis,
+    Joystick,
+    open_joystick,
+)
+
+
+class Device:
+    """Writes events as the kernel does."""
+
+    def __init__(self) -> None:
+        handle, self._write = os.pipe()
+        os.set_blocking(handle, False)
+        self.stick = Joystick(handle, Axis(-32768, 32767), Axis(0, 255))
+
+    def sends(self, kind: int, code: int, value: int) -> bool:
+        os.write(self._write, EVENT.pack(1, 2, kind, code, value) + EVENT.pack(1, 2, EV_SYN, 0, 0))
+        return self.stick.take(1.0)
+
+    def unplug(self) -> None:
+        os.close(self._write)
+
+
+@pytest.fixture
+def device() -> Iterator[Device]:
+    made = Device()
+    yield made
+    made.stick.close()
+
+
+def test_the_stick_is_a_share_of_its_own_range_with_a_dead_zone(device: Device) -> None:
+    device.sends(EV_ABS, ABS_Y, 0)
+    assert device.stick.forward == pytest.approx(1.0), "away from the operator"
+    device.sends(EV_ABS, ABS_Y, 140)
+    assert device.stick.forward == 0.0, "a stick that does not quite come back"
+    device.sends(EV_ABS, ABS_X, 32767)
+    assert device.stick.right == pytest.approx(1.0)
+    device.sends(EV_ABS, ABS_X, -20000)
+    assert -0.6 < device.stick.right < -0.5
+
+
+def test_every_button_is_the_emergency_stop_when_it_is_pressed_only(device: Device) -> None:
+    assert device.sends(EV_KEY, 0x130, 1)
+    assert not device.sends(EV_KEY, 0x130, 0)
+    assert not device.sends(EV_KEY, 30, 1), "a key of a keyboard"
+
+
+def test_lost_events_and_a_lost_device_let_go_of_the_stick(device: Device) -> None:
+    device.sends(EV_ABS, ABS_Y, 0)
+    device.sends(EV_SYN, SYN_DROPPED, 0)
+    assert device.stick.forward == 0.0
+    device.sends(EV_ABS, ABS_Y, 0)
+    device.unplug()
+    device.stick.take(1.0)
+    assert device.stick.lost and device.stick.forward == 0.0
+
+
+def test_what_is_no_joystick_is_refused_with_the_way_out(tmp_path: Path) -> None:
+    (tmp_path / "event0").write_text("")
+    for path, why in ((tmp_path / "event0", "has no stick"), (tmp_path / "event1", "No such file")):
+        with pytest.raises(ConfigError, match=why):
+            open_joystick(path)

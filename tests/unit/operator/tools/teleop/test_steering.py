@@ -1,0 +1,44 @@
+"""What keys and stick ask for."""
+
+import math
+
+import pytest
+
+from snakesim_operator.cli import main
+from snakesim_operator.tools.teleop.keyboard import _split  # pyright: ignore[reportPrivateUsage]
+from snakesim_operator.tools.teleop.steering import LEAD_RAD, VALID_NS, Steering
+
+
+def test_speed_goes_by_steps_and_never_beyond_the_fastest() -> None:
+    steering = Steering("anna", 0.12)
+    for _ in range(5):
+        steering.faster(1, 0.0)
+    assert steering.intent(7).speed_m_s == 0.12
+    for _ in range(9):
+        steering.faster(-1, 0.0)
+    intent = steering.intent(8)
+    assert (intent.speed_m_s, intent.go, intent.stamp_ns, intent.valid_for_ns) == (-0.12, True, 8, VALID_NS)
+    steering.stop(1.0)
+    assert not steering.intent(9).go
+
+
+def test_the_direction_begins_at_the_bodys_and_stays_near_it() -> None:
+    steering = Steering("anna", 0.3)
+    assert steering.intent(0).heading_w_rad is None, "the mission's own goal"
+    steering.turn(0.2, 3.1, 0.0)
+    assert steering.intent(0).heading_w_rad == pytest.approx(3.3 - 2 * math.pi)
+    for _ in range(50):
+        steering.turn(0.2, 0.0, 0.0)
+    assert steering.heading_w_rad == pytest.approx(LEAD_RAD)
+
+
+def test_keys_arrive_whole_or_in_bunches() -> None:
+    assert _split(b"\x1b[A\x1bOD q") == ["up", "left", " ", "q"]
+    assert _split(b"\x1b[Z\x1b\xff") == ["\x1b", "\xff"], "unknown keys do nothing"
+
+
+def test_without_a_terminal_it_says_so(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    with open("/dev/null") as nothing:  # noqa: PTH123
+        monkeypatch.setattr("sys.stdin", nothing)
+        assert main(["teleop"]) == 2
+    assert "stdin is no terminal" in capsys.readouterr().err

@@ -1,0 +1,67 @@
+"""The loop of teleop with a joystick, on a real network."""
+
+import itertools
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Clock, Intent
+from snakesim_operator.tools.teleop.command import Teleop, TeleopRequest
+from snakesim_operator.tools.teleop.joystick import ABS_Y, EV_ABS, EVENT, Axis, Joystick
+from tests.unit.hal.local_network import free_endpoint, wait_until
+
+
+@pytest.fixture(autouse=True)
+def handlers() -> Iterator[None]:
+    """Those of this process, given back."""
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = [signal.getsignal(number) for number in numbers]
+    yield
+    for number, handler in zip(numbers, before, strict=True):
+        signal.signal(number, handler)
+
+
+def clock(tick: int) -> Clock:
+    return Clock(
+        tick=tick,
+        stamp_ns=tick * 10_000_000,
+        period_ns=10_000_000,
+        pace="realtime",
+        lifecycle="armed",
+        arming=1,
+        lease_epoch=1,
+        newest={},
+    )
+
+
+def test_a_stick_that_is_unplugged_ends_it_with_a_stop(capsys: pytest.CaptureFixture[str]) -> None:
+    read, write = os.pipe()
+    os.set_blocking(read, False)
+    link = Link(free_endpoint(), "worm")
+    with open_session(Link(link.endpoint, "worm", listen=True)) as robot, open_session(link) as session:
+        heard, clocks = robot.reader(keys.INTENT, Intent, depth=256), robot.publisher(keys.CLOCK, Clock)
+
+        def be_a_robot_and_a_hand() -> None:
+            os.write(write, EVENT.pack(0, 0, EV_ABS, ABS_Y, 0))
+            for tick in itertools.takewhile(lambda tick: tick < 60, itertools.count(1)):
+                clocks.put(clock(tick))
+                time.sleep(0.01)
+            os.close(write)
+
+        hand = threading.Thread(target=be_a_robot_and_a_hand)
+        hand.start()
+        stick = Joystick(read, Axis(0, 255), Axis(0, 255))
+        assert Teleop(session, link, TeleopRequest(fastest_m_s=0.2), None, stick).go() == 1
+        hand.join()
+        stick.close()
+        intents = heard.drain()
+        wait_until(lambda: intents.extend(heard.drain()) or not intents[-1].go, "the stop, which is asked for last")
+    assert len(intents) > 3 and {intent.speed_m_s for intent in intents[:-1]} == {0.2}
+    assert all(a.stamp_ns <= b.stamp_ns for a, b in itertools.pairwise(intents))
+    assert "the joystick is gone" in capsys.readouterr().out

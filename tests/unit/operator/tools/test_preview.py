@@ -1,0 +1,72 @@
+"""Previews of images: what is in them, and that nothing is fetched or compressed unless somebody looks."""
+
+import io
+
+import numpy as np
+import PIL.Image
+import pytest
+
+from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import ColourImage, DepthImage, Preview, SensorDescription
+from snakesim_operator.tools.preview import cameras_of, preview_of
+from tests.unit.hal.local_network import free_endpoint, wait_until
+from tests.unit.hal.rig import description
+
+CAMERA = {
+    "link": 1,
+    "position_l": (0.1, 0.0, 0.0),
+    "orientation_l_wxyz": (1.0, 0.0, 0.0, 0.0),
+    "fx_px": 80.0,
+    "fy_px": 80.0,
+    "cx_px": 79.5,
+    "cy_px": 59.5,
+}
+
+
+def depth(tick: int = 0) -> DepthImage:
+    counts = np.arange(160 * 120, dtype="<u2").tobytes()
+    limits = {"range_min_m": 0.05, "range_max_m": 4.0, "scale_m": 0.001}
+    return DepthImage(tick=tick, stamp_ns=tick, width=160, height=120, depth=counts, **limits, **CAMERA)
+
+
+def test_depth_keeps_its_values() -> None:
+    made = preview_of(depth(7), 80)
+    seen = np.array(PIL.Image.open(io.BytesIO(made.data)))
+    assert (made.tick, made.width, made.height, made.format, made.scale_m) == (7, 80, 60, "png", 0.001)
+    assert np.array_equal(seen, np.arange(160 * 120).reshape(120, 160)[::2, ::2])
+
+
+@pytest.mark.parametrize(("width", "expected"), [(640, (160, 120)), (100, (80, 60)), (16, (16, 12))])
+def test_colour_is_small_and_looks_alike(width: int, expected: tuple[int, int]) -> None:
+    ramp = np.zeros((120, 160, 3), dtype=np.uint8)
+    ramp[..., 0] = np.linspace(0, 255, 160)
+    image = ColourImage(tick=0, stamp_ns=0, width=160, height=120, rgb=ramp.tobytes(), **CAMERA)
+    made = preview_of(image, width)
+    seen = np.array(PIL.Image.open(io.BytesIO(made.data))).astype(int)
+    assert (made.width, made.height) == expected and made.format == "jpeg" and made.scale_m is None
+    assert len(made.data) < 4000
+    across = np.linspace(0, 255, expected[0])
+    assert np.abs(seen[expected[1] // 2, :, 0] - across).max() < 24 and seen[..., 1].max() < 40
+
+
+def test_only_what_is_looked_at() -> None:
+    listed = description()
+    robot = type(listed)(
+        **{name: getattr(listed, name) for name in listed.__struct_fields__ if name != "sensors"},
+        sensors=[SensorDescription(key=keys.depth("head"), rate_hz=20.0, delay_s=0.0)],
+    )
+    endpoint = free_endpoint()
+    with open_session(Link(endpoint, "worm", listen=True)) as hal, open_session(Link(endpoint, "worm")) as beside:
+        images = hal.publisher(keys.depth("head"), DepthImage)
+        (camera,) = cameras_of(beside, robot, 80)
+        camera.turn()
+        assert not images.heard()
+        with open_session(Link(endpoint, "worm")) as far:
+            seen = far.reader(keys.preview(keys.depth("head")), Preview)
+            wait_until(lambda: camera.turn() or images.heard(), "the image fetched")
+            images.put(depth(3))
+            found: list[Preview] = []
+            wait_until(lambda: camera.turn() or found.extend(seen.drain()) or found, "a preview")
+            assert found[0].tick == 3 and found[0].width == 80
+        wait_until(lambda: camera.turn() or not images.heard(), "the image left alone again")

@@ -1,0 +1,59 @@
+"""The recording of a run: the record that is made of it alone, and what `snakesim info` tells of it."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from snakesim_hal.model.scenario import load, parse_set
+from snakesim_operator.recording.reader import RECORDING
+from snakesim_operator.results.record import RunRecord
+from snakesim_operator.run.in_process import simulate
+from tests.whole.command import snakesim
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("recorded") / "run"
+    simulate(load("clutter", [parse_set("duration_s=2")]).config, out)
+    return out
+
+
+def test_the_recording_alone_has_the_record_of_the_black_box(run: Path) -> None:
+    whole, alone = RunRecord.load(run), RunRecord.load(run / RECORDING)
+    arrays = {name: value for name, value in vars(whole).items() if isinstance(value, np.ndarray)}
+    assert len(arrays) > 8 and len(whole.time_s) == 200
+    for name, value in arrays.items():
+        assert np.array_equal(value, getattr(alone, name), equal_nan=True), name
+    assert alone.host.command_digest == whole.host.command_digest and alone.config == whole.config
+    assert (alone.control, alone.worlds, alone.trajectories) == (whole.control, whole.worlds, whole.trajectories)
+    assert alone.lacks == whole.lacks == []
+
+
+def test_info_tells_what_is_in_it_and_what_is_missing(run: Path, tmp_path: Path) -> None:
+    ended = snakesim("info", str(run), "--json", cwd=tmp_path)
+    info = json.loads(ended.out)
+    assert ended.code == 0 and info["finished"] and info["duration_s"] == pytest.approx(2.0)
+    assert (info["robot"], info["scenario"], info["ticks"]) == ("planar13_camera", "clutter", 200)
+    assert info["command_digest"] == RunRecord.load(run).host.command_digest
+    assert info["keys"]["sensor/joints"]["rate_hz"] == pytest.approx(100.0) and "sensor/depth/head" in info["keys"]
+    content = (run / RECORDING).read_bytes()
+    (tmp_path / "torn.mcap").write_bytes(content[: len(content) * 2 // 3])
+    told = snakesim("info", "torn.mcap", cwd=tmp_path)
+    assert told.code == 1 and "lacks: its end: the recorder was killed or the disk was full" in told.out
+
+
+def test_a_page_is_made_of_a_recording_alone(run: Path, tmp_path: Path) -> None:
+    (tmp_path / "lone.mcap").write_bytes((run / RECORDING).read_bytes())
+    ended = snakesim("report", "lone.mcap", cwd=tmp_path)
+    assert ended.code == 0 and "clutter" in (tmp_path / "lone.html").read_text()
+    compared = snakesim("compare", str(run), "lone.mcap", "--within", "0", cwd=tmp_path)
+    assert compared.code == 0 and "The runs are the same, joint by joint" in compared.out, compared.out
+
+
+@pytest.mark.parametrize("command", ["info", "report"])
+def test_what_is_no_recording_is_named(tmp_path: Path, command: str) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    assert "notes.txt is not a recording" in snakesim(command, "notes.txt", cwd=tmp_path).err
+    assert "gone" in snakesim(command, "gone", cwd=tmp_path).err
