@@ -10,6 +10,7 @@ of the speed, both bounded:
 A negative speed backs the body out along its own path. See `docs/poal.md`.
 """
 
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -20,15 +21,26 @@ from snakesim_gnc.control.bumpless import Followed
 from snakesim_gnc.control.controller import Action, Report, View
 from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_gnc.control.progress import Located, Progress
-from snakesim_gnc.control.push import find_touches, push_forward
+from snakesim_gnc.control.push import Push, Touches, find_touches, push_forward
+from snakesim_gnc.control.push_report import push_points, why_it_stands
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.outlines import Outlines
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import Description, World
 
 Floats = NDArray[np.float64]
 
 ANOTHER_SHAPE_RAD = 0.1
 SLOPE_M = 0.02  # over which theta' is taken
+STANDS_M_S, STANDS_S = 0.01, 0.5  # slower than this for so long counts as standing still
+
+
+@dataclass(frozen=True)
+class Found:
+    """What the body could push off when it was last looked at."""
+
+    world: World
+    touches: Touches
+    push: Push
 
 
 class ObstacleAided:
@@ -68,7 +80,9 @@ class ObstacleAided:
         self._bends = self._body.bends
         self._torques_nm = np.zeros(len(robot.joints))
         self._unit_nm = np.zeros(len(robot.joints))
-        self._most_n = 0.0
+        self._found: Found | None = None
+        self._most_n = self._force_n = 0.0  # what contacts and torques allow, and what is commanded of it
+        self._moved_at_s = 0.0
         self._waits = False
 
     def update(self, view: View) -> Action:
@@ -90,8 +104,28 @@ class ObstacleAided:
         set_points, self._waits = self._followed.to(view, reference, anew=anew), False
         slope = self._body.all_angles(at(located.tail_s_m + SLOPE_M)) - self._body.all_angles(at(located.tail_s_m))
         force_n = ahead_m * float(self._stiffness @ slope**2) / SLOPE_M**2
-        report = Report(path_s_m=located.tail_s_m, reference_rad=reference.tolist(), propulsion_n=force_n)
-        return Action(set_points, report)
+        return Action(set_points, self._report(view, located, force_n, reference))
+
+    def _report(self, view: View, located: Located, look_ahead_n: float, reference: Floats) -> Report:
+        if abs(located.speed_m_s) > STANDS_M_S:
+            self._moved_at_s = view.time_s
+        stands, found, force_n = view.time_s - self._moved_at_s > STANDS_S, self._found, self._force_n
+        told, why = [], ""
+        if found is not None:
+            told = push_points(self._body, found.world, found.touches, found.push, force_n)
+            why = why_it_stands(found.touches, found.push, force_n, self._most_n) if stands else ""
+        return Report(
+            why=why,
+            path_s_m=located.tail_s_m,
+            propulsion_n=look_ahead_n + force_n,
+            push_points=told,
+            solved_force_n=[float(np.hypot(*contact.force_w[:2])) for contact in told],
+            bending_torque_nm=self._torques_nm.tolist(),
+            reference_rad=reference.tolist(),
+            torque_headroom_nm=self._set.largest_torque_nm - float(np.abs(self._torques_nm).max()),
+            saturated=0.0 < self._most_n <= force_n,
+            jammed=why.startswith("jam"),
+        )
 
     def _look_ahead_m(self, located: Located, period_s: float) -> float:
         most = self._set.largest_look_ahead_m
@@ -105,7 +139,8 @@ class ObstacleAided:
         """Torques of the wanted force along the path, by the contacts that the body has, (n_joints,)."""
         config, wanted_m_s = self._set, located.trajectory.speed_m_s
         if wanted_m_s <= 0.0 or config.largest_push_n == 0.0:
-            self._push_n = 0.0
+            self._push_n = self._force_n = 0.0
+            self._found = None
             return np.zeros(len(self._robot.joints))
         error = wanted_m_s - located.speed_m_s
         self._push_n += config.push_n_m * error * period_s
@@ -117,12 +152,15 @@ class ObstacleAided:
                 located.nodes_w, self._body.radius_m, outlines, reach_m=config.reach_m, friction=config.peg_friction
             )
             push = push_forward(located.nodes_w, touches, loose_m=config.loose_m)
-            self._unit_nm = np.zeros(len(self._robot.joints))
+            self._found = Found(located.world, touches, push)
+            self._unit_nm, self._most_n = np.zeros(len(self._robot.joints)), 0.0
             if push.balanced:
                 self._unit_nm[self._bends] = push.torques_nm
                 most = float(np.abs(push.torques_nm).max(initial=0.0)) + 1e-9
-                self._most_n = min(config.largest_torque_nm / most, config.largest_contact_n / push.lambdas.max())
-        force_n = min(force_n, self._most_n)
+                largest = float(push.lambdas.max())
+                self._most_n = min(config.largest_torque_nm / most, config.largest_contact_n / largest)
+        self._push_n = min(self._push_n, self._most_n)  # who cannot push stores no force up for later
+        self._force_n = force_n = min(force_n, self._most_n)
         keep = np.exp(-period_s / config.torque_filter_s)
         self._torques_nm = keep * self._torques_nm + (1 - keep) * force_n * self._unit_nm
         bound = config.largest_torque_nm
@@ -130,8 +168,9 @@ class ObstacleAided:
 
     def _rest(self, view: View) -> Action:
         """At speed 0 every joint stays where it is, and nothing pushes."""
-        self._integral_m = self._push_n = 0.0
+        self._integral_m = self._push_n = self._force_n = 0.0
         self._torques_nm[:] = 0.0
+        self._moved_at_s = view.time_s
         if self._waits or self._followed.reference_rad is None:
             action = self._followed.hold(view, "")
         else:

@@ -32,6 +32,7 @@ class Touches:
     obstacle: NDArray[np.intp]
     places_w: Floats  # (k, 2) on the body's surface
     directions_w: Floats  # (k, 2) of the push, friction included
+    tangents_w: Floats  # (k, 2) along the body, towards the head
     body_s_m: Floats  # (k,) arc length from the tail end
     gap_m: Floats  # (k,)
 
@@ -52,7 +53,7 @@ def find_touches(nodes_w: Floats, radius_m: float, outlines: Outlines, *, reach_
     """Contacts of a chain with nodes (2, n): for each obstacle within reach the point of the body nearest to it."""
     if not len(outlines):
         none = np.empty((0, 2))
-        return Touches(np.empty(0, dtype=np.intp), none, none, np.empty(0), np.empty(0))
+        return Touches(np.empty(0, dtype=np.intp), none, none, none, np.empty(0), np.empty(0))
     rear, run = nodes_w[:, :-1].T, np.diff(nodes_w, axis=1).T
     lengths = np.hypot(*run.T)
     share = (np.arange(SAMPLES) + 0.5) / SAMPLES
@@ -71,6 +72,7 @@ def find_touches(nodes_w: Floats, radius_m: float, outlines: Outlines, *, reach_
         which[keep],
         (at - radius_m * normal)[keep],
         direction[keep],
+        tangent[keep],
         s[best[which]][keep],
         (distance - radius_m)[keep],
     )

@@ -14,10 +14,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_gnc.navigation.beam import STEP_M, Beam, Found, Search
+from snakesim_gnc.navigation.beam import LEAST_PUSH, STEP_M, Beam, Found, Search
 from snakesim_gnc.navigation.intents import Wish
 from snakesim_gnc.navigation.line import SPACING_M, evenly
-from snakesim_gnc.navigation.obstacle_map import ObstacleMap
+from snakesim_gnc.navigation.obstacle_map import NONE, ObstacleMap
 from snakesim_gnc.navigation.snap import Fit, snap
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.model.route import Route
@@ -33,6 +33,7 @@ ENDS_SOON_M = 0.6
 COMMITTED_M = 0.1  # of the path ahead of the head that is not changed any more
 SEEN_M, SAME_M = 1.5, 0.005  # obstacles within this distance of the head; a change that matters
 ENDS_SOON, MAP_CHANGED, TURNED = "ends soon", "the map has changed", "the direction has changed"
+LOST, LOST_M = "the body is off its path", 0.12  # median of its points; then no correction leads back
 TURNED_RAD = 0.35  # a change of direction that matters
 SHARPEST_RAD = 1.2  # a path begins with no greater turn from where the head points; further ones follow
 FORGET_M = 0.15  # beyond this from where it was stuck, what failed there is forgotten
@@ -42,16 +43,19 @@ BACK_EVERY = 3  # time at the same place: back out
 BACK_M, BACK_S = 0.1, 1.5
 ANEW_GAP_M = -0.012  # a body that has lost its contacts must press to get them back
 TRAIL = 20  # points of the way behind the tail
+JOIN_M = 0.1  # between them and a path: nearer, and beside its begin, they would fold it
 STANDS_S = 0.8
+MOST_TOLD = 512  # push-points in a message
 STANDS_M = 0.01
 
 
 @dataclass(frozen=True)
 class Planned:
-    """A path, and its number."""
+    """A path, its number, and what the body is to push off on it."""
 
     route: Route
     path_id: int
+    push_points: list[str]
 
 
 class ClutterPlanner:
@@ -108,7 +112,7 @@ class ClutterPlanner:
             path_id=planned.path_id,
             path_w=[(float(x), float(y)) for x, y in planned.route.points_w],
             speed_m_s=0.0 if self._finished else self._speed_m_s(wish.speed_m_s),
-            push_points=[],
+            push_points=planned.push_points,
             finished=self._finished,
             reason="the goal is reached" if self._finished else wish.why[:500],
         )
@@ -151,6 +155,8 @@ class ClutterPlanner:
                 self._back_from_m = None
                 return "backed out"
             return ""
+        if np.median([_off_m(planned.route, point) for point in body[::10]]) > LOST_M:
+            return LOST
         if planned.route.length_m - head_s < ENDS_SOON_M:
             return ENDS_SOON
         if full and moved < STANDS_M:
@@ -195,7 +201,7 @@ class ClutterPlanner:
         beam = Beam(obstacles, self._search)
         if why in (ENDS_SOON, MAP_CHANGED, TURNED):
             found, kept, points = self._onward(beam, body, goal_rad)
-        elif self._planned is None:
+        elif self._planned is None or why == LOST:
             found, kept = beam.ahead(body, goal_rad, round(HORIZON_M / STEP_M)), len(body) - 3
             points = body if found is None else np.concatenate([body, evenly(found.points_w)[1:]])
         else:
@@ -210,10 +216,12 @@ class ClutterPlanner:
         self._path_id += 1
         if why != MAP_CHANGED:  # a map that keeps changing must not hide that the body stands
             self._recent.clear()
-        behind = [place for place in self._trail if np.hypot(*(place - points[0])) > 0.04][-TRAIL:]
+        along = points[5] - points[0]
+        along /= max(float(np.hypot(*along)), 1e-9)
+        behind = [place for place in self._trail if (place - points[0]) @ along < -JOIN_M][-TRAIL:]
         if behind:
             points = np.concatenate([np.array(behind), points])
-        self._planned = Planned(Route(points), self._path_id)
+        self._planned = Planned(Route(points), self._path_id, self._pushed_off(points, obstacles, goal))
 
     def _onward(self, beam: Beam, body: Floats, goal_rad: float) -> tuple[Found | None, int, Floats]:
         """The present path as far as the body lies on it and a little further, then another one."""
@@ -243,6 +251,13 @@ class ClutterPlanner:
                 break
         return best
 
+    def _pushed_off(self, points: Floats, obstacles: ObstacleMap, goal: Floats) -> list[str]:
+        """Obstacles that a body on the path touches or nearly does, and that push it on, in order along the path."""
+        near = obstacles.near(points[:, 0], points[:, 1])
+        beside = (near.distance_m < self._search.radius_m + self._fit.touch_m) & (near.normal_w @ goal > LEAST_PUSH)
+        found = dict.fromkeys(near.obstacle[beside & (near.obstacle != NONE)].tolist())
+        return [obstacles.obstacles[k].name for k in found][:MOST_TOLD]
+
     def _leave_trail(self, tail: Floats) -> None:
         """Where the tail was: the way back."""
         trail = self._trail
@@ -261,3 +276,8 @@ def _within_reach(body: Floats, goal: Floats) -> float:
     head_rad = math.atan2(y, x)
     turn_rad = math.remainder(math.atan2(goal[1], goal[0]) - head_rad, math.tau)
     return head_rad + min(max(turn_rad, -SHARPEST_RAD), SHARPEST_RAD)
+
+
+def _off_m(route: Route, point_w: Floats) -> float:
+    """Distance of a point from a route."""
+    return float(np.hypot(*(route.position_w(route.project(point_w)) - point_w)))

@@ -20,6 +20,7 @@ class Fit:
     push_gap_m: float = -0.005  # between the body and what it pushes off
     brake_gap_m: float = 0.012
     least_gap_m: float = 0.004
+    touch_m: float = 0.005  # a gap that is smaller is a touch
     reach_m: float = 0.02  # a gap that is wider is left as it is
     smooth_m: float = 0.03  # bends are smoothed over this length
     hold: float = 40.0  # weight of a gap against staying where the path was

@@ -1,0 +1,44 @@
+"""What a controller tells about its forces on obstacles: where, how much, and why the body stands. Pure."""
+
+import numpy as np
+
+from snakesim_gnc.control.planar_body import PlanarBody
+from snakesim_gnc.control.push import Push, Touches
+from snakesim_hal.wire.messages import World, WorldContact
+
+MOST_TOLD = 64  # push-points in a message
+
+
+def push_points(body: PlanarBody, world: World, touches: Touches, push: Push, force_n: float) -> list[WorldContact]:
+    """The obstacles that are pushed, tail to head, with the wanted forces. world: that the touches were found in."""
+    height, told = world.base_position_w[2], list[WorldContact]()
+    for k in np.argsort(touches.body_s_m, kind="stable").tolist():
+        if push.lambdas[k] <= 0.0:
+            continue
+        (x, y), (nx, ny) = touches.places_w[k].tolist(), touches.directions_w[k].tolist()
+        ahead = 1.0 if touches.tangents_w[k] @ (ny, -nx) > 0.0 else -1.0
+        size = float(np.hypot(nx, ny))
+        nx, ny, force = nx / size, ny / size, force_n * float(push.lambdas[k]) * size
+        told.append(
+            WorldContact(
+                link=body.link_at(float(touches.body_s_m[k])),
+                obstacle=world.obstacles[int(touches.obstacle[k])].name,
+                body_s_m=float(touches.body_s_m[k]),
+                position_w=(x, y, height),
+                normal_w=(nx, ny, 0.0),
+                tangent_w=(ahead * ny, -ahead * nx, 0.0),
+                force_w=(force * nx, force * ny, 0.0),
+            )
+        )
+    return told[:MOST_TOLD]
+
+
+def why_it_stands(touches: Touches, push: Push, force_n: float, most_n: float) -> str:
+    """The class of a stall. force_n: wanted along the body; most_n: what torques and contacts allow."""
+    if not len(touches):
+        return "standing still: no obstacle is near enough to push off"
+    if not push.balanced:
+        return f"standing still: contacts lost, the {len(touches)} obstacles beside the body cannot push it forward"
+    if force_n >= most_n:
+        return f"standing still: torques and contacts allow no more than {most_n:.1f} N along the body"
+    return f"jam: stands still although it pushes with {force_n:.1f} N along the body"

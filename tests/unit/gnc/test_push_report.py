@@ -1,0 +1,62 @@
+"""What a controller tells about its push: where, how hard, and the class of a stall."""
+
+import numpy as np
+import pytest
+
+from snakesim_gnc.control.planar_body import PlanarBody
+from snakesim_gnc.control.push import find_touches, push_forward
+from snakesim_gnc.control.push_report import push_points, why_it_stands
+from snakesim_hal.model.outlines import Outlines
+from snakesim_hal.wire.messages import Obstacle, World
+from tests.unit.gnc.stage import make_robot
+
+BODY = PlanarBody(make_robot())
+NODES = np.vstack([np.array(BODY.node_s_m), 0.06 * np.sin(2 * np.pi * np.array(BODY.node_s_m) / 0.6)])
+
+
+def peg(name: str, x: float, side: int) -> Obstacle:
+    """A peg beside the wave at an inflection, 1 mm off the body."""
+    slope = 0.06 * 2 * np.pi / 0.6 * np.cos(2 * np.pi * x / 0.6)
+    left = np.array([-slope, 1.0]) / np.hypot(slope, 1.0)
+    place = np.array([x, 0.0]) + side * (0.05 + 0.04 + 0.001) * left
+    return Obstacle(name=name, shape="cylinder", position_w=(*place.tolist(), 0.1), radius_m=0.05, height_m=0.2)
+
+
+def seen(*obstacles: Obstacle) -> World:
+    return World(
+        tick=0,
+        stamp_ns=0,
+        base_position_w=(0.0, 0.0, 0.04),
+        base_orientation_wxyz=(1.0, 0.0, 0.0, 0.0),
+        base_confidence=1.0,
+        contacts=[],
+        obstacles=list(obstacles),
+    )
+
+
+def pushing(world: World):
+    touches = find_touches(NODES, 0.04, Outlines.of(world.obstacles), reach_m=0.03, friction=0.0)
+    return touches, push_forward(NODES, touches, loose_m=0.005)
+
+
+def test_the_told_forces_push_the_body_with_the_force_that_is_wanted() -> None:
+    world = seen(peg("c", 0.9, -1), peg("a", 0.3, -1), peg("b", 0.6, 1))
+    touches, push = pushing(world)
+    told = push_points(BODY, world, touches, push, 10.0)
+    assert [contact.obstacle for contact in told] == ["a", "b", "c"]  # tail to head
+    total = np.sum([contact.force_w for contact in told], axis=0)
+    assert push.balanced and total[0] == pytest.approx(10.0, rel=0.15) and abs(total[1]) < 1.0
+    assert all(contact.tangent_w[0] > 0.0 for contact in told)  # towards the head
+
+
+@pytest.mark.parametrize(
+    ("pegs", "force_n", "most_n", "words"),
+    [
+        ((), 5.0, 0.0, "no obstacle is near enough to push off"),
+        ((peg("a", 0.3, -1),), 5.0, 0.0, "contacts lost, the 1 obstacles beside the body cannot push it forward"),
+        ((peg("a", 0.3, -1), peg("b", 0.6, 1), peg("c", 0.9, -1)), 3.0, 3.0, "allow no more than 3.0 N"),
+        ((peg("a", 0.3, -1), peg("b", 0.6, 1), peg("c", 0.9, -1)), 9.0, 30.0, "jam: stands still although it pushes"),
+    ],
+)
+def test_a_stall_has_a_class(pegs: tuple[Obstacle, ...], force_n: float, most_n: float, words: str) -> None:
+    assert words in why_it_stands(*pushing(seen(*pegs)), force_n, most_n)
