@@ -24,7 +24,7 @@ packages := $(wildcard snakesim_*)
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test test-all test-here test-vcan attack faults mutation fuzz soak kills check bench bench-peers schemas docs lock clean FORCE
+.PHONY: help setup demo test test-all test-here test-vcan attack faults mutation fuzz soak kills check links bench bench-peers bench-paths schemas docs lock clean FORCE
 
 help: ## List these targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' Makefile
@@ -84,6 +84,12 @@ bench: $(stamp) ## Measure the ratios in benchmarks/
 
 bench-peers: $(stamp) ## Measure the loop beside raw Zenoh, dora-rs and rospy (installs them: build/peers, Debian)
 	$(bin)/python -m benchmarks.peers $(ARGS)
+
+links: $(stamp) ## Measure bad links between a robot and its controller, and write docs/lab-links.md (root; ARGS="--trials 4")
+	$(bin)/python -m tests.links --write $(ARGS)
+
+bench-paths: $(stamp) ## Measure the loop over routers, mTLS and a slow link beside raw Zenoh (root)
+	$(bin)/python -m benchmarks.paths $(ARGS)
 
 schemas: $(stamp) ## Write anew what is made from the code: JSON Schemas, key space, table of faults
 	$(bin)/snakesim schemas --write schemas

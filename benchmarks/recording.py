@@ -18,7 +18,7 @@ from snakesim_operator.recording.reader import RECORDING
 from snakesim_operator.results.record import SUMMARY
 from snakesim_operator.results.summary import RunSummary
 
-PAIRS = 5
+PAIRS = 4
 SCENARIOS = ("triplet", "clutter")
 AIM = 1.05
 
@@ -51,14 +51,14 @@ def main() -> int:
     sizes: list[str] = []
     for scenario in SCENARIOS:
         for what, flags in (("lockstep, in one process", ["--in-process"]), ("lockstep", [])):
-            typed = [scenario, "--pace", "lockstep", "--duration", "10", *flags]
+            typed = [scenario, "--pace", "lockstep", "--duration", "5", *flags]
             pairs = [(run(*typed), run(*typed, "--no-record")) for _ in range(PAIRS)]
             ours, theirs = ([one[i][0].wall_s / one[i][0].ticks * 1e6 for one in pairs] for i in (0, 1))
             tell(f"{scenario}, {what}: wall time of a tick", ours, theirs)
             ours, theirs = ([one[i][1] / one[i][0].ticks * 1e6 for one in pairs] for i in (0, 1))
             tell(f"{scenario}, {what}: CPU of the whole run", ours, theirs)
-        sizes.append(f"{scenario} {statistics.median(one[0][2] for one in pairs) * 360 / 1e6:.0f} MB")
-    typed = ["triplet", "--pace", "realtime", "--duration", "10"]
+        sizes.append(f"{scenario} {statistics.median(one[0][2] for one in pairs) * 720 / 1e6:.0f} MB")
+    typed = ["triplet", "--pace", "realtime", "--duration", "5"]
     pairs = [(run(*typed), run(*typed, "--no-record")) for _ in range(PAIRS)]
     for name in ("p50", "p99"):
         ours, theirs = ([one[i][0].state_to_command_us[name] or 0.0 for one in pairs] for i in (0, 1))

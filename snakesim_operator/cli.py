@@ -5,6 +5,7 @@ import os
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
+from math import inf
 from pathlib import Path
 
 from snakesim_hal import host_process, serve
@@ -192,6 +193,17 @@ def parser() -> argparse.ArgumentParser:
     add_network(doctor)
     _add_json(doctor)
     doctor.set_defaults(act=_doctor)
+
+    video = commands.add_parser("video", help="film a recorded run, as MP4 or GIF")
+    video.add_argument("run", type=Path, metavar="RUN", help="folder of a run, or a recording")
+    video.add_argument("--out", type=Path, required=True, metavar="FILE", help="FILE.mp4 or FILE.gif")
+    video.add_argument("--width", type=int, default=1280, help="pixels, an even number (default: 1280)")
+    video.add_argument("--height", type=int, default=720, help="pixels, an even number (default: 720)")
+    video.add_argument("--fps", type=float, default=30.0, help="pictures a second (default: 30)")
+    video.add_argument("--speed", type=float, default=1.0, metavar="X", help="2: twice as fast as it was (default: 1)")
+    video.add_argument("--from", dest="from_s", type=float, default=0.0, metavar="S", help="begin S seconds in")
+    video.add_argument("--to", dest="to_s", type=float, default=inf, metavar="S", help="end S seconds in")
+    video.set_defaults(act=_video)
 
     arm = commands.add_parser("arm", help="allow a robot to move; names robot and backend, to avoid mix-ups")
     arm.add_argument("robot", metavar="ROBOT", help="name of the robot, as printed by `snakesim status`")
@@ -385,6 +397,22 @@ def _console(arguments: argparse.Namespace) -> int:
     if arguments.run is not None:
         return show_record(arguments.run, arguments.port)
     return console(_where(arguments), arguments.port)
+
+
+def _video(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.video import video
+
+    size = (arguments.width, arguments.height)
+    for flag, value, low, high in (
+        ("--width", size[0], 16, 4096),
+        ("--height", size[1], 16, 4096),
+        ("--fps", arguments.fps, 1, 240),
+        ("--speed", arguments.speed, 0.01, 100),
+    ):
+        if not low <= value <= high or (flag in ("--width", "--height") and value % 2):
+            raise ConfigError(f"{flag} {value:g}: give a number from {low:g} to {high:g}; pixels must be even")
+    span_s = (arguments.from_s, arguments.to_s)
+    return video(arguments.run, arguments.out, size=size, fps=arguments.fps, speed=arguments.speed, span_s=span_s)
 
 
 def _arm(arguments: argparse.Namespace) -> int:

@@ -77,8 +77,8 @@ class Tab:
     def wait_for(self, text: str, limit_s: float = 60.0) -> float:
         """Until the page shows a text; returns how long it took in seconds."""
         began = time.monotonic()
-        while text not in self.text():
-            assert time.monotonic() - began < limit_s, f"{text!r} is not on the page:\n{self.text()[:3000]}"
+        while text not in (shown := self.text()):
+            assert time.monotonic() - began < limit_s, f"{text!r} is not on the page:\n{shown[:3000]}"
             time.sleep(0.02)
         return time.monotonic() - began
 

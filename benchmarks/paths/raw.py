@@ -54,7 +54,8 @@ def _publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:
 
 def _answer(session: zenoh.Session, reply: bytes) -> None:
     publisher = _publisher(session, REPLY)
-    for _ in session.declare_subscriber(REQUEST, zenoh.handlers.FifoChannel(16)):
+    requests = session.declare_subscriber(REQUEST, zenoh.handlers.FifoChannel(16))  # a temporary one would be closed
+    for _ in requests:
         publisher.put(reply)
 
 
@@ -82,7 +83,8 @@ def _read(session: zenoh.Session, key: str, out: Path) -> None:
     """Count what comes: twice a second the number of samples and of bytes."""
     count = size = 0
     shown = time.monotonic()
-    for sample in session.declare_subscriber(key, zenoh.handlers.RingChannel(256)):
+    samples = session.declare_subscriber(key, zenoh.handlers.RingChannel(256))
+    for sample in samples:
         count, size = count + 1, size + len(sample.payload)
         if time.monotonic() - shown > 0.5:
             shown = time.monotonic()

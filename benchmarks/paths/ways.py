@@ -53,15 +53,19 @@ class Lab:
             self._by("two routers", two, "tcp/10.78.1.1:7447", "tcp/10.78.4.1:7447"),
         ]
 
-    def one_router(self, send_buffer_bytes: int | None = None) -> Way:
-        """Host and controller at one router; the robot's session with a send buffer of its own size."""
+    def one_router(self, piece_bytes: int | None = None) -> Way:
+        """Host and controller at one router. piece_bytes: of what the robot's session hands to the kernel at once.
+
+        What the kernel has, nothing overtakes. Before that Zenoh sends by priority, also between pieces of an image.
+        """
         way = self.ways()[1]
-        if send_buffer_bytes is not None:
+        if piece_bytes is not None:
             settings = json.loads(way.robot_file.read_text())
-            settings["transport"] = {"link": {"tcp": {"so_sndbuf": send_buffer_bytes}}}
-            path = self.folder / "short-buffer.json5"
+            link = {"tx": {"batch_size": piece_bytes}, "tcp": {"so_sndbuf": 2 * piece_bytes}}
+            settings["transport"] = {"link": link}
+            path = self.folder / "pieces.json5"
             path.write_text(json.dumps(settings))
-            way.name = f"{way.name}, `so_sndbuf` {send_buffer_bytes // 1024} KiB"
+            way.name = f"{way.name}, pieces of {piece_bytes} bytes"
             way.robot_file, way.host = path, ["--session", str(path)]
         return way
 
@@ -85,6 +89,8 @@ class Lab:
         path = self.folder / f"{stem}.json5"
         settings: dict[str, Any] = {"mode": mode, "scouting": QUIET}
         settings |= {verb: {"endpoints": endpoints} for verb, endpoints in ends.items()}
+        if mode == "client":
+            settings["connect"]["timeout_ms"] = 30000
         if tls is not None:
             settings["transport"] = {"link": {"tls": tls}}
         path.write_text(json.dumps(settings))

@@ -6,12 +6,12 @@ the robot is stopped. Its output is checked (`guarded`): a controller that fails
 
 from collections.abc import Sequence
 
-from snakesim_gnc.control.controller import Controller, View
+from snakesim_gnc.control.controller import View
 from snakesim_gnc.control.freshness import Limits
 from snakesim_gnc.control.guarded import Guarded
+from snakesim_gnc.control.live_settings import LiveSettings
 from snakesim_gnc.control.state_reports import StateReports
 from snakesim_hal.errors import ControllerError
-from snakesim_hal.model.plugins import CONTROLLERS, find_plugin, plugin_settings
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.client import Client, Commander
 from snakesim_hal.service import Service
@@ -29,15 +29,11 @@ class Control(Service):
     def __init__(self, client: Client, config: RunConfig) -> None:
         """Finds the controller and checks its settings."""
         self._config = config
-        self._plugin: type[Controller] = find_plugin(CONTROLLERS, config.controller)
-        self._settings = plugin_settings(
-            self._plugin, config.control_settings, f"scenario {config.name!r}", config.control_section
-        )
+        self._settings = LiveSettings(client, config)
         self._client = client
         self._joints = client.subscribe(keys.JOINTS, JointState)
         self._world = client.subscribe(keys.WORLD, World)
         self._trajectory = client.subscribe(keys.TRAJECTORY, Trajectory)
-        self._robot: Description | None = None
         self._arming = -1
         self._armed_at_ns = 0
         self._noted: set[str] = set()  # streams that are too old, as the log has it
@@ -45,7 +41,7 @@ class Control(Service):
 
     def meet(self, robot: Description) -> None:
         """Get ready to command this robot."""
-        self._robot = robot
+        self._settings.meet(robot)
         self._commander = Commander(self._client, robot)
         self._limits = Limits.of(self._config, robot)
         self._reports = StateReports(self._config.controller, robot)
@@ -54,6 +50,8 @@ class Control(Service):
     def outputs(self, clock: Clock) -> list[tuple[str, Message]] | None:
         """Command the robot: while armed by the controller, otherwise to hold its pose."""
         self._last_clock = clock
+        if self._settings.turn(clock):
+            self._controller = None
         joints = self._client.read(self._joints)
         if joints is None:
             return None
@@ -119,11 +117,11 @@ class Control(Service):
         return world, trajectory, "; ".join(late)
 
     def _made_for(self, clock: Clock) -> Guarded:
-        """The controller of this arming."""
-        assert self._robot is not None
+        """The controller of this arming, and of the settings in force."""
         if self._controller is None or clock.arming != self._arming:
-            self._controller = Guarded(self._config.controller, self._plugin, self._robot, self._settings)
-            self._arming, self._armed_at_ns = clock.arming, clock.stamp_ns
+            self._controller = self._settings.controller()
+            if clock.arming != self._arming:
+                self._arming, self._armed_at_ns = clock.arming, clock.stamp_ns
         return self._controller
 
     def _note(self, clock: Clock, late: Sequence[str] = (), so: str = "") -> None:

@@ -22,6 +22,7 @@ from snakesim_hal.model.textfiles import read_bytes
 BACKENDS = "snakesim.backends"
 COMMANDS = "snakesim.commands"
 CONTROLLERS = "snakesim.controllers"
+FILMS = "snakesim.films"
 PLANTS = "snakesim.plants"
 SENSORS = "snakesim.sensors"
 SERVICES = "snakesim.services"

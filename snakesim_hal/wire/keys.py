@@ -28,6 +28,8 @@ DONE_ALL = "hal/done/*"
 WORLD = "guidance/world"
 TRAJECTORY = "navigation/trajectory"
 CONTROL_STATE = "control/state"
+SETTINGS = "control/settings"
+SETTINGS_IN_FORCE = "control/settings_in_force"
 INTENT = "operator/intent"
 ALIVE_ALL = "alive/*"
 HOST_ALL = "hal/host/*"
@@ -80,6 +82,8 @@ SPACE: tuple[Row, ...] = (
     Row(WORLD, m.World, "guidance", "stream", _TURN, "body pose, contacts and obstacles in the world"),
     Row(TRAJECTORY, m.Trajectory, "navigation", "stream", _TURN, "path, speed, push-points ahead"),
     Row(CONTROL_STATE, m.ControlState, "control", "stream", "on a change, and 20 Hz", "state, reason, forces, torques"),
+    Row(SETTINGS, m.SettingsRequest, "any", "query", _ASKED, "other settings for the running controller; Answer"),
+    Row(SETTINGS_IN_FORCE, m.ControlSettings, "control", "latched", "on a change", "the controller's settings now"),
     Row(INTENT, m.Intent, "operator", "stream", "before the last expires", "speed and direction wanted by somebody"),
     Row(ALIVE_ALL, None, "each service", "liveliness", _LIVES, "present while the service's process is connected"),
     Row(PROCESS_ALL, m.Process, "each process", "latched", "once", "its machine, version, settings; and its token"),

@@ -608,6 +608,28 @@ class ControlState(Message, frozen=True, kw_only=True):
     jammed: Annotated[bool, about("the body is stuck although a joint pushes")] = False
 
 
+class SettingsRequest(Message, frozen=True, kw_only=True):
+    """Query payload on `control/settings`: go on with these settings of the running controller."""
+
+    who: Annotated[q.Name, about("name of the requester, for log and record")]
+    controller: Annotated[q.Name, about("`ControlSettings.controller`; another one is refused")]
+    settings: Annotated[
+        str, Meta(max_length=q.MAX_SETTINGS), about("a JSON object; fields that it leaves out get their defaults")
+    ]
+
+
+class ControlSettings(Message, frozen=True, kw_only=True):
+    """`control/settings_in_force`, latched: what the controller runs with, and what it could."""
+
+    tick: Annotated[q.Tick, about("since when")]
+    stamp_ns: q.Stamp
+    controller: q.Name
+    settings: Annotated[str, Meta(max_length=q.MAX_SETTINGS), about("all of them, as a JSON object")]
+    schema: Annotated[str, Meta(max_length=q.MAX_SCHEMA), about("JSON Schema of `settings`, with bounds and units")]
+    who: Annotated[q.Name | None, about("who has asked for them; null: the configuration of the run")] = None
+    changes: Annotated[q.Count, about("how often they have been changed since control started")] = 0
+
+
 class Intent(Message, frozen=True, kw_only=True):
     """`operator/intent`: speed and direction asked for by a person or a mission. Send it repeatedly: it expires.
 
@@ -652,6 +674,8 @@ VERSIONS: dict[type[Message], int] = dict.fromkeys(
         World,
         Trajectory,
         ControlState,
+        SettingsRequest,
+        ControlSettings,
         Intent,
     ),
     1,

@@ -51,12 +51,12 @@ _ASKERS: dict[str, tuple[Role, ...]] = {
     keys.LIFECYCLE: _PERSONS,
     keys.ESTOP: (Role.GNC, Role.VIEWER, *_PERSONS),
     keys.FAULT_ALL: (Role.ADMINISTRATOR,),
-    "control/settings": _PERSONS,
+    keys.SETTINGS: _PERSONS,
 }
-_ANSWERERS: dict[str, tuple[Role, ...]] = {  # the others: the robot alone
+_ANSWERERS: dict[str, tuple[Role, ...]] = {
     keys.FAULT_ALL: (Role.ROBOT, Role.GNC),
-    "control/settings": (Role.GNC,),
-}
+    keys.SETTINGS: (Role.GNC,),
+}  # the others: the robot alone
 _NAMED = {keys.PROCESS_ALL: "-$*"}  # what follows the name of a service or a process at a key, if anything
 _WITH_TOKEN = (keys.PROCESS_ALL,)  # keys of samples that have a liveliness token, too
 RECORDER = "recorder"  # the name of its process

@@ -28,11 +28,13 @@ def show_live(link: Link, around: Surroundings | None, port: int | None, stop: t
     """Show a robot until `stop` is set. Raises NotConnectedError when the port is taken, or no network is there."""
     log = Log()
     with page_server(port) as (server, address):
-        page = Page(server, around, Operations(link, log), log)
+        operations = Operations(link, log)
+        page = Page(server, around, operations, log)
         say(f"console: {address}")
         page.show(None)
         whole = replace(link, largest_bytes=MAX_IMAGE_BYTES)
         with open_session(whole, START_LIMIT_S) as session:
+            operations.connect(session)
             watch, changes = Watch(session), Changes(log)
             for _ in frames(stop):
                 moment = watch.moment()

@@ -1,15 +1,20 @@
 """The controls of one viewer. Only the viewer in control can use them; everybody can stop the robot."""
 
+import math
 from collections.abc import Callable
 
 import viser
 
 from snakesim_hal.errors import SnakesimError
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import ControlSettings
+from snakesim_operator.console.moment import Moment
 from snakesim_operator.console.operations import Operations
+from snakesim_operator.console.settings_form import SettingsForm
 from snakesim_operator.console.token import ControlToken
 
 TOLD_S = 6.0
+DRIVE_HZ = 10.0
+FASTEST_M_S = 0.5
 
 
 class Controls:
@@ -21,19 +26,29 @@ class Controls:
         folder: viser.GuiFolderHandle,
         token: ControlToken,
         operations: Operations,
-        robot: Callable[[], Description | None],
+        moment: Callable[[], Moment | None],
+        settings_tab: viser.GuiFolderHandle,
         changed: Callable[[], None],
     ) -> None:
-        """folder: where on the page; changed: called when control was taken or released."""
+        """folder, settings_tab: places on the page; moment: the newest; changed: called when the token has moved."""
         self._client, self._token, self._operations = client, token, operations
-        self._robot, self._changed = robot, changed
+        self._moment, self._changed = moment, changed
+        self._settings_tab = settings_tab
+        self._form: SettingsForm | None = None
         self.viewer = client.client_id
         with folder:
             self._take = client.gui.add_button("Take control", icon=viser.Icon.HAND_STOP, color="blue")
             self._lifecycle = client.gui.add_button_group("Robot", ("Arm", "Disarm", "Clear"))
+            self._heading = client.gui.add_slider("Heading, °", -180, 180, 5, 0)
+            self._speed = client.gui.add_slider("Speed, m/s", 0.0, FASTEST_M_S, 0.01, 0.1)
+            self._drive = client.gui.add_button("Hold to drive", icon=viser.Icon.STEERING_WHEEL, color="green")
             self._dark = client.gui.add_checkbox("Dark page", initial_value=False)
         self._take.on_click(lambda _: self._take_or_release())
         self._lifecycle.on_click(lambda event: self._ask(event.target.value))
+        with settings_tab:
+            self._apply = client.gui.add_button("Apply", visible=False, order=0)
+        self._drive.on_hold(lambda _: self._go(), callback_hz=DRIVE_HZ)
+        self._apply.on_click(lambda _: self._configure())
         self._dark.on_update(lambda _: dress(client.gui, dark=self._dark.value))
         self.show()
 
@@ -50,7 +65,20 @@ class Controls:
         self._take.disabled = holder is not None and not mine
         taken = holder not in (None, self.viewer)
         self._take.hint = f"{name_of(holder)} has control, and may release it" if taken else None
-        self._lifecycle.visible = mine
+        for one in (self._lifecycle, self._heading, self._speed, self._drive):
+            one.visible = mine
+        self._apply.disabled = not mine
+        if self._form is not None:
+            self._form.enable(mine)
+
+    def show_settings(self, settings: ControlSettings) -> None:
+        """Show the settings in force."""
+        if self._form is None or not self._form.show(settings):
+            if self._form is not None:
+                self._form.remove()
+            self._form = SettingsForm(self._client.gui, self._settings_tab, settings)
+        self._apply.visible = True
+        self.show()
 
     def tell(self, title: str, text: str, *, bad: bool = False) -> None:
         """Show a message to this viewer."""
@@ -61,17 +89,33 @@ class Controls:
             self.tell("Not in control", f"{name_of(self._token.holder)} has it", bad=True)
         self._changed()
 
+    def _in_control(self) -> bool:
+        """Whether this viewer may: the page greys the others' buttons out, but a page can be changed."""
+        return self._token.holder == self.viewer
+
     def _ask(self, what: str) -> None:
-        robot = self._robot()
-        if robot is None or self._token.holder != self.viewer:
+        moment = self._moment()
+        if moment is None or not self._in_control():
             return
         match what:
             case "Arm":
-                self.do("Arm", lambda: self._operations.arm(self.who, robot))
+                self.do("Arm", lambda: self._operations.arm(self.who, moment.robot))
             case "Disarm":
                 self.do("Disarm", lambda: self._operations.disarm(self.who))
             case _:
                 self.do("Clear", lambda: self._operations.clear(self.who))
+
+    def _go(self) -> None:
+        """The button is held: the page says so ten times a second, and nobody else does when it does not."""
+        moment = self._moment()
+        if moment is not None and moment.time_s is not None and self._in_control():
+            heading_rad = math.radians(self._heading.value)
+            self._operations.drive(self.who, heading_rad, self._speed.value, round(moment.time_s * 1e9))
+
+    def _configure(self) -> None:
+        form = self._form
+        if form is not None and self._in_control():
+            self.do("Settings", lambda: self._operations.configure(self.who, form.controller, form.asked()))
 
     def do(self, title: str, call: Callable[[], str]) -> None:
         """Do something, and show its outcome."""

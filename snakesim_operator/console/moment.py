@@ -6,6 +6,7 @@ from snakesim_hal.wire.messages import (
     AppliedCommand,
     ColourImage,
     Contacts,
+    ControlSettings,
     ControlState,
     DepthImage,
     Description,
@@ -42,6 +43,7 @@ class Moment:
     trajectory: Trajectory | None = None
     control: ControlState | None = None
     applied: AppliedCommand | None = None
+    settings: ControlSettings | None = None
     power: Power | None = None
     images: dict[str, DepthImage | ColourImage] = field(default_factory=dict)  # by key
     streams: dict[str, Stream] = field(default_factory=dict)  # by key

@@ -9,15 +9,17 @@ from collections import deque
 from collections.abc import Callable
 from datetime import datetime
 
-from snakesim_hal.errors import SnakesimError
-from snakesim_hal.network.session import Link
-from snakesim_hal.wire.messages import Description
-from snakesim_operator.tools.command import arm, clear, disarm
+from snakesim_hal.errors import NotConnectedError, RefusedError, SnakesimError
+from snakesim_hal.network.session import Link, Publisher, Session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Description, Intent, Message, SettingsRequest
+from snakesim_operator.tools.command import ANSWER_S, arm, clear, disarm
 from snakesim_operator.tools.fault import FaultOrder, fault
 from snakesim_operator.tools.stop import estop
 from snakesim_operator.tools.targets import Where
 
 LOG_LINES = 200
+DRIVE_NS = 500_000_000  # an intent from the page is valid for this long: then a viewer who is gone moves nothing
 
 
 class Log:
@@ -46,6 +48,12 @@ class Operations:
     def __init__(self, link: Link, log: Log) -> None:
         self._where = Where(link.endpoint, link.namespace, link.session)
         self._log = log
+        self._session: Session | None = None
+        self._intents: Publisher[Intent] | None = None
+
+    def connect(self, session: Session) -> None:
+        """Use this session for what the command line has no command for."""
+        self._session, self._intents = session, session.publisher(keys.INTENT, Intent)
 
     def estop(self, who: str) -> str:
         """Emergency stop: over the stop port and over the network at once."""
@@ -66,6 +74,29 @@ class Operations:
     def inject(self, who: str, order: FaultOrder) -> str:
         """Inject a fault, where the run allows it."""
         return self._do(f"{who}: fault {order.kind}:{order.target}", lambda say: fault(order, self._where, say))
+
+    def configure(self, who: str, controller: str, settings: str) -> str:
+        """Have the running controller go on with other settings."""
+        request = SettingsRequest(who=who, controller=controller, settings=settings)
+        return self._do(f"{who}: settings", lambda say: self._ask(keys.SETTINGS, request, say))
+
+    def drive(self, who: str, heading_w_rad: float, speed_m_s: float, now_ns: int) -> None:
+        """Ask for a direction and a speed, for half a second. now_ns: robot time."""
+        if self._intents is not None:
+            intent = Intent(
+                stamp_ns=now_ns, who=who, speed_m_s=speed_m_s, heading_w_rad=heading_w_rad, valid_for_ns=DRIVE_NS
+            )
+            self._intents.put(intent)
+
+    def _ask(self, key: str, request: Message, say: Callable[[str], None]) -> int:
+        """One question, and its answer. Raises RefusedError, NotConnectedError."""
+        if self._session is None:
+            raise NotConnectedError("not connected to the robot yet")
+        answer = self._session.ask(key, request, ANSWER_S)
+        if not answer.ok:
+            raise RefusedError(answer.reason)
+        say(answer.reason)
+        return 0
 
     def _do(self, what: str, call: Callable[[Callable[[str], None]], int]) -> str:
         lines: list[str] = []

@@ -11,7 +11,7 @@ from functools import partial
 import viser
 
 from snakesim_hal.errors import SnakesimError
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import ControlSettings, Description
 from snakesim_operator.console import stage, texts
 from snakesim_operator.console.charts import JointCharts
 from snakesim_operator.console.controls import Controls, dress, name_of
@@ -52,7 +52,7 @@ class Page:
         self._log, self._recorded = log, recorded
         self._token = ControlToken()
         self._controls: dict[int, Controls] = {}
-        self._lock = threading.Lock()
+        self._lock = threading.Lock()  # of `_controls`; viser fills a folder from one thread at a time
         self._frames = 0
         self._moment: Moment | None = None
         self._stage: Stage | None = None
@@ -87,6 +87,9 @@ class Page:
             self._cameras_tab = gui.add_folder(None)
             with self._cameras_tab:
                 self._no_camera = gui.add_html("<div style='padding:.3em .6em;opacity:.7'>no image yet</div>")
+        if self._operations is not None:
+            with tabs.add_tab("Settings"):
+                self._settings_tab = gui.add_folder(None)
         with tabs.add_tab("Log"):
             self._log_text = gui.add_html("")
         gui.add_html(texts.legend(LEGEND), order=3)
@@ -95,10 +98,18 @@ class Page:
 
     def _came(self, client: viser.ClientHandle) -> None:
         assert self._operations is not None
-        controls = Controls(
-            client, self._control_folder, self._token, self._operations, self._robot, self._control_changed
-        )
         with self._lock:
+            controls = Controls(
+                client,
+                self._control_folder,
+                self._token,
+                self._operations,
+                lambda: self._moment,
+                self._settings_tab,
+                self._control_changed,
+            )
+            if self._moment is not None and self._moment.settings is not None:
+                controls.show_settings(self._moment.settings)
             self._controls[client.client_id] = controls
         self._log.write(f"{name_of(client.client_id)} came")
 
@@ -127,9 +138,6 @@ class Page:
             with contextlib.suppress(SnakesimError):  # the log has it
                 call()
 
-    def _robot(self) -> Description | None:
-        return None if self._moment is None else self._moment.robot
-
     def forget(self) -> None:
         """The next moment is not the one after this: trail and charts begin anew."""
         if self._stage is not None and self._charts is not None:
@@ -156,6 +164,8 @@ class Page:
                 self._charts.show(moment)
             if self._frames % PICTURES_EVERY == 1:
                 self._show_pictures(moment)
+            if moment.settings is not None and (before is None or moment.settings != before.settings):
+                self._show_settings(moment.settings)
         if self._frames % TEXT_EVERY == 1 or _what(before) != _what(moment):
             self._show_texts(moment)
 
@@ -172,6 +182,13 @@ class Page:
             if self._charts is not None:
                 self._charts.remove()
             self._charts = JointCharts(self._server.gui, robot)
+
+    def _show_settings(self, settings: ControlSettings) -> None:
+        with self._lock:
+            for controls in self._controls.values():
+                controls.show_settings(settings)
+        if settings.who is not None:
+            self._log.write(f"settings of {settings.controller} in force, as {settings.who} asked")
 
     def _show_texts(self, moment: Moment | None) -> None:
         holder = self._token.holder

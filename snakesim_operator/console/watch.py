@@ -18,6 +18,7 @@ from snakesim_hal.wire.messages import (
     Clock,
     ColourImage,
     Contacts,
+    ControlSettings,
     ControlState,
     DepthImage,
     Description,
@@ -37,7 +38,11 @@ BODIES_KEPT = 128  # joint states, to find that of the instant of a pose
 RATE_PERIOD_S = 1.0
 STATUS_LIMIT_S = 2.0  # a host that has been silent for longer is no impostor, only gone
 
-LATCHED: dict[str, type[Message]] = {keys.DESCRIPTION: Description, keys.STATUS: Status}
+LATCHED: dict[str, type[Message]] = {
+    keys.DESCRIPTION: Description,
+    keys.STATUS: Status,
+    keys.SETTINGS_IN_FORCE: ControlSettings,
+}
 STREAMS: dict[str, type[Message]] = {
     keys.CLOCK: Clock,
     keys.JOINTS: JointState,
@@ -138,6 +143,7 @@ class Watch:
             trajectory=self._get(keys.TRAJECTORY, Trajectory),
             control=self._get(keys.CONTROL_STATE, ControlState),
             applied=self._get(keys.APPLIED, AppliedCommand),
+            settings=self._get(keys.SETTINGS_IN_FORCE, ControlSettings),
             power=self._get(keys.POWER, Power),
             images={key: found for key, found in self._newest.items() if isinstance(found, DepthImage | ColourImage)},
             streams=self._streams(clock),

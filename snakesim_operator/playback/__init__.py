@@ -2,5 +2,5 @@
 
 `command`   the commands                `info`      what a recording holds
 `play`      plays it on Zenoh           `control`   replays its sensors into guidance, navigation and control
-`order`     its messages, tick by tick
+`order`     its messages, tick by tick  `export`    tables, arrays, a dataset
 """

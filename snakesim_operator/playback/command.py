@@ -1,4 +1,4 @@
-"""The commands for recordings: `snakesim info`, `report`, `replay`."""
+"""The commands for recordings: `snakesim info`, `report`, `replay`, `export`."""
 
 import argparse
 import sys
@@ -42,6 +42,14 @@ def add_commands(commands: Any) -> None:
     replay.add_argument("--out", type=Path, metavar="DIR", help="with --control: folder for a run that compare reads")
     replay.set_defaults(act=_replay)
 
+    exported = commands.add_parser(
+        "export", help="write a run as CSV, Parquet, NumPy, a LeRobot dataset or a whole MCAP"
+    )
+    exported.add_argument("recordings", type=Path, nargs="+", metavar="RUN", help="folders of runs, or MCAP files")
+    exported.add_argument("--format", required=True, choices=["csv", "parquet", "npz", "lerobot", "mcap"])
+    exported.add_argument("--out", type=Path, metavar="PATH", help="file or folder (default: beside the recording)")
+    exported.set_defaults(act=_export)
+
 
 def _add_recording(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("recording", type=Path, metavar="RUN", help="folder of a run, or an MCAP file")
@@ -65,6 +73,12 @@ def _report(arguments: argparse.Namespace) -> int:
     write_whole(out, page(record, summarise(record, record.host.ended)).encode())
     say(str(out))
     return 0
+
+
+def _export(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.playback.export import export
+
+    return export(arguments.recordings, arguments.format, arguments.out, say)
 
 
 def _replay(arguments: argparse.Namespace) -> int:

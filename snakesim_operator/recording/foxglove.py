@@ -39,13 +39,13 @@ from snakesim_hal.wire.messages import (
 )
 from snakesim_operator.recording import shapes
 
-MOVING_NS = 50_000_000  # 20 Hz
-IMAGES_NS = 100_000_000  # 10 Hz
+MOVING_NS = 100_000_000  # 10 Hz: viewers interpolate transforms
+IMAGES_NS = 200_000_000  # 5 Hz: all images are in the raw channels
 STILL_NS = 1_000_000_000  # what seldom changes, so that it is there wherever one begins to look
 
 
 class Seen(msgspec.Struct, frozen=True):
-    """What is shown of a world model twenty times a second: not its obstacles, which may be many."""
+    """What is shown of a world model at every turn: not its obstacles, which may be many."""
 
     base_position_w: tuple[float, float, float]
     base_orientation_wxyz: tuple[float, float, float, float]

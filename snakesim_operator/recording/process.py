@@ -130,6 +130,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     ended: list[bool] = []
     on_stop_signal(lambda: ended.append(True))
     os.nice(NICE)
+    os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))  # its threads, woken by each message, displace nobody
     try:
         recorder = record(given.link, given.arguments.out / RECORDING, lambda: not ended)
     except SnakesimError as error:

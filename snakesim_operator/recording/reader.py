@@ -1,5 +1,6 @@
 """Reads a recording: the messages in the order of the file, of a file that was never finished too."""
 
+import contextlib
 import json
 import struct
 from collections.abc import Collection, Iterator
@@ -9,7 +10,7 @@ from typing import Any
 
 import mcap.exceptions
 import zstandard
-from mcap.records import Channel, Chunk, DataEnd, Message, Metadata
+from mcap.records import Channel, Chunk, DataEnd, McapRecord, Message, Metadata
 from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
@@ -51,20 +52,32 @@ class RecordingReader:
 
     def messages(self, keys: Collection[str] | None = None) -> Iterator[Recorded]:
         """Messages at these keys of the robot, or at all. Raises ConfigError for a file that is no recording."""
+        channels: dict[int, Channel] = {}
+        for record in self.records():
+            if isinstance(record, Channel):
+                channels[record.id] = record
+            elif isinstance(record, Metadata) and record.name == ABOUT:
+                with contextlib.suppress(ValueError):
+                    self.about = {name: json.loads(value) for name, value in record.metadata.items()}
+            elif isinstance(record, Message) and (channel := channels.get(record.channel_id)) is not None:
+                encoding = channel.metadata.get("encoding")
+                if encoding is not None and (keys is None or channel.topic in keys):
+                    yield Recorded(channel.topic, record.data, encoding, record.log_time, record.publish_time)
+
+    def records(self) -> Iterator[McapRecord]:
+        """Everything in the file up to where it ends, or is damaged. Raises ConfigError for a file that is no MCAP."""
         try:
             with self.path.open("rb") as file:
                 if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
                     raise ConfigError(f"{self.path} is not a recording: it does not begin as an MCAP file")
                 file.seek(0)
-                reader = StreamReader(file, emit_chunks=True, record_size_limit=LARGEST_RECORD)
-                yield from self._read(reader, keys)
+                yield from self._read(StreamReader(file, emit_chunks=True, record_size_limit=LARGEST_RECORD))
         except OSError as error:
             raise ConfigError(f"{self.path} cannot be read: {error.strerror}") from None
 
-    def _read(self, reader: StreamReader, keys: Collection[str] | None) -> Iterator[Recorded]:
-        channels: dict[int, Channel] = {}
+    def _read(self, reader: StreamReader) -> Iterator[McapRecord]:
         records = reader.records
-        while True:
+        while not self.finished:
             try:
                 record = next(records)
                 inside = breakup_chunk(record, validate_crc=True) if isinstance(record, Chunk) else [record]
@@ -73,15 +86,5 @@ class RecordingReader:
             except DAMAGED as error:
                 self.trouble = f"{type(error).__name__}: {error}"[:200]
                 return
-            for found in inside:
-                if isinstance(found, Channel):
-                    channels[found.id] = found
-                elif isinstance(found, Metadata) and found.name == ABOUT:
-                    self.about = {name: json.loads(value) for name, value in found.metadata.items()}
-                elif isinstance(found, Message) and (channel := channels.get(found.channel_id)) is not None:
-                    encoding = channel.metadata.get("encoding")
-                    if encoding is not None and (keys is None or channel.topic in keys):
-                        yield Recorded(channel.topic, found.data, encoding, found.log_time, found.publish_time)
-                elif isinstance(found, DataEnd):
-                    self.finished = True
-                    return
+            self.finished = isinstance(record, DataEnd)
+            yield from inside

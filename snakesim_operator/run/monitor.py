@@ -18,6 +18,7 @@ from snakesim_operator.run.supervisor import Supervisor
 AFTER_FAULT_S = 1.5
 POLL_S = 0.05
 ARM_LIMIT_S = 10.0
+RECORDER_LIMIT_S = 20.0  # once everything else is ready
 WHO = "snakesim run"
 
 
@@ -40,6 +41,7 @@ class RunMonitor:
         self._control = session.reader(keys.CONTROL_STATE, ControlState)
         self._state: ControlState | None = None
         self._recorder_is_there = RECORDER not in supervisor.names
+        self._recorder_due_s: float | None = None
         session.on_alive(self._recorder_came, keys.alive(RECORDER))
         self._faults = ProcessFaults(config, session, supervisor, say)
         self._progress = Progress(config)
@@ -124,9 +126,20 @@ class RunMonitor:
             self._supervisor.came_up = True
         if self._armed or not self._may_arm or not status.ready_to_arm or self._robot is None:
             return
-        if not self._recorder_is_there and RECORDER not in self._supervisor.lost:
+        if self._waits_for_recorder():
             return
         self._ask_to_arm(status, self._robot)
+
+    def _waits_for_recorder(self) -> bool:
+        """A recording has every tick, unless the recorder does not come."""
+        if self._recorder_is_there or RECORDER in self._supervisor.lost:
+            return False
+        self._recorder_due_s = self._recorder_due_s or time.monotonic() + RECORDER_LIMIT_S
+        if time.monotonic() < self._recorder_due_s:
+            return True
+        self._say(f"warning: no recorder within {RECORDER_LIMIT_S:.0f} s; the run goes on without")
+        self._recorder_is_there = True
+        return False
 
     def _recorder_came(self, _key: str, present: bool) -> None:
         """In Zenoh's thread: it misses nothing from now on."""

@@ -69,7 +69,7 @@ class View:
         model.vis.global_.offheight = max(model.vis.global_.offheight, camera.height)
         model.vis.headlight.ambient[:] = AMBIENT
         model.vis.quality.offsamples = SAMPLES if smooth else 0
-        self._gl = _context(camera)
+        self._gl = opened_context(camera.width, camera.height, f"camera {camera.name!r}")
         self._gl.make_current()
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
@@ -108,18 +108,21 @@ class View:
             eye.frustum_near, eye.frustum_far = NEAREST_M, FURTHEST_M
 
 
-def _context(camera: DepthCamera) -> Any:
-    """An OpenGL context without a screen: EGL, or OSMesa if the environment says MUJOCO_GL=osmesa."""
+def opened_context(width: int, height: int, what: str) -> Any:
+    """An OpenGL context without a screen: EGL, or OSMesa if the environment says MUJOCO_GL=osmesa.
+
+    what: is drawn with it, for the ConfigError that is raised when there is no OpenGL.
+    """
     kind = "osmesa" if os.environ.get("MUJOCO_GL") == "osmesa" else "egl"
     try:
         if kind == "osmesa":
             from mujoco.osmesa import GLContext
         else:
             from mujoco.egl import GLContext
-        return GLContext(camera.width, camera.height)
+        return GLContext(width, height)
     except Exception as error:
         raise ConfigError(
-            f"camera {camera.name!r} is rendered, which needs OpenGL by {kind.upper()}, and that does not work here: "
+            f"{what} is rendered, which needs OpenGL by {kind.upper()}, and that does not work here: "
             f"{type(error).__name__}: {error}. Install the Debian packages {PACKAGES[kind]} and libgl1-mesa-dri; or "
             f'leave out `colour` and take `model = "rays"`, which need no OpenGL'
         ) from error

@@ -24,7 +24,7 @@ pytestmark = pytest.mark.e2e
 
 # One namespace is a prefix of the other, and the other robot has another number of joints.
 ROBOTS = {"lab": ("planar13", "lateral_undulation", 13), "lab/second": ("mamba", "hold", 18)}
-SECONDS = {"quick": 3, "a million messages": 1000}
+SECONDS = {"quick": 2, "a million messages": 1000}
 SCENE = 'name = "plain"\n[ground]\nfriction = 0.5\n'
 SCENARIO = """
 robot = "{robot}"
@@ -107,7 +107,7 @@ def test_two_robots_on_one_router_run_as_if_alone(form: str, lab: Lab) -> None:
 
 def only_one_is_armed_when_one_is_named(lab: Lab) -> None:
     """A command that names no robot goes to none of two; one that names the wrong robot is refused by the right one."""
-    for arguments in (("arm", "planar13", "sim"), ("disarm",), ("clear",), ("fault", "mute", "joint_3")):
+    for arguments in (("arm", "planar13", "sim"), ("disarm",)):
         ended = lab.tell(*arguments)
         assert ended.code == 1 and "several robots found" in ended.err and "--namespace lab/second" in ended.err
     wrong = lab.tell("arm", "planar13", "sim", "--namespace", "lab/second")

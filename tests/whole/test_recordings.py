@@ -1,5 +1,6 @@
 """The recording of a run: the record that is made of it alone, and what `snakesim info` tells of it."""
 
+import csv
 import json
 from pathlib import Path
 
@@ -50,6 +51,37 @@ def test_a_page_is_made_of_a_recording_alone(run: Path, tmp_path: Path) -> None:
     assert ended.code == 0 and "clutter" in (tmp_path / "lone.html").read_text()
     compared = snakesim("compare", str(run), "lone.mcap", "--within", "0", cwd=tmp_path)
     assert compared.code == 0 and "The runs are the same, joint by joint" in compared.out, compared.out
+
+
+def test_what_is_exported_is_the_record(run: Path, tmp_path: Path) -> None:
+    record = RunRecord.load(run)
+    for form in ("npz", "csv", "mcap"):
+        ended = snakesim("export", str(run), "--format", form, "--out", f"a.{form}", cwd=tmp_path)
+        assert ended.code == 0, ended.err
+    with np.load(tmp_path / "a.npz") as arrays:
+        assert np.array_equal(arrays["angle_rad"], record.angle_rad) and arrays["joints"][0] == "joint_1"
+    with (tmp_path / "a.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [float(row["target.joint_3"]) for row in rows] == record.target[:, 2].tolist()
+    assert [float(row["position_w_m.y"]) for row in rows] == record.position_w[:, 1].tolist()
+    assert np.array_equal(RunRecord.load(tmp_path / "a.mcap").angle_rad, record.angle_rad)
+    again = snakesim("export", str(run), "--format", "csv", "--out", "a.csv", cwd=tmp_path)
+    assert again.code == 2 and "there is such a file already" in again.err
+
+
+def test_several_runs_make_a_dataset(run: Path, tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `export`")
+    record = RunRecord.load(run)
+    ended = snakesim("export", str(run), str(run), "--format", "lerobot", "--out", "set", cwd=tmp_path)
+    assert ended.code == 0 and "2 episodes, 400 frames" in ended.out, ended.err
+    info = json.loads((tmp_path / "set" / "meta" / "info.json").read_text())
+    assert (info["fps"], info["total_frames"], info["total_episodes"]) == (100, 400, 2)
+    path = info["data_path"].format(episode_chunk=0, episode_index=1)
+    rows = parquet.read_table(tmp_path / "set" / path).to_pydict()
+    assert sorted(rows) == sorted(info["features"]) and rows["index"] == list(range(200, 400))
+    state, names = np.array(rows["observation.state"]), info["features"]["observation.state"]["names"]
+    assert np.allclose(state[:, names.index("angle_rad.joint_5")], record.angle_rad[:, 4], atol=1e-6)
+    assert rows["timestamp"][1] == pytest.approx(0.01)
 
 
 @pytest.mark.parametrize("command", ["info", "report"])

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import random
 import resource
 import signal
 import subprocess
@@ -21,6 +22,7 @@ from snakesim_hal.wire.messages import Clock, Done, Intent
 from snakesim_operator.recording import tap as tap_module
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.recording.recording import Recording
+from snakesim_operator.recording.recover import recover
 from snakesim_operator.recording.tap import Tap
 
 PERIOD_NS = 10_000_000
@@ -78,6 +80,7 @@ KILLED = """
 import os, sys, time
 from pathlib import Path
 from snakesim_operator.recording.recording import Recording
+from snakesim_operator.recording.recover import recover
 from tests.unit.operator.recording.test_recording import clock
 recording = Recording(Path(sys.argv[1]))
 for tick in range(10**9):
@@ -146,6 +149,24 @@ def test_what_is_no_recording_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.mcap").write_text("nothing of the kind")
     with pytest.raises(ConfigError, match=r"a\.mcap is not a recording"):
         list(RecordingReader(tmp_path / "a.mcap").messages())
+
+
+def test_damage_anywhere_ends_the_reading_and_nothing_else(tmp_path: Path) -> None:
+    recording, chance = Recording(tmp_path / "a.mcap"), random.Random(1)
+    for tick in range(300):
+        recording.take(clock(tick))
+        if tick % 50 == 0:
+            recording.flush()
+    recording.close({"dropped": {}})
+    whole = (tmp_path / "a.mcap").read_bytes()
+    for _ in range(100):
+        spoilt = bytearray(whole)
+        for _ in range(chance.choice([1, 3, 20])):
+            spoilt[chance.randrange(len(spoilt))] = chance.randrange(256)
+        (tmp_path / "spoilt.mcap").write_bytes(spoilt)
+        with contextlib.suppress(ConfigError):
+            assert len(list(RecordingReader(tmp_path / "spoilt.mcap").messages())) <= 300
+            recover(tmp_path / "spoilt.mcap", tmp_path / "whole.mcap")
 
 
 def test_a_flood_is_bounded_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:

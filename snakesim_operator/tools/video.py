@@ -1,0 +1,127 @@
+"""`snakesim video`: a film of a recorded run, as MP4 or GIF, rendered by MuJoCo without a screen."""
+
+import contextlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.plugins import FILMS, find_plugin
+from snakesim_hal.terminal import Say, say
+from snakesim_operator.results.record import RunRecord
+
+Floats = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+Write = Callable[[Picture], None]
+
+NEEDS = "a film needs imageio-ffmpeg and Pillow; install them with: pip install 'snakesim[video]'"
+FOLLOW_S = 0.8  # how slowly the view follows the snake
+M_PER_N, LEAST_N = 0.008, 0.3
+WORLD_LIMIT_S = 0.3  # older contacts are not drawn
+COLOURS = 48  # of a GIF
+TOLD_SHARE = 0.25
+
+
+class Film(Protocol):
+    """What a plugin in the group `snakesim.films` makes."""
+
+    def picture(
+        self, position_w: Floats, wxyz: Floats, angles_rad: Floats, look_at_w: Floats, arrows_w: list[Floats]
+    ) -> Picture:
+        """The snake at a pose, (height, width, 3)."""
+        ...
+
+    def close(self) -> None:
+        """Free the renderer."""
+        ...
+
+
+Span = tuple[float, float]  # from and to in seconds, since the first tick
+
+
+def video(
+    run: Path, out: Path, *, size: tuple[int, int], fps: float, speed: float, span_s: Span, say: Say = say
+) -> int:
+    """Film a run. Raises ConfigError for one without poses, and when something that it needs is not installed."""
+    if out.suffix not in (".mp4", ".gif"):
+        raise ConfigError(f"--out {out}: give a file that ends in .mp4 or .gif")
+    record = RunRecord.load(run)
+    times = _times(record, fps, speed, span_s)
+    film: Film = find_plugin(FILMS, "mujoco")(record.config, *size)
+    with contextlib.closing(film), _written(out, size, fps) as write:
+        middle = _centre(record, record.row_at(times[0]))
+        for i, time_s in enumerate(times):
+            row = record.row_at(time_s)
+            pose = record.position_w[row], record.orientation_wxyz[row], record.angle_rad[row]
+            middle = middle + (_centre(record, row) - middle) * min(speed / fps / FOLLOW_S, 1.0)
+            write(film.picture(*pose, middle, _forces(record, time_s)))
+            if (i + 1) % max(round(TOLD_SHARE * len(times)), 1) == 0:
+                say(f"{100 * (i + 1) // len(times)} %: {i + 1} of {len(times)} pictures")
+    say(f"{out}: {len(times) / fps:.1f} s, {out.stat().st_size / 1e6:.2f} MB")
+    return 0
+
+
+def _centre(record: RunRecord, row: int) -> Floats:
+    nodes = record.nodes_w(row)
+    assert nodes is not None
+    return nodes.mean(axis=0)
+
+
+def _times(record: RunRecord, fps: float, speed: float, span_s: Span) -> Floats:
+    """Robot time of each picture: where the pose is known."""
+    known = record.time_s[record.posed]
+    if not len(known):
+        raise ConfigError(f"{record.folder}: the pose of the robot is not in this record, so there is nothing to film")
+    first = max(float(known[0]), float(record.time_s[0]) + span_s[0])
+    last = min(float(known[-1]), float(record.time_s[0]) + span_s[1])
+    if last <= first:
+        lasts_s = known[-1] - known[0]
+        raise ConfigError(f"--from {span_s[0]:g} --to {span_s[1]:g}: the run has poses for {lasts_s:.2f} s")
+    times = np.arange(first, last, speed / fps)
+    return known[np.clip(np.searchsorted(known, times), 0, len(known) - 1)]
+
+
+def _forces(record: RunRecord, time_s: float) -> list[Floats]:
+    """Arrows of the contact forces then."""
+    recent = [world for world in record.worlds if 0 <= time_s - world.stamp_ns * 1e-9 < WORLD_LIMIT_S]
+    if not recent:
+        return []
+    found: list[Floats] = []
+    for contact in recent[-1].contacts:
+        at, force = np.array(contact.position_w), np.array(contact.force_w)
+        if np.linalg.norm(force) > LEAST_N:
+            found.append(np.stack([at, at + M_PER_N * force]))
+    return found
+
+
+@contextlib.contextmanager
+def _written(out: Path, size: tuple[int, int], fps: float) -> Iterator[Write]:
+    try:
+        import imageio_ffmpeg
+        from PIL import Image
+    except ModuleNotFoundError as error:
+        raise ConfigError(f"{NEEDS} ({error})") from error
+    out.parent.mkdir(parents=True, exist_ok=True)
+    if out.suffix == ".mp4":
+        rate: Any = fps  # annotated as int, but any number will do
+        writer: Any = imageio_ffmpeg.write_frames(str(out), size, fps=rate, macro_block_size=2, quality=7)
+        writer.send(None)
+        try:
+            yield lambda picture: writer.send(np.ascontiguousarray(picture))
+        finally:
+            writer.close()
+        return
+    pictures: list[Image.Image] = []
+    palette: list[Image.Image] = []  # of the first picture, for all: less to store, and no flicker
+
+    def keep(picture: Picture) -> None:
+        image = Image.fromarray(picture)
+        if not palette:
+            palette.append(image.quantize(COLOURS, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE))
+        pictures.append(image.quantize(palette=palette[0], dither=Image.Dither.NONE))
+
+    yield keep
+    pictures[0].save(out, save_all=True, append_images=pictures[1:], duration=1000 / fps, loop=0, optimize=True)

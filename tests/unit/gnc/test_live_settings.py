@@ -1,0 +1,75 @@
+"""Settings of a controller that runs: taken when they are valid, otherwise nothing changes."""
+
+import msgspec
+import pytest
+
+from snakesim_gnc.control.live_settings import LiveSettings
+from snakesim_hal.model.scenario import load
+from snakesim_hal.network.client import Client
+from snakesim_hal.network.local_network import LocalNetwork, LocalSession
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Answer, Clock, ControlSettings, SettingsRequest
+from tests.unit.hal.rig import description
+
+CLOCK = Clock(tick=7, stamp_ns=70, period_ns=10, pace="lockstep", lifecycle="armed", arming=1, lease_epoch=1, newest={})
+
+
+class Bench:
+    """Control's settings, and an operator."""
+
+    def __init__(self) -> None:
+        network = LocalNetwork()
+        config = load("triplet", []).config
+        self.settings = LiveSettings(Client(network.session(), "control"), config)
+        self.settings.meet(description())
+        self.anew: list[bool] = []
+        network.answer = lambda: self.anew.append(self.settings.turn(CLOCK))
+        self.operator: LocalSession = network.session()
+        self.settings.turn(CLOCK)
+
+    def ask(self, settings: str, controller: str = "obstacle_triplet") -> Answer:
+        return self.operator.ask(keys.SETTINGS, SettingsRequest(who="ada", controller=controller, settings=settings))
+
+    def in_force(self) -> ControlSettings:
+        found = self.operator.latest(keys.SETTINGS_IN_FORCE, ControlSettings, 1.0)
+        assert found is not None
+        return found
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()
+
+
+def test_the_configuration_is_in_force_first_with_its_schema(bench: Bench):
+    told = bench.in_force()
+    assert msgspec.json.decode(told.settings)["propulsion_n"] == 35.0
+    assert '"propulsion_n":{"unit":"N"' in told.schema and told.who is None and told.changes == 0
+
+
+def test_valid_settings_make_the_controller_anew(bench: Bench):
+    assert bench.ask('{"propulsion_n": 20}').ok and bench.anew == [True]
+    told = bench.in_force()
+    assert msgspec.json.decode(told.settings)["propulsion_n"] == 20.0
+    assert (told.who, told.changes, told.tick) == ("ada", 1, 7)
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ('{"propulsion_n": -1}', "`controllers.obstacle_triplet.propulsion_n` = -1 N is not allowed"),
+        ('{"propulsion": 1}', "did you mean `propulsion_n`?"),
+        ('{"propulsion_n": NaN}', "malformed"),
+        ("[]", "object"),
+    ],
+)
+def test_others_are_refused_and_nothing_changes(bench: Bench, settings: str, said: str):
+    before = bench.in_force()
+    answer = bench.ask(settings)
+    assert not answer.ok and answer.refusal == "bad_settings" and said in answer.reason
+    assert bench.anew == [False] and bench.in_force() == before
+
+
+def test_settings_for_another_controller_are_refused(bench: Bench):
+    answer = bench.ask("{}", controller="hold")
+    assert answer.refusal == "wrong_controller" and "obstacle_triplet" in answer.reason

@@ -1,0 +1,32 @@
+"""The form of a controller's settings, from the schema that control publishes."""
+
+import pytest
+
+from snakesim_hal.wire.messages import ControlSettings
+from snakesim_operator.console.settings_form import Field, fields_of
+
+SCHEMA = """{"$ref": "#/$defs/S", "$defs": {"S": {"properties": {
+    "push_n": {"type": "number", "unit": "N", "exclusiveMinimum": 0, "maximum": 10000},
+    "share": {"type": "number", "minimum": 0, "maximum": 1},
+    "bend_rad": {"type": "number"},
+    "mode": {"enum": ["a", "b"]},
+    "on": {"type": "boolean"},
+    "names": {"type": "array"}}}}}"""
+VALUES = '{"push_n": 10.0, "share": 0.5, "bend_rad": -0.2, "mode": "b", "on": true, "names": ["x"]}'
+
+
+def settings(values: str, schema: str) -> ControlSettings:
+    return ControlSettings(tick=0, stamp_ns=0, controller="any", settings=values, schema=schema)
+
+
+def test_each_setting_has_an_input_within_its_bounds():
+    push, share, bend, mode, on = fields_of(settings(VALUES, SCHEMA))
+    assert push == Field("push_n", 10.0, "N", low=0.1, high=40.0, step=0.1)
+    assert (share.low, share.high) == (0.0, 1.0)
+    assert (bend.low, bend.high) == (-0.8, 0.8)
+    assert mode.choices == ("a", "b") and on.value is True
+
+
+@pytest.mark.parametrize("schema", ["", "[]", "{}", "null", '{"properties": 1}', '{"$ref": "#/$defs/x"}', "{" * 9000])
+def test_a_schema_that_cannot_be_read_gives_no_form(schema: str):
+    assert fields_of(settings(VALUES, schema)) == []
