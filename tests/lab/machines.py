@@ -1,4 +1,4 @@
-"""Four machines of a lab as network namespaces, with veth pairs to a switch of their own. Needs root.
+"""Machines of a lab as network namespaces, with cables (veth) to the one in the middle. Needs root.
 
 A namespace has no name: it lives as long as a process in it, and that one ends with this process. Nothing outside is
 touched, and nothing is left.
@@ -25,7 +25,7 @@ class Machine:
 
     def inside(self) -> list[str]:
         """What runs a command in it."""
-        return ["nsenter", "--target", str(self._holder.pid), "--net"]
+        return ["nsenter", "--target", self.pid, "--net"]
 
     def run(self, *command: str, check: bool = True, cwd: Path | None = None, env: dict[str, str] | None = None) -> str:
         """Run a command in it to its end; what it says."""
@@ -72,17 +72,16 @@ class Machine:
 
 
 def connected(names: list[str], stack: ExitStack) -> dict[str, Machine]:
-    """Machines on one switch, which is a bridge in the first one's namespace; addresses 10.78.0.1, .2, ..."""
+    """Machines with a cable each to the first one; addresses 10.78.0.1, .2, ... They reach that one alone."""
     machines = {name: Machine(name, stack) for name in names}
-    switch = machines[names[0]]
-    switch.run("ip", "link", "add", "switch", "type", "bridge")
-    switch.run("ip", "address", "add", f"{NET}.1/24", "dev", "switch")
-    switch.run("ip", "link", "set", "switch", "up")
+    middle = machines[names[0]]
+    middle.run("ip", "address", "add", f"{NET}.1/32", "dev", "lo")
     for number, name in enumerate(names[1:], 2):
-        machine = machines[name]
-        port = f"port{number}"
-        switch.run("ip", "link", "add", port, "type", "veth", "peer", "name", "lab0", "netns", machine.pid)
-        switch.run("ip", "link", "set", port, "master", "switch", "up")
-        machine.run("ip", "address", "add", f"{NET}.{number}/24", "dev", "lab0")
+        machine, port, own = machines[name], f"port{number}", f"{NET}.{number}"
+        middle.run("ip", "link", "add", port, "type", "veth", "peer", "name", "lab0", "netns", machine.pid)
+        middle.run("ip", "link", "set", port, "up")
+        middle.run("ip", "route", "add", own, "dev", port, "src", f"{NET}.1")
+        machine.run("ip", "address", "add", f"{own}/32", "dev", "lab0")
         machine.run("ip", "link", "set", "lab0", "up")
+        machine.run("ip", "route", "add", f"{NET}.1", "dev", "lab0", "src", own)
     return machines
