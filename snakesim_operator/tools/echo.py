@@ -47,14 +47,17 @@ def echo(request: EchoRequest, where: Where, say: Say = say) -> int:
         raise ConfigError(f"there is no key {request.key!r}; available keys:", *_key_lines())
     latched = tuple(row.key for row in rows if row.kind == "latched")
     within = "" if where.namespace is not None else "**/"
+    pattern, latched_keys = key_expression(f"{within}{relative}"), tuple(f"{within}{key}" for key in latched)
     waiting = Waiting()
     with contextlib.ExitStack() as stack:
         for session in _sessions(where, stack):
             # A latched value is older than the streams: a subscriber to both would drop it as too old.
-            for key in latched:
-                session.on_latched_arrival(f"{within}{key}", waiting.put)
+            for key in latched_keys:
+                session.on_latched_arrival(key, waiting.only(lambda found: intersects(pattern, found)))
             if len(latched) < len(rows):
-                session.on_arrival(key_expression(f"{within}{relative}"), waiting.unless_at(latched))
+                session.on_arrival(
+                    pattern, waiting.only(lambda found: not any(intersects(key, found) for key in latched_keys))
+                )
         if request.rate_only:
             _print_rates(waiting, request.count, say)
         else:
@@ -80,7 +83,8 @@ def _echoed() -> list[keys.Row]:
 
 
 def _key_lines() -> list[str]:
-    return [f"  {row.key:<24}{row.about}" for row in _echoed()]
+    width = max(len(row.key) for row in _echoed())
+    return [f"  {row.key:<{width}}  {row.about}" for row in _echoed()]
 
 
 class Waiting:
@@ -101,14 +105,13 @@ class Waiting:
             self._bytes += len(arrival.payload)
         self._arrivals.put(arrival)
 
-    def unless_at(self, keys: tuple[str, ...]) -> Callable[[Arrival], None]:
-        """Adds samples that are not at one of these keys of a robot."""
+    def only(self, wanted: Callable[[str], bool]) -> Callable[[Arrival], None]:
+        """Adds samples at keys for which `wanted` is true."""
 
         def put(arrival: Arrival) -> None:
-            if not f"/{arrival.key}".endswith(suffixes):
+            if wanted(arrival.key):
                 self.put(arrival)
 
-        suffixes = tuple(f"/{key}" for key in keys)
         return put
 
     def get(self, timeout: float | None = None) -> Arrival:

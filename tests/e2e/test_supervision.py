@@ -208,7 +208,7 @@ def test_a_killed_supervisor_leaves_no_frozen_child(tmp_path: Path) -> None:
         run.wait_for("injected fault: freeze:host")
         frozen = [Path(f"/proc/{run.part(name)}/stat").read_text() for name in ("control", "host")]
         assert [re.sub(r".*\) ", "", line)[0] for line in frozen] == ["T", "T"]
-        assert len(processes_of(tmp_path / "run")) == 5
+        assert len(processes_of(tmp_path / "run")) == 6  # router, host, three services, recorder
         os.kill(run.process.pid, signal.SIGKILL)
         run.end()
         nothing_left(tmp_path / "run")
