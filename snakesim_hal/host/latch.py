@@ -89,8 +89,9 @@ class EstopLatch:
             then(None)
             return
         try:
-            self._path.unlink(missing_ok=True)
-            sync_folder(self._path.parent)
+            if self._path.parent.exists():  # else no stop was ever latched for this robot
+                self._path.unlink(missing_ok=True)
+                sync_folder(self._path.parent)
             self._kept = False
             then(None)
         except OSError as error:

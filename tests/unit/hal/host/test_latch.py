@@ -27,6 +27,7 @@ def asked(latch: EstopLatch, what: str) -> str | None:
 
 
 def test_kept_found_and_released(tmp_path: Path) -> None:
+    assert asked(EstopLatch(tmp_path / "no stop yet"), "release") is None
     first = EstopLatch(tmp_path)
     assert first.found is None and asked(first, "engage") is None
     assert (tmp_path / ESTOP).is_file() and [path.name for path in tmp_path.iterdir()] == [ESTOP]
