@@ -86,7 +86,7 @@ def test_the_readme_as_printed(section: Section, tmp_path: Path) -> None:
     shutil.copytree(REPOSITORY, tmp_path / "origin", ignore=documents.LEFT_OUT, symlinks=True)
     for arguments in (["init", "-q"], ["add", "-A"], ["commit", "-qm", "As it is"]):
         subprocess.run([*git, *arguments], check=True)
-    script = documents.script(section).replace("<this repository>", str(tmp_path / "origin"))
+    script = documents.script(section).replace(" URL ", f" {tmp_path / 'origin'} ")
     said = typed(script, tmp_path, [])
     assert "report:" in said and (tmp_path / "snakesim" / "runs" / "demo" / "report.html").is_file()
 
