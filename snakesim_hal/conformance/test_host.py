@@ -15,7 +15,7 @@ from snakesim_hal.wire.messages import Fault, JointState, Mode
 
 
 def undisturbed(hosted: Hosted, act: Callable[[], None]) -> None:
-    """Do it, and again if a lease ran out meanwhile: then this machine was too slow, not the backend."""
+    """Do it, and again if a lease ran out meanwhile: then this machine may have been too slow, not the backend."""
     for left in reversed(range(t.ATTEMPTS)):
         try:
             act()
@@ -115,13 +115,18 @@ def stops_at_a_fault(hosted: Hosted) -> None:
 def test_a_controller_that_falls_silent_stops_the_joints_within_the_lease(bench: Bench, hosted: Hosted) -> None:
     """The lease is the dead-man switch: it runs out, that is a fault, and the joints come to rest."""
     try:
-        moves_then(silent=True, hosted=hosted)
-        hosted.reaches("fault")
-        must_have_moved(hosted)
-        expired = next(fault for fault in hosted.host.authority.faults if fault.what == "lease_expired")
-        lease = math.ceil(hosted.robot.lease_ns / hosted.robot.period_ns)
-        late = expired.tick - hosted.controller.last_sent_tick - lease
-        assert late <= t.TRANSPORT_PERIODS, f"{late} periods after the end of the lease"
-        must_come_to_rest(hosted)
+        undisturbed(hosted, lambda: stops_with_the_lease(hosted))
     finally:
         bench.spoil()  # a lockstep host does not wait again for a service that has stalled
+
+
+def stops_with_the_lease(hosted: Hosted) -> None:
+    """One attempt."""
+    moves_then(silent=True, hosted=hosted)
+    hosted.reaches("fault")
+    must_have_moved(hosted)
+    expired = next(fault for fault in hosted.host.authority.faults if fault.what == "lease_expired")
+    lease = math.ceil(hosted.robot.lease_ns / hosted.robot.period_ns)
+    late = expired.tick - hosted.controller.last_sent_tick - lease
+    assert late <= t.TRANSPORT_PERIODS, f"{late} periods after the end of the lease"
+    must_come_to_rest(hosted)

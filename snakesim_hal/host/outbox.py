@@ -80,15 +80,12 @@ class Outbox:
 
     def put(self, key: str, message: Message) -> None:
         """Publish it."""
-        if self._lockstep:
-            self._publisher(key, type(message)).put(message)
-        else:
-            sender = self._images if isinstance(message, IMAGES) else self._streams
-            sender.do(lambda: self._publisher(key, type(message)).put(message))
+        sender = self._images if isinstance(message, IMAGES) else self._streams
+        self._send(sender, lambda: self._publisher(key, type(message)).put(message))
 
     def put_status(self, status: Status) -> None:
         """Publish the status."""
-        self._streams.do(lambda: self._publishers[keys.STATUS].put(status))
+        self._send(self._streams, lambda: self._publishers[keys.STATUS].put(status))
 
     def answer(self, question: Question, answer: Answer) -> None:
         """Answer a query. The requester may be slow."""
@@ -106,6 +103,12 @@ class Outbox:
         """Send queued messages for at most FLUSH_S."""
         for sender in dict.fromkeys((self._answers, self._images, self._streams)):
             sender.close()
+
+    def _send(self, sender: Sender, put: Callable[[], None]) -> None:
+        if self._lockstep:
+            put()
+        else:
+            sender.do(put)
 
     def _publisher(self, key: str, message: type[Message]) -> Publisher[Any]:
         publisher = self._publishers.get(key)
