@@ -63,7 +63,7 @@ class Lab:
 def example(folder: Path, backend: str) -> str:
     """The example with its folders here, without the recorder."""
     text = re.sub(r"^\[machines\.(\w+)\]$", rf'\g<0>\nfolder = "{folder}/\1"', EXAMPLE.read_text(), flags=re.M)
-    text = text.replace("10.0.0.1", f"{NET}.1").replace('backend = "can" ', f'backend = "{backend}" ')
+    text = text.replace("10.0.0.1", f"{NET}.1").replace('backend = "sim"', f'backend = "{backend}"')
     return re.sub(r'\[\[roles\]\]\nmachine = "ws1"\nrole = "recorder"\nrobot = "planar13"\n', "", text)
 
 

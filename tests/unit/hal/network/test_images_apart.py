@@ -21,7 +21,7 @@ def test_little_of_it_is_under_way_and_it_is_marked_as_what_may_wait() -> None:
     assert int(config.get_json(SNDBUF)) < 4096
     assert json.loads(config.get_json("connect/endpoints")) == [
         "tcp/robot-lab:7447#dscp=0x28",
-        "tls/[::1]:7447#iface=wlan0;dscp=0x28",
+        "tls/[::1]:7447#dscp=0x28;iface=wlan0",
         "tcp/far:7447#dscp=0x10",
         "unixsock-stream/x",
     ]
