@@ -84,10 +84,10 @@ def look_into(path: Path) -> RecordingInfo:
 def _told(path: Path, reader: RecordingReader, found: dict[str, KeyInfo], contents: Contents) -> RecordingInfo:
     robot, status = contents.description, contents.status
     config: dict[str, Any] = json.loads(contents.config.content) if contents.config is not None else {}
-    # Latched values, such as the description, are older than a recording that began later.
-    clocks = [found[keys.CLOCK]] if keys.CLOCK in found else found.values()
-    times = [t for one in clocks for t in (min(one.time_ns), max(one.time_ns))]
-    duration_s = (max(times) - min(times)) * 1e-9 if times else 0.0
+    # Not since the oldest message: latched values, such as the description, are older than a recording that began late.
+    dated = [found[keys.CLOCK]] if keys.CLOCK in found else found.values()
+    began_ns = min((min(one.time_ns) for one in dated), default=0)
+    duration_s = (max((max(one.time_ns) for one in found.values()), default=began_ns) - began_ns) * 1e-9
     host = contents.host(contents.columns(robot)) if robot is not None and status is not None else None
     return RecordingInfo(
         file=str(path),

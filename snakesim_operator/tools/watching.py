@@ -31,6 +31,14 @@ def add_commands(commands: Any) -> None:
     record = commands.add_parser("record", help="record everything that a robot publishes into an MCAP file")
     record.add_argument("--out", type=Path, metavar="FILE.mcap", help="the file (default: NAMESPACE-TIME.mcap)")
     record.add_argument("--duration", type=float, metavar="S", help="end after this time by the wall clock")
+    record.add_argument(
+        "--foxglove",
+        type=int,
+        nargs="?",
+        const=8765,
+        metavar="PORT",
+        help="serve Foxglove live as well, at ws://127.0.0.1:PORT (8765)",
+    )
     add_network(record)
     record.set_defaults(act=_record)
 
@@ -64,7 +72,7 @@ def _echo(arguments: argparse.Namespace) -> int:
 def _record(arguments: argparse.Namespace) -> int:
     from snakesim_operator.tools.record import record_robot
 
-    return record_robot(where_of(arguments), arguments.out, arguments.duration)
+    return record_robot(where_of(arguments), arguments.out, arguments.duration, arguments.foxglove)
 
 
 def _preview(arguments: argparse.Namespace) -> int:
