@@ -81,7 +81,10 @@ def _ask(session: Session, request: LifecycleRequest, done: str, link: Link, say
     doubt, shown = judge(answers, statuses)
     name = link.namespace
     if not answers:
-        raise NotConnectedError(f"{name}: NO ANSWER on {link.endpoint}; if the robot moves, `snakesim estop`")
+        raise NotConnectedError(
+            f"{name}: NO ANSWER on {link.endpoint}: its host hangs, or your role may not {request.action}; if the "
+            "robot moves, `snakesim estop`"
+        )
     if doubt is not None:
         now = "unknown" if shown is None else f"{shown.lifecycle} - {shown.why}"
         raise RefusedError(f"{name}: NOT CONFIRMED that it is {done}: {doubt}. Its status: {now}")
