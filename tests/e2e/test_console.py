@@ -50,7 +50,9 @@ def test_a_page_shows_the_snake_as_it_moves_and_its_escape_key_stops_it(tmp_path
 @pytest.mark.slow
 def test_one_viewer_has_control_and_anybody_stops_it(tmp_path: Path) -> None:
     with chromium() as browser, running(tmp_path / "run", *RUN) as run:
-        first, second = browser.open(address_of(run), *SMALL), browser.open(address_of(run), *SMALL)
+        first = browser.open(address_of(run), *SMALL)
+        first.wait_for("Take control")
+        second = browser.open(address_of(run), *SMALL)  # after the first, whose number is thus 1
         for tab in (first, second):
             tab.wait_for("armed by snakesim run")
             tab.wait_for("Take control")
