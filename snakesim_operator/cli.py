@@ -28,6 +28,7 @@ from snakesim_operator.lab.command import add_commands as add_lab_commands
 from snakesim_operator.playback.command import add_commands as add_playback_commands
 from snakesim_operator.robots.arguments import add_commands as add_robot_commands
 from snakesim_operator.ros2.command import add_command as add_ros2
+from snakesim_operator.tools.simulator_order import add_command as add_sim
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
 
@@ -219,6 +220,10 @@ def parser() -> argparse.ArgumentParser:
         told.set_defaults(act=act)
     add_network(arm)
     arm.set_defaults(act=_arm)
+
+    sim = add_sim(commands)
+    add_network(sim)
+    sim.set_defaults(act=_sim)
 
     fault = commands.add_parser(
         "fault",
@@ -438,6 +443,13 @@ def _estop(arguments: argparse.Namespace) -> int:
     from snakesim_operator.tools.stop import estop
 
     return estop(_where(arguments))
+
+
+def _sim(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.simulator import simulator
+    from snakesim_operator.tools.simulator_order import order_of
+
+    return simulator(order_of(arguments), _where(arguments))
 
 
 def _fault(arguments: argparse.Namespace) -> int:

@@ -31,7 +31,9 @@ def test_it_shows_the_run_and_anybody_stops_it_but_one_viewer_has_control(tmp_pa
     arguments = ["triplet", "--controller", "lateral_undulation", "--duration", "600", "--stay", "--console"]
     with running(tmp_path / "run", *arguments) as run, chromium() as browser:
         address = address_of(run)
-        first, second = browser.open(address, *SMALL), browser.open(address, *SMALL)
+        first = browser.open(address, *SMALL)
+        first.wait_for("Take control")
+        second = browser.open(address, *SMALL)  # after the first, whose number is thus 1
         for tab in (first, second):
             tab.wait_for("SIMULATOR")
             tab.wait_for("Take control")
@@ -41,7 +43,11 @@ def test_it_shows_the_run_and_anybody_stops_it_but_one_viewer_has_control(tmp_pa
         second.click("Take control")  # greyed out
         first.wait_for("Release control")
         assert "Release control" not in second.text()
+        first.click("Pause")
+        second.wait_for("PAUSED")
         change_settings(run)
+        first.click("Resume")
+        wait_until(lambda: "PAUSED" not in second.text(), "the end of the pause")
         stopped_after_s = stop_in(second, run)
         assert stopped_after_s < STOP_LIMIT_S, f"{stopped_after_s:.2f} s"
         first.wait_for("ESTOP")
