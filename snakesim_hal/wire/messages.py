@@ -420,9 +420,9 @@ class Status(Message, frozen=True, kw_only=True):
     host: Annotated[q.Name | None, HOST] = None
     faults_left_out: Annotated[q.Count, about("of `faults`, between the first and the newest")] = 0
     paused_by: Annotated[q.Name | None, about("who paused the simulator; null: it is not paused")] = None
-    speed: Annotated[float, Meta(gt=0, le=100), about("wanted in real time: robot time per wall time")] = 1.0
+    speed: Annotated[q.Speed, about("wanted in real time: robot time per wall time")] = 1.0
     real_time_factor: Annotated[
-        Annotated[float, Meta(ge=0, le=1e6)] | None,
+        Annotated[float, q.from_zero(1e6, "1")] | None,
         about("robot time per wall time over the last second; null: not measured, such as in a pause"),
     ] = None
 
@@ -475,7 +475,7 @@ class SimulatorRequest(Message, frozen=True, kw_only=True):
     who: Annotated[q.Name, about("name of the requester, for status, log and summary")] = "an unnamed client"
     host: Annotated[q.Name | None, about("id of the addressed host process; null: any")] = None
     ticks: Annotated[int, Meta(ge=1, le=1_000_000), about("of a step")] = 1
-    speed: Annotated[float, Meta(ge=0.1, le=10), about("robot time per wall time, in real time; 1: as the wall")] = 1.0
+    speed: Annotated[q.Speed, about("robot time per wall time, in real time; 1: as the wall")] = 1.0
 
 
 class FaultRequest(Message, frozen=True, kw_only=True):
