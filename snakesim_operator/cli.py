@@ -137,6 +137,14 @@ def parser() -> argparse.ArgumentParser:
     record = commands.add_parser("record", help="record everything that a robot publishes into an MCAP file")
     record.add_argument("--out", type=Path, metavar="FILE.mcap", help="the file (default: NAMESPACE-TIME.mcap)")
     record.add_argument("--duration", type=float, metavar="S", help="end after this time by the wall clock")
+    record.add_argument(
+        "--foxglove",
+        type=int,
+        nargs="?",
+        const=8765,
+        metavar="PORT",
+        help="serve Foxglove live as well, at ws://127.0.0.1:PORT (8765)",
+    )
     add_network(record)
     record.set_defaults(act=_record)
     add_playback_commands(commands)
@@ -368,7 +376,7 @@ def _echo(arguments: argparse.Namespace) -> int:
 def _record(arguments: argparse.Namespace) -> int:
     from snakesim_operator.tools.record import record_robot
 
-    return record_robot(_where(arguments), arguments.out, arguments.duration)
+    return record_robot(_where(arguments), arguments.out, arguments.duration, arguments.foxglove)
 
 
 def _status(arguments: argparse.Namespace) -> int:

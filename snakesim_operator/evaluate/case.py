@@ -1,9 +1,12 @@
 """One case: a configuration to run, and the numbers that come of it. Runs in a worker process."""
 
+import ctypes
 import hashlib
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import msgspec
@@ -15,6 +18,7 @@ from snakesim_operator.run.in_process import simulate
 
 Number = bool | int | float | str | None
 OF_THE_CLOCK = {"wall_s", "real_time_factor", "overruns", "answered_fraction"}  # differ from run to run
+GAVE_UP = "gave_up"  # the number that says that a run was ended because it was stuck
 _turn = threading.Lock()  # a run takes what is printed: one at a time in a process
 
 
@@ -28,6 +32,8 @@ class Case:
     controller: str
     field: int
     config: bytes  # the whole configuration as JSON
+    give_up_s: float  # robot time without an advance after which a run is ended
+    limit_s: float  # wall time after which it is stopped, whatever it does
     value: float | None = None  # of the setting, where that is one number
 
     @property
@@ -43,6 +49,10 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     error: str | None = None  # why there was no run
 
 
+class TookTooLongError(BaseException):
+    """Raised in a run whose wall time is over. No `Exception`: a controller's guard must not catch it."""
+
+
 @cache
 def code_digest() -> str:
     """Names the code that is installed here: results of other code are not mixed with these."""
@@ -52,12 +62,12 @@ def code_digest() -> str:
     return digest.hexdigest()[:16]
 
 
-def case_id(config: RunConfig) -> str:
+def case_id(config: RunConfig, give_up_s: float) -> str:
     """Equal for equal configurations and equal code."""
-    return f"{config_hash(config)}-{code_digest()}"
+    return f"{config_hash(config)}-{code_digest()}-{give_up_s:g}"
 
 
-def run_case(config: bytes, code: str) -> Outcome:
+def run_case(config: bytes, code: str, give_up_s: float, limit_s: float) -> Outcome:
     """Run it, and return the numbers. Anything but a SnakesimError is raised: a fault of this worker, perhaps."""
     if code != code_digest():
         return Outcome(error="the worker has another version of SnakeSIM; install the same, and go on with --resume")
@@ -65,9 +75,27 @@ def run_case(config: bytes, code: str) -> Outcome:
         try:
             asked = msgspec.json.decode(config, type=RunConfig)
             check(asked)
-            return Outcome(numbers=plain_numbers(simulate(asked, until_goal=True).summary))
+            with _stopped_after(limit_s):
+                result = simulate(asked, until_goal=True, give_up_s=give_up_s)
+            return Outcome(numbers={**plain_numbers(result.summary), GAVE_UP: result.gave_up})
+        except TookTooLongError:
+            return Outcome(error=f"stopped after {limit_s:g} s of wall time; the suite's `limit_s` allows no more")
         except SnakesimError as error:
             return Outcome(error=str(error))
+
+
+@contextmanager
+def _stopped_after(limit_s: float) -> Iterator[None]:
+    """Raise TookTooLongError in this thread, wherever its Python code is then: in a controller's endless loop, too."""
+    thread = ctypes.c_ulong(threading.get_ident())
+    raised = partial(ctypes.pythonapi.PyThreadState_SetAsyncExc, thread, ctypes.py_object(TookTooLongError))
+    timer = threading.Timer(limit_s, raised)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def plain_numbers(summary: RunSummary) -> dict[str, Number]:

@@ -71,7 +71,10 @@ def size(client: Client) -> int:
 def solve(client: Client, cases: Sequence[Case]) -> Iterator[tuple[Case, Outcome]]:
     """Run all cases; each with its outcome as it is done, in any order. No two may have one id."""
     submitted = {
-        client.submit(run_case, case.config, code_digest(), key=case.id, retries=RETRIES): case for case in cases
+        client.submit(
+            run_case, case.config, code_digest(), case.give_up_s, case.limit_s, key=case.id, retries=RETRIES
+        ): case
+        for case in cases
     }
     for future in as_completed(submitted, loop=client.loop):
         yield submitted[future], _outcome(future)

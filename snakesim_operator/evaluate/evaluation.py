@@ -67,7 +67,8 @@ def _run_one(request: Request, only: str) -> int:
     """One case again, in this process, with the whole folder of a run. Exit code: of `snakesim run`."""
     case = choose(request.suite, request.source, only)
     say(f"{case.setting}, {case.controller}, field {case.field}")
-    return run_in_process(msgspec.json.decode(case.config, type=RunConfig), request.out, until_goal=True)
+    config = msgspec.json.decode(case.config, type=RunConfig)
+    return run_in_process(config, request.out, until_goal=True, give_up_s=case.give_up_s)
 
 
 def choose(suite: Suite, source: str, only: str) -> Case:

@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from snakesim_hal.errors import ConfigError
-from snakesim_operator.evaluate.case import OF_THE_CLOCK, Case, Number, Outcome
+from snakesim_operator.evaluate.case import GAVE_UP, OF_THE_CLOCK, Case, Number, Outcome
 from snakesim_operator.results.summary import RunSummary
 
 CASES, PARQUET, CSV = "cases.jsonl", "results.parquet", "results.csv"
@@ -106,4 +106,4 @@ def _columns() -> dict[str, Any]:
         plain = [one for one in either if one is not types.NoneType]
         if name not in OF_THE_CLOCK and len(plain) == 1 and plain[0] in ARROW:
             found.setdefault(name, ARROW[plain[0]])
-    return {**found, "error": ARROW[str]}
+    return {**found, GAVE_UP: ARROW[bool], "error": ARROW[str]}

@@ -3,6 +3,8 @@
     scenario = "field"                              # what all cases begin with
     fields = 20                                     # when --fields is not given
     controllers = ["obstacle_triplet"]              # when --controllers is not given
+    give_up_s = 12                                  # robot time without 3 cm of advance that ends a run
+    limit_s = 1800                                  # wall time of one run, after which it counts as an error
 
     [set]                                           # in every case; any value, as with --set
     duration_s = 45
@@ -53,6 +55,8 @@ class Suite(FileStruct, frozen=True, kw_only=True):
     scenario: Annotated[str, Meta(min_length=1)]
     fields: Count = 20
     controllers: list[str] = []
+    give_up_s: Annotated[float, Meta(gt=0, le=100_000, extra_json_schema={"unit": "s"})] = 12.0
+    limit_s: Annotated[float, Meta(gt=0, le=100_000, extra_json_schema={"unit": "s"})] = 1800.0
     set: dict[str, Any] = {}
     unset: list[str] = []
     vary: dict[str, list[Any] | str] = {}
@@ -114,8 +118,19 @@ def cases_of(suite: Suite, source: str, controllers: Sequence[str], fields: int,
                 config = _on_field(table, field)
                 if field == seed:
                     _check(config, table, f"{source}, row {number} ({setting.name}), field {field}")
-                whole = written(config)
-                found.append(Case(case_id(config), number, setting.name, config.commander, field, whole, setting.value))
+                found.append(
+                    Case(
+                        case_id(config, suite.give_up_s),
+                        number,
+                        setting.name,
+                        config.commander,
+                        field,
+                        written(config),
+                        suite.give_up_s,
+                        suite.limit_s,
+                        setting.value,
+                    )
+                )
     return found
 
 

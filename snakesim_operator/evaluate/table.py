@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from snakesim_operator.evaluate.case import Case, Outcome
+from snakesim_operator.evaluate.case import GAVE_UP, Case, Outcome
 from snakesim_operator.evaluate.store import Results
 
 Z95 = 1.959964
@@ -143,4 +143,5 @@ def _why(outcome: Outcome) -> str:
     of = f" of {goal:g} m" if isinstance(goal, float) else ""
     last = f"{told.get('last_state')}: {told.get('last_reason')}" if told.get("last_reason") else told.get("last_state")
     ended = "" if told.get("ended") == "complete" else f"; {told.get('ended')}"
+    ended += "; given up: no advance for too long" if told.get(GAVE_UP) else ""
     return f"{far}{of}; {last or 'controller said nothing'}{ended}"

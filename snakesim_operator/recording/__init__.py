@@ -3,5 +3,6 @@
 `recording`  writes one file         `tap`       takes what a robot publishes, bounded
 `process`    the recorder, beside a run or any robot           `reader`   reads a file, also of a killed recorder
 `foxglove`   channels that Foxglove and Rerun show             `shapes`   their messages, made of ours
-`robot_time` when a message was, in robot time                 `disk`     the file's bytes, cut back when a disk is full
+`live`       serves those channels to Foxglove as they come    `disk`     the file's bytes, cut back when a disk is full
+`robot_time` when a message was, in robot time
 """

@@ -29,7 +29,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import Description
 from snakesim_operator.recording.reader import RECORDING
-from snakesim_operator.recording.recording import Recording
+from snakesim_operator.recording.recording import Recording, Show
 from snakesim_operator.recording.tap import Tap
 
 RECORDER = "recorder"
@@ -42,10 +42,11 @@ FULL = 4  # exit code: the disk took no more
 class Recorder:
     """Writes what a tap takes; a file for each host that the robot has, one after the other."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, show: Show | None = None) -> None:
         """Raises OSError when the file cannot be made."""
         self.path = path
-        self.recording = Recording(path)
+        self._show = show
+        self.recording = Recording(path, show)
         self._latched: dict[str, Arrival] = {}
         self._host: str | None = None
         self._new_host = False
@@ -86,15 +87,15 @@ class Recorder:
         self._hosts += 1
         self.close({})
         self.path.rename(next(p for n in count(1) if not (p := self.path.with_stem(f"{self.path.stem}-{n}")).exists()))
-        self.recording = Recording(self.path)
+        self.recording = Recording(self.path, self._show)
         for arrival in (*self._latched.values(), clock):
             self.recording.take(arrival)
 
 
-def record(link: Link, path: Path, goes_on: Callable[[], bool]) -> Recorder:
+def record(link: Link, path: Path, goes_on: Callable[[], bool], show: Show | None = None) -> Recorder:
     """Record a robot for as long as `goes_on` says. Raises NotConnectedError, ConfigError for a file that exists."""
     try:
-        recorder = Recorder(path)
+        recorder = Recorder(path, show)
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}; choose another file") from error
     with open_session(link, connect_timeout_s=START_LIMIT_S) as session:

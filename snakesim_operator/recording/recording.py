@@ -8,6 +8,7 @@ counts the arrivals at a key. A chunk is written at least every FLUSH_S, so that
 import json
 import time
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
 from google.protobuf.message import Message as Protobuf
@@ -25,13 +26,16 @@ CHUNK_BYTES = 1024 * 1024
 ABOUT = "snakesim"  # the name of the metadata record
 PROFILE = "snakesim"
 
+Show = Callable[[str, Protobuf, int], None]  # topic, message, robot time in ns
+
 
 class Recording:
     """A file that is written. A disk that takes no more ends it, and nothing else."""
 
-    def __init__(self, path: Path) -> None:
-        """Raises OSError, FileExistsError when there is such a file."""
+    def __init__(self, path: Path, show: Show | None = None) -> None:
+        """show: gets what is made for Foxglove, too. Raises OSError, FileExistsError when there is such a file."""
         self.path = path
+        self._show = show
         self.trouble = ""  # why nothing is written any more
         self.counts: Counter[str] = Counter()  # messages written, by key
         self.time = RobotTime()
@@ -61,6 +65,8 @@ class Recording:
             self._shown[topic] += 1
             channel = self._channels.get(topic) or self._open_shown(topic, message)
             self._add(channel, at_ns, wall_ns, message.SerializeToString(), self._shown[topic])
+            if self._show is not None:
+                self._show(topic, message, at_ns)
 
     def _add(self, channel: int, at_ns: int, wall_ns: int, data: bytes, number: int) -> None:
         self._writer.add_message(channel, log_time=at_ns, data=data, publish_time=wall_ns, sequence=number & 0xFFFFFFFF)

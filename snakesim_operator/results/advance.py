@@ -15,6 +15,7 @@ Floats = NDArray[np.float64]
 SAMPLE_S = 0.1
 STOOD_M, STOOD_S = 0.02, 1.0  # it stands while the body's centre has moved less than this within this time
 LASTING_S = 0.5  # noise may take it back over the line
+GIVE_UP_M = 0.03  # a run that does not come on so far within a given time has got stuck
 LEAST_M = 0.1  # below it, energy per metre says nothing
 
 
@@ -122,15 +123,17 @@ class Advance:
 
 
 class GoalWatch:
-    """Tells during a run that its goal has been reached for a while, so that the rest of the time can be saved."""
+    """Tells during a run that nothing more will come of it: its goal has been reached for a while, or it is stuck."""
 
-    def __init__(self, config: RunConfig, robot: Description) -> None:
-        self._goal, self._robot = config.mission.goal, robot
+    def __init__(self, config: RunConfig, robot: Description, give_up_s: float | None = None) -> None:
+        """give_up_s: robot time without an advance after which it is stuck; None: it never is."""
+        self._goal, self._robot, self._give_up_s = config.mission.goal, robot, give_up_s
+        self.gave_up = False
         self._time_s: list[float] = []
         self._nodes: list[Floats] = []
 
-    def reached(self, black_box: BlackBox) -> bool:
-        """Take the newest row. True from LASTING_S after the goal."""
+    def over(self, black_box: BlackBox) -> bool:
+        """Take the newest row. True from LASTING_S after the goal, and when it is stuck."""
         if self._goal is None or not black_box.ticks:
             return False
         row = black_box.layout.arrays(black_box.rows_from(black_box.ticks - 1)[1])
@@ -140,7 +143,11 @@ class GoalWatch:
         self._time_s.append(float(row["time_s"][-1]))
         self._nodes.append(nodes_w(self._robot, *pose))
         advance = Advance.along(self._goal, self._robot, np.array(self._time_s), np.array(self._nodes))
-        return advance.crossed_s is not None and self._time_s[-1] > advance.crossed_s + LASTING_S
+        if advance.crossed_s is not None:
+            return self._time_s[-1] > advance.crossed_s + LASTING_S
+        since = int(np.argmax(advance.along_m > advance.along_m[-1] - GIVE_UP_M))
+        self.gave_up = self._give_up_s is not None and self._time_s[-1] - self._time_s[since] >= self._give_up_s
+        return self.gave_up
 
 
 def energy_j_per_m(record: RunRecord, advance: Advance) -> float | None:

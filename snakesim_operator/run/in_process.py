@@ -50,12 +50,16 @@ class Result:
 
     record: RunRecord  # every tick, and what control and guidance told
     summary: RunSummary
+    gave_up: bool = False  # it was ended because it was stuck
 
 
-def simulate(config: RunConfig, out: Path | None = None, *, until_goal: bool = False) -> Result:
+def simulate(
+    config: RunConfig, out: Path | None = None, *, until_goal: bool = False, give_up_s: float | None = None
+) -> Result:
     """Run a configuration. out: folder for what a run leaves, the report too; None keeps nothing.
 
-    until_goal: a run whose mission has a goal is complete soon after that is reached.
+    until_goal: a run whose mission has a goal is complete soon after that is reached; give_up_s: and after so much
+    robot time without 3 cm of advance towards it.
     Raises SnakesimError when it cannot begin. A run that ends early is a result like others.
     """
     config, ending = check_plugins(config), Ending()
@@ -70,20 +74,27 @@ def simulate(config: RunConfig, out: Path | None = None, *, until_goal: bool = F
             raise ConfigError(f"{out} cannot be written to; choose another folder")
         opened.callback(files.close)
         recorded = TOLD if out is None else [row.key for row in keys.SPACE]
-        run, outcome = _go(config, files, ending, None, recorded, until_goal=until_goal)
+        run, outcome, gave_up = _go(config, files, ending, None, recorded, until_goal=until_goal, give_up_s=give_up_s)
         explain(ending, record_of(run.host), config)
-        return Result(*leave(files, files.folder, ending, outcome, report=out is not None))
+        return Result(*leave(files, files.folder, ending, outcome, report=out is not None), gave_up)
 
 
-def run_in_process(config: RunConfig, out: Path | None, *, until_goal: bool = False, record: bool = True) -> int:
-    """`snakesim run --in-process`. Exit code: as of a run in processes. until_goal: as of `simulate`."""
+def run_in_process(
+    config: RunConfig,
+    out: Path | None,
+    *,
+    until_goal: bool = False,
+    give_up_s: float | None = None,
+    record: bool = True,
+) -> int:
+    """`snakesim run --in-process`. Exit code: as of a run in processes. until_goal, give_up_s: as of `simulate`."""
     check(config)
     ending = Ending()
     with opened_files(config, out) as (files, _):
         say(f"{config.name}: {config.robot.name} in {config.scene.name}, {config.commander}, in one process")
         with interruptible(ending), Progress(config) as progress:
             recorded = [row.key for row in keys.SPACE] if record else []
-            _, outcome = _go(config, files, ending, progress, recorded, until_goal=until_goal)
+            _, outcome, _ = _go(config, files, ending, progress, recorded, until_goal=until_goal, give_up_s=give_up_s)
         return conclude(config, files, ending, outcome)
 
 
@@ -95,13 +106,14 @@ def _go(
     recorded: Iterable[str],
     *,
     until_goal: bool,
-) -> tuple[InProcessRun, Outcome]:
-    """recorded: keys, which may have wildcards."""
+    give_up_s: float | None,
+) -> tuple[InProcessRun, Outcome, bool]:
+    """recorded: keys, which may have wildcards. Also returns whether it was given up."""
     words = _Words(files)
     with contextlib.redirect_stderr(words), InProcessRun(config) as run:
         host, session = run.host, run.network.session()
         control = session.reader(keys.CONTROL_STATE, ControlState)
-        watch = GoalWatch(config, host.description)
+        watch = GoalWatch(config, host.description, give_up_s)
         with (
             Recorder(host.black_box, host.description, partial(record_of, host), files.folder),
             _recording(session, files, recorded) as recording,
@@ -113,14 +125,14 @@ def _go(
                     if progress is not None:
                         state = control.newest(lambda _state: True)
                         progress.show(host.status(), state, armed=host.authority.arming > 0)
-                    if until_goal and watch.reached(host.black_box):
+                    if until_goal and watch.over(host.black_box):
                         host.complete()
                 if ending.interrupted:
                     run.stop()
     for failure in run.failed:
         ending.because(failure)
     lost = [] if recording is None or not recording.trouble else [recording.trouble]
-    return run, Outcome(record_of(run.host), run.host.description, lost=lost)
+    return run, Outcome(record_of(run.host), run.host.description, lost=lost), watch.gave_up
 
 
 @contextlib.contextmanager

@@ -2,6 +2,7 @@
 
 import signal
 import time
+from contextlib import nullcontext
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -9,23 +10,36 @@ from pathlib import Path
 from snakesim_hal.process import on_stop_signal
 from snakesim_hal.terminal import Say, say
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
+from snakesim_operator.recording.live import LiveServer
 from snakesim_operator.recording.process import record
 from snakesim_operator.tools.targets import Where, the_one
 
 
-def record_robot(where: Where, out: Path | None, duration_s: float | None, say: Say = say) -> int:
-    """Record until Ctrl-C, or for a time by the wall clock. Exit code 1 when the disk took no more."""
+def record_robot(
+    where: Where, out: Path | None, duration_s: float | None, foxglove_port: int | None = None, say: Say = say
+) -> int:
+    """Record until Ctrl-C, or for a time by the wall clock. Exit code 1 when the disk took no more.
+
+    foxglove_port: serve viewers there meanwhile.
+    """
     link = replace(the_one(where, "record"), largest_bytes=MAX_IMAGE_BYTES)
     path = out or Path(f"{link.namespace}-{datetime.now():%Y%m%d-%H%M%S}.mcap")
     path.parent.mkdir(parents=True, exist_ok=True)
     stopped: list[bool] = []
     on_stop_signal(lambda: stopped.append(True))
     began = time.monotonic()
-    say(f"recording {link.namespace} on {link.endpoint} into {path}" + ("" if duration_s else "; Ctrl-C ends it"))
     try:
-        recorder = record(
-            link, path, lambda: not stopped and (duration_s is None or time.monotonic() < began + duration_s)
-        )
+        with nullcontext() if foxglove_port is None else LiveServer(link.namespace or "robot", foxglove_port) as live:
+            end = "" if duration_s else "; Ctrl-C ends it"
+            say(f"recording {link.namespace} on {link.endpoint} into {path}{end}")
+            if live is not None:
+                say(f"Foxglove: open connection {live.address}")
+            recorder = record(
+                link,
+                path,
+                lambda: not stopped and (duration_s is None or time.monotonic() < began + duration_s),
+                live.show if live is not None else None,
+            )
     finally:
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_DFL)

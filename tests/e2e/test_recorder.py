@@ -1,13 +1,18 @@
 """The recorder as a process: beside a run and as part of it, killed, and what is played from its file."""
 
+import json
 import os
 import signal
+import struct
 import subprocess
 import threading
 import time
 from pathlib import Path
 
 import pytest
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
 
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
@@ -20,7 +25,7 @@ from tests.whole import command
 
 pytestmark = pytest.mark.e2e
 
-LONG = ["triplet", "--controller", "hold", "--duration", "5", "--pace", "realtime", "--set", "rate_hz=50"]
+LONG = ["triplet", "--controller", "hold", "--duration", "7", "--pace", "realtime", "--set", "rate_hz=50"]
 
 
 def test_in_lockstep_the_recording_has_every_tick(tmp_path: Path) -> None:
@@ -34,16 +39,41 @@ def test_in_lockstep_the_recording_has_every_tick(tmp_path: Path) -> None:
     assert replayed.out == "200 commands, the same to the bit\n", replayed.out + replayed.err
 
 
+def sighted_live(address: str) -> list[str]:
+    """The frames that a viewer of Foxglove's is told of."""
+    with connect(address, subprotocols=[Subprotocol("foxglove.sdk.v1")]) as viewer:
+        frames: dict[str, str] | None = None
+        while frames is None:
+            told = viewer.recv(10.0)
+            if isinstance(told, str) and (message := json.loads(told))["op"] == "advertise":
+                frames = next((row for row in message["channels"] if row["topic"] == "foxglove/tf"), None)
+        assert frames["encoding"] == frames["schemaEncoding"] == "protobuf"
+        viewer.send(json.dumps({"op": "subscribe", "subscriptions": [{"id": 1, "channelId": frames["id"]}]}))
+        while isinstance(told := viewer.recv(10.0), str):
+            pass
+        operation, _, time_ns = struct.unpack("<BIQ", told[:13])
+        assert operation == 1 and 0 < time_ns < 60e9  # robot time
+        return [frame.child_frame_id for frame in FrameTransforms.FromString(told[13:]).transforms]
+
+
 def test_a_run_goes_on_without_its_recorder_and_another_records_beside_it(tmp_path: Path) -> None:
     with running(tmp_path / "run", *LONG) as run:
         run.wait_for(" s  ")
         time.sleep(1.0)
         os.kill(run.part("recorder"), signal.SIGKILL)
-        typed = [*SNAKESIM, "record", "--endpoint", run.endpoint, "--duration", "1.5", "--out", "beside.mcap"]
-        beside = subprocess.run(
-            typed, cwd=tmp_path, env=environment(tmp_path), capture_output=True, text=True, timeout=60, check=False
-        )
-        assert beside.returncode == 0 and "messages in" in beside.stdout, beside.stderr
+        typed = [*SNAKESIM, "record", "--endpoint", run.endpoint, "--out", "beside.mcap"]
+        with subprocess.Popen(
+            [*typed, "--foxglove", "0"], cwd=tmp_path, env=environment(tmp_path), stdout=subprocess.PIPE, text=True
+        ) as beside:
+            assert beside.stdout is not None
+            address = next(line for line in beside.stdout if "Foxglove" in line).rpartition(" ")[2].strip()
+            file = tmp_path / "beside.mcap"
+            wait_until(lambda: file.exists() and file.stat().st_size > 10_000, "the first second of the recording")
+            links = sighted_live(address)
+            time.sleep(1.0)
+            beside.send_signal(signal.SIGINT)
+            assert "messages in" in beside.stdout.read() and beside.wait(20) == 0
+        assert links == [f"link_{i}" for i in range(14)]
         assert run.end() == 3, run.said()  # complete, but the record lacks something
     nothing_left(tmp_path / "run")
     assert run.said().count("warning:") == 1 and "recorder was ended by SIGKILL" in run.said()

@@ -248,6 +248,6 @@ def test_extended_and_remote_frames_stay_in_the_kernel(channel: str, raw_socket:
                 raw_socket.send(frame(CAN_EFF_FLAG | number, bytes(8)))
                 raw_socket.send(frame(CAN_EFF_FLAG | 0x12340000 | number, bytes(8)))
                 raw_socket.send(frame(CAN_RTR_FLAG | number))
-        assert run.wire.receive() == []
+        assert not [one for one in run.wire.receive() if one.data in (b"", bytes(8))]  # the modules' own are not zero
         run.run(5, run.waving)
         assert not run.faults and run.states() == [ModuleState.ARMED] * 4

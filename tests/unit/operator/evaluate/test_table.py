@@ -7,7 +7,7 @@ from snakesim_operator.evaluate.table import lines_of, table, wilson, worst
 
 
 def case(field: int, controller: str = "poal", row: int = 1) -> Case:
-    return Case(f"{controller}-{row}-{field}", row, f"density {row}", controller, field, b"{}")
+    return Case(f"{controller}-{row}-{field}", row, f"density {row}", controller, field, b"{}", 12.0, 60.0)
 
 
 def outcome(advance_m: float, speed_m_s: float = 0.1) -> Outcome:
