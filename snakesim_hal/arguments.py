@@ -1,16 +1,20 @@
-"""Command-line arguments that several commands and processes share: a scenario, and how to reach the network."""
+"""Command-line arguments that several commands and processes share: a scenario, and how to reach the network.
+
+Every command reads this first, an emergency stop too: what takes long to import is imported where it is used.
+"""
 
 import argparse
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.files import short
-from snakesim_hal.model.scenario import Loaded, Override, RunConfig, load, parse_set
-from snakesim_hal.network.endpoint import check_endpoint, check_namespace
-from snakesim_hal.network.session import DEFAULT_ENDPOINT, Link
-from snakesim_hal.network.session_file import SessionFile, read_session
-from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES
+from snakesim_hal.errors import ConfigError, short
+from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT, check_endpoint, check_namespace
+
+if TYPE_CHECKING:
+    from snakesim_hal.model.scenario import Loaded, RunConfig
+    from snakesim_hal.network.session import Link
+    from snakesim_hal.network.session_file import SessionFile
 
 SESSION = "SNAKESIM_SESSION"  # environment variable: the session file of an operator's tools
 
@@ -34,8 +38,10 @@ def add_scenario(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def load_scenario(arguments: argparse.Namespace) -> Loaded:
+def load_scenario(arguments: argparse.Namespace) -> "Loaded":
     """The configuration that `add_scenario`'s arguments ask for. Raises ConfigError."""
+    from snakesim_hal.model.scenario import Override, load, parse_set
+
     flags = {
         "backend": arguments.backend,
         "controller": arguments.controller,
@@ -68,11 +74,46 @@ def add_network(parser: argparse.ArgumentParser, session: str = f"(default: ${SE
     parser.add_argument("--namespace", help="namespace of the robot (default: the robot's name)")
 
 
+def add_json(parser: argparse.ArgumentParser) -> None:
+    """Output for scripts."""
+    parser.add_argument("--json", action="store_true", help="print one line of JSON instead, for scripts")
+
+
 def add_insecure(parser: argparse.ArgumentParser) -> None:
     """Consent to listen without access control."""
     parser.add_argument(
         "--insecure", action="store_true", help="listen even where anybody on the network can command the robot"
     )
+
+
+def add_parent(parser: argparse.ArgumentParser) -> None:
+    """For processes of `snakesim run`."""
+    parser.add_argument("--parent", type=int, help=argparse.SUPPRESS)  # process id: this process dies with it
+
+
+def add_host(parser: argparse.ArgumentParser) -> None:
+    """Of a HAL host. Hidden is what a run hands to its host.
+
+    --memory: path of an in-memory file for the host's statistics; --channel: inherited socket to the parent process;
+    --stop-port: inherited UDP socket for emergency stops.
+    """
+    add_scenario(parser)
+    add_network(parser, "")
+    add_insecure(parser)
+    parser.add_argument("--out", type=Path, help="folder for the record: black box, description, statistics")
+    parser.add_argument("--once", action="store_true", help="end when the robot was armed for the scenario's duration")
+    parser.add_argument("--end-after-fault", type=float, metavar="S", help="end so many seconds after a fault, too")
+    add_parent(parser)
+    for flag, kind in (("--memory", str), ("--channel", int), ("--stop-port", int)):
+        parser.add_argument(flag, type=kind, help=argparse.SUPPRESS)
+
+
+def add_service(parser: argparse.ArgumentParser) -> None:
+    """Of a service."""
+    parser.add_argument("name", metavar="NAME", help="guidance, navigation, control, or another one of the scenario")
+    add_scenario(parser)
+    add_network(parser, "")
+    add_parent(parser)
 
 
 def check_network(arguments: argparse.Namespace) -> None:
@@ -86,7 +127,7 @@ def check_network(arguments: argparse.Namespace) -> None:
         check_namespace(arguments.namespace, "--namespace")
 
 
-def session_given(arguments: argparse.Namespace, *, or_environment: bool = False) -> SessionFile | None:
+def session_given(arguments: argparse.Namespace, *, or_environment: bool = False) -> "SessionFile | None":
     """The session file, if one is given. Raises ConfigError.
 
     or_environment: for operator's tools, that of SNAKESIM_SESSION, unless an endpoint is given. What moves a robot, or
@@ -95,14 +136,21 @@ def session_given(arguments: argparse.Namespace, *, or_environment: bool = False
     path = arguments.session
     if path is None and or_environment and arguments.endpoint is None and arguments.router is None:
         path = os.environ.get(SESSION) and Path(os.environ[SESSION])
-    return None if not path else read_session(path.expanduser())
+    if not path:
+        return None
+    from snakesim_hal.network.session_file import read_session
+
+    return read_session(path.expanduser())
 
 
-def link_of(arguments: argparse.Namespace, config: RunConfig, *, hosts: bool = False) -> Link:
+def link_of(arguments: argparse.Namespace, config: "RunConfig", *, hosts: bool = False) -> "Link":
     """How a process of a robot joins its network. Raises ConfigError.
 
     hosts: without a router the others connect to this process, so that it listens.
     """
+    from snakesim_hal.network.session import Link
+    from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES
+
     check_network(arguments)
     session = session_given(arguments)
     largest_bytes = max(MAX_PAYLOAD_BYTES, config.robot.sensors.largest_image_bytes)

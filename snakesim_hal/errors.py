@@ -45,3 +45,8 @@ class BackendError(SnakesimError, RuntimeError):
 
 class RefusedError(SnakesimError, PermissionError):
     """The HAL refused a request, with its reason: a lease held by another, an arming condition not met."""
+
+
+def short(text: str, most: int = 120) -> str:
+    """User text for quoting in a message: its beginning, if it is long."""
+    return text if len(text) <= most else text[: most - 3] + "..."

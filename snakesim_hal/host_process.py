@@ -11,12 +11,11 @@ import sys
 import time
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from snakesim_hal.arguments import add_insecure, add_network, add_scenario
+from snakesim_hal.arguments import add_host
 from snakesim_hal.backend import BackendFactory
 from snakesim_hal.errors import BackendError, ConfigError, RefusedError, SnakesimError
 from snakesim_hal.host.guarded_backend import GuardedBackend
@@ -31,7 +30,7 @@ from snakesim_hal.network.private_channel import HostEnd
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.network.stop_port import open_stop_port, serve_stops, stop_address
 from snakesim_hal.process import HOST_PRIORITY, begin_anew, hurry, on_stop_signal, settle_for_timing
-from snakesim_hal.serve import ProcessOptions, add_parent, joined, process_options
+from snakesim_hal.serve import ProcessOptions, joined, process_options
 from snakesim_hal.terminal import complain_of
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Fault
@@ -64,31 +63,12 @@ class HostRecord(msgspec.Struct, frozen=True, kw_only=True):
     isolated: list[str] = []  # joints that were isolated at the end
 
 
-def parser() -> argparse.ArgumentParser:
-    """The arguments of a host."""
-    parser = argparse.ArgumentParser(
-        prog="snakesim host", description="Run the HAL host of a robot, with its backend, until Ctrl-C."
-    )
-    add_scenario(parser)
-    add_network(parser, "")
-    add_insecure(parser)
-    parser.add_argument("--out", type=Path, help="folder for the record: black box, description, statistics")
-    parser.add_argument("--once", action="store_true", help="end when the robot was armed for the scenario's duration")
-    parser.add_argument("--end-after-fault", type=float, metavar="S", help="end so many seconds after a fault, too")
-    add_parent(parser)
-    for flag, kind in (("--memory", str), ("--channel", int), ("--stop-port", int)):
-        parser.add_argument(flag, type=kind, help=argparse.SUPPRESS)
-    return parser
-
-
 def main(argv: Sequence[str] | None = None) -> int:
-    """Exit code 0 when all ticks were done without a fault, 2 for wrong input, 1 otherwise.
-
-    What a run hands to its host: --memory, path of an in-memory file for the host's statistics; --channel, inherited
-    socket to the parent process; --stop-port, inherited UDP socket for emergency stops.
-    """
+    """Exit code 0 when all ticks were done without a fault, 2 for wrong input, 1 otherwise."""
+    parser = argparse.ArgumentParser(prog="snakesim host", description="Run the HAL host of a robot, with its backend.")
+    add_host(parser)
     try:
-        return host(process_options(parser().parse_args(argv), hosts=True))
+        return host(process_options(parser.parse_args(argv), hosts=True))
     except ConfigError as error:
         complain_of(error, "snakesim host")
         return 2

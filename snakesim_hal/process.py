@@ -2,6 +2,7 @@
 
 import ctypes
 import gc
+import getpass
 import os
 import resource
 import signal
@@ -21,6 +22,14 @@ MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT = 1, 2, 4
 SWITCH_INTERVAL_S = 0.0005  # of the interpreter, 5 ms by default: as long as half a control period
 # Of 99: above every ordinary process, below the kernel's own threads. A controller that hangs does not delay the host.
 HOST_PRIORITY, SERVICE_PRIORITY = 20, 19
+
+
+def who() -> str:
+    """The user's name."""
+    try:
+        return getpass.getuser()[:64]
+    except (KeyError, OSError):
+        return "operator"
 
 
 def die_with_parent(parent_pid: int | None = None) -> None:

@@ -6,11 +6,11 @@ import threading
 from collections.abc import Sequence
 from dataclasses import replace
 
-from snakesim_hal.arguments import add_insecure, add_network, add_scenario
+from snakesim_hal.arguments import add_insecure, add_network, add_parent, add_scenario
 from snakesim_hal.errors import SnakesimError
 from snakesim_hal.network.session import open_session
 from snakesim_hal.process import on_stop_signal
-from snakesim_hal.serve import add_parent, process_options
+from snakesim_hal.serve import process_options
 from snakesim_hal.terminal import complain_of
 
 

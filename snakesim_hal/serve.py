@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from threadpoolctl import threadpool_limits
 
-from snakesim_hal.arguments import add_network, add_scenario, link_of, load_scenario
+from snakesim_hal.arguments import add_service, link_of, load_scenario
 from snakesim_hal.errors import ConfigError, NotConnectedError, SnakesimError
 from snakesim_hal.model.plugins import SERVICES, find_plugin
 from snakesim_hal.model.scenario import Loaded, RunConfig
@@ -47,11 +47,6 @@ class ProcessOptions:
         return self.loaded.config
 
 
-def add_parent(parser: argparse.ArgumentParser) -> None:
-    """For processes of `snakesim run`."""
-    parser.add_argument("--parent", type=int, help=argparse.SUPPRESS)  # process id: this process dies with it
-
-
 def process_options(arguments: argparse.Namespace, *, hosts: bool = False) -> ProcessOptions:
     """Read the files that the arguments name, and tie this process to its parent if it has one. Raises ConfigError."""
     if arguments.parent is not None:
@@ -60,19 +55,11 @@ def process_options(arguments: argparse.Namespace, *, hosts: bool = False) -> Pr
     return ProcessOptions(loaded, link_of(arguments, loaded.config, hosts=hosts), arguments)
 
 
-def parser() -> argparse.ArgumentParser:
-    """The arguments of a service."""
-    parser = argparse.ArgumentParser(prog="snakesim service", description="Run one service of a robot.")
-    parser.add_argument("name", metavar="NAME", help="guidance, navigation, control, or another one of the scenario")
-    add_scenario(parser)
-    add_network(parser, "")
-    add_parent(parser)
-    return parser
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Exit code: 0 told to stop, 1 could not go on, 2 wrong input."""
-    return run(parser().parse_args(argv))
+    parser = argparse.ArgumentParser(prog="snakesim service", description="Run one service of a robot.")
+    add_service(parser)
+    return run(parser.parse_args(argv))
 
 
 def run(arguments: argparse.Namespace) -> int:

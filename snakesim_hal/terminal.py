@@ -4,12 +4,9 @@ A robot's name, the reason of an answer, a field of a file may hold escape seque
 bidirectional overrides. They are printed as JSON escapes instead, so that printed JSON stays valid.
 """
 
-import shutil
 import sys
 from collections.abc import Callable
 from typing import Any
-
-import msgspec
 
 from snakesim_hal.errors import SnakesimError
 
@@ -35,6 +32,8 @@ def say(line: str) -> None:
 
 def say_json(value: Any, say: Say = say) -> None:
     """Print a value, such as a Struct, as one line of JSON: for scripts. NaN and infinity become null."""
+    import msgspec  # most commands print none
+
     say(msgspec.json.encode(value).decode())
 
 
@@ -62,6 +61,8 @@ def say_over(lines: list[str], before: int) -> int:
 
     Also where the terminal is in raw mode, as for single keys.
     """
+    import shutil
+
     size = shutil.get_terminal_size()
     shown = [printable(line)[: size.columns - 1] for line in lines[: size.lines - 1]]
     up = f"\x1b[{before}A" if before else ""

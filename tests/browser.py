@@ -82,13 +82,20 @@ class Tab:
             time.sleep(0.02)
         return time.monotonic() - began
 
-    def click(self, label: str) -> None:
-        """Click the button with a label. A disabled one does nothing, as for a person."""
-        found = self.value(
-            f"(() => {{ const b = [...document.querySelectorAll('button')].find(b => b.innerText.trim() === "
-            f"{json.dumps(label)}); if (!b) return false; b.click(); return true; }})()"
+    def click(self, label: str, hold_s: float = 0.0) -> None:
+        """Press what has a label, and let go. A disabled button does nothing, as for a person."""
+        # Not at a place on the screen: the page moves things while it changes.
+        find = f"[...document.querySelectorAll('body *')].findLast(e => e.innerText?.trim() === {json.dumps(label)})"
+        assert self.value(f"(window.pressed = {find}) !== undefined"), (
+            f"no {label!r} on the page:\n{self.text()[:3000]}"
         )
-        assert found, f"no button {label!r}"
+        for kind in ("down", "up"):
+            self.value(
+                f"(() => {{ const r = pressed.getBoundingClientRect(); pressed.dispatchEvent(new PointerEvent("
+                f"'pointer{kind}', {{bubbles: true, pointerId: 1, clientX: r.x + 1, clientY: r.y + 1}})); }})()"
+            )
+            time.sleep(hold_s if kind == "down" else 0.0)
+        self.value("pressed.click()")
 
     def press(self, key: str, code: int) -> None:
         """Press a key."""

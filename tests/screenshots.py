@@ -1,44 +1,81 @@
-"""Pictures of the console for the documentation: `python -m tests.screenshots RUN OUT.png --at 5 --dark`."""
+"""Pictures of the console for the documentation, of a recorded run or of one that it starts.
+
+python -m tests.screenshots runs/clutter docs/console.png --at 5 --dark
+python -m tests.screenshots 'peg_row --stay' docs/console-live.png --click 'Take control' --click Settings
+"""
 
 import argparse
+import contextlib
+import shlex
 import subprocess
 import sys
+import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
+from PIL import Image
+
 from tests.browser import chromium
+from tests.e2e.command import running
 
 SETTLE_S = 6.0  # for the browser to draw, without a graphics card
+PHONE = 400, 800
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("run", type=Path, help="folder of a recorded run")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", help="folder of a recorded run, or what follows `snakesim run`")
     parser.add_argument("out", type=Path, help="the picture, a PNG")
     parser.add_argument("--at", type=float, default=0.0, metavar="S", help="seconds into the recording")
+    parser.add_argument("--after", type=float, default=8.0, metavar="S", help="seconds after the page was there")
+    parser.add_argument("--click", action="append", default=[], metavar="LABEL", help="in this order; may be repeated")
     parser.add_argument("--dark", action="store_true")
     parser.add_argument("--phone", action="store_true")
     given = parser.parse_args()
-    command = [sys.executable, "-m", "snakesim_operator", "console", str(given.run), "--at", str(given.at)]
+    width, height = PHONE if given.phone else (1280, 760)
+    recorded = Path(given.run).is_dir()
+    with recording(given.run, given.at) if recorded else live(given.run) as address, chromium() as browser:
+        tab = browser.open(address, width, height)
+        if given.phone:
+            tab.size(width, height, scale=2.0, mobile=True)
+        tab.wait_for("RECORDING" if recorded else "armed by")
+        time.sleep(SETTLE_S if recorded else given.after)
+        tab.value("document.querySelectorAll('[class*=Notification-closeButton]').forEach(e => e.click())")
+        if given.dark:
+            tab.click("Dark page")
+        for label in given.click:
+            tab.click(label)
+            time.sleep(1.0)
+        time.sleep(SETTLE_S if recorded else 0.0)
+        tab.picture(given.out)
+    with Image.open(given.out) as picture:
+        few = picture.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+        few.save(given.out, optimize=True)  # a quarter of the bytes
+
+
+@contextlib.contextmanager
+def recording(folder: str, at_s: float) -> Iterator[str]:
+    """The console of a recording, and its address."""
+    command = [sys.executable, "-m", "snakesim_operator", "console", folder, "--at", str(at_s)]
     console = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
         assert console.stdout is not None
-        address = console.stdout.readline().split()[1]
-        with chromium() as browser:
-            tab = browser.open(address, *((390, 780) if given.phone else (1280, 760)))
-            if given.phone:
-                tab.size(390, 780, scale=2.0, mobile=True)
-            else:
-                tab.wait_for("SIMULATOR")
-            time.sleep(SETTLE_S)
-            tab.value("document.querySelectorAll('[class*=Notification-closeButton]').forEach(e => e.click())")
-            if given.dark:
-                tab.value("[...document.querySelectorAll('input[type=checkbox]')].at(-1).click()")
-            time.sleep(SETTLE_S)
-            tab.picture(given.out)
+        yield console.stdout.readline().split()[1]
     finally:
         console.terminate()
         console.wait(10)
+
+
+@contextlib.contextmanager
+def live(arguments: str) -> Iterator[str]:
+    """A run with its console, and the address."""
+    words = [*shlex.split(arguments), "--pace", "realtime", "--console"]
+    with tempfile.TemporaryDirectory() as folder, running(Path(folder) / "run", *words) as run:
+        run.wait_for("console: http")
+        yield next(line.split()[1] for line in run.said().splitlines() if line.startswith("console: "))
+        run.process.terminate()
+        run.end()
 
 
 if __name__ == "__main__":

@@ -32,6 +32,7 @@ class Report:
     """A controller's own report; all fields are optional, and shown in `control/state` and in the run's report."""
 
     why: str = ""
+    why_if_still: str = ""  # likewise, if the body should turn out not to move
     usable_push_points: int | None = None  # None: this controller does not push off obstacles
     path_s_m: float | None = None
     propulsion_joint: int | None = None

@@ -31,6 +31,7 @@ Floats = NDArray[np.float64]
 
 ANOTHER_SHAPE_RAD = 0.1
 SLOPE_M = 0.02  # over which theta' is taken
+SIGNS = np.random.default_rng(1).choice((-1.0, 1.0), 4096)
 STANDS_M_S, STANDS_S = 0.01, 0.5  # slower than this for so long counts as standing still
 
 
@@ -54,6 +55,9 @@ class ObstacleAided:
         largest_look_ahead_m: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "m"})] = 0.05
         fresh_look_ahead_m: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "m"})] = 0.01  # on a new path
         push_scale: Annotated[float, Meta(ge=-1, le=1)] = 1.0  # for control experiments: of both terms
+        push_sign_s: Annotated[float, Meta(ge=0, le=100, extra_json_schema={"unit": "s"})] = (
+            0.0  # likewise: their sign is drawn at random after each such time; 0: never
+        )
         push_ns_m: Annotated[float, Meta(ge=0, le=1000, extra_json_schema={"unit": "N*s/m"})] = 40.0
         push_n_m: Annotated[float, Meta(ge=0, le=1000, extra_json_schema={"unit": "N/m"})] = 60.0
         largest_push_n: Annotated[float, Meta(ge=0, le=1000, extra_json_schema={"unit": "N"})] = 60.0
@@ -93,10 +97,11 @@ class ObstacleAided:
             return self._followed.hold(view, located)
         if located.trajectory.speed_m_s == 0.0:  # whatever path is planned meanwhile
             return self._rest(view)
-        ahead_m = self._set.push_scale * self._look_ahead_m(located, view.period_s)
+        scale = self._set.push_scale * self._sign(view.time_s)
+        ahead_m = scale * self._look_ahead_m(located, view.period_s)
         at = located.on_path.at
         reference = self._body.all_angles(at(located.tail_s_m + ahead_m))
-        torques = self._set.push_scale * self._push_nm(located, view.period_s)
+        torques = scale * self._push_nm(located, view.period_s)
         reference = reference + torques / self._stiffness
         anew, before = located.anew or self._waits, self._followed.reference_rad
         if anew and before is not None and np.abs(reference - before).max() > ANOTHER_SHAPE_RAD:
@@ -106,16 +111,24 @@ class ObstacleAided:
         force_n = ahead_m * float(self._stiffness @ slope**2) / SLOPE_M**2
         return Action(set_points, self._report(view, located, force_n, reference))
 
+    def _sign(self, time_s: float) -> float:
+        """The same for every run, so that runs can be repeated."""
+        if self._set.push_sign_s == 0.0:
+            return 1.0
+        return float(SIGNS[int(time_s / self._set.push_sign_s) % len(SIGNS)])
+
     def _report(self, view: View, located: Located, look_ahead_n: float, reference: Floats) -> Report:
         if abs(located.speed_m_s) > STANDS_M_S:
             self._moved_at_s = view.time_s
         stands, found, force_n = view.time_s - self._moved_at_s > STANDS_S, self._found, self._force_n
-        told, why = [], ""
+        told, class_of_stall = [], "standing still: backing out along its own path"
         if found is not None:
             told = push_points(self._body, found.world, found.touches, found.push, force_n)
-            why = why_it_stands(found.touches, found.push, force_n, self._most_n) if stands else ""
+            class_of_stall = why_it_stands(found.touches, found.push, force_n, self._most_n)
+        why = class_of_stall if stands and found is not None else ""
         return Report(
             why=why,
+            why_if_still=class_of_stall,
             path_s_m=located.tail_s_m,
             propulsion_n=look_ahead_n + force_n,
             push_points=told,

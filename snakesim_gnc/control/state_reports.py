@@ -49,6 +49,7 @@ class StateReports:
             rests=rests,
             usable_push_points=report.usable_push_points,
             obstacle=report.why,
+            still=report.why_if_still,
             advanced_m=self._advance.metres,
         )
         mark = (state, bool(missing), rests, report.propulsion_joint, report.jammed, clock.lifecycle, clock.arming)

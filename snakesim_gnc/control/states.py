@@ -14,6 +14,7 @@ def locomotion_state(
     rests: str = "",
     usable_push_points: int | None = None,
     obstacle: str = "",
+    still: str = "",
     advanced_m: float | None,
 ) -> tuple[LocomotionState, str]:
     """The state, and its reason as text. Locomoting means intended and measured motion.
@@ -21,6 +22,7 @@ def locomotion_state(
     missing: inputs that control lacks, such as a fresh pose. rests: why no motion is intended.
     usable_push_points: None for a controller that does not push off obstacles.
     obstacle: what prevents motion according to the controller (no feasible triplet, a jam), else empty.
+    still: why it stands, if it should turn out to stand, though nothing prevents motion for certain; else empty.
     advanced_m: displacement of the body within the last second; None when it is not measured.
     """
     if not hal_answers:
@@ -39,5 +41,5 @@ def locomotion_state(
     if advanced_m is None:
         return "NotLocomoting", "the motion of the body is not measured"
     if advanced_m < MOVING_M:
-        return "NotLocomoting", f"standing still: less than {MOVING_M * 1e3:g} mm in {WINDOW_S:g} s"
+        return "NotLocomoting", still or f"standing still: less than {MOVING_M * 1e3:g} mm in {WINDOW_S:g} s"
     return "Locomoting", "pushing" if usable_push_points is not None else "moving"

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.errors import ConfigError, short
 from snakesim_hal.model.field_types import Flaw, first_flaw, in_words, unit_of
 from snakesim_hal.model.textfiles import MAX_DEPTH, parse_json, parse_toml, read_text
 
@@ -199,11 +199,6 @@ def _explain(flaw: Flaw, table: Table, under: str) -> str:
     shown = f"{short(_repr(value))}{' ' + unit if unit and isinstance(value, int | float) else ''}"
     why = short(flaw.why[:1].lower() + flaw.why[1:])
     return f"{origin}: `{dotted}` = {shown} is not allowed: {why}; expected {in_words(info)}."
-
-
-def short(text: str, most: int = 120) -> str:
-    """User text for quoting in a message: its beginning, if it is long."""
-    return text if len(text) <= most else text[: most - 3] + "..."
 
 
 def _repr(value: Any) -> str:

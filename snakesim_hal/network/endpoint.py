@@ -3,9 +3,10 @@
 import re
 from ipaddress import ip_address
 
-from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.files import short
+from snakesim_hal.errors import ConfigError, short
 
+DEFAULT_PORT = 7447
+DEFAULT_ENDPOINT = f"tcp/127.0.0.1:{DEFAULT_PORT}"
 PROTOCOLS = ("tcp", "tls", "quic", "udp", "ws")
 VALID = "such as tcp/127.0.0.1:7447: PROTOCOL/HOST:PORT"
 _parts = re.compile(

@@ -1,22 +1,25 @@
 """The robots of this user on this computer: tools find every running HAL here, whatever its port.
 
 Each run keeps a small file, locked for as long as its process lives; the kernel releases the lock however it dies.
+An emergency stop reads them first of all, so this imports little.
 """
 
 import contextlib
 import fcntl
+import json
 import os
 import socket
 from collections.abc import Iterator
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import TYPE_CHECKING, cast
 
-import msgspec
-
-from snakesim_hal.network.session import Link
-from snakesim_hal.wire.codec import UNDECODABLE
+if TYPE_CHECKING:
+    from snakesim_hal.network.session import Link
 
 
-class LocalRobot(msgspec.Struct, frozen=True, kw_only=True):
+@dataclass(frozen=True, kw_only=True)
+class LocalRobot:
     """A robot whose HAL host runs, or is starting, on this computer."""
 
     namespace: str
@@ -30,7 +33,7 @@ class LocalRobot(msgspec.Struct, frozen=True, kw_only=True):
     session: str = ""  # path of the session file by which it has joined a lab; empty: without one
 
     @staticmethod
-    def on(link: Link, robot: str, backend: str, stop_port: socket.socket, config: str | None = None) -> "LocalRobot":
+    def on(link: "Link", robot: str, backend: str, stop_port: socket.socket, config: str | None = None) -> "LocalRobot":
         """A robot for which this process is responsible."""
         stop_host, port = stop_port.getsockname()[:2]
         return LocalRobot(
@@ -70,7 +73,7 @@ def registered(robot: LocalRobot) -> Iterator[str | None]:
     trouble = None
     try:
         fcntl.flock(handle, fcntl.LOCK_EX)
-        os.write(handle, msgspec.json.encode(robot))
+        os.write(handle, json.dumps(asdict(robot)).encode())
     except OSError as error:
         trouble = f"{path}: {error.strerror}; `snakesim status` and `estop` find this run only with --endpoint"
     try:
@@ -85,16 +88,26 @@ def local_robots() -> list[LocalRobot]:
     """Every robot whose process lives, by process id. Removes files of dead ones."""
     found: list[LocalRobot] = []
     for path in sorted(_live().glob("*.json")) if _live().is_dir() else []:
-        with contextlib.suppress(OSError, *UNDECODABLE):
+        with contextlib.suppress(OSError, ValueError, TypeError, RecursionError):
             handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
             try:
                 if _is_locked(handle):
-                    found.append(msgspec.json.decode(os.read(handle, 65536), type=LocalRobot))
+                    found.append(_decoded(os.read(handle, 65536)))
                 else:
                     path.unlink()
             finally:
                 os.close(handle)
     return found
+
+
+def _decoded(text: bytes) -> LocalRobot:
+    """The robot of a file. Raises ValueError or TypeError when it is none."""
+    values = json.loads(text)
+    robot = LocalRobot(**{one.name: values[one.name] for one in fields(LocalRobot) if one.name in values})
+    wrong = [one.name for one in fields(robot) if not isinstance(getattr(robot, one.name), cast(type, one.type))]
+    if wrong:
+        raise TypeError(f"{', '.join(wrong)} cannot be meant")
+    return robot
 
 
 def _live() -> Path:

@@ -1,6 +1,5 @@
 """Who is on a robot's network: every process shows an entry, and the host compares them before anything is armed."""
 
-import getpass
 import os
 import secrets
 import socket
@@ -12,6 +11,7 @@ from snakesim_hal.errors import WireError
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.shared_settings import shared_settings
 from snakesim_hal.network.session import Arrival, Session
+from snakesim_hal.process import who
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import VERSIONS, Process
@@ -39,14 +39,6 @@ def show_process(session: Session, entry: Process) -> None:
     key = keys.process(entry.name, secrets.token_hex(4))
     session.declare_token(key)
     session.latched_publisher(key, Process).put(entry)
-
-
-def who() -> str:
-    """The user's name."""
-    try:
-        return getpass.getuser()[:64]
-    except (KeyError, OSError):
-        return "operator"
 
 
 def differences(one: Process, other: Process) -> list[str]:

@@ -20,15 +20,13 @@ import zenoh
 from zenoh import ext, handlers  # pyright: ignore[reportMissingModuleSource]
 
 from snakesim_hal.errors import ConfigError, NotConnectedError, WireError
-from snakesim_hal.network.endpoint import check_guarded
+from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT, check_guarded
 from snakesim_hal.network.session_file import SessionFile, of_mode, read_zenoh_file, refused_by_zenoh
 from snakesim_hal.process import raise_open_files
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import IMAGES, MAX_PAYLOAD_BYTES, Decoder, MessageT, encode, encoding_of
 from snakesim_hal.wire.messages import Answer, Message, Preview
 
-DEFAULT_PORT = 7447
-DEFAULT_ENDPOINT = f"tcp/127.0.0.1:{DEFAULT_PORT}"
 ENVELOPE_BYTES = 4096  # around a payload: key, encoding, and the numbers of an image
 # Connections that stay silent are closed after a second, and many of them are allowed.
 UNICAST = {"accept_timeout": 1000, "accept_pending": 1000, "max_sessions": 4000}

@@ -11,7 +11,7 @@ flood of requests is a stop. Restrict access to the port by the network: stoppin
 """
 
 import ctypes
-import secrets
+import os
 import socket
 import struct
 import threading
@@ -89,7 +89,7 @@ def ask_to_stop(host: str, port: int, who: str, timeout_s: float) -> Stopped | N
 
     Raises NotConnectedError when that port is closed.
     """
-    nonce = secrets.token_bytes(NONCE_BYTES)
+    nonce = os.urandom(NONCE_BYTES)
     request = REQUEST + nonce + who.encode()[:MAX_WHO_BYTES]
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     deadline, refused = time.monotonic() + timeout_s, 0

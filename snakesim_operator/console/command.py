@@ -5,13 +5,13 @@ import threading
 from collections.abc import Sequence
 from pathlib import Path
 
-from snakesim_hal.arguments import add_network, add_scenario
+from snakesim_hal.arguments import add_network, add_parent, add_scenario
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.scenario import read
 from snakesim_hal.network.local_registry import local_robots
 from snakesim_hal.network.session import Link
 from snakesim_hal.process import on_stop_signal
-from snakesim_hal.serve import add_parent, process_options
+from snakesim_hal.serve import process_options
 from snakesim_hal.terminal import Say, say
 from snakesim_operator.tools.targets import Where, the_one
 

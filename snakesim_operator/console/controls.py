@@ -6,7 +6,8 @@ from collections.abc import Callable
 import viser
 
 from snakesim_hal.errors import SnakesimError
-from snakesim_hal.model.injection import KINDS
+from snakesim_hal.model.injection import KINDS, TargetType
+from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlSettings
 from snakesim_operator.console.moment import Moment
 from snakesim_operator.console.operations import Operations
@@ -16,7 +17,10 @@ from snakesim_operator.tools.fault import FaultOrder
 from snakesim_operator.tools.simulator_order import SimulatorOrder
 
 TOLD_S = 6.0
-KINDS_OF_FAULT = tuple(sorted({kind for kinds in KINDS.values() for kind in kinds}))
+FAULTS: dict[str, tuple[str, TargetType]] = {
+    f"{kind} ({sort})": (kind, sort) for sort, kinds in KINDS.items() for kind in kinds
+}
+TARGETS: dict[TargetType, str] = {"process": "control", "key": keys.JOINTS, "joint": "joint_3", "bus": "bus_1"}
 DRIVE_HZ = 10.0
 FASTEST_M_S = 0.5
 TIMES: tuple[str, ...] = ("0.1", "0.25", "0.5", "1", "2", "5", "10")  # speeds of a simulator
@@ -53,8 +57,8 @@ class Controls:
             self._drive = client.gui.add_button("Hold to drive", icon=viser.Icon.STEERING_WHEEL, color="green")
             self._faults = client.gui.add_folder("Inject a fault", expand_by_default=False)
             with self._faults:
-                self._kind = client.gui.add_dropdown("Kind", KINDS_OF_FAULT)
-                self._target = client.gui.add_text("Target", "joint_3")
+                self._kind = client.gui.add_dropdown("Kind", tuple(FAULTS), initial_value="mute (joint)")
+                self._target = client.gui.add_text("Target", TARGETS["joint"])
                 inject = client.gui.add_button_group("Fault", ("Inject", "End it"))
             self._dark = client.gui.add_checkbox("Dark page", initial_value=False)
         self._take.on_click(lambda _: self._take_or_release())
@@ -63,6 +67,7 @@ class Controls:
         self._time_speed.on_update(lambda _: self._change_time("speed"))
         with settings_tab:
             self._apply = client.gui.add_button("Apply", visible=False, order=0)
+        self._kind.on_update(lambda _: self._suggest_target())
         inject.on_click(lambda event: self._inject(end=event.target.value == "End it"))
         self._drive.on_hold(lambda _: self._go(), callback_hz=DRIVE_HZ)
         self._apply.on_click(lambda _: self._configure())
@@ -137,9 +142,15 @@ class Controls:
             heading_rad = math.radians(self._heading.value)
             self._operations.drive(self.who, heading_rad, self._speed.value, round(moment.time_s * 1e9))
 
+    def _suggest_target(self) -> None:
+        """A target of the sort that the kind is for; simulator and clock are their own."""
+        _, sort = FAULTS[self._kind.value]
+        self._target.value = TARGETS.get(sort, sort)
+
     def _inject(self, *, end: bool) -> None:
         if self._in_control():
-            order = FaultOrder(self._kind.value, self._target.value.strip(), end=end)
+            kind, _ = FAULTS[self._kind.value]
+            order = FaultOrder(kind, self._target.value.strip(), end=end)
             self.do("Fault", lambda: self._operations.inject(self.who, order))
 
     def _configure(self) -> None:

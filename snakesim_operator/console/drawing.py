@@ -17,7 +17,8 @@ from snakesim_operator.console.moment import Moment
 
 Floats = NDArray[np.float64]
 
-M_PER_N = 0.008  # length of a force arrow
+M_PER_N, LONGEST_M = 0.02, 0.5  # of a force arrow
+ABOVE_M = 0.02  # forces are drawn above the body, which would hide most of them at the height of the contacts
 NORMAL_M, TANGENT_M = 0.08, 0.05
 LEAST_N = 0.3  # weaker forces are not drawn
 # A camera looks along its x, z up; a frustum of the viewer along z, y down.
@@ -88,7 +89,7 @@ class Drawing:
     links_wxyz: Floats  # (links, 4)
     hinges_w: Floats  # (joints, 3)
     hinges_wxyz: Floats  # (joints, 4); z is the joint's axis
-    isolated: frozenset[int] = frozenset()  # joints that failed
+    failed: frozenset[int] = frozenset()  # joints that are isolated, or have a fault
     pushing: int | None = None  # the propulsion joint
     contacts_w: Floats = field(default_factory=_nothing)
     normals: Floats = field(default_factory=_no_arrows)  # (n, 2, 3) from, to; as all arrows
@@ -113,14 +114,14 @@ def draw(moment: Moment, around: Surroundings | None) -> Drawing | None:
     origins, rotations = link_frames(position_w, rotation_from_quaternion(wxyz), body.angle_rad, axes, lengths)
     middles = origins + rotations[:, :, 0] * (np.array(lengths)[:, None] / 2)
     control, trajectory, status = moment.control, moment.trajectory, moment.status
-    lost = [] if status is None else status.isolated
+    lost = set[str | None]() if status is None else {*status.isolated, *(fault.joint for fault in status.faults)}
     return Drawing(
         centre_w=middles.mean(axis=0),
         links_w=middles,
         links_wxyz=quaternions_from_rotations(rotations),
         hinges_w=origins[1:],
         hinges_wxyz=quaternions_from_rotations(_hinges(rotations[:-1], axes)),
-        isolated=frozenset(i for i, joint in enumerate(robot.joints) if joint.name in lost),
+        failed=frozenset(i for i, joint in enumerate(robot.joints) if joint.name in lost),
         pushing=pushing_joint(moment),
         path_w=_on_ground(np.array(trajectory.path_w), around) if trajectory is not None else _nothing(),
         perceived=_perceived(moment.world),
@@ -163,17 +164,25 @@ def _forces(moment: Moment, centre_w: Floats) -> dict[str, Floats]:
             "contacts_w": at,
             "normals": _arrows(at, NORMAL_M * np.array([c.normal_w for c in contacts])),
             "tangents": _arrows(at, TANGENT_M * np.array([c.tangent_w for c in contacts])),
-            "forces": _arrows(at[strong], M_PER_N * force[strong]),
+            "forces": _forces_above(moment, at[strong], force[strong]),
         }
         total = force.sum(axis=0)
         if np.linalg.norm(total) > LEAST_N:
-            found["resultant"] = _arrows(centre_w[None] + [0.0, 0.0, 0.06], M_PER_N * total[None])
+            found["resultant"] = _forces_above(moment, centre_w[None], total[None])
     control = moment.control
     if control is not None and control.push_points and len(control.push_points) == len(control.solved_force_n):
         at = np.array([c.position_w for c in control.push_points])
         normal = np.array([c.normal_w for c in control.push_points])
-        found["solved"] = _arrows(at, M_PER_N * np.array(control.solved_force_n)[:, None] * normal)
+        found["solved"] = _forces_above(moment, at, np.array(control.solved_force_n)[:, None] * normal)
     return found
+
+
+def _forces_above(moment: Moment, at_w: Floats, forces_n: Floats) -> Floats:
+    """Arrows of forces (n, 3), above where they act."""
+    size_n = np.linalg.norm(forces_n, axis=1, keepdims=True)
+    scale = np.minimum(M_PER_N, LONGEST_M / np.maximum(size_n, 1e-9))
+    above_m = max(link.radius_m for link in moment.robot.links) + ABOVE_M
+    return _arrows(at_w + np.array([0.0, 0.0, above_m]), scale * forces_n)
 
 
 def _arrows(start_w: Floats, span: Floats) -> Floats:

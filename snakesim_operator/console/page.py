@@ -12,6 +12,7 @@ import viser
 
 from snakesim_hal.errors import SnakesimError
 from snakesim_hal.wire.messages import ControlSettings, Description
+from snakesim_hal.wire.quantities import Vector
 from snakesim_operator.console import stage, texts
 from snakesim_operator.console.charts import JointCharts
 from snakesim_operator.console.controls import Controls, dress, name_of
@@ -79,6 +80,13 @@ class Page:
         tabs = gui.add_tab_group(order=4)
         with tabs.add_tab("Joints"):
             self._joints_tab = gui.add_folder(None)
+        if self._operations is not None:
+            self._lay_out_live(tabs)
+        gui.add_html(texts.legend(LEGEND), order=3)
+
+    def _lay_out_live(self, tabs: viser.GuiTabGroupHandle) -> None:
+        """What a recording has no page for."""
+        gui = self._server.gui
         with tabs.add_tab("State"):
             self._state = gui.add_html("")
             with gui.add_folder("Rates and ages", expand_by_default=False):
@@ -87,12 +95,10 @@ class Page:
             self._cameras_tab = gui.add_folder(None)
             with self._cameras_tab:
                 self._no_camera = gui.add_html("<div style='padding:.3em .6em;opacity:.7'>no image yet</div>")
-        if self._operations is not None:
-            with tabs.add_tab("Settings"):
-                self._settings_tab = gui.add_folder(None)
+        with tabs.add_tab("Settings"):
+            self._settings_tab = gui.add_folder(None)
         with tabs.add_tab("Log"):
             self._log_text = gui.add_html("")
-        gui.add_html(texts.legend(LEGEND), order=3)
 
     # --- viewers ---------------------------------------------------------------------------------------------
 
@@ -111,6 +117,8 @@ class Page:
             if self._moment is not None and self._moment.settings is not None:
                 controls.show_settings(self._moment.settings)
             self._controls[client.client_id] = controls
+        if self._moment is not None:
+            _aim(client, self._moment.robot)
         self._log.write(f"{name_of(client.client_id)} came")
 
     def _went(self, client: viser.ClientHandle) -> None:
@@ -173,10 +181,11 @@ class Page:
         """Another robot: scene and charts begin anew."""
         self._server.scene.reset()
         self._server.scene.set_up_direction("+z")
-        length_m = sum(link.length_m for link in robot.links)
         camera = self._server.initial_camera
-        camera.position, camera.look_at = (-0.65 * length_m, -1.15 * length_m, 1.6 * length_m), (0.0, 0.0, 0.0)
+        camera.position, camera.look_at = view_of(robot, narrow=False)
         camera.fov = VIEW_RAD
+        for client in self._server.get_clients().values():
+            _aim(client, robot)
         self._stage = Stage(self._server.scene, robot, self._around)
         with self._joints_tab:
             if self._charts is not None:
@@ -192,10 +201,13 @@ class Page:
             self._log.write(f"settings of {settings.controller} in force, as {settings.who} asked")
 
     def _show_texts(self, moment: Moment | None) -> None:
+        if self._operations is None:
+            self._header.content = texts.header(moment, recorded=self._recorded)
+            return
         holder = self._token.holder
         viewers = len(self._server.get_clients())
         control = f"{name_of(holder)} has control; {viewers} viewer{'' if viewers == 1 else 's'}"
-        self._header.content = texts.header(moment, recorded=self._recorded, control=control)
+        self._header.content = texts.header(moment, control=control)
         if moment is not None:
             self._state.content = texts.state_table(moment)
             self._streams.content = texts.stream_table(moment)
@@ -212,6 +224,25 @@ class Page:
                     self._pictures[key] = self._server.gui.add_image(picture(image), label=key)
             else:
                 handle.image = picture(image)
+
+
+def view_of(robot: Description, *, narrow: bool) -> tuple[Vector, Vector]:
+    """Where a camera stands and what it looks at, relative to the body's middle, to have the whole body in view.
+
+    narrow: a phone, whose lower half the panel covers.
+    """
+    length_m = sum(link.length_m for link in robot.links)
+    far_m, before_m = (1.15 * length_m, 0.7 * length_m) if narrow else (0.8 * length_m, 0.0)
+    x, y = -0.49, -0.87  # where it stands
+    at = x * before_m, y * before_m, 0.0
+    return (at[0] + 1.3 * far_m * x, at[1] + 1.3 * far_m * y, 1.6 * far_m), at
+
+
+def _aim(client: viser.ClientHandle, robot: Description) -> None:
+    """Turn a phone's view; other screens have the initial one."""
+    camera = client.camera
+    if camera.image_width < camera.image_height:
+        camera.position, camera.look_at = view_of(robot, narrow=True)
 
 
 def _what(moment: Moment | None) -> tuple[object, ...] | None:

@@ -91,9 +91,7 @@ class Stage:
             batch = self._batch(f"snake/links_{k}", capsule, len(numbers), LINK)
             # Neighbours share a sphere at their joint: drawn a little thinner, they do not flicker.
             batch.batched_scales = _single([[1.0, thin, thin] for thin in (1.0 - 0.012 * (i % 2) for i in numbers)])
-            batch.batched_colors = np.array(
-                [HEAD if i == last else (LINK, LINK_EDGE)[i % 2] for i in numbers], dtype=np.uint8
-            )
+            batch.batched_colors = _shades([HEAD if i == last else (LINK, LINK_EDGE)[i % 2] for i in numbers])
             found.append((batch, numbers))
         return found
 
@@ -105,7 +103,7 @@ class Stage:
             batched_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
             batched_positions=np.zeros((count, 3)),
             batched_scales=np.ones((count, 3)),
-            batched_colors=np.tile(np.array(of, dtype=np.uint8), (count, 1)),
+            batched_colors=_shades([of] * count),
             lod="off",
             **more,
         )
@@ -177,13 +175,13 @@ class Stage:
 
     def _mark_joints(self, drawing: Drawing) -> None:
         count = len(drawing.hinges_w)
-        colours = np.tile(np.array(HINGE, dtype=np.uint8), (count, 1))
+        colours = [HINGE] * count
         scales = np.ones((count, 3), dtype=np.float32)
-        for i in drawing.isolated:
+        for i in drawing.failed:
             colours[i], scales[i] = LOST, 1.25
         if drawing.pushing is not None:
             colours[drawing.pushing], scales[drawing.pushing] = PUSHED, (1.9, 1.9, 1.25)
-        self._hinges.batched_colors, self._hinges.batched_scales = colours, scales
+        self._hinges.batched_colors, self._hinges.batched_scales = _shades(colours), scales
 
     def _show_arrows(self, name: str, points: Floats, of: Colour, thick: float) -> None:
         arrows = self._arrows.get(name)
@@ -192,7 +190,12 @@ class Stage:
                 return
             size = thick * self._thick
             arrows = self._arrows[name] = self._scene.add_arrows(
-                f"/world/{name}", points, of, shaft_radius=size, head_radius=2.2 * size, head_length=5 * size
+                f"/world/{name}",
+                points,
+                _shades([of])[0],
+                shaft_radius=size,
+                head_radius=2.2 * size,
+                head_length=5 * size,
             )
         arrows.visible = len(points) > 0
         if len(points):
@@ -227,7 +230,7 @@ class Stage:
             batch.batched_wxyzs = _single([quaternion_from_yaw(o.yaw_rad) for o in these])
             batch.batched_scales = _single(grown * np.array([_size(o) for o in these]))
             if len(batch.batched_colors) != len(these):
-                batch.batched_colors = np.tile(np.array(of, dtype=np.uint8), (len(these), 1))
+                batch.batched_colors = _shades([of] * len(these))
             if name == "perceived":
                 batch.batched_opacities = _single([0.4 + 0.6 * o.confidence for o in these])
 
@@ -238,7 +241,7 @@ class Stage:
             if batch is not None:
                 names = [obstacle.name for obstacle in obstacles if obstacle.shape == shape]
                 of = [PUSHED if n in drawing.pushed else AHEAD if n in drawing.ahead else PEG for n in names]
-                batch.batched_colors = np.array(of, dtype=np.uint8)
+                batch.batched_colors = _shades(of)
 
     def _show_cameras(self, cameras: Sequence[Camera]) -> None:
         for camera in cameras:
@@ -275,6 +278,13 @@ class Stage:
 def _single(values: ArrayLike) -> NDArray[np.float32]:
     """As viser sends numbers."""
     return np.asarray(values, dtype=np.float32)
+
+
+def _shades(colours: Sequence[Colour]) -> NDArray[np.uint8]:
+    """Colours of instances, (n, 3): these viser takes as linear light, and all others as sRGB."""
+    srgb = np.array(colours) / 255
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    return np.round(255 * linear).astype(np.uint8)
 
 
 def _unit(shape: str) -> trimesh.Trimesh:

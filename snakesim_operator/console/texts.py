@@ -10,6 +10,7 @@ from snakesim_operator.console.moment import Moment
 SILENT_S = 1.0
 LIFECYCLE_COLOURS = {"disarmed": "#6b7683", "armed": "#1a7f4b", "fault": "#b3261e", "estop": "#b3261e"}
 STATE_COLOURS = {"Locomoting": "#1a7f4b", "NotLocomoting": "#b26a00", "Idle": "#6b7683", "PowerOff": "#59626d"}
+BAD = "#d64541"  # of text, on a light and on a dark page
 SIMULATED, EMULATED, REAL, RECORDED = "#0067b0", "#7a3fa8", "#b3261e", "#59626d"
 
 
@@ -32,9 +33,9 @@ def header(moment: Moment | None, *, recorded: str = "", control: str = "") -> s
         return _bar("WAITING FOR THE ROBOT", RECORDED, "no host has described itself yet")
     words, colour = backend_in_words(moment.robot)
     where = f"{plain(moment.robot.robot)}{' · ' + plain(moment.robot.hardware) if moment.robot.hardware else ''}"
-    if recorded:
-        return _bar(f"RECORDING OF: {words}", RECORDED, f"{where} · {plain(recorded)}")
     status = moment.status
+    if recorded:
+        words, colour, where = f"RECORDING OF: {words}", RECORDED, f"{where} · {plain(recorded)}"
     lines = [_bar(words, colour, where)]
     if status is not None and status.paused_by is not None:
         lines.append(_bar("PAUSED", RECORDED, f"by {plain(status.paused_by)}; robot time stands"))
@@ -77,7 +78,7 @@ def _bar(words: str, colour: str, below: str) -> str:
 
 def _warning(text: str) -> str:
     return (
-        f"<div style='border:2px solid #b3261e;color:#b3261e;border-radius:6px;padding:.3em .6em;margin-top:.4em;"
+        f"<div style='border:2px solid {BAD};color:{BAD};border-radius:6px;padding:.3em .6em;margin-top:.4em;"
         f"font-weight:600'>{plain(text)}</div>"
     )
 
@@ -121,7 +122,7 @@ def faults(status: Status | None) -> str:
         for fault in status.faults
     ]
     more = f"<li>and {status.faults_left_out} more</li>" if status.faults_left_out else ""
-    return f"<div style='padding:0 .6em;font-size:.85em;color:#b3261e'>Faults<ul>{''.join(items)}{more}</ul></div>"
+    return f"<div style='padding:0 .6em;font-size:.85em;color:{BAD}'>Faults<ul>{''.join(items)}{more}</ul></div>"
 
 
 def _health(moment: Moment) -> list[tuple[str, str]]:
@@ -159,7 +160,7 @@ def legend(entries: Iterable[tuple[str, tuple[int, int, int]]]) -> str:
         f"<span style='white-space:nowrap'><span style='color:rgb{colour}'>&#9632;</span> {plain(what)}</span> "
         for what, colour in entries
     )
-    return f"<div style='padding:.2em .6em;font-size:.82em;display:flex;flex-wrap:wrap;gap:.2em 1em'>{marks}</div>"
+    return f"<div style='padding:.2em .6em .9em;font-size:.82em;display:flex;flex-wrap:wrap;gap:.2em 1em'>{marks}</div>"
 
 
 def _counts(numbers: dict[str, int]) -> str:

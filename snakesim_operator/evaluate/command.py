@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.scenario import parse_set
 
 EXTRA = ("distributed", "optuna", "pyarrow")
 
@@ -86,6 +85,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
 
 def _sweep(arguments: argparse.Namespace) -> int:
     _check_extra()
+    from snakesim_hal.model.scenario import parse_set
     from snakesim_operator.evaluate.evaluation import Request, go
     from snakesim_operator.evaluate.suite import Suite, parse_vary
 

@@ -1,16 +1,11 @@
 """`snakesim deploy`: what a lab needs, made from one file. Importable without the extra `lab`."""
 
 import argparse
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.textfiles import read_text
 from snakesim_hal.terminal import say
-from snakesim_operator.lab.identities import identities
-from snakesim_operator.lab.lab_file import EXAMPLE, load_lab
-from snakesim_operator.lab.render import render
 
 AUTHORITY = "authority"
 
@@ -48,18 +43,27 @@ def _add_lab(parser: argparse.ArgumentParser) -> None:
 
 
 def _example(_arguments: argparse.Namespace) -> int:
+    from snakesim_hal.model.textfiles import read_text
+    from snakesim_operator.lab.lab_file import EXAMPLE
+
     for line in read_text(EXAMPLE).splitlines():
         say(line)
     return 0
 
 
 def _render(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.lab.lab_file import load_lab
+    from snakesim_operator.lab.render import render
+
     for path in render(load_lab(arguments.lab), arguments.out):
         say(str(path))
     return 0
 
 
 def _certs(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.lab.identities import identities
+    from snakesim_operator.lab.lab_file import load_lab
+
     lab = load_lab(arguments.lab)
     _need_extra()
     from snakesim_operator.lab.certificates import write_certificates
@@ -74,6 +78,8 @@ def _certs(arguments: argparse.Namespace) -> int:
 
 
 def _check(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.lab.lab_file import load_lab
+
     lab = load_lab(arguments.lab)
     _need_extra()
     from snakesim_operator.lab.check import check
@@ -82,5 +88,7 @@ def _check(arguments: argparse.Namespace) -> int:
 
 
 def _need_extra() -> None:
+    from importlib.util import find_spec
+
     if find_spec("cryptography") is None:
         raise ConfigError('certificates need the package `cryptography`: pip install "snakesim[lab]"')

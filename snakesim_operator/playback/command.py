@@ -1,12 +1,13 @@
-"""The commands for recordings: `snakesim info`, `report`, `replay`, `export`."""
+"""Arguments of the commands for results: `snakesim info`, `report`, `compare`, `replay`, `export`, `video`."""
 
 import argparse
 import sys
+from math import inf
 from pathlib import Path
 from typing import Any
 
+from snakesim_hal.arguments import add_json
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.scenario import parse_set
 from snakesim_hal.network.endpoint import check_endpoint, check_namespace
 from snakesim_hal.terminal import say
 
@@ -15,13 +16,25 @@ def add_commands(commands: Any) -> None:
     """Add them to the parser of `snakesim`."""
     info = commands.add_parser("info", help="print what a recording holds: keys, rates, sizes, gaps")
     _add_recording(info)
-    info.add_argument("--json", action="store_true", help="print one JSON object")
+    add_json(info)
     info.set_defaults(act=_info)
 
     report = commands.add_parser("report", help="write the page of a run anew, also from a recording alone")
     _add_recording(report)
     report.add_argument("--out", type=Path, metavar="FILE.html", help="the page (default: beside the recording)")
     report.set_defaults(act=_report)
+
+    compare = commands.add_parser("compare", help="compare two runs, as a table and as a page with plots")
+    compare.add_argument("run_a", type=Path, metavar="RUN_A", help="folder of a run; percentages refer to this one")
+    compare.add_argument(
+        "run_b", type=Path, metavar="RUN_B", help="folder of the other run, of a robot with the same joints"
+    )
+    compare.add_argument("--out", type=Path, metavar="FILE.html", help="the page (default: RUN_B/compare.html)")
+    compare.add_argument(
+        "--within", type=float, metavar="PERCENT", help="exit with 1 when the distances moved differ by more"
+    )
+    add_json(compare)
+    compare.set_defaults(act=_compare)
 
     replay = commands.add_parser(
         "replay",
@@ -50,6 +63,17 @@ def add_commands(commands: Any) -> None:
     exported.add_argument("--out", type=Path, metavar="PATH", help="file or folder (default: beside the recording)")
     exported.set_defaults(act=_export)
 
+    video = commands.add_parser("video", help="film a recorded run, as MP4 or GIF")
+    video.add_argument("run", type=Path, metavar="RUN", help="folder of a run, or a recording")
+    video.add_argument("--out", type=Path, required=True, metavar="FILE", help="FILE.mp4 or FILE.gif")
+    video.add_argument("--width", type=int, default=1280, help="pixels, an even number (default: 1280)")
+    video.add_argument("--height", type=int, default=720, help="pixels, an even number (default: 720)")
+    video.add_argument("--fps", type=float, default=30.0, help="pictures a second (default: 30)")
+    video.add_argument("--speed", type=float, default=1.0, metavar="X", help="2: twice as fast as it was (default: 1)")
+    video.add_argument("--from", dest="from_s", type=float, default=0.0, metavar="S", help="begin S seconds in")
+    video.add_argument("--to", dest="to_s", type=float, default=inf, metavar="S", help="end S seconds in")
+    video.set_defaults(act=_video)
+
 
 def _add_recording(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("recording", type=Path, metavar="RUN", help="folder of a run, or an MCAP file")
@@ -75,6 +99,28 @@ def _report(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _compare(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.results.compare import compare
+
+    return compare(arguments.run_a, arguments.run_b, arguments.out, arguments.within, as_json=arguments.json)
+
+
+def _video(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.video import video
+
+    size = (arguments.width, arguments.height)
+    for flag, value, low, high in (
+        ("--width", size[0], 16, 4096),
+        ("--height", size[1], 16, 4096),
+        ("--fps", arguments.fps, 1, 240),
+        ("--speed", arguments.speed, 0.01, 100),
+    ):
+        if not low <= value <= high or (flag in ("--width", "--height") and value % 2):
+            raise ConfigError(f"{flag} {value:g}: give a number from {low:g} to {high:g}; pixels must be even")
+    span_s = (arguments.from_s, arguments.to_s)
+    return video(arguments.run, arguments.out, size=size, fps=arguments.fps, speed=arguments.speed, span_s=span_s)
+
+
 def _export(arguments: argparse.Namespace) -> int:
     from snakesim_operator.playback.export import export
 
@@ -82,6 +128,7 @@ def _export(arguments: argparse.Namespace) -> int:
 
 
 def _replay(arguments: argparse.Namespace) -> int:
+    from snakesim_hal.model.scenario import parse_set
     from snakesim_operator.playback.control import replay_control
     from snakesim_operator.playback.info import recording_of
     from snakesim_operator.playback.play import PlayRequest, play

@@ -16,13 +16,13 @@ from pathlib import Path
 
 import msgspec
 
-from snakesim_hal.arguments import add_network, add_scenario
+from snakesim_hal.arguments import add_network, add_parent, add_scenario
 from snakesim_hal.errors import ConfigError, SnakesimError
 from snakesim_hal.network.process_entries import own_entry, show_process
 from snakesim_hal.network.run_key import is_proven, own_run_key
 from snakesim_hal.network.session import Arrival, Link, open_session
 from snakesim_hal.process import on_stop_signal
-from snakesim_hal.serve import add_parent, process_options
+from snakesim_hal.serve import process_options
 from snakesim_hal.service import START_LIMIT_S
 from snakesim_hal.terminal import complain, complain_of
 from snakesim_hal.wire import keys

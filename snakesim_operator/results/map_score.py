@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.model.outlines import outline_distance_m
+from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Obstacle
 
 Floats = NDArray[np.float64]
@@ -22,6 +22,7 @@ VIEW_RAD = math.pi / 2
 NEAREST_M = 0.15  # a camera sees nothing nearer
 MATCH_M = 0.05  # between a told outline and the true one
 POINTS = 48  # on an outline
+SIGHT = np.linspace(0.0, 1.0, 24)[1:-1]  # of a line of sight, where it is looked whether something hides
 
 
 @dataclass
@@ -56,16 +57,14 @@ def score(
 ) -> MapScore:
     """Score the obstacles whose outlines are within `within_m` of the head's front (2,). view_rad: of the camera."""
     head = np.asarray(head_w, dtype=np.float64)[:2]
-    near = [t for t in truth if outline_distance_m(t, head) < within_m + MATCH_M]
+    near = _within(truth, head, within_m + MATCH_M)
+    true_outlines = Outlines.of(near)
     found = MapScore()
     matched: set[str] = set()
-    for one in told:
-        if outline_distance_m(one, head) > within_m:
-            continue
+    for one in _within(told, head, within_m):
         found.told += 1
-        facing = facing_points_w(one, head)
-        errors = [float(np.mean([abs(outline_distance_m(t, p)) for p in facing])) for t in near]
-        best = int(np.argmin(errors)) if errors else -1
+        errors = np.abs(true_outlines.distance_m(facing_points_w(one, head))).mean(axis=0)
+        best = int(np.argmin(errors)) if near else -1
         if best < 0 or errors[best] > MATCH_M:
             found.ghosts += 1
             continue
@@ -73,7 +72,7 @@ def score(
         matched.add(true.name)
         off = math.dist(one.position_w[:2], true.position_w[:2])
         found.position_m.append(off)
-        found.surface_m.append(errors[best])
+        found.surface_m.append(float(errors[best]))
         found.size_m.append(_size_m(one) - _size_m(true))
         found.in_sd.append(off / max(one.position_sd_m, 1e-4))
     for true in visible(truth, head, heading_rad, within_m=within_m, view_rad=view_rad):
@@ -86,16 +85,18 @@ def visible(
     truth: Sequence[Obstacle], head_w: Floats, heading_rad: float, *, within_m: float, view_rad: float
 ) -> list[Obstacle]:
     """True obstacles near the head whose centre lies in view, and half of whose facing side no other one hides."""
-    near = [t for t in truth if outline_distance_m(t, head_w) < within_m]
-    found: list[Obstacle] = []
-    for true in near:
+    near = _within(truth, head_w, within_m)
+    outlines, found = Outlines.of(near), list[Obstacle]()
+    for i, true in enumerate(near):
         to = np.array(true.position_w[:2]) - head_w
         off = (math.atan2(to[1], to[0]) - heading_rad + math.pi) % (2 * math.pi) - math.pi
-        if abs(off) > 0.45 * view_rad or outline_distance_m(true, head_w) < NEAREST_M:
+        if abs(off) > 0.45 * view_rad or outlines.distance_m(head_w)[i] < NEAREST_M:
             continue
         facing = facing_points_w(true, head_w)
-        open_sight = [not any(_hides(o, head_w, p) for o in near if o is not true) for p in facing]
-        if np.mean(open_sight) > 0.5:
+        sight = head_w + SIGHT[:, None, None] * (facing - head_w)  # (steps, points, 2)
+        inside = outlines.distance_m(sight) < 0
+        inside[..., i] = False
+        if inside.any(axis=(0, 2)).mean() < 0.5:
             found.append(true)
     return found
 
@@ -136,10 +137,10 @@ def moved(told: Sequence[Obstacle], from_w: Sequence[float], to_w: Sequence[floa
     return found
 
 
-def _hides(obstacle: Obstacle, from_w: Floats, point_w: Floats) -> bool:
-    """Whether an obstacle stands on the line between two places."""
-    steps = np.linspace(0.0, 1.0, 24)[1:-1, None]
-    return any(outline_distance_m(obstacle, p) < 0 for p in from_w + steps * (point_w - from_w))
+def _within(obstacles: Sequence[Obstacle], head_w: Floats, within_m: float) -> list[Obstacle]:
+    """Those whose outline is so near."""
+    near = Outlines.of(obstacles).distance_m(head_w) <= within_m
+    return [one for one, is_near in zip(obstacles, near.tolist(), strict=True) if is_near]
 
 
 def _size_m(obstacle: Obstacle) -> float:

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from snakesim_operator.robots.imported import UPS, Order
+from snakesim_hal.arguments import add_json
 
 
 def add_commands(commands: Any) -> None:
@@ -15,12 +15,14 @@ def add_commands(commands: Any) -> None:
     into.add_argument("file", type=Path, metavar="FILE.urdf")
     into.add_argument("--out", type=Path, metavar="FILE.toml", help="robot file to write (default: NAME.toml)")
     into.add_argument("--tail", metavar="LINK", help="a link at the tail end (default: the root link)")
-    into.add_argument("--up", choices=list(UPS), default="z", help="axis of the root link that points up (z)")
+    into.add_argument(
+        "--up", choices=["x", "y", "z", "-x", "-y", "-z"], default="z", help="axis of the root link that points up (z)"
+    )
     into.add_argument("--scale", type=float, default=1.0, metavar="M", help="metres per unit of length; 0.001 for mm")
     into.add_argument(
         "--like", default="planar13", metavar="ROBOT", help="robot file with what URDF has no words for (planar13)"
     )
-    into.add_argument("--json", action="store_true", help="print one line of JSON instead, for scripts")
+    add_json(into)
     into.set_defaults(act=_import)
     out = both.add_parser("export", help="a URDF from any robot file")
     out.add_argument("robot", metavar="ROBOT", help="name of a shipped robot, or path of a robot file")
@@ -30,6 +32,7 @@ def add_commands(commands: Any) -> None:
 
 def _import(arguments: argparse.Namespace) -> int:
     from snakesim_operator.robots.command import import_robot
+    from snakesim_operator.robots.imported import Order
 
     order = Order(arguments.tail, arguments.up, arguments.scale, arguments.like)
     return import_robot(arguments.file, order, arguments.out, as_json=arguments.json)

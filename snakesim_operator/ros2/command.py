@@ -2,11 +2,10 @@
 
 import argparse
 import re
-from importlib.util import find_spec
 from typing import Any
 
-from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.files import short
+from snakesim_hal.arguments import add_network
+from snakesim_hal.errors import ConfigError, short
 from snakesim_hal.network.endpoint import check_endpoint
 
 ROS_ROUTER = "tcp/127.0.0.1:7447"  # where `ros2 run rmw_zenoh_cpp rmw_zenohd` listens
@@ -14,8 +13,8 @@ LAST_DOMAIN = 232  # as with DDS
 MOST_HZ = 200.0
 
 
-def add_command(commands: Any) -> argparse.ArgumentParser:
-    """Add it to the parser of `snakesim`; the caller adds the robot's network options."""
+def add_commands(commands: Any) -> None:
+    """Add it to the parser of `snakesim`."""
     made: argparse.ArgumentParser = commands.add_parser(
         "ros2",
         help="be a ROS 2 node for a robot, through the router of rmw_zenoh; needs no ROS",
@@ -34,11 +33,21 @@ def add_command(commands: Any) -> argparse.ArgumentParser:
         choices=["robot", "wall"],
         help="robot: robot time, with /clock; wall: wall-clock time (default: robot if nothing real moves, else wall)",
     )
-    return made
+    add_network(made)
+    made.set_defaults(act=_ros2)
+
+
+def _ros2(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.ros2.join import join
+    from snakesim_operator.tools.where import where_of
+
+    return join(arguments, where_of(arguments))
 
 
 def check(arguments: argparse.Namespace) -> None:
     """Raises ConfigError for what cannot be meant."""
+    from importlib.util import find_spec
+
     if find_spec("xxhash") is None:
         raise ConfigError("`snakesim ros2` needs packages that are not installed: pip install 'snakesim[ros2]'")
     check_endpoint(arguments.ros_router, "--ros-router")

@@ -6,8 +6,9 @@ from pathlib import Path
 
 from snakesim_hal.errors import NotConnectedError, RefusedError
 from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.network.endpoint import DEFAULT_PORT
 from snakesim_hal.network.local_registry import LocalRobot
-from snakesim_hal.network.session import DEFAULT_PORT, Link, open_session
+from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.network.stop_port import open_stop_port, stop_address
 from snakesim_hal.wire import keys
 from snakesim_operator.tools.targets import robots_on

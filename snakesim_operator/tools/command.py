@@ -9,8 +9,8 @@ from collections.abc import Sequence
 
 from snakesim_hal.errors import NotConnectedError, RefusedError
 from snakesim_hal.host.latch import forget_stop, stops_kept
-from snakesim_hal.network.process_entries import who
 from snakesim_hal.network.session import Link, Reader, Session, open_session
+from snakesim_hal.process import who
 from snakesim_hal.terminal import Say, say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, Description, LifecycleRequest, Message, Status

@@ -1,7 +1,7 @@
 """`snakesim sim`: pause, step, speed and reset of a simulator. A robot that moves something real refuses."""
 
-from snakesim_hal.network.process_entries import who
 from snakesim_hal.network.session import open_session
+from snakesim_hal.process import who
 from snakesim_hal.terminal import Say, say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import SimulatorRequest

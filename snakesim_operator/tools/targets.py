@@ -1,55 +1,15 @@
-"""Which robots a command addresses: those on the given endpoint, else all that run on this computer."""
+"""Searching the robots that a command addresses."""
 
 import shlex
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 
-from snakesim_hal.errors import ConfigError, NotConnectedError, RefusedError
-from snakesim_hal.network.local_registry import LocalRobot, local_robots
+from snakesim_hal.errors import NotConnectedError, RefusedError
 from snakesim_hal.network.session import DEFAULT_ENDPOINT, Link, Session, open_session
-from snakesim_hal.network.session_file import SessionFile, read_session
 from snakesim_hal.wire import keys
+from snakesim_operator.tools.where import Where
 
 CONNECT_S = 1.0
 HAL_EVERYWHERE = f"**/{keys.alive('hal')}"
-
-
-@dataclass(frozen=True)
-class Where:
-    """The command's network options."""
-
-    endpoint: str | None = None  # None: every network of a robot on this computer, and the default endpoint
-    namespace: str | None = None  # None: every robot there
-    session: SessionFile | None = None  # how to connect to `endpoint`, which is its first one then
-
-    def local(self) -> list[LocalRobot]:
-        """Addressed robots on this computer."""
-        return [
-            robot
-            for robot in local_robots()
-            if self.endpoint in (None, robot.endpoint) and self.namespace in (None, robot.namespace)
-        ]
-
-    def endpoints(self) -> list[str]:
-        """Endpoints of all networks to search."""
-        return [link.endpoint for link in self.networks()]
-
-    def networks(self) -> list[Link]:
-        """Every network to search, for the addressed namespace."""
-        if self.endpoint is not None:
-            return [Link(self.endpoint, self.namespace, session=self.session)]
-        found = {robot.endpoint: _link_to(robot, self.namespace) for robot in self.local()}
-        return list({**found, DEFAULT_ENDPOINT: found.get(DEFAULT_ENDPOINT, Link(namespace=self.namespace))}.values())
-
-
-def _link_to(robot: LocalRobot, namespace: str | None) -> Link:
-    """How a robot on this computer has joined its network, if this user may read that file."""
-    if robot.session:
-        try:
-            return Link.of_file(read_session(Path(robot.session)), namespace)
-        except ConfigError:
-            pass
-    return Link(robot.endpoint, namespace)
 
 
 def flags_of(link: Link, robot: str | None) -> str:

@@ -15,6 +15,7 @@ from snakesim_operator.results.report.events import Event, drawn_instants, event
 from snakesim_operator.results.report.instants import felt_along_n
 from snakesim_operator.results.report.playback import playback
 from snakesim_operator.results.report.polygon import force_polygon, pretty, units_per_n
+from snakesim_operator.results.report.pushing import pushing
 from snakesim_operator.results.report.timeline import (
     distance,
     end_s,
@@ -54,6 +55,7 @@ def page(record: RunRecord, summary: RunSummary) -> str:
         film=playback(record),
         events=listed(found),
         instants=_instants(record, found),
+        pushing=pushing(record),
         moved=distance(record) if len(record.time_s) else None,
         moved_m=distance_m(summary),
         limit_nm=max(joint.torque_limit_nm for joint in record.description.joints),

@@ -12,9 +12,8 @@ from pathlib import Path
 
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.kinematics import rotation_from_quaternion, yaw_of
-from snakesim_hal.network.process_entries import who
 from snakesim_hal.network.session import Link, Session, open_session
-from snakesim_hal.process import on_stop_signal
+from snakesim_hal.process import on_stop_signal, who
 from snakesim_hal.terminal import say, say_over
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, ControlState, Intent, Status, World

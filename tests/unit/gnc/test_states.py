@@ -19,6 +19,8 @@ READY = {"usable_push_points": 3, "advanced_m": 0.1}
         ({"obstacle": "jammed: x"}, "NotLocomoting", "jammed: x"),
         ({"advanced_m": 0.004}, "NotLocomoting", "standing still: less than 5 mm in 1 s"),
         ({"advanced_m": 0.004, "usable_push_points": None}, "NotLocomoting", "standing still"),
+        ({"advanced_m": 0.004, "still": "contacts lost"}, "NotLocomoting", "contacts lost"),
+        ({"still": "contacts lost"}, "Locomoting", "pushing"),
         ({"advanced_m": None}, "NotLocomoting", "the motion of the body is not measured"),
         ({"missing": "sensor/pose is 1 s old"}, "NotLocomoting", "sensor/pose is 1 s old"),
         ({"rests": "speed zero"}, "Idle", "no motion intended: speed zero"),

@@ -71,3 +71,15 @@ def test_a_scaled_push_is_turned_round() -> None:
     still = references(ways[2], stage, 300)
     forward, back = (references(way, stage, 300)[-1] - still[-1] for way in ways[:2])
     assert forward @ back < 0 and np.abs(still[-1] - still[0]).max() < 1e-6
+
+
+def test_a_push_of_random_sign_goes_both_ways() -> None:
+    stage = make_stage()
+    settings = (
+        ObstacleAided.Settings(),
+        ObstacleAided.Settings(push_scale=0.0),
+        ObstacleAided.Settings(push_sign_s=0.5),
+    )
+    steady, still, random = (references(ObstacleAided(stage.robot, one), stage, 300) for one in settings)
+    along = (random - still[0]) @ (steady[-1] - still[0])
+    assert along.max() > 0.0 > along.min()

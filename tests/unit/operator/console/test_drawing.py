@@ -7,7 +7,7 @@ import pytest
 
 from snakesim_hal.model.kinematics import quaternion_from_yaw, quaternions_from_rotations, rotation_from_quaternion
 from snakesim_hal.wire.messages import ControlState, DepthImage, JointState, Obstacle, World, WorldContact
-from snakesim_operator.console.drawing import M_PER_N, draw
+from snakesim_operator.console.drawing import LONGEST_M, M_PER_N, draw
 from snakesim_operator.console.moment import Moment
 from tests.unit.hal.rig import description
 
@@ -65,6 +65,18 @@ def test_forces_and_their_resultant():
     assert spans[0][0] == pytest.approx([0.0, 10 * M_PER_N, 0.0])
     assert spans[1][0] == pytest.approx([0.0, 20 * M_PER_N, 0.0])
     assert spans[2][0] == pytest.approx([0.0, 20 * M_PER_N, 0.0])
+
+
+def test_a_strong_force_has_an_arrow_of_limited_length_above_the_body():
+    contact = WorldContact(
+        link=0, obstacle="peg", body_s_m=0.1, position_w=(0.1, 0.0, 0.0), normal_w=(0.0, 1.0, 0.0),
+        tangent_w=(1.0, 0.0, 0.0), force_w=(0.0, 500.0, 0.0),
+    )  # fmt: skip
+    drawing = draw(Moment(robot=ROBOT, body=joints(), world=world([contact], [])), None)
+    assert drawing is not None
+    start, end = drawing.forces[0]
+    assert end - start == pytest.approx([0.0, LONGEST_M, 0.0]) and start[2] > ROBOT.links[0].radius_m
+    assert drawing.contacts_w[0] == pytest.approx(contact.position_w)
 
 
 def test_what_a_map_tells_is_not_drawn_as_perceived():

@@ -1,5 +1,7 @@
 """`snakesim estop`, `disarm`: who is asked, who is believed, and what is said when nobody is."""
 
+from pathlib import Path
+
 import pytest
 
 from snakesim_hal.errors import RefusedError
@@ -8,6 +10,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer
 from snakesim_operator.tools import command, stop
 from snakesim_operator.tools.targets import Where
+from tests.e2e.command import snakesim
 from tests.unit.hal.local_network import Follower, following, running
 from tests.unit.hal.network.test_client_host import run_config
 
@@ -26,6 +29,13 @@ def test_a_robot_that_does_not_answer_a_stop_is_named() -> None:
             said.clear()
             assert stop.estop(Where(at, "lab/nobody"), said.append) == 1
             assert said[0].startswith("lab/nobody: NOT STOPPED: NO ANSWER")
+
+
+def test_a_stop_waits_for_no_slow_import(tmp_path: Path) -> None:
+    ended = snakesim("estop", "--namespace", "nobody", cwd=tmp_path, more={"PYTHONPROFILEIMPORTTIME": "1"})
+    imported = [line.rpartition("|")[2].strip() for line in ended.err.splitlines()]
+    assert not {"numpy", "jinja2", "mujoco"} & set(imported)
+    assert imported.index("snakesim_hal.network.stop_port") < imported.index("msgspec") < imported.index("zenoh")
 
 
 def test_an_impostor_that_answers_too_is_told() -> None:

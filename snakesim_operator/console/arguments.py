@@ -1,0 +1,28 @@
+"""Arguments of `snakesim console`. Importable without the extra that it needs."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from snakesim_hal.arguments import add_network
+
+
+def add_commands(commands: Any) -> None:
+    """Add it to the parser of `snakesim`."""
+    console = commands.add_parser(
+        "console", help="show a running robot in the browser, and command it from there; or show a recorded run"
+    )
+    console.add_argument("run", type=Path, nargs="?", metavar="RUN", help="folder of a recorded run")
+    console.add_argument("--at", type=float, default=0.0, metavar="S", help="begin S seconds into the recording")
+    console.add_argument("--port", type=int, help="port on the loopback interface (default: 8080, or any free one)")
+    add_network(console)
+    console.set_defaults(act=_console)
+
+
+def _console(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.console.command import console, show_record
+    from snakesim_operator.tools.where import where_of
+
+    if arguments.run is not None:
+        return show_record(arguments.run, arguments.at, arguments.port)
+    return console(where_of(arguments), arguments.port)

@@ -1,0 +1,50 @@
+"""A live server for Foxglove: what a recording holds for it, as it is written. On loopback only."""
+
+from contextlib import suppress
+from types import TracebackType
+from typing import Self
+
+from google.protobuf.message import Message as Protobuf
+
+from snakesim_hal.errors import ConfigError, NotConnectedError
+from snakesim_operator.recording.foxglove import descriptor_set
+
+HOST = "127.0.0.1"
+
+
+class LiveServer:
+    """Hands messages to every viewer that has subscribed to their topic; a slow one loses the oldest."""
+
+    def __init__(self, robot: str, port: int) -> None:
+        """port: 0 takes any. Raises ConfigError without the extra, NotConnectedError when the port is in use."""
+        try:
+            import foxglove
+        except ImportError as error:
+            raise ConfigError("--foxglove needs: pip install 'snakesim[foxglove]'") from error
+        self._new_channel, self._schema = foxglove.Channel, foxglove.Schema
+        self._context = foxglove.Context()
+        self._channels: dict[str, foxglove.Channel] = {}
+        try:
+            self._server = foxglove.start_server(name=robot, host=HOST, port=port, context=self._context)
+        except RuntimeError as error:
+            raise NotConnectedError(f"cannot serve Foxglove on port {port}: {error}; choose another") from error
+        self.address = f"ws://{HOST}:{self._server.port}"
+
+    def show(self, topic: str, message: Protobuf, time_ns: int) -> None:
+        """Hand on one message. time_ns: robot time."""
+        channel = self._channels.get(topic)
+        if channel is None:
+            kind = message.DESCRIPTOR.full_name
+            schema = self._schema(name=kind, encoding="protobuf", data=descriptor_set(message))
+            channel = self._new_channel(topic, schema=schema, message_encoding="protobuf", context=self._context)
+            self._channels[topic] = channel
+        channel.log(message.SerializeToString(), log_time=time_ns)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with suppress(RuntimeError):  # it ends with its process in any case
+            self._server.stop()

@@ -1,0 +1,116 @@
+"""Arguments of `snakesim run`, `host` and `service`."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from snakesim_hal.arguments import (
+    add_host,
+    add_insecure,
+    add_network,
+    add_scenario,
+    add_service,
+    check_network,
+    load_scenario,
+    session_given,
+)
+from snakesim_hal.errors import ConfigError
+
+
+def add_commands(commands: Any) -> None:
+    """Add the three to the parser of `snakesim`."""
+    run = commands.add_parser(
+        "run",
+        help="run a scenario: backend, guidance, navigation and control",
+        epilog="Exit code: 0 complete, armed for all of the requested time; 1 a fault, or ended before that; 2 wrong "
+        "input, nothing was started; 3 complete, but the record has gaps; 130 interrupted. 1 and 130 take precedence.",
+    )
+    add_scenario(run)
+    run.add_argument(
+        "--fault",
+        action="append",
+        metavar="KIND:TARGET@START[-END][=AMOUNT]",
+        help="inject a fault, at seconds after arming; replaces the scenario's faults; may be repeated",
+    )
+    run.add_argument(
+        "--stay", action="store_true", help="faults do not end the run: processes restart, you clear and arm"
+    )
+    run.add_argument("--with-router", action="store_true", help="start a router for the run, as in a lab")
+    run.add_argument(
+        "--in-process",
+        action="store_true",
+        help="run in one process, without a network: lockstep, and faster; nothing can connect, arm or stop it",
+    )
+    run.add_argument("--no-record", action="store_true", help="keep no recording of the messages")
+    run.add_argument(
+        "--console",
+        action=argparse.BooleanOptionalAction,
+        default=False,
+        help="show the run in the browser, and print the address",
+    )
+    run.add_argument("--out", type=Path, help="folder for the run's record (default: runs/NAME-TIME)")
+    add_network(run, "")
+    add_insecure(run)
+    run.set_defaults(act=_run)
+
+    host = commands.add_parser(
+        "host",
+        help="run a robot's HAL host alone, for services on this or other machines",
+        epilog="It runs until Ctrl-C, and boots disarmed: `snakesim arm` arms it. Faults do not end it. Exit code: 0 "
+        "ended with --once and without a fault, 1 ended otherwise, 2 wrong input.",
+    )
+    add_host(host)
+    host.set_defaults(act=_host)
+
+    service = commands.add_parser(
+        "service",
+        help="run one service of a robot alone: guidance, navigation, control, ...",
+        epilog="It waits for the network and for the robot's host, and meets the next one after a restart.",
+    )
+    add_service(service)
+    service.set_defaults(act=_service)
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    from snakesim_hal.model.plugin_check import check_plugins
+
+    check_network(arguments)
+    loaded = load_scenario(arguments)
+    config = check_plugins(loaded.config, loaded.table)  # here, because only the table knows which flag set what
+    if arguments.in_process:
+        from snakesim_operator.run.in_process import run_in_process
+
+        for flag in ("endpoint", "router", "session", "namespace", "stay", "with_router", "console"):
+            if getattr(arguments, flag):
+                raise ConfigError(f"--in-process and --{flag.replace('_', '-')}: there is no network; leave one out")
+        return run_in_process(config, arguments.out, record=not arguments.no_record)
+
+    from snakesim_operator.run.run import RunRequest, run
+
+    return run(
+        RunRequest(
+            config,
+            out=arguments.out,
+            endpoint=arguments.endpoint,
+            router=arguments.router,
+            session=session_given(arguments),
+            namespace=arguments.namespace,
+            stay=arguments.stay,
+            with_router=arguments.with_router,
+            insecure=arguments.insecure,
+            record=not arguments.no_record,
+            console=arguments.console,
+        )
+    )
+
+
+def _host(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.run.host import run_host
+
+    return run_host(arguments)
+
+
+def _service(arguments: argparse.Namespace) -> int:
+    from snakesim_hal import serve
+
+    return serve.run(arguments)

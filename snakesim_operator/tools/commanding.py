@@ -1,0 +1,107 @@
+"""Arguments of the commands to a running robot: `snakesim arm`, `disarm`, `clear`, `estop`, `teleop`, `sim`, ..."""
+
+import argparse
+import contextlib
+import os
+from pathlib import Path
+from typing import Any
+
+from snakesim_hal.arguments import add_network
+from snakesim_operator.tools.simulator_order import add_command as add_sim
+from snakesim_operator.tools.simulator_order import order_of
+from snakesim_operator.tools.where import where_of
+
+URGENT = -10  # niceness of an emergency stop
+
+
+def add_commands(commands: Any) -> None:
+    """Add them to the parser of `snakesim`."""
+    arm = commands.add_parser("arm", help="allow a robot to move; names robot and backend, to avoid mix-ups")
+    arm.add_argument("robot", metavar="ROBOT", help="name of the robot, as printed by `snakesim status`")
+    arm.add_argument("backend", metavar="BACKEND", help="its backend: sim, can, ...")
+    add_network(arm)
+    arm.set_defaults(act=_arm)
+    for name, act, about in (
+        ("disarm", _disarm, "make a robot's joints passive"),
+        ("clear", _clear, "clear a fault or an emergency stop; the robot is disarmed then"),
+        ("estop", _estop, "stop a robot now, or all on the network without --namespace"),
+    ):
+        told = commands.add_parser(name, help=about)
+        add_network(told)
+        told.set_defaults(act=act)
+
+    teleop = commands.add_parser("teleop", help="drive a robot by keys or with a joystick; letting go stops it")
+    teleop.add_argument(
+        "--joystick",
+        nargs="?",
+        type=Path,
+        const=Path(),
+        metavar="DEVICE",
+        help="such as /dev/input/event5; or the first",
+    )
+    teleop.add_argument("--fastest", type=float, default=0.3, metavar="M/S", help="highest speed (0.3)")
+    add_network(teleop)
+    teleop.set_defaults(act=_teleop)
+
+    sim = add_sim(commands)
+    add_network(sim)
+    sim.set_defaults(act=_sim)
+
+    fault = commands.add_parser(
+        "fault", help="inject a fault into a run that allows it", epilog="`snakesim fault list` explains every kind."
+    )
+    fault.add_argument("kind", metavar="KIND", help="such as mute; `list` prints all of them")
+    fault.add_argument("target", nargs="?", metavar="TARGET", help="such as joint_3, bus_1, control, actuator/joints")
+    fault.add_argument("--for", dest="for_s", type=float, metavar="S", help="seconds of robot time until it ends")
+    fault.add_argument("--amount", type=float, metavar="X", help="amount, for kinds that have one")
+    fault.add_argument("--end", action="store_true", help="end it")
+    add_network(fault)
+    fault.set_defaults(act=_fault)
+
+
+def _arm(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.command import arm
+
+    return arm(arguments.robot, arguments.backend, where_of(arguments))
+
+
+def _disarm(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.command import disarm
+
+    return disarm(where_of(arguments))
+
+
+def _clear(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.command import clear
+
+    return clear(where_of(arguments))
+
+
+def _estop(arguments: argparse.Namespace) -> int:
+    with contextlib.suppress(PermissionError):
+        os.nice(URGENT)
+    from snakesim_operator.tools.stop import estop
+
+    return estop(where_of(arguments))
+
+
+def _teleop(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.teleop.command import TeleopRequest, teleop
+
+    stick: Path | None = arguments.joystick
+    request = TeleopRequest(arguments.fastest, stick is not None, None if stick in (None, Path()) else stick)
+    return teleop(request, where_of(arguments))
+
+
+def _sim(arguments: argparse.Namespace) -> int:
+    order = order_of(arguments)
+    from snakesim_operator.tools.simulator import simulator
+
+    return simulator(order, where_of(arguments))
+
+
+def _fault(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.fault import FaultOrder, fault
+
+    order = FaultOrder(arguments.kind, arguments.target, arguments.for_s, arguments.amount, arguments.end)
+    return fault(order, where_of(arguments))

@@ -1,0 +1,50 @@
+"""`snakesim scenarios` and `snakesim config`: what is shipped, and what a scenario comes to."""
+
+from snakesim_hal.model.files import read_part, shipped
+from snakesim_hal.model.plugin_check import check_plugins
+from snakesim_hal.model.plugins import in_file
+from snakesim_hal.model.scenario import Loaded
+from snakesim_hal.terminal import say, say_json
+
+ABOUT = {"scenarios": "title", "robots": "about", "scenes": "about", "suites": "title"}  # where each says what it is
+
+
+def list_shipped(*, as_json: bool) -> int:
+    """Print the name of every shipped file, and what it is."""
+    listed = {
+        kind: {name: read_part(name, kind).values.get(about, "") for name in shipped(kind)}
+        for kind, about in ABOUT.items()
+    }
+    if as_json:
+        say_json(listed)
+        return 0
+    for kind, names in listed.items():
+        say(f"{kind}:")
+        for name, about in names.items():
+            say(f"  {name:<18}{about}")
+    return 0
+
+
+def show_config(loaded: Loaded, *, as_json: bool) -> int:
+    """Print every value, and where it came from. Raises ConfigError."""
+    check_plugins(loaded.config, loaded.table, run_files=False)
+    if as_json:
+        say_json({key: {"value": value, "origin": origin} for key, value, origin in loaded.explain()})
+        return 0
+    rows = [(key, _shown(value), origin) for key, value, origin in loaded.explain()]
+    key_width = max(len(key) for key, _, _ in rows)
+    value_width = min(max(len(value) for _, value, _ in rows), 48)
+    for key, value, origin in rows:
+        say(f"{key:<{key_width}}  {value:<{value_width}}  {origin}")
+    for section, name in (
+        (loaded.config.control_section, loaded.config.controller),
+        (loaded.config.backend_section, loaded.config.backend),
+    ):
+        if in_file(name):
+            say(f"{section}: not checked, because that would run {name}; `snakesim run` checks it")
+    return 0
+
+
+def _shown(value: object) -> str:
+    text = repr(value) if isinstance(value, str) else str(value)
+    return text if len(text) <= 120 else text[:117] + "..."

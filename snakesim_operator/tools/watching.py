@@ -1,0 +1,81 @@
+"""Arguments of the commands that read what a robot publishes: `snakesim status`, `top`, `echo`, `record`, `preview`."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from snakesim_hal.arguments import add_json, add_network
+from snakesim_operator.tools.where import where_of
+
+
+def add_commands(commands: Any) -> None:
+    """Add them to the parser of `snakesim`."""
+    status = commands.add_parser("status", help="print the state of the robots on the network, and its reason")
+    add_network(status)
+    add_json(status)
+    status.set_defaults(act=_status)
+
+    top = commands.add_parser("top", help="show rate, jitter, size and age of every key, and commands' latency")
+    top.add_argument("--once", action="store_true", help="listen for two seconds, print one table, and end")
+    add_network(top)
+    add_json(top)
+    top.set_defaults(act=_top)
+
+    echo = commands.add_parser("echo", help="print what is published on a key, one JSON object a line")
+    echo.add_argument("key", nargs="?", help="such as sensor/joints or sensor/*; without it, list the keys")
+    echo.add_argument("--hz", action="store_true", help="print only rate and jitter")
+    echo.add_argument("--count", type=int, help="end after this many messages")
+    add_network(echo)
+    echo.set_defaults(act=_echo)
+
+    record = commands.add_parser("record", help="record everything that a robot publishes into an MCAP file")
+    record.add_argument("--out", type=Path, metavar="FILE.mcap", help="the file (default: NAMESPACE-TIME.mcap)")
+    record.add_argument("--duration", type=float, metavar="S", help="end after this time by the wall clock")
+    record.add_argument(
+        "--foxglove",
+        type=int,
+        nargs="?",
+        const=8765,
+        metavar="PORT",
+        help="serve Foxglove live as well, at ws://127.0.0.1:PORT (8765)",
+    )
+    add_network(record)
+    record.set_defaults(act=_record)
+
+    preview = commands.add_parser(
+        "preview", help="publish small, compressed copies of a robot's images; beside its host"
+    )
+    preview.add_argument("--hz", type=float, default=2.0, metavar="HZ", help="most previews a second of a camera (2)")
+    preview.add_argument("--width", type=int, default=320, metavar="PIXELS", help="widest preview (320)")
+    add_network(preview)
+    preview.set_defaults(act=_preview)
+
+
+def _status(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.status import show_status
+
+    return show_status(where_of(arguments), as_json=arguments.json)
+
+
+def _top(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.top import TopRequest, top
+
+    return top(TopRequest(arguments.once, arguments.json), where_of(arguments))
+
+
+def _echo(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.echo import EchoRequest, echo
+
+    return echo(EchoRequest(arguments.key, arguments.hz, arguments.count), where_of(arguments))
+
+
+def _record(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.record import record_robot
+
+    return record_robot(where_of(arguments), arguments.out, arguments.duration, arguments.foxglove)
+
+
+def _preview(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.preview import preview
+
+    return preview(where_of(arguments), arguments.hz, arguments.width)

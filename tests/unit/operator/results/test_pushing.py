@@ -1,0 +1,71 @@
+"""The report of a body that pushes with all joints: forces, obstacles, stops, and the map against the truth."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from snakesim_hal.model.scenario import load, parse_set, place_all
+from snakesim_operator.results.record import RunRecord
+from snakesim_operator.results.report import page
+from snakesim_operator.results.report.pushing import pushing
+from snakesim_operator.results.summary import summarise
+from snakesim_operator.run.in_process import simulate
+from tests.unit.operator.results.recorded import Reader, changed
+
+SECONDS = 1.5
+
+
+@pytest.fixture(scope="module")
+def record() -> RunRecord:
+    return simulate(load("surveyed_clutter", [parse_set(f"duration_s={SECONDS}")]).config).record
+
+
+def test_forces_are_told_along_the_body(record: RunRecord) -> None:
+    told = pushing(record)
+    assert told is not None and told.map_errors is None  # the map was known
+    wanted, felt = (np.array(line["y"], dtype=float) for line in told.forces["data"])
+    assert 2.0 < np.nanmax(wanted) < 60.0 and np.nanmax(felt) > 2.0
+    (drag,) = [one for one in told.forces["layout"]["shapes"] if one.get("xref") == "paper"]
+    assert drag["y0"] == pytest.approx(0.1 * 9.81 * sum(link.mass_kg for link in record.description.links))
+
+
+def test_every_obstacle_that_was_pushed_has_a_row(record: RunRecord) -> None:
+    told = pushing(record)
+    assert told is not None
+    pushed = {p.obstacle for state in record.control for p in state.push_points if np.hypot(*p.force_w[:2]) >= 0.5}
+    assert set(told.obstacles["data"][0]["y"]) == pushed and len(pushed) >= 3
+
+
+def test_a_stop_has_the_reason_that_held_longest(record: RunRecord) -> None:
+    reasons = {0.2: "contacts lost", 0.4: "jam", 1.0: "jam"}
+    control = [
+        msgspec.structs.replace(one, state="NotLocomoting", reason=next(w for t, w in reasons.items() if at_s <= t))
+        if (at_s := one.stamp_ns * 1e-9) <= 1.0
+        else msgspec.structs.replace(one, state="Locomoting")
+        for one in record.control
+    ]
+    told = pushing(changed(record, control=control))
+    assert told is not None and [one.why for one in told.stops] == ["jam"]
+    assert told.stops[0].end_s - told.stops[0].start_s == pytest.approx(1.0, abs=0.11)
+
+
+def test_a_perceived_map_is_held_against_the_truth(record: RunRecord) -> None:
+    config = msgspec.structs.replace(
+        record.config, mission=msgspec.structs.replace(record.config.mission, map="perceived")
+    )
+    truth = [placed.obstacle for placed in place_all(config)]
+    shifted = [
+        msgspec.structs.replace(one, position_w=(one.position_w[0] + 0.01, *one.position_w[1:]), position_sd_m=0.01)
+        for one in truth
+    ]
+    worlds = [msgspec.structs.replace(world, obstacles=shifted) for world in record.worlds]
+    told = pushing(changed(record, config=config, worlds=worlds))
+    assert told is not None and told.score is not None and told.map_errors is not None
+    assert told.position_mm == pytest.approx((10.0, 10.0), abs=0.01)
+    assert told.score.misses == told.score.ghosts == 0 < told.score.visible
+
+
+def test_the_page_has_the_section_only_for_such_a_controller(record: RunRecord) -> None:
+    assert "pushing" in Reader(page(record, summarise(record, "complete"))).ids
+    one_joint = [msgspec.structs.replace(one, propulsion_joint="joint_5") for one in record.control]
+    assert pushing(changed(record, control=one_joint)) is None

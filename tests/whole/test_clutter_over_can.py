@@ -1,0 +1,32 @@
+"""Through clutter with the CAN backend: the same guidance, navigation and control, with module twins as the robot."""
+
+import numpy as np
+import pytest
+
+from snakesim_hal.model.scenario import load, parse_set
+from snakesim_operator.results.advance import Advance
+from snakesim_operator.run.in_process import Result, simulate
+
+LOST_S = 3.0
+
+
+def over_can(*sets: str) -> Result:
+    """The shipped scenario with nothing changed but the backend and these."""
+    config = load("surveyed_clutter", [parse_set(text) for text in ("backend=can", *sets)]).config
+    return simulate(config, until_goal=True)
+
+
+def test_it_goes_on_without_a_joint_that_was_lost_on_the_way() -> None:
+    told = over_can("duration_s=6", "robot.safety.may_lose_joints=1", f'faults=["mute:joint_7@{LOST_S}"]')
+    assert told.summary.ended == "complete" and list(told.record.host.isolated) == ["joint_7"]
+    advance = Advance.of(told.record)
+    assert advance is not None
+    before_m = float(np.interp(LOST_S, advance.time_s, advance.along_m))
+    assert before_m > 0.4, "it moved before"
+    assert advance.along_m[-1] > before_m + 0.2, "and moves on"
+
+
+@pytest.mark.slow
+def test_it_crosses() -> None:
+    told = over_can().summary
+    assert told.crossed is True and not told.faults
