@@ -11,9 +11,10 @@ from snakesim_hal.host.simulated_time import Refusal, SimulatedTime
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import EstopRequest, Pace, SimulatorRequest
 from tests.unit.hal.local_network import Follower, Running, following, running, wait_until
-from tests.unit.hal.rig import LEASE_NS, description, run_config
+from tests.unit.hal.rig import description, run_config
 
-MANY_LEASES_S = 5 * LEASE_NS * 1e-9
+PATIENT: dict[str, Any] = {"rate_hz": 50.0}  # with the longest lease, 100 ms
+MANY_LEASES_S = 0.5
 
 
 @pytest.fixture(autouse=True)
@@ -38,7 +39,7 @@ def stands_at(run: Running) -> int:
 
 @pytest.mark.parametrize("pace", ["realtime", "lockstep"])
 def test_nothing_expires_in_a_pause_and_steps_are_exact(pace: Pace) -> None:
-    with running(run_config(pace=pace)) as run, following(run.link, Follower()) as control:
+    with running(run_config(pace=pace, **PATIENT)) as run, following(run.link, Follower()) as control:
         run.arm()
         wait_until(lambda: len(control.armed_ticks) > 5, "commands")
         assert "paused by ada" in ask(run, "pause")
@@ -59,7 +60,7 @@ def test_nothing_expires_in_a_pause_and_steps_are_exact(pace: Pace) -> None:
 
 def test_a_controller_that_dies_in_a_pause_stops_the_robot_after_it() -> None:
     """The lease counts robot time: it is as long after a pause as it was before."""
-    with running(run_config(pace="realtime")) as run, following(run.link, Follower()) as control:
+    with running(run_config(pace="realtime", **PATIENT)) as run, following(run.link, Follower()) as control:
         run.arm()
         wait_until(lambda: len(control.armed_ticks) > 5, "commands")
         ask(run, "pause")
@@ -71,7 +72,7 @@ def test_a_controller_that_dies_in_a_pause_stops_the_robot_after_it() -> None:
 
 
 def test_an_emergency_stop_in_a_pause_is_taken_at_once_and_outlasts_it() -> None:
-    with running(run_config(pace="realtime")) as run, following(run.link, Follower()):
+    with running(run_config(pace="realtime", **PATIENT)) as run, following(run.link, Follower()):
         run.arm()
         ask(run, "pause")
         tick = stands_at(run)
@@ -84,7 +85,7 @@ def test_an_emergency_stop_in_a_pause_is_taken_at_once_and_outlasts_it() -> None
 
 
 def test_speed_scales_real_time_and_tells_when_it_is_not_reached() -> None:
-    with running(run_config(pace="realtime", rate_hz=50.0)) as run, following(run.link, Follower()):
+    with running(run_config(pace="realtime", **PATIENT)) as run, following(run.link, Follower()):
         run.arm()
         ask(run, "speed", speed=0.2)
         wait_until(lambda: run.status.real_time_factor is not None, "a measured speed")
@@ -93,7 +94,7 @@ def test_speed_scales_real_time_and_tells_when_it_is_not_reached() -> None:
 
 
 def test_a_reset_ends_the_host_disarmed() -> None:
-    with running(run_config(pace="realtime")) as run, following(run.link, Follower()):
+    with running(run_config(pace="realtime", **PATIENT)) as run, following(run.link, Follower()):
         run.arm()
         ask(run, "reset")
         wait_until(run.ended, "the host's end")
