@@ -22,6 +22,7 @@ from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Ending, Host
 from snakesim_hal.host.latch import EstopLatch
 from snakesim_hal.host.recorder import Recorder
+from snakesim_hal.model.fault_plan import check_without_run
 from snakesim_hal.model.plugin_check import check_backend
 from snakesim_hal.model.plugins import BACKENDS, find_plugin, plugin_settings
 from snakesim_hal.model.scenario import RunConfig
@@ -82,6 +83,8 @@ def host(given: ProcessOptions) -> int:
 
     A simulator that is reset becomes another host, in the same process.
     """
+    if given.arguments.channel is None:
+        check_without_run(given.config, given.loaded.table)
     host = _run(given, check_backend(given.config, given.loaded.table))
     if host.ended == "reset":
         begin_anew()

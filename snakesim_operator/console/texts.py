@@ -93,7 +93,7 @@ def state_table(moment: Moment) -> str:
             ("robot time", f"{time_s}tick {status.tick}, {status.pace} at {status.rate_hz:g} Hz"),
             ("lease", f"{plain(status.lease_holder or 'free')} (epoch {status.lease_epoch})"),
             ("alive", plain(", ".join(status.alive) or "none")),
-            ("commands", f"{status.commands_accepted} accepted, {status.commands_standby} in standby"),
+            ("commands", f"{status.commands_accepted} accepted, {status.commands_standby} while disarmed"),
             ("rejected", _counts(status.commands_rejected)),
             ("limited", _counts(status.commands_limited)),
             ("overruns", f"{status.overruns}"),

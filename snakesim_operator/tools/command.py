@@ -82,7 +82,10 @@ def ask_host(session: Session, key: str, request: Message, done: str, link: Link
     doubt, shown = judge(answers, statuses)
     name = link.namespace
     if not answers:
-        raise NotConnectedError(f"{name}: NO ANSWER on {link.endpoint}; if the robot moves, `snakesim estop`")
+        raise NotConnectedError(
+            f"{name}: NO ANSWER on {link.endpoint}: its host hangs, or your role may not {request.action}; if the "
+            "robot moves, `snakesim estop`"
+        )
     if doubt is not None:
         now = "unknown" if shown is None else f"{shown.lifecycle} - {shown.why}"
         raise RefusedError(f"{name}: NOT CONFIRMED that it is {done}: {doubt}. Its status: {now}")
