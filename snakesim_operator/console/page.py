@@ -195,6 +195,7 @@ class Page:
             if self._charts is not None:
                 self._charts.remove()
             self._charts = JointCharts(self._server.gui, robot)
+        self._control_changed()  # a simulator has controls of its own
 
     def _show_settings(self, settings: ControlSettings) -> None:
         with self._lock:
@@ -253,4 +254,5 @@ def _what(moment: Moment | None) -> tuple[object, ...] | None:
     if moment is None:
         return None
     status, control = moment.status, moment.control
-    return (None if status is None else (status.lifecycle, status.why), None if control is None else control.state)
+    told = None if status is None else (status.lifecycle, status.why, status.paused_by)
+    return told, None if control is None else control.state
