@@ -22,6 +22,7 @@ from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Ending, Host
 from snakesim_hal.host.latch import EstopLatch
 from snakesim_hal.host.recorder import Recorder
+from snakesim_hal.model.fault_plan import check_without_run
 from snakesim_hal.model.plugin_check import check_backend
 from snakesim_hal.model.plugins import BACKENDS, find_plugin, plugin_settings
 from snakesim_hal.model.scenario import RunConfig
@@ -79,6 +80,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def host(given: ProcessOptions) -> int:
     """Run a host to its end. Returns 0 when all ticks were done without a fault, 1 otherwise. Raises SnakesimError."""
+    if given.arguments.channel is None:
+        check_without_run(given.config, given.loaded.table)
     host = _run(given, check_backend(given.config, given.loaded.table))
     stopped = any(fault.reach == "robot" for fault in host.authority.since_start.kept)
     return 1 if stopped or host.ended != "complete" else 0

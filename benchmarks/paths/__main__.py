@@ -34,7 +34,6 @@ START_LIMIT_S = 30.0
 CAMERA = (str(LOOP), "--set", "robot=planar13_camera")
 IMAGES = "planar13_camera/sensor/depth/*"
 RATE_MBIT = 6.0
-PIECE_BYTES = 1400
 AIM, AIM_SATURATED = 1.5, 1.3
 
 Percentiles = tuple[float, float]  # p50, p99 in microseconds
@@ -44,14 +43,14 @@ def ours(way: Way, seconds: float, folder: Path, scenario: Sequence[str] = (str(
     """One run of host and controller."""
     with ExitStack() as stack:
         routers(way, stack, folder)
-        log = str(folder / "ours.log")
+        log = folder / "ours.log"
         flags = [*scenario, "--duration", str(seconds)]
-        service = way.workstation.start("snakesim_hal.serve", "control", *flags, *way.service, log=log)
+        service = way.workstation.module("snakesim_hal.serve", "control", *flags, *way.service, log=log)
         stack.callback(_end, service)
         mine, its = socket_pair()
         with its:
             out = ["--once", "--end-after-fault", "1", "--out", str(folder), "--channel", str(its.fileno())]
-            host = way.robot.start(
+            host = way.robot.module(
                 "snakesim_hal.host_process", *flags, *way.host, *out, log=log, inherits=[its.fileno()]
             )
         stack.callback(_end, host)
@@ -83,12 +82,14 @@ def raw(way: Way, seconds: float, folder: Path, state: bytes, command: bytes) ->
     """The same with bare Zenoh."""
     with ExitStack() as stack:
         routers(way, stack, folder)
-        log, out = str(folder / "raw.log"), folder / "times.json"
+        log, out = folder / "raw.log", folder / "times.json"
         sizes = ("--bytes", str(len(state)), "--rounds", str(round(seconds / PERIOD_S)), "--out", str(out))
-        ask = way.robot.start(_RAW, "ask", str(way.robot_file), *sizes, log=log)
+        ask = way.robot.module(_RAW, "ask", str(way.robot_file), *sizes, log=log)
         stack.callback(_end, ask)
         time.sleep(0.5)  # direct: it listens
-        answer = way.workstation.start(_RAW, "answer", str(way.workstation_file), "--bytes", str(len(command)), log=log)
+        answer = way.workstation.module(
+            _RAW, "answer", str(way.workstation_file), "--bytes", str(len(command)), log=log
+        )
         stack.callback(_end, answer)
         if ask.wait(START_LIMIT_S + 2 * seconds) != 0:
             raise RuntimeError(f"{way.name}: {(folder / 'raw.log').read_text()[-300:]}")
@@ -102,7 +103,7 @@ _RAW = "benchmarks.paths.raw"
 def routers(way: Way, stack: ExitStack, folder: Path) -> None:
     """Start the routers of a way."""
     for machine, path in way.routers:
-        router = machine.start(_RAW, "router", str(path), log=str(folder / "router.log"))
+        router = machine.module(_RAW, "router", str(path), log=folder / "router.log")
         stack.callback(_end, router)
     time.sleep(1.0 if way.routers else 0.0)
 
@@ -146,9 +147,10 @@ def main() -> None:
             print(lines[-1], flush=True)
         slow = [
             "",
-            f"With a camera whose images somebody reads over a link of {RATE_MBIT:g} Mbit/s (`tbf`), against quiet.",
+            f"With a camera whose images somebody reads by one router over a link of {RATE_MBIT:g} Mbit/s (`tbf`),",
+            "less than the images need; against quiet. Before the link is one queue, or three by priority.",
             "",
-            "| way | watched p50 / p99, µs | quiet p50 / p99, µs | ratio p50 | ratio p99 | aim | images, Mbit/s |",
+            "| queue | watched p50 / p99, µs | quiet p50 / p99, µs | ratio p50 | ratio p99 | aim | images, Mbit/s |",
             "|---|---|---|---|---|---|---|",
         ]
         print("\n".join(slow), flush=True)
@@ -159,32 +161,40 @@ def main() -> None:
 
 def slow_link(lab: Lab, seconds: float, repeats: int, folder: Path) -> list[str]:
     """The loop over a slow link while somebody behind it watches the camera, against quiet: lines of a table."""
-    lab.robot.run(*f"tc qdisc add dev robot root tbf rate {RATE_MBIT:g}mbit burst 16kb latency 50ms".split())
+    lab.robot.run(*f"tc qdisc add dev robot root handle 1: tbf rate {RATE_MBIT:g}mbit burst 16kb latency 50ms".split())
     rows: list[str] = []
-    for way in (lab.one_router(), lab.one_router(PIECE_BYTES)):
+    way = lab.one_router()
+    for queue in ("bfifo limit 64kb", "pfifo_fast"):
+        lab.robot.run(*f"tc qdisc replace dev robot parent 1:1 {queue}".split())
         pairs: list[tuple[Percentiles, Percentiles]] = []
         stopped: list[str] = []
         shares: list[float] = []
         for _ in range(repeats):
             try:
                 quiet = ours(way, seconds, folder, CAMERA)
-                with ExitStack() as stack:
-                    seen = folder / "seen.json"
-                    reading = ("--key", IMAGES, "--out", str(seen))
-                    viewer = way.workstation.start(_RAW, "read", str(way.workstation_file), *reading, log="/dev/null")
-                    stack.callback(_end, viewer)
-                    busy = ours(way, seconds, folder, CAMERA)
-                    _, size = json.loads(seen.read_text())
+                busy, share = watched(way, seconds, folder)
             except (RuntimeError, TimeoutError) as error:
                 stopped.append(str(error))
                 continue
             pairs.append((busy, quiet))
-            shares.append(size * 8e-6 / seconds)
+            shares.append(share)
         if pairs:
-            rows.append(row(way.name, pairs, AIM_SATURATED) + f" {statistics.median(shares):.1f} |")
-        rows += [f"| {way.name} | {why} | | | | **missed** | |" for why in stopped]
+            rows.append(row(f"`{queue}`", pairs, AIM_SATURATED) + f" {statistics.median(shares):.1f} |")
+        rows += [f"| `{queue}` | {why} | | | | **missed** | |" for why in stopped]
         print("\n".join(rows[-len(stopped) - bool(pairs) :]), flush=True)
     return rows
+
+
+def watched(way: Way, seconds: float, folder: Path) -> tuple[Percentiles, float]:
+    """The loop while somebody reads the images, and how much of them comes through, in Mbit/s."""
+    seen = folder / "seen.json"
+    with ExitStack() as stack:
+        reading = ("--key", IMAGES, "--out", str(seen))
+        viewer = way.workstation.module(_RAW, "read", str(way.workstation_file), *reading, log=Path("/dev/null"))
+        stack.callback(_end, viewer)
+        busy = ours(way, seconds, folder, CAMERA)
+        _, size = json.loads(seen.read_text())
+    return busy, size * 8e-6 / seconds
 
 
 def row(name: str, pairs: Sequence[tuple[Percentiles, Percentiles]], aim: float = AIM) -> str:

@@ -10,7 +10,7 @@ from queue import Empty, SimpleQueue
 
 import zenoh
 
-from snakesim_hal.process import SERVICE_PRIORITY, die_with_parent, take_priority
+from snakesim_hal.process import SERVICE_PRIORITY, take_priority
 
 REQUEST, REPLY = "bench/request", "bench/reply"
 WARM_UP = 100
@@ -22,14 +22,12 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("part", choices=["router", "answer", "ask", "read"])
     parser.add_argument("file", type=Path)
-    parser.add_argument("--parent", type=int, required=True)
     parser.add_argument("--bytes", type=int, default=0)
     parser.add_argument("--rounds", type=int, default=0)
     parser.add_argument("--period-s", type=float, default=0.01)
     parser.add_argument("--key", default="")
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
-    die_with_parent(given.parent)
     if given.part != "read":
         take_priority(SERVICE_PRIORITY)
     zenoh.init_log_from_env_or("error")

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tests.links.machines import Machine, wire
+from tests.machines import Machine, wire
 
 PORT = 7447
 QUIET = {"multicast": {"enabled": False}, "gossip": {"enabled": False}}
@@ -53,21 +53,9 @@ class Lab:
             self._by("two routers", two, "tcp/10.78.1.1:7447", "tcp/10.78.4.1:7447"),
         ]
 
-    def one_router(self, piece_bytes: int | None = None) -> Way:
-        """Host and controller at one router. piece_bytes: of what the robot's session hands to the kernel at once.
-
-        What the kernel has, nothing overtakes. Before that Zenoh sends by priority, also between pieces of an image.
-        """
-        way = self.ways()[1]
-        if piece_bytes is not None:
-            settings = json.loads(way.robot_file.read_text())
-            link = {"tx": {"batch_size": piece_bytes}, "tcp": {"so_sndbuf": 2 * piece_bytes}}
-            settings["transport"] = {"link": link}
-            path = self.folder / "pieces.json5"
-            path.write_text(json.dumps(settings))
-            way.name = f"{way.name}, pieces of {piece_bytes} bytes"
-            way.robot_file, way.host = path, ["--session", str(path)]
-        return way
+    def one_router(self) -> Way:
+        """Host and controller at one router."""
+        return self.ways()[1]
 
     def _direct(self) -> Way:
         endpoint = "tcp/10.78.5.1:7447"

@@ -4,7 +4,7 @@ from collections.abc import Collection
 
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.files import Table
-from snakesim_hal.model.injection import HAL, Injection, check_targets, parse
+from snakesim_hal.model.injection import HAL, RUN, Injection, check_targets, parse
 from snakesim_hal.model.scenario import RunConfig
 
 MAX_BUSES = 8
@@ -37,6 +37,16 @@ def check_backend_can(config: RunConfig, *, does: Collection[str], buses: int, b
             raise ConfigError(
                 f"{_place(config, i, None)}: backend {config.backend!r} cannot do {injection.kind} to "
                 f"{injection.target}: {because}"
+            )
+
+
+def check_without_run(config: RunConfig, table: Table | None = None) -> None:
+    """Check that none needs `snakesim run`, which alone starts, kills and freezes processes. Raises ConfigError."""
+    for i, injection in enumerate(planned(config, table)):
+        if injection.part == RUN:
+            raise ConfigError(
+                f"{_place(config, i, table)} = {str(injection)!r}: only `snakesim run` does that; for a host by itself "
+                "leave it out, such as by --set 'faults=[]'"
             )
 
 

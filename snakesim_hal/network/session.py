@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Generic
 
@@ -21,6 +22,7 @@ from zenoh import ext, handlers  # pyright: ignore[reportMissingModuleSource]
 
 from snakesim_hal.errors import ConfigError, NotConnectedError, WireError
 from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT, check_guarded
+from snakesim_hal.network.images_apart import keep_apart, set_unless_given
 from snakesim_hal.network.session_file import SessionFile, of_mode, read_zenoh_file, refused_by_zenoh
 from snakesim_hal.process import raise_open_files
 from snakesim_hal.wire import keys
@@ -145,8 +147,10 @@ class Question:
 class Session:
     """A Zenoh session, as SnakeSIM uses it. Open one with `open_session`."""
 
-    def __init__(self, zenoh_session: Any) -> None:
+    def __init__(self, zenoh_session: Any, open_for_images: Callable[[], Any] | None = None) -> None:
+        """open_for_images: opens a connection for images alone; None: they take the one of everything else."""
         self._zenoh = zenoh_session
+        self._open_for_images, self._for_images = open_for_images, None
         self._declared: list[Any] = []
         self._publishers: dict[str, Publisher[Any]] = {}
         self._reroutes: dict[str, Callable[[bytes], None]] = {}
@@ -162,7 +166,9 @@ class Session:
             priority = zenoh.Priority.DATA_LOW
         elif message is Preview:
             priority = zenoh.Priority.BACKGROUND
-        publisher = self._zenoh.declare_publisher(
+        # In lockstep a clock must not overtake the images that it names.
+        session = self._images_session() if message in IMAGES and not lossless else self._zenoh
+        publisher = session.declare_publisher(
             key,
             encoding=encoding_of(message),
             congestion_control=zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP,
@@ -170,6 +176,13 @@ class Session:
             express=ends_a_tick,
         )
         return self._published(key, publisher, message)
+
+    def _images_session(self) -> Any:
+        if self._open_for_images is None:
+            return self._zenoh
+        if self._for_images is None:
+            self._for_images = self._open_for_images()
+        return self._for_images
 
     def latched_publisher(self, key: str, message: type[MessageT]) -> Publisher[MessageT]:
         """A publisher whose last value is sent to later subscribers."""
@@ -325,6 +338,8 @@ class Session:
         for declared in reversed(self._declared):
             declared.undeclare()
         self._declared.clear()
+        if self._for_images is not None:
+            self._for_images.close()
         self._zenoh.close()
 
 
@@ -368,7 +383,8 @@ def open_session(link: Link, connect_timeout_s: float = 5.0) -> Iterator[Session
         check_guarded(link.endpoint, "endpoint", insecure=link.insecure)
         raise_open_files(MAX_OPEN_FILES)
         os.environ.setdefault(*RUNTIME)
-    session = Session(open_zenoh(link, connect_timeout_s))
+    for_images = None if link.listen else partial(open_zenoh, link, connect_timeout_s, keep_apart)
+    session = Session(open_zenoh(link, connect_timeout_s), for_images)
     try:
         yield session
     finally:
@@ -386,10 +402,7 @@ def _config(link: Link, connect_timeout_s: float) -> zenoh.Config:
             config.insert_json5(f"{verb}/endpoints", json.dumps([link.endpoint] if does else []))
     for key, value in _ours(link, connect_timeout_s).items():
         config.insert_json5(key, json.dumps(value))
-    untouched = zenoh.Config()
-    for key, value in _unless_given(link).items():
-        if config.get_json(key) == untouched.get_json(key):
-            config.insert_json5(key, json.dumps(value))
+    set_unless_given(config, _unless_given(link))
     return config
 
 
@@ -419,11 +432,16 @@ def _unless_given(link: Link) -> dict[str, Any]:
     }
 
 
-def open_zenoh(link: Link, connect_timeout_s: float) -> zenoh.Session:
-    """The session under a `Session`. Raises NotConnectedError."""
+def open_zenoh(
+    link: Link, connect_timeout_s: float, change: Callable[[zenoh.Config], None] | None = None
+) -> zenoh.Session:
+    """The session under a `Session`. change: what is different for this one. Raises NotConnectedError."""
     zenoh.init_log_from_env_or("off")
+    config = _config(link, connect_timeout_s)
+    if change is not None:
+        change(config)
     try:
-        return zenoh.open(_config(link, connect_timeout_s))
+        return zenoh.open(config)
     except zenoh.ZError as error:
         if link.listen:
             raise NotConnectedError(

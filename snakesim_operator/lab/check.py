@@ -68,8 +68,9 @@ def check(lab: Lab, folder: Path, say: Say = say) -> int:
     for identity in identities(lab):
         _check_certificate(identity, folder, found)
     say("routers")
-    for name in lab.file.routers:
-        _check_router(name, lab, folder, found)
+    if not [name for name in lab.file.routers if _check_router(name, lab, folder, found)]:
+        say("no router can be reached, and so neither robots nor roles can be looked at")
+        return 1
     for robot in lab.file.robots:
         say(f"robot {robot}")
         _check_robot(robot, lab, folder, found)
@@ -101,20 +102,25 @@ def _tell_end(what: str, certificate: x509.Certificate, remedy: str, found: Find
         found.bad(f"{text}; {remedy}")
 
 
-def _check_router(name: str, lab: Lab, folder: Path, found: Findings) -> None:
-    """Whether it lets in who has a certificate, nobody else, and which certificate it shows."""
+def _check_router(name: str, lab: Lab, folder: Path, found: Findings) -> bool:
+    """Whether it lets in who has a certificate, nobody else, and which certificate it shows. False: not reached."""
     endpoint = lab.endpoint(name)
     identity = Identity(lab.file.routers[name].machine, None, name)
+    try:
+        _plain_connection(endpoint).close()
+    except OSError as error:
+        found.bad(f"{name}: nothing answers on {endpoint}: {error}; start it on {identity.machine}, or open the port")
+        return False
     anybody = next((other for other in identities(lab) if other.role is not None), None)
     if anybody is None:
-        return
+        return True
     settings = _settings(anybody, lab, folder, [endpoint])
     try:
         with open_probe(json.dumps(settings)) as probe:
             found.well(f"{name}: {endpoint}, round trip {1e3 * probe.round_trip_s():.2f} ms")
     except NotConnectedError as error:
         found.bad(f"{name}: {endpoint} lets {anybody.common_name} not in: {error}")
-        return
+        return True
     tls = settings["transport"]["link"]["tls"]
     shown = _shown_certificate(endpoint, tls)
     kept = read_certificate(_tls(identity, folder) / f"{identity.label}.pem")
@@ -126,15 +132,20 @@ def _check_router(name: str, lab: Lab, folder: Path, found: Findings) -> None:
             found.bad(f"{name}: lets in who has no certificate; it does not run with the rendered file")
     except NotConnectedError:
         found.well(f"{name}: keeps out who has no certificate")
+    return True
+
+
+def _plain_connection(endpoint: str) -> socket.socket:
+    host, _, port = endpoint.removeprefix("tls/").rpartition(":")
+    return socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_MS / 1000)
 
 
 def _shown_certificate(endpoint: str, tls: dict[str, Any]) -> x509.Certificate:
     """What a router shows to who connects."""
-    host, _, port = endpoint.removeprefix("tls/").rpartition(":")
+    host = endpoint.removeprefix("tls/").rpartition(":")[0].strip("[]")
     context = ssl.create_default_context(cafile=tls["root_ca_certificate"])
     context.load_cert_chain(tls["connect_certificate"], tls["connect_private_key"])
-    plain = socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_MS / 1000)
-    with plain, context.wrap_socket(plain, server_hostname=host.strip("[]")) as wrapped:
+    with _plain_connection(endpoint) as plain, context.wrap_socket(plain, server_hostname=host) as wrapped:
         return x509.load_der_x509_certificate(wrapped.getpeercert(binary_form=True) or b"")
 
 

@@ -50,9 +50,14 @@ class Robot(FileStruct, frozen=True, kw_only=True):
     scenario: Annotated[str, Meta(min_length=1, max_length=200, pattern=r"^[A-Za-z0-9_./-]+$")]
     backend: Name = "can"
     set: list[Setting] = []  # further settings, as with `snakesim run --set`
-    can: list[Interface] = []  # interfaces that its machine brings up
+    can: list[Interface] = []
     bitrate: Annotated[int, Meta(ge=10_000, le=1_000_000, extra_json_schema={"unit": "bit/s"})] = 1_000_000
     faults: bool = False  # whether an administrator may inject faults
+
+    @property
+    def interfaces(self) -> list[str]:
+        """CAN interfaces that its machine brings up; a simulator has none."""
+        return [] if self.backend == "sim" else self.can
 
 
 class Grant(FileStruct, frozen=True, kw_only=True):

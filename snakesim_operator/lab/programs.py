@@ -46,7 +46,7 @@ def programs(lab: Lab, machine: str) -> Iterator[Program]:
             robot = lab.file.robots[identity.of]
             out = ("--out", f"{STATE}/{identity.of}")
             arguments = ("host", *_scenario(robot), "--session", file, *out)
-            yield Program(identity, f"HAL host of {identity.of}", arguments, interfaces=tuple(robot.can))
+            yield Program(identity, f"HAL host of {identity.of}", arguments, interfaces=tuple(robot.interfaces))
         elif identity.role is Role.GNC:
             robot = lab.file.robots[identity.of]
             for service in identity.services:

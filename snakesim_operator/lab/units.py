@@ -6,6 +6,7 @@ from pathlib import Path
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+from snakesim_hal.process import SERVICE_PRIORITY
 from snakesim_operator.lab.lab_file import Lab
 from snakesim_operator.lab.programs import STATE, Program, programs
 
@@ -26,12 +27,13 @@ def unit_files(lab: Lab, machine: str, origin: str) -> Iterator[tuple[str, str]]
     entry = lab.file.machines[machine]
     found = list(programs(lab, machine))
     given = {"machine": entry, "origin": origin, "state": STATE, "refusals": REFUSALS, "uid": CONTAINER_USER}
+    given["priority"] = SERVICE_PRIORITY
     unit = templates.get_template("unit.j2")
     for program in found:
         text = unit.render(**given, program=program, command=_command_line(lab, program), addresses=_addresses(lab))
         yield f"systemd/{program.name}.service", text
     for robot in lab.file.robots.values():
-        for name in robot.can if robot.machine == machine else ():
+        for name in robot.interfaces if robot.machine == machine else ():
             text = templates.get_template("can.j2").render(
                 **given, name=name, virtual=name.startswith("v"), bitrate=robot.bitrate
             )

@@ -24,6 +24,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("rendered")
     program = Path(sys.executable).with_name("snakesim")
     text = MACHINE.sub(rf'\g<0>\nprogram = "{program}"', EXAMPLE.read_text())
+    text = text.replace('backend = "sim"', 'backend = "can"')
     text += '\n[routers.second]\nmachine = "hub"\nport = 7448\n'
     text += '\n[robots.twin]\nmachine = "robot1"\nscenario = "triplet"\ncan = ["vcan0"]\nset = ["rate_hz=50"]\n'
     (folder / "lab.toml").write_text(text)

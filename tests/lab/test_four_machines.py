@@ -2,7 +2,6 @@
 
 import os
 import re
-import sys
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -15,7 +14,7 @@ from snakesim_operator.lab.lab_file import EXAMPLE
 from snakesim_operator.results.record import SUMMARY
 from snakesim_operator.results.summary import RunSummary
 from tests.e2e.command import SNAKESIM
-from tests.lab.machines import NET, connected
+from tests.machines import NET, connected
 
 pytestmark = [
     pytest.mark.e2e,
@@ -44,7 +43,7 @@ class Lab:
     def start(self, machine: str, name: str, *arguments: str) -> None:
         """A program of ours on one machine."""
         state = {"XDG_STATE_HOME": str(self.folder / "state" / machine), "OMP_NUM_THREADS": "1"}
-        self.machines[machine].popen([*SNAKESIM, *arguments], log=self.folder / f"{name}.log", env=state)
+        self.machines[machine].start(*SNAKESIM, *arguments, log=self.folder / f"{name}.log", env=state)
 
     def session(self, machine: str, label: str) -> tuple[str, str]:
         return "--session", str(self.folder / machine / f"{label}.json5")
@@ -64,7 +63,7 @@ class Lab:
 def example(folder: Path, backend: str) -> str:
     """The example with its folders here, without the recorder."""
     text = re.sub(r"^\[machines\.(\w+)\]$", rf'\g<0>\nfolder = "{folder}/\1"', EXAMPLE.read_text(), flags=re.M)
-    text = text.replace("10.0.0.1", f"{NET}.1").replace('backend = "can" ', f'backend = "{backend}" ')
+    text = text.replace("10.0.0.1", f"{NET}.1").replace('backend = "sim"', f'backend = "{backend}"')
     return re.sub(r'\[\[roles\]\]\nmachine = "ws1"\nrole = "recorder"\nrobot = "planar13"\n', "", text)
 
 
@@ -90,9 +89,7 @@ def test_a_lockstep_run_across_four_machines_has_the_digest_of_one_machine(tmp_p
         until(lab, "next: `snakesim arm planar13", "status", *viewer)
         checked = lab.at("hub", "deploy", "check", "lab.toml", "--out", ".")
         assert "all is as it should be" in checked, checked
-        lab.machines["laptop"].popen(
-            [sys.executable, "-m", "tests.lab.intruder", viewer[1]], log=tmp_path / "intruder.log"
-        )
+        lab.machines["laptop"].module("tests.lab.intruder", viewer[1], log=tmp_path / "intruder.log")
         refused = lab.at("laptop", "arm", "planar13", backend, *viewer, check=False)
         assert "exit code 1" in refused, refused
         until(lab, "planar13: armed", "arm", "planar13", backend, *operator)

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from tests.e2e.documents import REPOSITORY, sections
-from tests.lab.machines import NET, Machine, connected
+from tests.machines import NET, Machine, connected
 
 pytestmark = [
     pytest.mark.e2e,
@@ -35,8 +35,10 @@ def test_a_new_lab_step_by_step(tmp_path: Path) -> None:
             if info == "sh by hand":
                 install(tmp_path)
             elif info.startswith("sh background on"):
-                machines[where].popen(
-                    ["bash", "-c", "exec env " + here(script, tmp_path, where)],
+                machines[where].start(
+                    "bash",
+                    "-c",
+                    "exec env " + here(script, tmp_path, where),
                     log=tmp_path / f"{number}.log",
                     env=environment(tmp_path, where),
                 )

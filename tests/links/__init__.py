@@ -1,6 +1,5 @@
 """A lab of network namespaces: links that are cut, lose and delay packets, and routers that die.
 
-`machines`  namespaces and the links between them; needs root
 `relay`     a link that loses and delays, packet by packet
 `lab`       the programs of a robot on three machines
 `measure`   `python -m tests.links --write` writes docs/lab-links.md

@@ -13,7 +13,8 @@ from pathlib import Path
 from snakesim_hal.model.scenario import RunConfig, load, parse_set, write
 from snakesim_hal.network.private_channel import StarterEnd, socket_pair
 from snakesim_hal.wire.messages import LifecycleRequest, Status
-from tests.links.machines import Machine, Radio, radio, wire
+from tests.e2e.command import SNAKESIM
+from tests.machines import Machine, Radio, radio, wire
 
 SCENARIO = "triplet"
 CHANGES = ("pace=realtime", "duration_s=86400")
@@ -23,9 +24,9 @@ START_LIMIT_S = 60.0
 class Lab:
     """Three machines, and what runs there."""
 
-    def __init__(self, folder: Path, stack: ExitStack, rate_hz: int) -> None:
+    def __init__(self, folder: Path, stack: ExitStack, *changes: str) -> None:
         self.folder = folder
-        self.config: RunConfig = load(SCENARIO, [parse_set(text) for text in (*CHANGES, f"rate_hz={rate_hz}")]).config
+        self.config: RunConfig = load(SCENARIO, [parse_set(text) for text in (*CHANGES, *changes)]).config
         self._saved = folder / "config.json"
         write(self.config, self._saved)
         self.router_machine, self.robot, self.workstation = (Machine(stack) for _ in range(3))
@@ -40,7 +41,14 @@ class Lab:
     def start_router(self) -> None:
         """A new router."""
         arguments = ("snakesim_hal.router_process", str(self._saved), "--endpoint", "tcp/0.0.0.0:7447", "--insecure")
-        self._router = self.router_machine.start(*arguments, log=str(self.folder / "router.log"), hurried=True)
+        self._router = self.router_machine.module(*arguments, log=self.folder / "router.log", hurried=True)
+
+    def record(self) -> Path:
+        """Start a recorder beside the controller, that reads everything; its file."""
+        out = self.folder / "recording.mcap"
+        arguments = ("record", "--out", str(out), "--router", "tcp/10.77.2.1:7447")
+        self.workstation.start(*SNAKESIM, *arguments, log=self.folder / "recorder.log")
+        return out
 
     def kill_router(self) -> None:
         """At once."""
@@ -49,14 +57,14 @@ class Lab:
 
     def _start(self, machine: Machine, module: str, name: str, router: str, *, log: str) -> None:
         arguments = (module, name, str(self._saved), "--router", f"tcp/{router}:7447")
-        machine.start(*arguments, log=str(self.folder / f"{log}.log"))
+        machine.module(*arguments, log=self.folder / f"{log}.log")
 
     def _start_host(self) -> StarterEnd:
         ours, its = socket_pair()
         with its:
             arguments = ("snakesim_hal.host_process", str(self._saved), "--router", "tcp/10.77.1.1:7447")
             out = ("--out", str(self.folder), "--channel", str(its.fileno()))
-            self.robot.start(*arguments, *out, log=str(self.folder / "host.log"), inherits=[its.fileno()])
+            self.robot.module(*arguments, *out, log=self.folder / "host.log", inherits=[its.fileno()])
         return StarterEnd(ours)
 
     @property
@@ -102,9 +110,9 @@ class Lab:
 
 
 @contextmanager
-def lab(folder: Path, rate_hz: int = 100) -> Iterator[Lab]:
-    """A lab whose robot is ready to be armed."""
+def lab(folder: Path, *changes: str) -> Iterator[Lab]:
+    """A lab whose robot is ready to be armed. changes: of the scenario, as `--set` takes them."""
     with ExitStack() as stack:
-        made = Lab(folder, stack, rate_hz)
+        made = Lab(folder, stack, *changes)
         made.until(lambda status: status.ready_to_arm, "ready")
         yield made

@@ -54,7 +54,7 @@ def held(condition: Condition, trials: int) -> str:
     """A line of the table: how long an armed robot keeps going, how fast, and what ends it."""
     armed_s: list[float] = []
     ended: list[str] = []
-    with tempfile.TemporaryDirectory() as folder, lab(Path(folder), condition.rate_hz) as made:
+    with tempfile.TemporaryDirectory() as folder, lab(Path(folder), f"rate_hz={condition.rate_hz}") as made:
         made.link.make(loss=condition.loss, delay_s=condition.delay_s, jitter_s=condition.jitter_s)
         for _ in range(trials):
             try:

@@ -1,6 +1,7 @@
 """A robot and its controller on machines of their own: what a broken link or a dead router does. Needs root."""
 
 import os
+import re
 import shutil
 import time
 from collections.abc import Iterator
@@ -16,6 +17,7 @@ pytestmark = [
     pytest.mark.skipif(not shutil.which("ip"), reason="makes network namespaces: needs iproute2"),
     pytest.mark.skipif(not Path("/dev/net/tun").exists(), reason="makes links of TAP interfaces: needs /dev/net/tun"),
 ]
+IMAGES_BYTES = 200_000
 STOP_LIMIT_S = 0.3  # 50 ms of the lease, a period, and a busy computer
 
 
@@ -58,3 +60,15 @@ def test_a_link_with_some_delay_keeps_the_robot_armed(robot: Lab) -> None:
         assert robot.status is not None and robot.status.lifecycle == "armed"
     finally:
         robot.link.make()
+
+
+def test_images_that_need_more_than_a_slow_link_has_stop_nothing(tmp_path: Path) -> None:
+    with lab(tmp_path, "robot=planar13_camera") as made:
+        made.robot.run("sh", "-c", "tc qdisc add dev robot root tbf rate 4mbit burst 16kb latency 50ms")
+        recording = made.record()
+        made.until(lambda _: recording.is_file() and recording.stat().st_size > IMAGES_BYTES, "images are recorded")
+        made.arm()
+        time.sleep(2.0)
+        assert made.status is not None and made.status.lifecycle == "armed", made.status
+        link = made.robot.run("tc", "-s", "qdisc", "show", "dev", "robot")
+        assert re.search(r"overlimits [1-9]\d{2,}", link), f"it was not full: {link}"

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.fault_plan import check_backend_can, check_planned, planned
+from snakesim_hal.model.fault_plan import check_backend_can, check_planned, check_without_run, planned
 from snakesim_hal.model.injection import (
     KINDS,
     Injection,
@@ -165,3 +165,9 @@ def test_a_backend_is_not_asked_for_what_it_cannot_do() -> None:
         check_backend_can(run_config(faults=["leak:joint_1@1", "reboot:joint_1@1"]), **does)
     with pytest.raises(ConfigError, match="no bus_2; this run has bus_1 to bus_1"):
         check_backend_can(run_config(faults=["cut:bus_2@1"]), **does)
+
+
+def test_a_host_by_itself_refuses_what_only_a_run_can_do() -> None:
+    check_without_run(run_config(faults=["hang:control@1", "mute:joint_2@1"]))
+    with pytest.raises(ConfigError, match=r"faults\[1\].*kill:control@1.*only `snakesim run`"):
+        check_without_run(run_config(faults=["mute:joint_2@1", "kill:control@1"]))

@@ -1,0 +1,33 @@
+"""What a connection for images alone has, and what a session file decides."""
+
+import json
+
+import zenoh
+
+from snakesim_hal.network.images_apart import keep_apart
+
+SNDBUF = "transport/link/tcp/so_sndbuf"
+
+
+def settings(**link: object) -> zenoh.Config:
+    endpoints = ["tcp/robot-lab:7447", "tls/[::1]:7447#iface=wlan0", "tcp/far:7447#dscp=0x10", "unixsock-stream/x"]
+    file = {"mode": "client", "connect": {"endpoints": endpoints}, "transport": {"link": link}}
+    return zenoh.Config.from_json5(json.dumps(file))
+
+
+def test_little_of_it_is_under_way_and_it_is_marked_as_what_may_wait() -> None:
+    config = settings()
+    keep_apart(config)
+    assert int(config.get_json(SNDBUF)) < 4096
+    assert json.loads(config.get_json("connect/endpoints")) == [
+        "tcp/robot-lab:7447#dscp=0x28",
+        "tls/[::1]:7447#dscp=0x28;iface=wlan0",
+        "tcp/far:7447#dscp=0x10",
+        "unixsock-stream/x",
+    ]
+
+
+def test_what_a_session_file_says_stays() -> None:
+    config = settings(tx={"batch_size": 9000}, tcp={"so_sndbuf": 100_000})
+    keep_apart(config)
+    assert (config.get_json(SNDBUF), config.get_json("transport/link/tx/batch_size")) == ("100000", "9000")
