@@ -3,18 +3,19 @@
 import argparse
 import difflib
 import os
+import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NoReturn
 
 from snakesim_hal.errors import ConfigError, SnakesimError, short
 from snakesim_hal.terminal import complain, complain_of, say
 from snakesim_operator.console import arguments as console
-from snakesim_operator.evaluate import command as evaluate
-from snakesim_operator.lab import command as lab
-from snakesim_operator.playback import command as playback
+from snakesim_operator.evaluate import arguments as evaluate
+from snakesim_operator.lab import arguments as lab
+from snakesim_operator.playback import arguments as playback
 from snakesim_operator.robots import arguments as robots
-from snakesim_operator.ros2 import command as ros2
+from snakesim_operator.ros2 import arguments as ros2
 from snakesim_operator.run import arguments as run
 from snakesim_operator.tools import commanding, setup, watching
 
@@ -52,8 +53,8 @@ def _act(given: list[str]) -> int:
         if name in installed(COMMANDS):
             return find_plugin(COMMANDS, name)(given[1:])
         raise ConfigError(
-            f"no command {short(name)!r}{_meant(name, [*ours.commands.choices, *installed(COMMANDS)])}; "
-            "`snakesim` alone lists them"
+            f"no command {short(name)!r}{_meant(name, [*ours.commands.choices, *installed(COMMANDS)])} "
+            "`snakesim` alone lists all"
         )
     arguments, unknown = ours.parse_known_args(given)
     if unknown:
@@ -64,18 +65,29 @@ def _act(given: list[str]) -> int:
 def _refuse(word: str, told: argparse.ArgumentParser) -> None:
     """Raise ConfigError for a word on the command line that means nothing to its command."""
     options = [option for action in told._actions for option in action.option_strings]
-    hint = _meant(word.partition("=")[0], options) if word.startswith("-") else ""
+    hint = _meant(word.partition("=")[0], options) if word.startswith("-") else ";"
     raise ConfigError(
-        f"{told.prog.removeprefix('snakesim ')}: unknown argument {short(word)!r}{hint}; see `{told.prog} --help`"
+        f"{told.prog.removeprefix('snakesim ')}: unknown argument {short(word)!r}{hint} see `{told.prog} --help`"
     )
 
 
 def _meant(word: str, known: Sequence[str]) -> str:
     close = difflib.get_close_matches(word, known, 1, 0.6)
-    return f"; did you mean `{close[0]}`?" if close else ""
+    return f"; did you mean `{close[0]}`?" if close else ";"
 
 
-class Commands(argparse.ArgumentParser):
+class Command(argparse.ArgumentParser):
+    """The arguments of one command."""
+
+    def error(self, message: str) -> NoReturn:
+        """End, with one line instead of the whole usage."""
+        told = re.sub(r"invalid float value: (.*)", r"\1 is not a number; give it without a unit", message)
+        told = re.sub(r"invalid int value: (.*)", r"\1 is not a whole number; give it without a unit", told)
+        complain(f"{self.prog}: {told}; see `{self.prog} --help`")
+        sys.exit(BAD_INPUT)
+
+
+class Commands(Command):
     """The command's arguments, without the commands of installed packages; its help lists the commands by task."""
 
     def __init__(self) -> None:
@@ -85,9 +97,7 @@ class Commands(argparse.ArgumentParser):
             epilog="`snakesim COMMAND --help` tells more. Begin with: snakesim run triplet --console",
         )
         self.add_argument("--version", action=_Version, nargs=0, help="print the version")
-        self.commands = self.add_subparsers(
-            dest="command", required=True, metavar="COMMAND", parser_class=argparse.ArgumentParser
-        )
+        self.commands = self.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=Command)
         self._tasks: dict[str, list[argparse.Action]] = {}
         for task, adders in TASKS.items():
             before = len(self.commands._choices_actions)

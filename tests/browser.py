@@ -84,18 +84,30 @@ class Tab:
 
     def click(self, label: str, hold_s: float = 0.0) -> None:
         """Press what has a label, and let go. A disabled button does nothing, as for a person."""
-        # Not at a place on the screen: the page moves things while it changes.
+        # Not at a place on the screen, and in one go: the page moves and replaces things while it changes.
         find = f"[...document.querySelectorAll('body *')].findLast(e => e.innerText?.trim() === {json.dumps(label)})"
-        assert self.value(f"(window.pressed = {find}) !== undefined"), (
-            f"no {label!r} on the page:\n{self.text()[:3000]}"
-        )
-        for kind in ("down", "up"):
-            self.value(
-                f"(() => {{ const r = pressed.getBoundingClientRect(); pressed.dispatchEvent(new PointerEvent("
-                f"'pointer{kind}', {{bubbles: true, pointerId: 1, clientX: r.x + 1, clientY: r.y + 1}})); }})()"
-            )
-            time.sleep(hold_s if kind == "down" else 0.0)
-        self.value("pressed.click()")
+        event = "{bubbles: true, pointerId: 1, clientX: r.x + 1, clientY: r.y + 1}"
+        found = self.send(
+            "Runtime.evaluate",
+            expression=f"(async () => {{ const e = {find}; if (!e) return false; const r = e.getBoundingClientRect();"
+            f"e.dispatchEvent(new PointerEvent('pointerdown', {event}));"
+            + (f"await new Promise(done => setTimeout(done, {1000 * hold_s}));" if hold_s else "")
+            + f"e.dispatchEvent(new PointerEvent('pointerup', {event})); e.click(); return true; }})()",
+            awaitPromise=True,
+            returnByValue=True,
+        )["result"].get("value")
+        assert found, f"no {label!r} on the page:\n{self.text()[:3000]}"
+
+    def type(self, label: str, text: str) -> None:
+        """Type a text into the field behind a label, over what is there."""
+        assert self.value(
+            f"(() => {{ let e = [...document.querySelectorAll('body *')].findLast(e => e.innerText?.trim() === "
+            f"{json.dumps(label)}); while (e && !e.querySelector('input[type=text]')) e = e.parentElement;"
+            "if (!e) return false; const field = e.querySelector('input[type=text]');"
+            "field.focus(); field.select(); return true; })()"
+        ), f"no {label!r} on the page:\n{self.text()[:3000]}"
+        self.send("Input.insertText", text=text)
+        self.value("document.activeElement.blur()")
 
     def press(self, key: str, code: int) -> None:
         """Press a key."""
@@ -108,9 +120,9 @@ class Tab:
             "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=scale, mobile=mobile
         )
 
-    def picture(self, path: Path) -> None:
-        """Save what it shows, as a PNG."""
-        path.write_bytes(base64.b64decode(self.send("Page.captureScreenshot", format="png")["data"]))
+    def picture(self, **more: Any) -> bytes:
+        """What it shows, as a PNG. more: for the protocol, such as `clip`."""
+        return base64.b64decode(self.send("Page.captureScreenshot", format="png", **more)["data"])
 
 
 class Browser:

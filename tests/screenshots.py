@@ -6,6 +6,7 @@ python -m tests.screenshots 'peg_row --stay' docs/console-live.png --click 'Take
 
 import argparse
 import contextlib
+import io
 import shlex
 import subprocess
 import sys
@@ -48,8 +49,8 @@ def main() -> None:
             tab.click(label)
             time.sleep(1.0)
         time.sleep(SETTLE_S if recorded else 0.0)
-        tab.picture(given.out)
-    with Image.open(given.out) as picture:
+        taken = tab.picture()
+    with Image.open(io.BytesIO(taken)) as picture:
         few = picture.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
         few.save(given.out, optimize=True)  # a quarter of the bytes
 

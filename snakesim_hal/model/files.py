@@ -123,11 +123,23 @@ def find(name: str, kind: str, beside: Path | None = None) -> Path:
         path = expanded(name)
         return path if path.is_absolute() or beside is None else beside / path
     if name not in shipped(kind):
-        raise ConfigError(
-            f"no {kind[:-1]} called {short(name)!r}; shipped are {', '.join(shipped(kind))}. "
-            f"For a file of your own give its path, such as ./{short(name)}.toml"
-        )
+        raise ConfigError(f"no {kind[:-1]} called {short(name)!r}{_what_it_is(name, kind)}")
     return SHIPPED / kind / f"{name}.toml"
+
+
+def _what_it_is(name: str, kind: str) -> str:
+    """What a name may be that no shipped file of a kind has, and what to do."""
+    if kind == "scenarios" and name.endswith(".py"):
+        return f": it is Python. A controller of your own: --controller ./{short(name)}:CLASS, behind a scenario's name"
+    for other in ("robots", "scenes"):
+        if kind == "scenarios" and name in shipped(other):
+            return f": it is a {other[:-1]}. Give a scenario, and --set {other[:-1]}={name}"
+    close = difflib.get_close_matches(name, shipped(kind), 1, 0.6)
+    meant = f"did you mean `{close[0]}`? " if close else ""
+    return (
+        f"; {meant}shipped are {', '.join(shipped(kind))}. For a file of your own give its path, such as "
+        f"./{short(name)}.toml"
+    )
 
 
 def read_part(name: str, kind: str, beside: Path | None = None) -> Table:
@@ -186,7 +198,8 @@ def _explain(flaw: Flaw, table: Table, under: str) -> str:
     *steps, name = [under, *flaw.steps] if under else flaw.steps or [""]
     dotted = ".".join([*steps, short(name)])
     if flaw.kind == "unknown":
-        close = difflib.get_close_matches(name, flaw.known, 1, 0.6)
+        deeper = [key for key in table.origin if key.endswith(f".{name}") and not key.startswith(f"{dotted}.")]
+        close = difflib.get_close_matches(name, flaw.known, 1, 0.6) or deeper
         hint = f"did you mean `{close[0]}`?" if close else f"known fields: {', '.join(sorted(flaw.known))}."
         set_by = [origin for key, origin in table.origin.items() if key == dotted or key.startswith(dotted + ".")]
         return f"{set_by[0] if set_by else table.file_of(dotted)}: unknown field `{dotted}`; {hint}"
@@ -197,8 +210,12 @@ def _explain(flaw: Flaw, table: Table, under: str) -> str:
     origin = table.origin_of(dotted)
     origin = table.file_of(dotted) if origin == "default" else origin
     shown = f"{short(_repr(value))}{' ' + unit if unit and isinstance(value, int | float) else ''}"
-    why = short(flaw.why[:1].lower() + flaw.why[1:])
-    return f"{origin}: `{dotted}` = {shown} is not allowed: {why}; expected {in_words(info)}."
+    why = "" if flaw.why.startswith(("Expected `int", "Expected `float")) else f": {short(_lower(flaw.why))}"
+    return f"{origin}: `{dotted}` = {shown} is not allowed{why}; expected {in_words(info)}."
+
+
+def _lower(text: str) -> str:
+    return text[:1].lower() + text[1:]
 
 
 def _repr(value: Any) -> str:

@@ -229,6 +229,7 @@ def compose(scenario: str, overrides: Sequence[Override] = ()) -> Table:
             from_flag = any(o.key == part for o in picks)
             inner = read_part(named, kind, None if from_flag else path.parent)
             table.put(part, inner.values, inner.source)
+            table.origin |= {f"{part}.{key}": origin for key, origin in inner.origin.items()}  # with `extends`, of two
     for override in sorted(overrides, key=lambda o: o.key.startswith(CHOSEN)):
         if override in picks:
             continue

@@ -5,6 +5,8 @@ Every failure is one ConfigError that names the file and the reason.
 
 import codecs
 import contextlib
+import difflib
+import itertools
 import json
 import os
 import re
@@ -19,6 +21,7 @@ from snakesim_hal.model.whole_file import write_whole
 
 MB = 1024 * 1024
 MAX_BYTES, MAX_TOML = 8 * MB, 2 * MB  # a route of 20,000 way-points has 1.8 MB as formatted JSON, 0.8 MB as TOML
+MAX_LISTED = 1000  # files of a folder that are looked at for one that may be meant
 MAX_DEPTH = 16  # sections within sections; a run's configuration has 6
 _KEY = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _DEEP_KEY = re.compile(rf"(?<![\w-])(?:{_KEY}[ \t]*+\.[ \t]*+){{{MAX_DEPTH}}}")  # tomllib takes quadratic time for it
@@ -55,7 +58,7 @@ def read_bytes(path: Path) -> bytes:
             with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
                 data = file.read(MAX_BYTES + 1)
     except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file") from None
+        raise ConfigError(f"{path}: no such file{_instead_of(path)}") from None
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
     except ValueError as error:  # a NUL in the name
@@ -64,6 +67,19 @@ def read_bytes(path: Path) -> bytes:
     if len(data) > MAX_BYTES:
         raise ConfigError(f"{path}: is larger than {MAX_BYTES // MB} MB, the limit of a settings file")
     return data
+
+
+def _instead_of(path: Path) -> str:
+    """What may be meant by the path of a file that is not there."""
+    try:
+        there = sorted(entry.name for entry in itertools.islice(path.parent.iterdir(), MAX_LISTED))
+    except OSError as error:
+        return f"; its folder {path.parent} cannot be read: {error.strerror}"
+    close = difflib.get_close_matches(path.name, there, 1, 0.6)
+    if close:
+        return f"; did you mean {path.parent / close[0]}?"
+    alike = [name for name in there if path.suffix and name.endswith(path.suffix)][:8]
+    return f"; in {path.parent.absolute()} " + (f"are {', '.join(alike)}" if alike else f"is no file *{path.suffix}")
 
 
 def _check_plain(path: Path, mode: int) -> None:

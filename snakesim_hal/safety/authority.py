@@ -293,7 +293,8 @@ class Authority:
     def _refusals(self, now_ns: int) -> list[tuple[str, str]]:
         found: list[tuple[str, str]] = []
         if self.state != "disarmed":
-            found.append(("wrong_state", f"state is {self.state}, must be disarmed"))
+            first = "; first `snakesim clear`" if self.state in ("fault", "estop") else ""
+            found.append(("wrong_state", f"state is {self.state}, must be disarmed{first}"))
         return found + [("not_ready", why) for why in self._unready(now_ns)]
 
     def _unready(self, now_ns: int) -> list[str]:
@@ -302,7 +303,7 @@ class Authority:
         if self.arming and not self._stop_sent:
             against.append("the motors have not received the stop yet; ask again in a period")
         if not self.lease.live(now_ns):
-            against.append("the lease is free")
+            against.append("nothing commands the robot: the lease is free")
         elif self._command is None:
             against.append(f"no commands from {self.lease.holder} yet")
         elif now_ns - self._command_ns > self.description.lease_ns:  # the lease may also be renewed by requests

@@ -16,10 +16,8 @@ from snakesim_operator.console.moment import Moment
 from snakesim_operator.console.operations import Log, Operations
 from snakesim_operator.console.page import Page
 from snakesim_operator.console.player import Player
-from snakesim_operator.console.recorded import Recorded
 from snakesim_operator.console.server import page_server
 from snakesim_operator.console.watch import Watch
-from snakesim_operator.results.record import RunRecord
 
 FRAMES_PER_S = 30.0
 
@@ -44,6 +42,10 @@ def show_live(link: Link, around: Surroundings | None, port: int | None, stop: t
 
 def show_recorded(folder: Path, at_s: float, port: int | None, stop: threading.Event, say: Say) -> None:
     """Show a run's record until `stop` is set. Raises ConfigError when the folder has none."""
+    # What only recordings need would delay the page of a run that starts.
+    from snakesim_operator.console.recorded import Recorded
+    from snakesim_operator.results.record import RunRecord
+
     recorded = Recorded(RunRecord.load(folder))
     with page_server(port) as (server, address):
         page = Page(server, Surroundings(recorded.record.config), None, Log(), recorded=folder.name)

@@ -7,10 +7,9 @@ as they like.
 import math
 from collections import deque
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
 import viser
 from numpy.typing import ArrayLike, NDArray
 
@@ -18,6 +17,9 @@ from snakesim_hal.model.kinematics import quaternion_from_yaw
 from snakesim_hal.wire.messages import Description, Obstacle
 from snakesim_operator.console.drawing import Camera, Drawing, Surroundings
 from snakesim_operator.results.page.palette import DARK, LIGHT
+
+if TYPE_CHECKING:
+    import trimesh  # where it is used: it takes as long to load as all of the page, which need not wait for it
 
 Floats = NDArray[np.float64]
 Colour = tuple[int, int, int]
@@ -46,6 +48,8 @@ class Stage:
     """The 3-D scene of one robot."""
 
     def __init__(self, scene: viser.SceneApi, robot: Description, around: Surroundings | None) -> None:
+        import trimesh
+
         self._scene, self._robot, self._around = scene, robot, around
         self._thick = max(link.radius_m for link in robot.links)
         scene.configure_environment_map("warehouse", environment_intensity=0.3)
@@ -79,6 +83,8 @@ class Stage:
 
     def _add_links(self) -> list[tuple[viser.BatchedMeshHandle, list[int]]]:
         """One batch for all links of one size."""
+        import trimesh
+
         alike: dict[tuple[float, float], list[int]] = {}
         for i, link in enumerate(self._robot.links):
             alike.setdefault((link.length_m, link.radius_m), []).append(i)
@@ -95,7 +101,9 @@ class Stage:
             found.append((batch, numbers))
         return found
 
-    def _batch(self, name: str, mesh: trimesh.Trimesh, count: int, of: Colour, **more: Any) -> viser.BatchedMeshHandle:
+    def _batch(
+        self, name: str, mesh: "trimesh.Trimesh", count: int, of: Colour, **more: Any
+    ) -> viser.BatchedMeshHandle:
         return self._scene.add_batched_meshes_simple(
             f"/world/{name}",
             np.asarray(mesh.vertices),
@@ -287,7 +295,9 @@ def _shades(colours: Sequence[Colour]) -> NDArray[np.uint8]:
     return np.round(255 * linear).astype(np.uint8)
 
 
-def _unit(shape: str) -> trimesh.Trimesh:
+def _unit(shape: str) -> "trimesh.Trimesh":
+    import trimesh
+
     if shape == "cylinder":
         return trimesh.creation.cylinder(1.0, 1.0, sections=40)
     return trimesh.creation.box((2.0, 2.0, 2.0)) if shape == "box" else trimesh.creation.icosphere(3, 1.0)

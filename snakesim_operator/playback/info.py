@@ -13,7 +13,9 @@ import numpy as np
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.terminal import Say
 from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Status
 from snakesim_operator.recording.reader import RECORDING, RecordingReader
+from snakesim_operator.results.record import GIVE
 from snakesim_operator.results.recorded import ALL, Contents
 
 IRREGULAR = (
@@ -63,7 +65,7 @@ def recording_of(given: Path) -> Path:
     """The recording of a run's folder, or the file itself. Raises ConfigError."""
     path = given / RECORDING if given.is_dir() else given
     if not path.is_file():
-        raise ConfigError(f"{path}: there is no such recording; give an MCAP file, or the folder of a run that has one")
+        raise ConfigError(f"{path}: there is no such recording; {GIVE}")
     return path
 
 
@@ -82,8 +84,10 @@ def look_into(path: Path) -> RecordingInfo:
 def _told(path: Path, reader: RecordingReader, found: dict[str, KeyInfo], contents: Contents) -> RecordingInfo:
     robot, status = contents.description, contents.status
     config: dict[str, Any] = json.loads(contents.config.content) if contents.config is not None else {}
-    times = [t for one in found.values() for t in (min(one.time_ns), max(one.time_ns))]
-    duration_s = (max(times) - min(times)) * 1e-9 if times else 0.0
+    # Not since the oldest message: latched values, such as the description, are older than a recording that began late.
+    dated = [found[keys.CLOCK]] if keys.CLOCK in found else found.values()
+    began_ns = min((min(one.time_ns) for one in dated), default=0)
+    duration_s = (max((max(one.time_ns) for one in found.values()), default=began_ns) - began_ns) * 1e-9
     host = contents.host(contents.columns(robot)) if robot is not None and status is not None else None
     return RecordingInfo(
         file=str(path),
@@ -99,10 +103,15 @@ def _told(path: Path, reader: RecordingReader, found: dict[str, KeyInfo], conten
         duration_s=duration_s,
         ticks=0 if host is None else host.ticks,
         command_digest=None if host is None or not host.ticks else host.command_digest,
-        lifecycle=None if status is None else f"{status.lifecycle}: {status.why}",
+        lifecycle=None if status is None else f"{status.lifecycle}: {_why(status)}",
         dropped=reader.about.get("dropped", {}),
         keys={key: _numbers(key, one, duration_s) for key, one in sorted(found.items())},
     )
+
+
+def _why(status: Status) -> str:
+    """Why it was in its state; without what a status says behind that, while disarmed: what prevents arming."""
+    return status.why.partition("; ")[0] if status.lifecycle == "disarmed" else status.why
 
 
 def _numbers(key: str, one: KeyInfo, duration_s: float) -> dict[str, float]:

@@ -27,6 +27,7 @@ from snakesim_operator.results.recorded import TOLD, Contents, read_recording
 CONFIG = "config.json"
 SUMMARY = "summary.json"
 REPORT = "report.html"
+GIVE = "give the folder that `snakesim run` left, such as runs/demo, or a recording"
 
 DAMAGED = (*UNDECODABLE, OSError, MemoryError)
 Floats = NDArray[np.float64]
@@ -55,6 +56,7 @@ class RunRecord:
     contact_peak_n: Floats  # (n,) strongest contact
     contact_count: Floats  # (n,) obstacles touched
     lacks: list[str] = field(default_factory=list[str])  # missing data, as text
+    replay_of: str = ""  # the recording whose sensors its services were given; empty: a run
 
     @staticmethod
     def load(folder: Path, host: HostRecord | None = None) -> "RunRecord":
@@ -64,9 +66,11 @@ class RunRecord:
         """
         if folder.is_file() or (not (folder / BLACK_BOX).exists() and (folder / RECORDING).is_file()):
             return RunRecord._alone(folder if folder.is_file() else folder / RECORDING)
+        if not folder.exists():
+            raise ConfigError(f"{folder}: no such folder; {GIVE}")
         for name in (CONFIG, BLACK_BOX, DESCRIPTION, *([] if host is not None else [HOST_RECORD])):
             if not (folder / name).is_file():
-                raise ConfigError(f"{folder} is not the folder of a run: {name} is missing")
+                raise ConfigError(f"{folder} is not the folder of a run: {name} is missing; {GIVE}")
         try:
             return RunRecord._read(folder, host)
         except ConfigError:
@@ -124,7 +128,16 @@ class RunRecord:
             control.pop()
         known = {name: column for name, column in columns.items() if name != "tick"}
         told = (control, contents.told[keys.WORLD], contents.told[keys.TRAJECTORY])
-        return RunRecord(folder, config, description, host, *told, **known, lacks=lacks + contents.lacks)
+        return RunRecord(
+            folder,
+            config,
+            description,
+            host,
+            *told,
+            **known,
+            lacks=lacks + contents.lacks,
+            replay_of=contents.replay_of,
+        )
 
     @cached_property
     def route(self) -> Route | None:

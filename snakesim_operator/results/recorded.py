@@ -57,6 +57,7 @@ class Contents:
     armed_wall_ns: list[int] = field(default_factory=list[int])  # wall clock at each clock since the first arming
     refused: Counter[str] = field(default_factory=Counter[str])  # messages that cannot be decoded, by key and reason
     lacks: list[str] = field(default_factory=list[str])
+    replay_of: str = ""  # the recording whose sensors these are
     _decoders: dict[str, Decoder[Any]] = field(default_factory=dict[str, Decoder[Any]])
 
     def take(self, recorded: Recorded) -> None:
@@ -78,6 +79,8 @@ class Contents:
                 self.config = message
             case Status():
                 self.status = message
+            case Clock(paused=True):
+                pass  # no tick
             case World() | Trajectory() | ControlState():
                 told = self.told[key]
                 if not told or _is_news(told[-1], message):
@@ -158,6 +161,7 @@ def read_recording(path: Path, wanted: Collection[str] = ALL) -> Contents:
     contents.lacks += unread(contents.refused)
     if reader.trouble:
         contents.lacks.append(f"recording: damaged from there on: {reader.trouble}")
+    contents.replay_of = str(reader.about.get("replay_of", ""))
     dropped = sum(reader.about.get("dropped", {}).values())
     if dropped:
         contents.lacks.append(f"recording: {dropped} messages were dropped, because the disk was too slow")

@@ -12,7 +12,7 @@ from pathlib import Path
 import msgspec
 
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.files import Table, read_part, short
+from snakesim_hal.model.files import Table, read_part, shipped, short
 from snakesim_hal.model.robot import RobotFile
 from snakesim_operator.robots.body import put_body
 from snakesim_operator.robots.imported import Imported, Order
@@ -46,6 +46,11 @@ def robot_of(file: Path, order: Order) -> Imported:
     found.table.put("name", _name(urdf.get("name", file.stem)), str(file))
     found.table.values = dict(sorted(found.table.values.items(), key=lambda item: SECTIONS.get(item[0], len(SECTIONS))))
     _tell_unread(found, urdf)
+    if found.table.values["name"] in shipped("robots"):
+        found.left_out.append(
+            f"a name of its own: it is {found.table.values['name']}, as a shipped robot is; change it, because the "
+            "network and a latched stop tell robots apart by it"
+        )
     found.robot  # noqa: B018 - raises for numbers that no robot file may hold
     return found
 
@@ -80,6 +85,11 @@ def _tell_unread(found: Imported, urdf: Element) -> None:
     lines: dict[str, list[int]] = {}
     for path, line in urdf.unread():
         lines.setdefault(path, []).append(line)
+    looks = [path for path in lines if path.endswith(("<visual>", "<material>"))]
+    if looks and urdf.first("snakesim") is None:  # those of an export of ours are made of its robot file
+        found.left_out.append(f"looks, which change nothing in a run: {', '.join(map(short, looks))}")
     for path, where in lines.items():
+        if path in looks:
+            continue
         shown = ", ".join(map(str, where[:12])) + (f" and {len(where) - 12} more" if len(where) > 12 else "")
         found.left_out.append(f"{short(path)} left out: line{'s' * (len(where) > 1)} {shown}")

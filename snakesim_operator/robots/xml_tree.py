@@ -151,5 +151,5 @@ def parse_xml(data: bytes, source: str) -> Element:
     except (expat.ExpatError, ValueError, LookupError) as error:  # LookupError: an encoding that nobody knows
         if isinstance(error, ConfigError):
             raise
-        raise ConfigError(f"{source}: not valid XML: {error}") from None
+        raise ConfigError(f"{source}: is no URDF: not valid XML: {error}; give a file that ends with .urdf") from None
     return top.children[0]

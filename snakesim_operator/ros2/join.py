@@ -1,6 +1,7 @@
 """The bridge's two sessions: one on the robot's network, one on that of the ROS nodes."""
 
 import argparse
+import contextlib
 import time
 from dataclasses import replace
 
@@ -11,8 +12,8 @@ from snakesim_hal.terminal import say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_hal.wire.messages import Description
+from snakesim_operator.ros2.arguments import check
 from snakesim_operator.ros2.bridge import Bridge, Options, adds_up
-from snakesim_operator.ros2.command import check
 from snakesim_operator.ros2.graph import Node, NodeName
 from snakesim_operator.tools.targets import Where, the_one
 
@@ -27,7 +28,8 @@ def join(arguments: argparse.Namespace, where: Where) -> int:
     if link.endpoint == arguments.ros_router:
         raise ConfigError(
             f"--ros-router {arguments.ros_router}: {link.namespace} itself is on this endpoint, and ROS nodes are not "
-            f"let into its network; start the router of ROS at another one, or the robot with --endpoint"
+            f"let into its network. On one computer give the robot another port: --endpoint tcp/127.0.0.1:7448 behind "
+            "`snakesim run`; this command finds it there"
         )
     with open_session(replace(link, largest_bytes=MAX_IMAGE_BYTES)) as session:
         robot = session.latest(keys.DESCRIPTION, Description, DESCRIBED_S, adds_up)
@@ -41,7 +43,14 @@ def join(arguments: argparse.Namespace, where: Where) -> int:
             cmd_vel=arguments.cmd_vel,
             wall_time=wall_time,
         )
-        with open_neighbour(arguments.ros_router, largest_bytes=MOST_IN_BYTES) as neighbour:
+        with contextlib.ExitStack() as opened:
+            try:
+                neighbour = opened.enter_context(open_neighbour(arguments.ros_router, largest_bytes=MOST_IN_BYTES))
+            except NotConnectedError:
+                raise NotConnectedError(
+                    f"no router of ROS nodes on {arguments.ros_router}; start it by "
+                    "`ros2 run rmw_zenoh_cpp rmw_zenohd`, or give --ros-router"
+                ) from None
             name = NodeName("snakesim", f"/{options.namespace}")
             made = Bridge(session, Node(neighbour, arguments.domain, name), robot, options)
             say(

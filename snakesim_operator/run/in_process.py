@@ -122,9 +122,8 @@ def _go(
                 if turn % TAKEN_EVERY == 0:
                     if recording is not None:
                         recording.flush_when_due()
-                    if progress is not None:
-                        state = control.newest(lambda _state: True)
-                        progress.show(host.status(), state, armed=host.authority.arming > 0)
+                    if progress is not None and host.authority.arming:  # before that there is nothing to wait for
+                        progress.show(host.status(), control.newest(lambda _state: True), armed=True)
                     if until_goal and watch.over(host.black_box):
                         host.complete()
                 if ending.interrupted:

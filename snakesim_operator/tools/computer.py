@@ -128,7 +128,9 @@ def can() -> Iterator[Finding]:
     try:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
     except OSError as error:
-        told = f"this kernel has none ({error.strerror}); needed for `--backend can` with channels, twins run without"
+        told = (
+            f"this kernel has none ({error.strerror}); only real joint modules need it, `--backend can` emulates them"
+        )
         yield Finding(what="CAN", state="warn", told=told, fix=["sudo modprobe -a can_raw vcan", vm])
         return
     found = [

@@ -1,6 +1,7 @@
 """`snakesim echo`: prints the messages on a key, as one JSON object a line, or their rate."""
 
 import contextlib
+import difflib
 import itertools
 import json
 import statistics
@@ -14,7 +15,7 @@ from typing import Any
 
 import msgspec
 
-from snakesim_hal.errors import ConfigError, NotConnectedError, WireError
+from snakesim_hal.errors import ConfigError, NotConnectedError, WireError, short
 from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.session import Arrival, Session, intersects, key_expression, open_session
 from snakesim_hal.terminal import Say, complain, say
@@ -40,11 +41,14 @@ def echo(request: EchoRequest, where: Where, say: Say = say) -> int:
     if request.key is None:
         for line in _key_lines():
             say(line)
+        complain("`snakesim echo KEY` prints the messages, with --hz the rate; `snakesim top` shows all rates at once")
         return 0
     relative = key_expression(request.key.strip("/"))
     rows = [row for row in _echoed() if intersects(relative, row.key)]
     if not rows:
-        raise ConfigError(f"there is no key {request.key!r}; available keys:", *_key_lines())
+        close = difflib.get_close_matches(request.key, [row.key for row in _echoed()], 1, 0.6)
+        meant = [f"did you mean `{close[0]}`?"] if close else []
+        raise ConfigError(f"there is no key {short(request.key)!r}; available keys:", *_key_lines(), *meant)
     latched = tuple(row.key for row in rows if row.kind == "latched")
     within = "" if where.namespace is not None else "**/"
     pattern, latched_keys = key_expression(f"{within}{relative}"), tuple(f"{within}{key}" for key in latched)

@@ -1,10 +1,11 @@
 """`snakesim fault`: inject a fault into a run that allows it, and end it."""
 
+import difflib
 from dataclasses import dataclass
 from math import inf
 
-from snakesim_hal.errors import ConfigError, NotConnectedError, RefusedError
-from snakesim_hal.model.injection import Injection, checked, explain
+from snakesim_hal.errors import ConfigError, NotConnectedError, RefusedError, short
+from snakesim_hal.model.injection import KINDS, Injection, checked, explain
 from snakesim_hal.network.session import open_session
 from snakesim_hal.terminal import Say, say
 from snakesim_hal.wire import keys
@@ -32,6 +33,13 @@ def fault(order: FaultOrder, where: Where, say: Say = say) -> int:
         for line in explain().splitlines():
             say(line)
         return 0
+    kinds = sorted({kind for of_target in KINDS.values() for kind in of_target})
+    if order.kind not in kinds:
+        close = difflib.get_close_matches(order.kind, kinds, 1, 0.6)
+        meant = f"did you mean `{close[0]}`? " if close else ""
+        raise ConfigError(
+            f"fault {short(order.kind)}: there is no such kind; {meant}`snakesim fault list` explains all"
+        )
     if order.target is None:
         raise ConfigError(f"fault {order.kind}: give a target, such as joint_3; see `snakesim fault list`")
     injection = checked(Injection(order.kind, order.target, amount=order.amount), f"{order.kind} {order.target}")

@@ -48,6 +48,7 @@ def show_status(where: Where, say: Say = say, *, as_json: bool = False) -> int:
         noted = last_run.recall()
         last = f"; the last run on this computer ended so: {noted[1]} ({noted[0]})" if noted is not None else ""
         say(f"no robot answers on {', '.join(where.endpoints())}{last}")
+        say("  next: `snakesim run triplet --console`, or another of `snakesim scenarios`")
         return 1
     for link, statuses in found:
         for line in _in_words(link, statuses[-1]):
@@ -124,9 +125,13 @@ def _in_words(link: Link, status: Status) -> list[str]:
         f", on {link.endpoint}",
         f"  lease: {status.lease_holder or 'free'} (epoch {status.lease_epoch})",
         f"  alive: {', '.join(status.alive) or 'none'}",
-        f"  commands: {status.commands_accepted} accepted, {status.commands_standby} in standby, rejected: "
+        f"  commands: {status.commands_accepted} accepted, {status.commands_standby} while disarmed, rejected: "
         f"{counts(status.commands_rejected)}; joint targets limited: {counts(status.commands_limited)}",
     ]
+    if status.paused_by is not None:
+        lines.append(f"  PAUSED by {status.paused_by}; `snakesim sim resume` or `step` go on")
+    elif status.speed != 1.0:
+        lines.append(f"  speed {status.speed:g} is wanted")
     for joint, share in sorted(status.derated.items()):
         lines.append(f"  derated: {joint} has {100 * share:.0f} % of its torque left")
     if status.isolated:
@@ -137,16 +142,19 @@ def _in_words(link: Link, status: Status) -> list[str]:
         lines.append(f"  injected fault: {what}")
     if status.waiting_for:
         lines.append(f"  waiting for: {', '.join(status.waiting_for)}")
+    ticks: dict[tuple[str, str, str], list[int]] = {}
     for fault in status.faults:
-        where = f" at {fault.joint}" if fault.joint else ""
-        lines.append(f"  fault {fault.what}{where} at tick {fault.tick}: {fault.cause}")
+        ticks.setdefault((fault.what, f" at {fault.joint}" if fault.joint else "", fault.cause), []).append(fault.tick)
+    for (what, where, cause), at in ticks.items():
+        more = f" and {len(at) - 1} times more" if len(at) > 1 else ""
+        lines.append(f"  fault {what}{where} at tick {at[0]}{more}: {cause}")
     if status.faults_left_out:
         lines.append(f"  and {status.faults_left_out} more faults, between the first and the newest of these")
     return lines
 
 
 def _what_to_type(link: Link, status: Status) -> list[str]:
-    """The next commands for a person; none while the robot moves, or cannot be armed yet."""
+    """The next commands for a person."""
     where = flags_of(link, status.robot)
     arm = f"`snakesim arm {status.robot} {status.backend}{where}`"
     if status.lifecycle in ("fault", "estop"):
@@ -154,7 +162,12 @@ def _what_to_type(link: Link, status: Status) -> list[str]:
     if status.isolated and status.lifecycle == "disarmed":
         back = f"`snakesim clear{where}`, to end the isolation of {', '.join(status.isolated)}"
         return [f"  next: {back}", *([f"  or, without: {arm}"] if status.ready_to_arm else [])]
-    return [f"  next: {arm}"] if status.ready_to_arm else []
+    if status.lifecycle == "armed":
+        return [f"  next: `snakesim console{where}` to watch, `snakesim disarm{where}` or `snakesim estop` to stop it"]
+    if status.ready_to_arm:
+        return [f"  next: {arm}"]
+    missing = ", ".join(f"`snakesim service {name} SCENARIO{where}`" for name in status.waiting_for)
+    return [f"  next: {missing or '`snakesim status` again: what prevents arming is told above'}"]
 
 
 def run_router(config: Path | None, *, insecure: bool = False) -> int:

@@ -53,6 +53,11 @@ def estop(where: Where, say: Say = say) -> int:
             say(f"{robot.name}: WARNING: {robot.text} ({robot.endpoint})")
     if not told:
         say(f"no robot on {', '.join(where.endpoints())}, and none that this user runs on this computer")
+    if where.namespace is not None and not any(robot.stopped for robot in told):
+        from snakesim_operator.tools.targets import find_robots
+
+        for link in find_robots(replace(where, namespace=None)):
+            say(f"there is {link.namespace}, on {link.endpoint}; `snakesim estop` without --namespace stops all")
     return 0 if told and all(robot.stopped for robot in told) else 1
 
 

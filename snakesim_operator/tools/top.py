@@ -100,7 +100,7 @@ def table_of(lines: list[KeyTraffic], latencies: list[Latency], left_out: int) -
 def _latency(latency: Latency) -> str:
     told = (
         f"state to command, as heard here: {latency.heard_median_ms:.2f} ms in the median, "
-        f"{latency.heard_p99_ms:.2f} ms in 99 % of {latency.count}"
+        f"at most {latency.heard_p99_ms:.2f} ms for 99 % of {latency.count} commands"
     )
     if latency.motors_median_ms is not None:
         told += f"; to the motors, in robot time: {latency.motors_median_ms:.0f} and {latency.motors_p99_ms:.0f} ms"

@@ -1,11 +1,55 @@
-"""Commands that need no robot: config, scenarios, echo's list of keys, version."""
+"""Commands that need no robot: help, typos, config, scenarios, echo's list of keys, version."""
 
 from importlib.metadata import version
 from pathlib import Path
 
+import pytest
+
 from snakesim_hal.model.files import find
 from snakesim_hal.wire import keys
 from tests.whole.command import snakesim
+
+
+def test_the_command_alone_lists_all_by_task(tmp_path: Path) -> None:
+    ended = snakesim(cwd=tmp_path)
+    assert ended.code == 0 and ended.out == snakesim("--help", cwd=tmp_path).out
+    tasks = [line.rstrip(":") for line in ended.out.splitlines() if line.endswith(":") and not line.startswith(" ")]
+    assert tasks[:4] == ["run", "watch", "command", "results"]
+    assert "can, modules" in ended.out, "those of installed backends"
+
+
+@pytest.mark.parametrize(
+    ("typed", "meant"),
+    [
+        ("estopp", "estop"),
+        ("modles", "modules"),
+        ("run triplet --durration 3", "--duration"),
+        ("config triplett", "triplet"),
+        ("config triplet --set propulsion_n=2", "controllers.obstacle_triplet.propulsion_n"),
+        ("fault kil control", "kill"),
+        ("echo sensor/jonts", "sensor/joints"),
+    ],
+)
+def test_a_typo_is_answered_by_what_may_be_meant(typed: str, meant: str, tmp_path: Path) -> None:
+    ended = snakesim(*typed.split(), cwd=tmp_path)
+    assert ended.code == 2 and ended.err.strip().splitlines()[-1].count(f"did you mean `{meant}`?") == 1, ended.err
+
+
+@pytest.mark.parametrize(
+    ("typed", "way_out"),
+    [
+        ("run planar13", "it is a robot. Give a scenario, and --set robot=planar13"),
+        ("run wave.py", "--controller ./wave.py:CLASS"),
+        ("run triplet --duration 3s", "'3s' is not a number; give it without a unit"),
+        ("config ./mine.tml", "did you mean mine.toml?"),
+        ("console runs/nothing", "no such folder; give the folder that `snakesim run` left"),
+    ],
+)
+def test_what_cannot_be_meant_tells_the_way_out(typed: str, way_out: str, tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").touch()
+    ended = snakesim(*typed.split(), cwd=tmp_path)
+    assert ended.code == 2 and way_out in ended.err, ended.err
+    assert len(ended.err.splitlines()) == 1
 
 
 def test_config_tells_where_each_value_came_from(tmp_path: Path) -> None:
@@ -17,6 +61,14 @@ def test_config_tells_where_each_value_came_from(tmp_path: Path) -> None:
     assert line["robot.module.length_m"].endswith("robots/planar13.toml")
     assert line["scene.ground.friction"].endswith("scenes/triplet.toml")
     assert line["stall_limit_s"].endswith("default")
+
+
+def test_config_tells_the_file_of_a_value_that_extends_another(tmp_path: Path) -> None:
+    (tmp_path / "eel.toml").write_text('extends = "planar13"\nname = "eel"\n[module]\nmass_kg = 0.2\n')
+    ended = snakesim("config", "triplet", "--set", "robot=./eel.toml", cwd=tmp_path)
+    line = {row.split()[0]: row for row in ended.out.splitlines()}
+    assert line["robot.module.mass_kg"].endswith("  eel.toml")
+    assert line["robot.module.length_m"].endswith("robots/planar13.toml")
 
 
 def test_scenarios_lists_what_is_shipped(tmp_path: Path) -> None:

@@ -51,6 +51,7 @@ def test_a_changed_gain_shows_in_compare(recorded: Path, tmp_path: Path) -> None
     assert not np.array_equal(before.target, weaker.target)
     compared = snakesim("compare", str(recorded), "weaker", cwd=tmp_path)
     assert compared.code == 0 and "propulsion_n" in compared.out and "torque target" in compared.out
+    assert "B is a replay: its robot moves as in" in compared.out
 
 
 def test_changes_that_need_the_services_are_refused_without_them(recorded: Path, tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ def compare(
     """Returns 0; 1 when the distances differ by more than `within_percent`. Raises ConfigError on wrong input."""
     if within_percent is not None and not 0 <= within_percent < float("inf"):
         raise ConfigError(f"--within {within_percent:g}: give a percentage that is not negative, such as --within 10")
-    difference = differ(_load(run_a), _load(run_b))
+    difference = differ(RunRecord.load(run_a.resolve()), RunRecord.load(run_b.resolve()))
     asked = within(difference, within_percent) if within_percent is not None else None
     if within_percent is not None and asked is None:
         raise ConfigError(
@@ -42,11 +42,3 @@ def compare(
         return 0
     say(asked.words)
     return 0 if asked.holds else 1
-
-
-def _load(folder: Path) -> RunRecord:
-    if not folder.exists():
-        raise ConfigError(
-            f"{folder}: no such folder; give the folder that `snakesim run --out FOLDER` left, or a recording"
-        )
-    return RunRecord.load(folder.resolve())

@@ -59,5 +59,5 @@ def hand_overs(difference: Difference) -> Figure:
 
 
 def parted(difference: Difference) -> list[Mark]:
-    """Where the runs part."""
-    return [Mark(difference.parted.time_s, "parted")] if difference.parted is not None else []
+    """Where the runs diverge."""
+    return [Mark(difference.parted.time_s, "diverge")] if difference.parted is not None else []

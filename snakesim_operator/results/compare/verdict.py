@@ -35,6 +35,12 @@ def sentences(difference: Difference) -> list[str]:
         return [f"The runs are the same, joint by joint, for all of their {_common(difference)}."]
     advance = difference.advance
     said = [*_untold(difference)]
+    for run, record in (("A", difference.a), ("B", difference.b)):
+        if record.replay_of:
+            said.append(
+                f"{run} is a replay: its robot moves as in {record.replay_of}, whatever its services command. Only the "
+                "commands can differ."
+            )
     said += [
         "How far they moved cannot be compared: there is no measure of it that both runs have."
         if advance is None
@@ -46,7 +52,7 @@ def sentences(difference: Difference) -> list[str]:
     else:
         joint = difference.joints[parted.joint]
         said.append(
-            f"The runs part at {parted.time_s:.2f} s, "
+            f"The runs diverge at {parted.time_s:.2f} s, "
             f"when {joint} is first more than {difference.apart_rad:g} rad apart."
         )
     hand_overs = difference.hand_overs

@@ -19,8 +19,8 @@ from tests.unit.hal.safety.authority_rig import ARM, CLEAR, DISARM, ESTOP, JOINT
 def test_the_way_to_armed() -> None:
     rig = Rig()
     steps = [
-        (lambda: None, ["no joint state yet", "the lease is free"]),
-        (lambda: rig.observe(0.1), ["the lease is free"]),
+        (lambda: None, ["no joint state yet", "nothing commands the robot: the lease is free"]),
+        (lambda: rig.observe(0.1), ["nothing commands the robot: the lease is free"]),
         (rig.acquire, ["no commands from control yet"]),
         (lambda: rig.send(0.1), []),
     ]

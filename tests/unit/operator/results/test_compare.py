@@ -158,7 +158,7 @@ def test_one_joint_that_is_off_is_named_with_its_time() -> None:
     assert parted is not None and (parted.row, parted.joint) == (120, 4) and parted.time_s == pytest.approx(1.2)
     assert difference.torque.rms == 0 and not difference.identical
     text, html = shown(difference)
-    assert "The runs part at 1.20 s, when joint_5 is first more than 0.05 rad apart." in text
+    assert "The runs diverge at 1.20 s, when joint_5 is first more than 0.05 rad apart." in text
     assert "joint_5 at 1.50 s" in text and 'data-joint="joint_5"' in html
 
 
@@ -308,7 +308,7 @@ def test_a_single_common_tick_is_enough() -> None:
 
 
 def test_folders_that_hold_no_run_are_named(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"nowhere: no such folder; .*--out FOLDER"):
+    with pytest.raises(ConfigError, match=r"nowhere: no such folder; give the folder that `snakesim run` left"):
         compare(tmp_path / "nowhere", tmp_path)
     with pytest.raises(ConfigError, match=r"not the folder of a run: config\.json is missing"):
         compare(tmp_path, tmp_path)

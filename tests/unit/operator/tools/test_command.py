@@ -29,6 +29,7 @@ def test_a_robot_that_does_not_answer_a_stop_is_named() -> None:
             said.clear()
             assert stop.estop(Where(at, "lab/nobody"), said.append) == 1
             assert said[0].startswith("lab/nobody: NOT STOPPED: NO ANSWER")
+            assert [line.split()[2] for line in said[1:]] == ["lab/deaf,", "lab/worm,"], "those that are there"
 
 
 def test_a_stop_waits_for_no_slow_import(tmp_path: Path) -> None:
