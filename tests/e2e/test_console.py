@@ -8,16 +8,17 @@ import pytest
 
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import ControlSettings, JointState
+from snakesim_hal.wire.messages import ControlSettings, JointState, Status
 from tests.browser import CHROMIUM, MISSING, Tab, chromium
 from tests.e2e.command import Running, nothing_left, running, wait_until
 
-pytestmark = [pytest.mark.e2e, pytest.mark.skipif(CHROMIUM is None, reason=MISSING)]
+pytestmark = [pytest.mark.e2e, pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=MISSING)]
 
 RUN = ("triplet", "--controller", "lateral_undulation", "--duration", "600", "--stay", "--console")
-# On a machine that does nothing else both are a fraction of this; here other tests run beside.
-OPEN_LIMIT_S = 15.0  # from the command to a page that shows the robot
-STOP_LIMIT_S = 2.0  # from the key to joints at rest
+# Far above what they take on a machine with little else to do: here other tests run beside.
+OPEN_LIMIT_S = 30.0  # from the command to a page that shows the robot
+STOP_LIMIT_S = 5.0  # from the key to motors that are off
+COAST_LIMIT_S = 2.0  # of robot time, until joints without torque are at rest
 SMALL = 800, 400, 0.25  # width, height, pixels a dot: the browser draws without a graphics card here
 GROUND = {"x": 0, "y": 200, "width": 370, "height": 200, "scale": 1}  # of the page: scene without notices
 
@@ -47,7 +48,6 @@ def test_a_page_shows_the_snake_as_it_moves_and_its_escape_key_stops_it(tmp_path
         assert not page.errors, page.errors
 
 
-@pytest.mark.slow
 def test_one_viewer_has_control_and_anybody_stops_it(tmp_path: Path) -> None:
     with chromium() as browser, running(tmp_path / "run", *RUN) as run:
         address = address_of(run)
@@ -67,7 +67,7 @@ def test_one_viewer_has_control_and_anybody_stops_it(tmp_path: Path) -> None:
         change_settings(first, run)
         first.click("Resume")
         wait_until(lambda: "PAUSED" not in second.text(), "the end of the pause")
-        stop_in(second, run)
+        stop_in(second, run)  # no limit: two pages drawn without a graphics card take seconds for a key
         first.wait_for("ESTOP")
         first.click("Clear")
         first.wait_for("DISARMED")
@@ -91,14 +91,20 @@ def change_settings(tab: Tab, run: Running) -> None:
 
 
 def stop_in(tab: Tab, run: Running) -> float:
-    """Press the emergency stop's key in a page; seconds until all joints are at rest."""
+    """Press the emergency stop's key in a page; seconds until the motors are off. Then the joints coast to rest."""
     with open_session(Link(run.endpoint, "planar13")) as session:
-        joints = session.reader(keys.JOINTS, JointState)
+        joints, status = session.reader(keys.JOINTS, JointState), session.latched_reader(keys.STATUS, Status)
         wait_until(lambda: any(fastest_rad_s(one) > 0.05 for one in joints.drain()), "moving joints")
+        pressed_s = time.monotonic()
         tab.press("Escape", 27)
-        pressed_s, recent = time.monotonic(), deque[float](maxlen=5)
+        wait_until(lambda: status.newest(lambda one: one.lifecycle == "estop") is not None, "the stop")
+        stopped_after_s = time.monotonic() - pressed_s
+        joints.drain()
+        from_ns, recent = None, deque[float](maxlen=5)
         while len(recent) < 5 or max(recent) > 0.02:
-            assert time.monotonic() < pressed_s + 30, f"joints still move: {list(recent)} rad/s"
-            recent += [fastest_rad_s(one) for one in joints.drain()]
+            for one in joints.drain():
+                from_ns = one.stamp_ns if from_ns is None else from_ns
+                assert one.stamp_ns < from_ns + COAST_LIMIT_S * 1e9, f"joints still move: {list(recent)} rad/s"
+                recent.append(fastest_rad_s(one))
             time.sleep(0.005)
-        return time.monotonic() - pressed_s
+    return stopped_after_s
