@@ -13,7 +13,7 @@ from snakesim_hal.network.session import Link, Reader, Session, open_session
 from snakesim_hal.process import who
 from snakesim_hal.terminal import Say, say
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Answer, Description, LifecycleRequest, Message, Status
+from snakesim_hal.wire.messages import Answer, Description, LifecycleRequest, SimulatorRequest, Status
 from snakesim_operator.tools.targets import CONNECT_S, Where, the_one
 
 ANSWER_S = 5.0
@@ -75,7 +75,9 @@ def clear(where: Where, say: Say = say) -> int:
         return ask_host(session, keys.LIFECYCLE, LifecycleRequest(action="clear", who=who()), "cleared", link, say)
 
 
-def ask_host(session: Session, key: str, request: Message, done: str, link: Link, say: Say) -> int:
+def ask_host(
+    session: Session, key: str, request: LifecycleRequest | SimulatorRequest, done: str, link: Link, say: Say
+) -> int:
     """Query the robot's host, and check who answers. done: in words. Raises RefusedError, NotConnectedError."""
     statuses = session.latched_reader(keys.STATUS, Status)
     answers = [answer for _, answer in session.ask_all(key, request, ANSWER_S)]
