@@ -11,11 +11,11 @@ from typing import Any, NoReturn
 from snakesim_hal.errors import ConfigError, SnakesimError, short
 from snakesim_hal.terminal import complain, complain_of, say
 from snakesim_operator.console import arguments as console
-from snakesim_operator.evaluate import command as evaluate
-from snakesim_operator.lab import command as lab
-from snakesim_operator.playback import command as playback
+from snakesim_operator.evaluate import arguments as evaluate
+from snakesim_operator.lab import arguments as lab
+from snakesim_operator.playback import arguments as playback
 from snakesim_operator.robots import arguments as robots
-from snakesim_operator.ros2 import command as ros2
+from snakesim_operator.ros2 import arguments as ros2
 from snakesim_operator.run import arguments as run
 from snakesim_operator.tools import commanding, setup, watching
 

@@ -20,6 +20,7 @@ from snakesim_operator.console.drawing import Surroundings, draw
 from snakesim_operator.console.moment import Moment
 from snakesim_operator.console.operations import Log, Operations
 from snakesim_operator.console.pictures import picture
+from snakesim_operator.console.polygon import force_polygon
 from snakesim_operator.console.stage import Stage
 from snakesim_operator.console.token import ControlToken
 
@@ -80,6 +81,8 @@ class Page:
         tabs = gui.add_tab_group(order=4)
         with tabs.add_tab("Joints"):
             self._joints_tab = gui.add_folder(None)
+        with tabs.add_tab("Forces"):
+            self._forces = gui.add_html("")
         if self._operations is not None:
             self._lay_out_live(tabs)
         gui.add_html(texts.legend(LEGEND), order=3)
@@ -170,6 +173,7 @@ class Page:
             self._charts.take(moment)
             if self._frames % CHARTS_EVERY == 1:
                 self._charts.show(moment)
+                self._forces.content = force_polygon(moment)
             if self._frames % PICTURES_EVERY == 1:
                 self._show_pictures(moment)
             if moment.settings is not None and (before is None or moment.settings != before.settings):

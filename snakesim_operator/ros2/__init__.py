@@ -1,6 +1,6 @@
 """`snakesim ros2`: a robot as a node among ROS 2 nodes, through the router of their own rmw_zenoh; no ROS needed here.
 
-`command.py` has the arguments, `join.py` the two sessions, `bridge.py` the loop: it reads the robot's keys as a viewer
+`arguments.py` has those, `join.py` the two sessions, `bridge.py` the loop: it reads the robot's keys as a viewer
 does, and publishes what they say. `robot_in_ros.py` translates message by message, `frames.py` names and places frames,
 `urdf.py` describes the robot, `steering.py` turns /cmd_vel into intents, `relay.py` bounds rates. Below them `graph.py`
 knows rmw_zenoh's keys, liveliness tokens and attachments, `messages.py` the layout of each ROS message, `cdr.py` how a

@@ -12,8 +12,8 @@ from snakesim_hal.terminal import say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_hal.wire.messages import Description
+from snakesim_operator.ros2.arguments import check
 from snakesim_operator.ros2.bridge import Bridge, Options, adds_up
-from snakesim_operator.ros2.command import check
 from snakesim_operator.ros2.graph import Node, NodeName
 from snakesim_operator.tools.targets import Where, the_one
 

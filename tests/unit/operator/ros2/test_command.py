@@ -6,7 +6,7 @@ import pytest
 
 from snakesim_hal.errors import ConfigError
 from snakesim_operator.cli import parser
-from snakesim_operator.ros2.command import check
+from snakesim_operator.ros2.arguments import check
 from snakesim_operator.ros2.relay import Stamps
 
 
