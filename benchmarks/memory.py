@@ -11,6 +11,7 @@ from pathlib import Path
 
 PAGE_MB = resource.getpagesize() / 2**20
 FIRST_S, EVERY_S = 60.0, 10.0
+END_LIMIT_S = 300.0  # summary and report of a long run
 MODULES = {"snakesim_hal.host_process": "host", "recording.process": "recorder", "operator.console": "console"}
 
 
@@ -51,14 +52,14 @@ def main() -> int:
                 time.sleep(EVERY_S)
                 last = resident_mb(run.pid)
                 most = {name: max(mb, most.get(name, 0.0)) for name, mb in last.items()}
+            size_mb = sum(path.stat().st_size for path in Path(folder, "run").glob("recording*.mcap")) / 1e6
+            print(f"\n| process | after {FIRST_S:.0f} s | after {seconds:.0f} s | most |\n|---|---|---|---|")
+            for name in sorted(last):
+                print(f"| {name} | {first.get(name, 0.0):.0f} MB | {last[name]:.0f} MB | {most[name]:.0f} MB |")
+            print(f"\nRecording: {size_mb:.0f} MB.", flush=True)
         finally:
             run.send_signal(signal.SIGINT)
-            run.wait(60)
-        size_mb = sum(path.stat().st_size for path in Path(folder, "run").glob("recording*.mcap")) / 1e6
-    print(f"\n| process | after {FIRST_S:.0f} s | after {seconds:.0f} s | most |\n|---|---|---|---|")
-    for name in sorted(last):
-        print(f"| {name} | {first.get(name, 0.0):.0f} MB | {last[name]:.0f} MB | {most[name]:.0f} MB |")
-    print(f"\nRecording: {size_mb:.0f} MB.")
+            run.wait(END_LIMIT_S)
     return 0
 
 
