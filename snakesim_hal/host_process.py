@@ -30,7 +30,7 @@ from snakesim_hal.network.local_registry import LocalRobot, registered, robot_fo
 from snakesim_hal.network.private_channel import HostEnd
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.network.stop_port import open_stop_port, serve_stops, stop_address
-from snakesim_hal.process import HOST_PRIORITY, hurry, on_stop_signal, settle_for_timing
+from snakesim_hal.process import HOST_PRIORITY, begin_anew, hurry, on_stop_signal, settle_for_timing
 from snakesim_hal.serve import ProcessOptions, joined, process_options
 from snakesim_hal.terminal import complain_of
 from snakesim_hal.wire import keys
@@ -79,10 +79,15 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def host(given: ProcessOptions) -> int:
-    """Run a host to its end. Returns 0 when all ticks were done without a fault, 1 otherwise. Raises SnakesimError."""
+    """Run a host to its end. Returns 0 when all ticks were done without a fault, 1 otherwise. Raises SnakesimError.
+
+    A simulator that is reset becomes another host, in the same process.
+    """
     if given.arguments.channel is None:
         check_without_run(given.config, given.loaded.table)
     host = _run(given, check_backend(given.config, given.loaded.table))
+    if host.ended == "reset":
+        begin_anew()
     stopped = any(fault.reach == "robot" for fault in host.authority.since_start.kept)
     return 1 if stopped or host.ended != "complete" else 0
 
@@ -92,7 +97,7 @@ def _run(given: ProcessOptions, config: RunConfig) -> Host:
     wanted = given.arguments
     with contextlib.ExitStack() as opened:
         if wanted.stop_port is not None:
-            stop_port = socket.socket(fileno=wanted.stop_port)
+            stop_port = socket.socket(fileno=os.dup(wanted.stop_port))  # it stays open for another host
         else:
             stop_port = open_stop_port(*stop_address(given.link.endpoint, listens=given.link.listen))
             entry = LocalRobot.on(given.link, config.robot.name, config.backend, stop_port)

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
+from typing import NoReturn
 
 from snakesim_hal.errors import RefusedError
 from snakesim_hal.terminal import complain
@@ -43,9 +44,23 @@ def die_with_parent(parent_pid: int | None = None) -> None:
         sys.exit(1)
 
 
+STOPS = (signal.SIGINT, signal.SIGTERM)
+
+
 def accept_interrupts() -> None:
     """From here on a SIGINT counts: a supervisor starts its children with it blocked, until they can handle it."""
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPS)
+
+
+def begin_anew() -> NoReturn:
+    """Become the same program again, in the same process: with its parent, its arguments and what it has inherited.
+
+    A stop that comes meanwhile waits until the program can handle it. Close everything before.
+    """
+    signal.pthread_sigmask(signal.SIG_BLOCK, STOPS)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os.execv(sys.executable, sys.orig_argv)
 
 
 def on_stop_signal(stop: Callable[[], None]) -> None:

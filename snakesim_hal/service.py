@@ -40,6 +40,9 @@ class Service(Protocol):
         """What to publish when the HAL's clock has been silent for a second."""
         return []
 
+    def pause(self, clock: Clock) -> None:
+        """Called some 20 times a second while a simulator is paused, for requests that need no tick."""
+
 
 class ServiceLoop:
     """One service of one robot, over one session."""
@@ -63,7 +66,7 @@ class ServiceLoop:
         self.service.meet(robot)
         self._injector = Injector(name, config, session, newest=lambda: client.heard)
         self._injector.allow(emulated=robot.emulated, faults_allowed=config.faults_allowed)
-        self._due = client.ticks(0.0)
+        self._due = client.ticks(0.0, pauses=True)
         self._session, self._entry = session, own_entry(name, config)
 
     def join(self) -> None:
@@ -76,7 +79,7 @@ class ServiceLoop:
 
     def run(self) -> None:
         """Act on every tick that is due, for as long as this process lives."""
-        for clock in self._client.ticks(SILENCE_S):
+        for clock in self._client.ticks(SILENCE_S, pauses=True):
             if clock is not None:
                 self._act(clock)
                 continue
@@ -94,7 +97,11 @@ class ServiceLoop:
         self._injector.close()
 
     def _act(self, clock: Clock) -> None:
-        """A tick that is shown again, because time stands still, is answered again."""
+        """A tick that is shown again, because the robot is not armed yet, is answered again."""
+        if clock.paused:
+            self._injector.idle()
+            self.service.pause(clock)
+            return
         self._injector.turn(clock.stamp_ns, clock.arming, clock.lifecycle)
         robot = self._client.met_anew()
         if robot is not None:

@@ -57,6 +57,7 @@ class SimBackend:
             lease_ns=config.lease_ns,
             config_hash=config_hash(config),
             emulated=True,
+            simulated_time=True,
         )
         log_warnings()
         self._sim = build(config, settings)

@@ -52,6 +52,9 @@ class LookingService:
         mujoco.mj_kinematics(self._sim.model, self._data)
         return [(key, reader.read(clock.tick, joints.stamp_ns)) for key, reader in self._readers]
 
+    def pause(self, clock: Clock) -> None:
+        """Nothing is asked of it."""
+
     def silence(self) -> list[tuple[str, Message]]:
         """Nothing to say without a robot."""
         return []

@@ -72,6 +72,11 @@ class Control(Service):
             return _told(self._reports.state(clock))
         return self._act(clock, joints)
 
+    def pause(self, clock: Clock) -> None:
+        """Settings may be changed; they are in force from the next tick on."""
+        if self._settings.turn(clock):
+            self._controller = None
+
     def silence(self) -> list[tuple[str, Message]]:
         """The HAL is gone, or delayed by a slow computer: PowerOff. The next tick decides about the controller."""
         if self._last_clock is None:

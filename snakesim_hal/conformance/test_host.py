@@ -1,6 +1,7 @@
 """Behind the real host, commanded by a real client over Zenoh: lease, staleness, faults."""
 
 import math
+import time
 from collections import Counter
 from collections.abc import Callable
 from typing import Any
@@ -11,7 +12,8 @@ from snakesim_hal.conformance import tolerances as t
 from snakesim_hal.conformance.bench import Bench
 from snakesim_hal.conformance.loopback import Hosted, stay, wait_until
 from snakesim_hal.conformance.rig import Asked
-from snakesim_hal.wire.messages import Fault, JointState, Mode
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Fault, JointState, Mode, SimulatorRequest
 
 
 def undisturbed(hosted: Hosted, act: Callable[[], None]) -> None:
@@ -130,3 +132,27 @@ def stops_with_the_lease(hosted: Hosted) -> None:
     late = expired.tick - hosted.controller.last_sent_tick - lease
     assert late <= t.TRANSPORT_PERIODS, f"{late} periods after the end of the lease"
     must_come_to_rest(hosted)
+
+
+def test_a_simulator_stands_still_on_request_and_a_robot_refuses(bench: Bench, hosted: Hosted) -> None:
+    """In a pause no tick passes and no lease expires; whatever cannot stand still says so."""
+    undisturbed(hosted, lambda: stands_or_refuses(hosted))
+
+
+def stands_or_refuses(hosted: Hosted) -> None:
+    """One attempt."""
+    hosted.arm(stay)
+    hosted.passes(t.ARMING_PERIODS)
+    answer = hosted.session.ask(keys.SIMULATOR, SimulatorRequest(action="pause", who="contract"), timeout_s=10.0)
+    if not hosted.robot.simulated_time:
+        assert answer.refusal == "not_simulated", answer
+        hosted.passes(t.ARMING_PERIODS)
+        return
+    assert answer.ok, answer
+    wait_until(lambda: hosted.host.status().paused_by == "contract", "the pause")
+    tick = hosted.tick
+    time.sleep(2 * hosted.robot.lease_ns * 1e-9)
+    assert hosted.tick == tick, "time goes on in a pause"
+    assert hosted.session.ask(keys.SIMULATOR, SimulatorRequest(action="resume"), timeout_s=10.0).ok
+    hosted.passes(t.ARMING_PERIODS)
+    assert hosted.host.authority.state == "armed", hosted.host.authority.why

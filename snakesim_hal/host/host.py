@@ -27,6 +27,7 @@ from snakesim_hal.host.latch import EstopLatch, replying
 from snakesim_hal.host.outbox import Outbox
 from snakesim_hal.host.participants import Participant, Participants
 from snakesim_hal.host.run_statistics import RunStatistics
+from snakesim_hal.host.simulated_time import Refusal, SimulatedTime
 from snakesim_hal.host.status_messages import applied_message, status_message
 from snakesim_hal.host.timing import Deadlines, PublishTimes
 from snakesim_hal.model.scenario import RunConfig, written
@@ -47,13 +48,16 @@ from snakesim_hal.wire.messages import (
     LifecycleRequest,
     Pace,
     Power,
+    SimulatorRequest,
     Status,
 )
 
-# Not yet; after the requested armed ticks; on request (`finish`); by a signal; by a fault, or too little armed time.
-Ending = Literal["running", "complete", "finished", "stopped", "failed"]
+# Not yet; after the requested armed ticks; on request (`finish`); by a signal; by a fault, or too little armed time;
+# for another host that begins anew.
+Ending = Literal["running", "complete", "finished", "stopped", "failed", "reset"]
 STATUS_PERIOD_NS = 200_000_000
 STANDBY_PERIOD_NS = 20_000_000
+STANDING_PERIOD_NS = 50_000_000  # between signs of life while a simulator is paused
 STATUS_GAP_NS = 10_000_000  # between status messages for frequent changes, such as a contested lease
 TAKEN_SHARE = 0.25  # of a period, for late arrivals: a flood must not take all of it
 MAX_REQUESTS_KEPT = 256
@@ -106,6 +110,8 @@ class Host:
         self._pace: Pace = config.pace
         self._period_ns = config.period_ns
         self._tick = 0
+        self._time = SimulatedTime(self.description, config.pace, time.monotonic_ns)
+        self._time_requests: list[tuple[SimulatorRequest, Callable[[Answer], None]]] = []  # until the next tick begins
         self._deadlines = Deadlines(config.period_ns)
         self._published = PublishTimes()
         self._published_arming = 0
@@ -168,6 +174,11 @@ class Host:
         try:
             while not self._over():
                 self.faults.turn(self._tick)
+                self._change_time()
+                if self._stands():
+                    yield
+                    self._stand_still()
+                    continue
                 last = self._sample(last)
                 if last is None:
                     break
@@ -219,6 +230,37 @@ class Host:
             self.authority.observe_power(power, now_ns)
         return samples
 
+    def _stands(self) -> bool:
+        """Whether the next tick has to wait. In lockstep tick 0 is shown until it is armed, also in a pause."""
+        return self._time.stands and not (self._pace == "lockstep" and self.authority.arming == 0)
+
+    def _stand_still(self) -> None:
+        """Paused: show that the host is there, and take in what comes; physics and robot time stand."""
+        if self._published.last_tick is not None:
+            self._outbox.put(keys.CLOCK, self._clock(self._published.last_tick, paused=True))
+        self._show_status()
+        until_ns = time.monotonic_ns() + STANDING_PERIOD_NS
+        while not self._time_requests and (left_ns := until_ns - time.monotonic_ns()) > 0:
+            self._inbox.take(left_ns * 1e-9)
+        self._show_status()
+
+    def _change_time(self) -> None:
+        """Carry out what was asked of the simulator's time, between two ticks."""
+        requests, self._time_requests = self._time_requests, []
+        for request, reply in requests:
+            outcome = self._time.take(request, self._tick)
+            if isinstance(outcome, Refusal):
+                answer = self._answer(ok=False, reason=outcome.why, refusal=outcome.word)
+            else:
+                self._deadlines.begin(self._tick, self._time.speed)
+                if request.action == "reset":
+                    self.authority.on_lifecycle(LifecycleRequest(action="finish", who=request.who), self._safety_now())
+                    self._end("reset", f"by {request.who}")
+                answer = self._answer(ok=True, reason=outcome)
+            self._keep(request, answer)
+            self._show_status()
+            reply(answer)
+
     def _publish(self, samples: Samples) -> None:
         tick = self._tick
         self._outbox.put(keys.JOINTS, self.authority.readable(samples.joints))
@@ -228,7 +270,13 @@ class Host:
             self._newest[key] = tick
         for name, participant in self.participants.items():
             self._newest[name] = participant.service.counting_at(tick)
-        clock = Clock(
+        clock = self._clock(tick)
+        self._published_arming = self.authority.arming
+        self._published.put(tick, self._safety_now(), time.monotonic_ns())
+        self._outbox.put(keys.CLOCK, clock)
+
+    def _clock(self, tick: int, *, paused: bool = False) -> Clock:
+        return Clock(
             tick=tick,
             stamp_ns=tick * self._period_ns,
             period_ns=self._period_ns,
@@ -237,10 +285,8 @@ class Host:
             arming=self.authority.arming,
             lease_epoch=self.authority.lease.epoch if self.authority.lease.holder else 0,
             newest=self._newest,
+            paused=paused,
         )
-        self._published_arming = self.authority.arming
-        self._published.put(tick, self._safety_now(), time.monotonic_ns())
-        self._outbox.put(keys.CLOCK, clock)
 
     def _finish_tick(self, samples: Samples) -> None:
         self.authority.expire(self._safety_now(), self._tick)
@@ -273,6 +319,7 @@ class Host:
                 self._inbox.take_until(self._deadlines.of(self._tick))
             elif self.authority.state == "armed":
                 self.statistics.overruns += 1
+        self._time.tick_done(self._tick)
 
     def _recorded(self) -> bool:
         """Whether to record this tick: a host that stays must not fill memory while it waits."""
@@ -283,9 +330,11 @@ class Host:
         if self._pace == "lockstep":
             self._wait_for_participants(samples)
         elif self._pace == "realtime":
-            spare_ns = 1.5 * self._advance_ns + 50_000
+            give_up_ns = self._deadlines.of(self._tick + 1) - 1.5 * self._advance_ns - 50_000
+            if self._time.speed > 1.0 and self.authority.state == "armed":  # as much time as at speed 1, if need be
+                give_up_ns = max(give_up_ns, self._published.of(self._tick)[1] + self._period_ns)
             while self._answered < self._tick and not self._stopping:
-                left_ns = self._deadlines.of(self._tick + 1) - spare_ns - time.monotonic_ns()
+                left_ns = give_up_ns - time.monotonic_ns()
                 if left_ns <= 0 or not self._inbox.take(left_ns * 1e-9):
                     break
         self._inbox.take_all(inf if self._pace == "lockstep" else TAKEN_SHARE * self._period_ns)
@@ -331,10 +380,13 @@ class Host:
     def refuse(self, error: WireError) -> Answer:
         """A message cannot be decoded."""
         self.authority.reject(error.reason)
+        return self._answer(ok=False, reason=str(error), refusal=error.reason)
+
+    def _answer(self, *, ok: bool, reason: str, refusal: str | None = None) -> Answer:
         return Answer(
-            ok=False,
-            reason=str(error)[:500],
-            refusal=error.reason,
+            ok=ok,
+            reason=reason[:500],
+            refusal=refusal,
             lifecycle=self.authority.state,
             host=self.description.host,
         )
@@ -349,14 +401,15 @@ class Host:
             answer = self.authority.on_estop(request, self._tick)
         elif request.host not in (None, self.description.host):
             meant = f"this is host {self.description.host}, the request is for {request.host}: two have one name"
-            answer = Answer(ok=False, reason=meant, refusal="wrong_host", lifecycle=self.authority.state)
+            answer = self._answer(ok=False, reason=meant, refusal="wrong_host")
+        elif isinstance(request, SimulatorRequest):
+            self._time_requests.append((request, reply))
+            return
         elif request.action == "arm" and (missing := self._missing()):
             waiting = f"waiting for {', '.join(missing)}"
-            answer = Answer(ok=False, reason=waiting, refusal="not_ready", lifecycle=self.authority.state)
+            answer = self._answer(ok=False, reason=waiting, refusal="not_ready")
         elif request.action == "arm" and (differing := self._differing()):
-            answer = Answer(
-                ok=False, reason="; ".join(differing)[:500], refusal="settings_differ", lifecycle=self.authority.state
-            )
+            answer = self._answer(ok=False, reason="; ".join(differing), refusal="settings_differ")
         else:
             answer = self.authority.on_lifecycle(request, now_ns)
             if request.action == "arm" and answer.ok:
@@ -375,7 +428,7 @@ class Host:
         else:
             reply(answer)
 
-    def _keep(self, request: LifecycleRequest | EstopRequest, answer: Answer) -> None:
+    def _keep(self, request: LifecycleRequest | EstopRequest | SimulatorRequest, answer: Answer) -> None:
         """Store a request and its result, for the record and the log."""
         action = "estop" if isinstance(request, EstopRequest) else request.action
         outcome = "done" if answer.ok else f"refused: {answer.reason}"
@@ -439,7 +492,7 @@ class Host:
             self.participants,
             tick=self._tick,
             pace=self._pace,
-            safety_now_ns=self._safety_now(),
+            time=self._time,
             missing=self._missing(),
             differing=self._differing(),
             overruns=self.statistics.overruns,
@@ -450,7 +503,8 @@ class Host:
     def _show_status(self, *, force: bool = False) -> None:
         """Publish the status: at once when the lifecycle changed, else a few times a second."""
         now_ns, was = time.monotonic_ns(), self._status_shown
-        mark = (self.authority.state, self.authority.lease.epoch, len(self.authority.faults))
+        time_now = self._time.stands, self._time.speed
+        mark = (self.authority.state, self.authority.lease.epoch, len(self.authority.faults), time_now)
         due_ns = self._status_due_ns if mark == was else self._status_due_ns - STATUS_PERIOD_NS + STATUS_GAP_NS
         if not force and now_ns < due_ns and was is not None and mark[0] == was[0]:
             return
@@ -463,10 +517,8 @@ class Host:
     # --- time and endings ----------------------------------------------------------------------------------
 
     def _safety_now(self, monotonic_ns: int | None = None) -> int:
-        """Time of leases and ages: simulated in lockstep, else the monotonic clock."""
-        if self._config.pace == "lockstep":
-            return self._tick * self._period_ns
-        return time.monotonic_ns() if monotonic_ns is None else monotonic_ns
+        """Time of leases and ages: simulated in lockstep, else the monotonic clock, as long as it is not paused."""
+        return self._time.safety_ns(self._tick, monotonic_ns)
 
     def _missing(self) -> list[str]:
         """Participants that are not connected, or in lockstep have not answered tick 0 yet."""

@@ -15,12 +15,20 @@ from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.session import Arrival, Question, Session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
-from snakesim_hal.wire.messages import Answer, Done, EstopRequest, JointCommand, LeaseRequest, LifecycleRequest
+from snakesim_hal.wire.messages import (
+    Answer,
+    Done,
+    EstopRequest,
+    JointCommand,
+    LeaseRequest,
+    LifecycleRequest,
+    SimulatorRequest,
+)
 
 STOPS, PRESENCE, SAMPLES, REQUESTS = range(4)  # lanes
 LIMITS = (64, None, 4096, 64)  # presence is limited to known services, so that lane needs no bound
 
-Request = LeaseRequest | LifecycleRequest | EstopRequest
+Request = LeaseRequest | LifecycleRequest | EstopRequest | SimulatorRequest
 Reply = Callable[[Answer], None]
 
 
@@ -75,13 +83,14 @@ class Inbox:
             keys.LEASE: Decoder(LeaseRequest),
             keys.LIFECYCLE: Decoder(LifecycleRequest),
             keys.ESTOP: Decoder(EstopRequest),
+            keys.SIMULATOR: Decoder(SimulatorRequest),
         }
         self._services = frozenset(services)
         self.dropped = 0
         session.on_arrival(keys.JOINT_COMMAND, self._put_sample)
         session.on_arrival(keys.DONE_ALL, self._put_sample)
         session.on_question(keys.ESTOP, self._put_stop)
-        for key in (keys.LEASE, keys.LIFECYCLE):
+        for key in (keys.LEASE, keys.LIFECYCLE, keys.SIMULATOR):
             session.on_question(key, self._put_request)
         session.on_alive(self._put_presence)
 

@@ -1,6 +1,7 @@
 """Builds the host's status messages. Pure."""
 
 from snakesim_hal.host.participants import Participants
+from snakesim_hal.host.simulated_time import SimulatedTime
 from snakesim_hal.safety.authority import Authority, Decision
 from snakesim_hal.wire.messages import AppliedCommand, Description, Pace, Status
 
@@ -25,7 +26,7 @@ def status_message(
     *,
     tick: int,
     pace: Pace,
-    safety_now_ns: int,
+    time: SimulatedTime,
     missing: list[str],
     differing: list[str],
     overruns: int,
@@ -34,7 +35,7 @@ def status_message(
 ) -> Status:
     """The status of the robot. missing: the services that arming waits for; differing: how others are set up."""
     description = authority.description
-    against = authority.against_arming(safety_now_ns)
+    against = authority.against_arming(time.safety_ns(tick))
     why = authority.why
     if authority.state == "disarmed" and (against or missing or differing):
         why = "; ".join([why, *differing, *(f"waiting for {name}" for name in missing), *against])[:500]
@@ -58,10 +59,13 @@ def status_message(
         alive=participants.present(),
         waiting_for=missing,
         overruns=overruns,
-        realtime_warnings=realtime_warnings,
+        realtime_warnings=[*realtime_warnings, *time.slow()],
         injected=injected,
         ready_to_arm=not against and not missing and not differing,
         derated=authority.derated,
         isolated=authority.isolated,
         host=description.host,
+        paused_by=time.paused_by if time.stands else None,
+        speed=time.speed,
+        real_time_factor=time.factor,
     )

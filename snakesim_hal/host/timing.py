@@ -12,11 +12,13 @@ class Deadlines:
     """Absolute deadlines: a late tick does not delay the next ones, unless it is much too late."""
 
     def __init__(self, period_ns: int) -> None:
-        self._period_ns = period_ns
+        self._robot_period_ns = self._period_ns = period_ns
         self._anchor_ns = 0  # when tick 0 began
 
-    def begin(self, tick: int) -> None:
-        """Start at this tick, now."""
+    def begin(self, tick: int, speed: float | None = None) -> None:
+        """Start at this tick, now. speed: of robot time from now on; None: as it was."""
+        if speed is not None:
+            self._period_ns = round(self._robot_period_ns / speed)
         self._anchor_ns = time.monotonic_ns() - tick * self._period_ns
 
     def of(self, tick: int) -> int:

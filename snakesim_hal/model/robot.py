@@ -150,9 +150,19 @@ class RobotFile(FileStruct, frozen=True, kw_only=True):
 
 
 def describe(
-    robot: RobotFile, *, backend: str, period_ns: int, lease_ns: int, config_hash: str, emulated: bool = False
+    robot: RobotFile,
+    *,
+    backend: str,
+    period_ns: int,
+    lease_ns: int,
+    config_hash: str,
+    emulated: bool = False,
+    simulated_time: bool = False,
 ) -> Description:
-    """The description that the HAL publishes, from a robot file. emulated: nothing real moves."""
+    """The description that the HAL publishes, from a robot file.
+
+    emulated: nothing real moves; simulated_time: and between two ticks any time may pass.
+    """
     axes = robot.axes
     joints = [
         JointDescription(
@@ -194,6 +204,7 @@ def describe(
         safe_action=robot.safety.action,
         may_lose_joints=robot.safety.may_lose_joints,
         emulated=emulated,
+        simulated_time=simulated_time,
         joints=joints,
         links=links,
         sensors=sensors,

@@ -1,6 +1,6 @@
 """The network; the only room that imports Zenoh.
 
-`session`         publishers, readers and queries on Zenoh; with `endpoint`, `mailbox`, `run_key`
+`session`         publishers, readers and queries on Zenoh; with `endpoint`, `images_apart`, `mailbox`, `run_key`
 `local_network`   the same sessions within one process, without Zenoh
 `client`          the interface of guidance, navigation and control; independent of the backend
 `robot_mismatch`  rejects messages that do not fit the robot

@@ -129,14 +129,21 @@ class Client:
         """Declare the service's liveliness token. A lockstep run waits for it from now on."""
         self.session.declare_alive(self.service)
 
-    def ticks(self, silence_s: float | None = None) -> Iterator[Clock | None]:
-        """Every due tick in lockstep; the newest one otherwise. None after each `silence_s` without any clock."""
+    def ticks(self, silence_s: float | None = None, *, pauses: bool = False) -> Iterator[Clock | None]:
+        """Every due tick in lockstep; the newest one otherwise. None after each `silence_s` without any clock.
+
+        pauses: also the clocks of a paused simulator (`Clock.paused`), which are no ticks, and are not answered.
+        """
         while True:
             try:
                 clock = self._next_clock(silence_s)
             except Empty:
                 if silence_s is None or time.monotonic() - self._heard_at >= silence_s:
                     yield None
+                continue
+            if clock.paused:
+                if pauses:
+                    yield clock
                 continue
             if self._clock is not None and clock.tick < self._clock.tick:
                 self._started_over = True
@@ -153,7 +160,8 @@ class Client:
         self._ahead = None
         while not self._clocks.empty():
             following = self._clocks.get()
-            if clock.pace == "lockstep" and following.tick != clock.tick:
+            another = clock.pace == "lockstep" and following.tick != clock.tick
+            if another or following.paused != clock.paused:
                 self._ahead = following
                 break
             clock = following
@@ -200,7 +208,7 @@ class Client:
             self.session.rejected["other_pace"] += 1
             return
         self.heard = clock
-        if clock.tick % self._every_ticks == 0:
+        if clock.paused or clock.tick % self._every_ticks == 0:
             self._clocks.put(clock)
 
     def read(self, feed: Feed[MessageT]) -> MessageT | None:

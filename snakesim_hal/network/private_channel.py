@@ -77,6 +77,7 @@ class StarterEnd:
         self.description: Description | None = None
         self.status: Status | None = None
         self.answers: list[Answer] = []
+        self.resets = 0  # how often another host has begun in the same process
 
     def take_in(self) -> None:
         """Read new messages."""
@@ -88,6 +89,9 @@ class StarterEnd:
             if not message:
                 return
             said = self._decoder.decode(message)
+            if said.description is not None and self.description is not None:  # it was reset
+                self.status, self.resets = None, self.resets + 1
+                self.answers.clear()
             self.description = said.description or self.description
             self.status = said.status or self.status
             if said.answer is not None:

@@ -23,6 +23,7 @@ APPLIED = "hal/applied"
 LEASE = "hal/lease"
 LIFECYCLE = "hal/lifecycle"
 ESTOP = "hal/estop"
+SIMULATOR = "hal/simulator"
 FAULT_ALL = "fault/*"
 DONE_ALL = "hal/done/*"
 WORLD = "guidance/world"
@@ -77,6 +78,7 @@ SPACE: tuple[Row, ...] = (
     Row(LEASE, m.LeaseRequest, "any", "query", _ASKED, "acquire, renew, release the right to command; replies Answer"),
     Row(LIFECYCLE, m.LifecycleRequest, "any", "query", _ASKED, "arm, disarm, clear, finish; replies Answer"),
     Row(ESTOP, m.EstopRequest, "any", "query", _ASKED, "stop now, needs no lease, latched; replies Answer"),
+    Row(SIMULATOR, m.SimulatorRequest, "any", "query", _ASKED, "pause, step, speed, reset a simulator; replies Answer"),
     Row(FAULT_ALL, m.FaultRequest, "any", "query", _ASKED, "inject a fault, where allowed; replies Answer"),
     Row(DONE_ALL, m.Done, "each service", "stream", _TURN, "lockstep: all output for a tick is published"),
     Row(WORLD, m.World, "guidance", "stream", _TURN, "body pose, contacts and obstacles in the world"),

@@ -283,6 +283,9 @@ class Clock(Message, frozen=True, kw_only=True):
         Meta(max_length=64),
         about("sensor key or service -> tick of its newest sample that is valid now"),
     ]
+    paused: Annotated[
+        bool, about("true: no tick, only a sign of life: the last one again, while robot time stands still")
+    ] = False
 
 
 class JointDescription(Message, frozen=True, kw_only=True):
@@ -342,6 +345,9 @@ class Description(Message, frozen=True, kw_only=True):
     ] = 0
     emulated: Annotated[
         bool, about("nothing real moves: a simulator, or emulated modules; fault injection is allowed")
+    ] = False
+    simulated_time: Annotated[
+        bool, about("a simulator: its time can stand, pass by single ticks, faster or slower, and begin anew")
     ] = False
     hardware: Annotated[
         str, Meta(max_length=200), about("hardware that it drives, such as `can0+can1`; empty: none")
@@ -413,6 +419,12 @@ class Status(Message, frozen=True, kw_only=True):
     ] = []
     host: Annotated[q.Name | None, HOST] = None
     faults_left_out: Annotated[q.Count, about("of `faults`, between the first and the newest")] = 0
+    paused_by: Annotated[q.Name | None, about("who paused the simulator; null: it is not paused")] = None
+    speed: Annotated[q.Speed, about("wanted in real time: robot time per wall time")] = 1.0
+    real_time_factor: Annotated[
+        Annotated[float, q.from_zero(1e6, "1")] | None,
+        about("robot time per wall time over the last second; null: not measured, such as in a pause"),
+    ] = None
 
 
 class LeaseRequest(Message, frozen=True, kw_only=True):
@@ -451,6 +463,19 @@ class EstopRequest(Message, frozen=True, kw_only=True):
     """Query payload on `hal/estop`; needs no lease. Latched until `clear` on `hal/lifecycle`."""
 
     who: Annotated[q.Name, about("name of the requester, for status, log and summary")]
+
+
+class SimulatorRequest(Message, frozen=True, kw_only=True):
+    """Query payload on `hal/simulator`: its time. Only for a robot with `Description.simulated_time`."""
+
+    action: Annotated[
+        Literal["pause", "resume", "step", "speed", "reset"],
+        about("step: some ticks, then paused; reset: another host, at the start and disarmed, takes the place of this"),
+    ]
+    who: Annotated[q.Name, about("name of the requester, for status, log and summary")] = "an unnamed client"
+    host: Annotated[q.Name | None, about("id of the addressed host process; null: any")] = None
+    ticks: Annotated[int, Meta(ge=1, le=1_000_000), about("of a step")] = 1
+    speed: Annotated[q.Speed, about("robot time per wall time, in real time; 1: as the wall")] = 1.0
 
 
 class FaultRequest(Message, frozen=True, kw_only=True):
@@ -667,6 +692,7 @@ VERSIONS: dict[type[Message], int] = dict.fromkeys(
         LeaseRequest,
         LifecycleRequest,
         EstopRequest,
+        SimulatorRequest,
         FaultRequest,
         Answer,
         Done,

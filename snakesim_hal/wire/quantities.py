@@ -53,6 +53,7 @@ Scalar = Annotated[float, _bounded(-1e12, 1e12, "1")]
 Pixels = Annotated[float, _bounded(-1e5, 1e5, "px")]
 FocalLength = Annotated[float, above(1e5, "px")]
 Distance = Annotated[float, from_zero(1e4, "m")]
+Speed = Annotated[float, _bounded(0.1, 10.0, "1")]  # of robot time, beside the wall clock
 Fraction = Annotated[float, _bounded(0.0, 1.0, "1")]
 
 Target = Annotated[float, _bounded(-MAX_TARGET, MAX_TARGET, "rad, rad/s or N·m, as the joint's mode says")]

@@ -49,6 +49,7 @@ _WRITERS: dict[str, tuple[Role, ...]] = {
 _ASKERS: dict[str, tuple[Role, ...]] = {
     keys.LEASE: (Role.GNC,),
     keys.LIFECYCLE: _PERSONS,
+    keys.SIMULATOR: _PERSONS,
     keys.ESTOP: (Role.GNC, Role.VIEWER, *_PERSONS),
     keys.FAULT_ALL: (Role.ADMINISTRATOR,),
     keys.SETTINGS: _PERSONS,

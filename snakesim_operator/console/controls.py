@@ -14,6 +14,7 @@ from snakesim_operator.console.operations import Operations
 from snakesim_operator.console.settings_form import SettingsForm
 from snakesim_operator.console.token import ControlToken
 from snakesim_operator.tools.fault import FaultOrder
+from snakesim_operator.tools.simulator_order import SimulatorOrder
 
 TOLD_S = 6.0
 FAULTS: dict[str, tuple[str, TargetType]] = {
@@ -22,6 +23,7 @@ FAULTS: dict[str, tuple[str, TargetType]] = {
 TARGETS: dict[TargetType, str] = {"process": "control", "key": keys.JOINTS, "joint": "joint_3", "bus": "bus_1"}
 DRIVE_HZ = 10.0
 FASTEST_M_S = 0.5
+TIMES: tuple[str, ...] = ("0.1", "0.25", "0.5", "1", "2", "5", "10")  # speeds of a simulator
 
 
 class Controls:
@@ -46,6 +48,10 @@ class Controls:
         with folder:
             self._take = client.gui.add_button("Take control", icon=viser.Icon.HAND_STOP, color="blue")
             self._lifecycle = client.gui.add_button_group("Robot", ("Arm", "Disarm", "Clear"))
+            self._simulator = client.gui.add_folder("Simulator")
+            with self._simulator:
+                time_buttons = client.gui.add_button_group("Time", ("Pause", "Resume", "Step", "Reset"))
+                self._time_speed = client.gui.add_dropdown("Speed", TIMES, initial_value="1")
             self._heading = client.gui.add_slider("Heading, °", -180, 180, 5, 0)
             self._speed = client.gui.add_slider("Speed, m/s", 0.0, FASTEST_M_S, 0.01, 0.1)
             self._drive = client.gui.add_button("Hold to drive", icon=viser.Icon.STEERING_WHEEL, color="green")
@@ -57,6 +63,8 @@ class Controls:
             self._dark = client.gui.add_checkbox("Dark page", initial_value=False)
         self._take.on_click(lambda _: self._take_or_release())
         self._lifecycle.on_click(lambda event: self._ask(event.target.value))
+        time_buttons.on_click(lambda event: self._change_time(event.target.value.lower()))
+        self._time_speed.on_update(lambda _: self._change_time("speed"))
         with settings_tab:
             self._apply = client.gui.add_button("Apply", visible=False, order=0)
         self._kind.on_update(lambda _: self._suggest_target())
@@ -81,6 +89,9 @@ class Controls:
         self._take.hint = f"{name_of(holder)} has control, and may release it" if taken else None
         for one in (self._lifecycle, self._heading, self._speed, self._drive, self._faults):
             one.visible = mine
+        moment = self._moment()
+        self._simulator.visible = mine and moment is not None and moment.robot.simulated_time
+        self._time_speed.visible = moment is not None and moment.status is not None and moment.status.pace == "realtime"
         self._apply.disabled = not mine
         if self._form is not None:
             self._form.enable(mine)
@@ -118,6 +129,11 @@ class Controls:
                 self.do("Disarm", lambda: self._operations.disarm(self.who))
             case _:
                 self.do("Clear", lambda: self._operations.clear(self.who))
+
+    def _change_time(self, action: str) -> None:
+        if self._in_control():
+            order = SimulatorOrder(action, speed=float(self._time_speed.value), who=self.who)
+            self.do("Simulator", lambda: self._operations.change_time(self.who, order))
 
     def _go(self) -> None:
         """The button is held: the page says so ten times a second, and nobody else does when it does not."""

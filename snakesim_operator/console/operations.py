@@ -15,6 +15,8 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Intent, Message, SettingsRequest
 from snakesim_operator.tools.command import ANSWER_S, arm, clear, disarm
 from snakesim_operator.tools.fault import FaultOrder, fault
+from snakesim_operator.tools.simulator import simulator
+from snakesim_operator.tools.simulator_order import SimulatorOrder
 from snakesim_operator.tools.stop import estop
 from snakesim_operator.tools.targets import Where
 
@@ -70,6 +72,10 @@ class Operations:
     def clear(self, who: str) -> str:
         """Clear a fault or an emergency stop."""
         return self._do(f"{who}: clear", lambda say: clear(self._where, say))
+
+    def change_time(self, who: str, order: SimulatorOrder) -> str:
+        """Pause, step, speed or reset, where the robot is a simulator."""
+        return self._do(f"{who}: simulator: {order}", lambda say: simulator(order, self._where, say))
 
     def inject(self, who: str, order: FaultOrder) -> str:
         """Inject a fault, where the run allows it."""

@@ -20,6 +20,7 @@ from snakesim_operator.console.drawing import Surroundings, draw
 from snakesim_operator.console.moment import Moment
 from snakesim_operator.console.operations import Log, Operations
 from snakesim_operator.console.pictures import picture
+from snakesim_operator.console.polygon import force_polygon
 from snakesim_operator.console.stage import Stage
 from snakesim_operator.console.token import ControlToken
 
@@ -80,6 +81,8 @@ class Page:
         tabs = gui.add_tab_group(order=4)
         with tabs.add_tab("Joints"):
             self._joints_tab = gui.add_folder(None)
+        with tabs.add_tab("Forces"):
+            self._forces = gui.add_html("")
         if self._operations is not None:
             self._lay_out_live(tabs)
         gui.add_html(texts.legend(LEGEND), order=3)
@@ -170,6 +173,7 @@ class Page:
             self._charts.take(moment)
             if self._frames % CHARTS_EVERY == 1:
                 self._charts.show(moment)
+                self._forces.content = force_polygon(moment)
             if self._frames % PICTURES_EVERY == 1:
                 self._show_pictures(moment)
             if moment.settings is not None and (before is None or moment.settings != before.settings):
@@ -191,6 +195,7 @@ class Page:
             if self._charts is not None:
                 self._charts.remove()
             self._charts = JointCharts(self._server.gui, robot)
+        self._control_changed()  # a simulator has controls of its own
 
     def _show_settings(self, settings: ControlSettings) -> None:
         with self._lock:
@@ -249,4 +254,5 @@ def _what(moment: Moment | None) -> tuple[object, ...] | None:
     if moment is None:
         return None
     status, control = moment.status, moment.control
-    return (None if status is None else (status.lifecycle, status.why), None if control is None else control.state)
+    told = None if status is None else (status.lifecycle, status.why, status.paused_by)
+    return told, None if control is None else control.state

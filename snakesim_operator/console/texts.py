@@ -37,6 +37,8 @@ def header(moment: Moment | None, *, recorded: str = "", control: str = "") -> s
     if recorded:
         words, colour, where = f"RECORDING OF: {words}", RECORDED, f"{where} · {plain(recorded)}"
     lines = [_bar(words, colour, where)]
+    if status is not None and status.paused_by is not None:
+        lines.append(_bar("PAUSED", RECORDED, f"by {plain(status.paused_by)}; robot time stands"))
     if len(moment.hosts) > 1:
         lines.append(_warning("IMPOSTOR: more than one host publishes a status under this name. Trust none of them."))
     if moment.silent_s > SILENT_S:
@@ -96,12 +98,18 @@ def state_table(moment: Moment) -> str:
             ("limited", _counts(status.commands_limited)),
             ("overruns", f"{status.overruns}"),
         ]
+        rows += [("speed", _speed(status))] if status.real_time_factor is not None else []
         rows += [("waiting for", plain(", ".join(status.waiting_for)))] if status.waiting_for else []
         rows += [("derated", plain(f"{joint}: {100 * share:.0f} %")) for joint, share in sorted(status.derated.items())]
         rows += [("isolated", plain(", ".join(status.isolated)))] if status.isolated else []
         rows += [("injected", plain(what)) for what in status.injected]
         rows += [("real time", plain(what)) for what in status.realtime_warnings]
     return _table([*rows, *_health(moment)]) + faults(status)
+
+
+def _speed(status: Status) -> str:
+    wanted = f", {status.speed:g} wanted" if status.speed != 1.0 else ""
+    return f"{status.real_time_factor:.2f} of the wall clock{wanted}"
 
 
 def faults(status: Status | None) -> str:

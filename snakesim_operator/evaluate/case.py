@@ -77,7 +77,9 @@ def run_case(config: bytes, code: str, give_up_s: float, limit_s: float) -> Outc
             check(asked)
             with _stopped_after(limit_s):
                 result = simulate(asked, until_goal=True, give_up_s=give_up_s)
-            return Outcome(numbers={**plain_numbers(result.summary), GAVE_UP: result.gave_up})
+            return Outcome(
+                numbers={**plain_numbers(result.summary), GAVE_UP: result.gave_up and not result.summary.crossed}
+            )
         except TookTooLongError:
             return Outcome(error=f"stopped after {limit_s:g} s of wall time; the suite's `limit_s` allows no more")
         except SnakesimError as error:

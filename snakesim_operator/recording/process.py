@@ -50,6 +50,7 @@ class Recorder:
         self._latched: dict[str, Arrival] = {}
         self._host: str | None = None
         self._new_host = False
+        self._back: Arrival | None = None  # the newest clock, if time went back and no file has begun since
         self._began = datetime.now(UTC)
         self._hosts = 1
 
@@ -60,8 +61,10 @@ class Recorder:
             if arrival.key == keys.DESCRIPTION:
                 self._meet(arrival.payload)
         self.recording.take(arrival)
-        if arrival.key == keys.CLOCK and self._new_host and self.recording.time.went_back:
-            self._start_over(arrival)
+        if arrival.key == keys.CLOCK and (self._back is not None or self.recording.time.went_back):
+            self._back = arrival
+        if self._new_host and self._back is not None:  # in either order
+            self._start_over(self._back)
 
     def close(self, dropped: dict[str, int]) -> str:
         """Finish the file. Returns why it lacks something, or an empty text."""
@@ -73,12 +76,12 @@ class Recorder:
         with contextlib.suppress(*UNDECODABLE):
             robot = msgspec.msgpack.decode(payload, type=Description)
             if is_proven(robot, own_run_key()):
-                self._new_host = self._host not in (None, robot.host)
+                self._new_host |= self._host not in (None, robot.host)
                 self._host = robot.host
 
     def _start_over(self, clock: Arrival) -> None:
         """Robot time began anew, with another host: what was before gets a file of its own."""
-        self._new_host = False
+        self._new_host, self._back = False, None
         if self._hosts >= MOST_HOSTS:
             return
         self._hosts += 1

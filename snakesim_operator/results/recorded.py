@@ -79,6 +79,8 @@ class Contents:
                 self.config = message
             case Status():
                 self.status = message
+            case Clock(paused=True):
+                pass  # no tick
             case World() | Trajectory() | ControlState():
                 told = self.told[key]
                 if not told or _is_news(told[-1], message):

@@ -77,14 +77,13 @@ class RunMonitor:
 
     def _take_in(self) -> None:
         """Process arrived messages."""
+        self._supervisor.take_in()
         if self._hosts != self._supervisor.hosts:
             self._hosts = self._supervisor.hosts
             self._may_arm = False
             self._progress.start_over()
             self._asked_at = None
         host = self._supervisor.host
-        if host is not None:
-            host.take_in()
         self._status, self._robot = (None, None) if host is None else (host.status, host.description)
         self._state = self._control.newest(lambda _state: True) or self._state
         self._progress.show(self._status, self._state, armed=self._armed)

@@ -76,6 +76,8 @@ class Progress:
             left_s = max(self._duration_s - self._armed_s, 0.0)
             if speed > 0 and status.lifecycle == "armed" and left_s > 0:
                 parts.append(f"about {in_minutes(left_s / speed)} left")
+        if status.paused_by is not None:
+            parts.append(f"PAUSED by {status.paused_by}")
         if status.lifecycle != "armed":
             parts.append(f"{status.lifecycle}: {status.why}")
         elif control is not None:

@@ -124,6 +124,19 @@ class Supervisor:
         """The host's description; None while unknown."""
         return self.host.description if self.host is not None else None
 
+    def take_in(self) -> None:
+        """Read what the host has said; one that was reset counts as another."""
+        if self.host is None:
+            return
+        before = self.host.resets
+        self.host.take_in()
+        for _ in range(self.host.resets - before):
+            at_s = time.monotonic() - self._begun_s
+            self.restarts.append(Restart(name=HOST, how="host was reset", at_s=round(at_s, 3), after_s=0.0))
+            robot = self.host.description
+            what = f"snakesim arm {robot.robot} {robot.backend}" if robot is not None else "snakesim arm"
+            self._say(f"the simulator was reset: it is at the start, and disarmed; go on with `{what}`")
+
     @property
     def names(self) -> list[str]:
         """Every process of the run."""

@@ -13,7 +13,7 @@ from snakesim_hal.network.session import Link, Reader, Session, open_session
 from snakesim_hal.process import who
 from snakesim_hal.terminal import Say, say
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Answer, Description, LifecycleRequest, Status
+from snakesim_hal.wire.messages import Answer, Description, LifecycleRequest, Message, Status
 from snakesim_operator.tools.targets import CONNECT_S, Where, the_one
 
 ANSWER_S = 5.0
@@ -47,14 +47,14 @@ def arm(robot: str, backend: str, where: Where, say: Say = say) -> int:
             backend=backend,
             config_hash=description.config_hash,
         )
-        return _ask(session, request, "armed", link, say)
+        return ask_host(session, keys.LIFECYCLE, request, "armed", link, say)
 
 
 def disarm(where: Where, say: Say = say) -> int:
     """Make the joints passive; later commands do not move them."""
     link = the_one(where, "disarm")
     with open_session(link, CONNECT_S) as session:
-        return _ask(session, LifecycleRequest(action="disarm", who=who()), "disarmed", link, say)
+        return ask_host(session, keys.LIFECYCLE, LifecycleRequest(action="disarm", who=who()), "disarmed", link, say)
 
 
 def clear(where: Where, say: Say = say) -> int:
@@ -72,12 +72,13 @@ def clear(where: Where, say: Say = say) -> int:
             say(f"{path.parent.name}: {forget_stop(path)}; cleared by {who()}. No robot of that name runs here")
         return 0
     with open_session(link, CONNECT_S) as session:
-        return _ask(session, LifecycleRequest(action="clear", who=who()), "cleared", link, say)
+        return ask_host(session, keys.LIFECYCLE, LifecycleRequest(action="clear", who=who()), "cleared", link, say)
 
 
-def _ask(session: Session, request: LifecycleRequest, done: str, link: Link, say: Say) -> int:
+def ask_host(session: Session, key: str, request: Message, done: str, link: Link, say: Say) -> int:
+    """Query the robot's host, and check who answers. done: in words. Raises RefusedError, NotConnectedError."""
     statuses = session.latched_reader(keys.STATUS, Status)
-    answers = [answer for _, answer in session.ask_all(keys.LIFECYCLE, request, ANSWER_S)]
+    answers = [answer for _, answer in session.ask_all(key, request, ANSWER_S)]
     doubt, shown = judge(answers, statuses)
     name = link.namespace
     if not answers:

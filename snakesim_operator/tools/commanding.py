@@ -1,4 +1,4 @@
-"""Arguments of the commands to a running robot: `snakesim arm`, `disarm`, `clear`, `estop`, `teleop`, `fault`."""
+"""Arguments of the commands to a running robot: `snakesim arm`, `disarm`, `clear`, `estop`, `teleop`, `sim`, ..."""
 
 import argparse
 import contextlib
@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from snakesim_hal.arguments import add_network
+from snakesim_operator.tools.simulator_order import add_command as add_sim
+from snakesim_operator.tools.simulator_order import order_of
 from snakesim_operator.tools.where import where_of
 
 URGENT = -10  # niceness of an emergency stop
@@ -40,6 +42,10 @@ def add_commands(commands: Any) -> None:
     teleop.add_argument("--fastest", type=float, default=0.3, metavar="M/S", help="highest speed (0.3)")
     add_network(teleop)
     teleop.set_defaults(act=_teleop)
+
+    sim = add_sim(commands)
+    add_network(sim)
+    sim.set_defaults(act=_sim)
 
     fault = commands.add_parser(
         "fault", help="inject a fault into a run that allows it", epilog="`snakesim fault list` explains every kind."
@@ -85,6 +91,13 @@ def _teleop(arguments: argparse.Namespace) -> int:
     stick: Path | None = arguments.joystick
     request = TeleopRequest(arguments.fastest, stick is not None, None if stick in (None, Path()) else stick)
     return teleop(request, where_of(arguments))
+
+
+def _sim(arguments: argparse.Namespace) -> int:
+    order = order_of(arguments)
+    from snakesim_operator.tools.simulator import simulator
+
+    return simulator(order, where_of(arguments))
 
 
 def _fault(arguments: argparse.Namespace) -> int:

@@ -128,6 +128,10 @@ def _in_words(link: Link, status: Status) -> list[str]:
         f"  commands: {status.commands_accepted} accepted, {status.commands_standby} while disarmed, rejected: "
         f"{counts(status.commands_rejected)}; joint targets limited: {counts(status.commands_limited)}",
     ]
+    if status.paused_by is not None:
+        lines.append(f"  PAUSED by {status.paused_by}; `snakesim sim resume` or `step` go on")
+    elif status.speed != 1.0:
+        lines.append(f"  speed {status.speed:g} is wanted")
     for joint, share in sorted(status.derated.items()):
         lines.append(f"  derated: {joint} has {100 * share:.0f} % of its torque left")
     if status.isolated:

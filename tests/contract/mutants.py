@@ -4,6 +4,7 @@ As a pytest plugin (`-p tests.contract.mutants`) it runs each mutant against tho
 """
 
 import random
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -495,6 +496,25 @@ class KeepsItsBus(Workbench):
 class OwnDice(Misread):
     def misread(self, joints):
         return replace(joints, torque_nm=[torque + random.gauss(0, 1e-4) for torque in joints.torque_nm])
+
+
+@breaks("a_simulator_stands_still_on_request_and_a_robot_refuses")
+class ModulesThatTellThemselvesASimulator(Misdescribed):
+    """Their watchdog counts wall time."""
+
+    stepped_s = 0.0
+
+    def mistold(self, robot):
+        return replace(robot, simulated_time=True)
+
+    def advance(self):
+        super().advance()
+        self.stepped_s = time.monotonic()
+
+    def sample(self, tick, stamp_ns):
+        if self.stepped_s and time.monotonic() - self.stepped_s > 0.05:
+            raise BackendError("the modules have stopped: no set-point for 50 ms")
+        return super().sample(tick, stamp_ns)
 
 
 # --- as a plugin -----------------------------------------------------------------------------------------------

@@ -50,7 +50,10 @@ def test_a_page_shows_the_snake_as_it_moves_and_its_escape_key_stops_it(tmp_path
 @pytest.mark.slow
 def test_one_viewer_has_control_and_anybody_stops_it(tmp_path: Path) -> None:
     with chromium() as browser, running(tmp_path / "run", *RUN) as run:
-        first, second = browser.open(address_of(run), *SMALL), browser.open(address_of(run), *SMALL)
+        address = address_of(run)
+        first = browser.open(address, *SMALL)
+        first.wait_for("Take control")
+        second = browser.open(address, *SMALL)  # after the first, whose number is thus 1
         for tab in (first, second):
             tab.wait_for("armed by snakesim run")
             tab.wait_for("Take control")
@@ -59,7 +62,11 @@ def test_one_viewer_has_control_and_anybody_stops_it(tmp_path: Path) -> None:
         second.click("Take control")  # greyed out
         first.wait_for("Release control")
         assert "Release control" not in second.text()
+        first.click("Pause")
+        second.wait_for("PAUSED")
         change_settings(first, run)
+        first.click("Resume")
+        wait_until(lambda: "PAUSED" not in second.text(), "the end of the pause")
         stop_in(second, run)
         first.wait_for("ESTOP")
         first.click("Clear")

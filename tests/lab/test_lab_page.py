@@ -38,7 +38,7 @@ def test_a_new_lab_step_by_step(tmp_path: Path) -> None:
                 machines[where].start(
                     "bash",
                     "-c",
-                    "exec env " + here(script, tmp_path, where),
+                    f"cd {tmp_path}; exec env {here(script, tmp_path, where)}",
                     log=tmp_path / f"{number}.log",
                     env=environment(tmp_path, where),
                 )

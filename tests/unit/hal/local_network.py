@@ -77,6 +77,7 @@ class LagBackend:
             period_ns=config.period_ns,
             lease_ns=config.lease_ns,
             config_hash=config_hash(config),
+            simulated_time=True,
         )
 
     def sample(self, tick: int, stamp_ns: int) -> Samples:

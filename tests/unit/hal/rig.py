@@ -122,9 +122,10 @@ def run_config(**dotted: Any) -> RunConfig:
     return msgspec.convert(changed(RUN, **dotted), RunConfig)
 
 
-def description(**dotted: Any) -> Description:
+def description(*, simulated_time: bool = False, **dotted: Any) -> Description:
     """The test robot as a HAL publishes it."""
-    return describe(robot_file(**dotted), backend="lag", period_ns=PERIOD_NS, lease_ns=LEASE_NS, config_hash="0" * 16)
+    told = {"backend": "lag", "period_ns": PERIOD_NS, "lease_ns": LEASE_NS, "config_hash": "0" * 16}
+    return describe(robot_file(**dotted), simulated_time=simulated_time, **told)
 
 
 def state(robot: Description, angle: Any = 0.0, velocity: Any = 0.0, torque: Any = 0.0, **other: Any) -> JointState:

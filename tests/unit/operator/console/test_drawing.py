@@ -9,6 +9,7 @@ from snakesim_hal.model.kinematics import quaternion_from_yaw, quaternions_from_
 from snakesim_hal.wire.messages import ControlState, DepthImage, JointState, Obstacle, World, WorldContact
 from snakesim_operator.console.drawing import LONGEST_M, M_PER_N, draw
 from snakesim_operator.console.moment import Moment
+from snakesim_operator.console.polygon import force_polygon
 from tests.unit.hal.rig import description
 
 ROBOT = description()
@@ -77,6 +78,19 @@ def test_a_strong_force_has_an_arrow_of_limited_length_above_the_body():
     start, end = drawing.forces[0]
     assert end - start == pytest.approx([0.0, LONGEST_M, 0.0]) and start[2] > ROBOT.links[0].radius_m
     assert drawing.contacts_w[0] == pytest.approx(contact.position_w)
+
+
+def test_the_force_polygon_names_every_force_and_their_resultant():
+    def contact(body_s_m: float, x_n: float, y_n: float) -> WorldContact:
+        return WorldContact(
+            link=0, obstacle="<b>", body_s_m=body_s_m, position_w=(0.1, 0.0, 0.0), normal_w=(0.0, 1.0, 0.0),
+            tangent_w=(1.0, 0.0, 0.0), force_w=(x_n, y_n, 0.0),
+        )  # fmt: skip
+
+    drawn = force_polygon(Moment(robot=ROBOT, world=world([contact(0.3, 0.0, 4.0), contact(0.1, 3.0, 0.0)], [])))
+    assert "resultant 5.0 N" in drawn
+    assert drawn.index(">3.0 N<") < drawn.index(">4.0 N<") < drawn.index(">5.0 N<")
+    assert "no contact force" in force_polygon(Moment(robot=ROBOT, world=world([], [])))
 
 
 def test_what_a_map_tells_is_not_drawn_as_perceived():

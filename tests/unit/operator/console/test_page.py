@@ -11,7 +11,7 @@ from snakesim_operator.console import texts
 from snakesim_operator.console.moment import Moment
 from snakesim_operator.console.server import page_server
 from snakesim_operator.console.token import ControlToken
-from tests.unit.hal.rig import description
+from tests.unit.hal.rig import description, status
 
 
 def test_a_page_of_another_site_cannot_connect():
@@ -54,15 +54,21 @@ def test_control_is_taken_while_free_and_never_taken_away():
 def test_text_from_the_network_is_no_markup():
     evil = "<img src=x onerror=alert(1)>\x1b[2J"
     robot = description()
-    status = Status(
+    told = Status(
         tick=0, stamp_ns=0, robot="r", backend="sim", pace="realtime", rate_hz=100.0, lifecycle="fault", why=evil,
         lease_holder=evil[:40], lease_epoch=1, commands_accepted=0, commands_standby=0,
         commands_rejected={evil[:40]: 1}, commands_limited={}, faults=[],
         alive=[evil[:40]], waiting_for=[evil[:40]], overruns=0, ready_to_arm=False,
     )  # fmt: skip
-    moment = Moment(robot=robot, status=status)
+    moment = Moment(robot=robot, status=told)
     shown = texts.header(moment) + texts.state_table(moment) + texts.log([evil])
     assert "<img" not in shown and "&lt;img" in shown and "\x1b" not in shown
+
+
+def test_the_page_says_that_a_simulator_is_paused_and_by_whom():
+    shown = texts.header(Moment(robot=description(), status=status(paused_by="<b>ada")))
+    assert ">PAUSED<" in shown and "by &lt;b&gt;ada" in shown
+    assert "PAUSED" not in texts.header(Moment(robot=description(), status=status()))
 
 
 @pytest.mark.parametrize(

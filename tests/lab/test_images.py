@@ -1,0 +1,53 @@
+"""A camera's images behind a lab's router, over the connection of their own."""
+
+import json
+
+from msgspec import structs
+
+from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.network.session_file import read_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import DepthImage
+from snakesim_hal.wire.roles import Role
+from tests.lab.small_lab import OWN, SmallLab
+from tests.unit.hal.local_network import wait_until
+
+KEY = keys.depth("head")
+# The largest that a robot may have: it is sent in many pieces, each of which waits for the one before it.
+IMAGE = DepthImage(
+    tick=1,
+    stamp_ns=1,
+    link=0,
+    position_l=(0.0, 0.0, 0.0),
+    orientation_l_wxyz=(1.0, 0.0, 0.0, 0.0),
+    width=1280,
+    height=960,
+    fx_px=600.0,
+    fy_px=600.0,
+    cx_px=639.5,
+    cy_px=479.5,
+    range_min_m=0.1,
+    range_max_m=2.0,
+    scale_m=0.001,
+    depth=bytes(2 * 1280 * 960),
+)
+
+
+def link(lab: SmallLab, role: Role) -> Link:
+    """As a rendered session file says; only the router that runs."""
+    identity = lab.who(role, OWN)
+    path = lab.folder / f"{identity.common_name}.json5"
+    path.write_text(json.dumps(lab.settings(identity, namespace=OWN)))
+    return Link.of_file(read_session(path), OWN)
+
+
+def test_the_largest_image_arrives_and_a_viewer_can_send_none(lab: SmallLab) -> None:
+    viewer_link, robot_link = link(lab, Role.VIEWER), link(lab, Role.ROBOT)
+    with open_session(viewer_link) as viewer, open_session(robot_link) as robot:
+        reader, found = viewer.reader(KEY, DepthImage), list[DepthImage]()
+        robots, viewers = robot.publisher(KEY, DepthImage), viewer.publisher(KEY, DepthImage)
+        wait_until(robots.heard, "the viewer subscribes")
+        viewers.put(structs.replace(IMAGE, tick=2))
+        robots.put(IMAGE)
+        wait_until(lambda: found.extend(reader.drain()) or found, "the image")
+        assert found == [IMAGE]
