@@ -85,7 +85,7 @@ def ask_host(
     name = link.namespace
     if not answers:
         raise NotConnectedError(
-            f"{name}: NO ANSWER on {link.endpoint}: its host hangs, or your role may not {request.action}; if the "
+            f"{name}: NO ANSWER on {link.endpoint}: its host hangs, or your role may not do this; if the "
             "robot moves, `snakesim estop`"
         )
     if doubt is not None:
