@@ -40,7 +40,7 @@ def test_a_stop_waits_for_no_slow_import(tmp_path: Path) -> None:
 
 
 def test_an_impostor_that_answers_too_is_told() -> None:
-    with running(run_config(pace="realtime")) as run, following(run.link, Follower()):
+    with running(run_config()) as run, following(run.link, Follower()):
         run.arm()
         with open_session(run.link) as impostor:
 
@@ -54,7 +54,7 @@ def test_an_impostor_that_answers_too_is_told() -> None:
 
 
 def test_an_answer_that_the_status_does_not_show_is_not_believed() -> None:
-    with running(run_config(pace="realtime")) as run, following(run.link, Follower()):
+    with running(run_config()) as run, following(run.link, Follower()):
         run.arm()
         with open_session(Link(run.link.endpoint, "lab/other")) as impostor:
             impostor.declare_alive("hal")
