@@ -196,9 +196,9 @@ def decode(table: Table, struct: type[StructT], under: str = "") -> StructT:
 
 def _explain(flaw: Flaw, table: Table, under: str) -> str:
     *steps, name = [under, *flaw.steps] if under else flaw.steps or [""]
-    dotted = ".".join([*steps, short(name)])
+    dotted, whole = ".".join([*steps, short(name)]), ".".join([*steps, name])
     if flaw.kind == "unknown":
-        deeper = [key for key in table.origin if key.endswith(f".{name}") and not key.startswith(f"{dotted}.")]
+        deeper = [short(key) for key in table.origin if key.endswith(f".{name}") and not key.startswith(whole)]
         close = difflib.get_close_matches(name, flaw.known, 1, 0.6) or deeper
         hint = f"did you mean `{close[0]}`?" if close else f"known fields: {', '.join(sorted(flaw.known))}."
         set_by = [origin for key, origin in table.origin.items() if key == dotted or key.startswith(dotted + ".")]
