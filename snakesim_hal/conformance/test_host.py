@@ -30,6 +30,7 @@ def undisturbed(hosted: Hosted, act: Callable[[], None]) -> None:
 
 def moves_then(silent: bool, hosted: Hosted) -> int:
     """Arm and move a joint for a while; returns for how many ticks."""
+    wait_until(lambda: hosted.backend.seen, "a first sample")
     angle = hosted.backend.seen[-1].angle_rad[0]
     go: Asked = {0: (Mode.VELOCITY, -math.copysign(t.CRUISE_RAD_S, angle))}  # away from the nearer stop
     ticks = t.ARMING_PERIODS + math.ceil(t.CRUISE_S * 1e9 / hosted.config.period_ns)
