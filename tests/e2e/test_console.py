@@ -44,6 +44,7 @@ def test_a_page_shows_the_snake_as_it_moves_and_its_escape_key_stops_it(tmp_path
         wait_until(lambda: page.picture(clip=GROUND) != before, "a snake that moves on the page")
         stopped_after_s = stop_in(page, run)
         assert stopped_after_s < STOP_LIMIT_S, f"{stopped_after_s:.2f} s"
+        print(f"the robot on the page after {opened_after_s:.1f} s, motors off {stopped_after_s:.2f} s after the key")
         page.wait_for("ESTOP")
         assert not page.errors, page.errors
 
