@@ -165,6 +165,8 @@ class Page:
         if moment is not None:
             if self._stage is None or before is None or before.robot.layout != moment.robot.layout:
                 self._meet(moment.robot)
+            if before is None or before.robot is not moment.robot:
+                self._control_changed()  # a simulator has controls of its own
             drawing = draw(moment, self._around)
             assert self._stage is not None and self._charts is not None
             if drawing is not None:
@@ -195,7 +197,6 @@ class Page:
             if self._charts is not None:
                 self._charts.remove()
             self._charts = JointCharts(self._server.gui, robot)
-        self._control_changed()  # a simulator has controls of its own
 
     def _show_settings(self, settings: ControlSettings) -> None:
         with self._lock:

@@ -7,7 +7,7 @@ as they like.
 import math
 from collections import deque
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import viser
@@ -16,10 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from snakesim_hal.model.kinematics import quaternion_from_yaw
 from snakesim_hal.wire.messages import Description, Obstacle
 from snakesim_operator.console.drawing import Camera, Drawing, Surroundings
+from snakesim_operator.console.meshes import Mesh, box, capsule, cylinder, sphere
 from snakesim_operator.results.page.palette import DARK, LIGHT
-
-if TYPE_CHECKING:
-    import trimesh  # where it is used: it takes as long to load as all of the page, which need not wait for it
 
 Floats = NDArray[np.float64]
 Colour = tuple[int, int, int]
@@ -29,7 +27,7 @@ FOLLOW_SHARE = 0.08  # of the way to the snake's centre, in a frame
 FURTHEST_M = 0.5  # from the view's middle
 MOST_ROWS = 200  # of hills along an edge
 SEE_THROUGH = 0.5  # so that no obstacle hides the snake, or a force
-SHAPES = ("cylinder", "box", "sphere")
+SHAPES: dict[str, Mesh] = {"cylinder": cylinder(1.0, 1.0), "box": box(1.0), "sphere": sphere(1.0)}  # to be stretched
 
 
 def colour(name: str, *, dark: bool = False) -> Colour:
@@ -48,8 +46,6 @@ class Stage:
     """The 3-D scene of one robot."""
 
     def __init__(self, scene: viser.SceneApi, robot: Description, around: Surroundings | None) -> None:
-        import trimesh
-
         self._scene, self._robot, self._around = scene, robot, around
         self._thick = max(link.radius_m for link in robot.links)
         scene.configure_environment_map("warehouse", environment_intensity=0.3)
@@ -63,12 +59,8 @@ class Stage:
         self._path: viser.LineSegmentsHandle | None = None
         self._path_w: Floats | None = None
         self._links = self._add_links()
-        self._hinges = self._batch(
-            "snake/hinges",
-            trimesh.creation.cylinder(0.5 * self._thick, 2.12 * self._thick, sections=20),
-            len(robot.joints),
-            HINGE,
-        )
+        hinge = cylinder(0.5 * self._thick, 2.12 * self._thick)
+        self._hinges = self._batch("snake/hinges", hinge, len(robot.joints), HINGE)
         self._contacts = scene.add_point_cloud(
             "/world/contacts/points", np.zeros((1, 3)), colour("ink"), point_size=0.4 * self._thick, visible=False
         )
@@ -83,31 +75,23 @@ class Stage:
 
     def _add_links(self) -> list[tuple[viser.BatchedMeshHandle, list[int]]]:
         """One batch for all links of one size."""
-        import trimesh
-
         alike: dict[tuple[float, float], list[int]] = {}
         for i, link in enumerate(self._robot.links):
             alike.setdefault((link.length_m, link.radius_m), []).append(i)
         found: list[tuple[viser.BatchedMeshHandle, list[int]]] = []
         last = len(self._robot.links) - 1
         for k, ((length_m, radius_m), numbers) in enumerate(alike.items()):
-            capsule = trimesh.creation.capsule(length_m, radius_m, count=[24, 12])
-            capsule.apply_translation(-capsule.bounds.mean(axis=0))
-            capsule.vertices = np.asarray(capsule.vertices)[:, [2, 0, 1]]  # along x
-            batch = self._batch(f"snake/links_{k}", capsule, len(numbers), LINK)
+            batch = self._batch(f"snake/links_{k}", capsule(length_m, radius_m), len(numbers), LINK)
             # Neighbours share a sphere at their joint: drawn a little thinner, they do not flicker.
             batch.batched_scales = _single([[1.0, thin, thin] for thin in (1.0 - 0.012 * (i % 2) for i in numbers)])
             batch.batched_colors = _shades([HEAD if i == last else (LINK, LINK_EDGE)[i % 2] for i in numbers])
             found.append((batch, numbers))
         return found
 
-    def _batch(
-        self, name: str, mesh: "trimesh.Trimesh", count: int, of: Colour, **more: Any
-    ) -> viser.BatchedMeshHandle:
+    def _batch(self, name: str, mesh: Mesh, count: int, of: Colour, **more: Any) -> viser.BatchedMeshHandle:
         return self._scene.add_batched_meshes_simple(
             f"/world/{name}",
-            np.asarray(mesh.vertices),
-            np.asarray(mesh.faces),
+            *mesh,
             batched_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
             batched_positions=np.zeros((count, 3)),
             batched_scales=np.ones((count, 3)),
@@ -233,7 +217,7 @@ class Stage:
             if not these:
                 continue
             if batch is None:
-                batch = self._shapes[key] = self._batch(key, _unit(shape), len(these), of, opacity=opacity)
+                batch = self._shapes[key] = self._batch(key, SHAPES[shape], len(these), of, opacity=opacity)
             batch.batched_positions = _single([o.position_w for o in these])
             batch.batched_wxyzs = _single([quaternion_from_yaw(o.yaw_rad) for o in these])
             batch.batched_scales = _single(grown * np.array([_size(o) for o in these]))
@@ -293,14 +277,6 @@ def _shades(colours: Sequence[Colour]) -> NDArray[np.uint8]:
     srgb = np.array(colours) / 255
     linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     return np.round(255 * linear).astype(np.uint8)
-
-
-def _unit(shape: str) -> "trimesh.Trimesh":
-    import trimesh
-
-    if shape == "cylinder":
-        return trimesh.creation.cylinder(1.0, 1.0, sections=40)
-    return trimesh.creation.box((2.0, 2.0, 2.0)) if shape == "box" else trimesh.creation.icosphere(3, 1.0)
 
 
 def _size(obstacle: Obstacle) -> tuple[float, float, float]:
