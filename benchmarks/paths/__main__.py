@@ -40,7 +40,7 @@ RATE_MBIT = 6.0
 AIM, AIM_SATURATED = 1.5, 1.3
 EXPLAINED = (
     "A run that stops is named; a lease lasts 50 ms. On such a link a packet of 1500 bytes takes 2 ms, and nothing",
-    "passes the one that is under way: so p99 is longer, and with raw Zenoh too. Smaller pieces of an image do not help,",
+    "passes the one that is under way: so p99 is longer, also with raw Zenoh. Smaller pieces of an image do not help,",
     "TCP joins them to whole packets again. Previews instead of images keep the aim: see",
     "[bandwidth](../docs/bandwidth.md).",
     "",
