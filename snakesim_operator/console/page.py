@@ -1,7 +1,7 @@
 """The page: the scene in the middle, the state and the controls beside it; the same for every viewer but the controls.
 
-The loop hands over one moment a frame. viser sends each viewer the newest value of each thing, so a slow browser gets
-fewer frames, and never makes the loop wait.
+The loop hands over one moment a frame. Each viewer gets the newest value of each thing when it has shown the one before
+(`pacing`), so a slow browser gets fewer frames, and never makes the loop wait.
 """
 
 import contextlib

@@ -10,6 +10,7 @@ from typing import Any
 import viser
 import websockets.asyncio.server
 
+from snakesim_operator.console.pacing import pace
 from snakesim_operator.console.port import LOOPBACK, address_of
 
 # A browser names the page that opens a connection. Any site could connect to loopback from the operator's browser, and
@@ -30,6 +31,7 @@ def page_server(listening: socket.socket) -> Iterator[tuple[PageServer, str]]:
     """The server on a socket of `port.open_port`, and its address."""
     with _on_our_terms(listening), contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
         server = PageServer(LOOPBACK, listening.getsockname()[1], label="SnakeSIM", verbose=False)
+    pace(server)
     try:
         yield server, address_of(listening)
     finally:
