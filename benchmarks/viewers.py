@@ -1,6 +1,6 @@
 """`python -m benchmarks.viewers`: what a console at 30 Hz with three viewers costs a run.
 
-With and without are measured in turn, and their ratios paired. The viewers are one process at the lowest priority, which
+With and without are measured in turn, and their ratios paired. The viewers are one process at the lowest priority, that
 reads and answers as viser's page does and draws nothing: three browsers without a graphics card would be what is
 measured, and on a lab's bench they run elsewhere.
 """

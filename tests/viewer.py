@@ -34,6 +34,7 @@ class Viewer:
     def __init__(self, socket: ClientConnection) -> None:
         self._socket = socket
         self._unzip = zstandard.ZstdDecompressor()
+        self._of: dict[str, dict[str, Any]] = {}  # what is on the page, by its id
 
     async def come(self) -> None:
         """What a page says first: from then on it counts as a viewer."""
@@ -44,7 +45,13 @@ class Viewer:
         data = await self._socket.recv()
         assert isinstance(data, bytes)
         size, packed = int.from_bytes(data[:8], "little"), int.from_bytes(data[8:16], "little")
-        return msgspec.msgpack.decode(self._unzip.decompress(data[16 : 16 + packed], size))["messages"]
+        messages = msgspec.msgpack.decode(self._unzip.decompress(data[16 : 16 + packed], size))["messages"]
+        for message in messages:
+            if "props" in message and "uuid" in message:
+                self._of[message["uuid"]] = dict(message["props"])
+            elif "updates" in message and message.get("uuid") in self._of:
+                self._of[message["uuid"]] |= message["updates"]
+        return messages
 
     async def answer(self, batch: list[dict[str, Any]]) -> None:
         """Tell the console that a batch has been shown, if it asks."""
@@ -52,6 +59,31 @@ class Viewer:
             if message["type"] == ASKED:
                 told = {"value": None, "error": None, "request_uuid": message["request_uuid"]}
                 await self._say({"type": "LocalStorageGetItemResponseMessage", **told})
+
+    async def watch(self) -> None:
+        """Show all that comes, until the connection ends."""
+        with contextlib.suppress(ConnectionClosed):
+            while True:
+                await self.answer(await self.batch())
+
+    def has(self, label: str) -> bool:
+        """Whether a button, an input or a command with this label is there."""
+        return any(props.get("label") == label for props in self._of.values())
+
+    def shows(self, text: str) -> bool:
+        """Whether a text is on the page, as HTML."""
+        return any(text in props.get("content", "") for props in self._of.values())
+
+    async def click(self, button: str) -> None:
+        """Press a button."""
+        await self._say({"type": "GuiUpdateMessage", "uuid": self._named(button), "updates": {"value": True}})
+
+    async def trigger(self, command: str) -> None:
+        """Press the key of a command."""
+        await self._say({"type": "CommandTriggerMessage", "uuid": self._named(command)})
+
+    def _named(self, label: str) -> str:
+        return next(uuid for uuid, props in self._of.items() if props.get("label") == label)
 
     async def _say(self, message: dict[str, Any]) -> None:
         await self._socket.send(msgspec.msgpack.encode(message))
@@ -68,9 +100,7 @@ async def watch(address: str) -> None:
     async with viewing(address) as socket:
         viewer = Viewer(socket)
         await viewer.come()
-        with contextlib.suppress(ConnectionClosed):
-            while True:
-                await viewer.answer(await viewer.batch())
+        await viewer.watch()
 
 
 async def watch_together(address: str, count: int) -> None:
