@@ -23,11 +23,6 @@ SMALL = 800, 400, 0.25  # width, height, pixels a dot: the browser draws without
 GROUND = {"x": 0, "y": 200, "width": 370, "height": 200, "scale": 1}  # of the page: scene without notices
 
 
-def address_of(run: Running) -> str:
-    run.wait_for("console: http")
-    return next(line.split()[1] for line in run.said().splitlines() if line.startswith("console: "))
-
-
 def fastest_rad_s(joints: JointState) -> float:
     return max(abs(speed) for speed in joints.velocity_rad_s)
 
@@ -35,7 +30,7 @@ def fastest_rad_s(joints: JointState) -> float:
 def test_a_page_shows_the_snake_as_it_moves_and_its_escape_key_stops_it(tmp_path: Path) -> None:
     with chromium() as browser, running(tmp_path / "run", *RUN) as run:
         began_s = time.monotonic()
-        page = browser.open(address_of(run), *SMALL)
+        page = browser.open(run.console(), *SMALL)
         page.wait_for("SIMULATOR")
         opened_after_s = time.monotonic() - began_s
         assert opened_after_s < OPEN_LIMIT_S, f"{opened_after_s:.1f} s"
@@ -51,7 +46,7 @@ def test_a_page_shows_the_snake_as_it_moves_and_its_escape_key_stops_it(tmp_path
 
 def test_one_viewer_has_control_and_anybody_stops_it(tmp_path: Path) -> None:
     with chromium() as browser, running(tmp_path / "run", *RUN) as run:
-        address = address_of(run)
+        address = run.console()
         first = browser.open(address, *SMALL)
         first.wait_for("Take control")
         second = browser.open(address, *SMALL)  # after the first, whose number is thus 1
