@@ -22,9 +22,7 @@ RUN = ("peg_row", "--pace", "realtime", "--duration", "600", "--stay", "--consol
 
 def test_keys_drive_a_lost_page_stands_still_and_another_stops(tmp_path: Path) -> None:
     with running(tmp_path / "run", *RUN) as run:
-        run.wait_for("console: http")
-        address = next(line.split()[1] for line in run.said().splitlines() if line.startswith("console: "))
-        asyncio.run(asyncio.wait_for(drive_and_stop(address, run.endpoint), 2 * LIMIT_S))
+        asyncio.run(asyncio.wait_for(drive_and_stop(run.console(), run.endpoint), 2 * LIMIT_S))
 
 
 async def drive_and_stop(address: str, endpoint: str) -> None:
