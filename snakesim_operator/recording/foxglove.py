@@ -1,17 +1,16 @@
 """Channels that Foxglove and Rerun show as they are, made of the newest messages a few times a second.
 
-They are beside the raw ones, in Foxglove's protobuf schemas: `foxglove/tf`, `foxglove/joints`, `foxglove/pose`,
-`foxglove/scene/...` (body, obstacles, map, forces, path), `foxglove/depth/<name>` and `foxglove/colour/<name>`.
+They are beside the raw ones, in Foxglove's protobuf schemas: `foxglove/tf` (a chain: each link in the frame of the one
+behind it), `foxglove/joints`, `foxglove/pose`, `foxglove/scene/...` (body, obstacles, map, forces, path),
+`foxglove/depth/<name>` and `foxglove/colour/<name>`.
 """
 
 from collections.abc import Iterator
 from contextlib import suppress
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
-import numpy as np
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
-from foxglove_schemas_protobuf.JointState_pb2 import JointState as NamedJoint
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
@@ -20,7 +19,6 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.message import Message as Protobuf
 
 from snakesim_hal.errors import SnakesimError
-from snakesim_hal.model.kinematics import link_frames, quaternions_from_rotations, rotation_from_quaternion
 from snakesim_hal.model.scenario import RunConfig, capsules_at_start
 from snakesim_hal.model.scene import place
 from snakesim_hal.wire import keys
@@ -31,16 +29,17 @@ from snakesim_hal.wire.messages import (
     DepthImage,
     Description,
     JointState,
-    Obstacle,
     Pose,
     Trajectory,
     World,
     WorldContact,
 )
 from snakesim_operator.recording import shapes
+from snakesim_operator.recording.body_frames import BodyFrames
 
 MOVING_NS = 100_000_000  # 10 Hz: viewers interpolate transforms
 IMAGES_NS = 200_000_000  # 5 Hz: all images are in the raw channels
+TOPICS = "foxglove/"
 STILL_NS = 1_000_000_000  # what seldom changes, so that it is there wherever one begins to look
 
 
@@ -57,10 +56,27 @@ _decoders: dict[type[Any], Any] = {
     for message in (JointState, Pose, Seen, World, Trajectory, DepthImage, ColourImage, Description, Configuration)
 }
 
-Made = tuple[str, Protobuf]
+ALWAYS: dict[str, type[Protobuf]] = {  # topics but for those of images, of which a robot may have none
+    TOPICS + name: kind
+    for name, kind in {
+        "tf": FrameTransforms,
+        "joints": JointStates,
+        "pose": PoseInFrame,
+        **{f"scene/{part}": SceneUpdate for part in ("body", "obstacles", "map", "forces", "path")},
+    }.items()
+}
+_KEPT = (keys.JOINTS, keys.POSE, keys.WORLD, keys.TRAJECTORY)
 
 
-def descriptor_set(message: Protobuf) -> bytes:
+class Shown(NamedTuple):
+    """One message for Foxglove."""
+
+    topic: str
+    kind: type[Protobuf]
+    payload: bytes
+
+
+def descriptor_set(kind: type[Protobuf]) -> bytes:
     """A message's schema as MCAP wants it: its file and all that it imports."""
     files: dict[str, Any] = {}
 
@@ -69,7 +85,7 @@ def descriptor_set(message: Protobuf) -> bytes:
             add(needed)
         files.setdefault(file.name, file)
 
-    add(message.DESCRIPTOR.file)
+    add(kind.DESCRIPTOR.file)
     found = FileDescriptorSet()
     for file in files.values():
         file.CopyToProto(found.file.add())
@@ -83,24 +99,32 @@ class FoxgloveChannels:
         self._newest: dict[str, bytes] = {}
         self._due_ns: dict[str, int] = {}
         self._robot: Description | None = None
-        self._truth: list[Obstacle] = []
+        self._frames: BodyFrames | None = None
+        self._truth = shapes.obstacles([], "obstacles", shapes.TRUTH, 0)
 
-    def take(self, key: str, payload: bytes, time_ns: int) -> list[Made]:
+    def take(self, key: str, payload: bytes, time_ns: int) -> list[Shown]:
         """What is due with this message. One that cannot be decoded makes nothing."""
+        if key in _KEPT:
+            self._newest[key] = payload
+            return []
         if key == keys.CLOCK:
             return self._at_clock(time_ns) if self._is_due("moving", time_ns, MOVING_NS) else []
+        if key.startswith(("sensor/depth/", "sensor/colour/")):
+            return list(self._image(key, payload, time_ns)) if self._is_due(key, time_ns, IMAGES_NS) else []
+        if key in (keys.DESCRIPTION, keys.CONFIG):
+            self._meet(key, payload)
+        return []
+
+    def _meet(self, key: str, payload: bytes) -> None:
         with suppress(SnakesimError, *UNDECODABLE):
             if key == keys.DESCRIPTION:
-                self._robot = _decoders[Description].decode(payload)
-            elif key == keys.CONFIG:
+                robot: Description = _decoders[Description].decode(payload)
+                if len(robot.links) == len(robot.joints) + 1:
+                    self._robot, self._frames = robot, BodyFrames(robot)
+            else:
                 config = msgspec.json.decode(_decoders[Configuration].decode(payload).content, type=RunConfig)
                 placed = place(config.scene, capsules_at_start(config))  # checked when the run began
-                self._truth = [one.obstacle for one in placed]
-            elif key.startswith(("sensor/depth/", "sensor/colour/")):
-                return list(self._image(key, payload, time_ns)) if self._is_due(key, time_ns, IMAGES_NS) else []
-            else:
-                self._newest[key] = payload
-        return []
+                self._truth = shapes.obstacles([one.obstacle for one in placed], "obstacles", shapes.TRUTH, 0)
 
     def _is_due(self, what: str, time_ns: int, every_ns: int) -> bool:
         due_ns = self._due_ns.get(what, 0)
@@ -110,30 +134,28 @@ class FoxgloveChannels:
         return True
 
     def _read(self, key: str, message: type[Any]) -> Any:
-        payload = self._newest.get(key)
-        with suppress(*UNDECODABLE):
-            return None if payload is None else _decoders[message].decode(payload)
-        return None
+        return _decoded(message, self._newest.get(key))
 
-    def _at_clock(self, time_ns: int) -> list[Made]:
-        robot = self._robot
+    def _at_clock(self, time_ns: int) -> list[Shown]:
+        robot, frames = self._robot, self._frames
         joints: JointState | None = self._read(keys.JOINTS, JointState)
         seen: Seen | None = self._read(keys.WORLD, Seen)
-        if robot is None or joints is None or not joints.is_of(len(robot.joints)):
+        if robot is None or frames is None or joints is None or not joints.is_of(len(robot.joints)):
             return []
-        made: list[Made] = [("foxglove/joints", _joint_states(robot, joints, time_ns))]
+        made = [_shown("joints", frames.joint_states(joints, time_ns))]
         base = self._base(seen)
+        made.append(_shown("tf", frames.transforms(joints.angle_rad, base, time_ns)))
         if base is not None:
-            frames = _frames(robot, joints, *base, time_ns)
-            made += [("foxglove/tf", FrameTransforms(transforms=frames)), ("foxglove/pose", _pose(*base, time_ns))]
+            made.append(_shown("pose", _pose(*base, time_ns)))
         if seen is not None:
             made.append(_scene("forces", [shapes.forces(seen.contacts, time_ns)]))
         return [*made, *self._still(robot, time_ns)]
 
-    def _still(self, robot: Description, time_ns: int) -> Iterator[Made]:
+    def _still(self, robot: Description, time_ns: int) -> Iterator[Shown]:
         if self._is_due("body", time_ns, STILL_NS):
             yield _scene("body", shapes.body(robot, time_ns))
-            yield _scene("obstacles", [shapes.obstacles(self._truth, "obstacles", shapes.TRUTH, time_ns)])
+            self._truth.timestamp.CopyFrom(shapes.stamp(time_ns))
+            yield _scene("obstacles", [self._truth])
         if keys.WORLD in self._newest and self._is_due(keys.WORLD, time_ns, STILL_NS):
             world: World | None = self._read(keys.WORLD, World)
             if world is not None:
@@ -150,34 +172,24 @@ class FoxgloveChannels:
             return pose.position_w, pose.orientation_wxyz
         return None if seen is None else (seen.base_position_w, seen.base_orientation_wxyz)
 
-    def _image(self, key: str, payload: bytes, time_ns: int) -> Iterator[Made]:
+    def _image(self, key: str, payload: bytes, time_ns: int) -> Iterator[Shown]:
         robot = self._robot
-        image: Any = _decoders[DepthImage if key.startswith("sensor/depth/") else ColourImage].decode(payload)
-        if robot is None or image.link >= len(robot.links):
+        image: Any = _decoded(DepthImage if key.startswith("sensor/depth/") else ColourImage, payload)
+        if robot is None or image is None or image.link >= len(robot.links):
             return
-        topic = f"foxglove/{key.removeprefix('sensor/')}"
+        name = key.removeprefix("sensor/")
+        frame_id = f"{TOPICS}{name}"
         turned = shapes.optical(image.orientation_l_wxyz)
-        mount = shapes.frame(time_ns, robot.links[image.link].name, topic, image.position_l, turned)
-        yield "foxglove/tf", FrameTransforms(transforms=[mount])
-        yield topic, shapes.raw_image(image, topic, time_ns)
-        yield f"{topic}/calibration", shapes.calibration(image, topic, time_ns)
+        mount = shapes.frame(time_ns, robot.links[image.link].name, frame_id, image.position_l, turned)
+        yield _shown("tf", FrameTransforms(transforms=[mount]))
+        yield _shown(name, shapes.raw_image(image, frame_id, time_ns))
+        yield _shown(f"{name}/calibration", shapes.calibration(image, frame_id, time_ns))
 
 
-def _frames(
-    robot: Description, joints: JointState, position: tuple[float, ...], wxyz: tuple[float, ...], time_ns: int
-) -> list[Any]:
-    axes, lengths = [joint.axis for joint in robot.joints], [link.length_m for link in robot.links]
-    angles = np.array(joints.angle_rad)
-    origins, rotations = link_frames(np.array(position), rotation_from_quaternion(wxyz), angles, axes, lengths)
-    turned = quaternions_from_rotations(np.array(rotations)).tolist()
-    placed = zip(robot.links, np.array(origins).tolist(), turned, strict=True)
-    return [shapes.frame(time_ns, shapes.WORLD_FRAME, link.name, at, turn) for link, at, turn in placed]
-
-
-def _joint_states(robot: Description, joints: JointState, time_ns: int) -> JointStates:
-    numbers = zip(robot.joints, joints.angle_rad, joints.velocity_rad_s, joints.torque_nm, strict=True)
-    named = [NamedJoint(name=one.name, position=at, velocity=speed, effort=nm) for one, at, speed, nm in numbers]
-    return JointStates(timestamp=shapes.stamp(time_ns), joints=named)
+def _decoded(message: type[Any], payload: bytes | None) -> Any:
+    with suppress(*UNDECODABLE):
+        return None if payload is None else _decoders[message].decode(payload)
+    return None
 
 
 def _pose(position: tuple[float, ...], wxyz: tuple[float, ...], time_ns: int) -> PoseInFrame:
@@ -188,5 +200,9 @@ def _pose(position: tuple[float, ...], wxyz: tuple[float, ...], time_ns: int) ->
     return made
 
 
-def _scene(name: str, entities: list[SceneEntity]) -> Made:
-    return f"foxglove/scene/{name}", SceneUpdate(entities=entities)
+def _scene(name: str, entities: list[SceneEntity]) -> Shown:
+    return _shown(f"scene/{name}", SceneUpdate(entities=entities))
+
+
+def _shown(name: str, message: Protobuf) -> Shown:
+    return Shown(TOPICS + name, type(message), message.SerializeToString())

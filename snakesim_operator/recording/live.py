@@ -2,12 +2,15 @@
 
 from contextlib import suppress
 from types import TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 from google.protobuf.message import Message as Protobuf
 
 from snakesim_hal.errors import ConfigError, NotConnectedError
-from snakesim_operator.recording.foxglove import descriptor_set
+from snakesim_operator.recording.foxglove import ALWAYS, Shown, descriptor_set
+
+if TYPE_CHECKING:
+    import foxglove
 
 HOST = "127.0.0.1"
 
@@ -24,21 +27,24 @@ class LiveServer:
         self._new_channel, self._schema = foxglove.Channel, foxglove.Schema
         self._context = foxglove.Context()
         self._channels: dict[str, foxglove.Channel] = {}
+        for topic, kind in ALWAYS.items():  # before the first viewer: it subscribes in vain to one made as it connects
+            self._add(topic, kind)
         try:
             self._server = foxglove.start_server(name=robot, host=HOST, port=port, context=self._context)
         except RuntimeError as error:
             raise NotConnectedError(f"cannot serve Foxglove on port {port}: {error}; choose another") from error
         self.address = f"ws://{HOST}:{self._server.port}"
 
-    def show(self, topic: str, message: Protobuf, time_ns: int) -> None:
+    def show(self, shown: Shown, time_ns: int) -> None:
         """Hand on one message. time_ns: robot time."""
-        channel = self._channels.get(topic)
-        if channel is None:
-            kind = message.DESCRIPTOR.full_name
-            schema = self._schema(name=kind, encoding="protobuf", data=descriptor_set(message))
-            channel = self._new_channel(topic, schema=schema, message_encoding="protobuf", context=self._context)
-            self._channels[topic] = channel
-        channel.log(message.SerializeToString(), log_time=time_ns)
+        channel = self._channels.get(shown.topic) or self._add(shown.topic, shown.kind)
+        channel.log(shown.payload, log_time=time_ns)
+
+    def _add(self, topic: str, kind: type[Protobuf]) -> "foxglove.Channel":
+        schema = self._schema(name=kind.DESCRIPTOR.full_name, encoding="protobuf", data=descriptor_set(kind))
+        channel = self._new_channel(topic, schema=schema, message_encoding="protobuf", context=self._context)
+        self._channels[topic] = channel
+        return channel
 
     def __enter__(self) -> Self:
         return self

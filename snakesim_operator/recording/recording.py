@@ -11,22 +11,18 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
-from google.protobuf.message import Message as Protobuf
-from mcap.writer import CompressionType, Writer
-
 from snakesim_hal.model.files import SCHEMAS
 from snakesim_hal.network.session import Arrival
 from snakesim_hal.wire import keys
 from snakesim_operator.recording.disk import GrowingFile
-from snakesim_operator.recording.foxglove import FoxgloveChannels, descriptor_set
+from snakesim_operator.recording.foxglove import FoxgloveChannels, Shown, descriptor_set
+from snakesim_operator.recording.mcap_file import McapFile
 from snakesim_operator.recording.robot_time import RobotTime
 
 FLUSH_S = 0.5
-CHUNK_BYTES = 1024 * 1024
 ABOUT = "snakesim"  # the name of the metadata record
-PROFILE = "snakesim"
 
-Show = Callable[[str, Protobuf, int], None]  # topic, message, robot time in ns
+Show = Callable[[Shown, int], None]  # and the robot time in ns
 
 
 class Recording:
@@ -42,12 +38,11 @@ class Recording:
         self._foxglove = FoxgloveChannels()
         self._shown: Counter[str] = Counter()  # messages made for Foxglove, by topic
         self._file = GrowingFile(path)
-        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)  # pyright: ignore[reportArgumentType]
+        self._mcap = McapFile(self._file)
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
         self._flush_at = 0.0
         self._wall_ns = time.time_ns() - time.monotonic_ns()
-        self._writer.start(PROFILE)
         self.flush()
 
     def take(self, arrival: Arrival) -> None:
@@ -60,16 +55,13 @@ class Recording:
         at_ns = self.time.of(arrival.key, arrival.payload)
         self.counts[arrival.key] += 1
         wall_ns = arrival.monotonic_ns + self._wall_ns
-        self._add(channel, at_ns, wall_ns, arrival.payload, self.counts[arrival.key])
-        for topic, message in self._foxglove.take(arrival.key, arrival.payload, at_ns):
-            self._shown[topic] += 1
-            channel = self._channels.get(topic) or self._open_shown(topic, message)
-            self._add(channel, at_ns, wall_ns, message.SerializeToString(), self._shown[topic])
+        self._mcap.add(channel, at_ns, wall_ns, self.counts[arrival.key], arrival.payload)
+        for shown in self._foxglove.take(arrival.key, arrival.payload, at_ns):
+            self._shown[shown.topic] += 1
+            channel = self._channels.get(shown.topic) or self._open_shown(shown)
+            self._mcap.add(channel, at_ns, wall_ns, self._shown[shown.topic], shown.payload)
             if self._show is not None:
-                self._show(topic, message, at_ns)
-
-    def _add(self, channel: int, at_ns: int, wall_ns: int, data: bytes, number: int) -> None:
-        self._writer.add_message(channel, log_time=at_ns, data=data, publish_time=wall_ns, sequence=number & 0xFFFFFFFF)
+                self._show(shown, at_ns)
 
     def flush_when_due(self) -> None:
         """Write what waits, a few times a second."""
@@ -80,26 +72,25 @@ class Recording:
         """Write what waits."""
         self._flush_at = time.monotonic() + FLUSH_S
         try:
-            self._writer.flush()
+            self._mcap.flush()
         except OSError as error:
             self.trouble = f"{self.path}: {error.strerror or error}"
 
     def close(self, about: dict[str, object]) -> None:
         """Write index and metadata. about: of the recording itself, kept as JSON."""
         if not self.trouble:
-            self._writer.add_metadata(ABOUT, {name: json.dumps(value) for name, value in about.items()})
-            self._writer.finish()
+            self._mcap.add_metadata(ABOUT, {name: json.dumps(value) for name, value in about.items()})
             try:
-                self._file.flush()
+                self._mcap.finish()
             except OSError as error:
                 self.trouble = f"{self.path}: {error.strerror or error}"
         self._file.close()
 
-    def _open_shown(self, topic: str, message: Protobuf) -> int:
-        name = message.DESCRIPTOR.full_name
+    def _open_shown(self, shown: Shown) -> int:
+        name = shown.kind.DESCRIPTOR.full_name
         if name not in self._schemas:
-            self._schemas[name] = self._writer.register_schema(name, "protobuf", descriptor_set(message))
-        channel = self._channels[topic] = self._writer.register_channel(topic, "protobuf", self._schemas[name])
+            self._schemas[name] = self._mcap.add_schema(name, "protobuf", descriptor_set(shown.kind))
+        channel = self._channels[shown.topic] = self._mcap.add_channel(shown.topic, "protobuf", self._schemas[name])
         return channel
 
     def _open(self, arrival: Arrival) -> int | None:
@@ -109,9 +100,9 @@ class Recording:
         name = message.__name__
         if name not in self._schemas:
             content = (SCHEMAS / "messages" / f"{name}.json").read_bytes()
-            self._schemas[name] = self._writer.register_schema(f"snakesim.{name}", "jsonschema", content)
-        channel = self._writer.register_channel(
-            arrival.key, "msgpack", self._schemas[name], {"encoding": arrival.encoding[:200]}
+            self._schemas[name] = self._mcap.add_schema(f"snakesim.{name}", "jsonschema", content)
+        metadata = {"encoding": arrival.encoding[:200]}
+        channel = self._channels[arrival.key] = self._mcap.add_channel(
+            arrival.key, "msgpack", self._schemas[name], metadata
         )
-        self._channels[arrival.key] = channel
         return channel

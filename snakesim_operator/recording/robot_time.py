@@ -1,13 +1,12 @@
 """When a message was, in robot time: by the tick that it names, as far as that can be true."""
 
-from contextlib import suppress
-
 import msgspec
 
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
 
 MOST_AWAY_NS = 1_000_000_000  # a tick further away from the clock is a lie, or of another host
+LATEST_NS = 2**63 - 1
 
 
 class _Dated(msgspec.Struct):
@@ -31,24 +30,26 @@ class RobotTime:
         self._clock = msgspec.msgpack.Decoder(_Clock)
         self.clock: _Clock | None = None  # the newest one
         self.went_back = False  # the newest clock is before the one before
+        self._now_ns = 0  # by the newest clock
 
     def of(self, key: str, payload: bytes) -> int:
         """Robot time in ns: of the message's own tick, or of the newest clock when it names none or none near it."""
-        with suppress(*UNDECODABLE):
+        try:
             if key == keys.CLOCK:
-                clock = self._clock.decode(payload)
-                self.went_back = self.clock is not None and clock.tick < self.clock.tick
-                self.clock = clock
-            else:
-                dated = self._dated.decode(payload)
-                if self.clock is None:
-                    return min(max(dated.stamp_ns or 0, 0), 2**63 - 1)
-                if dated.tick is not None:
-                    at_ns = dated.tick * self.clock.period_ns
-                    if abs(at_ns - self._now_ns()) <= MOST_AWAY_NS:
-                        return at_ns
-        return self._now_ns()
+                self._tick(self._clock.decode(payload))
+                return self._now_ns
+            dated = self._dated.decode(payload)
+        except UNDECODABLE:
+            return self._now_ns
+        if self.clock is None:
+            return min(max(dated.stamp_ns or 0, 0), LATEST_NS)
+        if dated.tick is not None:
+            at_ns = dated.tick * self.clock.period_ns
+            if at_ns >= 0 and abs(at_ns - self._now_ns) <= MOST_AWAY_NS:
+                return at_ns
+        return self._now_ns
 
-    def _now_ns(self) -> int:
-        clock = self.clock
-        return 0 if clock is None else min(max(clock.tick * clock.period_ns, 0), 2**63 - 1)
+    def _tick(self, clock: _Clock) -> None:
+        self.went_back = self.clock is not None and clock.tick < self.clock.tick
+        self.clock = clock
+        self._now_ns = min(max(clock.tick * clock.period_ns, 0), LATEST_NS)

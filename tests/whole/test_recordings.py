@@ -75,13 +75,31 @@ def test_several_runs_make_a_dataset(run: Path, tmp_path: Path) -> None:
     ended = snakesim("export", str(run), str(run), "--format", "lerobot", "--out", "set", cwd=tmp_path)
     assert ended.code == 0 and "2 episodes, 400 frames" in ended.out, ended.err
     info = json.loads((tmp_path / "set" / "meta" / "info.json").read_text())
-    assert (info["fps"], info["total_frames"], info["total_episodes"]) == (100, 400, 2)
-    path = info["data_path"].format(episode_chunk=0, episode_index=1)
-    rows = parquet.read_table(tmp_path / "set" / path).to_pydict()
-    assert sorted(rows) == sorted(info["features"]) and rows["index"] == list(range(200, 400))
+    assert (info["codebase_version"], info["fps"], info["total_frames"], info["total_episodes"]) == (
+        "v3.0",
+        100,
+        400,
+        2,
+    )
+    (episode, second), n = (
+        parquet.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").to_pylist(),
+        200,
+    )
+    assert [episode[f"dataset_{end}_index"] for end in ("from", "to")] == [0, n] and second["dataset_from_index"] == n
+    assert second["tasks"] == ["clutter"] and second["length"] == n and second["stats/index/min"] == [n]
+    at = {"chunk_index": second["data/chunk_index"], "file_index": second["data/file_index"]}
+    rows = parquet.read_table(tmp_path / "set" / info["data_path"].format(**at)).to_pydict()
+    assert sorted(rows) == sorted(info["features"]) and rows["index"] == list(range(n, 2 * n))
     state, names = np.array(rows["observation.state"]), info["features"]["observation.state"]["names"]
+    assert info["features"]["observation.state"]["shape"] == [state.shape[1]]
     assert np.allclose(state[:, names.index("angle_rad.joint_5")], record.angle_rad[:, 4], atol=1e-6)
     assert rows["timestamp"][1] == pytest.approx(0.01)
+    stats = json.loads((tmp_path / "set" / "meta" / "stats.json").read_text())
+    assert sorted(stats) == sorted(info["features"]) and stats["action"]["count"] == [400]
+    assert np.allclose(stats["observation.state"]["q50"], np.median(state, axis=0), atol=1e-5)
+    tasks = parquet.read_table(tmp_path / "set/meta/tasks.parquet")  # pandas reads the names as the index
+    assert tasks.to_pydict() == {"task_index": [0], "__index_level_0__": ["clutter"]}
+    assert json.loads(tasks.schema.metadata[b"pandas"])["index_columns"] == ["__index_level_0__"]
 
 
 @pytest.mark.parametrize("command", ["info", "report"])

@@ -9,6 +9,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
+from snakesim_hal.model.kinematics import rotation_from_quaternion
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_operator.recording.reader import RECORDING
 from snakesim_operator.recording.recover import recover
@@ -36,6 +37,17 @@ def shown(path: Path) -> dict[str, list[tuple[int, Any]]]:
     return found
 
 
+def in_the_world(chain: Any) -> tuple[Any, Any]:
+    """Origins (n, 3) of frames that are each in the one before, and the last one's x axis."""
+    origin, rotation, origins = np.zeros(3), np.eye(3), list[Any]()
+    for one in chain:
+        at, q = one.translation, one.rotation
+        origin = origin + rotation @ (at.x, at.y, at.z)
+        rotation = rotation @ rotation_from_quaternion((q.w, q.x, q.y, q.z))
+        origins.append(origin)
+    return np.array(origins), rotation[:, 0]
+
+
 def test_transforms_and_joints_are_those_of_the_robot(run: Path) -> None:
     found, record = shown(run / RECORDING), RunRecord.load(run)
     at_ns, update = found["foxglove/tf"][-1]
@@ -44,11 +56,11 @@ def test_transforms_and_joints_are_those_of_the_robot(run: Path) -> None:
     row = record.row_at(at_ns * 1e-9)
     nodes = record.nodes_w(row)
     assert nodes is not None and len(update.transforms) == len(record.description.links)
-    told = np.array([[t.translation.x, t.translation.y, t.translation.z] for t in update.transforms])
+    behind = ["world", *(link.name for link in record.description.links[:-1])]
+    assert [one.parent_frame_id for one in update.transforms] == behind
+    told, forward = in_the_world(update.transforms)
     assert np.allclose(told, nodes[:-1], atol=1e-9)
-    last = update.transforms[-1].rotation
-    forward = np.array([1 - 2 * (last.y**2 + last.z**2), 2 * (last.x * last.y + last.w * last.z)])
-    towards = (nodes[-1] - nodes[-2])[:2] / record.description.links[-1].length_m
+    towards = (nodes[-1] - nodes[-2]) / record.description.links[-1].length_m
     assert np.allclose(forward, towards, atol=1e-6)
     states = dict(found["foxglove/joints"])[at_ns]
     assert [joint.position for joint in states.joints] == record.angle_rad[row].tolist()

@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+import msgspec
 import pytest
 from mcap.reader import make_reader
 
@@ -49,14 +50,15 @@ def done(tick: int, service: str = "control") -> Arrival:
 def test_messages_are_kept_to_the_byte_in_robot_time(tmp_path: Path) -> None:
     recording = Recording(tmp_path / "a.mcap")
     intent = Arrival(keys.INTENT, encode(Intent(stamp_ns=5, who="anna")), encoding_of(Intent), time.monotonic_ns())
-    sent = [clock(7), done(8), done(2_000_000), intent, done(6, "guidance")]
+    negative = msgspec.structs.replace(done(0), payload=msgspec.msgpack.encode({"tick": -1}))
+    sent = [clock(7), done(8), done(2_000_000), intent, done(6, "guidance"), negative]
     for arrival in sent:
         recording.take(arrival)
     recording.close({"dropped": {}})
     found = list((reader := RecordingReader(tmp_path / "a.mcap")).messages())
     assert [(one.key, one.payload, one.encoding) for one in found] == [(a.key, a.payload, a.encoding) for a in sent]
     # A tick that cannot be true, or none: the time of the newest clock.
-    assert [one.time_ns // PERIOD_NS for one in found] == [7, 8, 7, 7, 6]
+    assert [one.time_ns // PERIOD_NS for one in found] == [7, 8, 7, 7, 6, 7]
     assert all(abs(one.wall_ns - time.time_ns()) < 60e9 for one in found)
     assert reader.finished and reader.about == {"dropped": {}} and not reader.trouble
 
@@ -65,12 +67,18 @@ def test_the_stock_reader_gets_schemas_and_messages(tmp_path: Path) -> None:
     recording = Recording(tmp_path / "a.mcap")
     for tick in range(50):
         recording.take(clock(tick))
-    recording.close({})
+        if tick in (20, 30):
+            recording.flush()
+    recording.close({"version": "1"})
     with (tmp_path / "a.mcap").open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         found = list(reader.iter_messages())
-        summary = reader.get_summary()
+        late = [message.log_time for *_, message in reader.iter_messages(starting_at=25 * PERIOD_NS)]
+        summary, about = reader.get_summary(), list(reader.iter_metadata())
     assert summary is not None and summary.statistics is not None and summary.statistics.message_count == 50
+    assert len(summary.chunk_indexes) == 3 and late == [tick * PERIOD_NS for tick in range(25, 50)]
+    assert summary.statistics.message_start_time == 0 and summary.statistics.message_end_time == 49 * PERIOD_NS
+    assert [(one.name, one.metadata) for one in about] == [("snakesim", {"version": '"1"'})]
     schema, channel, message = found[-1]
     assert schema is not None and (schema.name, schema.encoding) == ("snakesim.Clock", "jsonschema")
     assert (channel.topic, channel.message_encoding, message.log_time) == (keys.CLOCK, "msgpack", 49 * PERIOD_NS)
@@ -166,6 +174,7 @@ def test_damage_anywhere_ends_the_reading_and_nothing_else(tmp_path: Path) -> No
         (tmp_path / "spoilt.mcap").write_bytes(spoilt)
         with contextlib.suppress(ConfigError):
             assert len(list(RecordingReader(tmp_path / "spoilt.mcap").messages())) <= 300
+            (tmp_path / "whole.mcap").unlink(missing_ok=True)
             recover(tmp_path / "spoilt.mcap", tmp_path / "whole.mcap")
 
 
