@@ -41,10 +41,28 @@ def box(half_m: float) -> Mesh:
     return _joined([*[(side, faces) for side in sides], *[(side, faces[:, ::-1]) for side in turned]])
 
 
+def hoops(corners: NDArray[np.float64], half_m: float, width_m: float) -> Mesh:
+    """Bands about an upright prism of corners (n, 2): at its foot, from -half_m, and at its top."""
+    here, count = np.arange(len(corners)), len(corners)
+    after = np.roll(here, -1)
+    faces = np.vstack(
+        [np.column_stack([here, after, after + count]), np.column_stack([here, after + count, here + count])]
+    )
+    bands = [(-half_m, width_m - half_m), (half_m - width_m, half_m)]
+    return _joined(
+        [(np.vstack([np.column_stack([corners, np.full(count, z)]) for z in band]), faces) for band in bands]
+    )
+
+
+def circle() -> NDArray[np.float64]:
+    """Corners of the unit circle, (n, 2)."""
+    angle = np.linspace(0.0, 2 * np.pi, ROUND, endpoint=False)
+    return np.column_stack([np.cos(angle), np.sin(angle)])
+
+
 def _turned(profile: NDArray[np.float64]) -> Mesh:
     """A profile of (radius, z), turned about z. From low z to high z outside is outside."""
-    angle = np.linspace(0.0, 2 * np.pi, ROUND, endpoint=False)
-    around = np.column_stack([np.cos(angle), np.sin(angle)])
+    around = circle()
     rings = [np.column_stack([radius * around, np.full(ROUND, z)]) for radius, z in profile]
     here = np.arange(ROUND)
     after = np.roll(here, -1)

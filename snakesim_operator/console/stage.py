@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from snakesim_hal.model.kinematics import quaternion_from_yaw
 from snakesim_hal.wire.messages import Description, Obstacle
 from snakesim_operator.console.drawing import Camera, Drawing, Surroundings
-from snakesim_operator.console.meshes import Mesh, box, capsule, cylinder, sphere
+from snakesim_operator.console.meshes import Mesh, box, capsule, circle, cylinder, hoops, sphere
 from snakesim_operator.results.page.palette import DARK, LIGHT
 
 Floats = NDArray[np.float64]
@@ -27,7 +27,16 @@ FOLLOW_SHARE = 0.08  # of the way to the snake's centre, in a frame
 FURTHEST_M = 0.5  # from the view's middle
 MOST_ROWS = 200  # of hills along an edge
 SEE_THROUGH = 0.5  # so that no obstacle hides the snake, or a force
-SHAPES: dict[str, Mesh] = {"cylinder": cylinder(1.0, 1.0), "box": box(1.0), "sphere": sphere(1.0)}  # to be stretched
+# To be stretched. What is perceived is drawn as hoops about where it is believed to be, so that one sees the truth too.
+SQUARE = np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
+SHAPES: dict[str, dict[str, Mesh]] = {
+    "true": {"cylinder": cylinder(1.0, 1.0), "box": box(1.0), "sphere": sphere(1.0)},
+    "perceived": {
+        "cylinder": hoops(circle(), 0.5, 0.13),
+        "box": hoops(SQUARE, 1.0, 0.26),
+        "sphere": hoops(circle(), 0.13, 0.26),
+    },
+}
 
 
 def colour(name: str, *, dark: bool = False) -> Colour:
@@ -38,7 +47,7 @@ def colour(name: str, *, dark: bool = False) -> Colour:
 
 LINK, LINK_EDGE, HEAD = (52, 92, 138), (70, 112, 160), (22, 46, 84)
 HINGE, LOST = (52, 58, 66), colour("bad")
-PEG, PUSHED, AHEAD, SEEN = (176, 152, 112), (226, 88, 12), (232, 168, 56), (0, 150, 136)
+PEG, PUSHED, AHEAD, SEEN = (176, 152, 112), (226, 88, 12), (232, 168, 56), (0, 200, 170)
 FELT, SOLVED, RESULTANT = colour("measured"), colour("commanded"), (20, 160, 90)
 
 
@@ -153,7 +162,8 @@ class Stage:
         self._show_arrows("forces/solved", drawing.solved, SOLVED, 0.16)
         self._show_arrows("forces/resultant", drawing.resultant, RESULTANT, 0.30)
         self._show_path(drawing.path_w)
-        self._show_obstacles("perceived", drawing.perceived, SEEN, opacity=0.5, grown=1.03)
+        hoop = {"opacity": 1.0, "grown": 1.05, "side": "double", "cast_shadow": False}
+        self._show_obstacles("perceived", drawing.perceived, SEEN, **hoop)
         if self._around is not None:
             self._colour_obstacles(self._around.obstacles, drawing)
         self._show_cameras(drawing.cameras)
@@ -206,9 +216,9 @@ class Stage:
             self._path.points = _single(pieces)
 
     def _show_obstacles(
-        self, name: str, obstacles: Sequence[Obstacle], of: Colour, *, opacity: float | None = None, grown: float = 1.0
+        self, name: str, obstacles: Sequence[Obstacle], of: Colour, *, opacity: float, grown: float = 1.0, **more: Any
     ) -> None:
-        for shape in SHAPES:
+        for shape in SHAPES[name]:
             these = [obstacle for obstacle in obstacles if obstacle.shape == shape]
             key = f"{name}/{shape}"
             batch = self._shapes.get(key)
@@ -217,7 +227,9 @@ class Stage:
             if not these:
                 continue
             if batch is None:
-                batch = self._shapes[key] = self._batch(key, SHAPES[shape], len(these), of, opacity=opacity)
+                batch = self._shapes[key] = self._batch(
+                    key, SHAPES[name][shape], len(these), of, opacity=opacity, **more
+                )
             batch.batched_positions = _single([o.position_w for o in these])
             batch.batched_wxyzs = _single([quaternion_from_yaw(o.yaw_rad) for o in these])
             batch.batched_scales = _single(grown * np.array([_size(o) for o in these]))
@@ -228,7 +240,7 @@ class Stage:
 
     def _colour_obstacles(self, obstacles: Sequence[Obstacle], drawing: Drawing) -> None:
         """What the body pushes off, and what navigation expects it to."""
-        for shape in SHAPES:
+        for shape in SHAPES["true"]:
             batch = self._shapes.get(f"true/{shape}")
             if batch is not None:
                 names = [obstacle.name for obstacle in obstacles if obstacle.shape == shape]

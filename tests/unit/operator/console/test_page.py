@@ -1,6 +1,8 @@
 """The console's page: who may open it, who may command, and what strangers can write on it."""
 
+import asyncio
 import socket
+import threading
 
 import msgspec
 import numpy as np
@@ -14,10 +16,12 @@ from snakesim_hal.wire.messages import Status
 from snakesim_operator.console import texts
 from snakesim_operator.console.drawing import draw
 from snakesim_operator.console.moment import Moment, expected_of
-from snakesim_operator.console.port import open_port
+from snakesim_operator.console.port import address_of, open_port
 from snakesim_operator.console.server import page_server
 from snakesim_operator.console.token import ControlToken
+from tests.e2e.command import wait_until
 from tests.unit.hal.rig import description, status
+from tests.viewer import watch
 
 
 def test_a_page_of_another_site_cannot_connect():
@@ -45,8 +49,18 @@ def test_a_browser_that_comes_before_the_page_gets_it():
     listening = open_port(None)
     with socket.create_connection(listening.getsockname(), timeout=10.0) as early:
         early.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
-        with page_server(listening):
+        viewers = [threading.Thread(target=come, args=(address_of(listening),)) for _ in range(3)]
+        for viewer in viewers:
+            viewer.start()
+        with page_server(listening) as (server, _):
             assert early.recv(15) == b"HTTP/1.1 200 OK"
+            wait_until(lambda: len(server.get_clients()) == len(viewers), "the viewers that came early")
+        for viewer in viewers:
+            viewer.join(10.0)
+
+
+def come(address: str) -> None:
+    asyncio.run(watch(address))
 
 
 def test_nobody_can_open_a_tunnel_to_the_internet():
