@@ -10,6 +10,8 @@ import contextlib
 import fcntl
 import os
 import re
+import select
+import sys
 import threading
 import time
 from collections import Counter
@@ -23,6 +25,7 @@ ZENOH_LEVELS = (
 )
 LOOK_S = 0.01  # between two looks into the pipe: Zenoh's threads wait while it is full
 PIPE_BYTES = 1024 * 1024  # the most that Linux gives without privileges
+CLOSE_LIMIT_S = 2.0
 AGAIN_S = 60.0
 # A flood of different refusals must not fill a disk: some 20 MB a day.
 BURST, PER_TURN = 10000, 100  # lines: at once, and in each `AGAIN_S`
@@ -124,7 +127,7 @@ def _keep(kept: dict[str, str], key: str, value: str) -> None:
 @contextlib.contextmanager
 def short_log() -> Iterator[None]:
     """What Zenoh writes to stdout comes short to stderr, for as long as this lasts; what we print stays as it is."""
-    log = RouterLog(lambda line: complain(f"{time.strftime('%Y-%m-%dT%H:%M:%SZ', time.gmtime())} {line}"))
+    log = RouterLog(_to_stderr)
     reading, writing = os.pipe()
     os.set_blocking(reading, False)
     with contextlib.suppress(PermissionError):  # somebody has too many pipes
@@ -139,8 +142,15 @@ def short_log() -> Iterator[None]:
                 yield
         finally:
             os.dup2(stdout.fileno(), 1)
-            reader.join()
+            reader.join(CLOSE_LIMIT_S)
             log.turn()
+
+
+def _to_stderr(line: str) -> None:
+    """Unless nobody takes it there: a router must not wait for whoever reads its log."""
+    with contextlib.suppress(OSError):
+        if select.select([], [sys.stderr], [], 0.0)[1]:
+            complain(f"{time.strftime('%Y-%m-%dT%H:%M:%SZ', time.gmtime())} {line}")
 
 
 def _read(pipe: int, log: RouterLog) -> None:

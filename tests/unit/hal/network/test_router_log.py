@@ -1,6 +1,5 @@
 """What a router's log tells, from lines as Zenoh 1.10 writes them."""
 
-import os
 import subprocess
 import sys
 
@@ -108,16 +107,29 @@ import os
 from snakesim_hal.network.router_log import short_log
 with short_log():
     print("ours", flush=True)
-    for _ in range(20_000):
-        os.write(1, b"2026Z TRACE rx-0 ThreadId(08) acl: f1 is authorized to Put (egress) on " + 80 * b"k" + b"\\n")
+    for number in range(20_000):
+        text = f"f1 is {what} to Put (egress) on {number}"
+        os.write(1, f"2026Z TRACE rx-0 ThreadId(08) access_control: {text}\\n".encode())
     os.write(1, b"2026Z ERROR rx-0 ThreadId(08) zenoh: it failed\\n")
 print("afterwards")
 """
 
 
+def router(what: str) -> list[str]:
+    return [sys.executable, "-c", f"what = {what!r}{ROUTER}"]
+
+
 def test_only_what_zenoh_writes_is_made_short() -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", ROUTER], capture_output=True, text=True, timeout=60, check=True, env={**os.environ}
-    )
+    done = subprocess.run(router("authorized"), capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout == "ours\nafterwards\n"
     assert [at.partition("Z ")[2] for at in done.stderr.splitlines()] == ["ERROR zenoh: it failed"]
+
+
+def test_a_router_does_not_wait_for_whoever_reads_its_log() -> None:
+    with subprocess.Popen(router("unauthorized"), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        try:
+            assert process.wait(60) == 0
+            assert process.stdout.read() == "ours\nafterwards\n"
+        finally:
+            process.kill()
