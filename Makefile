@@ -37,7 +37,7 @@ demo: $(stamp) ## Run the simulated snake through a triplet of obstacles, into r
 test: test-here test-vcan ## Run the tests, but for those that are slow
 
 test-all: ## Run all tests, as before a release
-	$(MAKE) test-here test-vcan QUICK=
+	SNAKESIM_HYPOTHESIS=explore $(MAKE) test-here test-vcan QUICK=
 
 test-here: $(stamp) ## Run the tests that need no CAN bus (ARGS="-k gate")
 	$(here) -n $(WORKERS) --dist worksteal || $(here) $(again)

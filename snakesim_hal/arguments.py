@@ -5,6 +5,7 @@ Every command reads this first, an emergency stop too: what takes long to import
 
 import argparse
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +18,23 @@ if TYPE_CHECKING:
     from snakesim_hal.network.session_file import SessionFile
 
 SESSION = "SNAKESIM_SESSION"  # environment variable: the session file of an operator's tools
+
+
+def number(least: float, most: float, unit: str = "") -> Callable[[str], float]:
+    """A type for argparse: a number within bounds; a whole one, if `least` is. NaN is within no bounds."""
+    whole = isinstance(least, int)
+
+    def parse(text: str) -> float:
+        try:
+            value = int(text) if whole else float(text)
+        except ValueError:
+            value = float("nan")
+        if not least <= value <= most:
+            kind, of = "a whole number" if whole else "a number", f" {unit}" if unit else ""
+            raise argparse.ArgumentTypeError(f"{short(text, 40)!r}: give {kind} from {least:.12g} to {most:.12g}{of}")
+        return value
+
+    return parse
 
 
 def add_scenario(parser: argparse.ArgumentParser) -> None:

@@ -1,5 +1,7 @@
 """The one error tree. Each class is also the matching builtin, so plain `except ValueError` works too."""
 
+from collections.abc import Iterable
+
 
 class SnakesimError(Exception):
     """Base of all errors of SnakeSIM; the message says what is wrong, and what to do next.
@@ -50,3 +52,16 @@ class RefusedError(SnakesimError, PermissionError):
 def short(text: str, most: int = 120) -> str:
     """User text for quoting in a message: its beginning, if it is long."""
     return text if len(text) <= most else text[: most - 3] + "..."
+
+
+def nearest(word: str, known: Iterable[str]) -> str | None:
+    """What a mistyped word may have meant."""
+    import difflib  # only a mistake pays for it: `snakesim estop` must start at once
+
+    return next(iter(difflib.get_close_matches(word, list(known), 1, 0.6)), None)
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """The question for a message, with a space behind it; empty if nothing is near."""
+    close = nearest(word, known)
+    return f"did you mean `{close}`? " if close else ""

@@ -16,6 +16,7 @@ from typing import NoReturn
 from snakesim_hal.errors import RefusedError
 from snakesim_hal.terminal import complain
 
+STOPS = (signal.SIGINT, signal.SIGTERM)
 PR_SET_PDEATHSIG = 1
 CAP_IPC_LOCK = 14
 MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT = 1, 2, 4
@@ -44,11 +45,8 @@ def die_with_parent(parent_pid: int | None = None) -> None:
         sys.exit(1)
 
 
-STOPS = (signal.SIGINT, signal.SIGTERM)
-
-
 def accept_interrupts() -> None:
-    """From here on a SIGINT counts: a supervisor starts its children with it blocked, until they can handle it."""
+    """From here on a stop counts: children start with both signals blocked, until they can handle them."""
     signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPS)
 
 
@@ -69,8 +67,8 @@ def on_stop_signal(stop: Callable[[], None]) -> None:
     def handle(_number: int, _frame: FrameType | None) -> None:
         stop()
 
-    signal.signal(signal.SIGTERM, handle)
-    signal.signal(signal.SIGINT, handle)
+    for number in STOPS:
+        signal.signal(number, handle)
     accept_interrupts()
 
 

@@ -1,14 +1,13 @@
 """The `snakesim` command. Each room adds its own commands, and imports what they need when they are called."""
 
 import argparse
-import difflib
 import os
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NoReturn
 
-from snakesim_hal.errors import ConfigError, SnakesimError, short
+from snakesim_hal.errors import ConfigError, SnakesimError, did_you_mean, short
 from snakesim_hal.terminal import complain, complain_of, say
 from snakesim_operator.console import arguments as console
 from snakesim_operator.evaluate import arguments as evaluate
@@ -52,10 +51,8 @@ def _act(given: list[str]) -> int:
 
         if name in installed(COMMANDS):
             return find_plugin(COMMANDS, name)(given[1:])
-        raise ConfigError(
-            f"no command {short(name)!r}{_meant(name, [*ours.commands.choices, *installed(COMMANDS)])} "
-            "`snakesim` alone lists all"
-        )
+        meant = did_you_mean(name, [*ours.commands.choices, *installed(COMMANDS)])
+        raise ConfigError(f"no command {short(name)!r}; {meant}`snakesim` alone lists all")
     arguments, unknown = ours.parse_known_args(given)
     if unknown:
         _refuse(unknown[0], ours.of(given))
@@ -65,15 +62,10 @@ def _act(given: list[str]) -> int:
 def _refuse(word: str, told: argparse.ArgumentParser) -> None:
     """Raise ConfigError for a word on the command line that means nothing to its command."""
     options = [option for action in told._actions for option in action.option_strings]
-    hint = _meant(word.partition("=")[0], options) if word.startswith("-") else ";"
+    meant = did_you_mean(word.partition("=")[0], options) if word.startswith("-") else ""
     raise ConfigError(
-        f"{told.prog.removeprefix('snakesim ')}: unknown argument {short(word)!r}{hint} see `{told.prog} --help`"
+        f"{told.prog.removeprefix('snakesim ')}: unknown argument {short(word)!r}; {meant}see `{told.prog} --help`"
     )
-
-
-def _meant(word: str, known: Sequence[str]) -> str:
-    close = difflib.get_close_matches(word, known, 1, 0.6)
-    return f"; did you mean `{close[0]}`?" if close else ";"
 
 
 class Command(argparse.ArgumentParser):

@@ -73,8 +73,7 @@ def live(arguments: str) -> Iterator[str]:
     """A run with its console, and the address."""
     words = [*shlex.split(arguments), "--pace", "realtime", "--console"]
     with tempfile.TemporaryDirectory() as folder, running(Path(folder) / "run", *words) as run:
-        run.wait_for("console: http")
-        yield next(line.split()[1] for line in run.said().splitlines() if line.startswith("console: "))
+        yield run.console()
         run.process.terminate()
         run.end()
 

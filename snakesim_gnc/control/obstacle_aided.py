@@ -32,6 +32,7 @@ Floats = NDArray[np.float64]
 ANOTHER_SHAPE_RAD = 0.1
 SLOPE_M = 0.02  # over which theta' is taken
 SIGNS = np.random.default_rng(1).choice((-1.0, 1.0), 4096)
+LARGEST_REST = 0.3  # of a push: what is not in balance turns the body a little, until it meets other obstacles
 STANDS_M_S, STANDS_S = 0.01, 0.5  # slower than this for so long counts as standing still
 
 
@@ -54,12 +55,12 @@ class ObstacleAided:
         integral_per_s: Annotated[float, Meta(ge=0, le=50, extra_json_schema={"unit": "1/s"})] = 0.4
         largest_look_ahead_m: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "m"})] = 0.05
         fresh_look_ahead_m: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "m"})] = 0.01  # on a new path
-        push_scale: Annotated[float, Meta(ge=-1, le=1)] = 1.0  # for control experiments: of both terms
+        push_scale: Annotated[float, Meta(ge=-1, le=1)] = 1.0  # for control experiments, of both terms; < 0: backward
         push_sign_s: Annotated[float, Meta(ge=0, le=100, extra_json_schema={"unit": "s"})] = (
             0.0  # likewise: their sign is drawn at random after each such time; 0: never
         )
         push_ns_m: Annotated[float, Meta(ge=0, le=1000, extra_json_schema={"unit": "N*s/m"})] = 40.0
-        push_n_m: Annotated[float, Meta(ge=0, le=1000, extra_json_schema={"unit": "N/m"})] = 60.0
+        push_n_m: Annotated[float, Meta(ge=0, le=1000, extra_json_schema={"unit": "N/m"})] = 120.0
         largest_push_n: Annotated[float, Meta(ge=0, le=1000, extra_json_schema={"unit": "N"})] = 60.0
         largest_torque_nm: Annotated[float, Meta(ge=0, le=1000, extra_json_schema={"unit": "N*m"})] = 5.0
         largest_contact_n: Annotated[float, Meta(gt=0, le=1000, extra_json_schema={"unit": "N"})] = 60.0
@@ -98,16 +99,17 @@ class ObstacleAided:
         if located.trajectory.speed_m_s == 0.0:  # whatever path is planned meanwhile
             return self._rest(view)
         scale = self._set.push_scale * self._sign(view.time_s)
-        ahead_m = scale * self._look_ahead_m(located, view.period_s)
+        ahead_m = self._look_ahead_m(located, view.period_s)
+        ahead_m = scale * (ahead_m if scale >= 0 else abs(ahead_m))
         at = located.on_path.at
         reference = self._body.all_angles(at(located.tail_s_m + ahead_m))
-        torques = scale * self._push_nm(located, view.period_s)
+        slope = self._body.all_angles(at(located.tail_s_m + SLOPE_M)) - self._body.all_angles(at(located.tail_s_m))
+        torques = scale * self._push_nm(located, slope / SLOPE_M, view.period_s)
         reference = reference + torques / self._stiffness
         anew, before = located.anew or self._waits, self._followed.reference_rad
         if anew and before is not None and np.abs(reference - before).max() > ANOTHER_SHAPE_RAD:
             self._integral_m = min(self._integral_m, self._set.fresh_look_ahead_m)
         set_points, self._waits = self._followed.to(view, reference, anew=anew), False
-        slope = self._body.all_angles(at(located.tail_s_m + SLOPE_M)) - self._body.all_angles(at(located.tail_s_m))
         force_n = ahead_m * float(self._stiffness @ slope**2) / SLOPE_M**2
         return Action(set_points, self._report(view, located, force_n, reference))
 
@@ -148,7 +150,7 @@ class ObstacleAided:
         self._integral_m = min(max(self._integral_m, -most), most)
         return min(max(self._integral_m + self._set.lead_s * error_m_s, -most), most)
 
-    def _push_nm(self, located: Located, period_s: float) -> Floats:
+    def _push_nm(self, located: Located, turns_per_m: Floats, period_s: float) -> Floats:
         """Torques of the wanted force along the path, by the contacts that the body has, (n_joints,)."""
         config, wanted_m_s = self._set, located.trajectory.speed_m_s
         if wanted_m_s <= 0.0 or config.largest_push_n == 0.0:
@@ -164,10 +166,10 @@ class ObstacleAided:
             touches = find_touches(
                 located.nodes_w, self._body.radius_m, outlines, reach_m=config.reach_m, friction=config.peg_friction
             )
-            push = push_forward(located.nodes_w, touches, loose_m=config.loose_m)
+            push = push_forward(located.nodes_w, touches, turns_per_m[self._bends], loose_m=config.loose_m)
             self._found = Found(located.world, touches, push)
             self._unit_nm, self._most_n = np.zeros(len(self._robot.joints)), 0.0
-            if push.balanced:
+            if push.rest < LARGEST_REST:
                 self._unit_nm[self._bends] = push.torques_nm
                 most = float(np.abs(push.torques_nm).max(initial=0.0)) + 1e-9
                 largest = float(push.lambdas.max())

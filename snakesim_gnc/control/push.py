@@ -6,7 +6,9 @@ push with F along the body, and the torque of each joint i that goes with them:
     sum_c lambda_c [d_c ; o_c x d_c] = (F/L) integral [t ; gamma x t] d sigma
     tau_i = - sum_{c ahead of i} lambda_c (o_c - p_i) x d_c + (F/L) integral_{ahead of i} (gamma - p_i) x t d sigma
 
-Of all such forces those of least weighted squares are taken; the weight of a contact grows with its gap.
+Sliding on by ds, joint i turns by theta_i' ds, so of the work F ds = sum tau_i theta_i' ds some joints may do more than
+all of it and others take it out again. Of all such forces those of least squares of tau_i theta_i' are taken, and then
+the smallest; a contact's weight grows with its gap.
 """
 
 from dataclasses import dataclass
@@ -21,8 +23,9 @@ Floats = NDArray[np.float64]
 
 SAMPLES = 5  # of each link
 BUMP = 0.6  # |n.t| of a contact: beyond, something stands before the head
-BALANCED = 0.05  # of the force that is left over
+BALANCED = 0.05  # share of the force that is left over
 MOST_STEPS = 30
+BALANCE, THRIFT, SMALL = 10.0, 0.05, 0.02  # weights of: the balance of forces, tau_i theta_i', the size of the forces
 
 
 @dataclass(frozen=True)
@@ -46,7 +49,12 @@ class Push:
 
     lambdas: Floats  # (k,)
     torques_nm: Floats  # (n_joints,), of the joints that bend
-    balanced: bool  # whether these contacts can push at all
+    rest: float  # of the 1 N: what no contact can balance
+
+    @property
+    def balanced(self) -> bool:
+        """Whether these contacts can push at all."""
+        return self.rest < BALANCED
 
 
 def find_touches(nodes_w: Floats, radius_m: float, outlines: Outlines, *, reach_m: float, friction: float) -> Touches:
@@ -78,8 +86,12 @@ def find_touches(nodes_w: Floats, radius_m: float, outlines: Outlines, *, reach_
     )
 
 
-def push_forward(nodes_w: Floats, touches: Touches, *, loose_m: float) -> Push:
-    """Forces and torques for 1 N along the chain. loose_m: a gap that makes a contact count half."""
+def push_forward(nodes_w: Floats, touches: Touches, turns_per_m: Floats, *, loose_m: float) -> Push:
+    """Forces and torques for 1 N along the chain.
+
+    turns_per_m: (n_joints,) theta_i', rad per metre of the way, of the joints that bend. loose_m: a gap that makes a
+    contact count half.
+    """
     rear, run = nodes_w[:, :-1].T, np.diff(nodes_w, axis=1).T
     lengths = np.hypot(*run.T)
     middles, tangents = rear + 0.5 * run, run / lengths[:, None]
@@ -88,27 +100,24 @@ def push_forward(nodes_w: Floats, touches: Touches, *, loose_m: float) -> Push:
     drag = np.array([*(share @ tangents), share @ cross(middles - centre, tangents)])
     arms = touches.places_w - centre
     matrix = np.column_stack([touches.directions_w, cross(arms, touches.directions_w)]).T
-    weight = 1.0 + np.maximum(touches.gap_m, 0.0) / loose_m
-    lambdas, rest = _least_squares(matrix / weight, drag)
-    lambdas = lambdas / weight
     joints = nodes_w[:, 1:-1].T
     ahead = touches.body_s_m[None, :] > np.cumsum(lengths)[:-1, None]
-    lever = cross(touches.places_w[None] - joints[:, None], touches.directions_w[None])
+    lever = -(ahead * cross(touches.places_w[None] - joints[:, None], touches.directions_w[None]))
     later = np.triu(np.ones((len(joints), len(lengths)), dtype=bool), 1)
-    braked = cross(middles[None] - joints[:, None], tangents[None])
-    torques = -(ahead * lever) @ lambdas + (later * braked) @ share
-    return Push(lambdas, torques, bool(rest < BALANCED))
+    braked = (later * cross(middles[None] - joints[:, None], tangents[None])) @ share
+    weight = 1.0 + np.maximum(touches.gap_m, 0.0) / loose_m
+    costs = THRIFT * np.abs(turns_per_m)
+    full = np.vstack([BALANCE * matrix / weight, costs[:, None] * lever / weight, SMALL * np.eye(len(touches))])
+    lambdas = _least_squares(full, np.concatenate([BALANCE * drag, -costs * braked, np.zeros(len(touches))])) / weight
+    return Push(lambdas, lever @ lambdas + braked, float(np.linalg.norm(matrix @ lambdas - drag)))
 
 
-def _least_squares(matrix: Floats, wanted: Floats) -> tuple[Floats, float]:
-    """Non-negative least squares of matrix x = wanted by Lawson and Hanson's active set: x, and what is left over."""
-    count = matrix.shape[1]
-    if count == 0:
-        return np.zeros(0), float(np.linalg.norm(wanted))
-    small = 1e-3  # prefers small forces where many would do
-    full = np.vstack([matrix, small * np.eye(count)])
-    right = np.concatenate([wanted, np.zeros(count)])
+def _least_squares(full: Floats, right: Floats) -> Floats:
+    """The x >= 0 with the least |full x - right|, by active sets (Lawson and Hanson)."""
+    count = full.shape[1]
     x, used = np.zeros(count), np.zeros(count, dtype=bool)
+    if count == 0:
+        return x
     for _ in range(MOST_STEPS):
         gradient = full.T @ (right - full @ x)
         gradient[used] = -np.inf
@@ -129,4 +138,4 @@ def _least_squares(matrix: Floats, wanted: Floats) -> tuple[Floats, float]:
             if not used.any():
                 x = np.zeros(count)
                 break
-    return x, float(np.linalg.norm(matrix @ x - wanted))
+    return x

@@ -24,12 +24,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion
+from snakesim_hal.model.scene import GRAVITY_M_S2
 from snakesim_hal.wire.messages import Description, Imu, Pose
 from snakesim_hal.wire.quantities import Vector
 
 Floats = NDArray[np.float64]
 
-G = 9.81  # m/s²
 SLIP_M_S = 0.01  # slower links are held by friction as much as they are braked
 # Standard deviations of what goes in; of the shipped robots.
 TORQUE_NM, ACCELERATION_M_S2 = 0.012, 0.05
@@ -203,7 +203,7 @@ def _drag(body: Body, spins: Floats, pose: Pose | None) -> tuple[Floats, Floats]
         slide += rotation_from_quaternion(pose.orientation_wxyz).T @ pose.velocity_w
         slide[:, 2] = 0.0
         slide /= np.hypot(np.linalg.norm(slide, axis=1), SLIP_M_S)[:, None]
-    weights = G * body.masses_kg[:, None]
+    weights = GRAVITY_M_S2 * body.masses_kg[:, None]
     drag = body.effect(every, middles, -weights * slide).sum(axis=1)
     unshared = SHARING * np.hstack([body.effect(every, middles, weights * axis) for axis in np.eye(3)[:2]])
     return drag, unshared

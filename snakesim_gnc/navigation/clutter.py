@@ -9,7 +9,7 @@ third time at one place it backs out first, along its own path and the trail of 
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +41,6 @@ FAILURES = 4
 LEAST_AHEAD = 10  # arcs of a new path beyond the head
 BACK_EVERY = 3  # time at the same place: back out
 BACK_M, BACK_S = 0.1, 1.5
-ANEW_GAP_M = -0.012  # a body that has lost its contacts must press to get them back
 TRAIL = 20  # points of the way behind the tail
 JOIN_M = 0.1  # between them and a path: nearer, and beside its begin, they would fold it
 STANDS_S = 0.8
@@ -208,8 +207,7 @@ class ClutterPlanner:
             found, kept = self._anew(beam, body, goal_rad), 0
             points = body if found is None else evenly(found.points_w)
         if found is not None:
-            fit = self._fit if kept else replace(self._fit, push_gap_m=ANEW_GAP_M)
-            points = snap(points, kept, obstacles, goal, fit)
+            points = snap(points, kept, obstacles, goal, self._fit)
         else:
             ahead = body[-1] - body[-4]
             points = np.concatenate([body, body[-1] + np.linspace(0.1, 1.0, 10)[:, None] * ahead / np.hypot(*ahead)])

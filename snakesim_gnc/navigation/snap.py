@@ -17,7 +17,7 @@ class Fit:
 
     radius_m: float
     segment_m: float
-    push_gap_m: float = -0.005  # between the body and what it pushes off
+    push_gap_m: float = 0.004  # to what it pushes off: controllers close it; a path that presses moves a body by itself
     brake_gap_m: float = 0.012
     least_gap_m: float = 0.004
     touch_m: float = 0.005  # a gap that is smaller is a touch

@@ -4,7 +4,6 @@ An error names the file, the field, the value, its unit, what is allowed, and wh
 value, the file or flag that it came from.
 """
 
-import difflib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from snakesim_hal.errors import ConfigError, short
+from snakesim_hal.errors import ConfigError, did_you_mean, nearest, short
 from snakesim_hal.model.field_types import Flaw, first_flaw, in_words, unit_of
 from snakesim_hal.model.textfiles import MAX_DEPTH, parse_json, parse_toml, read_text
 
@@ -134,11 +133,9 @@ def _what_it_is(name: str, kind: str) -> str:
     for other in ("robots", "scenes"):
         if kind == "scenarios" and name in shipped(other):
             return f": it is a {other[:-1]}. Give a scenario, and --set {other[:-1]}={name}"
-    close = difflib.get_close_matches(name, shipped(kind), 1, 0.6)
-    meant = f"did you mean `{close[0]}`? " if close else ""
     return (
-        f"; {meant}shipped are {', '.join(shipped(kind))}. For a file of your own give its path, such as "
-        f"./{short(name)}.toml"
+        f"; {did_you_mean(name, shipped(kind))}shipped are {', '.join(shipped(kind))}. For a file of your own give its "
+        f"path, such as ./{short(name)}.toml"
     )
 
 
@@ -199,8 +196,8 @@ def _explain(flaw: Flaw, table: Table, under: str) -> str:
     dotted, whole = ".".join([*steps, short(name)]), ".".join([*steps, name])
     if flaw.kind == "unknown":
         deeper = [short(key) for key in table.origin if key.endswith(f".{name}") and not key.startswith(whole)]
-        close = difflib.get_close_matches(name, flaw.known, 1, 0.6) or deeper
-        hint = f"did you mean `{close[0]}`?" if close else f"known fields: {', '.join(sorted(flaw.known))}."
+        close = nearest(name, flaw.known) or next(iter(deeper), None)
+        hint = f"did you mean `{close}`?" if close else f"known fields: {', '.join(sorted(flaw.known))}."
         set_by = [origin for key, origin in table.origin.items() if key == dotted or key.startswith(dotted + ".")]
         return f"{set_by[0] if set_by else table.file_of(dotted)}: unknown field `{dotted}`; {hint}"
     info = msgspec.inspect.type_info(flaw.wanted)

@@ -15,8 +15,8 @@ from typing import Any
 
 import msgspec
 
-from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.files import Table, decode, expanded, short
+from snakesim_hal.errors import ConfigError, short
+from snakesim_hal.model.files import Table, decode, expanded
 from snakesim_hal.model.textfiles import read_bytes
 
 BACKENDS = "snakesim.backends"

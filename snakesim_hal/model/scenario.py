@@ -16,8 +16,8 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.files import FileStruct, Table, decode, find, leaves, read_part, read_table, short
+from snakesim_hal.errors import ConfigError, short
+from snakesim_hal.model.files import FileStruct, Table, decode, find, leaves, read_part, read_table
 from snakesim_hal.model.injection import CONTROL
 from snakesim_hal.model.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
 from snakesim_hal.model.outlines import Capsule, Heading, Point, Size

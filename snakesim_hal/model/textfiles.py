@@ -5,7 +5,6 @@ Every failure is one ConfigError that names the file and the reason.
 
 import codecs
 import contextlib
-import difflib
 import itertools
 import json
 import os
@@ -16,7 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.errors import ConfigError, nearest
 from snakesim_hal.model.whole_file import write_whole
 
 MB = 1024 * 1024
@@ -75,9 +74,9 @@ def _instead_of(path: Path) -> str:
         there = sorted(entry.name for entry in itertools.islice(path.parent.iterdir(), MAX_LISTED))
     except OSError as error:
         return f"; its folder {path.parent} cannot be read: {error.strerror}"
-    close = difflib.get_close_matches(path.name, there, 1, 0.6)
+    close = nearest(path.name, there)
     if close:
-        return f"; did you mean {path.parent / close[0]}?"
+        return f"; did you mean {path.parent / close}?"
     alike = [name for name in there if path.suffix and name.endswith(path.suffix)][:8]
     return f"; in {path.parent.absolute()} " + (f"are {', '.join(alike)}" if alike else f"is no file *{path.suffix}")
 

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any, Generic
 
 import msgspec
@@ -23,7 +22,7 @@ from zenoh import ext, handlers  # pyright: ignore[reportMissingModuleSource]
 from snakesim_hal.errors import ConfigError, NotConnectedError, WireError
 from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT, check_guarded
 from snakesim_hal.network.images_apart import keep_apart, set_unless_given
-from snakesim_hal.network.session_file import SessionFile, of_mode, read_zenoh_file, refused_by_zenoh
+from snakesim_hal.network.session_file import SessionFile
 from snakesim_hal.process import raise_open_files
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import IMAGES, MAX_PAYLOAD_BYTES, Decoder, MessageT, encode, encoding_of
@@ -454,37 +453,3 @@ def open_zenoh(
                 f"it does not accept the certificate; RUST_LOG=zenoh=warn says more"
             ) from error
         raise NotConnectedError(f"nothing listens on {link.endpoint}; start a run or a router there first") from error
-
-
-def router_settings(config: Path) -> zenoh.Config:
-    """The settings in a router's JSON5 file; opens nothing. Raises ConfigError."""
-    _, settings = read_zenoh_file(config)
-    if json.loads(settings.get_json("mode")) != "router":
-        raise ConfigError(f'{config}: `mode` must be "router"')
-    return settings
-
-
-def _denies_by_default(settings: zenoh.Config) -> bool:
-    rules = json.loads(settings.get_json("access_control"))
-    return bool(rules["enabled"]) and rules["default_permission"] == "deny"
-
-
-@contextmanager
-def open_router(config: Path, *, insecure: bool = False) -> Iterator[None]:
-    """Run a Zenoh router from a JSON5 file for as long as the context lives. Raises ConfigError.
-
-    insecure: also one that other machines can connect to, and that does not deny what its rules do not allow.
-    """
-    zenoh.init_log_from_env_or("error")
-    settings = router_settings(config)
-    for endpoint in of_mode(settings, "listen/endpoints", "router"):
-        guarded = _denies_by_default(settings)
-        check_guarded(endpoint, f"{config}: `listen.endpoints`:", access_control=guarded, insecure=insecure)
-    try:
-        session = zenoh.open(settings)
-    except zenoh.ZError as error:
-        raise refused_by_zenoh(config, error) from error
-    try:
-        yield
-    finally:
-        session.close()

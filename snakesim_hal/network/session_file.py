@@ -11,8 +11,7 @@ from typing import Any
 
 import zenoh
 
-from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.files import short
+from snakesim_hal.errors import ConfigError, short
 from snakesim_hal.model.textfiles import check_brackets, read_text
 from snakesim_hal.network.endpoint import check_endpoint, check_namespace
 

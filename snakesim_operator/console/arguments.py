@@ -1,10 +1,11 @@
 """Arguments of `snakesim console`. Importable without the extra that it needs."""
 
 import argparse
+from math import inf
 from pathlib import Path
 from typing import Any
 
-from snakesim_hal.arguments import add_network
+from snakesim_hal.arguments import add_network, number
 
 
 def add_commands(commands: Any) -> None:
@@ -13,8 +14,12 @@ def add_commands(commands: Any) -> None:
         "console", help="show a running robot in the browser, and command it from there; or show a recorded run"
     )
     console.add_argument("run", type=Path, nargs="?", metavar="RUN", help="folder of a recorded run")
-    console.add_argument("--at", type=float, default=0.0, metavar="S", help="begin S seconds into the recording")
-    console.add_argument("--port", type=int, help="port on the loopback interface (default: 8080, or any free one)")
+    console.add_argument(
+        "--at", type=number(0.0, inf, "s"), default=0.0, metavar="S", help="begin S seconds into the recording"
+    )
+    console.add_argument(
+        "--port", type=number(0, 65535), help="port on the loopback interface (default: 8080, or any free one)"
+    )
     add_network(console)
     console.set_defaults(act=_console)
 

@@ -1,6 +1,7 @@
 """`snakesim console`, and the process that `snakesim run --console` starts."""
 
 import argparse
+import socket
 import threading
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,6 +14,7 @@ from snakesim_hal.network.session import Link
 from snakesim_hal.process import on_stop_signal
 from snakesim_hal.serve import process_options
 from snakesim_hal.terminal import Say, say
+from snakesim_operator.console.port import open_port
 from snakesim_operator.tools.targets import Where, the_one
 
 NEEDS = "the console needs viser; install it with: pip install 'snakesim[console]'"
@@ -24,7 +26,7 @@ def console(where: Where, port: int | None, say: Say = say) -> int:
     from snakesim_operator.console.console import show_live
 
     link = the_one(where, "console")
-    show_live(link, _surroundings(link), port, _until_signal(), say)
+    show_live(link, _surroundings(link), open_port(port), _until_signal(), say)
     return 0
 
 
@@ -33,7 +35,7 @@ def show_record(folder: Path, at_s: float, port: int | None, say: Say = say) -> 
     _check_installed()
     from snakesim_operator.console.console import show_recorded
 
-    show_recorded(folder, at_s, port, _until_signal(), say)
+    show_recorded(folder, at_s, open_port(port), _until_signal(), say)
     return 0
 
 
@@ -64,15 +66,19 @@ def _until_signal() -> threading.Event:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The console of a run, as a child that dies with it."""
+    """The console of a run, as a child that dies with it, on a port that the run has opened."""
     parser = argparse.ArgumentParser(prog="snakesim_operator.console", description="Show a run in the browser.")
     add_scenario(parser)
     add_network(parser, "")
     add_parent(parser)
+    parser.add_argument("--listening", type=int, required=True, help=argparse.SUPPRESS)  # inherited socket
     given = process_options(parser.parse_args(argv))
     _check_installed()
     from snakesim_operator.console.console import show_live
     from snakesim_operator.console.drawing import Surroundings
+    from snakesim_operator.console.moment import expected_of
 
-    show_live(given.link, Surroundings(given.config), None, _until_signal(), say)
+    listening = socket.socket(fileno=given.arguments.listening)
+    expected = expected_of(given.config)
+    show_live(given.link, Surroundings(given.config), listening, _until_signal(), say, expected)
     return 0

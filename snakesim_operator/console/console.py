@@ -1,5 +1,6 @@
 """The loop: take in what has arrived, show it, wait for the next frame."""
 
+import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -22,32 +23,42 @@ from snakesim_operator.console.watch import Watch
 FRAMES_PER_S = 30.0
 
 
-def show_live(link: Link, around: Surroundings | None, port: int | None, stop: threading.Event, say: Say) -> None:
-    """Show a robot until `stop` is set. Raises NotConnectedError when the port is taken, or no network is there."""
+def show_live(
+    link: Link,
+    around: Surroundings | None,
+    listening: socket.socket,
+    stop: threading.Event,
+    say: Say,
+    expected: Moment | None = None,
+) -> None:
+    """Show a robot until `stop` is set. Raises NotConnectedError when no network is there.
+
+    expected: what to show until there is a robot.
+    """
     log = Log()
-    with page_server(port) as (server, address):
+    with page_server(listening) as (server, address):
         operations = Operations(link, log)
         page = Page(server, around, operations, log)
         say(f"console: {address}")
-        page.show(None)
+        page.show(expected)
         whole = replace(link, largest_bytes=MAX_IMAGE_BYTES)
         with open_session(whole, START_LIMIT_S) as session:
             operations.connect(session)
             watch, changes = Watch(session), Changes(log)
             for _ in frames(stop):
-                moment = watch.moment()
+                moment = watch.moment() or expected
                 changes.note(moment)
                 page.show(moment)
 
 
-def show_recorded(folder: Path, at_s: float, port: int | None, stop: threading.Event, say: Say) -> None:
+def show_recorded(folder: Path, at_s: float, listening: socket.socket, stop: threading.Event, say: Say) -> None:
     """Show a run's record until `stop` is set. Raises ConfigError when the folder has none."""
     # What only recordings need would delay the page of a run that starts.
     from snakesim_operator.console.recorded import Recorded
     from snakesim_operator.results.record import RunRecord
 
     recorded = Recorded(RunRecord.load(folder))
-    with page_server(port) as (server, address):
+    with page_server(listening) as (server, address):
         page = Page(server, Surroundings(recorded.record.config), None, Log(), recorded=folder.name)
         player = Player(server, recorded.span_s, at_s)
         say(f"console: {address}")

@@ -1,20 +1,24 @@
 """The controls of one viewer. Only the viewer in control can use them; everybody can stop the robot."""
 
 import math
+import time
 from collections.abc import Callable
+from typing import Literal
 
 import viser
 
 from snakesim_hal.errors import SnakesimError
 from snakesim_hal.model.injection import KINDS, TargetType
+from snakesim_hal.model.kinematics import rotation_from_quaternion, yaw_of
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlSettings
 from snakesim_operator.console.moment import Moment
-from snakesim_operator.console.operations import Operations
+from snakesim_operator.console.operations import BUTTON_NS, KEY_NS, Operations
 from snakesim_operator.console.settings_form import SettingsForm
 from snakesim_operator.console.token import ControlToken
 from snakesim_operator.tools.fault import FaultOrder
 from snakesim_operator.tools.simulator_order import SimulatorOrder
+from snakesim_operator.tools.teleop.steering import HEADING_STEP_RAD, turned
 
 TOLD_S = 6.0
 FAULTS: dict[str, tuple[str, TargetType]] = {
@@ -23,6 +27,8 @@ FAULTS: dict[str, tuple[str, TargetType]] = {
 TARGETS: dict[TargetType, str] = {"process": "control", "key": keys.JOINTS, "joint": "joint_3", "bus": "bus_1"}
 DRIVE_HZ = 10.0
 FASTEST_M_S = 0.5
+Key = Literal["I", "J", "K", "L"]
+KEYS: dict[str, Key] = {"Ahead": "I", "Backwards": "K", "Left": "J", "Right": "L"}  # viser's arrows turn the view
 TIMES: tuple[str, ...] = ("0.1", "0.25", "0.5", "1", "2", "5", "10")  # speeds of a simulator
 
 
@@ -44,6 +50,7 @@ class Controls:
         self._moment, self._changed = moment, changed
         self._settings_tab = settings_tab
         self._form: SettingsForm | None = None
+        self._way, self._driven_s = 1, -math.inf  # by keys: ahead or backwards, and when last
         self.viewer = client.client_id
         with folder:
             self._take = client.gui.add_button("Take control", icon=viser.Icon.HAND_STOP, color="blue")
@@ -110,8 +117,11 @@ class Controls:
         self._client.add_notification(title, text, auto_close_seconds=TOLD_S, color="red" if bad else "green")
 
     def _take_or_release(self) -> None:
-        if not self._token.release(self.viewer) and not self._token.take(self.viewer):
-            self.tell("Not in control", f"{name_of(self._token.holder)} has it", bad=True)
+        if not self._token.release(self.viewer):
+            if not self._token.take(self.viewer):
+                self.tell("Not in control", f"{name_of(self._token.holder)} has it", bad=True)
+            elif (body_w_rad := self._body_w_rad()) is not None:
+                self._heading.value = _degrees(body_w_rad)  # straight on, until asked to turn
         self._changed()
 
     def _in_control(self) -> bool:
@@ -137,10 +147,36 @@ class Controls:
 
     def _go(self) -> None:
         """The button is held: the page says so ten times a second, and nobody else does when it does not."""
+        self._ask_for(self._speed.value, BUTTON_NS)
+
+    def press(self, key: str) -> None:
+        """A key of `KEYS` was pressed, or its keyboard repeats it; only the last one of several is repeated."""
+        if not self._in_control():
+            return
+        now_s = time.monotonic()
+        if key in ("Ahead", "Backwards"):
+            self._way = 1 if key == "Ahead" else -1
+        else:
+            by_rad = HEADING_STEP_RAD if key == "Left" else -HEADING_STEP_RAD
+            self._heading.value = _degrees(turned(self._heading_w_rad, by_rad, self._body_w_rad()))
+            if now_s - self._driven_s > KEY_NS * 1e-9:
+                return  # it turns only while it drives
+        self._driven_s = now_s
+        self._ask_for(self._way * self._speed.value, KEY_NS)
+
+    def _ask_for(self, speed_m_s: float, valid_ns: int) -> None:
         moment = self._moment()
         if moment is not None and moment.time_s is not None and self._in_control():
-            heading_rad = math.radians(self._heading.value)
-            self._operations.drive(self.who, heading_rad, self._speed.value, round(moment.time_s * 1e9))
+            now_ns = round(moment.time_s * 1e9)
+            self._operations.drive(self.who, self._heading_w_rad, speed_m_s, now_ns, valid_ns)
+
+    @property
+    def _heading_w_rad(self) -> float:
+        return math.radians(self._heading.value)
+
+    def _body_w_rad(self) -> float | None:
+        moment = self._moment()
+        return None if moment is None or moment.base is None else yaw_of(rotation_from_quaternion(moment.base[1]))
 
     def _suggest_target(self) -> None:
         """A target of the sort that the kind is for; simulator and clock are their own."""
@@ -164,6 +200,11 @@ class Controls:
             self.tell(title, call())
         except SnakesimError as error:
             self.tell(title, str(error), bad=True)
+
+
+def _degrees(angle_rad: float) -> int:
+    """In steps of the slider."""
+    return 5 * round(math.degrees(angle_rad) / 5)
 
 
 def name_of(viewer: int | None) -> str:

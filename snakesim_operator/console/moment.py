@@ -2,6 +2,9 @@
 
 from dataclasses import dataclass, field
 
+from snakesim_hal.model.kinematics import quaternion_from_yaw
+from snakesim_hal.model.robot import describe
+from snakesim_hal.model.scenario import RunConfig, config_hash, start_of
 from snakesim_hal.wire.messages import (
     AppliedCommand,
     ColourImage,
@@ -32,6 +35,7 @@ class Moment:
     """One instant. Whatever is None is not known."""
 
     robot: Description
+    expected: bool = False  # not a robot's: its run is starting
     time_s: float | None = None  # robot time
     silent_s: float = 0.0  # since the host was heard
     status: Status | None = None
@@ -48,3 +52,27 @@ class Moment:
     images: dict[str, DepthImage | ColourImage] = field(default_factory=dict)  # by key
     streams: dict[str, Stream] = field(default_factory=dict)  # by key
     hosts: frozenset[str] = frozenset()  # ids of all that publish a status; more than one: an impostor
+
+
+def expected_of(config: RunConfig) -> Moment:
+    """The robot of a run that is starting, as its scenario places it on flat ground."""
+    robot = describe(
+        config.robot,
+        backend=config.backend,
+        period_ns=config.period_ns,
+        lease_ns=config.lease_ns,
+        config_hash=config_hash(config),
+    )
+    start = start_of(config)
+    zero = [0.0] * len(robot.joints)
+    joints = JointState(
+        tick=0,
+        stamp_ns=0,
+        angle_rad=start.angles_rad.tolist(),
+        velocity_rad_s=zero,
+        torque_nm=zero,
+        valid=[True] * len(zero),
+        age_ns=[0] * len(zero),
+    )
+    base = (*start.position_w, config.robot.module.radius_m), quaternion_from_yaw(start.yaw_rad)
+    return Moment(robot=robot, expected=True, joints=joints, body=joints, base=base)

@@ -21,7 +21,9 @@ from snakesim_operator.tools.stop import estop
 from snakesim_operator.tools.targets import Where
 
 LOG_LINES = 200
-DRIVE_NS = 500_000_000  # an intent from the page is valid for this long: then a viewer who is gone moves nothing
+# How long an intent from the page is valid: then a viewer who is gone moves nothing. A button tells ten times a second
+# that it is held; a held key at first after as long as its keyboard takes to repeat it, mostly 0.25 to 0.66 s.
+BUTTON_NS, KEY_NS = 500_000_000, 800_000_000
 
 
 class Log:
@@ -86,11 +88,11 @@ class Operations:
         request = SettingsRequest(who=who, controller=controller, settings=settings)
         return self._do(f"{who}: settings", lambda say: self._ask(keys.SETTINGS, request, say))
 
-    def drive(self, who: str, heading_w_rad: float, speed_m_s: float, now_ns: int) -> None:
-        """Ask for a direction and a speed, for half a second. now_ns: robot time."""
+    def drive(self, who: str, heading_w_rad: float, speed_m_s: float, now_ns: int, valid_ns: int) -> None:
+        """Ask for a direction and a speed, from a robot time on for so long."""
         if self._intents is not None:
             intent = Intent(
-                stamp_ns=now_ns, who=who, speed_m_s=speed_m_s, heading_w_rad=heading_w_rad, valid_for_ns=DRIVE_NS
+                stamp_ns=now_ns, who=who, speed_m_s=speed_m_s, heading_w_rad=heading_w_rad, valid_for_ns=valid_ns
             )
             self._intents.put(intent)
 

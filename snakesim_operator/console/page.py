@@ -1,7 +1,7 @@
 """The page: the scene in the middle, the state and the controls beside it; the same for every viewer but the controls.
 
-The loop hands over one moment a frame. viser sends each viewer the newest value of each thing, so a slow browser gets
-fewer frames, and never makes the loop wait.
+The loop hands over one moment a frame. Each viewer gets the newest value of each thing when it has shown the one before
+(`pacing`), so a slow browser gets fewer frames, and never makes the loop wait.
 """
 
 import contextlib
@@ -15,7 +15,7 @@ from snakesim_hal.wire.messages import ControlSettings, Description
 from snakesim_hal.wire.quantities import Vector
 from snakesim_operator.console import stage, texts
 from snakesim_operator.console.charts import JointCharts
-from snakesim_operator.console.controls import Controls, dress, name_of
+from snakesim_operator.console.controls import KEYS, Controls, dress, name_of
 from snakesim_operator.console.drawing import Surroundings, draw
 from snakesim_operator.console.moment import Moment
 from snakesim_operator.console.operations import Log, Operations
@@ -77,6 +77,9 @@ class Page:
             stop.on_click(lambda event: self._estop(event.client_id))
             key = gui.add_command("Emergency stop", hotkey="escape")
             key.on_trigger(lambda event: self._estop(event.client_id))
+            for what, hotkey in KEYS.items():
+                drive = gui.add_command(f"Drive: {what.lower()}", hotkey=hotkey)
+                drive.on_trigger(partial(self._press, what))
             self._control_folder = gui.add_folder("Control", order=2)
         tabs = gui.add_tab_group(order=4)
         with tabs.add_tab("Joints"):
@@ -149,6 +152,12 @@ class Page:
             with contextlib.suppress(SnakesimError):  # the log has it
                 call()
 
+    def _press(self, key: str, event: viser.CommandEvent) -> None:
+        with self._lock:
+            controls = None if event.client_id is None else self._controls.get(event.client_id)
+        if controls is not None:
+            controls.press(key)
+
     def forget(self) -> None:
         """The next moment is not the one after this: trail and charts begin anew."""
         if self._stage is not None and self._charts is not None:
@@ -165,6 +174,8 @@ class Page:
         if moment is not None:
             if self._stage is None or before is None or before.robot.layout != moment.robot.layout:
                 self._meet(moment.robot)
+            if before is None or before.robot is not moment.robot:
+                self._control_changed()  # a simulator has controls of its own
             drawing = draw(moment, self._around)
             assert self._stage is not None and self._charts is not None
             if drawing is not None:
@@ -195,7 +206,6 @@ class Page:
             if self._charts is not None:
                 self._charts.remove()
             self._charts = JointCharts(self._server.gui, robot)
-        self._control_changed()  # a simulator has controls of its own
 
     def _show_settings(self, settings: ControlSettings) -> None:
         with self._lock:

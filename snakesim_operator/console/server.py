@@ -1,19 +1,20 @@
 """The web server of the console: viser, on loopback only, and closed to pages of other sites."""
 
+import asyncio
 import contextlib
 import io
 import re
 import socket
+import threading
 from collections.abc import Iterator
 from typing import Any
 
 import viser
 import websockets.asyncio.server
 
-from snakesim_hal.errors import NotConnectedError
+from snakesim_operator.console.pacing import pace
+from snakesim_operator.console.port import LOOPBACK, address_of
 
-LOOPBACK = "127.0.0.1"
-DEFAULT_PORT = 8080
 # A browser names the page that opens a connection. Any site could connect to loopback from the operator's browser, and
 # arm the robot; so only pages that came from this computer may (through an SSH tunnel too, under any port).
 OUR_PAGES = re.compile(r"https?://(127\.0\.0\.1|localhost|\[::1\])(:\d+)?")
@@ -28,38 +29,37 @@ class PageServer(viser.ViserServer):
 
 
 @contextlib.contextmanager
-def page_server(port: int | None) -> Iterator[tuple[PageServer, str]]:
-    """The server and its address. port: None takes 8080, or any free one. Raises NotConnectedError."""
-    chosen = _free_port(port)
-    with _only_our_pages(), contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
-        server = PageServer(LOOPBACK, chosen, label="SnakeSIM", verbose=False)
+def page_server(listening: socket.socket) -> Iterator[tuple[PageServer, str]]:
+    """The server on a socket of `port.open_port`, and its address."""
+    complete = threading.Event()
+    with _on_our_terms(listening, complete), contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
+        server = PageServer(LOOPBACK, listening.getsockname()[1], label="SnakeSIM", verbose=False)
+    pace(server)
+    complete.set()
     try:
-        if server.get_port() != chosen:
-            raise NotConnectedError(f"port {chosen} of the console was taken just now; start it again")
-        yield server, f"http://{LOOPBACK}:{chosen}"
+        yield server, address_of(listening)
     finally:
         with contextlib.redirect_stdout(io.StringIO()):
             server.stop()
 
 
-def _free_port(port: int | None) -> int:
-    for wanted in (DEFAULT_PORT, 0) if port is None else (port,):
-        with contextlib.suppress(OSError), socket.socket() as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind((LOOPBACK, wanted))
-            return probe.getsockname()[1]
-    raise NotConnectedError(f"--port {port}: another program listens there; choose another, or leave --port out")
-
-
 @contextlib.contextmanager
-def _only_our_pages() -> Iterator[None]:
-    """Have viser's server check where a page came from; viser has no option for it."""
+def _on_our_terms(listening: socket.socket, complete: threading.Event) -> Iterator[None]:
+    """Have viser's server use the open socket, and check where a page came from; viser has no option for either.
+
+    Pages that have waited at the socket are let in when the server is complete: viser begins to listen before it is.
+    """
     serve = websockets.asyncio.server.serve
 
-    def checking(*arguments: Any, **options: Any) -> Any:
-        return serve(*arguments, origins=[OUR_PAGES, None], **options)
+    def serve_here(handler: Any, _host: str, _port: int, **options: Any) -> Any:
+        async def let_in(connection: Any) -> None:
+            while not complete.is_set():
+                await asyncio.sleep(0.01)
+            await handler(connection)
 
-    websockets.asyncio.server.serve = checking  # pyright: ignore[reportAttributeAccessIssue]
+        return serve(let_in, sock=listening, origins=[OUR_PAGES, None], **options)
+
+    websockets.asyncio.server.serve = serve_here  # pyright: ignore[reportAttributeAccessIssue]
     try:
         yield
     finally:

@@ -7,7 +7,7 @@ as they like.
 import math
 from collections import deque
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import viser
@@ -16,10 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from snakesim_hal.model.kinematics import quaternion_from_yaw
 from snakesim_hal.wire.messages import Description, Obstacle
 from snakesim_operator.console.drawing import Camera, Drawing, Surroundings
+from snakesim_operator.console.meshes import Mesh, box, capsule, circle, cylinder, hoops, sphere
 from snakesim_operator.results.page.palette import DARK, LIGHT
-
-if TYPE_CHECKING:
-    import trimesh  # where it is used: it takes as long to load as all of the page, which need not wait for it
 
 Floats = NDArray[np.float64]
 Colour = tuple[int, int, int]
@@ -29,7 +27,16 @@ FOLLOW_SHARE = 0.08  # of the way to the snake's centre, in a frame
 FURTHEST_M = 0.5  # from the view's middle
 MOST_ROWS = 200  # of hills along an edge
 SEE_THROUGH = 0.5  # so that no obstacle hides the snake, or a force
-SHAPES = ("cylinder", "box", "sphere")
+# To be stretched. What is perceived is drawn as hoops about where it is believed to be, so that one sees the truth too.
+SQUARE = np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
+SHAPES: dict[str, dict[str, Mesh]] = {
+    "true": {"cylinder": cylinder(1.0, 1.0), "box": box(1.0), "sphere": sphere(1.0)},
+    "perceived": {
+        "cylinder": hoops(circle(), 0.5, 0.13),
+        "box": hoops(SQUARE, 1.0, 0.26),
+        "sphere": hoops(circle(), 0.13, 0.26),
+    },
+}
 
 
 def colour(name: str, *, dark: bool = False) -> Colour:
@@ -40,7 +47,7 @@ def colour(name: str, *, dark: bool = False) -> Colour:
 
 LINK, LINK_EDGE, HEAD = (52, 92, 138), (70, 112, 160), (22, 46, 84)
 HINGE, LOST = (52, 58, 66), colour("bad")
-PEG, PUSHED, AHEAD, SEEN = (176, 152, 112), (226, 88, 12), (232, 168, 56), (0, 150, 136)
+PEG, PUSHED, AHEAD, SEEN = (176, 152, 112), (226, 88, 12), (232, 168, 56), (0, 200, 170)
 FELT, SOLVED, RESULTANT = colour("measured"), colour("commanded"), (20, 160, 90)
 
 
@@ -48,8 +55,6 @@ class Stage:
     """The 3-D scene of one robot."""
 
     def __init__(self, scene: viser.SceneApi, robot: Description, around: Surroundings | None) -> None:
-        import trimesh
-
         self._scene, self._robot, self._around = scene, robot, around
         self._thick = max(link.radius_m for link in robot.links)
         scene.configure_environment_map("warehouse", environment_intensity=0.3)
@@ -63,12 +68,8 @@ class Stage:
         self._path: viser.LineSegmentsHandle | None = None
         self._path_w: Floats | None = None
         self._links = self._add_links()
-        self._hinges = self._batch(
-            "snake/hinges",
-            trimesh.creation.cylinder(0.5 * self._thick, 2.12 * self._thick, sections=20),
-            len(robot.joints),
-            HINGE,
-        )
+        hinge = cylinder(0.5 * self._thick, 2.12 * self._thick)
+        self._hinges = self._batch("snake/hinges", hinge, len(robot.joints), HINGE)
         self._contacts = scene.add_point_cloud(
             "/world/contacts/points", np.zeros((1, 3)), colour("ink"), point_size=0.4 * self._thick, visible=False
         )
@@ -83,31 +84,23 @@ class Stage:
 
     def _add_links(self) -> list[tuple[viser.BatchedMeshHandle, list[int]]]:
         """One batch for all links of one size."""
-        import trimesh
-
         alike: dict[tuple[float, float], list[int]] = {}
         for i, link in enumerate(self._robot.links):
             alike.setdefault((link.length_m, link.radius_m), []).append(i)
         found: list[tuple[viser.BatchedMeshHandle, list[int]]] = []
         last = len(self._robot.links) - 1
         for k, ((length_m, radius_m), numbers) in enumerate(alike.items()):
-            capsule = trimesh.creation.capsule(length_m, radius_m, count=[24, 12])
-            capsule.apply_translation(-capsule.bounds.mean(axis=0))
-            capsule.vertices = np.asarray(capsule.vertices)[:, [2, 0, 1]]  # along x
-            batch = self._batch(f"snake/links_{k}", capsule, len(numbers), LINK)
+            batch = self._batch(f"snake/links_{k}", capsule(length_m, radius_m), len(numbers), LINK)
             # Neighbours share a sphere at their joint: drawn a little thinner, they do not flicker.
             batch.batched_scales = _single([[1.0, thin, thin] for thin in (1.0 - 0.012 * (i % 2) for i in numbers)])
             batch.batched_colors = _shades([HEAD if i == last else (LINK, LINK_EDGE)[i % 2] for i in numbers])
             found.append((batch, numbers))
         return found
 
-    def _batch(
-        self, name: str, mesh: "trimesh.Trimesh", count: int, of: Colour, **more: Any
-    ) -> viser.BatchedMeshHandle:
+    def _batch(self, name: str, mesh: Mesh, count: int, of: Colour, **more: Any) -> viser.BatchedMeshHandle:
         return self._scene.add_batched_meshes_simple(
             f"/world/{name}",
-            np.asarray(mesh.vertices),
-            np.asarray(mesh.faces),
+            *mesh,
             batched_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
             batched_positions=np.zeros((count, 3)),
             batched_scales=np.ones((count, 3)),
@@ -169,7 +162,8 @@ class Stage:
         self._show_arrows("forces/solved", drawing.solved, SOLVED, 0.16)
         self._show_arrows("forces/resultant", drawing.resultant, RESULTANT, 0.30)
         self._show_path(drawing.path_w)
-        self._show_obstacles("perceived", drawing.perceived, SEEN, opacity=0.5, grown=1.03)
+        hoop = {"opacity": 1.0, "grown": 1.05, "side": "double", "cast_shadow": False}
+        self._show_obstacles("perceived", drawing.perceived, SEEN, **hoop)
         if self._around is not None:
             self._colour_obstacles(self._around.obstacles, drawing)
         self._show_cameras(drawing.cameras)
@@ -222,9 +216,9 @@ class Stage:
             self._path.points = _single(pieces)
 
     def _show_obstacles(
-        self, name: str, obstacles: Sequence[Obstacle], of: Colour, *, opacity: float | None = None, grown: float = 1.0
+        self, name: str, obstacles: Sequence[Obstacle], of: Colour, *, opacity: float, grown: float = 1.0, **more: Any
     ) -> None:
-        for shape in SHAPES:
+        for shape in SHAPES[name]:
             these = [obstacle for obstacle in obstacles if obstacle.shape == shape]
             key = f"{name}/{shape}"
             batch = self._shapes.get(key)
@@ -233,7 +227,9 @@ class Stage:
             if not these:
                 continue
             if batch is None:
-                batch = self._shapes[key] = self._batch(key, _unit(shape), len(these), of, opacity=opacity)
+                batch = self._shapes[key] = self._batch(
+                    key, SHAPES[name][shape], len(these), of, opacity=opacity, **more
+                )
             batch.batched_positions = _single([o.position_w for o in these])
             batch.batched_wxyzs = _single([quaternion_from_yaw(o.yaw_rad) for o in these])
             batch.batched_scales = _single(grown * np.array([_size(o) for o in these]))
@@ -244,7 +240,7 @@ class Stage:
 
     def _colour_obstacles(self, obstacles: Sequence[Obstacle], drawing: Drawing) -> None:
         """What the body pushes off, and what navigation expects it to."""
-        for shape in SHAPES:
+        for shape in SHAPES["true"]:
             batch = self._shapes.get(f"true/{shape}")
             if batch is not None:
                 names = [obstacle.name for obstacle in obstacles if obstacle.shape == shape]
@@ -293,14 +289,6 @@ def _shades(colours: Sequence[Colour]) -> NDArray[np.uint8]:
     srgb = np.array(colours) / 255
     linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     return np.round(255 * linear).astype(np.uint8)
-
-
-def _unit(shape: str) -> "trimesh.Trimesh":
-    import trimesh
-
-    if shape == "cylinder":
-        return trimesh.creation.cylinder(1.0, 1.0, sections=40)
-    return trimesh.creation.box((2.0, 2.0, 2.0)) if shape == "box" else trimesh.creation.icosphere(3, 1.0)
 
 
 def _size(obstacle: Obstacle) -> tuple[float, float, float]:

@@ -31,6 +31,8 @@ def header(moment: Moment | None, *, recorded: str = "", control: str = "") -> s
     """The top of the page: which backend, which state, and why. control: who has it."""
     if moment is None:
         return _bar("WAITING FOR THE ROBOT", RECORDED, "no host has described itself yet")
+    if moment.expected:
+        return _bar("WAITING FOR THE ROBOT", RECORDED, f"{plain(moment.robot.robot)}, drawn as its scenario places it")
     words, colour = backend_in_words(moment.robot)
     where = f"{plain(moment.robot.robot)}{' · ' + plain(moment.robot.hardware) if moment.robot.hardware else ''}"
     status = moment.status

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from snakesim_hal.arguments import number
 from snakesim_hal.errors import ConfigError
 
 EXTRA = ("distributed", "optuna", "pyarrow")
@@ -21,7 +22,7 @@ def add_commands(commands: Any) -> None:
     )
     tried.add_argument("suite", help="name of a shipped suite, or path of a suite file")
     tried.add_argument("--controllers", metavar="A,B,...", help="installed controllers, or ./file.py:Class")
-    tried.add_argument("--fields", type=_count, metavar="N", help="fields for each row and controller")
+    tried.add_argument("--fields", type=number(1, 100_000), metavar="N", help="fields for each row and controller")
     _add_shared(tried)
     tried.set_defaults(act=_evaluate)
 
@@ -30,7 +31,7 @@ def add_commands(commands: Any) -> None:
     swept.add_argument(
         "--vary", action="append", required=True, metavar="KEY=LOW:HIGH:COUNT", help="or KEY=[A, B]; may be repeated"
     )
-    swept.add_argument("--seeds", type=_count, default=1, metavar="N", help="runs for each value (1)")
+    swept.add_argument("--seeds", type=number(1, 100_000), default=1, metavar="N", help="runs for each value (1)")
     _add_set(swept)
     _add_shared(swept)
     swept.set_defaults(act=_sweep)
@@ -40,8 +41,10 @@ def add_commands(commands: Any) -> None:
     searched.add_argument("--vary", action="append", required=True, metavar="KEY=LOW:HIGH", help="may be repeated")
     searched.add_argument("--goal", required=True, metavar="NAME", help="such as path_distance_m or energy_j_per_m")
     searched.add_argument("--minimise", action="store_true", help="search the smallest instead of the largest")
-    searched.add_argument("--trials", type=_count, default=50, metavar="N", help="in the file at the end (50)")
-    searched.add_argument("--seeds", type=_count, default=1, metavar="N", help="runs for each trial (1)")
+    searched.add_argument(
+        "--trials", type=number(1, 100_000), default=50, metavar="N", help="in the file at the end (50)"
+    )
+    searched.add_argument("--seeds", type=number(1, 100_000), default=1, metavar="N", help="runs for each trial (1)")
     searched.add_argument("--storage", type=Path, required=True, metavar="FILE", help="SQLite file; an old one goes on")
     _add_set(searched)
     _add_workers(searched)
@@ -67,7 +70,9 @@ def _add_workers(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--cluster", metavar="tcp://HOST:PORT", help="scheduler of a Dask cluster (default: this computer)"
     )
-    parser.add_argument("--workers", type=_count, metavar="N", help="processes on this computer (one a core)")
+    parser.add_argument(
+        "--workers", type=number(1, 100_000), metavar="N", help="processes on this computer (one a core)"
+    )
 
 
 def _evaluate(arguments: argparse.Namespace) -> int:
@@ -119,9 +124,3 @@ def _check_extra() -> None:
             f"this command needs {', '.join(missing)}, which a plain install leaves out; install it with: "
             f"{sys.executable} -m pip install 'snakesim[evaluate]'"
         )
-
-
-def _count(text: str) -> int:
-    if not text.isdecimal() or not 1 <= int(text) <= 100_000:
-        raise argparse.ArgumentTypeError(f"{text[:40]!r}: give a whole number from 1 to 100000")
-    return int(text)

@@ -10,8 +10,7 @@ import dask.config
 from distributed import Client, Future, LocalCluster, as_completed
 from distributed.scheduler import KilledWorker
 
-from snakesim_hal.errors import ConfigError, NotConnectedError
-from snakesim_hal.model.files import short
+from snakesim_hal.errors import ConfigError, NotConnectedError, short
 from snakesim_operator.evaluate.case import Case, Outcome, code_digest, run_case
 
 DEATHS, RETRIES = 4, 2  # of the workers that run a case, and of the case, until it is given up

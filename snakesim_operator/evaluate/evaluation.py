@@ -8,8 +8,7 @@ from pathlib import Path
 
 import msgspec
 
-from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.files import short
+from snakesim_hal.errors import ConfigError, short
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.textfiles import write_text
 from snakesim_hal.terminal import say

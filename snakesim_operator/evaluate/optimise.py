@@ -13,8 +13,7 @@ from optuna.distributions import BaseDistribution, FloatDistribution, IntDistrib
 from optuna.study import Study
 from optuna.trial import Trial, TrialState
 
-from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.files import short
+from snakesim_hal.errors import ConfigError, short
 from snakesim_hal.model.scenario import parse_set
 from snakesim_hal.terminal import say
 from snakesim_operator.evaluate.case import Case, Outcome

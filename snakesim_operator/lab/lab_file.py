@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.files import FileStruct, Table, decode, read_table, short
+from snakesim_hal.errors import ConfigError, short
+from snakesim_hal.model.files import FileStruct, Table, decode, read_table
 from snakesim_hal.wire.quantities import from_zero
 from snakesim_hal.wire.roles import Role
 

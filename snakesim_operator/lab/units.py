@@ -10,7 +10,6 @@ from snakesim_hal.process import SERVICE_PRIORITY
 from snakesim_operator.lab.lab_file import Lab
 from snakesim_operator.lab.programs import STATE, Program, programs
 
-REFUSALS = "info,zenoh::net::routing::interceptor::access_control=trace"
 CONTAINER_USER = "10001:10001"
 
 
@@ -26,7 +25,7 @@ def unit_files(lab: Lab, machine: str, origin: str) -> Iterator[tuple[str, str]]
     )
     entry = lab.file.machines[machine]
     found = list(programs(lab, machine))
-    given = {"machine": entry, "origin": origin, "state": STATE, "refusals": REFUSALS, "uid": CONTAINER_USER}
+    given = {"machine": entry, "origin": origin, "state": STATE, "uid": CONTAINER_USER}
     given["priority"] = SERVICE_PRIORITY
     unit = templates.get_template("unit.j2")
     for program in found:

@@ -6,7 +6,7 @@ from math import inf
 from pathlib import Path
 from typing import Any
 
-from snakesim_hal.arguments import add_json
+from snakesim_hal.arguments import add_json, number
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.network.endpoint import check_endpoint, check_namespace
 from snakesim_hal.terminal import say
@@ -42,7 +42,9 @@ def add_commands(commands: Any) -> None:
         epilog="Exit code of --control: 0 the commands are the same to the bit, or a setting was changed; 1 otherwise.",
     )
     _add_recording(replay)
-    replay.add_argument("--rate", type=float, default=1.0, metavar="X", help="robot time over wall time (1)")
+    replay.add_argument(
+        "--rate", type=number(0.001, 1e6), default=1.0, metavar="X", help="robot time over wall time (1)"
+    )
     replay.add_argument("--step", action="store_true", help="play one tick at each Enter")
     replay.add_argument("--endpoint", help="Zenoh endpoint to listen on (default: tcp/127.0.0.1:7447)")
     replay.add_argument("--namespace", help="namespace to play in (default: the robot's name)")
@@ -66,12 +68,18 @@ def add_commands(commands: Any) -> None:
     video = commands.add_parser("video", help="film a recorded run, as MP4 or GIF")
     video.add_argument("run", type=Path, metavar="RUN", help="folder of a run, or a recording")
     video.add_argument("--out", type=Path, required=True, metavar="FILE", help="FILE.mp4 or FILE.gif")
-    video.add_argument("--width", type=int, default=1280, help="pixels, an even number (default: 1280)")
-    video.add_argument("--height", type=int, default=720, help="pixels, an even number (default: 720)")
-    video.add_argument("--fps", type=float, default=30.0, help="pictures a second (default: 30)")
-    video.add_argument("--speed", type=float, default=1.0, metavar="X", help="2: twice as fast as it was (default: 1)")
-    video.add_argument("--from", dest="from_s", type=float, default=0.0, metavar="S", help="begin S seconds in")
-    video.add_argument("--to", dest="to_s", type=float, default=inf, metavar="S", help="end S seconds in")
+    video.add_argument("--width", type=number(16, 4096), default=1280, help="pixels, an even number (default: 1280)")
+    video.add_argument("--height", type=number(16, 4096), default=720, help="pixels, an even number (default: 720)")
+    video.add_argument("--fps", type=number(1.0, 240.0, "Hz"), default=30.0, help="pictures a second (default: 30)")
+    video.add_argument(
+        "--speed", type=number(0.01, 100.0), default=1.0, metavar="X", help="2: twice as fast as it was (default: 1)"
+    )
+    video.add_argument(
+        "--from", dest="from_s", type=number(0.0, inf, "s"), default=0.0, metavar="S", help="begin S seconds in"
+    )
+    video.add_argument(
+        "--to", dest="to_s", type=number(0.0, inf, "s"), default=inf, metavar="S", help="end S seconds in"
+    )
     video.set_defaults(act=_video)
 
 
@@ -109,14 +117,8 @@ def _video(arguments: argparse.Namespace) -> int:
     from snakesim_operator.tools.video import video
 
     size = (arguments.width, arguments.height)
-    for flag, value, low, high in (
-        ("--width", size[0], 16, 4096),
-        ("--height", size[1], 16, 4096),
-        ("--fps", arguments.fps, 1, 240),
-        ("--speed", arguments.speed, 0.01, 100),
-    ):
-        if not low <= value <= high or (flag in ("--width", "--height") and value % 2):
-            raise ConfigError(f"{flag} {value:g}: give a number from {low:g} to {high:g}; pixels must be even")
+    if any(pixels % 2 for pixels in size):
+        raise ConfigError(f"--width {size[0]} --height {size[1]}: give even numbers of pixels")
     span_s = (arguments.from_s, arguments.to_s)
     return video(arguments.run, arguments.out, size=size, fps=arguments.fps, speed=arguments.speed, span_s=span_s)
 

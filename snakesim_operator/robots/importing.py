@@ -11,8 +11,8 @@ from pathlib import Path
 
 import msgspec
 
-from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.files import Table, read_part, shipped, short
+from snakesim_hal.errors import ConfigError, short
+from snakesim_hal.model.files import Table, read_part, shipped
 from snakesim_hal.model.robot import RobotFile
 from snakesim_operator.robots.body import put_body
 from snakesim_operator.robots.imported import Imported, Order

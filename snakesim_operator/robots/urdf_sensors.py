@@ -12,7 +12,8 @@ from xml.sax.saxutils import escape, quoteattr
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.model.files import Table, short
+from snakesim_hal.errors import short
+from snakesim_hal.model.files import Table
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.sensors import DepthCamera
 from snakesim_operator.robots.urdf_tree import Row, rotation

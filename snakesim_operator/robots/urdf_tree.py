@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.files import short
+from snakesim_hal.errors import ConfigError, short
 from snakesim_operator.robots.meshes import find_mesh, vertices
 from snakesim_operator.robots.xml_tree import Element
 

@@ -10,8 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from xml.parsers import expat
 
-from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.files import short
+from snakesim_hal.errors import ConfigError, short
 from snakesim_hal.model.textfiles import read_bytes
 
 MAX_ELEMENTS, MAX_DEPTH = 100_000, 32

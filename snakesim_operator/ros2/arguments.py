@@ -4,7 +4,7 @@ import argparse
 import re
 from typing import Any
 
-from snakesim_hal.arguments import add_network
+from snakesim_hal.arguments import add_network, number
 from snakesim_hal.errors import ConfigError, short
 from snakesim_hal.network.endpoint import check_endpoint
 
@@ -20,13 +20,25 @@ def add_commands(commands: Any) -> None:
         help="be a ROS 2 node for a robot, through the router of rmw_zenoh; needs no ROS",
         epilog="Publishes joint states, transforms, markers, images, scans, the robot's URDF, diagnostics and /clock.",
     )
-    made.add_argument("--domain", type=int, default=0, metavar="N", help="ROS_DOMAIN_ID (0)")
+    made.add_argument("--domain", type=number(0, LAST_DOMAIN), default=0, metavar="N", help="ROS_DOMAIN_ID (0)")
     made.add_argument(
         "--ros-router", default=ROS_ROUTER, metavar="ENDPOINT", help=f"router of the ROS nodes ({ROS_ROUTER})"
     )
     made.add_argument("--ros-namespace", metavar="NAME", help="of topics and frames, for several robots in one graph")
-    made.add_argument("--hz", type=float, default=50.0, metavar="HZ", help="most messages a second of a topic (50)")
-    made.add_argument("--image-hz", type=float, default=5.0, metavar="HZ", help="most images a second of a camera (5)")
+    made.add_argument(
+        "--hz",
+        type=number(0.1, MOST_HZ, "Hz"),
+        default=50.0,
+        metavar="HZ",
+        help="most messages a second of a topic (50)",
+    )
+    made.add_argument(
+        "--image-hz",
+        type=number(0.1, MOST_HZ, "Hz"),
+        default=5.0,
+        metavar="HZ",
+        help="most images a second of a camera (5)",
+    )
     made.add_argument("--cmd-vel", action="store_true", help="let ROS ask for speed and direction, on cmd_vel")
     made.add_argument(
         "--stamps",
@@ -51,11 +63,6 @@ def check(arguments: argparse.Namespace) -> None:
     if find_spec("xxhash") is None:
         raise ConfigError("`snakesim ros2` needs packages that are not installed: pip install 'snakesim[ros2]'")
     check_endpoint(arguments.ros_router, "--ros-router")
-    if not 0 <= arguments.domain <= LAST_DOMAIN:
-        raise ConfigError(f"--domain {arguments.domain}: a ROS domain is a number from 0 to {LAST_DOMAIN}")
-    for flag, hz in (("--hz", arguments.hz), ("--image-hz", arguments.image_hz)):
-        if not 0.1 <= hz <= MOST_HZ:
-            raise ConfigError(f"{flag} {hz:g}: give from 0.1 to {MOST_HZ:g} Hz")
     name = arguments.ros_namespace
     if name is not None and not re.fullmatch(r"[A-Za-z_]\w*(/[A-Za-z_]\w*)*", name, re.ASCII):
         raise ConfigError(

@@ -3,13 +3,14 @@
 import contextlib
 import importlib.util
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 
 from snakesim_hal.errors import ConfigError
+from snakesim_operator.console.port import address_of, open_port
 from snakesim_operator.run import children
 from snakesim_operator.run.run_files import RunFiles
 
 LOG = "console.log"
-ADDRESS = b"console: http"
 
 
 def check_console() -> None:
@@ -21,17 +22,11 @@ def check_console() -> None:
 @contextlib.contextmanager
 def console_beside(common: Sequence[str], files: RunFiles, say: Callable[[str], None]) -> Iterator[None]:
     """Show the run in the browser for as long as the context lives. common: the arguments of each of its processes."""
-    told = False
-
-    def keep(words: bytes) -> None:
-        nonlocal told
-        files.append(LOG, words)
-        for line in words.splitlines():
-            if line.startswith(ADDRESS) and not told:
-                told = True
-                say(line.decode(errors="replace"))
-
-    child = children.start("console", ["snakesim_operator.console", *common], keep)
+    with open_port(None) as listening:  # only the console keeps it open: when that has ended, browsers are told at once
+        handle = listening.fileno()
+        arguments = ["snakesim_operator.console", *common, "--listening", str(handle)]
+        child = children.start("console", arguments, partial(files.append, LOG), inherits=[handle])
+        say(f"console: {address_of(listening)}")
     try:
         yield
     finally:

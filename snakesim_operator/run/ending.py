@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from types import FrameType
 
+from snakesim_hal.process import STOPS
+
 
 @dataclass
 class Ending:
@@ -33,7 +35,7 @@ def interruptible(ending: Ending) -> Iterator[None]:
         ending.interrupted = True
         signal.signal(number, signal.SIG_DFL)
 
-    old = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    old = {number: signal.signal(number, handle) for number in STOPS}
     try:
         yield
     finally:

@@ -82,6 +82,7 @@ def run(request: RunRequest) -> int:
         with (
             interruptible(ending),
             registered(local_robot(request.config, config_file, link, stop_port)) as trouble,
+            _console(request, link, files, config_file),  # first, because somebody waits for it
         ):
             if trouble is not None:
                 say(trouble)
@@ -132,13 +133,21 @@ def _check_router(request: RunRequest) -> None:
         raise ConfigError(f"fault {str(wanted[0])!r}: this run has no router of its own; add --with-router")
 
 
+def _console(
+    request: RunRequest, link: Link, files: RunFiles, config_file: Path
+) -> contextlib.AbstractContextManager[None]:
+    if not request.console:
+        return contextlib.nullcontext()
+    return console_beside([str(config_file), "--namespace", request.network_name, *_meeting(link)], files, say)
+
+
 def _conduct(
     request: RunRequest, supervisor: Supervisor, link: Link, files: RunFiles, config_file: Path, ending: Ending
 ) -> None:
     """Start the programs `snakesim host` and `snakesim service` as children, and see the run through."""
     config = request.config
     common = [str(config_file), "--namespace", request.network_name]
-    meeting = ["--session", str(link.session.path)] if link.session else ["--endpoint", link.endpoint]
+    meeting = _meeting(link)
     listening = ["--insecure"] if request.insecure else []
     joins = request.router is not None or request.with_router
     host_arguments = [
@@ -156,10 +165,7 @@ def _conduct(
         if request.record and files.folder is not None:
             recorder = ["snakesim_operator.recording.process", *common, *meeting, "--out", str(files.folder)]
             supervisor.start(RECORDER, recorder, vital=False)
-        with (
-            console_beside([*common, *meeting], files, say) if request.console else contextlib.nullcontext(),
-            _joined(link, supervisor, ending) as session,
-        ):
+        with _joined(link, supervisor, ending) as session:
             say(f"{config.name}: {config.robot.name} in {config.scene.name}, {config.commander}, {config.pace}")
             say(f"network: {link.endpoint}, namespace {link.namespace}")
             if not config.has_own_control:
@@ -169,6 +175,10 @@ def _conduct(
         ending.because(str(error))
     finally:
         supervisor.end()
+
+
+def _meeting(link: Link) -> list[str]:
+    return ["--session", str(link.session.path)] if link.session else ["--endpoint", link.endpoint]
 
 
 @contextlib.contextmanager

@@ -1,7 +1,6 @@
 """`snakesim echo`: prints the messages on a key, as one JSON object a line, or their rate."""
 
 import contextlib
-import difflib
 import itertools
 import json
 import statistics
@@ -15,7 +14,7 @@ from typing import Any
 
 import msgspec
 
-from snakesim_hal.errors import ConfigError, NotConnectedError, WireError, short
+from snakesim_hal.errors import ConfigError, NotConnectedError, WireError, did_you_mean, short
 from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.session import Arrival, Session, intersects, key_expression, open_session
 from snakesim_hal.terminal import Say, complain, say
@@ -46,9 +45,9 @@ def echo(request: EchoRequest, where: Where, say: Say = say) -> int:
     relative = key_expression(request.key.strip("/"))
     rows = [row for row in _echoed() if intersects(relative, row.key)]
     if not rows:
-        close = difflib.get_close_matches(request.key, [row.key for row in _echoed()], 1, 0.6)
-        meant = [f"did you mean `{close[0]}`?"] if close else []
-        raise ConfigError(f"there is no key {short(request.key)!r}; available keys:", *_key_lines(), *meant)
+        meant = did_you_mean(request.key, [row.key for row in _echoed()]).strip()
+        lines = [*_key_lines(), meant] if meant else _key_lines()
+        raise ConfigError(f"there is no key {short(request.key)!r}; available keys:", *lines)
     latched = tuple(row.key for row in rows if row.kind == "latched")
     within = "" if where.namespace is not None else "**/"
     pattern, latched_keys = key_expression(f"{within}{relative}"), tuple(f"{within}{key}" for key in latched)

@@ -1,10 +1,9 @@
 """`snakesim fault`: inject a fault into a run that allows it, and end it."""
 
-import difflib
 from dataclasses import dataclass
 from math import inf
 
-from snakesim_hal.errors import ConfigError, NotConnectedError, RefusedError, short
+from snakesim_hal.errors import ConfigError, NotConnectedError, RefusedError, did_you_mean, short
 from snakesim_hal.model.injection import KINDS, Injection, checked, explain
 from snakesim_hal.network.session import open_session
 from snakesim_hal.terminal import Say, say
@@ -35,8 +34,7 @@ def fault(order: FaultOrder, where: Where, say: Say = say) -> int:
         return 0
     kinds = sorted({kind for of_target in KINDS.values() for kind in of_target})
     if order.kind not in kinds:
-        close = difflib.get_close_matches(order.kind, kinds, 1, 0.6)
-        meant = f"did you mean `{close[0]}`? " if close else ""
+        meant = did_you_mean(order.kind, kinds)
         raise ConfigError(
             f"fault {short(order.kind)}: there is no such kind; {meant}`snakesim fault list` explains all"
         )

@@ -1,5 +1,6 @@
 """`snakesim scenarios` and `snakesim config`: what is shipped, and what a scenario comes to."""
 
+from snakesim_hal.errors import short
 from snakesim_hal.model.files import read_part, shipped
 from snakesim_hal.model.plugin_check import check_plugins
 from snakesim_hal.model.plugins import in_file
@@ -31,7 +32,10 @@ def show_config(loaded: Loaded, *, as_json: bool) -> int:
     if as_json:
         say_json({key: {"value": value, "origin": origin} for key, value, origin in loaded.explain()})
         return 0
-    rows = [(key, _shown(value), origin) for key, value, origin in loaded.explain()]
+    rows = [
+        (key, short(repr(value) if isinstance(value, str) else str(value)), origin)
+        for key, value, origin in loaded.explain()
+    ]
     key_width = max(len(key) for key, _, _ in rows)
     value_width = min(max(len(value) for _, value, _ in rows), 48)
     for key, value, origin in rows:
@@ -43,8 +47,3 @@ def show_config(loaded: Loaded, *, as_json: bool) -> int:
         if in_file(name):
             say(f"{section}: not checked, because that would run {name}; `snakesim run` checks it")
     return 0
-
-
-def _shown(value: object) -> str:
-    text = repr(value) if isinstance(value, str) else str(value)
-    return text if len(text) <= 120 else text[:117] + "..."

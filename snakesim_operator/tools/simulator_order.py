@@ -42,7 +42,7 @@ def order_of(arguments: argparse.Namespace) -> SimulatorOrder:
     action, number = arguments.action, arguments.number
     if action == "step":
         ticks = 1 if number is None else number
-        if ticks != int(ticks) or not 1 <= ticks <= MOST_TICKS:
+        if not 1 <= ticks <= MOST_TICKS or ticks != int(ticks):  # in this order: NaN and infinity have no int()
             raise ConfigError(f"sim step {ticks:g}: give a whole number of ticks from 1 to {MOST_TICKS}")
         return SimulatorOrder(action, ticks=int(ticks))
     if action == "speed":

@@ -172,7 +172,7 @@ def _what_to_type(link: Link, status: Status) -> list[str]:
 
 def run_router(config: Path | None, *, insecure: bool = False) -> int:
     """Run a router until Ctrl-C."""
-    from snakesim_hal.network.session import open_router
+    from snakesim_hal.network.router import open_router
 
     path = config or ROUTER
     with open_router(path, insecure=insecure):

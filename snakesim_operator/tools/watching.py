@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from snakesim_hal.arguments import add_json, add_network
+from snakesim_hal.arguments import add_json, add_network, number
 from snakesim_operator.tools.where import where_of
 
 
@@ -24,16 +24,18 @@ def add_commands(commands: Any) -> None:
     echo = commands.add_parser("echo", help="print what is published on a key, one JSON object a line")
     echo.add_argument("key", nargs="?", help="such as sensor/joints or sensor/*; without it, list the keys")
     echo.add_argument("--hz", action="store_true", help="print only rate and jitter")
-    echo.add_argument("--count", type=int, help="end after this many messages")
+    echo.add_argument("--count", type=number(1, 10**9), help="end after this many messages")
     add_network(echo)
     echo.set_defaults(act=_echo)
 
     record = commands.add_parser("record", help="record everything that a robot publishes into an MCAP file")
     record.add_argument("--out", type=Path, metavar="FILE.mcap", help="the file (default: NAMESPACE-TIME.mcap)")
-    record.add_argument("--duration", type=float, metavar="S", help="end after this time by the wall clock")
+    record.add_argument(
+        "--duration", type=number(0.0, 1e9, "s"), metavar="S", help="end after this time by the wall clock"
+    )
     record.add_argument(
         "--foxglove",
-        type=int,
+        type=number(0, 65535),
         nargs="?",
         const=8765,
         metavar="PORT",

@@ -93,6 +93,11 @@ class Running:
         """What the command has printed so far."""
         return self.out.with_suffix(".said").read_text(encoding="utf-8")
 
+    def console(self) -> str:
+        """The address of its live console, once it is told."""
+        self.wait_for("console: http")
+        return next(line.split()[1] for line in self.said().splitlines() if line.startswith("console: "))
+
     def end(self, limit_s: float = LIMIT_S) -> int:
         """Wait for the exit code."""
         return self.process.wait(limit_s)

@@ -76,7 +76,8 @@ def test_a_client_leases_arms_moves_and_disarms(run: Running) -> None:
         assert 0.09 < furthest[2] < 0.11, furthest
         assert max(furthest[:2] + furthest[3:]) < 0.03, furthest
         now = status(session)
-        assert now.lifecycle == "disarmed" and now.commands_rejected == {}
+        assert now.lifecycle == "disarmed"
+        assert now.commands_rejected in ({}, {"no_lease": 1})  # its last, if that arrives after it has left
         assert now.commands_accepted > 50 and {fault.what for fault in now.faults} <= {"service_lost"}
 
 

@@ -25,7 +25,7 @@ from snakesim_hal.model import files, injection, scenario
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scene import SceneFile
 from snakesim_hal.network.local_registry import LocalRobot, local_robots
-from snakesim_hal.network.session import router_settings
+from snakesim_hal.network.router import router_settings
 from snakesim_hal.network.stop_port import REQUEST, ask_to_stop, open_stop_port, serve_stops
 from snakesim_hal.wire.codec import Decoder, encode, encoding_of
 from snakesim_hal.wire.messages import EstopRequest, Pose

@@ -25,7 +25,6 @@ from snakesim_operator.lab.zenoh_files import session_settings
 from tests.e2e.command import SNAKESIM, environment
 
 OWN, OTHER = "planar13", "second"
-REFUSALS = "info,zenoh::net::routing::interceptor::access_control=trace"
 LIMIT_S = 20.0
 COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 MACHINES = ("hub", "robot1", "robot2", "ws1", "ws2", "laptop")
@@ -111,7 +110,7 @@ def small_lab(folder: Path) -> Iterator[SmallLab]:
         router = subprocess.Popen(
             [*SNAKESIM, "router", str(folder / "hub" / "router.main.json5")],
             cwd=folder,
-            env=environment(folder, RUST_LOG=REFUSALS),
+            env=environment(folder),
             stdout=out,
             stderr=subprocess.STDOUT,
             preexec_fn=lambda: die_with_parent(parent),

@@ -1,5 +1,7 @@
 """Every role x key x kind of message, at a real router with mTLS: what the table grants passes, and nothing else.
 
+What does not pass is in the router's log, with the name in the certificate.
+
 The witness holds a router's certificate: everything that the router lets pass reaches it, and whatever it sends passes
 on its side, so that only the rules of the other side decide.
 """
@@ -27,6 +29,15 @@ STRAYS = {
 PLACES = (*KEYS.values(), *STRAYS)
 KINDS = ("publish", "delete", "read", "ask", "answer", "declare", "watch")
 TO_ALL = "from the witness"
+REFUSED = {  # in the words of the router's log
+    "publish": ("Put (ingress)",),
+    "delete": ("Delete (ingress)",),
+    "read": ("Put (egress)", "Declare Subscriber (ingress)"),
+    "ask": ("Query (ingress)",),
+    "answer": ("Declare Queryable (ingress)",),
+    "declare": ("Liveliness Token (ingress)",),
+    "watch": ("Liveliness Query (ingress)",),
+}
 
 Seen = dict[str, set[str]]  # by kind: the keys at which it passed
 
@@ -61,7 +72,32 @@ def test_what_the_table_grants_passes_and_nothing_else(
     who = lab.who(role, robot)
     with lab.session(who) as session:
         seen = {**samples(session, witness), **queries(session, witness), **tokens(session, witness)}
-    assert seen == expected(role, robot), who.common_name
+    granted = expected(role, robot)
+    assert seen == granted, who.common_name
+    refused = {kind: set(PLACES) - keys for kind, keys in granted.items()}
+    eventually(lambda: told(lab, who.common_name), refused)
+
+
+def told(lab: SmallLab, name: str) -> Seen:
+    """What the router's log says that it refused to a certificate."""
+    said = [line.partition(f" refused: {name}: ")[2] for line in lab.said()]
+    return {
+        kind: {
+            line.removeprefix(start)
+            for words in all_words
+            for line in said
+            if line.startswith(start := f"{words} on {OWN}/")
+        }
+        for kind, all_words in REFUSED.items()
+    }
+
+
+def eventually(what: Callable[[], Any], wanted: Any) -> None:
+    """The log is read a moment after it is written."""
+    deadline = time.monotonic() + 2.0
+    while (found := what()) != wanted and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert found == wanted
 
 
 @pytest.mark.parametrize("role", [Role.VIEWER, Role.OPERATOR, Role.GNC])

@@ -52,6 +52,25 @@ def test_what_cannot_be_meant_tells_the_way_out(typed: str, way_out: str, tmp_pa
     assert len(ended.err.splitlines()) == 1
 
 
+@pytest.mark.parametrize(
+    ("typed", "way_out"),
+    [
+        ("ros2 --domain 233", "'233': give a whole number from 0 to 232"),
+        ("ros2 --image-hz nan", "'nan': give a number from 0.1 to 200 Hz"),
+        ("console runs/a --at nan", "'nan': give a number from 0 to inf s"),
+        ("console --port 65536", "'65536': give a whole number from 0 to 65535"),
+        ("record --duration -1", "'-1': give a number from 0 to 1000000000 s"),
+        ("replay runs/a --rate 1e-320", "'1e-320': give a number from 0.001 to 1000000"),
+        ("evaluate random_field --fields 0", "'0': give a whole number from 1 to 100000"),
+        ("sim step inf", "give a whole number of ticks from 1 to 1000000"),
+    ],
+)
+def test_a_number_out_of_bounds_is_told_its_bounds(typed: str, way_out: str, tmp_path: Path) -> None:
+    ended = snakesim(*typed.split(), cwd=tmp_path)
+    assert ended.code == 2 and way_out in ended.err, ended.err
+    assert len(ended.err.splitlines()) == 1
+
+
 def test_config_tells_where_each_value_came_from(tmp_path: Path) -> None:
     ended = snakesim("config", "triplet", "--seed", "5", "--set", "control.propulsion_n=20", cwd=tmp_path)
     assert ended.code == 0, ended.err

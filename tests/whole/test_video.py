@@ -51,7 +51,7 @@ def test_an_mp4_is_one(run: Path) -> None:
     [
         (["--out", "film.avi"], "ends in .mp4 or .gif"),
         (["--out", "film.gif", "--from", "5"], "the run has poses for"),
-        (["--out", "film.gif", "--width", "65"], "pixels must be even"),
+        (["--out", "film.gif", "--width", "65"], "give even numbers of pixels"),
     ],
 )
 def test_what_cannot_be_filmed_is_said(run: Path, more: list[str], said: str) -> None:

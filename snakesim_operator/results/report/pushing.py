@@ -6,14 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesim_hal.model.scene import GRAVITY_M_S2
 from snakesim_hal.wire.messages import WorldContact
 from snakesim_operator.results.map_score import MapScore, score
 from snakesim_operator.results.page.charts import Bar, Figure, Line, bars, lines
 from snakesim_operator.results.record import RunRecord
-from snakesim_operator.results.report.timeline import end_s, told_at_s, zero_s
+from snakesim_operator.results.report.timeline import end_s, told_at_s, told_spans, zero_s
 
 Floats = NDArray[np.float64]
-GRAVITY_M_S2 = 9.81
 MOST_OBSTACLES = 24  # that get a row of their own: those that gave most
 LEAST_N = 0.5  # a smaller wanted force is none
 STOOD_S = 0.5  # a shorter stop is not worth a line
@@ -95,9 +95,7 @@ def _sum_w(contacts: list[WorldContact]) -> Floats:
 def _obstacles(record: RunRecord) -> Figure:
     """A row for each obstacle that was pushed off, in the order of their first use."""
     spans: dict[str, list[tuple[float, float, float]]] = {}
-    ends = [told_at_s(record, one) for one in record.control[1:]] + [end_s(record)]
-    for state, until in zip(record.control, ends, strict=True):
-        since = told_at_s(record, state)
+    for since, until, state in told_spans(record):
         for contact in state.push_points:
             force_n = math.hypot(*contact.force_w[:2])
             if force_n >= LEAST_N and until > since:
@@ -124,12 +122,10 @@ def _joined(spans: list[tuple[float, float, float]]) -> list[tuple[float, float,
 
 def _stops(record: RunRecord) -> list[Stop]:
     """Every time that it did not locomote for a while."""
-    ends = [told_at_s(record, one) for one in record.control[1:]] + [end_s(record)]
     found: list[Stop] = []
     reasons: dict[str, float] = {}
-    for state, until in zip([*record.control, None], [*ends, end_s(record)], strict=True):
-        if state is not None and state.state == "NotLocomoting":
-            since = told_at_s(record, state)
+    for since, until, state in told_spans(record):
+        if state.state == "NotLocomoting":
             if not reasons:
                 found.append(Stop(since, until, ""))
             reasons[state.reason] = reasons.get(state.reason, 0.0) + until - since

@@ -71,6 +71,12 @@ def told_at_s(record: RunRecord, state: ControlState) -> float:
     return min(max(state.stamp_ns * 1e-9 - zero_s(record), 0.0), end_s(record))
 
 
+def told_spans(record: RunRecord) -> list[tuple[float, float, ControlState]]:
+    """(since, until, state) on the time axis: each state holds until the next is told."""
+    starts = [told_at_s(record, state) for state in record.control]
+    return list(zip(starts, [*starts, end_s(record)][1:], record.control, strict=True))
+
+
 def state_bands(record: RunRecord) -> list[Band]:
     """Locomotion states; each holds until the next is told."""
     return _merged(record, [state.state for state in record.control])
@@ -167,14 +173,12 @@ def told_distance(record: RunRecord) -> Series | None:
 
 def _merged(record: RunRecord, told: list[str | None]) -> list[Band]:
     """Equal neighbours become one band; None is left out."""
-    starts = [told_at_s(record, state) for state in record.control]
     bands: list[Band] = []
-    for i, what in enumerate(told):
-        until = starts[i + 1] if i + 1 < len(starts) else end_s(record)
-        if what is None or until <= starts[i]:
+    for (since, until, _), what in zip(told_spans(record), told, strict=True):
+        if what is None or until <= since:
             continue
-        if bands and bands[-1].what == what and bands[-1].end_s >= starts[i]:
+        if bands and bands[-1].what == what and bands[-1].end_s >= since:
             bands[-1] = Band(bands[-1].start_s, until, what)
         else:
-            bands.append(Band(starts[i], until, what))
+            bands.append(Band(since, until, what))
     return bands

@@ -31,10 +31,7 @@ class Steering:
     def turn(self, by_rad: float, body_w_rad: float | None, now_s: float) -> None:
         """Turn the wanted direction, positive to the left; at first from the body's, when that is known."""
         before = body_w_rad or 0.0 if self.heading_w_rad is None else self.heading_w_rad
-        body = before if body_w_rad is None else body_w_rad
-        ahead = math.remainder(before + by_rad - body, 2 * math.pi)
-        self.heading_w_rad = math.remainder(body + max(-LEAD_RAD, min(LEAD_RAD, ahead)), 2 * math.pi)
-        self.touched_s = now_s
+        self.heading_w_rad, self.touched_s = turned(before, by_rad, body_w_rad), now_s
 
     def stop(self, now_s: float) -> None:
         """Stand still; the direction stays."""
@@ -50,3 +47,10 @@ class Steering:
             valid_for_ns=VALID_NS,
             heading_w_rad=self.heading_w_rad,
         )
+
+
+def turned(heading_w_rad: float, by_rad: float, body_w_rad: float | None) -> float:
+    """A wanted direction after a turn, positive to the left; it runs ahead of the body's, if known, by a limit."""
+    body = heading_w_rad if body_w_rad is None else body_w_rad
+    ahead = math.remainder(heading_w_rad + by_rad - body, 2 * math.pi)
+    return math.remainder(body + max(-LEAD_RAD, min(LEAD_RAD, ahead)), 2 * math.pi)

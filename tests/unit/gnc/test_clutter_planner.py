@@ -140,6 +140,6 @@ def test_a_heading_that_is_asked_for_counts_and_not_the_mission(heading_rad: flo
     assert turned.path_id != ahead.path_id and not turned.finished
     way = np.array(turned.path_w[-1]) - moved[-1]
     reached = np.clip(heading_rad, -1.2, 1.2)  # one path turns the head by no more
-    assert np.arctan2(way[1], way[0]) == pytest.approx(reached, abs=0.35)
+    assert np.arctan2(way[1], way[0]) == pytest.approx(reached, abs=0.45)  # as obstacles let it
     assert planned(made, moved, 0.4, heading_rad=heading_rad + 0.1).path_id == turned.path_id
     assert planned(made, moved, 0.6).finished  # the mission again

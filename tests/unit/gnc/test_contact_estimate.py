@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from snakesim_gnc.guidance.contact_estimate import FeltContact, G, estimate
+from snakesim_gnc.guidance.contact_estimate import FeltContact, estimate
 from snakesim_hal.model.kinematics import link_frames
+from snakesim_hal.model.scene import GRAVITY_M_S2
 from snakesim_hal.wire.messages import Imu, Pose
 from tests.unit.gnc.stage import make_robot
 
@@ -26,14 +27,15 @@ def readings(pushes, shape=SHAPE, *, friction=0.0, acceleration=(0.0, 0.0)):
     middles = rear + frames[:, :, 0] * np.array(LENGTHS)[:, None] / 2
     masses = np.array([link.mass_kg for link in ROBOT.links])
     loads = [
-        (k, middles[k], masses[k] * (np.array([-friction * G, 0, 0]) - [*acceleration, 0])) for k in range(COUNT + 1)
+        (k, middles[k], masses[k] * (np.array([-friction * GRAVITY_M_S2, 0, 0]) - [*acceleration, 0]))
+        for k in range(COUNT + 1)
     ]
     for link, side, along_m, force_n in pushes:
         outward = side * frames[link][:, 1] if side else frames[link][:, 0]
         point = rear[link] + along_m * frames[link][:, 0] + ROBOT.links[link].radius_m * outward
         loads.append((link, point, -force_n * outward))
     torques = [-sum(np.cross(at - rear[i + 1], load)[2] for k, at, load in loads if k > i) for i in range(COUNT)]
-    felt = [tuple(frame.T @ [*acceleration, G]) for frame in frames]
+    felt = [tuple(frame.T @ [*acceleration, GRAVITY_M_S2]) for frame in frames]
     still = [(0.0, 0.0, 0.0)] * (COUNT + 1)
     imu = Imu(tick=0, stamp_ns=0, link=list(range(COUNT + 1)), angular_velocity_rad_s=still, acceleration_m_s2=felt)
     centre = masses @ middles / masses.sum()
@@ -59,7 +61,7 @@ def test_friction_of_the_ground_is_no_contact():
         velocity_w=(0.3, 0.0, 0.0),
         angular_velocity_w=(0, 0, 0),
     )
-    torques, imu, *_ = readings([], friction=0.3, acceleration=(-0.3 * G, 0.0))
+    torques, imu, *_ = readings([], friction=0.3, acceleration=(-0.3 * GRAVITY_M_S2, 0.0))
     assert estimated(torques, imu, pose=pose) == []
 
 

@@ -16,6 +16,19 @@ from tests.unit.gnc.stage import BODY_RADIUS_M, make_pegs, make_route, make_stag
 SEEDS = st.integers(0, 2**31)
 
 
+def turns(nodes: np.ndarray) -> np.ndarray:
+    """Change of the joint angles per metre of the way, of a body on the usual route."""
+    stage = make_stage()
+    tail_s_m = stage.route.project(nodes[:, 0])
+    now, then = (angles_of(nodes_of(stage, s)) for s in (tail_s_m, tail_s_m + 0.01))
+    return (then - now) / 0.01
+
+
+def angles_of(nodes: np.ndarray) -> np.ndarray:
+    headings = np.arctan2(*np.diff(nodes, axis=1)[::-1])
+    return np.diff(np.unwrap(headings))
+
+
 @given(seed=SEEDS, count=st.integers(3, 8))
 @settings(max_examples=50)
 def test_the_margin_is_that_of_the_best_three_contacts(seed: int, count: int) -> None:
@@ -48,7 +61,7 @@ def test_a_push_is_in_balance_and_only_pushes(tail_s_m: float) -> None:
     nodes = nodes_of(stage, tail_s_m)
     outlines = Outlines.of(make_pegs(make_route()))
     touches = find_touches(nodes, BODY_RADIUS_M, outlines, reach_m=0.03, friction=0.0)
-    push = push_forward(nodes, touches, loose_m=0.005)
+    push = push_forward(nodes, touches, turns(nodes), loose_m=0.005)
     assert len(touches) >= 3 and push.balanced
     assert push.lambdas.min() >= 0.0
     forces = push.lambdas[:, None] * touches.directions_w
@@ -74,7 +87,19 @@ def test_whatever_touches_it_a_balanced_push_has_no_pull(seed: int) -> None:
     nodes = nodes_of(make_stage(), float(random.uniform(0.0, 2.0)))
     pegs = [p for p in make_pegs(make_route()) if random.uniform() < 0.6]
     touches = find_touches(nodes, BODY_RADIUS_M, Outlines.of(pegs), reach_m=0.03, friction=0.0)
-    push = push_forward(nodes, touches, loose_m=0.005)
+    push = push_forward(nodes, touches, turns(nodes), loose_m=0.005)
     assert (push.lambdas >= 0.0).all() and np.isfinite(push.torques_nm).all()
     if len(touches) < 3:
         assert not push.balanced
+
+
+@pytest.mark.parametrize("tail_s_m", [0.1, 0.3, 0.55, 0.9])
+def test_no_joint_works_against_the_others_where_the_contacts_allow_it(tail_s_m: float) -> None:
+    nodes = nodes_of(make_stage(), tail_s_m)
+    touches = find_touches(nodes, BODY_RADIUS_M, Outlines.of(make_pegs(make_route())), reach_m=0.03, friction=0.0)
+    slope = turns(nodes)
+    thrifty, smallest = (push_forward(nodes, touches, one, loose_m=0.005) for one in (slope, np.zeros_like(slope)))
+    assert thrifty.balanced and smallest.balanced
+    done, circled = (np.abs(one.torques_nm * slope).sum() for one in (thrifty, smallest))
+    assert done < 0.9 * circled
+    assert done < 1.5  # J per metre and newton; by virtual work 1 is the least

@@ -36,7 +36,7 @@ def seen(*obstacles: Obstacle) -> World:
 
 def pushing(world: World):
     touches = find_touches(NODES, 0.04, Outlines.of(world.obstacles), reach_m=0.03, friction=0.0)
-    return touches, push_forward(NODES, touches, loose_m=0.005)
+    return touches, push_forward(NODES, touches, np.zeros(len(NODES[0]) - 2), loose_m=0.005)
 
 
 def test_the_told_forces_push_the_body_with_the_force_that_is_wanted() -> None:

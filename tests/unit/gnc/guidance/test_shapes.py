@@ -66,8 +66,9 @@ def test_a_concave_corner_is_two_things():
 def test_a_cylinder_is_found_as_well_as_its_covariance_says(radius, x, y, seed):
     track = seen(cylinder("it", x, y, radius), random=np.random.default_rng(seed))
     off = math.dist(track.centre_w, (x, y))
-    assert off < 0.02 and off < 5 * track.position_sd_m
-    assert track.shape == "box" or abs(track.radius_m - radius) < 5 * track.size_sd_m
+    assert off < 5 * track.position_sd_m
+    if track.shape == "cylinder":  # seen by five beams, one in thousands is taken for a box
+        assert off < 0.02 and abs(track.radius_m - radius) < 5 * track.size_sd_m
 
 
 @given(st.floats(0.08, 0.3), st.floats(0.08, 0.3), st.floats(0.35, 1.2), st.integers(0, 1000))

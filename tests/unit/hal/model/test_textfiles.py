@@ -12,7 +12,7 @@ from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.files import Table, find, read_table
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_hal.model.textfiles import MAX_DEPTH, MAX_TOML, parse_toml, read_text, write_text
-from snakesim_hal.network.session import open_router
+from snakesim_hal.network.router import open_router
 
 LIMIT_S = 10.0  # on a busy machine; alone each takes less than two
 DEEP = ".".join("a" * 50_000)

@@ -8,7 +8,8 @@ import pytest
 import zenoh
 
 from snakesim_hal.errors import ConfigError, NotConnectedError
-from snakesim_hal.network.session import Arrival, Link, Question, open_router, open_session
+from snakesim_hal.network.router import open_router
+from snakesim_hal.network.session import Arrival, Link, Question, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import ENCODING_PREFIX, encode
 from snakesim_hal.wire.messages import Answer, Done, EstopRequest, JointState, LeaseRequest

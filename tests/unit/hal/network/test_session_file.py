@@ -7,7 +7,8 @@ import pytest
 import zenoh
 
 from snakesim_hal.errors import ConfigError, NotConnectedError
-from snakesim_hal.network.session import Link, open_router, open_session
+from snakesim_hal.network.router import open_router
+from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.network.session_file import read_session
 from tests.e2e.command import free_endpoint, wait_until
 

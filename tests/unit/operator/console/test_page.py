@@ -1,22 +1,32 @@
 """The console's page: who may open it, who may command, and what strangers can write on it."""
 
+import asyncio
+import socket
+import threading
+
 import msgspec
+import numpy as np
 import pytest
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from snakesim_hal.errors import NotConnectedError
+from snakesim_hal.model.scenario import capsules_at_start, load
 from snakesim_hal.wire.messages import Status
 from snakesim_operator.console import texts
-from snakesim_operator.console.moment import Moment
+from snakesim_operator.console.drawing import draw
+from snakesim_operator.console.moment import Moment, expected_of
+from snakesim_operator.console.port import address_of, open_port
 from snakesim_operator.console.server import page_server
 from snakesim_operator.console.token import ControlToken
+from tests.e2e.command import wait_until
 from tests.unit.hal.rig import description, status
+from tests.viewer import watch
 
 
 def test_a_page_of_another_site_cannot_connect():
     """Any site could open a connection to loopback from the operator's browser."""
-    with page_server(None) as (server, address):
+    with page_server(open_port(None)) as (server, address):
         socket = address.replace("http", "ws")
         for theirs in (
             "https://example.org",
@@ -31,14 +41,30 @@ def test_a_page_of_another_site_cannot_connect():
 
 
 def test_a_port_that_is_taken_is_an_error_and_no_other_port():
-    with page_server(None) as (server, _):
-        second = page_server(server.get_port())
-        with pytest.raises(NotConnectedError, match="another program listens"):
-            second.__enter__()
+    with open_port(None) as first, pytest.raises(NotConnectedError, match="another program listens"):
+        open_port(first.getsockname()[1])
+
+
+def test_a_browser_that_comes_before_the_page_gets_it():
+    listening = open_port(None)
+    with socket.create_connection(listening.getsockname(), timeout=10.0) as early:
+        early.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+        viewers = [threading.Thread(target=come, args=(address_of(listening),)) for _ in range(3)]
+        for viewer in viewers:
+            viewer.start()
+        with page_server(listening) as (server, _):
+            assert early.recv(15) == b"HTTP/1.1 200 OK"
+            wait_until(lambda: len(server.get_clients()) == len(viewers), "the viewers that came early")
+        for viewer in viewers:
+            viewer.join(10.0)
+
+
+def come(address: str) -> None:
+    asyncio.run(watch(address))
 
 
 def test_nobody_can_open_a_tunnel_to_the_internet():
-    with page_server(None) as (server, _):
+    with page_server(open_port(None)) as (server, _):
         assert server.request_share_url() is None
 
 
@@ -69,6 +95,17 @@ def test_the_page_says_that_a_simulator_is_paused_and_by_whom():
     shown = texts.header(Moment(robot=description(), status=status(paused_by="<b>ada")))
     assert ">PAUSED<" in shown and "by &lt;b&gt;ada" in shown
     assert "PAUSED" not in texts.header(Moment(robot=description(), status=status()))
+
+
+def test_a_robot_that_is_only_expected_is_drawn_at_its_start_and_called_nothing_else():
+    config = load("triplet").config
+    moment = expected_of(config)
+    drawing = draw(moment, None)
+    assert drawing is not None
+    start = capsules_at_start(config)
+    middles = [np.add(capsule.rear_m, capsule.front_m) / 2 for capsule in start]
+    assert drawing.links_w[:, :2] == pytest.approx(np.array(middles))
+    assert "WAITING FOR THE ROBOT" in texts.header(moment) and "SIMULATOR" not in texts.header(moment)
 
 
 @pytest.mark.parametrize(

@@ -13,9 +13,6 @@ from snakesim_operator.ros2.relay import Stamps
 @pytest.mark.parametrize(
     ("arguments", "word"),
     [
-        (["--domain", "233"], "--domain 233: a ROS domain is a number from 0 to 232"),
-        (["--hz", "0"], "--hz 0: give from 0.1 to 200 Hz"),
-        (["--image-hz", "nan"], "--image-hz nan: give from 0.1 to 200 Hz"),
         (["--ros-namespace", "/2nd robot"], "--ros-namespace '/2nd robot': give a name such as planar13"),
         (["--ros-router", "localhost"], "--ros-router"),
     ],

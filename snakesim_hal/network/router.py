@@ -1,0 +1,50 @@
+"""A Zenoh router from a JSON5 file: `snakesim router`."""
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+
+import zenoh
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.network.endpoint import check_guarded
+from snakesim_hal.network.router_log import ZENOH_LEVELS, short_log
+from snakesim_hal.network.session_file import of_mode, read_zenoh_file, refused_by_zenoh
+
+
+def router_settings(config: Path) -> zenoh.Config:
+    """The settings in a router's JSON5 file; opens nothing. Raises ConfigError."""
+    _, settings = read_zenoh_file(config)
+    if json.loads(settings.get_json("mode")) != "router":
+        raise ConfigError(f'{config}: `mode` must be "router"')
+    return settings
+
+
+def _denies_by_default(settings: zenoh.Config) -> bool:
+    rules = json.loads(settings.get_json("access_control"))
+    return bool(rules["enabled"]) and rules["default_permission"] == "deny"
+
+
+@contextmanager
+def open_router(config: Path, *, insecure: bool = False) -> Iterator[None]:
+    """Run a Zenoh router from a JSON5 file for as long as the context lives. Raises ConfigError.
+
+    insecure: also one that other machines can connect to, and that does not deny what its rules do not allow.
+    Its log is short, unless RUST_LOG asks for Zenoh's own.
+    """
+    settings = router_settings(config)
+    for endpoint in of_mode(settings, "listen/endpoints", "router"):
+        guarded = _denies_by_default(settings)
+        check_guarded(endpoint, f"{config}: `listen.endpoints`:", access_control=guarded, insecure=insecure)
+    with nullcontext() if "RUST_LOG" in os.environ else short_log():
+        zenoh.init_log_from_env_or(ZENOH_LEVELS)
+        try:
+            session = zenoh.open(settings)
+        except zenoh.ZError as error:
+            raise refused_by_zenoh(config, error) from error
+        try:
+            yield
+        finally:
+            session.close()

@@ -1,0 +1,25 @@
+"""Drawn shapes are closed, of the size that they are asked for, and show their outside."""
+
+import math
+
+import numpy as np
+import pytest
+
+from snakesim_operator.console.meshes import Mesh, box, capsule, cylinder, sphere
+
+
+@pytest.mark.parametrize(
+    ("mesh", "half_m", "volume_m3"),
+    [
+        (capsule(0.1, 0.03), (0.08, 0.03, 0.03), math.pi * 0.03**2 * (0.1 + 4 / 3 * 0.03)),
+        (sphere(1.0), (1.0, 1.0, 1.0), 4 / 3 * math.pi),
+        (cylinder(1.0, 2.0), (1.0, 1.0, 1.0), 2 * math.pi),
+        (box(1.0), (1.0, 1.0, 1.0), 8.0),
+    ],
+)
+def test_a_shape_has_its_size_and_faces_outwards(mesh: Mesh, half_m: tuple[float, ...], volume_m3: float):
+    vertices, faces = mesh
+    assert vertices.max(axis=0) == pytest.approx(half_m) and vertices.min(axis=0) == pytest.approx(np.negative(half_m))
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    # Tetrahedra from the origin to each face: their sum is the volume, and negative for a shape inside out.
+    assert np.einsum("ij,ij->", a, np.cross(b, c)) / 6 == pytest.approx(volume_m3, rel=0.03)
