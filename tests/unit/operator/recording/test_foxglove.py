@@ -2,12 +2,16 @@
 
 import json
 import math
+import subprocess
+import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
+from mcap.exceptions import EndOfFile
+from mcap.reader import NonSeekingReader, make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from snakesim_hal.model.kinematics import rotation_from_quaternion
@@ -146,11 +150,36 @@ def test_the_layout_shows_fields_that_a_recording_has(run: Path) -> None:
         assert isinstance(at, (str, float)), path
 
 
-def test_a_recording_that_was_cut_off_is_made_whole(run: Path, tmp_path: Path) -> None:
-    whole = (run / RECORDING).read_bytes()
-    (tmp_path / "torn.mcap").write_bytes(whole[: len(whole) * 9 // 10])
-    count = recover(tmp_path / "torn.mcap", tmp_path / "whole.mcap")
-    found = shown(tmp_path / "whole.mcap")
-    assert count > 500 and len(found["foxglove/tf"]) > 10
+KILLED = """
+import sys, time
+from pathlib import Path
+from snakesim_hal.network.session import Arrival
+from snakesim_operator.recording.reader import RecordingReader
+from snakesim_operator.recording.recording import Recording
+recording = Recording(Path(sys.argv[2]))
+for number, one in enumerate(RecordingReader(Path(sys.argv[1])).messages()):
+    recording.take(Arrival(one.key, one.payload, one.encoding, time.monotonic_ns()))
+    if number % 100 == 0:
+        recording.flush()
+print(flush=True)
+time.sleep(60)
+"""
+
+
+def test_what_a_killed_recorder_leaves_has_transforms_joints_and_images(run: Path, tmp_path: Path) -> None:
+    torn, typed = tmp_path / "torn.mcap", [sys.executable, "-c", KILLED, str(run / RECORDING)]
+    with subprocess.Popen([*typed, str(torn)], stdout=subprocess.PIPE) as recorder:
+        assert recorder.stdout is not None and recorder.stdout.readline() == b"\n"
+        recorder.kill()
+    found: dict[str, Any] = {}
+    with torn.open("rb") as file, suppress(EndOfFile):  # the stock reader, as far as the file goes
+        reader = NonSeekingReader(file, validate_crcs=True, decoder_factories=FACTORIES)
+        for _, channel, _, one in reader.iter_decoded_messages(log_time_order=False):
+            found[channel.topic] = one
+    assert len(found["foxglove/joints"].joints) == 13 and found["foxglove/tf"].transforms
+    assert len(found["foxglove/depth/head"].data) > 1000
+    count = recover(torn, tmp_path / "whole.mcap")  # for readers that want an index
+    whole = shown(tmp_path / "whole.mcap")
+    assert count > 500 and len(whole["foxglove/tf"]) > 10
     alone = RunRecord.load(tmp_path / "whole.mcap")
     assert len(alone.time_s) > 20 and not alone.lacks
