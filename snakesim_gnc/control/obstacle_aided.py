@@ -32,6 +32,7 @@ Floats = NDArray[np.float64]
 ANOTHER_SHAPE_RAD = 0.1
 SLOPE_M = 0.02  # over which theta' is taken
 SIGNS = np.random.default_rng(1).choice((-1.0, 1.0), 4096)
+LARGEST_REST = 0.3  # of a push: what is not in balance turns the body a little, until it meets other obstacles
 STANDS_M_S, STANDS_S = 0.01, 0.5  # slower than this for so long counts as standing still
 
 
@@ -168,7 +169,7 @@ class ObstacleAided:
             push = push_forward(located.nodes_w, touches, turns_per_m[self._bends], loose_m=config.loose_m)
             self._found = Found(located.world, touches, push)
             self._unit_nm, self._most_n = np.zeros(len(self._robot.joints)), 0.0
-            if push.balanced:
+            if push.rest < LARGEST_REST:
                 self._unit_nm[self._bends] = push.torques_nm
                 most = float(np.abs(push.torques_nm).max(initial=0.0)) + 1e-9
                 largest = float(push.lambdas.max())

@@ -23,7 +23,7 @@ Floats = NDArray[np.float64]
 
 SAMPLES = 5  # of each link
 BUMP = 0.6  # |n.t| of a contact: beyond, something stands before the head
-BALANCED = 0.05  # of the force that is left over
+BALANCED = 0.05  # share of the force that is left over
 MOST_STEPS = 30
 BALANCE, THRIFT, SMALL = 10.0, 0.05, 0.02  # weights of: the balance of forces, tau_i theta_i', the size of the forces
 
@@ -49,7 +49,12 @@ class Push:
 
     lambdas: Floats  # (k,)
     torques_nm: Floats  # (n_joints,), of the joints that bend
-    balanced: bool  # whether these contacts can push at all
+    rest: float  # of the 1 N: what no contact can balance
+
+    @property
+    def balanced(self) -> bool:
+        """Whether these contacts can push at all."""
+        return self.rest < BALANCED
 
 
 def find_touches(nodes_w: Floats, radius_m: float, outlines: Outlines, *, reach_m: float, friction: float) -> Touches:
@@ -104,8 +109,7 @@ def push_forward(nodes_w: Floats, touches: Touches, turns_per_m: Floats, *, loos
     costs = THRIFT * np.abs(turns_per_m)
     full = np.vstack([BALANCE * matrix / weight, costs[:, None] * lever / weight, SMALL * np.eye(len(touches))])
     lambdas = _least_squares(full, np.concatenate([BALANCE * drag, -costs * braked, np.zeros(len(touches))])) / weight
-    balanced = bool(np.linalg.norm(matrix @ lambdas - drag) < BALANCED)
-    return Push(lambdas, lever @ lambdas + braked, balanced)
+    return Push(lambdas, lever @ lambdas + braked, float(np.linalg.norm(matrix @ lambdas - drag)))
 
 
 def _least_squares(full: Floats, right: Floats) -> Floats:

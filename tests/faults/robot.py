@@ -62,7 +62,7 @@ class Robot:
         common = [str(self.folder / "config.json"), "--endpoint", self.endpoint]
         inherits: list[int] = []
         if name == "host":
-            module = ["snakesim_hal.host_process", *common, "--out", str(self.folder)]
+            module = ["snakesim_hal.host_process", *common, "--out", str(self.folder), "--insecure"]  # network_cut
             module += ["--router", self.endpoint] if self.router else []
             inherits = [self.host.inherited.fileno()]
             module += ["--channel", str(inherits[0])]
