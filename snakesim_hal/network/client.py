@@ -102,7 +102,7 @@ class Client:
         self._started_over = False
         self._host_left = False
         self.commanded_tick = -1
-        session.on_arrival(keys.CLOCK, self._take_clock)
+        session.on_urgent_arrival(keys.CLOCK, self._take_clock)
         session.on_alive(self._take_host, keys.HOST_ALL)
 
     def description(self, timeout_s: float = 10.0) -> Description:

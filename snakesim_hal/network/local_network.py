@@ -153,6 +153,10 @@ class LocalSession(Session):
         """Call `take` for every sample."""
         self._subscribe(key, take)
 
+    def on_urgent_arrival(self, key: str, take: Take) -> None:
+        """All arrivals are at once."""
+        self._subscribe(key, take)
+
     def on_latched_arrival(self, key: str, take: Take) -> None:
         """Like `on_arrival`, and for the values that were latched before."""
         for at, arrival in list(self._network.latched.items()):

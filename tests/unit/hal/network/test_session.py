@@ -1,6 +1,7 @@
 """The Zenoh session over real loopback links: latched values, queries, liveliness, and robots kept apart."""
 
 import socket
+import threading
 import time
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import zenoh
 
 from snakesim_hal.errors import ConfigError, NotConnectedError
 from snakesim_hal.network.router import open_router
-from snakesim_hal.network.session import Arrival, Link, Question, open_session
+from snakesim_hal.network.session import Arrival, Link, Publisher, Question, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import ENCODING_PREFIX, encode
 from snakesim_hal.wire.messages import Answer, Done, EstopRequest, JointState, LeaseRequest
@@ -89,6 +90,26 @@ def test_a_reader_keeps_the_newest_and_counts_what_it_cannot_take() -> None:
         wait_until(lambda: found.extend(reader.drain()) or found, "the good one")
         assert [joints.tick for joints in found] == [20]
         assert session.rejected == {"unknown_version": 1, "unknown_message": 1, "malformed": 1}
+
+
+def test_a_session_closes_while_urgent_samples_arrive() -> None:
+    """They are taken in Zenoh's own threads, which wait for the interpreter that closes the session."""
+    endpoint, stopped = free_endpoint(), threading.Event()
+
+    def talk(publisher: Publisher[Done]) -> None:
+        while not stopped.is_set():
+            publisher.put(Done(tick=0))
+
+    with open_session(Link(endpoint, "a", listen=True)) as hal:
+        talker = threading.Thread(target=talk, args=(hal.publisher(keys.done("one"), Done),), daemon=True)
+        talker.start()
+        for _ in range(5):
+            arrived: list[Arrival] = []
+            with open_session(Link(endpoint, "a")) as session:
+                session.on_urgent_arrival(keys.DONE_ALL, arrived.append)
+                wait_until(lambda arrived=arrived: len(arrived) > 100, "samples")
+        stopped.set()
+        talker.join()
 
 
 def test_robots_of_two_namespaces_do_not_hear_each_other_and_a_tool_hears_both() -> None:
