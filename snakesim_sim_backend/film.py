@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from snakesim_hal.model.plugins import plugin_settings
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_sim_backend.ground import PLANE_GROUP
+from snakesim_sim_backend.ground import GROUND, HILLS, PLANE_GROUP
 from snakesim_sim_backend.model import FOOT_GROUP, build
 from snakesim_sim_backend.sensors.rendered import opened_context
 from snakesim_sim_backend.settings import Settings
@@ -23,7 +23,11 @@ AZIMUTH_DEG, ELEVATION_DEG = 60.0, -58.0
 MARKS = 400  # arrows and the like in a picture
 BLUE = (0.0, 0.4, 0.75, 1.0)
 BACKGROUND = (236, 240, 244)  # beyond the scene
-AMBIENT = 0.6
+LINK, NEXT_LINK, HEAD = (0.20, 0.36, 0.54, 1.0), (0.30, 0.48, 0.68, 1.0), (0.09, 0.18, 0.33, 1.0)
+OBSTACLE, FLOOR, GRID = (0.80, 0.67, 0.47, 1.0), (0.90, 0.91, 0.93, 1.0), (0.62, 0.66, 0.72, 1.0)
+CELL_M, CELLS, LINE_M = 0.5, 8, 0.006  # of the grid on flat ground, by which one sees how far the snake has come
+SUN = np.array([0.45, 0.35, -0.82])  # its direction
+AMBIENT, HEADLIGHT, SUNLIGHT = 0.35, 0.25, 0.55
 SAMPLES = 4  # a pixel
 
 
@@ -37,7 +41,9 @@ class Film:
         self._model, self._data = self._sim.model, mujoco.MjData(self._sim.model)
         view, quality = self._model.vis.global_, self._model.vis.quality
         view.offwidth, view.offheight, quality.offsamples = width, height, SAMPLES
-        self._model.vis.headlight.ambient[:] = AMBIENT
+        self._model.vis.headlight.ambient[:], self._model.vis.headlight.diffuse[:] = AMBIENT, HEADLIGHT
+        self._flat = config.scene.ground.uneven is None
+        self._paint()
         self._gl = opened_context(width, height, "the film")
         self._gl.make_current()
         self._context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100)
@@ -67,7 +73,10 @@ class Film:
         self._gl.make_current()
         every = mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(self._model, self._data, self._option, None, self._camera, every, self._scene)
-        for start_w, end_w in arrows_w[:MARKS]:
+        self._add_sun(look_at_w)
+        if self._flat:
+            self._add_grid(look_at_w)
+        for start_w, end_w in arrows_w:
             self._add_arrow(start_w, end_w)
         mujoco.mjr_render(self._frame, self._scene, self._context)
         mujoco.mjr_readPixels(self._rgb, self._depth, self._frame, self._context)
@@ -75,14 +84,44 @@ class Film:
         picture[self._depth >= 1.0] = BACKGROUND
         return np.flipud(picture)
 
+    def _paint(self) -> None:
+        """Colours of a film: the model's own are those that its colour cameras see."""
+        colours, first = self._model.geom_rgba, self._sim.first_link_body
+        colours[self._model.geom_bodyid == 0] = OBSTACLE
+        for body in range(first, self._model.nbody):
+            shade = HEAD if body == self._model.nbody - 1 else (LINK, NEXT_LINK)[(body - first) % 2]
+            colours[self._model.geom_bodyid == body] = shade
+        for name in (GROUND,) if self._flat else (GROUND, HILLS):
+            self._model.geom(name).rgba[:] = FLOOR
+
+    def _add_sun(self, look_at_w: Floats) -> None:
+        """A light from above the picture's left edge, for shadows: they show what stands where."""
+        sun = self._scene.lights[self._scene.nlight]
+        sun.type, sun.castshadow, sun.headlight, sun.texid = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, 1, 0, -1
+        sun.pos[:], sun.dir[:] = look_at_w - 4.0 * SUN, SUN / np.linalg.norm(SUN)
+        sun.ambient[:], sun.diffuse[:], sun.specular[:] = 0.0, SUNLIGHT, 0.1
+        self._scene.nlight += 1
+
+    def _add_grid(self, look_at_w: Floats) -> None:
+        middle, reach_m = CELL_M * np.round(look_at_w[:2] / CELL_M), CELL_M * CELLS
+        for along in (0, 1):
+            for k in range(-CELLS, CELLS + 1):
+                start, end = np.array([*middle, -0.5 * LINE_M]), np.array([*middle, -0.5 * LINE_M])  # half in the floor
+                start[1 - along] += k * CELL_M
+                end[1 - along] += k * CELL_M
+                start[along] -= reach_m
+                end[along] += reach_m
+                self._add(mujoco.mjtGeom.mjGEOM_CAPSULE, LINE_M, start, end, GRID)
+
     def _add_arrow(self, start_w: Floats, end_w: Floats) -> None:
+        self._add(mujoco.mjtGeom.mjGEOM_ARROW, 0.012, start_w, end_w, BLUE)
+
+    def _add(self, kind: mujoco.mjtGeom, width_m: float, start_w: Floats, end_w: Floats, rgba: Sequence[float]) -> None:
         if self._scene.ngeom >= self._scene.maxgeom:
             return
         geom = self._scene.geoms[self._scene.ngeom]
-        mujoco.mjv_initGeom(
-            geom, mujoco.mjtGeom.mjGEOM_ARROW, np.zeros(3), np.zeros(3), np.zeros(9), np.array(BLUE, np.float32)
-        )
-        mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_ARROW, 0.012, start_w, end_w)
+        mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.zeros(9), np.array(rgba, np.float32))
+        mujoco.mjv_connector(geom, kind, width_m, start_w, end_w)
         self._scene.ngeom += 1
 
     def close(self) -> None:

@@ -61,7 +61,9 @@ class Controls:
                 self._time_speed = client.gui.add_dropdown("Speed", TIMES, initial_value="1")
             self._heading = client.gui.add_slider("Heading, °", -180, 180, 5, 0)
             self._speed = client.gui.add_slider("Speed, m/s", 0.0, FASTEST_M_S, 0.01, 0.1)
-            self._drive = client.gui.add_button("Hold to drive", icon=viser.Icon.STEERING_WHEEL, color="green")
+            self._drive = client.gui.add_button(
+                "Hold to drive  (keys I, K; turn: J, L)", icon=viser.Icon.STEERING_WHEEL, color="green"
+            )
             self._faults = client.gui.add_folder("Inject a fault", expand_by_default=False)
             with self._faults:
                 self._kind = client.gui.add_dropdown("Kind", tuple(FAULTS), initial_value="mute (joint)")

@@ -28,7 +28,10 @@ class BodyFrames:
             FrameTransforms(transforms=[placed, *chained]),
         )
         self._pitched = [joint.axis == "pitch" for joint in robot.joints]
-        self._named = JointStates(joints=[NamedJoint(name=joint.name) for joint in robot.joints])
+        self.joints = len(robot.joints)
+        self._measured, self._wanted = (
+            JointStates(joints=[NamedJoint(name=joint.name) for joint in robot.joints]) for _ in range(2)
+        )
 
     def transforms(
         self, angles_rad: Sequence[float], base: tuple[Sequence[float], Sequence[float]] | None, time_ns: int
@@ -58,8 +61,17 @@ class BodyFrames:
 
     def joint_states(self, joints: JointState, time_ns: int) -> JointStates:
         """Angle, speed and torque of each joint by its name."""
-        self._named.timestamp.seconds, self._named.timestamp.nanos = divmod(time_ns, 1_000_000_000)
-        numbers = zip(self._named.joints, joints.angle_rad, joints.velocity_rad_s, joints.torque_nm, strict=True)
+        made = self._measured
+        made.timestamp.seconds, made.timestamp.nanos = divmod(time_ns, 1_000_000_000)
+        numbers = zip(made.joints, joints.angle_rad, joints.velocity_rad_s, joints.torque_nm, strict=True)
         for named, angle_rad, speed_rad_s, torque_nm in numbers:
             named.position, named.velocity, named.effort = angle_rad, speed_rad_s, torque_nm
-        return self._named
+        return made
+
+    def reference(self, wanted_rad: Sequence[float], time_ns: int) -> JointStates:
+        """The angle that the controller wants of each joint. wanted_rad: (n_joints,), tail to head."""
+        made = self._wanted
+        made.timestamp.seconds, made.timestamp.nanos = divmod(time_ns, 1_000_000_000)
+        for named, angle_rad in zip(made.joints, wanted_rad, strict=True):
+            named.position = angle_rad
+        return made

@@ -1,17 +1,19 @@
 """Channels that Foxglove and Rerun show as they are, made of the newest messages a few times a second.
 
-They are beside the raw ones, in Foxglove's protobuf schemas: `foxglove/tf` (a chain: each link in the frame of the one
-behind it), `foxglove/joints`, `foxglove/pose`, `foxglove/scene/...` (body, obstacles, map, forces, path),
-`foxglove/depth/<name>` and `foxglove/colour/<name>`.
+They are beside the raw ones, in Foxglove's protobuf schemas: `foxglove/tf` (a chain: each link in the frame of the
+one behind it), `foxglove/joints`, `foxglove/reference`, `foxglove/pose`, `foxglove/scene/...` (body, obstacles, map,
+forces, path), `foxglove/log`, `foxglove/depth/<name>` and `foxglove/colour/<name>`; `foxglove/state` is JSON.
 """
 
 from collections.abc import Iterator
 from contextlib import suppress
+from functools import cache
 from typing import Any, NamedTuple
 
 import msgspec
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
+from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
@@ -36,6 +38,7 @@ from snakesim_hal.wire.messages import (
 )
 from snakesim_operator.recording import shapes
 from snakesim_operator.recording.body_frames import BodyFrames
+from snakesim_operator.recording.told_state import State, ToldState
 
 MOVING_NS = 100_000_000  # 10 Hz: viewers interpolate transforms
 IMAGES_NS = 200_000_000  # 5 Hz: all images are in the raw channels
@@ -56,28 +59,45 @@ _decoders: dict[type[Any], Any] = {
     for message in (JointState, Pose, Seen, World, Trajectory, DepthImage, ColourImage, Description, Configuration)
 }
 
-ALWAYS: dict[str, type[Protobuf]] = {  # topics but for those of images, of which a robot may have none
+Kind = type[Protobuf] | type[State]
+ALWAYS: dict[str, Kind] = {  # topics but for those of images, of which a robot may have none
     TOPICS + name: kind
     for name, kind in {
         "tf": FrameTransforms,
         "joints": JointStates,
+        "reference": JointStates,
+        "state": State,
+        "log": Log,
         "pose": PoseInFrame,
         **{f"scene/{part}": SceneUpdate for part in ("body", "obstacles", "map", "forces", "path")},
     }.items()
 }
-_KEPT = (keys.JOINTS, keys.POSE, keys.WORLD, keys.TRAJECTORY)
+_KEPT = (keys.JOINTS, keys.POSE, keys.WORLD, keys.TRAJECTORY, keys.STATUS, keys.CONTROL_STATE)
 
 
 class Shown(NamedTuple):
     """One message for Foxglove."""
 
     topic: str
-    kind: type[Protobuf]
+    kind: Kind
     payload: bytes
 
 
-def descriptor_set(kind: type[Protobuf]) -> bytes:
-    """A message's schema as MCAP wants it: its file and all that it imports."""
+class ShownSchema(NamedTuple):
+    """How a kind of message is encoded."""
+
+    name: str
+    message_encoding: str
+    encoding: str  # of the schema
+    data: bytes
+
+
+@cache
+def schema_of(kind: Kind) -> ShownSchema:
+    """As MCAP wants it: of a protobuf message its file and all that it imports."""
+    if issubclass(kind, State):
+        schema = msgspec.json.schema(kind)["$defs"][kind.__name__]
+        return ShownSchema(f"snakesim.shown.{kind.__name__}", "json", "jsonschema", msgspec.json.encode(schema))
     files: dict[str, Any] = {}
 
     def add(file: Any) -> None:
@@ -89,7 +109,7 @@ def descriptor_set(kind: type[Protobuf]) -> bytes:
     found = FileDescriptorSet()
     for file in files.values():
         file.CopyToProto(found.file.add())
-    return found.SerializeToString()
+    return ShownSchema(kind.DESCRIPTOR.full_name, "protobuf", "protobuf", found.SerializeToString())
 
 
 class FoxgloveChannels:
@@ -100,6 +120,7 @@ class FoxgloveChannels:
         self._due_ns: dict[str, int] = {}
         self._robot: Description | None = None
         self._frames: BodyFrames | None = None
+        self._told = ToldState()
         self._truth = shapes.obstacles([], "obstacles", shapes.TRUTH, 0)
 
     def take(self, key: str, payload: bytes, time_ns: int) -> list[Shown]:
@@ -149,7 +170,15 @@ class FoxgloveChannels:
             made.append(_shown("pose", _pose(*base, time_ns)))
         if seen is not None:
             made.append(_scene("forces", [shapes.forces(seen.contacts, time_ns)]))
-        return [*made, *self._still(robot, time_ns)]
+        return [*made, *self._state(frames, time_ns), *self._still(robot, time_ns)]
+
+    def _state(self, frames: BodyFrames, time_ns: int) -> Iterator[Shown]:
+        status, control = (self._newest.get(key) for key in (keys.STATUS, keys.CONTROL_STATE))
+        state, logged, wanted_rad = self._told.of(status, control, time_ns)
+        yield Shown(f"{TOPICS}state", State, msgspec.json.encode(state))
+        yield from (_shown("log", one) for one in logged)
+        if len(wanted_rad) == frames.joints:
+            yield _shown("reference", frames.reference(wanted_rad, time_ns))
 
     def _still(self, robot: Description, time_ns: int) -> Iterator[Shown]:
         if self._is_due("body", time_ns, STILL_NS):

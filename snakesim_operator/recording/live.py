@@ -4,10 +4,8 @@ from contextlib import suppress
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
-from google.protobuf.message import Message as Protobuf
-
 from snakesim_hal.errors import ConfigError, NotConnectedError
-from snakesim_operator.recording.foxglove import ALWAYS, Shown, descriptor_set
+from snakesim_operator.recording.foxglove import ALWAYS, Kind, Shown, schema_of
 
 if TYPE_CHECKING:
     import foxglove
@@ -40,9 +38,10 @@ class LiveServer:
         channel = self._channels.get(shown.topic) or self._add(shown.topic, shown.kind)
         channel.log(shown.payload, log_time=time_ns)
 
-    def _add(self, topic: str, kind: type[Protobuf]) -> "foxglove.Channel":
-        schema = self._schema(name=kind.DESCRIPTOR.full_name, encoding="protobuf", data=descriptor_set(kind))
-        channel = self._new_channel(topic, schema=schema, message_encoding="protobuf", context=self._context)
+    def _add(self, topic: str, kind: Kind) -> "foxglove.Channel":
+        name, message_encoding, encoding, data = schema_of(kind)
+        schema = self._schema(name=name, encoding=encoding, data=data)
+        channel = self._new_channel(topic, schema=schema, message_encoding=message_encoding, context=self._context)
         self._channels[topic] = channel
         return channel
 

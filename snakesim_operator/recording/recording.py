@@ -15,7 +15,7 @@ from snakesim_hal.model.files import SCHEMAS
 from snakesim_hal.network.session import Arrival
 from snakesim_hal.wire import keys
 from snakesim_operator.recording.disk import GrowingFile
-from snakesim_operator.recording.foxglove import FoxgloveChannels, Shown, descriptor_set
+from snakesim_operator.recording.foxglove import FoxgloveChannels, Shown, schema_of
 from snakesim_operator.recording.mcap_file import McapFile
 from snakesim_operator.recording.robot_time import RobotTime
 
@@ -87,10 +87,11 @@ class Recording:
         self._file.close()
 
     def _open_shown(self, shown: Shown) -> int:
-        name = shown.kind.DESCRIPTOR.full_name
+        name, message_encoding, encoding, data = schema_of(shown.kind)
         if name not in self._schemas:
-            self._schemas[name] = self._mcap.add_schema(name, "protobuf", descriptor_set(shown.kind))
-        channel = self._channels[shown.topic] = self._mcap.add_channel(shown.topic, "protobuf", self._schemas[name])
+            self._schemas[name] = self._mcap.add_schema(name, encoding, data)
+        channel = self._mcap.add_channel(shown.topic, message_encoding, self._schemas[name])
+        self._channels[shown.topic] = channel
         return channel
 
     def _open(self, arrival: Arrival) -> int | None:

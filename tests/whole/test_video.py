@@ -37,7 +37,7 @@ def test_a_gif_shows_the_snake_in_every_picture(run: Path) -> None:
         for frame in range(gif.n_frames):  # pyright: ignore[reportAttributeAccessIssue]
             gif.seek(frame)
             red, _, blue = np.moveaxis(np.asarray(gif.convert("RGB")).astype(int), 2, 0)
-            assert (red > blue + 90).sum() > 100, f"no orange snake in picture {frame}"
+            assert (blue > red + 40).sum() > 100, f"no blue snake in picture {frame}"
 
 
 def test_an_mp4_is_one(run: Path) -> None:

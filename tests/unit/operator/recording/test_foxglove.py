@@ -1,12 +1,17 @@
 """What Foxglove shows of a recording, read with the library that reads its schemas: the snake is where it was."""
 
+import json
 import math
+import subprocess
+import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
+from mcap.exceptions import EndOfFile
+from mcap.reader import NonSeekingReader, make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from snakesim_hal.model.kinematics import rotation_from_quaternion
@@ -15,6 +20,20 @@ from snakesim_operator.recording.reader import RECORDING
 from snakesim_operator.recording.recover import recover
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.run.in_process import simulate
+
+LAYOUT = Path(__file__).parents[4] / "docs" / "foxglove-layout.json"
+
+
+class Json:
+    """Decodes JSON for the stock reader."""
+
+    def decoder_for(self, message_encoding: str, _schema: Any) -> Any:
+        return (
+            json.loads if message_encoding == "json" else (lambda data: data) if message_encoding == "msgpack" else None
+        )
+
+
+FACTORIES = [DecoderFactory(), Json()]
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +48,8 @@ def shown(path: Path) -> dict[str, list[tuple[int, Any]]]:
     found: dict[str, list[tuple[int, Any]]] = {}
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
-        topics = [f"foxglove/{name}" for name in ("tf", "joints", "pose", "depth/head", "depth/head/calibration")]
+        names = ("tf", "joints", "reference", "pose", "log", "depth/head", "depth/head/calibration")
+        topics = [f"foxglove/{name}" for name in names]
         scene = [f"foxglove/scene/{name}" for name in ("body", "obstacles", "map", "forces", "path")]
         for _, channel, message, decoded in reader.iter_decoded_messages(topics=topics + scene):
             found.setdefault(channel.topic, []).append((message.log_time, decoded))
@@ -92,11 +112,74 @@ def test_images_come_with_their_camera(run: Path) -> None:
     assert 2 * (q.x * q.z + q.w * q.y) > 0.9 and mount.parent_frame_id == "link_13"
 
 
-def test_a_recording_that_was_cut_off_is_made_whole(run: Path, tmp_path: Path) -> None:
-    whole = (run / RECORDING).read_bytes()
-    (tmp_path / "torn.mcap").write_bytes(whole[: len(whole) * 9 // 10])
-    count = recover(tmp_path / "torn.mcap", tmp_path / "whole.mcap")
-    found = shown(tmp_path / "whole.mcap")
-    assert count > 500 and len(found["foxglove/tf"]) > 10
+def test_state_and_log_tell_what_host_and_control_told(run: Path) -> None:
+    record, logged = RunRecord.load(run), [one for _, one in shown(run / RECORDING)["foxglove/log"]]
+    with (run / RECORDING).open("rb") as file:
+        read = list(make_reader(file).iter_messages(topics=["foxglove/state"]))
+    schema, channel, _ = read[0]
+    assert schema is not None and (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
+    states = [json.loads(message.data) for *_, message in read]
+    wanted = json.loads(schema.data)
+    assert all(set(wanted["required"]) <= set(state) <= set(wanted["properties"]) for state in states)
+    assert [one["lifecycle"] for one in states[-2:]] == ["armed", "armed"] and states[-1]["path_s_m"] > 0
+    assert {one["locomotion"] for one in states} <= {told.state for told in record.control} | {""}
+    assert any(one.name == "hal" and one.message.startswith("armed: armed by") for one in logged)
+    assert any(one.name == "control" and one.message.startswith("Locomoting: ") for one in logged)
+
+
+def test_the_layout_shows_fields_that_a_recording_has(run: Path) -> None:
+    layout, newest = json.loads(LAYOUT.read_text()), {}
+    with (run / RECORDING).open("rb") as file:
+        for _, channel, _, one in make_reader(file, decoder_factories=FACTORIES).iter_decoded_messages():
+            if channel.topic.startswith("foxglove/"):
+                newest[channel.topic] = one
+    panels, text = layout["configById"], json.dumps(layout["layout"])
+    assert all(f'"{name}"' in text for name in panels) and text.count("!") == len(panels)
+    paths = [path["value"] for panel in panels.values() for path in panel.get("paths", [])]
+    topics = [topic for panel in panels.values() for topic in panel.get("topics", {})]
+    image = panels["Image!depth"]["imageMode"]
+    topics += [image["imageTopic"], image["calibrationTopic"], panels["RosOut!log"]["topicToRender"]]
+    assert not set(topics) - set(newest)
+    for path in paths:
+        topic, _, fields = path.partition(".")
+        at = newest[topic]
+        for part in fields.split("."):
+            name, _, index = part.rstrip("]").partition("[")
+            at = at[name] if isinstance(at, dict) else getattr(at, name)
+            at = at[int(index)] if index else at
+        assert isinstance(at, (str, float)), path
+
+
+KILLED = """
+import sys, time
+from pathlib import Path
+from snakesim_hal.network.session import Arrival
+from snakesim_operator.recording.reader import RecordingReader
+from snakesim_operator.recording.recording import Recording
+recording = Recording(Path(sys.argv[2]))
+for number, one in enumerate(RecordingReader(Path(sys.argv[1])).messages()):
+    recording.take(Arrival(one.key, one.payload, one.encoding, time.monotonic_ns()))
+    if number % 100 == 0:
+        recording.flush()
+print(flush=True)
+time.sleep(60)
+"""
+
+
+def test_what_a_killed_recorder_leaves_has_transforms_joints_and_images(run: Path, tmp_path: Path) -> None:
+    torn, typed = tmp_path / "torn.mcap", [sys.executable, "-c", KILLED, str(run / RECORDING)]
+    with subprocess.Popen([*typed, str(torn)], stdout=subprocess.PIPE) as recorder:
+        assert recorder.stdout is not None and recorder.stdout.readline() == b"\n"
+        recorder.kill()
+    found: dict[str, Any] = {}
+    with torn.open("rb") as file, suppress(EndOfFile):  # the stock reader, as far as the file goes
+        reader = NonSeekingReader(file, validate_crcs=True, decoder_factories=FACTORIES)
+        for _, channel, _, one in reader.iter_decoded_messages(log_time_order=False):
+            found[channel.topic] = one
+    assert len(found["foxglove/joints"].joints) == 13 and found["foxglove/tf"].transforms
+    assert len(found["foxglove/depth/head"].data) > 1000
+    count = recover(torn, tmp_path / "whole.mcap")  # for readers that want an index
+    whole = shown(tmp_path / "whole.mcap")
+    assert count > 500 and len(whole["foxglove/tf"]) > 10
     alone = RunRecord.load(tmp_path / "whole.mcap")
     assert len(alone.time_s) > 20 and not alone.lacks

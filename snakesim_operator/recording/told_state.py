@@ -1,0 +1,98 @@
+"""What host and controller tell of themselves, for Foxglove: state as JSON, a log of its changes, joint references."""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Annotated, Any
+
+import msgspec
+from foxglove_schemas_protobuf.Log_pb2 import Log
+
+from snakesim_hal.wire import quantities as q
+from snakesim_hal.wire.codec import UNDECODABLE
+from snakesim_operator.recording.shapes import stamp
+
+Maybe = float | msgspec.UnsetType
+
+
+class State(msgspec.Struct, frozen=True, kw_only=True):
+    """`foxglove/state`, in JSON: Foxglove has no protobuf schema of states. What is unknown is empty, or left out."""
+
+    lifecycle: str
+    why: str
+    locomotion: str
+    reason: str
+    propulsion_joint: str
+    jammed: bool
+    saturated: bool
+    faults: int
+    path_s_m: Maybe = msgspec.UNSET
+    propulsion_n: Maybe = msgspec.UNSET
+    propulsion_torque_nm: Maybe = msgspec.UNSET
+    torque_headroom_nm: Maybe = msgspec.UNSET
+
+
+class _Told(msgspec.Struct, frozen=True):
+    """Of `hal/status`."""
+
+    lifecycle: q.Name = ""
+    why: q.Reason = ""
+    faults: Annotated[list[msgspec.Raw], msgspec.Meta(max_length=64)] = []
+
+
+class _Controlled(msgspec.Struct, frozen=True):
+    """Of `control/state`."""
+
+    state: q.Name = ""
+    reason: q.Reason = ""
+    propulsion_joint: q.Name | None = None
+    path_s_m: q.Length | None = None
+    propulsion_n: q.Force | None = None
+    propulsion_torque_nm: q.Torque | None = None
+    torque_headroom_nm: q.Torque | None = None
+    reference_rad: q.Angles = []
+    jammed: bool = False
+    saturated: bool = False
+
+
+_status, _control = msgspec.msgpack.Decoder(_Told), msgspec.msgpack.Decoder(_Controlled)
+_NUMBERS = ("path_s_m", "propulsion_n", "propulsion_torque_nm", "torque_headroom_nm")
+
+
+class ToldState:
+    """Remembers what it has logged."""
+
+    def __init__(self) -> None:
+        self._logged: dict[str, tuple[str, str]] = {}
+
+    def of(self, status: bytes | None, control: bytes | None, time_ns: int) -> tuple[State, list[Log], Sequence[float]]:
+        """State, what of it is new, and the angles that the controller wants, in rad: of the newest payloads."""
+        told, controlled = _Told(), _Controlled()
+        with suppress(*UNDECODABLE):
+            told = told if status is None else _status.decode(status)
+        with suppress(*UNDECODABLE):
+            controlled = controlled if control is None else _control.decode(control)
+        numbers: dict[str, Any] = {name: value for name in _NUMBERS if (value := getattr(controlled, name)) is not None}
+        state = State(
+            lifecycle=told.lifecycle,
+            why=told.why,
+            locomotion=controlled.state,
+            reason=controlled.reason,
+            propulsion_joint=controlled.propulsion_joint or "",
+            jammed=controlled.jammed,
+            saturated=controlled.saturated,
+            faults=len(told.faults),
+            **numbers,
+        )
+        return state, self._new(state, time_ns), controlled.reference_rad
+
+    def _new(self, state: State, time_ns: int) -> list[Log]:
+        stopped, stuck = state.lifecycle in ("fault", "estop"), state.jammed or state.saturated
+        found: list[Log] = []
+        for name, what, why, level in (
+            ("hal", state.lifecycle, state.why.partition("; ")[0], Log.ERROR if stopped else Log.INFO),
+            ("control", state.locomotion, state.reason, Log.WARNING if stuck else Log.INFO),
+        ):
+            if what and self._logged.get(name) != (what, why):
+                self._logged[name] = (what, why)
+                found.append(Log(timestamp=stamp(time_ns), level=level, name=name, message=f"{what}: {why}"))
+        return found
