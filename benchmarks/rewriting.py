@@ -9,6 +9,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from unittest.mock import patch
 
@@ -44,11 +45,11 @@ def main() -> int:
         arrivals = [Arrival(one.key, one.payload, one.encoding, one.time_ns) for one in found]
         times_ns = [one.time_ns for one in found if one.time_ns]
         lasted_s = (max(times_ns) - min(times_ns)) * 1e-9
-        for what, bare in (("", False), (", without Foxglove's channels", True)):
-            with (
-                tempfile.TemporaryDirectory() as folder,
-                patch.object(FoxgloveChannels, "take", *([lambda *_: []] if bare else [FoxgloveChannels.take])),
-            ):
+        for what, without in (
+            ("", nullcontext()),
+            (", without Foxglove's channels", patch.object(FoxgloveChannels, "take", lambda *_: [])),
+        ):
+            with tempfile.TemporaryDirectory() as folder, without:
                 written = [rewrite(arrivals, Path(folder) / f"{i}.mcap") for i in range(TIMES)]
             cpu_s, size = min(written)
             print(

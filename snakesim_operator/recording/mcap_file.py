@@ -1,7 +1,7 @@
 """Writes an MCAP file, chunked, indexed and compressed, for little CPU a message: one `pack` and two appends.
 
-The stock writer builds a record of each message field by field, which takes five times as long; records that are rare
-are its own. Source: https://mcap.dev/spec.
+The stock writer builds a record of each message field by field, which costs much more; records that are rare are its
+own. Source: https://mcap.dev/spec.
 """
 
 import struct
