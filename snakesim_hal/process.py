@@ -16,7 +16,7 @@ from typing import NoReturn
 from snakesim_hal.errors import RefusedError
 from snakesim_hal.terminal import complain
 
-STOPS = (signal.SIGINT, signal.SIGTERM)
+STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # the last one: the terminal, or the ssh session, was closed
 PR_SET_PDEATHSIG = 1
 CAP_IPC_LOCK = 14
 MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT = 1, 2, 4
@@ -45,8 +45,14 @@ def die_with_parent(parent_pid: int | None = None) -> None:
         sys.exit(1)
 
 
+def heeded() -> tuple[signal.Signals, ...]:
+    """The stop signals that this program is to handle: all, but for a closed terminal under `nohup`."""
+    ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    return tuple(number for number in STOPS if not (ignored and number == signal.SIGHUP))
+
+
 def accept_interrupts() -> None:
-    """From here on a stop counts: children start with both signals blocked, until they can handle them."""
+    """From here on a stop counts: children start with these signals blocked, until they can handle them."""
     signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPS)
 
 
@@ -62,12 +68,12 @@ def begin_anew() -> NoReturn:
 
 
 def on_stop_signal(stop: Callable[[], None]) -> None:
-    """Call `stop` on SIGTERM and SIGINT instead of ending at once."""
+    """Call `stop` on SIGTERM, SIGINT, and when the terminal is closed, instead of ending at once."""
 
     def handle(_number: int, _frame: FrameType | None) -> None:
         stop()
 
-    for number in STOPS:
+    for number in heeded():
         signal.signal(number, handle)
     accept_interrupts()
 

@@ -4,9 +4,12 @@ A robot's name, the reason of an answer, a field of a file may hold escape seque
 bidirectional overrides. They are printed as JSON escapes instead, so that printed JSON stays valid.
 """
 
+import io
+import os
 import sys
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from typing import Any, TextIO
 
 from snakesim_hal.errors import SnakesimError
 
@@ -28,6 +31,47 @@ def _escaped(char: str) -> str:
 def say(line: str) -> None:
     """Print one line, at once."""
     print(printable(line), flush=True)
+
+
+@contextmanager
+def even_if_unread() -> Iterator[None]:
+    """Inside, words that nobody can read end nothing, for a robot moves: a closed pipe or terminal, a full disk."""
+    with redirect_stdout(_Unending(sys.stdout)), redirect_stderr(_Unending(sys.stderr)):
+        yield
+
+
+class _Unending(io.TextIOBase):
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        try:
+            return self._stream.write(text)
+        except OSError:
+            self._give_up()
+            return len(text)
+
+    def flush(self) -> None:
+        try:
+            self._stream.flush()
+        except OSError:
+            self._give_up()
+
+    def isatty(self) -> bool:
+        return self._stream.isatty()
+
+    def fileno(self) -> int:
+        return self._stream.fileno()
+
+    def _give_up(self) -> None:
+        nowhere(self._stream)
+
+
+def nowhere(stream: TextIO) -> None:
+    """From here on what is printed is thrown away, what is still in the buffer, too."""
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, stream.fileno())
+    os.close(null)
 
 
 def say_json(value: Any, say: Say = say) -> None:

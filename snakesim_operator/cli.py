@@ -1,14 +1,13 @@
 """The `snakesim` command. Each room adds its own commands, and imports what they need when they are called."""
 
 import argparse
-import os
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NoReturn
 
 from snakesim_hal.errors import ConfigError, SnakesimError, did_you_mean, short
-from snakesim_hal.terminal import complain, complain_of, say
+from snakesim_hal.terminal import complain, complain_of, nowhere, say
 from snakesim_operator.console import arguments as console
 from snakesim_operator.evaluate import arguments as evaluate
 from snakesim_operator.lab import arguments as lab
@@ -33,10 +32,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         complain_of(error, "snakesim")
         return FAILED
     except OSError as error:  # such as a full disk under what is printed
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        nowhere(sys.stdout)
         if isinstance(error, BrokenPipeError):  # the reader of a pipe has closed it
             return OK
-        complain(f"snakesim: {error}")
+        complain(f"snakesim: {f'{error.filename}: ' if error.filename else ''}{error.strerror or error}")
         return FAILED
 
 

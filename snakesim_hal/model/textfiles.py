@@ -77,7 +77,9 @@ def _instead_of(path: Path) -> str:
     close = nearest(path.name, there)
     if close:
         return f"; did you mean {path.parent / close}?"
-    alike = [name for name in there if path.suffix and name.endswith(path.suffix)][:8]
+    if not path.suffix:
+        return ""
+    alike = [name for name in there if name.endswith(path.suffix)][:8]
     return f"; in {path.parent.absolute()} " + (f"are {', '.join(alike)}" if alike else f"is no file *{path.suffix}")
 
 

@@ -75,7 +75,7 @@ def _study(request: Request) -> Study:
             load_if_exists=True,
         )
     except Exception as error:  # noqa: BLE001 - of SQLite and SQLAlchemy, for a file of another kind, a folder, a full disk
-        why = str(error).splitlines()[0][:200]
+        why = (getattr(error, "strerror", None) or str(error)).splitlines()[0][:200]
         raise ConfigError(f"--storage {request.storage}: {why}; choose another file") from None
     study.sampler = optuna.samplers.TPESampler(seed=request.seed + len(study.trials), constant_liar=True)
     for trial in study.get_trials(states=(TrialState.RUNNING,)):  # of a process that was killed

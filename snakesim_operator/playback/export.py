@@ -30,6 +30,12 @@ def export(runs: Sequence[Path], form: str, out: Path | None, say: Say) -> int:
     path = out or _beside(runs[0], form)
     if path.exists():
         raise ConfigError(f"{path}: there is such a file already; choose another one with --out")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()  # before the work of minutes
+        path.unlink()
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written: {error.strerror}; choose another one with --out") from None
     if form == "mcap":
         say(f"{recover(recording_of(runs[0]), path)} messages: {path}")
         return 0

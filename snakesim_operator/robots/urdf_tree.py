@@ -126,7 +126,8 @@ def _walk(urdf: Element, links: dict[str, Element], joints: dict[str, Element], 
         below.setdefault(ends[0], []).append((ends[1], joint))
     roots = [name for name in links if name not in parents]
     if len(roots) != 1:
-        raise urdf.wrong(f"has {len(roots)} links without a parent, and needs one: {', '.join(map(short, roots[:8]))}")
+        found = f": {', '.join(map(short, roots[:8]))}" if roots else ""
+        raise urdf.wrong(f"needs one link without a parent, and has {len(roots)}{found}")
     frames, body_of, movable = {roots[0]: np.eye(4)}, {roots[0]: roots[0]}, list[tuple[str, str, Joint]]()
     waiting = [roots[0]]
     while waiting:

@@ -15,6 +15,7 @@ from snakesim_hal.arguments import (
     session_given,
 )
 from snakesim_hal.errors import ConfigError
+from snakesim_hal.terminal import even_if_unread
 
 
 def add_commands(commands: Any) -> None:
@@ -83,31 +84,33 @@ def _run(arguments: argparse.Namespace) -> int:
         for flag in ("endpoint", "router", "session", "namespace", "stay", "with_router", "console"):
             if getattr(arguments, flag):
                 raise ConfigError(f"--in-process and --{flag.replace('_', '-')}: there is no network; leave one out")
-        return run_in_process(config, arguments.out, record=not arguments.no_record)
+        with even_if_unread():
+            return run_in_process(config, arguments.out, record=not arguments.no_record)
 
     from snakesim_operator.run.run import RunRequest, run
 
-    return run(
-        RunRequest(
-            config,
-            out=arguments.out,
-            endpoint=arguments.endpoint,
-            router=arguments.router,
-            session=session_given(arguments),
-            namespace=arguments.namespace,
-            stay=arguments.stay,
-            with_router=arguments.with_router,
-            insecure=arguments.insecure,
-            record=not arguments.no_record,
-            console=arguments.console,
-        )
+    request = RunRequest(
+        config,
+        out=arguments.out,
+        endpoint=arguments.endpoint,
+        router=arguments.router,
+        session=session_given(arguments),
+        namespace=arguments.namespace,
+        stay=arguments.stay,
+        with_router=arguments.with_router,
+        insecure=arguments.insecure,
+        record=not arguments.no_record,
+        console=arguments.console,
     )
+    with even_if_unread():
+        return run(request)
 
 
 def _host(arguments: argparse.Namespace) -> int:
     from snakesim_operator.run.host import run_host
 
-    return run_host(arguments)
+    with even_if_unread():
+        return run_host(arguments)
 
 
 def _service(arguments: argparse.Namespace) -> int:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from types import FrameType
 
-from snakesim_hal.process import STOPS
+from snakesim_hal.process import heeded
 
 
 @dataclass
@@ -29,13 +29,16 @@ class Ending:
 
 @contextlib.contextmanager
 def interruptible(ending: Ending) -> Iterator[None]:
-    """Ctrl-C and SIGTERM end the run in order; a second one is left to the default."""
+    """Ctrl-C, SIGTERM and a closed terminal end the run in order.
+
+    A second Ctrl-C or SIGTERM is left to the default; SIGHUP comes twice of itself, from the kernel and the shell.
+    """
 
     def handle(number: int, _frame: FrameType | None) -> None:
         ending.interrupted = True
-        signal.signal(number, signal.SIG_DFL)
+        signal.signal(number, signal.SIG_IGN if number == signal.SIGHUP else signal.SIG_DFL)
 
-    old = {number: signal.signal(number, handle) for number in STOPS}
+    old = {number: signal.signal(number, handle) for number in heeded()}
     try:
         yield
     finally:

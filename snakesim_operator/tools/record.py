@@ -7,7 +7,7 @@ from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
-from snakesim_hal.process import STOPS, on_stop_signal
+from snakesim_hal.process import heeded, on_stop_signal
 from snakesim_hal.terminal import Say, say
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_operator.recording.live import LiveServer
@@ -41,7 +41,7 @@ def record_robot(
                 live.show if live is not None else None,
             )
     finally:
-        for number in STOPS:
+        for number in heeded():
             signal.signal(number, signal.SIG_DFL)
     messages, size = recorder.recording.counts.total(), path.stat().st_size
     say(f"{messages} messages in {time.monotonic() - began:.1f} s, {size / 1e6:.1f} MB: {path}")

@@ -2,6 +2,7 @@
 
 import json
 import os
+import pty
 import re
 import signal
 import subprocess
@@ -76,6 +77,35 @@ def test_output_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
         ["sh", "-c", f"{' '.join(SNAKESIM)} config triplet | head -1"], cwd=tmp_path, capture_output=True, check=False
     )
     assert seen.stderr == b"" and seen.stdout.count(b"\n") == 1
+
+
+def test_a_run_goes_on_when_nobody_reads_what_it_prints(tmp_path: Path) -> None:
+    run = f"{' '.join(SNAKESIM)} run triplet --in-process --duration 1 --no-record --out"
+    for number, unread in enumerate(("| head -0", ">&-", "> /dev/full 2>&1")):
+        command = f"set -o pipefail; {run} {number} {unread}"
+        ended = subprocess.run(["bash", "-c", command], cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert (ended.returncode, ended.stderr) == (0, ""), f"{unread}: {ended.stderr}"
+        assert (tmp_path / str(number) / "summary.json").exists(), unread
+
+
+def test_a_closed_terminal_ends_a_run_in_order(tmp_path: Path) -> None:
+    (ours, theirs), endpoint = pty.openpty(), free_endpoint()
+    process = subprocess.Popen(
+        ["setsid", "--ctty", *SNAKESIM, "run", "triplet", "--pace", "realtime", "--out", "run", "--endpoint", endpoint],
+        cwd=tmp_path,
+        env=environment(tmp_path),
+        stdin=theirs,
+        stdout=theirs,
+        stderr=theirs,
+    )
+    os.close(theirs)
+    said = b""
+    while b" of 10 s" not in said:
+        said += os.read(ours, 4096)
+    os.close(ours)
+    assert process.wait(30) == 130
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["command_digest"]
+    nothing_left(tmp_path / "run")
 
 
 INTERRUPTED = (

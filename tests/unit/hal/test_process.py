@@ -66,3 +66,10 @@ print(os.sched_getscheduler(0) == os.SCHED_OTHER)
         pytest.skip("real-time priority is refused here")
     assert words.startswith("True\nTrue\n"), words
     assert "priority dropped after computing for 50 ms without a pause" in words
+
+
+def test_a_closed_terminal_is_a_stop_but_under_nohup() -> None:
+    code = PRINT.format("heeded", "")
+    assert "SIGHUP" in said(code)
+    words = subprocess.run(["nohup", sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert "SIGTERM" in words and "SIGHUP" not in words
