@@ -81,7 +81,7 @@ def main() -> int:
         field = Path(folder) / "field.toml"
         field.write_text(FIELD)
         print("| scene | geoms | ms an image |\n|---|---|---|")
-        for scene in ("peg_row", str(field), "clutter"):
+        for scene in ("peg_row", str(field), "mamba_hills"):
             ms, geoms = image_ms(config_of("planar13_camera", scene))
             print(f"| {Path(scene).stem} | {geoms} | {ms:.1f} |", flush=True)
         print("\n| robot | pace | own ms a tick, p50 | p99 | CPU s of 400 ticks | images | late |")

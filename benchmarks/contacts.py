@@ -21,7 +21,7 @@ from snakesim_hal.wire.messages import Contacts, Description, Imu, Pose
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.truth import TrueState
 
-SCENARIOS = ("triplet", "peg_row", "jam", "clutter")
+SCENARIOS = ("triplet", "peg_row", "jam", "mamba_hills")
 NEAR_M, LEAST_N = 0.08, 2.0
 FROM_TICK, EVERY = 30, 2
 Push = tuple[float, int, float]  # place along the body in m, side (1: left), force in N
