@@ -88,7 +88,7 @@ KINDS: Mapping[TargetType, Mapping[str, Kind]] = {
             in_module="its main loop hangs: repeats its last joint state, no heartbeat; passive after its watchdog",
         ),
         "wrong": Kind("its angle is off", ("samples",), Amount("offset", "rad", 0.5, -6.3, 6.3)),
-        "nan": Kind("its angle is no number", ("samples",)),
+        "nan": Kind("its angle is NaN", ("samples",)),
         "reboot": Kind("its module restarts", ("module",), once=True),
         "counter": Kind("joint states with a wrong count", ("module",)),
         "checksum": Kind("joint states with a wrong checksum", ("module",)),
