@@ -158,7 +158,7 @@ class ObstacleAided:
         why = class_of_stall if stands and found is not None else ""
         return Report(
             why=why,
-            why_if_still=class_of_stall,
+            why_if_still=class_of_stall if view.time_s > STANDS_S else "",
             path_s_m=located.tail_s_m,
             propulsion_n=look_ahead_n + force_n,
             push_points=told,

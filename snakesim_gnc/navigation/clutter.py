@@ -9,7 +9,7 @@ third time at one place it backs out first, along its own path and the trail of 
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,7 @@ TURNED_RAD = 0.35  # a change of direction that matters
 SHARPEST_RAD = 1.2  # a path begins with no greater turn from where the head points; further ones follow
 FORGET_M = 0.15  # beyond this from where it was stuck, what failed there is forgotten
 FAILURES = 4
+FIRST_WIDTH, FIRST_CROWD = 2700, 48  # of the search of the first path on a known map
 LEAST_AHEAD = 10  # arcs of a new path beyond the head
 BACK_EVERY = 3  # time at the same place: back out
 BACK_M, BACK_S = 0.1, 1.5
@@ -203,7 +204,10 @@ class ClutterPlanner:
 
     def _plan(self, body: Floats, obstacles: ObstacleMap, goal: Floats, why: str) -> None:
         goal_rad = self._headed_rad = _within_reach(body, goal)
-        beam = Beam(obstacles, self._search)
+        search = self._search
+        if self._planned is None and self._known is not None:  # nobody waits for it while something moves
+            search = replace(search, width=FIRST_WIDTH, crowd=FIRST_CROWD)
+        beam = Beam(obstacles, search)
         if why in (ENDS_SOON, MAP_CHANGED, TURNED):
             found, kept, points = self._onward(beam, body, goal_rad)
         elif self._planned is None or why in (LOST, SHIFTED):
