@@ -7,7 +7,8 @@ of the speed, both bounded:
 - the shape at s plus a small look-ahead l: tau_i = k (theta_i(s + l) - theta_i(s)), hence by virtual work a force
   F = l k sum theta_i'^2, also where no contacts can balance it.
 
-A negative speed backs the body out along its own path. See `docs/poal.md`.
+A negative speed backs the body out along its own path. A body that stands, and that nothing can push, undulates until
+something can (`contact_search.py`). See `docs/poal.md`.
 """
 
 from dataclasses import dataclass
@@ -18,11 +19,13 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from snakesim_gnc.control.bumpless import Followed
+from snakesim_gnc.control.contact_search import ContactSearch, Patience
 from snakesim_gnc.control.controller import Action, Report, View
 from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_gnc.control.progress import Located, Progress
 from snakesim_gnc.control.push import Push, Touches, find_touches, push_forward
 from snakesim_gnc.control.push_report import push_points, why_it_stands
+from snakesim_gnc.control.undulation import HeadSteeredUndulation
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Description, World
@@ -33,6 +36,7 @@ ANOTHER_SHAPE_RAD = 0.1
 SLOPE_M = 0.02  # over which theta' is taken
 SIGNS = np.random.default_rng(1).choice((-1.0, 1.0), 4096)
 LARGEST_REST = 0.3  # of a push: what is not in balance turns the body a little, until it meets other obstacles
+POWERLESS_N = 4.0  # contacts that allow no more cannot overcome the friction of the ground
 STANDS_M_S, STANDS_S = 0.01, 0.5  # slower than this for so long counts as standing still
 
 
@@ -70,6 +74,12 @@ class ObstacleAided:
         loose_m: Annotated[float, Meta(gt=0, le=1, extra_json_schema={"unit": "m"})] = 0.005  # a gap that counts half
         torque_filter_s: Annotated[float, Meta(gt=0, le=5, extra_json_schema={"unit": "s"})] = 0.1
         peg_friction: Annotated[float, Meta(ge=0, le=5, extra_json_schema={"unit": "1 (Coulomb coefficient)"})] = 0.0
+        search_after_s: Annotated[float, Meta(ge=0, le=1000, extra_json_schema={"unit": "s"})] = (
+            2.0  # of standing with nothing that can push; 0: never undulate in search of it
+        )
+        search_s: Annotated[float, Meta(gt=0, le=1000, extra_json_schema={"unit": "s"})] = 4.0
+        search_swing_rad: Annotated[float, Meta(ge=0, le=2, extra_json_schema={"unit": "rad"})] = 0.5
+        search_until_n: Annotated[float, Meta(ge=0, le=1000, extra_json_schema={"unit": "N"})] = 12.0
         blend_s: Annotated[float, Meta(gt=0, le=10, extra_json_schema={"unit": "s"})] = 0.3
         speed_filter_s: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "s"})] = 0.05
 
@@ -89,6 +99,11 @@ class ObstacleAided:
         self._most_n = self._force_n = 0.0  # what contacts and torques allow, and what is commanded of it
         self._moved_at_s = 0.0
         self._waits = False
+        self._search = ContactSearch(
+            robot,
+            Patience(settings.search_after_s, settings.search_s, settings.search_until_n),
+            HeadSteeredUndulation.Settings(amplitude_rad=settings.search_swing_rad),
+        )
 
     def update(self, view: View) -> Action:
         """Angles of the body further along the path, as far as the wanted speed needs it."""
@@ -98,6 +113,11 @@ class ObstacleAided:
             return self._followed.hold(view, located)
         if located.trajectory.speed_m_s == 0.0:  # whatever path is planned meanwhile
             return self._rest(view)
+        if self._search.active:
+            self._look(located, np.zeros(len(self._robot.joints)))
+        stands = abs(located.speed_m_s) < STANDS_M_S or self._most_n < POWERLESS_N
+        if self._search.decide(view, stands=stands, most_n=self._most_n):
+            return self._undulate(view)
         scale = self._set.push_scale * self._sign(view.time_s)
         ahead_m = self._look_ahead_m(located, view.period_s)
         ahead_m = scale * (ahead_m if scale >= 0 else abs(ahead_m))
@@ -106,12 +126,20 @@ class ObstacleAided:
         slope = self._body.all_angles(at(located.tail_s_m + SLOPE_M)) - self._body.all_angles(at(located.tail_s_m))
         torques = scale * self._push_nm(located, slope / SLOPE_M, view.period_s)
         reference = reference + torques / self._stiffness
-        anew, before = located.anew or self._waits, self._followed.reference_rad
+        anew, before = located.anew or self._waits or self._search.changed, self._followed.reference_rad
         if anew and before is not None and np.abs(reference - before).max() > ANOTHER_SHAPE_RAD:
             self._integral_m = min(self._integral_m, self._set.fresh_look_ahead_m)
         set_points, self._waits = self._followed.to(view, reference, anew=anew), False
         force_n = ahead_m * float(self._stiffness @ slope**2) / SLOPE_M**2
         return Action(set_points, self._report(view, located, force_n, reference))
+
+    def _undulate(self, view: View) -> Action:
+        """In search of something to push off."""
+        self._torques_nm[:] = self._push_n = self._force_n = 0.0
+        reference = self._search.reference_rad(view)
+        set_points = self._followed.to(view, reference, anew=self._search.changed)
+        why = "nothing beside the body can push it: it undulates in search of contacts"
+        return Action(set_points, Report(why=why, reference_rad=reference.tolist()))
 
     def _sign(self, time_s: float) -> float:
         """The same for every run, so that runs can be repeated."""
@@ -130,7 +158,7 @@ class ObstacleAided:
         why = class_of_stall if stands and found is not None else ""
         return Report(
             why=why,
-            why_if_still=class_of_stall,
+            why_if_still=class_of_stall if view.time_s > STANDS_S else "",
             path_s_m=located.tail_s_m,
             propulsion_n=look_ahead_n + force_n,
             push_points=told,
@@ -161,19 +189,7 @@ class ObstacleAided:
         self._push_n += config.push_n_m * error * period_s
         self._push_n = min(max(self._push_n, 0.0), config.largest_push_n)
         force_n = min(max(self._push_n + config.push_ns_m * error, 0.0), config.largest_push_n)
-        if located.fresh:
-            outlines = Outlines.of(located.world.obstacles)
-            touches = find_touches(
-                located.nodes_w, self._body.radius_m, outlines, reach_m=config.reach_m, friction=config.peg_friction
-            )
-            push = push_forward(located.nodes_w, touches, turns_per_m[self._bends], loose_m=config.loose_m)
-            self._found = Found(located.world, touches, push)
-            self._unit_nm, self._most_n = np.zeros(len(self._robot.joints)), 0.0
-            if push.rest < LARGEST_REST:
-                self._unit_nm[self._bends] = push.torques_nm
-                most = float(np.abs(push.torques_nm).max(initial=0.0)) + 1e-9
-                largest = float(push.lambdas.max())
-                self._most_n = min(config.largest_torque_nm / most, config.largest_contact_n / largest)
+        self._look(located, turns_per_m)
         self._push_n = min(self._push_n, self._most_n)  # who cannot push stores no force up for later
         self._force_n = force_n = min(force_n, self._most_n)
         keep = np.exp(-period_s / config.torque_filter_s)
@@ -181,11 +197,30 @@ class ObstacleAided:
         bound = config.largest_torque_nm
         return np.clip(self._torques_nm, -bound, bound)
 
+    def _look(self, located: Located, turns_per_m: Floats) -> None:
+        """What the body could push off by the newest world model, and how hard."""
+        if not located.fresh:
+            return
+        config = self._set
+        outlines = Outlines.of(located.world.obstacles)
+        touches = find_touches(
+            located.nodes_w, self._body.radius_m, outlines, reach_m=config.reach_m, friction=config.peg_friction
+        )
+        push = push_forward(located.nodes_w, touches, turns_per_m[self._bends], loose_m=config.loose_m)
+        self._found = Found(located.world, touches, push)
+        self._unit_nm, self._most_n = np.zeros(len(self._robot.joints)), 0.0
+        if push.rest < LARGEST_REST:
+            self._unit_nm[self._bends] = push.torques_nm
+            most = float(np.abs(push.torques_nm).max(initial=0.0)) + 1e-9
+            largest = float(push.lambdas.max())
+            self._most_n = min(config.largest_torque_nm / most, config.largest_contact_n / largest)
+
     def _rest(self, view: View) -> Action:
         """At speed 0 every joint stays where it is, and nothing pushes."""
         self._integral_m = self._push_n = self._force_n = 0.0
         self._torques_nm[:] = 0.0
         self._moved_at_s = view.time_s
+        self._search.stop()
         if self._waits or self._followed.reference_rad is None:
             action = self._followed.hold(view, "")
         else:

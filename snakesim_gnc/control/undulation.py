@@ -9,6 +9,7 @@ from typing import Annotated
 
 import numpy as np
 from msgspec import Meta
+from numpy.typing import NDArray
 
 from snakesim_gnc.control.bumpless import Followed
 from snakesim_gnc.control.controller import Action, Report, View
@@ -39,13 +40,22 @@ class LateralUndulation:
     def update(self, view: View) -> Action:
         """The wave goes on while there is a path to go along."""
         moving = view.trajectory is not None and view.trajectory.speed_m_s != 0.0 and view.world is not None
-        if moving:
-            self._phase_rad += math.tau * view.period_s / self._set.period_s
+        reference = self.reference_rad(view, view.period_s if moving else 0.0)
+        return Action(self._followed.to(view, reference), Report(reference_rad=reference.tolist()))
+
+    def begin_like(self, angles_rad: NDArray[np.float64]) -> None:
+        """Choose the phase at which the wave is most like a shape, (n_joints,)."""
+        lags = self._set.lag_rad * np.arange(len(self._body.bends))[::-1]
+        self._phase_rad = float(np.angle(1j * (angles_rad[self._body.bends] @ np.exp(1j * lags))))
+
+    def reference_rad(self, view: View, passed_s: float) -> NDArray[np.float64]:
+        """Angles of all joints, a time later than before."""
+        self._phase_rad += math.tau * passed_s / self._set.period_s
         turns = np.arange(len(self._body.bends))[::-1]  # 0 at the head
         reference = np.zeros(len(self._robot.joints))
         swing = self._set.amplitude_rad * np.sin(self._phase_rad - self._set.lag_rad * turns)
         reference[self._body.bends] = swing + self._bend_rad(view)
-        return Action(self._followed.to(view, reference), Report(reference_rad=reference.tolist()))
+        return reference
 
     def _bend_rad(self, view: View) -> float:
         """Bend of every joint that turns the body towards the path ahead."""

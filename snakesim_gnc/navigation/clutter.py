@@ -9,7 +9,7 @@ third time at one place it backs out first, along its own path and the trail of 
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,10 +34,12 @@ COMMITTED_M = 0.1  # of the path ahead of the head that is not changed any more
 SEEN_M, SAME_M = 1.5, 0.005  # obstacles within this distance of the head; a change that matters
 ENDS_SOON, MAP_CHANGED, TURNED = "ends soon", "the map has changed", "the direction has changed"
 LOST, LOST_M = "the body is off its path", 0.12  # median of its points; then no correction leads back
+SHIFTED, SHIFTED_M = "the body has left the place where it stood", 0.03  # likewise: control looks for contacts
 TURNED_RAD = 0.35  # a change of direction that matters
 SHARPEST_RAD = 1.2  # a path begins with no greater turn from where the head points; further ones follow
 FORGET_M = 0.15  # beyond this from where it was stuck, what failed there is forgotten
 FAILURES = 4
+FIRST_WIDTH, FIRST_CROWD = 2700, 48  # of the search of the first path on a known map
 LEAST_AHEAD = 10  # arcs of a new path beyond the head
 BACK_EVERY = 3  # time at the same place: back out
 BACK_M, BACK_S = 0.1, 1.5
@@ -73,6 +75,7 @@ class ClutterPlanner:
         self._search = search
         self._fit = Fit(radius_m=search.radius_m, segment_m=search.segment_m)
         self._planned: Planned | None = None
+        self._planned_ns = 0
         self._path_id = 0
         self._start: Floats | None = None
         self._seen = np.empty((0, 5))
@@ -103,6 +106,7 @@ class ClutterPlanner:
             self._recent.clear()  # who is to stand still is not stuck
         elif why := self._why_again(body, world):
             self._plan(body, self._known or ObstacleMap(world.obstacles), goal, why)
+            self._planned_ns = world.stamp_ns
         planned = self._planned
         assert planned is not None
         return Trajectory(
@@ -154,8 +158,11 @@ class ClutterPlanner:
                 self._back_from_m = None
                 return "backed out"
             return ""
-        if np.median([_off_m(planned.route, point) for point in body[::10]]) > LOST_M:
+        off_m = np.median([_off_m(planned.route, point) for point in body[::10]])
+        if off_m > LOST_M:
             return LOST
+        if self._failed and off_m > SHIFTED_M and now_ns - self._planned_ns > STANDS_S * 1e9:
+            return SHIFTED
         if planned.route.length_m - head_s < ENDS_SOON_M:
             return ENDS_SOON
         if full and moved < STANDS_M:
@@ -197,11 +204,15 @@ class ClutterPlanner:
 
     def _plan(self, body: Floats, obstacles: ObstacleMap, goal: Floats, why: str) -> None:
         goal_rad = self._headed_rad = _within_reach(body, goal)
-        beam = Beam(obstacles, self._search)
+        search = self._search
+        if self._planned is None and self._known is not None:  # nobody waits for it while something moves
+            search = replace(search, width=FIRST_WIDTH, crowd=FIRST_CROWD)
+        beam = Beam(obstacles, search)
         if why in (ENDS_SOON, MAP_CHANGED, TURNED):
             found, kept, points = self._onward(beam, body, goal_rad)
-        elif self._planned is None or why == LOST:
-            found, kept = beam.ahead(body, goal_rad, round(HORIZON_M / STEP_M)), len(body) - 3
+        elif self._planned is None or why in (LOST, SHIFTED):
+            horizon_m = AGAIN_M if why == SHIFTED else HORIZON_M
+            found, kept = beam.ahead(body, goal_rad, round(horizon_m / STEP_M)), len(body) - 3
             points = body if found is None else np.concatenate([body, evenly(found.points_w)[1:]])
         else:
             found, kept = self._anew(beam, body, goal_rad), 0

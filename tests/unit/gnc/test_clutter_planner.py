@@ -105,6 +105,16 @@ def test_a_body_that_stands_still_gets_another_path_and_then_backs_out() -> None
     assert seen[0].speed_m_s == 0.2
 
 
+def test_a_body_that_has_left_where_it_stood_gets_a_path_from_where_it_lies() -> None:
+    config = field()
+    made, body = planner(obstacles_of(config)), body_of(config)
+    stood = [planned(made, body, at_s) for at_s in np.arange(0.0, 1.2, 0.2).tolist()][-1]
+    moved = body + np.array([0.0, 0.05])
+    again = planned(made, moved, 2.5)
+    assert again.path_id > stood.path_id
+    assert np.hypot(*(np.array(again.path_w) - moved[-1]).T).min() < 0.02
+
+
 def test_only_what_is_seen_is_planned_around() -> None:
     config = field()
     made, body = planner(None), body_of(config)

@@ -1,0 +1,66 @@
+"""When nothing beside a standing body can push it: an undulation on the spot, until something can.
+
+Waves travel along the body from head to tail and sweep it sideways, by a few centimetres. What they meet is pushed at
+from both sides in turn, so a body with one contact or none shifts and turns until it lies between others. Navigation
+plans a new path from wherever that is.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snakesim_gnc.control.controller import View
+from snakesim_gnc.control.undulation import HeadSteeredUndulation
+from snakesim_hal.wire.messages import Description
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Patience:
+    """When to search, and for how long."""
+
+    after_s: float  # of standing without a push; 0: never
+    for_s: float
+    enough_n: float  # of force along the body that contacts allow: nothing is to be searched for
+
+
+class ContactSearch:
+    """Decides whether to search, and makes the waves."""
+
+    def __init__(self, robot: Description, patience: Patience, wave: HeadSteeredUndulation.Settings) -> None:
+        self._patience = patience
+        self._wave = HeadSteeredUndulation(robot, wave)
+        self._powerless_since_s: float | None = None
+        self._until_s: float | None = None
+        self.changed = False  # it has begun or ended at this tick
+
+    @property
+    def active(self) -> bool:
+        """Whether the body undulates."""
+        return self._until_s is not None
+
+    def decide(self, view: View, *, stands: bool, most_n: float) -> bool:
+        """Whether to undulate at this tick. most_n: force along the body that its contacts allow."""
+        before, enough = self.active, most_n >= self._patience.enough_n
+        if self._until_s is not None:
+            if enough or view.time_s >= self._until_s:
+                self.stop()
+        elif enough or not stands:
+            self._powerless_since_s = None
+        elif self._powerless_since_s is None:
+            self._powerless_since_s = view.time_s
+        elif 0.0 < self._patience.after_s <= view.time_s - self._powerless_since_s:
+            self._until_s = view.time_s + self._patience.for_s
+            self._wave.begin_like(np.array(view.joints.angle_rad))
+        self.changed = self.active != before
+        return self.active
+
+    def reference_rad(self, view: View) -> Floats:
+        """Angles of all joints."""
+        return self._wave.reference_rad(view, view.period_s)
+
+    def stop(self) -> None:
+        """Not before the body has stood for a while again."""
+        self._until_s = self._powerless_since_s = None

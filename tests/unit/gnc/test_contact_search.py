@@ -1,0 +1,54 @@
+"""A body that nothing can push undulates until something can, and goes over from one to the other without a jump."""
+
+import numpy as np
+
+from snakesim_gnc.control.controller import Action
+from snakesim_gnc.control.obstacle_aided import ObstacleAided
+from tests.unit.gnc.stage import Stage, make_stage
+
+TAIL_S_M = 0.3
+SEARCHES = "in search of contacts"
+JUMP_RAD = 0.08  # of a target from one tick to the next; the waves themselves make 0.02
+
+
+def stands(controller: ObstacleAided, stage: Stage, ticks: range) -> list[Action]:
+    """What is commanded while the body stays where it is."""
+    return [controller.update(stage.view(tick, TAIL_S_M)) for tick in ticks]
+
+
+def targets(actions: list[Action]) -> np.ndarray:
+    return np.array([action.set_points.target for action in actions])
+
+
+def test_a_body_without_contacts_searches_for_some_and_pushes_when_it_has_them() -> None:
+    stage = make_stage()
+    pegs, stage.pegs = stage.pegs, []
+    controller = ObstacleAided(stage.robot, ObstacleAided.Settings(search_after_s=1.0, search_s=4.0))
+    alone = stands(controller, stage, range(350))
+    searches = [SEARCHES in action.report.why for action in alone]
+    assert not any(searches[:95]) and all(searches[105:])
+    assert np.ptp(targets(alone[105:]), axis=0).min() > 0.5
+    stage.pegs = pegs
+    beside = stands(controller, stage, range(350, 500))
+    assert not any(SEARCHES in action.report.why for action in beside[1:])
+    assert max(action.report.propulsion_n or 0.0 for action in beside) > 5.0
+    assert np.abs(np.diff(targets(alone + beside), axis=0)).max() < JUMP_RAD
+
+
+def test_it_searches_only_for_a_while_and_then_tries_its_path_again() -> None:
+    stage = make_stage()
+    stage.pegs = []
+    controller = ObstacleAided(stage.robot, ObstacleAided.Settings(search_after_s=1.0, search_s=2.0))
+    searches = [SEARCHES in action.report.why for action in stands(controller, stage, range(600))]
+    assert searches[150] and not searches[350] and searches[450]
+
+
+def test_nobody_searches_beside_obstacles_that_can_push_or_when_told_not_to() -> None:
+    stage = make_stage()
+    assert not any(
+        SEARCHES in action.report.why
+        for action in stands(ObstacleAided(stage.robot, ObstacleAided.Settings()), stage, range(500))
+    )
+    stage.pegs = []
+    never = ObstacleAided(stage.robot, ObstacleAided.Settings(search_after_s=0.0))
+    assert not any(SEARCHES in action.report.why for action in stands(never, stage, range(500)))
