@@ -50,6 +50,8 @@ class Limits:
             for sensor in robot.sensors
             if sensor.key in said
         }
+        if config.mission.localisation == "dead_reckoning":
+            sensors_s.pop(keys.POSE, None)
         looking = [sensor for sensor in robot.sensors if sensor.key.startswith(LOOKING)]
         if looking and config.mission.map == "perceived":
             ages_s = [sensor.delay_s + turn_s + lag_s + _margin_s(1.0 / sensor.rate_hz) for sensor in looking]

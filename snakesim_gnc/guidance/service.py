@@ -85,7 +85,8 @@ class _Perceived:
         self._joints = client.subscribe(keys.JOINTS, JointState)
         self._contacts = client.subscribe(keys.CONTACTS, Contacts)
         self._imu = client.subscribe(keys.IMU, Imu)
-        self._pose = client.subscribe(keys.POSE, Pose)
+        by_pose = config.mission.localisation == "pose_sensor"
+        self._pose = client.subscribe(keys.POSE, Pose) if by_pose else None
         self._depth = [(client.subscribe(keys.depth(c.name), DepthImage), _noise(c)) for c in robot.sensors.depth]
         self._ranges = [(client.subscribe(keys.ranges(r.name), Ranges), _noise(r)) for r in robot.sensors.range]
         self._client = client
@@ -103,7 +104,7 @@ class _Perceived:
             return None
         contacts = read(self._contacts)
         model.take_joints(joints, contacts, read(self._imu))
-        pose = read(self._pose)
+        pose = None if self._pose is None else read(self._pose)
         if pose is not None:
             model.take_pose(pose)
         if contacts is not None and self._is_new(keys.CONTACTS, contacts.stamp_ns):

@@ -64,6 +64,12 @@ class Mission(FileStruct, frozen=True, kw_only=True):
     speed_m_s: Annotated[float, Meta(ge=0, le=10, extra_json_schema={"unit": "m/s"})] = 0.2
     goal: HeadingGoal | WaypointGoal | None = None
     map: Literal["known", "perceived"] = "known"  # the scene's obstacles as from a survey, or only what sensors tell
+    localisation: Literal["pose_sensor", "dead_reckoning"] = "pose_sensor"  # or joints, IMU and contacts, and the map
+
+    def __post_init__(self) -> None:
+        """Dead reckoning is part of perception."""
+        if self.localisation == "dead_reckoning" and self.map == "known":
+            raise ValueError('localisation = "dead_reckoning" needs map = "perceived"')
 
 
 class Service(FileStruct, frozen=True, kw_only=True):

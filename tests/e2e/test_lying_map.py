@@ -31,9 +31,9 @@ class Deceived(Guidance):
         super().__init__(client, msgspec.structs.replace(config, scene=scene))
 
 
-def worlds(map_: str, *, deceived: bool) -> tuple[list[World], RunConfig]:
+def worlds(map_: str, *more: str, deceived: bool = False) -> tuple[list[World], RunConfig]:
     """What guidance told in a run on a row of pegs."""
-    config = load("peg_row", [parse_set(text) for text in (*HOW, f'mission.map="{map_}"')]).config
+    config = load("peg_row", [parse_set(text) for text in (*HOW, f'mission.map="{map_}"', *more)]).config
     with offered(SERVICES, "guidance", Deceived if deceived else Guidance):
         result = simulate(config)
     assert result.summary.ended == "complete" and (result.summary.path_distance_m or 0) > 0.3
@@ -49,10 +49,16 @@ def worlds(map_: str, *, deceived: bool) -> tuple[list[World], RunConfig]:
 
 
 def test_perceived_is_the_true_map_and_to_the_bit_the_same_whatever_the_scene_file_says():
-    honest, _ = worlds("perceived", deceived=False)
+    honest, _ = worlds("perceived")
     deceived, _ = worlds("perceived", deceived=True)
     common = min(len(honest), len(deceived))
     assert common > 20 and honest[1:common] == deceived[1:common]  # how often tick 0 is shown is chance
+
+
+def test_dead_reckoning_takes_no_pose_and_still_knows_where_it_is() -> None:
+    told, _ = worlds("perceived", "mission.localisation=dead_reckoning")
+    assert all(world.pose_stamp_ns is None for world in told)
+    assert 0.0 < told[-1].base_position_sd_m < 0.05
 
 
 def test_known_is_what_the_scene_file_says():
