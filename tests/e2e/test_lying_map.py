@@ -58,7 +58,8 @@ def test_perceived_is_the_true_map_and_to_the_bit_the_same_whatever_the_scene_fi
 def test_dead_reckoning_takes_no_pose_and_still_knows_where_it_is() -> None:
     told, _ = worlds("perceived", "mission.localisation=dead_reckoning")
     assert all(world.pose_stamp_ns is None for world in told)
-    assert 0.0 < told[-1].base_position_sd_m < 0.05
+    sd_m = told[-1].base_position_sd_m
+    assert sd_m is not None and 0.0 < sd_m < 0.05
 
 
 def test_known_is_what_the_scene_file_says():
