@@ -45,6 +45,9 @@ def _act(given: list[str]) -> int:
         ours.print_help()
         return OK
     name = given[0]
+    for before, word in zip(["", *given], given, strict=False):
+        if not word or (word.startswith("--") and word.endswith("=")):  # as of a variable that is not set
+            raise ConfigError(f"{word.rstrip('=') or before or 'the command'}: empty; give a value, or leave it out")
     if not name.startswith("-") and name not in ours.commands.choices:
         from snakesim_hal.model.plugins import COMMANDS, find_plugin, installed
 

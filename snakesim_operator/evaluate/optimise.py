@@ -44,7 +44,9 @@ def optimise(request: Request) -> int:
     """Go on until so many trials have a result, or have been tried. Returns 0, or 1 when none has a result."""
     space: dict[str, BaseDistribution] = dict(map(_span, request.vary))
     if request.goal not in RunSummary.__struct_fields__:
-        raise ConfigError(f"--goal {request.goal}: no number of a summary, such as path_distance_m or advance_m_s")
+        raise ConfigError(
+            f"--goal {request.goal}: the summary of a run has no such number; it has path_distance_m, advance_m_s, ..."
+        )
     for end in ("low", "high"):  # before anything is started
         _cases(request, {key: getattr(one, end) for key, one in space.items()})
     study = _study(request)

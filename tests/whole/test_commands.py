@@ -1,5 +1,6 @@
 """Commands that need no robot: help, typos, config, scenarios, echo's list of keys, version."""
 
+import shlex
 from importlib.metadata import version
 from pathlib import Path
 
@@ -43,11 +44,13 @@ def test_a_typo_is_answered_by_what_may_be_meant(typed: str, meant: str, tmp_pat
         ("run triplet --duration 3s", "'3s' is not a number; give it without a unit"),
         ("config ./mine.tml", "did you mean mine.toml?"),
         ("console runs/nothing", "no such folder; give the folder that `snakesim run` left"),
+        ("run triplet --out ''", "--out: empty; give a value, or leave it out"),
+        ("evaluate clutter --controllers=", "--controllers: empty; give a value, or leave it out"),
     ],
 )
 def test_what_cannot_be_meant_tells_the_way_out(typed: str, way_out: str, tmp_path: Path) -> None:
     (tmp_path / "mine.toml").touch()
-    ended = snakesim(*typed.split(), cwd=tmp_path)
+    ended = snakesim(*shlex.split(typed), cwd=tmp_path)
     assert ended.code == 2 and way_out in ended.err, ended.err
     assert len(ended.err.splitlines()) == 1
 
