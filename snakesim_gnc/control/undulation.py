@@ -2,6 +2,7 @@
 
 Lateral undulation is the serpenoid curve: every joint swings by `amplitude_rad`, a phase `lag_rad` behind the one ahead
 of it. Head-steered undulation adds a bend to all joints in proportion to the direction of the path, seen from the head.
+Compliant undulation lets obstacles change the amplitude of the wave: body-shape compliance (Travers et al. 2018).
 """
 
 import math
@@ -53,9 +54,12 @@ class LateralUndulation:
         self._phase_rad += math.tau * passed_s / self._set.period_s
         turns = np.arange(len(self._body.bends))[::-1]  # 0 at the head
         reference = np.zeros(len(self._robot.joints))
-        swing = self._set.amplitude_rad * np.sin(self._phase_rad - self._set.lag_rad * turns)
-        reference[self._body.bends] = swing + self._bend_rad(view)
+        waves = np.sin(self._phase_rad - self._set.lag_rad * turns)
+        reference[self._body.bends] = self._amplitude_rad(view, waves) * waves + self._bend_rad(view)
         return reference
+
+    def _amplitude_rad(self, _view: View, _waves: NDArray[np.float64]) -> float:
+        return self._set.amplitude_rad
 
     def _bend_rad(self, view: View) -> float:
         """Bend of every joint that turns the body towards the path ahead."""
@@ -77,3 +81,29 @@ class HeadSteeredUndulation(LateralUndulation):
         """As of lateral undulation, with steering."""
 
         steering: Annotated[float, Meta(ge=0, le=2, extra_json_schema={"unit": "1"})] = 0.8
+
+
+class CompliantUndulation(HeadSteeredUndulation):
+    """A wave whose amplitude A yields to the torques on it: A follows A0 + softness sum(w_i tau_i), tau_i from outside.
+
+    w_i = dtheta_i/dA is the wave itself, so the sum is the generalized force on A.
+    """
+
+    class Settings(HeadSteeredUndulation.Settings, frozen=True, kw_only=True):
+        """As of head-steered undulation, with a softness."""
+
+        softness_rad_per_nm: Annotated[float, Meta(ge=0, le=10, extra_json_schema={"unit": "rad/(N*m)"})] = 0.05
+        yield_s: Annotated[float, Meta(gt=0, le=10, extra_json_schema={"unit": "s"})] = 0.2
+
+    def __init__(self, robot: Description, settings: Settings) -> None:
+        super().__init__(robot, settings)
+        self._now_rad = settings.amplitude_rad
+
+    def _amplitude_rad(self, view: View, waves: NDArray[np.float64]) -> float:
+        config = self._set
+        assert isinstance(config, CompliantUndulation.Settings)
+        from_outside_nm = -float(waves @ np.array(view.joints.torque_nm)[self._body.bends])
+        wanted = config.amplitude_rad + config.softness_rad_per_nm * from_outside_nm
+        bounded = min(max(wanted, 0.0), 2.0 * config.amplitude_rad)
+        self._now_rad += (1.0 - math.exp(-view.period_s / config.yield_s)) * (bounded - self._now_rad)
+        return self._now_rad

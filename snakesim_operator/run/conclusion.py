@@ -16,6 +16,7 @@ from snakesim_hal.wire.messages import Description
 from snakesim_operator.results import last_run
 from snakesim_operator.results.gaps import unwritten
 from snakesim_operator.results.record import REPORT, SUMMARY, RunRecord
+from snakesim_operator.results.report.verdict import distance_m
 from snakesim_operator.results.summary import Restart, RunSummary, summarise
 from snakesim_operator.run.ending import Ending
 from snakesim_operator.run.run_files import RunFiles
@@ -131,8 +132,9 @@ def _print_summary(summary: RunSummary) -> None:
     def number(value: float | None, unit: str, digits: int = 2) -> str:
         return "unknown" if value is None else f"{value:.{digits}f} {unit}"
 
+    straight = summary.path_distance_m is None
     rows = [
-        ("moved along the path", number(summary.path_distance_m, "m", 3)),
+        ("moved" if straight else "moved along the path", number(distance_m(summary), "m", 3)),
         (
             "time",
             f"{summary.duration_s:.2f} s in {summary.wall_s:.2f} s ({number(summary.real_time_factor, 'x', 1)})",

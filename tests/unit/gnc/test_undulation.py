@@ -1,9 +1,12 @@
 """The baselines: a wave that travels to the tail, and bends towards the goal."""
 
+import dataclasses
+
+import msgspec
 import numpy as np
 
 from snakesim_gnc.control.obstacle_aided import ObstacleAided
-from snakesim_gnc.control.undulation import HeadSteeredUndulation, LateralUndulation
+from snakesim_gnc.control.undulation import CompliantUndulation, HeadSteeredUndulation, LateralUndulation
 from snakesim_hal.model.route import Route
 from tests.unit.gnc.stage import make_stage
 
@@ -83,3 +86,20 @@ def test_a_push_of_random_sign_goes_both_ways() -> None:
     steady, still, random = (references(ObstacleAided(stage.robot, one), stage, 300) for one in settings)
     along = (random - still[0]) @ (steady[-1] - still[0])
     assert along.max() > 0.0 > along.min()
+
+
+def test_a_compliant_wave_shrinks_where_it_meets_resistance_and_not_otherwise() -> None:
+    stage, settings = make_stage(), CompliantUndulation.Settings(softness_rad_per_nm=0.1, steering=0.0)
+
+    def largest(resistance: float) -> float:
+        controller, swing = CompliantUndulation(stage.robot, settings), 0.0
+        for tick in range(400):
+            view = stage.view(tick, TAIL_S_M)
+            resisted = [resistance * angle for angle in controller.reference_rad(view, 0.0)]
+            joints = msgspec.structs.replace(view.joints, torque_nm=resisted)
+            reference = controller.update(dataclasses.replace(view, joints=joints)).report.reference_rad
+            swing = max(swing, float(np.abs(reference).max())) if tick > 200 else 0.0
+        return swing
+
+    assert abs(largest(0.0) - settings.amplitude_rad) < 0.01
+    assert largest(4.0) < 0.8 * settings.amplitude_rad

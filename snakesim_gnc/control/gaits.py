@@ -1,0 +1,113 @@
+"""Gaits in three dimensions, for robots whose joints turn left-right and up-down in alternation. They use no map.
+
+All are sums of two waves, one of the yaw joints and one of the pitch joints (Tesch et al. 2009). Sidewinding lifts
+parts of the body over while others rest on the ground; rolling turns a bent body about its own axis; a raised head
+bends its last pitch joints up, and looks around.
+"""
+
+import math
+from typing import Annotated, Any
+
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from snakesim_gnc.control.bumpless import Followed
+from snakesim_gnc.control.controller import Action, Report, View
+from snakesim_hal.model.files import FileStruct
+from snakesim_hal.wire.messages import Description
+
+Floats = NDArray[np.float64]
+
+Swing = Annotated[float, Meta(ge=-2, le=2, extra_json_schema={"unit": "rad"})]
+Lag = Annotated[float, Meta(ge=-3.2, le=3.2, extra_json_schema={"unit": "rad"})]
+Seconds = Annotated[float, Meta(gt=0, le=100, extra_json_schema={"unit": "s"})]
+
+
+class _Gait:
+    """A reference in time for yaw and pitch joints, followed without a jump."""
+
+    stays = ""  # why it does not travel, if it does not
+
+    def __init__(self, robot: Description, settings: Any) -> None:
+        self._set = settings
+        self._followed = Followed(robot, settings.blend_s)
+        axes = [joint.axis for joint in robot.joints]
+        self._yaw, self._pitch = ([i for i, axis in enumerate(axes) if axis == one] for one in ("yaw", "pitch"))
+        self._from_head = np.arange(len(axes))[::-1]  # 0 at the head
+        self._lacks = "" if self._pitch else "this robot has no joints that turn up and down"
+
+    def update(self, view: View) -> Action:
+        """The gait at this time; nothing moves on a robot that cannot do it."""
+        reference = np.zeros(len(self._from_head))
+        if not self._lacks:
+            self._shape(reference, math.tau * view.time_s / self._set.period_s)
+        set_points = self._followed.to(view, reference)
+        return Action(set_points, Report(why=self._lacks or self.stays, reference_rad=reference.tolist()))
+
+    def _shape(self, reference: Floats, phase_rad: float) -> None:
+        """Fill in the angles of all joints."""
+        raise NotImplementedError
+
+    def _wave(self, joints: list[int], phase_rad: float, lag_rad: float) -> Floats:
+        """A wave that travels from the head to the tail, (len(joints),)."""
+        return np.sin(phase_rad - lag_rad * self._from_head[joints])
+
+
+class Sidewinding(_Gait):
+    """Travels sideways."""
+
+    class Settings(FileStruct, frozen=True, kw_only=True):
+        """Two waves, a quarter of a period apart; a negative `pitch_rad` travels to the other side."""
+
+        yaw_rad: Swing = 0.6
+        pitch_rad: Swing = 0.2
+        lag_rad: Lag = 0.45  # from one joint to the next
+        period_s: Seconds = 2.0
+        blend_s: Seconds = 1.0
+
+    def _shape(self, reference: Floats, phase_rad: float) -> None:
+        lag_rad = self._set.lag_rad
+        reference[self._yaw] = self._set.yaw_rad * self._wave(self._yaw, phase_rad, lag_rad)
+        reference[self._pitch] = self._set.pitch_rad * self._wave(self._pitch, phase_rad + 0.5 * math.pi, lag_rad)
+
+
+class Rolling(_Gait):
+    """An arc that turns about its own axis, and so rolls over the ground like a wheel."""
+
+    class Settings(FileStruct, frozen=True, kw_only=True):
+        """The arc; a negative `bend_rad` of the pitch joints rolls to the other side."""
+
+        bend_rad: Swing = 0.25
+        period_s: Seconds = 2.0
+        blend_s: Seconds = 1.0
+
+    def _shape(self, reference: Floats, phase_rad: float) -> None:
+        reference[self._yaw] = abs(self._set.bend_rad) * math.sin(phase_rad)
+        reference[self._pitch] = self._set.bend_rad * math.cos(phase_rad)
+
+
+class RaisedHead(_Gait):
+    """Lifts its head by one pitch joint, keeps it level by the next, and looks left and right.
+
+    The body behind lies in a wave: a straight round body would roll over.
+    """
+
+    stays = "it lifts its head, looks around, and travels nowhere"
+
+    class Settings(FileStruct, frozen=True, kw_only=True):
+        """How high, and how far to each side."""
+
+        lift_rad: Annotated[float, Meta(ge=0, le=1.5, extra_json_schema={"unit": "rad"})] = 0.6
+        look_rad: Swing = 0.4  # of the foremost yaw joint
+        stance_rad: Swing = 0.5  # of the other yaw joints
+        lag_rad: Lag = 0.6
+        period_s: Seconds = 6.0
+        blend_s: Seconds = 2.0
+
+    def _shape(self, reference: Floats, phase_rad: float) -> None:
+        if len(self._pitch) > 1:
+            reference[self._pitch[-1]] = self._set.lift_rad  # down is positive
+        reference[self._pitch[-2:][0]] = -self._set.lift_rad
+        reference[self._yaw] = self._set.stance_rad * self._wave(self._yaw, 0.0, self._set.lag_rad)
+        reference[self._yaw[-1:]] = self._set.look_rad * math.sin(phase_rad)

@@ -1,0 +1,49 @@
+"""Gaits on flat ground, in the simulator: where they carry the body, and a robot that cannot do them."""
+
+import numpy as np
+import pytest
+
+from snakesim_hal.model.scenario import load, parse_set
+from snakesim_operator.results.record import RunRecord
+from snakesim_operator.run.in_process import Result, simulate
+
+
+def on_flat_ground(*sets: str) -> Result:
+    result = simulate(load("mamba_flat", [parse_set(text) for text in sets]).config)
+    assert result.summary.ended == "complete"
+    return result
+
+
+def moved_m(record: RunRecord) -> np.ndarray:
+    """Of the middle of the body, x and y; it lies along x at first."""
+    rows = np.flatnonzero(record.posed)[[0, -1]]
+    first, last = (record.nodes_w(int(row)) for row in rows)
+    assert first is not None and last is not None
+    return (last - first).mean(axis=0)[:2]
+
+
+@pytest.mark.parametrize(("pitch_rad", "side"), [(0.2, -1.0), (-0.2, 1.0)])
+def test_sidewinding_travels_sideways_and_to_the_side_that_is_asked_for(pitch_rad: float, side: float) -> None:
+    along, across = moved_m(on_flat_ground("duration_s=5", f"control.pitch_rad={pitch_rad}").record)
+    assert side * across > 0.8 and abs(along) < 0.6 * abs(across)
+
+
+def test_rolling_travels_sideways() -> None:
+    record = on_flat_ground("controller=rolling", "duration_s=5").record
+    assert np.hypot(*moved_m(record)) > 0.4
+
+
+def test_a_raised_head_is_level_above_the_ground_and_looks_around() -> None:
+    record = on_flat_ground("controller=raised_head", "duration_s=7").record
+    shapes = [record.nodes_w(k) for k in range(400, 650)]
+    heads = np.array([nodes[-2:] for nodes in shapes if nodes is not None])
+    assert heads[..., 2].min() > 0.09
+    assert np.abs(heads[:, 1, 2] - heads[:, 0, 2]).max() < 0.03
+    run = heads[:, 1] - heads[:, 0]
+    assert np.ptp(np.unwrap(np.arctan2(run[:, 1], run[:, 0]))) > 0.4
+
+
+def test_a_planar_robot_stays_where_it_is_and_says_why() -> None:
+    result = on_flat_ground("robot=planar13", "duration_s=1.5")
+    assert np.hypot(*moved_m(result.record)) < 0.01
+    assert "no joints that turn up and down" in (result.summary.last_reason or "")
