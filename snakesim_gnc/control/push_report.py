@@ -38,7 +38,8 @@ def why_it_stands(touches: Touches, push: Push, force_n: float, most_n: float) -
     if not len(touches):
         return "standing still: no obstacle is near enough to push off"
     if not push.balanced:
-        return f"standing still: contacts lost, the {len(touches)} obstacles beside the body cannot push it forward"
+        beside = "the obstacle" if len(touches) == 1 else f"the {len(touches)} obstacles"
+        return f"standing still: contacts lost, {beside} beside the body cannot push it forward"
     if force_n >= most_n:
         return f"standing still: torques and contacts allow no more than {most_n:.1f} N along the body"
     return f"jam: stands still although it pushes with {force_n:.1f} N along the body"

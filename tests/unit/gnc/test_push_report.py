@@ -53,7 +53,7 @@ def test_the_told_forces_push_the_body_with_the_force_that_is_wanted() -> None:
     ("pegs", "force_n", "most_n", "words"),
     [
         ((), 5.0, 0.0, "no obstacle is near enough to push off"),
-        ((peg("a", 0.3, -1),), 5.0, 0.0, "contacts lost, the 1 obstacles beside the body cannot push it forward"),
+        ((peg("a", 0.3, -1),), 5.0, 0.0, "contacts lost, the obstacle beside the body cannot push it forward"),
         ((peg("a", 0.3, -1), peg("b", 0.6, 1), peg("c", 0.9, -1)), 3.0, 3.0, "allow no more than 3.0 N"),
         ((peg("a", 0.3, -1), peg("b", 0.6, 1), peg("c", 0.9, -1)), 9.0, 30.0, "jam: stands still although it pushes"),
     ],
