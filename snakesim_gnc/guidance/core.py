@@ -7,7 +7,7 @@ import numpy as np
 
 from snakesim_gnc.guidance.contacts_w import contact_w
 from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion
-from snakesim_hal.model.scene import outline_distance_m
+from snakesim_hal.model.outlines import outline_distance_m
 from snakesim_hal.wire.messages import (
     Contacts,
     Description,

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from snakesim_gnc.navigation.intents import Wish
+from snakesim_hal.model.outlines import outline_distance_m
 from snakesim_hal.model.route import Route
-from snakesim_hal.model.scene import outline_distance_m
 from snakesim_hal.wire.messages import Obstacle, Trajectory, World
 
 PUSH_REACH_M = 0.15  # an obstacle whose outline is nearer to the path than this can be pushed on

@@ -33,8 +33,18 @@ def margins_n(contacts: Floats, drag: Floats, largest_n: float = LARGEST_N) -> F
     contacts: (n, k, 3) wrenches of the contacts' unit pushes, zero where a body has fewer; drag: (n, 3) mean wrench of
     the tangent, the right-hand side for 1 N. All moments about one point near the bodies.
     """
-    if contacts.shape[1] < 3:
-        return np.zeros(len(contacts))
+    margins = np.zeros(len(contacts))
+    there: NDArray[np.bool_] = np.any(contacts != 0.0, axis=2)
+    has = there.sum(axis=1)
+    for count in range(3, contacts.shape[1] + 1):  # most have far fewer than k: those of equal number together
+        rows = np.flatnonzero(has == count)
+        if len(rows):
+            margins[rows] = _of_as_many(contacts[rows][there[rows]].reshape(-1, count, 3), drag[rows], largest_n)
+    return margins
+
+
+def _of_as_many(contacts: Floats, drag: Floats, largest_n: float) -> Floats:
+    """The same for bodies that all have k contacts."""
     first, second, third = _threes(contacts.shape[1])
     scaled = contacts * (1.0, 1.0, 2.0)  # moments over half a metre
     wanted = drag * (1.0, 1.0, 2.0)

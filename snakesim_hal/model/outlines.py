@@ -127,13 +127,6 @@ class Capsule(FileStruct, frozen=True, kw_only=True):
     front_m: tuple[float, float]
     radius_m: float
 
-    def distance_m(self, point: Floats) -> float:
-        """Distance from a point to the capsule's surface; negative inside."""
-        rear, front = np.array(self.rear_m), np.array(self.front_m)
-        axis = front - rear
-        along = float(np.clip((point - rear) @ axis / max(float(axis @ axis), 1e-12), 0.0, 1.0))
-        return float(np.hypot(*(point - rear - along * axis))) - self.radius_m
-
 
 def outline_distance_m(obstacle: Obstacle, point: Floats) -> float:
     """Distance from a point on the ground to an obstacle's outline from above; negative inside."""

@@ -19,10 +19,10 @@ from snakesim_hal.model.outlines import (
     Coordinate,
     Friction,
     Heading,
+    Outlines,
     Point,
     Size,
     metres,
-    outline_distance_m,
 )
 from snakesim_hal.model.random_field import MAX_STREWN, RandomField, strew
 from snakesim_hal.model.route import Route, sine_points
@@ -130,6 +130,8 @@ class PegsAlongRoute(FileStruct, frozen=True, kw_only=True):
     friction: Friction = 0.0
 
 
+SAMPLES = 24  # of a link's axis, of which the nearest to a box counts
+OVERLAP_M = 1e-4  # of an obstacle and a link, that is let pass
 MAX_OBSTACLES = 4096  # bound of the message World
 
 
@@ -275,20 +277,16 @@ def _pegs_along(scene: SceneFile, index: int, row: PegsAlongRoute, route: Route 
 
 def check_clear(scene: SceneFile, placed: list[Placed], snake: list[Capsule]) -> None:
     """Raise ConfigError when an obstacle overlaps the snake's start."""
-    for item in placed:
-        if item.walkable:
-            continue
-        for capsule in snake:
-            rear, front = np.array(capsule.rear_m), np.array(capsule.front_m)
-            steps = np.linspace(0.0, 1.0, 24)[:, None]
-            gap = min(outline_distance_m(item.obstacle, p) for p in rear + steps * (front - rear))
-            gap = min(gap, capsule.distance_m(np.array(item.obstacle.position_w[:2])) + capsule.radius_m)
-            overlap = capsule.radius_m - gap
-            if item.obstacle.shape != "box":
-                overlap = item.obstacle.radius_m - capsule.distance_m(np.array(item.obstacle.position_w[:2]))
-            if overlap > 1e-4:
-                raise ConfigError(
-                    f"scene {scene.name!r}: obstacle {item.obstacle.name!r} overlaps {capsule.name} of the snake at "
-                    f"its start by {overlap * 1000:.1f} mm; move the obstacle, give the pegs more `corridor_m`, or "
-                    f"change [start] in the scenario"
-                )
+    solid = [item.obstacle for item in placed if not item.walkable]
+    obstacles = Outlines.of(solid)
+    rear, front = np.array([link.rear_m for link in snake]), np.array([link.front_m for link in snake])
+    along = rear[:, None] + np.linspace(0.0, 1.0, SAMPLES)[:, None] * (front - rear)[:, None]  # (links, SAMPLES, 2)
+    to_middles = Outlines.of_segments(rear, front).distance_m(obstacles.centre_w).T - obstacles.rounding_m
+    gaps = np.minimum(obstacles.distance_m(along).min(axis=1), to_middles)  # (links, obstacles), from the links' axes
+    overlaps = np.array([link.radius_m for link in snake])[:, None] - gaps
+    for k, i in np.argwhere(overlaps.T > OVERLAP_M)[:1]:
+        raise ConfigError(
+            f"scene {scene.name!r}: obstacle {solid[k].name!r} overlaps {snake[i].name} of the snake at its start by "
+            f"{overlaps[i, k] * 1000:.1f} mm; move the obstacle, give the pegs more `corridor_m`, or change [start] in "
+            f"the scenario"
+        )

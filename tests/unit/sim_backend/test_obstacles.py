@@ -4,8 +4,8 @@ import mujoco
 import numpy as np
 import pytest
 
+from snakesim_hal.model.outlines import outline_distance_m
 from snakesim_hal.model.scenario import place_all
-from snakesim_hal.model.scene import outline_distance_m
 from tests.unit.sim_backend.rig import Run, make_config
 
 KINDS = {

@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.files import Table, decode
+from snakesim_hal.model.outlines import Outlines, outline_distance_m
 from snakesim_hal.model.scene import (
     Capsule,
     Placed,
     SceneFile,
     check_clear,
-    outline_distance_m,
     place,
     route_of,
 )
@@ -35,6 +35,9 @@ FIELD: dict[str, Any] = {
 SNAKE = [
     Capsule(name=f"link_{i}", rear_m=(0.2 * i, 0.0), front_m=(0.2 * i + 0.2, 0.0), radius_m=0.04) for i in range(3)
 ]
+LINKS = Outlines.of_segments(
+    np.array([link.rear_m for link in SNAKE]), np.array([link.front_m for link in SNAKE]), 0.04
+)
 
 
 def scene(**sections: Any) -> SceneFile:
@@ -127,7 +130,7 @@ def test_a_random_field_keeps_its_clearances(seed: int, clearance_m: float, rout
         assert -1e-9 <= centre[0] <= 2 and -1 <= centre[1] <= 1
         for other in [pegs[0], *strewn[:i]]:
             assert outline_distance_m(other, centre) - peg.radius_m >= clearance_m - 1e-9
-        assert min(link.distance_m(centre) for link in SNAKE) - peg.radius_m >= clearance_m - 1e-9
+        assert LINKS.distance_m(centre).min() - peg.radius_m >= clearance_m - 1e-9
         dense = route.position_w(np.linspace(0, route.length_m, 2000))
         assert np.hypot(*(dense - centre).T).min() - peg.radius_m >= route_clearance_m - 1e-5
 
@@ -149,7 +152,7 @@ def test_blocks_keep_their_clearances_from_everything(seed: int) -> None:
             assert all(0.06 <= 2 * half <= 0.18 for half in one.half_size_m[:2])
         for point in np.array(one.position_w[:2]) + rim:
             assert min((outline_distance_m(o, point) for o in placed if o is not one), default=1.0) >= 0.1 - 1e-9
-            assert min(link.distance_m(point) for link in SNAKE) >= 0.1 - 1e-9
+            assert LINKS.distance_m(point).min() >= 0.1 - 1e-9
 
 
 def test_the_same_seed_gives_the_same_pegs_and_another_seed_others() -> None:
@@ -267,6 +270,3 @@ def test_distances_to_outlines() -> None:
     assert outline_distance_m(block, np.array([0.0, 3.0])) == pytest.approx(1.0)
     assert outline_distance_m(block, np.array([4.0, 6.0])) == pytest.approx(5.0)
     assert outline_distance_m(block, np.array([0.5, 0.0])) == pytest.approx(-0.5)
-    link = Capsule(name="l", rear_m=(0, 0), front_m=(1, 0), radius_m=0.1)
-    assert link.distance_m(np.array([0.5, 0.3])) == pytest.approx(0.2)
-    assert link.distance_m(np.array([-3.0, 4.0])) == pytest.approx(4.9)
