@@ -216,22 +216,29 @@ def _expand(arguments: argparse.Namespace) -> int:
 # --- arguments ---------------------------------------------------------------------------------------------
 
 
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number; give it without a unit") from None
+
+
 def _joints(text: str) -> int:
-    count = int(text)
-    if not 1 <= count <= LAST_NODE:
-        raise argparse.ArgumentTypeError(f"{text} joints; from 1 to {LAST_NODE}, the last node id")
-    return count
+    count = _number(text)
+    if not (1 <= count <= LAST_NODE and count == int(count)):
+        raise argparse.ArgumentTypeError(f"{text} joints; whole, from 1 to {LAST_NODE}, the last node id")
+    return int(count)
 
 
 def _rate(text: str) -> float:
-    rate_hz = float(text)
+    rate_hz = _number(text)
     if not MIN_RATE_HZ <= rate_hz <= MAX_RATE_HZ:
         raise argparse.ArgumentTypeError(f"{text} Hz; from {MIN_RATE_HZ} to {MAX_RATE_HZ}")
     return rate_hz
 
 
 def _seconds(text: str) -> float:
-    seconds = float(text)
+    seconds = _number(text)
     if not 0 < seconds <= 3600:
         raise argparse.ArgumentTypeError(f"{text} s; from above 0 to 3600")
     return seconds

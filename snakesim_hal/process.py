@@ -52,7 +52,7 @@ def heeded() -> tuple[signal.Signals, ...]:
 
 
 def accept_interrupts() -> None:
-    """From here on a stop counts: children start with these signals blocked, until they can handle them."""
+    """From here on every stop counts: children start with Ctrl-C blocked, until they can handle it."""
     signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPS)
 
 

@@ -47,6 +47,8 @@ class _Unending(io.TextIOBase):
     def write(self, text: str) -> int:
         try:
             return self._stream.write(text)
+        except UnicodeEncodeError:
+            return self.write(text.encode("ascii", "backslashreplace").decode())
         except OSError:
             self._give_up()
             return len(text)

@@ -68,6 +68,11 @@ class Controller(Protocol):
         ...
 
 
+def motion_wanted(view: View) -> bool:
+    """Whether there is a path, a speed along it, and a world to move in; without them a controller holds."""
+    return view.world is not None and view.trajectory is not None and view.trajectory.speed_m_s != 0.0
+
+
 def positions(robot: Description, angles_rad: Sequence[float]) -> SetPoints:
     """Every joint to an angle, tail to head, with its full torque."""
     return SetPoints(

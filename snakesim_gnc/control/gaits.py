@@ -13,7 +13,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from snakesim_gnc.control.bumpless import Followed
-from snakesim_gnc.control.controller import Action, Report, View
+from snakesim_gnc.control.controller import Action, Report, View, motion_wanted
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
 
@@ -35,15 +35,19 @@ class _Gait:
         axes = [joint.axis for joint in robot.joints]
         self._yaw, self._pitch = ([i for i, axis in enumerate(axes) if axis == one] for one in ("yaw", "pitch"))
         self._from_head = np.arange(len(axes))[::-1]  # 0 at the head
-        self._lacks = "" if self._pitch else "this robot has no joints that turn up and down"
+        lacking = [name for name, joints in (("up and down", self._pitch), ("left and right", self._yaw)) if not joints]
+        self._lacks = f"this robot has no joints that turn {' and '.join(lacking)}" if lacking else ""
+        self._phase_rad = 0.0
 
     def update(self, view: View) -> Action:
-        """The gait at this time; nothing moves on a robot that cannot do it."""
+        """The gait goes on while motion is wanted; a robot that cannot do it stays as it is."""
+        if self._lacks or not motion_wanted(view):
+            return self._followed.hold(view, self._lacks)
+        self._phase_rad += math.tau * view.period_s / self._set.period_s
         reference = np.zeros(len(self._from_head))
-        if not self._lacks:
-            self._shape(reference, math.tau * view.time_s / self._set.period_s)
+        self._shape(reference, self._phase_rad)
         set_points = self._followed.to(view, reference)
-        return Action(set_points, Report(why=self._lacks or self.stays, reference_rad=reference.tolist()))
+        return Action(set_points, Report(why=self.stays, reference_rad=reference.tolist()))
 
     def _shape(self, reference: Floats, phase_rad: float) -> None:
         """Fill in the angles of all joints."""

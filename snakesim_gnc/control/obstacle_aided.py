@@ -36,6 +36,7 @@ ANOTHER_SHAPE_RAD = 0.1
 SLOPE_M = 0.02  # over which theta' is taken
 SIGNS = np.random.default_rng(1).choice((-1.0, 1.0), 4096)
 LARGEST_REST = 0.3  # of a push: what is not in balance turns the body a little, until it meets other obstacles
+AS_WANTED = 0.5  # share of the wanted speed from which on a body moves as it is to, whatever carries it
 POWERLESS_N = 4.0  # contacts that allow no more cannot overcome the friction of the ground
 STANDS_M_S, STANDS_S = 0.01, 0.5  # slower than this for so long counts as standing still
 
@@ -115,8 +116,10 @@ class ObstacleAided:
             return self._rest(view)
         if self._search.active:
             self._look(located, np.zeros(len(self._robot.joints)))
-        stands = abs(located.speed_m_s) < STANDS_M_S or self._most_n < POWERLESS_N
-        if self._search.decide(view, stands=stands, most_n=self._most_n):
+        wanted_m_s = located.trajectory.speed_m_s
+        goes = located.speed_m_s > AS_WANTED * wanted_m_s  # it has no push to look for
+        stands = abs(located.speed_m_s) < STANDS_M_S or (self._most_n < POWERLESS_N and not goes)
+        if (self._search.active or wanted_m_s > 0.0) and self._search.decide(view, stands=stands, most_n=self._most_n):
             return self._undulate(view)
         scale = self._set.push_scale * self._sign(view.time_s)
         ahead_m = self._look_ahead_m(located, view.period_s)
@@ -209,10 +212,10 @@ class ObstacleAided:
         push = push_forward(located.nodes_w, touches, turns_per_m[self._bends], loose_m=config.loose_m)
         self._found = Found(located.world, touches, push)
         self._unit_nm, self._most_n = np.zeros(len(self._robot.joints)), 0.0
-        if push.rest < LARGEST_REST:
+        largest = float(push.lambdas.max(initial=0.0))
+        if push.rest < LARGEST_REST and largest > 0.0:  # a body in a U has nearly no drag, and needs nobody to push
             self._unit_nm[self._bends] = push.torques_nm
             most = float(np.abs(push.torques_nm).max(initial=0.0)) + 1e-9
-            largest = float(push.lambdas.max())
             self._most_n = min(config.largest_torque_nm / most, config.largest_contact_n / largest)
 
     def _rest(self, view: View) -> Action:

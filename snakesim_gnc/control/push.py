@@ -54,7 +54,7 @@ class Push:
     @property
     def balanced(self) -> bool:
         """Whether these contacts can push at all."""
-        return self.rest < BALANCED
+        return self.rest < BALANCED and bool((self.lambdas > 0.0).any())
 
 
 def find_touches(nodes_w: Floats, radius_m: float, outlines: Outlines, *, reach_m: float, friction: float) -> Touches:

@@ -13,7 +13,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from snakesim_gnc.control.bumpless import Followed
-from snakesim_gnc.control.controller import Action, Report, View
+from snakesim_gnc.control.controller import Action, Report, View, motion_wanted
 from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
@@ -40,8 +40,7 @@ class LateralUndulation:
 
     def update(self, view: View) -> Action:
         """The wave goes on while there is a path to go along."""
-        moving = view.trajectory is not None and view.trajectory.speed_m_s != 0.0 and view.world is not None
-        reference = self.reference_rad(view, view.period_s if moving else 0.0)
+        reference = self.reference_rad(view, view.period_s if motion_wanted(view) else 0.0)
         return Action(self._followed.to(view, reference), Report(reference_rad=reference.tolist()))
 
     def begin_like(self, angles_rad: NDArray[np.float64]) -> None:
@@ -55,10 +54,10 @@ class LateralUndulation:
         turns = np.arange(len(self._body.bends))[::-1]  # 0 at the head
         reference = np.zeros(len(self._robot.joints))
         waves = np.sin(self._phase_rad - self._set.lag_rad * turns)
-        reference[self._body.bends] = self._amplitude_rad(view, waves) * waves + self._bend_rad(view)
+        reference[self._body.bends] = self._amplitude_rad(view, waves, passed_s) * waves + self._bend_rad(view)
         return reference
 
-    def _amplitude_rad(self, _view: View, _waves: NDArray[np.float64]) -> float:
+    def _amplitude_rad(self, _view: View, _waves: NDArray[np.float64], _passed_s: float) -> float:
         return self._set.amplitude_rad
 
     def _bend_rad(self, view: View) -> float:
@@ -99,11 +98,11 @@ class CompliantUndulation(HeadSteeredUndulation):
         super().__init__(robot, settings)
         self._now_rad = settings.amplitude_rad
 
-    def _amplitude_rad(self, view: View, waves: NDArray[np.float64]) -> float:
+    def _amplitude_rad(self, view: View, waves: NDArray[np.float64], passed_s: float) -> float:
         config = self._set
         assert isinstance(config, CompliantUndulation.Settings)
         from_outside_nm = -float(waves @ np.array(view.joints.torque_nm)[self._body.bends])
         wanted = config.amplitude_rad + config.softness_rad_per_nm * from_outside_nm
         bounded = min(max(wanted, 0.0), 2.0 * config.amplitude_rad)
-        self._now_rad += (1.0 - math.exp(-view.period_s / config.yield_s)) * (bounded - self._now_rad)
+        self._now_rad += (1.0 - math.exp(-passed_s / config.yield_s)) * (bounded - self._now_rad)
         return self._now_rad

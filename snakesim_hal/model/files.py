@@ -139,16 +139,21 @@ def _what_it_is(name: str, kind: str) -> str:
     )
 
 
-def read_part(name: str, kind: str, beside: Path | None = None) -> Table:
-    """Read a robot or a scene. With `extends = "planar13"` its file says only what differs from another one's."""
+def read_part(name: str, kind: str, beside: Path | None = None, *, extended: tuple[Path, ...] = ()) -> Table:
+    """Read a robot or a scene. With `extends = "planar13"` its file says only what differs from another one's.
+
+    extended: the files that extend this one, which it cannot extend in turn.
+    """
     path = find(name, kind, beside)
+    if path.resolve() in extended:
+        raise ConfigError(f"{path}: `extends` leads back to this file, so that none says what the robot or scene is")
     table = read_table(path)
     base = table.values.pop("extends", None)
     if base is None:
         return table
     if not isinstance(base, str):
         raise ConfigError(f"{path}: `extends` = {short(repr(base))} must be the name or the path of another file")
-    whole = read_table(find(base, kind, path.parent))
+    whole = read_part(base, kind, path.parent, extended=(*extended, path.resolve()))
     for dotted, value in _settings(table.values):
         whole.put(dotted, value, str(path))
     return whole

@@ -36,6 +36,9 @@ def recover(path: Path, out: Path) -> int:
                 if file.waiting_bytes > FLUSH_BYTES:
                     copy.flush()
         copy.finish()
+    except BaseException:
+        out.unlink(missing_ok=True)  # no half copy, that would refuse the next try
+        raise
     finally:
         file.close()
     return count

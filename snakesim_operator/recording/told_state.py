@@ -1,5 +1,6 @@
 """What host and controller tell of themselves, for Foxglove: state as JSON, a log of its changes, joint references."""
 
+import re
 from collections.abc import Sequence
 from contextlib import suppress
 from typing import Annotated, Any
@@ -55,6 +56,7 @@ class _Controlled(msgspec.Struct, frozen=True):
 
 
 _status, _control = msgspec.msgpack.Decoder(_Told), msgspec.msgpack.Decoder(_Controlled)
+_NUMBER = re.compile(r"-?\d+(\.\d+)?")
 _NUMBERS = ("path_s_m", "propulsion_n", "propulsion_torque_nm", "torque_headroom_nm")
 
 
@@ -92,7 +94,8 @@ class ToldState:
             ("hal", state.lifecycle, state.why.partition("; ")[0], Log.ERROR if stopped else Log.INFO),
             ("control", state.locomotion, state.reason, Log.WARNING if stuck else Log.INFO),
         ):
-            if what and self._logged.get(name) != (what, why):
-                self._logged[name] = (what, why)
+            said = (what, _NUMBER.sub("#", why))  # a force or an age that changes is no news
+            if what and self._logged.get(name) != said:
+                self._logged[name] = said
                 found.append(Log(timestamp=stamp(time_ns), level=level, name=name, message=f"{what}: {why}"))
         return found

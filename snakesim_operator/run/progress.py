@@ -50,6 +50,8 @@ class Progress:
         self._count(status)
         if now < self._next and armed == self._armed:
             return
+        if armed and not self._armed_s:
+            return  # the robot has been armed since the status before: for how long tells the next one
         self._armed = armed
         self._next = now + (TERMINAL_PERIOD_S if self._terminal else PLAIN_PERIOD_S)
         text = self._running(status, control, now) if armed else f"starting: {status.why}"
