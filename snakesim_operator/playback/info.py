@@ -32,10 +32,11 @@ class KeyInfo:
     time_ns: "array[int]" = field(default_factory=lambda: array("q"))  # robot time
     bytes: int = 0
 
-    def gaps(self, key: str) -> int:
+    @property
+    def gaps(self) -> int:
         """How many messages are missing between the first and the last, by the usual step between them."""
         steps = np.diff(np.unique(np.array(self.time_ns)))
-        if key in IRREGULAR or len(steps) < 2:
+        if len(steps) < 2:
             return 0
         return int((np.round(steps / np.median(steps)) - 1).clip(0).sum())
 
@@ -88,6 +89,8 @@ def _told(path: Path, reader: RecordingReader, found: dict[str, KeyInfo], conten
     dated = [found[keys.CLOCK]] if keys.CLOCK in found else found.values()
     began_ns = min((min(one.time_ns) for one in dated), default=0)
     duration_s = (max((max(one.time_ns) for one in found.values()), default=began_ns) - began_ns) * 1e-9
+    in_turns = robot is not None and robot.backend == "can"  # the IMUs of modules on a bus: at some ticks none
+    irregular = (*IRREGULAR, keys.IMU) if in_turns else IRREGULAR
     host = contents.host(contents.columns(robot)) if robot is not None and status is not None else None
     return RecordingInfo(
         file=str(path),
@@ -105,7 +108,7 @@ def _told(path: Path, reader: RecordingReader, found: dict[str, KeyInfo], conten
         command_digest=None if host is None or not host.ticks else host.command_digest,
         lifecycle=None if status is None else f"{status.lifecycle}: {_why(status)}",
         dropped=reader.about.get("dropped", {}),
-        keys={key: _numbers(key, one, duration_s) for key, one in sorted(found.items())},
+        keys={key: _numbers(one, duration_s, regular=key not in irregular) for key, one in sorted(found.items())},
     )
 
 
@@ -114,14 +117,14 @@ def _why(status: Status) -> str:
     return status.why.partition("; ")[0] if status.lifecycle == "disarmed" else status.why
 
 
-def _numbers(key: str, one: KeyInfo, duration_s: float) -> dict[str, float]:
+def _numbers(one: KeyInfo, duration_s: float, *, regular: bool) -> dict[str, float]:
     count = len(one.time_ns)
     lasted_s = (max(one.time_ns) - min(one.time_ns)) * 1e-9
     return {
         "count": count,
         "rate_hz": (len(set(one.time_ns)) - 1) / lasted_s if lasted_s > 0 else 0.0,
         "bytes": one.bytes,
-        "gaps": one.gaps(key),
+        "gaps": one.gaps if regular else 0,
     }
 
 

@@ -139,6 +139,7 @@ def _print_summary(summary: RunSummary) -> None:
             "time",
             f"{summary.duration_s:.2f} s in {summary.wall_s:.2f} s ({number(summary.real_time_factor, 'x', 1)})",
         ),
+        *([("goal", f"{summary.goal_m:g} m, reached after {summary.crossed_s:.1f} s")] if summary.crossed_s else []),
         (
             "locomoting",
             "unknown" if summary.locomoting_fraction is None else f"{100 * summary.locomoting_fraction:.0f} %",

@@ -1,9 +1,12 @@
 """A body that nothing can push undulates until something can, and goes over from one to the other without a jump."""
 
 import numpy as np
+import pytest
 
 from snakesim_gnc.control.controller import Action
 from snakesim_gnc.control.obstacle_aided import ObstacleAided
+from snakesim_hal.model.route import Route
+from snakesim_hal.wire.messages import Obstacle
 from tests.unit.gnc.stage import Stage, make_stage
 
 TAIL_S_M = 0.3
@@ -52,3 +55,27 @@ def test_nobody_searches_beside_obstacles_that_can_push_or_when_told_not_to() ->
     stage.pegs = []
     never = ObstacleAided(stage.robot, ObstacleAided.Settings(search_after_s=0.0))
     assert not any(SEARCHES in action.report.why for action in stands(never, stage, range(500)))
+
+
+@pytest.mark.parametrize("speed_m_s", [0.2, -0.2])
+def test_a_body_that_moves_as_it_is_to_does_not_search_whatever_carries_it(speed_m_s: float) -> None:
+    stage = make_stage()
+    stage.pegs, stage.speed_m_s = [], speed_m_s
+    controller = ObstacleAided(stage.robot, ObstacleAided.Settings(search_after_s=1.0))
+    moving = [controller.update(stage.view(tick, 1.5 + speed_m_s * 0.01 * tick)) for tick in range(400)]
+    assert not any(SEARCHES in action.report.why for action in moving)
+
+
+@pytest.mark.parametrize(
+    "pegs", [[], [Obstacle(name="p", shape="cylinder", position_w=(0.5, 0.12, 0.1), radius_m=0.05)]]
+)
+def test_a_body_in_a_u_that_nothing_can_push_is_no_error(pegs: list[Obstacle]) -> None:
+    stage = make_stage()
+    turn = np.linspace(-np.pi / 2, np.pi / 2, 40)
+    bend = np.column_stack([0.7 + 0.12 * np.cos(turn), 0.12 + 0.12 * np.sin(turn)])
+    stage.route = Route([(-0.3, 0.0), *map(tuple, bend.tolist()), (-3.0, 0.24)])
+    stage.pegs = pegs
+    for tail_s_m in np.linspace(0.3, 0.7, 9):
+        controller = ObstacleAided(stage.robot, ObstacleAided.Settings())
+        for tick in range(5):
+            assert np.isfinite(controller.update(stage.view(tick, float(tail_s_m))).set_points.target).all()

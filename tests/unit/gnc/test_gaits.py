@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
+from snakesim_gnc.control.gaits import RaisedHead, Rolling, Sidewinding
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.run.in_process import Result, simulate
+from tests.unit.gnc.stage import make_stage
 
 
 def on_flat_ground(*sets: str) -> Result:
@@ -47,6 +49,14 @@ def test_a_raised_head_is_level_above_the_ground_and_looks_around() -> None:
 def test_at_speed_zero_a_gait_stands(gait: str) -> None:
     result = on_flat_ground(f"controller={gait}", "mission.speed_m_s=0", "duration_s=2")
     assert np.hypot(*moved_m(result.record)) < 0.005
+
+
+@pytest.mark.parametrize("gait", [Sidewinding, Rolling, RaisedHead])
+def test_a_bent_robot_that_cannot_do_it_stays_bent(gait: type[Sidewinding | Rolling | RaisedHead]) -> None:
+    stage = make_stage()
+    controller = gait(stage.robot, gait.Settings())
+    targets = [controller.update(stage.view(tick, 0.3)).set_points.target for tick in range(200)]
+    assert np.abs(targets[0]).max() > 0.2 and np.abs(np.array(targets) - targets[0]).max() < 1e-9
 
 
 def test_a_planar_robot_stays_where_it_is_and_says_why() -> None:

@@ -103,3 +103,11 @@ def test_a_compliant_wave_shrinks_where_it_meets_resistance_and_not_otherwise() 
 
     assert abs(largest(0.0) - settings.amplitude_rad) < 0.01
     assert largest(4.0) < 0.8 * settings.amplitude_rad
+
+
+def test_without_a_path_a_compliant_wave_yields_to_nothing() -> None:
+    stage = make_stage()
+    controller = CompliantUndulation(stage.robot, CompliantUndulation.Settings())
+    views = [stage.view(t, TAIL_S_M, without="trajectory", torque_nm=3.0) for t in range(50)]
+    held = [controller.update(view).report.reference_rad for view in views]
+    assert all(one == held[0] for one in held)

@@ -90,6 +90,13 @@ def test_a_robot_may_extend_another_and_say_only_what_differs(tmp_path: Path) ->
     assert robot.chain == plain.chain and robot.sensors.imu == plain.sensors.imu
     assert table.origin_of("limits.torque_nm") == str(file)
     assert table.origin_of("limits.angle_rad").endswith("planar13.toml")
+    more = tmp_path / "more.toml"
+    more.write_text('extends = "./worm.toml"\nname = "more"')
+    further = decode(read_part(str(more), "robots"), RobotFile)
+    assert (further.name, further.limits.torque_nm, further.chain) == ("more", 3.0, plain.chain)
+    file.write_text('extends = "./more.toml"')
+    with pytest.raises(ConfigError, match="`extends` leads back to this file"):
+        read_part(str(more), "robots")
     file.write_text("extends = 13")
     with pytest.raises(ConfigError, match="`extends` = 13 must be the name or the path of another file"):
         read_part(str(file), "robots")

@@ -8,6 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from mcap.exceptions import EndOfFile
@@ -18,6 +19,7 @@ from snakesim_hal.model.kinematics import rotation_from_quaternion
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_operator.recording.reader import RECORDING
 from snakesim_operator.recording.recover import recover
+from snakesim_operator.recording.told_state import ToldState
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.run.in_process import simulate
 
@@ -183,3 +185,11 @@ def test_what_a_killed_recorder_leaves_has_transforms_joints_and_images(run: Pat
     assert count > 500 and len(whole["foxglove/tf"]) > 10
     alone = RunRecord.load(tmp_path / "whole.mcap")
     assert len(alone.time_s) > 20 and not alone.lacks
+
+
+def test_a_reason_in_which_only_a_number_changes_is_logged_once() -> None:
+    told, logged = ToldState(), []
+    for k in range(20):
+        control = msgspec.msgpack.encode({"state": "Locomoting", "reason": f"pushes with {k + 0.5} N", "jammed": True})
+        logged += told.of(None, control, k)[1]
+    assert [one.message for one in logged] == ["Locomoting: pushes with 0.5 N"]

@@ -202,3 +202,10 @@ def test_in_lockstep_a_slow_disk_is_waited_for_but_one_that_hangs_only_once(monk
         publisher.put(Done(tick=tick))
     assert 0.2 <= time.monotonic() - began < 0.5
     assert tap.dropped.total() + len(tap.take()) == 200
+
+
+def test_a_copy_that_cannot_be_made_leaves_no_file_behind(tmp_path: Path) -> None:
+    (tmp_path / "bad.mcap").write_bytes(b"no recording at all")
+    with pytest.raises(ConfigError):
+        recover(tmp_path / "bad.mcap", tmp_path / "copy.mcap")
+    assert not (tmp_path / "copy.mcap").exists()
