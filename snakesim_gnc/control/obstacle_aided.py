@@ -98,7 +98,7 @@ class ObstacleAided:
         self._unit_nm = np.zeros(len(robot.joints))
         self._found: Found | None = None
         self._most_n = self._force_n = 0.0  # what contacts and torques allow, and what is commanded of it
-        self._moved_at_s = 0.0
+        self._moved_at_s = self._slow_at_s = 0.0
         self._waits = False
         self._search = ContactSearch(
             robot,
@@ -117,9 +117,11 @@ class ObstacleAided:
         if self._search.active:
             self._look(located, np.zeros(len(self._robot.joints)))
         wanted_m_s = located.trajectory.speed_m_s
-        goes = located.speed_m_s > AS_WANTED * wanted_m_s  # it has no push to look for
+        if located.speed_m_s * wanted_m_s < AS_WANTED * wanted_m_s**2:
+            self._slow_at_s = view.time_s
+        goes = view.time_s - self._slow_at_s > STANDS_S  # whatever carries it: it has no push to look for
         stands = abs(located.speed_m_s) < STANDS_M_S or (self._most_n < POWERLESS_N and not goes)
-        if (self._search.active or wanted_m_s > 0.0) and self._search.decide(view, stands=stands, most_n=self._most_n):
+        if self._search.decide(view, stands=stands, most_n=self._most_n):
             return self._undulate(view)
         scale = self._set.push_scale * self._sign(view.time_s)
         ahead_m = self._look_ahead_m(located, view.period_s)
