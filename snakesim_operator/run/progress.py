@@ -50,6 +50,8 @@ class Progress:
         self._count(status)
         if now < self._next and armed == self._armed:
             return
+        if armed and self._origin is None:
+            self._origin = (now, status.tick / self._rate_hz)
         if armed and not self._armed_s:
             return  # the robot has been armed since the status before: for how long tells the next one
         self._armed = armed
@@ -67,10 +69,8 @@ class Progress:
             self._armed_s += max(status.tick - before.tick, 0) / self._rate_hz
 
     def _running(self, status: Status, control: ControlState | None, now: float) -> str:
-        time_s = status.tick / self._rate_hz
-        if self._origin is None:
-            self._origin = (now, time_s)
-        passed_s, wall_s = time_s - self._origin[1], now - self._origin[0]
+        assert self._origin is not None
+        passed_s, wall_s = status.tick / self._rate_hz - self._origin[1], now - self._origin[0]
         parts = [f"{min(self._armed_s, self._duration_s):6.2f} of {self._duration_s:g} s"]
         if wall_s > 0.3:
             speed = passed_s / wall_s
