@@ -16,6 +16,8 @@ QUICK ?= 1
 
 # A sourced ROS workspace sets these; its packages and pytest plugins must not leak into ours.
 unexport PYTHONPATH PYTHONHOME PYTHONSTARTUP PYTEST_ADDOPTS VIRTUAL_ENV
+# Containers set this one; without bytecode on disk each of a run's six processes compiles all that it imports.
+unexport PYTHONDONTWRITEBYTECODE
 
 bin := .venv/bin
 stamp := .venv/.setup
@@ -42,7 +44,9 @@ test-all: ## Run all tests, as before a release
 test-here: $(stamp) ## Run the tests that need no CAN bus (ARGS="-k gate")
 	$(here) -n $(WORKERS) --dist worksteal || $(here) $(again)
 
+# Compiled before: in the emulated machine that would take many times as long.
 test-vcan: $(stamp) ## Run the CAN tests on real SocketCAN, in a small VM where the kernel has none (ARGS="-m slow": kills, triplet, openings)
+	-@$(bin)/python -m compileall -qq -j 0 $(packages) .venv/lib
 	SNAKESIM_NEED_VCAN=1 $(bin)/python deploy/vm/with_vcan.py -- sh -c '$(on_vcan) || exec $(on_vcan) $(again)'
 
 # Robots in real time stumble on a busy machine, an emulated one most of all. What failed is tried once more: here, alone.
