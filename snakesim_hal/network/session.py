@@ -39,7 +39,8 @@ TX = {"lease": 2000, "queue/congestion_control/drop/wait_before_drop": 100}
 MAX_MESSAGE = "transport/link/rx/max_message_size"
 # Closing a frozen subscriber blocks a receiving thread of Zenoh, and by default it has two: three subscribers that
 # froze together blocked the controller's commands for long enough to end its lease.
-RUNTIME = ("ZENOH_RUNTIME", "(rx: (worker_threads: 16))")
+# A client has one connection to read; with two threads each message would wake both.
+RECEIVERS_LISTENING, RECEIVERS_CONNECTED = 16, 1
 MAX_OPEN_FILES = 16384  # each connection takes one, and the default limit of a process is 1024
 READER_DEPTH = 256  # so that a burst of noise on a key does not displace the valid sample
 IMAGES_DEPTH = 32  # of images, which take much memory; in lockstep a reader may lag by that many
@@ -401,13 +402,26 @@ def open_session(link: Link, connect_timeout_s: float = 5.0) -> Iterator[Session
     if link.listen:
         check_guarded(link.endpoint, "endpoint", insecure=link.insecure)
         raise_open_files(MAX_OPEN_FILES)
-        os.environ.setdefault(*RUNTIME)
     for_images = None if link.listen else partial(open_zenoh, link, connect_timeout_s, keep_apart)
-    session = Session(open_zenoh(link, connect_timeout_s), for_images)
+    with _receiving_threads(RECEIVERS_LISTENING if link.listen else RECEIVERS_CONNECTED):
+        session = Session(open_zenoh(link, connect_timeout_s), for_images)
     try:
         yield session
     finally:
         session.close()
+
+
+@contextmanager
+def _receiving_threads(count: int) -> Iterator[None]:
+    """How many threads Zenoh gets to receive with, in this process but not in its children, unless the user says so."""
+    if "ZENOH_RUNTIME" in os.environ:
+        yield
+        return
+    os.environ["ZENOH_RUNTIME"] = f"(rx: (worker_threads: {count}))"
+    try:
+        yield
+    finally:
+        del os.environ["ZENOH_RUNTIME"]
 
 
 def _config(link: Link, connect_timeout_s: float) -> zenoh.Config:

@@ -28,7 +28,7 @@ class Tap:
             if row.kind == "latched":
                 session.on_latched_arrival(row.key, self._put)
             elif row.kind == "stream":
-                session.on_arrival(row.key, self._put)
+                session.on_urgent_arrival(row.key, self._put)  # a thread for each key would wake with every message
 
     def take(self) -> list[Arrival]:
         """What has arrived since the last call, in order."""

@@ -52,7 +52,7 @@ class ProcessFaults:
         self._supervisor = supervisor
         self._say = say
         self._plan = Plan(injection for injection in planned(config) if injection.part == RUN)
-        self._time = RobotTime(session)
+        self._time = None if self._plan.next_s() == inf else RobotTime(session)  # every clock wakes this process
         self._frozen: dict[str, float] = {}  # name of a process -> monotonic time at which it continues
         self._asked: list[Injection] = []
         self._stepped_s = 0.0
@@ -69,7 +69,7 @@ class ProcessFaults:
 
         Raises RefusedError when a planned fault is not permitted.
         """
-        now_s = self._time.seconds()
+        now_s = None if self._time is None else self._time.seconds()
         if now_s is not None:
             for change in self._plan.until(now_s):
                 if change.begins:
