@@ -64,14 +64,14 @@ class ServiceLoop:
         self.service = service_type(client, config)
         robot = _met(client, goes_on)
         self.service.meet(robot)
-        self._injector = Injector(name, config, session, newest=lambda: client.heard)
+        self._injector = Injector(name, config, session, newest=lambda: client.newest_clock)
         self._injector.allow(emulated=robot.emulated, faults_allowed=config.faults_allowed)
         self._due = client.ticks(0.0, pauses=True)
         self._session, self._entry = session, own_entry(name, config)
 
     def join(self) -> None:
         """Show that the service is here. From now on the robot may be armed, perhaps before the first tick here."""
-        clock = self._client.hear(SILENCE_S)
+        clock = self._client.wait_for_clock(SILENCE_S)
         if clock is not None:
             self._injector.turn(clock.stamp_ns, clock.arming, clock.lifecycle)
         show_process(self._session, self._entry)

@@ -35,7 +35,7 @@ def say(line: str) -> None:
 
 @contextmanager
 def even_if_unread() -> Iterator[None]:
-    """Inside, words that nobody can read end nothing, for a robot moves: a closed pipe or terminal, a full disk."""
+    """Inside, a failed write ends nothing, because a robot moves: a closed pipe or terminal, a full disk."""
     with redirect_stdout(_Unending(sys.stdout)), redirect_stderr(_Unending(sys.stderr)):
         yield
 

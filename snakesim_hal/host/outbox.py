@@ -72,8 +72,8 @@ class Outbox:
         self._images = Sender("images", IMAGES_WAITING_LIMIT) if has_camera else self._streams
         session.latched_publisher(keys.DESCRIPTION, Description).put(description)
         if len(config) <= MAX_CONFIG:
-            told = Configuration(config_hash=description.config_hash, content=config.decode())
-            session.latched_publisher(keys.CONFIG, Configuration).put(told)
+            effective = Configuration(config_hash=description.config_hash, content=config.decode())
+            session.latched_publisher(keys.CONFIG, Configuration).put(effective)
         session.declare_alive(HAL)
         if description.host is not None:
             session.declare_token(keys.host(description.host))

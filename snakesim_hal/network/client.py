@@ -91,7 +91,7 @@ class Client:
         self._every_ticks, self._pace = every_ticks, pace
         self._clocks: Mailbox[Clock] = Mailbox()
         self._heard_at = time.monotonic()
-        self.heard: Clock | None = None  # the newest clock, due or not
+        self.newest_clock: Clock | None = None  # the newest clock, due or not
         self._clock_decoder = Decoder(Clock)
         self._feeds: dict[str, Feed[Any]] = {}
         self._publishers: dict[str, Publisher[Any]] = {}
@@ -167,12 +167,12 @@ class Client:
             clock = following
         return clock
 
-    def hear(self, timeout_s: float) -> Clock | None:
+    def wait_for_clock(self, timeout_s: float) -> Clock | None:
         """The newest clock, due or not; waits for the first one. None when none comes in time."""
         deadline = time.monotonic() + timeout_s
-        while self.heard is None and time.monotonic() < deadline:
+        while self.newest_clock is None and time.monotonic() < deadline:
             time.sleep(0.001)
-        return self.heard
+        return self.newest_clock
 
     def met_anew(self) -> Description | None:
         """The robot's description, if it may have another HAL host than at the last call; else None.
@@ -207,7 +207,7 @@ class Client:
         if clock.pace == "lockstep" != self._pace:
             self.session.rejected["other_pace"] += 1
             return
-        self.heard = clock
+        self.newest_clock = clock
         if clock.paused or clock.tick % self._every_ticks == 0:
             self._clocks.put(clock)
 

@@ -1,7 +1,7 @@
 """A network within one process: sessions that hand each other the bytes that Zenoh would carry, in the same thread.
 
-What is published is with its readers when `put` returns, in order, and nothing is lost. Who asks a question has whoever
-is asked handle it first (`LocalNetwork.answer`), because nobody else would.
+A message has reached its readers when `put` returns; the order is kept, and nothing is lost. A query first runs the
+one that answers it (`LocalNetwork.answer`), because both are in the same thread.
 """
 
 import time
@@ -34,7 +34,7 @@ class LocalNetwork:
     """Where the sessions of one process meet."""
 
     def __init__(self) -> None:
-        self.answer: Callable[[], None] = lambda: None  # lets those who are asked answer
+        self.answer: Callable[[], None] = lambda: None  # runs the parts that answer queries
         self.subscribers: list[tuple[str, Take]] = []
         self.askable: list[tuple[str, Callable[[Question], None]]] = []
         self.watchers: list[tuple[str, Callable[[str, bool], None]]] = []
@@ -47,14 +47,14 @@ class LocalNetwork:
         return LocalSession(self)
 
     def takers(self, key: str) -> list[Take]:
-        """Who gets what is published on a key."""
+        """The subscribers of a key."""
         found = self._takers.get(key)
         if found is None:
             found = self._takers[key] = [take for pattern, take in self.subscribers if intersects(pattern, key)]
         return found
 
     def subscribe(self, pattern: str, take: Take) -> Callable[[], None]:
-        """Have `take` called for what is published from now on. Returns how to end it."""
+        """Call `take` for what is published from now on. Returns a function that ends it."""
         row = pattern, take
         self.subscribers.append(row)
         self._takers.clear()

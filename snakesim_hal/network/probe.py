@@ -1,4 +1,4 @@
-"""Asks a network how it is, without moving anything: round trips, clocks, and who gets an answer."""
+"""Measures a network without moving anything: round trips, clock offsets, and which keys answer."""
 
 import statistics
 import time
@@ -11,7 +11,7 @@ import zenoh
 
 from snakesim_hal.errors import NotConnectedError
 
-NOBODY = "nobody/is/here"
+UNUSED_KEY = "nobody/is/here"
 TRIES = 9
 
 
@@ -26,7 +26,7 @@ class Probe:
         took: list[float] = []
         for _ in range(TRIES):
             began = time.perf_counter()
-            list(self._session.liveliness().get(NOBODY, timeout=1.0))
+            list(self._session.liveliness().get(UNUSED_KEY, timeout=1.0))
             took.append(time.perf_counter() - began)
         return statistics.median(took)
 
@@ -57,7 +57,7 @@ class Probe:
 
 @contextmanager
 def open_probe(settings: str) -> Iterator[Probe]:
-    """Connect. settings: of a session, as JSON5. Raises NotConnectedError when nobody lets it in."""
+    """Connect. settings: of a session, as JSON5. Raises NotConnectedError when no router accepts it."""
     zenoh.init_log_from_env_or("off")
     try:
         session = zenoh.open(zenoh.Config.from_json5(settings))

@@ -1,9 +1,9 @@
-"""A router's log, short and bounded: who was let in, and whom it refused what.
+"""A router's log, short and bounded: who connected, and what was refused to whom.
 
-Zenoh tells whom it refuses at its most detailed level alone. There it also writes two lines for every message that it
-lets pass, and lists what a session would not be allowed at a key as soon as the session mentions it. The name in a
-certificate, and where a session comes from, are in lines of other levels. So Zenoh writes all of it into a pipe, and
-what is worth reading goes to stderr: a line once, and how often it came again once a minute.
+Zenoh logs refusals only at its most detailed level, where it also writes two lines for each message that it forwards,
+and lists all permissions of a session when that session first uses a key. The name in a certificate and the address of
+a session are logged at other levels. So Zenoh logs everything into a pipe, and the relevant lines go to stderr: each
+once, and once a minute how often it was repeated.
 """
 
 import contextlib
@@ -29,7 +29,7 @@ CLOSE_LIMIT_S = 2.0
 AGAIN_S = 60.0
 # A flood of different refusals must not fill a disk: some 20 MB a day.
 BURST, PER_TURN = 10000, 100  # lines: at once, and in each `AGAIN_S`
-MOST_CHARACTERS = 300  # of a line
+MAX_LINE_CHARACTERS = 300  # of a line
 SESSIONS_KEPT = 4000  # as many as a host of ours takes
 
 COLOUR = re.compile(r"\x1b\[[0-9;]*m")
@@ -40,19 +40,19 @@ REFUSED = re.compile(
 )
 IN_SUBJECT = re.compile(r"CertCommonName\((.*?)\)")
 CERTIFIED = re.compile(r"Accepted TLS connection on .*?: (?P<address>\S+)\. Common Name: (?P<name>.*)\.")
-NOBODY = re.compile(r"(?P<session>[0-9a-f]+) did not match any configured ACL subject")
+UNMATCHED = re.compile(r"(?P<session>[0-9a-f]+) did not match any configured ACL subject")
 LET_IN = re.compile(r"New transport link accepted from (?P<session>[0-9a-f]+) to .*? dst: \w+/(?P<address>[^ ,]+)")
 
 
 class RouterLog:
-    """Takes Zenoh's lines, tells the short ones."""
+    """Takes Zenoh's lines, and passes on the relevant ones."""
 
-    def __init__(self, tell: Callable[[str], None]) -> None:
-        self._tell = tell
+    def __init__(self, write: Callable[[str], None]) -> None:
+        self._write = write
         self._names: dict[str, str] = {}  # in certificates, by session, and until it is there by address
-        self._nobodies: dict[str, str] = {}  # sessions that no rule names
+        self._unmatched: dict[str, str] = {}  # sessions that no rule names
         self._listing: set[str] = set()  # threads that list what would not be allowed
-        self._again: Counter[str] = Counter()  # lines told in this turn: how often they came again
+        self._again: Counter[str] = Counter()  # lines of this turn -> number of repetitions
         self._left, self._left_out = BURST, 0
 
     def take(self, line: str) -> None:
@@ -73,14 +73,14 @@ class RouterLog:
             self._say(f"{found['level']} {found['module']}: {found['text']}")
 
     def turn(self) -> None:
-        """Call it every `AGAIN_S`: tells what came again, and begins anew."""
+        """Call it every `AGAIN_S`: reports repeated lines, and starts counting anew."""
         again, left_out = self._again, self._left_out
         self._again, self._left_out, self._left = Counter(), 0, min(self._left + PER_TURN, BURST)
         for line, times in again.items():
             if times:
                 self._say(f"{times} times more: {line}")
         if left_out or self._left_out:
-            self._tell(f"{left_out + self._left_out} lines left out: more than {PER_TURN} different ones a minute")
+            self._write(f"{left_out + self._left_out} lines left out: more than {PER_TURN} different ones a minute")
 
     def _take_decision(self, thread: str, text: str) -> None:
         refused = REFUSED.fullmatch(text)
@@ -93,19 +93,19 @@ class RouterLog:
             named = IN_SUBJECT.search(refused["subject"] or "")
             who = named[1] if named else self._names.get(refused["session"], f"session {refused['session']}")
             self._say(f"refused: {who}: {refused['what']}")
-        elif nobody := NOBODY.match(text):
-            _keep(self._nobodies, nobody["session"], "")
+        elif unmatched := UNMATCHED.match(text):
+            _keep(self._unmatched, unmatched["session"], "")
 
     def _let_in(self, session: str, address: str) -> None:
         name = self._names.pop(address, f"session {session}")
         _keep(self._names, session, name)
-        if self._nobodies.pop(session, None) is None:
+        if self._unmatched.pop(session, None) is None:
             self._say(f"let in: {name} from {address}")
         else:
             self._say(f"refused: {name} from {address}: everything, because no rule is for it")
 
     def _say(self, line: str) -> None:
-        line = line[:MOST_CHARACTERS]
+        line = line[:MAX_LINE_CHARACTERS]
         if line in self._again:
             self._again[line] += 1
         elif self._left <= 0:
@@ -113,7 +113,7 @@ class RouterLog:
         else:
             self._left -= 1
             self._again[line] = 0
-            self._tell(line)
+            self._write(line)
 
 
 def _keep(kept: dict[str, str], key: str, value: str) -> None:
@@ -126,7 +126,7 @@ def _keep(kept: dict[str, str], key: str, value: str) -> None:
 
 @contextlib.contextmanager
 def short_log() -> Iterator[None]:
-    """What Zenoh writes to stdout comes short to stderr, for as long as this lasts; what we print stays as it is."""
+    """While this lasts, Zenoh's output on stdout goes shortened to stderr; our own output is unchanged."""
     log = RouterLog(_to_stderr)
     reading, writing = os.pipe()
     os.set_blocking(reading, False)
@@ -147,14 +147,14 @@ def short_log() -> Iterator[None]:
 
 
 def _to_stderr(line: str) -> None:
-    """Unless nobody takes it there: a router must not wait for whoever reads its log."""
+    """Drop the line when stderr is full: a router must not wait for the reader of its log."""
     with contextlib.suppress(OSError):
         if select.select([], [sys.stderr], [], 0.0)[1]:
             complain(f"{time.strftime('%Y-%m-%dT%H:%M:%SZ', time.gmtime())} {line}")
 
 
 def _read(pipe: int, log: RouterLog) -> None:
-    """Until nobody can write into the pipe any more."""
+    """Until the last writer has closed the pipe."""
     rest, turn_at_s = b"", time.monotonic() + AGAIN_S
     with os.fdopen(pipe, "rb", buffering=0) as source:
         while (got := source.read(PIPE_BYTES)) != b"":
