@@ -3,7 +3,7 @@
 import subprocess
 import sys
 
-from snakesim_hal.network.router_log import BURST, MOST_CHARACTERS, PER_TURN, RouterLog
+from snakesim_hal.network.router_log import BURST, MAX_LINE_CHARACTERS, PER_TURN, RouterLog
 
 ACL, TLS, LINK = (
     "zenoh::net::routing::interceptor::access_control",
@@ -98,7 +98,7 @@ def test_a_flood_of_different_lines_is_bounded() -> None:
             log.take(line(f"{SUBJECT} is unauthorized to Put (ingress) on {number:09}{'x' * 5000}"))
         log.turn()
     assert len(said) <= BURST + 3 * PER_TURN + 3
-    assert max(map(len, said)) <= MOST_CHARACTERS
+    assert max(map(len, said)) <= MAX_LINE_CHARACTERS
     assert "left out" in said[-1]
 
 
