@@ -43,12 +43,15 @@ def main() -> int:
         ours, theirs = sensing(stepped)
         say(compare(f"simulator tick, all sensors published; {physics}", "bare `mj_step`", ours, theirs, 1.25).row())
         floors: list[float] = []
+        unrecorded: list[float] = []
         for _ in range(REPEATS):
             ticks[step].append(lockstep_tick_us(step))
+            unrecorded.append(lockstep_tick_us(step, "--no-record"))
             points, controller_us = motion(stepped)
             floors.append(BareLoop(stepped).tick_us(points) + echo_us(state, command) + controller_us)
-        what = f"lockstep tick, three GNC processes; {physics}"
-        say(compare(what, "bare physics + raw echo + controller", ticks[step], floors, 1.5).row())
+        what, bare = f"lockstep tick, three GNC processes; {physics}", "bare physics + raw echo + controller"
+        say(compare(what, bare, ticks[step], floors, 1.5).row())
+        say(compare(f"the same without a recording (`--no-record`); {physics}", bare, unrecorded, floors, 1.5).row())
 
     latencies: list[float] = []
     echoes: list[float] = []

@@ -1,5 +1,6 @@
 """`python -m benchmarks.cameras`: the cost of a depth camera of 160 x 120 pixels, in CPU time for busy machines."""
 
+import argparse
 import sys
 import tempfile
 import time
@@ -77,6 +78,7 @@ def ticks(config: RunConfig) -> str:
 
 def main() -> int:
     """Print two tables."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
     with tempfile.TemporaryDirectory() as folder:
         field = Path(folder) / "field.toml"
         field.write_text(FIELD)

@@ -3,6 +3,7 @@
 With and without are measured in turn, and their ratios paired: on a shared machine only these mean something.
 """
 
+import argparse
 import os
 import resource
 import statistics
@@ -47,6 +48,7 @@ def tell(what: str, ours: list[float], theirs: list[float]) -> None:
 
 def main() -> int:
     """Print the table."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
     print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores\n{HEADER}", flush=True)
     sizes: list[str] = []
     for scenario in SCENARIOS:

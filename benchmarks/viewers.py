@@ -5,6 +5,7 @@ reads and answers as viser's page does and draws nothing: three browsers without
 measured, and on a lab's bench they run elsewhere.
 """
 
+import argparse
 import os
 import subprocess
 import sys
@@ -77,6 +78,7 @@ def pairs_of(*arguments: str) -> list[tuple[Run, Run]]:
 
 def main() -> int:
     """Print the table."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
     print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores; {VIEWERS} viewers\n{HEADER}", flush=True)
     pairs = pairs_of("--pace", "realtime", "--duration", "10")
     for name in ("p50", "p99"):

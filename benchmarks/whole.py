@@ -26,9 +26,9 @@ def run(*arguments: str, scenario: str = "triplet") -> RunSummary:
         return msgspec.json.decode((out / SUMMARY).read_bytes(), type=RunSummary)
 
 
-def lockstep_tick_us(timestep_s: str, duration_s: float = 10.0) -> float:
-    """Wall time of one tick of a whole lockstep run with guidance, navigation and control as processes."""
-    summary = run("--pace", "lockstep", "--duration", str(duration_s), "--set", f"backends.sim.timestep_s={timestep_s}")
+def lockstep_tick_us(timestep_s: str, *more: str) -> float:
+    """Wall time of one tick of a whole lockstep run with guidance, navigation, control and recorder as processes."""
+    summary = run("--pace", "lockstep", "--duration", "10", "--set", f"backends.sim.timestep_s={timestep_s}", *more)
     return summary.wall_s / summary.ticks * 1e6
 
 
