@@ -22,19 +22,19 @@ from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.truth import TrueState
 
 SCENARIOS = ("triplet", "peg_row", "jam", "mamba_hills")
-NEAR_M, LEAST_N = 0.08, 2.0
+NEAR_M, MIN_FORCE_N = 0.08, 2.0
 FROM_TICK, EVERY = 30, 2
 Push = tuple[float, int, float]  # place along the body in m, side (1: left), force in N
 
 
 @dataclass
 class Score:
-    """Errors over a run, for true pushes of at least LEAST_N."""
+    """Errors over a run, for true pushes of at least MIN_FORCE_N."""
 
     true_n: list[float] = field(default_factory=list[float])
     share: list[float] = field(default_factory=list[float])  # error / true force; 1 where nothing was found
     place_m: list[float] = field(default_factory=list[float])  # of those found
-    ghosts: int = 0  # found, at least LEAST_N, and nothing there
+    ghosts: int = 0  # found, at least MIN_FORCE_N, and nothing there
 
     def add(self, true: list[Push], felt: list[Push]) -> None:
         """One tick."""
@@ -42,14 +42,14 @@ class Score:
         for place, side, force in true:
             mine = [push for push in left if push[1] == side and abs(push[0] - place) < NEAR_M]
             left = [push for push in left if push not in mine]
-            if force < LEAST_N:
+            if force < MIN_FORCE_N:
                 continue
             found = sum(push[2] for push in mine)
             self.true_n.append(force)
             self.share.append(abs(found - force) / force)
             if mine:
                 self.place_m.append(abs(sum(push[0] * push[2] for push in mine) / found - place))
-        self.ghosts += sum(push[2] >= LEAST_N for push in left)
+        self.ghosts += sum(push[2] >= MIN_FORCE_N for push in left)
 
     def row(self, name: str) -> str:
         """A line of the table."""
@@ -143,7 +143,7 @@ def together(found: list[Push]) -> list[Push]:
 
 def main() -> int:
     """Print a table."""
-    print(f"| run | pushes >= {LEAST_N:g} N | median error | 75 % below | >= 10 N | missed | ghosts | place |")
+    print(f"| run | pushes >= {MIN_FORCE_N:g} N | median error | 75 % below | >= 10 N | missed | ghosts | place |")
     print("|---|---|---|---|---|---|---|---|")
     for given in sys.argv[1:] or SCENARIOS:
         scenario, *settings = given.split(",")

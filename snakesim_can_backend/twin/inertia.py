@@ -18,7 +18,7 @@ from snakesim_hal.wire.quantities import from_zero
 
 Floats = NDArray[np.float64]
 
-LEAST_INERTIA_KG_M2 = 1e-6
+MIN_INERTIA_KG_M2 = 1e-6
 
 
 class InertiaSettings(FileStruct, frozen=True, kw_only=True):
@@ -40,7 +40,7 @@ class InertiaPlant:
         period_s = config.period_ns * 1e-9
         self.step_s = period_s / max(int(np.ceil(period_s / settings.timestep_s - 1e-9)), 1)
         links = [mass * length**2 / 12 for mass, length in zip(robot.link_masses_kg, robot.link_lengths_m, strict=True)]
-        inertia = np.maximum(motor.armature_kg_m2 + np.array(links[1:]), LEAST_INERTIA_KG_M2)
+        inertia = np.maximum(motor.armature_kg_m2 + np.array(links[1:]), MIN_INERTIA_KG_M2)
         self._speed_per_nm = self.step_s / inertia
         self._keep = 1.0 / (1.0 + self._speed_per_nm * motor.viscous_nm_s_per_rad)  # implicit: stable at any friction
         self._rubbed_off = self._speed_per_nm * (motor.friction_nm + settings.drag_nm)

@@ -24,7 +24,7 @@ from snakesim_hal.wire.codec import UNDECODABLE, Decoder
 from snakesim_hal.wire.messages import Answer, Clock, ControlSettings, Description, SettingsRequest
 from snakesim_hal.wire.quantities import MAX_SCHEMA, MAX_SETTINGS
 
-MOST_WAITING = 8  # later requests displace the oldest, which gets no answer
+MAX_WAITING = 8  # later requests displace the oldest, which gets no answer
 
 
 class LiveSettings:
@@ -36,7 +36,7 @@ class LiveSettings:
         self._plugin: type[Controller] = find_plugin(CONTROLLERS, config.controller)
         self._name = config.controller[-64:]
         self._settings = self._checked(config.control_settings, f"scenario {config.name!r}")
-        self._waiting: Mailbox[Question] = Mailbox((MOST_WAITING,))
+        self._waiting: Mailbox[Question] = Mailbox((MAX_WAITING,))
         self._decoder = Decoder(SettingsRequest)
         self._robot: Description | None = None
         self._by: str | None = None

@@ -24,7 +24,7 @@ Floats = NDArray[np.float64]
 SAMPLES = 5  # of each link
 BUMP = 0.6  # |n.t| of a contact: beyond, something stands before the head
 BALANCED = 0.05  # share of the force that is left over
-MOST_STEPS = 30
+MAX_STEPS = 30
 BALANCE, THRIFT, SMALL = 10.0, 0.05, 0.02  # weights of: the balance of forces, tau_i theta_i', the size of the forces
 
 
@@ -118,7 +118,7 @@ def _least_squares(full: Floats, right: Floats) -> Floats:
     x, used = np.zeros(count), np.zeros(count, dtype=bool)
     if count == 0:
         return x
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_STEPS):
         gradient = full.T @ (right - full @ x)
         gradient[used] = -np.inf
         enters = int(np.argmax(gradient))

@@ -6,7 +6,7 @@ from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_gnc.control.push import Push, Touches
 from snakesim_hal.wire.messages import World, WorldContact
 
-MOST_TOLD = 64  # push-points in a message
+MAX_REPORTED = 64  # push-points in a message
 
 
 def push_points(body: PlanarBody, world: World, touches: Touches, push: Push, force_n: float) -> list[WorldContact]:
@@ -30,7 +30,7 @@ def push_points(body: PlanarBody, world: World, touches: Touches, push: Push, fo
                 force_w=(force * nx, force * ny, 0.0),
             )
         )
-    return told[:MOST_TOLD]
+    return told[:MAX_REPORTED]
 
 
 def why_it_stands(touches: Touches, push: Push, force_n: float, most_n: float) -> str:

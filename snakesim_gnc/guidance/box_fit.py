@@ -18,7 +18,7 @@ DEPTH_M, DEPTH_SD_M = 0.10, 0.04  # of a box of which one face was seen
 WALL_M = 0.45  # a longer face is a wall,
 THICKNESS_M = 0.05  # which is this thick unless its other side was seen
 FAR_M = 1e3
-LEAST_FACE_M = 0.012  # along it
+MIN_FACE_M = 0.012  # along it
 END_SD_M = 0.008  # of a face's end that no other face fixes
 COARSE_RAD = np.arange(0.0, 90.0, 5.0) * math.pi / 180
 FINE_RAD = np.array([-3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0]) * math.pi / 180
@@ -115,7 +115,7 @@ def _closed(points: Floats, weight: Floats, outward: Floats, yaw: Floats, faces:
         for sign in (-1.0, 1.0):
             mine = (weight > 0) & (first if k == 0 else ~first)[:, 0] & (sign * away[k][:, 0] > 0)
             left, right = np.where(mine, along, np.inf).min(axis=1), np.where(mine, along, -np.inf).max(axis=1)
-            seen.append(right - left > LEAST_FACE_M)  # not just the corner of another
+            seen.append(right - left > MIN_FACE_M)  # not just the corner of another
             information.append(np.where(mine, weight, 0.0).sum(axis=1))
     longest = np.maximum(high[0] - low[0], high[1] - low[1])
     depth = np.where(longest > WALL_M, THICKNESS_M, DEPTH_M)

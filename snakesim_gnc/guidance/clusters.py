@@ -10,7 +10,7 @@ from snakesim_gnc.guidance.scan import Scan
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
 GRAZING_RAD = 0.26  # a surface seen flatter than this falls apart (adaptive breakpoint detector, Borges 2004)
-LEAST_JUMP_M = 0.02
+MIN_JUMP_M = 0.02
 MISSED_BINS = 1  # dropped out within a surface
 HOLLOW_M = 0.025  # an obstacle is convex: its points do not lie this far behind the line between its ends
 
@@ -25,7 +25,7 @@ def clusters_of(scan: Scan) -> list[Indices]:
     bins = np.diff(hits)
     allowed = bins * np.minimum(ranges[:-1], ranges[1:]) * scan.step_rad / math.sin(GRAZING_RAD)
     noise = 3 * np.maximum(scan.sd_m[hits[1:]], scan.sd_m[hits[:-1]])
-    jumps = (bins > MISSED_BINS + 1) | (gaps > np.maximum(allowed, LEAST_JUMP_M) + noise)
+    jumps = (bins > MISSED_BINS + 1) | (gaps > np.maximum(allowed, MIN_JUMP_M) + noise)
     found: list[Indices] = []
     for run in np.split(hits, np.flatnonzero(jumps) + 1):
         found += _convex_parts(run, scan)

@@ -38,7 +38,7 @@ SHARING = 0.06  # of the weight of each link, in each direction: the ground does
 TURNING_RAD_S2, BASE_M_S2 = 30.0, 3.0
 LIKELY = 1.0  # standard deviations by which a push may show to be considered
 SURE = 3.0  # standard deviations by which a push must show
-MOST_STEPS = 30  # of the search
+MAX_STEPS = 30  # of the search
 
 
 class FeltContact(NamedTuple):
@@ -233,7 +233,7 @@ def _fewest(columns: Floats, right: Floats) -> tuple[Floats, Floats]:
     """
     amounts, active = np.zeros(columns.shape[1]), [0]
     lengths = np.linalg.norm(columns, axis=0) + 1e-12
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_STEPS):
         active = _nonnegative(columns, right, amounts, active)
         telling = columns.T @ (right - columns @ amounts) / lengths
         telling[active] = 0.0

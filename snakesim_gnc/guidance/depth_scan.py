@@ -19,7 +19,7 @@ Singles = NDArray[np.float32]
 CELL_M = 0.02  # of range near the camera; a surface is sought cell by cell,
 STRETCH_M = 1.0  # and cells grow beyond this, as noise does
 RISE_M = 0.02  # least height that an upright surface spans within a cell
-LEAST_PIXELS = 2  # in a cell
+MIN_PIXELS = 2  # in a cell
 NEAR_LIMIT_M = 0.03
 PLANE_EVERY = 7  # one pixel of these is used for the ground's plane
 
@@ -118,7 +118,7 @@ class DepthScanner:
         high = np.full(count * cells, -np.inf, dtype=np.float32)
         np.minimum.at(low, cell, heights)
         np.maximum.at(high, cell, heights)
-        upright = ((pixels >= LEAST_PIXELS) & (high - low >= RISE_M)).reshape(count, cells)
+        upright = ((pixels >= MIN_PIXELS) & (high - low >= RISE_M)).reshape(count, cells)
         has = upright.any(axis=1)
         at = STRETCH_M * np.sinh((upright.argmax(axis=1) + 0.5) * (CELL_M / STRETCH_M))
         at = np.where(has, at, np.nan)

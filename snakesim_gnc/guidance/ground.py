@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 FLAT_M, PER_M = 0.015, 0.02  # deviation of ground from its plane: near the robot, and more for each metre of distance
 NEAR_M = 1.5  # the plane is fitted to what is nearer
-LEAST_POINTS = 30
+MIN_POINTS = 30
 MAX_SLOPE = 0.3
 
 
@@ -43,7 +43,7 @@ def refined(plane: Floats, points: Floats) -> Floats:
     for width in (0.04, 0.025):
         off = z - rows @ plane
         weights = np.clip(1.0 - np.square(off / np.where(off > 0, 0.5 * width, width)), 0.0, None) ** 2
-        if np.count_nonzero(weights) < LEAST_POINTS:
+        if np.count_nonzero(weights) < MIN_POINTS:
             return first
         prior = np.diag([1.0, 0.3, 0.3])
         right = rows.T @ (z * weights) + prior @ first

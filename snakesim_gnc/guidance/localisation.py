@@ -20,10 +20,10 @@ Floats = NDArray[np.float64]
 MessageT = TypeVar("MessageT", Contacts, Imu)
 GATE = 25.0  # squared Mahalanobis distance
 JUMP_S = 0.3  # a pose that is refused for longer than this was right: the robot has been carried
-LEAST_SD = np.array([0.0005, 0.0005, 0.001])  # of a pose sensor, m and rad
+MIN_SD = np.array([0.0005, 0.0005, 0.001])  # of a pose sensor, m and rad
 START_SD = np.array([0.01, 0.01, 0.02])  # of the start pose, by which a robot without a pose sensor begins
 LEVEL_S = 0.5  # over which accelerations are averaged to tell what is level
-LEAST_OWN = 0.05  # share of the variance that is the robot's own, not the map's
+MIN_OWN_SHARE = 0.05  # share of the variance that is the robot's own, not the map's
 FRESH_NS = 60_000_000  # contacts and gyros count for steps within this of them
 
 
@@ -43,7 +43,7 @@ class Localiser:
         self.history = BodyHistory(robot)
         self._odometry = Odometry(robot)
         self._start = self.base = start
-        self._measured = np.square(np.maximum([noise.position_m, noise.position_m, noise.angle_rad], LEAST_SD))
+        self._measured = np.square(np.maximum([noise.position_m, noise.position_m, noise.angle_rad], MIN_SD))
         self.covariance = np.diag(START_SD**2)  # (3, 3) of x, y and heading
         self.pose_stamp_ns: int | None = None  # of the newest pose that was believed
         self.refused = 0
@@ -101,7 +101,7 @@ class Localiser:
         common_m2: variance of the position of what it was measured against, which no number of measurements lowers.
         """
         mean_m2 = 0.5 * float(np.trace(self.covariance[:2, :2]))
-        own = self.covariance * max(1.0 - common_m2 / max(mean_m2, 1e-12), LEAST_OWN)
+        own = self.covariance * max(1.0 - common_m2 / max(mean_m2, 1e-12), MIN_OWN_SHARE)
         error = measured - then.planar_w
         error[2] = wrapped(error[2])
         gain = own @ np.linalg.inv(own + spread)

@@ -24,7 +24,7 @@ Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
 GATE_M = 0.02  # from an outline, beside what its sd and the point's allow
 WIDEST_GATE_M = 0.08
-LEAST_POINTS = 2  # of a cluster that begins an obstacle
+MIN_POINTS = 2  # of a cluster that begins an obstacle
 APART_M = 0.03  # from the outline of a well known circle: what is further off is something else
 LOOKED_PAST_M = 0.03  # further than a cell: it was looked through
 TOUCH_SD_M, NORMAL_SD_RAD = 0.003, 0.2
@@ -138,7 +138,7 @@ class ObstacleMap:
         """Which track gets which bins of a cluster, in order of azimuth; new tracks are made as needed."""
         points = scan.points_w[cluster]
         if not near:
-            return [(self._new(), cluster)] if len(cluster) >= min(LEAST_POINTS, len(scan.range_m)) else []
+            return [(self._new(), cluster)] if len(cluster) >= min(MIN_POINTS, len(scan.range_m)) else []
         off = np.abs(outlines.distance_m(points))
         gate = np.minimum(GATE_M + 2 * position_sd_m(near) + sd_m, WIDEST_GATE_M) + 2 * scan.sd_m[cluster][:, None]
         nearest = off.argmin(axis=1)
@@ -146,7 +146,7 @@ class ObstacleMap:
         counts = Counter(nearest[fits].tolist())
         owners = [k for k, n in counts.items() if n >= 0.2 * len(cluster) or n >= 4]
         if not owners:
-            return [(self._new(), cluster)] if len(cluster) >= min(LEAST_POINTS, len(scan.range_m)) else []
+            return [(self._new(), cluster)] if len(cluster) >= min(MIN_POINTS, len(scan.range_m)) else []
         best = np.array(owners)[off[:, owners].argmin(axis=1)]
         others = np.zeros(len(cluster), dtype=bool)
         for k in owners:
@@ -154,7 +154,7 @@ class ObstacleMap:
             if track.shape == "cylinder" and track.position_sd_m < 0.01 and len(track.surface) > 6:
                 others |= (best == k) & (off[:, k] > gate[:, k] + APART_M)
         found = [(near[k], cluster[(best == k) & ~others]) for k in owners]
-        if np.count_nonzero(others) > LEAST_POINTS:
+        if np.count_nonzero(others) > MIN_POINTS:
             found.append((self._new(), cluster[others]))
         found = [(track, bins) for track, bins in found if len(bins)]
         return sorted(found, key=lambda each: int(each[1][0]))

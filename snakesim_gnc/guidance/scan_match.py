@@ -15,8 +15,8 @@ from snakesim_gnc.guidance.tracks import Track, outlines_of, position_sd_m
 
 Floats = NDArray[np.float64]
 GATE_M = 0.05
-LEAST_POINTS = 8
-LEAST_BELIEF = 1.0  # log odds: seen a few times
+MIN_POINTS = 8
+MIN_BELIEF = 1.0  # log odds: seen a few times
 SHARE = 0.1  # of the points' information
 STEPS = 4
 PROBE_M = 0.001
@@ -33,9 +33,9 @@ class Match:
 
 def matched(scan: Scan, tracks: Sequence[Track], base_w: Floats) -> Match | None:
     """base_w: (3,) the base as it was thought to be at the scan's stamp; None when too little of the scan is known."""
-    known = [t for t in tracks if t.log_odds >= LEAST_BELIEF and t.position_sd_m < 0.02 and t.size_sd_m < 0.02]
+    known = [t for t in tracks if t.log_odds >= MIN_BELIEF and t.position_sd_m < 0.02 and t.size_sd_m < 0.02]
     hits = np.flatnonzero(np.isfinite(scan.range_m))
-    if not known or len(hits) < LEAST_POINTS:
+    if not known or len(hits) < MIN_POINTS:
         return None
     outlines, sd = outlines_of(known), position_sd_m(known)
     arm = scan.points_w[hits] - base_w[:2]
@@ -55,7 +55,7 @@ def matched(scan: Scan, tracks: Sequence[Track], base_w: Floats) -> Match | None
         )
         spread = np.hypot(np.hypot(scan.sd_m[hits], sd[nearest]), 0.003)
         ours = np.abs(off) < GATE_M
-        if np.count_nonzero(ours) < LEAST_POINTS:
+        if np.count_nonzero(ours) < MIN_POINTS:
             return None
         weight = ours / spread**2 * np.minimum(1.0, 2.0 * spread / np.maximum(np.abs(off), 1e-9))
         jacobian = np.column_stack([slope, slope[:, 1] * turned[:, 0] - slope[:, 0] * turned[:, 1]])

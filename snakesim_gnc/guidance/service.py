@@ -28,7 +28,7 @@ from snakesim_hal.wire.messages import (
     World,
 )
 
-LEAST_NOISE_M = 0.001
+MIN_NOISE_M = 0.001
 
 
 class Guidance(Service):
@@ -128,4 +128,4 @@ class _Perceived:
 def _noise(sensor: DepthCamera | RangeSensor) -> Noise:
     """As the robot's file has it. One without noise is not trusted without end."""
     per_m2 = sensor.noise_m_per_m2 if isinstance(sensor, DepthCamera) else 0.0
-    return Noise(max(sensor.noise_m, LEAST_NOISE_M), per_m2)
+    return Noise(max(sensor.noise_m, MIN_NOISE_M), per_m2)

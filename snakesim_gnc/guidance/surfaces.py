@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 CELL_M = 0.01
 MAX_CELLS = 48
-MOST_INFORMATION = 1.0 / 0.0015**2  # errors of pose and mount are common to all points, and do not average out
+MAX_INFORMATION = 1.0 / 0.0015**2  # errors of pose and mount are common to all points, and do not average out
 SPREAD = 0.05  # share of one measurement's variance that a cell's mean keeps, however many: it is but a slice of them
 MAX_DOUBTS = 3  # times that a cell was looked through before it is dropped
 
@@ -78,7 +78,7 @@ class Surface:
         self.points_w = np.stack([mean(points[:, 0]), mean(points[:, 1])], axis=1)
         away = np.stack([mean(outward[:, 0]), mean(outward[:, 1])], axis=1)
         self.outward_w = away / np.maximum(np.hypot(away[:, 0], away[:, 1]), 1e-9)[:, None]
-        self.weight = np.minimum(total, MOST_INFORMATION)
+        self.weight = np.minimum(total, MAX_INFORMATION)
         self.count = np.bincount(cell, count) * self.weight / total
         felt = np.bincount(cell, np.where(normal > 0, weight, 0.0))
         self.normal_weight = np.minimum(np.bincount(cell, normal), 1e5) * (felt > 0.2 * total)

@@ -25,7 +25,7 @@ STEP_M = 0.05
 CONTACTS = 8  # of a body that are remembered, the newest
 CELL_M, CELL_RAD = 0.02, np.pi / 18
 WIDE_CELL_M, WIDE_CELL_RAD = 0.1, 0.6
-LEAST_PUSH = -0.1  # n.g of a touch that counts for the margin: `snap` takes the body away from those that brake more
+MIN_PUSH = -0.1  # n.g of a touch that counts for the margin: `snap` takes the body away from those that brake more
 FAILED_M = 0.025  # a path this far from one that failed is another path
 ALONG = 0.35  # |n.t| of a touch: beyond, it is the head that bumps
 
@@ -190,7 +190,7 @@ class Beam:
         along = np.abs(np.einsum("ij,ij->i", near.normal_w, tangents))
         beside = (near.obstacle != NONE) & (gap < self._set.skin_m) & (along < ALONG)
         towards = near.normal_w @ self._goal
-        touches = beside & (towards > LEAST_PUSH)
+        touches = beside & (towards > MIN_PUSH)
         places = points_w - near.normal_w * self._set.radius_m - self._origin
         direction = near.normal_w - self._set.peg_friction * tangents
         push = wrenches(places, direction)

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_gnc.navigation.beam import LEAST_PUSH, STEP_M, Beam, Found, Search
+from snakesim_gnc.navigation.beam import MIN_PUSH, STEP_M, Beam, Found, Search
 from snakesim_gnc.navigation.intents import Wish
 from snakesim_gnc.navigation.line import SPACING_M, evenly
 from snakesim_gnc.navigation.obstacle_map import NONE, ObstacleMap
@@ -40,13 +40,13 @@ SHARPEST_RAD = 1.2  # a path begins with no greater turn from where the head poi
 FORGET_M = 0.15  # beyond this from where it was stuck, what failed there is forgotten
 FAILURES = 4
 FIRST_WIDTH, FIRST_CROWD = 2700, 48  # of the search of the first path on a known map
-LEAST_AHEAD = 10  # arcs of a new path beyond the head
+MIN_AHEAD = 10  # arcs of a new path beyond the head
 BACK_EVERY = 3  # time at the same place: back out
 BACK_M, BACK_S = 0.1, 1.5
 TRAIL = 20  # points of the way behind the tail
 JOIN_M = 0.1  # between them and a path: nearer, and beside its begin, they would fold it
 STANDS_S = 0.8
-MOST_TOLD = 512  # push-points in a message
+MAX_REPORTED = 512  # push-points in a message
 STANDS_M = 0.01
 
 
@@ -252,7 +252,7 @@ class ClutterPlanner:
         for reach_m in REACHES_M:
             found = beam.whole(body, goal_rad, round(AGAIN_M / STEP_M), reach_m, failed)
             arcs = round(self._search.body_length_m / STEP_M)
-            if found is None or len(found.points_w) < arcs + LEAST_AHEAD:
+            if found is None or len(found.points_w) < arcs + MIN_AHEAD:
                 continue
             if best is None or found.cost < best.cost - 0.1:
                 best = found
@@ -263,9 +263,9 @@ class ClutterPlanner:
     def _pushed_off(self, points: Floats, obstacles: ObstacleMap, goal: Floats) -> list[str]:
         """Obstacles that a body on the path touches or nearly does, and that push it on, in order along the path."""
         near = obstacles.near(points[:, 0], points[:, 1])
-        beside = (near.distance_m < self._search.radius_m + self._fit.touch_m) & (near.normal_w @ goal > LEAST_PUSH)
+        beside = (near.distance_m < self._search.radius_m + self._fit.touch_m) & (near.normal_w @ goal > MIN_PUSH)
         found = dict.fromkeys(near.obstacle[beside & (near.obstacle != NONE)].tolist())
-        return [obstacles.obstacles[k].name for k in found][:MOST_TOLD]
+        return [obstacles.obstacles[k].name for k in found][:MAX_REPORTED]
 
     def _leave_trail(self, tail: Floats) -> None:
         """Where the tail was: the way back."""

@@ -20,7 +20,7 @@ Floats = NDArray[np.float64]
 M_PER_N, LONGEST_M = 0.02, 0.5  # of a force arrow
 ABOVE_M = 0.02  # forces are drawn above the body, which would hide most of them at the height of the contacts
 NORMAL_M, TANGENT_M = 0.08, 0.05
-LEAST_N = 0.3  # weaker forces are not drawn
+MIN_FORCE_N = 0.3  # weaker forces are not drawn
 # A camera looks along its x, z up; a frustum of the viewer along z, y down.
 Z_TO_Y = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 LINK_FROM_FRUSTUM = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -159,7 +159,7 @@ def _forces(moment: Moment, centre_w: Floats) -> dict[str, Floats]:
     if contacts:
         at = np.array([c.position_w for c in contacts])
         force = np.array([c.force_w for c in contacts])
-        strong = np.linalg.norm(force, axis=1) > LEAST_N
+        strong = np.linalg.norm(force, axis=1) > MIN_FORCE_N
         found |= {
             "contacts_w": at,
             "normals": _arrows(at, NORMAL_M * np.array([c.normal_w for c in contacts])),
@@ -167,7 +167,7 @@ def _forces(moment: Moment, centre_w: Floats) -> dict[str, Floats]:
             "forces": _forces_above(moment, at[strong], force[strong]),
         }
         total = force.sum(axis=0)
-        if np.linalg.norm(total) > LEAST_N:
+        if np.linalg.norm(total) > MIN_FORCE_N:
             found["resultant"] = _forces_above(moment, centre_w[None], total[None])
     control = moment.control
     if control is not None and control.push_points and len(control.push_points) == len(control.solved_force_n):

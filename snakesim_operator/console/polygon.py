@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 
 from snakesim_operator.console import stage
-from snakesim_operator.console.drawing import LEAST_N
+from snakesim_operator.console.drawing import MIN_FORCE_N
 from snakesim_operator.console.moment import Moment
 
 WIDTH, HEIGHT, EDGE = 380.0, 250.0, 34.0
@@ -17,7 +17,7 @@ def force_polygon(moment: Moment) -> str:
     """x of the world to the right, y upwards."""
     contacts = [] if moment.world is None else sorted(moment.world.contacts, key=lambda contact: contact.body_s_m)
     forces_n = np.array([contact.force_w[:2] for contact in contacts]).reshape(-1, 2)
-    forces_n = forces_n[np.linalg.norm(forces_n, axis=1) > LEAST_N]
+    forces_n = forces_n[np.linalg.norm(forces_n, axis=1) > MIN_FORCE_N]
     if not len(forces_n):
         return "<div style='padding:.3em .6em;opacity:.7'>the body feels no contact force now</div>"
     corners_n = np.vstack([np.zeros(2), np.cumsum(forces_n, axis=0)])

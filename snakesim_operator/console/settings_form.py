@@ -13,7 +13,7 @@ import viser
 
 from snakesim_hal.wire.messages import ControlSettings
 
-MOST_FIELDS = 100
+MAX_FIELDS = 100
 LONGEST_LABEL = 40
 
 
@@ -36,7 +36,7 @@ def fields_of(settings: ControlSettings) -> list[Field]:
         schema, values = json.loads(settings.schema), msgspec.json.decode(settings.settings, type=dict[str, Any])
         properties = _resolved(schema, schema)["properties"]
         described = [(name, _resolved(schema, properties.get(name, {})), value) for name, value in values.items()]
-        found = [_field(name[:LONGEST_LABEL], of, value) for name, of, value in described[:MOST_FIELDS]]
+        found = [_field(name[:LONGEST_LABEL], of, value) for name, of, value in described[:MAX_FIELDS]]
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError, msgspec.DecodeError):
         return []
     return [field for field in found if field is not None]

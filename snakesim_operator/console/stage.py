@@ -25,7 +25,7 @@ Colour = tuple[int, int, int]
 TRAIL_STEP_M, TRAIL_MOST = 0.02, 1000
 FOLLOW_SHARE = 0.08  # of the way to the snake's centre, in a frame
 FURTHEST_M = 0.5  # from the view's middle
-MOST_ROWS = 200  # of hills along an edge
+MAX_ROWS = 200  # of hills along an edge
 SEE_THROUGH = 0.5  # so that no obstacle hides the snake, or a force
 # To be stretched. What is perceived is drawn as hoops about where it is believed to be, so that one sees the truth too.
 SQUARE = np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
@@ -114,7 +114,7 @@ class Stage:
         lowest = -0.002
         if around is not None and (uneven := around.heights_m) is not None:
             along, heights = uneven
-            step = max(1, math.ceil(len(along) / MOST_ROWS))
+            step = max(1, math.ceil(len(along) / MAX_ROWS))
             along, heights = along[::step], heights[::step, ::step]
             x, y = np.meshgrid(along, along)
             n = len(along)

@@ -35,7 +35,7 @@ from snakesim_operator.recording.tap import Tap
 RECORDER = "recorder"
 TURN_S = 0.02
 NICE = 10  # a robot's own processes come first
-MOST_HOSTS = 100  # files: one for each host that a robot had
+MAX_HOSTS = 100  # files: one for each host that a robot had
 FULL = 4  # exit code: the disk took no more
 
 
@@ -82,7 +82,7 @@ class Recorder:
     def _start_over(self, clock: Arrival) -> None:
         """Robot time began anew, with another host: what was before gets a file of its own."""
         self._new_host, self._back = False, None
-        if self._hosts >= MOST_HOSTS:
+        if self._hosts >= MAX_HOSTS:
             return
         self._hosts += 1
         self.close({})

@@ -5,7 +5,7 @@ import msgspec
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
 
-MOST_AWAY_NS = 1_000_000_000  # a tick further away from the clock is a lie, or of another host
+MAX_AWAY_NS = 1_000_000_000  # a tick further away from the clock is a lie, or of another host
 LATEST_NS = 2**63 - 1
 
 
@@ -45,7 +45,7 @@ class RobotTime:
             return min(max(dated.stamp_ns or 0, 0), LATEST_NS)
         if dated.tick is not None:
             at_ns = dated.tick * self.clock.period_ns
-            if at_ns >= 0 and abs(at_ns - self._now_ns) <= MOST_AWAY_NS:
+            if at_ns >= 0 and abs(at_ns - self._now_ns) <= MAX_AWAY_NS:
                 return at_ns
         return self._now_ns
 

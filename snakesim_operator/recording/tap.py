@@ -1,4 +1,4 @@
-"""Takes everything that a robot publishes, for a writer that may be slower; never more than MOST_BYTES wait.
+"""Takes everything that a robot publishes, for a writer that may be slower; never more than MAX_BYTES wait.
 
 In real time what finds no room is dropped, and counted. In lockstep nothing may be lost: there the network waits for
 room, and the robot with it, but at most once for LIMIT_S. After that the disk hangs, and the robot goes on without.
@@ -11,7 +11,7 @@ from collections import Counter, deque
 from snakesim_hal.network.session import Arrival, Session
 from snakesim_hal.wire import keys
 
-MOST_BYTES = 64 * 1024 * 1024
+MAX_BYTES = 64 * 1024 * 1024
 LIMIT_S = 2.0
 
 
@@ -41,10 +41,10 @@ class Tap:
     def _put(self, arrival: Arrival) -> None:
         """In Zenoh's threads."""
         size = len(arrival.payload)
-        if self.lossless and self._bytes + size > MOST_BYTES:
+        if self.lossless and self._bytes + size > MAX_BYTES:
             self._wait_for_room(size)
         with self._lock:
-            if self._bytes + size > MOST_BYTES:
+            if self._bytes + size > MAX_BYTES:
                 self.dropped[arrival.key] += 1
                 return
             self._bytes += size
@@ -52,7 +52,7 @@ class Tap:
 
     def _wait_for_room(self, size: int) -> None:
         give_up = time.monotonic() + LIMIT_S
-        while self._bytes + size > MOST_BYTES:
+        while self._bytes + size > MAX_BYTES:
             if time.monotonic() > give_up:
                 self.lossless = False
                 return

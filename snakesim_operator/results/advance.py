@@ -16,7 +16,7 @@ SAMPLE_S = 0.1
 STOOD_M, STOOD_S = 0.02, 1.0  # it stands while the body's centre has moved less than this within this time
 LASTING_S = 0.5  # noise may take it back over the line
 GIVE_UP_M = 0.03  # a run that does not come on so far within a given time has got stuck
-LEAST_M = 0.1  # below it, energy per metre says nothing
+MIN_DISTANCE_M = 0.1  # below it, energy per metre says nothing
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ class GoalWatch:
 
 def energy_j_per_m(record: RunRecord, advance: Advance) -> float | None:
     """Energy until the goal was reached or the end, over the advance until then."""
-    if advance.reached_m < LEAST_M:
+    if advance.reached_m < MIN_DISTANCE_M:
         return None
     return energy_j(record, record.time_s - record.time_s[0] <= advance.until_s) / advance.reached_m
 

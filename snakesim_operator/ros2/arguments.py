@@ -10,7 +10,7 @@ from snakesim_hal.network.endpoint import check_endpoint
 
 ROS_ROUTER = "tcp/127.0.0.1:7447"  # where `ros2 run rmw_zenoh_cpp rmw_zenohd` listens
 LAST_DOMAIN = 232  # as with DDS
-MOST_HZ = 200.0
+MAX_HZ = 200.0
 
 
 def add_commands(commands: Any) -> None:
@@ -27,14 +27,14 @@ def add_commands(commands: Any) -> None:
     made.add_argument("--ros-namespace", metavar="NAME", help="of topics and frames, for several robots in one graph")
     made.add_argument(
         "--hz",
-        type=number(0.1, MOST_HZ, "Hz"),
+        type=number(0.1, MAX_HZ, "Hz"),
         default=50.0,
         metavar="HZ",
         help="most messages a second of a topic (50)",
     )
     made.add_argument(
         "--image-hz",
-        type=number(0.1, MOST_HZ, "Hz"),
+        type=number(0.1, MAX_HZ, "Hz"),
         default=5.0,
         metavar="HZ",
         help="most images a second of a camera (5)",

@@ -17,7 +17,7 @@ from snakesim_operator.ros2.bridge import Bridge, Options, adds_up
 from snakesim_operator.ros2.graph import Node, NodeName
 from snakesim_operator.tools.targets import Where, the_one
 
-MOST_IN_BYTES = 65536  # of a message from ROS; a Twist has 52
+MAX_IN_BYTES = 65536  # of a message from ROS; a Twist has 52
 DESCRIBED_S = 5.0
 
 
@@ -45,7 +45,7 @@ def join(arguments: argparse.Namespace, where: Where) -> int:
         )
         with contextlib.ExitStack() as opened:
             try:
-                neighbour = opened.enter_context(open_neighbour(arguments.ros_router, largest_bytes=MOST_IN_BYTES))
+                neighbour = opened.enter_context(open_neighbour(arguments.ros_router, largest_bytes=MAX_IN_BYTES))
             except NotConnectedError:
                 raise NotConnectedError(
                     f"no router of ROS nodes on {arguments.ros_router}; start it by "

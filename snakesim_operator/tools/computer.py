@@ -21,7 +21,7 @@ import msgspec
 
 from snakesim_hal.process import HOST_PRIORITY, die_with_parent, lock_memory
 
-LEAST_PYTHON = (3, 11)
+MIN_PYTHON = (3, 11)
 PROBE_LIMIT_S = 30.0
 CAN_DEVICE = "280"  # ARPHRD_CAN in if_arp.h
 TIME_ERROR = 5  # adjtimex: the clock is not synchronised
@@ -53,7 +53,7 @@ class Finding(msgspec.Struct, frozen=True, kw_only=True):
 def python() -> Iterator[Finding]:
     """The interpreter."""
     told = f"{sys.version.split()[0]} at {sys.executable}"
-    if sys.version_info < LEAST_PYTHON:
+    if sys.version_info < MIN_PYTHON:
         yield Finding(
             what="Python", state="fail", told=f"{told}; 3.11 or newer is needed", fix=["make setup PYTHON=python3.11"]
         )

@@ -24,7 +24,7 @@ from snakesim_hal.wire.messages import ColourImage, DepthImage, Description, Pre
 from snakesim_hal.wire.quantities import MAX_PREVIEW_BYTES
 from snakesim_operator.tools.targets import Where, the_one
 
-MOST_HZ = 10.0
+MAX_HZ = 10.0
 WIDEST, NARROWEST = 640, 16  # pixels
 JPEG_QUALITY = 70
 DESCRIBED_S = 5.0
@@ -55,8 +55,8 @@ def _check(hz: float, width: int) -> None:
         import PIL.Image  # noqa: F401
     except ModuleNotFoundError:
         raise ConfigError("`snakesim preview` needs Pillow: pip install 'snakesim[preview]'") from None
-    if not 0.01 <= hz <= MOST_HZ:
-        raise ConfigError(f"--hz {hz:g}: give from 0.01 to {MOST_HZ:g} Hz")
+    if not 0.01 <= hz <= MAX_HZ:
+        raise ConfigError(f"--hz {hz:g}: give from 0.01 to {MAX_HZ:g} Hz")
     if not NARROWEST <= width <= WIDEST:
         raise ConfigError(f"--width {width}: give from {NARROWEST} to {WIDEST} pixels")
 

@@ -7,7 +7,7 @@ from typing import Any
 from snakesim_hal.errors import ConfigError
 
 ACTIONS = ("pause", "resume", "step", "speed", "reset")
-MOST_TICKS, SLOWEST, FASTEST = 1_000_000, 0.1, 10.0  # as the message allows
+MAX_TICKS, SLOWEST, FASTEST = 1_000_000, 0.1, 10.0  # as the message allows
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ def order_of(arguments: argparse.Namespace) -> SimulatorOrder:
     action, number = arguments.action, arguments.number
     if action == "step":
         ticks = 1 if number is None else number
-        if not 1 <= ticks <= MOST_TICKS or ticks != int(ticks):  # in this order: NaN and infinity have no int()
-            raise ConfigError(f"sim step {ticks:g}: give a whole number of ticks from 1 to {MOST_TICKS}")
+        if not 1 <= ticks <= MAX_TICKS or ticks != int(ticks):  # in this order: NaN and infinity have no int()
+            raise ConfigError(f"sim step {ticks:g}: give a whole number of ticks from 1 to {MAX_TICKS}")
         return SimulatorOrder(action, ticks=int(ticks))
     if action == "speed":
         if number is None or not SLOWEST <= number <= FASTEST:

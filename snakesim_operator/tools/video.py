@@ -19,7 +19,7 @@ Write = Callable[[Picture], None]
 
 NEEDS = "a film needs imageio-ffmpeg and Pillow; install them with: pip install 'snakesim[video]'"
 FOLLOW_S = 0.8  # how slowly the view follows the snake
-M_PER_N, LEAST_N = 0.008, 0.3
+M_PER_N, MIN_FORCE_N = 0.008, 0.3
 WORLD_LIMIT_S = 0.3  # older contacts are not drawn
 COLOURS = 48  # of a GIF
 TOLD_SHARE = 0.25
@@ -92,7 +92,7 @@ def _forces(record: RunRecord, time_s: float) -> list[Floats]:
     found: list[Floats] = []
     for contact in recent[-1].contacts:
         at, force = np.array(contact.position_w), np.array(contact.force_w)
-        if np.linalg.norm(force) > LEAST_N:
+        if np.linalg.norm(force) > MIN_FORCE_N:
             found.append(np.stack([at, at + M_PER_N * force]))
     return found
 

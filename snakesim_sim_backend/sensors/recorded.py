@@ -13,7 +13,7 @@ from snakesim_hal.model.sensors import DepthCamera
 from snakesim_hal.wire.messages import DepthImage
 from snakesim_sim_backend.sensors.scope import Scope
 
-MOST_BYTES = 500_000_000  # of a recording: it is kept in memory
+MAX_BYTES = 500_000_000  # of a recording: it is kept in memory
 
 
 class Line(msgspec.Struct, frozen=True):
@@ -49,8 +49,8 @@ class Recorded:
 def _read(file: str, camera: DepthCamera) -> list[DepthImage]:
     path, decoder = expanded(file), msgspec.json.Decoder(Line)
     try:
-        if path.stat().st_size > MOST_BYTES:
-            raise ConfigError(f"{file}: {path.stat().st_size} bytes, at most {MOST_BYTES}; record for a shorter time")
+        if path.stat().st_size > MAX_BYTES:
+            raise ConfigError(f"{file}: {path.stat().st_size} bytes, at most {MAX_BYTES}; record for a shorter time")
         images = [decoder.decode(line).message for line in path.read_bytes().splitlines()]
     except (OSError, msgspec.DecodeError) as error:
         raise ConfigError(

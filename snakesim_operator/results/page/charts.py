@@ -16,7 +16,7 @@ Figure = dict[str, Any]
 BUCKETS = 500  # of time; each keeps its smallest and its largest value
 MAP_COLUMNS = 480
 ROW = 21  # height of a row of bars
-MOST_BARS = 2000
+MAX_BARS = 2000
 NAMED_SHARE = 0.03  # of the time: a shorter bar has no room for words
 
 
@@ -95,7 +95,7 @@ def lines(
 
 def bars(label: str, rows: Sequence[str], drawn: Sequence[Bar], until_s: float, marks: Sequence[Mark] = ()) -> Figure:
     """What held when, a row each, the first on top. Of very many the longest are drawn."""
-    drawn = sorted(drawn, key=lambda bar: bar.start_s - bar.end_s)[:MOST_BARS]
+    drawn = sorted(drawn, key=lambda bar: bar.start_s - bar.end_s)[:MAX_BARS]
     trace = {
         "type": "bar",
         "orientation": "h",

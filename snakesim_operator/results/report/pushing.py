@@ -14,10 +14,10 @@ from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.timeline import end_s, told_at_s, told_spans, zero_s
 
 Floats = NDArray[np.float64]
-MOST_OBSTACLES = 24  # that get a row of their own: those that gave most
-LEAST_N = 0.5  # a smaller wanted force is none
+MAX_OBSTACLES = 24  # that get a row of their own: those that gave most
+MIN_FORCE_N = 0.5  # a smaller wanted force is none
 STOOD_S = 0.5  # a shorter stop is not worth a line
-MOST_STOPS = 40
+MAX_STOPS = 40
 MAPS_SCORED = 60
 
 
@@ -49,7 +49,7 @@ def pushing(record: RunRecord) -> Pushing | None:
     if not told or any(state.propulsion_joint is not None for state in told) or not len(record.time_s):
         return None
     stops = _stops(record)
-    longest = sorted(stops, key=lambda one: one.start_s - one.end_s)[:MOST_STOPS]
+    longest = sorted(stops, key=lambda one: one.start_s - one.end_s)[:MAX_STOPS]
     total, errors = _scored(record)
     off_mm = [1e3 * off for off in total.position_m] if total is not None else []
     return Pushing(
@@ -98,10 +98,10 @@ def _obstacles(record: RunRecord) -> Figure:
     for since, until, state in told_spans(record):
         for contact in state.push_points:
             force_n = math.hypot(*contact.force_w[:2])
-            if force_n >= LEAST_N and until > since:
+            if force_n >= MIN_FORCE_N and until > since:
                 spans.setdefault(contact.obstacle or "unnamed", []).append((since, until, force_n))
     impulse = {name: sum((b - a) * force for a, b, force in found) for name, found in spans.items()}
-    shown = sorted(sorted(spans, key=lambda name: -impulse[name])[:MOST_OBSTACLES], key=lambda name: spans[name][0])
+    shown = sorted(sorted(spans, key=lambda name: -impulse[name])[:MAX_OBSTACLES], key=lambda name: spans[name][0])
     drawn: list[Bar] = []
     for name in shown:
         for since, until, most in _joined(spans[name]):

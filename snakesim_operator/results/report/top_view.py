@@ -26,7 +26,7 @@ from snakesim_operator.results.report.svg import (
 from snakesim_operator.results.report.view import EDGE, FELT_SHARE, FOOT, LONGEST_ARROW, View, nodes_xy_w, reach_m
 
 Floats = NDArray[np.float64]
-MOST_POINTS = 1500  # of the route
+MAX_POINTS = 1500  # of the route
 ROUND = 12  # corners of a circle
 
 
@@ -59,7 +59,7 @@ def ground(record: RunRecord, view: View, labels: Labels) -> str:
 def _route(record: RunRecord, view: View) -> str:
     if record.route is None:
         return ""
-    s = np.linspace(-0.2, record.route.length_m + 0.2, min(int(record.route.length_m * 50) + 20, MOST_POINTS))
+    s = np.linspace(-0.2, record.route.length_m + 0.2, min(int(record.route.length_m * 50) + 20, MAX_POINTS))
     return polyline([view.at(point) for point in record.route.position_w(s)], "route")
 
 

@@ -20,7 +20,7 @@ ABS_X, ABS_Y = 0, 1
 BUTTONS = range(0x120, 0x140)  # BTN_JOYSTICK to BTN_THUMBR; every one of them is the emergency stop
 ABSINFO = struct.Struct("6i")  # value, minimum, maximum, fuzz, flat, resolution
 DEAD_ZONE = 0.12  # of the way to either side
-MOST_EVENTS = 256  # in one read
+MAX_EVENTS = 256  # in one read
 
 
 def _read_ioctl(number: int, size: int) -> int:
@@ -58,7 +58,7 @@ class Joystick:
         if not ready:
             return False
         try:
-            data = os.read(self.handle, MOST_EVENTS * EVENT.size)
+            data = os.read(self.handle, MAX_EVENTS * EVENT.size)
         except BlockingIOError:
             return False
         except OSError:  # ENODEV: unplugged

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from snakesim_gnc.guidance.clusters import clusters_of
 from snakesim_gnc.guidance.obstacle_map import ObstacleMap
 from snakesim_gnc.guidance.scan import Noise, scan_of_ranges
-from snakesim_gnc.guidance.surfaces import MAX_CELLS, MOST_INFORMATION, Surface
+from snakesim_gnc.guidance.surfaces import MAX_CELLS, MAX_INFORMATION, Surface
 from snakesim_gnc.guidance.tracks import Track, fit
 from snakesim_hal.model.outlines import outline_distance_m
 from tests.unit.gnc.guidance.rendered import box, cylinder, lidar, turned
@@ -113,7 +113,7 @@ def test_a_surface_is_bounded_and_never_surer_than_the_mount(places):
     for _ in range(3):
         surface.add(np.array(places), np.full(len(places), 0.001), np.tile([1.0, 0.0], (len(places), 1)))
     assert 0 < len(surface) <= MAX_CELLS
-    assert surface.weight.max() <= MOST_INFORMATION
+    assert surface.weight.max() <= MAX_INFORMATION
 
 
 def test_fusing_looks_lowers_the_scatter_and_the_told_error():

@@ -179,7 +179,7 @@ def test_damage_anywhere_ends_the_reading_and_nothing_else(tmp_path: Path) -> No
 
 
 def test_a_flood_is_bounded_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tap_module, "MOST_BYTES", 1000)
+    monkeypatch.setattr(tap_module, "MAX_BYTES", 1000)
     network = LocalNetwork()
     tap, publisher = Tap(network.session()), network.session().publisher(keys.done("control"), Done)
     for tick in range(2000):
@@ -192,7 +192,7 @@ def test_a_flood_is_bounded_and_counted(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_in_lockstep_a_slow_disk_is_waited_for_but_one_that_hangs_only_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tap_module, "MOST_BYTES", 100)
+    monkeypatch.setattr(tap_module, "MAX_BYTES", 100)
     monkeypatch.setattr(tap_module, "LIMIT_S", 0.2)
     network = LocalNetwork()
     tap, publisher = Tap(network.session()), network.session().publisher(keys.done("control"), Done)
