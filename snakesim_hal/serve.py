@@ -86,7 +86,7 @@ def serve(service_type: type[Service], given: ProcessOptions) -> None:
         hurry(SERVICE_PRIORITY)
         calm_down_after(config.lease_ns * 1e-9)
     with joined(given.link, name) as session:
-        waiting = Waiting(name, f"a HAL host of {given.link.namespace} on {given.link.endpoint}")
+        waiting = StartupWait(name, f"a HAL host of {given.link.namespace} on {given.link.endpoint}")
         loop = ServiceLoop(service_type, config, session, waiting.goes_on)
         loop.join()
         settle_for_timing()
@@ -96,7 +96,7 @@ def serve(service_type: type[Service], given: ProcessOptions) -> None:
             loop.close()
 
 
-class Waiting:
+class StartupWait:
     """Waits for something that others start, and says so."""
 
     def __init__(self, name: str, what: str) -> None:
@@ -116,7 +116,7 @@ class Waiting:
 @contextmanager
 def joined(link: Link, name: str) -> Iterator[Session]:
     """A session, as soon as there is a network. Raises NotConnectedError when there is none in time."""
-    waiting = Waiting(name, f"the network: {link.endpoint}")
+    waiting = StartupWait(name, f"the network: {link.endpoint}")
     with ExitStack() as stack:
         while True:
             try:

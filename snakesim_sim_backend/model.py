@@ -21,7 +21,7 @@ from snakesim_sim_backend.ground import GROUND, add_ground
 from snakesim_sim_backend.imu import add_imus
 from snakesim_sim_backend.obstacles import OBSTACLE, add_obstacle
 from snakesim_sim_backend.settings import Settings
-from snakesim_sim_backend.surface import Grip, grip, link_skin
+from snakesim_sim_backend.surface import PairSurface, grip, link_skin
 from snakesim_sim_backend.tether import add_tether
 
 FREE_QPOS = 7  # of the base: position and quaternion
@@ -111,7 +111,7 @@ def _add_scene(spec: mujoco.MjSpec, config: RunConfig, settings: Settings) -> No
             _pair(spec, rough, links, grip(placed.friction, settings, bears_weight=placed.walkable))
 
 
-def _pair(spec: mujoco.MjSpec, name: str, others: list[str], with_grip: Grip) -> None:
+def _pair(spec: mujoco.MjSpec, name: str, others: list[str], with_grip: PairSurface) -> None:
     for other in others:
         spec.add_pair(geomname1=name, geomname2=other, **with_grip)
 

@@ -17,7 +17,7 @@ RUBBING = [0.9, 0.95, 0.001, 0.5, 2.0]
 LYING = [0.5, 0.9, 0.001, 0.5, 2.0]  # takes up the push of sliding under the body's own weight; sinks in by 0.1 mm
 
 
-class Skin(TypedDict):
+class LinkSurface(TypedDict):
     """Keyword arguments of MjsBody.add_geom."""
 
     friction: list[float]
@@ -27,7 +27,7 @@ class Skin(TypedDict):
     solimp: list[float]
 
 
-class Grip(TypedDict):
+class PairSurface(TypedDict):
     """Keyword arguments of MjSpec.add_pair."""
 
     friction: list[float]
@@ -37,14 +37,16 @@ class Grip(TypedDict):
     solimp: list[float]
 
 
-def frictionless_skin(settings: Settings) -> Skin:
+def frictionless_skin(settings: Settings) -> LinkSurface:
     """Of an obstacle that only pushes. Its priority is above the links', or their friction would act."""
-    return Skin(friction=[0.0, 0.0, 0.0], condim=1, priority=1, solref=[settings.contact_time_s, 1.0], solimp=BARE)
+    return LinkSurface(
+        friction=[0.0, 0.0, 0.0], condim=1, priority=1, solref=[settings.contact_time_s, 1.0], solimp=BARE
+    )
 
 
-def link_skin(settings: Settings) -> Skin:
+def link_skin(settings: Settings) -> LinkSurface:
     """Of a link; acts only between links."""
-    return Skin(
+    return LinkSurface(
         friction=[settings.self_friction, 0.0, 0.0],
         condim=3 if settings.self_friction > 0 else 1,
         priority=0,
@@ -53,9 +55,9 @@ def link_skin(settings: Settings) -> Skin:
     )
 
 
-def grip(friction: float, settings: Settings, *, bears_weight: bool) -> Grip:
+def grip(friction: float, settings: Settings, *, bears_weight: bool) -> PairSurface:
     """Between a link and ground, step or rough obstacle. Only a pair of geoms can have a slip time of its own."""
-    return Grip(
+    return PairSurface(
         friction=[friction, friction, 0.0, 0.0, 0.0],
         condim=3 if friction > 0 else 1,
         solref=[settings.contact_time_s, 1.0],

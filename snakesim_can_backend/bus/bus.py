@@ -36,19 +36,19 @@ _wire_format = struct.Struct("<IB3x8s")
 
 
 class Wire(Protocol):
-    """One end of a bus. Errors are reported by `troubles` or a BackendError, never another exception."""
+    """One end of a bus. Errors are reported by `errors` or a BackendError, never another exception."""
 
     channel: str
 
     def send(self, frame: Frame) -> bool:
-        """Send a frame. False when it was not accepted; `troubles` says why, and nothing is queued for later."""
+        """Send a frame. False when it was not accepted; `errors` says why, and nothing is queued for later."""
         ...
 
     def receive(self) -> list[Frame]:
         """All received frames, in order; never waits."""
         ...
 
-    def troubles(self) -> list[BusError]:
+    def errors(self) -> list[BusError]:
         """Bus errors since the last call."""
         ...
 
@@ -117,7 +117,7 @@ class SocketCanWire:
             self._note_failure(error)
         return frames
 
-    def troubles(self) -> list[BusError]:
+    def errors(self) -> list[BusError]:
         """Bus errors since the last call."""
         dropped = self._count_drops()
         if dropped > self._dropped:
@@ -233,9 +233,9 @@ class VirtualWire:
             raise BackendError(f"{self.channel}: cannot receive: {error}") from error
         return self._faults.leaves(frames) if self._faults.on else frames
 
-    def troubles(self) -> list[BusError]:
+    def errors(self) -> list[BusError]:
         """A virtual bus has only injected errors."""
-        return self._faults.take_troubles()
+        return self._faults.take_errors()
 
     def fileno(self) -> int | None:
         """None: there is nothing to wait on."""

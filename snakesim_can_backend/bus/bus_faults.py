@@ -77,7 +77,7 @@ class VirtualFaults:
             return []
         return frames
 
-    def take_troubles(self) -> list[BusError]:
+    def take_errors(self) -> list[BusError]:
         """Bus errors since the last call."""
         found, self._found = self._found, []
         return found

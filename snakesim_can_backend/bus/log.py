@@ -46,9 +46,9 @@ class LoggedWire:
             self._write(frame)
         return frames
 
-    def troubles(self) -> list[BusError]:
+    def errors(self) -> list[BusError]:
         """As the wire does."""
-        return self._wire.troubles()
+        return self._wire.errors()
 
     def fileno(self) -> int | None:
         """As the wire does."""

@@ -83,7 +83,7 @@ class CanBackend:
         joints = config.robot.chain.modules
         self._mocap: MocapReceiver | None = None
         self._twins: TwinProcess | None = None
-        self._here: OtherEnd | None = None
+        self._local_twins: OtherEnd | None = None
         self._wires: list[Wire] = []
         self._open = True
         self._ours = (
@@ -165,10 +165,10 @@ class CanBackend:
         """Faults reported by the modules and the buses, or detected by the driver."""
         if not self._open:
             return []
-        troubles: list[BusError] = [trouble for wire in self._wires for trouble in wire.troubles()]
+        errors: list[BusError] = [error for wire in self._wires for error in wire.errors()]
         names = self._description.joints
         found = self._watch.look(
-            self._reading, self._lifecycle, troubles, self._unsent, self._unconfigured, self._isolated
+            self._reading, self._lifecycle, errors, self._unsent, self._unconfigured, self._isolated
         )
         failed = frozenset(finding.joint for finding in found if finding.joint is not None)
         few = len(self._isolated | failed) <= self._description.may_lose_joints
@@ -201,7 +201,7 @@ class CanBackend:
                 raise ConfigError(f"there is no {injection.target}; this robot has bus_1 to bus_{len(self._wires)}")
             self._wires[injection.number].inject(injection.kind, begins=begins)
             return True
-        twins = self._twins or self._here
+        twins = self._twins or self._local_twins
         if twins is None or not modules_know(injection, len(self._wire_of)):
             return False
         twins.inject(injection, begins=begins)
@@ -262,8 +262,8 @@ class CanBackend:
             if settings.channels:
                 self._wires.append(SocketCanWire(name))
             else:
-                self._here = twins_here(self._config, settings, name, pose, stepped=self._lockstep)
-                self._wires.append(VirtualWire(name, self._here))
+                self._local_twins = twins_here(self._config, settings, name, pose, stepped=self._lockstep)
+                self._wires.append(VirtualWire(name, self._local_twins))
         if settings.log:
             log = open_log(Path(settings.log))
             self._wires = [LoggedWire(wire, log) for wire in self._wires]

@@ -83,7 +83,7 @@ class Watch:
         self,
         reading: Reading,
         lifecycle: LifecycleState,
-        troubles: Iterable[BusError] = (),
+        errors: Iterable[BusError] = (),
         unsent: Iterable[str] = (),
         unconfigured: Iterable[int] = (),
         isolated: Set[int] = frozenset(),
@@ -99,7 +99,7 @@ class Watch:
         elif self._armed_sync is None:
             self._armed_sync = reading.sync
         self._unasked |= dict.fromkeys(unsent := set(unsent), reading.sync)
-        found = [*self._of_bus(troubles, unsent), *self._of_strangers(reading)]
+        found = [*self._of_bus(errors, unsent), *self._of_strangers(reading)]
         for i, module in enumerate(reading.modules):
             found += self._of_answers(i, module, reading)
             found += self._of_state(i, module, reading, lifecycle, aside=i in isolated)
@@ -206,18 +206,18 @@ class Watch:
 
     # --- the bus ----------------------------------------------------------------------------------------------
 
-    def _of_bus(self, troubles: Iterable[BusError], unsent: set[str]) -> list[Finding]:
+    def _of_bus(self, errors: Iterable[BusError], unsent: set[str]) -> list[Finding]:
         found: list[Finding] = []
-        for trouble in troubles:
-            if trouble.kind == "interface_down":
-                self._down.add(trouble.channel)
-            elif trouble.kind == "interface_up":
-                self._down.discard(trouble.channel)
-            advice = BUS_FAULTS.get(trouble.kind)
+        for error in errors:
+            if error.kind == "interface_down":
+                self._down.add(error.channel)
+            elif error.kind == "interface_up":
+                self._down.discard(error.channel)
+            advice = BUS_FAULTS.get(error.kind)
             if advice is not None:
-                found.append(Finding(trouble.kind, f"{trouble.channel}: {trouble.detail}; {advice}"))
+                found.append(Finding(error.kind, f"{error.channel}: {error.detail}; {advice}"))
             else:
-                self.seen[trouble.kind] = self.seen.get(trouble.kind, 0) + 1
+                self.seen[error.kind] = self.seen.get(error.kind, 0) + 1
         self._unsent = {channel: self._unsent.get(channel, 0) + 1 for channel in unsent - self._down}
         for channel, ticks in self._unsent.items():
             if ticks >= IN_A_ROW:

@@ -5,7 +5,7 @@
 `chain`       all modules of a robot, their motors, and the plant that they move; wall-clock or stepped time
 `firmware`    one module: states, watchdog, set-points, reports; `parameters` is its flash
 `motors`      all motors as vectors; their heat is `snakesim_hal.model.thermal`
-`senses`      sensor readings, with their noise; `reports` rounds them as the bus does; `frames` are the layouts
+`module_sensors`  sensor readings, with their noise; `reports` rounds them as the bus does; `frames` are the layouts
 `module_slot` a module's place on a bus, and its injected faults
 `bus_time`    timing of a bus of 1 Mbit/s: arbitration, and load
 `faults`      injected faults

@@ -20,10 +20,10 @@ from snakesim_can_backend.twin.bus_time import FRAME_US, BusTime, Traffic
 from snakesim_can_backend.twin.faults import parse
 from snakesim_can_backend.twin.firmware import BOOT_US, Module
 from snakesim_can_backend.twin.frames import LENGTHS, read_sync
+from snakesim_can_backend.twin.module_sensors import ModuleSensors, PoseCamera
 from snakesim_can_backend.twin.module_slot import ModuleSlot
 from snakesim_can_backend.twin.motors import Motors
 from snakesim_can_backend.twin.parameters import Parameters, from_factory
-from snakesim_can_backend.twin.senses import PoseCamera, Senses
 from snakesim_hal.model.injection import Change, Injection, Plan
 from snakesim_hal.model.plant import Plant
 from snakesim_hal.model.scenario import RunConfig
@@ -76,7 +76,7 @@ class ModuleChain:
             for joint in range(starts[channel], starts[channel] + count):
                 self._seat(joint, channel, self._serial(joint), -BOOT_US if stepped else 0.0)
         self._senses = [
-            Senses(robot, plant, start, count, (config.seed, channel))
+            ModuleSensors(robot, plant, start, count, (config.seed, channel))
             for channel, (start, count) in enumerate(zip(starts, self.counts, strict=False))
         ]
         self._send_pose = send_pose

@@ -113,7 +113,7 @@ def make_plant(config: RunConfig, settings: Settings) -> Plant:
     return factory(config, plugin_settings(factory, settings.plant_settings, f"plant {settings.plant!r}", where))
 
 
-class Here:
+class InProcessTwins:
     """Twins in this process, at the other end of a virtual bus: calling it runs them."""
 
     def __init__(self, server: TwinServer, send_pose: PoseSender | None, clock_ns: Callable[[], int]) -> None:
@@ -144,8 +144,8 @@ def here(
     *,
     stepped: bool,
     clock_ns: Callable[[], int] = time.monotonic_ns,
-) -> Here:
+) -> InProcessTwins:
     """All twins of a run on one virtual bus; pose: address for poses, HOST:PORT. Raises ConfigError."""
     send_pose = None if pose is None else PoseSender(pose)
     chain = ModuleChain(config, settings, make_plant(config, settings), stepped=stepped, send_pose=send_pose)
-    return Here(TwinServer([VirtualWire(channel)], chain), send_pose, clock_ns)
+    return InProcessTwins(TwinServer([VirtualWire(channel)], chain), send_pose, clock_ns)

@@ -63,7 +63,7 @@ class HandOver:
         return (1.0 - self._share) * self._torque_before_nm + self._share * wanted_nm
 
 
-class Followed:
+class BumplessReference:
     """The reference of joints that are all in position mode, and set-points that follow it without a jump."""
 
     def __init__(self, robot: Description, blend_s: float) -> None:

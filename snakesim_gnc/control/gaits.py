@@ -12,7 +12,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from snakesim_gnc.control.bumpless import Followed
+from snakesim_gnc.control.bumpless import BumplessReference
 from snakesim_gnc.control.controller import Action, Report, View, motion_wanted
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
@@ -31,7 +31,7 @@ class _Gait:
 
     def __init__(self, robot: Description, settings: Any) -> None:
         self._set = settings
-        self._followed = Followed(robot, settings.blend_s)
+        self._bumpless = BumplessReference(robot, settings.blend_s)
         axes = [joint.axis for joint in robot.joints]
         self._yaw, self._pitch = ([i for i, axis in enumerate(axes) if axis == one] for one in ("yaw", "pitch"))
         self._from_head = np.arange(len(axes))[::-1]  # 0 at the head
@@ -42,11 +42,11 @@ class _Gait:
     def update(self, view: View) -> Action:
         """The gait goes on while motion is wanted; a robot that cannot do it stays as it is."""
         if self._lacks or not motion_wanted(view):
-            return self._followed.hold(view, self._lacks)
+            return self._bumpless.hold(view, self._lacks)
         self._phase_rad += math.tau * view.period_s / self._set.period_s
         reference = np.zeros(len(self._from_head))
         self._shape(reference, self._phase_rad)
-        set_points = self._followed.to(view, reference)
+        set_points = self._bumpless.to(view, reference)
         return Action(set_points, Report(why=self.stays, reference_rad=reference.tolist()))
 
     def _shape(self, reference: Floats, phase_rad: float) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from snakesim_gnc.control.bumpless import Followed
+from snakesim_gnc.control.bumpless import BumplessReference
 from snakesim_gnc.control.contact_search import ContactSearch, Patience
 from snakesim_gnc.control.controller import Action, Report, View
 from snakesim_gnc.control.planar_body import PlanarBody
@@ -42,7 +42,7 @@ STANDS_M_S, STANDS_S = 0.01, 0.5  # slower than this for so long counts as stand
 
 
 @dataclass(frozen=True)
-class Found:
+class PushSnapshot:
     """What the body could push off when it was last looked at."""
 
     world: World
@@ -89,14 +89,14 @@ class ObstacleAided:
         self._set = settings
         self._body = PlanarBody(robot)
         self._progress = Progress(self._body, speed_filter_s=settings.speed_filter_s)
-        self._followed = Followed(robot, settings.blend_s)
+        self._bumpless = BumplessReference(robot, settings.blend_s)
         self._stiffness = np.array([joint.stiffness_nm_per_rad for joint in robot.joints])
         self._integral_m = 0.0
         self._push_n = 0.0
         self._bends = self._body.bends
         self._torques_nm = np.zeros(len(robot.joints))
         self._unit_nm = np.zeros(len(robot.joints))
-        self._found: Found | None = None
+        self._last_push: PushSnapshot | None = None
         self._most_n = self._force_n = 0.0  # what contacts and torques allow, and what is commanded of it
         self._moved_at_s = self._slow_at_s = 0.0
         self._waits = False
@@ -111,7 +111,7 @@ class ObstacleAided:
         located = self._progress.update(view)
         if isinstance(located, str):
             self._waits = True
-            return self._followed.hold(view, located)
+            return self._bumpless.hold(view, located)
         if located.trajectory.speed_m_s == 0.0:  # whatever path is planned meanwhile
             return self._rest(view)
         if self._search.active:
@@ -131,10 +131,10 @@ class ObstacleAided:
         slope = self._body.all_angles(at(located.tail_s_m + SLOPE_M)) - self._body.all_angles(at(located.tail_s_m))
         torques = scale * self._push_nm(located, slope / SLOPE_M, view.period_s)
         reference = reference + torques / self._stiffness
-        anew, before = located.anew or self._waits or self._search.changed, self._followed.reference_rad
+        anew, before = located.anew or self._waits or self._search.changed, self._bumpless.reference_rad
         if anew and before is not None and np.abs(reference - before).max() > ANOTHER_SHAPE_RAD:
             self._integral_m = min(self._integral_m, self._set.fresh_look_ahead_m)
-        set_points, self._waits = self._followed.to(view, reference, anew=anew), False
+        set_points, self._waits = self._bumpless.to(view, reference, anew=anew), False
         force_n = ahead_m * float(self._stiffness @ slope**2) / SLOPE_M**2
         return Action(set_points, self._report(view, located, force_n, reference))
 
@@ -142,7 +142,7 @@ class ObstacleAided:
         """In search of something to push off."""
         self._torques_nm[:] = self._push_n = self._force_n = 0.0
         reference = self._search.reference_rad(view)
-        set_points = self._followed.to(view, reference, anew=self._search.changed)
+        set_points = self._bumpless.to(view, reference, anew=self._search.changed)
         why = "nothing beside the body can push it: it undulates in search of contacts"
         return Action(set_points, Report(why=why, reference_rad=reference.tolist()))
 
@@ -155,7 +155,7 @@ class ObstacleAided:
     def _report(self, view: View, located: Located, look_ahead_n: float, reference: Floats) -> Report:
         if abs(located.speed_m_s) > STANDS_M_S:
             self._moved_at_s = view.time_s
-        stands, found, force_n = view.time_s - self._moved_at_s > STANDS_S, self._found, self._force_n
+        stands, found, force_n = view.time_s - self._moved_at_s > STANDS_S, self._last_push, self._force_n
         told, class_of_stall = [], "standing still: backing out along its own path"
         if found is not None:
             told = push_points(self._body, found.world, found.touches, found.push, force_n)
@@ -188,7 +188,7 @@ class ObstacleAided:
         config, wanted_m_s = self._set, located.trajectory.speed_m_s
         if wanted_m_s <= 0.0 or config.largest_push_n == 0.0:
             self._push_n = self._force_n = 0.0
-            self._found = None
+            self._last_push = None
             return np.zeros(len(self._robot.joints))
         error = wanted_m_s - located.speed_m_s
         self._push_n += config.push_n_m * error * period_s
@@ -212,7 +212,7 @@ class ObstacleAided:
             located.nodes_w, self._body.radius_m, outlines, reach_m=config.reach_m, friction=config.peg_friction
         )
         push = push_forward(located.nodes_w, touches, turns_per_m[self._bends], loose_m=config.loose_m)
-        self._found = Found(located.world, touches, push)
+        self._last_push = PushSnapshot(located.world, touches, push)
         self._unit_nm, self._most_n = np.zeros(len(self._robot.joints)), 0.0
         largest = float(push.lambdas.max(initial=0.0))
         if push.rest < LARGEST_REST and largest > 0.0:  # a body in a U has nearly no drag, and needs nobody to push
@@ -226,11 +226,11 @@ class ObstacleAided:
         self._torques_nm[:] = 0.0
         self._moved_at_s = view.time_s
         self._search.stop()
-        if self._waits or self._followed.reference_rad is None:
-            action = self._followed.hold(view, "")
+        if self._waits or self._bumpless.reference_rad is None:
+            action = self._bumpless.hold(view, "")
         else:
             reference = np.array(view.joints.angle_rad)
-            set_points = self._followed.to(view, reference, anew=True)
+            set_points = self._bumpless.to(view, reference, anew=True)
             action = Action(set_points, Report(reference_rad=reference.tolist()))
         self._waits = True
         return action

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from snakesim_gnc.control.bumpless import Followed
+from snakesim_gnc.control.bumpless import BumplessReference
 from snakesim_gnc.control.controller import Action, Report, View
 from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_gnc.control.progress import Progress
@@ -30,19 +30,19 @@ class PathFollowing:
         self._set = settings
         self._body = PlanarBody(robot)
         self._progress = Progress(self._body, speed_filter_s=settings.speed_filter_s)
-        self._followed = Followed(robot, settings.blend_s)
+        self._bumpless = BumplessReference(robot, settings.blend_s)
         self._ahead_s_m = 0.0
 
     def update(self, view: View) -> Action:
         """Angles of the body slightly further along the path."""
         located = self._progress.update(view)
         if isinstance(located, str):
-            return self._followed.hold(view, located)
+            return self._bumpless.hold(view, located)
         tail_s_m = located.tail_s_m
         if located.anew:
             self._ahead_s_m = tail_s_m
         advanced = self._ahead_s_m + located.trajectory.speed_m_s * view.period_s
         self._ahead_s_m = min(max(advanced, tail_s_m), tail_s_m + self._set.look_ahead_m)
         reference = self._body.all_angles(located.on_path.at(self._ahead_s_m))
-        set_points = self._followed.to(view, reference, anew=located.anew)
+        set_points = self._bumpless.to(view, reference, anew=located.anew)
         return Action(set_points, Report(path_s_m=tail_s_m, reference_rad=reference.tolist()))

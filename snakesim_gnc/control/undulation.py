@@ -12,7 +12,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from snakesim_gnc.control.bumpless import Followed
+from snakesim_gnc.control.bumpless import BumplessReference
 from snakesim_gnc.control.controller import Action, Report, View, motion_wanted
 from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_hal.model.files import FileStruct
@@ -35,13 +35,13 @@ class LateralUndulation:
 
     def __init__(self, robot: Description, settings: Settings) -> None:
         self._robot, self._set, self._body = robot, settings, PlanarBody(robot)
-        self._followed = Followed(robot, settings.blend_s)
+        self._bumpless = BumplessReference(robot, settings.blend_s)
         self._phase_rad = 0.0
 
     def update(self, view: View) -> Action:
         """The wave goes on while there is a path to go along."""
         reference = self.reference_rad(view, view.period_s if motion_wanted(view) else 0.0)
-        return Action(self._followed.to(view, reference), Report(reference_rad=reference.tolist()))
+        return Action(self._bumpless.to(view, reference), Report(reference_rad=reference.tolist()))
 
     def begin_like(self, angles_rad: NDArray[np.float64]) -> None:
         """Choose the phase at which the wave is most like a shape, (n_joints,)."""

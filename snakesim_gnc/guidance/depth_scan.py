@@ -25,7 +25,7 @@ PLANE_EVERY = 7  # one pixel of these is used for the ground's plane
 
 
 @dataclass(frozen=True)
-class Lens:
+class Intrinsics:
     """Intrinsics of a camera; pixel (u, v) sees along (1, -(u - cx) / fx, -(v - cy) / fy) in its frame."""
 
     width: int
@@ -36,9 +36,9 @@ class Lens:
     cy_px: float
 
     @staticmethod
-    def of(image: DepthImage) -> "Lens":
+    def of(image: DepthImage) -> "Intrinsics":
         """Of the image's camera."""
-        return Lens(image.width, image.height, image.fx_px, image.fy_px, image.cx_px, image.cy_px)
+        return Intrinsics(image.width, image.height, image.fx_px, image.fy_px, image.cx_px, image.cy_px)
 
     def rays(self) -> Singles:
         """(height * width, 3), row by row from the top."""
@@ -58,7 +58,7 @@ def metres_of(image: DepthImage) -> Singles:
 class DepthScanner:
     """Scans of one camera."""
 
-    def __init__(self, lens: Lens, noise: Noise) -> None:
+    def __init__(self, lens: Intrinsics, noise: Noise) -> None:
         self.lens = lens
         self._rays = lens.rays()
         self._noise = noise

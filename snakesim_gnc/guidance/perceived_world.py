@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from snakesim_gnc.guidance.body_history import Base, Body
 from snakesim_gnc.guidance.contacts_w import contact_w
-from snakesim_gnc.guidance.depth_scan import DepthScanner, Lens, metres_of
+from snakesim_gnc.guidance.depth_scan import DepthScanner, Intrinsics, metres_of
 from snakesim_gnc.guidance.ground import plane_under
 from snakesim_gnc.guidance.localisation import Localiser, PoseNoise
 from snakesim_gnc.guidance.obstacle_map import ObstacleMap
@@ -47,7 +47,7 @@ class PerceivedWorld:
         self.map = ObstacleMap()
         self.localiser = Localiser(robot, start, pose_noise)
         self.refused: Counter[str] = Counter()  # samples that could not be used, by reason
-        self._scanners: dict[tuple[Lens, Noise], DepthScanner] = {}
+        self._scanners: dict[tuple[Intrinsics, Noise], DepthScanner] = {}
         lengths = np.array([link.length_m for link in robot.links])
         masses = np.array([link.mass_kg for link in robot.links])
         self._half_m, self._shares = 0.5 * lengths, masses / masses.sum()
@@ -98,7 +98,7 @@ class PerceivedWorld:
         body = self._body_of(image.stamp_ns, "image")
         if body is None or image.link >= len(body.origins_w):
             return
-        kind = (Lens.of(image), noise)
+        kind = (Intrinsics.of(image), noise)
         scanner = self._scanners.get(kind)
         if scanner is None:
             scanner = self._scanners[kind] = DepthScanner(*kind)

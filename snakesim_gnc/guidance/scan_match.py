@@ -23,7 +23,7 @@ PROBE_M = 0.001
 
 
 @dataclass(frozen=True)
-class Match:
+class PoseMeasurement:
     """A measurement of the base's pose at the scan's stamp."""
 
     planar_w: Floats  # (3,) x, y, heading
@@ -31,7 +31,7 @@ class Match:
     map_m2: float  # variance of the map's own place in the world
 
 
-def matched(scan: Scan, tracks: Sequence[Track], base_w: Floats) -> Match | None:
+def matched(scan: Scan, tracks: Sequence[Track], base_w: Floats) -> PoseMeasurement | None:
     """base_w: (3,) the base as it was thought to be at the scan's stamp; None when too little of the scan is known."""
     known = [t for t in tracks if t.log_odds >= MIN_BELIEF and t.position_sd_m < 0.02 and t.size_sd_m < 0.02]
     hits = np.flatnonzero(np.isfinite(scan.range_m))
@@ -66,4 +66,4 @@ def matched(scan: Scan, tracks: Sequence[Track], base_w: Floats) -> Match | None
         return None
     covariance = np.asarray(np.linalg.inv(SHARE * information + np.eye(3)), dtype=np.float64)
     map_m2 = float(np.average([known[k].born_m2 for k in nearest], weights=weight))
-    return Match(base_w + by, covariance, map_m2)
+    return PoseMeasurement(base_w + by, covariance, map_m2)

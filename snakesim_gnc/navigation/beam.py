@@ -83,7 +83,7 @@ class Layer:
 
 
 @dataclass(frozen=True)
-class Found:
+class PlannedPath:
     """A path ahead of the head."""
 
     points_w: Floats  # (n + 1, 2) every STEP_M, the first is the head
@@ -107,7 +107,7 @@ class Beam:
         self._end = np.stack([chord * np.cos(half), chord * np.sin(half)])
         self._middle = np.stack([chord_mid * np.cos(0.5 * half), chord_mid * np.sin(0.5 * half)])
 
-    def ahead(self, body_w: Floats, goal_rad: float, steps: int) -> Found | None:
+    def ahead(self, body_w: Floats, goal_rad: float, steps: int) -> PlannedPath | None:
         """The best path of a number of steps ahead of the head, or of as many as there is room for; None: none at all.
 
         body_w: (n, 2) the body's curve, tail to head.
@@ -118,7 +118,7 @@ class Beam:
 
     def whole(
         self, body_w: Floats, goal_rad: float, steps: int, reach_m: float, failed_w: Floats | None = None
-    ) -> Found | None:
+    ) -> PlannedPath | None:
         """The best path of the whole body, from the tail, and of a number of steps beyond: within reach of the body.
 
         failed_w: (k, 2) points of paths on which the body got stuck here; other ways round are preferred.
@@ -132,7 +132,7 @@ class Beam:
         self._goal = np.array([np.cos(goal_rad), np.sin(goal_rad)])
         self._goal_rad = goal_rad
 
-    def _grow(self, start: Layer, steps: int) -> Found | None:
+    def _grow(self, start: Layer, steps: int) -> PlannedPath | None:
         layers = [start]
         for _ in range(steps):
             after = self._expand(layers[-1])
@@ -275,7 +275,7 @@ class Beam:
         cut = np.where(inner, self._set.segment_m**2 * np.abs(self._bends) / 8, 0.0)
         return near.distance_m >= self._set.radius_m + self._set.clearance_m + cut
 
-    def _trace(self, layers: list[Layer]) -> Found:
+    def _trace(self, layers: list[Layer]) -> PlannedPath:
         row = int(np.argmin(layers[-1].cost))
         cost = float(layers[-1].cost[row])
         rows: list[int] = []
@@ -286,7 +286,7 @@ class Beam:
         x, y, heading, bend, margin = np.array(
             [(n.x[r], n.y[r], n.heading[r], n.bend[r], n.margin_n[r]) for n, r in picked]
         ).T
-        return Found(np.stack([x, y], axis=-1), heading, bend[1:], margin, cost)
+        return PlannedPath(np.stack([x, y], axis=-1), heading, bend[1:], margin, cost)
 
 
 def _one_a_cell(x: Floats, y: Floats, heading: Floats, cost: Floats) -> Ints:

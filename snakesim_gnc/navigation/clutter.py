@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_gnc.navigation.beam import MIN_PUSH, STEP_M, Beam, Found, Search
-from snakesim_gnc.navigation.intents import Wish
+from snakesim_gnc.navigation.beam import MIN_PUSH, STEP_M, Beam, PlannedPath, Search
+from snakesim_gnc.navigation.intents import DesiredMotion
 from snakesim_gnc.navigation.line import SPACING_M, evenly
 from snakesim_gnc.navigation.obstacle_map import NONE, ObstacleMap
 from snakesim_gnc.navigation.snap import Fit, snap
@@ -92,16 +92,16 @@ class ClutterPlanner:
         self._next_point = 0
         self._headed_rad = 0.0  # for which the present path was planned
 
-    def update(self, tick: int, world: World, nodes_w: Floats, wish: Wish) -> Trajectory:
+    def update(self, tick: int, world: World, nodes_w: Floats, desired: DesiredMotion) -> Trajectory:
         """The trajectory. nodes_w: (n, 2) tail end, joints, head end."""
         body = evenly(nodes_w)
-        if wish.heading_w_rad is None:
+        if desired.heading_w_rad is None:
             goal = self._aim = self._towards(body)
         else:
-            goal = self._aim = np.array([np.cos(wish.heading_w_rad), np.sin(wish.heading_w_rad)])
+            goal = self._aim = np.array([np.cos(desired.heading_w_rad), np.sin(desired.heading_w_rad)])
             self._finished = False
         self._leave_trail(body[0])
-        resting = self._planned is not None and (self._finished or wish.speed_m_s == 0.0)
+        resting = self._planned is not None and (self._finished or desired.speed_m_s == 0.0)
         if resting:
             self._recent.clear()  # who is to stand still is not stuck
         elif why := self._why_again(body, world):
@@ -114,10 +114,10 @@ class ClutterPlanner:
             stamp_ns=world.stamp_ns,
             path_id=planned.path_id,
             path_w=[(float(x), float(y)) for x, y in planned.route.points_w],
-            speed_m_s=0.0 if self._finished else self._speed_m_s(wish.speed_m_s),
+            speed_m_s=0.0 if self._finished else self._speed_m_s(desired.speed_m_s),
             push_points=planned.push_points,
             finished=self._finished,
-            reason="the goal is reached" if self._finished else wish.why[:500],
+            reason="the goal is reached" if self._finished else desired.why[:500],
         )
 
     def _speed_m_s(self, wanted_m_s: float) -> float:
@@ -232,7 +232,7 @@ class ClutterPlanner:
             points = np.concatenate([np.array(behind), points])
         self._planned = Planned(Route(points), self._path_id, self._pushed_off(points, obstacles, goal))
 
-    def _onward(self, beam: Beam, body: Floats, goal_rad: float) -> tuple[Found | None, int, Floats]:
+    def _onward(self, beam: Beam, body: Floats, goal_rad: float) -> tuple[PlannedPath | None, int, Floats]:
         """The present path as far as the body lies on it and a little further, then another one."""
         assert self._planned is not None
         route = self._planned.route
@@ -245,10 +245,10 @@ class ClutterPlanner:
         points = lies if found is None else np.concatenate([lies, evenly(found.points_w)[1:]])
         return found, len(lies) - 3, points
 
-    def _anew(self, beam: Beam, body: Floats, goal_rad: float) -> Found | None:
+    def _anew(self, beam: Beam, body: Floats, goal_rad: float) -> PlannedPath | None:
         """A path for the whole body: the least change of shape that can push well."""
         failed = np.concatenate(self._failed) if self._failed else None
-        best: Found | None = None
+        best: PlannedPath | None = None
         for reach_m in REACHES_M:
             found = beam.whole(body, goal_rad, round(AGAIN_M / STEP_M), reach_m, failed)
             arcs = round(self._search.body_length_m / STEP_M)

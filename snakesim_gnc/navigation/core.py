@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from snakesim_gnc.navigation.intents import Wish
+from snakesim_gnc.navigation.intents import DesiredMotion
 from snakesim_hal.model.outlines import outline_distance_m
 from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import Obstacle, Trajectory, World
@@ -27,7 +27,7 @@ class KnownPath:
         self._push_points = sorted(found)
         self._tail_s_m: float | None = None
 
-    def update(self, tick: int, world: World | None, wish: Wish) -> Trajectory:
+    def update(self, tick: int, world: World | None, desired: DesiredMotion) -> Trajectory:
         """The trajectory from where the body was by this world model; its stamp is the world model's."""
         if world is not None:
             tail = np.array(world.base_position_w[:2])
@@ -38,10 +38,10 @@ class KnownPath:
             stamp_ns=None if world is None else world.stamp_ns,
             path_id=0,
             path_w=self._path,
-            speed_m_s=0.0 if finished else wish.speed_m_s,
+            speed_m_s=0.0 if finished else desired.speed_m_s,
             push_points=self._ahead(),
             finished=finished,
-            reason="the path is finished" if finished else wish.why[:500],
+            reason="the path is finished" if finished else desired.why[:500],
         )
 
     def _ahead(self) -> list[str]:

@@ -18,7 +18,7 @@ NONE = -1
 
 
 @dataclass(frozen=True)
-class Near:
+class NearestObstacles:
     """The obstacle nearest to each point; all arrays have the points' shape."""
 
     obstacle: Ints  # its index; NONE: there is none within REACH_M
@@ -59,7 +59,7 @@ class ObstacleMap:
             nearest[window][nearer] = i
         self._nearest = nearest.ravel()
 
-    def near(self, x: Floats, y: Floats) -> Near:
+    def near(self, x: Floats, y: Floats) -> NearestObstacles:
         """The nearest obstacle to points; x and y of one shape."""
         shape = np.shape(x)
         cell_x = ((x - self._low[0]) / CELL_M + 0.5).astype(int)
@@ -70,4 +70,4 @@ class ObstacleMap:
         some = found >= 0
         if some.any():
             distance[some], normal[some] = self.outlines.towards(np.stack([x[some], y[some]], axis=-1), found[some])
-        return Near(found, distance, normal)
+        return NearestObstacles(found, distance, normal)

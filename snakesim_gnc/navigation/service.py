@@ -53,15 +53,15 @@ class Navigation(Service):
     def outputs(self, clock: Clock) -> list[tuple[str, Message]] | None:
         """The trajectory at this tick. An operator's intent is used as soon as it arrives."""
         world, joints = self._client.read(self._world), self._client.read(self._joints)
-        wish = self._intents.wish(self._intent.newest(), clock.stamp_ns)
+        desired = self._intents.desired(self._intent.newest(), clock.stamp_ns)
         if joints is not None:
             self._recent.put(joints.stamp_ns, joints.angle_rad)
-        if self._along is not None and wish.heading_w_rad is None:
-            return [(keys.TRAJECTORY, self._along.update(clock.tick, world, wish))]
+        if self._along is not None and desired.heading_w_rad is None:
+            return [(keys.TRAJECTORY, self._along.update(clock.tick, world, desired))]
         if world is None or not self._recent:
             return None
         nodes = self._body.nodes_w(world, self._recent.at(pose_instant_ns(world)))
-        return [(keys.TRAJECTORY, self._planner.update(clock.tick, world, nodes.T, wish))]
+        return [(keys.TRAJECTORY, self._planner.update(clock.tick, world, nodes.T, desired))]
 
 
 def _along_route(config: RunConfig, known: list[Obstacle]) -> KnownPath:

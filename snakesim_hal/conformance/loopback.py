@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from snakesim_hal.backend import Backend, Samples, SetPoints
-from snakesim_hal.conformance.rig import HOLDER, Asked
+from snakesim_hal.conformance.rig import HOLDER, JointTargets
 from snakesim_hal.host.host import Host
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.client import Client, Commander
@@ -29,10 +29,10 @@ from snakesim_hal.wire.messages import (
 )
 
 LIMIT_S = 60.0  # for operations of a tenth of a second; a slow machine is not a failure
-Plan = Callable[[int], "Asked | None"]  # ticks since arming -> commanded joints; None: send nothing
+Plan = Callable[[int], "JointTargets | None"]  # ticks since arming -> commanded joints; None: send nothing
 
 
-def stay(_ticks: int) -> Asked:
+def stay(_ticks: int) -> JointTargets:
     """Command no joint: all hold their position."""
     return {}
 
@@ -46,7 +46,7 @@ def wait_until(happened: Callable[[], Any], what: str) -> None:
 
 
 @dataclass
-class Watched:
+class RecordingBackend:
     """A backend that forwards and records all calls; a fault can be planted in it."""
 
     inner: Backend
@@ -139,7 +139,7 @@ class Hosted:
             probe.bind(("127.0.0.1", 0))
             endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
         namespace = f"contract/{config.robot.name}"
-        self.backend = Watched(backend)
+        self.backend = RecordingBackend(backend)
         self.controller = Controller()
         self.config = config
         self._link = Link(endpoint, namespace)

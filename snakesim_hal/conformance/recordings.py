@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from snakesim_hal.conformance import tolerances as t
-from snakesim_hal.conformance.rig import Asked, Floats, Record, Rig
+from snakesim_hal.conformance.rig import Floats, JointTargets, Record, Rig
 from snakesim_hal.wire.messages import Mode
 
 # Every ordered pair of modes once, and back to the first: an Eulerian circuit.
@@ -34,7 +34,7 @@ def sway(rig: Rig) -> Record:
     began = rig.tick
     for tick in range(rig.periods(1.0)):
         angle = 0.3 * t.STEP_RAD * math.sin(2 * math.pi * tick * rig.period_ns * 1e-9)
-        asked: Asked = {i: (Mode.POSITION, rig.home_rad[i] + angle * (-1) ** i) for i in range(rig.count)}
+        asked: JointTargets = {i: (Mode.POSITION, rig.home_rad[i] + angle * (-1) ** i) for i in range(rig.count)}
         rig.drive(asked)
     rig.must_be_armed()
     return rig.since(began)
@@ -46,7 +46,7 @@ def push(rig: Rig) -> Pushing:
     began = rig.tick
     upper, lower = rig.robot.joints[0], rig.robot.joints[1]
 
-    def both(mode: Mode, up: float, down: float) -> Asked:
+    def both(mode: Mode, up: float, down: float) -> JointTargets:
         return {0: (mode, up), 1: (mode, down)}
 
     near = both(Mode.POSITION, t.NEAR_STOP * upper.angle_max_rad, t.NEAR_STOP * lower.angle_min_rad)

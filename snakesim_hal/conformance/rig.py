@@ -27,7 +27,7 @@ from snakesim_hal.wire.messages import (
 )
 
 Floats = NDArray[np.float64]
-Asked = Mapping[int, tuple[Mode, float]]  # joint index -> mode and target
+JointTargets = Mapping[int, tuple[Mode, float]]  # joint index -> mode and target
 HOLDER = "control"
 REANCHOR_PERIODS = 10
 
@@ -141,7 +141,7 @@ class Rig:
             self.hand(self.authority.decide().set_points, self.authority.state)
         return self.since(began)
 
-    def drive(self, asked: Asked, periods: int = 1, *, torque_limit_nm: list[float] | None = None) -> Record:
+    def drive(self, asked: JointTargets, periods: int = 1, *, torque_limit_nm: list[float] | None = None) -> Record:
         """Command some joints, while the others hold the start pose; through lease, gate and lifecycle."""
         began = self.tick
         for _ in range(periods):
@@ -149,7 +149,7 @@ class Rig:
             self.idle()
         return self.since(began)
 
-    def press(self, asked: Asked, periods: int = 1, *, torque_limit_nm: list[float] | None = None) -> Record:
+    def press(self, asked: JointTargets, periods: int = 1, *, torque_limit_nm: list[float] | None = None) -> Record:
         """The same without the gate, which would not drive a joint against its stop; the lifecycle still applies."""
         began = self.tick
         for _ in range(periods):
@@ -159,7 +159,7 @@ class Rig:
             self.hand(self.points(asked, torque_limit_nm), self.authority.state)
         return self.since(began)
 
-    def points(self, asked: Asked, torque_limit_nm: list[float] | None = None) -> SetPoints:
+    def points(self, asked: JointTargets, torque_limit_nm: list[float] | None = None) -> SetPoints:
         """Set-points of all joints; those without a command hold the start pose."""
         mode, target = [Mode.POSITION] * self.count, list(self.home_rad)
         for joint, (wanted_mode, wanted) in asked.items():

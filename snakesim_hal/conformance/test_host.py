@@ -11,7 +11,7 @@ import numpy as np
 from snakesim_hal.conformance import tolerances as t
 from snakesim_hal.conformance.bench import Bench
 from snakesim_hal.conformance.loopback import Hosted, stay, wait_until
-from snakesim_hal.conformance.rig import Asked
+from snakesim_hal.conformance.rig import JointTargets
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Fault, Mode, SimulatorRequest
 
@@ -32,10 +32,10 @@ def moves_then(silent: bool, hosted: Hosted) -> int:
     """Arm and move a joint for a while; returns for how many ticks."""
     wait_until(lambda: hosted.backend.seen, "a first sample")
     angle = hosted.backend.seen[-1].angle_rad[0]
-    go: Asked = {0: (Mode.VELOCITY, -math.copysign(t.CRUISE_RAD_S, angle))}  # away from the nearer stop
+    go: JointTargets = {0: (Mode.VELOCITY, -math.copysign(t.CRUISE_RAD_S, angle))}  # away from the nearer stop
     ticks = t.ARMING_PERIODS + math.ceil(t.CRUISE_S * 1e9 / hosted.config.period_ns)
 
-    def plan(since_arming: int) -> Asked | None:
+    def plan(since_arming: int) -> JointTargets | None:
         if since_arming < t.ARMING_PERIODS:
             return {}
         return go if since_arming < ticks or not silent else None

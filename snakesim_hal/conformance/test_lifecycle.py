@@ -7,10 +7,10 @@ import pytest
 
 from snakesim_hal.conformance import tolerances as t
 from snakesim_hal.conformance.bench import Bench
-from snakesim_hal.conformance.rig import Asked, Record, Rig
+from snakesim_hal.conformance.rig import JointTargets, Record, Rig
 from snakesim_hal.wire.messages import LifecycleState, Mode
 
-GO: Asked = {0: (Mode.VELOCITY, t.CRUISE_RAD_S)}
+GO: JointTargets = {0: (Mode.VELOCITY, t.CRUISE_RAD_S)}
 
 
 def must_rest(record: Record, rig: Rig) -> None:

@@ -33,7 +33,7 @@ Reply = Callable[[Answer], None]
 
 
 @dataclass(frozen=True)
-class Asked:
+class LocalRequest:
     """A request that did not come over Zenoh."""
 
     request: Request
@@ -100,7 +100,7 @@ class Inbox:
 
     def ask(self, request: Request, reply: Reply) -> None:
         """Put a request that did not come over Zenoh; from any thread."""
-        self._queue.put(Asked(request, reply), STOPS)
+        self._queue.put(LocalRequest(request, reply), STOPS)
 
     def take(self, timeout_s: float) -> bool:
         """Handle the next item; False when none came in time."""
@@ -126,7 +126,7 @@ class Inbox:
     def handle(self, item: Any) -> None:
         """Decode one item, and hand it over."""
         receiver = self._receiver
-        if isinstance(item, Asked):
+        if isinstance(item, LocalRequest):
             receiver.answer(item.request, item.reply)
         elif isinstance(item, Question):
             self._answer(item)

@@ -10,7 +10,7 @@ from msgspec import inspect
 
 
 @dataclass(frozen=True)
-class Flaw:
+class Violation:
     """The first place where a value is not what it should be."""
 
     kind: Literal["unknown", "missing", "wrong"]
@@ -21,7 +21,7 @@ class Flaw:
     known: Sequence[str] = ()  # fields beside an unknown one
 
 
-def first_flaw(value: Any, wanted: Any, steps: Sequence[str] = ()) -> Flaw | None:
+def first_violation(value: Any, wanted: Any, steps: Sequence[str] = ()) -> Violation | None:
     """None when the value is of the type; else the innermost part that is wrong by itself."""
     try:
         msgspec.convert(value, wanted)
@@ -36,31 +36,31 @@ def first_flaw(value: Any, wanted: Any, steps: Sequence[str] = ()) -> Flaw | Non
         if found is not None:
             return found
     for step, part, type_ in _parts(value, wanted):
-        found = first_flaw(part, type_, [*steps, step])
+        found = first_violation(part, type_, [*steps, step])
         if found is not None:
             return found
-    return Flaw("wrong", list(steps), value, wanted, why)
+    return Violation("wrong", list(steps), value, wanted, why)
 
 
-def _flaw_of_section(section: dict[str, Any], struct: type[msgspec.Struct], steps: Sequence[str]) -> Flaw | None:
+def _flaw_of_section(section: dict[str, Any], struct: type[msgspec.Struct], steps: Sequence[str]) -> Violation | None:
     """A field too many, or one too few."""
     config, fields = struct.__struct_config__, msgspec.structs.fields(struct)
     known = [field.encode_name for field in fields] + ([config.tag_field] if config.tag_field else [])
     for name in section if config.forbid_unknown_fields else ():
         if name not in known:
-            return Flaw("unknown", [*steps, name], known=known)
+            return Violation("unknown", [*steps, name], known=known)
     for field in fields:
         if field.required and field.encode_name not in section:
-            return Flaw("missing", [*steps, field.encode_name], wanted=field.type)
+            return Violation("missing", [*steps, field.encode_name], wanted=field.type)
     return None
 
 
-def _flaw_of_tag(section: dict[str, Any], structs: Sequence[type[msgspec.Struct]], steps: Sequence[str]) -> Flaw:
+def _flaw_of_tag(section: dict[str, Any], structs: Sequence[type[msgspec.Struct]], steps: Sequence[str]) -> Violation:
     tag = str(structs[0].__struct_config__.tag_field)
     wanted = Literal[tuple(struct.__struct_config__.tag for struct in structs)]
     if tag not in section:
-        return Flaw("missing", [*steps, tag], wanted=wanted)
-    return Flaw("wrong", [*steps, tag], section[tag], wanted, "there is no such kind")
+        return Violation("missing", [*steps, tag], wanted=wanted)
+    return Violation("wrong", [*steps, tag], section[tag], wanted, "there is no such kind")
 
 
 def _parts(value: Any, wanted: Any) -> Iterator[tuple[str, Any, Any]]:

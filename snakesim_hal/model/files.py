@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from snakesim_hal.errors import ConfigError, did_you_mean, nearest, short
-from snakesim_hal.model.field_types import Flaw, first_flaw, in_words, unit_of
+from snakesim_hal.model.field_types import Violation, first_violation, in_words, unit_of
 from snakesim_hal.model.textfiles import MAX_DEPTH, parse_json, parse_toml, read_text
 
 StructT = TypeVar("StructT", bound=msgspec.Struct)
@@ -186,9 +186,9 @@ def decode(table: Table, struct: type[StructT], under: str = "") -> StructT:
     try:
         return msgspec.convert(table.values, struct)
     except msgspec.ValidationError as error:
-        flaw = first_flaw(table.values, struct)
-        assert flaw is not None, error
-        raise ConfigError(_explain(flaw, table, under)) from None
+        violation = first_violation(table.values, struct)
+        assert violation is not None, error
+        raise ConfigError(_explain(violation, table, under)) from None
     except UnicodeEncodeError as error:  # JSON may escape, and a command line may hold, half of a character
         odd = ascii(error.object[error.start : error.end])[:40]
         raise ConfigError(
@@ -196,23 +196,23 @@ def decode(table: Table, struct: type[StructT], under: str = "") -> StructT:
         ) from None
 
 
-def _explain(flaw: Flaw, table: Table, under: str) -> str:
-    *steps, name = [under, *flaw.steps] if under else flaw.steps or [""]
+def _explain(violation: Violation, table: Table, under: str) -> str:
+    *steps, name = [under, *violation.steps] if under else violation.steps or [""]
     dotted, whole = ".".join([*steps, short(name)]), ".".join([*steps, name])
-    if flaw.kind == "unknown":
+    if violation.kind == "unknown":
         deeper = [short(key) for key in table.origin if key.endswith(f".{name}") and not key.startswith(whole)]
-        close = nearest(name, flaw.known) or next(iter(deeper), None)
-        hint = f"did you mean `{close}`?" if close else f"known fields: {', '.join(sorted(flaw.known))}."
+        close = nearest(name, violation.known) or next(iter(deeper), None)
+        hint = f"did you mean `{close}`?" if close else f"known fields: {', '.join(sorted(violation.known))}."
         set_by = [origin for key, origin in table.origin.items() if key == dotted or key.startswith(dotted + ".")]
         return f"{set_by[0] if set_by else table.file_of(dotted)}: unknown field `{dotted}`; {hint}"
-    info = msgspec.inspect.type_info(flaw.wanted)
-    if flaw.kind == "missing":
+    info = msgspec.inspect.type_info(violation.wanted)
+    if violation.kind == "missing":
         return f"{table.file_of(dotted)}: field `{dotted}` is missing; add it ({in_words(info)})."
-    unit, value = unit_of(info), flaw.value
+    unit, value = unit_of(info), violation.value
     origin = table.origin_of(dotted)
     origin = table.file_of(dotted) if origin == "default" else origin
     shown = f"{short(_repr(value))}{' ' + unit if unit and isinstance(value, int | float) else ''}"
-    why = "" if flaw.why.startswith(("Expected `int", "Expected `float")) else f": {short(_lower(flaw.why))}"
+    why = "" if violation.why.startswith(("Expected `int", "Expected `float")) else f": {short(_lower(violation.why))}"
     return f"{origin}: `{dotted}` = {shown} is not allowed{why}; expected {in_words(info)}."
 
 

@@ -17,7 +17,7 @@ from snakesim_hal.safety.fault_log import FaultLog
 from snakesim_hal.safety.gate import Applied, JointLimits
 from snakesim_hal.safety.isolation import Isolation, Mask
 from snakesim_hal.safety.lease import Lease, freed, renewed, rule
-from snakesim_hal.safety.plausibility import Doubt, PlausibilityCheck, readable
+from snakesim_hal.safety.plausibility import ImplausibleState, PlausibilityCheck, readable
 from snakesim_hal.safety.stop_ramp import StopRamp
 from snakesim_hal.wire.messages import (
     Answer,
@@ -69,7 +69,7 @@ class Authority:
         self._state_tick = 0  # of the newest joint state
         self._armed_tick = -1  # of the state that was the newest at the last arming
         self._isolation = Isolation(description)
-        self._doubt: Doubt | None = self._unknown("no joint state yet")
+        self._implausible: ImplausibleState | None = self._unknown("no joint state yet")
         self._derating = Derating(description)
         self._command: JointCommand | None = None
         self._command_ns = 0  # when it was received
@@ -90,7 +90,7 @@ class Authority:
         applied = self._applied if self.state == "armed" else None
         now_ns = joints.stamp_ns if now_ns is None else now_ns
         self._state_tick = joints.tick
-        self._doubt = self._watch.take(joints, now_ns=now_ns, applied=applied, aside=self._isolation.joints)
+        self._implausible = self._watch.take(joints, now_ns=now_ns, applied=applied, aside=self._isolation.joints)
         self._measured = self._watch.measured
 
     def observe_power(self, power: Power, now_ns: int) -> None:
@@ -246,8 +246,8 @@ class Authority:
         An armed robot without plausible joint states goes to fault too, and so does one, armed or not, whose
         modules are too hot, leak or lack voltage.
         """
-        if self.state == "armed" and self._doubt is not None:
-            self.fault(msgspec.structs.replace(self._doubt.fault, tick=tick), self._doubt.joints)
+        if self.state == "armed" and self._implausible is not None:
+            self.fault(msgspec.structs.replace(self._implausible.fault, tick=tick), self._implausible.joints)
         wrong, silent = self._derating.look(now_ns, tick)
         for fault in wrong:
             self.fault(fault)
@@ -298,7 +298,7 @@ class Authority:
         return found + [("not_ready", why) for why in self._unready(now_ns)]
 
     def _unready(self, now_ns: int) -> list[str]:
-        against = [] if self._doubt is None else [self._doubt.fault.cause]
+        against = [] if self._implausible is None else [self._implausible.fault.cause]
         against += [fault.cause for fault in self._derating.wrong if not self._is_aside(fault)]
         if self.arming and not self._stop_sent:
             against.append("the motors have not received the stop yet; ask again in a period")
@@ -313,9 +313,9 @@ class Authority:
             against.extend(lifecycle.far_targets(self._command, at, self.description, aside))
         return against
 
-    def _unknown(self, cause: str) -> Doubt:
+    def _unknown(self, cause: str) -> ImplausibleState:
         fault = Fault(tick=0, what="state_invalid", cause=cause)
-        return Doubt(fault, np.ones(len(self.description.joints), dtype=np.bool_))
+        return ImplausibleState(fault, np.ones(len(self.description.joints), dtype=np.bool_))
 
     def _is_aside(self, fault: Fault) -> bool:
         return fault.reach == "joint" and self._isolation.has(fault.joint)
@@ -334,7 +334,7 @@ class Authority:
         """End the isolation of joints; first a new joint state must arrive."""
         if self.isolated:
             self._isolation.clear()
-            self._doubt = self._unknown("no joint state since the clear")
+            self._implausible = self._unknown("no joint state since the clear")
 
     def _safe(self) -> Applied:
         zeros = np.zeros_like(self._measured.angle_rad)

@@ -31,7 +31,7 @@ LONGEST_CAUSE = 400
 
 
 @dataclass(frozen=True)
-class Doubt:
+class ImplausibleState:
     """An implausible joint state: its fault, and the joints concerned."""
 
     fault: Fault
@@ -55,7 +55,7 @@ class PlausibilityCheck:
         """The last good state of every joint; zeros for one that never had any."""
         return Measured(*self._columns)
 
-    def take(self, joints: JointState, *, now_ns: int, applied: Applied | None, aside: Mask) -> Doubt | None:
+    def take(self, joints: JointState, *, now_ns: int, applied: Applied | None, aside: Mask) -> ImplausibleState | None:
         """Take a joint state; returns what is implausible, or None.
 
         now_ns: safety time. After a delay of the host, more time has passed than its ticks show.
@@ -65,7 +65,9 @@ class PlausibilityCheck:
         count = len(self._known)
         if not joints.is_of(count):
             cause = f"no joint state of {count} joints"
-            return Doubt(Fault(tick=joints.tick, what="state_invalid", cause=cause), np.ones_like(self._known))
+            return ImplausibleState(
+                Fault(tick=joints.tick, what="state_invalid", cause=cause), np.ones_like(self._known)
+            )
         ages_ns = np.array(joints.age_ns, dtype=np.float64)
         taken_s = (np.array([[joints.stamp_ns], [now_ns]], dtype=np.float64) - ages_ns) * 1e-9
         columns = np.array((joints.angle_rad, joints.velocity_rad_s, joints.torque_nm))
@@ -86,23 +88,29 @@ class PlausibilityCheck:
             return None
         unknown, jumped, frozen = ~sound & ~aside, jumped & ~aside, frozen & ~aside
         if unknown.any():
-            return self._doubt(joints.tick, "state_invalid", "no valid and fresh state of ", unknown)
+            return self._implausible(joints.tick, "state_invalid", "no valid and fresh state of ", unknown)
         if jumped.any():
             tails = [
                 f" by {by:+.2f} rad in {within * 1e3:.0f} ms" for by, within in zip(jump_rad, elapsed_s, strict=True)
             ]
-            return self._doubt(joints.tick, "state_invalid", "faster than any joint turns: a jump of ", jumped, tails)
+            return self._implausible(
+                joints.tick, "state_invalid", "faster than any joint turns: a jump of ", jumped, tails
+            )
         if frozen.any():
-            return self._doubt(joints.tick, "joint_frozen", "the same state repeated while its target moves: ", frozen)
+            return self._implausible(
+                joints.tick, "joint_frozen", "the same state repeated while its target moves: ", frozen
+            )
         return None
 
-    def _doubt(self, tick: int, what: str, words: str, which: Mask, tails: list[str] | None = None) -> Doubt:
+    def _implausible(
+        self, tick: int, what: str, words: str, which: Mask, tails: list[str] | None = None
+    ) -> ImplausibleState:
         found = np.flatnonzero(which).tolist()
         names = [self._limits.joints[i].name for i in found]
         told = names if tails is None else [name + tails[i] for name, i in zip(names, found, strict=True)]
         cause = (words + ", ".join(told))[:LONGEST_CAUSE]
         joint = names[0] if len(names) == 1 else None
-        return Doubt(Fault(tick=tick, what=what, cause=cause, joint=joint, reach="joint"), which)
+        return ImplausibleState(Fault(tick=tick, what=what, cause=cause, joint=joint, reach="joint"), which)
 
 
 def readable(joints: JointState, good: Measured) -> JointState:

@@ -1,6 +1,6 @@
 """The console: a robot in the browser, live or from a recording.
 
-`moment` is what there is to show of one instant; `watch` takes it from the network, `recorded` from a run's folder.
+`snapshot` is what there is to show of one instant; `watch` takes it from the network, `recorded` from a run's folder.
 `drawing` turns it into poses, arrows and lines in the world, without any I/O. `stage` draws those with viser (shapes
 from `meshes`), `page` and `charts` show the rest, `controls` has the buttons of one viewer. `token` decides who has
 control. `port` is open at once, `server` serves pages there. `console` is the loop around them, `command` the

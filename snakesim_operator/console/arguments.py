@@ -26,8 +26,8 @@ def add_commands(commands: Any) -> None:
 
 def _console(arguments: argparse.Namespace) -> int:
     from snakesim_operator.console.command import console, show_record
-    from snakesim_operator.tools.where import where_of
+    from snakesim_operator.tools.robot_selection import selection_of
 
     if arguments.run is not None:
         return show_record(arguments.run, arguments.at, arguments.port)
-    return console(where_of(arguments), arguments.port)
+    return console(selection_of(arguments), arguments.port)

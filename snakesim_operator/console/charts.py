@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from snakesim_hal.wire.messages import Description, Mode
 from snakesim_operator.console.drawing import pushing_joint
-from snakesim_operator.console.moment import Moment
+from snakesim_operator.console.snapshot import RobotSnapshot
 from snakesim_operator.results.page.palette import joint_colours
 
 Floats = NDArray[np.float64]
@@ -77,9 +77,9 @@ class JointCharts:
         """Another place in time."""
         self._history.clear()
 
-    def take(self, moment: Moment) -> None:
+    def take(self, snapshot: RobotSnapshot) -> None:
         """Keep a sample for the charts over time; each frame."""
-        joints, time_s = moment.joints, moment.time_s
+        joints, time_s = snapshot.joints, snapshot.time_s
         if joints is None or time_s is None:
             return
         if self._history and time_s < self._history[-1][0]:
@@ -87,16 +87,16 @@ class JointCharts:
         if not self._history or time_s - self._history[-1][0] >= HISTORY_S / SAMPLES_MOST:
             self._history.append((time_s, np.array(joints.angle_rad), np.array(joints.torque_nm)))
 
-    def show(self, moment: Moment) -> None:
+    def show(self, snapshot: RobotSnapshot) -> None:
         """Draw them anew; a few times a second."""
-        joints = moment.joints
+        joints = snapshot.joints
         if joints is None:
             return
         measured = np.where(joints.valid, joints.angle_rad, np.nan)
-        self._angles.data = (self._number, measured, references_rad(moment))
-        limits = np.array([self._share(moment, name) for name in self._names]) * self._limits
+        self._angles.data = (self._number, measured, references_rad(snapshot))
+        limits = np.array([self._share(snapshot, name) for name in self._names]) * self._limits
         torque = np.where(joints.valid, joints.torque_nm, np.nan)
-        pushing = pushing_joint(moment)
+        pushing = pushing_joint(snapshot)
         marked = np.where(np.arange(len(torque)) == pushing, torque, np.nan)
         self._torques.data = (self._number, torque, limits, -limits, marked)
         if len(self._history) > 1:
@@ -106,14 +106,14 @@ class JointCharts:
                 values = np.array([sample[which] for sample in self._history])[kept]
                 chart.data = (times[kept], *np.ascontiguousarray(values.T))
 
-    def _share(self, moment: Moment, joint: str) -> float:
-        return 1.0 if moment.status is None else moment.status.derated.get(joint, 1.0)
+    def _share(self, snapshot: RobotSnapshot, joint: str) -> float:
+        return 1.0 if snapshot.status is None else snapshot.status.derated.get(joint, 1.0)
 
 
-def references_rad(moment: Moment) -> Floats:
+def references_rad(snapshot: RobotSnapshot) -> Floats:
     """Where each joint is to be: the controller's reference, else the target of joints in position mode; else NaN."""
-    count = len(moment.robot.joints)
-    control, applied = moment.control, moment.applied
+    count = len(snapshot.robot.joints)
+    control, applied = snapshot.control, snapshot.applied
     if control is not None and len(control.reference_rad) == count:
         return np.array(control.reference_rad)
     if applied is not None and len(applied.target) == len(applied.mode) == count:

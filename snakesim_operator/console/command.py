@@ -15,12 +15,12 @@ from snakesim_hal.process import on_stop_signal
 from snakesim_hal.serve import process_options
 from snakesim_hal.terminal import Say, say
 from snakesim_operator.console.port import open_port
-from snakesim_operator.tools.targets import Where, the_one
+from snakesim_operator.tools.targets import RobotSelection, the_one
 
 NEEDS = "the console needs viser; install it with: pip install 'snakesim[console]'"
 
 
-def console(where: Where, port: int | None, say: Say = say) -> int:
+def console(where: RobotSelection, port: int | None, say: Say = say) -> int:
     """Show a running robot until Ctrl-C. Raises NotConnectedError when there is none."""
     _check_installed()
     from snakesim_operator.console.console import show_live
@@ -76,7 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     _check_installed()
     from snakesim_operator.console.console import show_live
     from snakesim_operator.console.drawing import Surroundings
-    from snakesim_operator.console.moment import expected_of
+    from snakesim_operator.console.snapshot import expected_of
 
     listening = socket.socket(fileno=given.arguments.listening)
     expected = expected_of(given.config)

@@ -13,11 +13,11 @@ from snakesim_hal.terminal import Say
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_hal.wire.messages import ControlState, Status
 from snakesim_operator.console.drawing import Surroundings
-from snakesim_operator.console.moment import Moment
 from snakesim_operator.console.operations import Log, Operations
 from snakesim_operator.console.page import Page
 from snakesim_operator.console.player import Player
 from snakesim_operator.console.server import page_server
+from snakesim_operator.console.snapshot import RobotSnapshot
 from snakesim_operator.console.watch import Watch
 
 FRAMES_PER_S = 30.0
@@ -29,7 +29,7 @@ def show_live(
     listening: socket.socket,
     stop: threading.Event,
     say: Say,
-    expected: Moment | None = None,
+    expected: RobotSnapshot | None = None,
 ) -> None:
     """Show a robot until `stop` is set. Raises NotConnectedError when no network is there.
 
@@ -46,9 +46,9 @@ def show_live(
             operations.connect(session)
             watch, changes = Watch(session), Changes(log)
             for _ in frames(stop):
-                moment = watch.moment() or expected
-                changes.note(moment)
-                page.show(moment)
+                snapshot = watch.snapshot() or expected
+                changes.note(snapshot)
+                page.show(snapshot)
 
 
 def show_recorded(folder: Path, at_s: float, listening: socket.socket, stop: threading.Event, say: Say) -> None:
@@ -89,11 +89,11 @@ class Changes:
         self._status: Status | None = None
         self._control: ControlState | None = None
 
-    def note(self, moment: Moment | None) -> None:
-        """Compare with the moment before."""
-        if moment is None:
+    def note(self, snapshot: RobotSnapshot | None) -> None:
+        """Compare with the snapshot before."""
+        if snapshot is None:
             return
-        status, before = moment.status, self._status
+        status, before = snapshot.status, self._status
         if status is not None:
             if before is None or (status.lifecycle, status.why) != (before.lifecycle, before.why):
                 self._log.write(f"robot {status.lifecycle}: {status.why}")
@@ -102,7 +102,7 @@ class Changes:
                 if fault not in known:
                     self._log.write(f"fault {fault.what}{' at ' + fault.joint if fault.joint else ''}: {fault.cause}")
             self._status = status
-        control = moment.control
+        control = snapshot.control
         if control is not None and control is not self._control:
             if self._control is None or control.state != self._control.state:
                 self._log.write(f"control {control.state}: {control.reason}")

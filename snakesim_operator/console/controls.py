@@ -12,9 +12,9 @@ from snakesim_hal.model.injection import KINDS, TargetType
 from snakesim_hal.model.kinematics import rotation_from_quaternion, yaw_of
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlSettings
-from snakesim_operator.console.moment import Moment
 from snakesim_operator.console.operations import BUTTON_NS, KEY_NS, Operations
 from snakesim_operator.console.settings_form import SettingsForm
+from snakesim_operator.console.snapshot import RobotSnapshot
 from snakesim_operator.console.token import ControlToken
 from snakesim_operator.tools.fault import FaultOrder
 from snakesim_operator.tools.simulator_order import SimulatorOrder
@@ -41,13 +41,13 @@ class Controls:
         folder: viser.GuiFolderHandle,
         token: ControlToken,
         operations: Operations,
-        moment: Callable[[], Moment | None],
+        snapshot: Callable[[], RobotSnapshot | None],
         settings_tab: viser.GuiFolderHandle,
         changed: Callable[[], None],
     ) -> None:
-        """folder, settings_tab: places on the page; moment: the newest; changed: called when the token has moved."""
+        """folder, settings_tab: places on the page; snapshot: the newest; changed: called when the token has moved."""
         self._client, self._token, self._operations = client, token, operations
-        self._moment, self._changed = moment, changed
+        self._moment, self._changed = snapshot, changed
         self._settings_tab = settings_tab
         self._form: SettingsForm | None = None
         self._way, self._driven_s = 1, -math.inf  # by keys: ahead or backwards, and when last
@@ -98,9 +98,11 @@ class Controls:
         self._take.hint = f"{name_of(holder)} has control, and may release it" if taken else None
         for one in (self._lifecycle, self._heading, self._speed, self._drive, self._faults):
             one.visible = mine
-        moment = self._moment()
-        self._simulator.visible = mine and moment is not None and moment.robot.simulated_time
-        self._time_speed.visible = moment is not None and moment.status is not None and moment.status.pace == "realtime"
+        snapshot = self._moment()
+        self._simulator.visible = mine and snapshot is not None and snapshot.robot.simulated_time
+        self._time_speed.visible = (
+            snapshot is not None and snapshot.status is not None and snapshot.status.pace == "realtime"
+        )
         self._apply.disabled = not mine
         if self._form is not None:
             self._form.enable(mine)
@@ -131,12 +133,12 @@ class Controls:
         return self._token.holder == self.viewer
 
     def _ask(self, what: str) -> None:
-        moment = self._moment()
-        if moment is None or not self._in_control():
+        snapshot = self._moment()
+        if snapshot is None or not self._in_control():
             return
         match what:
             case "Arm":
-                self.do("Arm", lambda: self._operations.arm(self.who, moment.robot))
+                self.do("Arm", lambda: self._operations.arm(self.who, snapshot.robot))
             case "Disarm":
                 self.do("Disarm", lambda: self._operations.disarm(self.who))
             case _:
@@ -167,9 +169,9 @@ class Controls:
         self._ask_for(self._way * self._speed.value, KEY_NS)
 
     def _ask_for(self, speed_m_s: float, valid_ns: int) -> None:
-        moment = self._moment()
-        if moment is not None and moment.time_s is not None and self._in_control():
-            now_ns = round(moment.time_s * 1e9)
+        snapshot = self._moment()
+        if snapshot is not None and snapshot.time_s is not None and self._in_control():
+            now_ns = round(snapshot.time_s * 1e9)
             self._operations.drive(self.who, self._heading_w_rad, speed_m_s, now_ns, valid_ns)
 
     @property
@@ -177,8 +179,8 @@ class Controls:
         return math.radians(self._heading.value)
 
     def _body_w_rad(self) -> float | None:
-        moment = self._moment()
-        return None if moment is None or moment.base is None else yaw_of(rotation_from_quaternion(moment.base[1]))
+        snapshot = self._moment()
+        return None if snapshot is None or snapshot.base is None else yaw_of(rotation_from_quaternion(snapshot.base[1]))
 
     def _suggest_target(self) -> None:
         """A target of the sort that the kind is for; simulator and clock are their own."""

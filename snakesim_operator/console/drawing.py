@@ -1,4 +1,4 @@
-"""A moment as shapes in the world: poses of links, arrows, lines, cameras. Pure; metres, quaternions wxyz."""
+"""A snapshot as shapes in the world: poses of links, arrows, lines, cameras. Pure; metres, quaternions wxyz."""
 
 import math
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from snakesim_hal.model.kinematics import link_frames, quaternions_from_rotation
 from snakesim_hal.model.scenario import RunConfig, place_all
 from snakesim_hal.model.scene import route_of
 from snakesim_hal.wire.messages import ColourImage, DepthImage, Obstacle, World
-from snakesim_operator.console.moment import Moment
+from snakesim_operator.console.snapshot import RobotSnapshot
 
 Floats = NDArray[np.float64]
 
@@ -82,7 +82,7 @@ class Camera:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Drawing:
-    """Everything that is drawn of one moment."""
+    """Everything that is drawn of one snapshot."""
 
     centre_w: Floats  # of the body
     links_w: Floats  # (links, 3) middle of each link
@@ -104,16 +104,16 @@ class Drawing:
     cameras: tuple[Camera, ...] = ()
 
 
-def draw(moment: Moment, around: Surroundings | None) -> Drawing | None:
+def draw(snapshot: RobotSnapshot, around: Surroundings | None) -> Drawing | None:
     """None while the joints are unknown. Without a pose the tail end lies at the origin."""
-    body, robot = moment.body or moment.joints, moment.robot
+    body, robot = snapshot.body or snapshot.joints, snapshot.robot
     if body is None:
         return None
-    position_w, wxyz = moment.base or ((0.0, 0.0, robot.links[0].radius_m), (1.0, 0.0, 0.0, 0.0))
+    position_w, wxyz = snapshot.base or ((0.0, 0.0, robot.links[0].radius_m), (1.0, 0.0, 0.0, 0.0))
     axes, lengths = [joint.axis for joint in robot.joints], [link.length_m for link in robot.links]
     origins, rotations = link_frames(position_w, rotation_from_quaternion(wxyz), body.angle_rad, axes, lengths)
     middles = origins + rotations[:, :, 0] * (np.array(lengths)[:, None] / 2)
-    control, trajectory, status = moment.control, moment.trajectory, moment.status
+    control, trajectory, status = snapshot.control, snapshot.trajectory, snapshot.status
     lost = set[str | None]() if status is None else {*status.isolated, *(fault.joint for fault in status.faults)}
     return Drawing(
         centre_w=middles.mean(axis=0),
@@ -122,13 +122,13 @@ def draw(moment: Moment, around: Surroundings | None) -> Drawing | None:
         hinges_w=origins[1:],
         hinges_wxyz=quaternions_from_rotations(_hinges(rotations[:-1], axes)),
         failed=frozenset(i for i, joint in enumerate(robot.joints) if joint.name in lost),
-        pushing=pushing_joint(moment),
+        pushing=pushing_joint(snapshot),
         path_w=_on_ground(np.array(trajectory.path_w), around) if trajectory is not None else _nothing(),
-        perceived=_perceived(moment.world),
+        perceived=_perceived(snapshot.world),
         pushed=frozenset(c.obstacle for c in control.push_points if c.obstacle) if control is not None else frozenset(),
         ahead=frozenset(trajectory.push_points) if trajectory is not None else frozenset(),
-        cameras=tuple(_camera(key, image, origins, rotations) for key, image in moment.images.items()),
-        **_forces(moment, middles.mean(axis=0)),
+        cameras=tuple(_camera(key, image, origins, rotations) for key, image in snapshot.images.items()),
+        **_forces(snapshot, middles.mean(axis=0)),
     )
 
 
@@ -141,10 +141,10 @@ def _hinges(rotations: Floats, axes: Sequence[str]) -> Floats:
     return found
 
 
-def pushing_joint(moment: Moment) -> int | None:
+def pushing_joint(snapshot: RobotSnapshot) -> int | None:
     """Number of the propulsion joint."""
-    name = None if moment.control is None else moment.control.propulsion_joint
-    return next((i for i, joint in enumerate(moment.robot.joints) if joint.name == name), None)
+    name = None if snapshot.control is None else snapshot.control.propulsion_joint
+    return next((i for i, joint in enumerate(snapshot.robot.joints) if joint.name == name), None)
 
 
 def _perceived(world: World | None) -> tuple[Obstacle, ...]:
@@ -152,10 +152,10 @@ def _perceived(world: World | None) -> tuple[Obstacle, ...]:
     return () if world is None else tuple(o for o in world.obstacles if o.last_seen_ns is not None or o.felt)
 
 
-def _forces(moment: Moment, centre_w: Floats) -> dict[str, Floats]:
+def _forces(snapshot: RobotSnapshot, centre_w: Floats) -> dict[str, Floats]:
     """Contacts and forces; at most as long as the body's contacts are known."""
     found: dict[str, Floats] = {}
-    contacts = moment.world.contacts if moment.world is not None else []
+    contacts = snapshot.world.contacts if snapshot.world is not None else []
     if contacts:
         at = np.array([c.position_w for c in contacts])
         force = np.array([c.force_w for c in contacts])
@@ -164,24 +164,24 @@ def _forces(moment: Moment, centre_w: Floats) -> dict[str, Floats]:
             "contacts_w": at,
             "normals": _arrows(at, NORMAL_M * np.array([c.normal_w for c in contacts])),
             "tangents": _arrows(at, TANGENT_M * np.array([c.tangent_w for c in contacts])),
-            "forces": _forces_above(moment, at[strong], force[strong]),
+            "forces": _forces_above(snapshot, at[strong], force[strong]),
         }
         total = force.sum(axis=0)
         if np.linalg.norm(total) > MIN_FORCE_N:
-            found["resultant"] = _forces_above(moment, centre_w[None], total[None])
-    control = moment.control
+            found["resultant"] = _forces_above(snapshot, centre_w[None], total[None])
+    control = snapshot.control
     if control is not None and control.push_points and len(control.push_points) == len(control.solved_force_n):
         at = np.array([c.position_w for c in control.push_points])
         normal = np.array([c.normal_w for c in control.push_points])
-        found["solved"] = _forces_above(moment, at, np.array(control.solved_force_n)[:, None] * normal)
+        found["solved"] = _forces_above(snapshot, at, np.array(control.solved_force_n)[:, None] * normal)
     return found
 
 
-def _forces_above(moment: Moment, at_w: Floats, forces_n: Floats) -> Floats:
+def _forces_above(snapshot: RobotSnapshot, at_w: Floats, forces_n: Floats) -> Floats:
     """Arrows of forces (n, 3), above where they act."""
     size_n = np.linalg.norm(forces_n, axis=1, keepdims=True)
     scale = np.minimum(M_PER_N, LONGEST_M / np.maximum(size_n, 1e-9))
-    above_m = max(link.radius_m for link in moment.robot.links) + ABOVE_M
+    above_m = max(link.radius_m for link in snapshot.robot.links) + ABOVE_M
     return _arrows(at_w + np.array([0.0, 0.0, above_m]), scale * forces_n)
 
 

@@ -18,7 +18,7 @@ from snakesim_operator.tools.fault import FaultOrder, fault
 from snakesim_operator.tools.simulator import simulator
 from snakesim_operator.tools.simulator_order import SimulatorOrder
 from snakesim_operator.tools.stop import estop
-from snakesim_operator.tools.targets import Where
+from snakesim_operator.tools.targets import RobotSelection
 
 LOG_LINES = 200
 # How long an intent from the page is valid: then a viewer who is gone moves nothing. A button tells ten times a second
@@ -50,7 +50,7 @@ class Operations:
     """The robot at a link, as far as one can act on it."""
 
     def __init__(self, link: Link, log: Log) -> None:
-        self._where = Where(link.endpoint, link.namespace, link.session)
+        self._where = RobotSelection(link.endpoint, link.namespace, link.session)
         self._log = log
         self._session: Session | None = None
         self._intents: Publisher[Intent] | None = None

@@ -1,7 +1,7 @@
 """The page: the scene in the middle, the state and the controls beside it; the same for every viewer but the controls.
 
-The loop hands over one moment a frame. Each viewer gets the newest value of each thing when it has shown the one before
-(`pacing`), so a slow browser gets fewer frames, and never makes the loop wait.
+The loop hands over one snapshot a frame. Each viewer gets the newest value of each thing when it has shown the one
+before (`pacing`), so a slow browser gets fewer frames, and never makes the loop wait.
 """
 
 import contextlib
@@ -17,10 +17,10 @@ from snakesim_operator.console import stage, texts
 from snakesim_operator.console.charts import JointCharts
 from snakesim_operator.console.controls import KEYS, Controls, dress, name_of
 from snakesim_operator.console.drawing import Surroundings, draw
-from snakesim_operator.console.moment import Moment
 from snakesim_operator.console.operations import Log, Operations
 from snakesim_operator.console.pictures import picture
 from snakesim_operator.console.polygon import force_polygon
+from snakesim_operator.console.snapshot import RobotSnapshot
 from snakesim_operator.console.stage import Stage
 from snakesim_operator.console.token import ControlToken
 
@@ -56,7 +56,7 @@ class Page:
         self._controls: dict[int, Controls] = {}
         self._lock = threading.Lock()  # of `_controls`; viser fills a folder from one thread at a time
         self._frames = 0
-        self._moment: Moment | None = None
+        self._moment: RobotSnapshot | None = None
         self._stage: Stage | None = None
         self._charts: JointCharts | None = None
         self._shown_log = -1
@@ -159,7 +159,7 @@ class Page:
             controls.press(key)
 
     def forget(self) -> None:
-        """The next moment is not the one after this: trail and charts begin anew."""
+        """The next snapshot is not the one after this: trail and charts begin anew."""
         if self._stage is not None and self._charts is not None:
             self._stage.forget()
             self._charts.forget()
@@ -167,30 +167,30 @@ class Page:
 
     # --- each frame ------------------------------------------------------------------------------------------
 
-    def show(self, moment: Moment | None) -> None:
-        """Show a moment; None: there is no robot yet."""
-        before, self._moment = self._moment, moment
+    def show(self, snapshot: RobotSnapshot | None) -> None:
+        """Show a snapshot; None: there is no robot yet."""
+        before, self._moment = self._moment, snapshot
         self._frames += 1
-        if moment is not None:
-            if self._stage is None or before is None or before.robot.layout != moment.robot.layout:
-                self._meet(moment.robot)
-            if before is None or before.robot is not moment.robot:
+        if snapshot is not None:
+            if self._stage is None or before is None or before.robot.layout != snapshot.robot.layout:
+                self._meet(snapshot.robot)
+            if before is None or before.robot is not snapshot.robot:
                 self._control_changed()  # a simulator has controls of its own
-            drawing = draw(moment, self._around)
+            drawing = draw(snapshot, self._around)
             assert self._stage is not None and self._charts is not None
             if drawing is not None:
                 with self._server.atomic():
                     self._stage.show(drawing)
-            self._charts.take(moment)
+            self._charts.take(snapshot)
             if self._frames % CHARTS_EVERY == 1:
-                self._charts.show(moment)
-                self._forces.content = force_polygon(moment)
+                self._charts.show(snapshot)
+                self._forces.content = force_polygon(snapshot)
             if self._frames % PICTURES_EVERY == 1:
-                self._show_pictures(moment)
-            if moment.settings is not None and (before is None or moment.settings != before.settings):
-                self._show_settings(moment.settings)
-        if self._frames % TEXT_EVERY == 1 or _what(before) != _what(moment):
-            self._show_texts(moment)
+                self._show_pictures(snapshot)
+            if snapshot.settings is not None and (before is None or snapshot.settings != before.settings):
+                self._show_settings(snapshot.settings)
+        if self._frames % TEXT_EVERY == 1 or _what(before) != _what(snapshot):
+            self._show_texts(snapshot)
 
     def _meet(self, robot: Description) -> None:
         """Another robot: scene and charts begin anew."""
@@ -214,23 +214,23 @@ class Page:
         if settings.who is not None:
             self._log.write(f"settings of {settings.controller} in force, as {settings.who} asked")
 
-    def _show_texts(self, moment: Moment | None) -> None:
+    def _show_texts(self, snapshot: RobotSnapshot | None) -> None:
         if self._operations is None:
-            self._header.content = texts.header(moment, recorded=self._recorded)
+            self._header.content = texts.header(snapshot, recorded=self._recorded)
             return
         holder = self._token.holder
         viewers = len(self._server.get_clients())
         control = f"{name_of(holder)} has control; {viewers} viewer{'' if viewers == 1 else 's'}"
-        self._header.content = texts.header(moment, control=control)
-        if moment is not None:
-            self._state.content = texts.state_table(moment)
-            self._streams.content = texts.stream_table(moment)
+        self._header.content = texts.header(snapshot, control=control)
+        if snapshot is not None:
+            self._state.content = texts.state_table(snapshot)
+            self._streams.content = texts.stream_table(snapshot)
         if self._log.written != self._shown_log:
             self._shown_log = self._log.written
             self._log_text.content = texts.log(self._log.lines())
 
-    def _show_pictures(self, moment: Moment) -> None:
-        for key, image in moment.images.items():
+    def _show_pictures(self, snapshot: RobotSnapshot) -> None:
+        for key, image in snapshot.images.items():
             handle = self._pictures.get(key)
             if handle is None:
                 self._no_camera.visible = False
@@ -259,10 +259,10 @@ def _aim(client: viser.ClientHandle, robot: Description) -> None:
         camera.position, camera.look_at = view_of(robot, narrow=True)
 
 
-def _what(moment: Moment | None) -> tuple[object, ...] | None:
+def _what(snapshot: RobotSnapshot | None) -> tuple[object, ...] | None:
     """What viewers must see at once when it changes."""
-    if moment is None:
+    if snapshot is None:
         return None
-    status, control = moment.status, moment.control
+    status, control = snapshot.status, snapshot.control
     told = None if status is None else (status.lifecycle, status.why, status.paused_by)
     return told, None if control is None else control.state

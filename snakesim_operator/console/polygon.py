@@ -1,4 +1,4 @@
-"""The force polygon of a moment: the contact forces on the body tail to head, and their resultant, as SVG. Pure."""
+"""The force polygon of a snapshot: the contact forces on the body tail to head, and their resultant, as SVG. Pure."""
 
 from itertools import pairwise
 
@@ -6,16 +6,16 @@ import numpy as np
 
 from snakesim_operator.console import stage
 from snakesim_operator.console.drawing import MIN_FORCE_N
-from snakesim_operator.console.moment import Moment
+from snakesim_operator.console.snapshot import RobotSnapshot
 
 WIDTH, HEIGHT, EDGE = 380.0, 250.0, 34.0
 SPANS_N = (5.0, 10.0, 20.0, 50.0, 100.0, 200.0)  # that the height stands for: few, so that it seldom jumps
 NAMED_PX = 26.0  # shorter arrows have no number
 
 
-def force_polygon(moment: Moment) -> str:
+def force_polygon(snapshot: RobotSnapshot) -> str:
     """x of the world to the right, y upwards."""
-    contacts = [] if moment.world is None else sorted(moment.world.contacts, key=lambda contact: contact.body_s_m)
+    contacts = [] if snapshot.world is None else sorted(snapshot.world.contacts, key=lambda contact: contact.body_s_m)
     forces_n = np.array([contact.force_w[:2] for contact in contacts]).reshape(-1, 2)
     forces_n = forces_n[np.linalg.norm(forces_n, axis=1) > MIN_FORCE_N]
     if not len(forces_n):

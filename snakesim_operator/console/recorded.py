@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from snakesim_hal.wire.messages import AppliedCommand, ControlState, JointState, Mode, Trajectory, World
 from snakesim_hal.wire.quantities import Quaternion, Vector
-from snakesim_operator.console.moment import Moment
+from snakesim_operator.console.snapshot import RobotSnapshot
 from snakesim_operator.results.record import RunRecord
 
 CONTROL_LIMIT_S = 0.3  # older states are of before a gap
@@ -32,15 +32,15 @@ class Recorded:
         times = self.record.time_s
         return (float(times[0]), float(times[-1])) if len(times) else (0.0, 0.0)
 
-    def at(self, time_s: float) -> Moment:
+    def at(self, time_s: float) -> RobotSnapshot:
         """What was known then."""
         record = self.record
         if not len(record.time_s):
-            return Moment(robot=record.description)
+            return RobotSnapshot(robot=record.description)
         row = record.row_at(time_s)
         joints = self._joints(row)
         control = self._before(record.control, time_s, CONTROL_LIMIT_S)
-        return Moment(
+        return RobotSnapshot(
             robot=record.description,
             time_s=float(record.time_s[row]),
             joints=joints,

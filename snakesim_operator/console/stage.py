@@ -146,7 +146,7 @@ class Stage:
     # --- each frame ------------------------------------------------------------------------------------------
 
     def show(self, drawing: Drawing) -> None:
-        """Draw a moment."""
+        """Draw a snapshot."""
         for batch, numbers in self._links:
             batch.batched_positions = _single(drawing.links_w[numbers])
             batch.batched_wxyzs = _single(drawing.links_wxyz[numbers])

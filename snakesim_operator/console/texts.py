@@ -5,7 +5,7 @@ from html import escape
 
 from snakesim_hal.terminal import printable
 from snakesim_hal.wire.messages import Description, Status
-from snakesim_operator.console.moment import Moment
+from snakesim_operator.console.snapshot import RobotSnapshot
 
 SILENT_S = 1.0
 LIFECYCLE_COLOURS = {"disarmed": "#6b7683", "armed": "#1a7f4b", "fault": "#b3261e", "estop": "#b3261e"}
@@ -27,32 +27,34 @@ def backend_in_words(robot: Description) -> tuple[str, str]:
     return (f"EMULATED ROBOT ON {kind}", EMULATED) if robot.emulated else (f"ROBOT ON {kind}", REAL)
 
 
-def header(moment: Moment | None, *, recorded: str = "", control: str = "") -> str:
+def header(snapshot: RobotSnapshot | None, *, recorded: str = "", control: str = "") -> str:
     """The top of the page: which backend, which state, and why. control: who has it."""
-    if moment is None:
+    if snapshot is None:
         return _bar("WAITING FOR THE ROBOT", RECORDED, "no host has described itself yet")
-    if moment.expected:
-        return _bar("WAITING FOR THE ROBOT", RECORDED, f"{plain(moment.robot.robot)}, drawn as its scenario places it")
-    words, colour = backend_in_words(moment.robot)
-    where = f"{plain(moment.robot.robot)}{' · ' + plain(moment.robot.hardware) if moment.robot.hardware else ''}"
-    status = moment.status
+    if snapshot.expected:
+        return _bar(
+            "WAITING FOR THE ROBOT", RECORDED, f"{plain(snapshot.robot.robot)}, drawn as its scenario places it"
+        )
+    words, colour = backend_in_words(snapshot.robot)
+    where = f"{plain(snapshot.robot.robot)}{' · ' + plain(snapshot.robot.hardware) if snapshot.robot.hardware else ''}"
+    status = snapshot.status
     if recorded:
         words, colour, where = f"RECORDING OF: {words}", RECORDED, f"{where} · {plain(recorded)}"
     lines = [_bar(words, colour, where)]
     if status is not None and status.paused_by is not None:
         lines.append(_bar("PAUSED", RECORDED, f"by {plain(status.paused_by)}; robot time stands"))
-    if len(moment.hosts) > 1:
+    if len(snapshot.hosts) > 1:
         lines.append(_warning("IMPOSTOR: more than one host publishes a status under this name. Trust none of them."))
-    if moment.silent_s > SILENT_S:
-        lines.append(_warning(f"NO ANSWER for {moment.silent_s:.0f} s. What is shown is old."))
+    if snapshot.silent_s > SILENT_S:
+        lines.append(_warning(f"NO ANSWER for {snapshot.silent_s:.0f} s. What is shown is old."))
     if status is not None:
         lines.append(
             f"<div style='display:flex;gap:.5em;align-items:baseline;margin-top:.45em'>"
             f"{badge(status.lifecycle.upper(), LIFECYCLE_COLOURS[status.lifecycle])}"
             f"<span>{plain(status.why)}</span></div>"
         )
-    if moment.control is not None:
-        state = moment.control
+    if snapshot.control is not None:
+        state = snapshot.control
         lines.append(
             f"<div style='display:flex;gap:.5em;align-items:baseline;margin-top:.35em'>"
             f"{badge(state.state, STATE_COLOURS[state.state])}<span>{plain(state.reason)}</span></div>"
@@ -85,12 +87,12 @@ def _warning(text: str) -> str:
     )
 
 
-def state_table(moment: Moment) -> str:
+def state_table(snapshot: RobotSnapshot) -> str:
     """Lease, commands, faults, warnings, health."""
-    status = moment.status
+    status = snapshot.status
     rows: list[tuple[str, str]] = []
     if status is not None:
-        time_s = "" if moment.time_s is None else f"{moment.time_s:.2f} s · "
+        time_s = "" if snapshot.time_s is None else f"{snapshot.time_s:.2f} s · "
         rows = [
             ("robot time", f"{time_s}tick {status.tick}, {status.pace} at {status.rate_hz:g} Hz"),
             ("lease", f"{plain(status.lease_holder or 'free')} (epoch {status.lease_epoch})"),
@@ -106,7 +108,7 @@ def state_table(moment: Moment) -> str:
         rows += [("isolated", plain(", ".join(status.isolated)))] if status.isolated else []
         rows += [("injected", plain(what)) for what in status.injected]
         rows += [("real time", plain(what)) for what in status.realtime_warnings]
-    return _table([*rows, *_health(moment)]) + faults(status)
+    return _table([*rows, *_health(snapshot)]) + faults(status)
 
 
 def _speed(status: Status) -> str:
@@ -127,8 +129,8 @@ def faults(status: Status | None) -> str:
     return f"<div style='padding:0 .6em;font-size:.85em;color:{BAD}'>Faults<ul>{''.join(items)}{more}</ul></div>"
 
 
-def _health(moment: Moment) -> list[tuple[str, str]]:
-    power, joints = moment.power, moment.robot.joints
+def _health(snapshot: RobotSnapshot) -> list[tuple[str, str]]:
+    power, joints = snapshot.power, snapshot.robot.joints
     if power is None or not power.motor_c:
         return []
     hottest = max(range(len(joints)), key=lambda i: power.motor_c[i])
@@ -141,11 +143,11 @@ def _health(moment: Moment) -> list[tuple[str, str]]:
     return [*rows, ("WATER", plain(", ".join(wet)))] if wet else rows
 
 
-def stream_table(moment: Moment) -> str:
+def stream_table(snapshot: RobotSnapshot) -> str:
     """Rates and ages of all keys."""
     rows = [
         (plain(key), f"{stream.rate_hz:.0f} Hz" + (f", {stream.age_s * 1e3:.0f} ms old" if stream.age_s else ""))
-        for key, stream in sorted(moment.streams.items())
+        for key, stream in sorted(snapshot.streams.items())
     ]
     return _table(rows)
 

@@ -1,4 +1,4 @@
-"""The newest message of each key of one robot. Zenoh's threads only store; decoding happens at `moment`.
+"""The newest message of each key of one robot. Zenoh's threads only store; decoding happens at `snapshot`.
 
 Each key keeps a few arrivals, so that neither a slow page nor a flood costs memory, and noise on a key does not hide
 its good messages.
@@ -30,7 +30,7 @@ from snakesim_hal.wire.messages import (
     Trajectory,
     World,
 )
-from snakesim_operator.console.moment import Moment, Stream
+from snakesim_operator.console.snapshot import RobotSnapshot, Stream
 
 KEPT, IMAGES_KEPT = 64, 2  # arrivals of a key between two looks
 MAX_CAMERAS = 16
@@ -58,7 +58,7 @@ IMAGES: dict[str, type[Message]] = {keys.DEPTH_ALL: DepthImage, keys.COLOUR_ALL:
 MessageT = TypeVar("MessageT", bound=Message)
 
 
-class Inlet:
+class KeyBuffer:
     """The arrivals of one key."""
 
     def __init__(self, message: type[Message], kept: int) -> None:
@@ -87,7 +87,7 @@ class Watch:
     """Everything that one robot publishes, as far as the console shows it."""
 
     def __init__(self, session: Session) -> None:
-        self._inlets: dict[str, Inlet] = {}
+        self._buffers: dict[str, KeyBuffer] = {}
         self._newest: dict[str, Any] = {}
         self._bodies: deque[JointState] = deque(maxlen=BODIES_KEPT)
         self._hosts: dict[str, float] = {}
@@ -102,26 +102,26 @@ class Watch:
         for key in IMAGES:
             session.on_arrival(key, self._take_image)
 
-    def _inlet(self, key: str, message: type[Message], kept: int) -> Inlet:
-        inlet = self._inlets[key] = Inlet(message, kept)
-        return inlet
+    def _inlet(self, key: str, message: type[Message], kept: int) -> KeyBuffer:
+        buffer = self._buffers[key] = KeyBuffer(message, kept)
+        return buffer
 
     def _take_image(self, arrival: Arrival) -> None:
         """In Zenoh's threads: each camera has a key of its own."""
-        inlet = self._inlets.get(arrival.key)
-        if inlet is None:
+        buffer = self._buffers.get(arrival.key)
+        if buffer is None:
             message = keys.message_at(arrival.key)
-            if message is None or len(self._inlets) >= len(LATCHED) + len(STREAMS) + MAX_CAMERAS:
+            if message is None or len(self._buffers) >= len(LATCHED) + len(STREAMS) + MAX_CAMERAS:
                 return
-            inlet = self._inlet(arrival.key, message, IMAGES_KEPT)
-        inlet.put(arrival)
+            buffer = self._inlet(arrival.key, message, IMAGES_KEPT)
+        buffer.put(arrival)
 
     @property
     def robot(self) -> Description | None:
         """The newest description."""
         return self._newest.get(keys.DESCRIPTION)
 
-    def moment(self) -> Moment | None:
+    def snapshot(self) -> RobotSnapshot | None:
         """What is known now; None before the robot has described itself."""
         self._take_in()
         robot = self.robot
@@ -130,7 +130,7 @@ class Watch:
         now_s, clock = time.monotonic(), self._get(keys.CLOCK, Clock)
         world, status = self._get(keys.WORLD, World), self._get(keys.STATUS, Status)
         body, base = self._body(world)
-        return Moment(
+        return RobotSnapshot(
             robot=robot,
             time_s=None if clock is None else clock.stamp_ns * 1e-9,
             silent_s=now_s - self._heard_s,
@@ -155,8 +155,8 @@ class Watch:
 
     def _take_in(self) -> None:
         """Decode what has arrived; what does not fit the robot is counted and dropped."""
-        for key, inlet in list(self._inlets.items()):
-            for message in inlet.take(self.rejected):
+        for key, buffer in list(self._buffers.items()):
+            for message in buffer.take(self.rejected):
                 if key == keys.DESCRIPTION:
                     self._meet(message)
                 elif self.robot is not None and (wrong := mismatch(message, self.robot)) is not None:
@@ -197,14 +197,14 @@ class Watch:
         now_s, (since_s, before) = time.monotonic(), self._counted
         if now_s - since_s < RATE_PERIOD_S:
             return
-        counts = {key: inlet.count for key, inlet in list(self._inlets.items())}
+        counts = {key: buffer.count for key, buffer in list(self._buffers.items())}
         self._rates = {key: (count - before.get(key, 0)) / (now_s - since_s) for key, count in counts.items()}
         self._counted = now_s, counts
 
     def _streams(self, clock: Clock | None) -> dict[str, Stream]:
         return {
             key: Stream(self._rates.get(key, 0.0), _age_s(self._newest.get(key), clock))
-            for key in self._inlets
+            for key in self._buffers
             if key in self._newest and key not in LATCHED
         }
 

@@ -5,5 +5,5 @@
 `foxglove`    channels that Foxglove and Rerun show             `shapes`   their messages, made of ours
 `body_frames` transforms and joint states among them         `disk`     the file's bytes, cut back when a disk is full
 `live`        serves those channels to Foxglove as they come    `robot_time` when a message was, in robot time
-`recover`     makes a whole file of a torn one                  `told_state` state, log and references for Foxglove
+`recover`     makes a whole file of a torn one                  `state_messages` state, log and references for Foxglove
 """

@@ -38,7 +38,7 @@ from snakesim_hal.wire.messages import (
 )
 from snakesim_operator.recording import shapes
 from snakesim_operator.recording.body_frames import BodyFrames
-from snakesim_operator.recording.told_state import State, ToldState
+from snakesim_operator.recording.state_messages import State, StateMessages
 
 MOVING_NS = 100_000_000  # 10 Hz: viewers interpolate transforms
 IMAGES_NS = 200_000_000  # 5 Hz: all images are in the raw channels
@@ -46,7 +46,7 @@ TOPICS = "foxglove/"
 STILL_NS = 1_000_000_000  # what seldom changes, so that it is there wherever one begins to look
 
 
-class Seen(msgspec.Struct, frozen=True):
+class PoseAndContacts(msgspec.Struct, frozen=True):
     """What is shown of a world model at every turn: not its obstacles, which may be many."""
 
     base_position_w: tuple[float, float, float]
@@ -56,7 +56,17 @@ class Seen(msgspec.Struct, frozen=True):
 
 _decoders: dict[type[Any], Any] = {
     message: msgspec.msgpack.Decoder(message)
-    for message in (JointState, Pose, Seen, World, Trajectory, DepthImage, ColourImage, Description, Configuration)
+    for message in (
+        JointState,
+        Pose,
+        PoseAndContacts,
+        World,
+        Trajectory,
+        DepthImage,
+        ColourImage,
+        Description,
+        Configuration,
+    )
 }
 
 Kind = type[Protobuf] | type[State]
@@ -75,7 +85,7 @@ ALWAYS: dict[str, Kind] = {  # topics but for those of images, of which a robot 
 _KEPT = (keys.JOINTS, keys.POSE, keys.WORLD, keys.TRAJECTORY, keys.STATUS, keys.CONTROL_STATE)
 
 
-class Shown(NamedTuple):
+class FoxgloveMessage(NamedTuple):
     """One message for Foxglove."""
 
     topic: str
@@ -83,7 +93,7 @@ class Shown(NamedTuple):
     payload: bytes
 
 
-class ShownSchema(NamedTuple):
+class FoxgloveSchema(NamedTuple):
     """How a kind of message is encoded."""
 
     name: str
@@ -93,11 +103,11 @@ class ShownSchema(NamedTuple):
 
 
 @cache
-def schema_of(kind: Kind) -> ShownSchema:
+def schema_of(kind: Kind) -> FoxgloveSchema:
     """As MCAP wants it: of a protobuf message its file and all that it imports."""
     if issubclass(kind, State):
         schema = msgspec.json.schema(kind)["$defs"][kind.__name__]
-        return ShownSchema(f"snakesim.shown.{kind.__name__}", "json", "jsonschema", msgspec.json.encode(schema))
+        return FoxgloveSchema(f"snakesim.shown.{kind.__name__}", "json", "jsonschema", msgspec.json.encode(schema))
     files: dict[str, Any] = {}
 
     def add(file: Any) -> None:
@@ -109,7 +119,7 @@ def schema_of(kind: Kind) -> ShownSchema:
     found = FileDescriptorSet()
     for file in files.values():
         file.CopyToProto(found.file.add())
-    return ShownSchema(kind.DESCRIPTOR.full_name, "protobuf", "protobuf", found.SerializeToString())
+    return FoxgloveSchema(kind.DESCRIPTOR.full_name, "protobuf", "protobuf", found.SerializeToString())
 
 
 class FoxgloveChannels:
@@ -120,10 +130,10 @@ class FoxgloveChannels:
         self._due_ns: dict[str, int] = {}
         self._robot: Description | None = None
         self._frames: BodyFrames | None = None
-        self._told = ToldState()
+        self._told = StateMessages()
         self._truth = shapes.obstacles([], "obstacles", shapes.TRUTH, 0)
 
-    def take(self, key: str, payload: bytes, time_ns: int) -> list[Shown]:
+    def take(self, key: str, payload: bytes, time_ns: int) -> list[FoxgloveMessage]:
         """What is due with this message. One that cannot be decoded makes nothing."""
         if key in _KEPT:
             self._newest[key] = payload
@@ -157,10 +167,10 @@ class FoxgloveChannels:
     def _read(self, key: str, message: type[Any]) -> Any:
         return _decoded(message, self._newest.get(key))
 
-    def _at_clock(self, time_ns: int) -> list[Shown]:
+    def _at_clock(self, time_ns: int) -> list[FoxgloveMessage]:
         robot, frames = self._robot, self._frames
         joints: JointState | None = self._read(keys.JOINTS, JointState)
-        seen: Seen | None = self._read(keys.WORLD, Seen)
+        seen: PoseAndContacts | None = self._read(keys.WORLD, PoseAndContacts)
         if robot is None or frames is None or joints is None or not joints.is_of(len(robot.joints)):
             return []
         made = [_shown("joints", frames.joint_states(joints, time_ns))]
@@ -172,15 +182,15 @@ class FoxgloveChannels:
             made.append(_scene("forces", [shapes.forces(seen.contacts, time_ns)]))
         return [*made, *self._state(frames, time_ns), *self._still(robot, time_ns)]
 
-    def _state(self, frames: BodyFrames, time_ns: int) -> Iterator[Shown]:
+    def _state(self, frames: BodyFrames, time_ns: int) -> Iterator[FoxgloveMessage]:
         status, control = (self._newest.get(key) for key in (keys.STATUS, keys.CONTROL_STATE))
         state, logged, wanted_rad = self._told.of(status, control, time_ns)
-        yield Shown(f"{TOPICS}state", State, msgspec.json.encode(state))
+        yield FoxgloveMessage(f"{TOPICS}state", State, msgspec.json.encode(state))
         yield from (_shown("log", one) for one in logged)
         if len(wanted_rad) == frames.joints:
             yield _shown("reference", frames.reference(wanted_rad, time_ns))
 
-    def _still(self, robot: Description, time_ns: int) -> Iterator[Shown]:
+    def _still(self, robot: Description, time_ns: int) -> Iterator[FoxgloveMessage]:
         if self._is_due("body", time_ns, STILL_NS):
             yield _scene("body", shapes.body(robot, time_ns))
             self._truth.timestamp.CopyFrom(shapes.stamp(time_ns))
@@ -194,14 +204,14 @@ class FoxgloveChannels:
             if trajectory is not None:
                 yield _scene("path", [shapes.path(trajectory.path_w, time_ns)])
 
-    def _base(self, seen: Seen | None) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
+    def _base(self, seen: PoseAndContacts | None) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
         """Position and orientation of link 0: as measured, else as guidance believes."""
         pose: Pose | None = self._read(keys.POSE, Pose)
         if pose is not None:
             return pose.position_w, pose.orientation_wxyz
         return None if seen is None else (seen.base_position_w, seen.base_orientation_wxyz)
 
-    def _image(self, key: str, payload: bytes, time_ns: int) -> Iterator[Shown]:
+    def _image(self, key: str, payload: bytes, time_ns: int) -> Iterator[FoxgloveMessage]:
         robot = self._robot
         image: Any = _decoded(DepthImage if key.startswith("sensor/depth/") else ColourImage, payload)
         if robot is None or image is None or image.link >= len(robot.links):
@@ -229,9 +239,9 @@ def _pose(position: tuple[float, ...], wxyz: tuple[float, ...], time_ns: int) ->
     return made
 
 
-def _scene(name: str, entities: list[SceneEntity]) -> Shown:
+def _scene(name: str, entities: list[SceneEntity]) -> FoxgloveMessage:
     return _shown(f"scene/{name}", SceneUpdate(entities=entities))
 
 
-def _shown(name: str, message: Protobuf) -> Shown:
-    return Shown(TOPICS + name, type(message), message.SerializeToString())
+def _shown(name: str, message: Protobuf) -> FoxgloveMessage:
+    return FoxgloveMessage(TOPICS + name, type(message), message.SerializeToString())

@@ -5,7 +5,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 from snakesim_hal.errors import ConfigError, NotConnectedError
-from snakesim_operator.recording.foxglove import ALWAYS, Kind, Shown, schema_of
+from snakesim_operator.recording.foxglove import ALWAYS, FoxgloveMessage, Kind, schema_of
 
 if TYPE_CHECKING:
     import foxglove
@@ -33,7 +33,7 @@ class LiveServer:
             raise NotConnectedError(f"cannot serve Foxglove on port {port}: {error}; choose another") from error
         self.address = f"ws://{HOST}:{self._server.port}"
 
-    def show(self, shown: Shown, time_ns: int) -> None:
+    def show(self, shown: FoxgloveMessage, time_ns: int) -> None:
         """Hand on one message. time_ns: robot time."""
         channel = self._channels.get(shown.topic) or self._add(shown.topic, shown.kind)
         channel.log(shown.payload, log_time=time_ns)

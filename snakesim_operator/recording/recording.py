@@ -15,14 +15,14 @@ from snakesim_hal.model.files import SCHEMAS
 from snakesim_hal.network.session import Arrival
 from snakesim_hal.wire import keys
 from snakesim_operator.recording.disk import GrowingFile
-from snakesim_operator.recording.foxglove import FoxgloveChannels, Shown, schema_of
+from snakesim_operator.recording.foxglove import FoxgloveChannels, FoxgloveMessage, schema_of
 from snakesim_operator.recording.mcap_file import McapFile
 from snakesim_operator.recording.robot_time import RobotTime
 
 FLUSH_S = 0.5
 ABOUT = "snakesim"  # the name of the metadata record
 
-Show = Callable[[Shown, int], None]  # and the robot time in ns
+Show = Callable[[FoxgloveMessage, int], None]  # and the robot time in ns
 
 
 class Recording:
@@ -86,7 +86,7 @@ class Recording:
                 self.trouble = f"{self.path}: {error.strerror or error}"
         self._file.close()
 
-    def _open_shown(self, shown: Shown) -> int:
+    def _open_shown(self, shown: FoxgloveMessage) -> int:
         name, message_encoding, encoding, data = schema_of(shown.kind)
         if name not in self._schemas:
             self._schemas[name] = self._mcap.add_schema(name, encoding, data)

@@ -9,7 +9,7 @@ MAX_AWAY_NS = 1_000_000_000  # a tick further away from the clock is a lie, or o
 LATEST_NS = 2**63 - 1
 
 
-class _Dated(msgspec.Struct):
+class _Stamped(msgspec.Struct):
     """What the messages have in common; the rest is skipped."""
 
     tick: int | None = None
@@ -26,7 +26,7 @@ class RobotTime:
     """The time of messages, in the order of their arrival."""
 
     def __init__(self) -> None:
-        self._dated = msgspec.msgpack.Decoder(_Dated)
+        self._dated = msgspec.msgpack.Decoder(_Stamped)
         self._clock = msgspec.msgpack.Decoder(_Clock)
         self.clock: _Clock | None = None  # the newest one
         self.went_back = False  # the newest clock is before the one before

@@ -19,7 +19,7 @@ DIGITS_M = 9  # lengths are rounded to a nanometre, which removes the noise of a
 OFF_LINE = 0.05  # of the mean distance between joints: a joint further beside the line is an error
 OBLIQUE = math.cos(math.radians(1.0))
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # ixx, iyy, izz, ixy, ixz, iyz
-MIN_DISTANCE_M, MAX_DISTANCE_M, MIN_MASS_KG = 0.001, 2, 0.001
+MIN_GAP_M, MAX_GAP_M, MIN_MASS_KG = 0.001, 2, 0.001
 
 
 def _axes_of_body(row: Row, order: Order, urdf: Element) -> Floats:
@@ -43,9 +43,9 @@ def put_body(found: Imported, row: Row, order: Order, urdf: Element) -> list[Flo
     places = np.array([turn @ joint.origin for joint in row.joints]) * scale
     on_line = places - [0.0, *places[0][1:]]  # x as it is; y and z from the first joint
     gap_m = float(np.mean(np.diff(on_line[:, 0])))
-    if gap_m > MAX_DISTANCE_M:
+    if gap_m > MAX_GAP_M:
         raise urdf.wrong(
-            f"has joints {gap_m:g} m apart, and a link has {MAX_DISTANCE_M} m at most; in mm? Give --scale 0.001"
+            f"has joints {gap_m:g} m apart, and a link has {MAX_GAP_M} m at most; in mm? Give --scale 0.001"
         )
     axes = [_axis(joint, turn @ joint.axis) for joint in row.joints]
     for joint, axis, at in zip(row.joints, axes, on_line, strict=True):
@@ -128,11 +128,11 @@ def _lengths(joints_x: Floats, outlines: list[Floats | None], radius_m: float, f
     if min(gaps) < 0:
         raise ConfigError("the joints are not in order along the chain at zero angles: it is folded")
     for i, gap in enumerate(gaps):
-        if gap < MIN_DISTANCE_M:
+        if gap < MIN_GAP_M:
             found.changed.append(
-                f"joint_{i + 1} and joint_{i + 2} are {gap * 1e3:.2f} mm apart; here {MIN_DISTANCE_M * 1e3:g} mm, the least"
+                f"joint_{i + 1} and joint_{i + 2} are {gap * 1e3:.2f} mm apart; here {MIN_GAP_M * 1e3:g} mm"
             )
-    middle = [max(gap, MIN_DISTANCE_M) for gap in gaps]
+    middle = [max(gap, MIN_GAP_M) for gap in gaps]
     ends: list[float] = []
     for i, joint_x, outward in ((0, joints_x[0], -1), (len(outlines) - 1, joints_x[-1], 1)):
         outline = outlines[i]
@@ -141,7 +141,7 @@ def _lengths(joints_x: Floats, outlines: list[Floats | None], radius_m: float, f
             found.changed.append(f"link_{i} has no geometry; its length is taken as half of the others'")
             continue
         reach = float((outward * (outline[:, 0] - joint_x)).max()) - radius_m
-        ends.append(max(round(reach, DIGITS_M), MIN_DISTANCE_M))
+        ends.append(max(round(reach, DIGITS_M), MIN_GAP_M))
     return [ends[0], *middle, ends[1]]
 
 

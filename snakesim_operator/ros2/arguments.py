@@ -51,9 +51,9 @@ def add_commands(commands: Any) -> None:
 
 def _ros2(arguments: argparse.Namespace) -> int:
     from snakesim_operator.ros2.join import join
-    from snakesim_operator.tools.where import where_of
+    from snakesim_operator.tools.robot_selection import selection_of
 
-    return join(arguments, where_of(arguments))
+    return join(arguments, selection_of(arguments))
 
 
 def check(arguments: argparse.Namespace) -> None:

@@ -23,7 +23,7 @@ from snakesim_operator.ros2 import robot_in_ros
 from snakesim_operator.ros2.frames import Frames, ros_name
 from snakesim_operator.ros2.graph import Node, RosPublisher, RosType, Topic
 from snakesim_operator.ros2.messages import Transform
-from snakesim_operator.ros2.relay import Relay, Stamps
+from snakesim_operator.ros2.relay import Relay, RosTime
 from snakesim_operator.ros2.steering import Steering
 from snakesim_operator.ros2.urdf import urdf_of
 
@@ -53,7 +53,7 @@ class Bridge:
     def __init__(self, session: Session, node: Node, robot: m.Description, options: Options, say: Say = say) -> None:
         self._session, self._node, self._options, self._say = session, node, options, say
         self._prefix = f"{options.namespace.strip('/')}/" if options.namespace else ""
-        self._stamps = Stamps(wall_time=options.wall_time)
+        self._ros_time = RosTime(wall_time=options.wall_time)
         self._clocks = session.reader(keys.CLOCK, m.Clock)
         self._descriptions = session.latched_reader(keys.DESCRIPTION, m.Description)
         self._clock: m.Clock | None = None
@@ -100,7 +100,7 @@ class Bridge:
         self._tf_static.put(ros.transforms(self._now_ns(), fixed))
 
     def _now_ns(self) -> int:
-        return self._stamps.of(0 if self._clock is None else self._clock.stamp_ns)
+        return self._ros_time.of(0 if self._clock is None else self._clock.stamp_ns)
 
     def _make_relays(self, robot: m.Description) -> list[Relay[Any]]:
         images = self._every(self._options.images_hz)
@@ -136,7 +136,7 @@ class Bridge:
         infos = self._publisher(f"{topic}/camera_info", ros.CAMERA_INFO, depth=1)
 
         def pass_on(seen: m.DepthImage | m.ColourImage) -> None:
-            frame, stamp_ns = self._frames.optical(kind, name), self._stamps.of(seen.stamp_ns)
+            frame, stamp_ns = self._frames.optical(kind, name), self._ros_time.of(seen.stamp_ns)
             self._place(key, self._frames.of_camera(kind, name, seen))
             infos.put(robot_in_ros.camera_info(stamp_ns, frame, seen))
             images.put(translate(stamp_ns, frame, seen))
@@ -148,7 +148,7 @@ class Bridge:
 
         def pass_on(seen: m.Ranges) -> None:
             self._place(key, self._frames.of_beams(name, seen))
-            scans.put(robot_in_ros.laser_scan(self._stamps.of(seen.stamp_ns), self._frames.beams(name), seen))
+            scans.put(robot_in_ros.laser_scan(self._ros_time.of(seen.stamp_ns), self._frames.beams(name), seen))
 
         return Relay(self._session, key, m.Ranges, 1, pass_on, scans.heard)
 
@@ -162,7 +162,7 @@ class Bridge:
 
     def _on_joints(self, joints: m.JointState) -> None:
         self._joints = joints
-        stamp_ns = self._stamps.of(joints.stamp_ns)
+        stamp_ns = self._ros_time.of(joints.stamp_ns)
         self._joint_states.put(robot_in_ros.joint_state(stamp_ns, self._names, joints))
         self._tf.put(ros.transforms(stamp_ns, self._frames.of_joints(joints)))
 
@@ -171,15 +171,15 @@ class Bridge:
         self._world_s = time.monotonic()
         reckoned = world.base_position_sd_m is not None or world.pose_stamp_ns is None
         at_ns = world.stamp_ns if reckoned else world.pose_stamp_ns or world.stamp_ns
-        self._tf.put(ros.transforms(self._stamps.of(at_ns), [self._frames.of_base(world)]))
+        self._tf.put(ros.transforms(self._ros_time.of(at_ns), [self._frames.of_base(world)]))
 
     def _on_pose(self, pose: m.Pose) -> None:
         """Where the base is, while no guidance says it."""
         if time.monotonic() - self._world_s > SILENT_S:
-            self._tf.put(ros.transforms(self._stamps.of(pose.stamp_ns), [self._frames.of_base(pose)]))
+            self._tf.put(ros.transforms(self._ros_time.of(pose.stamp_ns), [self._frames.of_base(pose)]))
 
     def _on_status(self, status: m.Status) -> None:
-        self._diagnostics.put(robot_in_ros.diagnostics(self._stamps.of(status.stamp_ns), status))
+        self._diagnostics.put(robot_in_ros.diagnostics(self._ros_time.of(status.stamp_ns), status))
 
     # --- the loop
 
@@ -204,9 +204,9 @@ class Bridge:
         clock = self._clocks.newest(lambda _clock: True)
         if clock is not None:
             if self._clock is not None and clock.tick < self._clock.tick:
-                self._stamps.start_over()
+                self._ros_time.start_over()
                 self._say("the robot's host has restarted: its time starts anew")
-            self._stamps.heard(clock.stamp_ns)
+            self._ros_time.heard(clock.stamp_ns)
             self._clock = clock
             if self._ros_clock is not None:
                 self._ros_clock.put(ros.clock(clock.stamp_ns))
@@ -226,9 +226,9 @@ class Bridge:
     def _draw(self, world: m.World) -> None:
         at_ns = world.stamp_ns if world.contacts_stamp_ns is None else world.contacts_stamp_ns
         contacts = robot_in_ros.contact_markers(world.contacts)
-        self._contacts.put(ros.markers(self._stamps.of(at_ns), self._frames.odom, contacts))
+        self._contacts.put(ros.markers(self._ros_time.of(at_ns), self._frames.odom, contacts))
         obstacles = robot_in_ros.obstacle_markers(world)
-        self._obstacles.put(ros.markers(self._stamps.of(world.stamp_ns), self._frames.odom, obstacles))
+        self._obstacles.put(ros.markers(self._ros_time.of(world.stamp_ns), self._frames.odom, obstacles))
 
     def _steer(self) -> None:
         """What ROS asks for; nothing while the robot is silent, because an intent needs its time."""

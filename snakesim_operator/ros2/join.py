@@ -15,13 +15,13 @@ from snakesim_hal.wire.messages import Description
 from snakesim_operator.ros2.arguments import check
 from snakesim_operator.ros2.bridge import Bridge, Options, adds_up
 from snakesim_operator.ros2.graph import Node, NodeName
-from snakesim_operator.tools.targets import Where, the_one
+from snakesim_operator.tools.targets import RobotSelection, the_one
 
 MAX_IN_BYTES = 65536  # of a message from ROS; a Twist has 52
 DESCRIBED_S = 5.0
 
 
-def join(arguments: argparse.Namespace, where: Where) -> int:
+def join(arguments: argparse.Namespace, where: RobotSelection) -> int:
     """Run the bridge until Ctrl-C. Raises ConfigError, NotConnectedError."""
     check(arguments)
     link = the_one(where, "ros2")

@@ -45,7 +45,7 @@ class Relay(Generic[MessageT]):
             self._pass_on(newest)
 
 
-class Stamps:
+class RosTime:
     """Robot time as the time of the ROS side."""
 
     def __init__(self, *, wall_time: bool) -> None:

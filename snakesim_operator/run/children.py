@@ -18,7 +18,7 @@ PIPE_BYTES = 2**20  # of output, while this process is frozen
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
-class Words:
+class ProcessOutput:
     """The output of a process: read from a pipe at once, so that it never waits for a disk, and passed on."""
 
     def __init__(self, pipe: int, keep: Callable[[bytes], object]) -> None:
@@ -47,7 +47,7 @@ class Child:
 
     name: str
     process: subprocess.Popen[bytes]
-    words: Words
+    words: ProcessOutput
 
     def how_it_ended(self) -> str | None:
         """Its exit as text; None while it runs."""
@@ -100,7 +100,7 @@ def start(
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         os.close(theirs)
-    return Child(name, process, Words(ours, keep))
+    return Child(name, process, ProcessOutput(ours, keep))
 
 
 def ask_to_end(child: Child) -> None:

@@ -109,7 +109,7 @@ def _go(
     give_up_s: float | None,
 ) -> tuple[InProcessRun, Outcome, bool]:
     """recorded: keys, which may have wildcards. Also returns whether it was given up."""
-    words = _Words(files)
+    words = _LogWriter(files)
     with contextlib.redirect_stderr(words), InProcessRun(config) as run:
         host, session = run.host, run.network.session()
         control = session.reader(keys.CONTROL_STATE, ControlState)
@@ -154,7 +154,7 @@ def _recording(session: Session, files: RunFiles, recorded: Iterable[str]) -> It
                 files.warn(recording.trouble)
 
 
-class _Words(io.TextIOBase):
+class _LogWriter(io.TextIOBase):
     """Takes what is printed to stderr into the run's folder."""
 
     def __init__(self, files: RunFiles) -> None:

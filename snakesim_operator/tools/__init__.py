@@ -1,7 +1,7 @@
 """Commands on running robots.
 
 `watching`, `commanding`, `setup`   the arguments of all these commands; they import little, so that a stop is quick
-`where`, `targets`   which robots a command addresses: those of this machine, or of a network
+`robot_selection`, `targets`   which robots a command addresses: those of this machine, or of a network
 `status`, `echo`   read     `command`, `stop`, `stop_by_query`, `fault`   act: arm, disarm, clear; emergency stop
 `schemas`, `completion`, `scenario_files`   need no robot
 """

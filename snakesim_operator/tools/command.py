@@ -14,14 +14,14 @@ from snakesim_hal.process import who
 from snakesim_hal.terminal import Say, say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, Description, LifecycleRequest, SimulatorRequest, Status
-from snakesim_operator.tools.targets import CONNECT_S, Where, the_one
+from snakesim_operator.tools.targets import CONNECT_S, RobotSelection, the_one
 
 ANSWER_S = 5.0
 DESCRIPTION_S = 3.0
 SHOWN_S = 1.5  # until the host's status must show what its answer says
 
 
-def arm(robot: str, backend: str, where: Where, say: Say = say) -> int:
+def arm(robot: str, backend: str, where: RobotSelection, say: Say = say) -> int:
     """Arm a robot, if robot and backend match. Raises RefusedError with the reason."""
     link = the_one(where, f"arm {robot} {backend}")
     with open_session(link, CONNECT_S) as session:
@@ -50,14 +50,14 @@ def arm(robot: str, backend: str, where: Where, say: Say = say) -> int:
         return ask_host(session, keys.LIFECYCLE, request, "armed", link, say)
 
 
-def disarm(where: Where, say: Say = say) -> int:
+def disarm(where: RobotSelection, say: Say = say) -> int:
     """Make the joints passive; later commands do not move them."""
     link = the_one(where, "disarm")
     with open_session(link, CONNECT_S) as session:
         return ask_host(session, keys.LIFECYCLE, LifecycleRequest(action="disarm", who=who()), "disarmed", link, say)
 
 
-def clear(where: Where, say: Say = say) -> int:
+def clear(where: RobotSelection, say: Say = say) -> int:
     """Clear a fault or an emergency stop. The robot is disarmed then.
 
     If no robot runs, an emergency stop stored by the last run is removed.

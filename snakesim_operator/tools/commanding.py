@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from snakesim_hal.arguments import add_network
+from snakesim_operator.tools.robot_selection import selection_of
 from snakesim_operator.tools.simulator_order import add_command as add_sim
 from snakesim_operator.tools.simulator_order import order_of
-from snakesim_operator.tools.where import where_of
 
 URGENT = -10  # niceness of an emergency stop
 
@@ -62,19 +62,19 @@ def add_commands(commands: Any) -> None:
 def _arm(arguments: argparse.Namespace) -> int:
     from snakesim_operator.tools.command import arm
 
-    return arm(arguments.robot, arguments.backend, where_of(arguments))
+    return arm(arguments.robot, arguments.backend, selection_of(arguments))
 
 
 def _disarm(arguments: argparse.Namespace) -> int:
     from snakesim_operator.tools.command import disarm
 
-    return disarm(where_of(arguments))
+    return disarm(selection_of(arguments))
 
 
 def _clear(arguments: argparse.Namespace) -> int:
     from snakesim_operator.tools.command import clear
 
-    return clear(where_of(arguments))
+    return clear(selection_of(arguments))
 
 
 def _estop(arguments: argparse.Namespace) -> int:
@@ -82,7 +82,7 @@ def _estop(arguments: argparse.Namespace) -> int:
         os.nice(URGENT)
     from snakesim_operator.tools.stop import estop
 
-    return estop(where_of(arguments))
+    return estop(selection_of(arguments))
 
 
 def _teleop(arguments: argparse.Namespace) -> int:
@@ -90,18 +90,18 @@ def _teleop(arguments: argparse.Namespace) -> int:
 
     stick: Path | None = arguments.joystick
     request = TeleopRequest(arguments.fastest, stick is not None, None if stick in (None, Path()) else stick)
-    return teleop(request, where_of(arguments))
+    return teleop(request, selection_of(arguments))
 
 
 def _sim(arguments: argparse.Namespace) -> int:
     order = order_of(arguments)
     from snakesim_operator.tools.simulator import simulator
 
-    return simulator(order, where_of(arguments))
+    return simulator(order, selection_of(arguments))
 
 
 def _fault(arguments: argparse.Namespace) -> int:
     from snakesim_operator.tools.fault import FaultOrder, fault
 
     order = FaultOrder(arguments.kind, arguments.target, arguments.for_s, arguments.amount, arguments.end)
-    return fault(order, where_of(arguments))
+    return fault(order, selection_of(arguments))

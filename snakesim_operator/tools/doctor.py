@@ -8,7 +8,7 @@ from snakesim_hal.terminal import Say, say, say_json
 from snakesim_operator.tools import computer
 from snakesim_operator.tools.computer import Finding
 from snakesim_operator.tools.network_findings import ports, routers
-from snakesim_operator.tools.targets import Where
+from snakesim_operator.tools.targets import RobotSelection
 
 CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
     computer.python,
@@ -23,7 +23,7 @@ CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
 )
 
 
-def doctor(where: Where, *, as_json: bool, say: Say = say) -> int:
+def doctor(where: RobotSelection, *, as_json: bool, say: Say = say) -> int:
     """Check everything. Returns 1 when something fails without which no run is possible, else 0."""
     found: list[Finding] = []
     for check in (*CHECKS, ports, lambda: routers(where)):

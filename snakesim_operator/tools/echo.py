@@ -20,7 +20,7 @@ from snakesim_hal.network.session import Arrival, Session, intersects, key_expre
 from snakesim_hal.terminal import Say, complain, say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES, Decoder
-from snakesim_operator.tools.targets import CONNECT_S, Where
+from snakesim_operator.tools.targets import CONNECT_S, RobotSelection
 
 RATE_PERIOD_S = 1.0
 MAX_WAITING_BYTES = 64 * 1024 * 1024  # while the terminal or pipe is slower than the network
@@ -35,7 +35,7 @@ class EchoRequest:
     count: int | None = None
 
 
-def echo(request: EchoRequest, where: Where, say: Say = say) -> int:
+def echo(request: EchoRequest, where: RobotSelection, say: Say = say) -> int:
     """Print messages on a key, from every addressed robot. Raises NotConnectedError, ConfigError."""
     if request.key is None:
         for line in _key_lines():
@@ -51,7 +51,7 @@ def echo(request: EchoRequest, where: Where, say: Say = say) -> int:
     latched = tuple(row.key for row in rows if row.kind == "latched")
     within = "" if where.namespace is not None else "**/"
     pattern, latched_keys = key_expression(f"{within}{relative}"), tuple(f"{within}{key}" for key in latched)
-    waiting = Waiting()
+    waiting = OutputQueue()
     with contextlib.ExitStack() as stack:
         for session in _sessions(where, stack):
             # A latched value is older than the streams: a subscriber to both would drop it as too old.
@@ -68,7 +68,7 @@ def echo(request: EchoRequest, where: Where, say: Say = say) -> int:
     return 0
 
 
-def _sessions(where: Where, stack: contextlib.ExitStack) -> list[Session]:
+def _sessions(where: RobotSelection, stack: contextlib.ExitStack) -> list[Session]:
     """One on every network that answers."""
     found: list[Session] = []
     for link in where.networks():
@@ -90,7 +90,7 @@ def _key_lines() -> list[str]:
     return [f"  {row.key:<{width}}  {row.about}" for row in _echoed()]
 
 
-class Waiting:
+class OutputQueue:
     """Samples queued for the terminal; if it is too slow, the newest are dropped, and this is reported."""
 
     def __init__(self) -> None:
@@ -128,7 +128,7 @@ class Waiting:
         return arrival
 
 
-def _print_messages(waiting: Waiting, count: int | None, say: Say) -> None:
+def _print_messages(waiting: OutputQueue, count: int | None, say: Say) -> None:
     for _ in itertools.count() if count is None else range(count):
         arrival = waiting.get()
         told = {"key": arrival.key, **_content(arrival)}
@@ -150,7 +150,7 @@ def _content(arrival: Arrival) -> dict[str, Any]:
 _decoder = cache(Decoder)
 
 
-def _print_rates(waiting: Waiting, count: int | None, say: Say) -> None:
+def _print_rates(waiting: OutputQueue, count: int | None, say: Say) -> None:
     for _ in itertools.count() if count is None else range(count):
         stamps: dict[str, list[int]] = {}
         until = time.monotonic() + RATE_PERIOD_S

@@ -10,7 +10,7 @@ from snakesim_hal.terminal import Say, say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import FaultRequest
 from snakesim_operator.tools.command import ANSWER_S
-from snakesim_operator.tools.targets import CONNECT_S, Where, the_one
+from snakesim_operator.tools.targets import CONNECT_S, RobotSelection, the_one
 
 LIST = "list"
 
@@ -26,7 +26,7 @@ class FaultOrder:
     end: bool = False
 
 
-def fault(order: FaultOrder, where: Where, say: Say = say) -> int:
+def fault(order: FaultOrder, where: RobotSelection, say: Say = say) -> int:
     """Send the request to the responsible part. Raises RefusedError if it refuses, NotConnectedError without answer."""
     if order.kind == LIST and order.target is None:
         for line in explain().splitlines():

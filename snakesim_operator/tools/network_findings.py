@@ -9,7 +9,7 @@ from snakesim_hal.errors import SnakesimError
 from snakesim_hal.network.local_registry import local_robots
 from snakesim_hal.network.session import DEFAULT_ENDPOINT, open_session
 from snakesim_operator.tools.computer import Finding
-from snakesim_operator.tools.targets import CONNECT_S, Where, robots_on
+from snakesim_operator.tools.targets import CONNECT_S, RobotSelection, robots_on
 
 
 def ports() -> Iterator[Finding]:
@@ -35,7 +35,7 @@ def ports() -> Iterator[Finding]:
         yield Finding(what=f"port {port}", state="ok", told="free")
 
 
-def routers(where: Where) -> Iterator[Finding]:
+def routers(where: RobotSelection) -> Iterator[Finding]:
     """Every endpoint that was given, or has a robot of this computer."""
     links = where.networks() if where.endpoint or local_robots() else []
     for link in links:

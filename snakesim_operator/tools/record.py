@@ -12,11 +12,11 @@ from snakesim_hal.terminal import Say, say
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_operator.recording.live import LiveServer
 from snakesim_operator.recording.process import record
-from snakesim_operator.tools.targets import Where, the_one
+from snakesim_operator.tools.targets import RobotSelection, the_one
 
 
 def record_robot(
-    where: Where, out: Path | None, duration_s: float | None, foxglove_port: int | None = None, say: Say = say
+    where: RobotSelection, out: Path | None, duration_s: float | None, foxglove_port: int | None = None, say: Say = say
 ) -> int:
     """Record until Ctrl-C, or for a time by the wall clock. Exit code 1 when the disk took no more.
 

@@ -51,9 +51,9 @@ def _config(arguments: argparse.Namespace) -> int:
 
 def _doctor(arguments: argparse.Namespace) -> int:
     from snakesim_operator.tools.doctor import doctor
-    from snakesim_operator.tools.where import where_of
+    from snakesim_operator.tools.robot_selection import selection_of
 
-    return doctor(where_of(arguments), as_json=arguments.json)
+    return doctor(selection_of(arguments), as_json=arguments.json)
 
 
 def _router(arguments: argparse.Namespace) -> int:

@@ -7,12 +7,12 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import SimulatorRequest
 from snakesim_operator.tools.command import ask_host
 from snakesim_operator.tools.simulator_order import SimulatorOrder
-from snakesim_operator.tools.targets import CONNECT_S, Where, the_one
+from snakesim_operator.tools.targets import CONNECT_S, RobotSelection, the_one
 
 DONE = {"pause": "paused", "resume": "resumed", "step": "stepped", "speed": "changed", "reset": "reset"}
 
 
-def simulator(order: SimulatorOrder, where: Where, say: Say = say) -> int:
+def simulator(order: SimulatorOrder, where: RobotSelection, say: Say = say) -> int:
     """Ask for it. Raises RefusedError with the reason, NotConnectedError without an answer."""
     link = the_one(where, f"sim {order}")
     request = SimulatorRequest(action=order.action, who=order.who or who(), ticks=order.ticks, speed=order.speed)

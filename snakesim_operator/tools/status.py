@@ -19,13 +19,13 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import Process, Status
 from snakesim_operator.results import last_run
-from snakesim_operator.tools.targets import Where, flags_of, namespace_of
+from snakesim_operator.tools.targets import RobotSelection, flags_of, namespace_of
 
 STATUS_WAIT_S = 1.0
 CONNECT_S = 1.0
 
 
-def show_status(where: Where, say: Say = say, *, as_json: bool = False) -> int:
+def show_status(where: RobotSelection, say: Say = say, *, as_json: bool = False) -> int:
     """Print the state of every reachable robot. Returns 0 without faults, 1 otherwise."""
     found: list[tuple[Link, list[Status]]] = []
     processes: dict[tuple[str, str | None], list[Process]] = {}

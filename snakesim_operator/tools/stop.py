@@ -12,14 +12,14 @@ from snakesim_hal.errors import NotConnectedError
 from snakesim_hal.network.stop_port import ask_to_stop, stop_address
 from snakesim_hal.process import who
 from snakesim_hal.terminal import Say, say
-from snakesim_operator.tools.where import Where
+from snakesim_operator.tools.robot_selection import RobotSelection
 
 LIMIT_S = 5.0
 Address = tuple[str, int]  # of a stop port
 
 
 @dataclass(frozen=True)
-class Told:
+class StopResult:
     """The result for one robot."""
 
     name: str
@@ -29,7 +29,7 @@ class Told:
     in_doubt: bool = False  # an impostor may answer in its name
 
 
-def estop(where: Where, say: Say = say) -> int:
+def estop(where: RobotSelection, say: Say = say) -> int:
     """Stop them. Returns 0 when every known robot has confirmed that it is stopped."""
     local = {(robot.stop_host, robot.stop_port): (robot.endpoint, robot.namespace) for robot in where.local()}
     elsewhere: dict[Address, tuple[str, str | None]] = {}
@@ -61,7 +61,7 @@ def estop(where: Where, say: Say = say) -> int:
     return 0 if told and all(robot.stopped for robot in told) else 1
 
 
-def _confirmed(there: list[Told], shown: list[Told]) -> list[Told]:
+def _confirmed(there: list[StopResult], shown: list[StopResult]) -> list[StopResult]:
     """Answers of stop ports of other computers, once the robot's network confirms them: such a port may be forged.
 
     A silent port counts for nothing when the network confirms the stop: at a router's address there may be none.
@@ -77,22 +77,22 @@ def _confirmed(there: list[Told], shown: list[Told]) -> list[Told]:
     ]
 
 
-def _others(here: list[Told], there: list[Told], shown: list[Told]) -> list[Told]:
+def _others(here: list[StopResult], there: list[StopResult], shown: list[StopResult]) -> list[StopResult]:
     """Robots that only the network reports."""
     return [told for told in shown if not any(_same(told, other) for other in (*here, *there))]
 
 
-def _same(a: Told, b: Told) -> bool:
+def _same(a: StopResult, b: StopResult) -> bool:
     return (a.endpoint, a.name) == (b.endpoint, b.name)
 
 
-def _at_port(address: Address, endpoint: str, namespace: str | None) -> Told | None:
+def _at_port(address: Address, endpoint: str, namespace: str | None) -> StopResult | None:
     """Send a stop to a stop port; None when the port is closed."""
     try:
         answer = ask_to_stop(*address, who(), LIMIT_S)
     except NotConnectedError:
         return None
     if answer is not None:
-        return Told(answer.robot, endpoint, stopped=True, text=answer.text)
+        return StopResult(answer.robot, endpoint, stopped=True, text=answer.text)
     text = f"NO ANSWER at udp/{address[0]}:{address[1]} for {LIMIT_S:g} s: use its own emergency stop"
-    return Told(namespace or "a robot", endpoint, stopped=False, text=text)
+    return StopResult(namespace or "a robot", endpoint, stopped=False, text=text)

@@ -10,13 +10,13 @@ from snakesim_hal.process import who
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, EstopRequest, Status
 from snakesim_operator.tools.command import judge
-from snakesim_operator.tools.stop import Told
+from snakesim_operator.tools.stop import StopResult
 from snakesim_operator.tools.targets import CONNECT_S, namespace_of, robots_on
 
 ASK_S = 1.0
 
 
-def ask_network(link: Link, limit_s: float) -> list[Told]:
+def ask_network(link: Link, limit_s: float) -> list[StopResult]:
     """Query all hosts on a network, repeatedly while none can be reached."""
     deadline = time.monotonic() + limit_s
     while True:
@@ -38,7 +38,7 @@ def _anybody(link: Link) -> bool:
         return False
 
 
-def _ask(session: Session, link: Link, limit_s: float) -> list[Told]:
+def _ask(session: Session, link: Link, limit_s: float) -> list[StopResult]:
     names = [link.namespace] if link.namespace is not None else robots_on(session)
     prefix = "" if link.namespace is not None else "**/"
     answers: dict[str, list[Answer]] = {}
@@ -49,12 +49,12 @@ def _ask(session: Session, link: Link, limit_s: float) -> list[Told]:
             answers.setdefault(link.namespace or namespace_of(key), []).append(answer)
         if not names:
             break
-    told: list[Told] = []
+    told: list[StopResult] = []
     for name in dict.fromkeys([*names, *answers]):
         given = answers.get(name, [])
         if not given:
             told.append(
-                Told(
+                StopResult(
                     name, link.endpoint, stopped=False, text=f"NO ANSWER for {limit_s:g} s: use its own emergency stop"
                 )
             )
@@ -64,7 +64,9 @@ def _ask(session: Session, link: Link, limit_s: float) -> list[Told]:
         refused = next((answer.reason for answer in given if not answer.ok), None)
         wrong = doubt or refused
         told.append(
-            Told(name, link.endpoint, stopped=wrong is None, text=wrong or given[0].reason, in_doubt=doubt is not None)
+            StopResult(
+                name, link.endpoint, stopped=wrong is None, text=wrong or given[0].reason, in_doubt=doubt is not None
+            )
         )
     return told
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 from snakesim_hal.errors import NotConnectedError, RefusedError
 from snakesim_hal.network.session import DEFAULT_ENDPOINT, Link, Session, open_session
 from snakesim_hal.wire import keys
-from snakesim_operator.tools.where import Where
+from snakesim_operator.tools.robot_selection import RobotSelection
 
 CONNECT_S = 1.0
 HAL_EVERYWHERE = f"**/{keys.alive('hal')}"
@@ -31,7 +31,7 @@ def namespace_of(key: str) -> str:
     return key if split is None else split[0]
 
 
-def find_robots(where: Where) -> list[Link]:
+def find_robots(where: RobotSelection) -> list[Link]:
     """Every addressed robot that can be reached."""
     found: list[Link] = []
     for link in where.networks():
@@ -46,7 +46,7 @@ def find_robots(where: Where) -> list[Link]:
     return found
 
 
-def the_one(where: Where, command: str) -> Link:
+def the_one(where: RobotSelection, command: str) -> Link:
     """The single addressed robot. Raises NotConnectedError when there is none, RefusedError when there are more."""
     found = find_robots(where)
     if not found:

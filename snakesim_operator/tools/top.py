@@ -12,7 +12,7 @@ from snakesim_hal.network.session import Arrival, Link, Session, open_session
 from snakesim_hal.terminal import Say, say, say_json, say_over
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
-from snakesim_operator.tools.targets import CONNECT_S, Where
+from snakesim_operator.tools.targets import CONNECT_S, RobotSelection
 from snakesim_operator.tools.traffic import KeyTraffic, Latency, Traffic
 
 PERIOD_S = 1.0
@@ -28,7 +28,7 @@ class TopRequest:
     as_json: bool = False  # a line of JSON for each table
 
 
-def top(request: TopRequest, where: Where, say: Say = say) -> int:
+def top(request: TopRequest, where: RobotSelection, say: Say = say) -> int:
     """Until Ctrl-C. Returns 1 when nothing was heard, 0 otherwise. Raises NotConnectedError."""
     with contextlib.ExitStack() as stack:
         heard = [_listen(link, stack) for link in where.networks()]

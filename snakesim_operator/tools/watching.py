@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from snakesim_hal.arguments import add_json, add_network, number
-from snakesim_operator.tools.where import where_of
+from snakesim_operator.tools.robot_selection import selection_of
 
 
 def add_commands(commands: Any) -> None:
@@ -56,28 +56,28 @@ def add_commands(commands: Any) -> None:
 def _status(arguments: argparse.Namespace) -> int:
     from snakesim_operator.tools.status import show_status
 
-    return show_status(where_of(arguments), as_json=arguments.json)
+    return show_status(selection_of(arguments), as_json=arguments.json)
 
 
 def _top(arguments: argparse.Namespace) -> int:
     from snakesim_operator.tools.top import TopRequest, top
 
-    return top(TopRequest(arguments.once, arguments.json), where_of(arguments))
+    return top(TopRequest(arguments.once, arguments.json), selection_of(arguments))
 
 
 def _echo(arguments: argparse.Namespace) -> int:
     from snakesim_operator.tools.echo import EchoRequest, echo
 
-    return echo(EchoRequest(arguments.key, arguments.hz, arguments.count), where_of(arguments))
+    return echo(EchoRequest(arguments.key, arguments.hz, arguments.count), selection_of(arguments))
 
 
 def _record(arguments: argparse.Namespace) -> int:
     from snakesim_operator.tools.record import record_robot
 
-    return record_robot(where_of(arguments), arguments.out, arguments.duration, arguments.foxglove)
+    return record_robot(selection_of(arguments), arguments.out, arguments.duration, arguments.foxglove)
 
 
 def _preview(arguments: argparse.Namespace) -> int:
     from snakesim_operator.tools.preview import preview
 
-    return preview(where_of(arguments), arguments.hz, arguments.width)
+    return preview(selection_of(arguments), arguments.hz, arguments.width)

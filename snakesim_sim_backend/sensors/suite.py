@@ -20,7 +20,7 @@ from snakesim_sim_backend.sensors.joints import JointReader
 from snakesim_sim_backend.sensors.registry import WITHIN_TICK, mounted_reader, own_noise
 from snakesim_sim_backend.sensors.scope import BodyScope, Reader, Scope
 from snakesim_sim_backend.sensors.snapshots import Snapshots
-from snakesim_sim_backend.sensors.timing import DelayLine, Due, ticks_of
+from snakesim_sim_backend.sensors.timing import DelayLine, SamplingSchedule, ticks_of
 
 
 class Channel(Protocol):
@@ -92,7 +92,7 @@ class WithinTick:
 
     def __init__(self, reader: Reader, sensor: AnySensor, config: RunConfig) -> None:
         self._read = reader.read
-        self._due = Due(sensor.rate_hz, config.rate_hz, config.period_ns)
+        self._due = SamplingSchedule(sensor.rate_hz, config.rate_hz, config.period_ns)
         self._line = DelayLine(ticks_of(sensor.delay_s, config.period_ns))
 
     def arriving(self, tick: int, stamp_ns: int) -> Message | None:
@@ -115,7 +115,7 @@ class BesideTick:
         self._key, self._read, self._snapshots, self._late = key, reader.read, snapshots, late
         self._qpos = scope.data.qpos
         self._waits = config.pace != "realtime"
-        self._due = Due(sensor.rate_hz, config.rate_hz, config.period_ns)
+        self._due = SamplingSchedule(sensor.rate_hz, config.rate_hz, config.period_ns)
         self._delay_ticks = max(ticks_of(sensor.delay_s, config.period_ns), 1)
         self._under_way: deque[tuple[int, Future[Message]]] = deque()  # with the tick of arrival
 

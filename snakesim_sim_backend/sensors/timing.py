@@ -7,7 +7,7 @@ import msgspec
 from snakesim_hal.wire.messages import Message
 
 
-class Due:
+class SamplingSchedule:
     """Which ticks a sensor of a given rate samples: those at which floor(stamp * rate) advances, computed exactly."""
 
     def __init__(self, sensor_hz: float, tick_hz: float, period_ns: int) -> None:

@@ -130,7 +130,7 @@ def test_ctrl_c_at_any_moment_leaves_no_traceback(words: list[str], tmp_path: Pa
     """From the first line of ours on; what comes before is the interpreter's own start."""
     on_network = words[0] in ("echo", "status", "arm", "run")
     endpoint = ["--endpoint", free_endpoint()] if on_network else []
-    for moment in range(7):
+    for snapshot in range(7):
         process = subprocess.Popen(
             [*SNAKESIM, *words, *endpoint],
             cwd=tmp_path,
@@ -141,7 +141,7 @@ def test_ctrl_c_at_any_moment_leaves_no_traceback(words: list[str], tmp_path: Pa
             start_new_session=True,
         )
         wait_until(lambda pid=process.pid: first_line_ran(pid), "our first line")
-        time.sleep(0.12 * moment)
+        time.sleep(0.12 * snapshot)
         os.killpg(process.pid, signal.SIGINT)  # a terminal tells all that it has started
         said, _ = process.communicate(timeout=60)
         assert "Traceback" not in said and "KeyboardInterrupt" not in said, said

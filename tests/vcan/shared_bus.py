@@ -65,7 +65,7 @@ class SharedBus(Loop):
             self.true_state_at[self.tick] = set(self.true_states())
 
     def watch_seen(self, kind: str) -> int:
-        """How often a trouble that is no fault was counted."""
+        """How often a error that is no fault was counted."""
         return self.backend._watch.seen.get(kind, 0)
 
     @property

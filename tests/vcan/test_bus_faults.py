@@ -65,7 +65,7 @@ def test_an_adapter_that_is_pulled_and_plugged_in_again_is_taken_up_again(spare_
         assert fault.what == "interface_down"
         must(ip("link", "add", spare_channel, "type", "vcan"))
         must(ip("link", "set", spare_channel, "up"))
-        run.wire.server.wires[0].troubles()  # the modules were never unplugged; only on this bus do they need this
+        run.wire.server.wires[0].errors()  # the modules were never unplugged; only on this bus do they need this
         run.run(10)
         assert run.watch_seen("interface_up") == 1
         cleared_and_armed_again(run)

@@ -26,7 +26,7 @@ TARGETS = (
 
 
 @dataclass(frozen=True)
-class Worst:
+class LargestDifference:
     """The largest difference, and where and when it was."""
 
     joint: int
@@ -48,9 +48,9 @@ class Gap:
     unit: str
     difference: Floats  # (n, joints), B - A; NaN where it cannot be told
     joint_rms: Floats  # (joints,)
-    joint_worst: list[Worst | None]
+    joint_worst: list[LargestDifference | None]
     rms: float | None  # over all joints
-    worst: Worst | None
+    worst: LargestDifference | None
     correlation: float | None  # over all joints and instants; None when one of them never changes
     untold: float  # share of what is compared that is not a number in one of the runs, or in both
 
@@ -85,7 +85,7 @@ class Advance:
 
 
 @dataclass(frozen=True)
-class Parted:
+class FirstDivergence:
     """The first tick at which a joint's angles were further apart than a limit."""
 
     row: int  # on the common time axis
@@ -145,7 +145,7 @@ class Difference:
     tracking_rad: tuple[float | None, float | None]  # RMS of angle - target in position mode, in A and in B
     hand_overs: HandOvers
     apart_rad: float
-    parted: Parted | None
+    parted: FirstDivergence | None
 
     @property
     def identical(self) -> bool:
@@ -239,10 +239,10 @@ def _gap(what: str, unit: str, time_s: Floats, a: Floats, b: Floats, compared: N
     squares = np.where(known, difference, 0.0) ** 2
     count = known.sum(axis=0)
     joint_rms = np.sqrt(np.where(count > 0, squares.sum(axis=0) / np.maximum(count, 1), np.nan))
-    joint_worst: list[Worst | None] = []
+    joint_worst: list[LargestDifference | None] = []
     for joint in range(difference.shape[1]):
         row = int(np.argmax(np.where(known[:, joint], squares[:, joint], -1.0)))
-        told = Worst(joint, float(time_s[row]), float(a[row, joint]), float(b[row, joint]))
+        told = LargestDifference(joint, float(time_s[row]), float(a[row, joint]), float(b[row, joint]))
         joint_worst.append(told if count[joint] else None)
     worst = max((one for one in joint_worst if one is not None), key=lambda one: abs(one.difference), default=None)
     rms = float(np.sqrt(squares.sum() / known.sum())) if known.any() else None
@@ -281,14 +281,14 @@ def _hand_overs(record: RunRecord, until_s: float) -> list[HandOver]:
     return taken
 
 
-def _parted(time_s: Floats, difference_rad: Floats, apart_rad: float) -> Parted | None:
+def _parted(time_s: Floats, difference_rad: Floats, apart_rad: float) -> FirstDivergence | None:
     sizes = np.abs(np.nan_to_num(difference_rad))
     beyond = np.flatnonzero((sizes > apart_rad).any(axis=1))
     if not len(beyond):
         return None
     row = int(beyond[0])
     joint = int(np.argmax(sizes[row]))
-    return Parted(row, float(time_s[row]), joint, float(difference_rad[row, joint]))
+    return FirstDivergence(row, float(time_s[row]), joint, float(difference_rad[row, joint]))
 
 
 def order(names: Sequence[str], hand_overs: Sequence[HandOver], most: int = 12) -> str:

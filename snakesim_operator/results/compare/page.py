@@ -7,14 +7,14 @@ import numpy as np
 
 from snakesim_operator.results.compare import figures
 from snakesim_operator.results.compare.difference import Difference
-from snakesim_operator.results.compare.verdict import Within, sentences, who_propelled
+from snakesim_operator.results.compare.verdict import ToleranceCheck, sentences, who_propelled
 from snakesim_operator.results.page.html import render, shown
 
 UNKNOWN = "–"
 HAND_OVERS_SHOWN = 40
 
 
-def page(difference: Difference, asked: Within | None = None) -> str:
+def page(difference: Difference, asked: ToleranceCheck | None = None) -> str:
     """The whole page. asked: what `--within` asked for."""
     said = [*sentences(difference), *([f"{asked.words[:1].upper()}{asked.words[1:]}."] if asked is not None else [])]
     turns = list(zip_longest(difference.hand_overs.a, difference.hand_overs.b))

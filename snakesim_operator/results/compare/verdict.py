@@ -8,7 +8,7 @@ SAME = "the same"
 
 
 @dataclass(frozen=True)
-class Within:
+class ToleranceCheck:
     """What `--within` asked for, and whether it holds."""
 
     percent: float
@@ -16,7 +16,7 @@ class Within:
     words: str
 
 
-def within(difference: Difference, percent: float) -> Within | None:
+def within(difference: Difference, percent: float) -> ToleranceCheck | None:
     """Whether the distance differs by no more than so many per cent of A's; None when nobody knows the distance."""
     advance = difference.advance
     if advance is None:
@@ -24,9 +24,9 @@ def within(difference: Difference, percent: float) -> Within | None:
     found = advance.percent
     if found is None:
         words = f"A stood still and B moved {advance.b_m:.3f} m, which is more than any percentage"
-        return Within(percent, False, f"not within {percent:g} %: {words}")
+        return ToleranceCheck(percent, False, f"not within {percent:g} %: {words}")
     holds = abs(found) <= percent
-    return Within(percent, holds, f"{'within' if holds else 'not within'} {percent:g} %: {relation(advance)}")
+    return ToleranceCheck(percent, holds, f"{'within' if holds else 'not within'} {percent:g} %: {relation(advance)}")
 
 
 def sentences(difference: Difference) -> list[str]:

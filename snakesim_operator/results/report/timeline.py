@@ -16,7 +16,7 @@ STATES = {"Locomoting": "moving as meant", "NotLocomoting": "not moving", "Idle"
 
 
 @dataclass(frozen=True)
-class Band:
+class Interval:
     """Something that held for a while."""
 
     start_s: float
@@ -77,12 +77,12 @@ def told_spans(record: RunRecord) -> list[tuple[float, float, ControlState]]:
     return list(zip(starts, [*starts, end_s(record)][1:], record.control, strict=True))
 
 
-def state_bands(record: RunRecord) -> list[Band]:
+def state_bands(record: RunRecord) -> list[Interval]:
     """Locomotion states; each holds until the next is told."""
     return _merged(record, [state.state for state in record.control])
 
 
-def jam_bands(record: RunRecord) -> list[Band]:
+def jam_bands(record: RunRecord) -> list[Interval]:
     """When the controller said that the snake was jammed."""
     bands = _merged(record, ["jammed" if state.jammed else None for state in record.control])
     return [band for band in bands if band.what == "jammed"]
@@ -171,14 +171,14 @@ def told_distance(record: RunRecord) -> Series | None:
     return Series(stamps, along - along[0], "advance of the tail along the path, as the controller knew it")
 
 
-def _merged(record: RunRecord, told: list[str | None]) -> list[Band]:
+def _merged(record: RunRecord, told: list[str | None]) -> list[Interval]:
     """Equal neighbours become one band; None is left out."""
-    bands: list[Band] = []
+    bands: list[Interval] = []
     for (since, until, _), what in zip(told_spans(record), told, strict=True):
         if what is None or until <= since:
             continue
         if bands and bands[-1].what == what and bands[-1].end_s >= since:
-            bands[-1] = Band(bands[-1].start_s, until, what)
+            bands[-1] = Interval(bands[-1].start_s, until, what)
         else:
-            bands.append(Band(since, until, what))
+            bands.append(Interval(since, until, what))
     return bands

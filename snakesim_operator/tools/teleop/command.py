@@ -18,7 +18,7 @@ from snakesim_hal.terminal import say, say_over
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, ControlState, Intent, Status, World
 from snakesim_operator.tools.stop import estop
-from snakesim_operator.tools.targets import CONNECT_S, Where, the_one
+from snakesim_operator.tools.targets import CONNECT_S, RobotSelection, the_one
 from snakesim_operator.tools.teleop.joystick import Joystick, open_joystick
 from snakesim_operator.tools.teleop.keyboard import Keyboard
 from snakesim_operator.tools.teleop.steering import HEADING_STEP_RAD, TURN_RAD_S, Steering
@@ -39,7 +39,7 @@ class TeleopRequest:
     device: Path | None = None
 
 
-def teleop(request: TeleopRequest, where: Where) -> int:
+def teleop(request: TeleopRequest, where: RobotSelection) -> int:
     """Until q, Ctrl-C, or the terminal or the joystick is gone. Returns 1 for the latter. Raises SnakesimError."""
     if not 0 < request.fastest_m_s <= 10:
         raise ConfigError(f"--fastest {request.fastest_m_s:g}: give a speed above 0, and at most 10 m/s")
@@ -142,7 +142,7 @@ class Teleop:
         """By all ways, beside this loop; and nothing is asked for any more."""
         if not self._stopped:
             self._stopped = True
-            at = Where(self._link.endpoint, self._link.namespace, self._link.session)
+            at = RobotSelection(self._link.endpoint, self._link.namespace, self._link.session)
             threading.Thread(target=estop, args=(at, self._stopping.append), name="estop").start()
 
     def _read_robot(self) -> None:

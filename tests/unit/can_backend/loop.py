@@ -11,7 +11,7 @@ from snakesim_can_backend.bus.bus import VirtualWire
 from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.protocol.definitions import ModuleState
 from snakesim_can_backend.settings import Settings
-from snakesim_can_backend.twin.server import Here
+from snakesim_can_backend.twin.server import InProcessTwins
 from snakesim_hal.backend import Samples, SetPoints
 from snakesim_hal.model.plant import Plant
 from snakesim_hal.model.scenario import RunConfig
@@ -80,7 +80,7 @@ class Loop:
     def plant(self) -> Plant:
         """What the twins' motors move."""
         (wire,) = self.backend._wires
-        assert isinstance(wire, VirtualWire) and isinstance(wire.other_end, Here)
+        assert isinstance(wire, VirtualWire) and isinstance(wire.other_end, InProcessTwins)
         return wire.other_end.server.chain.plant
 
 

@@ -6,7 +6,7 @@ import pytest
 from snakesim_gnc.control.body_on_path import chain_nodes
 from snakesim_gnc.navigation.beam import Beam, Search
 from snakesim_gnc.navigation.clutter import ClutterPlanner
-from snakesim_gnc.navigation.intents import Wish
+from snakesim_gnc.navigation.intents import DesiredMotion
 from snakesim_gnc.navigation.obstacle_map import NONE, REACH_M, ObstacleMap
 from snakesim_hal.model.kinematics import quaternion_from_yaw
 from snakesim_hal.model.outlines import outline_distance_m
@@ -56,7 +56,7 @@ def planned(
     seen: list[Obstacle] | None = None,
     heading_rad: float | None = None,
 ) -> Trajectory:
-    return made.update(round(100 * at_s), world(at_s, seen or []), body, Wish(0.2, heading_w_rad=heading_rad))
+    return made.update(round(100 * at_s), world(at_s, seen or []), body, DesiredMotion(0.2, heading_w_rad=heading_rad))
 
 
 def test_the_map_knows_the_nearest_obstacle_and_its_distance() -> None:

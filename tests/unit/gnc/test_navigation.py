@@ -5,12 +5,12 @@ from typing import Any
 import pytest
 
 from snakesim_gnc.navigation.core import KnownPath
-from snakesim_gnc.navigation.intents import LONGEST_NS, Intents, Wish
+from snakesim_gnc.navigation.intents import LONGEST_NS, DesiredMotion, Intents
 from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import Intent, Obstacle, World
 
 MISSION_M_S = 0.2
-MISSION = Wish(MISSION_M_S)
+MISSION = DesiredMotion(MISSION_M_S)
 SECOND = 10**9
 ROUTE = Route([(0.0, 0.0), (1.0, 0.0), (10.0, 0.0)])
 PEG = Obstacle(name="peg", shape="cylinder", position_w=(2.0, 0.1, 0.1), radius_m=0.05, height_m=0.2)
@@ -32,8 +32,8 @@ def world(tail_x_m: float, stamp_ns: int = 0) -> World:
     )
 
 
-def wish(intents: Intents, newest: Intent | None, at_s: float) -> tuple[float, str]:
-    found = intents.wish(newest, round(at_s * SECOND))
+def desired(intents: Intents, newest: Intent | None, at_s: float) -> tuple[float, str]:
+    found = intents.desired(newest, round(at_s * SECOND))
     return found.speed_m_s, found.why
 
 
@@ -54,23 +54,23 @@ def test_the_path_ends() -> None:
 
 def test_an_intent_counts_for_as_long_as_it_says_and_then_the_robot_stops() -> None:
     intents = Intents(MISSION_M_S)
-    assert wish(intents, None, 0.0) == (MISSION_M_S, "")
+    assert desired(intents, None, 0.0) == (MISSION_M_S, "")
     asked = intent(1.0)
-    assert wish(intents, asked, 1.2) == (0.1, "as ann wants it")
-    assert wish(intents, asked, 2.0) == (0.1, "as ann wants it")
-    speed, why = wish(intents, asked, 2.2)
+    assert desired(intents, asked, 1.2) == (0.1, "as ann wants it")
+    assert desired(intents, asked, 2.0) == (0.1, "as ann wants it")
+    speed, why = desired(intents, asked, 2.2)
     assert speed == 0.0 and why.startswith("the intent of ann has expired: it is 1.2 s old, valid for 1 s")
-    speed, why = wish(intents, None, 60.0)  # it does not go back to its mission
+    speed, why = desired(intents, None, 60.0)  # it does not go back to its mission
     assert speed == 0.0 and "send a new one to go on" in why
-    assert wish(intents, intent(60.0, who="bob", speed_m_s=None), 60.1) == (MISSION_M_S, "as bob wants it")
+    assert desired(intents, intent(60.0, who="bob", speed_m_s=None), 60.1) == (MISSION_M_S, "as bob wants it")
 
 
 def test_an_intent_may_ask_for_less_time_and_gets_no_more_than_the_longest() -> None:
     intents, brief = Intents(MISSION_M_S), intent(0.0, valid_for_ns=SECOND // 2)
-    assert wish(intents, brief, 0.5)[0] == 0.1 and wish(intents, brief, 0.6)[0] == 0.0
+    assert desired(intents, brief, 0.5)[0] == 0.1 and desired(intents, brief, 0.6)[0] == 0.0
     intents, endless = Intents(MISSION_M_S), intent(0.0, valid_for_ns=2**62)
-    assert wish(intents, endless, LONGEST_NS / SECOND)[0] == 0.1
-    speed, why = wish(intents, endless, LONGEST_NS / SECOND + 0.1)
+    assert desired(intents, endless, LONGEST_NS / SECOND)[0] == 0.1
+    speed, why = desired(intents, endless, LONGEST_NS / SECOND + 0.1)
     assert speed == 0.0 and "valid for 5 s" in why
 
 
@@ -79,44 +79,44 @@ def test_an_intent_may_ask_for_less_time_and_gets_no_more_than_the_longest() -> 
 )
 def test_what_is_stamped_in_the_future_or_long_ago_is_refused(at_s: float, words: str) -> None:
     intents = Intents(MISSION_M_S)
-    speed, why = wish(intents, intent(at_s), 10.0)
+    speed, why = desired(intents, intent(at_s), 10.0)
     assert speed == MISSION_M_S and words in why  # nobody has taken over from the mission
     good = intent(10.0)
-    assert wish(intents, good, 10.1)[0] == 0.1
-    assert wish(intents, intent(at_s, speed_m_s=5.0), 10.2) == (0.1, "as ann wants it")  # the good one goes on
-    assert wish(intents, intent(at_s, speed_m_s=5.0), 11.5)[0] == 0.0  # and ends when it says
+    assert desired(intents, good, 10.1)[0] == 0.1
+    assert desired(intents, intent(at_s, speed_m_s=5.0), 10.2) == (0.1, "as ann wants it")  # the good one goes on
+    assert desired(intents, intent(at_s, speed_m_s=5.0), 11.5)[0] == 0.0  # and ends when it says
 
 
 def test_a_clock_that_the_sender_heard_first_is_no_future() -> None:
-    assert wish(Intents(MISSION_M_S), intent(1.09), 1.0)[0] == 0.1
+    assert desired(Intents(MISSION_M_S), intent(1.09), 1.0)[0] == 0.1
 
 
 @pytest.mark.parametrize("speed_m_s", [10.1, -11.0, 1e5])
 def test_nobody_goes_faster_than_a_mission_may(speed_m_s: float) -> None:
-    speed, why = wish(Intents(MISSION_M_S), intent(1.0, speed_m_s=speed_m_s), 1.0)
+    speed, why = desired(Intents(MISSION_M_S), intent(1.0, speed_m_s=speed_m_s), 1.0)
     assert speed == MISSION_M_S and f"asks for {speed_m_s:g} m/s, at most 10 m/s" in why
 
 
 def test_a_direction_holds_while_the_robot_stands_and_until_somebody_wants_the_mission_again() -> None:
     intents = Intents(MISSION_M_S)
-    assert intents.wish(intent(0.0, heading_w_rad=1.5), 0).heading_w_rad == 1.5
-    expired = intents.wish(None, 2 * SECOND)
+    assert intents.desired(intent(0.0, heading_w_rad=1.5), 0).heading_w_rad == 1.5
+    expired = intents.desired(None, 2 * SECOND)
     assert (expired.speed_m_s, expired.heading_w_rad) == (0.0, 1.5)  # it stops on the path that it is on
-    assert intents.wish(intent(2.1, go=False), 2_100_000_000).heading_w_rad == 1.5
-    assert intents.wish(intent(2.2), 2_200_000_000).heading_w_rad is None
+    assert intents.desired(intent(2.1, go=False), 2_100_000_000).heading_w_rad == 1.5
+    assert intents.desired(intent(2.2), 2_200_000_000).heading_w_rad is None
 
 
 def test_stop_is_a_wish_too() -> None:
-    assert wish(Intents(MISSION_M_S), intent(1.0, go=False), 1.1) == (0.0, "ann wants it to stop")
+    assert desired(Intents(MISSION_M_S), intent(1.0, go=False), 1.1) == (0.0, "ann wants it to stop")
 
 
 def test_after_another_start_of_the_robot_an_intent_of_before_does_not_count_at_the_same_time_again() -> None:
     intents, asked = Intents(MISSION_M_S), intent(50.0)
-    assert wish(intents, asked, 50.1)[0] == 0.1
+    assert desired(intents, asked, 50.1)[0] == 0.1
     intents.start_over()
-    speed, why = wish(intents, None, 0.0)
+    speed, why = desired(intents, None, 0.0)
     assert speed == 0.0 and "the intent of ann was for another start of the robot" in why
-    assert wish(intents, None, 50.1)[0] == 0.0
+    assert desired(intents, None, 50.1)[0] == 0.0
     fresh = Intents(MISSION_M_S)
     fresh.start_over()
-    assert wish(fresh, None, 0.0) == (MISSION_M_S, "")
+    assert desired(fresh, None, 0.0) == (MISSION_M_S, "")

@@ -10,7 +10,7 @@ from snakesim_hal.model.scenario import load
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode
 from snakesim_hal.wire.messages import Contacts, Imu, Mode, Pose
-from snakesim_sim_backend.sensors.timing import Due
+from snakesim_sim_backend.sensors.timing import SamplingSchedule
 from tests.unit.sim_backend.rig import G, Run, make_config
 
 CORNER = {
@@ -199,7 +199,7 @@ def test_a_sensor_is_due_whenever_a_period_of_its_own_has_passed(tick_hz, sensor
 
 
 def test_over_a_long_run_the_number_of_samples_is_exact():
-    due = Due(70.0, 1000.0, 1_000_000)
+    due = SamplingSchedule(70.0, 1000.0, 1_000_000)
     assert sum(due.at(tick * 1_000_000) for tick in range(1, 10_001)) == 700
 
 

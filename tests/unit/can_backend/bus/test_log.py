@@ -31,7 +31,7 @@ class FakeWire:
         frames, self.incoming = self.incoming, []
         return frames
 
-    def troubles(self) -> list[BusError]:
+    def errors(self) -> list[BusError]:
         return [BusError("queue_full", self.channel, "full")]
 
     def fileno(self) -> int | None:
@@ -84,7 +84,7 @@ def test_everything_else_is_the_wires_own(tmp_path: Path) -> None:
     log = open_log(tmp_path / "bus.log")
     wire = LoggedWire(inner, log)
     assert (wire.channel, wire.fileno(), wire.idle()) == ("can3", 42, 0.25)
-    assert wire.troubles() == inner.troubles()
+    assert wire.errors() == inner.errors()
     wire.send(Frame(0x105, b"\x01"))
     wire.close()
     assert inner.closed and (tmp_path / "bus.log").read_text().endswith("105#01\n")

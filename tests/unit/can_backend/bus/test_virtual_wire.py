@@ -71,7 +71,7 @@ def test_two_ends_of_a_virtual_bus_hear_each_other_and_not_themselves(pair: tupl
     frames = [Frame(0x105, b"\x01\x02"), Frame(0x7FF, b""), Frame(0, bytes(8))]
     assert all(near.send(frame) for frame in frames)
     assert far.receive() == frames and far.receive() == [] and near.receive() == []
-    assert near.fileno() is None and near.troubles() == []
+    assert near.fileno() is None and near.errors() == []
 
 
 def test_a_virtual_bus_says_when_something_may_come(pair: tuple[VirtualWire, VirtualWire]) -> None:

@@ -62,7 +62,7 @@ def test_an_error_frame_in_words(classes: int, controller: int, kinds: list[Kind
 @given(st.integers(0, 0x1FFFFFFF), st.binary(min_size=8, max_size=8))
 def test_every_error_frame_says_something(classes: int, data: bytes) -> None:
     found = bus_errors_of(CAN_ERR_FLAG | classes, data, "can0")
-    assert found and len({trouble.kind for trouble in found}) == len(found)
+    assert found and len({error.kind for error in found}) == len(found)
 
 
 # --- frames through a socket -------------------------------------------------------------------------------
@@ -127,7 +127,7 @@ class Rig:
         self.wire = SocketCanWire("can7", only)
 
     def kinds(self) -> list[Kind]:
-        return [trouble.kind for trouble in self.wire.troubles()]
+        return [error.kind for error in self.wire.errors()]
 
 
 @pytest.fixture
@@ -199,7 +199,7 @@ def test_a_full_queue_is_told_and_nothing_is_kept_for_later(rig: Rig) -> None:
 def test_the_kernels_ways_to_say_full(rig: Rig, number: int) -> None:
     rig.socket.fails = OSError(number, "full")
     assert not rig.wire.send(Frame(0x101, b""))
-    assert rig.wire.troubles() == [BusError("queue_full", "can7", "the transmit queue is full")]
+    assert rig.wire.errors() == [BusError("queue_full", "can7", "the transmit queue is full")]
 
 
 @pytest.mark.parametrize(("number", "word"), [(errno.ENETDOWN, "down"), (errno.ENODEV, "gone"), (errno.ENXIO, "gone")])
@@ -207,10 +207,10 @@ def test_an_interface_that_goes_is_told_once_and_again_when_it_is_back(rig: Rig,
     rig.socket.fails, rig.up = OSError(number, ""), False
     for _ in range(3):
         assert not rig.wire.send(Frame(0x101, b"")) and rig.wire.receive() == []
-    assert rig.wire.troubles() == [BusError("interface_down", "can7", f"the interface is {word}")]
+    assert rig.wire.errors() == [BusError("interface_down", "can7", f"the interface is {word}")]
     assert rig.kinds() == []
     rig.socket.fails, rig.up = None, True
-    assert rig.wire.troubles() == [BusError("interface_up", "can7", "the interface is up again")]
+    assert rig.wire.errors() == [BusError("interface_up", "can7", "the interface is up again")]
     assert rig.socket.bound_to == (("can7",) if word == "gone" else None)
     assert rig.kinds() == [] and rig.wire.send(Frame(0x101, b""))
 
@@ -267,7 +267,7 @@ def test_dropped_frames_are_told_with_their_number(rig: Rig, monkeypatch: pytest
         return struct.pack("=9I", *range(8), next(drops))
 
     monkeypatch.setattr(rig.socket, "getsockopt", meminfo)
-    told = [rig.wire.troubles() for _ in range(3)]
+    told = [rig.wire.errors() for _ in range(3)]
     assert [[t.kind for t in found] for found in told] == [["receive_overflow"], [], ["receive_overflow"]]
     assert "dropped 3 frames" in told[0][0].detail and "dropped 7 frames" in told[2][0].detail
 

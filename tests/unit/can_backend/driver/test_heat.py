@@ -11,7 +11,7 @@ import pytest
 
 from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.settings import Settings as CanSettings
-from snakesim_can_backend.twin.server import Here
+from snakesim_can_backend.twin.server import InProcessTwins
 from snakesim_hal.conformance.rig import Rig
 from snakesim_hal.model import thermal
 from snakesim_hal.model.thermal import Thermal
@@ -50,8 +50,8 @@ def hot_robot(backend: str, curve: str, celsius: float, monkeypatch: pytest.Monk
 def windings(backend: SimBackend | CanBackend) -> Thermal:
     if isinstance(backend, SimBackend):
         return backend._windings
-    assert isinstance(backend._here, Here)
-    return backend._here.server.chain.thermal
+    assert isinstance(backend._local_twins, InProcessTwins)
+    return backend._local_twins.server.chain.thermal
 
 
 def until_told(rig: Rig, celsius: float) -> None:

@@ -151,7 +151,7 @@ def test_one_end_of_a_virtual_bus() -> None:
     here, there = VirtualWire("wire-faults"), VirtualWire("wire-faults")
     try:
         frame = Frame(0x105, b"1")
-        assert here.send(frame) and there.receive() == [frame] and here.troubles() == []
+        assert here.send(frame) and there.receive() == [frame] and here.errors() == []
         for kind, taken in (("cut", False), ("bus_off", True), ("full", False)):
             here.inject(kind, begins=True)
             assert here.send(frame) is taken and there.receive() == []
@@ -165,7 +165,7 @@ def test_one_end_of_a_virtual_bus() -> None:
         assert here.receive() == []
         there.send(frame)
         assert here.receive() == [frame]
-        said = [(trouble.kind, trouble.detail) for trouble in here.troubles()]
+        said = [(error.kind, error.detail) for error in here.errors()]
         assert said == [
             ("interface_down", "the interface is down"),
             ("interface_up", "the interface is up again"),
@@ -176,7 +176,7 @@ def test_one_end_of_a_virtual_bus() -> None:
         ]
         here.inject("cut", begins=True)
         here.inject("cut", begins=True)
-        assert here.troubles() == [BusError("interface_down", "wire-faults", "the interface is down")]
+        assert here.errors() == [BusError("interface_down", "wire-faults", "the interface is down")]
     finally:
         here.close()
         there.close()

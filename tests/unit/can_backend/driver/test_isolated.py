@@ -17,7 +17,7 @@ from snakesim_can_backend.protocol.definitions import Action, Frame, ModuleFault
 from snakesim_can_backend.settings import Settings
 from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_can_backend.twin.firmware import PASSIVE
-from snakesim_can_backend.twin.server import Here
+from snakesim_can_backend.twin.server import InProcessTwins
 from snakesim_hal.conformance.rig import Rig
 from snakesim_hal.model.injection import parse
 from snakesim_hal.wire.messages import LifecycleRequest, Mode
@@ -46,7 +46,7 @@ class Lame(Rig):
     @property
     def chain(self) -> ModuleChain:
         (wire,) = self.can._wires
-        assert isinstance(wire, VirtualWire) and isinstance(wire.other_end, Here)
+        assert isinstance(wire, VirtualWire) and isinstance(wire.other_end, InProcessTwins)
         return wire.other_end.server.chain
 
     def ask(self, action: Literal["disarm", "clear"]) -> None:

@@ -11,7 +11,7 @@ import pytest
 from snakesim_can_backend.driver import own_twins
 from snakesim_can_backend.driver.own_twins import TwinProcess, check_twins, twins_here
 from snakesim_can_backend.settings import Settings
-from snakesim_can_backend.twin.server import Here
+from snakesim_can_backend.twin.server import InProcessTwins
 from snakesim_hal.errors import BackendError, ConfigError
 from snakesim_hal.model.injection import Injection
 from tests.unit.can_backend.loop import config
@@ -42,7 +42,7 @@ def test_twins_that_cannot_be_are_refused(settings: Settings, words: str) -> Non
 def test_twins_here_are_at_the_other_end_of_the_named_bus() -> None:
     end = twins_here(RUN, Settings(plant="inertia"), "own-twins-test", None, stepped=True)
     try:
-        assert isinstance(end, Here) and end.server.wires[0].channel == "own-twins-test"
+        assert isinstance(end, InProcessTwins) and end.server.wires[0].channel == "own-twins-test"
         assert end.server.chain.stepped and end.server.chain.count == 4
     finally:
         end.close()

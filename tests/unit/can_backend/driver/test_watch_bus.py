@@ -26,21 +26,21 @@ from tests.unit.can_backend.frames import answer, joint_state
 )
 def test_a_bus_that_fails_is_a_fault_of_no_joint(kind: Kind, advice: str) -> None:
     bench = Bench()
-    trouble = BusError(kind, "can0", "transmit errors 200, receive errors 3")
-    (found,) = bench.tick(troubles=[trouble, trouble][:1])
+    error = BusError(kind, "can0", "transmit errors 200, receive errors 3")
+    (found,) = bench.tick(errors=[error, error][:1])
     assert (found.what, found.joint) == (kind, None)
     assert found.cause.startswith("can0: transmit errors 200, receive errors 3; ") and advice in found.cause
-    assert bench.tick(troubles=[trouble]) == []
-    assert [f.cause[:5] for f in bench.tick(troubles=[BusError(kind, "can1", "")])] == ["can1:"], "the other bus is new"
+    assert bench.tick(errors=[error]) == []
+    assert [f.cause[:5] for f in bench.tick(errors=[BusError(kind, "can1", "")])] == ["can1:"], "the other bus is new"
     bench.clear()
-    assert said(bench.tick(troubles=[trouble])) == [(kind, None)]
+    assert said(bench.tick(errors=[error])) == [(kind, None)]
 
 
 @pytest.mark.parametrize("kind", ["error_warning", "not_acknowledged", "queue_full", "error_frames", "interface_up"])
 def test_lesser_troubles_are_only_counted(kind: Kind) -> None:
     bench = Bench()
     for _ in range(2):
-        assert bench.tick(troubles=[BusError(kind, "can0", "")]) == []
+        assert bench.tick(errors=[BusError(kind, "can0", "")]) == []
     assert bench.watch.seen == {kind: 2}
 
 
@@ -118,9 +118,9 @@ def test_a_module_is_not_silent_that_was_not_asked() -> None:
 def test_a_bus_whose_interface_is_down_is_not_called_stuck_too() -> None:
     bench = Bench()
     down, up = (BusError(kind, "can1", "") for kind in ("interface_down", "interface_up"))
-    assert said(bench.tick(troubles=[down], unsent="can1")) == [("interface_down", None)]
+    assert said(bench.tick(errors=[down], unsent="can1")) == [("interface_down", None)]
     for _ in range(10):
         assert bench.tick(unsent="can1") == []
-    bench.tick(troubles=[up], unsent="can1")
+    bench.tick(errors=[up], unsent="can1")
     found = [f for _ in range(3) for f in bench.tick(unsent="can1")]
     assert said(found) == [("bus_stuck", None)]

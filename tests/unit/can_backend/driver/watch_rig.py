@@ -31,16 +31,14 @@ class Bench:
         self.isolated: set[int] = set()
         self.ticks(3)
 
-    def tick(
-        self, speak: Speak | None = None, troubles: list[BusError] | None = None, unsent: str = ""
-    ) -> list[Finding]:
+    def tick(self, speak: Speak | None = None, errors: list[BusError] | None = None, unsent: str = "") -> list[Finding]:
         """One Sync and its look. speak: what comes of node 2, instead of an answer."""
         begin(self.reading)
         answer(self.reading, EVERYBODY if speak is None else (1, 3), state=self.state)
         if speak is not None:
             speak(self.reading)
         unsent_on = [unsent] if unsent else []
-        return self.watch.look(self.reading, self.lifecycle, troubles or (), unsent_on, isolated=self.isolated)
+        return self.watch.look(self.reading, self.lifecycle, errors or (), unsent_on, isolated=self.isolated)
 
     def ticks(self, count: int, speak: Speak | None = None) -> list[Finding]:
         return [found for _ in range(count) for found in self.tick(speak)]

@@ -10,7 +10,7 @@ import pytest
 from snakesim_can_backend.bus.bus import VirtualWire, wait
 from snakesim_can_backend.protocol.definitions import Action, Frame, ModuleState, Opcode
 from snakesim_can_backend.twin.chain import ModuleChain
-from snakesim_can_backend.twin.server import Here, PoseSender, TwinServer
+from snakesim_can_backend.twin.server import InProcessTwins, PoseSender, TwinServer
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.wire.messages import Mode
 from tests.unit.can_backend.twin.rig import chain, command, only, set_point, sync
@@ -96,7 +96,7 @@ def test_stepped_twins_run_when_the_host_has_nothing_to_do():
     name = f"test-{uuid.uuid4().hex[:8]}"
     far = VirtualWire(name)
     server = TwinServer([far], made)
-    near = VirtualWire(name, Here(server, None, time.monotonic_ns))
+    near = VirtualWire(name, InProcessTwins(server, None, time.monotonic_ns))
     try:
         assert wait([near], 1.0), "their first heartbeats"
         near.receive()

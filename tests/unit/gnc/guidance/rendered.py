@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_gnc.guidance.depth_scan import Lens
+from snakesim_gnc.guidance.depth_scan import Intrinsics
 from snakesim_hal.wire.messages import DepthImage, Obstacle, Ranges
 
 Floats = NDArray[np.float64]
 Ground = Callable[[Floats, Floats], Floats]
-LENS = Lens(width=160, height=120, fx_px=90.0, fy_px=90.0, cx_px=79.5, cy_px=59.5)
+INTRINSICS = Intrinsics(width=160, height=120, fx_px=90.0, fy_px=90.0, cx_px=79.5, cy_px=59.5)
 RANGE_M = (0.05, 3.0)
 SCALE_M = 0.001
 
@@ -111,7 +111,7 @@ def depth_image(
     link: int = 0,
     position_l: tuple[float, float, float] = (0.0, 0.0, 0.0),
     orientation_l_wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0),
-    lens: Lens = LENS,
+    lens: Intrinsics = INTRINSICS,
 ) -> DepthImage:
     """An image from a camera at a pose in the world (rotation: world_from_camera); the mount is only told."""
     rays = lens.rays().astype(np.float64) @ rotation.T

@@ -11,7 +11,7 @@ from snakesim_gnc.guidance.depth_scan import DepthScanner, metres_of
 from snakesim_gnc.guidance.ground import plane_under, refined
 from snakesim_gnc.guidance.scan import Noise, Scan, scan_of_ranges
 from snakesim_hal.model.outlines import outline_distance_m
-from tests.unit.gnc.guidance.rendered import LENS, Eye, box, cylinder, depth_image, flat, hills, lidar, turned
+from tests.unit.gnc.guidance.rendered import INTRINSICS, Eye, box, cylinder, depth_image, flat, hills, lidar, turned
 
 EYE_M = 0.06  # height of the camera
 SCENE = [cylinder("near", 0.6, 0.1, 0.04), cylinder("far", 1.2, -0.3, 0.06), box("block", 0.8, 0.4, (0.12, 0.08), 0.5)]
@@ -21,7 +21,7 @@ def look(obstacles, rotation, *, ground=flat, eye=None, at=(0.0, 0.0)) -> Scan:
     z = EYE_M + float(ground(np.array(at[0]), np.array(at[1])))
     position = np.array([*at, z])
     image = depth_image(obstacles, position, rotation, ground=ground, eye=eye)
-    scanner = DepthScanner(LENS, Noise(0.002, 0.003))
+    scanner = DepthScanner(INTRINSICS, Noise(0.002, 0.003))
     return scanner.scan(metres_of(image), 0, position, rotation, np.array([z - EYE_M, 0.0, 0.0]))
 
 

@@ -8,8 +8,8 @@ import pytest
 from snakesim_hal.model.kinematics import quaternion_from_yaw, quaternions_from_rotations, rotation_from_quaternion
 from snakesim_hal.wire.messages import ControlState, DepthImage, JointState, Obstacle, World, WorldContact
 from snakesim_operator.console.drawing import LONGEST_M, M_PER_N, draw
-from snakesim_operator.console.moment import Moment
 from snakesim_operator.console.polygon import force_polygon
+from snakesim_operator.console.snapshot import RobotSnapshot
 from tests.unit.hal.rig import description
 
 ROBOT = description()
@@ -34,7 +34,7 @@ def world(contacts: list[WorldContact], obstacles: list[Obstacle]) -> World:
 
 def test_links_and_hinges_follow_base_and_angles():
     base = (1.0, 2.0, 0.1), quaternion_from_yaw(math.pi / 2)
-    drawing = draw(Moment(robot=ROBOT, body=joints(-math.pi / 2), base=base), None)
+    drawing = draw(RobotSnapshot(robot=ROBOT, body=joints(-math.pi / 2), base=base), None)
     assert drawing is not None
     first, second = ROBOT.links[0].length_m, ROBOT.links[1].length_m
     assert drawing.links_w[0] == pytest.approx([1.0, 2.0 + first / 2, 0.1])
@@ -46,7 +46,7 @@ def test_links_and_hinges_follow_base_and_angles():
 
 
 def test_without_joints_there_is_nothing_to_draw():
-    assert draw(Moment(robot=ROBOT), None) is None
+    assert draw(RobotSnapshot(robot=ROBOT), None) is None
 
 
 def test_forces_and_their_resultant():
@@ -59,7 +59,7 @@ def test_forces_and_their_resultant():
         push_points=[contact], solved_force_n=[20.0],
     )  # fmt: skip
     seen = world([contact, contact], [])
-    drawing = draw(Moment(robot=ROBOT, body=joints(), world=seen, control=control), None)
+    drawing = draw(RobotSnapshot(robot=ROBOT, body=joints(), world=seen, control=control), None)
     assert drawing is not None and drawing.pushing == COUNT - 1 and drawing.pushed == {"peg"}
     spans = [arrows[:, 1] - arrows[:, 0] for arrows in (drawing.forces, drawing.resultant, drawing.solved)]
     assert [len(span) for span in spans] == [2, 1, 1]
@@ -73,7 +73,7 @@ def test_a_strong_force_has_an_arrow_of_limited_length_above_the_body():
         link=0, obstacle="peg", body_s_m=0.1, position_w=(0.1, 0.0, 0.0), normal_w=(0.0, 1.0, 0.0),
         tangent_w=(1.0, 0.0, 0.0), force_w=(0.0, 500.0, 0.0),
     )  # fmt: skip
-    drawing = draw(Moment(robot=ROBOT, body=joints(), world=world([contact], [])), None)
+    drawing = draw(RobotSnapshot(robot=ROBOT, body=joints(), world=world([contact], [])), None)
     assert drawing is not None
     start, end = drawing.forces[0]
     assert end - start == pytest.approx([0.0, LONGEST_M, 0.0]) and start[2] > ROBOT.links[0].radius_m
@@ -87,17 +87,17 @@ def test_the_force_polygon_names_every_force_and_their_resultant():
             tangent_w=(1.0, 0.0, 0.0), force_w=(x_n, y_n, 0.0),
         )  # fmt: skip
 
-    drawn = force_polygon(Moment(robot=ROBOT, world=world([contact(0.3, 0.0, 4.0), contact(0.1, 3.0, 0.0)], [])))
+    drawn = force_polygon(RobotSnapshot(robot=ROBOT, world=world([contact(0.3, 0.0, 4.0), contact(0.1, 3.0, 0.0)], [])))
     assert "resultant 5.0 N" in drawn
     assert drawn.index(">3.0 N<") < drawn.index(">4.0 N<") < drawn.index(">5.0 N<")
-    assert "no contact force" in force_polygon(Moment(robot=ROBOT, world=world([], [])))
+    assert "no contact force" in force_polygon(RobotSnapshot(robot=ROBOT, world=world([], [])))
 
 
 def test_what_a_map_tells_is_not_drawn_as_perceived():
     mapped = Obstacle(name="a", shape="sphere", position_w=(0.0, 0.0, 0.0))
     found = Obstacle(name="b", shape="sphere", position_w=(0.0, 0.0, 0.0), last_seen_ns=1)
     felt = Obstacle(name="c", shape="sphere", position_w=(0.0, 0.0, 0.0), felt=True)
-    drawing = draw(Moment(robot=ROBOT, body=joints(), world=world([], [mapped, found, felt])), None)
+    drawing = draw(RobotSnapshot(robot=ROBOT, body=joints(), world=world([], [mapped, found, felt])), None)
     assert drawing is not None and [o.name for o in drawing.perceived] == ["b", "c"]
 
 
@@ -107,7 +107,7 @@ def test_a_camera_that_looks_along_its_link_looks_along_x():
         height=2, fx_px=1.0, fy_px=1.0, cx_px=2.0, cy_px=1.0, range_min_m=0.1, range_max_m=1.0, scale_m=0.001,
         depth=bytes(16),
     )  # fmt: skip
-    drawing = draw(Moment(robot=ROBOT, body=joints(), images={"sensor/depth/head": image}), None)
+    drawing = draw(RobotSnapshot(robot=ROBOT, body=joints(), images={"sensor/depth/head": image}), None)
     assert drawing is not None
     looks = rotation_from_quaternion(drawing.cameras[0].wxyz)
     assert looks[:, 2] == pytest.approx([1.0, 0.0, 0.0]) and looks[:, 1] == pytest.approx([0.0, 0.0, -1.0])

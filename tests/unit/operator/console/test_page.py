@@ -15,9 +15,9 @@ from snakesim_hal.model.scenario import capsules_at_start, load
 from snakesim_hal.wire.messages import Status
 from snakesim_operator.console import texts
 from snakesim_operator.console.drawing import draw
-from snakesim_operator.console.moment import Moment, expected_of
 from snakesim_operator.console.port import address_of, open_port
 from snakesim_operator.console.server import page_server
+from snakesim_operator.console.snapshot import RobotSnapshot, expected_of
 from snakesim_operator.console.token import ControlToken
 from tests.e2e.command import wait_until
 from tests.unit.hal.rig import description, status
@@ -86,26 +86,26 @@ def test_text_from_the_network_is_no_markup():
         commands_rejected={evil[:40]: 1}, commands_limited={}, faults=[],
         alive=[evil[:40]], waiting_for=[evil[:40]], overruns=0, ready_to_arm=False,
     )  # fmt: skip
-    moment = Moment(robot=robot, status=told)
-    shown = texts.header(moment) + texts.state_table(moment) + texts.log([evil])
+    snapshot = RobotSnapshot(robot=robot, status=told)
+    shown = texts.header(snapshot) + texts.state_table(snapshot) + texts.log([evil])
     assert "<img" not in shown and "&lt;img" in shown and "\x1b" not in shown
 
 
 def test_the_page_says_that_a_simulator_is_paused_and_by_whom():
-    shown = texts.header(Moment(robot=description(), status=status(paused_by="<b>ada")))
+    shown = texts.header(RobotSnapshot(robot=description(), status=status(paused_by="<b>ada")))
     assert ">PAUSED<" in shown and "by &lt;b&gt;ada" in shown
-    assert "PAUSED" not in texts.header(Moment(robot=description(), status=status()))
+    assert "PAUSED" not in texts.header(RobotSnapshot(robot=description(), status=status()))
 
 
 def test_a_robot_that_is_only_expected_is_drawn_at_its_start_and_called_nothing_else():
     config = load("triplet").config
-    moment = expected_of(config)
-    drawing = draw(moment, None)
+    snapshot = expected_of(config)
+    drawing = draw(snapshot, None)
     assert drawing is not None
     start = capsules_at_start(config)
     middles = [np.add(capsule.rear_m, capsule.front_m) / 2 for capsule in start]
     assert drawing.links_w[:, :2] == pytest.approx(np.array(middles))
-    assert "WAITING FOR THE ROBOT" in texts.header(moment) and "SIMULATOR" not in texts.header(moment)
+    assert "WAITING FOR THE ROBOT" in texts.header(snapshot) and "SIMULATOR" not in texts.header(snapshot)
 
 
 @pytest.mark.parametrize(
@@ -114,4 +114,4 @@ def test_a_robot_that_is_only_expected_is_drawn_at_its_start_and_called_nothing_
 )
 def test_the_page_says_what_moves(backend: str, emulated: bool, words: str):
     robot = msgspec.structs.replace(description(), backend=backend, emulated=emulated)
-    assert f">{words}<" in texts.header(Moment(robot=robot))
+    assert f">{words}<" in texts.header(RobotSnapshot(robot=robot))

@@ -2,9 +2,9 @@
 
 from snakesim_hal.wire.messages import Obstacle, World
 from snakesim_operator.console.drawing import draw
-from snakesim_operator.console.moment import Moment
 from snakesim_operator.console.port import open_port
 from snakesim_operator.console.server import page_server
+from snakesim_operator.console.snapshot import RobotSnapshot
 from snakesim_operator.console.stage import Stage
 from tests.unit.hal.rig import description
 from tests.unit.operator.console.test_drawing import joints
@@ -23,7 +23,7 @@ def test_every_shape_that_is_perceived_is_drawn_and_goes_when_it_is_forgotten():
                 tick=1, stamp_ns=1, base_position_w=(0.0, 0.0, 0.0), base_orientation_wxyz=(1.0, 0.0, 0.0, 0.0),
                 base_confidence=1.0, contacts=[], obstacles=obstacles,
             )  # fmt: skip
-            drawing = draw(Moment(robot=description(), body=joints(), world=world), None)
+            drawing = draw(RobotSnapshot(robot=description(), body=joints(), world=world), None)
             assert drawing is not None
             stage.show(drawing)
             shown = [batch for name, batch in stage._shapes.items() if name.startswith("perceived")]

@@ -19,7 +19,7 @@ from snakesim_hal.model.kinematics import rotation_from_quaternion
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_operator.recording.reader import RECORDING
 from snakesim_operator.recording.recover import recover
-from snakesim_operator.recording.told_state import ToldState
+from snakesim_operator.recording.state_messages import StateMessages
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.run.in_process import simulate
 
@@ -188,7 +188,7 @@ def test_what_a_killed_recorder_leaves_has_transforms_joints_and_images(run: Pat
 
 
 def test_a_reason_in_which_only_a_number_changes_is_logged_once() -> None:
-    told, logged = ToldState(), []
+    told, logged = StateMessages(), []
     for k in range(20):
         control = msgspec.msgpack.encode({"state": "Locomoting", "reason": f"pushes with {k + 0.5} N", "jammed": True})
         logged += told.of(None, control, k)[1]

@@ -7,7 +7,7 @@ import pytest
 from snakesim_hal.errors import ConfigError
 from snakesim_operator.cli import parser
 from snakesim_operator.ros2.arguments import check
-from snakesim_operator.ros2.relay import Stamps
+from snakesim_operator.ros2.relay import RosTime
 
 
 @pytest.mark.parametrize(
@@ -24,13 +24,13 @@ def test_bad_arguments_are_named(arguments: list[str], word: str) -> None:
 
 
 def test_robot_time_is_taken_as_it_is() -> None:
-    stamps = Stamps(wall_time=False)
+    stamps = RosTime(wall_time=False)
     stamps.heard(5)
     assert stamps.of(7) == 7
 
 
 def test_wall_time_is_that_of_the_quickest_clock() -> None:
-    stamps = Stamps(wall_time=True)
+    stamps = RosTime(wall_time=True)
     started_ns = time.time_ns()
     for late_ns in (80_000_000, 0, 50_000_000):
         stamps.heard(time.time_ns() - started_ns - late_ns)

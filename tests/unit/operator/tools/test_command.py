@@ -9,7 +9,7 @@ from snakesim_hal.network.session import Link, Question, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer
 from snakesim_operator.tools import command, stop
-from snakesim_operator.tools.targets import Where
+from snakesim_operator.tools.targets import RobotSelection
 from tests.e2e.command import snakesim
 from tests.unit.hal.local_network import Follower, following, running
 from tests.unit.hal.network.test_client_host import run_config
@@ -18,16 +18,16 @@ from tests.unit.hal.network.test_client_host import run_config
 def test_a_robot_that_does_not_answer_a_stop_is_named() -> None:
     with running(run_config()) as run:
         at, said = run.link.endpoint, list[str]()
-        assert stop.estop(Where(at), said.append) == 0
+        assert stop.estop(RobotSelection(at), said.append) == 0
         assert said == [f"lab/worm: stopped: {run.status.why} ({at})"] and run.status.lifecycle == "estop"
         with open_session(Link(at, "lab/deaf")) as deaf:
             deaf.declare_alive("hal")
             said.clear()
-            assert stop.estop(Where(at), said.append) == 1
+            assert stop.estop(RobotSelection(at), said.append) == 1
             assert {line.split(": ")[1] for line in said if line.startswith("lab/worm")} == {"stopped"}
             assert any(line.startswith("lab/deaf: NOT STOPPED: NO ANSWER") for line in said)
             said.clear()
-            assert stop.estop(Where(at, "lab/nobody"), said.append) == 1
+            assert stop.estop(RobotSelection(at, "lab/nobody"), said.append) == 1
             assert said[0].startswith("lab/nobody: NOT STOPPED: NO ANSWER")
             assert [line.split()[2] for line in said[1:]] == ["lab/deaf,", "lab/worm,"], "those that are there"
 
@@ -49,7 +49,7 @@ def test_an_impostor_that_answers_too_is_told() -> None:
 
             impostor.on_question(keys.LIFECYCLE, lie)
             with pytest.raises(RefusedError, match="2 answered in its name"):
-                command.disarm(Where(run.link.endpoint))
+                command.disarm(RobotSelection(run.link.endpoint))
         assert run.status.lifecycle == "disarmed"
 
 
@@ -62,5 +62,5 @@ def test_an_answer_that_the_status_does_not_show_is_not_believed() -> None:
                 keys.LIFECYCLE, lambda question: question.reply(Answer(ok=True, reason="done", lifecycle="disarmed"))
             )
             with pytest.raises(RefusedError, match="NOT CONFIRMED"):
-                command.disarm(Where(run.link.endpoint, "lab/other"))
+                command.disarm(RobotSelection(run.link.endpoint, "lab/other"))
         assert run.status.lifecycle == "armed"

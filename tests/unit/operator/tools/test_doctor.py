@@ -8,7 +8,7 @@ import pytest
 
 from snakesim_operator.cli import main
 from snakesim_operator.tools.network_findings import ports, routers
-from snakesim_operator.tools.targets import Where
+from snakesim_operator.tools.targets import RobotSelection
 from tests.unit.hal.local_network import free_endpoint
 
 WHAT = {"Python", "packages", "OpenGL", "CAN", "KVM", "wake-ups", "wall clock", "priority", "memory lock", "disk"}
@@ -28,7 +28,7 @@ def test_it_checks_everything_and_leaves_this_process_as_it_was(capsys: pytest.C
 
 def test_an_endpoint_that_is_not_zenoh_is_a_failure_within_seconds() -> None:
     with socket.create_server(("127.0.0.1", 0)) as mute:
-        (finding,) = routers(Where(f"tcp/127.0.0.1:{mute.getsockname()[1]}"))
+        (finding,) = routers(RobotSelection(f"tcp/127.0.0.1:{mute.getsockname()[1]}"))
     assert finding.state == "fail" and finding.fix
 
 

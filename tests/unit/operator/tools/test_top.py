@@ -10,7 +10,7 @@ from snakesim_hal.network.session import Arrival, Link, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode, encoding_of
 from snakesim_hal.wire.messages import Clock, JointState, Message
-from snakesim_operator.tools.targets import Where
+from snakesim_operator.tools.targets import RobotSelection
 from snakesim_operator.tools.top import TopRequest, table_of, top
 from snakesim_operator.tools.traffic import KEPT, MAX_KEYS, Traffic
 from tests.unit.hal.local_network import free_endpoint
@@ -81,7 +81,7 @@ def test_a_table_for_scripts_from_a_real_network() -> None:
         teller = threading.Thread(target=tell_time, args=(session,))
         teller.start()
         try:
-            assert top(TopRequest(once=True, as_json=True), Where(endpoint), lines.append) == 0
+            assert top(TopRequest(once=True, as_json=True), RobotSelection(endpoint), lines.append) == 0
         finally:
             over.set()
             teller.join()

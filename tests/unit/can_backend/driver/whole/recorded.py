@@ -6,7 +6,7 @@ from snakesim_can_backend.bus.bus import OtherEnd, VirtualWire
 from snakesim_can_backend.bus.log import LoggedWire
 from snakesim_can_backend.protocol.definitions import BROADCAST, Action, Frame, ModuleState, Opcode, node_of, opcode_of
 from snakesim_can_backend.twin.firmware import Module
-from snakesim_can_backend.twin.server import Here
+from snakesim_can_backend.twin.server import InProcessTwins
 from snakesim_hal.wire.messages import LifecycleState
 from tests.unit.can_backend.loop import Loop
 from tests.unit.can_backend.twin import rig
@@ -76,7 +76,7 @@ def words(frames: list[Frame]) -> list[str]:
 def module_of(run: Loop, node: int) -> Module:
     wire = run.backend._wires[0]
     wire = wire._wire if isinstance(wire, LoggedWire) else wire
-    assert isinstance(wire, RecordedWire) and isinstance(wire.other_end, Here)
+    assert isinstance(wire, RecordedWire) and isinstance(wire.other_end, InProcessTwins)
     return wire.other_end.server.chain.slots[node - 1].module
 
 

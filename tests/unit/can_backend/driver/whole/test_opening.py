@@ -21,7 +21,7 @@ from snakesim_can_backend.protocol.definitions import (
 )
 from snakesim_can_backend.settings import Settings
 from snakesim_can_backend.twin.firmware import Module
-from snakesim_can_backend.twin.server import Here, here
+from snakesim_can_backend.twin.server import InProcessTwins, here
 from snakesim_hal.backend import SetPoints
 from snakesim_hal.errors import BackendError, ConfigError
 from snakesim_hal.model.scenario import RunConfig
@@ -90,7 +90,7 @@ def left_behind(module: Module, kind: str) -> None:
 def test_what_a_killed_driver_left_is_cleared_and_nothing_else(
     kind: str, state: ModuleState, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def twins(run: RunConfig, settings: Settings, channel: str, pose: str | None, *, stepped: bool) -> Here:
+    def twins(run: RunConfig, settings: Settings, channel: str, pose: str | None, *, stepped: bool) -> InProcessTwins:
         end = here(run, settings, channel, pose, stepped=stepped)
         left_behind(end.server.chain.slots[1].module, kind)
         return end
@@ -105,7 +105,7 @@ def test_what_a_killed_driver_left_is_cleared_and_nothing_else(
 
 
 def test_a_module_that_is_too_weak_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    def twins(run: RunConfig, settings: Settings, channel: str, pose: str | None, *, stepped: bool) -> Here:
+    def twins(run: RunConfig, settings: Settings, channel: str, pose: str | None, *, stepped: bool) -> InProcessTwins:
         end = here(run, settings, channel, pose, stepped=stepped)
         end.server.chain.slots[2].module.parameters.values[Parameter.RATED_TORQUE] = 1.0
         return end

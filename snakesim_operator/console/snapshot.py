@@ -31,7 +31,7 @@ class Stream:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Moment:
+class RobotSnapshot:
     """One instant. Whatever is None is not known."""
 
     robot: Description
@@ -54,7 +54,7 @@ class Moment:
     hosts: frozenset[str] = frozenset()  # ids of all that publish a status; more than one: an impostor
 
 
-def expected_of(config: RunConfig) -> Moment:
+def expected_of(config: RunConfig) -> RobotSnapshot:
     """The robot of a run that is starting, as its scenario places it on flat ground."""
     robot = describe(
         config.robot,
@@ -75,4 +75,4 @@ def expected_of(config: RunConfig) -> Moment:
         age_ns=[0] * len(zero),
     )
     base = (*start.position_w, config.robot.module.radius_m), quaternion_from_yaw(start.yaw_rad)
-    return Moment(robot=robot, expected=True, joints=joints, body=joints, base=base)
+    return RobotSnapshot(robot=robot, expected=True, joints=joints, body=joints, base=base)

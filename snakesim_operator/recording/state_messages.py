@@ -32,7 +32,7 @@ class State(msgspec.Struct, frozen=True, kw_only=True):
     torque_headroom_nm: Maybe = msgspec.UNSET
 
 
-class _Told(msgspec.Struct, frozen=True):
+class _StatusFields(msgspec.Struct, frozen=True):
     """Of `hal/status`."""
 
     lifecycle: q.Name = ""
@@ -40,7 +40,7 @@ class _Told(msgspec.Struct, frozen=True):
     faults: Annotated[list[msgspec.Raw], msgspec.Meta(max_length=64)] = []
 
 
-class _Controlled(msgspec.Struct, frozen=True):
+class _ControlFields(msgspec.Struct, frozen=True):
     """Of `control/state`."""
 
     state: q.Name = ""
@@ -55,12 +55,12 @@ class _Controlled(msgspec.Struct, frozen=True):
     saturated: bool = False
 
 
-_status, _control = msgspec.msgpack.Decoder(_Told), msgspec.msgpack.Decoder(_Controlled)
+_status, _control = msgspec.msgpack.Decoder(_StatusFields), msgspec.msgpack.Decoder(_ControlFields)
 _NUMBER = re.compile(r"-?\d+(\.\d+)?")
 _NUMBERS = ("path_s_m", "propulsion_n", "propulsion_torque_nm", "torque_headroom_nm")
 
 
-class ToldState:
+class StateMessages:
     """Remembers what it has logged."""
 
     def __init__(self) -> None:
@@ -68,7 +68,7 @@ class ToldState:
 
     def of(self, status: bytes | None, control: bytes | None, time_ns: int) -> tuple[State, list[Log], Sequence[float]]:
         """State, what of it is new, and the angles that the controller wants, in rad: of the newest payloads."""
-        told, controlled = _Told(), _Controlled()
+        told, controlled = _StatusFields(), _ControlFields()
         with suppress(*UNDECODABLE):
             told = told if status is None else _status.decode(status)
         with suppress(*UNDECODABLE):

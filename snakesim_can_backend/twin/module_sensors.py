@@ -30,7 +30,7 @@ from snakesim_hal.model.sensors import PoseSensor
 Floats = NDArray[np.float64]
 
 
-class Senses:
+class ModuleSensors:
     """Sensors of neighbouring modules on one bus, with a noise generator of their own."""
 
     def __init__(self, robot: RobotFile, plant: Plant, first: int, count: int, seed: Sequence[int]) -> None:

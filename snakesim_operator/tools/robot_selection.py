@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Where:
+class RobotSelection:
     """Which robots a command addresses: those on the given endpoint, else all that run on this computer."""
 
     endpoint: str | None = None  # None: every network of a robot on this computer, and the default endpoint
@@ -45,13 +45,13 @@ class Where:
         return list({**found, DEFAULT_ENDPOINT: found.get(DEFAULT_ENDPOINT, Link(namespace=self.namespace))}.values())
 
 
-def where_of(arguments: argparse.Namespace) -> Where:
+def selection_of(arguments: argparse.Namespace) -> RobotSelection:
     """What `add_network`'s arguments address. Raises ConfigError."""
     check_network(arguments)
     session = session_given(arguments, or_environment=True)
     if session is not None:
-        return Where(session.endpoints[0], session.namespace_for(arguments.namespace), session)
-    return Where(arguments.router or arguments.endpoint, arguments.namespace)
+        return RobotSelection(session.endpoints[0], session.namespace_for(arguments.namespace), session)
+    return RobotSelection(arguments.router or arguments.endpoint, arguments.namespace)
 
 
 def _link_to(robot: LocalRobot, namespace: str | None) -> "Link":
