@@ -1,4 +1,4 @@
-"""When nothing beside a standing body can push it: an undulation on the spot, until something can.
+"""Search for contacts: a body at rest without usable push-points undulates in place until it has some.
 
 Waves travel along the body from head to tail and sweep it sideways, by a few centimetres. What they meet is pushed at
 from both sides in turn, so a body with one contact or none shifts and turns until it lies between others. Navigation

@@ -1,4 +1,4 @@
-"""What a controller tells about its forces on obstacles: where, how much, and why the body stands. Pure."""
+"""Report of the forces on obstacles: where, how much, and why the body stands. Pure."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""The world as the sensors tell it: pose, contacts, and a map that begins empty. Pure.
+"""The world model from sensors alone: pose, contacts, and a map that begins empty. Pure.
 
 Each sample is taken in once, with the body as it was at the sample's own stamp. Nothing is invented: without images the
 map stays as it is and fades, without contacts none are told, without poses the covariance grows.

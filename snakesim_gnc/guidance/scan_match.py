@@ -1,4 +1,4 @@
-"""Where the base must have been for a scan to lie on the map: the map corrects dead reckoning. Pure.
+"""Scan matching: the pose of the base at which a scan fits the map, to correct dead reckoning. Pure.
 
 Gauss-Newton on the distances of the scan's points from the outlines of well known obstacles. The same points refine the
 map afterwards, so their information is counted at a share only.

@@ -1,4 +1,4 @@
-"""What the console says in words, as HTML. Everything that comes from the network is escaped. Pure."""
+"""The texts of the console, as HTML. Everything that comes from the network is escaped. Pure."""
 
 from collections.abc import Iterable
 from html import escape

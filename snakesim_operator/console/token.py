@@ -1,4 +1,4 @@
-"""Who of the viewers has control. Pure, but for a lock: viewers press buttons in threads of their own."""
+"""Which viewer has control. Pure, but for a lock: viewers press buttons in threads of their own."""
 
 import threading
 

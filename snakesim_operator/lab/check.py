@@ -1,4 +1,4 @@
-"""`snakesim deploy check`: asks the lab as it runs whether it is what the lab file says.
+"""`snakesim deploy check`: checks that a running lab is as its lab file says.
 
 It connects as each identity in turn, with the certificates in the output folder, and moves nothing: it subscribes,
 looks for liveliness tokens, and asks with empty queries, which a host refuses.

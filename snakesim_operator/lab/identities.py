@@ -1,4 +1,4 @@
-"""Who is who in a lab: every router, and every pair of a machine and a role, with the name in its certificate."""
+"""The identities in a lab: every router, and every pair of a machine and a role, with the name in its certificate."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Makes a whole file of a recording whose recorder was killed: all that can be read of it, and the index."""
+"""Repairs a recording whose recorder was killed: keeps every readable message, and adds the index."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""When a message was, in robot time: by the tick that it names, as far as that can be true."""
+"""The robot time of a message, by the tick that it names, if that is plausible."""
 
 import msgspec
 

@@ -1,4 +1,4 @@
-"""What host and controller tell of themselves, for Foxglove: state as JSON, a log of its changes, joint references."""
+"""The state of host and controller for Foxglove: state as JSON, a log of its changes, joint references."""
 
 import re
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""How good a map is: the obstacles that guidance told, held against those that stand there. Pure.
+"""The quality of a map: the obstacles that guidance published, compared with the true ones. Pure.
 
     score(world.obstacles, truth, head_w, heading_rad).position_m
 

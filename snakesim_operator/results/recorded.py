@@ -1,4 +1,4 @@
-"""What a recording holds of a run: a row for each tick, and what guidance, navigation and control told.
+"""What a recording holds of a run: a row for each tick, and the outputs of guidance, navigation and control.
 
 The rows have the columns of the black box, made of the messages: joints of `sensor/joints`, set-points of
 `hal/applied`, pose and contacts as of their newest sample. They begin with the first arming that the recording saw.

@@ -1,4 +1,4 @@
-"""Limits and friction of a URDF's joints. A robot file has one set for all joints: the tightest is taken, and told."""
+"""Limits and friction of a URDF's joints. A robot file has one set for all joints: the tightest is taken, and reported."""
 
 from collections.abc import Callable
 

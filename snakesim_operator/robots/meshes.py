@@ -1,4 +1,4 @@
-"""Vertices of mesh files, to find how much room a link takes: STL, both kinds, and OBJ."""
+"""Vertices of mesh files, to find the extent of a link: STL, both kinds, and OBJ."""
 
 import struct
 from pathlib import Path

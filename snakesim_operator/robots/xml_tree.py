@@ -1,4 +1,4 @@
-"""XML as a tree that remembers what was read of it, so that the rest can be reported.
+"""XML as a tree that records which parts were read, so that the rest can be reported.
 
 Document types are refused, and with them entities and anything fetched from elsewhere. Size, depth and number of
 elements are bounded.

@@ -1,4 +1,4 @@
-"""A thread that looks: it makes the samples of cameras and lidars from copies of the state, beside the ticks."""
+"""A thread that renders: it makes the samples of cameras and lidars from copies of the state, beside the ticks."""
 
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor

@@ -1,4 +1,4 @@
-"""What was asked of two runs differently: a fair comparison differs only in what is meant."""
+"""Settings in which two runs differ: in a fair comparison, only the intended ones."""
 
 from dataclasses import dataclass
 from typing import Any

@@ -1,4 +1,4 @@
-"""What a comparison amounts to, in a few sentences: for the end of the table and the top of the page."""
+"""The result of a comparison, in a few sentences: for the end of the table and the top of the page."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""What a record tells over time: states, propulsion intervals, references, distance; all from the first tick on."""
+"""Time series of a record: states, propulsion intervals, references, distance; all from the first tick on."""
 
 from dataclasses import dataclass
 from functools import lru_cache

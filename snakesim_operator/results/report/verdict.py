@@ -1,4 +1,4 @@
-"""What a run amounted to, in one sentence."""
+"""The result of a run, in one sentence."""
 
 from dataclasses import dataclass
 from typing import Literal
