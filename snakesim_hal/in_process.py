@@ -80,7 +80,9 @@ class InProcessRun:
         backend = open_backend(find_plugin(BACKENDS, config.backend), config)
         opened.callback(backend.close)
         if not backend.describe().emulated:
-            raise RefusedError(f"backend {config.backend!r} moves something real, which nobody could stop from outside")
+            raise RefusedError(
+                f"backend {config.backend!r} moves real hardware, which could not be stopped from outside"
+            )
         ticks = round(config.duration_s * config.rate_hz)
         session = self.network.session()
         opened.callback(session.close)

@@ -101,7 +101,7 @@ class LiveSettings:
     def _publish(self, clock: Clock) -> None:
         settings, schema = _in_json(self._settings), _schema(type(self._settings))
         if len(settings) > MAX_SETTINGS or len(schema) > MAX_SCHEMA:
-            return  # a controller of which nobody changes the settings live
+            return  # this controller's settings cannot be changed while it runs
         self._publisher.put(
             ControlSettings(
                 tick=clock.tick,

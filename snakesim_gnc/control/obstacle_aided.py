@@ -215,7 +215,7 @@ class ObstacleAided:
         self._last_push = PushSnapshot(located.world, touches, push)
         self._unit_nm, self._most_n = np.zeros(len(self._robot.joints)), 0.0
         largest = float(push.lambdas.max(initial=0.0))
-        if push.rest < LARGEST_REST and largest > 0.0:  # a body in a U has nearly no drag, and needs nobody to push
+        if push.rest < LARGEST_REST and largest > 0.0:  # a body bent into a U has hardly any drag, and needs no push
             self._unit_nm[self._bends] = push.torques_nm
             most = float(np.abs(push.torques_nm).max(initial=0.0)) + 1e-9
             self._most_n = min(config.largest_torque_nm / most, config.largest_contact_n / largest)

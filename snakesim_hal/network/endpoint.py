@@ -34,8 +34,8 @@ def check_guarded(endpoint: str, origin: str, *, access_control: bool = False, i
     if access_control or insecure or not is_exposed(endpoint):
         return
     raise ConfigError(
-        f"{origin} {short(endpoint)}: whoever reaches this address could command the robot, because nothing there asks "
-        f"who they are. Listen on loopback, let the robot join a router with access control (`snakesim router FILE`, "
+        f"{origin} {short(endpoint)}: anyone who reaches this address could command the robot, because clients are not "
+        f"authenticated there. Listen on loopback, let the robot join a router with access control (`snakesim router FILE`, "
         f"`snakesim run --router ENDPOINT`), or accept it with --insecure"
     )
 

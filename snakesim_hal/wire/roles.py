@@ -1,6 +1,6 @@
 """Who may do what at which key. The one table from which the access rules of routers and `schemas/roles.md` are made.
 
-A role belongs to one robot: whoever is operator of one robot is nobody to another. Reading is open to every role of the
+A role belongs to one robot: the operator of one robot has no rights on another. Reading is open to every role of the
 robot, because nothing on its keys is a secret; whatever moves, stops or describes the robot has a named writer. What
 the table does not grant is denied.
 """

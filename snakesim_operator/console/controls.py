@@ -150,7 +150,7 @@ class Controls:
             self.do("Simulator", lambda: self._operations.change_time(self.who, order))
 
     def _go(self) -> None:
-        """The button is held: the page says so ten times a second, and nobody else does when it does not."""
+        """The button is held: the page repeats this ten times a second; without it, motion stops."""
         self._ask_for(self._speed.value, BUTTON_NS)
 
     def press(self, key: str) -> None:

@@ -12,7 +12,7 @@ class ControlToken:
 
     @property
     def holder(self) -> int | None:
-        """The viewer in control; None: nobody."""
+        """The viewer in control, if any."""
         return self._holder
 
     def take(self, viewer: int) -> bool:

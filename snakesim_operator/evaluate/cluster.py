@@ -22,7 +22,7 @@ LOOPBACK = "127.0.0.1"
 def workers(cluster: str | None, count: int | None = None, *, dashboard: bool = False) -> Iterator[Client]:
     """Connect to a cluster, or start one here: a process a core, reachable from this computer only.
 
-    Raises NotConnectedError when nobody answers, ConfigError for what is no address.
+    Raises NotConnectedError when there is no answer, ConfigError for an invalid address.
     """
     with ExitStack() as opened:
         if cluster is not None:

@@ -103,7 +103,7 @@ def _tell_end(what: str, certificate: x509.Certificate, remedy: str, found: Find
 
 
 def _check_router(name: str, lab: Lab, folder: Path, found: Findings) -> bool:
-    """Whether it lets in who has a certificate, nobody else, and which certificate it shows. False: not reached."""
+    """Whether it accepts only clients with a certificate, and which one it shows itself. False: not reached."""
     endpoint = lab.endpoint(name)
     identity = Identity(lab.file.routers[name].machine, None, name)
     try:

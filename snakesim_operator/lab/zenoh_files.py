@@ -53,7 +53,7 @@ def session_settings(identity: Identity, lab: Lab) -> dict[str, Any]:
 
 
 def _link(tls: dict[str, Any]) -> dict[str, Any]:
-    # `close_link_on_expiration`: whoever left the lab is out when the certificate ends, not when the session does.
+    # `close_link_on_expiration`: an expired certificate ends its session too.
     return {
         "protocols": ["tls"],
         "tx": {"lease": LEASE_MS, "queue": {"congestion_control": {"drop": {"wait_before_drop": 100}}}},

@@ -1,4 +1,4 @@
-"""Limits and friction of a URDF's joints. A robot file has one set for all joints: the tightest is taken, and reported."""
+"""Limits and friction of a URDF's joints. A robot file has one set for all joints: the tightest, which is reported."""
 
 from collections.abc import Callable
 

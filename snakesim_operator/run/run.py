@@ -169,7 +169,7 @@ def _conduct(
             say(f"{config.name}: {config.robot.name} in {config.scene.name}, {config.commander}, {config.pace}")
             say(f"network: {link.endpoint}, namespace {link.namespace}")
             if not config.has_own_control:
-                say("whoever takes the lease commands the robot, and arms it")
+                say("no control service of its own: a client that takes the lease commands and arms the robot")
             RunMonitor(config, session, supervisor, ending, say, stay=request.stay).go()
     except SnakesimError as error:
         ending.because(str(error))

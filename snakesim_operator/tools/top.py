@@ -59,7 +59,7 @@ def top(request: TopRequest, where: RobotSelection, say: Say = say) -> int:
 
 
 def _listen(link: Link, stack: contextlib.ExitStack) -> Traffic | None:
-    """Subscribe to everything on a network; None when nobody answers there."""
+    """Subscribe to everything on a network; None when there is no answer."""
     try:
         session: Session = stack.enter_context(open_session(replace(link, largest_bytes=MAX_IMAGE_BYTES), CONNECT_S))
     except NotConnectedError:

@@ -26,7 +26,7 @@ DEPTH = 8192
 def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
     """One for both clients: it ends in an emergency stop."""
     with running(tmp_path_factory.mktemp("client") / "run", *EXTERNAL, "--pace", request.param) as started:
-        started.wait_for("whoever takes the lease")
+        started.wait_for("a client that takes the lease")
         yield started
 
 

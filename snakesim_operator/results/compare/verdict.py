@@ -17,7 +17,7 @@ class ToleranceCheck:
 
 
 def within(difference: Difference, percent: float) -> ToleranceCheck | None:
-    """Whether the distance differs by no more than so many per cent of A's; None when nobody knows the distance."""
+    """Whether the distance differs by no more than so many per cent of A's; None when the distance is unknown."""
     advance = difference.advance
     if advance is None:
         return None
@@ -65,7 +65,7 @@ def _untold(difference: Difference) -> list[str]:
     untold = [f"{gap.what} {100 * gap.untold:.2g} %" for gap in difference.gaps if gap.untold]
     if not untold:
         return []
-    return [f"Not a number in one run or in both, so that nobody can tell whether it is the same: {', '.join(untold)}."]
+    return [f"Not a number in one run or in both, so it cannot be compared: {', '.join(untold)}."]
 
 
 def how_far(advance: Advance) -> str:

@@ -94,7 +94,7 @@ def _moved(summary: RunSummary) -> str:
         return f"Moved {abs(summary.path_distance_m):.2f} m{back} along the path {duration}"
     if summary.net_displacement_m is not None:
         return f"Moved {summary.net_displacement_m:.2f} m {duration}"
-    return f"Ran for {summary.duration_s:.1f} s; nobody measured how far it moved, for the robot has no pose sensor"
+    return f"Ran for {summary.duration_s:.1f} s; the distance is unknown, because the robot has no pose sensor"
 
 
 def _handed_over(record: RunRecord, summary: RunSummary) -> str:

@@ -116,7 +116,7 @@ def test_what_is_not_a_number_in_both_runs_is_not_called_the_same(name: str, whe
     for difference in (differ(hurt, hurt), differ(record, hurt), differ(hurt, record)):
         text, html = shown(difference)
         assert not difference.identical and "The runs are the same" not in text + html
-        assert "Not a number in one run or in both, so that nobody can tell whether it is the same: " in text
+        assert "Not a number in one run or in both, so it cannot be compared: " in text
 
 
 def test_infinity_in_both_runs_is_not_called_the_same() -> None:
