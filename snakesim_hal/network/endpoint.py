@@ -35,7 +35,7 @@ def check_guarded(endpoint: str, origin: str, *, access_control: bool = False, i
         return
     raise ConfigError(
         f"{origin} {short(endpoint)}: anyone who reaches this address could command the robot, because clients are not "
-        f"authenticated there. Listen on loopback, let the robot join a router with access control (`snakesim router FILE`, "
+        f"authenticated. Listen on loopback, let the robot join a router with access control (`snakesim router FILE`, "
         f"`snakesim run --router ENDPOINT`), or accept it with --insecure"
     )
 
