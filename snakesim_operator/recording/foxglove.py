@@ -43,6 +43,7 @@ from snakesim_operator.recording.state_messages import State, StateMessages
 MOVING_NS = 100_000_000  # 10 Hz: viewers interpolate transforms
 IMAGES_NS = 200_000_000  # 5 Hz: all images are in the raw channels
 TOPICS = "foxglove/"
+SILENCE_NS = 5_000_000_000  # older messages are not shown as if they were current
 STILL_NS = 1_000_000_000  # what seldom changes, so that it is there wherever one begins to look
 
 
@@ -126,7 +127,7 @@ class FoxgloveChannels:
     """Keeps the newest payload of each key, and makes messages of them when the clock says that they are due."""
 
     def __init__(self) -> None:
-        self._newest: dict[str, bytes] = {}
+        self._newest: dict[str, tuple[bytes, int]] = {}  # payload and its robot time in ns
         self._due_ns: dict[str, int] = {}
         self._robot: Description | None = None
         self._frames: BodyFrames | None = None
@@ -136,7 +137,7 @@ class FoxgloveChannels:
     def take(self, key: str, payload: bytes, time_ns: int) -> list[FoxgloveMessage]:
         """What is due with this message. One that cannot be decoded makes nothing."""
         if key in _KEPT:
-            self._newest[key] = payload
+            self._newest[key] = payload, time_ns
             return []
         if key == keys.CLOCK:
             return self._at_clock(time_ns) if self._is_due("moving", time_ns, MOVING_NS) else []
@@ -164,17 +165,22 @@ class FoxgloveChannels:
         self._due_ns[what] = time_ns + every_ns
         return True
 
-    def _read(self, key: str, message: type[Any]) -> Any:
-        return _decoded(message, self._newest.get(key))
+    def _fresh(self, key: str, time_ns: int) -> bytes | None:
+        """The newest payload, unless its writer has fallen silent, or robot time has begun anew since."""
+        payload, written_ns = self._newest.get(key, (None, 0))
+        return payload if 0 <= time_ns - written_ns <= SILENCE_NS else None
+
+    def _read(self, key: str, message: type[Any], time_ns: int) -> Any:
+        return _decoded(message, self._fresh(key, time_ns))
 
     def _at_clock(self, time_ns: int) -> list[FoxgloveMessage]:
         robot, frames = self._robot, self._frames
-        joints: JointState | None = self._read(keys.JOINTS, JointState)
-        seen: PoseAndContacts | None = self._read(keys.WORLD, PoseAndContacts)
+        joints: JointState | None = self._read(keys.JOINTS, JointState, time_ns)
+        seen: PoseAndContacts | None = self._read(keys.WORLD, PoseAndContacts, time_ns)
         if robot is None or frames is None or joints is None or not joints.is_of(len(robot.joints)):
             return []
         made = [_shown("joints", frames.joint_states(joints, time_ns))]
-        base = self._base(seen)
+        base = self._base(seen, time_ns)
         made.append(_shown("tf", frames.transforms(joints.angle_rad, base, time_ns)))
         if base is not None:
             made.append(_shown("pose", _pose(*base, time_ns)))
@@ -183,7 +189,7 @@ class FoxgloveChannels:
         return [*made, *self._state(frames, time_ns), *self._still(robot, time_ns)]
 
     def _state(self, frames: BodyFrames, time_ns: int) -> Iterator[FoxgloveMessage]:
-        status, control = (self._newest.get(key) for key in (keys.STATUS, keys.CONTROL_STATE))
+        status, control = (self._fresh(key, time_ns) for key in (keys.STATUS, keys.CONTROL_STATE))
         state, logged, wanted_rad = self._told.of(status, control, time_ns)
         yield FoxgloveMessage(f"{TOPICS}state", State, msgspec.json.encode(state))
         yield from (_shown("log", one) for one in logged)
@@ -196,17 +202,17 @@ class FoxgloveChannels:
             self._truth.timestamp.CopyFrom(shapes.stamp(time_ns))
             yield _scene("obstacles", [self._truth])
         if keys.WORLD in self._newest and self._is_due(keys.WORLD, time_ns, STILL_NS):
-            world: World | None = self._read(keys.WORLD, World)
+            world: World | None = self._read(keys.WORLD, World, time_ns)
             if world is not None:
                 yield _scene("map", [shapes.obstacles(world.obstacles, "map", shapes.MAP, time_ns)])
         if keys.TRAJECTORY in self._newest and self._is_due(keys.TRAJECTORY, time_ns, STILL_NS):
-            trajectory: Trajectory | None = self._read(keys.TRAJECTORY, Trajectory)
+            trajectory: Trajectory | None = self._read(keys.TRAJECTORY, Trajectory, time_ns)
             if trajectory is not None:
                 yield _scene("path", [shapes.path(trajectory.path_w, time_ns)])
 
-    def _base(self, seen: PoseAndContacts | None) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
+    def _base(self, seen: PoseAndContacts | None, time_ns: int) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
         """Position and orientation of link 0: as measured, else as guidance believes."""
-        pose: Pose | None = self._read(keys.POSE, Pose)
+        pose: Pose | None = self._read(keys.POSE, Pose, time_ns)
         if pose is not None:
             return pose.position_w, pose.orientation_wxyz
         return None if seen is None else (seen.base_position_w, seen.base_orientation_wxyz)

@@ -94,6 +94,8 @@ class StateMessages:
             ("hal", state.lifecycle, state.why.partition("; ")[0], Log.ERROR if stopped else Log.INFO),
             ("control", state.locomotion, state.reason, Log.WARNING if stuck else Log.INFO),
         ):
+            if not what and name in self._logged:
+                what, why, level = "silent", f"the state of {name} is no longer published", Log.ERROR
             said = (what, _NUMBER.sub("#", why))  # a force or an age that changes is no news
             if what and self._logged.get(name) != said:
                 self._logged[name] = said

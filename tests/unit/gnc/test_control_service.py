@@ -50,7 +50,8 @@ def test_without_joints_it_sends_nothing_and_the_lease_ends(tmp_path: Path) -> N
         made.run.reaches("fault")
         assert [fault.what for fault in made.run.status.faults] == ["lease_expired"]
         told = made.tells("sensor/joints is ")
-        assert told.state == "NotLocomoting" and "at most 0.06 s" in told.reason
+        assert told.state in ("NotLocomoting", "Idle")  # the latter when a busy machine delays it until the stop
+        assert "at most 0.06 s" in told.reason
         last_joints, last_command = joints.drain()[-1].tick, commands.drain()[-1].tick
         assert last_command == last_joints  # no command ever named a state that was not
         assert len(made.views) < 80

@@ -11,17 +11,24 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from foxglove_schemas_protobuf.Log_pb2 import Log
 from mcap.exceptions import EndOfFile
 from mcap.reader import NonSeekingReader, make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from snakesim_hal.model.kinematics import rotation_from_quaternion
 from snakesim_hal.model.scenario import load, parse_set
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import encode
+from snakesim_hal.wire.messages import ControlState
+from snakesim_operator.recording.foxglove import FoxgloveChannels
 from snakesim_operator.recording.reader import RECORDING
 from snakesim_operator.recording.recover import recover
 from snakesim_operator.recording.state_messages import StateMessages
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.run.in_process import simulate
+from tests.unit.hal.rig import description
+from tests.unit.hal.rig import state as joint_state
 
 LAYOUT = Path(__file__).parents[4] / "docs" / "foxglove-layout.json"
 
@@ -193,3 +200,18 @@ def test_a_reason_in_which_only_a_number_changes_is_logged_once() -> None:
         control = msgspec.msgpack.encode({"state": "Locomoting", "reason": f"pushes with {k + 0.5} N", "jammed": True})
         logged += told.of(None, control, k)[1]
     assert [one.message for one in logged] == ["Locomoting: pushes with 0.5 N"]
+
+
+def test_the_state_of_a_controller_that_fell_silent_is_not_shown_as_current() -> None:
+    channels, robot = FoxgloveChannels(), description()
+    control = ControlState(tick=0, stamp_ns=0, controller="hold", state="Locomoting", reason="pushes")
+    seen: list[tuple[str, list[str]]] = []
+    channels.take(keys.DESCRIPTION, encode(robot), 0)
+    channels.take(keys.CONTROL_STATE, encode(control), 0)
+    for time_s in (0, 4, 6, 8):
+        channels.take(keys.JOINTS, encode(joint_state(robot)), time_s * 10**9)
+        made = channels.take(keys.CLOCK, b"", time_s * 10**9)
+        (state,) = (json.loads(one.payload)["locomotion"] for one in made if one.topic == "foxglove/state")
+        seen.append((state, [Log.FromString(one.payload).message for one in made if one.topic == "foxglove/log"]))
+    silent = "silent: the state of control is no longer published"
+    assert seen == [("Locomoting", ["Locomoting: pushes"]), ("Locomoting", []), ("", [silent]), ("", [])]
