@@ -60,16 +60,16 @@ class Guarded:
 def check(action: Action, joints: Sequence[str]) -> None:
     """Raises ValueError with the field, its value and what is allowed. joints: names, tail to head."""
     if not isinstance(action, Action):
-        raise ValueError(f"update() returned {_shown(action)}, must return an Action")
+        raise ValueError(f"update() returned {_repr(action)}, must return an Action")
     points, report = action.set_points, action.report
     if not isinstance(points, SetPoints):
-        raise ValueError(f"Action.set_points is {_shown(points)}, must be SetPoints")
+        raise ValueError(f"Action.set_points is {_repr(points)}, must be SetPoints")
     if not isinstance(report, Report):
-        raise ValueError(f"Action.report is {_shown(report)}, must be a Report")
+        raise ValueError(f"Action.report is {_repr(report)}, must be a Report")
     _check_length("mode", points.mode, joints)
     for i, mode in enumerate(points.mode):
         if type(mode) is not Mode:
-            raise ValueError(f"SetPoints.mode[{i}] ({joints[i]}) is {_shown(mode)}, must be one of {MODES}")
+            raise ValueError(f"SetPoints.mode[{i}] ({joints[i]}) is {_repr(mode)}, must be one of {MODES}")
     _check_numbers("target", points.target, joints, least=-MAX_TARGET)
     _check_numbers("torque_limit_nm", points.torque_limit_nm, joints, least=0.0)
     _check_report(report, joints)
@@ -78,7 +78,7 @@ def check(action: Action, joints: Sequence[str]) -> None:
 def _check_length(field: str, values: Any, joints: Sequence[str]) -> None:
     if type(values) is not list:
         hint = "; use .tolist()" if hasattr(values, "tolist") else ""
-        raise ValueError(f"SetPoints.{field} is {_shown(values)}, must be a list{hint}")
+        raise ValueError(f"SetPoints.{field} is {_repr(values)}, must be a list{hint}")
     if len(values) != len(joints):
         wanted = f"{len(joints)}: one a joint, {joints[0]} to {joints[-1]}"
         raise ValueError(f"SetPoints.{field} has {len(values)} values, must have {wanted}")
@@ -89,7 +89,7 @@ def _check_numbers(field: str, values: Any, joints: Sequence[str], *, least: flo
     for i, value in enumerate(values):
         if type(value) in NUMBERS and least <= value <= MAX_TARGET:  # false for NaN
             continue
-        where = f"SetPoints.{field}[{i}] ({joints[i]}) is {_shown(value)}"
+        where = f"SetPoints.{field}[{i}] ({joints[i]}) is {_repr(value)}"
         if type(value) not in NUMBERS:
             raise ValueError(f"{where}, must be a plain float: use float(), or .tolist() of an array")
         unit = "N·m" if field == "torque_limit_nm" else "rad, rad/s or N·m"
@@ -99,15 +99,15 @@ def _check_numbers(field: str, values: Any, joints: Sequence[str], *, least: flo
 def _check_report(report: Report, joints: Sequence[str]) -> None:
     """Checks the fields that decide about the state; the others are checked when published."""
     if not isinstance(report.why, str):
-        raise ValueError(f"Report.why is {_shown(report.why)}, must be a str")
+        raise ValueError(f"Report.why is {_repr(report.why)}, must be a str")
     for field, most in (("usable_push_points", math.inf), ("propulsion_joint", len(joints) - 1)):
         value = getattr(report, field)
         if value is not None and not (type(value) is int and 0 <= value <= most):
             allowed = "None or an int from 0" + ("" if most == math.inf else f" to {most}")
-            raise ValueError(f"Report.{field} is {_shown(value)}, must be {allowed}")
+            raise ValueError(f"Report.{field} is {_repr(value)}, must be {allowed}")
 
 
-def _shown(value: Any) -> str:
+def _repr(value: Any) -> str:
     """A value for an error message, with its type unless that is plain."""
     text = repr(value)
     text = text if len(text) <= 60 else f"{text[:57]}..."

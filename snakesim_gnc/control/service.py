@@ -61,15 +61,15 @@ class Control(Service):
             self._controller = None
         if not mine:
             why = f"no right to command: {self._commander.refusal or 'the lease is not ours'}"
-            return _told(self._reports.state(clock, armed=armed, missing=why))
+            return _state_messages(self._reports.state(clock, armed=armed, missing=why))
         late = self._limits.against_joints(joints, clock.stamp_ns)
         if late:
             self._note(clock, [late], "no commands")
-            return _told(self._reports.state(clock, armed=armed, missing=late))
+            return _state_messages(self._reports.state(clock, armed=armed, missing=late))
         if not armed:
             self._note(clock)
             self._commander.send(clock, joints, self._commander.stay(joints))
-            return _told(self._reports.state(clock))
+            return _state_messages(self._reports.state(clock))
         return self._act(clock, joints)
 
     def pause(self, clock: Clock) -> None:
@@ -81,7 +81,7 @@ class Control(Service):
         """The HAL is gone, or delayed by a slow computer: PowerOff. The next tick decides about the controller."""
         if self._last_clock is None:
             return []
-        return _told(self._reports.state(self._last_clock, answers=False))
+        return _state_messages(self._reports.state(self._last_clock, answers=False))
 
     def _act(self, clock: Clock, joints: JointState) -> list[tuple[str, Message]]:
         """Call the controller, with world and trajectory as far as they are fresh."""
@@ -106,7 +106,7 @@ class Control(Service):
         except ControllerError as error:
             self._client.put(keys.CONTROL_STATE, self._reports.failure(clock, str(error)))
             raise
-        return _told(told)
+        return _state_messages(told)
 
     def _outlook(self, clock: Clock) -> tuple[World | None, Trajectory | None, str]:
         """World and trajectory as far as they are available and fresh, and why they are not."""
@@ -146,5 +146,5 @@ def _why_it_rests(trajectory: Trajectory | None) -> str:
     return trajectory.reason or "the speed is zero"
 
 
-def _told(state: ControlState | None) -> list[tuple[str, Message]]:
+def _state_messages(state: ControlState | None) -> list[tuple[str, Message]]:
     return [] if state is None else [(keys.CONTROL_STATE, state)]

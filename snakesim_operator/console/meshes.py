@@ -29,7 +29,7 @@ def cylinder(radius_m: float, height_m: float) -> Mesh:
     half_m = height_m / 2
     side = [(radius_m, -half_m), (radius_m, half_m)]
     parts = [_turned(np.array(part)) for part in ([(0.0, -half_m), side[0]], side, [side[1], (0.0, half_m)])]
-    return _joined(parts)
+    return _merged(parts)
 
 
 def box(half_m: float) -> Mesh:
@@ -38,7 +38,7 @@ def box(half_m: float) -> Mesh:
     faces = np.array([(0, 1, 2), (0, 2, 3)])
     sides = [np.roll(square, k, axis=1) * half_m for k in range(3)]
     turned = [side * [-1.0, -1.0, -1.0] for side in sides]
-    return _joined([*[(side, faces) for side in sides], *[(side, faces[:, ::-1]) for side in turned]])
+    return _merged([*[(side, faces) for side in sides], *[(side, faces[:, ::-1]) for side in turned]])
 
 
 def hoops(corners: NDArray[np.float64], half_m: float, width_m: float) -> Mesh:
@@ -49,7 +49,7 @@ def hoops(corners: NDArray[np.float64], half_m: float, width_m: float) -> Mesh:
         [np.column_stack([here, after, after + count]), np.column_stack([here, after + count, here + count])]
     )
     bands = [(-half_m, width_m - half_m), (half_m - width_m, half_m)]
-    return _joined(
+    return _merged(
         [(np.vstack([np.column_stack([corners, np.full(count, z)]) for z in band]), faces) for band in bands]
     )
 
@@ -77,7 +77,7 @@ def _turned(profile: NDArray[np.float64]) -> Mesh:
     return np.vstack(rings), np.vstack(faces)
 
 
-def _joined(parts: list[Mesh]) -> Mesh:
+def _merged(parts: list[Mesh]) -> Mesh:
     offsets = np.cumsum([0, *[len(vertices) for vertices, _ in parts[:-1]]])
     faces = np.vstack([faces + offset for (_, faces), offset in zip(parts, offsets, strict=True)])
     return np.vstack([vertices for vertices, _ in parts]), faces

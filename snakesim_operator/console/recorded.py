@@ -21,9 +21,9 @@ class Recorded:
 
     def __init__(self, record: RunRecord) -> None:
         self.record = record
-        self._stamps = {id(told): [_stamp_s(m) for m in told] for told in self._told()}
+        self._stamps = {id(told): [_stamp_s(m) for m in told] for told in self._outputs()}
 
-    def _told(self) -> tuple[Sequence[ControlState], Sequence[World], Sequence[Trajectory]]:
+    def _outputs(self) -> tuple[Sequence[ControlState], Sequence[World], Sequence[Trajectory]]:
         return self.record.control, self.record.worlds, self.record.trajectories
 
     @property

@@ -88,7 +88,7 @@ def settings_of(suite: Suite, source: str) -> list[Setting]:
         where = f"{source}: row {row.name!r}" if row is not None else source
         own = [*_overrides(row.set, where), *_left_out(row.unset, where)] if row is not None else []
         for values in itertools.product(*varied.values()):
-            told = [f"{words[key]} {_shown(value)}" for key, value in zip(varied, values, strict=True)]
+            told = [f"{words[key]} {_short_text(value)}" for key, value in zip(varied, values, strict=True)]
             name = ", ".join([*([row.name] if row is not None else []), *told]) or "as it is"
             here = [Override(key, v, f"{source}: [vary]") for key, v in zip(varied, values, strict=True)]
             number = values[0] if len(values) == 1 and row is None and _is_number(values[0]) else None
@@ -204,7 +204,7 @@ def _short_names(keys: list[str]) -> dict[str, str]:
     return {key: end if last.count(end) == 1 else key for key, end in zip(keys, last, strict=True)}
 
 
-def _shown(value: object) -> str:
+def _short_text(value: object) -> str:
     return f"{value:g}" if isinstance(value, float) else short(str(value), 40)
 
 

@@ -130,7 +130,7 @@ def write_certificates(
         tls = folder / identity.machine / "tls"
         tls.mkdir(parents=True, exist_ok=True)
         at = tls / f"{identity.label}.pem"
-        kept = _kept(at, issuer, identity, lab)
+        kept = _still_valid(at, issuer, identity, lab)
         state = "made" if kept is None and not at.exists() else "renewed" if kept is None or rotate else "kept"
         if state != "kept":
             certificate, key = issue(issuer, identity, lab)
@@ -149,7 +149,7 @@ def read_certificate(at: Path) -> x509.Certificate:
         raise ConfigError(f"{at}: not a certificate: {error}; remove it and run `snakesim deploy certs`") from None
 
 
-def _kept(at: Path, issuer: Issuer, identity: Identity, lab: Lab) -> x509.Certificate | None:
+def _still_valid(at: Path, issuer: Issuer, identity: Identity, lab: Lab) -> x509.Certificate | None:
     """The certificate that is there, if it may stay."""
     if not at.exists() or not at.with_suffix(".key").exists():
         return None

@@ -129,9 +129,9 @@ def _check_router(name: str, lab: Lab, folder: Path, found: Findings) -> bool:
     settings["transport"]["link"]["tls"] = {"root_ca_certificate": tls["root_ca_certificate"]}
     try:
         with open_probe(json.dumps(settings)):
-            found.bad(f"{name}: lets in who has no certificate; it does not run with the rendered file")
+            found.bad(f"{name}: accepts clients without a certificate; it does not run with the rendered file")
     except NotConnectedError:
-        found.well(f"{name}: keeps out who has no certificate")
+        found.well(f"{name}: refuses clients without a certificate")
     return True
 
 

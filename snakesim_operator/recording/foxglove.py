@@ -179,11 +179,11 @@ class FoxgloveChannels:
         seen: PoseAndContacts | None = self._read(keys.WORLD, PoseAndContacts, time_ns)
         if robot is None or frames is None or joints is None or not joints.is_of(len(robot.joints)):
             return []
-        made = [_shown("joints", frames.joint_states(joints, time_ns))]
+        made = [_protobuf("joints", frames.joint_states(joints, time_ns))]
         base = self._base(seen, time_ns)
-        made.append(_shown("tf", frames.transforms(joints.angle_rad, base, time_ns)))
+        made.append(_protobuf("tf", frames.transforms(joints.angle_rad, base, time_ns)))
         if base is not None:
-            made.append(_shown("pose", _pose(*base, time_ns)))
+            made.append(_protobuf("pose", _pose(*base, time_ns)))
         if seen is not None:
             made.append(_scene("forces", [shapes.forces(seen.contacts, time_ns)]))
         return [*made, *self._state(frames, time_ns), *self._still(robot, time_ns)]
@@ -192,9 +192,9 @@ class FoxgloveChannels:
         status, control = (self._fresh(key, time_ns) for key in (keys.STATUS, keys.CONTROL_STATE))
         state, logged, wanted_rad = self._told.of(status, control, time_ns)
         yield FoxgloveMessage(f"{TOPICS}state", State, msgspec.json.encode(state))
-        yield from (_shown("log", one) for one in logged)
+        yield from (_protobuf("log", one) for one in logged)
         if len(wanted_rad) == frames.joints:
-            yield _shown("reference", frames.reference(wanted_rad, time_ns))
+            yield _protobuf("reference", frames.reference(wanted_rad, time_ns))
 
     def _still(self, robot: Description, time_ns: int) -> Iterator[FoxgloveMessage]:
         if self._is_due("body", time_ns, STILL_NS):
@@ -226,9 +226,9 @@ class FoxgloveChannels:
         frame_id = f"{TOPICS}{name}"
         turned = shapes.optical(image.orientation_l_wxyz)
         mount = shapes.frame(time_ns, robot.links[image.link].name, frame_id, image.position_l, turned)
-        yield _shown("tf", FrameTransforms(transforms=[mount]))
-        yield _shown(name, shapes.raw_image(image, frame_id, time_ns))
-        yield _shown(f"{name}/calibration", shapes.calibration(image, frame_id, time_ns))
+        yield _protobuf("tf", FrameTransforms(transforms=[mount]))
+        yield _protobuf(name, shapes.raw_image(image, frame_id, time_ns))
+        yield _protobuf(f"{name}/calibration", shapes.calibration(image, frame_id, time_ns))
 
 
 def _decoded(message: type[Any], payload: bytes | None) -> Any:
@@ -246,8 +246,8 @@ def _pose(position: tuple[float, ...], wxyz: tuple[float, ...], time_ns: int) ->
 
 
 def _scene(name: str, entities: list[SceneEntity]) -> FoxgloveMessage:
-    return _shown(f"scene/{name}", SceneUpdate(entities=entities))
+    return _protobuf(f"scene/{name}", SceneUpdate(entities=entities))
 
 
-def _shown(name: str, message: Protobuf) -> FoxgloveMessage:
+def _protobuf(name: str, message: Protobuf) -> FoxgloveMessage:
     return FoxgloveMessage(TOPICS + name, type(message), message.SerializeToString())

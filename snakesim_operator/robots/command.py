@@ -21,11 +21,11 @@ def import_robot(file: Path, order: Order, out: Path | None, *, as_json: bool = 
     path = out or Path(f"{found.robot.name}.toml")
     _check_new(path, ".toml", file)
     notes = [f"From {file.name}, by `snakesim robot import`."]
-    for key, lines in _told(found).items():
+    for key, lines in _as_json(found).items():
         notes += ["", f"{HEADS[key]}:", *(f"  {line}" for line in lines)] if lines else []
     write_text(path, toml_of(found.table.values, [printable(note) for note in notes]))
     if as_json:
-        say_json({"file": str(path), **_told(found)})
+        say_json({"file": str(path), **_as_json(found)})
         return 0
     for note in notes[1:]:
         say(note)
@@ -39,7 +39,7 @@ def import_robot(file: Path, order: Order, out: Path | None, *, as_json: bool = 
     return 0
 
 
-def _told(found: Imported) -> dict[str, list[str]]:
+def _as_json(found: Imported) -> dict[str, list[str]]:
     return {"names": found.names, "changed": found.changed, "left_out": found.left_out}
 
 

@@ -165,7 +165,7 @@ def _conduct(
         if request.record and files.folder is not None:
             recorder = ["snakesim_operator.recording.process", *common, *meeting, "--out", str(files.folder)]
             supervisor.start(RECORDER, recorder, vital=False)
-        with _joined(link, supervisor, ending) as session:
+        with _session_of_run(link, supervisor, ending) as session:
             say(f"{config.name}: {config.robot.name} in {config.scene.name}, {config.commander}, {config.pace}")
             say(f"network: {link.endpoint}, namespace {link.namespace}")
             if not config.has_own_control:
@@ -182,7 +182,7 @@ def _meeting(link: Link) -> list[str]:
 
 
 @contextlib.contextmanager
-def _joined(link: Link, supervisor: Supervisor, ending: Ending) -> Iterator[Session]:
+def _session_of_run(link: Link, supervisor: Supervisor, ending: Ending) -> Iterator[Session]:
     """A session on the run's network, as soon as there is one. Raises NotConnectedError when a part has ended."""
     began = told = time.monotonic()
     with contextlib.ExitStack() as stack:

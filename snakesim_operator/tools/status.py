@@ -31,7 +31,7 @@ def show_status(where: RobotSelection, say: Say = say, *, as_json: bool = False)
     processes: dict[tuple[str, str | None], list[Process]] = {}
     for link in where.networks():
         with contextlib.suppress(NotConnectedError):
-            found += _heard(link, processes)
+            found += _statuses(link, processes)
     silent = [
         robot
         for robot in where.local()
@@ -62,7 +62,7 @@ def show_status(where: RobotSelection, say: Say = say, *, as_json: bool = False)
     return 0 if well and not silent else 1
 
 
-def _heard(link: Link, processes: dict[tuple[str, str | None], list[Process]]) -> list[tuple[Link, list[Status]]]:
+def _statuses(link: Link, processes: dict[tuple[str, str | None], list[Process]]) -> list[tuple[Link, list[Status]]]:
     """The newest status of each host of each robot on a network; and its live processes, put into `processes`."""
     arrivals: Mailbox[Arrival] = Mailbox()
     decoders = {keys.STATUS: Decoder(Status), keys.PROCESS_ALL: Decoder(Process)}

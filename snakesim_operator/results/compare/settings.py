@@ -36,7 +36,7 @@ def identity(a: RunRecord, b: RunRecord) -> list[Setting]:
         ("seed", "seed"),
     ]
     of_a, of_b = (dict(leaves(msgspec.to_builtins(record.config))) for record in (a, b))
-    return [Setting(name, _said(of_a, key), _said(of_b, key)) for name, key in rows]
+    return [Setting(name, _value_text(of_a, key), _value_text(of_b, key)) for name, key in rows]
 
 
 def differences(a: RunRecord, b: RunRecord) -> list[Setting]:
@@ -51,7 +51,7 @@ def differences(a: RunRecord, b: RunRecord) -> list[Setting]:
     for prefix, of_a, of_b in sources:
         for key in [*of_a, *(key for key in of_b if key not in of_a)]:
             if key not in of_a or key not in of_b or of_a[key] != of_b[key]:
-                found.append(Setting(prefix + key, _said(of_a, key), _said(of_b, key)))
+                found.append(Setting(prefix + key, _value_text(of_a, key), _value_text(of_b, key)))
     return found
 
 
@@ -65,7 +65,7 @@ def _described(record: RunRecord) -> dict[str, Any]:
     return dict(leaves({key: value for key, value in told.items() if key not in FOLLOWS}))
 
 
-def _said(values: dict[str, Any], key: str) -> str:
+def _value_text(values: dict[str, Any], key: str) -> str:
     if key not in values:
         return UNSET
     value = values[key]

@@ -104,12 +104,12 @@ def _obstacles(record: RunRecord) -> Figure:
     shown = sorted(sorted(spans, key=lambda name: -impulse[name])[:MAX_OBSTACLES], key=lambda name: spans[name][0])
     drawn: list[Bar] = []
     for name in shown:
-        for since, until, most in _joined(spans[name]):
+        for since, until, most in _merged(spans[name]):
             drawn.append(Bar(name, since, until, f"{most:.0f} N", "--reference"))
     return bars("Obstacles pushed off over time", shown, drawn, end_s(record))
 
 
-def _joined(spans: list[tuple[float, float, float]]) -> list[tuple[float, float, float]]:
+def _merged(spans: list[tuple[float, float, float]]) -> list[tuple[float, float, float]]:
     """Spans that touch become one, with the largest force."""
     found: list[tuple[float, float, float]] = []
     for since, until, force in spans:

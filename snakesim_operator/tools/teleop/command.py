@@ -93,7 +93,7 @@ class Teleop:
             if not self._ending:
                 self._send()
             if turn % SHOWN_EVERY == 0 and sys.stdout.isatty():
-                drawn = say_over(self._shown(), drawn)
+                drawn = say_over(self._screen_lines(), drawn)
             turn += 1
             time.sleep(max(PERIOD_S - (time.monotonic() - began), 0.0))
         if self._steering.touched_s is not None and not self._stopped:  # sooner than by expiry
@@ -166,7 +166,7 @@ class Teleop:
         self._sent_ns = clock.stamp_ns
         self._intents.put(self._steering.intent(clock.stamp_ns))
 
-    def _shown(self) -> list[str]:
+    def _screen_lines(self) -> list[str]:
         status, control, steering = self._status, self._control, self._steering
         robot = "no status yet" if status is None else f"{status.lifecycle}: {status.why}"
         backend = "" if status is None else f" ({status.backend})"
