@@ -79,12 +79,10 @@ def look_into(path: Path) -> RecordingInfo:
         one.bytes += len(recorded.payload)
         if recorded.key in ALL:
             contents.take(recorded)
-    return _recording_info(path, reader, found, contents)
+    return _summed_up(path, reader, found, contents)
 
 
-def _recording_info(
-    path: Path, reader: RecordingReader, found: dict[str, KeyInfo], contents: Contents
-) -> RecordingInfo:
+def _summed_up(path: Path, reader: RecordingReader, found: dict[str, KeyInfo], contents: Contents) -> RecordingInfo:
     robot, status = contents.description, contents.status
     config: dict[str, Any] = json.loads(contents.config.content) if contents.config is not None else {}
     # Not since the oldest message: latched values, such as the description, are older than a recording that began late.
