@@ -41,9 +41,9 @@ class ContactSearch:
         """Whether the body undulates."""
         return self._until_s is not None
 
-    def decide(self, view: View, *, stands: bool, most_n: float) -> bool:
-        """Whether to undulate at this tick. most_n: force along the body that its contacts allow."""
-        before, enough = self.active, most_n >= self._patience.enough_n
+    def decide(self, view: View, *, stands: bool, max_force_n: float) -> bool:
+        """Whether to undulate at this tick. max_force_n: force along the body that its contacts allow."""
+        before, enough = self.active, max_force_n >= self._patience.enough_n
         if self._until_s is not None:
             if enough or view.time_s >= self._until_s:
                 self.stop()

@@ -54,7 +54,7 @@ class ObstacleAided:
     """Speed along the path by look-ahead, with every joint."""
 
     class Settings(FileStruct, frozen=True, kw_only=True):
-        """Look-ahead l = lead_s (v_wanted - v) + integral; its bound is the most that the body is pushed."""
+        """Look-ahead l = lead_s (v_wanted - v) + integral; its bound limits how hard the body is pushed."""
 
         lead_s: Annotated[float, Meta(ge=0, le=5, extra_json_schema={"unit": "s"})] = 0.2
         integral_per_s: Annotated[float, Meta(ge=0, le=50, extra_json_schema={"unit": "1/s"})] = 0.4
@@ -97,7 +97,7 @@ class ObstacleAided:
         self._torques_nm = np.zeros(len(robot.joints))
         self._unit_nm = np.zeros(len(robot.joints))
         self._last_push: PushSnapshot | None = None
-        self._most_n = self._force_n = 0.0  # what contacts and torques allow, and what is commanded of it
+        self._max_force_n = self._force_n = 0.0  # what contacts and torques allow, and what is commanded of it
         self._moved_at_s = self._slow_at_s = 0.0
         self._waits = False
         self._search = ContactSearch(
@@ -120,8 +120,8 @@ class ObstacleAided:
         if located.speed_m_s * wanted_m_s < AS_WANTED * wanted_m_s**2:
             self._slow_at_s = view.time_s
         goes = view.time_s - self._slow_at_s > STANDS_S  # whatever carries it: it has no push to look for
-        stands = abs(located.speed_m_s) < STANDS_M_S or (self._most_n < POWERLESS_N and not goes)
-        if self._search.decide(view, stands=stands, most_n=self._most_n):
+        stands = abs(located.speed_m_s) < STANDS_M_S or (self._max_force_n < POWERLESS_N and not goes)
+        if self._search.decide(view, stands=stands, max_force_n=self._max_force_n):
             return self._undulate(view)
         scale = self._set.push_scale * self._sign(view.time_s)
         ahead_m = self._look_ahead_m(located, view.period_s)
@@ -159,7 +159,7 @@ class ObstacleAided:
         told, class_of_stall = [], "standing still: backing out along its own path"
         if found is not None:
             told = push_points(self._body, found.world, found.touches, found.push, force_n)
-            class_of_stall = why_it_stands(found.touches, found.push, force_n, self._most_n)
+            class_of_stall = why_it_stands(found.touches, found.push, force_n, self._max_force_n)
         why = class_of_stall if stands and found is not None else ""
         return Report(
             why=why,
@@ -171,17 +171,17 @@ class ObstacleAided:
             bending_torque_nm=self._torques_nm.tolist(),
             reference_rad=reference.tolist(),
             torque_headroom_nm=self._set.largest_torque_nm - float(np.abs(self._torques_nm).max()),
-            saturated=0.0 < self._most_n <= force_n,
+            saturated=0.0 < self._max_force_n <= force_n,
             jammed=why.startswith("jam"),
         )
 
     def _look_ahead_m(self, located: Located, period_s: float) -> float:
-        most = self._set.largest_look_ahead_m
+        largest_m = self._set.largest_look_ahead_m
         wanted_m_s = located.trajectory.speed_m_s
         error_m_s = wanted_m_s - located.speed_m_s
         self._integral_m += self._set.integral_per_s * error_m_s * period_s
-        self._integral_m = min(max(self._integral_m, -most), most)
-        return min(max(self._integral_m + self._set.lead_s * error_m_s, -most), most)
+        self._integral_m = min(max(self._integral_m, -largest_m), largest_m)
+        return min(max(self._integral_m + self._set.lead_s * error_m_s, -largest_m), largest_m)
 
     def _push_nm(self, located: Located, turns_per_m: Floats, period_s: float) -> Floats:
         """Torques of the wanted force along the path, by the contacts that the body has, (n_joints,)."""
@@ -195,8 +195,8 @@ class ObstacleAided:
         self._push_n = min(max(self._push_n, 0.0), config.largest_push_n)
         force_n = min(max(self._push_n + config.push_ns_m * error, 0.0), config.largest_push_n)
         self._look(located, turns_per_m)
-        self._push_n = min(self._push_n, self._most_n)  # who cannot push stores no force up for later
-        self._force_n = force_n = min(force_n, self._most_n)
+        self._push_n = min(self._push_n, self._max_force_n)  # who cannot push stores no force up for later
+        self._force_n = force_n = min(force_n, self._max_force_n)
         keep = np.exp(-period_s / config.torque_filter_s)
         self._torques_nm = keep * self._torques_nm + (1 - keep) * force_n * self._unit_nm
         bound = config.largest_torque_nm
@@ -213,12 +213,12 @@ class ObstacleAided:
         )
         push = push_forward(located.nodes_w, touches, turns_per_m[self._bends], loose_m=config.loose_m)
         self._last_push = PushSnapshot(located.world, touches, push)
-        self._unit_nm, self._most_n = np.zeros(len(self._robot.joints)), 0.0
+        self._unit_nm, self._max_force_n = np.zeros(len(self._robot.joints)), 0.0
         largest = float(push.lambdas.max(initial=0.0))
         if push.rest < LARGEST_REST and largest > 0.0:  # a body bent into a U has hardly any drag, and needs no push
             self._unit_nm[self._bends] = push.torques_nm
-            most = float(np.abs(push.torques_nm).max(initial=0.0)) + 1e-9
-            self._most_n = min(config.largest_torque_nm / most, config.largest_contact_n / largest)
+            largest_nm = float(np.abs(push.torques_nm).max(initial=0.0)) + 1e-9
+            self._max_force_n = min(config.largest_torque_nm / largest_nm, config.largest_contact_n / largest)
 
     def _rest(self, view: View) -> Action:
         """At speed 0 every joint stays where it is, and nothing pushes."""

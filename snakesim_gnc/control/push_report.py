@@ -33,13 +33,13 @@ def push_points(body: PlanarBody, world: World, touches: Touches, push: Push, fo
     return told[:MAX_REPORTED]
 
 
-def why_it_stands(touches: Touches, push: Push, force_n: float, most_n: float) -> str:
-    """The class of a stall. force_n: wanted along the body; most_n: what torques and contacts allow."""
+def why_it_stands(touches: Touches, push: Push, force_n: float, max_force_n: float) -> str:
+    """The class of a stall. force_n: wanted along the body; max_force_n: what torques and contacts allow."""
     if not len(touches):
         return "standing still: no obstacle is near enough to push off"
     if not push.balanced:
         beside = "the obstacle" if len(touches) == 1 else f"the {len(touches)} obstacles"
         return f"standing still: contacts lost, {beside} beside the body cannot push it forward"
-    if force_n >= most_n:
-        return f"standing still: torques and contacts allow no more than {most_n:.1f} N along the body"
+    if force_n >= max_force_n:
+        return f"standing still: torques and contacts allow no more than {max_force_n:.1f} N along the body"
     return f"jam: stands still although it pushes with {force_n:.1f} N along the body"

@@ -228,17 +228,17 @@ def _pushes(body: Body) -> list[Push]:
 def _fewest(columns: Floats, right: Floats) -> tuple[Floats, Floats]:
     """Amounts >= 0 of few columns that explain the right side up to noise of deviation 1, and their covariance.
 
-    The most telling columns enter one after another, but for the first, which is always considered. Then those go of
-    which the rest can do without.
+    Forward selection by gradient, with the first column always active; then columns that the others can replace are
+    dropped again.
     """
     amounts, active = np.zeros(columns.shape[1]), [0]
     lengths = np.linalg.norm(columns, axis=0) + 1e-12
     for _ in range(MAX_STEPS):
         active = _nonnegative(columns, right, amounts, active)
-        telling = columns.T @ (right - columns @ amounts) / lengths
-        telling[active] = 0.0
-        best = int(np.argmax(telling))
-        if telling[best] < LIKELY:
+        gradient = columns.T @ (right - columns @ amounts) / lengths
+        gradient[active] = 0.0
+        best = int(np.argmax(gradient))
+        if gradient[best] < LIKELY:
             break
         active.append(best)
     while True:

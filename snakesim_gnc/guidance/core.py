@@ -55,7 +55,7 @@ class WorldModel:
                 for c in felt
                 if c.link < len(origins)
             ],
-            obstacles=self._near(origins),
+            obstacles=self._obstacles_nearby(origins),
             pose_stamp_ns=pose.stamp_ns,
             contacts_stamp_ns=None if contacts is None else contacts.stamp_ns,
             centre_w=(x, y, z),
@@ -70,7 +70,7 @@ class WorldModel:
         best = min(gaps, key=lambda i: gaps[i], default=None)
         return self._known[best].name if best is not None and gaps[best] < 0.03 else None
 
-    def _near(self, origins: np.ndarray) -> list[Obstacle]:
+    def _obstacles_nearby(self, origins: np.ndarray) -> list[Obstacle]:
         if not self._known:
             return []
         gaps = np.hypot(

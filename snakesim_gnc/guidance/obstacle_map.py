@@ -47,9 +47,9 @@ class ObstacleMap:
         """The robot's position has become less certain by this variance, and with it all that was mapped before."""
         self._drift_m2 += variance_m2
 
-    def told(self, now_ns: int, ground_z_m: float) -> list[Obstacle]:
-        """Obstacles that are believed in."""
-        return [t.told(now_ns, ground_z_m) for t in self.tracks if t.believed(now_ns) > BELIEVED]
+    def obstacles(self, now_ns: int, ground_z_m: float) -> list[Obstacle]:
+        """The obstacles with enough evidence."""
+        return [t.obstacle(now_ns, ground_z_m) for t in self.tracks if t.believed(now_ns) > BELIEVED]
 
     def take_scan(self, scan: Scan, sd_m: float = 0.0) -> None:
         """Take in a look. sd_m: of the sensor's position against the map."""

@@ -138,7 +138,7 @@ class PerceivedWorld:
             base_orientation_wxyz=quaternion_of(base.rotation),
             base_confidence=1.0 / (1.0 + (here.position_sd_m / SURE_SD_M) ** 2),
             contacts=told,
-            obstacles=self.map.told(now_ns, base.z_m - self._radius_m),
+            obstacles=self.map.obstacles(now_ns, base.z_m - self._radius_m),
             pose_stamp_ns=here.pose_stamp_ns,
             contacts_stamp_ns=None if contacts is None else contacts.stamp_ns,
             centre_w=(x, y, z),

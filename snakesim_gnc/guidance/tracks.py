@@ -67,7 +67,7 @@ class Track:
         """Log odds that it is there, now."""
         return self.log_odds * math.exp(-max(now_ns - self.last_seen_ns, 0) * 1e-9 / MEMORY_S)
 
-    def told(self, now_ns: int, ground_z_m: float) -> Obstacle:
+    def obstacle(self, now_ns: int, ground_z_m: float) -> Obstacle:
         """As a message."""
         height = max(self.top_m, UNKNOWN_HEIGHT_M)
         x, y = self.centre_w.tolist()

@@ -117,9 +117,9 @@ class RangeSensor(Mounted, frozen=True, kw_only=True):
             )
 
 
-def _check_range(least_m: float, most_m: float) -> None:
-    if least_m >= most_m:
-        raise ValueError(f"`range_min_m` = {least_m:g} m must be below `range_max_m` = {most_m:g} m")
+def _check_range(min_m: float, max_m: float) -> None:
+    if min_m >= max_m:
+        raise ValueError(f"`range_min_m` = {min_m:g} m must be below `range_max_m` = {max_m:g} m")
 
 
 AnySensor = ContactSensor | ImuSensor | PoseSensor | PowerSensor | DepthCamera | RangeSensor

@@ -346,8 +346,8 @@ class Authority:
         return self._uniform(Mode.POSITION, self._halt.target_rad)
 
     def _uniform(self, mode: Mode, target: gate.Floats) -> Applied:
-        most_nm = self.limits.torque_nm * self._derating.share
-        return Applied(np.full(len(target), int(mode), dtype=np.int64), target, most_nm)
+        limit_nm = self.limits.torque_nm * self._derating.share
+        return Applied(np.full(len(target), int(mode), dtype=np.int64), target, limit_nm)
 
     def _go(self, event: lifecycle.Event, why: str) -> bool:
         """Make a transition; False when the event is not allowed in this state."""

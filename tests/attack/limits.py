@@ -13,7 +13,7 @@ def beyond_limits(robot: dict[str, Any], applied: list[dict[str, Any]]) -> list[
     period_s, before = robot["period_ns"] * 1e-9, None
     for row in applied:
         for i, joint in enumerate(robot["joints"]):
-            mode, target, most_nm = row["mode"][i], row["target"][i], row["torque_limit_nm"][i]
+            mode, target, limit_nm = row["mode"][i], row["target"][i], row["torque_limit_nm"][i]
             where = f"tick {row['tick']}, {joint['name']}"
             low, high = {
                 PASSIVE: (-1e9, 1e9),
@@ -23,8 +23,8 @@ def beyond_limits(robot: dict[str, Any], applied: list[dict[str, Any]]) -> list[
             }[mode]
             if not low - ROUNDING <= target <= high + ROUNDING:
                 found.append(f"{where}: target {target:g} in mode {mode}, allowed are {low:g} to {high:g}")
-            if not 0 <= most_nm <= joint["torque_limit_nm"] + ROUNDING:
-                found.append(f"{where}: torque limit {most_nm:g}, at most {joint['torque_limit_nm']:g}")
+            if not 0 <= limit_nm <= joint["torque_limit_nm"] + ROUNDING:
+                found.append(f"{where}: torque limit {limit_nm:g}, at most {joint['torque_limit_nm']:g}")
             if before is not None and before["tick"] == row["tick"] - 1 and before["mode"][i] == mode == POSITION:
                 # A joint that is pushed takes the target along, by as much as a target may be away from it.
                 step = abs(target - before["target"][i])

@@ -118,8 +118,8 @@ class ObstacleTriplet:
         if before is None or located.anew:
             body_pose = located.on_path.at(s)
         else:
-            most_m = max(located.trajectory.speed_m_s, 0.0) * set_.overspeed_share * view.period_s
-            followed = min(max(before.tail_s_m, s - set_.slack_m), s + set_.slack_m, before.tail_s_m + most_m)
+            max_advance_m = max(located.trajectory.speed_m_s, 0.0) * set_.overspeed_share * view.period_s
+            followed = min(max(before.tail_s_m, s - set_.slack_m), s + set_.slack_m, before.tail_s_m + max_advance_m)
             body_pose = located.on_path.at(max(followed, s - set_.brake_m))
         reference = self._body.all_angles(body_pose)
         if not len(self._reference):

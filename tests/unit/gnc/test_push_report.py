@@ -50,7 +50,7 @@ def test_the_told_forces_push_the_body_with_the_force_that_is_wanted() -> None:
 
 
 @pytest.mark.parametrize(
-    ("pegs", "force_n", "most_n", "words"),
+    ("pegs", "force_n", "max_force_n", "words"),
     [
         ((), 5.0, 0.0, "no obstacle is near enough to push off"),
         ((peg("a", 0.3, -1),), 5.0, 0.0, "contacts lost, the obstacle beside the body cannot push it forward"),
@@ -58,5 +58,5 @@ def test_the_told_forces_push_the_body_with_the_force_that_is_wanted() -> None:
         ((peg("a", 0.3, -1), peg("b", 0.6, 1), peg("c", 0.9, -1)), 9.0, 30.0, "jam: stands still although it pushes"),
     ],
 )
-def test_a_stall_has_a_class(pegs: tuple[Obstacle, ...], force_n: float, most_n: float, words: str) -> None:
-    assert words in why_it_stands(*pushing(seen(*pegs)), force_n, most_n)
+def test_a_stall_has_a_class(pegs: tuple[Obstacle, ...], force_n: float, max_force_n: float, words: str) -> None:
+    assert words in why_it_stands(*pushing(seen(*pegs)), force_n, max_force_n)

@@ -210,7 +210,7 @@ def test_a_position_loop_run_once_a_step_moves_it_as_the_simulator_s_own_motors_
     config = make_config({"chain": {"modules": 6}}, rate_hz=1000)
     plant, run = make_plant(config), Run(config, timestep_s=0.001)
     firmware = Firmware(config, plant.step_s)
-    worst_rad, worst_nm, most_rad, most_nm = 0.0, 0.0, 0.0, 0.0
+    worst_rad, worst_nm, max_rad, max_nm = 0.0, 0.0, 0.0, 0.0
     for k in range(1000):
         target = np.array([0.1 * np.sin(0.0063 * k - 0.8 * i) - 0.1 * np.sin(-0.8 * i) for i in range(6)])
         run.command(Mode.POSITION, target.tolist())
@@ -219,11 +219,11 @@ def test_a_position_loop_run_once_a_step_moves_it_as_the_simulator_s_own_motors_
         state = run.sim.true_state()
         worst_rad = max(worst_rad, np.abs(plant.angle_rad - state.angles_rad).max())
         worst_nm = max(worst_nm, np.abs(firmware.torque_nm - state.torques_nm).max())
-        most_rad = max(most_rad, np.abs(state.angles_rad).max())
-        most_nm = max(most_nm, np.abs(state.torques_nm).max())
-    assert most_rad > 0.1
-    assert worst_rad < 1e-3 * most_rad
-    assert worst_nm < 0.03 * most_nm
+        max_rad = max(max_rad, np.abs(state.angles_rad).max())
+        max_nm = max(max_nm, np.abs(state.torques_nm).max())
+    assert max_rad > 0.1
+    assert worst_rad < 1e-3 * max_rad
+    assert worst_nm < 0.03 * max_nm
     assert plant.pose().position_w == pytest.approx(run.sim.true_state().base_position_w, abs=1e-4)
 
 

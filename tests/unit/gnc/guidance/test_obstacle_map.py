@@ -38,7 +38,7 @@ def touch(map_, centre, radius_m, angle_rad, stamp_ns=0) -> None:
 
 
 def only(map_, now_ns=0) -> Obstacle:
-    (told,) = map_.told(now_ns, 0.0)
+    (told,) = map_.obstacles(now_ns, 0.0)
     return told
 
 
@@ -51,7 +51,7 @@ def test_what_is_seen_again_and_again_is_believed_more():
 
 
 def test_the_message_holds_what_is_told():
-    told = mapped(cylinder("a", 0.8, 0.3), box("b", 0.9, -0.3, (0.2, 0.1))).told(0, 0.0)
+    told = mapped(cylinder("a", 0.8, 0.3), box("b", 0.9, -0.3, (0.2, 0.1))).obstacles(0, 0.0)
     world = World(
         tick=0,
         stamp_ns=0,
@@ -88,25 +88,25 @@ def test_a_touch_of_what_is_seen_makes_no_second_one_and_keeps_its_name():
 def test_an_unexplained_touch_is_something_new():
     map_ = mapped(cylinder("a", 0.8, 0.0))
     touch(map_, (0.8, 0.4), 0.05, 3.0)
-    assert len(map_.told(0, 0.0)) == 2
+    assert len(map_.obstacles(0, 0.0)) == 2
 
 
 def test_what_one_can_see_through_is_dropped():
     map_ = mapped(cylinder("ghost", 0.6, 0.0), cylinder("real", 0.8, 0.4))
     for k in range(8):
         map_.take_scan(scan_of(cylinder("real", 0.8, 0.4), box("behind", 2.0, 0.0, (0.1, 1.5)), stamp_ns=k))
-    assert all(math.dist(o.position_w[:2], (0.6, 0.0)) > 0.3 for o in map_.told(0, 0.0))
-    assert any(math.dist(o.position_w[:2], (0.8, 0.4)) < 0.01 for o in map_.told(0, 0.0))
+    assert all(math.dist(o.position_w[:2], (0.6, 0.0)) > 0.3 for o in map_.obstacles(0, 0.0))
+    assert any(math.dist(o.position_w[:2], (0.8, 0.4)) < 0.01 for o in map_.obstacles(0, 0.0))
 
 
 def test_what_is_hidden_or_out_of_view_is_kept():
     map_ = mapped(cylinder("a", 1.2, 0.0))
     for k in range(20):
         map_.take_scan(scan_of(box("screen", 0.5, 0.0, (0.05, 0.8)), stamp_ns=k))
-    assert any(math.dist(o.position_w[:2], (1.2, 0.0)) < 0.01 for o in map_.told(0, 0.0))
+    assert any(math.dist(o.position_w[:2], (1.2, 0.0)) < 0.01 for o in map_.obstacles(0, 0.0))
     for k in range(20):
         map_.take_scan(scan_of(at=(2.0, 0.0), stamp_ns=k))
-    assert any(math.dist(o.position_w[:2], (1.2, 0.0)) < 0.01 for o in map_.told(0, 0.0))
+    assert any(math.dist(o.position_w[:2], (1.2, 0.0)) < 0.01 for o in map_.obstacles(0, 0.0))
 
 
 def test_what_the_body_passes_through_does_not_exist():
@@ -114,7 +114,7 @@ def test_what_the_body_passes_through_does_not_exist():
     for k in range(40):
         axis = np.column_stack([np.linspace(0, 0.02 * k, 50), np.zeros(50)])
         map_.take_body(axis, BODY_M)
-    told = map_.told(0, 0.0)
+    told = map_.obstacles(0, 0.0)
     assert len(told) == 1 and math.dist(told[0].position_w[:2], (0.6, 0.3)) < 0.01
 
 

@@ -30,8 +30,8 @@ def scored(drive: Drive, turns: int, *, pose: bool = True) -> MapScore:
 
 
 def test_a_field_is_mapped_to_millimetres():
-    total = scored(Drive(random_field(1)), 300)
-    assert len(total.position_m) > 60 and total.visible > 20
+    total = scored(Drive(random_field(1)), 200)
+    assert len(total.position_m) > 30 and total.visible > 20
     assert np.median(total.position_m) < 0.005 and np.median(total.surface_m) < 0.003
     assert total.misses <= 0.05 * total.visible and total.ghosts <= 0.02 * total.told
     assert np.median(total.in_sd) < 1.5 and np.percentile(total.in_sd, 90) < 3.5  # as sure as it may be

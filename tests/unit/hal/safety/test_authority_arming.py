@@ -34,6 +34,20 @@ def test_the_way_to_armed() -> None:
     assert answer.ok and answer.lifecycle == "armed" and rig.authority.arming == 1
 
 
+def test_a_command_before_any_lease_is_rejected() -> None:
+    assert Rig().send() == "no_lease"
+
+
+def test_a_stopped_robot_is_armed_only_after_a_clear_and_says_so() -> None:
+    rig = Rig()
+    rig.authority.on_estop(ESTOP, rig.tick)
+    assert "state is estop, must be disarmed; first `snakesim clear`" in rig.arm().reason
+    assert rig.authority.on_lifecycle(CLEAR, rig.now_ns).ok
+    rig.authority.fault(Fault(tick=rig.tick, what="test", cause="test"))
+    assert "state is fault, must be disarmed; first `snakesim clear`" in rig.arm().reason
+    assert "snakesim clear" not in armed().arm().reason
+
+
 @pytest.mark.parametrize(
     ("request_", "words"),
     [

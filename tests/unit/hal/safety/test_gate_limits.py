@@ -352,6 +352,32 @@ def test_a_joint_near_its_end_is_said_to_be_bound_by_its_angle() -> None:
     assert words == dict.fromkeys(range(JOINTS), "acceleration")
 
 
+BRAKED = stoppable_speed(1.5 - 1.45, 100.0, 0.01)  # the maximum speed there: below the speed limit of 5 rad/s
+
+
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize(
+    ("angle", "wanted", "speed_limit", "word"),
+    [
+        (1.45, BRAKED - 0.1, 5.0, "acceleration"),
+        (1.45, BRAKED, 5.0, "acceleration"),
+        (1.45, BRAKED + 0.1, 5.0, "angle"),
+        (1.45, BRAKED + 0.1, BRAKED, "speed"),
+        (0.0, 20.0, 5.0, "speed"),
+    ],
+)
+def test_the_tightest_limit_is_the_one_that_is_named(
+    side: int, angle: float, wanted: float, speed_limit: float, word: str
+) -> None:
+    joints = [msgspec.structs.replace(joint, speed_limit_rad_s=speed_limit) for joint in ROBOT.joints]
+    robot = msgspec.structs.replace(ROBOT, joints=joints)
+    measured = Measured(np.full(JOINTS, side * angle), np.zeros(JOINTS), np.zeros(JOINTS))
+    applied = Applied(np.full(JOINTS, int(Mode.VELOCITY)), np.zeros(JOINTS), LIMITS.torque_nm)
+    asked, limits = command(robot, side * wanted, Mode.VELOCITY), JointLimits.of(robot)
+    words = why_limited(asked, applied, measured=measured, limits=limits, share=COOL)
+    assert words == dict.fromkeys(range(JOINTS), word)
+
+
 @pytest.mark.parametrize("velocity", [-3.0, 0.0, 3.0])
 def test_at_its_end_a_joint_needs_no_torque_to_stay_or_to_leave(velocity: float) -> None:
     """Outwards nothing, and inwards only what brakes a joint that still goes outwards."""
