@@ -89,9 +89,11 @@ def score(scenario: str, *settings: str, seconds: float = 5.0, with_pose: bool =
         robot = run.host.description
     nothing = Imu(tick=0, stamp_ns=0, link=[], angular_velocity_rad_s=[], acceleration_m_s2=[])
     for samples, true in seen:
-        imu, pose, told = samples.others.get(keys.IMU, nothing), samples.others.get(keys.POSE), samples.joints
+        imu, pose, reported = samples.others.get(keys.IMU, nothing), samples.others.get(keys.POSE), samples.joints
         assert isinstance(imu, Imu) and isinstance(pose, Pose | None)
-        felt = estimate(robot, told.angle_rad, told.velocity_rad_s, told.torque_nm, imu, pose if with_pose else None)
+        felt = estimate(
+            robot, reported.angle_rad, reported.velocity_rad_s, reported.torque_nm, imu, pose if with_pose else None
+        )
         result.add(true, pushes(robot, felt))
     return result
 
@@ -117,13 +119,13 @@ def true_pushes(robot: Description, truth: TrueState) -> list[Push]:
     return together(found)
 
 
-def felt_pushes(robot: Description, told: Contacts) -> list[Push]:
+def felt_pushes(robot: Description, reported: Contacts) -> list[Push]:
     """The contacts that sensors tell of."""
     starts = np.append(0.0, np.cumsum([link.length_m for link in robot.links]))
     return together(
         [
             (float(starts[c.link]) + c.position_l[0], 1 if c.position_l[1] > 0 else -1, float(np.hypot(*c.force_l[:2])))
-            for c in told.contacts
+            for c in reported.contacts
         ]
     )
 

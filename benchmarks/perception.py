@@ -27,7 +27,7 @@ from snakesim_operator.run.in_process import simulate
 HOW = ("robot=planar13_camera", "controller=path_following", "control.look_ahead_m=0.1", 'mission.map="perceived"')
 HEADER = (
     "| scene, runs | sensors | position, median (90 %) | facing side | misses | ghosts | error / sd "
-    "| place off, at the end | told sd | CPU an image, median (95 %) |\n|---|---|---|---|---|---|---|---|---|---|"
+    "| place off, at the end | reported sd | CPU an image, median (95 %) |\n|---|---|---|---|---|---|---|---|---|---|"
 )
 
 
@@ -36,13 +36,13 @@ class PoseBlind(Guidance):
 
     def outputs(self, clock: Clock) -> list[tuple[str, Message]] | None:
         """With the stamp that control waits for."""
-        told = super().outputs(clock)
+        reported = super().outputs(clock)
         return (
             None
-            if told is None
+            if reported is None
             else [
                 (key, msgspec.structs.replace(m, pose_stamp_ns=m.stamp_ns) if isinstance(m, World) else m)
-                for key, m in told
+                for key, m in reported
             ]
         )
 
@@ -113,9 +113,9 @@ def add_up(record: RunRecord, total: MapScore, *, pose: bool) -> tuple[float, fl
         real = (*record.position_w[row, :2].tolist(), heading(record.orientation_wxyz[row].tolist()))
         thought = (*world.base_position_w[:2], heading(world.base_orientation_wxyz))
         off_m = math.dist(real[:2], thought[:2])
-        told = world.obstacles if pose else moved(world.obstacles, thought, real)
+        reported = world.obstacles if pose else moved(world.obstacles, thought, real)
         along = nodes[-1] - nodes[-2]
-        total.add(score(told, truth, nodes[-1], math.atan2(along[1], along[0])))
+        total.add(score(reported, truth, nodes[-1], math.atan2(along[1], along[0])))
     return off_m, record.worlds[-1].base_position_sd_m or 0.0
 
 
@@ -134,7 +134,7 @@ def row(name: str, pose: bool, total: MapScore, off: list[float], sds: list[floa
     sensors = "camera, touch, pose" if pose else "camera, touch, IMU"
     return (
         f"| {name} | {sensors} | {mm(total.position_m, 50)} ({mm(total.position_m, 90)}) | {mm(total.surface_m, 50)} "
-        f"| {total.misses} of {total.visible} | {total.ghosts} of {total.told} | {np.median(total.in_sd):.2f} "
+        f"| {total.misses} of {total.visible} | {total.ghosts} of {total.reported} | {np.median(total.in_sd):.2f} "
         f"| {mm(off, 50)} | {mm(sds, 50)} | {cpu[0]:.1f} ms ({cpu[1]:.1f} ms) |"
     )
 

@@ -57,7 +57,7 @@ class HostRecord(msgspec.Struct, frozen=True, kw_only=True):
     ended: Ending = "complete"
     ended_why: str = ""  # unless complete
     lost_ticks: int = 0  # missing from the black box on disk
-    trouble: str = ""  # which files could not be written, and why
+    failure: str = ""  # which files could not be written, and why
     faults_left_out: int = 0  # of `faults`, in the middle
     injected: list[str] = []  # injected faults, each begin and end
     requests: list[str] = []  # to arm, disarm, clear, finish or stop: by whom, and the result
@@ -156,7 +156,7 @@ def backend_settings(config: RunConfig, factory: BackendFactory) -> Any:
     return plugin_settings(factory, config.backend_settings, f"scenario {config.name!r}", config.backend_section)
 
 
-def record_of(host: Host, *, lost_ticks: int = 0, trouble: str = "") -> HostRecord:
+def record_of(host: Host, *, lost_ticks: int = 0, failure: str = "") -> HostRecord:
     """The host's present statistics. Called from another thread than its loop, which updates each value atomically."""
     statistics, authority = host.statistics, host.authority
     return HostRecord(
@@ -176,7 +176,7 @@ def record_of(host: Host, *, lost_ticks: int = 0, trouble: str = "") -> HostReco
         ended=host.ended,
         ended_why=host.ended_why,
         lost_ticks=lost_ticks,
-        trouble=trouble,
+        failure=failure,
         injected=list(host.faults.noted),
         requests=list(host.requests),
         isolated=authority.isolated,

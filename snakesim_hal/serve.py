@@ -102,13 +102,13 @@ class StartupWait:
     def __init__(self, name: str, what: str) -> None:
         self._name, self._what = name, what
         self._began = time.monotonic()
-        self._told = self._began - TELL_S
+        self._shown_at = self._began - TELL_S
 
     def goes_on(self) -> bool:
         """Whether to try again; call it after each try that failed."""
         now = time.monotonic()
-        if now - self._told >= TELL_S:
-            self._told = now
+        if now - self._shown_at >= TELL_S:
+            self._shown_at = now
             complain(f"{self._name}: waiting for {self._what}")
         return now - self._began < START_LIMIT_S
 

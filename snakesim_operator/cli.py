@@ -61,12 +61,12 @@ def _act(given: list[str]) -> int:
     return arguments.act(arguments)
 
 
-def _refuse(word: str, told: argparse.ArgumentParser) -> None:
+def _refuse(word: str, parser: argparse.ArgumentParser) -> None:
     """Raise ConfigError for a word on the command line that means nothing to its command."""
-    options = [option for action in told._actions for option in action.option_strings]
+    options = [option for action in parser._actions for option in action.option_strings]
     meant = did_you_mean(word.partition("=")[0], options) if word.startswith("-") else ""
     raise ConfigError(
-        f"{told.prog.removeprefix('snakesim ')}: unknown argument {short(word)!r}; {meant}see `{told.prog} --help`"
+        f"{parser.prog.removeprefix('snakesim ')}: unknown argument {short(word)!r}; {meant}see `{parser.prog} --help`"
     )
 
 
@@ -75,9 +75,9 @@ class Command(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """End, with one line instead of the whole usage."""
-        told = re.sub(r"invalid float value: (.*)", r"\1 is not a number; give it without a unit", message)
-        told = re.sub(r"invalid int value: (.*)", r"\1 is not a whole number; give it without a unit", told)
-        complain(f"{self.prog}: {told}; see `{self.prog} --help`")
+        plain = re.sub(r"invalid float value: (.*)", r"\1 is not a number; give it without a unit", message)
+        plain = re.sub(r"invalid int value: (.*)", r"\1 is not a whole number; give it without a unit", plain)
+        complain(f"{self.prog}: {plain}; see `{self.prog} --help`")
         sys.exit(BAD_INPUT)
 
 

@@ -58,13 +58,15 @@ class Tab:
             self._note(answer)
 
     def _note(self, event: dict[str, Any]) -> None:
-        kind, told = event.get("method"), event.get("params", {})
+        kind, reported = event.get("method"), event.get("params", {})
         if kind == "Runtime.exceptionThrown":
-            self.errors.append(str(told["exceptionDetails"].get("exception", told["exceptionDetails"]))[:500])
-        elif kind == "Log.entryAdded" and told["entry"]["level"] == "error":
-            self.errors.append(f"{told['entry']['text']} {told['entry'].get('url', '')}"[:500])
-        elif kind == "Runtime.consoleAPICalled" and told["type"] == "error":
-            self.errors.append(" ".join(str(part.get("value", part.get("description"))) for part in told["args"])[:500])
+            self.errors.append(str(reported["exceptionDetails"].get("exception", reported["exceptionDetails"]))[:500])
+        elif kind == "Log.entryAdded" and reported["entry"]["level"] == "error":
+            self.errors.append(f"{reported['entry']['text']} {reported['entry'].get('url', '')}"[:500])
+        elif kind == "Runtime.consoleAPICalled" and reported["type"] == "error":
+            self.errors.append(
+                " ".join(str(part.get("value", part.get("description"))) for part in reported["args"])[:500]
+            )
 
     def value(self, script: str) -> Any:
         """The value of a JavaScript expression."""

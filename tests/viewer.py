@@ -57,8 +57,8 @@ class Viewer:
         """Tell the console that a batch has been shown, if it asks."""
         for message in batch:
             if message["type"] == ASKED:
-                told = {"value": None, "error": None, "request_uuid": message["request_uuid"]}
-                await self._say({"type": "LocalStorageGetItemResponseMessage", **told})
+                reported = {"value": None, "error": None, "request_uuid": message["request_uuid"]}
+                await self._say({"type": "LocalStorageGetItemResponseMessage", **reported})
 
     async def watch(self) -> None:
         """Show all that comes, until the connection ends."""

@@ -47,16 +47,16 @@ class Run:
     @property
     def states(self) -> list[str]:
         """As control told them."""
-        return [state.state for state in self._told()]
+        return [state.state for state in self._reported()]
 
     @property
     def reasons(self) -> list[str]:
         """As control told them."""
-        return [state.reason for state in self._told()]
+        return [state.reason for state in self._reported()]
 
-    def _told(self) -> list[Any]:
-        told = [state for state in self.record.control if state.tick in range(len(self.reports))]
-        by_tick = {state.tick: state for state in told}
+    def _reported(self) -> list[Any]:
+        reported = [state for state in self.record.control if state.tick in range(len(self.reports))]
+        by_tick = {state.tick: state for state in reported}
         now = by_tick[0]
         return [now := by_tick.get(tick, now) for tick in range(len(self.reports))]
 

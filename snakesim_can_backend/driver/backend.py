@@ -134,14 +134,14 @@ class CanBackend:
             self._remind(lifecycle)
         elif lifecycle == "armed":
             self._arming = Arming(self._reading.sync)
-        told = commands.on_change(self._lifecycle, lifecycle)
-        for frame in told:
+        frames = commands.on_change(self._lifecycle, lifecycle)
+        for frame in frames:
             if not commands.is_arming(frame):
                 self._broadcast(frame)  # stop and disarm first: the rest may take a while
         back = self._isolate(set_points.isolated)
         if lifecycle not in commands.LATCHED and (back or self._lifecycle in commands.LATCHED):
             self._cleared(back)  # before the arm command: parameters are written while motors are off
-        if any(map(commands.is_arming, told)) and not self._unconfigured - self._isolated:
+        if any(map(commands.is_arming, frames)) and not self._unconfigured - self._isolated:
             self._arm()
         self._lifecycle = lifecycle
         if lifecycle != "armed":

@@ -73,8 +73,8 @@ def on_change(before: LifecycleState, now: LifecycleState) -> list[Frame]:
         return [emergency()]
     if before == "armed":
         return [command(Action.STOP if now == "fault" else Action.DISARM)]
-    told = [command(Action.CLEAR)] if before in LATCHED and now not in LATCHED else []
-    return [*told, command(Action.ARM)] if now == "armed" else told
+    first = [command(Action.CLEAR)] if before in LATCHED and now not in LATCHED else []
+    return [*first, command(Action.ARM)] if now == "armed" else first
 
 
 def reminder(lifecycle: LifecycleState, state: ModuleState, node: int) -> Frame | None:

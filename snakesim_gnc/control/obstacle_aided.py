@@ -156,18 +156,18 @@ class ObstacleAided:
         if abs(located.speed_m_s) > STANDS_M_S:
             self._moved_at_s = view.time_s
         stands, found, force_n = view.time_s - self._moved_at_s > STANDS_S, self._last_push, self._force_n
-        told, class_of_stall = [], "standing still: backing out along its own path"
+        points, standing = [], "standing still: backing out along its own path"
         if found is not None:
-            told = push_points(self._body, found.world, found.touches, found.push, force_n)
-            class_of_stall = why_it_stands(found.touches, found.push, force_n, self._max_force_n)
-        why = class_of_stall if stands and found is not None else ""
+            points = push_points(self._body, found.world, found.touches, found.push, force_n)
+            standing = why_it_stands(found.touches, found.push, force_n, self._max_force_n)
+        why = standing if stands and found is not None else ""
         return Report(
             why=why,
-            why_if_still=class_of_stall if view.time_s > STANDS_S else "",
+            why_if_still=standing if view.time_s > STANDS_S else "",
             path_s_m=located.tail_s_m,
             propulsion_n=look_ahead_n + force_n,
-            push_points=told,
-            solved_force_n=[float(np.hypot(*contact.force_w[:2])) for contact in told],
+            push_points=points,
+            solved_force_n=[float(np.hypot(*contact.force_w[:2])) for contact in points],
             bending_torque_nm=self._torques_nm.tolist(),
             reference_rad=reference.tolist(),
             torque_headroom_nm=self._set.largest_torque_nm - float(np.abs(self._torques_nm).max()),

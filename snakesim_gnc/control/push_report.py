@@ -11,7 +11,7 @@ MAX_REPORTED = 64  # push-points in a message
 
 def push_points(body: PlanarBody, world: World, touches: Touches, push: Push, force_n: float) -> list[WorldContact]:
     """The obstacles that are pushed, tail to head, with the wanted forces. world: that the touches were found in."""
-    height, told = world.base_position_w[2], list[WorldContact]()
+    height, points = world.base_position_w[2], list[WorldContact]()
     for k in np.argsort(touches.body_s_m, kind="stable").tolist():
         if push.lambdas[k] <= 0.0:
             continue
@@ -19,7 +19,7 @@ def push_points(body: PlanarBody, world: World, touches: Touches, push: Push, fo
         ahead = 1.0 if touches.tangents_w[k] @ (ny, -nx) > 0.0 else -1.0
         size = float(np.hypot(nx, ny))
         nx, ny, force = nx / size, ny / size, force_n * float(push.lambdas[k]) * size
-        told.append(
+        points.append(
             WorldContact(
                 link=body.link_at(float(touches.body_s_m[k])),
                 obstacle=world.obstacles[int(touches.obstacle[k])].name,
@@ -30,7 +30,7 @@ def push_points(body: PlanarBody, world: World, touches: Touches, push: Push, fo
                 force_w=(force * nx, force * ny, 0.0),
             )
         )
-    return told[:MAX_REPORTED]
+    return points[:MAX_REPORTED]
 
 
 def why_it_stands(touches: Touches, push: Push, force_n: float, max_force_n: float) -> str:

@@ -100,13 +100,13 @@ class Control(Service):
             self._commander.send(clock, joints, action.set_points)
             rests = _why_it_rests(trajectory)
             try:
-                told = self._reports.state(clock, action.report, armed=True, missing=missing, rests=rests)
+                state = self._reports.state(clock, action.report, armed=True, missing=missing, rests=rests)
             except ValueError as error:
                 raise controller.wrong(str(error)) from None
         except ControllerError as error:
             self._client.put(keys.CONTROL_STATE, self._reports.failure(clock, str(error)))
             raise
-        return _state_messages(told)
+        return _state_messages(state)
 
     def _outlook(self, clock: Clock) -> tuple[World | None, Trajectory | None, str]:
         """World and trajectory as far as they are available and fresh, and why they are not."""

@@ -64,7 +64,7 @@ class StateReports:
 
     def _message(self, clock: Clock, state: LocomotionState, reason: str, report: Report) -> ControlState:
         joint = report.propulsion_joint
-        told = ControlState(
+        message = ControlState(
             tick=clock.tick,
             stamp_ns=clock.stamp_ns,
             controller=self._controller,
@@ -84,15 +84,15 @@ class StateReports:
             jammed=report.jammed,
         )
         try:
-            return self._decoder.decode(msgspec.msgpack.encode(told))
+            return self._decoder.decode(msgspec.msgpack.encode(message))
         except (TypeError, msgspec.ValidationError) as error:
-            raise ValueError(_what_is_wrong(told) or str(error)) from None
+            raise ValueError(_what_is_wrong(message) or str(error)) from None
 
 
-def _what_is_wrong(told: ControlState) -> str:
+def _what_is_wrong(message: ControlState) -> str:
     """The field of the report that cannot be sent, with its value."""
     for field in msgspec.structs.fields(ControlState):
-        value = getattr(told, field.name)
+        value = getattr(message, field.name)
         try:
             msgspec.msgpack.decode(msgspec.msgpack.encode(value), type=field.type)
         except msgspec.ValidationError as error:

@@ -1,7 +1,7 @@
 """The world model from sensors alone: pose, contacts, and a map that begins empty. Pure.
 
 Each sample is taken in once, with the body as it was at the sample's own stamp. Nothing is invented: without images the
-map stays as it is and fades, without contacts none are told, without poses the covariance grows.
+map stays as it is and fades, without contacts none are reported, without poses the covariance grows.
 """
 
 import math
@@ -130,14 +130,16 @@ class PerceivedWorld:
         contacts = self._contacts
         felt = [] if contacts is None else [c for c in contacts.contacts if c.link < len(body.origins_w)]
         then = body if contacts is None else here.history.body_at(contacts.stamp_ns) or body
-        told = [contact_w(c, then.origins_w, then.rotations, self._rear_s, self._name_at) for c in felt[:MAX_CONTACTS]]
+        contacts_w = [
+            contact_w(c, then.origins_w, then.rotations, self._rear_s, self._name_at) for c in felt[:MAX_CONTACTS]
+        ]
         return World(
             tick=tick,
             stamp_ns=joints.stamp_ns,
             base_position_w=_vector(base.position_w),
             base_orientation_wxyz=quaternion_of(base.rotation),
             base_confidence=1.0 / (1.0 + (here.position_sd_m / SURE_SD_M) ** 2),
-            contacts=told,
+            contacts=contacts_w,
             obstacles=self.map.obstacles(now_ns, base.z_m - self._radius_m),
             pose_stamp_ns=here.pose_stamp_ns,
             contacts_stamp_ns=None if contacts is None else contacts.stamp_ns,

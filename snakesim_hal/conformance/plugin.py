@@ -212,11 +212,11 @@ class Outcomes:
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         """Store an outcome; with pytest-xdist this runs in the controller process."""
-        told = dict(report.user_properties)
-        if CLAUSE not in told or (report.when != "call" and report.passed):
+        properties = dict(report.user_properties)
+        if CLAUSE not in properties or (report.when != "call" and report.passed):
             return
-        module, _, clause = str(told[CLAUSE]).partition("::")
-        cell = self._rows.setdefault((module, clause), {}).setdefault(str(told[BENCH]), [])
+        module, _, clause = str(properties[CLAUSE]).partition("::")
+        cell = self._rows.setdefault((module, clause), {}).setdefault(str(properties[BENCH]), [])
         if (outcome := _outcome(report)) not in cell:
             cell.append(outcome)
 

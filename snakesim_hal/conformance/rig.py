@@ -37,7 +37,7 @@ class Record:
     """Joint states and set-points over some ticks. All arrays are (ticks, n_joints)."""
 
     samples: list[Samples]
-    told: list[SetPoints]
+    set_points: list[SetPoints]
     faults: list[Fault]  # reported by the backend in these ticks
 
     @property
@@ -82,7 +82,7 @@ class Rig:
         self._sequence = 0
         self._anchor_ns = time.monotonic_ns()
         self._samples: list[Samples] = []
-        self._told: list[SetPoints] = []
+        self._set_points: list[SetPoints] = []
         self.first = self._sample()
         # On a bus the first joint states may take a few periods.
         for _ in range(t.ARMING_PERIODS):
@@ -108,7 +108,7 @@ class Rig:
         """Everything after a tick."""
         first = len(self._samples) - (self.tick - tick)
         faults = [fault for found_at, fault in self._found if found_at >= tick]
-        return Record(self._samples[first:], self._told[first - 1 :], faults)
+        return Record(self._samples[first:], self._set_points[first - 1 :], faults)
 
     def periods(self, seconds: float) -> int:
         """Number of periods in a time, rounded up."""
@@ -121,9 +121,9 @@ class Rig:
         self.backend.enact(points, lifecycle)
         self.let_pass(points)
 
-    def let_pass(self, told: SetPoints | None = None) -> None:
+    def let_pass(self, set_points: SetPoints | None = None) -> None:
         """Let a period pass and sample, as the host does. Faults go to the authority, as in the host."""
-        self._told.append(told or self._told[-1])
+        self._set_points.append(set_points or self._set_points[-1])
         self.backend.advance()
         for fault in self.backend.faults():
             self._found.append((self.tick, fault))

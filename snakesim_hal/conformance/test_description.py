@@ -23,8 +23,8 @@ def test_the_description_is_what_the_robot_file_says(bench: Bench, rig: Rig) -> 
         config_hash=config_hash(config),
     )
     assert [joint.name for joint in robot.joints] == [joint.name for joint in wanted.joints], "names and order"
-    for told, right in zip(robot.joints, wanted.joints, strict=True):
-        assert told == right
+    for joint, expected in zip(robot.joints, wanted.joints, strict=True):
+        assert joint == expected
     assert robot.links == wanted.links
     for name in ("robot", "config_hash", "period_ns", "lease_ns", "max_step_rad", "safe_action"):
         assert getattr(robot, name) == getattr(wanted, name), name

@@ -66,10 +66,10 @@ def test_a_silent_joint_grows_old_and_the_robot_stops(bench: Bench, rig: Rig) ->
         assert all(joints.valid[i] and joints.age_ns[i] <= rig.period_ns for i in others), "the others are fresh"
     assert rig.authority.state == "fault", "the robot goes on with a joint of unknown state"
     must_rest_but_the_muted(rig)
-    told = len(rig.faults)
+    before = len(rig.faults)
     assert all(fault.what and fault.cause for fault in rig.faults)
     rig.idle(t.TRANSPORT_PERIODS)
-    assert len(rig.faults) == told, f"reported again: {rig.faults[told:]}"
+    assert len(rig.faults) == before, f"reported again: {rig.faults[before:]}"
     rig.close()
 
 

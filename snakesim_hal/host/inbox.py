@@ -87,8 +87,8 @@ class Inbox:
         }
         self._services = frozenset(services)
         self.dropped = 0
-        session.on_arrival(keys.JOINT_COMMAND, self._put_sample)
-        session.on_arrival(keys.DONE_ALL, self._put_sample)
+        session.on_urgent_arrival(keys.JOINT_COMMAND, self._put_sample)
+        session.on_urgent_arrival(keys.DONE_ALL, self._put_sample)
         session.on_question(keys.ESTOP, self._put_stop)
         for key in (keys.LEASE, keys.LIFECYCLE, keys.SIMULATOR):
             session.on_question(key, self._put_request)

@@ -132,17 +132,17 @@ class _Once:
         self._then = then
         self._first = threading.Lock()
 
-    def __call__(self, trouble: str | None) -> None:
+    def __call__(self, failure: str | None) -> None:
         if self._first.acquire(blocking=False):  # and never released
-            self._then(trouble)
+            self._then(failure)
 
 
 def replying(reply: Callable[[Answer], None], answer: Answer) -> Callable[[str | None], None]:
     """Reply as soon as the latch is written, and report errors of that."""
 
-    def written(trouble: str | None) -> None:
+    def written(failure: str | None) -> None:
         reply(
-            answer if trouble is None else msgspec.structs.replace(answer, reason=f"{answer.reason}; {trouble}"[:500])
+            answer if failure is None else msgspec.structs.replace(answer, reason=f"{answer.reason}; {failure}"[:500])
         )
 
     return written

@@ -31,8 +31,8 @@ CLOSE_LIMIT_S = 2.0  # for a disk that hangs
 class Numbers(Protocol):
     """Makes a message of the host's statistics, at any time and from any thread."""
 
-    def __call__(self, *, lost_ticks: int, trouble: str) -> msgspec.Struct:
-        """lost_ticks: rows missing from the file for good; trouble: which file cannot be written, and why, or empty."""
+    def __call__(self, *, lost_ticks: int, failure: str) -> msgspec.Struct:
+        """lost_ticks: rows missing from the file for good; failure: which file cannot be written, and why, or empty."""
         ...
 
 
@@ -49,7 +49,7 @@ class Recorder:
         self._begins = 0  # offset of the first row in the file
         self._next = 0  # the first row that is not in the file yet
         self._skipped = 0  # rows that were overwritten before they were written to disk
-        self._trouble = ""
+        self._failure = ""
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
 
@@ -81,17 +81,17 @@ class Recorder:
 
     def _written(self, folder: Path) -> str:
         """Bring the folder up to date. Returns which file could not be written, and why."""
-        trouble = ""
+        failure = ""
         for write in (self._write_rows, self._write_numbers):
             try:
-                write(folder, trouble)
+                write(folder, failure)
             except OSError as error:
-                trouble = trouble or f"{folder}: {error.strerror or error}"
-        return trouble
+                failure = failure or f"{folder}: {error.strerror or error}"
+        return failure
 
-    def _write_numbers(self, folder: Path, trouble: str) -> None:
+    def _write_numbers(self, folder: Path, failure: str) -> None:
         if self._file is not None:  # else they would overwrite an earlier host's
-            write_whole(folder / HOST_RECORD, msgspec.json.format(msgspec.json.encode(self._message(trouble))))
+            write_whole(folder / HOST_RECORD, msgspec.json.format(msgspec.json.encode(self._message(failure))))
 
     def _open(self, folder: Path) -> int:
         """Create the files of this host; those of an earlier one in this run get a number."""
@@ -106,7 +106,7 @@ class Recorder:
         self._begins = len(header)
         return os.open(folder / BLACK_BOX, os.O_WRONLY | os.O_CLOEXEC)
 
-    def _write_rows(self, folder: Path, _trouble: str) -> None:
+    def _write_rows(self, folder: Path, _failure: str) -> None:
         if self._file is None:
             self._file = self._open(folder)
         size = self._box.layout.row_bytes
@@ -120,18 +120,18 @@ class Recorder:
             if written < len(rows):  # a full disk first takes a part
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    def _note(self, trouble: str) -> None:
-        if trouble and not self._trouble:
-            complain(f"record: {trouble}")
-        self._trouble = trouble
+    def _note(self, failure: str) -> None:
+        if failure and not self._failure:
+            complain(f"record: {failure}")
+        self._failure = failure
 
-    def _message(self, trouble: str) -> msgspec.Struct:
+    def _message(self, failure: str) -> msgspec.Struct:
         lost = self._skipped + (self._box.ticks - self._next if self._closing.is_set() else 0)
-        return self._numbers(lost_ticks=lost, trouble=trouble)
+        return self._numbers(lost_ticks=lost, failure=failure)
 
     def _remember(self) -> None:
         if self._memory is not None:
-            content = msgspec.json.encode(self._message(self._trouble))
+            content = msgspec.json.encode(self._message(self._failure))
             with contextlib.suppress(OSError):  # no memory left: then only the folder has them
                 os.pwrite(self._memory, content, 0)
                 os.ftruncate(self._memory, len(content))

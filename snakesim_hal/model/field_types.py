@@ -145,8 +145,8 @@ def _word(option: inspect.Type, unit: str) -> str | None:
         case inspect.StructType(fields=fields, tag_field=None):
             return "a section with " + ", ".join(field.encode_name for field in fields)
         case inspect.StructType(fields=fields):
-            told = [f"{option.tag_field} = {option.tag!r}", *(field.encode_name for field in fields)]
-            return "a section with " + ", ".join(told)
+            names = [f"{option.tag_field} = {option.tag!r}", *(field.encode_name for field in fields)]
+            return "a section with " + ", ".join(names)
         case inspect.ListType():
             return f"a list, each {in_words(option.item_type)}"
         case inspect.TupleType():

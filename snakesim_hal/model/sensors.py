@@ -1,4 +1,4 @@
-"""The sensors in a robot file. What they publish, and how they are simulated, is told in docs/sensors.md."""
+"""The sensors in a robot file. What they publish, and how they are simulated, is described in docs/sensors.md."""
 
 import math
 from collections.abc import Iterator

@@ -70,14 +70,14 @@ def registered(robot: LocalRobot) -> Iterator[str | None]:
     except OSError as error:
         yield f"{path}: {error.strerror}; `snakesim status` and `estop` find this run only with --endpoint"
         return
-    trouble = None
+    failure = None
     try:
         fcntl.flock(handle, fcntl.LOCK_EX)
         os.write(handle, json.dumps(asdict(robot)).encode())
     except OSError as error:
-        trouble = f"{path}: {error.strerror}; `snakesim status` and `estop` find this run only with --endpoint"
+        failure = f"{path}: {error.strerror}; `snakesim status` and `estop` find this run only with --endpoint"
     try:
-        yield trouble
+        yield failure
     finally:
         with contextlib.suppress(OSError):
             path.unlink()

@@ -81,7 +81,7 @@ class ProcessEntries:
                 continue
             entry = self._entries.get(key)
             if entry is None or entry.name != name:
-                found.append(f"{keys.service_of(key)} has not told its settings yet")
+                found.append(f"{keys.service_of(key)} has not published its settings yet")
             else:
                 found += differences(entry, own)
         return found

@@ -37,5 +37,5 @@ def is_proven(description: Description, key: str | None) -> bool:
 
 
 def _proof(description: Description, key: str) -> str:
-    told = encode(msgspec.structs.replace(description, proof=""))
-    return hmac.new(key.encode(), told, "sha256").hexdigest()
+    unproven = encode(msgspec.structs.replace(description, proof=""))
+    return hmac.new(key.encode(), unproven, "sha256").hexdigest()

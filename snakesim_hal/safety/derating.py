@@ -30,7 +30,7 @@ class Derating:
         self._expected = any(sensor.key == keys.POWER for sensor in description.sensors)
         self._began_ns: int | None = None
         self._due_ns = -math.inf  # before that nothing changes without a sample
-        self._told: set[tuple[str, str | None]] = set()
+        self._reported: set[tuple[str, str | None]] = set()
         self._silent: set[str] = set()
         self.share: Floats = np.ones(len(self._healths))  # of its torque limit, left to each joint
         self.wrong: list[Fault] = []  # present faults
@@ -61,9 +61,9 @@ class Derating:
                 reach="joint" if what == "overheated" else "robot",
             )
             for health in self._healths
-            for what, cause in health.troubles(now_ns)
+            for what, cause in health.failures(now_ns)
         ]
-        before, self._told = self._told, {(fault.what, fault.joint) for fault in self.wrong}
+        before, self._reported = self._reported, {(fault.what, fault.joint) for fault in self.wrong}
         fresh = [fault for fault in self.wrong if (fault.what, fault.joint) not in before]
         return fresh, self._newly_silent(now_ns, tick)
 
@@ -124,7 +124,7 @@ class _Health:
             return 1.0
         return HeatLimits(self.joint.derate_from_c, self.joint.stop_at_c).share_left(self.winding_c)
 
-    def troubles(self, now_ns: int) -> list[tuple[str, str]]:
+    def failures(self, now_ns: int) -> list[tuple[str, str]]:
         """Reasons to stop the robot: a word, and the full cause."""
         joint, found = self.joint, list[tuple[str, str]]()
         if self.hot:

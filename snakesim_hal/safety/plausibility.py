@@ -107,8 +107,8 @@ class PlausibilityCheck:
     ) -> ImplausibleState:
         found = np.flatnonzero(which).tolist()
         names = [self._limits.joints[i].name for i in found]
-        told = names if tails is None else [name + tails[i] for name, i in zip(names, found, strict=True)]
-        cause = (words + ", ".join(told))[:LONGEST_CAUSE]
+        labels = names if tails is None else [name + tails[i] for name, i in zip(names, found, strict=True)]
+        cause = (words + ", ".join(labels))[:LONGEST_CAUSE]
         joint = names[0] if len(names) == 1 else None
         return ImplausibleState(Fault(tick=tick, what=what, cause=cause, joint=joint, reach="joint"), which)
 

@@ -264,5 +264,5 @@ def _what(snapshot: RobotSnapshot | None) -> tuple[object, ...] | None:
     if snapshot is None:
         return None
     status, control = snapshot.status, snapshot.control
-    told = None if status is None else (status.lifecycle, status.why, status.paused_by)
-    return told, None if control is None else control.state
+    host_state = None if status is None else (status.lifecycle, status.why, status.paused_by)
+    return host_state, None if control is None else control.state

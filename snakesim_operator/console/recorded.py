@@ -21,7 +21,7 @@ class Recorded:
 
     def __init__(self, record: RunRecord) -> None:
         self.record = record
-        self._stamps = {id(told): [_stamp_s(m) for m in told] for told in self._outputs()}
+        self._stamps = {id(messages): [_stamp_s(m) for m in messages] for messages in self._outputs()}
 
     def _outputs(self) -> tuple[Sequence[ControlState], Sequence[World], Sequence[Trajectory]]:
         return self.record.control, self.record.worlds, self.record.trajectories
@@ -52,11 +52,11 @@ class Recorded:
             applied=self._applied(row),
         )
 
-    def _before(self, told: Sequence[MessageT], time_s: float, limit_s: float | None = None) -> MessageT | None:
+    def _before(self, messages: Sequence[MessageT], time_s: float, limit_s: float | None = None) -> MessageT | None:
         """The newest message of that time, unless it is older than the limit."""
-        stamps = self._stamps[id(told)]
+        stamps = self._stamps[id(messages)]
         i = bisect_right(stamps, time_s) - 1
-        return None if i < 0 or (limit_s is not None and time_s - stamps[i] > limit_s) else told[i]
+        return None if i < 0 or (limit_s is not None and time_s - stamps[i] > limit_s) else messages[i]
 
     def _joints(self, row: int) -> JointState:
         record = self.record

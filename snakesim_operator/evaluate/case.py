@@ -102,5 +102,5 @@ def _stopped_after(limit_s: float) -> Iterator[None]:
 
 def plain_numbers(summary: RunSummary) -> dict[str, Number]:
     """Every plain field that depends on nothing but configuration and code."""
-    told = {name: getattr(summary, name) for name in summary.__struct_fields__ if name not in OF_THE_CLOCK}
-    return {name: value for name, value in told.items() if isinstance(value, Number)}
+    fields = {name: getattr(summary, name) for name in summary.__struct_fields__ if name not in OF_THE_CLOCK}
+    return {name: value for name, value in fields.items() if isinstance(value, Number)}

@@ -94,8 +94,8 @@ def write_tables(folder: Path, cases: Sequence[Case], done: Results) -> list[Pat
 
 
 def _row(case: Case, outcome: Outcome, columns: list[str]) -> dict[str, Number]:
-    told = {**outcome.numbers, **case.columns, "error": outcome.error}
-    return {name: told.get(name) for name in columns}
+    values = {**outcome.numbers, **case.columns, "error": outcome.error}
+    return {name: values.get(name) for name in columns}
 
 
 def _columns() -> dict[str, Any]:

@@ -88,8 +88,8 @@ def settings_of(suite: Suite, source: str) -> list[Setting]:
         where = f"{source}: row {row.name!r}" if row is not None else source
         own = [*_overrides(row.set, where), *_left_out(row.unset, where)] if row is not None else []
         for values in itertools.product(*varied.values()):
-            told = [f"{words[key]} {_short_text(value)}" for key, value in zip(varied, values, strict=True)]
-            name = ", ".join([*([row.name] if row is not None else []), *told]) or "as it is"
+            parts = [f"{words[key]} {_short_text(value)}" for key, value in zip(varied, values, strict=True)]
+            name = ", ".join([*([row.name] if row is not None else []), *parts]) or "as it is"
             here = [Override(key, v, f"{source}: [vary]") for key, v in zip(varied, values, strict=True)]
             number = values[0] if len(values) == 1 and row is None and _is_number(values[0]) else None
             found.append(Setting(name, [*always, *own, *here], number))
@@ -103,7 +103,7 @@ def cases_of(suite: Suite, source: str, controllers: Sequence[str], fields: int,
     """Every case in the order of the table, with its whole configuration. Raises ConfigError.
 
     What the suite asks for is checked here on the first field of each row; a later field that cannot be laid out is
-    told in its result.
+    named in its result.
     """
     settings = settings_of(suite, source)
     if (count := len(settings) * len(controllers or [""]) * fields) > MAX_CASES:

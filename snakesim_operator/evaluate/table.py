@@ -39,8 +39,8 @@ class Line:
     @property
     def crossed(self) -> int | None:
         """Of all runs, also those that could not begin; None when they had no goal."""
-        told = [one.numbers.get("crossed") for one in self.outcomes if one.error is None]
-        return None if told and all(one is None for one in told) else sum(one is True for one in told)
+        crossings = [one.numbers.get("crossed") for one in self.outcomes if one.error is None]
+        return None if crossings and all(one is None for one in crossings) else sum(one is True for one in crossings)
 
     def values(self, name: str, *, of_crossed: bool = False) -> list[float]:
         """The known values of one number; of_crossed: of the runs that reached their goal, where there is one."""
@@ -83,11 +83,11 @@ def table(lines: Sequence[Line]) -> list[str]:
     rows = [list(HEAD), *(line.cells for line in lines)]
     keep = [i for i in range(len(HEAD)) if i < 2 or any(row[i].strip(UNKNOWN) for row in rows[1:])]
     widths = [max(len(row[i]) for row in rows) for i in keep]
-    told: list[str] = []
+    texts: list[str] = []
     for row in rows:
         cells = [row[i].ljust(width) if i < 2 else row[i].rjust(width) for i, width in zip(keep, widths, strict=True)]
-        told.append("  ".join(cells).rstrip())
-    return told
+        texts.append("  ".join(cells).rstrip())
+    return texts
 
 
 def best_of(lines: Sequence[Line]) -> str:
@@ -137,11 +137,15 @@ def _share(outcome: Outcome) -> float:
 def _why(outcome: Outcome) -> str:
     if outcome.error is not None:
         return outcome.error
-    told = outcome.numbers
-    way, goal = told.get("advance_m"), told.get("goal_m")
+    numbers = outcome.numbers
+    way, goal = numbers.get("advance_m"), numbers.get("goal_m")
     far = f"{way:.2f} m" if isinstance(way, float) else "unknown"
     of = f" of {goal:g} m" if isinstance(goal, float) else ""
-    last = f"{told.get('last_state')}: {told.get('last_reason')}" if told.get("last_reason") else told.get("last_state")
-    ended = "" if told.get("ended") == "complete" else f"; {told.get('ended')}"
-    ended += "; given up: no advance for too long" if told.get(GAVE_UP) else ""
+    last = (
+        f"{numbers.get('last_state')}: {numbers.get('last_reason')}"
+        if numbers.get("last_reason")
+        else numbers.get("last_state")
+    )
+    ended = "" if numbers.get("ended") == "complete" else f"; {numbers.get('ended')}"
+    ended += "; given up: no advance for too long" if numbers.get(GAVE_UP) else ""
     return f"{far}{of}; {last or 'controller said nothing'}{ended}"

@@ -104,11 +104,11 @@ def size_limits() -> list[dict[str, Any]]:
     ]
 
 
-def _limit(name: str, messages: list[str], places: list[str], most_bytes: int) -> dict[str, Any]:
+def _limit(name: str, messages: list[str], places: list[str], max_bytes: int) -> dict[str, Any]:
     return {
         "id": name,
         "flows": ["ingress"],
         "messages": messages,
         "key_exprs": [f"{ANY}/{place}" for place in places],
-        "size_limit": most_bytes,
+        "size_limit": max_bytes,
     }

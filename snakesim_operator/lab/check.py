@@ -201,11 +201,11 @@ def _check_role(identity: Identity, lab: Lab, folder: Path, found: Findings) -> 
                 for line in (line for line in TABLE if line.key in ASKABLE):
                     granted = own and "ask" in line.acts(identity.role or Role.VIEWER)
                     answers = probe.answers(f"{robot}/{line.key}")
-                    told = f"{identity.common_name}: {robot}/{line.key}"
+                    query = f"{identity.common_name}: {robot}/{line.key}"
                     if answers > granted:
-                        found.bad(f"{told} answers, though the role may not ask; the router has other rules")
+                        found.bad(f"{query} answers, though the role may not ask; the router has other rules")
                     elif answers < granted:
-                        found.bad(f"{told} does not answer, though the role may ask; no host, or other rules")
+                        found.bad(f"{query} does not answer, though the role may ask; no host, or other rules")
             found.well(f"{identity.common_name}: round trip {trip_ms:.2f} ms")
     except NotConnectedError as error:
         found.bad(f"{identity.common_name}: not let in: {error}")

@@ -119,8 +119,8 @@ class Replay:
                     self._session.on_latched_arrival(row.key, self._recording.take)
             self._session.on_question(keys.LEASE, self._lend)
             self._session.on_arrival(keys.JOINT_COMMAND, self._keep)
-            told = Configuration(config_hash=self.robot.config_hash, content=written(self.config).decode())
-            self._session.latched_publisher(keys.CONFIG, Configuration).put(told)
+            effective = Configuration(config_hash=self.robot.config_hash, content=written(self.config).decode())
+            self._session.latched_publisher(keys.CONFIG, Configuration).put(effective)
             self._session.latched_publisher(keys.DESCRIPTION, Description).put(self.robot)
             for name in self._names:
                 loop = ServiceLoop(find_plugin(SERVICES, name), self.config, self._network.session())

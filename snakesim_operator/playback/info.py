@@ -47,7 +47,7 @@ class RecordingInfo(msgspec.Struct, kw_only=True):
     file: str
     size_bytes: int
     finished: bool
-    trouble: str
+    failure: str
     robot: str | None
     backend: str | None
     scenario: str | None
@@ -96,7 +96,7 @@ def _summed_up(path: Path, reader: RecordingReader, found: dict[str, KeyInfo], c
         file=str(path),
         size_bytes=path.stat().st_size,
         finished=reader.finished,
-        trouble=reader.trouble,
+        failure=reader.failure,
         robot=None if robot is None else robot.robot,
         backend=None if robot is None else robot.backend,
         scenario=config.get("name"),
@@ -152,8 +152,8 @@ def show(given: Path, say: Say, *, as_json: bool = False) -> int:
 def lacking(info: RecordingInfo) -> list[str]:
     """What a recording lacks, as text."""
     found: list[str] = []
-    if info.trouble:
-        found.append(f"damaged from there on: {info.trouble}")
+    if info.failure:
+        found.append(f"damaged from there on: {info.failure}")
     elif not info.finished:
         found.append("its end: the recorder was killed or the disk was full, so the last second may be missing")
     counts = Counter(info.dropped)

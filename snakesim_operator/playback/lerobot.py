@@ -57,7 +57,7 @@ def write_lerobot(records: Sequence[RunRecord], folder: Path, write_table: Write
         chunk, file = divmod(episode, FILES_A_CHUNK)
         columns = {name: list(values) if values.ndim > 1 else values for name, values in frames.items()}
         write_table(columns, folder / DATA.format(chunk_index=chunk, file_index=file), None)
-        told = {
+        row = {
             "episode_index": episode,
             "tasks": [record.config.name],
             "length": count,
@@ -69,8 +69,8 @@ def write_lerobot(records: Sequence[RunRecord], folder: Path, write_table: Write
             "meta/episodes/file_index": 0,
         }
         for name, values in frames.items():
-            told |= {f"stats/{name}/{which}": numbers for which, numbers in _stats(values).items()}
-        episodes.append(told)
+            row |= {f"stats/{name}/{which}": numbers for which, numbers in _stats(values).items()}
+        episodes.append(row)
         all_frames.append(frames)
         index += count
     write_table({name: [row[name] for row in episodes] for name in episodes[0]}, folder / EPISODES, None)

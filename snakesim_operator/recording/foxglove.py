@@ -131,7 +131,7 @@ class FoxgloveChannels:
         self._due_ns: dict[str, int] = {}
         self._robot: Description | None = None
         self._frames: BodyFrames | None = None
-        self._told = StateMessages()
+        self._state_messages = StateMessages()
         self._truth = shapes.obstacles([], "obstacles", shapes.TRUTH, 0)
 
     def take(self, key: str, payload: bytes, time_ns: int) -> list[FoxgloveMessage]:
@@ -190,7 +190,7 @@ class FoxgloveChannels:
 
     def _state(self, frames: BodyFrames, time_ns: int) -> Iterator[FoxgloveMessage]:
         status, control = (self._fresh(key, time_ns) for key in (keys.STATUS, keys.CONTROL_STATE))
-        state, logged, wanted_rad = self._told.of(status, control, time_ns)
+        state, logged, wanted_rad = self._state_messages.of(status, control, time_ns)
         yield FoxgloveMessage(f"{TOPICS}state", State, msgspec.json.encode(state))
         yield from (_protobuf("log", one) for one in logged)
         if len(wanted_rad) == frames.joints:

@@ -70,7 +70,7 @@ class Recorder:
         """Finish the file. Returns why it lacks something, or an empty text."""
         about = {"version": version("snakesim"), "began": self._began.isoformat(), "dropped": dropped}
         self.recording.close(about)
-        return self.recording.trouble
+        return self.recording.failure
 
     def _meet(self, payload: bytes) -> None:
         with contextlib.suppress(*UNDECODABLE):
@@ -102,15 +102,15 @@ def record(link: Link, path: Path, goes_on: Callable[[], bool], show: Show | Non
         tap = Tap(session)
         session.declare_alive(RECORDER)
         show_process(session, own_entry(RECORDER))
-        while goes_on() and not recorder.recording.trouble:
+        while goes_on() and not recorder.recording.failure:
             _turn(tap, recorder)
             time.sleep(TURN_S)
         _turn(tap, recorder)
     for key, number in sorted(tap.dropped.items()):
         complain(f"{number} messages on {key} were dropped: the disk was too slow")
-    trouble = recorder.close(dict(tap.dropped))
-    if trouble:
-        complain(f"recording ended: {trouble}")
+    failure = recorder.close(dict(tap.dropped))
+    if failure:
+        complain(f"recording ended: {failure}")
     return recorder
 
 
@@ -140,7 +140,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SnakesimError as error:
         complain_of(error, f"snakesim {RECORDER}")
         return 1
-    return FULL if recorder.recording.trouble else 0
+    return FULL if recorder.recording.failure else 0
 
 
 if __name__ == "__main__":

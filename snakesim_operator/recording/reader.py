@@ -47,7 +47,7 @@ class RecordingReader:
 
     path: Path
     finished: bool = False  # else its recorder was killed, or the disk was full
-    trouble: str = ""  # what ended the reading early, unless the file ends there
+    failure: str = ""  # what ended the reading early, unless the file ends there
     about: dict[str, Any] = field(default_factory=dict[str, Any])
 
     def messages(self, keys: Collection[str] | None = None) -> Iterator[Recorded]:
@@ -84,7 +84,7 @@ class RecordingReader:
             except (StopIteration, mcap.exceptions.EndOfFile, mcap.exceptions.InvalidMagic, struct.error):
                 return  # cut off there
             except DAMAGED as error:
-                self.trouble = f"{type(error).__name__}: {error}"[:200]
+                self.failure = f"{type(error).__name__}: {error}"[:200]
                 return
             self.finished = isinstance(record, DataEnd)
             yield from inside

@@ -32,7 +32,7 @@ class Recording:
         """show: gets what is made for Foxglove, too. Raises OSError, FileExistsError when there is such a file."""
         self.path = path
         self._show = show
-        self.trouble = ""  # why nothing is written any more
+        self.failure = ""  # why nothing is written any more
         self.counts: Counter[str] = Counter()  # messages written, by key
         self.time = RobotTime()
         self._foxglove = FoxgloveChannels()
@@ -47,7 +47,7 @@ class Recording:
 
     def take(self, arrival: Arrival) -> None:
         """Write one message. Those that are not at a key of the key space are left out."""
-        if self.trouble:
+        if self.failure:
             return
         channel = self._channels.get(arrival.key)
         if channel is None and (channel := self._open(arrival)) is None:
@@ -65,7 +65,7 @@ class Recording:
 
     def flush_when_due(self) -> None:
         """Write what waits, a few times a second."""
-        if not self.trouble and time.monotonic() >= self._flush_at:
+        if not self.failure and time.monotonic() >= self._flush_at:
             self.flush()
 
     def flush(self) -> None:
@@ -74,16 +74,16 @@ class Recording:
         try:
             self._mcap.flush()
         except OSError as error:
-            self.trouble = f"{self.path}: {error.strerror or error}"
+            self.failure = f"{self.path}: {error.strerror or error}"
 
     def close(self, about: dict[str, object]) -> None:
         """Write index and metadata. about: of the recording itself, kept as JSON."""
-        if not self.trouble:
+        if not self.failure:
             self._mcap.add_metadata(ABOUT, {name: json.dumps(value) for name, value in about.items()})
             try:
                 self._mcap.finish()
             except OSError as error:
-                self.trouble = f"{self.path}: {error.strerror or error}"
+                self.failure = f"{self.path}: {error.strerror or error}"
         self._file.close()
 
     def _open_shown(self, shown: FoxgloveMessage) -> int:

@@ -68,24 +68,26 @@ class StateMessages:
 
     def of(self, status: bytes | None, control: bytes | None, time_ns: int) -> tuple[State, list[Log], Sequence[float]]:
         """State, what of it is new, and the angles that the controller wants, in rad: of the newest payloads."""
-        told, controlled = _StatusFields(), _ControlFields()
+        host, control_state = _StatusFields(), _ControlFields()
         with suppress(*UNDECODABLE):
-            told = told if status is None else _status.decode(status)
+            host = host if status is None else _status.decode(status)
         with suppress(*UNDECODABLE):
-            controlled = controlled if control is None else _control.decode(control)
-        numbers: dict[str, Any] = {name: value for name in _NUMBERS if (value := getattr(controlled, name)) is not None}
+            control_state = control_state if control is None else _control.decode(control)
+        numbers: dict[str, Any] = {
+            name: value for name in _NUMBERS if (value := getattr(control_state, name)) is not None
+        }
         state = State(
-            lifecycle=told.lifecycle,
-            why=told.why,
-            locomotion=controlled.state,
-            reason=controlled.reason,
-            propulsion_joint=controlled.propulsion_joint or "",
-            jammed=controlled.jammed,
-            saturated=controlled.saturated,
-            faults=len(told.faults),
+            lifecycle=host.lifecycle,
+            why=host.why,
+            locomotion=control_state.state,
+            reason=control_state.reason,
+            propulsion_joint=control_state.propulsion_joint or "",
+            jammed=control_state.jammed,
+            saturated=control_state.saturated,
+            faults=len(host.faults),
             **numbers,
         )
-        return state, self._new(state, time_ns), controlled.reference_rad
+        return state, self._new(state, time_ns), control_state.reference_rad
 
     def _new(self, state: State, time_ns: int) -> list[Log]:
         stopped, stuck = state.lifecycle in ("fault", "estop"), state.jammed or state.saturated

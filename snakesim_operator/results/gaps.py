@@ -45,7 +45,7 @@ def cleaned(
 
 def unwritten(host: HostRecord) -> list[str]:
     """Data that the host could not write."""
-    found = [host.trouble] if host.trouble else []
+    found = [host.failure] if host.failure else []
     if host.lost_ticks:
         found.append(f"{host.lost_ticks} of {host.ticks} ticks are missing in the black box")
     if host.ended == "running":

@@ -20,7 +20,7 @@ Floats = NDArray[np.float64]
 NEAR_M = 1.0
 VIEW_RAD = math.pi / 2
 NEAREST_M = 0.15  # a camera sees nothing nearer
-MATCH_M = 0.05  # between a told outline and the true one
+MATCH_M = 0.05  # between a reported outline and the true one
 POINTS = 48  # on an outline
 SIGHT = np.linspace(0.0, 1.0, 24)[1:-1]  # of a line of sight, where it is looked whether something hides
 
@@ -31,11 +31,11 @@ class MapScore:
 
     position_m: list[float] = field(default_factory=list[float])  # of centres, from where they are
     surface_m: list[float] = field(default_factory=list[float])  # of the side that faces the head, mean
-    size_m: list[float] = field(default_factory=list[float])  # told radius, or longer half, less the true one
-    in_sd: list[float] = field(default_factory=list[float])  # error of the position in told standard deviations
-    misses: int = 0  # that could be seen, and are not told
-    ghosts: int = 0  # told, with nothing there
-    told: int = 0  # near the head
+    size_m: list[float] = field(default_factory=list[float])  # reported radius, or longer half, less the true one
+    in_sd: list[float] = field(default_factory=list[float])  # error of the position in reported standard deviations
+    misses: int = 0  # that could be seen, and are not reported
+    ghosts: int = 0  # reported, with nothing there
+    reported: int = 0  # near the head
     visible: int = 0  # true ones that could be seen
 
     def add(self, other: "MapScore") -> None:
@@ -43,11 +43,11 @@ class MapScore:
         for name in ("position_m", "surface_m", "size_m", "in_sd"):
             getattr(self, name).extend(getattr(other, name))
         self.misses, self.ghosts = self.misses + other.misses, self.ghosts + other.ghosts
-        self.told, self.visible = self.told + other.told, self.visible + other.visible
+        self.reported, self.visible = self.reported + other.reported, self.visible + other.visible
 
 
 def score(
-    told: Sequence[Obstacle],
+    reported: Sequence[Obstacle],
     truth: Sequence[Obstacle],
     head_w: Sequence[float] | Floats,
     heading_rad: float,
@@ -61,8 +61,8 @@ def score(
     true_outlines = Outlines.of(near)
     found = MapScore()
     matched: set[str] = set()
-    for one in _within(told, head, within_m):
-        found.told += 1
+    for one in _within(reported, head, within_m):
+        found.reported += 1
         errors = np.abs(true_outlines.distance_m(facing_points_w(one, head))).mean(axis=0)
         best = int(np.argmin(errors)) if near else -1
         if best < 0 or errors[best] > MATCH_M:
@@ -122,7 +122,7 @@ def facing_points_w(obstacle: Obstacle, from_w: Floats) -> Floats:
     return points[seen] if seen.any() else points
 
 
-def moved(told: Sequence[Obstacle], from_w: Sequence[float], to_w: Sequence[float]) -> list[Obstacle]:
+def moved(reported: Sequence[Obstacle], from_w: Sequence[float], to_w: Sequence[float]) -> list[Obstacle]:
     """Obstacles as they are when the base, thought to be at `from_w`, is at `to_w`, both x, y, heading.
 
     It takes a wrong pose out of a map's errors: what is left is the map as the robot sees it.
@@ -130,7 +130,7 @@ def moved(told: Sequence[Obstacle], from_w: Sequence[float], to_w: Sequence[floa
     turn = to_w[2] - from_w[2]
     c, s = math.cos(turn), math.sin(turn)
     found: list[Obstacle] = []
-    for one in told:
+    for one in reported:
         x, y = one.position_w[0] - from_w[0], one.position_w[1] - from_w[1]
         place = (to_w[0] + c * x - s * y, to_w[1] + s * x + c * y, one.position_w[2])
         found.append(msgspec.structs.replace(one, position_w=place, yaw_rad=one.yaw_rad + turn))

@@ -22,7 +22,7 @@ from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import ControlState, Description, Trajectory, World
 from snakesim_operator.recording.reader import RECORDING
 from snakesim_operator.results.gaps import cleaned, unwritten
-from snakesim_operator.results.recorded import TOLD, Contents, read_recording
+from snakesim_operator.results.recorded import SERVICE_STREAMS, Contents, read_recording
 
 CONFIG = "config.json"
 SUMMARY = "summary.json"
@@ -95,7 +95,7 @@ class RunRecord:
         known, lacks = cleaned(columns, description, has_pose=config.robot.sensors.pose is not None)
         lacks += unwritten(host)
         path = folder / RECORDING
-        contents = read_recording(path, TOLD) if path.is_file() else Contents(path)
+        contents = read_recording(path, SERVICE_STREAMS) if path.is_file() else Contents(path)
         return RunRecord._of(folder, config, description, host, contents, known, lacks)
 
     @staticmethod
@@ -123,17 +123,17 @@ class RunRecord:
         columns: dict[str, NDArray[Any]],
         lacks: list[str],
     ) -> "RunRecord":
-        control = contents.told[keys.CONTROL_STATE]
+        control = contents.streams[keys.CONTROL_STATE]
         while control and control[-1].state == "PowerOff":  # the host has ended, so its clock is expected to stop
             control.pop()
         known = {name: column for name, column in columns.items() if name != "tick"}
-        told = (control, contents.told[keys.WORLD], contents.told[keys.TRAJECTORY])
+        streams = (control, contents.streams[keys.WORLD], contents.streams[keys.TRAJECTORY])
         return RunRecord(
             folder,
             config,
             description,
             host,
-            *told,
+            *streams,
             **known,
             lacks=lacks + contents.lacks,
             replay_of=contents.replay_of,
@@ -156,8 +156,8 @@ class RunRecord:
     @cached_property
     def posed(self) -> NDArray[np.bool_]:
         """Rows in which the pose and all angles are known, (n,)."""
-        told = (self.position_w, self.orientation_wxyz, self.angle_rad)
-        return np.logical_and.reduce([np.isfinite(signal).all(axis=1) for signal in told])
+        signals = (self.position_w, self.orientation_wxyz, self.angle_rad)
+        return np.logical_and.reduce([np.isfinite(signal).all(axis=1) for signal in signals])
 
     def nodes_w(self, row: int) -> Floats | None:
         """Tail end, joints and head end in the world, (joints + 2, 3); None when the pose is unknown."""

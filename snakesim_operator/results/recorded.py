@@ -31,15 +31,15 @@ from snakesim_hal.wire.messages import (
 from snakesim_operator.recording.reader import Recorded, RecordingReader
 from snakesim_operator.results.gaps import unread
 
-TOLD: dict[str, type[Message]] = {
+SERVICE_STREAMS: dict[str, type[Message]] = {
     keys.CONTROL_STATE: ControlState,
     keys.WORLD: World,
     keys.TRAJECTORY: Trajectory,
 }
-"""What guidance, navigation and control tell."""
+"""What guidance, navigation and control publish."""
 WORLDS_PER_S = 20.0  # as often as control publishes its state
 _TICKED = (keys.CLOCK, keys.JOINTS, keys.APPLIED, keys.POSE, keys.CONTACTS, keys.JOINT_COMMAND)
-ALL: tuple[str, ...] = (*TOLD, *_TICKED, keys.DESCRIPTION, keys.CONFIG, keys.STATUS)
+ALL: tuple[str, ...] = (*SERVICE_STREAMS, *_TICKED, keys.DESCRIPTION, keys.CONFIG, keys.STATUS)
 
 
 @dataclass
@@ -50,7 +50,7 @@ class Contents:
     description: Description | None = None
     config: Configuration | None = None
     status: Status | None = None  # the last one
-    told: dict[str, list[Any]] = field(default_factory=lambda: {key: [] for key in TOLD})
+    streams: dict[str, list[Any]] = field(default_factory=lambda: {key: [] for key in SERVICE_STREAMS})
     at: dict[str, dict[int, Any]] = field(
         default_factory=lambda: {key: {} for key in _TICKED}
     )  # key -> tick -> message
@@ -82,9 +82,9 @@ class Contents:
             case Clock(paused=True):
                 pass  # no tick
             case World() | Trajectory() | ControlState():
-                told = self.told[key]
-                if not told or _is_news(told[-1], message):
-                    told.append(message)
+                kept = self.streams[key]
+                if not kept or _is_news(kept[-1], message):
+                    kept.append(message)
             case _:
                 self.at[key][message.tick] = message
                 if isinstance(message, Clock) and message.arming:
@@ -159,8 +159,8 @@ def read_recording(path: Path, wanted: Collection[str] = ALL) -> Contents:
     for recorded in reader.messages(wanted):
         contents.take(recorded)
     contents.lacks += unread(contents.refused)
-    if reader.trouble:
-        contents.lacks.append(f"recording: damaged from there on: {reader.trouble}")
+    if reader.failure:
+        contents.lacks.append(f"recording: damaged from there on: {reader.failure}")
     contents.replay_of = str(reader.about.get("replay_of", ""))
     dropped = sum(reader.about.get("dropped", {}).values())
     if dropped:

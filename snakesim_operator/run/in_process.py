@@ -32,7 +32,7 @@ from snakesim_operator.recording.reader import RECORDING
 from snakesim_operator.recording.recording import Recording
 from snakesim_operator.results.advance import GoalWatch
 from snakesim_operator.results.record import CONFIG, RunRecord
-from snakesim_operator.results.recorded import TOLD
+from snakesim_operator.results.recorded import SERVICE_STREAMS
 from snakesim_operator.results.summary import RunSummary
 from snakesim_operator.run.conclusion import Outcome, conclude, explain, leave
 from snakesim_operator.run.ending import Ending, interruptible
@@ -48,7 +48,7 @@ TAKEN_EVERY = 50  # turns
 class Result:
     """A run that is over; `summary.ended` says how."""
 
-    record: RunRecord  # every tick, and what control and guidance told
+    record: RunRecord  # every tick, and what control and guidance reported
     summary: RunSummary
     gave_up: bool = False  # it was ended because it was stuck
 
@@ -73,7 +73,7 @@ def simulate(
         if files.folder is None:
             raise ConfigError(f"{out} cannot be written to; choose another folder")
         opened.callback(files.close)
-        recorded = TOLD if out is None else [row.key for row in keys.SPACE]
+        recorded = SERVICE_STREAMS if out is None else [row.key for row in keys.SPACE]
         run, outcome, gave_up = _go(config, files, ending, None, recorded, until_goal=until_goal, give_up_s=give_up_s)
         explain(ending, record_of(run.host), config)
         return Result(*leave(files, files.folder, ending, outcome, report=out is not None), gave_up)
@@ -130,7 +130,7 @@ def _go(
                     run.stop()
     for failure in run.failed:
         ending.because(failure)
-    lost = [] if recording is None or not recording.trouble else [recording.trouble]
+    lost = [] if recording is None or not recording.failure else [recording.failure]
     return run, Outcome(record_of(run.host), run.host.description, lost=lost), watch.gave_up
 
 
@@ -150,8 +150,8 @@ def _recording(session: Session, files: RunFiles, recorded: Iterable[str]) -> It
     finally:
         if recording is not None:
             recording.close({"version": version("snakesim"), "dropped": {}})
-            if recording.trouble:
-                files.warn(recording.trouble)
+            if recording.failure:
+                files.warn(recording.failure)
 
 
 class _LogWriter(io.TextIOBase):

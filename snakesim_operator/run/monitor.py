@@ -52,7 +52,7 @@ class RunMonitor:
         self._own_services = frozenset(config.own_services)
         self._hosts = supervisor.hosts
         self._asked_at: float | None = None
-        self._told: str | None = None
+        self._last_latched: str | None = None
 
     def go(self) -> None:
         """Until the run is over. Raises SnakesimError when it cannot go on."""
@@ -112,10 +112,10 @@ class RunMonitor:
     def _tell(self, status: Status) -> None:
         """Print once how to recover from a fault."""
         latched = f"{status.lifecycle}: {status.why}" if status.lifecycle in ("fault", "estop") else None
-        if latched is not None and latched != self._told:
+        if latched is not None and latched != self._last_latched:
             self._say(latched)
             self._say(f"  go on with `snakesim clear`, then `snakesim arm {status.robot} {status.backend}`")
-        self._told = latched
+        self._last_latched = latched
 
     def _arm_once(self) -> None:
         status = self._status

@@ -81,11 +81,11 @@ def run(request: RunRequest) -> int:
         supervisor = Supervisor(files, ending, say, stop_port, stay=request.stay)
         with (
             interruptible(ending),
-            registered(local_robot(request.config, config_file, link, stop_port)) as trouble,
+            registered(local_robot(request.config, config_file, link, stop_port)) as failure,
             _console(request, link, files, config_file),  # first, because somebody waits for it
         ):
-            if trouble is not None:
-                say(trouble)
+            if failure is not None:
+                say(failure)
             _conduct(request, supervisor, link, files, config_file, ending)
         from snakesim_operator.run.conclusion import Outcome, conclude
 
@@ -117,8 +117,8 @@ def opened_files(config: RunConfig, out: Path | None) -> Iterator[tuple[RunFiles
             yield RunFiles(folder, _warn), folder / CONFIG
 
 
-def _warn(trouble: str) -> None:
-    say(f"warning: {trouble}; the run goes on, its record may lack something")
+def _warn(failure: str) -> None:
+    say(f"warning: {failure}; the run goes on, its record may lack something")
 
 
 def _check_router(request: RunRequest) -> None:
@@ -184,7 +184,7 @@ def _meeting(link: Link) -> list[str]:
 @contextlib.contextmanager
 def _session_of_run(link: Link, supervisor: Supervisor, ending: Ending) -> Iterator[Session]:
     """A session on the run's network, as soon as there is one. Raises NotConnectedError when a part has ended."""
-    began = told = time.monotonic()
+    began = shown_at = time.monotonic()
     with contextlib.ExitStack() as stack:
         while True:
             try:
@@ -197,7 +197,7 @@ def _session_of_run(link: Link, supervisor: Supervisor, ending: Ending) -> Itera
                 now = time.monotonic()
                 if now > began + START_LIMIT_S or ending.interrupted:
                     raise
-                if now > told + TELL_S:
+                if now > shown_at + TELL_S:
                     say(f"starting: the host has not opened its network yet, after {now - began:.0f} s")
-                    told = now
+                    shown_at = now
         yield session

@@ -41,7 +41,7 @@ class RunFiles:
         """folder: None for no files. warn: called once, from another thread, when something cannot be written."""
         self.folder = folder
         self._warn = warn
-        self._trouble = ""  # of the last attempt
+        self._failure = ""  # of the last attempt
         self._warned = False
         self._lost = ""  # why data was lost
         self._tasks: deque[_Task] = deque()
@@ -64,16 +64,16 @@ class RunFiles:
         """Rename an appended file; later appends begin a new one."""
         self._ask(_Task("rename", name, to.encode()))
 
-    def warn(self, trouble: str) -> None:
+    def warn(self, failure: str) -> None:
         """Warn once that something cannot be written, by whomever."""
         if not self._warned:
             self._warned = True
-            self._warn(trouble)
+            self._warn(failure)
 
     def settle(self) -> None:
         """Wait until everything is written, or the disk is found to be full or to hang."""
         with self._changed:
-            self._changed.wait_for(lambda: not self._tasks or self._trouble, LIMIT_S)
+            self._changed.wait_for(lambda: not self._tasks or self._failure, LIMIT_S)
 
     def close(self) -> str:
         """Retry everything pending once more. Returns why data is lost, or an empty text."""
@@ -90,7 +90,7 @@ class RunFiles:
             if self.folder is None:
                 return
             if self._waiting_bytes + len(task.content) > MEMORY_BYTES:
-                self._lost = self._trouble or f"{self.folder}: the disk is too slow for the run's output"
+                self._lost = self._failure or f"{self.folder}: the disk is too slow for the run's output"
                 return
             if len(self._tasks) > 1 and self._tasks[-1].takes(task):  # the first one may be in progress
                 self._tasks[-1].content += task.content
@@ -107,14 +107,14 @@ class RunFiles:
                     break
                 task = self._tasks[0]
             before = len(task.content)
-            self._trouble = self._attempt(task)
-            if self._trouble:
-                self.warn(self._trouble)
+            self._failure = self._attempt(task)
+            if self._failure:
+                self.warn(self._failure)
             with self._changed:
-                if not self._trouble or self._closing:
+                if not self._failure or self._closing:
                     self._tasks.popleft()
                     self._waiting_bytes -= before
-                    self._lost = self._lost or self._trouble
+                    self._lost = self._lost or self._failure
                 else:
                     self._waiting_bytes -= before - len(task.content)
                     self._changed.notify_all()

@@ -26,9 +26,9 @@ def add_commands(commands: Any) -> None:
         ("clear", _clear, "clear a fault or an emergency stop; the robot is disarmed then"),
         ("estop", _estop, "stop a robot now, or all on the network without --namespace"),
     ):
-        told = commands.add_parser(name, help=about)
-        add_network(told)
-        told.set_defaults(act=act)
+        command = commands.add_parser(name, help=about)
+        add_network(command)
+        command.set_defaults(act=act)
 
     teleop = commands.add_parser("teleop", help="drive a robot by keys or with a joystick; letting go stops it")
     teleop.add_argument(

@@ -71,8 +71,8 @@ def completion(parser: argparse.ArgumentParser, shell: str) -> Iterator[str]:
     after = [f'        {"|".join(places)}) choices="{choices}" ;;' for choices, places in values.items()]
     words: list[str] = []
     for command in commands:
-        told = f'choices="{" ".join(command.words)}"; options="{" ".join(command.options)}"'
-        words.append(f'                "{command.path}") {told} ;;')
+        lists = f'choices="{" ".join(command.words)}"; options="{" ".join(command.options)}"'
+        words.append(f'                "{command.path}") {lists} ;;')
     text = FUNCTION.replace("@COMMANDS@", paths).replace("@VALUES@", "\n".join(after))
     if shell == "zsh":
         yield ZSH

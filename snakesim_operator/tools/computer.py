@@ -46,19 +46,22 @@ class Finding(msgspec.Struct, frozen=True, kw_only=True):
 
     what: str
     state: Literal["ok", "warn", "fail"]
-    told: str
+    detail: str
     fix: list[str] = []  # commands
 
 
 def python() -> Iterator[Finding]:
     """The interpreter."""
-    told = f"{sys.version.split()[0]} at {sys.executable}"
+    detail = f"{sys.version.split()[0]} at {sys.executable}"
     if sys.version_info < MIN_PYTHON:
         yield Finding(
-            what="Python", state="fail", told=f"{told}; 3.11 or newer is needed", fix=["make setup PYTHON=python3.11"]
+            what="Python",
+            state="fail",
+            detail=f"{detail}; 3.11 or newer is needed",
+            fix=["make setup PYTHON=python3.11"],
         )
         return
-    yield Finding(what="Python", state="ok", told=told)
+    yield Finding(what="Python", state="ok", detail=detail)
 
 
 def packages() -> Iterator[Finding]:
@@ -80,25 +83,25 @@ def packages() -> Iterator[Finding]:
             yield Finding(
                 what=what,
                 state="warn" if group else "fail",
-                told=f"missing: {', '.join(missing)}",
+                detail=f"missing: {', '.join(missing)}",
                 fix=["make setup", f"python -m pip install {wanted}"],
             )
         else:
-            yield Finding(what=what, state="ok", told=", ".join(there[group]))
+            yield Finding(what=what, state="ok", detail=", ".join(there[group]))
 
 
 def opengl() -> Iterator[Finding]:
     """Whether MuJoCo can draw without a screen; only colour images, videos and the model `rendered` need that."""
-    told: list[str] = []
+    detail: list[str] = []
     for kind in ("egl", "osmesa"):
         why = _probe(kind)
         if why is None:
             more = "" if kind == "egl" else "; set MUJOCO_GL=osmesa for every run"
-            yield Finding(what="OpenGL", state="ok", told=f"{kind.upper()} draws without a screen{more}")
+            yield Finding(what="OpenGL", state="ok", detail=f"{kind.upper()} draws without a screen{more}")
             return
-        told.append(f"{kind.upper()}: {why}")
+        detail.append(f"{kind.upper()}: {why}")
     fix = ["sudo apt install libegl1 libgl1-mesa-dri"]
-    yield Finding(what="OpenGL", state="warn", told=f"no colour images and videos: {'; '.join(told)}", fix=fix)
+    yield Finding(what="OpenGL", state="warn", detail=f"no colour images and videos: {'; '.join(detail)}", fix=fix)
 
 
 def _probe(kind: str) -> str | None:
@@ -128,10 +131,10 @@ def can() -> Iterator[Finding]:
     try:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
     except OSError as error:
-        told = (
+        detail = (
             f"this kernel has none ({error.strerror}); only real joint modules need it, `--backend can` emulates them"
         )
-        yield Finding(what="CAN", state="warn", told=told, fix=["sudo modprobe -a can_raw vcan", vm])
+        yield Finding(what="CAN", state="warn", detail=detail, fix=["sudo modprobe -a can_raw vcan", vm])
         return
     found = [
         path.parent.name for path in Path("/sys/class/net").glob("*/type") if path.read_text().strip() == CAN_DEVICE
@@ -140,9 +143,9 @@ def can() -> Iterator[Finding]:
         up = [name for name in found if _is_up(name)]
         down = [name for name in found if name not in up]
         fix = [f"sudo ip link set {name} up" for name in down]
-        yield Finding(what="CAN", state="warn" if down else "ok", told=f"up: {', '.join(up) or 'none'}", fix=fix)
+        yield Finding(what="CAN", state="warn" if down else "ok", detail=f"up: {', '.join(up) or 'none'}", fix=fix)
     else:
-        yield Finding(what="CAN", state="warn", told="no interface", fix=["sudo deploy/can/up.sh vcan0"])
+        yield Finding(what="CAN", state="warn", detail="no interface", fix=["sudo deploy/can/up.sh vcan0"])
 
 
 def _is_up(name: str) -> bool:
@@ -156,13 +159,13 @@ def kvm() -> Iterator[Finding]:
     """Makes the VM for CAN tests fast."""
     device = Path("/dev/kvm")
     if os.access(device, os.R_OK | os.W_OK):
-        yield Finding(what="KVM", state="ok", told=f"{device} can be used")
+        yield Finding(what="KVM", state="ok", detail=f"{device} can be used")
     elif device.exists():
         fix = ["sudo usermod -aG kvm $USER    # then log in again"]
-        yield Finding(what="KVM", state="warn", told=f"no permission for {device}; VMs for CAN are slow", fix=fix)
+        yield Finding(what="KVM", state="warn", detail=f"no permission for {device}; VMs for CAN are slow", fix=fix)
     else:
-        told = f"no {device}: VMs for CAN are emulated, and slow; switch virtualization on in the BIOS or the cloud"
-        yield Finding(what="KVM", state="warn", told=told)
+        detail = f"no {device}: VMs for CAN are emulated, and slow; switch virtualization on in the BIOS or the cloud"
+        yield Finding(what="KVM", state="warn", detail=detail)
 
 
 def clock() -> Iterator[Finding]:
@@ -174,20 +177,20 @@ def clock() -> Iterator[Finding]:
         late.append(time.monotonic() - due)
     late.sort()
     worst_s = late[98]
-    told = (
+    detail = (
         f"wake-ups {late[50] * 1e6:.0f} us late in the median, {worst_s * 1e6:.0f} us in 99 % (no real-time priority)"
     )
     yield Finding(
         what="wake-ups",
         state="warn" if worst_s > LATE_WARN_S else "ok",
-        told=told,
+        detail=detail,
         fix=["uptime    # is something else running?"] if worst_s > LATE_WARN_S else [],
     )
     if ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(TIMEX_BYTES)) == TIME_ERROR:
-        told = "not synchronised; only dates of records and of other machines' certificates depend on it"
-        yield Finding(what="wall clock", state="warn", told=told, fix=["sudo timedatectl set-ntp true"])
+        detail = "not synchronised; only dates of records and of other machines' certificates depend on it"
+        yield Finding(what="wall clock", state="warn", detail=detail, fix=["sudo timedatectl set-ntp true"])
     else:
-        yield Finding(what="wall clock", state="ok", told="synchronised")
+        yield Finding(what="wall clock", state="ok", detail="synchronised")
 
 
 def real_time() -> Iterator[Finding]:
@@ -196,22 +199,22 @@ def real_time() -> Iterator[Finding]:
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(HOST_PRIORITY))
         os.sched_setscheduler(0, *before)
-        yield Finding(what="priority", state="ok", told=f"SCHED_FIFO {HOST_PRIORITY} is granted")
+        yield Finding(what="priority", state="ok", detail=f"SCHED_FIFO {HOST_PRIORITY} is granted")
     except OSError as error:
         fix = [f'echo "$USER - rtprio {HOST_PRIORITY}" | sudo tee -a {LIMITS}    # then log in again']
-        told = f"SCHED_FIFO {HOST_PRIORITY} is refused ({error.strerror}): real-time runs stumble on a busy machine"
-        yield Finding(what="priority", state="warn", told=told, fix=fix)
+        detail = f"SCHED_FIFO {HOST_PRIORITY} is refused ({error.strerror}): real-time runs stumble on a busy machine"
+        yield Finding(what="priority", state="warn", detail=detail, fix=fix)
     refused = lock_memory()
     ctypes.CDLL(None).munlockall()
     if refused is None:
-        yield Finding(what="memory lock", state="ok", told="granted")
+        yield Finding(what="memory lock", state="ok", detail="granted")
     else:
         fix = [f'echo "$USER - memlock unlimited" | sudo tee -a {LIMITS}    # then log in again']
-        yield Finding(what="memory lock", state="warn", told=refused, fix=fix)
+        yield Finding(what="memory lock", state="warn", detail=refused, fix=fix)
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     few = hard != resource.RLIM_INFINITY and hard < 4096
     fix = [f'echo "$USER - nofile 8192" | sudo tee -a {LIMITS}    # then log in again'] if few else []
-    yield Finding(what="open files", state="warn" if few else "ok", told=f"{soft}, at most {hard}", fix=fix)
+    yield Finding(what="open files", state="warn" if few else "ok", detail=f"{soft}, at most {hard}", fix=fix)
 
 
 def shared_memory() -> Iterator[Finding]:
@@ -220,11 +223,13 @@ def shared_memory() -> Iterator[Finding]:
     try:
         free = shutil.disk_usage(folder).free
     except OSError as error:
-        yield Finding(what="shared memory", state="warn", told=f"{folder}: {error.strerror}; images go through sockets")
+        yield Finding(
+            what="shared memory", state="warn", detail=f"{folder}: {error.strerror}; images go through sockets"
+        )
         return
     little = free < 64 * MB
     fix = ["sudo mount -o remount,size=512M /dev/shm    # of a container: --shm-size=512m"] if little else []
-    yield Finding(what="shared memory", state="warn" if little else "ok", told=f"{free / MB:.0f} MB free", fix=fix)
+    yield Finding(what="shared memory", state="warn" if little else "ok", detail=f"{free / MB:.0f} MB free", fix=fix)
 
 
 def disk() -> Iterator[Finding]:
@@ -232,8 +237,8 @@ def disk() -> Iterator[Finding]:
     here = Path.cwd()
     free = shutil.disk_usage(here).free
     if not os.access(here, os.W_OK):
-        yield Finding(what="disk", state="warn", told=f"{here} is read-only; give runs an --out", fix=["cd ~"])
+        yield Finding(what="disk", state="warn", detail=f"{here} is read-only; give runs an --out", fix=["cd ~"])
         return
     fix = ["du -sh runs/* | sort -h    # and remove what is not needed"] if free < GB else []
     state = "ok" if free >= GB else "warn" if free >= 100 * MB else "fail"
-    yield Finding(what="disk", state=state, told=f"{free / GB:.1f} GB free in {here}", fix=fix)
+    yield Finding(what="disk", state=state, detail=f"{free / GB:.1f} GB free in {here}", fix=fix)

@@ -41,6 +41,6 @@ def doctor(where: RobotSelection, *, as_json: bool, say: Say = say) -> int:
 
 
 def _print(finding: Finding, say: Say) -> None:
-    say(f"{finding.state:<5}{finding.what:<21}{finding.told}")
+    say(f"{finding.state:<5}{finding.what:<21}{finding.detail}")
     for fix in finding.fix:
         say(f"     {'':<21}$ {fix}")

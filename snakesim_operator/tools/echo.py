@@ -131,8 +131,8 @@ class OutputQueue:
 def _print_messages(waiting: OutputQueue, count: int | None, say: Say) -> None:
     for _ in itertools.count() if count is None else range(count):
         arrival = waiting.get()
-        told = {"key": arrival.key, **_content(arrival)}
-        say(json.dumps(told, ensure_ascii=False, separators=(",", ":")))
+        content = {"key": arrival.key, **_content(arrival)}
+        say(json.dumps(content, ensure_ascii=False, separators=(",", ":")))
 
 
 def _content(arrival: Arrival) -> dict[str, Any]:

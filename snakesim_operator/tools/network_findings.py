@@ -26,13 +26,13 @@ def ports() -> Iterator[Finding]:
                 taken.append(name)
     robots = [robot for robot in local_robots() if robot.endpoint == DEFAULT_ENDPOINT]
     if robots:
-        told = f"used by {robots[0].namespace}, process {robots[0].pid}"
-        yield Finding(what=f"port {port}", state="ok", told=told)
+        detail = f"used by {robots[0].namespace}, process {robots[0].pid}"
+        yield Finding(what=f"port {port}", state="ok", detail=detail)
     elif taken:
-        told = f"{' and '.join(taken)} used by another program; runs take other ports, and tools find them here"
-        yield Finding(what=f"port {port}", state="warn", told=told, fix=[f"ss -lntup | grep {port}"])
+        detail = f"{' and '.join(taken)} used by another program; runs take other ports, and tools find them here"
+        yield Finding(what=f"port {port}", state="warn", detail=detail, fix=[f"ss -lntup | grep {port}"])
     else:
-        yield Finding(what=f"port {port}", state="ok", told="free")
+        yield Finding(what=f"port {port}", state="ok", detail="free")
 
 
 def routers(where: RobotSelection) -> Iterator[Finding]:
@@ -46,6 +46,6 @@ def routers(where: RobotSelection) -> Iterator[Finding]:
                 robots = ", ".join(robots_on(session)) or "no robot"
         except SnakesimError as error:
             fix = ["snakesim router    # there; and is a firewall between?"]
-            yield Finding(what="endpoint", state="fail", told=f"{link.endpoint}: {error}", fix=fix)
+            yield Finding(what="endpoint", state="fail", detail=f"{link.endpoint}: {error}", fix=fix)
             continue
-        yield Finding(what="endpoint", state="ok", told=f"{link.endpoint} answers in {took_s * 1e3:.0f} ms: {robots}")
+        yield Finding(what="endpoint", state="ok", detail=f"{link.endpoint} answers in {took_s * 1e3:.0f} ms: {robots}")

@@ -45,4 +45,4 @@ def record_robot(
             signal.signal(number, signal.SIG_DFL)
     messages, size = recorder.recording.counts.total(), path.stat().st_size
     say(f"{messages} messages in {time.monotonic() - began:.1f} s, {size / 1e6:.1f} MB: {path}")
-    return 1 if recorder.recording.trouble else 0
+    return 1 if recorder.recording.failure else 0

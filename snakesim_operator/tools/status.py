@@ -167,7 +167,7 @@ def _what_to_type(link: Link, status: Status) -> list[str]:
     if status.ready_to_arm:
         return [f"  next: {arm}"]
     missing = ", ".join(f"`snakesim service {name} SCENARIO{where}`" for name in status.waiting_for)
-    return [f"  next: {missing or '`snakesim status` again: what prevents arming is told above'}"]
+    return [f"  next: {missing or '`snakesim status` again: what prevents arming is named above'}"]
 
 
 def run_router(config: Path | None, *, insecure: bool = False) -> int:

@@ -42,23 +42,23 @@ def estop(where: RobotSelection, say: Say = say) -> int:
         from snakesim_operator.tools.stop_by_query import ask_network  # only now: the datagrams are on their way
 
         asked_all = [side_by_side.submit(ask_network, link, LIMIT_S) for link in where.networks()]
-        here = [told for future in asked_here if (told := future.result()) is not None]
-        there = [told for future in asked_there if (told := future.result()) is not None]
-        shown = [told for future in asked_all for told in future.result()]
-    told = [*here, *_confirmed(there, shown), *_others(here, there, shown)]
-    for robot in told:
+        here = [result for future in asked_here if (result := future.result()) is not None]
+        there = [result for future in asked_there if (result := future.result()) is not None]
+        shown = [result for future in asked_all for result in future.result()]
+    results = [*here, *_confirmed(there, shown), *_others(here, there, shown)]
+    for robot in results:
         say(f"{robot.name}: {'stopped' if robot.stopped else 'NOT STOPPED'}: {robot.text} ({robot.endpoint})")
     for robot in shown:
         if robot.in_doubt and any(_same(robot, other) for other in here):
             say(f"{robot.name}: WARNING: {robot.text} ({robot.endpoint})")
-    if not told:
+    if not results:
         say(f"no robot on {', '.join(where.endpoints())}, and none that this user runs on this computer")
-    if where.namespace is not None and not any(robot.stopped for robot in told):
+    if where.namespace is not None and not any(robot.stopped for robot in results):
         from snakesim_operator.tools.targets import find_robots
 
         for link in find_robots(replace(where, namespace=None)):
             say(f"there is {link.namespace}, on {link.endpoint}; `snakesim estop` without --namespace stops all")
-    return 0 if told and all(robot.stopped for robot in told) else 1
+    return 0 if results and all(robot.stopped for robot in results) else 1
 
 
 def _confirmed(there: list[StopResult], shown: list[StopResult]) -> list[StopResult]:
@@ -67,19 +67,21 @@ def _confirmed(there: list[StopResult], shown: list[StopResult]) -> list[StopRes
     A silent port counts for nothing when the network confirms the stop: at a router's address there may be none.
     """
     return [
-        told
-        if not told.stopped or any(_same(told, other) and other.stopped for other in shown)
+        result
+        if not result.stopped or any(_same(result, other) and other.stopped for other in shown)
         else replace(
-            told, stopped=False, text=f"its stop port reports it, but nothing on its network confirms it: {told.text}"
+            result,
+            stopped=False,
+            text=f"its stop port reports it, but nothing on its network confirms it: {result.text}",
         )
-        for told in there
-        if told.stopped or not any(_same(told, other) and other.stopped for other in shown)
+        for result in there
+        if result.stopped or not any(_same(result, other) and other.stopped for other in shown)
     ]
 
 
 def _others(here: list[StopResult], there: list[StopResult], shown: list[StopResult]) -> list[StopResult]:
     """Robots that only the network reports."""
-    return [told for told in shown if not any(_same(told, other) for other in (*here, *there))]
+    return [result for result in shown if not any(_same(result, other) for other in (*here, *there))]
 
 
 def _same(a: StopResult, b: StopResult) -> bool:

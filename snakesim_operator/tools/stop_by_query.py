@@ -49,11 +49,11 @@ def _ask(session: Session, link: Link, limit_s: float) -> list[StopResult]:
             answers.setdefault(link.namespace or namespace_of(key), []).append(answer)
         if not names:
             break
-    told: list[StopResult] = []
+    results: list[StopResult] = []
     for name in dict.fromkeys([*names, *answers]):
         given = answers.get(name, [])
         if not given:
-            told.append(
+            results.append(
                 StopResult(
                     name, link.endpoint, stopped=False, text=f"NO ANSWER for {limit_s:g} s: use its own emergency stop"
                 )
@@ -63,12 +63,12 @@ def _ask(session: Session, link: Link, limit_s: float) -> list[StopResult]:
         doubt, _ = judge(given, reader)
         refused = next((answer.reason for answer in given if not answer.ok), None)
         wrong = doubt or refused
-        told.append(
+        results.append(
             StopResult(
                 name, link.endpoint, stopped=wrong is None, text=wrong or given[0].reason, in_doubt=doubt is not None
             )
         )
-    return told
+    return results
 
 
 def _of(name: str, link: Link, key: str) -> str:

@@ -45,8 +45,8 @@ def top(request: TopRequest, where: RobotSelection, say: Say = say) -> int:
             latencies = [latency for traffic in traffics for latency in traffic.latencies()]
             left_out = sum(traffic.keys_left_out for traffic in traffics)
             if request.as_json:
-                told = {"keys": lines, "latencies": latencies, "left_out": left_out}
-                say_json(msgspec.to_builtins(told), say)
+                content = {"keys": lines, "latencies": latencies, "left_out": left_out}
+                say_json(msgspec.to_builtins(content), say)
             else:
                 table = table_of(lines, latencies, left_out)
                 if sys.stdout.isatty() and not request.once:
@@ -85,26 +85,26 @@ def table_of(lines: list[KeyTraffic], latencies: list[Latency], left_out: int) -
     """The table, as lines of text: robot by robot, what is not of the key space at the end of each."""
     if not lines:
         return ["nothing arrives"]
-    told: list[str] = []
+    text: list[str] = []
     for robot in dict.fromkeys(line.robot for line in lines):
-        told += ["", f"{robot or 'of no robot'}:", HEAD] if told else [f"{robot or 'of no robot'}:", HEAD]
-        told += [_row(line) for line in lines if line.robot == robot]
+        text += ["", f"{robot or 'of no robot'}:", HEAD] if text else [f"{robot or 'of no robot'}:", HEAD]
+        text += [_row(line) for line in lines if line.robot == robot]
         for latency in latencies:
             if latency.robot == robot:
-                told.append(_latency(latency))
+                text.append(_latency(latency))
     if left_out:
-        told.append(f"and {left_out} messages on still more keys: somebody floods this network")
-    return told
+        text.append(f"and {left_out} messages on still more keys: somebody floods this network")
+    return text
 
 
 def _latency(latency: Latency) -> str:
-    told = (
+    text = (
         f"state to command, as heard here: {latency.heard_median_ms:.2f} ms in the median, "
         f"at most {latency.heard_p99_ms:.2f} ms for 99 % of {latency.count} commands"
     )
     if latency.motors_median_ms is not None:
-        told += f"; to the motors, in robot time: {latency.motors_median_ms:.0f} and {latency.motors_p99_ms:.0f} ms"
-    return told
+        text += f"; to the motors, in robot time: {latency.motors_median_ms:.0f} and {latency.motors_p99_ms:.0f} ms"
+    return text
 
 
 def _row(line: KeyTraffic) -> str:
@@ -112,9 +112,9 @@ def _row(line: KeyTraffic) -> str:
         return "-" if value is None else f"{value:{form}}{unit}"
 
     writer = line.writer or "STRANGER"
-    trouble = f"  {line.trouble}" if line.trouble else ""
+    failure = f"  {line.failure}" if line.failure else ""
     return (
         f"{line.key[:29]:<30}{writer[:17]:<18}{number(line.rate_hz, '.1f', ''):>8}"
         f"{number(line.jitter_ms, '.2f', ' ms'):>9}{number(line.gap_max_ms, '.1f', ' ms'):>9}{line.bytes:>9}"
-        f"{number(line.age_ms, '.0f', ' ms'):>9}{number(line.heard_ago_s, '.1f', ' s'):>9}{trouble}"
+        f"{number(line.age_ms, '.0f', ' ms'):>9}{number(line.heard_ago_s, '.1f', ' s'):>9}{failure}"
     )

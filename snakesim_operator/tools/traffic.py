@@ -34,7 +34,7 @@ class KeyTraffic(msgspec.Struct, frozen=True, kw_only=True):
     robot: str
     key: str
     writer: str | None  # as the key space says; None: the key is not in it
-    trouble: str = ""  # why the newest message cannot be read
+    failure: str = ""  # why the newest message cannot be read
     rate_hz: float | None
     jitter_ms: float | None  # standard deviation of the gaps
     gap_max_ms: float | None
@@ -104,7 +104,7 @@ class Traffic:
                     robot=robot,
                     key=relative,
                     writer=writer,
-                    trouble=said if isinstance(said, str) else "",
+                    failure=said if isinstance(said, str) else "",
                     **_rhythm(times[key]),
                     bytes=len(arrival.payload),
                     heard_ago_s=max(now_ns - arrival.monotonic_ns, 0) * 1e-9,

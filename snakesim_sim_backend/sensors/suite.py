@@ -46,7 +46,7 @@ class Sensors:
         has = config.robot.sensors
         self._joints = JointReader(data, has.joints, motors, scope.noise.standard_normal, config.period_ns)
         self.late: Counter[str] = Counter()  # samples that were dropped because they were not ready in time, by key
-        self._told: Counter[str] = Counter()  # how many of them have been told of
+        self._reported: Counter[str] = Counter()  # how many of them have been reported
         self._others: list[tuple[str, Channel]] = []
         self._snapshots = Snapshots(sim.model) if next(has.mounted(), None) else None
         for key, sensor in has.published():
@@ -67,12 +67,12 @@ class Sensors:
 
     def lateness(self) -> list[str]:
         """What to tell of dropped samples since the last call: at the first one, and when their number has doubled."""
-        told: list[str] = []
+        lines: list[str] = []
         for key, count in self.late.items():
-            if count >= max(2 * self._told[key], 1):
-                self._told[key] = count
-                told.append(f"{key}: {count} samples so far were not ready in time, and were dropped")
-        return told
+            if count >= max(2 * self._reported[key], 1):
+                self._reported[key] = count
+                lines.append(f"{key}: {count} samples so far were not ready in time, and were dropped")
+        return lines
 
     def close(self) -> None:
         """Stop looking."""

@@ -436,11 +436,11 @@ class NeverWakesAgain(Workbench):
 
 @breaks("a_healthy_robot_reports_no_fault")
 class CriesWolf(Workbench):
-    told = False
+    reported = False
 
     def faults(self):
-        told, self.told = self.told, True
-        return [] if told else [Fault(tick=0, what="wolf", cause="none to be seen")]
+        reported, self.reported = self.reported, True
+        return [] if reported else [Fault(tick=0, what="wolf", cause="none to be seen")]
 
 
 @breaks("a_silent_joint_grows_old_and_the_robot_stops")

@@ -86,10 +86,10 @@ def script(section: Section) -> str:
 
 def _expecting(command: str) -> str:
     code = re.search(r"#.*\(exit code (\d+)\)", command)
-    told = f"echo '$' {_quoted(command)}"
+    reported = f"echo '$' {_quoted(command)}"
     if code is None:
-        return f"{told}\n{command}"
-    return f"{told}\ncode=0; {command.partition('#')[0].strip()} || code=$?; [ $code = {code[1]} ]"
+        return f"{reported}\n{command}"
+    return f"{reported}\ncode=0; {command.partition('#')[0].strip()} || code=$?; [ $code = {code[1]} ]"
 
 
 def _quoted(text: str) -> str:

@@ -63,8 +63,8 @@ def done(out: Path) -> int:
 
 
 def children(pid: int) -> list[int]:
-    told = Path(f"/proc/{pid}/task").glob("*/children")
-    return [int(child) for path in told for child in path.read_text().split()]
+    reported = Path(f"/proc/{pid}/task").glob("*/children")
+    return [int(child) for path in reported for child in path.read_text().split()]
 
 
 def lives(pid: int) -> bool:

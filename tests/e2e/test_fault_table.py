@@ -53,5 +53,5 @@ def test_a_row_is_judged_by_its_worst_trial_and_by_everything_that_went_wrong() 
     assert judged(late, why_over="it is so") == (False, True, "1 of 1 trials over 50 ms, because it is so")
     assert judged(late, Trial(value=None), why_over="it is so")[:2] == (False, False)
     assert "no recovery" in judged(Trial(value=1.0, recovered=False))[2]
-    assert "odd" in judged(good, Trial(value=1.0, trouble="odd"))[2]
+    assert "odd" in judged(good, Trial(value=1.0, failure="odd"))[2]
     assert judged(good, broken="it broke")[0] is False and judged()[0] is False

@@ -49,14 +49,14 @@ def test_a_fault_is_asked_for_with_a_command(tmp_path: Path, backend: str) -> No
     arguments = ["triplet", "--controller", "hold", "--duration", "600", "--pace", "realtime", "--backend", backend]
     with running(tmp_path / "run", *arguments) as run:
         run.wait_for(" s  ")  # the first line of progress: armed
-        told = ask(run, "leak", "joint_3") if backend == "sim" else ask(run, "diverge", "simulator")
-        assert told.code == 1 and f"backend '{backend}' cannot do" in told.err
-        told = ask(run, "mute", "joint_99")
-        assert told.code == 1 and "no joint_99" in told.err
-        told = ask(run, "drop", "guidance/world", "--amount", "0.2", "--for", "0.5")
-        assert told.code == 0 and told.out.startswith("drop of guidance/world has begun, at "), told.err
-        told = ask(run, "mute", "joint_3", "--for", "30")
-        assert told.code == 0 and told.out.startswith("mute of joint_3 has begun, at "), told.err
+        result = ask(run, "leak", "joint_3") if backend == "sim" else ask(run, "diverge", "simulator")
+        assert result.code == 1 and f"backend '{backend}' cannot do" in result.err
+        result = ask(run, "mute", "joint_99")
+        assert result.code == 1 and "no joint_99" in result.err
+        result = ask(run, "drop", "guidance/world", "--amount", "0.2", "--for", "0.5")
+        assert result.code == 0 and result.out.startswith("drop of guidance/world has begun, at "), result.err
+        result = ask(run, "mute", "joint_3", "--for", "30")
+        assert result.code == 0 and result.out.startswith("mute of joint_3 has begun, at "), result.err
         assert run.end() == 1
     record = host_record(tmp_path / "run")
     assert record.faults[0].joint in (None, "joint_3") and "joint_3" in record.faults[0].cause
@@ -74,14 +74,14 @@ def test_an_operator_takes_back_a_joint_that_was_lost(tmp_path: Path) -> None:
     def operator(*words: str):
         return command.snakesim(*words, "--endpoint", run.endpoint, cwd=tmp_path)
 
-    def told(what: str) -> None:
+    def result(what: str) -> None:
         wait_until(lambda: what in operator("status").out, f"{what!r} in the status")
 
     arguments = ["triplet", "--controller", "hold", "--duration", "3600", "--stay", *MAY_LOSE_ONE]
     with running(tmp_path / "run", *arguments) as run:
         run.wait_for(" s  ")
         assert ask(run, "mute", "joint_3", "--for", "1").code == 0
-        told("isolated: joint_3; passive until a clear")
+        result("isolated: joint_3; passive until a clear")
         assert "armed, without joint_3: no valid and fresh state of joint_3" in operator("status").out
         refused = operator("clear")
         assert (
@@ -89,7 +89,7 @@ def test_an_operator_takes_back_a_joint_that_was_lost(tmp_path: Path) -> None:
             and "disarm first, then a clear ends the isolation of joint_3" in refused.err + refused.out
         )
         assert operator("disarm").code == 0
-        told("or, without: `snakesim arm planar13 sim")
+        result("or, without: `snakesim arm planar13 sim")
         assert operator("arm", "planar13", "sim").code == 0
         assert "isolated: joint_3" in operator("status").out
         assert operator("disarm").code == 0 and operator("clear").code == 0
@@ -122,8 +122,8 @@ def test_where_something_real_moves_faults_are_not_allowed(tmp_path: Path) -> No
     with running(tmp_path / "run", *arguments, "--duration", "600") as run:
         run.wait_for(" s  ")
         for words in (("mute", "joint_3"), ("hang", "control")):
-            told = ask(run, *words)
-            assert told.code == 1 and "fault injection is not allowed: something real moves here" in told.err
+            result = ask(run, *words)
+            assert result.code == 1 and "fault injection is not allowed: something real moves here" in result.err
         run.process.terminate()
         run.end()
     ended = snakesim("run", *arguments, "--fault", "mute:joint_3@1", "--out", str(tmp_path / "other"), cwd=tmp_path)

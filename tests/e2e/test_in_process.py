@@ -31,7 +31,9 @@ def same_both_ways(out: Path, scenario: str, *arguments: str) -> Result:
         assert np.array_equal(getattr(ours.record, name), getattr(theirs, name), equal_nan=True), name
     # How often tick 0 is shown until the arming is chance, and whether the last one still comes while the host ends.
     for name in ("control", "worlds"):
-        mine, other = ([told for told in getattr(record, name) if told.tick] for record in (ours.record, theirs))
+        mine, other = (
+            [reported for reported in getattr(record, name) if reported.tick] for record in (ours.record, theirs)
+        )
         assert mine[: len(other)] == other and len(mine) - len(other) in (0, 1), name
     return ours
 

@@ -56,15 +56,15 @@ def test_perceived_is_the_true_map_and_to_the_bit_the_same_whatever_the_scene_fi
 
 
 def test_dead_reckoning_takes_no_pose_and_still_knows_where_it_is() -> None:
-    told, _ = worlds("perceived", "mission.localisation=dead_reckoning")
-    assert all(world.pose_stamp_ns is None for world in told)
-    sd_m = told[-1].base_position_sd_m
+    reported, _ = worlds("perceived", "mission.localisation=dead_reckoning")
+    assert all(world.pose_stamp_ns is None for world in reported)
+    sd_m = reported[-1].base_position_sd_m
     assert sd_m is not None and 0.0 < sd_m < 0.05
 
 
 def test_known_is_what_the_scene_file_says():
-    told, _ = worlds("known", deceived=True)
-    obstacles = [o for world in told for o in world.obstacles]
+    reported, _ = worlds("known", deceived=True)
+    obstacles = [o for world in reported for o in world.obstacles]
     assert obstacles and all(o.name.startswith("lie_") for o in obstacles)
     assert all(o.last_seen_ns is None for o in obstacles)
     assert outline_distance_m(obstacles[0], np.array(LIES[0].position_m)) < 0

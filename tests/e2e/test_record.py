@@ -80,8 +80,8 @@ def test_a_killed_supervisor_leaves_a_record_too(tmp_path: Path) -> None:
     nothing_left(tmp_path / "run")
     record = RunRecord.load(tmp_path / "run")
     assert round(record.time_s[-1] * RATE_HZ) > tick - RATE_HZ and record.host.ended == "running" and record.control
-    told = command.snakesim("compare", "run", "run", cwd=tmp_path)
-    assert told.code == 0 and "last second may be missing" in told.out
+    result = command.snakesim("compare", "run", "run", cwd=tmp_path)
+    assert result.code == 0 and "last second may be missing" in result.out
     ended, _ = command.run_to_summary(tmp_path / "run", *SHORT)  # and its folder can be used again
     assert ended.code == 0 and "held an earlier run: moved to" in ended.out
 
@@ -116,8 +116,8 @@ def test_a_run_that_somebody_finishes_early_is_no_complete_run(tmp_path: Path) -
 def test_time_in_which_the_robot_was_not_armed_does_not_count(tmp_path: Path) -> None:
     with running(tmp_path / "run", *LONG, "--duration", "2") as run:
         run.wait_for(" s  ")
-        told = command.snakesim("disarm", "--endpoint", run.endpoint, cwd=tmp_path)
-        assert told.code == 0, told.err
+        result = command.snakesim("disarm", "--endpoint", run.endpoint, cwd=tmp_path)
+        assert result.code == 0, result.err
         assert run.end() == 1, run.said()
     ended = summary_of(tmp_path / "run").ended
     assert "of 2 s" in ended and "the time was over before the requested armed time was reached" in ended

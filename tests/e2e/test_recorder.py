@@ -44,16 +44,16 @@ def sighted_live(address: str) -> list[str]:
     with connect(address, subprotocols=[Subprotocol("foxglove.sdk.v1")]) as viewer:
         frames: dict[str, str] | None = None
         while frames is None:
-            told = viewer.recv(10.0)
-            if isinstance(told, str) and (message := json.loads(told))["op"] == "advertise":
+            reported = viewer.recv(10.0)
+            if isinstance(reported, str) and (message := json.loads(reported))["op"] == "advertise":
                 frames = next((row for row in message["channels"] if row["topic"] == "foxglove/tf"), None)
         assert frames["encoding"] == frames["schemaEncoding"] == "protobuf"
         viewer.send(json.dumps({"op": "subscribe", "subscriptions": [{"id": 1, "channelId": frames["id"]}]}))
-        while isinstance(told := viewer.recv(10.0), str):
+        while isinstance(reported := viewer.recv(10.0), str):
             pass
-        operation, _, time_ns = struct.unpack("<BIQ", told[:13])
+        operation, _, time_ns = struct.unpack("<BIQ", reported[:13])
         assert operation == 1 and 0 < time_ns < 60e9  # robot time
-        return [frame.child_frame_id for frame in FrameTransforms.FromString(told[13:]).transforms]
+        return [frame.child_frame_id for frame in FrameTransforms.FromString(reported[13:]).transforms]
 
 
 def test_a_run_goes_on_without_its_recorder_and_another_records_beside_it(tmp_path: Path) -> None:

@@ -46,9 +46,9 @@ def test_without_another_stream_it_holds_and_goes_on_when_it_is_back(tmp_path: P
     held = (time_s > FROM_S + limit_s + 0.1) & (time_s < TO_S)
     assert pushes[time_s < FROM_S].any() and not pushes[held].any() and pushes[time_s > TO_S + 0.5].any()
     assert (record.mode[held] == Mode.POSITION).all()
-    told = [state for state in record.control if state.reason.startswith(f"{key} is 0.")]
-    assert told and all(state.state == "NotLocomoting" for state in told)
-    assert any(f"s old, at most {limit_s:g} s" in state.reason for state in told)
+    reported = [state for state in record.control if state.reason.startswith(f"{key} is 0.")]
+    assert reported and all(state.state == "NotLocomoting" for state in reported)
+    assert any(f"s old, at most {limit_s:g} s" in state.reason for state in reported)
     assert record.control[-1].state == "Locomoting"
     late = (time_s > FROM_S + limit_s + FADED_S) & (time_s < TO_S)
     if late.any():  # nothing moves any more, and no target moves

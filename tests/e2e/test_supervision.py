@@ -136,9 +136,9 @@ def test_a_router_that_dies_stops_the_robot_and_nothing_arms_it_again(tmp_path: 
             assert robot.status().lifecycle == "fault" and pids(run, "host", *SERVICES) == before
             assert "lease_expired" in [fault.what for fault in robot.status().faults]
             for command in (["clear"], ["arm", "planar13", "sim"]):
-                told = snakesim(*command, "--router", run.endpoint, cwd=tmp_path)
+                result = snakesim(*command, "--router", run.endpoint, cwd=tmp_path)
                 if command == ["clear"]:
-                    assert told.code == 0, told.err
+                    assert result.code == 0, result.err
                     robot.is_ready()
             robot.reaches("armed")
         interrupt(run)

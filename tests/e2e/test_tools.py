@@ -90,8 +90,9 @@ def test_a_run_goes_on_when_nobody_reads_what_it_prints(tmp_path: Path) -> None:
 
 def test_a_closed_terminal_ends_a_run_in_order(tmp_path: Path) -> None:
     (ours, theirs), endpoint = pty.openpty(), free_endpoint()
+    run = ["run", "triplet", "--pace", "realtime", "--out", "run", "--endpoint", endpoint]
     process = subprocess.Popen(
-        ["setsid", "--ctty", *SNAKESIM, "run", "triplet", "--pace", "realtime", "--out", "run", "--endpoint", endpoint],
+        ["env", "--default-signal=HUP", "setsid", "--ctty", *SNAKESIM, *run],
         cwd=tmp_path,
         env=environment(tmp_path),
         stdin=theirs,
@@ -168,8 +169,8 @@ def test_echo_and_status_of_a_running_robot(tmp_path: Path) -> None:
         found = re.findall(r"planar13/sensor/joints: ([\d.]+) Hz", rate.out)
         assert found and float(found[-1]) == pytest.approx(100, rel=0.1), rate.out + rate.err
         one = command.snakesim("echo", "hal/description", "--count", "1", "--endpoint", run.endpoint, cwd=tmp_path)
-        told = json.loads(one.out)
-        assert told["key"] == "planar13/hal/description" and told["message"]["joints"][12]["name"] == "joint_13"
+        reported = json.loads(one.out)
+        assert reported["key"] == "planar13/hal/description" and reported["message"]["joints"][12]["name"] == "joint_13"
         found = echoed(run, tmp_path, "sensor/**", 40)
         assert {"planar13/sensor/joints", "planar13/sensor/imu"} <= {line["key"] for line in found}
         assert all("tick" in line["message"] for line in found)

@@ -38,14 +38,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     for row, backend in wanted:
         if row.place in ("here", inside):
             store.put(_measured(row, backend, given.trials))
-            failed += _told(row, backend, store)
+            failed += _reported(row, backend, store)
     if inside is not None:
         return 0
     for place in ELSEWHERE:
         there = [job for job in wanted if job[0].place == place]
         if there:
             _elsewhere(place, there, given, store)
-            failed += [name for row, backend in there for name in _told(row, backend, store)]
+            failed += [name for row, backend in there for name in _reported(row, backend, store)]
     if given.write:
         from tests.faults.page import write
 
@@ -70,8 +70,8 @@ def _measured(row: Row, backend: Backend, trials: int) -> Result:
         try:
             for trial in measure(request):
                 done.append(trial)
-                if trial.trouble:
-                    print(f"    {trial.trouble}", flush=True)
+                if trial.failure:
+                    print(f"    {trial.failure}", flush=True)
         except Exception as error:  # noqa: BLE001 - a row that breaks is a result, and the others go on
             traceback.print_tb(error.__traceback__)
             print(f"{type(error).__name__}: {str(error)[:1000]}", file=sys.stderr)
@@ -79,8 +79,8 @@ def _measured(row: Row, backend: Backend, trials: int) -> Result:
             print("\n".join(logs), file=sys.stderr, flush=True)
             broken = f"{type(error).__name__}: {error}"[:500]
     took_s = round(time.monotonic() - started, 1)
-    told = {"trials": done, "retried": request.retried, "notes": request.notes, "broken": broken}
-    return _result(row, backend, took_s=took_s, load=load, **told)
+    reported = {"trials": done, "retried": request.retried, "notes": request.notes, "broken": broken}
+    return _result(row, backend, took_s=took_s, load=load, **reported)
 
 
 def _elsewhere(place: str, wanted: Sequence[Job], given: argparse.Namespace, store: Store) -> None:
@@ -109,7 +109,7 @@ def _result(row: Row, backend: str, **measured: Any) -> Result:
     return Result(row=row.name, backend=backend, when=when, machine=machine(), **(empty | measured))
 
 
-def _told(row: Row, backend: str, store: Store) -> list[str]:
+def _reported(row: Row, backend: str, store: Store) -> list[str]:
     """Print how a row came out; its name when it is not met."""
     result = store.read()[row.name, backend]
     verdict = judge(row, result)

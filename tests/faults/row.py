@@ -17,7 +17,7 @@ class Trial(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """One injection."""
 
     value: float | None  # in the row's unit; None: what should have happened did not
-    trouble: str = ""  # what else was wrong
+    failure: str = ""  # what else was wrong
     recovered: bool | None = None  # by an operator's command; None: there was nothing to recover from
     step_rad: float | None = None  # largest change of an applied angle target in a tick, after the recovery
     first_rad: float | None = None  # largest distance of the first angle targets from the measured angles
@@ -104,9 +104,9 @@ def judge(row: Row, result: Result) -> Verdict:
     missing = sum(trial.value is None for trial in result.trials)
     if missing:
         against.append(f"nothing measured in {missing} of {len(result.trials)} trials")
-    troubles = [trial.trouble for trial in result.trials if trial.trouble]
-    if troubles:
-        against.append(f"{len(troubles)} of {len(result.trials)} trials: {troubles[0]}")
+    failures = [trial.failure for trial in result.trials if trial.failure]
+    if failures:
+        against.append(f"{len(failures)} of {len(result.trials)} trials: {failures[0]}")
     stuck = sum(trial.recovered is False for trial in result.trials)
     if stuck:
         against.append(f"no recovery in {stuck} trials")

@@ -65,12 +65,12 @@ def lease_row(
 
 def watchdog_row(name: str, fault: str, measure: Measure, limit_ms: float, place: Place = "here") -> Row:
     """Modules that are left alone. Where a listener tells their time from their heartbeats, it may be a little off."""
-    told = f", which a listener can tell to {limit_ms - 100:.0f} ms" if limit_ms > 100 else ""
+    reported = f", which a listener can tell to {limit_ms - 100:.0f} ms" if limit_ms > 100 else ""
     return Row(
         name,
         fault,
         "every module stops by itself, motor off, latched",
-        f"100 ms after the last set-point, in the module's own time{told}",
+        f"100 ms after the last set-point, in the module's own time{reported}",
         limit_ms,
         "ms",
         {"sim": NO_MODULES_LEFT, "can": measure},

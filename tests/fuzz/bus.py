@@ -150,9 +150,9 @@ def _tick(run: Loop, stranger: Stranger, words: Counter[str]) -> None:
     if run.tick % 20 == 15:
         run.lifecycle = "armed"
     stranger.speak(PER_TICK)
-    told = len(run.faults)
+    reported = len(run.faults)
     run.run(1)
-    words.update(f"fault {fault.what}" for fault in run.faults[told:])
+    words.update(f"fault {fault.what}" for fault in run.faults[reported:])
     samples = run.samples[-1]
     for message in (samples.joints, *samples.others.values()):
         assert Decoder(type(message)).decode(encode(message), encoding_of(type(message))) == message

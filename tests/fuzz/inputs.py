@@ -138,7 +138,7 @@ def mocap() -> Iterator[Input]:
 
         try:
             yield Input(
-                "motion capture", [*map(_pose, (1, 10**7, 10**9)), _pose(10**8, told=False)], take, MAX_BYTES + 100
+                "motion capture", [*map(_pose, (1, 10**7, 10**9)), _pose(10**8, reported=False)], take, MAX_BYTES + 100
             )
         finally:
             receiver.close()
@@ -177,10 +177,10 @@ def stop_port() -> Iterator[Input]:
             opened.close()
 
 
-def _pose(stamp_ns: int, *, told: bool = True) -> bytes:
+def _pose(stamp_ns: int, *, reported: bool = True) -> bytes:
     plain = {"stamp_ns": stamp_ns, "position_w": [0.1, 0.2, 0.3], "orientation_wxyz": [1, 0, 0, 0]}
     velocities = {"velocity_w": [0.0, 0.1, 0.0], "angular_velocity_w": [0.0, 0.0, 1.0]}
-    return msgspec.json.encode({**plain, **(velocities if told else {})})
+    return msgspec.json.encode({**plain, **(velocities if reported else {})})
 
 
 def texts() -> list[Input]:

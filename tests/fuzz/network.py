@@ -44,7 +44,7 @@ class Stretch:
     first: Status
     last: Status
     seen: dict[str, list[Vitals]] = field(default_factory=dict[str, list[Vitals]])
-    trouble: list[str] = field(default_factory=list[str])
+    failure: list[str] = field(default_factory=list[str])
 
     @property
     def ticks(self) -> int:
@@ -108,13 +108,13 @@ class Watcher:
             for name, pid in self._parts.items():
                 now = vitals(pid)
                 if now is None:
-                    stretch.trouble.append(f"{name} (process {pid}) has ended")
+                    stretch.failure.append(f"{name} (process {pid}) has ended")
                     continue
                 stretch.seen.setdefault(name, []).append(now)
             status = self.status()
             if status is not None and status.lifecycle != "armed":
-                stretch.trouble.append(f"the robot is in {status.lifecycle}: {status.why}")
-            if stretch.trouble:
+                stretch.failure.append(f"the robot is in {status.lifecycle}: {status.why}")
+            if stretch.failure:
                 break
         stretch.last = self._fresh()
         return stretch
@@ -150,10 +150,10 @@ def fuzz(out: Path, request: Request) -> Verdict:
         wait_until(watcher.ready, "armed and commanded")
         until = time.monotonic() + (request.payloads / request.rate if request.quiet_s is None else request.quiet_s)
         quiet = fuzzed = watcher.stretch(lambda: time.monotonic() < until)
-        if not quiet.trouble:
+        if not quiet.failure:
             with _stranger(run.endpoint, request) as stranger:
                 fuzzed = watcher.stretch(lambda: stranger.poll() is None)
-                if fuzzed.trouble:
+                if fuzzed.failure:
                     stranger.kill()
                 said, _ = stranger.communicate(timeout=LIMIT_S)
             if stranger.returncode == 0:
@@ -162,12 +162,12 @@ def fuzz(out: Path, request: Request) -> Verdict:
         run.end()
     wait_until(lambda: not processes_of(out), "all processes of the run gone")
     record = msgspec.json.decode((out / HOST_RECORD).read_bytes(), type=HostRecord)
-    trouble = [*_complaints(out), *_foreign(out, record)]
-    if quiet.trouble:
-        trouble += [f"before anything was sent, {what}: is this machine too busy?" for what in quiet.trouble]
+    failure = [*_complaints(out), *_foreign(out, record)]
+    if quiet.failure:
+        failure += [f"before anything was sent, {what}: is this machine too busy?" for what in quiet.failure]
     else:
-        trouble += [*fuzzed.trouble, *_differences(quiet, fuzzed, sent, request.payloads)]
-    return Verdict(quiet, fuzzed, sent, record, trouble)
+        failure += [*fuzzed.failure, *_differences(quiet, fuzzed, sent, request.payloads)]
+    return Verdict(quiet, fuzzed, sent, record, failure)
 
 
 @contextmanager

@@ -109,20 +109,20 @@ class Stranger:
         self._collect(0.0)
         self._by["queries"][key] += 1
         self._open += 1
-        told: list[str] = []
+        reported: list[str] = []
 
         def take(reply: zenoh.Reply) -> None:
             if reply.ok is None:
-                told.append("an error")
+                reported.append("an error")
                 return
             try:
                 answer = self._answer_decoder.decode(reply.ok.payload.to_bytes(), str(reply.ok.encoding))
-                told.append("yes" if answer.ok else "no")
+                reported.append("yes" if answer.ok else "no")
             except WireError as error:
-                told.append(f"cannot be read: {error}"[:80])
+                reported.append(f"cannot be read: {error}"[:80])
 
         def close() -> None:
-            self._closed.put((answerable, told))
+            self._closed.put((answerable, reported))
 
         selector = key if self._rng.random() > 0.01 else f"{key}?{'x' * self._rng.randrange(300)}=;{{}}"
         bare = self._rng.random() < 0.01
@@ -140,13 +140,13 @@ class Stranger:
         """Note the queries that have come to their end."""
         while self._open:
             try:
-                to_hal, told = self._closed.get(timeout=wait_s) if wait_s else self._closed.get_nowait()
+                to_hal, reported = self._closed.get(timeout=wait_s) if wait_s else self._closed.get_nowait()
             except Empty:
                 return
             wait_s = 0.0
             self._open -= 1
-            self._answered += to_hal and bool(told)
-            self._by["answers"].update(told)
+            self._answered += to_hal and bool(reported)
+            self._by["answers"].update(reported)
 
     def _key_of(self, message: type[Message]) -> str:
         rng = self._rng

@@ -19,14 +19,14 @@ from tests.lab.small_lab import OTHER, OWN, SmallLab
 
 # One key of each line; a gnc has only its own services' names, and `hal` is none of them.
 KEYS = {line.key: line.key.replace("*", "control") for line in TABLE} | {"process/*": "process/control-1a2b"}
-STRAYS = {
+FORGED_PLACES = {
     "alive/hal": "alive/*",
     "hal/done/hal": "hal/done/*",
     "fault/run": "fault/*",
     "process/host-1a2b": "process/*",
     "sensor/unknown": None,
 }
-PLACES = (*KEYS.values(), *STRAYS)
+PLACES = (*KEYS.values(), *FORGED_PLACES)
 KINDS = ("publish", "delete", "read", "ask", "answer", "declare", "watch")
 TO_ALL = "from the witness"
 REFUSED = {  # in the words of the router's log
@@ -52,11 +52,11 @@ def expected(role: Role, robot: str) -> Seen:
     """What the published table says. Under a name that is not its service's, a gnc may not write."""
     granted: Seen = {kind: set() for kind in KINDS}
     for line in TABLE if robot == OWN else ():
-        strays = {stray for stray, key in STRAYS.items() if key == line.key}
+        forged = {name for name, key in FORGED_PLACES.items() if key == line.key}
         for act in line.acts(role):
             own_name = "*" in line.key and act in OWN_NAME_ONLY
             if not (own_name and role is Role.RECORDER):
-                granted[act] |= {KEYS[line.key]} | (set() if own_name and role is Role.GNC else strays)
+                granted[act] |= {KEYS[line.key]} | (set() if own_name and role is Role.GNC else forged)
     return granted
 
 
@@ -75,10 +75,10 @@ def test_what_the_table_grants_passes_and_nothing_else(
     granted = expected(role, robot)
     assert seen == granted, who.common_name
     refused = {kind: set(PLACES) - keys for kind, keys in granted.items()}
-    eventually(lambda: told(lab, who.common_name), refused)
+    eventually(lambda: seen_by(lab, who.common_name), refused)
 
 
-def told(lab: SmallLab, name: str) -> Seen:
+def seen_by(lab: SmallLab, name: str) -> Seen:
     """What the router's log says that it refused to a certificate."""
     said = [line.partition(f" refused: {name}: ")[2] for line in lab.said()]
     return {
@@ -143,8 +143,8 @@ def test_only_an_administrator_reads_the_routers_own_state_and_nobody_changes_it
     """The admin space of Zenoh names every session and address."""
     for role in Role:
         with lab.session(lab.who(role, OWN)) as session:
-            told = [reply for reply in session.get("@/*/router", timeout=0.5) if reply.ok is not None]
-            assert bool(told) == (role is Role.ADMINISTRATOR), role
+            replies = [reply for reply in session.get("@/*/router", timeout=0.5) if reply.ok is not None]
+            assert bool(replies) == (role is Role.ADMINISTRATOR), role
             session.put("@/*/router/config/access_control/enabled", "false")
 
 

@@ -54,9 +54,9 @@ def test_a_fault_that_is_not_explained_is_found() -> None:
     endpoint = free_endpoint()
     with open_session(Link(endpoint, "worm", listen=True)) as hal, open_session(Link(endpoint, "worm")) as session:
         watch, teller = Watch(session), hal.latched_publisher(keys.STATUS, Status)
-        for told in (stopped("too hot", "too hot"), stopped("too hot"), stopped("", "too hot")):
+        for reported in (stopped("too hot", "too hot"), stopped("too hot"), stopped("", "too hot")):
             watch.status = None
-            teller.put(told)
+            teller.put(reported)
             wait_until(lambda: watch.listen() or watch.status is not None, "the status")
         assert watch.violations[0] == "fault without a fault: too hot"
         assert "fault without a why" in watch.violations

@@ -50,8 +50,8 @@ def test_an_interface_that_goes_down_stops_the_joints_and_comes_back(spare_chann
         must(ip("link", "set", spare_channel, "up"))
         run.run(10)
         assert run.states() == [ModuleState.FAULT] * 4 and run.watch_seen("interface_up") == 1
-        told = {f.what for f in run.faults[1:]}
-        assert told and told <= {"module_watchdog", "module_fault"}, "now they can tell"
+        reported = {f.what for f in run.faults[1:]}
+        assert reported and reported <= {"module_watchdog", "module_fault"}, "now they can tell"
         cleared_and_armed_again(run)
         assert moved_again(run)
 

@@ -107,11 +107,11 @@ class Listener:
 
     def states(self) -> list[ModuleState]:
         """The state that each module told last, in whatever frame."""
-        told = dict.fromkeys(NODES, ModuleState.BOOT)
+        reported = dict.fromkeys(NODES, ModuleState.BOOT)
         for heard in self.listen():
             if heard.opcode in (Opcode.HEARTBEAT, Opcode.JOINT_STATE):
-                told[node_of(heard.frame.id)] = ModuleState(int(heard.says()["state"]))
-        return list(told.values())
+                reported[node_of(heard.frame.id)] = ModuleState(int(heard.says()["state"]))
+        return list(reported.values())
 
     def close(self) -> None:
         self._socket.close()

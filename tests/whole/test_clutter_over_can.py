@@ -17,9 +17,9 @@ def over_can(*sets: str) -> Result:
 
 
 def test_it_goes_on_without_a_joint_that_was_lost_on_the_way() -> None:
-    told = over_can("duration_s=6", "robot.safety.may_lose_joints=1", f'faults=["mute:joint_7@{LOST_S}"]')
-    assert told.summary.ended == "complete" and list(told.record.host.isolated) == ["joint_7"]
-    advance = Advance.of(told.record)
+    reported = over_can("duration_s=6", "robot.safety.may_lose_joints=1", f'faults=["mute:joint_7@{LOST_S}"]')
+    assert reported.summary.ended == "complete" and list(reported.record.host.isolated) == ["joint_7"]
+    advance = Advance.of(reported.record)
     assert advance is not None
     before_m = float(np.interp(LOST_S, advance.time_s, advance.along_m))
     assert before_m > 0.4, "it moved before"
@@ -28,5 +28,5 @@ def test_it_goes_on_without_a_joint_that_was_lost_on_the_way() -> None:
 
 @pytest.mark.slow
 def test_it_crosses() -> None:
-    told = over_can().summary
-    assert told.crossed is True and not told.faults
+    reported = over_can().summary
+    assert reported.crossed is True and not reported.faults

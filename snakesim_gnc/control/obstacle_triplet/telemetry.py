@@ -22,10 +22,10 @@ def bending(body: PlanarBody, body_pose: BodyPose, choice: Choice, force_n: floa
 def planned_contacts(body: PlanarBody, world: World, choice: Choice, forces_n: Sequence[float]) -> list[WorldContact]:
     """The triplet's planned push-points, with the solved forces, tail to head."""
     height = world.base_position_w[2]
-    told: list[WorldContact] = []
+    points: list[WorldContact] = []
     for contact, body_s, force in zip(choice.triplet.contacts, choice.body_s_m, forces_n, strict=True):
         (x, y), (nx, ny), (tx, ty) = contact.point_w, contact.normal_w, contact.tangent_w
-        told.append(
+        points.append(
             WorldContact(
                 link=body.link_at(body_s),
                 obstacle=contact.obstacle,
@@ -36,7 +36,7 @@ def planned_contacts(body: PlanarBody, world: World, choice: Choice, forces_n: S
                 force_w=(force * nx, force * ny, 0.0),
             )
         )
-    return told
+    return points
 
 
 def largest_contact_force_n(world: World) -> float:

@@ -46,7 +46,7 @@ class Gap:
 
     what: str
     unit: str
-    difference: Floats  # (n, joints), B - A; NaN where it cannot be told
+    difference: Floats  # (n, joints), B - A; NaN where it is unknown
     joint_rms: Floats  # (joints,)
     joint_worst: list[LargestDifference | None]
     rms: float | None  # over all joints
@@ -173,8 +173,8 @@ def differ(a: RunRecord, b: RunRecord, apart_rad: float = APART_RAD) -> Differen
     for mode, what, unit in TARGETS:
         both = same_mode & (on_a.mode == mode)
         if both.any():
-            told = [np.where(both, joints.target, np.nan) for joints in (on_a, on_b)]
-            targets.append(_gap(what, unit, time_s, told[0], told[1], both))
+            a_target, b_target = (np.where(both, joints.target, np.nan) for joints in (on_a, on_b))
+            targets.append(_gap(what, unit, time_s, a_target, b_target, both))
     angle = _gap("angle", "rad", time_s, on_a.angle_rad, on_b.angle_rad)
     return Difference(
         a=a,
@@ -204,9 +204,9 @@ def _check(a: RunRecord, b: RunRecord) -> None:
                 f"{record.folder / 'host.log'} may say more. Run it again, until the summary tells a time"
             )
     if a.description.layout != b.description.layout:
-        told = [f"{r.folder} has {r.description.robot} with {len(r.description.joints)} joints" for r in (a, b)]
+        robots = [f"{r.folder} has {r.description.robot} with {len(r.description.joints)} joints" for r in (a, b)]
         raise ConfigError(
-            f"{told[0]}, {told[1]}: their names, order or axes are not the same, so there is no joint to compare with "
+            f"{', '.join(robots)}: their names, order or axes are not the same, so there is no joint to compare with "
             "which. Compare runs of one robot file"
         )
     for record in (a, b):
@@ -242,8 +242,8 @@ def _gap(what: str, unit: str, time_s: Floats, a: Floats, b: Floats, compared: N
     joint_worst: list[LargestDifference | None] = []
     for joint in range(difference.shape[1]):
         row = int(np.argmax(np.where(known[:, joint], squares[:, joint], -1.0)))
-        told = LargestDifference(joint, float(time_s[row]), float(a[row, joint]), float(b[row, joint]))
-        joint_worst.append(told if count[joint] else None)
+        worst = LargestDifference(joint, float(time_s[row]), float(a[row, joint]), float(b[row, joint]))
+        joint_worst.append(worst if count[joint] else None)
     worst = max((one for one in joint_worst if one is not None), key=lambda one: abs(one.difference), default=None)
     rms = float(np.sqrt(squares.sum() / known.sum())) if known.any() else None
     correlation = _correlation(a[known], b[known])

@@ -42,7 +42,7 @@ def identity(a: RunRecord, b: RunRecord) -> list[Setting]:
 def differences(a: RunRecord, b: RunRecord) -> list[Setting]:
     """Every value that is not the same in both: of the effective configuration, and of the robot as described.
 
-    The description follows from the robot's file, so it is told only where one file was described in two ways.
+    The description follows from the robot's file, so it is shown only where one file was described in two ways.
     """
     found: list[Setting] = []
     sources = [("", _configured(a), _configured(b))]
@@ -61,8 +61,8 @@ def _configured(record: RunRecord) -> dict[str, Any]:
 
 
 def _described(record: RunRecord) -> dict[str, Any]:
-    told = msgspec.to_builtins(record.description)
-    return dict(leaves({key: value for key, value in told.items() if key not in FOLLOWS}))
+    fields = msgspec.to_builtins(record.description)
+    return dict(leaves({key: value for key, value in fields.items() if key not in FOLLOWS}))
 
 
 def _value_text(values: dict[str, Any], key: str) -> str:

@@ -131,7 +131,7 @@ def _beside(difference: Difference) -> list[str]:
     lines: list[str] = []
     if difference.torque.correlation is not None:
         lines.append(f"  torques correlate by {difference.torque.correlation:.3f}")
-    tracking = [f"{told:.4f} rad" if told is not None else "unknown" for told in difference.tracking_rad]
+    tracking = [f"{error:.4f} rad" if error is not None else "unknown" for error in difference.tracking_rad]
     lines.append(f"  angle off its own target, RMS in position mode: A {tracking[0]}, B {tracking[1]}")
     if difference.other_mode:
         lines.append(

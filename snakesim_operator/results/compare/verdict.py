@@ -70,12 +70,12 @@ def _untold(difference: Difference) -> list[str]:
 
 def how_far(advance: Advance) -> str:
     """Both distances, and B's relative to A's."""
-    told = f"A moved {advance.a_m:.3f} m, B {advance.b_m:.3f} m"
+    moved = f"A moved {advance.a_m:.3f} m, B {advance.b_m:.3f} m"
     if advance.percent is None:
-        return f"{told}; A stood still"
+        return f"{moved}; A stood still"
     if max(abs(advance.a_m), abs(advance.b_m)) < STOOD_M:
-        return f"{told}; both stood still"
-    return f"{told}: {relation(advance)}"
+        return f"{moved}; both stood still"
+    return f"{moved}: {relation(advance)}"
 
 
 def relation(advance: Advance) -> str:

@@ -5,11 +5,11 @@
   const touch = matchMedia("(pointer: coarse)").matches;
   const look = getComputedStyle(document.documentElement);
 
-  const coloured = (told) => {
-    if (typeof told === "string") return told.startsWith("--") ? look.getPropertyValue(told).trim() : told;
-    if (Array.isArray(told)) return told.map(coloured);
-    if (told === null || typeof told !== "object") return told;
-    return Object.fromEntries(Object.entries(told).map(([key, value]) => [key, coloured(value)]));
+  const coloured = (value) => {
+    if (typeof value === "string") return value.startsWith("--") ? look.getPropertyValue(value).trim() : value;
+    if (Array.isArray(value)) return value.map(coloured);
+    if (value === null || typeof value !== "object") return value;
+    return Object.fromEntries(Object.entries(value).map(([key, item]) => [key, coloured(item)]));
   };
   const axis = {
     gridcolor: "--grid", zerolinecolor: "--rule", linecolor: "--faint", tickcolor: "--faint", zerolinewidth: 1,

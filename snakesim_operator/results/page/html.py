@@ -42,9 +42,9 @@ def chart(figure: Figure) -> Markup:
     )
 
 
-def data(told: Any) -> Markup:
+def data(value: Any) -> Markup:
     """JSON for a script of the page, with no text in it that the page or a figure would take for markup."""
-    encoded = msgspec.json.encode(_harmless(told)).decode().replace("<", "\\u003c")
+    encoded = msgspec.json.encode(_harmless(value)).decode().replace("<", "\\u003c")
     return Markup(f'<script type="application/json">{encoded}</script>')
 
 
@@ -77,12 +77,12 @@ def _visible(value: Any) -> Any:
     return value if isinstance(value, Markup) or not isinstance(value, str) else printable(value, KEPT)
 
 
-def _harmless(told: Any) -> Any:
-    if isinstance(told, str):
-        return escape(printable(told), quote=False)
-    if isinstance(told, dict):
-        return {key: _harmless(value) for key, value in told.items()}
-    return [_harmless(value) for value in told] if isinstance(told, list) else told
+def _harmless(value: Any) -> Any:
+    if isinstance(value, str):
+        return escape(printable(value), quote=False)
+    if isinstance(value, dict):
+        return {key: _harmless(item) for key, item in value.items()}
+    return [_harmless(item) for item in value] if isinstance(value, list) else value
 
 
 def _text(*paths: Path) -> str:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from snakesim_hal.wire.messages import ControlState, World, WorldContact
 from snakesim_operator.results.record import RunRecord
-from snakesim_operator.results.report.timeline import told_at_s
+from snakesim_operator.results.report.timeline import reported_at_s
 
 Floats = NDArray[np.float64]
 NEEDED = 3
@@ -89,12 +89,12 @@ def balanced_instants(record: RunRecord, begin_s: float = 0.0, end_s: float = ma
         return []
     found: list[Instant] = []
     for state in record.control:
-        balance = balance_of(state) if begin_s <= told_at_s(record, state) <= end_s else None
+        balance = balance_of(state) if begin_s <= reported_at_s(record, state) <= end_s else None
         if balance is None or state.propulsion_joint is None or state.state != "Locomoting":
             continue
         if balance.gap_n > 0.05 * balance.commanded_n or min(balance.size_n) <= 0:
             continue
-        instant = _instant(record, told_at_s(record, state), state, balance)
+        instant = _instant(record, reported_at_s(record, state), state, balance)
         if record.nodes_w(instant.row) is not None:
             found.append(instant)
     return found
@@ -105,7 +105,7 @@ def instant_at(record: RunRecord, time_s: float) -> Instant | None:
     row = record.row_at(float(record.time_s[0]) + time_s)
     if record.nodes_w(row) is None:
         return None
-    earlier = [state for state in record.control if told_at_s(record, state) <= time_s]
+    earlier = [state for state in record.control if reported_at_s(record, state) <= time_s]
     return _instant(record, time_s, earlier[-1] if earlier else None, None)
 
 

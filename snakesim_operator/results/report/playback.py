@@ -76,7 +76,11 @@ def playback(record: RunRecord) -> Playback | None:
         view.width,
         view.height,
         "The snake on the map, moved by the slider",
-        ground(record, view, labels) + '<g class="told"></g>' + snake + '<g class="forces"></g>' + scales(view),
+        ground(record, view, labels)
+        + '<g class="seen-obstacles"></g>'
+        + snake
+        + '<g class="forces"></g>'
+        + scales(view),
     )
     data = {"frames": frames, "said": said, "joints": names, "end": round(end_s(record), 3)}
     data |= {"maps": maps, "paths": paths}
@@ -89,8 +93,8 @@ def _perceived(record: RunRecord, view: View, rows: NDArray[np.intp]) -> tuple[l
     if record.config.mission.map != "perceived" or not record.worlds:
         return [], [-1] * len(rows)
     some = record.worlds[:: max(len(record.worlds) // MAPS, 1)]
-    told = [[_flat(view, outline_w(one)) for one in world.obstacles if view.shows(one)] for world in some]
-    return told, _last_before(record, rows, [world.stamp_ns for world in some])
+    outlines = [[_flat(view, outline_w(one)) for one in world.obstacles if view.shows(one)] for world in some]
+    return outlines, _last_before(record, rows, [world.stamp_ns for world in some])
 
 
 def _planned(record: RunRecord, view: View, rows: NDArray[np.intp]) -> tuple[list[list[float]], list[int]]:
@@ -98,8 +102,8 @@ def _planned(record: RunRecord, view: View, rows: NDArray[np.intp]) -> tuple[lis
     planned = [one for one in record.trajectories if one.stamp_ns is not None]
     if len({one.path_id for one in planned}) < 2:
         return [], [-1] * len(rows)
-    told = [_flat(view, np.array(one.path_w)[:: max(len(one.path_w) // PATH_POINTS, 1)]) for one in planned]
-    return told, _last_before(record, rows, [one.stamp_ns or 0 for one in planned])
+    outlines = [_flat(view, np.array(one.path_w)[:: max(len(one.path_w) // PATH_POINTS, 1)]) for one in planned]
+    return outlines, _last_before(record, rows, [one.stamp_ns or 0 for one in planned])
 
 
 def _flat(view: View, points_w: Floats) -> list[float]:
@@ -117,10 +121,10 @@ def _nodes(record: RunRecord, row: int) -> Floats:
     return nodes[:, :2]
 
 
-def _latest(record: RunRecord, rows: NDArray[np.intp], told: Sequence[Told]) -> list[Told | None]:
+def _latest(record: RunRecord, rows: NDArray[np.intp], messages: Sequence[Told]) -> list[Told | None]:
     """What was said last before each row, unless that is long ago."""
-    before = _last_before(record, rows, [one.stamp_ns for one in told])
-    newest = [told[i] if i >= 0 else None for i in before]
+    before = _last_before(record, rows, [one.stamp_ns for one in messages])
+    newest = [messages[i] if i >= 0 else None for i in before]
     times_s = record.time_s[rows].tolist()
     return [
         one if one is not None and time_s - one.stamp_ns * 1e-9 < TOLD_FOR_S else None

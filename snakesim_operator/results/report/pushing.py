@@ -11,7 +11,7 @@ from snakesim_hal.wire.messages import WorldContact
 from snakesim_operator.results.map_score import MapScore, score
 from snakesim_operator.results.page.charts import Bar, Figure, Line, bars, lines
 from snakesim_operator.results.record import RunRecord
-from snakesim_operator.results.report.timeline import end_s, told_at_s, told_spans, zero_s
+from snakesim_operator.results.report.timeline import end_s, reported_at_s, reported_spans, zero_s
 
 Floats = NDArray[np.float64]
 MAX_OBSTACLES = 24  # that get a row of their own: those that gave most
@@ -45,8 +45,8 @@ class Pushing:
 
 def pushing(record: RunRecord) -> Pushing | None:
     """None for a controller that tells no push-points, or one joint that pushes: that has sections of its own."""
-    told = [state for state in record.control if state.push_points]
-    if not told or any(state.propulsion_joint is not None for state in told) or not len(record.time_s):
+    states = [state for state in record.control if state.push_points]
+    if not states or any(state.propulsion_joint is not None for state in states) or not len(record.time_s):
         return None
     stops = _stops(record)
     longest = sorted(stops, key=lambda one: one.start_s - one.end_s)[:MAX_STOPS]
@@ -65,7 +65,7 @@ def pushing(record: RunRecord) -> Pushing | None:
 
 def _forces(record: RunRecord) -> Figure:
     """Wanted and measured contact forces in the direction from tail to head, and the drag that they work against."""
-    wanted = [(told_at_s(record, one), one.stamp_ns, _sum_w(one.push_points)) for one in record.control]
+    wanted = [(reported_at_s(record, one), one.stamp_ns, _sum_w(one.push_points)) for one in record.control]
     felt = [(one.stamp_ns * 1e-9 - zero_s(record), one.stamp_ns, _sum_w(one.contacts)) for one in record.worlds]
     drawn = [
         Line("wanted of all push-points", np.array([t for t, _, _ in wanted]), _ahead_n(record, wanted), "--reference"),
@@ -95,7 +95,7 @@ def _sum_w(contacts: list[WorldContact]) -> Floats:
 def _obstacles(record: RunRecord) -> Figure:
     """A row for each obstacle that was pushed off, in the order of their first use."""
     spans: dict[str, list[tuple[float, float, float]]] = {}
-    for since, until, state in told_spans(record):
+    for since, until, state in reported_spans(record):
         for contact in state.push_points:
             force_n = math.hypot(*contact.force_w[:2])
             if force_n >= MIN_FORCE_N and until > since:
@@ -124,7 +124,7 @@ def _stops(record: RunRecord) -> list[Stop]:
     """Every time that it did not locomote for a while."""
     found: list[Stop] = []
     reasons: dict[str, float] = {}
-    for since, until, state in told_spans(record):
+    for since, until, state in reported_spans(record):
         if state.state == "NotLocomoting":
             if not reasons:
                 found.append(Stop(since, until, ""))

@@ -66,14 +66,14 @@ def end_s(record: RunRecord) -> float:
     return record.control[-1].stamp_ns * 1e-9 - zero_s(record) if record.control else 0.0
 
 
-def told_at_s(record: RunRecord, state: ControlState) -> float:
+def reported_at_s(record: RunRecord, state: ControlState) -> float:
     """When a state was told, on the time axis and within the run."""
     return min(max(state.stamp_ns * 1e-9 - zero_s(record), 0.0), end_s(record))
 
 
-def told_spans(record: RunRecord) -> list[tuple[float, float, ControlState]]:
+def reported_spans(record: RunRecord) -> list[tuple[float, float, ControlState]]:
     """(since, until, state) on the time axis: each state holds until the next is told."""
-    starts = [told_at_s(record, state) for state in record.control]
+    starts = [reported_at_s(record, state) for state in record.control]
     return list(zip(starts, [*starts, end_s(record)][1:], record.control, strict=True))
 
 
@@ -121,10 +121,10 @@ def most_used_joints(intervals: list[Propulsion], most: int = 6) -> list[int]:
 def reference_rad(record: RunRecord, joint: int) -> Floats:
     """Where a joint was meant to be, (n,): its target in position mode, else what the controller said; NaN unknown."""
     reference = np.full(len(record.time_s), np.nan)
-    told = [state for state in record.control if len(state.reference_rad) > joint]
-    if told:
-        stamps = np.array([state.stamp_ns * 1e-9 for state in told])
-        angles = np.array([state.reference_rad[joint] for state in told])
+    states = [state for state in record.control if len(state.reference_rad) > joint]
+    if states:
+        stamps = np.array([state.stamp_ns * 1e-9 for state in states])
+        angles = np.array([state.reference_rad[joint] for state in states])
         reference = np.interp(record.time_s, stamps, angles, left=np.nan, right=angles[-1])
     in_position = record.mode[:, joint] == Mode.POSITION
     return np.where(in_position, record.target[:, joint], reference)
@@ -163,18 +163,18 @@ def came_to_rest_s(record: RunRecord, within_m: float) -> float | None:
 
 def told_distance(record: RunRecord) -> Series | None:
     """Advance of the tail since the controller first told its place on the path."""
-    told = [state for state in record.control if state.path_s_m is not None]
-    if len(told) < 2:
+    states = [state for state in record.control if state.path_s_m is not None]
+    if len(states) < 2:
         return None
-    along = np.array([state.path_s_m for state in told], dtype=np.float64)
-    stamps = np.array([told_at_s(record, state) for state in told])
+    along = np.array([state.path_s_m for state in states], dtype=np.float64)
+    stamps = np.array([reported_at_s(record, state) for state in states])
     return Series(stamps, along - along[0], "advance of the tail along the path, as the controller knew it")
 
 
-def _merged(record: RunRecord, told: list[str | None]) -> list[Interval]:
+def _merged(record: RunRecord, values: list[str | None]) -> list[Interval]:
     """Equal neighbours become one band; None is left out."""
     bands: list[Interval] = []
-    for (since, until, _), what in zip(told_spans(record), told, strict=True):
+    for (since, until, _), what in zip(reported_spans(record), values, strict=True):
         if what is None or until <= since:
             continue
         if bands and bands[-1].what == what and bands[-1].end_s >= since:

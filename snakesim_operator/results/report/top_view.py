@@ -71,11 +71,11 @@ def _obstacle(item: Placed, view: View, labels: Labels) -> str:
     if not view.shows(obstacle):
         return ""
     labels.keep_off((x - reach, y - reach, x + reach, y + reach), 0.15)
-    told = title(obstacle.name)
+    tooltip = title(obstacle.name)
     if obstacle.shape != "box":
-        return element("circle", told, cx=x, cy=y, r=obstacle.radius_m * view.scale, class_=class_)
+        return element("circle", tooltip, cx=x, cy=y, r=obstacle.radius_m * view.scale, class_=class_)
     corners = [view.at(corner) for corner in outline_w(obstacle)]
-    return element("polygon", told, points=points_text(corners), class_=class_)
+    return element("polygon", tooltip, points=points_text(corners), class_=class_)
 
 
 def outline_w(obstacle: Obstacle) -> Floats:

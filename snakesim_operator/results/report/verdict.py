@@ -8,15 +8,18 @@ from snakesim_operator.results.report.timeline import (
     came_to_rest_s,
     end_s,
     propulsion_intervals,
+    reported_at_s,
     state_bands,
-    told_at_s,
 )
 from snakesim_operator.results.summary import RunSummary
 
 MOVED_M = 0.02  # less than this is no locomotion
 MIN_STOP_S = 0.5  # a shorter stop at the end is not worth a word
 RESTING_SHARE = 0.02  # of all its way: what is so near to the end of it has arrived, but for who moves to the last,
-REST_SHARE, REST_S = 0.1, 5.0  # which is told from a rest by how long it takes: a tenth of the run, or so many seconds
+REST_SHARE, REST_S = (
+    0.1,
+    5.0,
+)  # which is distinguished from a rest by how long it takes: a tenth of the run, or so many seconds
 POOR_SHARE = 0.5  # a run that stood still for more of its time than this, up to its end, is no good one
 SHOWN_HANDOVERS = 8
 Kind = Literal["good", "poor", "bad"]
@@ -112,8 +115,8 @@ def _handed_over(record: RunRecord, summary: RunSummary) -> str:
 
 def _control_said(record: RunRecord, at_s: float) -> str:
     """What control lacked when the robot was stopped: a fault of the lease only tells that no command came."""
-    told = [state for state in record.control if told_at_s(record, state) <= at_s]
-    return f" Control said: {_sentence(told[-1].reason)}" if told and told[-1].state == "NotLocomoting" else ""
+    states = [state for state in record.control if reported_at_s(record, state) <= at_s]
+    return f" Control said: {_sentence(states[-1].reason)}" if states and states[-1].state == "NotLocomoting" else ""
 
 
 @dataclass(frozen=True)
@@ -127,7 +130,7 @@ class Stop:
 
 
 def stop_of(record: RunRecord, moved_m: float) -> Stop | None:
-    """When and why it came to rest, by what control told and by what was measured; None when it did not."""
+    """When and why it came to rest, by what control reported and by what was measured; None when it did not."""
     bands, end = state_bands(record), end_s(record)
     at_s = bands[-1].start_s if len(bands) > 1 and bands[-1].what != "Locomoting" else end
     rest_s = came_to_rest_s(record, min(MOVED_M, RESTING_SHARE * moved_m))
@@ -135,7 +138,7 @@ def stop_of(record: RunRecord, moved_m: float) -> Stop | None:
         at_s = rest_s
     if end - at_s < MIN_STOP_S:
         return None
-    after = [state for state in record.control if told_at_s(record, state) >= at_s and state.state != "Locomoting"]
+    after = [state for state in record.control if reported_at_s(record, state) >= at_s and state.state != "Locomoting"]
     why = after[0].reason if after else "its controller reported Locomoting all the same"
     return Stop(at_s, (end - at_s) / end, _sentence(why), bool(after) and after[-1].state == "Idle")
 

@@ -94,8 +94,8 @@ def _stopped(
     made.host.first(lambda status: status.lifecycle == "estop", asked_ns, "the emergency stop")
     asking.join(ANSWER_S)
     period_ns = observer.description().period_ns
-    trouble = "" if answers and answers[0] else "the stop was not confirmed to who asked for it"
-    return recovered(observer, (stop.at_ns - asked_ns + period_ns) / 1e6, trouble)
+    failure = "" if answers and answers[0] else "the stop was not confirmed to who asked for it"
+    return recovered(observer, (stop.at_ns - asked_ns + period_ns) / 1e6, failure)
 
 
 # --- a second run --------------------------------------------------------------------------------------------------
@@ -125,11 +125,11 @@ def second_run(request: Request) -> Iterator[Trial]:
                 said.seek(0)
                 words = said.read()
             observer.listen()
-            troubles: list[str] = []
+            failures: list[str] = []
             if code not in (1, 2) or made.config.robot.name not in words:
-                troubles.append(f"the second run ended with {code}: {words[-300:]}")
+                failures.append(f"the second run ended with {code}: {words[-300:]}")
             moving = sum(any(mode is not Mode.PASSIVE for mode in h.message.mode) for h in observer.applied)
             if observer.state() != "disarmed":
-                troubles.append(f"the robot is {observer.in_words()}")
-            yield Trial(value=float(moving), trouble="; ".join(troubles))
+                failures.append(f"the robot is {observer.in_words()}")
+            yield Trial(value=float(moving), failure="; ".join(failures))
         request.note("in turn on the robot's network (`--router`) and at its endpoint (`--endpoint`)")

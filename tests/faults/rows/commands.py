@@ -93,16 +93,16 @@ def _bombarded(observer: Observer, stranger: Stranger, kinds: Kinds) -> Trial:
     return _judged(observer, uncounted, [])
 
 
-def _judged(observer: Observer, uncounted: Callable[[], Counter[str]], troubles: list[str]) -> Trial:
-    """How many set-points got through; trouble besides `troubles` when not all are counted, or the robot stopped."""
+def _judged(observer: Observer, uncounted: Callable[[], Counter[str]], failures: list[str]) -> Trial:
+    """How many set-points got through; a failure besides `failures` when not all are counted, or the robot stopped."""
     try:
         observer.until(lambda: not uncounted(), "all counted", COUNTED_S)
     except TrialError:
-        troubles.append(f"not counted: {dict(uncounted())}")
+        failures.append(f"not counted: {dict(uncounted())}")
     observer.watch(0.05)
     if observer.state() != "armed":
-        troubles.append(f"the robot stopped: {observer.in_words()}")
-    return Trial(value=float(applied_of_others(observer)), trouble="; ".join(troubles))
+        failures.append(f"the robot stopped: {observer.in_words()}")
+    return Trial(value=float(applied_of_others(observer)), failure="; ".join(failures))
 
 
 def _counts(observer: Observer) -> Counter[str]:
@@ -136,16 +136,16 @@ def _second(observer: Observer, stranger: Stranger, answered_ms: list[float]) ->
     before, asked = _counts(observer), time.monotonic()
     answer = observer.ask(keys.LEASE, LeaseRequest(action="acquire", holder="second"))
     answered_ms.append(1e3 * (time.monotonic() - asked))
-    troubles: list[str] = []
+    failures: list[str] = []
     if answer.ok or answer.refusal != "lease_held":
-        troubles.append(f"not refused as held: ok {answer.ok}, {answer.refusal!r}: {answer.reason}")
+        failures.append(f"not refused as held: ok {answer.ok}, {answer.refusal!r}: {answer.reason}")
     epoch = observer.status.lease_epoch if observer.status else 0
     guesses = [0, epoch - 1, epoch + 1, answer.epoch + 2] * EACH
     for guess in guesses:
         stranger.send(stranger.forged(lease_epoch=guess))
         time.sleep(stranger.random.random() * PERIOD_NS * 1e-9)
     expected = Counter(wrong_epoch=len(guesses))
-    return _judged(observer, lambda: expected - (_counts(observer) - before), troubles)
+    return _judged(observer, lambda: expected - (_counts(observer) - before), failures)
 
 
 def interleaved(request: Request) -> Iterator[Trial]:

@@ -33,13 +33,13 @@ def cannot_keep_up(kind: str) -> Measure:
             with _consumer(kind, made.endpoint, made.config.robot.name, request.folder) as process:
                 for _ in range(request.trials):
                     with_it.append(_missed(observer))
-                    trouble = ""
+                    failure = ""
                     if observer.state() != "armed":
-                        trouble = f"the robot stopped: {observer.in_words()}"
+                        failure = f"the robot stopped: {observer.in_words()}"
                         observer.arm()
                     elif process.poll() is not None:
-                        trouble = "the consumer has ended"
-                    yield Trial(value=float(max(with_it[-1] - max(before), 0)), trouble=trouble)
+                        failure = "the consumer has ended"
+                    yield Trial(value=float(max(with_it[-1] - max(before), 0)), failure=failure)
             request.note(
                 f"in {request.trials} windows of {WINDOW_S:g} s: {sum(before)} cycles missed without the consumer, "
                 f"worst {max(before)}; {sum(with_it)} with it, worst {max(with_it)}"
@@ -63,11 +63,11 @@ def frozen_readers(request: Request) -> Iterator[Trial]:
             observer.arm()
         for _ in range(request.trials):
             with_them.append(_missed(observer, FROZEN_WINDOW_S))
-            trouble = ""
+            failure = ""
             if observer.state() != "armed":
-                trouble = f"the robot stopped: {observer.in_words()}"
+                failure = f"the robot stopped: {observer.in_words()}"
                 observer.arm()
-            yield Trial(value=float(max(with_them[-1] - max(before), 0)), trouble=trouble)
+            yield Trial(value=float(max(with_them[-1] - max(before), 0)), failure=failure)
         request.note(
             f"{FROZEN} readers at {rate_hz:g} Hz for {request.trials * FROZEN_WINDOW_S:g} s: {sum(before)} cycles "
             f"missed in {len(before)} windows of {FROZEN_WINDOW_S:g} s without them, {sum(with_them)} in "

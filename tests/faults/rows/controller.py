@@ -22,18 +22,18 @@ def _trial(made: Robot, observer: Observer, fail: Callable[[], int], mend: Calla
     failed_ns = fail()
     value = observer.safe_after_ms(failed_ns)
     status = observer.first_fault(failed_ns)
-    troubles: list[str] = []
+    failures: list[str] = []
     if not any(fault.what == "lease_expired" for fault in status.faults):
-        troubles.append(f"not because of the lease: {status.why}")
+        failures.append(f"not because of the lease: {status.why}")
     if status.lease_holder is not None:
-        troubles.append(f"the lease is still {status.lease_holder}'s")
+        failures.append(f"the lease is still {status.lease_holder}'s")
     mend()
     observer.until(lambda: observer.status is not None and observer.status.lease_holder == "control", "control is back")
     observer.forget()
     observer.watch(LATCHED_S)
     if observer.state() != "fault" or any(h.message.sequence is not None for h in observer.applied):
-        troubles.append(f"not latched: {observer.in_words()}")
-    return recovered(observer, value, "; ".join(troubles))
+        failures.append(f"not latched: {observer.in_words()}")
+    return recovered(observer, value, "; ".join(failures))
 
 
 def killed(request: Request) -> Iterator[Trial]:
@@ -87,11 +87,11 @@ def host_restarts(request: Request) -> Iterator[Trial]:
             made.start("host")
             observer.until(lambda: observer.statuses, "a status of the new host", START_LIMIT_S)
             observer.until(lambda: observer.applied, "the new host's set-points")
-            troubles = _objections(observer, streamed)
+            failures = _objections(observer, streamed)
             if observer.status is None or 0 < observer.status.lease_epoch <= epoch:
-                troubles.append(f"the lease's epoch did not grow from {epoch}: {observer.in_words()}")
+                failures.append(f"the lease's epoch did not grow from {epoch}: {observer.in_words()}")
             moved = sum(set(h.message.mode) != {Mode.PASSIVE} for h in observer.applied)
-            yield recovered(observer, float(moved), "; ".join(troubles))
+            yield recovered(observer, float(moved), "; ".join(failures))
         request.note(f"in each trial {REPLAYED} commands of before were sent to the new host")
 
 
@@ -104,15 +104,15 @@ def _objections(observer: Observer, streamed: list[bytes]) -> list[str]:
     before = refused()
     for payload in streamed:
         send_raw(observer.session, payload)
-    troubles: list[str] = []
+    failures: list[str] = []
     try:
         observer.until(lambda: refused() >= before + len(streamed), "old commands refused", REFUSED_S)
     except TrialError:
-        troubles.append(f"{refused() - before} of {len(streamed)} old commands were refused")
+        failures.append(f"{refused() - before} of {len(streamed)} old commands were refused")
     observer.watch(LATCHED_S)
     if {h.message.lifecycle for h in observer.statuses} != {"disarmed"}:
-        troubles.append(f"did not boot disarmed, and stay so: {observer.in_words()}")
-    return troubles
+        failures.append(f"did not boot disarmed, and stay so: {observer.in_words()}")
+    return failures
 
 
 def void(_: object) -> None:

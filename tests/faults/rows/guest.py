@@ -92,17 +92,17 @@ def _left_alone(robot: Bench, pid: int, number: signal.Signals, by_kernel_ms: li
         return None
     stopped = first_in(heard, fault, now_ns)
     if len(stopped) < JOINTS:
-        return Trial(value=None, trouble=f"not all in fault {LEFT_S:g} s after the signal: {listener.states()}")
+        return Trial(value=None, failure=f"not all in fault {LEFT_S:g} s after the signal: {listener.states()}")
     by_kernel_ms.append(max(h.at_ns for h in stopped.values()) / 1e6 - now_ns / 1e6)
-    troubles: list[str] = []
+    failures: list[str] = []
     causes = {h.says()["last_stop"] for h in stopped.values() if h.opcode == Opcode.HEARTBEAT}
     if causes - {LastStop.WATCHDOG}:
-        troubles.append(f"stopped by {causes}")
+        failures.append(f"stopped by {causes}")
     own_ms: list[float] = []
     for node in NODES:
         points = [h.at_ns for h in heard if h.opcode == Opcode.SET_POINT and node_of(h.frame.id) == node]
         own_ms.append(passed_for_module_ms(heard, node, max(points), stopped[node].at_ns))
-    return Trial(value=max(own_ms), trouble="; ".join(troubles), recovered=True)
+    return Trial(value=max(own_ms), failure="; ".join(failures), recovered=True)
 
 
 def _went_well_until(heard: Sequence[Heard], now_ns: int) -> bool:
@@ -168,8 +168,8 @@ def watchdog(request: Request) -> Iterator[Trial]:
         while module.state == ModuleState.ARMED and now_us - last_us < 1000 * MS:
             now_us += MS / 10
             module.poll(now_us)
-        trouble = "" if module.state == ModuleState.FAULT else f"it is {module.state.name}"
-        yield Trial(value=(now_us - last_us) / MS, trouble=trouble)
+        failure = "" if module.state == ModuleState.FAULT else f"it is {module.state.name}"
+        yield Trial(value=(now_us - last_us) / MS, failure=failure)
 
 
 def clock_step(request: Request) -> Iterator[Trial]:
@@ -208,10 +208,10 @@ def _stepped(made: Robot, observer: Observer, by_s: float) -> Trial:
     observer.watch(AFTER_STEP_S)
     faults = len(observer.status.faults) if observer.status is not None else 1
     stops = sum(h.message.sequence is None for h in observer.applied)
-    trouble = "" if observer.state() == "armed" else f"stopped: {observer.in_words()}"
+    failure = "" if observer.state() == "armed" else f"stopped: {observer.in_words()}"
     if len(observer.applied) < AFTER_STEP_S * RATE_HZ / 2:
-        trouble = trouble or f"only {len(observer.applied)} set-points heard of in {AFTER_STEP_S:g} s"
-    return Trial(value=float(faults + stops), trouble=trouble)
+        failure = failure or f"only {len(observer.applied)} set-points heard of in {AFTER_STEP_S:g} s"
+    return Trial(value=float(faults + stops), failure=failure)
 
 
 def _step_clock(by_s: float) -> None:

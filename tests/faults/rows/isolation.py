@@ -29,9 +29,9 @@ def set_aside(kind: str) -> Measure:
                 observer.inject("hal", kind, names[joint], for_s=ASKED_FOR_S)
                 value = (_let_go(observer, joint, asked_ns).at_ns - asked_ns) / 1e6
                 observer.watch(ASKED_FOR_S + MORE_S)
-                troubles = _objections(observer, names[joint], asked_ns)
+                failures = _objections(observer, names[joint], asked_ns)
                 _take_back(observer)
-                yield recovered(observer, value, "; ".join(troubles))
+                yield recovered(observer, value, "; ".join(failures))
 
     return measure
 
@@ -51,16 +51,16 @@ def _objections(observer: Observer, name: str, since_ns: int) -> list[str]:
     status = observer.status
     if status is None:
         raise TrialError("no status")
-    troubles: list[str] = []
+    failures: list[str] = []
     if status.lifecycle != "armed":
-        troubles.append(f"the robot stopped: {observer.in_words()}")
+        failures.append(f"the robot stopped: {observer.in_words()}")
     if status.isolated != [name]:
-        troubles.append(f"{status.isolated} are set aside, not {name}")
+        failures.append(f"{status.isolated} are set aside, not {name}")
     if [fault.joint for fault in status.faults] != [name]:
-        troubles.append(f"{name} was not named alone: {[fault.cause for fault in status.faults]}")
+        failures.append(f"{name} was not named alone: {[fault.cause for fault in status.faults]}")
     if (first := observer.first_safe(since_ns)) is not None:
-        troubles.append(f"the host stopped all joints at tick {first.message.tick}")
-    return troubles
+        failures.append(f"the host stopped all joints at tick {first.message.tick}")
+    return failures
 
 
 def _take_back(observer: Observer) -> None:

@@ -55,14 +55,14 @@ def _trial(observer: Observer, injection: Injection, what: str) -> Trial:
     status = observer.first_fault(asked_ns)
     found = min((fault for fault in status.faults if fault.tick >= begun), key=lambda fault: fault.tick, default=None)
     if found is None:
-        return Trial(value=None, trouble=f"nothing found after tick {begun}: {status.faults}")
+        return Trial(value=None, failure=f"nothing found after tick {begun}: {status.faults}")
     observer.watch(REST_S)
-    troubles = _objections(observer, injection, what, asked_ns)
+    failures = _objections(observer, injection, what, asked_ns)
     if injection.target_type == "joint" and found.joint != injection.target:
-        troubles.append(f"{found.joint} was named, not {injection.target}: {found.cause}")
+        failures.append(f"{found.joint} was named, not {injection.target}: {found.cause}")
     observer.watch(ASKED_FOR_S)
     periods = found.tick - begun + (2 if injection.target_type == "joint" else 1)
-    return recovered(observer, PERIOD_MS * periods, "; ".join(troubles))
+    return recovered(observer, PERIOD_MS * periods, "; ".join(failures))
 
 
 def _begun_tick(answer: Answer) -> int:
@@ -75,13 +75,13 @@ def _begun_tick(answer: Answer) -> int:
 
 def _objections(observer: Observer, injection: Injection, what: str, asked_ns: int) -> list[str]:
     """What is not as it must be after the safe action."""
-    troubles: list[str] = []
-    told: list[Status] = [heard.message for heard in observer.statuses if heard.at_ns >= asked_ns]
-    words = {fault.what for status in told for fault in status.faults}
+    failures: list[str] = []
+    reported: list[Status] = [heard.message for heard in observer.statuses if heard.at_ns >= asked_ns]
+    words = {fault.what for status in reported for fault in status.faults}
     if what not in words:
-        troubles.append(f"found as {sorted(words)}, not {what}")
+        failures.append(f"found as {sorted(words)}, not {what}")
     if observer.state() != "fault":
-        troubles.append(f"not latched: {observer.in_words()}")
+        failures.append(f"not latched: {observer.in_words()}")
     joints = observer.joints[max(observer.joints)]
     aside = {injection.number} if injection.target_type == "joint" else set[int]()
     torques = [
@@ -90,8 +90,8 @@ def _objections(observer: Observer, injection: Injection, what: str, asked_ns: i
         if valid and i not in aside
     ]
     if max(torques, default=0.0) > OFF_NM:
-        troubles.append(f"a motor still gives {max(torques):.2f} N·m after {REST_S:g} s")
-    return troubles
+        failures.append(f"a motor still gives {max(torques):.2f} N·m after {REST_S:g} s")
+    return failures
 
 
 def twice_at_start(request: Request) -> Iterator[Trial]:
@@ -106,9 +106,9 @@ def twice_at_start(request: Request) -> Iterator[Trial]:
             host = made.start("host")
             host.process.wait(START_LIMIT_S)
             words = "\n".join(host.last_words())
-        trouble = "" if joint in words and "2 times" in words else f"in other words: {words}"
+        failure = "" if joint in words and "2 times" in words else f"in other words: {words}"
         frames = bus_log.read(log)
-        yield Trial(value=float(bus_log.commands(frames, Action.ARM) + bus_log.set_points(frames)), trouble=trouble)
+        yield Trial(value=float(bus_log.commands(frames, Action.ARM) + bus_log.set_points(frames)), failure=failure)
     request.note("the real host process, which says why it refuses; enabled is what its bus log shows")
 
 
@@ -128,12 +128,12 @@ def through_robot(kind: str, *words: str) -> Measure:
                 observer.inject("hal", kind, joint, for_s=ASKED_FOR_S)
                 value = observer.safe_after_ms(asked_ns)
                 status = observer.first_fault(asked_ns)
-                troubles: list[str] = []
+                failures: list[str] = []
                 if not any(joint in fault.cause or fault.joint == joint for fault in status.faults):
-                    troubles.append(f"{joint} was not named: {[fault.cause for fault in status.faults]}")
+                    failures.append(f"{joint} was not named: {[fault.cause for fault in status.faults]}")
                 if words and not {fault.what for fault in status.faults} & set(words):
-                    troubles.append(f"found as {[fault.what for fault in status.faults]}, not {' or '.join(words)}")
+                    failures.append(f"found as {[fault.what for fault in status.faults]}, not {' or '.join(words)}")
                 observer.watch(ASKED_FOR_S)
-                yield recovered(observer, value, "; ".join(troubles))
+                yield recovered(observer, value, "; ".join(failures))
 
     return measure

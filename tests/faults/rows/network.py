@@ -62,18 +62,18 @@ def _all_back(observer: Observer) -> bool:
     return status is not None and not status.waiting_for and status.lease_holder == "control"
 
 
-def _after(observer: Observer, value: float, troubles: list[str]) -> Trial:
+def _after(observer: Observer, value: float, failures: list[str]) -> Trial:
     """Still stopped, because of the lease; and back by an operator's commands."""
     observer.forget()
     observer.watch(STEADY_S)
     status = observer.status
     if status is None or status.lifecycle != "fault":
-        return recovered(observer, None, "; ".join([*troubles, f"not stopped: {observer.in_words()}"]))
+        return recovered(observer, None, "; ".join([*failures, f"not stopped: {observer.in_words()}"]))
     if any(h.message.sequence is not None for h in observer.applied):
-        troubles.append("commands were applied without an arming")
+        failures.append("commands were applied without an arming")
     if not any(fault.what == "lease_expired" for fault in status.faults):
-        troubles.append(f"not because of the lease: {status.why}")
-    return recovered(observer, value, "; ".join(troubles))
+        failures.append(f"not because of the lease: {status.why}")
+    return recovered(observer, value, "; ".join(failures))
 
 
 # --- a cable ---------------------------------------------------------------------------------------------------
@@ -97,7 +97,7 @@ def network_cut(request: Request) -> Iterator[Trial]:
                 _set_link("ours", up=False)
                 value = observer.safe_after_ms(cut_ns)
                 status = observer.first_fault(cut_ns)
-                troubles = [] if status.lease_holder is None else [f"the lease is still {status.lease_holder}'s"]
+                failures = [] if status.lease_holder is None else [f"the lease is still {status.lease_holder}'s"]
                 observer.watch(CUTS_S[number % len(CUTS_S)])
                 observer.forget()
                 _set_link("ours", up=True)
@@ -105,8 +105,8 @@ def network_cut(request: Request) -> Iterator[Trial]:
                 observer.until(lambda: _all_back(observer), "every service reconnected", START_LIMIT_S)
                 slowest_s = max(slowest_s, time.monotonic() - started)
                 if observer.state() != "fault" or any(h.message.sequence is not None for h in observer.applied):
-                    troubles.append(f"not latched: {observer.in_words()}")
-                yield recovered(observer, value, "; ".join(troubles))
+                    failures.append(f"not latched: {observer.in_words()}")
+                yield recovered(observer, value, "; ".join(failures))
             request.retry(observer.stumbles)
             request.note(
                 f"two network namespaces with a veth pair, one end down for {CUTS_S[0]:g} to {CUTS_S[-1]:g} s; "

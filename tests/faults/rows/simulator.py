@@ -32,10 +32,10 @@ def slow(request: Request) -> Iterator[Trial]:
             if len(observer.clocks) > 2:
                 took_s = (observer.clocks[-1].at_ns - observer.clocks[1].at_ns) * 1e-9
                 shares.append((len(observer.clocks) - 2) * period_s / took_s)
-            trouble = "" if observer.state() == "armed" else f"stopped: {observer.in_words()}"
+            failure = "" if observer.state() == "armed" else f"stopped: {observer.in_words()}"
             if shares and shares[-1] > 2 * SHARE:
-                trouble = trouble or f"the simulator was not slow: {shares[-1]:.2f} of real time"
-            yield Trial(value=float(faults + stops), trouble=trouble)
+                failure = failure or f"the simulator was not slow: {shares[-1]:.2f} of real time"
+            yield Trial(value=float(faults + stops), failure=failure)
         observer.inject("hal", "slow", "simulator", end=True)
         request.note(f"{WINDOW_TICKS} ticks each, at {min(shares):.3f} to {max(shares):.3f} of real time")
 
@@ -52,25 +52,25 @@ def diverges(request: Request) -> Iterator[Trial]:
             observer.listen()
             left = msgspec.json.decode(record.read_bytes(), type=HostRecord)
             _, box = read_black_box(request.folder / BLACK_BOX)
-            troubles: list[str] = []
+            failures: list[str] = []
             fault = next((f for f in left.faults if "diverged" in f.cause), None)
             if fault is None:
                 raise TrialError(f"no divergence among {left.faults}")
             if left.lifecycle != "fault":
-                troubles.append(f"the host ended {left.lifecycle}")
+                failures.append(f"the host ended {left.lifecycle}")
             angles = box["angle_rad"]
             if not np.isfinite(angles).all():
-                troubles.append("a state that is no number was recorded")
+                failures.append("a state that is no number was recorded")
             last = [h for _, h in sorted(observer.joints.items())][-1]
             if not all(map(math.isfinite, last.angle_rad)):
-                troubles.append("a state that is no number was published")
+                failures.append("a state that is no number was published")
             elif np.abs(np.array(last.angle_rad) - angles[-1]).max() > MAX_STEP_RAD:
-                troubles.append("the last state that was published is not the last good one")
+                failures.append("the last state that was published is not the last good one")
             observer.forget()
             made.start("host")
             observer.until(lambda: observer.statuses, "a status of the new host", START_LIMIT_S)
             begun = _begun_tick(left)
-            yield recovered(observer, float(fault.tick - begun + 1), "; ".join(troubles))
+            yield recovered(observer, float(fault.tick - begun + 1), "; ".join(failures))
         request.note("the host process ends after a divergence, with its record; a new one was started and armed")
 
 

@@ -25,13 +25,13 @@ def no_joints(request: Request) -> Iterator[Trial]:
             asked_ns = _cut(observer, keys.JOINTS)
             value = observer.safe_after_ms(asked_ns)
             status = observer.first_fault(asked_ns)
-            troubles: list[str] = []
+            failures: list[str] = []
             if [fault.what for fault in status.faults] != ["lease_expired"]:
-                troubles.append(f"not because of the lease: {status.why}")
+                failures.append(f"not because of the lease: {status.why}")
             if status.lease_holder is not None:
-                troubles.append(f"the lease is still {status.lease_holder}'s")
+                failures.append(f"the lease is still {status.lease_holder}'s")
             _mend(observer, keys.JOINTS)
-            yield recovered(observer, value, "; ".join(troubles))
+            yield recovered(observer, value, "; ".join(failures))
 
 
 def withheld(key: str) -> Measure:
@@ -47,8 +47,8 @@ def withheld(key: str) -> Measure:
                 asked_ns = _cut(observer, key)
                 observer.until(lambda: _named(states.drain(), key), f"{key} named in control/state", BACK_S)
                 observer.watch(AWAY_S)
-                value, troubles = _held(observer, asked_ns)
-                yield _back(observer, key, value, troubles, back_ms)
+                value, failures = _held(observer, asked_ns)
+                yield _back(observer, key, value, failures, back_ms)
             request.note(
                 "along `peg_row` at 0.2 m/s; until the first set-points with which no joint pushes, nor does again "
                 f"while the stream is away, for {AWAY_S:g} s more"
@@ -90,20 +90,20 @@ def _named(states: list[ControlState], key: str) -> bool:
 
 def _held(observer: Observer, asked_ns: int) -> tuple[float | None, list[str]]:
     """When the push ended for good, in ms, and what else is not as it must be."""
-    troubles: list[str] = []
+    failures: list[str] = []
     if observer.state() != "armed" or observer.first_safe(asked_ns) is not None:
-        troubles.append(f"the robot stopped: {observer.in_words()}")
+        failures.append(f"the robot stopped: {observer.in_words()}")
     since = [h for h in observer.applied if h.at_ns >= asked_ns]
     pushing = [i for i, h in enumerate(since) if Mode.TORQUE in h.message.mode]
     last = pushing[-1] if pushing else -1
     if last + 1 >= len(since):
-        return None, [*troubles, "a joint pushes on"]
+        return None, [*failures, "a joint pushes on"]
     if any(set(h.message.mode) != {Mode.POSITION} for h in since[last + 1 :]):
-        troubles.append("not all joints hold their position")
-    return (since[last + 1].at_ns - asked_ns) / 1e6, troubles
+        failures.append("not all joints hold their position")
+    return (since[last + 1].at_ns - asked_ns) / 1e6, failures
 
 
-def _back(observer: Observer, key: str, value: float | None, troubles: list[str], back_ms: list[float]) -> Trial:
+def _back(observer: Observer, key: str, value: float | None, failures: list[str], back_ms: list[float]) -> Trial:
     """Let the stream come again: the controller pushes by itself, and no target jumps."""
     observer.forget()
     began_ns = time.monotonic_ns()
@@ -115,9 +115,9 @@ def _back(observer: Observer, key: str, value: float | None, troubles: list[str]
     try:
         observer.until(pushing, "a joint pushes again", BACK_S)
     except TrialError as error:
-        return Trial(value=value, trouble="; ".join([*troubles, str(error)]), recovered=False)
+        return Trial(value=value, failure="; ".join([*failures, str(error)]), recovered=False)
     back_ms.append((pushing()[0] - began_ns) / 1e6)
     steps = observer.steps()
     return Trial(
-        value=value, trouble="; ".join(troubles), recovered=True, step_rad=steps.within_rad, first_rad=steps.first_rad
+        value=value, failure="; ".join(failures), recovered=True, step_rad=steps.within_rad, first_rad=steps.first_rad
     )

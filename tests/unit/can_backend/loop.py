@@ -108,11 +108,11 @@ def armed(run: LoopT) -> LoopT:
 
 def cleared_and_armed_again(run: Loop) -> None:
     """A person clears the fault and arms; nothing is left of it."""
-    told = len(run.faults)
+    reported = len(run.faults)
     run.lifecycle = "disarmed"
     run.run(10)
     assert run.states() == [ModuleState.DISARMED] * 4
     run.wanted = None
     run.arm()
     run.run(10, run.waving)
-    assert len(run.faults) == told, run.faults[told:]
+    assert len(run.faults) == reported, run.faults[reported:]

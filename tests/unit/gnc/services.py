@@ -67,7 +67,7 @@ class Stage:
     services: dict[str, Serving]
     states: Reader[ControlState]
     trajectories: Reader[Trajectory]
-    told: list[ControlState] = field(default_factory=list[ControlState])
+    reported: list[ControlState] = field(default_factory=list[ControlState])
 
     @property
     def views(self) -> list[View]:
@@ -80,17 +80,17 @@ class Stage:
 
     def state(self) -> ControlState | None:
         """The newest of what control told."""
-        self.told += self.states.drain()
-        return self.told[-1] if self.told else None
+        self.reported += self.states.drain()
+        return self.reported[-1] if self.reported else None
 
     def tells(self, words: str) -> ControlState:
         """Wait until control has told a reason with these words."""
 
         def found() -> list[ControlState]:
             self.state()
-            return [state for state in self.told if words in state.reason]
+            return [state for state in self.reported if words in state.reason]
 
-        wait_until(found, f"{words!r} told; last: {self.told[-1].reason if self.told else 'nothing'}")
+        wait_until(found, f"{words!r} told; last: {self.reported[-1].reason if self.reported else 'nothing'}")
         return found()[0]
 
 

@@ -49,9 +49,9 @@ def test_without_joints_it_sends_nothing_and_the_lease_ends(tmp_path: Path) -> N
         made.run.arm()
         made.run.reaches("fault")
         assert [fault.what for fault in made.run.status.faults] == ["lease_expired"]
-        told = made.tells("sensor/joints is ")
-        assert told.state in ("NotLocomoting", "Idle")  # the latter when a busy machine delays it until the stop
-        assert "at most 0.06 s" in told.reason
+        reported = made.tells("sensor/joints is ")
+        assert reported.state in ("NotLocomoting", "Idle")  # the latter when a busy machine delays it until the stop
+        assert "at most 0.06 s" in reported.reason
         last_joints, last_command = joints.drain()[-1].tick, commands.drain()[-1].tick
         assert last_command == last_joints  # no command ever named a state that was not
         assert len(made.views) < 80
@@ -89,11 +89,14 @@ def test_a_stream_that_stops_is_withheld_named_and_given_again(tmp_path: Path, k
         made.run.arm()
         wait_until(lambda: sighted(made), "views with everything in them")
         wait_until(lambda: blind(made, what), f"views without a {what}")
-        told = made.tells(words)
-        assert told.state == "NotLocomoting" and f"at most {limits[key.partition('/')[2] + '_s']:.3g} s" in told.reason
+        reported = made.tells(words)
+        assert (
+            reported.state == "NotLocomoting"
+            and f"at most {limits[key.partition('/')[2] + '_s']:.3g} s" in reported.reason
+        )
         since = len(made.views)
         wait_until(lambda: sighted(made, since), "views with everything again")
-        wait_until(lambda: words not in (made.state() or told).reason, "another reason")
+        wait_until(lambda: words not in (made.state() or reported).reason, "another reason")
         assert made.run.status.lifecycle == "armed" and not made.run.status.faults
         for view in made.views:  # nothing too old was ever handed over
             if view.world is not None:
@@ -124,8 +127,8 @@ def test_when_an_operators_intent_has_expired_the_robot_rests_and_says_why(tmp_p
         wait_until(lambda: speed(made) == 0.0, "no speed")
         stopped = next(view for view in made.views if view.trajectory is not None and view.trajectory.speed_m_s == 0.0)
         assert (stopped.tick * PERIOD_NS - now_ns) * 1e-9 == pytest.approx(0.6, abs=0.25)
-        told = made.tells("the intent of ann has expired")
-        assert told.state == "Idle" and "send a new one to go on" in told.reason
+        reported = made.tells("the intent of ann has expired")
+        assert reported.state == "Idle" and "send a new one to go on" in reported.reason
         intents.put(Intent(stamp_ns=clocks.drain()[-1].stamp_ns, who="ann"))
         wait_until(lambda: speed(made) == 0.2, "a new intent")
 

@@ -42,16 +42,16 @@ def bench() -> Bench:
 
 
 def test_the_configuration_is_in_force_first_with_its_schema(bench: Bench):
-    told = bench.in_force()
-    assert msgspec.json.decode(told.settings)["propulsion_n"] == 35.0
-    assert '"propulsion_n":{"unit":"N"' in told.schema and told.who is None and told.changes == 0
+    reported = bench.in_force()
+    assert msgspec.json.decode(reported.settings)["propulsion_n"] == 35.0
+    assert '"propulsion_n":{"unit":"N"' in reported.schema and reported.who is None and reported.changes == 0
 
 
 def test_valid_settings_make_the_controller_anew(bench: Bench):
     assert bench.ask('{"propulsion_n": 20}').ok and bench.anew == [True]
-    told = bench.in_force()
-    assert msgspec.json.decode(told.settings)["propulsion_n"] == 20.0
-    assert (told.who, told.changes, told.tick) == ("ada", 1, 7)
+    reported = bench.in_force()
+    assert msgspec.json.decode(reported.settings)["propulsion_n"] == 20.0
+    assert (reported.who, reported.changes, reported.tick) == ("ada", 1, 7)
 
 
 @pytest.mark.parametrize(

@@ -42,11 +42,11 @@ def pushing(world: World):
 def test_the_told_forces_push_the_body_with_the_force_that_is_wanted() -> None:
     world = seen(peg("c", 0.9, -1), peg("a", 0.3, -1), peg("b", 0.6, 1))
     touches, push = pushing(world)
-    told = push_points(BODY, world, touches, push, 10.0)
-    assert [contact.obstacle for contact in told] == ["a", "b", "c"]  # tail to head
-    total = np.sum([contact.force_w for contact in told], axis=0)
+    reported = push_points(BODY, world, touches, push, 10.0)
+    assert [contact.obstacle for contact in reported] == ["a", "b", "c"]  # tail to head
+    total = np.sum([contact.force_w for contact in reported], axis=0)
     assert push.balanced and total[0] == pytest.approx(10.0, rel=0.15) and abs(total[1]) < 1.0
-    assert all(contact.tangent_w[0] > 0.0 for contact in told)  # towards the head
+    assert all(contact.tangent_w[0] > 0.0 for contact in reported)  # towards the head
 
 
 @pytest.mark.parametrize(

@@ -124,8 +124,8 @@ def run_config(**dotted: Any) -> RunConfig:
 
 def description(*, simulated_time: bool = False, **dotted: Any) -> Description:
     """The test robot as a HAL publishes it."""
-    told = {"backend": "lag", "period_ns": PERIOD_NS, "lease_ns": LEASE_NS, "config_hash": "0" * 16}
-    return describe(robot_file(**dotted), simulated_time=simulated_time, **told)
+    reported = {"backend": "lag", "period_ns": PERIOD_NS, "lease_ns": LEASE_NS, "config_hash": "0" * 16}
+    return describe(robot_file(**dotted), simulated_time=simulated_time, **reported)
 
 
 def state(robot: Description, angle: Any = 0.0, velocity: Any = 0.0, torque: Any = 0.0, **other: Any) -> JointState:
@@ -192,7 +192,7 @@ def write_files(
     return str(folder / "crawl.toml")
 
 
-def status(**told: Any) -> Status:
+def status(**reported: Any) -> Status:
     """What a host of the worm tells, with these values."""
     values: dict[str, Any] = {
         "tick": 0,
@@ -215,4 +215,4 @@ def status(**told: Any) -> Status:
         "waiting_for": [],
         "ready_to_arm": False,
     }
-    return Status(**{**values, **told})
+    return Status(**{**values, **reported})

@@ -237,15 +237,15 @@ def test_a_sensor_that_the_robot_lacks_is_never_published():
 def bytes_of_a_run(seed):
     config = load("triplet").config
     run = Run(msgspec.structs.replace(config, seed=seed))
-    told = bytearray()
+    reported = bytearray()
     for tick in range(60):
         samples = run.sample()
-        told += encode(samples.joints)
+        reported += encode(samples.joints)
         for key, message in samples.others.items():
-            told += key.encode() + encode(message)
+            reported += key.encode() + encode(message)
         run.command([Mode.POSITION] * 13, [0.5 * np.sin(0.1 * tick + 0.6 * i) for i in range(13)])
         run.go()
-    return bytes(told)
+    return bytes(reported)
 
 
 def test_the_same_seed_and_commands_give_the_same_bytes():

@@ -83,15 +83,15 @@ def test_an_image_shows_what_was_there_and_arrives_after_the_delay_but_never_at_
 def bytes_of_a_run(robot, seed=3):
     config = load("peg_row", [Override("robot", robot, "--robot")]).config
     run = Run(msgspec.structs.replace(config, seed=seed))
-    told = {}
+    reported = {}
     for tick in range(40):
         samples = run.sample()
         for key, message in (("joints", samples.joints), *samples.others.items()):
-            told[key] = told.get(key, b"") + encode(message)
+            reported[key] = reported.get(key, b"") + encode(message)
         run.command([Mode.POSITION] * 13, [0.5 * np.sin(0.1 * tick + 0.6 * i) for i in range(13)])
         run.go()
     run.sim.close()
-    return told
+    return reported
 
 
 def test_the_same_seed_gives_the_same_images_and_a_camera_changes_nothing_else():
@@ -128,21 +128,21 @@ def test_in_real_time_a_late_image_is_dropped_and_counted_and_never_waited_for(t
     assert found == []
     assert longest_s < 0.1
     assert run.sim.faults() != []
-    told = run.sim.faults()
-    assert told == []  # once for the same number
+    reported = run.sim.faults()
+    assert reported == []  # once for the same number
     assert sum(run.sim._sensors.late.values()) == 4  # pyright: ignore[reportPrivateUsage]
 
 
 def test_what_is_told_of_late_images_stops_nothing_and_becomes_rarer(tmp_path):
     run = run_with({**slow(tmp_path, 1.0), "delay_s": 0.01, "rate_hz": 100.0}, pace="realtime")
-    told = []
+    reported = []
     for _ in range(40):
         run.sample()
-        told += run.sim.faults()
+        reported += run.sim.faults()
         run.go()
     run.sim.close()
-    assert {(fault.what, fault.reach) for fault in told} == {("sample_late", "none")}
-    assert [int(fault.cause.split()[1]) for fault in told] == [1, 2, 4, 8, 16, 32]
+    assert {(fault.what, fault.reach) for fault in reported} == {("sample_late", "none")}
+    assert [int(fault.cause.split()[1]) for fault in reported] == [1, 2, 4, 8, 16, 32]
 
 
 def test_in_lockstep_a_late_image_is_waited_for(tmp_path):

@@ -267,9 +267,9 @@ def test_dropped_frames_are_told_with_their_number(rig: Rig, monkeypatch: pytest
         return struct.pack("=9I", *range(8), next(drops))
 
     monkeypatch.setattr(rig.socket, "getsockopt", meminfo)
-    told = [rig.wire.errors() for _ in range(3)]
-    assert [[t.kind for t in found] for found in told] == [["receive_overflow"], [], ["receive_overflow"]]
-    assert "dropped 3 frames" in told[0][0].detail and "dropped 7 frames" in told[2][0].detail
+    reported = [rig.wire.errors() for _ in range(3)]
+    assert [[t.kind for t in found] for found in reported] == [["receive_overflow"], [], ["receive_overflow"]]
+    assert "dropped 3 frames" in reported[0][0].detail and "dropped 7 frames" in reported[2][0].detail
 
 
 # --- interfaces --------------------------------------------------------------------------------------------

@@ -203,13 +203,13 @@ def test_a_whole_robot_is_not_objected_to() -> None:
     ],
 )
 def test_what_is_wrong_is_told_with_joint_node_and_bus(found: list[Identity], words: str) -> None:
-    (told,) = wrong_with(found)
-    assert told.startswith(words)
+    (reported,) = wrong_with(found)
+    assert reported.startswith(words)
 
 
 def test_modules_that_cannot_wait_are_no_good_for_lockstep() -> None:
-    told = wrong_with([replace(i, stepped=i.node > 1) for i in GOOD], lockstep=True)
-    assert told == ["joint_1 (node 1 on can_a) does not support lockstep: use --pace realtime"]
+    reported = wrong_with([replace(i, stepped=i.node > 1) for i in GOOD], lockstep=True)
+    assert reported == ["joint_1 (node 1 on can_a) does not support lockstep: use --pace realtime"]
 
 
 def test_everything_is_told_at_once() -> None:
@@ -220,10 +220,10 @@ def test_everything_is_told_at_once() -> None:
         replace(GOOD[3], stepped=True),
         replace(GOOD[3], node=62),
     ]
-    told = wrong_with(found)
-    assert len(told) == 7
+    reported = wrong_with(found)
+    assert len(reported) == 7
     for words in ("answers 2 times", "version 3", "joint_2 .*does not answer$", "answers on can_a", "--stepped", "62"):
-        assert any(re.search(words, line) for line in told), words
+        assert any(re.search(words, line) for line in reported), words
 
 
 # --- parameters --------------------------------------------------------------------------------------------

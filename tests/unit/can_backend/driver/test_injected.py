@@ -47,8 +47,8 @@ def test_what_a_module_cannot_know_the_host_makes() -> None:
         run.run(3)
         faulty = FaultyBackend(run.backend)
         faulty.inject(parse("wrong:joint_2@0=0.4"), True)
-        told = faulty.sample(3, 3 * run.config.period_ns).joints.angle_rad
-        assert told == pytest.approx([0.0, 0.4, 0.0, 0.0], abs=0.02)
+        reported = faulty.sample(3, 3 * run.config.period_ns).joints.angle_rad
+        assert reported == pytest.approx([0.0, 0.4, 0.0, 0.0], abs=0.02)
         with pytest.raises(ConfigError, match="cannot do diverge to simulator"):
             faulty.inject(parse("diverge:simulator@0"), True)
         with pytest.raises(ConfigError, match="no joint_9"):
@@ -91,8 +91,8 @@ def test_an_interface_that_goes_down_stops_the_joints_and_comes_back() -> None:
         inject(run, "cut:bus_1", begins=False)
         run.run(10)
         assert run.states() == [ModuleState.FAULT] * 4 and run.backend._watch.seen["interface_up"] == 1
-        told = {f.what for f in run.faults[1:]}
-        assert told and told <= {"module_watchdog", "module_fault"}, "now they can tell"
+        reported = {f.what for f in run.faults[1:]}
+        assert reported and reported <= {"module_watchdog", "module_fault"}, "now they can tell"
         cleared_and_armed_again(run)
 
 

@@ -103,7 +103,7 @@ def test_the_joint_is_taken_back_by_a_clear(kind: str) -> None:
         robot.wave(40)
         robot.must_be_armed()
         assert robot.states()[FAILS] != ModuleState.ARMED, "its motor is on"
-        told = len(robot.faults)
+        reported = len(robot.faults)
         robot.ask("disarm")
         robot.idle(5)
         robot.ask("clear")
@@ -112,7 +112,7 @@ def test_the_joint_is_taken_back_by_a_clear(kind: str) -> None:
         robot.wave(30)
         robot.must_be_armed()
         assert robot.states() == [ModuleState.ARMED] * JOINTS and robot.authority.isolated == []
-        assert len(robot.faults) == told, robot.faults[told:]
+        assert len(robot.faults) == reported, robot.faults[reported:]
 
 
 def test_it_may_be_armed_again_without_the_joint() -> None:

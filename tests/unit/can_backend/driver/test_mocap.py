@@ -90,8 +90,8 @@ def test_what_was_captured_before_the_robots_time_began_is_no_pose() -> None:
 
 def bare(mocap: Mocap, x: float, late_ms: float = 0.0) -> dict[str, Any]:
     """A datagram without velocities."""
-    told = mocap.at(late_ms, position_w=[x, 0.0, 0.0])
-    return {name: value for name, value in told.items() if name not in TOLD}
+    reported = mocap.at(late_ms, position_w=[x, 0.0, 0.0])
+    return {name: value for name, value in reported.items() if name not in TOLD}
 
 
 @pytest.mark.parametrize("late_ms", [0.0, 4.0, 9.0])

@@ -86,17 +86,17 @@ def test_a_child_is_told_everything_and_ends_when_asked(
     noted = child(tmp_path, monkeypatch, end + "print('a warning')\n" + SERVE)
     settings = Settings(channels=["vcan0", "vcan1"], twins="process", plant="inertia", faults=["mute:joint_1@2"])
     twins = TwinProcess(RUN, settings, "127.0.0.1:5000", stepped=True)
-    told = json.loads(noted.read_text())
-    arguments = told["arguments"]
+    reported = json.loads(noted.read_text())
+    arguments = reported["arguments"]
     assert arguments[:2] == ["-m", "snakesim_can_backend.twin.command"] and "--stepped" in arguments
     assert [arguments[i + 1] for i, word in enumerate(arguments) if word == "--channel"] == ["vcan0", "vcan1"]
     assert arguments[arguments.index("--pose") + 1] == "127.0.0.1:5000"
     assert arguments[arguments.index("--parent") + 1] == str(os.getpid())
-    assert told["session"] == told["pid"], "Ctrl-C is not for it"
-    assert told["config"]["backends"]["can"]["plant"] == "inertia"
-    assert told["config"]["backends"]["can"]["faults"] == ["mute:joint_1@2"]
+    assert reported["session"] == reported["pid"], "Ctrl-C is not for it"
+    assert reported["config"]["backends"]["can"]["plant"] == "inertia"
+    assert reported["config"]["backends"]["can"]["faults"] == ["mute:joint_1@2"]
     twins.stop()
-    assert gone(told["pid"]) and not Path(arguments[2]).exists()
+    assert gone(reported["pid"]) and not Path(arguments[2]).exists()
     said = capsys.readouterr().err
     assert "a warning" in said and "last words" in said
 
@@ -126,8 +126,8 @@ def test_a_child_that_does_not_get_ready_is_told_and_leaves_nothing(
     noted = child(tmp_path, monkeypatch, "print('no such plant', flush=True)\n" + ending)
     with pytest.raises(BackendError, match="the module twins did not start"):
         TwinProcess(RUN, Settings(channels=VCAN, twins="process"), None, stepped=False)
-    told = json.loads(noted.read_text())
-    assert gone(told["pid"]) and not Path(told["arguments"][2]).exists()
+    reported = json.loads(noted.read_text())
+    assert gone(reported["pid"]) and not Path(reported["arguments"][2]).exists()
     assert "no such plant" in capsys.readouterr().err
 
 

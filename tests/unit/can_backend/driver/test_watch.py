@@ -124,11 +124,11 @@ def test_who_has_not_its_parameters_is_told_when_the_robot_is_armed() -> None:
         ("armed", [("module_not_configured", 1)]),
         ("armed", []),
     ]
-    for lifecycle, told in steps:
+    for lifecycle, reported in steps:
         bench.lifecycle = lifecycle
         begin(bench.reading)
         answer(bench.reading)
-        assert said(bench.watch.look(bench.reading, bench.lifecycle, unconfigured={1})) == told
+        assert said(bench.watch.look(bench.reading, bench.lifecycle, unconfigured={1})) == reported
 
 
 def test_two_modules_with_one_id_are_not_called_a_restart() -> None:
@@ -176,8 +176,8 @@ def test_an_emergency_concerns_all_whatever_else_is_wrong() -> None:
 
 def test_a_joint_without_its_parameters_that_is_set_aside_is_no_news() -> None:
     bench = Bench("armed")
-    told = bench.watch.look(bench.reading, "armed", unconfigured={1}, isolated={1})
-    assert told == []
+    reported = bench.watch.look(bench.reading, "armed", unconfigured={1}, isolated={1})
+    assert reported == []
     (found,) = bench.watch.look(bench.reading, "armed", unconfigured={1})
     assert found.what == "module_not_configured" and not found.alone
 
@@ -212,11 +212,13 @@ def test_a_modules_fault_has_time_to_go_after_a_clearing() -> None:
     assert said(bench.tick(faulty)) == [("module_overheat", 1)], "and is told again when it stays"
 
 
-@pytest.mark.parametrize(("lifecycle", "told"), [("estop", []), ("disarmed", [("module_emergency", 1)])])
-def test_an_emergency_is_as_it_should_be_only_in_one(lifecycle: LifecycleState, told: list[tuple[str, int]]) -> None:
+@pytest.mark.parametrize(("lifecycle", "reported"), [("estop", []), ("disarmed", [("module_emergency", 1)])])
+def test_an_emergency_is_as_it_should_be_only_in_one(
+    lifecycle: LifecycleState, reported: list[tuple[str, int]]
+) -> None:
     bench = Bench()
     bench.lifecycle = lifecycle
-    assert said(bench.ticks(9, lambda reading: answer(reading, [2], state=ModuleState.EMERGENCY))) == told
+    assert said(bench.ticks(9, lambda reading: answer(reading, [2], state=ModuleState.EMERGENCY))) == reported
 
 
 def test_a_module_that_does_not_arm_is_told_after_its_grace() -> None:
@@ -226,9 +228,11 @@ def test_a_module_that_does_not_arm_is_told_after_its_grace() -> None:
     bench = Bench()
     bench.lifecycle, bench.state = "armed", ModuleState.ARMED
     found = [bench.tick(refuses) for _ in range(20)]
-    first = next(i for i, told in enumerate(found) if told)
+    first = next(i for i, reported in enumerate(found) if reported)
     assert ARM_GRACE < first <= ARM_GRACE + 3
-    assert [f for told in found for f in told] == [Finding("module_not_armed", WHO + "does not arm: it is disarmed", 1)]
+    assert [f for reported in found for f in reported] == [
+        Finding("module_not_armed", WHO + "does not arm: it is disarmed", 1)
+    ]
 
 
 def test_who_arms_within_the_grace_or_misses_a_moment_is_let_be() -> None:

@@ -37,7 +37,7 @@ def test_a_bus_that_fails_is_a_fault_of_no_joint(kind: Kind, advice: str) -> Non
 
 
 @pytest.mark.parametrize("kind", ["error_warning", "not_acknowledged", "queue_full", "error_frames", "interface_up"])
-def test_lesser_troubles_are_only_counted(kind: Kind) -> None:
+def test_lesser_errors_are_only_counted(kind: Kind) -> None:
     bench = Bench()
     for _ in range(2):
         assert bench.tick(errors=[BusError(kind, "can0", "")]) == []

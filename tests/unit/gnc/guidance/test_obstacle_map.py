@@ -38,20 +38,20 @@ def touch(map_, centre, radius_m, angle_rad, stamp_ns=0) -> None:
 
 
 def only(map_, now_ns=0) -> Obstacle:
-    (told,) = map_.obstacles(now_ns, 0.0)
-    return told
+    (reported,) = map_.obstacles(now_ns, 0.0)
+    return reported
 
 
 def test_what_is_seen_again_and_again_is_believed_more():
     once, often = mapped(cylinder("a", 0.8, 0.0), looks=1), mapped(cylinder("a", 0.8, 0.0), looks=6)
-    told = only(often)
+    reported = only(often)
     assert only(once).confidence < 0.65
-    assert told.confidence > 0.9 and told.last_seen_ns == 5 * S // 20 and not told.felt
-    assert only(often, now_ns=120 * S).confidence < told.confidence  # belief fades
+    assert reported.confidence > 0.9 and reported.last_seen_ns == 5 * S // 20 and not reported.felt
+    assert only(often, now_ns=120 * S).confidence < reported.confidence  # belief fades
 
 
 def test_the_message_holds_what_is_told():
-    told = mapped(cylinder("a", 0.8, 0.3), box("b", 0.9, -0.3, (0.2, 0.1))).obstacles(0, 0.0)
+    reported = mapped(cylinder("a", 0.8, 0.3), box("b", 0.9, -0.3, (0.2, 0.1))).obstacles(0, 0.0)
     world = World(
         tick=0,
         stamp_ns=0,
@@ -59,7 +59,7 @@ def test_the_message_holds_what_is_told():
         base_orientation_wxyz=(1, 0, 0, 0),
         base_confidence=1.0,
         contacts=[],
-        obstacles=told,
+        obstacles=reported,
     )
     assert Decoder(World).decode(encode(world), encoding_of(World)) == world
 
@@ -70,18 +70,18 @@ def test_touches_all_around_find_a_thing_that_was_never_seen(radius, angles):
     map_ = ObstacleMap()
     for angle in angles:
         touch(map_, (0.5, 0.2), radius, angle)
-    told = only(map_)
-    assert told.felt and told.name.startswith("felt") and told.shape == "cylinder"
-    off = math.dist(told.position_w[:2], (0.5, 0.2))
-    assert off < 3 * told.position_sd_m + 0.005
+    reported = only(map_)
+    assert reported.felt and reported.name.startswith("felt") and reported.shape == "cylinder"
+    off = math.dist(reported.position_w[:2], (0.5, 0.2))
+    assert off < 3 * reported.position_sd_m + 0.005
 
 
 def test_a_touch_of_what_is_seen_makes_no_second_one_and_keeps_its_name():
     map_ = mapped(cylinder("a", 0.8, 0.0))
     name = only(map_).name
     touch(map_, (0.8, 0.0), 0.05, 3.0)
-    told = only(map_)
-    assert told.felt and told.name == name
+    reported = only(map_)
+    assert reported.felt and reported.name == name
     assert map_.at(np.array([0.75, 0.0])) is map_.tracks[0] and map_.at(np.array([0.5, 0.5])) is None
 
 
@@ -114,8 +114,8 @@ def test_what_the_body_passes_through_does_not_exist():
     for k in range(40):
         axis = np.column_stack([np.linspace(0, 0.02 * k, 50), np.zeros(50)])
         map_.take_body(axis, BODY_M)
-    told = map_.obstacles(0, 0.0)
-    assert len(told) == 1 and math.dist(told[0].position_w[:2], (0.6, 0.3)) < 0.01
+    reported = map_.obstacles(0, 0.0)
+    assert len(reported) == 1 and math.dist(reported[0].position_w[:2], (0.6, 0.3)) < 0.01
 
 
 def test_where_the_body_lies_nothing_reaches():
@@ -129,9 +129,9 @@ def test_where_the_body_lies_nothing_reaches():
     assert _depth_beyond(only(map_), axis) < 0.012
 
 
-def _depth_beyond(told: Obstacle, axis: np.ndarray) -> float:
+def _depth_beyond(reported: Obstacle, axis: np.ndarray) -> float:
     """How far an obstacle reaches into the body."""
-    return BODY_M - min(outline_distance_m(told, p) for p in axis)
+    return BODY_M - min(outline_distance_m(reported, p) for p in axis)
 
 
 def test_the_newest_look_counts_most_after_drift():

@@ -11,7 +11,7 @@ from tests.unit.gnc.guidance.drive import NOISE, STEP_NS, Drive, Place, random_f
 from tests.unit.gnc.guidance.rendered import cylinder, hills, lidar
 
 
-def told(drive: Drive) -> World:
+def reported(drive: Drive) -> World:
     world = drive.world.world(drive.turn, drive.turn * STEP_NS)
     assert world is not None
     return world
@@ -22,7 +22,7 @@ def scored(drive: Drive, turns: int, *, pose: bool = True) -> MapScore:
     total = MapScore()
     for here in drive.turns(turns, pose=pose):
         if drive.turn % 25 == 0 and drive.turn > 25:
-            obstacles = told(drive).obstacles
+            obstacles = reported(drive).obstacles
             if not pose:
                 obstacles = moved(obstacles, drive.world.localiser.base.planar_w.tolist(), here.base_w)
             total.add(score(obstacles, drive.obstacles, here.head_w, here.headings_rad[-1]))
@@ -33,20 +33,20 @@ def test_a_field_is_mapped_to_millimetres():
     total = scored(Drive(random_field(1)), 200)
     assert len(total.position_m) > 30 and total.visible > 20
     assert np.median(total.position_m) < 0.005 and np.median(total.surface_m) < 0.003
-    assert total.misses <= 0.05 * total.visible and total.ghosts <= 0.02 * total.told
+    assert total.misses <= 0.05 * total.visible and total.ghosts <= 0.02 * total.reported
     assert np.median(total.in_sd) < 1.5 and np.percentile(total.in_sd, 90) < 3.5  # as sure as it may be
 
 
 def test_so_it_is_on_hills():
     total = scored(Drive(random_field(2), ground=hills(0.02, 1.5)), 200)
     assert np.median(total.position_m) < 0.008
-    assert total.misses <= 0.1 * total.visible and total.ghosts <= 0.05 * total.told
+    assert total.misses <= 0.1 * total.visible and total.ghosts <= 0.05 * total.reported
 
 
 def test_without_a_pose_sensor_it_is_right_as_the_robot_sees_it():
     total = scored(Drive(random_field(3)), 300, pose=False)
     assert np.median(total.position_m) < 0.02
-    assert total.ghosts <= 0.1 * total.told
+    assert total.ghosts <= 0.1 * total.reported
 
 
 def test_an_image_counts_where_it_was_taken_not_where_it_arrives():
@@ -58,7 +58,7 @@ def test_an_image_counts_where_it_was_taken_not_where_it_arrives():
 def test_samples_without_a_body_of_their_time_are_counted_and_not_used():
     drive = Drive(random_field(1))
     *_, here = drive.turns(100)
-    image, before = drive.image(here, 100 * STEP_NS), told(drive)
+    image, before = drive.image(here, 100 * STEP_NS), reported(drive)
     drive.world.take_depth(msgspec.structs.replace(image, stamp_ns=STEP_NS), NOISE)  # older than what is in the map
     drive.world.take_depth(msgspec.structs.replace(image, stamp_ns=900 * STEP_NS), NOISE)  # of the future
     joints = drive.joints(here, here)
@@ -66,7 +66,7 @@ def test_samples_without_a_body_of_their_time_are_counted_and_not_used():
     drive.world.take_joints(broken, None, None)
     drive.world.take_depth(image, NOISE)
     assert sum(drive.world.refused.values()) == 3 and len(drive.world.refused) == 3
-    after = told(drive)
+    after = reported(drive)
     assert after.depth_stamp_ns == before.depth_stamp_ns and len(after.obstacles) == len(before.obstacles)
 
 
@@ -75,10 +75,10 @@ def test_when_the_streams_end_nothing_new_is_told_and_doubt_grows():
     for _ in drive.turns(150):
         pass
     drive.under_way.clear()
-    before = told(drive)
+    before = reported(drive)
     for _ in drive.turns(100, pose=False, images=False, imu=False):
         pass
-    after = told(drive)
+    after = reported(drive)
     assert after.pose_stamp_ns == before.pose_stamp_ns and after.depth_stamp_ns == before.depth_stamp_ns
     assert after.base_confidence < before.base_confidence
     assert (after.base_position_sd_m or 0) > 5 * (before.base_position_sd_m or 1)
@@ -119,7 +119,7 @@ def test_a_lidar_maps_as_a_camera_does():
     for here in drive.turns(60, images=False):
         beams = lidar(drive.obstacles, here.origins_w[-1], here.rotations[-1], stamp_ns=drive.turn * STEP_NS)
         drive.world.take_ranges(msgspec.structs.replace(beams, link=len(here.origins_w) - 1), NOISE)
-    total = score(told(drive).obstacles, drive.obstacles, here.head_w, here.headings_rad[-1])
+    total = score(reported(drive).obstacles, drive.obstacles, here.head_w, here.headings_rad[-1])
     assert len(total.position_m) == 2 and max(total.position_m) < 0.005 and not total.ghosts
 
 

@@ -26,8 +26,8 @@ def decision(target: float = 0.1, mode: Mode = Mode.POSITION, torque_limit: floa
 
 def digest(*rows: tuple[int, Decision], angle: float = 0.0) -> str:
     box = BlackBox(ROBOT)
-    for tick, told in rows:
-        box.record(tick, tick * 10_000_000, Samples(state(ROBOT, angle)), told)
+    for tick, reported in rows:
+        box.record(tick, tick * 10_000_000, Samples(state(ROBOT, angle)), reported)
     return box.command_digest
 
 
@@ -177,15 +177,15 @@ def test_rows_are_whole_while_another_thread_takes_them() -> None:
 def test_a_tick_costs_the_same_after_any_time_and_keeps_no_memory() -> None:
     robot = description(chain__modules=100)
     box, row = BlackBox(robot, memory_bytes=100 * BlackBox(robot).layout.row_bytes), Samples(state(robot, 0.1))
-    told = Decision(SetPoints([Mode.POSITION] * 100, [0.1] * 100, [4.0] * 100), 1, {})
+    reported = Decision(SetPoints([Mode.POSITION] * 100, [0.1] * 100, [4.0] * 100), 1, {})
     for tick in range(300):
-        box.record(tick, tick, row, told)
+        box.record(tick, tick, row, reported)
     peaks = [0] * 700
     tracemalloc.start()
     before = tracemalloc.get_traced_memory()[0]
     for i in range(len(peaks)):
         tracemalloc.reset_peak()
-        box.record(300 + i, i, row, told)
+        box.record(300 + i, i, row, reported)
         peaks[i] = tracemalloc.get_traced_memory()[1] - before - 36 * i  # the list's own numbers
     kept = tracemalloc.get_traced_memory()[0] - before - 36 * len(peaks)
     tracemalloc.stop()

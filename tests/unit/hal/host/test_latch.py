@@ -53,8 +53,8 @@ def test_what_cannot_be_read_counts_as_latched(tmp_path: Path, content: bytes) -
 def test_a_stop_that_cannot_be_kept_says_so(tmp_path: Path) -> None:
     (tmp_path / "in the way").write_text("a file where the folder belongs")
     latch = EstopLatch(tmp_path / "in the way")
-    trouble = asked(latch, "engage")
-    assert trouble is not None and "will not outlive this host" in trouble
+    failure = asked(latch, "engage")
+    assert failure is not None and "will not outlive this host" in failure
 
 
 def test_a_host_that_finds_one_begins_in_estop(tmp_path: Path) -> None:

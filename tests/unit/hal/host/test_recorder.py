@@ -30,7 +30,7 @@ ROW = BlackBox(ROBOT).layout.row_bytes
 class Numbers(msgspec.Struct):
     ticks: int
     lost_ticks: int
-    trouble: str
+    failure: str
 
 
 def fill(box: BlackBox, *ticks: int) -> None:
@@ -39,13 +39,13 @@ def fill(box: BlackBox, *ticks: int) -> None:
 
 
 def recorder(box: BlackBox, folder: Path | None, memory: int | None = None) -> Recorder:
-    def numbers(*, lost_ticks: int, trouble: str) -> Numbers:
-        return Numbers(box.ticks, lost_ticks, trouble)
+    def numbers(*, lost_ticks: int, failure: str) -> Numbers:
+        return Numbers(box.ticks, lost_ticks, failure)
 
     return Recorder(box, ROBOT, numbers, folder, memory)
 
 
-def told(folder: Path) -> Numbers:
+def reported(folder: Path) -> Numbers:
     return msgspec.json.decode((folder / HOST_RECORD).read_bytes(), type=Numbers)
 
 
@@ -73,10 +73,10 @@ def test_rows_and_numbers_are_on_disk_within_a_second_and_all_of_them_at_the_end
         began = time.monotonic()
         wait_until(lambda: ticks_on_disk(tmp_path) == list(range(40)), "the rows", 5.0)
         assert time.monotonic() - began < 1.0
-        wait_until(lambda: (tmp_path / HOST_RECORD).exists() and told(tmp_path).ticks == 40, "the numbers", 1.0)
+        wait_until(lambda: (tmp_path / HOST_RECORD).exists() and reported(tmp_path).ticks == 40, "the numbers", 1.0)
         fill(box, *range(40, 45))
     assert ticks_on_disk(tmp_path) == list(range(45))
-    assert told(tmp_path) == remembered(memory) == Numbers(45, 0, "")
+    assert reported(tmp_path) == remembered(memory) == Numbers(45, 0, "")
     assert digest_of(read_black_box(tmp_path / BLACK_BOX)[1]) == box.command_digest
     assert msgspec.json.decode((tmp_path / DESCRIPTION).read_bytes(), type=Description) == ROBOT
     assert {path.name for path in tmp_path.iterdir()} == {BLACK_BOX, HOST_RECORD, DESCRIPTION}
@@ -121,12 +121,12 @@ def test_what_a_full_disk_did_not_take_is_written_when_there_is_room_again(
     disk = Disk(monkeypatch, memory, begins + 7 * ROW + 11)  # the eighth row is torn
     with recorder(box, tmp_path, memory):
         fill(box, *range(20))
-        wait_until(lambda: len(os.pread(memory, 9, 0)) and remembered(memory).trouble, "a word about it")
+        wait_until(lambda: len(os.pread(memory, 9, 0)) and remembered(memory).failure, "a word about it")
         assert ticks_on_disk(tmp_path) == list(range(7)) and remembered(memory).lost_ticks == 0
         disk.space = 2**30
-        wait_until(lambda: not remembered(memory).trouble, "room")
+        wait_until(lambda: not remembered(memory).failure, "room")
     assert ticks_on_disk(tmp_path) == list(range(20))
-    assert told(tmp_path) == remembered(memory) == Numbers(20, 0, "")
+    assert reported(tmp_path) == remembered(memory) == Numbers(20, 0, "")
     assert capfd.readouterr().err == f"record: {tmp_path}: No space left on device\n"  # once
 
 
@@ -144,7 +144,7 @@ def test_what_is_never_written_is_counted_and_seen_in_the_ticks(
         wait_until(lambda: len(ticks_on_disk(tmp_path)) == 8, "some of the newest")
     assert ticks_on_disk(tmp_path) == [0, 1, 2, 21, 22, 23, 24, 25]
     last = remembered(memory)
-    assert last.lost_ticks == 18 + 4 and last.trouble == f"{tmp_path}: No space left on device"
+    assert last.lost_ticks == 18 + 4 and last.failure == f"{tmp_path}: No space left on device"
 
 
 def test_a_folder_that_cannot_be_written_to_leaves_no_empty_file(tmp_path: Path, memory: int) -> None:
@@ -153,7 +153,7 @@ def test_a_folder_that_cannot_be_written_to_leaves_no_empty_file(tmp_path: Path,
         fill(box, 1, 2)
     assert not (tmp_path / "gone").exists()
     last = remembered(memory)
-    assert last.lost_ticks == 2 and "No such file" in last.trouble
+    assert last.lost_ticks == 2 and "No such file" in last.failure
 
 
 def test_no_tick_and_no_end_waits_for_a_disk_that_hangs(
@@ -176,7 +176,7 @@ def test_no_tick_and_no_end_waits_for_a_disk_that_hangs(
         assert run.host.ended == "complete" and not run.host.authority.faults
     last = msgspec.json.decode(os.pread(memory, 2**20, 0), type=HostRecord)
     assert last.ended == "complete" and last.armed_ticks == 75
-    assert 0 < last.lost_ticks < 75 and "has not answered" in last.trouble
+    assert 0 < last.lost_ticks < 75 and "has not answered" in last.failure
     disk.goes_on.set()
 
 
@@ -202,4 +202,4 @@ def test_numbers_are_written_although_the_disk_never_catches_up(
     monkeypatch.setattr(under_test.os, "pwrite", slow)
     with recorder(box, tmp_path, memory):
         fill(box, 0)
-        wait_until(lambda: (tmp_path / HOST_RECORD).exists() and told(tmp_path).ticks > 3, "numbers", 5.0)
+        wait_until(lambda: (tmp_path / HOST_RECORD).exists() and reported(tmp_path).ticks > 3, "numbers", 5.0)

@@ -159,18 +159,18 @@ def test_set_without_key_or_value_is_refused(text: str) -> None:
 
 def test_every_value_says_where_it_came_from(tmp_path: Path) -> None:
     loaded = with_flags(write_files(tmp_path), "robot.limits.torque_nm=2.0", "start.tail_s_m=0.2", "control.gain=1")
-    told = {key: (value, origin) for key, value, origin in loaded.explain()}
-    assert told["robot.limits.torque_nm"] == (2.0, "--set robot.limits.torque_nm=2.0")
-    assert told["start.tail_s_m"] == (0.2, "--set start.tail_s_m=0.2")
-    assert told["controllers.hold.gain"] == (1, "--set control.gain=1")
-    assert told["robot.limits.speed_rad_s"] == (5.0, str(tmp_path / "worm.toml"))
-    assert told["robot.sensors.pose.rate_hz"] == (50.0, str(tmp_path / "worm.toml"))
-    assert told["scene.cylinder.1.position_m"] == ((1.5, 1.0), str(tmp_path / "bend.toml"))
-    assert told["rate_hz"] == (100.0, str(tmp_path / "crawl.toml"))
-    assert told["services.guidance.every_ticks"] == (2, str(tmp_path / "crawl.toml"))
+    reported = {key: (value, origin) for key, value, origin in loaded.explain()}
+    assert reported["robot.limits.torque_nm"] == (2.0, "--set robot.limits.torque_nm=2.0")
+    assert reported["start.tail_s_m"] == (0.2, "--set start.tail_s_m=0.2")
+    assert reported["controllers.hold.gain"] == (1, "--set control.gain=1")
+    assert reported["robot.limits.speed_rad_s"] == (5.0, str(tmp_path / "worm.toml"))
+    assert reported["robot.sensors.pose.rate_hz"] == (50.0, str(tmp_path / "worm.toml"))
+    assert reported["scene.cylinder.1.position_m"] == ((1.5, 1.0), str(tmp_path / "bend.toml"))
+    assert reported["rate_hz"] == (100.0, str(tmp_path / "crawl.toml"))
+    assert reported["services.guidance.every_ticks"] == (2, str(tmp_path / "crawl.toml"))
     for key in ("seed", "robot.motor.friction_nm", "services.control.every_ticks", "scene.cylinder.0.friction", "pace"):
-        assert told[key][1] == "default", key
-    assert set(told) == {key for key, _ in flat(msgspec.to_builtins(loaded.config))}
+        assert reported[key][1] == "default", key
+    assert set(reported) == {key for key, _ in flat(msgspec.to_builtins(loaded.config))}
 
 
 def flat(value: Any, at: str = "") -> list[tuple[str, Any]]:

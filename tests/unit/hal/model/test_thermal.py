@@ -33,10 +33,10 @@ def test_derating_is_linear(celsius: float, share: float) -> None:
 
 def test_a_share_is_told_while_one_winding_is_hot_and_once_more_when_it_has_cooled() -> None:
     heat = Thermal(2, 4.0, LIMITS)
-    for celsius, told in ((80.0, False), (80.1, True), (100.0, True), (79.0, True), (79.0, False)):
+    for celsius, reported in ((80.0, False), (80.1, True), (100.0, True), (79.0, True), (79.0, False)):
         heat.winding_c[1] = celsius
         share = heat.share_left()
-        assert (share is not None) is told
+        assert (share is not None) is reported
         assert share is None or share.tolist() == pytest.approx([1.0, LIMITS.share_left(celsius)])
 
 

@@ -84,6 +84,6 @@ def test_a_tick_that_was_commanded_before_is_reported_done_when_it_is_shown_agai
         if arming == 0:
             client.commanded_tick = 0
         client.done(0)
-    told: list[Done] = []
-    wait_until(lambda: told.extend(reports.drain()) is None and bool(told), "the tick reported done", 5.0)
-    assert told == [Done(tick=0)]
+    reported: list[Done] = []
+    wait_until(lambda: reported.extend(reports.drain()) is None and bool(reported), "the tick reported done", 5.0)
+    assert reported == [Done(tick=0)]

@@ -102,8 +102,8 @@ def test_robots_of_this_computer_are_found_as_long_as_they_live(
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     assert local_robots() == []
-    with registered(a_robot()) as trouble:
-        assert trouble is None and local_robots() == [a_robot()]
+    with registered(a_robot()) as failure:
+        assert failure is None and local_robots() == [a_robot()]
     assert local_robots() == []
 
 
@@ -128,8 +128,8 @@ def test_a_run_that_was_killed_is_not_found_any_more(tmp_path: Path, monkeypatch
 def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "snakesim").write_text("a file where the folder belongs")
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    with registered(a_robot()) as trouble:
-        assert trouble is not None and "--endpoint" in trouble
+    with registered(a_robot()) as failure:
+        assert failure is not None and "--endpoint" in failure
     assert local_robots() == []
 
 

@@ -44,8 +44,8 @@ def test_a_difference_is_told_with_both_places(change: str, named: str, sessions
     show_process(there, own_entry("control", config(change)))
     wait_until(lambda: bool(entries.against(own, ["control"])), "an entry", 5.0)
     wait_until(lambda: named in entries.against(own, ["control"])[0], named, 5.0)
-    (told,) = entries.against(own, ["control"])
-    assert f"(control, process {own.pid})" in told and f"(host, process {own.pid})" in told
+    (reported,) = entries.against(own, ["control"])
+    assert f"(control, process {own.pid})" in reported and f"(host, process {own.pid})" in reported
     assert entries.against(own, ["guidance"]) == []
 
 
@@ -61,14 +61,16 @@ def test_what_only_one_of_them_uses_may_differ(sessions: tuple[Session, Session]
     wait_until(lambda: entries.against(own, ["control", "recorder"]) == [], "no difference", 5.0)
 
 
-def test_another_version_of_a_message_is_told_and_the_entry_counts_as_long_as_its_process_lives(
+def test_another_version_of_a_message_is_reported_and_the_entry_counts_as_long_as_its_process_lives(
     sessions: tuple[Session, Session],
 ) -> None:
     here, there = sessions
     entries, own = ProcessEntries(here), own_entry("host", config())
     key = keys.process("control", "1")
     there.declare_token(key)
-    wait_until(lambda: entries.against(own, ["control"]) == ["control-1 has not told its settings yet"], "a token", 5.0)
+    wait_until(
+        lambda: entries.against(own, ["control"]) == ["control-1 has not published its settings yet"], "a token", 5.0
+    )
     newer = msgspec.structs.replace(own, name="control", messages={**own.messages, "JointCommand": 2, "Leap": 1})
     there.latched_publisher(key, Process).put(newer)
     wait_until(

@@ -22,7 +22,7 @@ def line(text: str, module: str = ACL, level: str = "TRACE", thread: int = 8) ->
     )
 
 
-def told(*lines: str) -> list[str]:
+def reported(*lines: str) -> list[str]:
     said: list[str] = []
     log = RouterLog(said.append)
     for one in lines:
@@ -43,7 +43,7 @@ def comes(name: str = VIEWER, zid: str = ZID) -> list[str]:
 def test_who_comes_and_what_they_are_refused_is_told_with_the_name_in_the_certificate() -> None:
     put = line(f"{SUBJECT} is unauthorized to Put (ingress) on planar13/actuator/joints")
     cached = line(f"Using cached result: {ZID} is unauthorized to Declare Queryable (ingress) on planar13/hal/lease")
-    assert told(*comes(), put, cached) == [
+    assert reported(*comes(), put, cached) == [
         f"let in: {VIEWER} from 10.78.0.4:53700",
         f"refused: {VIEWER}: Put (ingress) on planar13/actuator/joints",
         f"refused: {VIEWER}: Declare Queryable (ingress) on planar13/hal/lease",
@@ -53,7 +53,7 @@ def test_who_comes_and_what_they_are_refused_is_told_with_the_name_in_the_certif
 def test_a_certificate_that_no_rule_names_is_told() -> None:
     certified, let_in = comes("gnc.planar13.laptop")
     nobody = line(f"{ZID} did not match any configured ACL subject. Default permission `Deny` will be applied", ACL)
-    assert told(certified, nobody, let_in) == [
+    assert reported(certified, nobody, let_in) == [
         "refused: gnc.planar13.laptop from 10.78.0.4:53700: everything, because no rule is for it"
     ]
 
@@ -65,7 +65,7 @@ def test_neither_what_passes_nor_what_nobody_asked_for_is_told() -> None:
     other = line(f"{SUBJECT} is unauthorized to Delete (ingress) on planar13/hal/clock", thread=9)
     begins = line("ACL (ingress): caching permissions for `planar13/hal/lease` ...")
     after = line(f"{SUBJECT} is unauthorized to Query (ingress) on planar13/hal/lifecycle")
-    assert told(begins, *listed[:2], other, passes, *listed[2:], after) == [
+    assert reported(begins, *listed[:2], other, passes, *listed[2:], after) == [
         f"refused: {VIEWER}: Delete (ingress) on planar13/hal/clock",
         f"refused: {VIEWER}: Query (ingress) on planar13/hal/lifecycle",
     ]
@@ -75,11 +75,11 @@ def test_the_end_of_a_list_may_be_allowed() -> None:
     begins = line("ACL (egress): caching permissions for `planar13/alive/hal` ...")
     ends = line(f"{SUBJECT} is authorized to Declare Liveliness Subscriber (egress) on planar13/alive/hal")
     after = line(f"{SUBJECT} is unauthorized to Query (ingress) on planar13/hal/lifecycle")
-    assert len(told(begins, ends, after)) == 1
+    assert len(reported(begins, ends, after)) == 1
 
 
 def test_zenohs_own_warnings_are_told() -> None:
-    assert told(line("peer sent no certificates", TLS, "WARN"), line("Closing", LINK, "DEBUG")) == [
+    assert reported(line("peer sent no certificates", TLS, "WARN"), line("Closing", LINK, "DEBUG")) == [
         f"WARN {TLS}: peer sent no certificates"
     ]
 
@@ -87,7 +87,7 @@ def test_zenohs_own_warnings_are_told() -> None:
 def test_what_comes_again_is_counted() -> None:
     put = f"{SUBJECT} is unauthorized to Put (ingress) on planar13/actuator/joints"
     first = f"refused: {VIEWER}: Put (ingress) on planar13/actuator/joints"
-    assert told(*[line(put)] * 1000) == [first, f"999 times more: {first}"]
+    assert reported(*[line(put)] * 1000) == [first, f"999 times more: {first}"]
 
 
 def test_a_flood_of_different_lines_is_bounded() -> None:

@@ -49,8 +49,8 @@ class Health:
 
     def wrong(self, now_ns: int) -> set[str]:
         low = self.low_since_ns is not None and now_ns - self.low_since_ns >= LOW_FOR_NS
-        told = {"leak": self.leak, "undervoltage": low} if self.known(now_ns) else {}
-        return {word for word, there in {"overheated": self.hot, **told}.items() if there}
+        reported = {"leak": self.leak, "undervoltage": low} if self.known(now_ns) else {}
+        return {word for word, there in {"overheated": self.hot, **reported}.items() if there}
 
     def share(self, now_ns: int) -> float:
         over = (self.celsius - DERATE_FROM) / (STOP_AT - DERATE_FROM)
@@ -97,7 +97,7 @@ class Model(RuleBasedStateMachine):
         self.wrong: set[tuple[str, int]] = set()  # at the last tick
         self.silent: set[int] = set()
         self.shares = [1.0] * JOINTS
-        self.told = True  # the motors were told of the last stop
+        self.reported = True  # the motors were told of the last stop
         self.last: Decision | None = None
 
     @property
@@ -108,7 +108,7 @@ class Model(RuleBasedStateMachine):
         if following != self.state:
             self.hold_at = self.measured[0]
             self.halt = [self.beginning_of_halt(i) for i in range(JOINTS)] if self.state == "armed" else None
-            self.told = self.told and following != "disarmed"
+            self.reported = self.reported and following != "disarmed"
         if self.state == "armed":
             self.heard = None
         self.state = following

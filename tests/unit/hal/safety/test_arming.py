@@ -48,5 +48,5 @@ def test_only_staying_is_allowed() -> None:
 def test_a_joint_that_is_set_aside_may_be_anywhere() -> None:
     here, aside = np.zeros(len(ROBOT.joints)), NONE.copy()
     aside[1] = True
-    told = far_targets(command(ROBOT, 2 * MAX), here, ROBOT, aside)
-    assert [words.partition(" ")[0] for words in told] == ["joint_1", "joint_3"]
+    reported = far_targets(command(ROBOT, 2 * MAX), here, ROBOT, aside)
+    assert [words.partition(" ")[0] for words in reported] == ["joint_1", "joint_3"]

@@ -98,7 +98,7 @@ class Everything(Model):
         angle=per_joint(st.floats(-1.7, 1.7)),
         velocity=per_joint(st.floats(-6, 6)),
         torque=per_joint(st.floats(-5, 5)),
-        trouble=often(None, "valid", "age", "nan", "inf", "short", "no_valid", "no_age"),
+        failure=often(None, "valid", "age", "nan", "inf", "short", "no_valid", "no_age"),
         joint=st.integers(0, JOINTS - 1),
         later_ns=often(LONG_NS, PERIOD_NS, 0),
     )
@@ -107,20 +107,20 @@ class Everything(Model):
         angle: list[float],
         velocity: list[float],
         torque: list[float],
-        trouble: str | None,
+        failure: str | None,
         joint: int,
         later_ns: int,
     ) -> None:
         valid, age_ns = [True] * JOINTS, [FRESH_NS] * JOINTS
         shown = list(angle)
         self.stamp_ns += later_ns
-        match trouble:
+        match failure:
             case "valid":
                 valid[joint] = False
             case "age":
                 age_ns[joint] += 1
             case "nan" | "inf":
-                shown[joint] = float(trouble)
+                shown[joint] = float(failure)
             case "short":
                 shown.pop()
             case "no_valid":
@@ -133,7 +133,7 @@ class Everything(Model):
         seen = state(self.robot, shown, velocity, torque, valid=valid, age_ns=age_ns, **when)
         self.authority.observe(seen)
         self.seen_tick = self.tick
-        if trouble in ("short", "no_valid", "no_age"):
+        if failure in ("short", "no_valid", "no_age"):
             self.doubt = None
             return
         measured = (list(self.measured[0]), list(self.measured[1]), list(self.measured[2]))
@@ -141,7 +141,7 @@ class Everything(Model):
         for i in range(JOINTS):
             taken_s = (self.stamp_ns - age_ns[i]) * 1e-9
             frozen = self.is_frozen(i, (shown[i], velocity[i], torque[i]), taken_s)
-            sound = trouble is None or i != joint
+            sound = failure is None or i != joint
             believed = sound and self.believe(i, angle[i], taken_s)
             if believed or not sound:
                 self.strays[i] = []
@@ -161,16 +161,16 @@ class Everything(Model):
         volts=per_joint(often(24.0, 18.0, 17.9)),
         leak=st.none() | st.integers(0, 3 * JOINTS),
         silent=st.none() | st.integers(0, JOINTS - 1),
-        trouble=often(None, "nan", "short"),
+        failure=often(None, "nan", "short"),
     )
     def hear_of_power(
-        self, celsius: list[float], volts: list[float], leak: int | None, silent: int | None, trouble: str | None
+        self, celsius: list[float], volts: list[float], leak: int | None, silent: int | None, failure: str | None
     ) -> None:
         leaks, valid = [i == leak for i in range(JOINTS)], [i != silent for i in range(JOINTS)]
-        told = [NAN, *celsius[1:]] if trouble == "nan" else celsius[1:] if trouble == "short" else celsius
-        self.authority.observe_power(power(told, volts, leaks, valid), self.now_ns)
-        for i, health in enumerate(self.healths if trouble != "short" else ()):
-            if i == silent or not math.isfinite(told[i]):
+        reported = [NAN, *celsius[1:]] if failure == "nan" else celsius[1:] if failure == "short" else celsius
+        self.authority.observe_power(power(reported, volts, leaks, valid), self.now_ns)
+        for i, health in enumerate(self.healths if failure != "short" else ()):
+            if i == silent or not math.isfinite(reported[i]):
                 continue
             health.heard_ns, health.celsius, health.volts, health.leak = self.now_ns, celsius[i], volts[i], leaks[i]
             health.hot = celsius[i] >= (DERATE_FROM if health.hot else STOP_AT)
@@ -305,7 +305,7 @@ class Everything(Model):
     def arm(self, robot: str | None, backend: str | None, config_hash: str | None) -> None:
         ready = self.state == "disarmed" and self.known and self.live and self.heard is not None
         wrong = self.wrong - {("overheated", i) for i in self.aside}
-        ready = ready and not wrong and (self.told or self.arming == 0)
+        ready = ready and not wrong and (self.reported or self.arming == 0)
         if ready and self.heard is not None:
             heard_ns, asked = self.heard
             ready = self.now_ns - heard_ns <= LEASE_NS and all(
@@ -313,13 +313,13 @@ class Everything(Model):
                 for i, mode, target, angle in zip(ALL, asked.mode, asked.target, self.measured[0], strict=True)
             )
         assert (not self.authority.against_arming(self.now_ns)) == ready
-        told = {
+        reported = {
             "wrong_robot": robot == "worm",
             "wrong_backend": backend == "lag",
             "wrong_config": config_hash == "0" * 16,
         }
-        told |= {"wrong_state": self.state == "disarmed", "not_ready": ready}
-        ready = all(told.values())
+        reported |= {"wrong_state": self.state == "disarmed", "not_ready": ready}
+        ready = all(reported.values())
         request = LifecycleRequest(action="arm", robot=robot, backend=backend, config_hash=config_hash)
         answer = self.authority.on_lifecycle(request, self.now_ns)
         if ready:
@@ -330,7 +330,7 @@ class Everything(Model):
             self.since_arming, self.counting = [], None
             self.expires_ns = self.now_ns + LEASE_NS
         self.check(answer, ready)
-        assert answer.refusal == next((word for word, right in told.items() if not right), None)
+        assert answer.refusal == next((word for word, right in reported.items() if not right), None)
 
     @rule(action=st.sampled_from(["disarm", "finish", "clear"]))
     def ask_for_less(self, action: Any) -> None:
@@ -441,7 +441,7 @@ class Everything(Model):
         self.check_aside(decision)
         assert self.authority.limited.total() == limited + len(decision.limited)
         if self.state != "armed":
-            self.told = True
+            self.reported = True
             self.check_safe(decision)
         else:
             assert self.live and self.doubt is not None and self.doubt <= self.aside

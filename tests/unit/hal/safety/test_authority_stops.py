@@ -301,5 +301,5 @@ def test_what_never_became_a_command_is_counted_by_reason() -> None:
 
 def test_what_is_published_of_a_joint_without_a_number_is_its_last_good_state() -> None:
     rig = armed()
-    told = rig.authority.readable(state(rig.robot, [0.2, float("nan"), 0.2]))
-    assert told.angle_rad == [0.2, 0.1, 0.2] and told.valid == [True, False, True]
+    reported = rig.authority.readable(state(rig.robot, [0.2, float("nan"), 0.2]))
+    assert reported.angle_rad == [0.2, 0.1, 0.2] and reported.valid == [True, False, True]

@@ -146,10 +146,10 @@ def test_who_falls_silent_is_told_once_and_is_not_derated() -> None:
     assert len(bench.notes) == 2 and bench.notes[1].cause.endswith("for joint_1, joint_2")
 
 
-@pytest.mark.parametrize("told", [{"leak": True}, {"voltage_v": 12.0}])
-def test_water_and_voltage_do_not_count_when_nothing_is_heard_any_more(told: dict[str, Any]) -> None:
+@pytest.mark.parametrize("reported", [{"leak": True}, {"voltage_v": 12.0}])
+def test_water_and_voltage_do_not_count_when_nothing_is_heard_any_more(reported: dict[str, Any]) -> None:
     bench = Bench()
-    bench.hear(**told)
+    bench.hear(**reported)
     bench.look(50 * MS)
     assert len(bench.derating.wrong) == JOINTS
     bench.look(3 * S)
@@ -182,10 +182,10 @@ def test_a_long_list_of_silent_modules_fits_into_a_message() -> None:
 
 
 @pytest.mark.parametrize(
-    ("told", "reach"), [({"motor_c": 110.0}, "joint"), ({"leak": True}, "robot"), ({"voltage_v": 12.0}, "robot")]
+    ("reported", "reach"), [({"motor_c": 110.0}, "joint"), ({"leak": True}, "robot"), ({"voltage_v": 12.0}, "robot")]
 )
-def test_heat_concerns_a_joint_and_water_and_voltage_the_robot(told: dict[str, Any], reach: str) -> None:
+def test_heat_concerns_a_joint_and_water_and_voltage_the_robot(reported: dict[str, Any], reach: str) -> None:
     bench = Bench()
-    bench.hear(**told)
+    bench.hear(**reported)
     bench.look(50 * MS)
     assert [fault.reach for fault in bench.derating.wrong] == [reach] * JOINTS

@@ -287,15 +287,15 @@ def test_a_joint_can_stop_before_its_end() -> None:
 @pytest.mark.parametrize("delay", [1, 2])
 def test_a_joint_that_is_driven_at_its_end_by_velocity_stops_before_it(side: int, delay: int) -> None:
     """A joint that turns as it is told, one or two periods later."""
-    angle, told = 0.0, [0.0] * delay
+    angle, reported = 0.0, [0.0] * delay
     last = Applied(np.full(JOINTS, int(Mode.VELOCITY)), np.zeros(JOINTS), LIMITS.torque_nm)
     speeds: list[float] = []
     for _ in range(400):
-        measured = Measured(np.full(JOINTS, angle), np.full(JOINTS, told[0]), np.zeros(JOINTS))
+        measured = Measured(np.full(JOINTS, angle), np.full(JOINTS, reported[0]), np.zeros(JOINTS))
         last = limit(command(ROBOT, side * 5.0, Mode.VELOCITY), measured=measured, last=last, limits=LIMITS, share=COOL)
-        told = [*told[1:], float(last.target[0])]
-        angle += told[0] * 0.01
-        speeds.append(abs(told[0]))
+        reported = [*reported[1:], float(last.target[0])]
+        angle += reported[0] * 0.01
+        speeds.append(abs(reported[0]))
         assert abs(angle) <= 1.5
     assert max(speeds) == 5.0 and abs(angle) > 1.49
     assert max(np.abs(np.diff(speeds))) <= SPEED_STEP + TINY  # what outranks the rate limit hardly needs to

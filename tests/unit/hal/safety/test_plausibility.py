@@ -19,7 +19,7 @@ WORD = "state_invalid"
 NOBODY: Mask = np.zeros(JOINTS, dtype=np.bool_)
 
 
-def told(target: Any = 0.0, mode: Mode = Mode.POSITION, torque_limit: float = 4.0) -> Applied:
+def targets(target: Any = 0.0, mode: Mode = Mode.POSITION, torque_limit: float = 4.0) -> Applied:
     return Applied(np.full(JOINTS, int(mode)), np.full(JOINTS, target), np.full(JOINTS, torque_limit))
 
 
@@ -59,7 +59,7 @@ def test_the_first_angle_is_believed_wherever_it_is() -> None:
     assert Bench(angle=1.4).angles == [1.4] * JOINTS
 
 
-@pytest.mark.parametrize("applied", [None, told()])
+@pytest.mark.parametrize("applied", [None, targets()])
 @pytest.mark.parametrize("side", [1, -1])
 def test_a_glitch_is_not_believed_and_named(applied: Applied | None, side: int) -> None:
     bench = Bench()
@@ -102,7 +102,7 @@ def test_a_host_that_was_held_up_knows_that_more_time_has_passed() -> None:
 
 def test_what_stays_at_a_new_place_is_believed_again_but_not_while_armed() -> None:
     """A joint that was bent by hand between two samples; slowly, so that time alone does not make it good."""
-    for applied, seen in ((None, 5), (told(), 6)):
+    for applied, seen in ((None, 5), (targets(), 6)):
         bench = Bench()
         found = [bench.see(1.2 + 0.01 * k, applied=applied) for k in range(5)] + [bench.see(1.25, periods=0.5)]
         assert [fault is None for fault in found].index(True) == seen - 1
@@ -210,11 +210,11 @@ def test_what_is_published_has_numbers_only(column: str) -> None:
     sound = state(ROBOT, 0.12, 0.2, 0.3)
     assert readable(sound, bench.watch.measured) is sound
     spoilt = msgspec.structs.replace(sound, **{column: [0.5, float("nan"), 0.7]})
-    told = readable(spoilt, bench.watch.measured)
-    assert told.valid == [True, False, True]
-    assert told.angle_rad[1] == 0.1 and told.velocity_rad_s[1] == told.torque_nm[1] == 0.0
-    assert getattr(told, column)[::2] == [0.5, 0.7] and told.age_ns == sound.age_ns
-    assert [told.angle_rad[0], told.velocity_rad_s[2], told.torque_nm[2]] != [0.1, 0.0, 0.0]
+    published = readable(spoilt, bench.watch.measured)
+    assert published.valid == [True, False, True]
+    assert published.angle_rad[1] == 0.1 and published.velocity_rad_s[1] == published.torque_nm[1] == 0.0
+    assert getattr(published, column)[::2] == [0.5, 0.7] and published.age_ns == sound.age_ns
+    assert [published.angle_rad[0], published.velocity_rad_s[2], published.torque_nm[2]] != [0.1, 0.0, 0.0]
     assert readable(msgspec.structs.replace(spoilt, valid=[False, True, True]), bench.watch.measured).valid == [
         False,
         False,
@@ -239,14 +239,16 @@ FAR_PERIODS = 4  # until a target that moves by 0.02 rad a period is further tha
 def stuck(bench: Bench, periods: int, step: float = 0.02, **other: Any) -> Fault | None:
     fault = None
     for k in range(periods):
-        fault = bench.see(0.0, 0.0, other.get("torque", 0.5), applied=told(step * k, other.get("mode", Mode.POSITION)))
+        fault = bench.see(
+            0.0, 0.0, other.get("torque", 0.5), applied=targets(step * k, other.get("mode", Mode.POSITION))
+        )
     return fault
 
 
 def test_a_joint_that_repeats_itself_while_its_target_moves_is_frozen() -> None:
     bench = Bench(torque=0.5)
     assert stuck(bench, FAR_PERIODS + LEASE_PERIODS + 1) is None  # for a lease, and no longer
-    fault = bench.see(0.0, 0.0, 0.5, applied=told(0.2))
+    fault = bench.see(0.0, 0.0, 0.5, applied=targets(0.2))
     assert fault is not None and fault.what == "joint_frozen"
     assert fault.cause == "the same state repeated while its target moves: joint_1, joint_2, joint_3"
 
@@ -264,7 +266,7 @@ def test_a_target_that_hardly_moves_proves_nothing() -> None:
 def test_a_joint_that_rested_for_long_has_a_lease_to_follow_a_target_that_jumps() -> None:
     bench = Bench(torque=0.5)
     assert stuck(bench, 100, 0.0) is None
-    seen = [bench.see(0.0, 0.0, 0.5, applied=told(0.3)) for _ in range(LEASE_PERIODS + 2)]
+    seen = [bench.see(0.0, 0.0, 0.5, applied=targets(0.3)) for _ in range(LEASE_PERIODS + 2)]
     assert seen[:LEASE_PERIODS] == [None] * LEASE_PERIODS and seen[-1] is not None
 
 
@@ -273,7 +275,7 @@ def test_a_motor_at_its_limit_may_say_the_same_for_ever() -> None:
     assert stuck(Bench(torque=-4.0), 50, torque=-3.9) is None
     bench = Bench()
     for k in range(50):
-        assert bench.see(applied=told(0.02 * k, torque_limit=0.0)) is None
+        assert bench.see(applied=targets(0.02 * k, torque_limit=0.0)) is None
 
 
 def test_only_joints_with_a_position_target_of_an_armed_robot_can_be_frozen() -> None:
@@ -291,14 +293,14 @@ def test_a_mode_between_begins_anew() -> None:
     bench = Bench(torque=0.5)
     for _ in range(4):
         assert stuck(bench, FAR_PERIODS + LEASE_PERIODS) is None
-        assert bench.see(0.0, 0.0, 0.5, applied=told(9.0, Mode.VELOCITY)) is None
+        assert bench.see(0.0, 0.0, 0.5, applied=targets(9.0, Mode.VELOCITY)) is None
 
 
 def test_a_joint_that_came_to_life_again_has_a_whole_lease_before_it_is_frozen() -> None:
     bench = Bench(torque=0.5)
     assert stuck(bench, FAR_PERIODS + LEASE_PERIODS) is None  # far for nearly a lease
-    assert bench.see(1e-9, 0.0, 0.5, applied=told(0.2)) is None  # every joint moves
-    assert [bench.see(1e-9, 0.0, 0.5, applied=told(0.4)) for _ in range(LEASE_PERIODS)] == [None] * LEASE_PERIODS
+    assert bench.see(1e-9, 0.0, 0.5, applied=targets(0.2)) is None  # every joint moves
+    assert [bench.see(1e-9, 0.0, 0.5, applied=targets(0.4)) for _ in range(LEASE_PERIODS)] == [None] * LEASE_PERIODS
 
 
 @pytest.mark.parametrize("column", [0, 1, 2])
@@ -306,24 +308,24 @@ def test_whatever_still_changes_is_alive(column: int) -> None:
     bench = Bench()
     for k in range(50):
         row = np.array([0.0, 0.0, 0.5]) + 1e-9 * (k % 2) * (np.arange(3) == column)
-        assert bench.see(float(row[0]), float(row[1]), float(row[2]), applied=told(0.02 * k)) is None
+        assert bench.see(float(row[0]), float(row[1]), float(row[2]), applied=targets(0.02 * k)) is None
 
 
 def test_a_target_that_moved_just_so_far_proves_nothing() -> None:
     bench = Bench(torque=0.5)
-    assert bench.see(0.0, 0.0, 0.5, applied=told(0.0)) is None
+    assert bench.see(0.0, 0.0, 0.5, applied=targets(0.0)) is None
     for _ in range(3 * LEASE_PERIODS):
-        assert bench.see(0.0, 0.0, 0.5, applied=told(0.075)) is None
+        assert bench.see(0.0, 0.0, 0.5, applied=targets(0.075)) is None
 
 
 def test_that_the_host_was_held_up_makes_no_joint_frozen() -> None:
     bench = Bench(torque=0.5)
     for k in range(FAR_PERIODS + 4):
-        assert bench.see(0.0, 0.0, 0.5, applied=told(0.02 * k), late_ns=k * LEASE_NS) is None
+        assert bench.see(0.0, 0.0, 0.5, applied=targets(0.02 * k), late_ns=k * LEASE_NS) is None
 
 
 def test_a_sample_that_is_only_old_is_not_frozen() -> None:
     """It was taken once: what is lost is judged by its age."""
     bench = Bench(torque=0.5)
     for k in range(1, FRESH_PERIODS + 1):
-        assert bench.see(0.0, 0.0, 0.5, applied=told(0.1 * k), age_ns=[k * PERIOD_NS] * JOINTS) is None
+        assert bench.see(0.0, 0.0, 0.5, applied=targets(0.1 * k), age_ns=[k * PERIOD_NS] * JOINTS) is None

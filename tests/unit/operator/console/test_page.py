@@ -80,13 +80,13 @@ def test_control_is_taken_while_free_and_never_taken_away():
 def test_text_from_the_network_is_no_markup():
     evil = "<img src=x onerror=alert(1)>\x1b[2J"
     robot = description()
-    told = Status(
+    reported = Status(
         tick=0, stamp_ns=0, robot="r", backend="sim", pace="realtime", rate_hz=100.0, lifecycle="fault", why=evil,
         lease_holder=evil[:40], lease_epoch=1, commands_accepted=0, commands_standby=0,
         commands_rejected={evil[:40]: 1}, commands_limited={}, faults=[],
         alive=[evil[:40]], waiting_for=[evil[:40]], overruns=0, ready_to_arm=False,
     )  # fmt: skip
-    snapshot = RobotSnapshot(robot=robot, status=told)
+    snapshot = RobotSnapshot(robot=robot, status=reported)
     shown = texts.header(snapshot) + texts.state_table(snapshot) + texts.log([evil])
     assert "<img" not in shown and "&lt;img" in shown and "\x1b" not in shown
 

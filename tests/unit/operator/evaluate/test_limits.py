@@ -27,14 +27,14 @@ def ran(controller: str, duration_s: float = 4, give_up_s: float = 12.0, limit_s
 
 
 def test_who_comes_no_further_is_given_up() -> None:
-    told = ran("hold", give_up_s=1.0).numbers
-    assert told[GAVE_UP] is True and told["crossed"] is False
-    assert isinstance(told["duration_s"], float) and 1.0 <= told["duration_s"] < 2.0
+    reported = ran("hold", give_up_s=1.0).numbers
+    assert reported[GAVE_UP] is True and reported["crossed"] is False
+    assert isinstance(reported["duration_s"], float) and 1.0 <= reported["duration_s"] < 2.0
 
 
 def test_who_comes_on_is_not() -> None:
-    told = ran("path_following", give_up_s=1.0).numbers
-    assert told[GAVE_UP] is False and told["crossed"] is True
+    reported = ran("path_following", give_up_s=1.0).numbers
+    assert reported[GAVE_UP] is False and reported["crossed"] is True
 
 
 def test_endless_code_is_stopped_and_the_worker_goes_on(tmp_path: Path) -> None:

@@ -76,7 +76,7 @@ def test_a_range_has_both_its_ends() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "reported"),
     [
         ("", ["mine.toml", "scenario", "missing"]),
         ('scenario = "nowhere"', ["no scenario called 'nowhere'", "triplet"]),
@@ -99,17 +99,17 @@ def test_a_range_has_both_its_ends() -> None:
     ],
 )
 def test_a_wrong_suite_is_told_what_and_where(
-    text: str, told: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    text: str, reported: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "mine.toml").write_text(text)
     assert main(["evaluate", str(tmp_path / "mine.toml"), "--out", str(tmp_path / "out")]) == 2
     said = capsys.readouterr().err
-    assert all(part in said for part in told), said
+    assert all(part in said for part in reported), said
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "reported"),
     [
         (["evaluate", "nothing"], ["no suite called 'nothing'", "clutter"]),
         (["evaluate", "clutter", "--resume"], ["--resume", "--out"]),
@@ -129,7 +129,7 @@ def test_a_wrong_suite_is_told_what_and_where(
 )
 def test_a_wrong_command_starts_nothing(
     arguments: list[str],
-    told: list[str],
+    reported: list[str],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -137,7 +137,7 @@ def test_a_wrong_command_starts_nothing(
     monkeypatch.chdir(tmp_path)
     assert main(arguments) in (1, 2)
     said = capsys.readouterr().err
-    assert all(part in said for part in told), said
+    assert all(part in said for part in reported), said
 
 
 def test_without_the_extra_it_tells_how_to_install_it(

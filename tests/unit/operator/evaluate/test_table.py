@@ -11,8 +11,10 @@ def case(field: int, controller: str = "poal", row: int = 1) -> Case:
 
 
 def outcome(advance_m: float, speed_m_s: float = 0.1) -> Outcome:
-    told = {"goal_m": 3.0, "advance_m": advance_m, "crossed": advance_m >= 3, "ended": "complete"}
-    return Outcome(numbers={**told, "advance_m_s": speed_m_s, "last_state": "NotLocomoting", "last_reason": "stuck"})
+    reported = {"goal_m": 3.0, "advance_m": advance_m, "crossed": advance_m >= 3, "ended": "complete"}
+    return Outcome(
+        numbers={**reported, "advance_m_s": speed_m_s, "last_state": "NotLocomoting", "last_reason": "stuck"}
+    )
 
 
 @pytest.mark.parametrize(
@@ -36,9 +38,9 @@ def test_the_worst_come_first() -> None:
     cases = [case(field) for field in (1, 2, 3, 4)]
     done = {"poal-1-1": outcome(2.0), "poal-1-2": outcome(3.0), "poal-1-3": Outcome(error="no room")}
     done["poal-1-4"] = outcome(0.5)
-    told = worst(cases, done)
-    assert [one.field for one, _ in told] == [3, 4, 1]
-    assert [why for _, why in told] == [
+    reported = worst(cases, done)
+    assert [one.field for one, _ in reported] == [3, 4, 1]
+    assert [why for _, why in reported] == [
         "no room",
         "0.50 m of 3 m; NotLocomoting: stuck",
         "2.00 m of 3 m; NotLocomoting: stuck",

@@ -87,8 +87,8 @@ def test_transforms_and_joints_are_those_of_the_robot(run: Path) -> None:
     assert nodes is not None and len(update.transforms) == len(record.description.links)
     behind = ["world", *(link.name for link in record.description.links[:-1])]
     assert [one.parent_frame_id for one in update.transforms] == behind
-    told, forward = in_the_world(update.transforms)
-    assert np.allclose(told, nodes[:-1], atol=1e-9)
+    reported, forward = in_the_world(update.transforms)
+    assert np.allclose(reported, nodes[:-1], atol=1e-9)
     towards = (nodes[-1] - nodes[-2]) / record.description.links[-1].length_m
     assert np.allclose(forward, towards, atol=1e-6)
     states = dict(found["foxglove/joints"])[at_ns]
@@ -103,7 +103,7 @@ def test_the_scene_has_body_obstacles_map_forces_and_path(run: Path) -> None:
     assert [entity.frame_id for entity in scene["body"]] == [link.name for link in record.description.links]
     truth = scene["obstacles"][0]
     assert len(truth.cylinders) + len(truth.cubes) + len(truth.spheres) == len(record.placed)
-    assert len(scene["path"][0].lines[0].points) in {len(told.path_w) for told in record.trajectories}
+    assert len(scene["path"][0].lines[0].points) in {len(reported.path_w) for reported in record.trajectories}
     arrows = [arrow for _, update in found["foxglove/scene/forces"] for arrow in update.entities[0].arrows]
     turns = [arrow.pose.orientation for arrow in arrows]
     assert arrows and all(math.hypot(q.w, q.x, q.y, q.z) == pytest.approx(1.0) for q in turns)
@@ -131,7 +131,7 @@ def test_state_and_log_tell_what_host_and_control_told(run: Path) -> None:
     wanted = json.loads(schema.data)
     assert all(set(wanted["required"]) <= set(state) <= set(wanted["properties"]) for state in states)
     assert [one["lifecycle"] for one in states[-2:]] == ["armed", "armed"] and states[-1]["path_s_m"] > 0
-    assert {one["locomotion"] for one in states} <= {told.state for told in record.control} | {""}
+    assert {one["locomotion"] for one in states} <= {reported.state for reported in record.control} | {""}
     assert any(one.name == "hal" and one.message.startswith("armed: armed by") for one in logged)
     assert any(one.name == "control" and one.message.startswith("Locomoting: ") for one in logged)
 
@@ -195,10 +195,10 @@ def test_what_a_killed_recorder_leaves_has_transforms_joints_and_images(run: Pat
 
 
 def test_a_reason_in_which_only_a_number_changes_is_logged_once() -> None:
-    told, logged = StateMessages(), []
+    reported, logged = StateMessages(), []
     for k in range(20):
         control = msgspec.msgpack.encode({"state": "Locomoting", "reason": f"pushes with {k + 0.5} N", "jammed": True})
-        logged += told.of(None, control, k)[1]
+        logged += reported.of(None, control, k)[1]
     assert [one.message for one in logged] == ["Locomoting: pushes with 0.5 N"]
 
 

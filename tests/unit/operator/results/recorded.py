@@ -30,11 +30,11 @@ def triplet() -> RunRecord:
     """As shipped, 10 s; armed later, and with commands that were refused or limited."""
     record = simulate(load("triplet").config).record
     later_ns = round(ARMED_S * 1e9)
-    told = {
+    reported = {
         name: [msgspec.structs.replace(one, stamp_ns=one.stamp_ns + later_ns) for one in getattr(record, name)]
         for name in ("control", "worlds")
     }
-    return dataclasses.replace(record, host=finished(1000), time_s=record.time_s + ARMED_S, **told)
+    return dataclasses.replace(record, host=finished(1000), time_s=record.time_s + ARMED_S, **reported)
 
 
 def finished(ticks: int) -> HostRecord:
@@ -92,11 +92,11 @@ class Reader(HTMLParser):
 
     def handle_data(self, data: str) -> None:
         if self._open[-1:] == ["script"] and data.startswith("{"):
-            told = json.loads(data)
-            if "frames" in told:
-                self.film = told
+            reported = json.loads(data)
+            if "frames" in reported:
+                self.film = reported
             else:
-                self.charts[told["label"]] = told
+                self.charts[reported["label"]] = reported
         elif not {"style", "script", "pre"} & set(self._open):
             self.words.append(data)
 

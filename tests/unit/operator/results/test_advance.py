@@ -32,46 +32,52 @@ def centre_m(result: Result, row: int) -> float:
 
 def test_a_goal_is_crossed_when_the_whole_body_has_advanced() -> None:
     result = ran("path_following", goal="heading")
-    told, record = result.summary, result.record
-    assert told.crossed is True and told.goal_m == told.advance_m == 0.3
-    assert told.crossed_s is not None and told.advance_m_s == pytest.approx(0.3 / told.crossed_s)
-    row = record.row_at(record.time_s[0] + told.crossed_s)
+    reported, record = result.summary, result.record
+    assert reported.crossed is True and reported.goal_m == reported.advance_m == 0.3
+    assert reported.crossed_s is not None and reported.advance_m_s == pytest.approx(0.3 / reported.crossed_s)
+    row = record.row_at(record.time_s[0] + reported.crossed_s)
     assert centre_m(result, row) - centre_m(result, 0) == pytest.approx(0.3, abs=0.01)
     used_j = np.abs(record.torque_nm * record.velocity_rad_s)[: row + 1].sum() * 0.01
-    assert told.energy_j_per_m == pytest.approx(used_j / 0.3, rel=0.02)
-    assert told.stalled_s == 0
+    assert reported.energy_j_per_m == pytest.approx(used_j / 0.3, rel=0.02)
+    assert reported.stalled_s == 0
 
 
 def test_a_goal_out_of_reach_is_not() -> None:
-    told = ran("path_following", goal="too far").summary
-    assert told.crossed is False and told.crossed_s is None and told.goal_m == 50
-    assert told.advance_m is not None and 0.4 < told.advance_m < 1
+    reported = ran("path_following", goal="too far").summary
+    assert reported.crossed is False and reported.crossed_s is None and reported.goal_m == 50
+    assert reported.advance_m is not None and 0.4 < reported.advance_m < 1
 
 
 def test_the_wrong_way_is_no_advance() -> None:
-    told = ran("path_following", goal="backward").summary
-    assert told.crossed is False and told.advance_m == pytest.approx(0, abs=0.01) and told.energy_j_per_m is None
+    reported = ran("path_following", goal="backward").summary
+    assert (
+        reported.crossed is False
+        and reported.advance_m == pytest.approx(0, abs=0.01)
+        and reported.energy_j_per_m is None
+    )
 
 
 def test_points_are_passed_by_the_head() -> None:
     result = ran("path_following", goal="points")
-    told, nodes = result.summary, result.record.nodes_w(0)
+    reported, nodes = result.summary, result.record.nodes_w(0)
     assert nodes is not None
     head = nodes[-1, :2]
-    assert told.goal_m == pytest.approx(np.hypot(1.7 - head[0], head[1]) + 0.2)
-    assert told.crossed is True and told.crossed_s is not None
-    last = result.record.nodes_w(result.record.row_at(result.record.time_s[0] + told.crossed_s))
+    assert reported.goal_m == pytest.approx(np.hypot(1.7 - head[0], head[1]) + 0.2)
+    assert reported.crossed is True and reported.crossed_s is not None
+    last = result.record.nodes_w(result.record.row_at(result.record.time_s[0] + reported.crossed_s))
     assert last is not None and np.hypot(1.9 - last[-1, 0], last[-1, 1]) < 0.06
 
 
 def test_who_stands_has_stalled_all_the_time() -> None:
-    told = ran("hold", goal="heading").summary
-    assert told.stalled_s == pytest.approx(2.5 - 1.0, abs=0.2) and told.crossed is False
+    reported = ran("hold", goal="heading").summary
+    assert reported.stalled_s == pytest.approx(2.5 - 1.0, abs=0.2) and reported.crossed is False
 
 
 def test_without_a_goal_it_is_the_way_ahead() -> None:
-    told = ran("path_following").summary
-    assert told.goal_m is told.crossed is None and told.advance_m == pytest.approx(told.net_displacement_m, rel=0.02)
+    reported = ran("path_following").summary
+    assert reported.goal_m is reported.crossed is None and reported.advance_m == pytest.approx(
+        reported.net_displacement_m, rel=0.02
+    )
 
 
 def test_the_work_of_torque_joints_is_told_apart() -> None:

@@ -86,12 +86,12 @@ def describe_of(run: RunConfig):
 def shown(difference: Difference) -> tuple[str, str]:
     """Table and page; neither may show what is not a number. And for scripts, which get null."""
     assert json.loads(msgspec.json.encode(for_scripts(difference)))["identical"] == difference.identical
-    told = "\n".join(table(difference)), page(difference, within(difference, 5))
-    for text in told:
+    reported = "\n".join(table(difference)), page(difference, within(difference, 5))
+    for text in reported:
         assert not re.search(
             r"\b(nan|inf|None)\b", re.sub(r"<(style|script)>.*?</\1>|base64,[^\"]*", "", text, flags=re.S)
         )
-    return told
+    return reported
 
 
 def test_the_same_run_twice_differs_in_nothing() -> None:

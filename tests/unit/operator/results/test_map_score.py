@@ -22,7 +22,7 @@ def test_a_true_map_has_no_errors():
     truth = [peg("a", 0.6, 0.1), block("b", 0.7, -0.2, (0.05, 0.1), 0.3)]
     found = score(truth, truth, HEAD, 0.0)
     assert found.position_m == [0.0, 0.0] and max(found.surface_m) < 1e-9
-    assert (found.misses, found.ghosts, found.visible, found.told) == (0, 0, 2, 2)
+    assert (found.misses, found.ghosts, found.visible, found.reported) == (0, 0, 2, 2)
 
 
 def test_errors_are_of_centres_surfaces_and_sizes():
@@ -68,4 +68,4 @@ def test_scores_add_up():
     total = MapScore()
     for _ in range(2):
         total.add(score([peg("g", 0.5, -0.3)], [peg("a", 0.6, 0.2)], HEAD, 0.0))
-    assert (total.misses, total.ghosts, total.told, total.visible) == (2, 2, 2, 2)
+    assert (total.misses, total.ghosts, total.reported, total.visible) == (2, 2, 2, 2)

@@ -57,8 +57,10 @@ def put_down(folder: Path, record: RunRecord) -> None:
     write(record.config, folder / CONFIG)
     (folder / DESCRIPTION).write_bytes(msgspec.json.encode(record.description))
     (folder / HOST_RECORD).write_bytes(msgspec.json.encode(record.host))
-    told = [(keys.CONTROL_STATE, state) for state in record.control] + [(keys.WORLD, world) for world in record.worlds]
-    record_messages(folder, [(key, msgspec.msgpack.encode(message, enc_hook=float)) for key, message in told])
+    messages = [(keys.CONTROL_STATE, state) for state in record.control] + [
+        (keys.WORLD, world) for world in record.worlds
+    ]
+    record_messages(folder, [(key, msgspec.msgpack.encode(message, enc_hook=float)) for key, message in messages])
     layout, count = Layout.of(record.description), len(record.time_s)
     rows = bytearray(count * layout.row_bytes)
     columns = layout.arrays(rows)  # pyright: ignore[reportArgumentType]
@@ -94,11 +96,11 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> RunRecord:
     )
     put_down(folder, record)
     loaded = RunRecord.load(folder)
-    assert loaded.lacks == [] and "lacks something" not in reported(loaded)[1].text
+    assert loaded.lacks == [] and "lacks something" not in summary_and_page(loaded)[1].text
     return loaded
 
 
-def reported(record: RunRecord) -> tuple[RunSummary, Reader]:
+def summary_and_page(record: RunRecord) -> tuple[RunSummary, Reader]:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         summary = summarise(record, "complete")
@@ -154,7 +156,7 @@ def test_a_black_box_with_numbers_that_are_none(base: RunRecord, tmp_path: Path,
         assert f"of {LAST - FIRST} samples are not numbers" in said[name]
         counts = zip(JOINTS, bad.sum(axis=0), strict=True) if values.ndim > 1 else [("", bad.sum())]
         assert all(f"{joint} {n}" in said[name] for joint, n in counts if n)
-    summary, reader = reported(record)
+    summary, reader = summary_and_page(record)
     assert summary.lacks == record.lacks and all(lack in reader.text for lack in record.lacks)
     compared(base, record)
     compared(record, record)
@@ -172,8 +174,8 @@ def leaves(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 @settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_a_recording_with_numbers_that_are_none(base: RunRecord, tmp_path: Path, data: st.DataObject) -> None:
     put_down(tmp_path, base)
-    told = [(keys.CONTROL_STATE, state) for state in base.control] + [(keys.WORLD, world) for world in base.worlds]
-    payloads = [(key, msgspec.msgpack.encode(message)) for key, message in told]
+    messages = [(keys.CONTROL_STATE, state) for state in base.control] + [(keys.WORLD, world) for world in base.worlds]
+    payloads = [(key, msgspec.msgpack.encode(message)) for key, message in messages]
     refused = 0
     for number in data.draw(st.sets(st.integers(0, len(payloads) - 1), min_size=1, max_size=8)):
         key, payload = payloads[number]
@@ -190,10 +192,10 @@ def test_a_recording_with_numbers_that_are_none(base: RunRecord, tmp_path: Path,
     record_messages(tmp_path, payloads)
     record = RunRecord.load(tmp_path)
     assert len(record.control) + len(record.worlds) == len(payloads) - refused
-    told = [re.match(r"recording: (\d+) messages? cannot be read, (control/state|guidance/world)", lack)
+    lacking = [re.match(r"recording: (\d+) messages? cannot be read, (control/state|guidance/world)", lack)
             for lack in record.lacks]  # fmt: skip
-    assert sum(int(found[1]) for found in told if found) == refused and all(told)
-    _, reader = reported(record)
+    assert sum(int(found[1]) for found in lacking if found) == refused and all(lacking)
+    _, reader = summary_and_page(record)
     assert all(lack in reader.text for lack in record.lacks)
     compared(record, base)
 
@@ -208,7 +210,7 @@ def test_a_pose_that_is_not_known_yet_or_never_is_lacking_only_where_there_is_a_
         config = msgspec.structs.replace(base.config, robot=robot)
         put_down(tmp_path, dataclasses.replace(base, config=config, position_w=position))
         record = RunRecord.load(tmp_path)
-        reported(record)
+        summary_and_page(record)
         return record.lacks
 
     sensors = base.config.robot.sensors

@@ -21,19 +21,19 @@ def record() -> RunRecord:
 
 
 def test_forces_are_told_along_the_body(record: RunRecord) -> None:
-    told = pushing(record)
-    assert told is not None and told.map_errors is None  # the map was known
-    wanted, felt = (np.array(line["y"], dtype=float) for line in told.forces["data"])
+    reported = pushing(record)
+    assert reported is not None and reported.map_errors is None  # the map was known
+    wanted, felt = (np.array(line["y"], dtype=float) for line in reported.forces["data"])
     assert 2.0 < np.nanmax(wanted) < 60.0 and np.nanmax(felt) > 2.0
-    (drag,) = [one for one in told.forces["layout"]["shapes"] if one.get("xref") == "paper"]
+    (drag,) = [one for one in reported.forces["layout"]["shapes"] if one.get("xref") == "paper"]
     assert drag["y0"] == pytest.approx(0.1 * 9.81 * sum(link.mass_kg for link in record.description.links))
 
 
 def test_every_obstacle_that_was_pushed_has_a_row(record: RunRecord) -> None:
-    told = pushing(record)
-    assert told is not None
+    reported = pushing(record)
+    assert reported is not None
     pushed = {p.obstacle for state in record.control for p in state.push_points if np.hypot(*p.force_w[:2]) >= 0.5}
-    assert set(told.obstacles["data"][0]["y"]) == pushed and len(pushed) >= 3
+    assert set(reported.obstacles["data"][0]["y"]) == pushed and len(pushed) >= 3
 
 
 def test_a_stop_has_the_reason_that_held_longest(record: RunRecord) -> None:
@@ -44,9 +44,9 @@ def test_a_stop_has_the_reason_that_held_longest(record: RunRecord) -> None:
         else msgspec.structs.replace(one, state="Locomoting")
         for one in record.control
     ]
-    told = pushing(changed(record, control=control))
-    assert told is not None and [one.why for one in told.stops] == ["jam"]
-    assert told.stops[0].end_s - told.stops[0].start_s == pytest.approx(1.0, abs=0.11)
+    reported = pushing(changed(record, control=control))
+    assert reported is not None and [one.why for one in reported.stops] == ["jam"]
+    assert reported.stops[0].end_s - reported.stops[0].start_s == pytest.approx(1.0, abs=0.11)
 
 
 def test_a_perceived_map_is_held_against_the_truth(record: RunRecord) -> None:
@@ -59,10 +59,10 @@ def test_a_perceived_map_is_held_against_the_truth(record: RunRecord) -> None:
         for one in truth
     ]
     worlds = [msgspec.structs.replace(world, obstacles=shifted) for world in record.worlds]
-    told = pushing(changed(record, config=config, worlds=worlds))
-    assert told is not None and told.score is not None and told.map_errors is not None
-    assert told.position_mm == pytest.approx((10.0, 10.0), abs=0.01)
-    assert told.score.misses == told.score.ghosts == 0 < told.score.visible
+    reported = pushing(changed(record, config=config, worlds=worlds))
+    assert reported is not None and reported.score is not None and reported.map_errors is not None
+    assert reported.position_mm == pytest.approx((10.0, 10.0), abs=0.01)
+    assert reported.score.misses == reported.score.ghosts == 0 < reported.score.visible
 
 
 def test_the_page_has_the_section_only_for_such_a_controller(record: RunRecord) -> None:

@@ -34,16 +34,16 @@ def test_without_a_recording(record: RunRecord) -> None:
 def test_the_page_of_a_long_run_is_no_larger(record: RunRecord) -> None:
     """Ten runs a minute, for ten minutes."""
     times = 60
-    told = {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
-    long = {name: np.concatenate([one] * times) for name, one in told.items() if isinstance(one, np.ndarray)}
+    reported = {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
+    long = {name: np.concatenate([one] * times) for name, one in reported.items() if isinstance(one, np.ndarray)}
     long["time_s"] = ARMED_S + np.arange(len(long["time_s"])) / RATE_HZ
     later = [
         [
             msgspec.structs.replace(one, stamp_ns=one.stamp_ns + round(k * SECONDS * 1e9))
             for k in range(times)
-            for one in told
+            for one in reported
         ]
-        for told in (record.control, record.worlds)
+        for reported in (record.control, record.worlds)
     ]
     page = read(changed(record, control=later[0], worlds=later[1], **long))  # holds the size against the limit
     assert len(page.film["frames"]) <= 300 and "handed over 419 times among 7 joints" in page.text
@@ -168,9 +168,9 @@ def test_a_run_that_rests_at_the_end_of_its_path_has_not_failed(record: RunRecor
 def test_who_says_nothing_more_is_not_known_to_move(record: RunRecord) -> None:
     silent = [state for state in record.control if state.stamp_ns < (ARMED_S + 4.0) * 1e9]
     assert silent[-1].state == "Locomoting"
-    told = summarise(changed(record, control=silent), "complete").locomoting_fraction
+    reported = summarise(changed(record, control=silent), "complete").locomoting_fraction
     whole = summarise(record, "complete").locomoting_fraction
-    assert told == pytest.approx((4.0 - 0.26 + 0.5) / 10.0, abs=0.06) and whole == pytest.approx(0.61, abs=0.01)
+    assert reported == pytest.approx((4.0 - 0.26 + 0.5) / 10.0, abs=0.06) and whole == pytest.approx(0.61, abs=0.01)
 
 
 def test_a_controller_that_says_it_moves_and_does_not(record: RunRecord) -> None:
@@ -183,9 +183,9 @@ def test_a_controller_that_says_it_moves_and_does_not(record: RunRecord) -> None
 def test_text_from_outside_is_escaped(record: RunRecord) -> None:
     nasty = '<script>alert("x")</script>&'
     config_ = msgspec.structs.replace(record.config, title=nasty)
-    told = [msgspec.structs.replace(state, reason=nasty, state="NotLocomoting") for state in record.control]
+    reported = [msgspec.structs.replace(state, reason=nasty, state="NotLocomoting") for state in record.control]
     host = msgspec.structs.replace(record.host, faults=[Fault(tick=90, what=nasty, cause=nasty)])
-    hurt = changed(record, config=config_, control=told, host=host)
+    hurt = changed(record, config=config_, control=reported, host=host)
     page = report_page(hurt, summarise(hurt, nasty))
     assert "<script>alert" not in page
     assert page.count("&lt;script&gt;alert") >= 5
@@ -195,7 +195,7 @@ def test_text_from_outside_is_escaped(record: RunRecord) -> None:
 def test_names_from_outside_are_escaped_and_turn_no_text_around(record: RunRecord) -> None:
     nasty = "</title><script>alert(1)\u202e\x9b31m\x1b[31m\u2028"
     encoded = msgspec.json.encode(record.description).replace(b"joint_", msgspec.json.encode(nasty)[1:-1])
-    told = [
+    reported = [
         msgspec.structs.replace(one, propulsion_joint=one.propulsion_joint.replace("joint_", nasty))
         if one.propulsion_joint
         else one
@@ -204,7 +204,7 @@ def test_names_from_outside_are_escaped_and_turn_no_text_around(record: RunRecor
     pegs_ = [msgspec.structs.replace(peg, name=f"{nasty}{i}") for i, peg in enumerate(record.config.scene.cylinder)]
     scene = msgspec.structs.replace(record.config.scene, cylinder=pegs_)
     config_ = msgspec.structs.replace(record.config, scene=scene)
-    hurt = changed(record, description=msgspec.json.decode(encoded, type=Description), control=told, config=config_)
+    hurt = changed(record, description=msgspec.json.decode(encoded, type=Description), control=reported, config=config_)
     page = report_page(hurt, summarise(hurt, "complete"))
     assert propulsion_intervals(hurt) and "<script>alert" not in page and "&lt;script&gt;alert" in page
     assert not {"\u202e", "\x9b", "\x1b", "\u2028"} & set(page) and "\\u202e\\u009b31m" in page

@@ -206,9 +206,11 @@ def test_a_urdf_that_is_no_snake_is_refused_with_the_place(case: str, tmp_path: 
 
 def test_the_report_for_scripts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["robot", "import", str(SLIDER), "--out", str(tmp_path / "a.toml"), "--tail", "seg08", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["file"] == str(tmp_path / "a.toml") and "joint_1: hinge08, yaw" in told["names"]
-    assert any("hinge01" in line for line in told["changed"]) and any("<gazebo>" in line for line in told["left_out"])
+    reported = json.loads(capsys.readouterr().out)
+    assert reported["file"] == str(tmp_path / "a.toml") and "joint_1: hinge08, yaw" in reported["names"]
+    assert any("hinge01" in line for line in reported["changed"]) and any(
+        "<gazebo>" in line for line in reported["left_out"]
+    )
 
 
 def test_an_existing_robot_file_is_not_overwritten(tmp_path: Path) -> None:

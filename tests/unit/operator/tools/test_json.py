@@ -15,11 +15,11 @@ from tests.unit.hal.rig import status
 
 def test_scenarios_and_configurations(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["scenarios", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert sorted(told["robots"]) == shipped("robots") and told["scenarios"]["triplet"]
+    reported = json.loads(capsys.readouterr().out)
+    assert sorted(reported["robots"]) == shipped("robots") and reported["scenarios"]["triplet"]
     assert main(["config", "triplet", "--json", "--set", "robot.limits.torque_nm=3"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["robot.limits.torque_nm"] == {"value": 3, "origin": "--set robot.limits.torque_nm=3"}
+    reported = json.loads(capsys.readouterr().out)
+    assert reported["robot.limits.torque_nm"] == {"value": 3, "origin": "--set robot.limits.torque_nm=3"}
 
 
 def test_the_state_of_a_robot_and_that_there_is_none(capsys: pytest.CaptureFixture[str]) -> None:

@@ -46,14 +46,14 @@ def test_whole_numbers_flags_and_null_say_what_they_mean(path: str) -> None:
 
 
 def test_the_modes_are_told_with_their_numbers_and_units() -> None:
-    told = json.loads(CONTRACT["messages/JointCommand.json"])["$defs"]["Mode"]["description"]
+    reported = json.loads(CONTRACT["messages/JointCommand.json"])["$defs"]["Mode"]["description"]
     for mode, unit in (
         (Mode.PASSIVE, "ignored"),
         (Mode.POSITION, "rad"),
         (Mode.VELOCITY, "rad/s"),
         (Mode.TORQUE, "N·m"),
     ):
-        assert re.search(rf"^{mode.value} {mode.name.lower()}: .*\b{unit}$", told, re.MULTILINE), mode
+        assert re.search(rf"^{mode.value} {mode.name.lower()}: .*\b{unit}$", reported, re.MULTILINE), mode
 
 
 def test_every_refusal_is_told() -> None:

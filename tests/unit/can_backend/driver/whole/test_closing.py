@@ -92,8 +92,8 @@ def test_what_is_wrong_is_told_even_when_the_bus_no_longer_takes_the_stop() -> N
         wire.refuses = breaks
         with pytest.raises(BackendError, match="the bus is broken"):  # by the next tick, which tries again
             run.run(3, run.waving)
-        told = {fault.what: fault.cause for fault in run.faults}
-        assert "leak" in told["module_leak"] and told["stop_not_sent"] == "the bus is broken"
+        reported = {fault.what: fault.cause for fault in run.faults}
+        assert "leak" in reported["module_leak"] and reported["stop_not_sent"] == "the bus is broken"
 
 
 def test_the_log_holds_everything_that_went_over_the_bus(tmp_path: Path) -> None:
