@@ -14,7 +14,7 @@ import zenoh
 from zenoh import handlers  # pyright: ignore[reportMissingModuleSource]
 
 from benchmarks.echo import REPLY, REQUEST
-from snakesim_hal.process import SERVICE_PRIORITY, take_priority
+from snakesim_hal.process import SERVICE_PRIORITY, set_realtime_priority
 
 PING_HZ = 100.0
 SETTLE_S = 1.5
@@ -122,7 +122,7 @@ def main() -> None:
     """Do what the command line says."""
     act, endpoint, *rest = sys.argv[1:]
     if act in ("ping", "pong"):
-        take_priority(SERVICE_PRIORITY)  # as control has it
+        set_realtime_priority(SERVICE_PRIORITY)  # as control has it
     if act == "read":
         print(json.dumps(read(endpoint, rest[0], float(rest[1]))))
     elif act == "ping":

@@ -30,9 +30,9 @@ from snakesim_hal.network.local_registry import LocalRobot, registered, robot_fo
 from snakesim_hal.network.private_channel import HostEnd
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.network.stop_port import open_stop_port, serve_stops, stop_address
-from snakesim_hal.process import HOST_PRIORITY, begin_anew, hurry, on_stop_signal, settle_for_timing
+from snakesim_hal.process import HOST_PRIORITY, enter_realtime, on_stop_signal, restart_process, tune_garbage_collector
 from snakesim_hal.serve import ProcessOptions, joined, process_options
-from snakesim_hal.terminal import complain_of
+from snakesim_hal.terminal import report_error
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Fault
 
@@ -71,10 +71,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         return host(process_options(parser.parse_args(argv), hosts=True))
     except ConfigError as error:
-        complain_of(error, "snakesim host")
+        report_error(error, "snakesim host")
         return 2
     except SnakesimError as error:
-        complain_of(error, "snakesim host")
+        report_error(error, "snakesim host")
         return 1
 
 
@@ -87,7 +87,7 @@ def host(given: ProcessOptions) -> int:
         check_without_run(given.config, given.loaded.table)
     host = _run(given, check_backend(given.config, given.loaded.table))
     if host.ended == "reset":
-        begin_anew()
+        restart_process()
     stopped = any(fault.reach == "robot" for fault in host.authority.since_start.kept)
     return 1 if stopped or host.ended != "complete" else 0
 
@@ -105,7 +105,7 @@ def _run(given: ProcessOptions, config: RunConfig) -> Host:
         opened.callback(stop_port.close)
         backend = open_backend(find_plugin(BACKENDS, config.backend), config)
         opened.callback(backend.close)
-        realtime_warnings = hurry(HOST_PRIORITY) if config.pace == "realtime" else []
+        realtime_warnings = enter_realtime(HOST_PRIORITY) if config.pace == "realtime" else []
         session = opened.enter_context(open_session(given.link) if given.link.listen else joined(given.link, "host"))
         refuse_second_host(session, given.link)
         described = backend.describe()
@@ -122,7 +122,7 @@ def _run(given: ProcessOptions, config: RunConfig) -> Host:
         )
         serve_stops(stop_port, given.link.namespace or described.robot, host.take_stop)
         on_stop_signal(host.stop)
-        settle_for_timing()
+        tune_garbage_collector()
         memory = wanted.memory and os.open(wanted.memory, os.O_WRONLY)
         with Recorder(host.black_box, host.description, partial(record_of, host), wanted.out, memory):
             host.run()

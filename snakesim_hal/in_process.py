@@ -25,7 +25,7 @@ from snakesim_hal.model.plugins import BACKENDS, SERVICES, find_plugin
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.local_network import LocalNetwork
 from snakesim_hal.service import ServiceLoop
-from snakesim_hal.terminal import complain_of
+from snakesim_hal.terminal import report_error
 from snakesim_hal.wire.messages import LifecycleRequest
 
 AFTER_FAULT_S = 1.5
@@ -123,7 +123,7 @@ class InProcessRun:
             try:
                 loop.act()
             except SnakesimError as error:  # its process would end here, and the host would go on
-                complain_of(error, f"snakesim {name}")
+                report_error(error, f"snakesim {name}")
                 self.failed.append(f"{name} ended: {error}")
                 del self._loops[name]
                 self._parts[name].close()

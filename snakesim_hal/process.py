@@ -14,7 +14,7 @@ from types import FrameType
 from typing import NoReturn
 
 from snakesim_hal.errors import RefusedError
-from snakesim_hal.terminal import complain
+from snakesim_hal.terminal import print_error
 
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # the last one: the terminal, or the ssh session, was closed
 PR_SET_PDEATHSIG = 1
@@ -25,7 +25,7 @@ SWITCH_INTERVAL_S = 0.0005  # of the interpreter, 5 ms by default: as long as ha
 HOST_PRIORITY, SERVICE_PRIORITY = 20, 19
 
 
-def who() -> str:
+def user_name() -> str:
     """The user's name."""
     try:
         return getpass.getuser()[:64]
@@ -45,7 +45,7 @@ def die_with_parent(parent_pid: int | None = None) -> None:
         sys.exit(1)
 
 
-def heeded() -> tuple[signal.Signals, ...]:
+def stop_signals() -> tuple[signal.Signals, ...]:
     """The stop signals that this program is to handle: all, but for a closed terminal under `nohup`."""
     ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     return tuple(number for number in STOPS if not (ignored and number == signal.SIGHUP))
@@ -56,7 +56,7 @@ def accept_interrupts() -> None:
     signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPS)
 
 
-def begin_anew() -> NoReturn:
+def restart_process() -> NoReturn:
     """Become the same program again, in the same process: with its parent, its arguments and what it has inherited.
 
     A stop that comes meanwhile waits until the program can handle it. Close everything before.
@@ -73,31 +73,31 @@ def on_stop_signal(stop: Callable[[], None]) -> None:
     def handle(_number: int, _frame: FrameType | None) -> None:
         stop()
 
-    for number in heeded():
+    for number in stop_signals():
         signal.signal(number, handle)
     accept_interrupts()
 
 
-def settle_for_timing() -> None:
+def tune_garbage_collector() -> None:
     """Keep the garbage collector out of the loop: freeze all present objects, and make collections rare."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(50_000, 50, 1000)
 
 
-def hurry(priority: int) -> list[str]:
+def enter_realtime(priority: int) -> list[str]:
     """Apply all real-time measures to a process in the control loop. Call it before a session is opened.
 
     Best effort: measures that the system refuses are printed to stderr, and returned as short reasons.
     """
     sys.setswitchinterval(SWITCH_INTERVAL_S)
-    refused = [reason for reason in (take_priority(priority), lock_memory()) if reason is not None]
+    refused = [reason for reason in (set_realtime_priority(priority), lock_memory()) if reason is not None]
     for reason in refused:
-        complain(f"real time: {reason}")
+        print_error(f"real time: {reason}")
     return refused
 
 
-def take_priority(priority: int) -> str | None:
+def set_realtime_priority(priority: int) -> str | None:
     """Ask the kernel to run this process, and the threads that it will start, before ordinary ones.
 
     Returns why it was refused, or None.
@@ -109,18 +109,18 @@ def take_priority(priority: int) -> str | None:
     return None
 
 
-def calm_down_after(longest_s: float) -> None:
+def drop_priority_after(longest_s: float) -> None:
     """Have this process give up its priority once it has computed for this long without a pause: it hangs.
 
     A busy thread with real-time priority starves ordinary processes, until the kernel throttles all real-time
     processes for some 50 ms.
     """
 
-    def calm_down(_number: int, _frame: FrameType | None) -> None:
+    def drop_priority(_number: int, _frame: FrameType | None) -> None:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-        complain(f"real time: priority dropped after computing for {longest_s * 1e3:.0f} ms without a pause")
+        print_error(f"real time: priority dropped after computing for {longest_s * 1e3:.0f} ms without a pause")
 
-    signal.signal(signal.SIGXCPU, calm_down)
+    signal.signal(signal.SIGXCPU, drop_priority)
     _, most = resource.getrlimit(resource.RLIMIT_RTTIME)
     resource.setrlimit(resource.RLIMIT_RTTIME, (round(longest_s * 1e6), most))
 

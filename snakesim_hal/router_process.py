@@ -11,7 +11,7 @@ from snakesim_hal.errors import SnakesimError
 from snakesim_hal.network.session import open_session
 from snakesim_hal.process import on_stop_signal
 from snakesim_hal.serve import process_options
-from snakesim_hal.terminal import complain_of
+from snakesim_hal.terminal import report_error
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -28,7 +28,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         with open_session(replace(given.link, namespace=None)):
             stopped.wait()
     except SnakesimError as error:
-        complain_of(error, "snakesim router")
+        report_error(error, "snakesim router")
         return 1
     return 0
 

@@ -21,13 +21,13 @@ from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.process import (
     SERVICE_PRIORITY,
     accept_interrupts,
-    calm_down_after,
     die_with_parent,
-    hurry,
-    settle_for_timing,
+    drop_priority_after,
+    enter_realtime,
+    tune_garbage_collector,
 )
 from snakesim_hal.service import START_LIMIT_S, Service, ServiceLoop
-from snakesim_hal.terminal import complain, complain_of
+from snakesim_hal.terminal import print_error, report_error
 
 TRY_S = 2.0  # to connect
 TELL_S = 20.0  # between two signs of life
@@ -67,10 +67,10 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         serve(find_plugin(SERVICES, arguments.name), process_options(arguments))
     except ConfigError as error:
-        complain_of(error, f"snakesim {arguments.name}")
+        report_error(error, f"snakesim {arguments.name}")
         return 2
     except SnakesimError as error:
-        complain_of(error, f"snakesim {arguments.name}")
+        report_error(error, f"snakesim {arguments.name}")
         return 1
     except KeyboardInterrupt:
         return 0
@@ -83,13 +83,13 @@ def serve(service_type: type[Service], given: ProcessOptions) -> None:
     accept_interrupts()
     threadpool_limits(1)  # so that one seed gives one digest, however many cores there are
     if service_type.urgent and config.pace == "realtime":
-        hurry(SERVICE_PRIORITY)
-        calm_down_after(config.lease_ns * 1e-9)
+        enter_realtime(SERVICE_PRIORITY)
+        drop_priority_after(config.lease_ns * 1e-9)
     with joined(given.link, name) as session:
         waiting = StartupWait(name, f"a HAL host of {given.link.namespace} on {given.link.endpoint}")
         loop = ServiceLoop(service_type, config, session, waiting.goes_on)
         loop.join()
-        settle_for_timing()
+        tune_garbage_collector()
         try:
             loop.run()
         finally:
@@ -109,7 +109,7 @@ class StartupWait:
         now = time.monotonic()
         if now - self._shown_at >= TELL_S:
             self._shown_at = now
-            complain(f"{self._name}: waiting for {self._what}")
+            print_error(f"{self._name}: waiting for {self._what}")
         return now - self._began < START_LIMIT_S
 
 

@@ -28,7 +28,7 @@ class Service(Protocol):
 
     def __init__(self, client: Client, config: RunConfig) -> None: ...
 
-    def meet(self, robot: Description) -> None:
+    def configure(self, robot: Description) -> None:
         """Learn what robot is there; called before the first tick, and again when the HAL has started over."""
         ...
 
@@ -63,7 +63,7 @@ class ServiceLoop:
         self._client = client = Client(session, name, every_ticks=schedule.every_ticks, pace=config.pace)
         self.service = service_type(client, config)
         robot = _met(client, goes_on)
-        self.service.meet(robot)
+        self.service.configure(robot)
         self._injector = Injector(name, config, session, newest=lambda: client.newest_clock)
         self._injector.allow(emulated=robot.emulated, faults_allowed=config.faults_allowed)
         self._due = client.ticks(0.0, pauses=True)
@@ -103,9 +103,9 @@ class ServiceLoop:
             self.service.pause(clock)
             return
         self._injector.turn(clock.stamp_ns, clock.arming, clock.lifecycle)
-        robot = self._client.met_anew()
+        robot = self._client.new_description()
         if robot is not None:
-            self.service.meet(robot)
+            self.service.configure(robot)
         outputs = self.service.outputs(clock)
         if outputs is None:
             return

@@ -34,13 +34,13 @@ def say(line: str) -> None:
 
 
 @contextmanager
-def even_if_unread() -> Iterator[None]:
+def output_may_fail() -> Iterator[None]:
     """Inside, a failed write ends nothing, because a robot moves: a closed pipe or terminal, a full disk."""
-    with redirect_stdout(_Unending(sys.stdout)), redirect_stderr(_Unending(sys.stderr)):
+    with redirect_stdout(_FailSafeStream(sys.stdout)), redirect_stderr(_FailSafeStream(sys.stderr)):
         yield
 
 
-class _Unending(io.TextIOBase):
+class _FailSafeStream(io.TextIOBase):
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
 
@@ -66,10 +66,10 @@ class _Unending(io.TextIOBase):
         return self._stream.fileno()
 
     def _give_up(self) -> None:
-        nowhere(self._stream)
+        discard(self._stream)
 
 
-def nowhere(stream: TextIO) -> None:
+def discard(stream: TextIO) -> None:
     """From here on what is printed is thrown away, what is still in the buffer, too."""
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, stream.fileno())
@@ -83,26 +83,26 @@ def say_json(value: Any, say: Say = say) -> None:
     say(msgspec.json.encode(value).decode())
 
 
-def complain(line: str) -> None:
+def print_error(line: str) -> None:
     """Print one line to stderr."""
     print(printable(line), file=sys.stderr, flush=True)
 
 
-def complain_of(error: SnakesimError, tool: str) -> None:
+def report_error(error: SnakesimError, tool: str) -> None:
     """Print an error to stderr: the tool's name, and the error's own lines."""
     first, *more = error.lines
     for line in (f"{tool}: {first}", *more):
-        complain(line)
+        print_error(line)
 
 
-def say_again(line: str, most: int, before: int) -> int:
+def overwrite_line(line: str, most: int, before: int) -> int:
     """Print a line, cut to `most` characters, over the previous one of `before` characters; returns its length."""
     shown = printable(line)[:most]
     print("\r" + shown.ljust(before), end="", flush=True)
     return len(shown)
 
 
-def say_over(lines: list[str], before: int) -> int:
+def overwrite_lines(lines: list[str], before: int) -> int:
     """Print lines over the `before` lines printed last, cut to the terminal's size; returns how many they are.
 
     Also where the terminal is in raw mode, as for single keys.

@@ -6,7 +6,7 @@
 `model`      robot file + scene -> compiled MuJoCo model; `ground` and `obstacles` are its parts
 `start`      lays the snake on the ground and lets it come to rest
 `actuators`  the motors' modes; `contacts` and `loads` what touches the links
-`sensors/`   everything that the robot senses; `looking_service` its cameras in a process of their own, for CAN
+`sensors/`   everything that the robot senses; `sensor_service` its cameras in a process of their own, for CAN
 `tether`, `truth`, `divergence`  the rope of the static checks, the state without noise, detection of divergence
 
 Imports the HAL and MuJoCo, never guidance, navigation, control or Zenoh. Nothing heavy is imported here.

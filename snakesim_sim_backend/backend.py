@@ -22,7 +22,7 @@ from snakesim_sim_backend.sensors.frames import rotate
 from snakesim_sim_backend.sensors.registry import check_models
 from snakesim_sim_backend.sensors.suite import Sensors
 from snakesim_sim_backend.settings import Settings
-from snakesim_sim_backend.start import lay_down
+from snakesim_sim_backend.start import place_robot
 from snakesim_sim_backend.tether import Rope
 from snakesim_sim_backend.truth import TrueContact, TrueState
 
@@ -63,7 +63,7 @@ class SimBackend:
         self._sim = build(config, settings)
         self._data = mujoco.MjData(self._sim.model)
         self._motors = Motors(self._sim.model, self._data, config.robot, config.period_ns * 1e-9)
-        lay_down(self._sim, self._data, config, self._motors, settings.settle_s)
+        place_robot(self._sim, self._data, config, self._motors, settings.settle_s)
         self._rope = None
         if settings.tether is not None:
             self._rope = Rope(self._sim.model, self._data, settings.tether)

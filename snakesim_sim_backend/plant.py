@@ -21,7 +21,7 @@ from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS, SimModel, build
 from snakesim_sim_backend.sensors.imu import ImuReader
 from snakesim_sim_backend.sensors.pose import PoseReader
 from snakesim_sim_backend.settings import PlantSettings, Settings
-from snakesim_sim_backend.start import lay_down
+from snakesim_sim_backend.start import place_robot
 from snakesim_sim_backend.tether import Rope
 
 Floats = NDArray[np.float64]
@@ -173,5 +173,5 @@ def _rest(config: RunConfig, settings: PlantSettings) -> Floats:
     step_s = min(Settings().timestep_s, settings.contact_time_s / 2)
     sim = build(config, msgspec.structs.replace(settings, timestep_s=step_s))
     data = mujoco.MjData(sim.model)
-    lay_down(sim, data, config, Motors(sim.model, data, config.robot, config.period_ns * 1e-9), settings.settle_s)
+    place_robot(sim, data, config, Motors(sim.model, data, config.robot, config.period_ns * 1e-9), settings.settle_s)
     return data.qpos

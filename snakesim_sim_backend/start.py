@@ -19,7 +19,7 @@ GRIP = np.array([2.0, 2.0, 0.1, 0.1, 0.1])
 ALL_FRICTION = 6  # condim with which all three act
 
 
-def lay_down(sim: SimModel, data: mujoco.MjData, config: RunConfig, motors: Motors, settle_s: float) -> None:
+def place_robot(sim: SimModel, data: mujoco.MjData, config: RunConfig, motors: Motors, settle_s: float) -> None:
     """Put the snake at its start pose, at rest at time 0 with motors off.
 
     It is placed above the highest ground under it and falls; the motors hold its start angles meanwhile. If it has

@@ -10,7 +10,7 @@ from queue import Empty, SimpleQueue
 
 import zenoh
 
-from snakesim_hal.process import SERVICE_PRIORITY, take_priority
+from snakesim_hal.process import SERVICE_PRIORITY, set_realtime_priority
 
 REQUEST, REPLY = "bench/request", "bench/reply"
 WARM_UP = 100
@@ -29,7 +29,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
     if given.part != "read":
-        take_priority(SERVICE_PRIORITY)
+        set_realtime_priority(SERVICE_PRIORITY)
     zenoh.init_log_from_env_or("error")
     sys.setswitchinterval(0.0005)
     with zenoh.open(zenoh.Config.from_file(given.file)) as session:

@@ -150,7 +150,7 @@ class ModuleChain:
 
     # --- frames from the bus -------------------------------------------------------------------------------
 
-    def hear(self, channel: int, frame: Frame) -> None:
+    def receive(self, channel: int, frame: Frame) -> None:
         """A frame of the host has arrived."""
         opcode, node = opcode_of(frame.id), node_of(frame.id)
         wrong_length = opcode != Opcode.EMERGENCY and len(frame.data) != LENGTHS.get(
@@ -167,14 +167,14 @@ class ModuleChain:
             self._sync(channel, frame)
         elif opcode == Opcode.SET_POINT:
             for slot in self._at(channel, node):
-                slot.module.hear_set_point(frame, self.now_us)
+                slot.module.receive_set_point(frame, self.now_us)
                 if slot.module.frames:
                     self._follow_up(slot)
         else:
             everybody = node == BROADCAST and opcode != Opcode.PARAMETER_REQUEST
             for slot in self.slots if everybody else self._at(channel, node):
                 if slot.channel == channel:
-                    slot.module.hear(frame, self.now_us)
+                    slot.module.receive(frame, self.now_us)
                     self._follow_up(slot)
             if opcode != Opcode.PARAMETER_REQUEST:
                 self._poll(self.now_us)

@@ -20,8 +20,8 @@ from snakesim_can_backend.twin.server import PoseSender, TwinServer, make_plant
 from snakesim_hal.errors import ConfigError, SnakesimError
 from snakesim_hal.model.files import Table, decode
 from snakesim_hal.model.scenario import Loaded, Override, load, parse_set
-from snakesim_hal.process import die_with_parent, on_stop_signal, settle_for_timing
-from snakesim_hal.terminal import complain_of, say
+from snakesim_hal.process import die_with_parent, on_stop_signal, tune_garbage_collector
+from snakesim_hal.terminal import report_error, say
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
 DEFAULT_CHANNEL = "vcan0"
@@ -40,10 +40,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         with ExitStack() as open_things:
             return _serve(arguments, open_things)
     except ConfigError as error:
-        complain_of(error, "snakesim modules")
+        report_error(error, "snakesim modules")
         return BAD_INPUT
     except SnakesimError as error:
-        complain_of(error, "snakesim modules")
+        report_error(error, "snakesim modules")
         return FAILED
 
 
@@ -96,7 +96,7 @@ def _serve(arguments: argparse.Namespace, open_things: ExitStack) -> int:
     chain = ModuleChain(loaded.config, settings, plant, stepped=arguments.stepped, send_pose=send_pose)
     loop = Loop(TwinServer(wires, chain), arguments)
     on_stop_signal(loop.stop)
-    settle_for_timing()
+    tune_garbage_collector()
     count = loaded.config.robot.chain.modules
     say(f"modules ready: {count} on {', '.join(settings.channels)}")
     loop.run()

@@ -104,7 +104,7 @@ class Module:
 
     # --- frames from the bus -------------------------------------------------------------------------------
 
-    def hear(self, frame: Frame, now_us: float) -> None:
+    def receive(self, frame: Frame, now_us: float) -> None:
         """An Emergency, Command or ParameterRequest for this node or, the first two, for all."""
         opcode = frame.id >> 6
         if self.hangs:
@@ -123,7 +123,7 @@ class Module:
         else:
             self.refused += 1
 
-    def hear_set_point(self, frame: Frame, now_us: float) -> None:
+    def receive_set_point(self, frame: Frame, now_us: float) -> None:
         """A SetPoint for this node. It waits for the next Sync."""
         if self.state != ModuleState.ARMED or self.hangs:
             return

@@ -66,10 +66,10 @@ class ModuleSlot:
         if self.mute:
             return []
         if self.wrong_count or self.wrong_checksum:
-            return [self._spoilt(frame) for frame in frames]
+            return [self._corrupted(frame) for frame in frames]
         return frames
 
-    def _spoilt(self, frame: Frame) -> Frame:
+    def _corrupted(self, frame: Frame) -> Frame:
         if opcode_of(frame.id) != Opcode.JOINT_STATE:
             return frame
         data = bytearray(frame.data)

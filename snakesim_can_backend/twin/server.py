@@ -41,24 +41,24 @@ class TwinServer:
         arrived = [wire.receive() for wire in self.wires]
         if self.chain.stepped:
             for channel, frames in enumerate(arrived):
-                self._hear(channel, frames)
+                self._receive(channel, frames)
             self._send()
             return None
         if self._start_ns is None:
             self._start_ns = now_ns
         clock_us = (now_ns - self._start_ns) / 1000
-        self._hear_in_time(arrived, clock_us)
+        self._receive_in_time(arrived, clock_us)
         self.chain.advance_to(clock_us)
         self._send()
         now_us = self.chain.now_us
         wait_us = min(self.chain.next_us() - now_us, IN_STEP_US)
         return max(wait_us, FINEST_US) * 1e-6
 
-    def _hear(self, channel: int, frames: Sequence[Frame]) -> None:
+    def _receive(self, channel: int, frames: Sequence[Frame]) -> None:
         for frame in frames:
-            self.chain.hear(channel, frame)
+            self.chain.receive(channel, frame)
 
-    def _hear_in_time(self, arrived: Sequence[Sequence[Frame]], clock_us: float) -> None:
+    def _receive_in_time(self, arrived: Sequence[Sequence[Frame]], clock_us: float) -> None:
         """Handle frames at their estimated times of arrival.
 
         After a delay of this process several periods are in the queue: they are spread over the time that it took, so
@@ -76,7 +76,7 @@ class TwinServer:
                 if frame.id >> NODE_BITS == Opcode.SYNC:
                     met += 1
                     self.chain.advance_to(before_us + (clock_us - before_us) * met / syncs)
-                self.chain.hear(channel, frame)
+                self.chain.receive(channel, frame)
 
     def _send(self) -> None:
         for channel, wire in enumerate(self.wires):

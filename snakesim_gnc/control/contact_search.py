@@ -53,7 +53,7 @@ class ContactSearch:
             self._powerless_since_s = view.time_s
         elif 0.0 < self._patience.after_s <= view.time_s - self._powerless_since_s:
             self._until_s = view.time_s + self._patience.for_s
-            self._wave.begin_like(np.array(view.joints.angle_rad))
+            self._wave.start_from(np.array(view.joints.angle_rad))
         self.changed = self.active != before
         return self.active
 

@@ -15,7 +15,7 @@ from snakesim_hal.errors import ControllerError
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.client import Client, Commander
 from snakesim_hal.service import Service
-from snakesim_hal.terminal import complain
+from snakesim_hal.terminal import print_error
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, ControlState, Description, JointState, Message, Trajectory, World
 
@@ -39,9 +39,9 @@ class Control(Service):
         self._noted: set[str] = set()  # streams that are too old, as the log has it
         self._last_clock: Clock | None = None
 
-    def meet(self, robot: Description) -> None:
+    def configure(self, robot: Description) -> None:
         """Get ready to command this robot."""
-        self._settings.meet(robot)
+        self._settings.configure(robot)
         self._commander = Commander(self._client, robot)
         self._limits = Limits.of(self._config, robot)
         self._reports = StateReports(self._config.controller, robot)
@@ -134,7 +134,7 @@ class Control(Service):
         streams = {why.partition(" ")[0] for why in late}
         if streams != self._noted:
             text = f"{'; '.join(late)}: {so}" if late else "all inputs of control are fresh again"
-            complain(f"{clock.stamp_ns * 1e-9:.3f} s: {text}")
+            print_error(f"{clock.stamp_ns * 1e-9:.3f} s: {text}")
         self._noted = streams
 
 

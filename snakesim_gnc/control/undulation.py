@@ -43,7 +43,7 @@ class LateralUndulation:
         reference = self.reference_rad(view, view.period_s if motion_wanted(view) else 0.0)
         return Action(self._bumpless.to(view, reference), Report(reference_rad=reference.tolist()))
 
-    def begin_like(self, angles_rad: NDArray[np.float64]) -> None:
+    def start_from(self, angles_rad: NDArray[np.float64]) -> None:
         """Choose the phase at which the wave is most like a shape, (n_joints,)."""
         lags = self._set.lag_rad * np.arange(len(self._body.bends))[::-1]
         self._phase_rad = float(np.angle(1j * (angles_rad[self._body.bends] @ np.exp(1j * lags))))

@@ -41,9 +41,9 @@ class Guidance(Service):
         perceived = config.mission.map == "perceived"
         self._view = _Perceived(client, config) if perceived else _Surveyed(client, config)
 
-    def meet(self, robot: Description) -> None:
+    def configure(self, robot: Description) -> None:
         """Create the model for this robot."""
-        self._view.meet(robot)
+        self._view.configure(robot)
 
     def outputs(self, clock: Clock) -> list[tuple[str, Message]] | None:
         """The world at this tick; None while it cannot be told."""
@@ -62,7 +62,7 @@ class _Surveyed:
         self._client = client
         self._model: WorldModel | None = None
 
-    def meet(self, robot: Description) -> None:
+    def configure(self, robot: Description) -> None:
         self._model = WorldModel(robot, self._known)
 
     def world(self, clock: Clock) -> World | None:
@@ -93,7 +93,7 @@ class _Perceived:
         self._model: PerceivedWorld | None = None
         self._taken: dict[str, int] = {}  # stamp of the newest sample used, by key
 
-    def meet(self, robot: Description) -> None:
+    def configure(self, robot: Description) -> None:
         self._model = PerceivedWorld(robot, self._start, self._noise)
         self._taken.clear()
 

@@ -36,7 +36,7 @@ class Navigation(Service):
         self._client = client
         self._intents = Intents(config.mission.speed_m_s)
 
-    def meet(self, robot: Description) -> None:
+    def configure(self, robot: Description) -> None:
         """Works for any robot; its position is unknown again."""
         config = self._config
         self._intents.start_over()

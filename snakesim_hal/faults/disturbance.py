@@ -79,7 +79,7 @@ class Disturbance:
 
     def _passed(self, payload: bytes, now_s: float) -> list[bytes]:
         if self._happens("corrupt"):
-            payload = spoilt(payload, self._random)
+            payload = corrupted(payload, self._random)
         if self._happens("drop"):
             return []
         out = [payload, payload] if self._happens("duplicate") else [payload]
@@ -104,7 +104,7 @@ class Disturbance:
         return []
 
 
-def spoilt(payload: bytes, rng: random.Random) -> bytes:
+def corrupted(payload: bytes, rng: random.Random) -> bytes:
     """A corrupted payload: bytes flipped, cut off, inserted or copied, a NaN, or pure noise."""
     data = bytearray(payload)
     match rng.randrange(7):

@@ -2,7 +2,7 @@
 
 from snakesim_hal.backend import Backend
 from snakesim_hal.faults.faulty_backend import FaultyBackend
-from snakesim_hal.faults.injector import Injector, nothing_more
+from snakesim_hal.faults.injector import Injector, no_action
 from snakesim_hal.model.injection import HAL
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Session
@@ -22,7 +22,7 @@ class HostFaults:
         self.noted: list[str] = []
         self._authority, self._period_ns = authority, config.period_ns
         self._tick = 0
-        carry_out = nothing_more
+        carry_out = no_action
         if emulated or config.faults_allowed:
             self.backend = faulty = FaultyBackend(backend)
             carry_out = faulty.inject

@@ -17,7 +17,7 @@ from snakesim_hal.model.fault_plan import planned
 from snakesim_hal.model.injection import Change, Injection, Plan, checked
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Question, Session
-from snakesim_hal.terminal import complain
+from snakesim_hal.terminal import print_error
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import Answer, Clock, FaultRequest, LifecycleState
@@ -28,14 +28,14 @@ HOW_TO_ALLOW = "something real moves here; to allow it set `faults_allowed = tru
 CarryOut = Callable[[Injection, bool], None]  # the second: whether it begins, or ends. Raises ConfigError
 
 
-def nothing_more(injection: Injection, _begins: bool) -> None:
+def no_action(injection: Injection, _begins: bool) -> None:
     """For a part that supports only message faults and `hang`."""
     raise ConfigError(f"{injection.part} cannot do {injection.kind} to {injection.target}")
 
 
 def print_note(text: str, now_s: float) -> None:
     """For a part that reports to a log."""
-    complain(f"{now_s:.3f} s: injected: {text}")
+    print_error(f"{now_s:.3f} s: injected: {text}")
 
 
 class Injector:
@@ -47,7 +47,7 @@ class Injector:
         config: RunConfig,
         session: Session,
         *,
-        carry_out: CarryOut = nothing_more,
+        carry_out: CarryOut = no_action,
         newest: Callable[[], Clock | None] | None = None,
         note: Callable[[str, float], None] = print_note,
         refused: Callable[[str], None] = lambda _text: None,

@@ -453,7 +453,7 @@ class Host:
             return None
         return holder.service.counting_at(self._tick + 1)
 
-    def came_or_went(self, service: str, present: bool) -> None:
+    def presence_changed(self, service: str, present: bool) -> None:
         """A service's liveliness token has appeared or vanished."""
         if present:
             self.participants.came(service)

@@ -51,7 +51,7 @@ class Receiver(Protocol):
         """A service has completed a tick."""
         ...
 
-    def came_or_went(self, service: str, present: bool) -> None:
+    def presence_changed(self, service: str, present: bool) -> None:
         """A service's liveliness token has appeared or vanished."""
         ...
 
@@ -131,7 +131,7 @@ class Inbox:
         elif isinstance(item, Question):
             self._answer(item)
         elif not isinstance(item, Arrival):
-            receiver.came_or_went(*item)
+            receiver.presence_changed(*item)
         else:
             try:
                 if item.key == keys.JOINT_COMMAND:

@@ -42,7 +42,7 @@ class EstopLatch:
         self.found = None if self._path is None else _read(self._path)  # left by an earlier host
         self._kept = self.found is not None and self.found.tick >= 0
         self._writer.start()
-        threading.Thread(target=self._lose_patience, name="estop late", daemon=True).start()
+        threading.Thread(target=self._give_up, name="estop late", daemon=True).start()
 
     def engage(self, who: str, tick: int, then: Callable[[str | None], None]) -> None:
         """Store a stop. `then` is called once, from another thread: with None, or with why it could not be stored."""
@@ -67,7 +67,7 @@ class EstopLatch:
         while (ask := self._asked.get()) is not None:
             ask()
 
-    def _lose_patience(self) -> None:
+    def _give_up(self) -> None:
         while (once := self._waiting.get()) is not None:
             time.sleep(max(once.until_s - time.monotonic(), 0.0))
             once(once.late)

@@ -42,7 +42,7 @@ class RandomField(FileStruct, frozen=True, kw_only=True):
         return round(self.density_per_m2 * math.prod(np.subtract(self.high_m, self.low_m).tolist()))
 
 
-def strew(
+def random_obstacles(
     field: RandomField,
     where: str,
     index: int,

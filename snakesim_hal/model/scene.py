@@ -24,7 +24,7 @@ from snakesim_hal.model.outlines import (
     Size,
     metres,
 )
-from snakesim_hal.model.random_field import MAX_STREWN, RandomField, strew
+from snakesim_hal.model.random_field import MAX_STREWN, RandomField, random_obstacles
 from snakesim_hal.model.route import Route, sine_points
 from snakesim_hal.wire.messages import Obstacle
 from snakesim_hal.wire.quantities import Name
@@ -209,8 +209,10 @@ def place(scene: SceneFile, keep_clear: list[Capsule] | None = None) -> list[Pla
         placed.extend(_pegs_along(scene, i, row, route))
     for i, field in enumerate(scene.random_field):
         standing = [p.obstacle for p in placed if not p.walkable]
-        strewn = strew(field, f"scene {scene.name!r}: `random_field.{i}`", i, route, standing, keep_clear or [])
-        placed.extend(Placed(obstacle=obstacle, friction=field.friction) for obstacle in strewn)
+        found = random_obstacles(
+            field, f"scene {scene.name!r}: `random_field.{i}`", i, route, standing, keep_clear or []
+        )
+        placed.extend(Placed(obstacle=obstacle, friction=field.friction) for obstacle in found)
     names = Counter(p.obstacle.name for p in placed)
     twice = sorted(name for name, count in names.items() if count > 1)
     if twice:

@@ -174,7 +174,7 @@ class Client:
             time.sleep(0.001)
         return self.newest_clock
 
-    def met_anew(self) -> Description | None:
+    def new_description(self) -> Description | None:
         """The robot's description, if it may have another HAL host than at the last call; else None.
 
         Robot time that starts over shows it, and, when this service was cut off meanwhile, the token of the old host.

@@ -11,7 +11,7 @@ from snakesim_hal.errors import WireError
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.shared_settings import shared_settings
 from snakesim_hal.network.session import Arrival, Session
-from snakesim_hal.process import who
+from snakesim_hal.process import user_name
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import VERSIONS, Process
@@ -25,7 +25,7 @@ def own_entry(name: str, config: RunConfig | None = None) -> Process:
     return Process(
         name=name,
         machine=socket.gethostname()[:64] or "unnamed",
-        user=who(),
+        user=user_name(),
         pid=os.getpid(),
         version=version("snakesim"),
         started_unix_s=round(time.time()),

@@ -23,7 +23,7 @@ from zenoh import ext, handlers  # pyright: ignore[reportMissingModuleSource]
 
 from snakesim_hal.errors import ConfigError, NotConnectedError, WireError
 from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT, check_guarded
-from snakesim_hal.network.images_apart import keep_apart, set_unless_given
+from snakesim_hal.network.image_connection import configure_for_images, set_unless_given
 from snakesim_hal.network.session_file import SessionFile
 from snakesim_hal.process import raise_open_files
 from snakesim_hal.wire import keys
@@ -402,7 +402,7 @@ def open_session(link: Link, connect_timeout_s: float = 5.0) -> Iterator[Session
     if link.listen:
         check_guarded(link.endpoint, "endpoint", insecure=link.insecure)
         raise_open_files(MAX_OPEN_FILES)
-    for_images = None if link.listen else partial(open_zenoh, link, connect_timeout_s, keep_apart)
+    for_images = None if link.listen else partial(open_zenoh, link, connect_timeout_s, configure_for_images)
     with _receiving_threads(RECEIVERS_LISTENING if link.listen else RECEIVERS_CONNECTED):
         session = Session(open_zenoh(link, connect_timeout_s), for_images)
     try:

@@ -15,7 +15,7 @@ from snakesim_hal.process import on_stop_signal
 from snakesim_hal.serve import process_options
 from snakesim_hal.terminal import Say, say
 from snakesim_operator.console.port import open_port
-from snakesim_operator.tools.targets import RobotSelection, the_one
+from snakesim_operator.tools.targets import RobotSelection, only_robot
 
 NEEDS = "the console needs viser; install it with: pip install 'snakesim[console]'"
 
@@ -25,7 +25,7 @@ def console(where: RobotSelection, port: int | None, say: Say = say) -> int:
     _check_installed()
     from snakesim_operator.console.console import show_live
 
-    link = the_one(where, "console")
+    link = only_robot(where, "console")
     show_live(link, _surroundings(link), open_port(port), _until_signal(), say)
     return 0
 

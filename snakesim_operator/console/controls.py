@@ -80,7 +80,7 @@ class Controls:
         inject.on_click(lambda event: self._inject(end=event.target.value == "End it"))
         self._drive.on_hold(lambda _: self._go(), callback_hz=DRIVE_HZ)
         self._apply.on_click(lambda _: self._configure())
-        self._dark.on_update(lambda _: dress(client.gui, dark=self._dark.value))
+        self._dark.on_update(lambda _: set_appearance(client.gui, dark=self._dark.value))
         self.show()
 
     @property
@@ -216,7 +216,7 @@ def name_of(viewer: int | None) -> str:
     return "nobody" if viewer is None else f"viewer {viewer + 1}"
 
 
-def dress(gui: viser.GuiApi, *, dark: bool) -> None:
+def set_appearance(gui: viser.GuiApi, *, dark: bool) -> None:
     """What the page looks like."""
     gui.configure_theme(
         dark_mode=dark, show_logo=False, show_share_button=False, control_width="large", brand_color=(0, 103, 176)

@@ -46,16 +46,16 @@ async def _shown(page: viser.ClientHandle) -> None:
     """Until the page has shown what it was sent."""
     request, answered = uuid.uuid4().hex, asyncio.Event()
 
-    def hear(_client_id: int, message: wire.LocalStorageGetItemResponseMessage) -> None:
+    def receive(_client_id: int, message: wire.LocalStorageGetItemResponseMessage) -> None:
         if message.request_uuid == request:
             answered.set()
 
     connection = page._websock_connection
-    connection.register_handler(wire.LocalStorageGetItemResponseMessage, hear)
+    connection.register_handler(wire.LocalStorageGetItemResponseMessage, receive)
     try:
         connection.queue_message(wire.LocalStorageGetItemRequestMessage(key=KEY, request_uuid=request))
         page.flush()
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(answered.wait(), ANSWER_LIMIT_S)
     finally:
-        connection.unregister_handler(wire.LocalStorageGetItemResponseMessage, hear)
+        connection.unregister_handler(wire.LocalStorageGetItemResponseMessage, receive)

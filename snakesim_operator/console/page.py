@@ -15,7 +15,7 @@ from snakesim_hal.wire.messages import ControlSettings, Description
 from snakesim_hal.wire.quantities import Vector
 from snakesim_operator.console import stage, texts
 from snakesim_operator.console.charts import JointCharts
-from snakesim_operator.console.controls import KEYS, Controls, dress, name_of
+from snakesim_operator.console.controls import KEYS, Controls, name_of, set_appearance
 from snakesim_operator.console.drawing import Surroundings, draw
 from snakesim_operator.console.operations import Log, Operations
 from snakesim_operator.console.pictures import picture
@@ -68,7 +68,7 @@ class Page:
 
     def _lay_out(self) -> None:
         gui = self._server.gui
-        dress(gui, dark=False)
+        set_appearance(gui, dark=False)
         gui.main_panel.dock_right()
         gui.main_panel.set_width(420)
         self._header = gui.add_html(texts.header(None), order=0)

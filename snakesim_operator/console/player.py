@@ -4,7 +4,7 @@ import time
 
 import viser
 
-from snakesim_operator.console.controls import dress
+from snakesim_operator.console.controls import set_appearance
 
 SPEEDS = ("0.1x", "0.25x", "0.5x", "1x", "2x", "4x")
 SLIDER_EVERY_S = 0.1
@@ -29,7 +29,7 @@ class Player:
         self.playing = False
         self._play.on_click(lambda _: self._toggle())
         self._slider.on_update(lambda event: self._jump() if event.client is not None else None)
-        dark.on_update(lambda _: dress(gui, dark=dark.value))
+        dark.on_update(lambda _: set_appearance(gui, dark=dark.value))
 
     def turn(self) -> tuple[float, bool]:
         """The time to show now, and whether it has jumped."""

@@ -5,7 +5,7 @@ import time
 from types import TracebackType
 from typing import Self
 
-from snakesim_hal.terminal import say, say_again
+from snakesim_hal.terminal import overwrite_line, say
 from snakesim_operator.evaluate.case import Outcome
 from snakesim_operator.run.progress import in_minutes
 
@@ -38,7 +38,7 @@ class Progress:
         self._errors += outcome.error is not None
         now = time.monotonic()
         if self._terminal:
-            self._shown = say_again(self._text(now), 118, self._shown)
+            self._shown = overwrite_line(self._text(now), 118, self._shown)
         elif now >= self._next or self._done == self._total:
             self._next = now + PLAIN_PERIOD_S
             say(self._text(now))

@@ -51,11 +51,11 @@ class Findings:
     say: Say
     wrong: int = 0
 
-    def well(self, text: str) -> None:
+    def passed(self, text: str) -> None:
         """As it should be."""
         self.say(f"  {text}")
 
-    def bad(self, text: str) -> None:
+    def failed(self, text: str) -> None:
         """Not as it should be."""
         self.wrong += 1
         self.say(f"! {text}")
@@ -87,7 +87,7 @@ def _check_certificate(identity: Identity, folder: Path, found: Findings) -> Non
     try:
         certificate = read_certificate(at)
     except ConfigError as error:
-        found.bad(f"{identity.common_name}: {error}")
+        found.failed(f"{identity.common_name}: {error}")
         return
     _tell_end(identity.common_name, certificate, "run `snakesim deploy certs` and install it", found)
 
@@ -97,9 +97,9 @@ def _tell_end(what: str, certificate: x509.Certificate, remedy: str, found: Find
     left, life = end - datetime.now(UTC), end - certificate.not_valid_before_utc
     text = f"{what}: ends {end:%Y-%m-%d %H:%M} UTC, in {left.total_seconds() / 86400:.1f} days"
     if left > life * RENEW_AT:
-        found.well(text)
+        found.passed(text)
     else:
-        found.bad(f"{text}; {remedy}")
+        found.failed(f"{text}; {remedy}")
 
 
 def _check_router(name: str, lab: Lab, folder: Path, found: Findings) -> bool:
@@ -109,7 +109,9 @@ def _check_router(name: str, lab: Lab, folder: Path, found: Findings) -> bool:
     try:
         _plain_connection(endpoint).close()
     except OSError as error:
-        found.bad(f"{name}: nothing answers on {endpoint}: {error}; start it on {identity.machine}, or open the port")
+        found.failed(
+            f"{name}: nothing answers on {endpoint}: {error}; start it on {identity.machine}, or open the port"
+        )
         return False
     anybody = next((other for other in identities(lab) if other.role is not None), None)
     if anybody is None:
@@ -117,9 +119,9 @@ def _check_router(name: str, lab: Lab, folder: Path, found: Findings) -> bool:
     settings = _settings(anybody, lab, folder, [endpoint])
     try:
         with open_probe(json.dumps(settings)) as probe:
-            found.well(f"{name}: {endpoint}, round trip {1e3 * probe.round_trip_s():.2f} ms")
+            found.passed(f"{name}: {endpoint}, round trip {1e3 * probe.round_trip_s():.2f} ms")
     except NotConnectedError as error:
-        found.bad(f"{name}: {endpoint} lets {anybody.common_name} not in: {error}")
+        found.failed(f"{name}: {endpoint} lets {anybody.common_name} not in: {error}")
         return True
     tls = settings["transport"]["link"]["tls"]
     shown = _shown_certificate(endpoint, tls)
@@ -129,9 +131,9 @@ def _check_router(name: str, lab: Lab, folder: Path, found: Findings) -> bool:
     settings["transport"]["link"]["tls"] = {"root_ca_certificate": tls["root_ca_certificate"]}
     try:
         with open_probe(json.dumps(settings)):
-            found.bad(f"{name}: accepts clients without a certificate; it does not run with the rendered file")
+            found.failed(f"{name}: accepts clients without a certificate; it does not run with the rendered file")
     except NotConnectedError:
-        found.well(f"{name}: refuses clients without a certificate")
+        found.passed(f"{name}: refuses clients without a certificate")
     return True
 
 
@@ -162,10 +164,10 @@ def _check_robot(robot: str, lab: Lab, folder: Path, found: Findings) -> None:
                 ahead = probe.clock_offsets_s(list(WRITERS), LISTEN_S)
             entries = reader.drain()
     except NotConnectedError as error:
-        found.bad(f"cannot be looked at as {watcher.common_name}: {error}")
+        found.failed(f"cannot be looked at as {watcher.common_name}: {error}")
         return
     if status is not None:
-        found.well(f"{status.lifecycle} - {status.why}")
+        found.passed(f"{status.lifecycle} - {status.why}")
     host = next((entry for entry in entries if entry.name == HOST), None)
     expected = {HOST: lab.file.robots[robot].machine}
     for identity in held:
@@ -174,20 +176,20 @@ def _check_robot(robot: str, lab: Lab, folder: Path, found: Findings) -> None:
     for name, machine in expected.items():
         running = [entry for entry in entries if entry.name == name]
         if not running or not any(keys.service_of(key).rpartition("-")[0] == name for key in live):
-            found.bad(f"{name}: not running; it belongs on {machine}")
+            found.failed(f"{name}: not running; it belongs on {machine}")
         for entry in running:
             _tell_process(entry, host, ahead, found)
 
 
 def _tell_process(entry: Process, host: Process | None, ahead: dict[str, float], found: Findings) -> None:
-    found.well(f"{entry.name}: on {entry.machine}, process {entry.pid}, snakesim {entry.version}")
+    found.passed(f"{entry.name}: on {entry.machine}, process {entry.pid}, snakesim {entry.version}")
     if host is not None and entry.version != host.version:
-        found.bad(f"{entry.name}: snakesim {entry.version}, but the host has {host.version}")
+        found.failed(f"{entry.name}: snakesim {entry.version}, but the host has {host.version}")
     for difference in differences(entry, host) if host is not None else ():
-        found.bad(f"{entry.name}: {difference}")
+        found.failed(f"{entry.name}: {difference}")
     for key, writer in WRITERS.items():
         if writer == entry.name and key in ahead:
-            tell = found.well if abs(ahead[key]) < CLOCK_LIMIT_S else found.bad
+            tell = found.passed if abs(ahead[key]) < CLOCK_LIMIT_S else found.failed
             tell(f"{entry.name}: clock {ahead[key]:+.3f} s against this computer's")
 
 
@@ -203,12 +205,12 @@ def _check_role(identity: Identity, lab: Lab, folder: Path, found: Findings) -> 
                     answers = probe.answers(f"{robot}/{line.key}")
                     query = f"{identity.common_name}: {robot}/{line.key}"
                     if answers > granted:
-                        found.bad(f"{query} answers, though the role may not ask; the router has other rules")
+                        found.failed(f"{query} answers, though the role may not ask; the router has other rules")
                     elif answers < granted:
-                        found.bad(f"{query} does not answer, though the role may ask; no host, or other rules")
-            found.well(f"{identity.common_name}: round trip {trip_ms:.2f} ms")
+                        found.failed(f"{query} does not answer, though the role may ask; no host, or other rules")
+            found.passed(f"{identity.common_name}: round trip {trip_ms:.2f} ms")
     except NotConnectedError as error:
-        found.bad(f"{identity.common_name}: not let in: {error}")
+        found.failed(f"{identity.common_name}: not let in: {error}")
 
 
 @contextmanager

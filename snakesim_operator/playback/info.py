@@ -70,7 +70,7 @@ def recording_of(given: Path) -> Path:
     return path
 
 
-def look_into(path: Path) -> RecordingInfo:
+def inspect_recording(path: Path) -> RecordingInfo:
     """Read a recording once. Raises ConfigError for a file that is none."""
     reader, found, contents = RecordingReader(path), dict[str, KeyInfo](), Contents(path)
     for recorded in reader.messages():
@@ -130,7 +130,7 @@ def _numbers(one: KeyInfo, duration_s: float, *, regular: bool) -> dict[str, flo
 
 def show(given: Path, say: Say, *, as_json: bool = False) -> int:
     """Print what a recording holds. Exit code 1 when it lacks something."""
-    info = look_into(recording_of(given))
+    info = inspect_recording(recording_of(given))
     lacks = lacking(info)
     if as_json:
         say(msgspec.json.encode(info).decode())

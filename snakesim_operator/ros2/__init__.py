@@ -6,5 +6,5 @@ does, and publishes what they say. `robot_in_ros.py` translates message by messa
 knows rmw_zenoh's keys, liveliness tokens and attachments, `messages.py` the layout of each ROS message, `cdr.py` how a
 number lies on the wire.
 
-It must not import zenoh (that is `snakesim_hal.network.neighbour`), and sends the robot nothing but intents.
+It must not import zenoh (that is `snakesim_hal.network.foreign_network`), and sends the robot nothing but intents.
 """

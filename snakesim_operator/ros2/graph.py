@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import count
 
-from snakesim_hal.network.neighbour import Neighbour, RawPublisher, RawReader
+from snakesim_hal.network.foreign_network import ForeignNetwork, RawPublisher, RawReader
 
 NODE, PUBLISHER, SUBSCRIPTION = "NN", "MP", "MS"
 NODE_ID = 0
@@ -109,24 +109,24 @@ class RosPublisher:
 class Node:
     """A node in the ROS graph, present as long as the session."""
 
-    def __init__(self, neighbour: Neighbour, domain: int, name: NodeName) -> None:
-        self._neighbour, self._domain, self._name = neighbour, domain, name
+    def __init__(self, foreign_network: ForeignNetwork, domain: int, name: NodeName) -> None:
+        self._network, self._domain, self._name = foreign_network, domain, name
         self._entities: Iterator[int] = count(NODE_ID)
-        neighbour.declare_token(self._token(NODE))
+        foreign_network.declare_token(self._token(NODE))
 
     def publisher(self, topic: Topic) -> RosPublisher:
         """A publisher that `ros2 topic info` shows."""
         key = topic_key(self._domain, topic)
-        publisher = self._neighbour.publisher(key, latched=topic.latched, background=topic.images)
+        publisher = self._network.publisher(key, latched=topic.latched, background=topic.images)
         token = self._token(PUBLISHER, topic)
-        self._neighbour.declare_token(token)
+        self._network.declare_token(token)
         return RosPublisher(publisher, token)
 
     def subscription(self, topic: Topic) -> RawReader:
         """The newest message of a topic, in CDR."""
-        reader = self._neighbour.reader(topic_key(self._domain, topic))
-        self._neighbour.declare_token(self._token(SUBSCRIPTION, topic))
+        reader = self._network.reader(topic_key(self._domain, topic))
+        self._network.declare_token(self._token(SUBSCRIPTION, topic))
         return reader
 
     def _token(self, kind: str, topic: Topic | None = None) -> str:
-        return token_key(self._domain, self._neighbour.id, next(self._entities), kind, self._name, topic)
+        return token_key(self._domain, self._network.id, next(self._entities), kind, self._name, topic)

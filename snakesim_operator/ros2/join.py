@@ -6,7 +6,7 @@ import time
 from dataclasses import replace
 
 from snakesim_hal.errors import ConfigError, NotConnectedError
-from snakesim_hal.network.neighbour import open_neighbour
+from snakesim_hal.network.foreign_network import foreign_network
 from snakesim_hal.network.session import open_session
 from snakesim_hal.terminal import say
 from snakesim_hal.wire import keys
@@ -15,7 +15,7 @@ from snakesim_hal.wire.messages import Description
 from snakesim_operator.ros2.arguments import check
 from snakesim_operator.ros2.bridge import Bridge, Options, adds_up
 from snakesim_operator.ros2.graph import Node, NodeName
-from snakesim_operator.tools.targets import RobotSelection, the_one
+from snakesim_operator.tools.targets import RobotSelection, only_robot
 
 MAX_IN_BYTES = 65536  # of a message from ROS; a Twist has 52
 DESCRIBED_S = 5.0
@@ -24,7 +24,7 @@ DESCRIBED_S = 5.0
 def join(arguments: argparse.Namespace, where: RobotSelection) -> int:
     """Run the bridge until Ctrl-C. Raises ConfigError, NotConnectedError."""
     check(arguments)
-    link = the_one(where, "ros2")
+    link = only_robot(where, "ros2")
     if link.endpoint == arguments.ros_router:
         raise ConfigError(
             f"--ros-router {arguments.ros_router}: {link.namespace} itself is on this endpoint, and ROS nodes are not "
@@ -45,14 +45,14 @@ def join(arguments: argparse.Namespace, where: RobotSelection) -> int:
         )
         with contextlib.ExitStack() as opened:
             try:
-                neighbour = opened.enter_context(open_neighbour(arguments.ros_router, largest_bytes=MAX_IN_BYTES))
+                network = opened.enter_context(foreign_network(arguments.ros_router, largest_bytes=MAX_IN_BYTES))
             except NotConnectedError:
                 raise NotConnectedError(
                     f"no router of ROS nodes on {arguments.ros_router}; start it by "
                     "`ros2 run rmw_zenoh_cpp rmw_zenohd`, or give --ros-router"
                 ) from None
             name = NodeName("snakesim", f"/{options.namespace}")
-            made = Bridge(session, Node(neighbour, arguments.domain, name), robot, options)
+            made = Bridge(session, Node(network, arguments.domain, name), robot, options)
             say(
                 f"{link.namespace} is in ROS domain {arguments.domain} through {arguments.ros_router}; stamps are "
                 f"{'wall-clock' if wall_time else 'robot'} time; Ctrl-C ends it"

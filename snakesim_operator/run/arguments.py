@@ -15,7 +15,7 @@ from snakesim_hal.arguments import (
     session_given,
 )
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.terminal import even_if_unread
+from snakesim_hal.terminal import output_may_fail
 
 
 def add_commands(commands: Any) -> None:
@@ -84,7 +84,7 @@ def _run(arguments: argparse.Namespace) -> int:
         for flag in ("endpoint", "router", "session", "namespace", "stay", "with_router", "console"):
             if getattr(arguments, flag):
                 raise ConfigError(f"--in-process and --{flag.replace('_', '-')}: there is no network; leave one out")
-        with even_if_unread():
+        with output_may_fail():
             return run_in_process(config, arguments.out, record=not arguments.no_record)
 
     from snakesim_operator.run.run import RunRequest, run
@@ -102,14 +102,14 @@ def _run(arguments: argparse.Namespace) -> int:
         record=not arguments.no_record,
         console=arguments.console,
     )
-    with even_if_unread():
+    with output_may_fail():
         return run(request)
 
 
 def _host(arguments: argparse.Namespace) -> int:
     from snakesim_operator.run.host import run_host
 
-    with even_if_unread():
+    with output_may_fail():
         return run_host(arguments)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from types import FrameType
 
-from snakesim_hal.process import heeded
+from snakesim_hal.process import stop_signals
 
 
 @dataclass
@@ -38,7 +38,7 @@ def interruptible(ending: Ending) -> Iterator[None]:
         ending.interrupted = True
         signal.signal(number, signal.SIG_IGN if number == signal.SIGHUP else signal.SIG_DFL)
 
-    old = {number: signal.signal(number, handle) for number in heeded()}
+    old = {number: signal.signal(number, handle) for number in stop_signals()}
     try:
         yield
     finally:

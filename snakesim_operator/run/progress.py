@@ -6,7 +6,7 @@ from types import TracebackType
 from typing import Self
 
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.terminal import say, say_again
+from snakesim_hal.terminal import overwrite_line, say
 from snakesim_hal.wire.messages import ControlState, Status
 
 TERMINAL_PERIOD_S = 0.1
@@ -58,7 +58,7 @@ class Progress:
         self._next = now + (TERMINAL_PERIOD_S if self._terminal else PLAIN_PERIOD_S)
         text = self._running(status, control, now) if armed else f"starting: {status.why}"
         if self._terminal:
-            self._shown = say_again(text, 118, self._shown)
+            self._shown = overwrite_line(text, 118, self._shown)
         elif text != self._last:
             say(text)
         self._last = text

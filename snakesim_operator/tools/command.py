@@ -10,11 +10,11 @@ from collections.abc import Sequence
 from snakesim_hal.errors import NotConnectedError, RefusedError
 from snakesim_hal.host.latch import forget_stop, stops_kept
 from snakesim_hal.network.session import Link, Reader, Session, open_session
-from snakesim_hal.process import who
+from snakesim_hal.process import user_name
 from snakesim_hal.terminal import Say, say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, Description, LifecycleRequest, SimulatorRequest, Status
-from snakesim_operator.tools.targets import CONNECT_S, RobotSelection, the_one
+from snakesim_operator.tools.targets import CONNECT_S, RobotSelection, only_robot
 
 ANSWER_S = 5.0
 DESCRIPTION_S = 3.0
@@ -23,7 +23,7 @@ SHOWN_S = 1.5  # until the host's status must show what its answer says
 
 def arm(robot: str, backend: str, where: RobotSelection, say: Say = say) -> int:
     """Arm a robot, if robot and backend match. Raises RefusedError with the reason."""
-    link = the_one(where, f"arm {robot} {backend}")
+    link = only_robot(where, f"arm {robot} {backend}")
     with open_session(link, CONNECT_S) as session:
         description = _description(session, link)
         wrong = [
@@ -41,7 +41,7 @@ def arm(robot: str, backend: str, where: RobotSelection, say: Say = say) -> int:
             )
         request = LifecycleRequest(
             action="arm",
-            who=who(),
+            who=user_name(),
             host=description.host,
             robot=robot,
             backend=backend,
@@ -52,9 +52,11 @@ def arm(robot: str, backend: str, where: RobotSelection, say: Say = say) -> int:
 
 def disarm(where: RobotSelection, say: Say = say) -> int:
     """Make the joints passive; later commands do not move them."""
-    link = the_one(where, "disarm")
+    link = only_robot(where, "disarm")
     with open_session(link, CONNECT_S) as session:
-        return ask_host(session, keys.LIFECYCLE, LifecycleRequest(action="disarm", who=who()), "disarmed", link, say)
+        return ask_host(
+            session, keys.LIFECYCLE, LifecycleRequest(action="disarm", who=user_name()), "disarmed", link, say
+        )
 
 
 def clear(where: RobotSelection, say: Say = say) -> int:
@@ -63,16 +65,18 @@ def clear(where: RobotSelection, say: Say = say) -> int:
     If no robot runs, an emergency stop stored by the last run is removed.
     """
     try:
-        link = the_one(where, "clear")
+        link = only_robot(where, "clear")
     except NotConnectedError:
         kept = [path for path in stops_kept() if where.namespace in (None, path.parent.name)]
         if not kept or where.endpoint is not None:
             raise
         for path in kept:
-            say(f"{path.parent.name}: {forget_stop(path)}; cleared by {who()}. No robot of that name runs here")
+            say(f"{path.parent.name}: {forget_stop(path)}; cleared by {user_name()}. No robot of that name runs here")
         return 0
     with open_session(link, CONNECT_S) as session:
-        return ask_host(session, keys.LIFECYCLE, LifecycleRequest(action="clear", who=who()), "cleared", link, say)
+        return ask_host(
+            session, keys.LIFECYCLE, LifecycleRequest(action="clear", who=user_name()), "cleared", link, say
+        )
 
 
 def ask_host(

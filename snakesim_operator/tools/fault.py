@@ -10,7 +10,7 @@ from snakesim_hal.terminal import Say, say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import FaultRequest
 from snakesim_operator.tools.command import ANSWER_S
-from snakesim_operator.tools.targets import CONNECT_S, RobotSelection, the_one
+from snakesim_operator.tools.targets import CONNECT_S, RobotSelection, only_robot
 
 LIST = "list"
 
@@ -46,7 +46,7 @@ def fault(order: FaultOrder, where: RobotSelection, say: Say = say) -> int:
     if injection.about.once and (order.end or order.for_s is not None):
         raise ConfigError(f"{order.kind} happens once and has no end; omit --for and --end")
     request = FaultRequest(kind=order.kind, target=order.target, for_s=order.for_s, amount=order.amount, end=order.end)
-    with open_session(the_one(where, f"fault {order.kind} {order.target}"), CONNECT_S) as session:
+    with open_session(only_robot(where, f"fault {order.kind} {order.target}"), CONNECT_S) as session:
         try:
             answer = session.ask(keys.fault(injection.part), request, ANSWER_S)
         except NotConnectedError:

@@ -22,7 +22,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_hal.wire.messages import ColourImage, DepthImage, Description, Preview
 from snakesim_hal.wire.quantities import MAX_PREVIEW_BYTES
-from snakesim_operator.tools.targets import RobotSelection, the_one
+from snakesim_operator.tools.targets import RobotSelection, only_robot
 
 MAX_HZ = 10.0
 WIDEST, NARROWEST = 640, 16  # pixels
@@ -34,7 +34,7 @@ KEPT = 4  # images: a few of noise do not displace the valid one
 def preview(where: RobotSelection, hz: float, width: int, say: Say = say) -> int:
     """Publish previews of every camera of the addressed robot until Ctrl-C. Raises ConfigError, NotConnectedError."""
     _check(hz, width)
-    link = the_one(where, "preview")
+    link = only_robot(where, "preview")
     with open_session(replace(link, largest_bytes=MAX_IMAGE_BYTES)) as session:
         robot = session.latest(keys.DESCRIPTION, Description, DESCRIBED_S)
         if robot is None:

@@ -7,12 +7,12 @@ from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
-from snakesim_hal.process import heeded, on_stop_signal
+from snakesim_hal.process import on_stop_signal, stop_signals
 from snakesim_hal.terminal import Say, say
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_operator.recording.live import LiveServer
 from snakesim_operator.recording.process import record
-from snakesim_operator.tools.targets import RobotSelection, the_one
+from snakesim_operator.tools.targets import RobotSelection, only_robot
 
 
 def record_robot(
@@ -22,7 +22,7 @@ def record_robot(
 
     foxglove_port: serve viewers there meanwhile.
     """
-    link = replace(the_one(where, "record"), largest_bytes=MAX_IMAGE_BYTES)
+    link = replace(only_robot(where, "record"), largest_bytes=MAX_IMAGE_BYTES)
     path = out or Path(f"{link.namespace}-{datetime.now():%Y%m%d-%H%M%S}.mcap")
     path.parent.mkdir(parents=True, exist_ok=True)
     stopped: list[bool] = []
@@ -41,7 +41,7 @@ def record_robot(
                 live.show if live is not None else None,
             )
     finally:
-        for number in heeded():
+        for number in stop_signals():
             signal.signal(number, signal.SIG_DFL)
     messages, size = recorder.recording.counts.total(), path.stat().st_size
     say(f"{messages} messages in {time.monotonic() - began:.1f} s, {size / 1e6:.1f} MB: {path}")

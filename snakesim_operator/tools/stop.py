@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 from snakesim_hal.errors import NotConnectedError
 from snakesim_hal.network.stop_port import ask_to_stop, stop_address
-from snakesim_hal.process import who
+from snakesim_hal.process import user_name
 from snakesim_hal.terminal import Say, say
 from snakesim_operator.tools.robot_selection import RobotSelection
 
@@ -91,7 +91,7 @@ def _same(a: StopResult, b: StopResult) -> bool:
 def _at_port(address: Address, endpoint: str, namespace: str | None) -> StopResult | None:
     """Send a stop to a stop port; None when the port is closed."""
     try:
-        answer = ask_to_stop(*address, who(), LIMIT_S)
+        answer = ask_to_stop(*address, user_name(), LIMIT_S)
     except NotConnectedError:
         return None
     if answer is not None:

@@ -6,7 +6,7 @@ import time
 from snakesim_hal.errors import NotConnectedError
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.network.stop_port import stop_address
-from snakesim_hal.process import who
+from snakesim_hal.process import user_name
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, EstopRequest, Status
 from snakesim_operator.tools.command import judge
@@ -45,7 +45,7 @@ def _ask(session: Session, link: Link, limit_s: float) -> list[StopResult]:
     statuses = {name: session.latched_reader(_of(name, link, keys.STATUS), Status) for name in names}
     deadline = time.monotonic() + limit_s
     while not answers and time.monotonic() < deadline:
-        for key, answer in session.ask_all(f"{prefix}{keys.ESTOP}", EstopRequest(who=who()), ASK_S):
+        for key, answer in session.ask_all(f"{prefix}{keys.ESTOP}", EstopRequest(who=user_name()), ASK_S):
             answers.setdefault(link.namespace or namespace_of(key), []).append(answer)
         if not names:
             break

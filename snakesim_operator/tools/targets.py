@@ -46,7 +46,7 @@ def find_robots(where: RobotSelection) -> list[Link]:
     return found
 
 
-def the_one(where: RobotSelection, command: str) -> Link:
+def only_robot(where: RobotSelection, command: str) -> Link:
     """The single addressed robot. Raises NotConnectedError when there is none, RefusedError when there are more."""
     found = find_robots(where)
     if not found:

@@ -9,7 +9,7 @@ import msgspec
 
 from snakesim_hal.errors import NotConnectedError
 from snakesim_hal.network.session import Arrival, Link, Session, open_session
-from snakesim_hal.terminal import Say, say, say_json, say_over
+from snakesim_hal.terminal import Say, overwrite_lines, say, say_json
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_operator.tools.targets import CONNECT_S, RobotSelection
@@ -50,7 +50,7 @@ def top(request: TopRequest, where: RobotSelection, say: Say = say) -> int:
             else:
                 table = table_of(lines, latencies, left_out)
                 if sys.stdout.isatty() and not request.once:
-                    drawn = say_over(table, drawn)
+                    drawn = overwrite_lines(table, drawn)
                 else:
                     for line in table:
                         say(line)

@@ -76,7 +76,7 @@ def joined(run: Run, limit_s: float = LONG_S) -> Stranger:
 
     until(join, f"a network at {run.endpoint}", limit_s)
     assert found, f"the run ended with {run.process.returncode}: {run.said()[-2000:]}"
-    found[0].hear("hal/status", "hal/clock", "hal/applied", "hal/description")
+    found[0].receive("hal/status", "hal/clock", "hal/applied", "hal/description")
     return found[0]
 
 

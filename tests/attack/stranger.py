@@ -87,7 +87,7 @@ class Stranger:
 
     # --- listening --------------------------------------------------------------------------------------------
 
-    def hear(self, *keys: str) -> None:
+    def receive(self, *keys: str) -> None:
         """Listen to keys from now on; latched ones give their last value."""
         for key in keys:
             if key in self._heard:
@@ -112,7 +112,7 @@ class Stranger:
 
     def heard(self, key: str) -> list[Heard]:
         """Everything kept of a key, oldest first."""
-        self.hear(key)
+        self.receive(key)
         return list(self._heard[key])
 
     def forget(self) -> None:
@@ -123,13 +123,13 @@ class Stranger:
 
     def newest(self, key: str, limit_s: float = LONG_S) -> Any:
         """The newest message at a key; waits for the first one."""
-        self.hear(key)
+        self.receive(key)
         self.until(lambda: self._heard[key], f"something on {key}", limit_s)
         return self._heard[key][-1].message
 
     def next(self, key: str, limit_s: float = LONG_S) -> Any:
         """A message at a key that comes from now on."""
-        self.hear(key)
+        self.receive(key)
         now = time.monotonic()
         self.until(lambda: self._heard[key] and self._heard[key][-1].at_s > now, f"something new on {key}", limit_s)
         return self._heard[key][-1].message
@@ -202,7 +202,7 @@ class Stranger:
 
     def lifecycle(self) -> str:
         """As the newest status or clock has it."""
-        self.hear("hal/status", "hal/clock")
+        self.receive("hal/status", "hal/clock")
         found = [kept[-1] for key in ("hal/status", "hal/clock") if (kept := self._heard[key])]
         if not found:
             return self.status()["lifecycle"]
@@ -237,7 +237,7 @@ class Stranger:
 
     def recover(self, limit_s: float = LONG_S) -> None:
         """Have the robot armed and following its controller, whatever happened to it."""
-        self.hear("hal/status", "hal/clock", "hal/applied", "hal/description")
+        self.receive("hal/status", "hal/clock", "hal/applied", "hal/description")
         deadline = time.monotonic() + limit_s
         last: Any = None
         while time.monotonic() < deadline:
@@ -278,7 +278,7 @@ class Stranger:
 
     def stop(self) -> tuple[float, list[Any]]:
         """Ask for an emergency stop. Seconds until it is seen in what the host publishes, and the answers."""
-        self.hear("hal/status", "hal/clock", "hal/applied")
+        self.receive("hal/status", "hal/clock", "hal/applied")
         answers: list[Any] = []
         asked_s = time.monotonic()
 

@@ -23,7 +23,7 @@ def applied_of_strangers(operator: Stranger) -> list[int]:
 @pytest.mark.parametrize("kind", ["left_out", "none", "before", "after"])
 def test_a6_a_command_of_no_or_another_arming_is_never_applied(robot: Robot, kind: str, _time: int) -> None:
     operator = robot.operator
-    operator.hear("sensor/joints")
+    operator.receive("sensor/joints")
     operator.stand_by()
     operator.forget()
     clock = operator.next("hal/clock")
@@ -70,7 +70,7 @@ def lives_on(robot: Robot) -> None:
 )
 def test_a6_a_wrong_command_with_a_high_sequence_keeps_no_right_one_out(robot: Robot, changes: dict[str, Any]) -> None:
     operator = robot.operator
-    operator.hear("sensor/joints")
+    operator.receive("sensor/joints")
     for i in range(20):
         wrong = operator.command(operator.next("hal/clock"), sequence=2**61 + i, **changes)
         operator.put("actuator/joints", wrong)
@@ -81,7 +81,7 @@ def test_a6_a_wrong_command_with_a_high_sequence_keeps_no_right_one_out(robot: R
 def test_a6_what_a_stranger_knows_to_forge_stays_within_limits_and_ends_with_him(robot: Robot) -> None:
     """What remains: epoch, arming and sequence are there to read, and who forges all three commands the robot."""
     operator = robot.operator
-    operator.hear("sensor/joints")
+    operator.receive("sensor/joints")
     about = operator.newest("hal/description")
     for i in range(50):
         wild = [(-1) ** (i + joint) * 1e5 for joint in range(len(about["joints"]))]

@@ -28,7 +28,7 @@ def moving(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
     home = tmp_path_factory.mktemp("moving")
     arguments = ("triplet", "--pace", "realtime", "--set", "rate_hz=50", "--duration", "3600", "--stay")
     with standing(home, *arguments) as robot:
-        robot.operator.hear("sensor/joints", "guidance/world", "navigation/trajectory", "actuator/joints")
+        robot.operator.receive("sensor/joints", "guidance/world", "navigation/trajectory", "actuator/joints")
         yield robot
 
 

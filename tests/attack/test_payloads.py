@@ -180,7 +180,7 @@ def test_many_robots_that_are_none_do_not_keep_a_stop_from_the_one_that_is(
 def test_a_stranger_that_joins_as_a_router_or_peer_changes_nothing(robot: Robot, mode: str) -> None:
     before = robot.health()
     with Stranger(robot.endpoint, mode=mode, listen=free_endpoint()) as stranger:
-        stranger.hear("hal/clock")
+        stranger.receive("hal/clock")
         stranger.until(lambda: stranger.heard("hal/clock"), "the clock")
         robot.stays("armed", 1.0)
         assert robot.run.tell("estop").code == 0

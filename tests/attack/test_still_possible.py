@@ -28,7 +28,7 @@ def test_anybody_may_listen_to_everything(robot: Robot) -> None:
 
 def test_anybody_may_stop_clear_and_disarm(robot: Robot) -> None:
     with Stranger(robot.endpoint) as stranger:
-        stranger.hear("hal/clock")
+        stranger.receive("hal/clock")
         assert stranger.ask("hal/estop", {"who": "mallory"})[0]["ok"]
         robot.operator.until(lambda: robot.operator.next("hal/clock")["lifecycle"] == "estop", "estop")
         assert "mallory" in robot.operator.next("hal/status")["why"]
@@ -61,7 +61,7 @@ def test_anybody_may_take_the_lease_which_disarms_and_arm_and_move_within_the_li
     about, armings = operator.newest("hal/description"), operator.next("hal/clock")["arming"]
     operator.forget()
     with Stranger(robot.endpoint) as stranger:
-        stranger.hear("hal/clock", "sensor/joints", "hal/status", "hal/description")
+        stranger.receive("hal/clock", "sensor/joints", "hal/status", "hal/description")
         answer = stranger.ask("hal/lease", {"action": "acquire", "holder": "mallory", "priority": 255})[0]
         assert answer["ok"], answer
         operator.until(lambda: operator.lifecycle() == "disarmed", "disarmed, as the lease changes hands", 2.0)

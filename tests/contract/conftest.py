@@ -53,8 +53,8 @@ def cut_off(backend: Any, joint: int) -> None:
     """From now on the driver hears nothing of a joint's module."""
     take = backend._reading.take
 
-    def hear(frame: Frame) -> None:
+    def receive(frame: Frame) -> None:
         if node_of(frame.id) != joint + 1:
             take(frame)
 
-    backend._reading.take = hear
+    backend._reading.take = receive

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.network.session import Link, Session, open_session
-from snakesim_hal.process import SERVICE_PRIORITY, take_priority
+from snakesim_hal.process import SERVICE_PRIORITY, set_realtime_priority
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import JointState, Status
 from tests.e2e.command import Ended, Running, running, wait_until
@@ -37,7 +37,7 @@ def call(script: Path, *arguments: str) -> Ended:
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        preexec_fn=lambda: take_priority(SERVICE_PRIORITY),
+        preexec_fn=lambda: set_realtime_priority(SERVICE_PRIORITY),
     ) as process:
         out, err = process.communicate(timeout=30)
     return Ended(process.returncode, out, err)

@@ -98,13 +98,13 @@ class Observer:
             except WireError as error:  # a joint state with no number in it, say
                 self.could_not_read(arrival, error)
             else:
-                self.hear(arrival.monotonic_ns, message)
+                self.receive(arrival.monotonic_ns, message)
 
     def could_not_read(self, arrival: Arrival, error: WireError) -> None:
         """Something came that is no message."""
         self.unreadable += 1
 
-    def hear(self, at_ns: int, message: Any) -> None:
+    def receive(self, at_ns: int, message: Any) -> None:
         """A message came."""
         match message:
             case Status():

@@ -48,10 +48,10 @@ class FrameMaker:
         kind, (identifier, data) = rng.choice(KINDS), rng.choice(self.heard)
         match kind:
             case "bit-flipped" if data:
-                spoilt = bytearray(data)
+                corrupted = bytearray(data)
                 for _ in range(rng.choice((1, 1, 2, 16))):
-                    spoilt[rng.randrange(len(spoilt))] ^= 1 << rng.randrange(8)
-                data = bytes(spoilt)
+                    corrupted[rng.randrange(len(corrupted))] ^= 1 << rng.randrange(8)
+                data = bytes(corrupted)
             case "other node":
                 identifier = identifier & ~((1 << NODE_BITS) - 1) | rng.randrange(JOINTS + 2)
             case "other message":

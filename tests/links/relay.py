@@ -18,7 +18,7 @@ import sys
 import time
 from collections import deque
 
-from snakesim_hal.process import HOST_PRIORITY, take_priority
+from snakesim_hal.process import HOST_PRIORITY, set_realtime_priority
 
 TUNSETIFF, IFF_TAP, IFF_NO_PI = 0x400454CA, 0x0002, 0x1000
 CLONE_NEWNET = 0x40000000
@@ -72,7 +72,7 @@ def main() -> None:
     """Until stdin is closed."""
     pid_a, pid_b, name = sys.argv[1:]
     a, b = interface(pid_a, name), interface(pid_b, name)
-    take_priority(HOST_PRIORITY + 1)
+    set_realtime_priority(HOST_PRIORITY + 1)
     ways = Way(a, b), Way(b, a)
     link = {"loss": 0.0, "delay_s": 0.0, "jitter_s": 0.0, "cut": False}
     os.set_blocking(0, False)

@@ -22,7 +22,7 @@ class Watch(Observer):
         self.violations: list[str] = []
         self.counts: Counter[str] = Counter()
         self.sequences = 0  # applied commands of a controller
-        self.blind: set[str] = set()  # keys that are spoilt on purpose: what comes there proves nothing
+        self.blind: set[str] = set()  # keys that are corrupted on purpose: what comes there proves nothing
         self._robot: Description | None = None
         self._before: AppliedCommand | None = None
         self._pending: list[AppliedCommand] = []
@@ -36,9 +36,9 @@ class Watch(Observer):
         """It is counted, by key and reason."""
         self.counts[f"{arrival.key}: {error.reason}"] += 1
 
-    def hear(self, at_ns: int, message: Any) -> None:
+    def receive(self, at_ns: int, message: Any) -> None:
         """Judge it at once, and keep little."""
-        super().hear(at_ns, message)
+        super().receive(at_ns, message)
         match message:
             case Status():
                 del self.statuses[:-21]

@@ -13,7 +13,7 @@ from snakesim_hal.wire.messages import Mode
 from snakesim_operator.results.compare.alignment import SAME_INSTANT_S, Aligned, Joints, align
 from snakesim_operator.results.compare.settings import Setting, differences, identity
 from snakesim_operator.results.record import RunRecord
-from snakesim_operator.results.report.timeline import Series, distance, propulsion_intervals, told_distance
+from snakesim_operator.results.report.timeline import Series, distance, propulsion_intervals, reported_distance
 
 Floats = NDArray[np.float64]
 APART_RAD = 0.05  # three degrees: a hundred times the noise of a joint's sensor, a fifth of a strong bend
@@ -264,7 +264,7 @@ def _tracking_rad(joints: Joints) -> float | None:
 
 def _advance(a: RunRecord, b: RunRecord, at_s: float) -> Advance | None:
     """By the same measure in both, or not at all: along the route, else as both controllers knew it."""
-    for measure in (distance, told_distance):
+    for measure in (distance, reported_distance):
         of_a, of_b = measure(a), measure(b)
         if of_a is not None and of_b is not None and of_a.what == of_b.what:
             ends = (float(np.interp(at_s, series.time_s, series.value)) for series in (of_a, of_b))

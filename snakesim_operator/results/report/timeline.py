@@ -149,7 +149,7 @@ def distance(record: RunRecord) -> Series | None:
             return Series(time_s, along - along[0], "advance along the route, mean over the body")
         moved = record.position_w[rows, :2] - record.position_w[rows[0], :2]
         return Series(time_s, np.hypot(*moved.T), "distance of the tail end from where it was")
-    return told_distance(record)
+    return reported_distance(record)
 
 
 def came_to_rest_s(record: RunRecord, within_m: float) -> float | None:
@@ -161,7 +161,7 @@ def came_to_rest_s(record: RunRecord, within_m: float) -> float | None:
     return float(moved.time_s[away[-1] + 1]) if len(away) else 0.0
 
 
-def told_distance(record: RunRecord) -> Series | None:
+def reported_distance(record: RunRecord) -> Series | None:
     """Advance of the tail since the controller first told its place on the path."""
     states = [state for state in record.control if state.path_s_m is not None]
     if len(states) < 2:

@@ -13,12 +13,12 @@ from pathlib import Path
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.kinematics import rotation_from_quaternion, yaw_of
 from snakesim_hal.network.session import Link, Session, open_session
-from snakesim_hal.process import on_stop_signal, who
-from snakesim_hal.terminal import say, say_over
+from snakesim_hal.process import on_stop_signal, user_name
+from snakesim_hal.terminal import overwrite_lines, say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, ControlState, Intent, Status, World
 from snakesim_operator.tools.stop import estop
-from snakesim_operator.tools.targets import CONNECT_S, RobotSelection, the_one
+from snakesim_operator.tools.targets import CONNECT_S, RobotSelection, only_robot
 from snakesim_operator.tools.teleop.joystick import Joystick, open_joystick
 from snakesim_operator.tools.teleop.keyboard import Keyboard
 from snakesim_operator.tools.teleop.steering import HEADING_STEP_RAD, TURN_RAD_S, Steering
@@ -48,7 +48,7 @@ def teleop(request: TeleopRequest, where: RobotSelection) -> int:
         if stick is not None:
             opened.callback(stick.close)
         keyboard = Keyboard() if stick is None or sys.stdin.isatty() else None
-        link = the_one(where, "teleop")
+        link = only_robot(where, "teleop")
         session = opened.enter_context(open_session(link, CONNECT_S))
         if keyboard is not None:
             opened.enter_context(keyboard)
@@ -62,7 +62,7 @@ class Teleop:
         self, session: Session, link: Link, request: TeleopRequest, keyboard: Keyboard | None, stick: Joystick | None
     ) -> None:
         self._link, self._keyboard, self._stick = link, keyboard, stick
-        self._me = f"{who()[:40]}, teleop {os.getpid()}"  # two may steer
+        self._me = f"{user_name()[:40]}, teleop {os.getpid()}"  # two may steer
         self._steering = Steering(self._me, request.fastest_m_s)
         self._intents = session.publisher(keys.INTENT, Intent)
         self._clocks = session.reader(keys.CLOCK, Clock)
@@ -93,7 +93,7 @@ class Teleop:
             if not self._ending:
                 self._send()
             if turn % SHOWN_EVERY == 0 and sys.stdout.isatty():
-                drawn = say_over(self._screen_lines(), drawn)
+                drawn = overwrite_lines(self._screen_lines(), drawn)
             turn += 1
             time.sleep(max(PERIOD_S - (time.monotonic() - began), 0.0))
         if self._steering.touched_s is not None and not self._stopped:  # sooner than by expiry

@@ -162,7 +162,7 @@ def watchdog(request: Request) -> Iterator[Trial]:
             now_us += 10 * MS
             module.sync(count, QUIET)
             module.poll(now_us)
-            module.hear_set_point(set_point(count), now_us)
+            module.receive_set_point(set_point(count), now_us)
         assert module.state == ModuleState.ARMED, module.state
         last_us = now_us
         while module.state == ModuleState.ARMED and now_us - last_us < 1000 * MS:

@@ -34,7 +34,7 @@ def health(node: int, **values: float) -> Frame:
     return codec()[Opcode.HEALTH].frame(node, **values)
 
 
-def spoilt(frame: Frame) -> Frame:
+def corrupted(frame: Frame) -> Frame:
     """With a wrong checksum."""
     return Frame(frame.id, frame.data[:-1] + bytes((frame.data[-1] ^ 0x5A,)))
 

@@ -21,7 +21,7 @@ class Bench:
         network = LocalNetwork()
         config = load("triplet", []).config
         self.settings = LiveSettings(Client(network.session(), "control"), config)
-        self.settings.meet(description())
+        self.settings.configure(description())
         self.anew: list[bool] = []
         network.answer = lambda: self.anew.append(self.settings.turn(CLOCK))
         self.operator: LocalSession = network.session()

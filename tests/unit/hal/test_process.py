@@ -33,7 +33,7 @@ def test_memory_is_locked_where_that_is_allowed() -> None:
 
 
 def test_what_is_refused_is_returned_and_printed() -> None:
-    code = "from snakesim_hal.process import hurry; r = hurry(20); print(len(r), r)"
+    code = "from snakesim_hal.process import enter_realtime; r = enter_realtime(20); print(len(r), r)"
     words = said(LOCK.format(1 << 20) + code, drop="ipc_lock,-sys_nice")
     assert words.startswith("2 [") and words.count("no real-time priority") == 2, words
 
@@ -46,10 +46,10 @@ def test_the_clock_is_not_stepped_without_permission() -> None:
 def test_a_thread_that_never_pauses_gives_up_its_priority() -> None:
     code = """
 import os, time
-from snakesim_hal.process import calm_down_after, take_priority
-if take_priority(5) is not None:
+from snakesim_hal.process import drop_priority_after, set_realtime_priority
+if set_realtime_priority(5) is not None:
     raise SystemExit("refused")
-calm_down_after(0.05)
+drop_priority_after(0.05)
 def compute(seconds):
     end = time.monotonic() + seconds
     while time.monotonic() < end:
@@ -69,7 +69,7 @@ print(os.sched_getscheduler(0) == os.SCHED_OTHER)
 
 
 def test_a_closed_terminal_is_a_stop_but_under_nohup() -> None:
-    code = PRINT.format("heeded", "")
+    code = PRINT.format("stop_signals", "")
     in_a_terminal = ["env", "--default-signal=HUP"]  # these tests may run under nohup
     words, under_nohup = (
         subprocess.run([*prefix, sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout

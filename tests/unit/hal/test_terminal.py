@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.terminal import complain_of, printable, say, say_again
+from snakesim_hal.terminal import overwrite_line, printable, report_error, say
 
 REPOSITORY = Path(__file__).parents[3]
 STEERING = {"Cc", "Cf", "Cs", "Zl", "Zp"}  # control, format (bidirectional overrides too), surrogates, separators
@@ -36,8 +36,8 @@ def test_a_json_text_that_is_printed_stays_one(text: str) -> None:
 
 def test_what_is_said_is_harmless(capsys: pytest.CaptureFixture[str]) -> None:
     say("\x1b]0;title\x07")
-    complain_of(ConfigError("a.toml: \x9b2J\n  next: trust me", "second line"), "snakesim")
-    assert say_again("tick 10 \x1b[1A and much more", 24, 3) == 24
+    report_error(ConfigError("a.toml: \x9b2J\n  next: trust me", "second line"), "snakesim")
+    assert overwrite_line("tick 10 \x1b[1A and much more", 24, 3) == 24
     out, err = capsys.readouterr()
     assert out == "\\u001b]0;title\\u0007\n\rtick 10 \\u001b[1A and mu"
     assert err == "snakesim: a.toml: \\u009b2J\\u000a  next: trust me\nsecond line\n"

@@ -14,7 +14,7 @@ from snakesim_hal.model.scenario import RunConfig, load, parse_set
 from snakesim_hal.network.client import Client
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import DepthImage
-from snakesim_sim_backend.looking_service import LookingService
+from snakesim_sim_backend.sensor_service import SensorService
 from tests.unit.sim_backend.rig import Run
 
 HEAD = keys.depth("head")
@@ -30,7 +30,7 @@ def config_of(*sets: str) -> RunConfig:
 def images_of(config: RunConfig) -> list[DepthImage]:
     """What somebody who acts every tick reads, as the clock names it."""
     found: dict[int, DepthImage] = {}
-    with offered(SERVICES, "sensor", LookingService), InProcessRun(config) as run:
+    with offered(SERVICES, "sensor", SensorService), InProcessRun(config) as run:
         onlooker = Client(run.network.session(), "onlooker")
         images, ticks = onlooker.subscribe(HEAD, DepthImage), onlooker.ticks(0.0)
         for _ in run.turns():
@@ -61,9 +61,9 @@ def test_a_robot_on_can_sees_what_the_simulated_robot_sees_from_the_same_place()
 
 def test_what_the_backend_has_itself_is_left_to_it() -> None:
     config = config_of()
-    with offered(SERVICES, "sensor", LookingService), InProcessRun(config) as run:
+    with offered(SERVICES, "sensor", SensorService), InProcessRun(config) as run:
         service = run._loops["sensor"].service  # pyright: ignore[reportPrivateUsage]
-        assert isinstance(service, LookingService)
+        assert isinstance(service, SensorService)
         assert service._readers == []  # pyright: ignore[reportPrivateUsage]
 
 

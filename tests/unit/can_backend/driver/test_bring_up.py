@@ -66,7 +66,7 @@ class Modules:
         for frame in self.far.receive():
             self.heard.append(frame)
             for passed in self.to_modules(frame):
-                self.chain.hear(0, passed)
+                self.chain.receive(0, passed)
         for frame in self.chain.take(0):
             for passed in self.to_host(frame):
                 self.far.send(passed)
@@ -299,7 +299,7 @@ def test_a_value_out_of_range_is_told_with_node_name_value_and_range(modules: Mo
 
 
 def test_an_armed_module_refuses(modules: Modules) -> None:
-    modules.chain.hear(0, rig.command(Action.ARM))
+    modules.chain.receive(0, rig.command(Action.ARM))
     modules.chain.take(0)
     with pytest.raises(BackendError, match="not while armed"):
         configure([modules.bus], wanted(), 5.0)

@@ -7,7 +7,7 @@ from snakesim_can_backend.driver.reports import Reading
 from snakesim_can_backend.protocol.definitions import LastStop, ModuleState
 from snakesim_hal.wire.messages import LifecycleState
 from tests.unit.can_backend.driver.watch_rig import PERIOD_S, WHO, Bench, Speak, faulty, quiet, said
-from tests.unit.can_backend.frames import answer, begin, heartbeat, joint_state, spoilt
+from tests.unit.can_backend.frames import answer, begin, corrupted, heartbeat, joint_state
 
 # --- what one module can do wrong --------------------------------------------------------------------------
 
@@ -21,7 +21,7 @@ def miscounting(reading: Reading) -> None:
 
 
 def corrupt(reading: Reading) -> None:
-    reading.take(spoilt(joint_state(2, reading.sync)))
+    reading.take(corrupted(joint_state(2, reading.sync)))
 
 
 def doubled(reading: Reading) -> None:

@@ -161,11 +161,11 @@ def module_in(state: ModuleState) -> Module:
         ModuleState.FAULT: [Action.ARM],
         ModuleState.EMERGENCY: [],
     }[state]:
-        module.hear(commands.command(opened_by, NODE), now_us)
+        module.receive(commands.command(opened_by, NODE), now_us)
     if state == ModuleState.FAULT:
         module.poll(now_us + 1e5)
     if state == ModuleState.EMERGENCY:
-        module.hear(commands.emergency(), now_us)
+        module.receive(commands.emergency(), now_us)
     assert module.state == state
     module.frames.clear()
     return module
@@ -176,11 +176,11 @@ def now_of(module: Module) -> float:
 
 
 def command(action: Action) -> Callable[[Module], None]:
-    return lambda module: module.hear(commands.command(action, NODE), now_of(module))
+    return lambda module: module.receive(commands.command(action, NODE), now_of(module))
 
 
 def emergency(module: Module) -> None:
-    module.hear(commands.emergency(), now_of(module))
+    module.receive(commands.emergency(), now_of(module))
 
 
 def time_passes(module: Module) -> None:
@@ -197,7 +197,7 @@ def rest(module: Module) -> None:
 def wrong_counts(module: Module) -> None:
     layout = codec()[Opcode.SET_POINT]
     for _ in range(WRONG_COUNTS + 1):
-        module.hear_set_point(layout.frame(NODE, mode=0, count=9), now_of(module))
+        module.receive_set_point(layout.frame(NODE, mode=0, count=9), now_of(module))
 
 
 def leak(module: Module) -> None:

@@ -58,7 +58,7 @@ def parameter(index: int, value: float = 0.0, operation: int = Operation.WRITE, 
     return Frame(frame.id, frame.data[:1] + bytes((operation,)) + frame.data[2:])  # also operations that there are not
 
 
-def spoilt(frame: Frame) -> Frame:
+def corrupted(frame: Frame) -> Frame:
     return Frame(frame.id, frame.data[:-1] + bytes((frame.data[-1] ^ 1,)))
 
 
@@ -85,7 +85,7 @@ def booted(**flash: float) -> Module:
 
 def armed(**flash: float) -> Module:
     module = booted(**flash)
-    module.hear(command(Action.ARM), BOOTED)
+    module.receive(command(Action.ARM), BOOTED)
     module.frames.clear()
     assert module.state == ModuleState.ARMED
     return module
@@ -120,15 +120,15 @@ class Host:
 
     def arm(self) -> None:
         self.tick()
-        self.chain.hear(0, command(Action.ARM))
+        self.chain.receive(0, command(Action.ARM))
 
     def tick(self, target: float | None = None, mode: Mode = Mode.POSITION) -> list[Frame]:
         self.count += 1
-        self.chain.hear(0, sync(self.count, self.count * self.period_us))
+        self.chain.receive(0, sync(self.count, self.count * self.period_us))
         frames = self.chain.take(0)
         if target is not None:
             for node in range(1, self.chain.count + 1):
-                self.chain.hear(0, set_point(self.count, mode, target, 4.0, node))
+                self.chain.receive(0, set_point(self.count, mode, target, 4.0, node))
         return frames
 
     def ticks(self, count: int, target: float | None = None, mode: Mode = Mode.POSITION) -> list[Frame]:
@@ -146,7 +146,7 @@ def run_at(joints: int, rate_hz: int, seconds: float = 2.0) -> tuple[list[int], 
     for slot in twins.slots:
         slot.module.parameters.values |= {Parameter.CONTACT_EVERY: 1.0, Parameter.IMU_EVERY: 20.0}
     twins.advance_to(110_000.0)
-    twins.hear(0, command(Action.ARM))
+    twins.receive(0, command(Action.ARM))
     period_us, before = 1e6 / rate_hz, twins.traffic()[0]
     late: list[int] = []
     backlog = 0
@@ -155,8 +155,8 @@ def run_at(joints: int, rate_hz: int, seconds: float = 2.0) -> tuple[list[int], 
         for answer in twins.take(0):
             if opcode_of(answer.id) == Opcode.JOINT_STATE:
                 late.append(((tick - 1) - (answer.data[6] & 0xF)) % 16)
-        twins.hear(0, sync(tick))
+        twins.receive(0, sync(tick))
         for node in range(1, joints + 1):
-            twins.hear(0, set_point(tick, node=node, target=0.0))
+            twins.receive(0, set_point(tick, node=node, target=0.0))
         backlog = max(backlog, sum(map(len, twins.buses[0]._waiting.values())))
     return late, before, twins.traffic()[0], backlog

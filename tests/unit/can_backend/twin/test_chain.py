@@ -59,9 +59,9 @@ def test_time_passes_only_when_a_sync_is_later_also_across_the_round_of_32_bits(
     made = chain(plant=plant)
     start = (1 << 32) - 15_000
     for time_us, steps in ((start, 0), (start, 0), (start + 10_000, 10), (start + 20_000, 20), (start + 10_000, 20)):
-        made.hear(0, sync(0, time_us))
+        made.receive(0, sync(0, time_us))
         assert plant.steps == steps
-    made.hear(0, command(Action.IDENTIFY))
+    made.receive(0, command(Action.IDENTIFY))
     assert plant.steps == 20 and len(only(made.take(0), Opcode.IDENTITY)) == 4
 
 
@@ -69,7 +69,7 @@ def test_a_latecomer_on_another_bus_takes_no_time_and_a_new_host_begins_at_its_o
     plant = Pushed(4)
     made = chain(plant=plant)
     for time_s, steps in ((0, 0), (5.01, 5010), (5.0, 5010), (5.01, 5010), (5.02, 5020), (0.0, 5020), (0.01, 5030)):
-        made.hear(0, sync(0, round(time_s * 1e6)))
+        made.receive(0, sync(0, round(time_s * 1e6)))
         assert plant.steps == steps
 
 
@@ -78,19 +78,19 @@ def test_two_buses_with_one_sync_time_share_one_step_of_time():
     made = chain(config(5), plant=plant, channels=["vcan0", "vcan1"])
     for tick in range(3):
         for channel in (0, 1):
-            made.hear(channel, sync(tick, tick * 10_000))
+            made.receive(channel, sync(tick, tick * 10_000))
     assert plant.steps == 20 and made.counts == [3, 2]
     assert [s["count"] for s in only(made.take(1), Opcode.JOINT_STATE)] == [0, 0, 1, 1, 2, 2]
-    made.hear(1, command(Action.ARM))
+    made.receive(1, command(Action.ARM))
     assert [s.module.state for s in made.slots] == [1, 1, 1, 2, 2]
-    made.hear(0, set_point(0, node=4))
+    made.receive(0, set_point(0, node=4))
     assert made.slots[3].module._pending is None, "node 4 is on the other bus"
 
 
 def test_forces_are_felt_by_the_link_in_front_and_the_tail():
     made = chain(config(**SENSORS), plant=Pushed(4))
     made.slots[0].module.parameters.values[Parameter.TAIL] = 1.0
-    made.hear(0, sync(0))
+    made.receive(0, sync(0))
     frames = made.take(0)
     contacts = only(frames, Opcode.CONTACT)
     assert [c["touched"] for c in contacts] == [0, 1, 0, 0]
@@ -107,10 +107,10 @@ def test_neighbours_take_turns_with_their_imus():
     for slot in made.slots:
         slot.module.parameters.values[Parameter.IMU_EVERY] = 4.0
     for tick in range(4):
-        made.hear(0, sync(tick))
+        made.receive(0, sync(tick))
         gyros = only(made.take(0), Opcode.GYRO)
         assert len(gyros) == 1 and gyros[0]["rate_x"] in (1.0, 2.0, 3.0, 4.0)
-    made.hear(0, sync(4))
+    made.receive(0, sync(4))
     frames = made.take(0)
     assert only(frames, Opcode.ACCELEROMETER)[0]["acceleration_z"] == pytest.approx(G)
     assert only(frames, Opcode.SHAFT_LOAD)[0]["torque"] == pytest.approx(0.25)
@@ -121,7 +121,7 @@ def test_the_pose_is_sent_once_a_sync_before_the_answers():
     made = chain(config(6, **SENSORS), plant=Pushed(6), channels=["a", "b"], send_pose=sent.append)
     for tick in range(3):
         for channel in (0, 1):
-            made.hear(channel, sync(tick, tick * 10_000))
+            made.receive(channel, sync(tick, tick * 10_000))
     assert len(sent) == 3
     sample = msgspec.json.decode(sent[0], type=MocapSample)
     assert sample.position_w == POSE.position_w and sample.angular_velocity_w == POSE.angular_velocity_w
@@ -172,7 +172,7 @@ def test_a_sync_of_another_clock_sets_a_stepped_chain_s_time_and_lets_none_pass(
         (2_000_000_000, 60_010),
         (2_000_010_000, 60_020),
     ):
-        made.hear(0, sync(0, time_us))
+        made.receive(0, sync(0, time_us))
         assert plant.steps == steps
 
 

@@ -71,7 +71,7 @@ def test_a_duplicate_answers_with_another_serial():
     run = host("duplicate:joint_2@0.05-0.2")
     frames = run.ticks(8, 0.1)
     assert len(of_node_2(frames)) == 2
-    run.chain.hear(0, command(Action.IDENTIFY))
+    run.chain.receive(0, command(Action.IDENTIFY))
     serials = [i["serial"] for i in only(run.chain.take(0), Opcode.IDENTITY)]
     assert len(serials) == len(set(serials)) == 5
     frames = run.ticks(20, 0.1)
@@ -86,7 +86,7 @@ def test_a_module_that_finds_something_wrong_inside_gives_up(kind: str):
     assert run.states() == [2, 4, 2, 2]
     for _ in range(4000 if kind == "overheat" else 1):
         run.tick()
-    run.chain.hear(0, command(Action.CLEAR))
+    run.chain.receive(0, command(Action.CLEAR))
     assert run.states()[1] == ModuleState.DISARMED
 
 

@@ -18,27 +18,27 @@ from tests.unit.can_backend.twin.rig import (
     armed,
     booted,
     command,
+    corrupted,
     emergency,
     new_module,
     only,
     parameter,
     set_point,
-    spoilt,
     sync,
 )
 
 
 def drive(module: Module, count: int, now_us: float, **how: Any) -> None:
     """A set-point, and the Sync that enacts it."""
-    module.hear_set_point(set_point(count, **how), now_us)
+    module.receive_set_point(set_point(count, **how), now_us)
     module.sync(count, QUIET)
 
 
 def test_it_boots_silent_and_answers_nothing_until_its_first_heartbeat():
     module = new_module()
     module.poll(0.0)
-    module.hear(command(Action.IDENTIFY), 50 * MS)
-    module.hear(command(Action.ARM), 50 * MS)
+    module.receive(command(Action.IDENTIFY), 50 * MS)
+    module.receive(command(Action.ARM), 50 * MS)
     module.sync(1, QUIET)
     module.poll(99 * MS)
     assert module.frames == [] and module.state == ModuleState.BOOT
@@ -58,7 +58,7 @@ def test_it_beats_ten_times_a_second_and_tells_its_health_twice():
 
 def test_a_set_point_is_enacted_at_the_next_sync():
     module = armed()
-    module.hear_set_point(set_point(7, target=2.0, limit=1.5), BOOTED)
+    module.receive_set_point(set_point(7, target=2.0, limit=1.5), BOOTED)
     assert module.demand.mode == Mode.PASSIVE
     module.sync(0, QUIET)
     assert module.demand == (Mode.TORQUE, pytest.approx(2.0), pytest.approx(1.5))
@@ -73,10 +73,10 @@ def test_position_targets_end_at_the_angle_limit():
 def test_arming_is_ignored_but_when_disarmed():
     module = armed()
     fed = module._fed_us
-    module.hear(command(Action.ARM), BOOTED + 50 * MS)
+    module.receive(command(Action.ARM), BOOTED + 50 * MS)
     assert module._fed_us == fed and module.frames == []
-    module.hear(emergency(), BOOTED)
-    module.hear(command(Action.ARM), BOOTED)
+    module.receive(emergency(), BOOTED)
+    module.receive(command(Action.ARM), BOOTED)
     assert module.state == ModuleState.EMERGENCY
 
 
@@ -88,12 +88,12 @@ def test_a_condition_is_a_fault_until_it_is_gone_and_cleared(sensed: str, fault:
     [beat] = only(module.frames, Opcode.HEARTBEAT)
     assert beat[f"fault_{fault.name.lower()}"] == 1 and beat["last_stop"] == LastStop[fault.name]
     module.inside.winding_c = 80.0 if sensed == "hot" else 20.0
-    module.hear(command(Action.CLEAR), BOOTED + 2 * MS)
+    module.receive(command(Action.CLEAR), BOOTED + 2 * MS)
     assert module.state == ModuleState.FAULT
     module.inside.leak, module.inside.winding_c = False, 79.0
     module.poll(BOOTED + 3 * MS)
     assert module.state == ModuleState.FAULT, "latched"
-    module.hear(command(Action.CLEAR), BOOTED + 3 * MS)
+    module.receive(command(Action.CLEAR), BOOTED + 3 * MS)
     assert module.state == ModuleState.DISARMED and module.faults == 0
 
 
@@ -105,7 +105,7 @@ def test_the_watchdog_makes_it_passive_at_once_and_is_latched():
     module.poll(BOOTED + 100 * MS)
     assert module.state == ModuleState.FAULT and module.demand.mode == Mode.PASSIVE
     assert module.last_stop == LastStop.WATCHDOG and module.faults == 1 << ModuleFault.WATCHDOG
-    module.hear_set_point(set_point(1), BOOTED + 101 * MS)
+    module.receive_set_point(set_point(1), BOOTED + 101 * MS)
     module.sync(1, QUIET)
     assert module.demand.mode == Mode.PASSIVE
 
@@ -141,7 +141,7 @@ def test_set_points_without_syncs_do_not_keep_a_module_alive():
     module = armed()
     drive(module, 0, BOOTED)
     for k in range(1, 30):
-        module.hear_set_point(set_point(k, Mode.PASSIVE), BOOTED + k * 10 * MS)
+        module.receive_set_point(set_point(k, Mode.PASSIVE), BOOTED + k * 10 * MS)
         module.poll(BOOTED + k * 10 * MS)
     assert module.state == ModuleState.FAULT and module.last_stop == LastStop.WATCHDOG
     assert module.demand.mode == Mode.PASSIVE
@@ -150,7 +150,7 @@ def test_set_points_without_syncs_do_not_keep_a_module_alive():
 def test_a_wrong_checksum_is_as_if_nothing_had_come():
     module = armed()
     drive(module, 0, BOOTED, target=1.0)
-    module.hear_set_point(spoilt(set_point(1, target=2.0)), BOOTED + 50 * MS)
+    module.receive_set_point(corrupted(set_point(1, target=2.0)), BOOTED + 50 * MS)
     module.sync(1, QUIET)
     assert module.demand.target == pytest.approx(1.0) and module._fed_us == BOOTED and module.refused == 1
 
@@ -159,7 +159,7 @@ def test_stopping_damps_until_at_rest():
     module = armed()
     drive(module, 0, BOOTED)
     module.inside.speed_rad_s = 3.0
-    module.hear(command(Action.STOP), BOOTED)
+    module.receive(command(Action.STOP), BOOTED)
     assert module.state == ModuleState.STOPPING and module.demand[:2] == (Mode.VELOCITY, 0.0)
     assert only(module.frames, Opcode.HEARTBEAT)[-1]["mode"] == Mode.VELOCITY
     module.poll(BOOTED + 50 * MS)
@@ -173,7 +173,7 @@ def test_stopping_damps_until_at_rest():
 def test_stopping_ends_after_the_watchdog_s_time_and_may_be_passive():
     module = armed(safe_action=0, watchdog=0.05)
     module.inside.speed_rad_s = 3.0
-    module.hear(command(Action.STOP), BOOTED)
+    module.receive(command(Action.STOP), BOOTED)
     assert module.demand.mode == Mode.PASSIVE
     module.poll(BOOTED + 50 * MS)
     assert module.state == ModuleState.DISARMED
@@ -183,8 +183,8 @@ def test_disarm_and_emergency_are_passive_at_once():
     for frame, state in ((command(Action.DISARM), ModuleState.DISARMED), (emergency(), ModuleState.EMERGENCY)):
         module = armed()
         drive(module, 0, BOOTED)
-        module.hear_set_point(set_point(1), BOOTED)
-        module.hear(frame, BOOTED)
+        module.receive_set_point(set_point(1), BOOTED)
+        module.receive(frame, BOOTED)
         assert module.state == state and module.demand.mode == Mode.PASSIVE
         module.sync(2, QUIET)
         assert module.demand.mode == Mode.PASSIVE, "nothing pending is left"
@@ -192,23 +192,23 @@ def test_disarm_and_emergency_are_passive_at_once():
 
 def test_an_emergency_while_booting_is_remembered():
     module = new_module()
-    module.hear(emergency(), 10 * MS)
+    module.receive(emergency(), 10 * MS)
     module.poll(100 * MS)
     assert module.state == ModuleState.EMERGENCY
-    module.hear(command(Action.CLEAR), 101 * MS)
+    module.receive(command(Action.CLEAR), 101 * MS)
     assert module.state == ModuleState.DISARMED
 
 
-@pytest.mark.parametrize("frame", [command(Action.ARM, key=1), spoilt(command(Action.ARM))])
+@pytest.mark.parametrize("frame", [command(Action.ARM, key=1), corrupted(command(Action.ARM))])
 def test_commands_need_key_and_checksum(frame):
     module = booted()
-    module.hear(frame, BOOTED)
+    module.receive(frame, BOOTED)
     assert module.state == ModuleState.DISARMED
 
 
 def test_identity_says_that_it_is_a_twin():
     module = booted()
-    module.hear(command(Action.IDENTIFY), BOOTED)
+    module.receive(command(Action.IDENTIFY), BOOTED)
     [identity] = only(module.frames, Opcode.IDENTITY)
     assert identity == {
         "serial": SERIAL,
@@ -222,11 +222,11 @@ def test_identity_says_that_it_is_a_twin():
 
 def test_a_reboot_forgets_what_was_not_saved():
     module = armed()
-    module.hear(command(Action.DISARM), BOOTED)
-    module.hear(parameter(Parameter.STIFFNESS, 12.0), BOOTED)
-    module.hear(parameter(Parameter.DAMPING, 2.0), BOOTED)
-    module.hear(parameter(Parameter.DAMPING, operation=2), BOOTED)
-    module.hear(command(Action.REBOOT, NODE), BOOTED)
+    module.receive(command(Action.DISARM), BOOTED)
+    module.receive(parameter(Parameter.STIFFNESS, 12.0), BOOTED)
+    module.receive(parameter(Parameter.DAMPING, 2.0), BOOTED)
+    module.receive(parameter(Parameter.DAMPING, operation=2), BOOTED)
+    module.receive(command(Action.REBOOT, NODE), BOOTED)
     assert module.state == ModuleState.BOOT
     module.frames.clear()
     module.poll(BOOTED + 100 * MS)
@@ -269,8 +269,8 @@ NOT_ARM = st.one_of(
     st.sampled_from([Action.DISARM, Action.STOP, Action.CLEAR, Action.REBOOT, Action.IDENTIFY]).map(command),
     st.just(emergency()),
     st.builds(set_point, st.integers(0, 15), st.sampled_from(list(Mode))),
-    st.builds(spoilt, st.builds(set_point, st.integers(0, 15))),
-    st.builds(spoilt, st.just(command(Action.ARM))),
+    st.builds(corrupted, st.builds(set_point, st.integers(0, 15))),
+    st.builds(corrupted, st.just(command(Action.ARM))),
     st.builds(parameter, st.integers(0, 20), st.floats(-1, 40, width=32), st.integers(0, 4)),
     st.builds(sync, st.integers(0, 255)),
 )
@@ -283,9 +283,9 @@ def give(module: Module, frame, now_us: float) -> None:
     if opcode == Opcode.SYNC:
         module.sync(frame.data[0], QUIET)
     elif opcode == Opcode.SET_POINT:
-        module.hear_set_point(frame, now_us)
+        module.receive_set_point(frame, now_us)
     else:
-        module.hear(frame, now_us)
+        module.receive(frame, now_us)
 
 
 @settings(max_examples=100, deadline=None)

@@ -10,7 +10,7 @@ from tests.unit.can_backend.twin.rig import BOOTED, armed, booted, only, paramet
 
 def ask(module, *request, **given):
     module.frames.clear()
-    module.hear(parameter(*request, **given), BOOTED)
+    module.receive(parameter(*request, **given), BOOTED)
     [answer] = only(module.frames, Opcode.PARAMETER_ANSWER)
     return Result(int(answer["result"])), answer["value"]
 
@@ -50,7 +50,7 @@ def test_what_is_wrong_is_refused_and_changes_nothing(index, value, result):
 def test_nan_is_refused():
     module = booted()
     good = parameter(Parameter.DAMPING, 1.0)
-    module.hear(Frame(good.id, good.data[:2] + struct.pack("<f", float("nan"))), BOOTED)
+    module.receive(Frame(good.id, good.data[:2] + struct.pack("<f", float("nan"))), BOOTED)
     assert only(module.frames, Opcode.PARAMETER_ANSWER)[0]["result"] == Result.OUT_OF_RANGE
 
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from snakesim_hal.errors import WireError
-from snakesim_hal.faults.disturbance import MAX_AT_ONCE, Disturbance, spoilt
+from snakesim_hal.faults.disturbance import MAX_AT_ONCE, Disturbance, corrupted
 from snakesim_hal.model.injection import Injection, checked
 from snakesim_hal.wire.codec import Decoder, encode, encoding_of
 from snakesim_hal.wire.messages import JointCommand
@@ -139,14 +139,14 @@ def test_a_flood_repeats_the_newest_message_at_its_rate() -> None:
 
 @given(st.binary(max_size=200), st.integers(0, 2**32))
 def test_corrupt_bytes_are_other_bytes(payload: bytes, seed: int) -> None:
-    assert spoilt(payload, random.Random(seed)) != payload
+    assert corrupted(payload, random.Random(seed)) != payload
 
 
 def test_decoders_get_noise_cuts_and_numbers_that_are_none_and_refuse_them_in_order() -> None:
     payload, decoder, rng = encode(command(description(), 0.1)), Decoder(JointCommand), random.Random(5)
     lengths, refused, taken = set(), 0, 0
     for _ in range(20_000):
-        wrong = spoilt(payload, rng)
+        wrong = corrupted(payload, rng)
         lengths.add(len(wrong))
         try:
             decoder.decode(wrong, encoding_of(JointCommand))

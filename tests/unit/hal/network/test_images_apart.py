@@ -4,7 +4,7 @@ import json
 
 import zenoh
 
-from snakesim_hal.network.images_apart import keep_apart
+from snakesim_hal.network.image_connection import configure_for_images
 
 SNDBUF = "transport/link/tcp/so_sndbuf"
 
@@ -19,7 +19,7 @@ def settings(endpoints: list[str] = ENDPOINTS, **link: object) -> zenoh.Config:
 
 def test_little_of_it_is_under_way_and_it_is_marked_as_what_may_wait() -> None:
     config = settings()
-    keep_apart(config)
+    configure_for_images(config)
     assert int(config.get_json(SNDBUF)) < 5000
     assert json.loads(config.get_json("connect/endpoints")) == [
         "tcp/robot-lab:7447#dscp=0x28",
@@ -30,11 +30,11 @@ def test_little_of_it_is_under_way_and_it_is_marked_as_what_may_wait() -> None:
 
 def test_loopback_is_never_slow() -> None:
     config = settings(["tcp/127.0.0.1:7447"])
-    keep_apart(config)
+    configure_for_images(config)
     assert config.get_json(SNDBUF) == "null"
 
 
 def test_what_a_session_file_says_stays() -> None:
     config = settings(tx={"batch_size": 9000}, tcp={"so_sndbuf": 100_000})
-    keep_apart(config)
+    configure_for_images(config)
     assert (config.get_json(SNDBUF), config.get_json("transport/link/tx/batch_size")) == ("100000", "9000")

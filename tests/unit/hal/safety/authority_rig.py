@@ -62,5 +62,5 @@ def modes(decision: Decision) -> set[Mode]:
     return set(decision.set_points.mode)
 
 
-def hear(rig: Rig, motor_c: list[float], volts: float = 24.0, valid: list[bool] | None = None) -> None:
+def receive(rig: Rig, motor_c: list[float], volts: float = 24.0, valid: list[bool] | None = None) -> None:
     rig.authority.observe_power(power(motor_c, volts, valid=valid or True), rig.now_ns)

@@ -6,7 +6,7 @@ from snakesim_hal.safety.authority import COMMANDS_KEPT
 from snakesim_hal.safety.fault_log import MAX_FAULTS_KEPT
 from snakesim_hal.wire.messages import Fault, JointCommand, LifecycleState, Mode
 from tests.unit.hal.rig import PERIOD_NS, command, state
-from tests.unit.hal.safety.authority_rig import CLEAR, DISARM, ESTOP, FINISH, JOINTS, Rig, armed, hear, modes
+from tests.unit.hal.safety.authority_rig import CLEAR, DISARM, ESTOP, FINISH, JOINTS, Rig, armed, modes, receive
 
 # --- stops -----------------------------------------------------------------------------------------------------
 
@@ -78,7 +78,7 @@ def test_a_joint_that_moves_when_a_fault_comes_is_slowed_down_over_some_periods(
 
 def test_all_joints_that_are_hot_are_named() -> None:
     rig = armed()
-    hear(rig, [90.0] * JOINTS)
+    receive(rig, [90.0] * JOINTS)
     rig.pass_tick()
     rig.send(0.1, torque_limit_nm=[4.0] * JOINTS)
     assert rig.pass_tick().limited == dict.fromkeys(range(JOINTS), "thermal")
@@ -251,13 +251,13 @@ def test_a_frozen_joint_stops_an_armed_robot() -> None:
 
 def test_heat_derates_then_stops_and_must_be_gone_before_the_next_arming() -> None:
     rig = armed()
-    hear(rig, [20.0, 92.5, 20.0])
+    receive(rig, [20.0, 92.5, 20.0])
     rig.send(0.1)
     decision = rig.pass_tick()
     assert decision.set_points.torque_limit_nm == pytest.approx([4.0, 2.4, 4.0])
     assert decision.limited == {1: "thermal"} and rig.authority.limited == {"thermal": 1}
     assert rig.authority.derated == {"joint_2": pytest.approx(0.6)}
-    hear(rig, [20.0, 110.0, 20.0])
+    receive(rig, [20.0, 110.0, 20.0])
     decision = rig.pass_tick()
     assert [(fault.what, fault.joint) for fault in rig.authority.faults] == [("overheated", "joint_2")]
     assert decision.set_points.torque_limit_nm == pytest.approx([4.0, 0.8, 4.0])  # also of the safe action
@@ -267,7 +267,7 @@ def test_heat_derates_then_stops_and_must_be_gone_before_the_next_arming() -> No
     rig.pass_tick()
     answer = rig.arm()
     assert rig.authority.state == "disarmed" and answer.refusal == "not_ready" and "joint_2 is at 110" in answer.reason
-    hear(rig, [20.0, 70.0, 20.0])
+    receive(rig, [20.0, 70.0, 20.0])
     rig.pass_tick()
     rig.send(0.1)
     assert rig.arm().ok and rig.authority.derated == {}
@@ -275,14 +275,14 @@ def test_heat_derates_then_stops_and_must_be_gone_before_the_next_arming() -> No
 
 def test_who_tells_nothing_of_its_health_is_noted() -> None:
     rig = Rig()
-    hear(rig, [20.0] * JOINTS)
+    receive(rig, [20.0] * JOINTS)
     rig.pass_tick(301)
     assert [fault.what for fault in rig.authority.faults] == ["power_unknown"] and rig.authority.state == "disarmed"
 
 
 def test_a_weak_supply_stops_an_armed_robot_within_50_ms() -> None:
     rig = armed()
-    hear(rig, [20.0] * JOINTS, volts=12.0)
+    receive(rig, [20.0] * JOINTS, volts=12.0)
     for _ in range(5):
         assert rig.authority.state == "armed"
         rig.send(0.1)

@@ -27,7 +27,7 @@ class Bench:
         self.now_ns = 5 * S
         self.notes: list[Fault] = []
 
-    def hear(self, *values: Any, after_ns: int = 500 * MS, **other: Any) -> list[Fault]:
+    def receive(self, *values: Any, after_ns: int = 500 * MS, **other: Any) -> list[Fault]:
         """A sample, and what is newly wrong."""
         self.now_ns += after_ns
         self.derating.take(power(*values, **other), self.now_ns)
@@ -56,67 +56,67 @@ def test_nothing_is_derated_before_anything_is_known() -> None:
 )
 def test_torque_fades_linearly(celsius: float, share: float) -> None:
     bench = Bench()
-    bench.hear([20.0, celsius, 20.0])
+    bench.receive([20.0, celsius, 20.0])
     assert bench.shares == pytest.approx([1.0, share, 1.0])
     assert bench.derating.derated() == ({} if share == 1.0 else {"joint_2": pytest.approx(share)})
 
 
 def test_the_robot_file_says_from_where_to_where() -> None:
     bench = Bench(limits__derate_from_c=50.0, limits__stop_at_c=60.0)
-    assert bench.hear(55.0) == [] and bench.shares == pytest.approx([0.6] * JOINTS)
-    assert len(bench.hear(60.0)) == JOINTS
+    assert bench.receive(55.0) == [] and bench.shares == pytest.approx([0.6] * JOINTS)
+    assert len(bench.receive(60.0)) == JOINTS
 
 
 def test_a_winding_that_is_too_hot_stops_the_robot_until_it_has_cooled() -> None:
     bench = Bench()
-    assert bench.hear([20.0, 104.9, 20.0]) == []
-    (fault,) = bench.hear([20.0, 105.0, 20.0])
+    assert bench.receive([20.0, 104.9, 20.0]) == []
+    (fault,) = bench.receive([20.0, 105.0, 20.0])
     assert (fault.what, fault.joint, fault.tick) == ("overheated", "joint_2", 3)
     assert fault.cause == ("the winding of joint_2 is at 105.0 °C; the limit is 105 °C, and it must cool below 80 °C")
-    assert bench.hear([20.0, 104.0, 20.0]) == [] and len(bench.derating.wrong) == 1  # told once, and not over
-    assert bench.hear([20.0, 80.0, 20.0]) == [] and len(bench.derating.wrong) == 1
-    assert bench.hear([20.0, 79.9, 20.0]) == [] and bench.derating.wrong == []
-    assert len(bench.hear([20.0, 110.0, 20.0])) == 1
+    assert bench.receive([20.0, 104.0, 20.0]) == [] and len(bench.derating.wrong) == 1  # told once, and not over
+    assert bench.receive([20.0, 80.0, 20.0]) == [] and len(bench.derating.wrong) == 1
+    assert bench.receive([20.0, 79.9, 20.0]) == [] and bench.derating.wrong == []
+    assert len(bench.receive([20.0, 110.0, 20.0])) == 1
 
 
 def test_heat_that_was_too_much_is_not_forgotten_in_silence() -> None:
     bench = Bench()
-    bench.hear([20.0, 110.0, 20.0])
+    bench.receive([20.0, 110.0, 20.0])
     assert bench.look(10 * S) == [] and [fault.what for fault in bench.derating.wrong] == ["overheated"]
     assert bench.shares == [1.0] * JOINTS
 
 
 def test_water_stops_the_robot() -> None:
     bench = Bench()
-    (fault,) = bench.hear(leak=[False, False, True])
+    (fault,) = bench.receive(leak=[False, False, True])
     assert (fault.what, fault.joint, fault.cause) == ("leak", "joint_3", "joint_3 reports water inside")
-    assert bench.hear() == [] and bench.derating.wrong == []
+    assert bench.receive() == [] and bench.derating.wrong == []
 
 
 def test_a_weak_supply_stops_the_robot_after_50_ms() -> None:
     bench = Bench()
-    assert bench.hear(voltage_v=[24.0, 17.9, 18.0]) == []
+    assert bench.receive(voltage_v=[24.0, 17.9, 18.0]) == []
     assert bench.look(50 * MS - 1) == []
     (fault,) = bench.look(1)
     assert (fault.what, fault.joint) == ("undervoltage", "joint_2")
     assert fault.cause == "the supply of joint_2 is at 17.9 V, it needs 18 V"
     assert bench.look(1) == [] and len(bench.derating.wrong) == 1
-    assert bench.hear() == [] and bench.derating.wrong == []
+    assert bench.receive() == [] and bench.derating.wrong == []
 
 
 def test_a_dip_of_the_supply_is_forgiven() -> None:
     bench = Bench()
     for _ in range(20):
-        assert bench.hear(voltage_v=12.0, after_ns=20 * MS) == []
-        assert bench.hear(voltage_v=24.0, after_ns=20 * MS) == []
-    assert bench.hear(voltage_v=12.0, after_ns=30 * MS) == []
-    assert len(bench.hear(voltage_v=12.0, after_ns=50 * MS)) == JOINTS  # since it was low first
+        assert bench.receive(voltage_v=12.0, after_ns=20 * MS) == []
+        assert bench.receive(voltage_v=24.0, after_ns=20 * MS) == []
+    assert bench.receive(voltage_v=12.0, after_ns=30 * MS) == []
+    assert len(bench.receive(voltage_v=12.0, after_ns=50 * MS)) == JOINTS  # since it was low first
 
 
 def test_what_is_not_valid_or_no_number_says_nothing() -> None:
     bench = Bench()
     nan = float("nan")
-    assert bench.hear([300.0, nan, 300.0], [5.0, 24.0, nan], leak=True, valid=[False, True, True]) == []
+    assert bench.receive([300.0, nan, 300.0], [5.0, 24.0, nan], leak=True, valid=[False, True, True]) == []
     assert bench.look(1 * S) == [] and bench.shares == [1.0] * JOINTS
 
 
@@ -124,22 +124,22 @@ def test_what_is_not_valid_or_no_number_says_nothing() -> None:
 def test_a_sample_of_another_number_of_joints_says_nothing(column: str) -> None:
     bench = Bench()
     values: dict[str, Any] = {"motor_c": 300.0, column: [1.0] * (JOINTS + 1)}
-    assert bench.hear(**values) == []
+    assert bench.receive(**values) == []
 
 
 def test_who_falls_silent_is_told_once_and_is_not_derated() -> None:
     bench = Bench()
-    bench.hear(90.0)
+    bench.receive(90.0)
     valid = [True, False, False]
     for _ in range(6):
-        bench.hear(90.0, valid=valid)
+        bench.receive(90.0, valid=valid)
     assert bench.notes == [] and bench.shares[1] < 1.0
-    bench.hear(90.0, valid=valid, after_ns=1)
+    bench.receive(90.0, valid=valid, after_ns=1)
     (note,) = bench.notes
     assert (note.what, note.joint, note.tick) == ("power_unknown", None, 3)
     assert note.cause == "supply and heat are unknown, and ignored, for joint_2, joint_3"
     assert bench.shares == pytest.approx([0.68, 1.0, 1.0])
-    bench.hear(90.0, valid=[True, True, False])
+    bench.receive(90.0, valid=[True, True, False])
     bench.look(3 * S)
     assert len(bench.notes) == 1
     bench.look(1)
@@ -149,7 +149,7 @@ def test_who_falls_silent_is_told_once_and_is_not_derated() -> None:
 @pytest.mark.parametrize("reported", [{"leak": True}, {"voltage_v": 12.0}])
 def test_water_and_voltage_do_not_count_when_nothing_is_heard_any_more(reported: dict[str, Any]) -> None:
     bench = Bench()
-    bench.hear(**reported)
+    bench.receive(**reported)
     bench.look(50 * MS)
     assert len(bench.derating.wrong) == JOINTS
     bench.look(3 * S)
@@ -169,7 +169,7 @@ def test_a_sensor_that_never_says_anything_is_told_where_there_should_be_one() -
 
 def test_one_silent_module_is_named() -> None:
     bench = Bench()
-    bench.hear(valid=[True, False, False])
+    bench.receive(valid=[True, False, False])
     bench.look(4 * S)
     assert bench.notes[0].joint == "joint_1"
 
@@ -186,6 +186,6 @@ def test_a_long_list_of_silent_modules_fits_into_a_message() -> None:
 )
 def test_heat_concerns_a_joint_and_water_and_voltage_the_robot(reported: dict[str, Any], reach: str) -> None:
     bench = Bench()
-    bench.hear(**reported)
+    bench.receive(**reported)
     bench.look(50 * MS)
     assert [fault.reach for fault in bench.derating.wrong] == [reach] * JOINTS

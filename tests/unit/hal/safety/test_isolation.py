@@ -6,7 +6,7 @@ import pytest
 
 from snakesim_hal.safety.fault_log import MAX_FAULTS_KEPT
 from snakesim_hal.wire.messages import Fault, Mode
-from tests.unit.hal.safety.authority_rig import CLEAR, DISARM, ESTOP, JOINTS, Rig, armed, hear
+from tests.unit.hal.safety.authority_rig import CLEAR, DISARM, ESTOP, JOINTS, Rig, armed, receive
 
 SAYS_NO = [True, False, True]  # joint_2 has no valid state
 
@@ -166,14 +166,14 @@ def test_an_emergency_stop_keeps_the_joint_aside_until_the_clear() -> None:
 
 def test_a_joint_that_is_too_hot_is_set_aside_and_water_is_not() -> None:
     rig = armed(safety__may_lose_joints=1)
-    hear(rig, [20.0, 110.0, 20.0])
+    receive(rig, [20.0, 110.0, 20.0])
     rig.send(0.1)
     assert rig.pass_tick().set_points.isolated == {1} and rig.authority.state == "armed"
     rig.authority.on_lifecycle(DISARM, rig.now_ns)
     rig.pass_tick()
     rig.send(0.1)
     assert rig.arm().ok  # it stays hot, and is not asked
-    hear(rig, [20.0, 110.0, 20.0], volts=12.0)
+    receive(rig, [20.0, 110.0, 20.0], volts=12.0)
     for _ in range(7):
         rig.send(0.1)
         rig.pass_tick()
@@ -182,10 +182,10 @@ def test_a_joint_that_is_too_hot_is_set_aside_and_water_is_not() -> None:
 
 def test_that_a_lost_joint_tells_nothing_of_its_health_is_no_news() -> None:
     rig = lame()
-    hear(rig, [20.0] * JOINTS)
+    receive(rig, [20.0] * JOINTS)
     rig.authority.on_lifecycle(DISARM, rig.now_ns)
     rig.pass_tick(250)
-    hear(rig, [20.0] * JOINTS, valid=[True, False, True])
+    receive(rig, [20.0] * JOINTS, valid=[True, False, True])
     rig.pass_tick(100)
     assert [fault.what for fault in rig.authority.faults] == ["state_invalid"]
     rig.pass_tick(250)

@@ -209,13 +209,13 @@ def test_what_is_published_has_numbers_only(column: str) -> None:
     bench = Bench(angle=0.1)
     sound = state(ROBOT, 0.12, 0.2, 0.3)
     assert readable(sound, bench.watch.measured) is sound
-    spoilt = msgspec.structs.replace(sound, **{column: [0.5, float("nan"), 0.7]})
-    published = readable(spoilt, bench.watch.measured)
+    corrupted = msgspec.structs.replace(sound, **{column: [0.5, float("nan"), 0.7]})
+    published = readable(corrupted, bench.watch.measured)
     assert published.valid == [True, False, True]
     assert published.angle_rad[1] == 0.1 and published.velocity_rad_s[1] == published.torque_nm[1] == 0.0
     assert getattr(published, column)[::2] == [0.5, 0.7] and published.age_ns == sound.age_ns
     assert [published.angle_rad[0], published.velocity_rad_s[2], published.torque_nm[2]] != [0.1, 0.0, 0.0]
-    assert readable(msgspec.structs.replace(spoilt, valid=[False, True, True]), bench.watch.measured).valid == [
+    assert readable(msgspec.structs.replace(corrupted, valid=[False, True, True]), bench.watch.measured).valid == [
         False,
         False,
         True,

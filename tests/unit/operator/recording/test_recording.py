@@ -168,10 +168,10 @@ def test_damage_anywhere_ends_the_reading_and_nothing_else(tmp_path: Path) -> No
     recording.close({"dropped": {}})
     whole = (tmp_path / "a.mcap").read_bytes()
     for _ in range(100):
-        spoilt = bytearray(whole)
+        corrupted = bytearray(whole)
         for _ in range(chance.choice([1, 3, 20])):
-            spoilt[chance.randrange(len(spoilt))] = chance.randrange(256)
-        (tmp_path / "spoilt.mcap").write_bytes(spoilt)
+            corrupted[chance.randrange(len(corrupted))] = chance.randrange(256)
+        (tmp_path / "spoilt.mcap").write_bytes(corrupted)
         with contextlib.suppress(ConfigError):
             assert len(list(RecordingReader(tmp_path / "spoilt.mcap").messages())) <= 300
             (tmp_path / "whole.mcap").unlink(missing_ok=True)

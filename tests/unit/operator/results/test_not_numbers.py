@@ -52,7 +52,7 @@ WRONG_NUMBERS = [math.nan, math.inf, -math.inf, 1e300]
 WRONG = st.sampled_from(WRONG_NUMBERS)
 
 
-def put_down(folder: Path, record: RunRecord) -> None:
+def write_record(folder: Path, record: RunRecord) -> None:
     """A record as a run leaves it."""
     write(record.config, folder / CONFIG)
     (folder / DESCRIPTION).write_bytes(msgspec.json.encode(record.description))
@@ -94,7 +94,7 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> RunRecord:
         host=msgspec.structs.replace(whole.host, ticks=LAST - FIRST),
         **kept,
     )
-    put_down(folder, record)
+    write_record(folder, record)
     loaded = RunRecord.load(folder)
     assert loaded.lacks == [] and "lacks something" not in summary_and_page(loaded)[1].text
     return loaded
@@ -141,15 +141,15 @@ def spoilt_cells(draw: st.DrawFn) -> list[tuple[str, slice, int, float]]:
 @given(cells=spoilt_cells())
 @settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_a_black_box_with_numbers_that_are_none(base: RunRecord, tmp_path: Path, cells: Any) -> None:
-    spoilt = {name: np.array(getattr(base, name)) for name in SIGNALS}
+    corrupted = {name: np.array(getattr(base, name)) for name in SIGNALS}
     for signal, rows, column, value in cells:
-        place = spoilt[signal]
+        place = corrupted[signal]
         place[(rows, column) if place.ndim > 1 else rows] = value
-    put_down(tmp_path, dataclasses.replace(base, **spoilt))
+    write_record(tmp_path, dataclasses.replace(base, **corrupted))
     record = RunRecord.load(tmp_path)
     assert np.allclose(record.time_s, base.time_s)
     said = {line.partition(":")[0]: line for line in record.lacks}
-    for name, values in spoilt.items():
+    for name, values in corrupted.items():
         bad = ~(np.abs(values) < 1e9)
         if name in ("position_w", "orientation_wxyz") or not bad.any():
             continue
@@ -173,7 +173,7 @@ def leaves(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 @given(data=st.data())
 @settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_a_recording_with_numbers_that_are_none(base: RunRecord, tmp_path: Path, data: st.DataObject) -> None:
-    put_down(tmp_path, base)
+    write_record(tmp_path, base)
     messages = [(keys.CONTROL_STATE, state) for state in base.control] + [(keys.WORLD, world) for world in base.worlds]
     payloads = [(key, msgspec.msgpack.encode(message)) for key, message in messages]
     refused = 0
@@ -208,7 +208,7 @@ def test_a_pose_that_is_not_known_yet_or_never_is_lacking_only_where_there_is_a_
         position[unknown] = np.nan
         robot = msgspec.structs.replace(base.config.robot, sensors=sensors)
         config = msgspec.structs.replace(base.config, robot=robot)
-        put_down(tmp_path, dataclasses.replace(base, config=config, position_w=position))
+        write_record(tmp_path, dataclasses.replace(base, config=config, position_w=position))
         record = RunRecord.load(tmp_path)
         summary_and_page(record)
         return record.lacks

@@ -72,9 +72,9 @@ def test_who_does_not_answer_syncs_is_told_and_everything_is_closed(monkeypatch:
 def left_behind(module: Module, kind: str) -> None:
     """What a module is like whose driver was killed, or worse."""
     if kind == "emergency":
-        module.hear(rig.emergency(), 0.0)
+        module.receive(rig.emergency(), 0.0)
         return
-    module.hear(rig.command(Action.ARM), 0.0)
+    module.receive(rig.command(Action.ARM), 0.0)
     module._fail(ModuleFault.STREAM if kind == "stream" else ModuleFault.WATCHDOG, 0.0)
     if kind == "leak":  # after the watchdog had stopped it, water came, and went
         module.inside.leak = True

@@ -87,7 +87,7 @@ def test_who_was_armed_and_stopped_is_not_armed_again_by_itself() -> None:
     with loop() as run:
         go(run, "armed", 3)
         assert run.states() == [ARMED] * JOINTS
-        module_of(run, 2).hear(rig.command(Action.DISARM), 0.0)
+        module_of(run, 2).receive(rig.command(Action.DISARM), 0.0)
         before = len(WIRES[0].sent)
         run.run(5)
         assert words(WIRES[0].sent[before:]) == ["stop"] and module_of(run, 2).state == DISARMED

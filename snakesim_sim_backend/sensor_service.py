@@ -18,7 +18,7 @@ from snakesim_sim_backend.sensors.scope import Reader, Scope
 from snakesim_sim_backend.settings import Settings
 
 
-class LookingService:
+class SensorService:
     """A `snakesim_hal.service.Service`."""
 
     name = "sensor"
@@ -32,7 +32,7 @@ class LookingService:
         self._data = mujoco.MjData(self._sim.model)
         self._readers: list[tuple[str, Reader]] = []
 
-    def meet(self, robot: Description) -> None:
+    def configure(self, robot: Description) -> None:
         """Look with the sensors of the robot file that its HAL does not have."""
         config, listed = self._config, {sensor.key for sensor in robot.sensors}
         self._readers = [

@@ -28,7 +28,7 @@ BULK = "dscp=0x28"
 MARKED = ("tcp/", "tls/")
 
 
-def keep_apart(config: zenoh.Config) -> None:
+def configure_for_images(config: zenoh.Config) -> None:
     """Make a client's settings those of its connection for images. Values that a session file has stay."""
     endpoints = of_mode(config, "connect/endpoints", "client")
     set_unless_given(config, PATIENCE)

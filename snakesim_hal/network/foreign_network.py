@@ -42,8 +42,8 @@ class RawReader:
         return None if sample is None else sample.payload.to_bytes()
 
 
-class Neighbour:
-    """A session on a network of somebody else. Open one with `open_neighbour`."""
+class ForeignNetwork:
+    """A session on a network of somebody else. Open one with `foreign_network`."""
 
     def __init__(self, zenoh_session: zenoh.Session) -> None:
         self._zenoh = zenoh_session
@@ -82,9 +82,9 @@ class Neighbour:
 
 
 @contextmanager
-def open_neighbour(endpoint: str, *, largest_bytes: int, connect_timeout_s: float = 5.0) -> Iterator[Neighbour]:
+def foreign_network(endpoint: str, *, largest_bytes: int, connect_timeout_s: float = 5.0) -> Iterator[ForeignNetwork]:
     """Connect to a router. largest_bytes: of a payload from there. Raises NotConnectedError."""
-    session = Neighbour(open_zenoh(Link(endpoint, largest_bytes=largest_bytes), connect_timeout_s))
+    session = ForeignNetwork(open_zenoh(Link(endpoint, largest_bytes=largest_bytes), connect_timeout_s))
     try:
         yield session
     finally:
