@@ -70,7 +70,7 @@ attack: $(stamp) ## Every attack of a stranger on the network, in full (ARGS="-k
 kills: $(stamp) ## Random kills and freezes of runs that start, arm, stop, clear and end (TRIALS=300, ARGS="--seed 2")
 	$(bin)/python -m tests.soak.kills --trials $(TRIALS) $(ARGS)
 
-soak: $(stamp) ## A long run with faults at random, and an operator who mends (MINUTES=30, ARGS="--backend can --seed 2")
+soak: $(stamp) ## A long run with faults at random, and an operator who recovers (MINUTES=30, ARGS="--backend can --seed 2")
 	$(bin)/python -m tests.soak --minutes $(MINUTES) $(ARGS)
 
 check: $(stamp) ## Lint, format, types and import rules, without changing anything
@@ -95,14 +95,14 @@ links: $(stamp) ## Measure bad links between a robot and its controller, and wri
 bench-paths: $(stamp) ## Measure the loop over routers, mTLS and a slow link beside raw Zenoh (root)
 	$(bin)/python -m benchmarks.paths $(ARGS)
 
-schemas: $(stamp) ## Write anew what is made from the code: JSON Schemas, key space, table of faults
+schemas: $(stamp) ## Regenerate what is made from the code: JSON Schemas, key space, table of faults
 	$(bin)/snakesim schemas --write schemas
 	$(bin)/python -m tests.kinds_table
 
 docs: $(stamp) ## Write the API reference into build/docs
 	PDOC_ALLOW_EXEC=1 $(bin)/python -m pdoc --output-directory build/docs $(packages)
 
-lock: ## Resolve the lock files anew (UPGRADE=1 for newer versions)
+lock: ## Resolve the lock files again (UPGRADE=1 for newer versions)
 	$(bootstrap) lock $(if $(UPGRADE),--upgrade)
 
 clean: ## Remove what setup, builds and caches left; recordings in runs/ stay

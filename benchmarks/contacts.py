@@ -120,7 +120,7 @@ def true_pushes(robot: Description, truth: TrueState) -> list[Push]:
 
 
 def felt_pushes(robot: Description, reported: Contacts) -> list[Push]:
-    """The contacts that sensors tell of."""
+    """The contacts that sensors report."""
     starts = np.append(0.0, np.cumsum([link.length_m for link in robot.links]))
     return together(
         [

@@ -48,7 +48,7 @@ def link_bytes() -> int:
 
 
 def read(endpoint: str, key: str, seconds: float) -> dict[str, float | int | None]:
-    """Subscribe to one key alone. `robot_s`: robot time between the first and the last message, if they tell it."""
+    """Subscribe to one key alone. `robot_s`: robot time between the first and the last message, if they carry it."""
     sizes: list[int] = []
     ticks: list[int] = []
 

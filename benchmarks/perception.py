@@ -2,7 +2,7 @@
 
 The snake follows the launch row into each field (path following, so that the motion does not depend on the map), with a
 depth camera of 160 x 120 pixels. Every 0.12 s of the run the map within 1 m of the head is scored. Without a pose
-sensor the map is scored as the robot sees it: its own wrong place is taken out, and told beside it.
+sensor the map is scored as the robot sees it: its own position error is taken out, and reported beside it.
 """
 
 import argparse

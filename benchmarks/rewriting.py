@@ -1,6 +1,6 @@
 """`python -m benchmarks.rewriting RUN...`: what a recorder costs and an hour takes, by writing recordings again.
 
-CPU time, so that a busy machine matters little. Channels for Foxglove are made anew, or left out. The share of a core
+CPU time, so that a busy machine matters little. Channels for Foxglove are made again, or left out. The share of a core
 is that of the writing alone, without what receiving the messages costs.
 """
 

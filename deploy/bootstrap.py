@@ -45,7 +45,7 @@ def main() -> None:
     commands.required = True
     setup_command = commands.add_parser("setup", help="make .venv")
     setup_command.add_argument("--python", default="", help="the interpreter to use (default: search)")
-    lock_command = commands.add_parser("lock", help="write the hashed lock files anew")
+    lock_command = commands.add_parser("lock", help="rewrite the hashed lock files")
     lock_command.add_argument("--upgrade", action="store_true", help="take the newest versions allowed")
     arguments = parser.parse_args()
     os.chdir(str(ROOT))

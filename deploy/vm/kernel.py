@@ -1,6 +1,6 @@
 """Keeps a kernel ready to boot: its image, the few modules that a guest needs, and a static busybox.
 
-They come from the distribution's packages and lie in `$XDG_CACHE_HOME/snakesim/vm`. Remove that folder to fetch anew.
+They come from the distribution's packages and lie in `$XDG_CACHE_HOME/snakesim/vm`. Remove that folder to fetch again.
 """
 
 import fcntl

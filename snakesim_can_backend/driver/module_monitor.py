@@ -126,7 +126,7 @@ class Watch:
         """Findings about its frames, or that there are none."""
         found: list[Finding] = []
 
-        def tell(what: str, cause: str) -> None:
+        def report(what: str, cause: str) -> None:
             found.append(self._finding(i, module, what, cause))
 
         if self._has_restarted(i, module, reading):
@@ -134,24 +134,24 @@ class Watch:
             self._changed.add(i)
         if i in self._restarted:
             up_s = module.uptime_ms / 1000
-            tell(
+            report(
                 "module_restarted",
                 f"has restarted, its uptime is {up_s:.2f} s: a clear writes its parameters again",
             )
         if module.repeats >= IN_A_ROW:
-            tell("module_frozen", f"is frozen: it repeats its answer number {module.last_count} to every Sync")
+            report("module_frozen", f"is frozen: it repeats its answer number {module.last_count} to every Sync")
         elif module.wrong_counts >= IN_A_ROW:
-            tell("wrong_counter", f"answers Syncs that were not sent: {module.wrong_counts} wrong counters in a row")
+            report("wrong_counter", f"answers Syncs that were not sent: {module.wrong_counts} wrong counters in a row")
         if module.corrupt >= IN_A_ROW:
-            tell("bad_checksum", f"sends corrupt states: {module.corrupt} wrong checksums in a row")
+            report("bad_checksum", f"sends corrupt states: {module.corrupt} wrong checksums in a row")
         if module.answered_twice(reading.sync) >= IN_A_ROW:
-            tell("duplicate_node", "is duplicated: every Sync is answered twice; give each module its own node id")
+            report("duplicate_node", "is duplicated: every Sync is answered twice; give each module its own node id")
         if module.frames > MAX_FRAMES:
-            tell("module_babbling", f"floods the bus: {module.frames} frames within one period")
+            report("module_babbling", f"floods the bus: {module.frames} frames within one period")
         unanswered = reading.sync - module.sync - module.corrupt - max(module.repeats, module.wrong_counts)
         unanswered = min(unanswered, reading.sync - self._unasked.get(self._channels[i], -1))
         if unanswered >= SILENT_AFTER and not found:
-            tell(
+            report(
                 "module_silent",
                 f"is silent: no state for {unanswered * self._period_s * 1000:.0f} ms{_alive(module, reading)}",
             )

@@ -205,13 +205,13 @@ class ModuleChain:
         first = sum(self.counts[:channel])
         slots = self.slots[first : first + self.counts[channel]]
         imu_due = [slot.module.imu_is_due() for slot in slots]
-        sights = self._senses[channel].look(self.motors.torque_nm, self.motors.derated(), imu_due)
-        for slot, sight in zip(slots, sights, strict=True):
-            slot.module.sync(count, sight)
+        readings = self._senses[channel].look(self.motors.torque_nm, self.motors.derated(), imu_due)
+        for slot, reading in zip(slots, readings, strict=True):
+            slot.module.sync(count, reading)
             self._follow_up(slot)
         for slot in self.slots[self.count :]:
             if slot.channel == channel:
-                slot.module.sync(count, sights[slot.joint - first])
+                slot.module.sync(count, readings[slot.joint - first])
                 self._follow_up(slot)
         out = self._out[channel]
         out[sent:] = sorted(out[sent:], key=lambda frame: frame.id)  # in the order of arbitration

@@ -149,7 +149,7 @@ class Module:
             target = self._within(target)
         self._pending = Demand(MODES[mode], target, limit * LIMIT_STEP)
 
-    def sync(self, count: int, sight: Readings) -> None:
+    def sync(self, count: int, reading: Readings) -> None:
         """Answer a Sync with the sensor readings of that instant, then enact the newest set-point."""
         if self.state == ModuleState.BOOT:
             return
@@ -158,16 +158,16 @@ class Module:
                 self.frames.append(self._last_joint_state)
             return
         values = self.parameters.values
-        joint = (sight.angle, sight.velocity, sight.torque, count, self.state, sight.derated)
+        joint = (reading.angle, reading.velocity, reading.torque, count, self.state, reading.derated)
         self._last_joint_state = write_joint_state(self.node, joint)
         self.frames.append(self._last_joint_state)
         every = int(values[Parameter.CONTACT_EVERY])
         if every and count % every == 0:
-            self.frames.append(write_contact(self.node, (*sight.contact, count)))
+            self.frames.append(write_contact(self.node, (*reading.contact, count)))
             if values[Parameter.TAIL]:
-                self.frames.append(write_tail_contact(self.node, (*sight.tail_contact, count)))
+                self.frames.append(write_tail_contact(self.node, (*reading.tail_contact, count)))
         if self.imu_is_due():
-            self._report_imu(count, sight)
+            self._report_imu(count, reading)
         self._syncs += 1
         self._synced = True
         if self._pending is not None:
@@ -318,9 +318,9 @@ class Module:
     def _identify(self, _now_us: float) -> None:
         self.frames.append(write_identity(self.node, (self.serial, *FIRMWARE, VERSION, 1, self._stepped)))
 
-    def _report_imu(self, count: int, sight: Readings) -> None:
-        if sight.gyro is not None and sight.acceleration is not None:
-            self.frames.append(write_gyro(self.node, (*sight.gyro, count)))
-            self.frames.append(write_acceleration(self.node, (*sight.acceleration, count)))
-        if sight.shaft_load is not None:
-            self.frames.append(write_shaft_load(self.node, (sight.shaft_load, count)))
+    def _report_imu(self, count: int, reading: Readings) -> None:
+        if reading.gyro is not None and reading.acceleration is not None:
+            self.frames.append(write_gyro(self.node, (*reading.gyro, count)))
+            self.frames.append(write_acceleration(self.node, (*reading.acceleration, count)))
+        if reading.shaft_load is not None:
+            self.frames.append(write_shaft_load(self.node, (reading.shaft_load, count)))

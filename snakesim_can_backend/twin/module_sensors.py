@@ -50,18 +50,18 @@ class ModuleSensors:
         joints = np.stack((self._plant.angle_rad[here], self._plant.velocity_rad_s[here], torque_nm[here]))
         if self._noisy:
             joints += self._joint_sigma * self._noise((3, self._count))
-        sights = [
+        readings = [
             Readings(angle, velocity, torque, bool(hot))
             for angle, velocity, torque, hot in zip(
                 ANGLE.many(joints[0]), VELOCITY.many(joints[1]), TORQUE.many(joints[2]), derated[here], strict=True
             )
         ]
-        self._feel(sights)
+        self._feel(readings)
         if any(imu_due):
-            self._weigh(sights, imu_due)
-        return sights
+            self._weigh(readings, imu_due)
+        return readings
 
-    def _feel(self, sights: list[Readings]) -> None:
+    def _feel(self, readings: list[Readings]) -> None:
         sensor = self._contacts
         if sensor is None:
             return
@@ -70,9 +70,9 @@ class ModuleSensors:
             for load in self._plant.loads()
             if math.hypot(*load.force_l) >= sensor.threshold_n
         }
-        for i, sight in enumerate(sights if touches else ()):
-            sight.tail_contact = touches.get(self._first + i, UNTOUCHED)
-            sight.contact = touches.get(self._first + i + 1, UNTOUCHED)
+        for i, reading in enumerate(readings if touches else ()):
+            reading.tail_contact = touches.get(self._first + i, UNTOUCHED)
+            reading.contact = touches.get(self._first + i + 1, UNTOUCHED)
 
     def _blurred(self, load: LinkLoad) -> LinkLoad:
         sensor = self._contacts
@@ -83,20 +83,20 @@ class ModuleSensors:
         m, n = sensor.position_noise_m, sensor.force_noise_n
         return LinkLoad(load.link, (x + m * a, y + m * b, z + m * c), (fx + n * d, fy + n * e, fz + n * f))
 
-    def _weigh(self, sights: list[Readings], due: Sequence[bool]) -> None:
+    def _weigh(self, readings: list[Readings], due: Sequence[bool]) -> None:
         shaft = self._plant.shaft_torque_nm()[self._first : self._first + self._count]
         shafts = SHAFT_LOAD.many(shaft + self._torque_sigma * self._noise(self._count))
         imu = self._plant.imu() if self._imu is not None else None
-        for i, sight in enumerate(sights):
+        for i, reading in enumerate(readings):
             if not due[i]:
                 continue
-            sight.shaft_load = shafts[i]
+            reading.shaft_load = shafts[i]
             if imu is not None and self._imu is not None and self._first + i + 1 in imu.link:
                 at = imu.link.index(self._first + i + 1)
                 rate = np.array(imu.angular_velocity_rad_s[at])
                 force = np.array(imu.acceleration_m_s2[at])
-                sight.gyro = RATE.many(rate + self._imu.angular_velocity_noise_rad_s * self._noise(3))
-                sight.acceleration = ACCELERATION.many(force + self._imu.acceleration_noise_m_s2 * self._noise(3))
+                reading.gyro = RATE.many(rate + self._imu.angular_velocity_noise_rad_s * self._noise(3))
+                reading.acceleration = ACCELERATION.many(force + self._imu.acceleration_noise_m_s2 * self._noise(3))
 
 
 class PoseCamera:

@@ -73,11 +73,11 @@ class BumplessReference:
         self._hand_over = HandOver(robot)
         self.reference_rad: Floats | None = None  # of the tick before; None before the first
 
-    def to(self, view: View, reference_rad: Floats, *, anew: bool = False) -> SetPoints:
-        """Follow a reference. anew: it may have jumped."""
+    def to(self, view: View, reference_rad: Floats, *, restarted: bool = False) -> SetPoints:
+        """Follow a reference. restarted: it may have jumped."""
         if self.reference_rad is None:
             self._hand_over.start(view.joints, reference_rad)
-        elif anew:
+        elif restarted:
             self._hand_over.shift(reference_rad - self.reference_rad)
         self.reference_rad = reference_rad
         self._hand_over.fade(view.period_s / self._blend_s)

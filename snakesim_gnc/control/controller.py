@@ -1,7 +1,7 @@
 """The interface of a controller: settings in, then a view of the world each tick, set-points out. No clock, no I/O.
 
 A controller is a class with a `Settings` Struct, a constructor that takes the robot and the settings, and `update`.
-It is created anew at every arming, and called once a tick while the robot is armed. Any view may lack the world or the
+It is created again at every arming, and called once a tick while the robot is armed. Any view may lack the world or the
 trajectory, also during a run: then it must not push, but hold, and resume without a jump when they are back.
 """
 

@@ -1,7 +1,7 @@
 """The controller's settings: from the configuration, and then as operators change them while it runs.
 
 A request is answered between two ticks. It is refused, and nothing changes, unless the controller accepts all values
-and can be made with them. Then the controller is made anew: it takes over from the measured state, as after an arming.
+and can be made with them. Then the controller is made again: it takes over from the measured state, as after an arming.
 """
 
 from collections.abc import Iterator
@@ -46,7 +46,7 @@ class LiveSettings:
         self._publisher = client.session.latched_publisher(keys.SETTINGS_IN_FORCE, ControlSettings)
 
     def configure(self, robot: Description) -> None:
-        """For this robot from now on, whose time may have begun anew."""
+        """For this robot from now on, whose time may have started over."""
         self._robot, self._published = robot, -1
 
     def controller(self) -> Guarded:
@@ -54,7 +54,7 @@ class LiveSettings:
         return self._made(self._settings)
 
     def turn(self, clock: Clock) -> bool:
-        """Answer all requests that wait, and publish what is new; whether a controller must be made anew."""
+        """Answer all requests that wait, and publish what is new; whether a controller must be made again."""
         before = self._changes
         for question in self._questions():
             answer = self._answer(question)

@@ -131,10 +131,10 @@ class ObstacleAided:
         slope = self._body.all_angles(at(located.tail_s_m + SLOPE_M)) - self._body.all_angles(at(located.tail_s_m))
         torques = scale * self._push_nm(located, slope / SLOPE_M, view.period_s)
         reference = reference + torques / self._stiffness
-        anew, before = located.anew or self._waits or self._search.changed, self._bumpless.reference_rad
-        if anew and before is not None and np.abs(reference - before).max() > ANOTHER_SHAPE_RAD:
+        restarted, before = located.restarted or self._waits or self._search.changed, self._bumpless.reference_rad
+        if restarted and before is not None and np.abs(reference - before).max() > ANOTHER_SHAPE_RAD:
             self._integral_m = min(self._integral_m, self._set.fresh_look_ahead_m)
-        set_points, self._waits = self._bumpless.to(view, reference, anew=anew), False
+        set_points, self._waits = self._bumpless.to(view, reference, restarted=restarted), False
         force_n = ahead_m * float(self._stiffness @ slope**2) / SLOPE_M**2
         return Action(set_points, self._report(view, located, force_n, reference))
 
@@ -142,7 +142,7 @@ class ObstacleAided:
         """In search of something to push off."""
         self._torques_nm[:] = self._push_n = self._force_n = 0.0
         reference = self._search.reference_rad(view)
-        set_points = self._bumpless.to(view, reference, anew=self._search.changed)
+        set_points = self._bumpless.to(view, reference, restarted=self._search.changed)
         why = "nothing beside the body can push it: it undulates in search of contacts"
         return Action(set_points, Report(why=why, reference_rad=reference.tolist()))
 
@@ -230,7 +230,7 @@ class ObstacleAided:
             action = self._bumpless.hold(view, "")
         else:
             reference = np.array(view.joints.angle_rad)
-            set_points = self._bumpless.to(view, reference, anew=True)
+            set_points = self._bumpless.to(view, reference, restarted=True)
             action = Action(set_points, Report(reference_rad=reference.tolist()))
         self._waits = True
         return action

@@ -39,10 +39,10 @@ class PathFollowing:
         if isinstance(located, str):
             return self._bumpless.hold(view, located)
         tail_s_m = located.tail_s_m
-        if located.anew:
+        if located.restarted:
             self._ahead_s_m = tail_s_m
         advanced = self._ahead_s_m + located.trajectory.speed_m_s * view.period_s
         self._ahead_s_m = min(max(advanced, tail_s_m), tail_s_m + self._set.look_ahead_m)
         reference = self._body.all_angles(located.on_path.at(self._ahead_s_m))
-        set_points = self._bumpless.to(view, reference, anew=located.anew)
+        set_points = self._bumpless.to(view, reference, restarted=located.restarted)
         return Action(set_points, Report(path_s_m=tail_s_m, reference_rad=reference.tolist()))

@@ -25,7 +25,7 @@ class Located:
     speed_m_s: float
     nodes_w: Floats  # (2, n_nodes), last measurement
     fresh: bool  # there is a new world model
-    anew: bool  # on a new path, or localised again after it was unknown: the position may have jumped
+    restarted: bool  # on a new path, or localised again after it was unknown: the position may have jumped
     world: World
     trajectory: Trajectory
 
@@ -75,9 +75,9 @@ class Progress:
             self._filter(body, max(_seconds(pose_ns - before_ns, view), view.period_s))
         assert self._measured_ns is not None
         s = self._s_m + self._speed_m_s * _seconds(view.joints.stamp_ns - self._measured_ns, view)
-        anew = new_path or before_ns is None
+        restarted = new_path or before_ns is None
         fresh, self._world_tick = world.tick != self._world_tick, world.tick
-        return Located(body, s, self._speed_m_s, self._nodes, fresh, anew, world, trajectory)
+        return Located(body, s, self._speed_m_s, self._nodes, fresh, restarted, world, trajectory)
 
     def _filter(self, body: BodyOnPath, passed_s: float) -> None:
         """Critically damped alpha-beta filter with the time constant `speed_filter_s`."""

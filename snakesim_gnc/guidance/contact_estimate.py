@@ -12,7 +12,7 @@ friction of the ground along the links' velocities, and pushes at the ends of ea
 one link are one push between. The fewest that explain the readings are sought, one after another, none negative
 (Lawson and Hanson's active set, stopped at the noise).
 
-What it cannot tell: pushes of opposite sign close together, forces along the links but at the head's tip, contacts
+What it cannot resolve: pushes of opposite sign close together, forces along the links but at the head's tip, contacts
 from above or below, and pushes below about 1 N. Pitch joints give no equation of their own.
 """
 

@@ -46,7 +46,7 @@ class Guidance(Service):
         self._view.configure(robot)
 
     def outputs(self, clock: Clock) -> list[tuple[str, Message]] | None:
-        """The world at this tick; None while it cannot be told."""
+        """The world at this tick; None while it is unknown."""
         world = self._view.world(clock)
         return None if world is None else [(keys.WORLD, world)]
 
@@ -74,7 +74,7 @@ class _Surveyed:
 
 
 class _Perceived:
-    """Map and pose are what the sensors tell. Of the scene only the place where the snake is laid down is used."""
+    """Map and pose are what the sensors measure. Of the scene only the place where the snake is laid down is used."""
 
     def __init__(self, client: Client, config: RunConfig) -> None:
         start, robot = start_of(config), config.robot

@@ -1,6 +1,6 @@
 """One obstacle of the map: its surface, its shape with covariance, and the evidence that it exists. Pure.
 
-The shape is fitted anew whenever the surface has changed: circle or box, whichever explains it with fewer parameters
+The shape is fitted again whenever the surface has changed: circle or box, whichever explains it with fewer parameters
 (Bayesian information criterion). So what began as a short arc becomes the box that it turns out to be.
 """
 

@@ -48,7 +48,7 @@ class Search:
     weak: float = 6.0
     bend_m: float = 0.02
     progress: float = 1.2
-    grip: float = 4.0  # reward of a touch while the whole body is laid anew
+    grip: float = 4.0  # reward of a touch while the whole body is laid again
     weak_now: float = 15.0  # instead of `weak`, over the first `now_m` from where the body lies
     now_m: float = 0.3
     repeat: float = 1.0  # of a path that has failed

@@ -1,7 +1,7 @@
 """The planner through clutter: a path for the whole body, from where it lies to where the goal is. Pure.
 
 The first path begins with the body's measured curve, from tail to head; ahead of the head it is what the search finds.
-When it ends soon, when the map has changed, or when the body stands still, the path of the whole body is planned anew,
+When it ends soon, when the map has changed, or when the body stands still, the path of the whole body is replanned,
 close to where the body lies, with touches that can push. Paths on which it got stuck are remembered and avoided. Every
 third time at one place it backs out first, along its own path and the trail of its tail.
 """
@@ -143,7 +143,7 @@ class ClutterPlanner:
         return ahead / max(float(np.hypot(*ahead)), 1e-9)
 
     def _why_again(self, body: Floats, world: World) -> str:
-        """Why the path is to be planned anew; empty when it is not. Decides about backing out, too."""
+        """Why the path is to be replanned; empty when it is not. Decides about backing out, too."""
         planned, now_ns = self._planned, world.stamp_ns
         if planned is None:
             return "start"
@@ -215,7 +215,7 @@ class ClutterPlanner:
             found, kept = beam.ahead(body, goal_rad, round(horizon_m / STEP_M)), len(body) - 3
             points = body if found is None else np.concatenate([body, evenly(found.points_w)[1:]])
         else:
-            found, kept = self._anew(beam, body, goal_rad), 0
+            found, kept = self._replanned(beam, body, goal_rad), 0
             points = body if found is None else evenly(found.points_w)
         if found is not None:
             points = snap(points, kept, obstacles, goal, self._fit)
@@ -245,7 +245,7 @@ class ClutterPlanner:
         points = lies if found is None else np.concatenate([lies, evenly(found.points_w)[1:]])
         return found, len(lies) - 3, points
 
-    def _anew(self, beam: Beam, body: Floats, goal_rad: float) -> PlannedPath | None:
+    def _replanned(self, beam: Beam, body: Floats, goal_rad: float) -> PlannedPath | None:
         """A path for the whole body: the least change of shape that can push well."""
         failed = np.concatenate(self._failed) if self._failed else None
         best: PlannedPath | None = None

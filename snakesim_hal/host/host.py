@@ -53,7 +53,7 @@ from snakesim_hal.wire.messages import (
 )
 
 # Not yet; after the requested armed ticks; on request (`finish`); by a signal; by a fault, or too little armed time;
-# for another host that begins anew.
+# for another host that starts over.
 Ending = Literal["running", "complete", "finished", "stopped", "failed", "reset"]
 STATUS_PERIOD_NS = 200_000_000
 STANDBY_PERIOD_NS = 20_000_000

@@ -1,4 +1,4 @@
-"""Obstacles strewn by chance: upright pegs and blocks with a least gap between any two, the same for the same seed."""
+"""Randomly placed obstacles: upright pegs and blocks with a minimum gap between any two, the same for the same seed."""
 
 import math
 from collections.abc import Sequence
@@ -59,25 +59,25 @@ def random_obstacles(
     kept = [_snake(keep_clear, field.clearance_m)] if keep_clear else []
     if route is not None and field.route_clearance_m is not None:
         kept.append(Outlines.of_segments(route.points_w[:-1], route.points_w[1:], field.route_clearance_m))
-    strewn: list[Obstacle] = []
+    placed: list[Obstacle] = []
     others = Outlines.of(standing)
     for _ in range(TRIES * field.wanted):
-        if len(strewn) == field.wanted:
-            return strewn
-        tried = _draw(field, random, f"random_{index}_{len(strewn)}")
+        if len(placed) == field.wanted:
+            return placed
+        tried = _draw(field, random, f"random_{index}_{len(placed)}")
         outline = Outlines.of([tried])
         if len(others) and gaps_m(outline, others).min() < field.clearance_m:
             continue
         if any(gaps_m(outline, free).min() < 0.0 for free in kept):
             continue
-        strewn.append(tried)
-        others = Outlines.of([*standing, *strewn])
-    if len(strewn) < field.wanted:
+        placed.append(tried)
+        others = Outlines.of([*standing, *placed])
+    if len(placed) < field.wanted:
         raise ConfigError(
-            f"{where}: only {len(strewn)} of {field.wanted} pegs fit; lower `density_per_m2` = "
+            f"{where}: only {len(placed)} of {field.wanted} pegs fit; lower `density_per_m2` = "
             f"{field.density_per_m2} or `clearance_m` = {field.clearance_m}"
         )
-    return strewn
+    return placed
 
 
 def _snake(links: Sequence[Capsule], clearance_m: float) -> Outlines:

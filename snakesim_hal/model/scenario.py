@@ -63,7 +63,7 @@ class Mission(FileStruct, frozen=True, kw_only=True):
 
     speed_m_s: Annotated[float, Meta(ge=0, le=10, extra_json_schema={"unit": "m/s"})] = 0.2
     goal: HeadingGoal | WaypointGoal | None = None
-    map: Literal["known", "perceived"] = "known"  # the scene's obstacles as from a survey, or only what sensors tell
+    map: Literal["known", "perceived"] = "known"  # the scene's obstacles as from a survey, or only what sensors measure
     localisation: Literal["pose_sensor", "dead_reckoning"] = "pose_sensor"  # or joints, IMU and contacts, and the map
 
     def __post_init__(self) -> None:

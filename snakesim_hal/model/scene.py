@@ -30,7 +30,7 @@ from snakesim_hal.wire.messages import Obstacle
 from snakesim_hal.wire.quantities import Name
 
 Floats = NDArray[np.float64]
-GRAVITY_M_S2 = 9.81  # as in MuJoCo, unless told otherwise
+GRAVITY_M_S2 = 9.81  # as in MuJoCo, unless configured otherwise
 
 
 class Uneven(FileStruct, frozen=True, kw_only=True):

@@ -73,7 +73,7 @@ class RouterLog:
             self._say(f"{found['level']} {found['module']}: {found['text']}")
 
     def turn(self) -> None:
-        """Call it every `AGAIN_S`: reports repeated lines, and starts counting anew."""
+        """Call it every `AGAIN_S`: reports repeated lines, and restarts the count."""
         again, left_out = self._again, self._left_out
         self._again, self._left_out, self._left = Counter(), 0, min(self._left + PER_TURN, BURST)
         for line, times in again.items():

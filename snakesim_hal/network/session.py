@@ -373,7 +373,7 @@ def _in_zenohs_thread(handle: Callable[[zenoh.Sample], None]) -> Callable[[zenoh
 
     def direct(sample: zenoh.Sample) -> None:
         if not hasattr(known, "state"):
-            # Keep what Python has of this thread; else it makes that, and a stack, anew for each sample, which in the
+            # Keep what Python has of this thread; else it makes that, and a stack, again for each sample, which in the
             # kernel costs twice what a sample costs otherwise.
             known.state = ctypes.pythonapi.PyGILState_Ensure()
         handle(sample)

@@ -347,7 +347,7 @@ class Description(Message, frozen=True, kw_only=True):
         bool, about("nothing real moves: a simulator, or emulated modules; fault injection is allowed")
     ] = False
     simulated_time: Annotated[
-        bool, about("a simulator: its time can stand, pass by single ticks, faster or slower, and begin anew")
+        bool, about("a simulator: its time can stand, pass by single ticks, faster or slower, and start over")
     ] = False
     hardware: Annotated[
         str, Meta(max_length=200), about("hardware that it drives, such as `can0+can1`; empty: none")

@@ -88,7 +88,7 @@ class JointCharts:
             self._history.append((time_s, np.array(joints.angle_rad), np.array(joints.torque_nm)))
 
     def show(self, snapshot: RobotSnapshot) -> None:
-        """Draw them anew; a few times a second."""
+        """Redraw them; a few times a second."""
         joints = snapshot.joints
         if joints is None:
             return

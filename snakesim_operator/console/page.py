@@ -159,7 +159,7 @@ class Page:
             controls.press(key)
 
     def forget(self) -> None:
-        """The next snapshot is not the one after this: trail and charts begin anew."""
+        """The next snapshot is not the one after this: trail and charts start over."""
         if self._stage is not None and self._charts is not None:
             self._stage.forget()
             self._charts.forget()
@@ -193,7 +193,7 @@ class Page:
             self._show_texts(snapshot)
 
     def _meet(self, robot: Description) -> None:
-        """Another robot: scene and charts begin anew."""
+        """Another robot: scene and charts start over."""
         self._server.scene.reset()
         self._server.scene.set_up_direction("+z")
         camera = self._server.initial_camera

@@ -171,7 +171,7 @@ class Stage:
         self._follow(drawing.centre_w)
 
     def forget(self) -> None:
-        """Another place in time: the trail begins anew."""
+        """Another place in time: the trail starts over."""
         self._trail.clear()
         self._middle_w = None
 

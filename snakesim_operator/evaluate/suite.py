@@ -158,8 +158,8 @@ def _check(config: RunConfig, table: Table, where: str) -> None:
 def _on_field(table: Table, field: int) -> RunConfig:
     table.put("seed", field, "--seed")
     scene = table.values.get("scene")
-    strewn = scene.get("random_field") if isinstance(scene, dict) else None
-    for i in range(len(strewn) if isinstance(strewn, list) else 0):
+    random_fields = scene.get("random_field") if isinstance(scene, dict) else None
+    for i in range(len(random_fields) if isinstance(random_fields, list) else 0):
         table.put(f"scene.random_field.{i}.seed", field, "--seed")
     return decode(table, RunConfig)
 

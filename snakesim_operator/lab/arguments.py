@@ -25,7 +25,7 @@ def add_commands(commands: Any) -> None:
     certs = parts.add_parser("certs", help="make the lab's authority, and the certificates that are missing or ending")
     _add_lab(certs)
     certs.add_argument("--authority", type=Path, metavar="DIR", help="folder of the authority (default: DIR/authority)")
-    certs.add_argument("--rotate", action="store_true", help="make every certificate anew")
+    certs.add_argument("--rotate", action="store_true", help="renew every certificate")
     certs.set_defaults(act=_certs)
 
     live = parts.add_parser(

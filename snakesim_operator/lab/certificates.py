@@ -25,7 +25,7 @@ from snakesim_operator.lab.lab_file import Lab
 
 AUTHORITY = "authority"
 CLOCK_SLACK = timedelta(minutes=10)  # a robot's clock may be behind
-RENEW_AT = 1 / 3  # of its life left, and a certificate is made anew
+RENEW_AT = 1 / 3  # of its life left, and it is renewed
 
 
 @dataclass(frozen=True)

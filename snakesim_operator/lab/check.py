@@ -33,7 +33,7 @@ from snakesim_operator.lab.zenoh_files import session_settings
 
 CONNECT_MS = 2000
 LISTEN_S = 1.0
-CLOCK_LIMIT_S = 0.5  # by which a clock may differ; Zenoh's routers stamp anew what is further in the future
+CLOCK_LIMIT_S = 0.5  # by which a clock may differ; Zenoh's routers restamp what is further in the future
 ASKABLE = (keys.LEASE, keys.LIFECYCLE)  # an empty query there has no effect
 # Who is behind a key that is published all the time.
 WRITERS = {

@@ -19,7 +19,7 @@ def add_commands(commands: Any) -> None:
     add_json(info)
     info.set_defaults(act=_info)
 
-    report = commands.add_parser("report", help="write the page of a run anew, also from a recording alone")
+    report = commands.add_parser("report", help="rewrite the page of a run, also from a recording alone")
     _add_recording(report)
     report.add_argument("--out", type=Path, metavar="FILE.html", help="the page (default: beside the recording)")
     report.set_defaults(act=_report)

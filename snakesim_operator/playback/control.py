@@ -36,7 +36,7 @@ MADE_BY = {
     "navigation": (keys.TRAJECTORY,),
     "control": (keys.JOINT_COMMAND, keys.CONTROL_STATE),
 }
-"""What the replayed services publish: these messages are made anew."""
+"""What the replayed services publish: these messages are made again."""
 
 
 @dataclass

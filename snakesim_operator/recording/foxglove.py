@@ -160,13 +160,13 @@ class FoxgloveChannels:
 
     def _is_due(self, what: str, time_ns: int, every_ns: int) -> bool:
         due_ns = self._due_ns.get(what, 0)
-        if due_ns - every_ns <= time_ns < due_ns:  # else it is late, or robot time began anew
+        if due_ns - every_ns <= time_ns < due_ns:  # else it is late, or robot time started over
             return False
         self._due_ns[what] = time_ns + every_ns
         return True
 
     def _fresh(self, key: str, time_ns: int) -> bytes | None:
-        """The newest payload, unless its writer has fallen silent, or robot time has begun anew since."""
+        """The newest payload, unless its writer has fallen silent, or robot time has started over since."""
         payload, written_ns = self._newest.get(key, (None, 0))
         return payload if 0 <= time_ns - written_ns <= SILENCE_NS else None
 

@@ -80,7 +80,7 @@ class Recorder:
                 self._host = robot.host
 
     def _start_over(self, clock: Arrival) -> None:
-        """Robot time began anew, with another host: what was before gets a file of its own."""
+        """Robot time started over, with another host: what was before gets a file of its own."""
         self._new_host, self._back = False, None
         if self._hosts >= MAX_HOSTS:
             return

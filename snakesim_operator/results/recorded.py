@@ -129,7 +129,7 @@ class Contents:
         return found
 
     def host(self, columns: dict[str, NDArray[Any]]) -> HostRecord:
-        """The host's statistics, as far as the recording tells."""
+        """The host's statistics, as far as the recording shows."""
         status, armed = self.status, {t for t, clock in self.at[keys.CLOCK].items() if clock.lifecycle == "armed"}
         if status is None:
             raise ConfigError(f"{self.path}: holds no hal/status, so it is not known what became of the run")
@@ -169,7 +169,7 @@ def read_recording(path: Path, wanted: Collection[str] = ALL) -> Contents:
 
 
 def _is_news(before: Any, message: Any) -> bool:
-    """Worlds are thinned; a path is told once."""
+    """Worlds are thinned; a path is kept once."""
     match message:
         case World():
             return message.stamp_ns >= before.stamp_ns + round(1e9 / WORLDS_PER_S)

@@ -32,20 +32,20 @@ def robot_of(file: Path, order: Order) -> Imported:
     if urdf.tag != "robot":
         raise urdf.wrong("is no URDF; its outermost element is <robot>")
     found = Imported(_rest(urdf, order))
-    row = row_of(urdf, file, tail=order.tail, tell=found.left_out.append)
+    row = row_of(urdf, file, tail=order.tail, warn=found.left_out.append)
     frames = put_body(found, row, order, urdf)
     put_limits(found.table, row.joints, str(file), found.changed.append)
     if urdf.first("snakesim") is not None:  # of a <snakesim> element; the others say the same, in fewer words
         for gazebo in urdf.all("gazebo"):
             gazebo.read_all()
     else:
-        put_sensors(found.table, urdf, row, frames, order.scale, tell=found.left_out.append)
+        put_sensors(found.table, urdf, row, frames, order.scale, warn=found.left_out.append)
         found.changed.append(
             f"not in the file, so as of robot {order.like!r}: gains, rates of change, heat, safety, noise"
         )
     found.table.put("name", _name(urdf.get("name", file.stem)), str(file))
     found.table.values = dict(sorted(found.table.values.items(), key=lambda item: SECTIONS.get(item[0], len(SECTIONS))))
-    _tell_unread(found, urdf)
+    _warn_unread(found, urdf)
     if found.table.values["name"] in shipped("robots"):
         found.left_out.append(
             f"a name of its own: it is {found.table.values['name']}, as a shipped robot is; change it, because the "
@@ -80,7 +80,7 @@ def _name(text: str) -> str:
     )
 
 
-def _tell_unread(found: Imported, urdf: Element) -> None:
+def _warn_unread(found: Imported, urdf: Element) -> None:
     """What nothing here has read, by kind, with the lines where it is."""
     lines: dict[str, list[int]] = {}
     for path, line in urdf.unread():

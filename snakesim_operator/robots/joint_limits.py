@@ -8,13 +8,13 @@ from snakesim_operator.robots.urdf_tree import Joint
 FULL_TURN_RAD = 3.14159
 
 
-def put_limits(table: Table, joints: list[Joint], source: str, tell: Callable[[str], None]) -> None:
+def put_limits(table: Table, joints: list[Joint], source: str, warn: Callable[[str], None]) -> None:
     """Put what the joints say into a robot file's values; what they do not say stays. Raises ConfigError."""
     endless = [joint.name for joint in joints if joint.element.get("type") == "continuous"]
     if endless:
-        tell(f"{', '.join(endless)}: continuous; here they turn by {FULL_TURN_RAD} rad to either side")
-    angles = {joint.name: _angle(joint, tell) for joint in joints}
-    _put(table, "limits.angle_rad", angles, min, source, tell)
+        warn(f"{', '.join(endless)}: continuous; here they turn by {FULL_TURN_RAD} rad to either side")
+    angles = {joint.name: _angle(joint, warn) for joint in joints}
+    _put(table, "limits.angle_rad", angles, min, source, warn)
     said: dict[str, dict[str, float]] = {
         "speed_rad_s": {},
         "torque_nm": {},
@@ -36,13 +36,13 @@ def put_limits(table: Table, joints: list[Joint], source: str, tell: Callable[[s
     for key, values in said.items():
         dotted = f"{'limits' if key in ('speed_rad_s', 'torque_nm') else 'motor'}.{key}"
         if values:
-            _put(table, dotted, values, min if dotted.startswith("limits") else max, source, tell)
+            _put(table, dotted, values, min if dotted.startswith("limits") else max, source, warn)
         elif dotted.startswith("limits"):
             kept = table.values.get("limits", {}).get(key)
-            tell(f"no joint says its `{'effort' if key == 'torque_nm' else 'velocity'}`; {dotted} stays {kept}")
+            warn(f"no joint says its `{'effort' if key == 'torque_nm' else 'velocity'}`; {dotted} stays {kept}")
 
 
-def _angle(joint: Joint, tell: Callable[[str], None]) -> float:
+def _angle(joint: Joint, warn: Callable[[str], None]) -> float:
     """To either side of zero."""
     if joint.element.get("type") == "continuous":
         return FULL_TURN_RAD
@@ -53,7 +53,7 @@ def _angle(joint: Joint, tell: Callable[[str], None]) -> float:
     if not lower < 0 < upper:
         raise limit.wrong(f"is {lower:g} to {upper:g} rad; a joint must be able to turn to either side of zero")
     if abs(lower + upper) > 1e-9:
-        tell(
+        warn(
             f"joint {joint.name!r} turns from {lower:g} to {upper:g} rad; here by {min(-lower, upper):g} to either side"
         )
     return min(-lower, upper, FULL_TURN_RAD)
@@ -65,11 +65,11 @@ def _put(
     values: dict[str, float],
     choose: Callable[..., float],
     source: str,
-    tell: Callable[[str], None],
+    warn: Callable[[str], None],
 ) -> None:
     chosen = choose(values.values())
     others = [f"{name!r} {value:g}" for name, value in values.items() if value != chosen]
     if others:
         shown = ", ".join(others[:8]) + (f" and {len(others) - 8} more" if len(others) > 8 else "")
-        tell(f"{dotted} = {chosen:g} for all joints; the file has {shown}")
+        warn(f"{dotted} = {chosen:g} for all joints; the file has {shown}")
     table.put(dotted, chosen, source)

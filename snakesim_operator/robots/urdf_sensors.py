@@ -27,7 +27,7 @@ DEPTH = ("depth", "depth_camera", "rgbd_camera")
 RANGE = ("ray", "gpu_ray", "lidar", "gpu_lidar")
 
 
-def put_sensors(table: Table, urdf: Element, row: Row, frames: list[Floats], scale: float, *, tell: Tell) -> None:
+def put_sensors(table: Table, urdf: Element, row: Row, frames: list[Floats], scale: float, *, warn: Tell) -> None:
     """Put a URDF's sensors into a robot file's values. frames: link_from_root (4, 4) of every link, in m."""
     link_of = {name: i for i, body in enumerate(row.bodies) for name in body.links}
     for gazebo in urdf.all("gazebo"):
@@ -48,7 +48,7 @@ def put_sensors(table: Table, urdf: Element, row: Row, frames: list[Floats], sca
                 @ _in_metres(row.bodies[index].frames[reference], scale)
                 @ _in_metres(_pose(sensor), scale)
             )
-            values |= {"name": _plain(name), "link": index} | _place(pose, name, tell)
+            values |= {"name": _plain(name), "link": index} | _place(pose, name, warn)
             values |= _camera(sensor) if kind in DEPTH else _lidar(sensor)
             group = "depth" if kind in DEPTH else "range"
             listed = table.values.get("sensors", {}).get(group, [])
@@ -80,11 +80,11 @@ def _in_metres(frame: Floats, scale: float) -> Floats:
     return scaled
 
 
-def _place(link_from_sensor: Floats, name: str, tell: Tell) -> dict[str, Any]:
+def _place(link_from_sensor: Floats, name: str, warn: Tell) -> dict[str, Any]:
     turn = link_from_sensor[:3, :3]
     roll = math.atan2(turn[2, 1], turn[2, 2])
     if abs(roll) > 0.01:
-        tell(
+        warn(
             f"sensor {short(name)!r} is rolled by {roll:.2f} rad about its viewing direction; a robot file has no roll"
         )
     return {

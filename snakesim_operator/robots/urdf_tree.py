@@ -69,17 +69,17 @@ class Row:
     joints: list[Joint]
 
 
-def row_of(urdf: Element, file: Path, *, tail: str | None, tell: Tell) -> Row:
+def row_of(urdf: Element, file: Path, *, tail: str | None, warn: Tell) -> Row:
     """The bodies of a URDF, tail to head. tail: a link of the first one; None: the root link. Raises ConfigError."""
     links = _named(urdf, "link")
     joints = _named(urdf, "joint")
-    frames, movable, body_of = _walk(urdf, links, joints, tell)
+    frames, movable, body_of = _walk(urdf, links, joints, warn)
     bodies: dict[str, Body] = {}
     for name, element in links.items():
         body = bodies.setdefault(body_of[name], Body())
         body.links.append(name)
         body.frames[name] = frames[name]
-        _add_link(body, element, frames[name], file, tell)
+        _add_link(body, element, frames[name], file, warn)
     return _in_a_row(bodies, movable, body_of, tail, urdf)
 
 
@@ -108,7 +108,7 @@ def rotation(roll: float, pitch: float, yaw: float) -> Floats:
     return np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]]) @ about_y @ about_x
 
 
-def _walk(urdf: Element, links: dict[str, Element], joints: dict[str, Element], tell: Tell):
+def _walk(urdf: Element, links: dict[str, Element], joints: dict[str, Element], warn: Tell):
     """Frames of all links, the joints that turn as (parent, child, joint), and the first link of each link's body."""
     below: dict[str, list[tuple[str, Element]]] = {}
     parents: dict[str, Element] = {}
@@ -142,7 +142,7 @@ def _walk(urdf: Element, links: dict[str, Element], joints: dict[str, Element], 
                 body_of[child] = body_of[parent]
                 element.first("axis")
             elif kind in ("floating", "planar") and parent == roots[0] and not below[parent][1:]:
-                tell(f"joint {short(element.get('name'))!r} ({kind}) left out: the base is always free to move")
+                warn(f"joint {short(element.get('name'))!r} ({kind}) left out: the base is always free to move")
                 frames[child] = np.eye(4)
                 body_of[child] = body_of[parent]
             else:
@@ -164,7 +164,7 @@ def _joint(element: Element, frame: Floats) -> Joint:
     return Joint(element, element.get("name"), frame[:3, 3], frame[:3, :3] @ axis / length, backwards=False)
 
 
-def _add_link(body: Body, link: Element, frame: Floats, file: Path, tell: Tell) -> None:
+def _add_link(body: Body, link: Element, frame: Floats, file: Path, warn: Tell) -> None:
     inertial = link.first("inertial")
     if inertial is not None:
         mass, moments = inertial.first("mass"), inertial.first("inertia")
@@ -181,13 +181,13 @@ def _add_link(body: Body, link: Element, frame: Floats, file: Path, tell: Tell) 
         geometry = element.first("geometry")
         if geometry is None or not geometry.children:
             raise element.wrong("has no shape in <geometry>")
-        points = _outline(geometry.children[0], file, tell)
+        points = _outline(geometry.children[0], file, warn)
         placed = frame @ transform(element.first("origin"))
         if points is not None:
             body.points.append(points @ placed[:3, :3].T + placed[:3, 3])
 
 
-def _outline(shape: Element, file: Path, tell: Tell) -> Floats | None:
+def _outline(shape: Element, file: Path, warn: Tell) -> Floats | None:
     """Points whose hull holds a shape, in its frame, (n, 3)."""
     shape.read = True
     match shape.tag:
@@ -212,7 +212,7 @@ def _outline(shape: Element, file: Path, tell: Tell) -> Floats | None:
                     raise ConfigError("not on this computer")
                 found = vertices(path) * scale
             except ConfigError as error:
-                tell(f"line {shape.line}: mesh {short(name)!r} left out: {error}")
+                warn(f"line {shape.line}: mesh {short(name)!r} left out: {error}")
                 return None
             return found
         case _:

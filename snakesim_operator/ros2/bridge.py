@@ -205,7 +205,7 @@ class Bridge:
         if clock is not None:
             if self._clock is not None and clock.tick < self._clock.tick:
                 self._ros_time.start_over()
-                self._say("the robot's host has restarted: its time starts anew")
+                self._say("the robot's host has restarted: its time starts over")
             self._ros_time.heard(clock.stamp_ns)
             self._clock = clock
             if self._ros_clock is not None:

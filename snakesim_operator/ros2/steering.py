@@ -48,7 +48,7 @@ class Steering:
         )
 
     def _turn(self, turn_rad_s: float, now_ns: int, body_w_rad: float | None) -> None:
-        """Turn the wanted direction for the time since the last Twist; anew from the body's after a silence."""
+        """Turn the wanted direction for the time since the last Twist; again from the body's after a silence."""
         since_ns = VALID_NS + 1 if self._last_ns is None else now_ns - self._last_ns
         self._last_ns = now_ns
         if self._heading_w_rad is None or not 0 <= since_ns <= VALID_NS:

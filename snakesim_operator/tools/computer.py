@@ -1,4 +1,4 @@
-"""Findings of `snakesim doctor` about the computer: each says what is there, and how to mend it.
+"""Findings of `snakesim doctor` about the computer: each says what is there, and how to fix it.
 
 `fail`: no run is possible; `warn`: something that some users need is missing.
 """

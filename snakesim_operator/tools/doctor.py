@@ -1,4 +1,4 @@
-"""`snakesim doctor`: what this computer has, what it lacks, and the command that mends each."""
+"""`snakesim doctor`: what this computer has, what it lacks, and the command that fixes each."""
 
 from collections.abc import Callable, Iterator
 

@@ -22,7 +22,7 @@ def add_files(commands: Any) -> None:
 
 def add_commands(commands: Any) -> None:
     """Add the others."""
-    doctor = commands.add_parser("doctor", help="check this computer, and print what mends what it lacks")
+    doctor = commands.add_parser("doctor", help="check this computer, and print the commands that add what it lacks")
     add_network(doctor)
     add_json(doctor)
     doctor.set_defaults(act=_doctor)

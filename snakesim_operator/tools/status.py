@@ -91,7 +91,7 @@ def _statuses(link: Link, processes: dict[tuple[str, str | None], list[Process]]
 
 
 def _for_scripts(link: Link, statuses: list[Status], processes: dict[tuple[str, str | None], list[Process]]):
-    """One robot, as JSON tells of it."""
+    """One robot, as JSON."""
     return {
         "namespace": link.namespace,
         "endpoint": link.endpoint,

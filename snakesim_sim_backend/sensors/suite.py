@@ -66,7 +66,7 @@ class Sensors:
         return Samples(self._joints.read(tick, stamp_ns), others)
 
     def lateness(self) -> list[str]:
-        """What to tell of dropped samples since the last call: at the first one, and when their number has doubled."""
+        """What to report of dropped samples since the last call: the first one, and each doubling."""
         lines: list[str] = []
         for key, count in self.late.items():
             if count >= max(2 * self._reported[key], 1):

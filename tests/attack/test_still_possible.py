@@ -86,7 +86,7 @@ def test_a_forged_description_misleads_neither_host_nor_services(robot: Robot) -
     operator.forget()
     with Stranger(robot.endpoint) as stranger:
         publisher = stranger.latch("hal/description", forged)
-        os.kill(robot.run.part("control"), signal.SIGKILL)  # so that a controller learns the robot anew
+        os.kill(robot.run.part("control"), signal.SIGKILL)  # so that a controller learns the robot again
         over = threading.Event()
 
         def repeat() -> None:

@@ -1,4 +1,4 @@
-"""Raw results: one JSON file, written anew after each row, so that rows can be run on different days."""
+"""Raw results: one JSON file, written again after each row, so that rows can be run on different days."""
 
 import os
 import platform

@@ -30,7 +30,7 @@ from snakesim_hal.wire.codec import Decoder, encode, encoding_of
 from tests.unit.can_backend.loop import JOINTS, Loop, config, loop
 
 PER_TICK = 40
-PER_OPENING = 2000  # frames until the bus is opened anew, with the stranger on it
+PER_OPENING = 2000  # frames until the bus is opened again, with the stranger on it
 ROBOT = config(pace="realtime", robot__sensors__contacts__rate_hz=50.0, robot__sensors__imu__rate_hz=50.0)
 KINDS = ("again", "bit-flipped", "other node", "other message", "length", "random", "odd id")
 

@@ -245,7 +245,7 @@ def test_it_goes_through_a_random_field_that_nobody_laid_out(seed: int):
 
 @pytest.mark.parametrize("scale", [0.0, -1.0])
 def test_in_clutter_nothing_but_the_push_moves_it(scale: float):
-    """Neither the paths that are planned anew, since it stands, nor a push of the wrong sign."""
+    """Neither the paths that are replanned, since it stands, nor a push of the wrong sign."""
     field = ("scene.random_field.0.seed=10", "scene.random_field.0.density_per_m2=12")
     whole = run(configure("surveyed_clutter", *field, f"control.push_scale={scale}"), duration_s=5.0)
     assert len(whole.record.trajectories) >= 3

@@ -54,7 +54,7 @@ def test_that_the_clock_is_gone_is_no_news_of_a_run_that_has_ended(tmp_path: Pat
     for reported in before:
         recording.take(Arrival(reported.key, reported.payload, reported.encoding, reported.wall_ns))
     reported = Arrival(keys.CONTROL_STATE, encode(gone), encoding_of(ControlState), 0)
-    recording.take(reported)  # as control tells it while a host writes a long record
+    recording.take(reported)  # as control reports it while a host writes a long record
     recording.close({})
     again = summarise(RunRecord.load(tmp_path / "run"), "complete")
     assert (again.last_state, again.last_reason) == (summary.last_state, summary.last_reason)

@@ -93,7 +93,7 @@ class ObstacleTriplet:
         if located.trajectory.speed_m_s <= 0:
             self._choice = None
             self._stall_watch.forget()
-        if located.fresh or located.anew:
+        if located.fresh or located.restarted:
             self._look(located, body_pose)
             self._choose(view, located, body_pose)
         self._guard(view, body_pose)
@@ -115,7 +115,7 @@ class ObstacleTriplet:
     def _follow(self, view: View, located: Located) -> BodyPose:
         """Reference of the joints in position mode; starts, and continues from another place, without a jump."""
         set_, s, before = self._set, located.tail_s_m, self._body_pose
-        if before is None or located.anew:
+        if before is None or located.restarted:
             body_pose = located.on_path.at(s)
         else:
             max_advance_m = max(located.trajectory.speed_m_s, 0.0) * set_.overspeed_share * view.period_s
@@ -124,7 +124,7 @@ class ObstacleTriplet:
         reference = self._body.all_angles(body_pose)
         if not len(self._reference):
             self._hand_over.start(view.joints, reference)
-        elif located.anew:
+        elif located.restarted:
             self._hand_over.shift(reference - self._reference)
         self._body_pose, self._reference = body_pose, reference
         return body_pose
@@ -150,7 +150,7 @@ class ObstacleTriplet:
     def _look(self, located: Located, body_pose: BodyPose) -> None:
         """Plan the contacts with the obstacles near the body, and find those that the body is at."""
         world = located.world
-        if located.anew:
+        if located.restarted:
             self._planned.clear()
         near = {obstacle.name: obstacle for obstacle in world.obstacles}
         for name in [name for name in self._planned if name not in near]:

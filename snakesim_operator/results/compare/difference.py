@@ -128,7 +128,7 @@ class HandOvers:
 
 @dataclass(frozen=True)
 class Difference:
-    """Everything that is told about two runs."""
+    """Everything that is known about two runs."""
 
     a: RunRecord
     b: RunRecord
@@ -201,7 +201,7 @@ def _check(a: RunRecord, b: RunRecord) -> None:
         if not len(record.time_s):
             raise ConfigError(
                 f"{record.folder / BLACK_BOX}: holds no tick, because the robot was never armed ({record.host.why}); "
-                f"{record.folder / 'host.log'} may say more. Run it again, until the summary tells a time"
+                f"{record.folder / 'host.log'} may say more. Run it again, until the summary has a time"
             )
     if a.description.layout != b.description.layout:
         robots = [f"{r.folder} has {r.description.robot} with {len(r.description.joints)} joints" for r in (a, b)]

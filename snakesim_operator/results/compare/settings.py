@@ -9,7 +9,7 @@ from snakesim_hal.model.files import leaves
 from snakesim_operator.results.record import RunRecord
 
 UNSET = "not set"
-# Of the description: what the configuration tells already, and what is another in every run.
+# Of the description: what the configuration has already, and what is another in every run.
 FOLLOWS = ("config_hash", "robot", "backend", "period_ns", "lease_ns", "host", "proof")
 
 

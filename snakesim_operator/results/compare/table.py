@@ -12,7 +12,7 @@ HAND_OVERS_SHOWN = 8
 
 
 def table(difference: Difference) -> list[str]:
-    """Everything that the page tells in numbers, in lines."""
+    """Everything that the page shows in numbers, in lines."""
     lines = [
         _row("", "A", "B"),
         *_compared(difference),
@@ -84,7 +84,7 @@ def _settings(settings: list[Setting]) -> list[str]:
     width = max(len(one.key) for one in settings[:SETTINGS_SHOWN])
     lines += [f"  {one.key:<{width}}  {_short(one.a)} -> {_short(one.b)}" for one in settings[:SETTINGS_SHOWN]]
     if len(settings) > SETTINGS_SHOWN:
-        lines.append(f"  and {len(settings) - SETTINGS_SHOWN} more, which the page tells")
+        lines.append(f"  and {len(settings) - SETTINGS_SHOWN} more, which the page lists")
     return lines
 
 

@@ -13,7 +13,7 @@ from snakesim_operator.results.summary import RunSummary
 
 HAND_OVERS_DRAWN, HAND_OVERS_LISTED = 4, 8
 SETTLED_S = 0.6  # so soon after a hand-over the forces are drawn that belong to it
-AT_ONCE_S = 0.06  # control tells its state twenty times a second
+AT_ONCE_S = 0.06  # control publishes its state twenty times a second
 SAME_M, SAME_S = 0.008, 0.1  # a body that moved less looks the same
 
 

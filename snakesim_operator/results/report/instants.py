@@ -84,7 +84,7 @@ def balance_of(state: ControlState) -> Balance | None:
 
 
 def balanced_instants(record: RunRecord, begin_s: float = 0.0, end_s: float = math.inf) -> list[Instant]:
-    """Every moment of locomotion, of those told within a time, whose solved forces balance; in order of time."""
+    """Every moment of locomotion, of those reported within a time, whose solved forces balance; in order of time."""
     if not len(record.time_s):
         return []
     found: list[Instant] = []

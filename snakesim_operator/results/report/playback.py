@@ -28,7 +28,7 @@ MAPS, PATH_POINTS = 80, 60  # of a whole run; of a path
 WIDTH = 1040.0
 SAME_TICK_S = 1e-6
 USUAL_SHARE = 0.9  # of all forces are drawn in full; the strongest are cut
-TOLD_FOR_S = 0.3  # what is older is not shown: control and guidance tell their state many times a second
+SHOWN_FOR_S = 0.3  # what is older is not shown: control and guidance publish their state many times a second
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def playback(record: RunRecord) -> Playback | None:
 
 
 def _perceived(record: RunRecord, view: View, rows: NDArray[np.intp]) -> tuple[list[list[list[float]]], list[int]]:
-    """Some of the maps that guidance told, each obstacle as its outline; and for each row which one, or -1."""
+    """Some of the maps that guidance published, each obstacle as its outline; and for each row which one, or -1."""
     if record.config.mission.map != "perceived" or not record.worlds:
         return [], [-1] * len(rows)
     some = record.worlds[:: max(len(record.worlds) // MAPS, 1)]
@@ -127,7 +127,7 @@ def _latest(record: RunRecord, rows: NDArray[np.intp], messages: Sequence[Told])
     newest = [messages[i] if i >= 0 else None for i in before]
     times_s = record.time_s[rows].tolist()
     return [
-        one if one is not None and time_s - one.stamp_ns * 1e-9 < TOLD_FOR_S else None
+        one if one is not None and time_s - one.stamp_ns * 1e-9 < SHOWN_FOR_S else None
         for one, time_s in zip(newest, times_s, strict=True)
     ]
 

@@ -44,7 +44,7 @@ class Pushing:
 
 
 def pushing(record: RunRecord) -> Pushing | None:
-    """None for a controller that tells no push-points, or one joint that pushes: that has sections of its own."""
+    """None for a controller that reports no push-points, or one joint that pushes: that has sections of its own."""
     states = [state for state in record.control if state.push_points]
     if not states or any(state.propulsion_joint is not None for state in states) or not len(record.time_s):
         return None

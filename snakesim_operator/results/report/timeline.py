@@ -67,18 +67,18 @@ def end_s(record: RunRecord) -> float:
 
 
 def reported_at_s(record: RunRecord, state: ControlState) -> float:
-    """When a state was told, on the time axis and within the run."""
+    """When a state was reported, on the time axis and within the run."""
     return min(max(state.stamp_ns * 1e-9 - zero_s(record), 0.0), end_s(record))
 
 
 def reported_spans(record: RunRecord) -> list[tuple[float, float, ControlState]]:
-    """(since, until, state) on the time axis: each state holds until the next is told."""
+    """(since, until, state) on the time axis: each state holds until the next is reported."""
     starts = [reported_at_s(record, state) for state in record.control]
     return list(zip(starts, [*starts, end_s(record)][1:], record.control, strict=True))
 
 
 def state_bands(record: RunRecord) -> list[Interval]:
-    """Locomotion states; each holds until the next is told."""
+    """Locomotion states; each holds until the next is reported."""
     return _merged(record, [state.state for state in record.control])
 
 
@@ -162,7 +162,7 @@ def came_to_rest_s(record: RunRecord, within_m: float) -> float | None:
 
 
 def reported_distance(record: RunRecord) -> Series | None:
-    """Advance of the tail since the controller first told its place on the path."""
+    """Advance of the tail since the controller first reported its place on the path."""
     states = [state for state in record.control if state.path_s_m is not None]
     if len(states) < 2:
         return None

@@ -114,7 +114,7 @@ def _handed_over(record: RunRecord, summary: RunSummary) -> str:
 
 
 def _control_said(record: RunRecord, at_s: float) -> str:
-    """What control lacked when the robot was stopped: a fault of the lease only tells that no command came."""
+    """What control lacked when the robot was stopped: a fault of the lease only shows that no command came."""
     states = [state for state in record.control if reported_at_s(record, state) <= at_s]
     return f" Control said: {_sentence(states[-1].reason)}" if states and states[-1].state == "NotLocomoting" else ""
 

@@ -46,7 +46,7 @@ def begin(reading: Reading, *, contacts: bool = False, tail: bool = False) -> in
 
 
 def answer(reading: Reading, nodes: Iterable[int] | None = None, **values: Any) -> None:
-    """Modules answer the newest Sync; all of them unless told otherwise."""
+    """Modules answer the newest Sync; all of them unless configured otherwise."""
     for node in range(1, len(reading.modules) + 1) if nodes is None else nodes:
         reading.take(joint_state(node, reading.sync, **values))
 

@@ -118,7 +118,7 @@ def test_a_body_that_was_lost_is_found_again_where_it_is():
     for tick in range(61, 161):
         progress.update(stage.view(tick, 0.5, without="world"))
     found = progress.update(stage.view(161, 0.55))
-    assert isinstance(found, Located) and found.anew
+    assert isinstance(found, Located) and found.restarted
     assert found.tail_s_m == pytest.approx(0.55, abs=2e-3) and found.speed_m_s == 0.0
 
 
@@ -131,4 +131,4 @@ def test_a_new_path_is_noticed():
     assert isinstance(first, Located)
     assert isinstance(again, Located)
     assert isinstance(other, Located)
-    assert (first.anew, again.anew, other.anew) == (True, False, True)
+    assert (first.restarted, again.restarted, other.restarted) == (True, False, True)

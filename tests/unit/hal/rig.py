@@ -169,7 +169,7 @@ def power(
 
 
 def pose(tick: int = 0, stamp_ns: int = 0, **other: Any) -> Pose:
-    """A body at rest at the origin, unless told otherwise."""
+    """A body at rest at the origin, unless configured otherwise."""
     still = (0.0, 0.0, 0.0)
     values = {"position_w": still, "orientation_wxyz": (1.0, 0.0, 0.0, 0.0)}
     values |= {"velocity_w": still, "angular_velocity_w": still, **other}

@@ -71,7 +71,7 @@ class Drive:
         return Place((*lay.tail_w, lay.heading_rad), lay.angles_rad, origins, rotations, headings, head)
 
     def turns(self, count: int, *, pose: bool = True, images: bool = True, imu: bool = True) -> Iterator[Place]:
-        """Move, tell guidance what the sensors tell, and yield where it really is, after each turn."""
+        """Move, tell guidance what the sensors measure, and yield where it really is, after each turn."""
         for turn in range(self.turn, self.turn + count):
             self.turn = turn
             here, before = self.place(self.turn), self.place(self.turn - 1)

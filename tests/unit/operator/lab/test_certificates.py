@@ -1,4 +1,4 @@
-"""The lab's certificates on the disk: who can read them, and when they are made anew."""
+"""The lab's certificates on the disk: who can read them, and when they are made again."""
 
 import stat
 from datetime import UTC, datetime, timedelta

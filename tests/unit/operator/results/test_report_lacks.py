@@ -127,7 +127,7 @@ def test_a_run_that_moved_and_then_jammed_is_called_jammed(record: RunRecord) ->
 
 
 def stopped_at(record: RunRecord, at_s: float, **state: Any) -> RunRecord:
-    """The same run, in which nothing moves any more from a time on, and control tells this."""
+    """The same run, in which nothing moves any more from a time on, and control reports this."""
     row = record.row_at(float(record.time_s[0]) + at_s)
     held = {name: getattr(record, name).copy() for name in MOVING}
     for column in held.values():
