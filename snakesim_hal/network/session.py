@@ -41,6 +41,9 @@ MAX_MESSAGE = "transport/link/rx/max_message_size"
 # froze together blocked the controller's commands for long enough to end its lease.
 # A client has one connection to read; with two threads each message would wake both.
 RECEIVERS_LISTENING, RECEIVERS_CONNECTED = 16, 1
+RUNTIME = "ZENOH_RUNTIME"
+_environment = threading.Lock()
+_opening: list[int] = []  # sessions that are being opened
 MAX_OPEN_FILES = 16384  # each connection takes one, and the default limit of a process is 1024
 READER_DEPTH = 256  # so that a burst of noise on a key does not displace the valid sample
 IMAGES_DEPTH = 32  # of images, which take much memory; in lockstep a reader may lag by that many
@@ -413,15 +416,23 @@ def open_session(link: Link, connect_timeout_s: float = 5.0) -> Iterator[Session
 
 @contextmanager
 def _receiving_threads(count: int) -> Iterator[None]:
-    """How many threads Zenoh gets to receive with, in this process but not in its children, unless the user says so."""
-    if "ZENOH_RUNTIME" in os.environ:
-        yield
-        return
-    os.environ["ZENOH_RUNTIME"] = f"(rx: (worker_threads: {count}))"
+    """How many threads Zenoh gets to receive with, in this process but not in its children, unless the user says so.
+
+    Any number of threads may open sessions at once; Zenoh reads the variable at the first one.
+    """
+    with _environment:
+        ours = bool(_opening) or RUNTIME not in os.environ
+        if ours:
+            _opening.append(count)
+            os.environ.setdefault(RUNTIME, f"(rx: (worker_threads: {count}))")
     try:
         yield
     finally:
-        del os.environ["ZENOH_RUNTIME"]
+        if ours:
+            with _environment:
+                _opening.remove(count)
+                if not _opening:
+                    del os.environ[RUNTIME]
 
 
 def _config(link: Link, connect_timeout_s: float) -> zenoh.Config:

@@ -1,6 +1,8 @@
 """The Zenoh session over real loopback links: latched values, queries, liveliness, and robots kept apart."""
 
+import os
 import socket
+import sys
 import threading
 import time
 from pathlib import Path
@@ -243,3 +245,29 @@ def test_a_router_wants_a_file_that_says_so(tmp_path: Path) -> None:
         wait_until(publisher.heard, "the subscription")
         publisher.put(Done(tick=1))
         wait_until(lambda: arrived, "the sample through the router")
+
+
+def test_threads_may_open_sessions_at_once_and_the_environment_of_children_stays_as_it_was() -> None:
+    endpoint, before, failed = free_endpoint(), dict(os.environ), list[BaseException]()
+
+    def open_often(start: threading.Barrier) -> None:
+        try:
+            for _ in range(20):
+                start.wait(20.0)
+                with open_session(Link(endpoint, "worm")):
+                    pass
+        except BaseException as error:  # noqa: BLE001 - shown below
+            failed.append(error)
+            start.abort()
+
+    switch_s = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    with open_session(Link(endpoint, "worm", listen=True)):
+        together = threading.Barrier(8)
+        threads = [threading.Thread(target=open_often, args=(together,)) for _ in range(8)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    sys.setswitchinterval(switch_s)
+    assert not failed and dict(os.environ) == before, failed
