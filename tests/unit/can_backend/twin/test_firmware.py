@@ -303,3 +303,11 @@ def test_only_armed_and_stopping_modules_drive_and_only_valid_set_points_feed(se
             assert frame.id >> 6 == Opcode.SET_POINT and module.refused == refused
         if module.state not in (ModuleState.ARMED, ModuleState.STOPPING):
             assert module.demand.mode == Mode.PASSIVE
+
+
+@pytest.mark.parametrize(("voltage_v", "faults"), [(18.0, 0), (17.99, 1 << ModuleFault.VOLTAGE)])
+def test_it_is_driven_down_to_18_v_and_not_below(voltage_v: float, faults: int) -> None:
+    module = armed()
+    module.inside.voltage_v = voltage_v
+    module.poll(BOOTED + 10 * MS)
+    assert (module.faults, module.state) == (faults, ModuleState.FAULT if faults else ModuleState.ARMED)
