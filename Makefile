@@ -34,7 +34,7 @@ help: ## List these targets
 setup: $(stamp) ## Make .venv from the hashed lock (PYTHON=python3.12 to choose)
 
 demo: $(stamp) ## Run the simulated snake through a triplet of obstacles, into runs/demo, with a page to watch it
-	$(bin)/snakesim run triplet --console --pace realtime --out runs/demo $(ARGS)
+	$(bin)/snakesim run triplet --console --pace realtime --duration 8 --out runs/demo $(ARGS)
 
 test: test-here test-vcan ## Run the tests, but for those that are slow
 

@@ -23,7 +23,7 @@ LOCK = Path("requirements.lock")
 OLDEST = (3, 11)
 FALLBACKS = ("python3.13", "python3.12", "python3.11")
 
-PIP_INSTALL = "-m pip install --quiet --no-deps --require-hashes --only-binary :all:"
+PIP_INSTALL = "-m pip install --quiet --root-user-action=ignore --no-deps --require-hashes --only-binary :all:"
 COMPILE = (
     "pip compile --quiet --universal --python-version 3.11 --fork-strategy fewest --generate-hashes"
     " --no-emit-index-url --no-emit-find-links"
@@ -127,11 +127,11 @@ def install_uv(python: str) -> None:
     pip_install = (*PIP_INSTALL.split(), "-r", UV_LOCK)
     if not has_venv(python) and not has_pip(python):
         install_debian_venv(python)
-    if has_venv(python):
+    if has_pip(python):
+        run(python, *pip_install, "--target", TOOLS)
+    else:
         run(python, "-m", "venv", TOOLS)
         run(TOOLS / "bin" / "python", *pip_install)
-    else:
-        run(python, *pip_install, "--target", TOOLS)
 
 
 def has_pip(python: str) -> bool:
