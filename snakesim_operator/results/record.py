@@ -65,7 +65,7 @@ class RunRecord:
         host: the host's statistics, if known from elsewhere; None: from the folder.
         """
         if folder.is_file() or (not (folder / BLACK_BOX).exists() and (folder / RECORDING).is_file()):
-            return RunRecord._alone(folder if folder.is_file() else folder / RECORDING)
+            return RunRecord._alone(folder if folder.is_file() else folder / RECORDING, host)
         if not folder.exists():
             raise ConfigError(f"{folder}: no such folder; {GIVE}")
         for name in (CONFIG, BLACK_BOX, DESCRIPTION, *([] if host is not None else [HOST_RECORD])):
@@ -90,8 +90,7 @@ class RunRecord:
             host = msgspec.json.decode((folder / HOST_RECORD).read_bytes(), type=HostRecord)
         if host.ended == "running":
             host = msgspec.structs.replace(host, ticks=len(columns["tick"]), command_digest=digest_of(columns))
-        lost = max(host.lost_ticks, host.ticks - len(columns["tick"]))
-        host = msgspec.structs.replace(host, lost_ticks=lost)
+        host = _with_lost_ticks(host, columns)
         known, lacks = cleaned(columns, description, has_pose=config.robot.sensors.pose is not None)
         lacks += unwritten(host)
         path = folder / RECORDING
@@ -99,8 +98,8 @@ class RunRecord:
         return RunRecord._of(folder, config, description, host, contents, known, lacks)
 
     @staticmethod
-    def _alone(path: Path) -> "RunRecord":
-        """Of a recording without the run's other files."""
+    def _alone(path: Path, host: HostRecord | None) -> "RunRecord":
+        """Of a recording without the run's other files: a full disk may have had no room for them."""
         contents = read_recording(path)
         description = contents.description
         if description is None or contents.config is None:
@@ -111,7 +110,12 @@ class RunRecord:
             raise ConfigError(f"{path}: its hal/config cannot be read: {str(error)[:200]}") from None
         columns = contents.columns(description)
         known, lacks = cleaned(columns, description, has_pose=config.robot.sensors.pose is not None)
-        return RunRecord._of(path, config, description, contents.host(columns), contents, known, lacks)
+        if host is None:
+            host = contents.host(columns)
+        else:
+            host = _with_lost_ticks(host, columns)
+            lacks += unwritten(host)
+        return RunRecord._of(path, config, description, host, contents, known, lacks)
 
     @staticmethod
     def _of(
@@ -172,3 +176,8 @@ def nodes_w(robot: Description, position_w: Floats, orientation_wxyz: Floats, an
     rotation = rotation_from_quaternion(orientation_wxyz)
     origins, rotations = link_frames(position_w, rotation, angle_rad, [joint.axis for joint in robot.joints], lengths)
     return np.vstack([origins, origins[-1] + lengths[-1] * rotations[-1][:, 0]])
+
+
+def _with_lost_ticks(host: HostRecord, columns: dict[str, NDArray[Any]]) -> HostRecord:
+    """The host's statistics, with the number of its ticks that have no row."""
+    return msgspec.structs.replace(host, lost_ticks=max(host.lost_ticks, host.ticks - len(columns["tick"])))

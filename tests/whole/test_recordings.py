@@ -32,6 +32,14 @@ def test_the_recording_alone_has_the_record_of_the_black_box(run: Path) -> None:
     assert alone.lacks == whole.lacks == []
 
 
+def test_without_a_black_box_for_lack_of_room_the_hosts_numbers_stay(run: Path, tmp_path: Path) -> None:
+    content, host = (run / RECORDING).read_bytes(), RunRecord.load(run).host
+    (tmp_path / RECORDING).write_bytes(content[: len(content) * 2 // 3])
+    record = RunRecord.load(tmp_path, host)
+    assert 0 < len(record.time_s) < 200 and record.host.command_digest == host.command_digest
+    assert f"{200 - len(record.time_s)} of 200 ticks are missing in the black box" in record.lacks
+
+
 def test_info_tells_what_is_in_it_and_what_is_missing(run: Path, tmp_path: Path) -> None:
     ended = snakesim("info", str(run), "--json", cwd=tmp_path)
     info = json.loads(ended.out)
