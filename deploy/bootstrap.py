@@ -125,13 +125,13 @@ def install_uv(python: str) -> None:
         return
     shutil.rmtree(str(TOOLS), ignore_errors=True)
     pip_install = (*PIP_INSTALL.split(), "-r", UV_LOCK)
-    if not has_venv(python) and not has_pip(python):
-        install_debian_venv(python)
     if has_pip(python):
         run(python, *pip_install, "--target", TOOLS)
-    else:
-        run(python, "-m", "venv", TOOLS)
-        run(TOOLS / "bin" / "python", *pip_install)
+        return
+    if not has_venv(python):
+        install_debian_venv(python)
+    run(python, "-m", "venv", TOOLS)
+    run(TOOLS / "bin" / "python", *pip_install)
 
 
 def has_pip(python: str) -> bool:

@@ -14,7 +14,7 @@ from types import FrameType
 from typing import NoReturn
 
 from snakesim_hal.errors import RefusedError
-from snakesim_hal.terminal import print_error
+from snakesim_hal.terminal import print_stderr
 
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # the last one: the terminal, or the ssh session, was closed
 PR_SET_PDEATHSIG = 1
@@ -93,7 +93,7 @@ def enter_realtime(priority: int) -> list[str]:
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     refused = [reason for reason in (set_realtime_priority(priority), lock_memory()) if reason is not None]
     for reason in refused:
-        print_error(f"real time: {reason}")
+        print_stderr(f"real time: {reason}")
     return refused
 
 
@@ -118,7 +118,7 @@ def drop_priority_after(longest_s: float) -> None:
 
     def drop_priority(_number: int, _frame: FrameType | None) -> None:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-        print_error(f"real time: priority dropped after computing for {longest_s * 1e3:.0f} ms without a pause")
+        print_stderr(f"real time: priority dropped after computing for {longest_s * 1e3:.0f} ms without a pause")
 
     signal.signal(signal.SIGXCPU, drop_priority)
     _, most = resource.getrlimit(resource.RLIMIT_RTTIME)

@@ -27,7 +27,7 @@ from snakesim_hal.process import (
     tune_garbage_collector,
 )
 from snakesim_hal.service import START_LIMIT_S, Service, ServiceLoop
-from snakesim_hal.terminal import print_error, report_error
+from snakesim_hal.terminal import print_stderr, report_error
 
 TRY_S = 2.0  # to connect
 TELL_S = 20.0  # between two signs of life
@@ -109,7 +109,7 @@ class StartupWait:
         now = time.monotonic()
         if now - self._shown_at >= TELL_S:
             self._shown_at = now
-            print_error(f"{self._name}: waiting for {self._what}")
+            print_stderr(f"{self._name}: waiting for {self._what}")
         return now - self._began < START_LIMIT_S
 
 

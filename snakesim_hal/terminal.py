@@ -83,7 +83,7 @@ def say_json(value: Any, say: Say = say) -> None:
     say(msgspec.json.encode(value).decode())
 
 
-def print_error(line: str) -> None:
+def print_stderr(line: str) -> None:
     """Print one line to stderr."""
     print(printable(line), file=sys.stderr, flush=True)
 
@@ -92,7 +92,7 @@ def report_error(error: SnakesimError, tool: str) -> None:
     """Print an error to stderr: the tool's name, and the error's own lines."""
     first, *more = error.lines
     for line in (f"{tool}: {first}", *more):
-        print_error(line)
+        print_stderr(line)
 
 
 def overwrite_line(line: str, most: int, before: int) -> int:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NoReturn
 
 from snakesim_hal.errors import ConfigError, SnakesimError, did_you_mean, short
-from snakesim_hal.terminal import discard, print_error, report_error, say
+from snakesim_hal.terminal import discard, print_stderr, report_error, say
 from snakesim_operator.console import arguments as console
 from snakesim_operator.evaluate import arguments as evaluate
 from snakesim_operator.lab import arguments as lab
@@ -35,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         discard(sys.stdout)
         if isinstance(error, BrokenPipeError):  # the reader of a pipe has closed it
             return OK
-        print_error(f"snakesim: {f'{error.filename}: ' if error.filename else ''}{error.strerror or error}")
+        print_stderr(f"snakesim: {f'{error.filename}: ' if error.filename else ''}{error.strerror or error}")
         return FAILED
 
 
@@ -77,7 +77,7 @@ class Command(argparse.ArgumentParser):
         """End, with one line instead of the whole usage."""
         plain = re.sub(r"invalid float value: (.*)", r"\1 is not a number; give it without a unit", message)
         plain = re.sub(r"invalid int value: (.*)", r"\1 is not a whole number; give it without a unit", plain)
-        print_error(f"{self.prog}: {plain}; see `{self.prog} --help`")
+        print_stderr(f"{self.prog}: {plain}; see `{self.prog} --help`")
         sys.exit(BAD_INPUT)
 
 

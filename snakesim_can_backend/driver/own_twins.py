@@ -18,7 +18,7 @@ from snakesim_hal.model.fault_plan import check_backend_can
 from snakesim_hal.model.injection import KINDS, Injection
 from snakesim_hal.model.scenario import RunConfig, write
 from snakesim_hal.service import START_LIMIT_S
-from snakesim_hal.terminal import print_error
+from snakesim_hal.terminal import print_stderr
 
 READY = "modules ready"
 STOP_LIMIT_S = 5.0
@@ -134,7 +134,7 @@ class TwinProcess:
                 self._process.stdin.close()
         with contextlib.suppress(OSError):  # an unreadable log does not prevent ending
             for line in self._said.read_text(encoding="utf-8", errors="replace").splitlines():
-                print_error(line)
+                print_stderr(line)
         self._folder.cleanup()
 
     def _await_ready(self) -> None:

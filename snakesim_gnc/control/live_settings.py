@@ -18,7 +18,7 @@ from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.client import Client
 from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.session import Question
-from snakesim_hal.terminal import print_error
+from snakesim_hal.terminal import print_stderr
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE, Decoder
 from snakesim_hal.wire.messages import Answer, Clock, ControlSettings, Description, SettingsRequest
@@ -87,7 +87,7 @@ class LiveSettings:
         except (ConfigError, ControllerError, *UNDECODABLE) as error:
             return Answer(ok=False, reason=str(error)[:500], refusal="bad_settings")
         self._settings, self._by, self._changes = settings, request.who, self._changes + 1
-        print_error(f"settings changed by {request.who!r}: {_in_json(settings)[:2000]}")
+        print_stderr(f"settings changed by {request.who!r}: {_in_json(settings)[:2000]}")
         return Answer(ok=True, reason=f"{self._name} has the settings of {request.who}")
 
     def _checked(self, section: dict[str, Any], source: str) -> Any:

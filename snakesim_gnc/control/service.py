@@ -15,7 +15,7 @@ from snakesim_hal.errors import ControllerError
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.client import Client, Commander
 from snakesim_hal.service import Service
-from snakesim_hal.terminal import print_error
+from snakesim_hal.terminal import print_stderr
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, ControlState, Description, JointState, Message, Trajectory, World
 
@@ -134,7 +134,7 @@ class Control(Service):
         streams = {why.partition(" ")[0] for why in late}
         if streams != self._noted:
             text = f"{'; '.join(late)}: {so}" if late else "all inputs of control are fresh again"
-            print_error(f"{clock.stamp_ns * 1e-9:.3f} s: {text}")
+            print_stderr(f"{clock.stamp_ns * 1e-9:.3f} s: {text}")
         self._noted = streams
 
 

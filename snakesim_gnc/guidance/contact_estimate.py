@@ -170,9 +170,8 @@ def _motion(body: Body, spins: Floats, imu: Imu) -> tuple[Floats, Floats]:
     Least squares over all accelerometers: neighbours share a joint, so that they correct one another.
     """
     model = _accelerations(body, spins)[:, imu.link].reshape(2 * len(imu.link), len(spins) + 3)
-    measured = np.einsum("kij,kj->ki", body.frames[imu.link], np.reshape(imu.acceleration_m_s2, (-1, 3)))[
-        :, :2
-    ].T.ravel()
+    in_links = np.reshape(imu.acceleration_m_s2, (-1, 3))
+    measured = np.einsum("kij,kj->ki", body.frames[imu.link], in_links)[:, :2].T.ravel()
     before = np.append(np.full(2, BASE_M_S2), np.full(len(spins), TURNING_RAD_S2))
     precision = model[:, :-1].T @ model[:, :-1] / ACCELERATION_M_S2**2 + np.diag(before**-2.0)
     covariance = np.linalg.inv(precision)

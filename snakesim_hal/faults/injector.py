@@ -17,7 +17,7 @@ from snakesim_hal.model.fault_plan import planned
 from snakesim_hal.model.injection import Change, Injection, Plan, checked
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Question, Session
-from snakesim_hal.terminal import print_error
+from snakesim_hal.terminal import print_stderr
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import Answer, Clock, FaultRequest, LifecycleState
@@ -35,7 +35,7 @@ def no_action(injection: Injection, _begins: bool) -> None:
 
 def print_note(text: str, now_s: float) -> None:
     """For a part that reports to a log."""
-    print_error(f"{now_s:.3f} s: injected: {text}")
+    print_stderr(f"{now_s:.3f} s: injected: {text}")
 
 
 class Injector:

@@ -13,7 +13,7 @@ from typing import Any
 from snakesim_hal.model.injection import HAL
 from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.session import Publisher, Question, Session
-from snakesim_hal.terminal import print_error
+from snakesim_hal.terminal import print_stderr
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import IMAGES
 from snakesim_hal.wire.messages import MAX_CONFIG, Answer, Configuration, Description, Message, Status
@@ -55,7 +55,7 @@ class Sender:
                 action()
             except Exception as error:  # noqa: BLE001 - this thread's outermost loop; usually the network is closed
                 if not self._closing:
-                    print_error(f"not sent: {type(error).__name__}: {error}")
+                    print_stderr(f"not sent: {type(error).__name__}: {error}")
             self._since_ns = 0
 
 
@@ -93,7 +93,7 @@ class Outbox:
 
     def log(self, text: str) -> None:
         """Write a line to the process's log. A disk may be slow."""
-        self._answers.do(lambda: print_error(text))
+        self._answers.do(lambda: print_stderr(text))
 
     def held_up_s(self) -> float:
         """For how long the network has been blocked."""

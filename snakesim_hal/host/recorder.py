@@ -18,7 +18,7 @@ import msgspec
 
 from snakesim_hal.host.black_box import BlackBox
 from snakesim_hal.model.whole_file import write_whole
-from snakesim_hal.terminal import print_error
+from snakesim_hal.terminal import print_stderr
 from snakesim_hal.wire.messages import Description
 
 BLACK_BOX = "blackbox.rows"
@@ -122,7 +122,7 @@ class Recorder:
 
     def _note(self, failure: str) -> None:
         if failure and not self._failure:
-            print_error(f"record: {failure}")
+            print_stderr(f"record: {failure}")
         self._failure = failure
 
     def _message(self, failure: str) -> msgspec.Struct:

@@ -17,7 +17,7 @@ from snakesim_hal.wire.messages import Obstacle
 
 Floats = NDArray[np.float64]
 
-MAX_STREWN = 1000
+MAX_RANDOM_OBSTACLES = 1000
 TRIES = 200  # for each obstacle that is wanted
 
 
@@ -94,10 +94,10 @@ def _check(field: RandomField, where: str, route: Route | None) -> None:
             raise ConfigError(f"{where}: `{name}` = {sizes}: smallest first, then largest")
     if field.route_clearance_m is not None and route is None:
         raise ConfigError(f"{where}: `route_clearance_m` is set but the scene has no route; add a [route] section")
-    if field.wanted > MAX_STREWN:
+    if field.wanted > MAX_RANDOM_OBSTACLES:
         raise ConfigError(
             f"{where}: `density_per_m2` = {field.density_per_m2} asks for {field.wanted} pegs on this area; at most "
-            f"{MAX_STREWN}"
+            f"{MAX_RANDOM_OBSTACLES}"
         )
 
 

@@ -24,7 +24,7 @@ from snakesim_hal.model.outlines import (
     Size,
     metres,
 )
-from snakesim_hal.model.random_field import MAX_STREWN, RandomField, random_obstacles
+from snakesim_hal.model.random_field import MAX_RANDOM_OBSTACLES, RandomField, random_obstacles
 from snakesim_hal.model.route import Route, sine_points
 from snakesim_hal.wire.messages import Obstacle
 from snakesim_hal.wire.quantities import Name
@@ -223,7 +223,7 @@ def place(scene: SceneFile, keep_clear: list[Capsule] | None = None) -> list[Pla
 def _check_count(scene: SceneFile) -> None:
     given = (scene.cylinder, scene.box, scene.sphere, scene.wall, scene.step)
     count = sum(len(kind) for kind in given) + sum(row.count for row in scene.pegs_along_route)
-    count += sum(min(field.wanted, MAX_STREWN) for field in scene.random_field)
+    count += sum(min(field.wanted, MAX_RANDOM_OBSTACLES) for field in scene.random_field)
     if count > MAX_OBSTACLES:
         raise ConfigError(f"scene {scene.name!r}: has {count} obstacles; at most {MAX_OBSTACLES} are allowed")
 

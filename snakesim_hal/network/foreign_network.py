@@ -43,7 +43,7 @@ class RawReader:
 
 
 class ForeignNetwork:
-    """A session on a network of somebody else. Open one with `foreign_network`."""
+    """A session on a network of somebody else. Open one with `open_foreign_network`."""
 
     def __init__(self, zenoh_session: zenoh.Session) -> None:
         self._zenoh = zenoh_session
@@ -82,7 +82,9 @@ class ForeignNetwork:
 
 
 @contextmanager
-def foreign_network(endpoint: str, *, largest_bytes: int, connect_timeout_s: float = 5.0) -> Iterator[ForeignNetwork]:
+def open_foreign_network(
+    endpoint: str, *, largest_bytes: int, connect_timeout_s: float = 5.0
+) -> Iterator[ForeignNetwork]:
     """Connect to a router. largest_bytes: of a payload from there. Raises NotConnectedError."""
     session = ForeignNetwork(open_zenoh(Link(endpoint, largest_bytes=largest_bytes), connect_timeout_s))
     try:

@@ -17,7 +17,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 
-from snakesim_hal.terminal import print_error
+from snakesim_hal.terminal import print_stderr
 
 ZENOH_LEVELS = (
     "info,zenoh::net::routing::interceptor::access_control=trace,"
@@ -150,7 +150,7 @@ def _to_stderr(line: str) -> None:
     """Drop the line when stderr is full: a router must not wait for the reader of its log."""
     with contextlib.suppress(OSError):
         if select.select([], [sys.stderr], [], 0.0)[1]:
-            print_error(f"{time.strftime('%Y-%m-%dT%H:%M:%SZ', time.gmtime())} {line}")
+            print_stderr(f"{time.strftime('%Y-%m-%dT%H:%M:%SZ', time.gmtime())} {line}")
 
 
 def _read(pipe: int, log: RouterLog) -> None:

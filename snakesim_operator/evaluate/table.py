@@ -141,11 +141,8 @@ def _why(outcome: Outcome) -> str:
     way, goal = numbers.get("advance_m"), numbers.get("goal_m")
     far = f"{way:.2f} m" if isinstance(way, float) else "unknown"
     of = f" of {goal:g} m" if isinstance(goal, float) else ""
-    last = (
-        f"{numbers.get('last_state')}: {numbers.get('last_reason')}"
-        if numbers.get("last_reason")
-        else numbers.get("last_state")
-    )
+    state, reason = numbers.get("last_state"), numbers.get("last_reason")
+    last = f"{state}: {reason}" if reason else state
     ended = "" if numbers.get("ended") == "complete" else f"; {numbers.get('ended')}"
     ended += "; given up: no advance for too long" if numbers.get(GAVE_UP) else ""
     return f"{far}{of}; {last or 'controller said nothing'}{ended}"

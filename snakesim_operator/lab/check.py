@@ -89,10 +89,10 @@ def _check_certificate(identity: Identity, folder: Path, found: Findings) -> Non
     except ConfigError as error:
         found.failed(f"{identity.common_name}: {error}")
         return
-    _tell_end(identity.common_name, certificate, "run `snakesim deploy certs` and install it", found)
+    _check_end(identity.common_name, certificate, "run `snakesim deploy certs` and install it", found)
 
 
-def _tell_end(what: str, certificate: x509.Certificate, remedy: str, found: Findings) -> None:
+def _check_end(what: str, certificate: x509.Certificate, remedy: str, found: Findings) -> None:
     end = certificate.not_valid_after_utc
     left, life = end - datetime.now(UTC), end - certificate.not_valid_before_utc
     text = f"{what}: ends {end:%Y-%m-%d %H:%M} UTC, in {left.total_seconds() / 86400:.1f} days"
@@ -127,7 +127,7 @@ def _check_router(name: str, lab: Lab, folder: Path, found: Findings) -> bool:
     shown = _shown_certificate(endpoint, tls)
     kept = read_certificate(_tls(identity, folder) / f"{identity.label}.pem")
     if shown.serial_number != kept.serial_number:
-        _tell_end(f"{name} shows an earlier certificate", shown, f"restart it on {identity.machine}", found)
+        _check_end(f"{name} shows an earlier certificate", shown, f"restart it on {identity.machine}", found)
     settings["transport"]["link"]["tls"] = {"root_ca_certificate": tls["root_ca_certificate"]}
     try:
         with open_probe(json.dumps(settings)):
@@ -178,10 +178,10 @@ def _check_robot(robot: str, lab: Lab, folder: Path, found: Findings) -> None:
         if not running or not any(keys.service_of(key).rpartition("-")[0] == name for key in live):
             found.failed(f"{name}: not running; it belongs on {machine}")
         for entry in running:
-            _tell_process(entry, host, ahead, found)
+            _check_process(entry, host, ahead, found)
 
 
-def _tell_process(entry: Process, host: Process | None, ahead: dict[str, float], found: Findings) -> None:
+def _check_process(entry: Process, host: Process | None, ahead: dict[str, float], found: Findings) -> None:
     found.passed(f"{entry.name}: on {entry.machine}, process {entry.pid}, snakesim {entry.version}")
     if host is not None and entry.version != host.version:
         found.failed(f"{entry.name}: snakesim {entry.version}, but the host has {host.version}")

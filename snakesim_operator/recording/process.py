@@ -24,7 +24,7 @@ from snakesim_hal.network.session import Arrival, Link, open_session
 from snakesim_hal.process import on_stop_signal
 from snakesim_hal.serve import process_options
 from snakesim_hal.service import START_LIMIT_S
-from snakesim_hal.terminal import print_error, report_error
+from snakesim_hal.terminal import print_stderr, report_error
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import Description
@@ -107,10 +107,10 @@ def record(link: Link, path: Path, goes_on: Callable[[], bool], show: Show | Non
             time.sleep(TURN_S)
         _turn(tap, recorder)
     for key, number in sorted(tap.dropped.items()):
-        print_error(f"{number} messages on {key} were dropped: the disk was too slow")
+        print_stderr(f"{number} messages on {key} were dropped: the disk was too slow")
     failure = recorder.close(dict(tap.dropped))
     if failure:
-        print_error(f"recording ended: {failure}")
+        print_stderr(f"recording ended: {failure}")
     return recorder
 
 

@@ -90,12 +90,9 @@ class RunRecord:
             host = msgspec.json.decode((folder / HOST_RECORD).read_bytes(), type=HostRecord)
         if host.ended == "running":
             host = msgspec.structs.replace(host, ticks=len(columns["tick"]), command_digest=digest_of(columns))
-        host = _with_lost_ticks(host, columns)
-        known, lacks = cleaned(columns, description, has_pose=config.robot.sensors.pose is not None)
-        lacks += unwritten(host)
         path = folder / RECORDING
         contents = read_recording(path, SERVICE_STREAMS) if path.is_file() else Contents(path)
-        return RunRecord._of(folder, config, description, host, contents, known, lacks)
+        return RunRecord._of(folder, config, description, host, contents, columns)
 
     @staticmethod
     def _alone(path: Path, host: HostRecord | None) -> "RunRecord":
@@ -109,13 +106,8 @@ class RunRecord:
         except UNDECODABLE as error:
             raise ConfigError(f"{path}: its hal/config cannot be read: {str(error)[:200]}") from None
         columns = contents.columns(description)
-        known, lacks = cleaned(columns, description, has_pose=config.robot.sensors.pose is not None)
-        if host is None:
-            host = contents.host(columns)
-        else:
-            host = _with_lost_ticks(host, columns)
-            lacks += unwritten(host)
-        return RunRecord._of(path, config, description, host, contents, known, lacks)
+        host = contents.host(columns) if host is None else host
+        return RunRecord._of(path, config, description, host, contents, columns)
 
     @staticmethod
     def _of(
@@ -125,12 +117,13 @@ class RunRecord:
         host: HostRecord,
         contents: Contents,
         columns: dict[str, NDArray[Any]],
-        lacks: list[str],
     ) -> "RunRecord":
+        host = msgspec.structs.replace(host, lost_ticks=max(host.lost_ticks, host.ticks - len(columns["tick"])))
+        cleaned_columns, lacks = cleaned(columns, description, has_pose=config.robot.sensors.pose is not None)
         control = contents.streams[keys.CONTROL_STATE]
         while control and control[-1].state == "PowerOff":  # the host has ended, so its clock is expected to stop
             control.pop()
-        known = {name: column for name, column in columns.items() if name != "tick"}
+        known = {name: column for name, column in cleaned_columns.items() if name != "tick"}
         streams = (control, contents.streams[keys.WORLD], contents.streams[keys.TRAJECTORY])
         return RunRecord(
             folder,
@@ -139,7 +132,7 @@ class RunRecord:
             host,
             *streams,
             **known,
-            lacks=lacks + contents.lacks,
+            lacks=lacks + unwritten(host) + contents.lacks,
             replay_of=contents.replay_of,
         )
 
@@ -176,8 +169,3 @@ def nodes_w(robot: Description, position_w: Floats, orientation_wxyz: Floats, an
     rotation = rotation_from_quaternion(orientation_wxyz)
     origins, rotations = link_frames(position_w, rotation, angle_rad, [joint.axis for joint in robot.joints], lengths)
     return np.vstack([origins, origins[-1] + lengths[-1] * rotations[-1][:, 0]])
-
-
-def _with_lost_ticks(host: HostRecord, columns: dict[str, NDArray[Any]]) -> HostRecord:
-    """The host's statistics, with the number of its ticks that have no row."""
-    return msgspec.structs.replace(host, lost_ticks=max(host.lost_ticks, host.ticks - len(columns["tick"])))

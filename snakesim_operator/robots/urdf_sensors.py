@@ -20,14 +20,14 @@ from snakesim_operator.robots.urdf_tree import Row, rotation
 from snakesim_operator.robots.xml_tree import Element
 
 Floats = NDArray[np.float64]
-Tell = Callable[[str], None]
+Warn = Callable[[str], None]
 
 EVERYWHERE = {"imu": "imu", "contact": "contacts"}
 DEPTH = ("depth", "depth_camera", "rgbd_camera")
 RANGE = ("ray", "gpu_ray", "lidar", "gpu_lidar")
 
 
-def put_sensors(table: Table, urdf: Element, row: Row, frames: list[Floats], scale: float, *, warn: Tell) -> None:
+def put_sensors(table: Table, urdf: Element, row: Row, frames: list[Floats], scale: float, *, warn: Warn) -> None:
     """Put a URDF's sensors into a robot file's values. frames: link_from_root (4, 4) of every link, in m."""
     link_of = {name: i for i, body in enumerate(row.bodies) for name in body.links}
     for gazebo in urdf.all("gazebo"):
@@ -80,7 +80,7 @@ def _in_metres(frame: Floats, scale: float) -> Floats:
     return scaled
 
 
-def _place(link_from_sensor: Floats, name: str, warn: Tell) -> dict[str, Any]:
+def _place(link_from_sensor: Floats, name: str, warn: Warn) -> dict[str, Any]:
     turn = link_from_sensor[:3, :3]
     roll = math.atan2(turn[2, 1], turn[2, 2])
     if abs(roll) > 0.01:

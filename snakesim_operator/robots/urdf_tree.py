@@ -16,7 +16,7 @@ from snakesim_operator.robots.meshes import find_mesh, vertices
 from snakesim_operator.robots.xml_tree import Element
 
 Floats = NDArray[np.float64]
-Tell = Callable[[str], None]
+Warn = Callable[[str], None]
 TURNING = ("revolute", "continuous")
 RIM = 32  # points of a cylinder's rim
 
@@ -69,7 +69,7 @@ class Row:
     joints: list[Joint]
 
 
-def row_of(urdf: Element, file: Path, *, tail: str | None, warn: Tell) -> Row:
+def row_of(urdf: Element, file: Path, *, tail: str | None, warn: Warn) -> Row:
     """The bodies of a URDF, tail to head. tail: a link of the first one; None: the root link. Raises ConfigError."""
     links = _named(urdf, "link")
     joints = _named(urdf, "joint")
@@ -108,7 +108,7 @@ def rotation(roll: float, pitch: float, yaw: float) -> Floats:
     return np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]]) @ about_y @ about_x
 
 
-def _walk(urdf: Element, links: dict[str, Element], joints: dict[str, Element], warn: Tell):
+def _walk(urdf: Element, links: dict[str, Element], joints: dict[str, Element], warn: Warn):
     """Frames of all links, the joints that turn as (parent, child, joint), and the first link of each link's body."""
     below: dict[str, list[tuple[str, Element]]] = {}
     parents: dict[str, Element] = {}
@@ -164,7 +164,7 @@ def _joint(element: Element, frame: Floats) -> Joint:
     return Joint(element, element.get("name"), frame[:3, 3], frame[:3, :3] @ axis / length, backwards=False)
 
 
-def _add_link(body: Body, link: Element, frame: Floats, file: Path, warn: Tell) -> None:
+def _add_link(body: Body, link: Element, frame: Floats, file: Path, warn: Warn) -> None:
     inertial = link.first("inertial")
     if inertial is not None:
         mass, moments = inertial.first("mass"), inertial.first("inertia")
@@ -187,7 +187,7 @@ def _add_link(body: Body, link: Element, frame: Floats, file: Path, warn: Tell) 
             body.points.append(points @ placed[:3, :3].T + placed[:3, 3])
 
 
-def _outline(shape: Element, file: Path, warn: Tell) -> Floats | None:
+def _outline(shape: Element, file: Path, warn: Warn) -> Floats | None:
     """Points whose hull holds a shape, in its frame, (n, 3)."""
     shape.read = True
     match shape.tag:

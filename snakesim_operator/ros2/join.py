@@ -6,7 +6,7 @@ import time
 from dataclasses import replace
 
 from snakesim_hal.errors import ConfigError, NotConnectedError
-from snakesim_hal.network.foreign_network import foreign_network
+from snakesim_hal.network.foreign_network import open_foreign_network
 from snakesim_hal.network.session import open_session
 from snakesim_hal.terminal import say
 from snakesim_hal.wire import keys
@@ -45,7 +45,7 @@ def join(arguments: argparse.Namespace, where: RobotSelection) -> int:
         )
         with contextlib.ExitStack() as opened:
             try:
-                network = opened.enter_context(foreign_network(arguments.ros_router, largest_bytes=MAX_IN_BYTES))
+                network = opened.enter_context(open_foreign_network(arguments.ros_router, largest_bytes=MAX_IN_BYTES))
             except NotConnectedError:
                 raise NotConnectedError(
                     f"no router of ROS nodes on {arguments.ros_router}; start it by "

@@ -25,7 +25,7 @@ from snakesim_hal.in_process import InProcessRun, check
 from snakesim_hal.model.plugin_check import check_plugins
 from snakesim_hal.model.scenario import RunConfig, write
 from snakesim_hal.network.session import Session
-from snakesim_hal.terminal import print_error, say
+from snakesim_hal.terminal import print_stderr, say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlState
 from snakesim_operator.recording.reader import RECORDING
@@ -67,7 +67,7 @@ def simulate(
         if out is None:
             folder = Path(opened.enter_context(TemporaryDirectory(prefix="snakesim-")))
             write(config, folder / CONFIG)
-            files = RunFiles(folder, print_error)
+            files = RunFiles(folder, print_stderr)
         else:
             files, _ = opened.enter_context(opened_files(config, out))
         if files.folder is None:

@@ -13,7 +13,7 @@ from importlib.metadata import entry_points
 from snakesim_hal.model.files import shipped
 from snakesim_hal.model.injection import KINDS
 from snakesim_hal.model.plugins import BACKENDS, COMMANDS, CONTROLLERS, installed
-from snakesim_hal.terminal import print_error
+from snakesim_hal.terminal import print_stderr
 from snakesim_hal.wire import keys
 
 KNOWN: dict[str, Callable[[], list[str]]] = {  # values of arguments, by the argument's name in any command
@@ -110,7 +110,7 @@ def _of_package(name: str) -> list[Command]:
     try:
         parser = getattr(import_module(entry.module), "parser", None)
     except ImportError as error:
-        print_error(f"snakesim {name} cannot be completed: {error}")
+        print_stderr(f"snakesim {name} cannot be completed: {error}")
         return []
     return list(_walk(parser(), f" {name}")) if parser is not None else [Command(f" {name}")]
 

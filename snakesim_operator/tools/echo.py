@@ -17,7 +17,7 @@ import msgspec
 from snakesim_hal.errors import ConfigError, NotConnectedError, WireError, did_you_mean, short
 from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.session import Arrival, Session, intersects, key_expression, open_session
-from snakesim_hal.terminal import Say, print_error, say
+from snakesim_hal.terminal import Say, print_stderr, say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES, Decoder
 from snakesim_operator.tools.targets import CONNECT_S, RobotSelection
@@ -40,7 +40,7 @@ def echo(request: EchoRequest, where: RobotSelection, say: Say = say) -> int:
     if request.key is None:
         for line in _key_lines():
             say(line)
-        print_error("`snakesim echo KEY` prints the messages, --hz their rate; `snakesim top` shows all rates at once")
+        print_stderr("`snakesim echo KEY` prints the messages, --hz their rate; `snakesim top` shows all rates at once")
         return 0
     relative = key_expression(request.key.strip("/"))
     rows = [row for row in _echoed() if intersects(relative, row.key)]
@@ -120,7 +120,7 @@ class OutputQueue:
     def get(self, timeout: float | None = None) -> Arrival:
         """The oldest one. Raises queue.Empty."""
         if self._dropped and self._arrivals.empty():
-            print_error(f"{self._dropped} messages were dropped: they came faster than they could be printed")
+            print_stderr(f"{self._dropped} messages were dropped: they came faster than they could be printed")
             self._dropped = 0
         arrival = self._arrivals.get(timeout)
         with self._lock:

@@ -6,7 +6,7 @@
   const find = (what) => player.querySelector(what);
   const slider = find("input"), button = find(".play"), speed = find("select"), words = find("output");
   const links = [...player.querySelectorAll(".snake line")], dots = [...player.querySelectorAll(".snake circle")];
-  const forces = find(".forces"), seen = find(".seen-obstacles");
+  const forces = find(".forces"), perceived = find(".perceived");
   const set = (node, values) => { for (const [key, value] of Object.entries(values)) node.setAttribute(key, value); };
 
   const arrow = ([x1, y1, x2, y2], kind) => {
@@ -36,7 +36,7 @@
       set(dot, { cx: at[2 * k + 2], cy: at[2 * k + 3], r: on ? 8 : 2.4, class: on ? "propelling" : "joint",
         style: on ? `fill:var(--joint-${k})` : "" });
     });
-    seen.innerHTML = (maps[map] ?? []).map((outline) => `<polygon class="seen" points="${outline}"/>`).join("")
+    perceived.innerHTML = (maps[map] ?? []).map((outline) => `<polygon class="seen" points="${outline}"/>`).join("")
       + (paths[path] ? `<polyline class="planned" points="${paths[path]}"/>` : "");
     const last = solved.length - 4;
     forces.innerHTML = pieces(felt).map((one) => arrow(one, "felt")).join("")

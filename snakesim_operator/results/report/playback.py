@@ -22,7 +22,7 @@ from snakesim_operator.results.report.top_view import body, ground, outline_w, s
 from snakesim_operator.results.report.view import FELT_SHARE, LONGEST_ARROW, View, map_view
 
 Floats = NDArray[np.float64]
-Told = TypeVar("Told", ControlState, World)
+MessageT = TypeVar("MessageT", ControlState, World)
 FRAMES = 300
 MAPS, PATH_POINTS = 80, 60  # of a whole run; of a path
 WIDTH = 1040.0
@@ -76,11 +76,7 @@ def playback(record: RunRecord) -> Playback | None:
         view.width,
         view.height,
         "The snake on the map, moved by the slider",
-        ground(record, view, labels)
-        + '<g class="seen-obstacles"></g>'
-        + snake
-        + '<g class="forces"></g>'
-        + scales(view),
+        ground(record, view, labels) + '<g class="perceived"></g>' + snake + '<g class="forces"></g>' + scales(view),
     )
     data = {"frames": frames, "said": said, "joints": names, "end": round(end_s(record), 3)}
     data |= {"maps": maps, "paths": paths}
@@ -102,8 +98,8 @@ def _planned(record: RunRecord, view: View, rows: NDArray[np.intp]) -> tuple[lis
     planned = [one for one in record.trajectories if one.stamp_ns is not None]
     if len({one.path_id for one in planned}) < 2:
         return [], [-1] * len(rows)
-    outlines = [_flat(view, np.array(one.path_w)[:: max(len(one.path_w) // PATH_POINTS, 1)]) for one in planned]
-    return outlines, _last_before(record, rows, [one.stamp_ns or 0 for one in planned])
+    paths = [_flat(view, np.array(one.path_w)[:: max(len(one.path_w) // PATH_POINTS, 1)]) for one in planned]
+    return paths, _last_before(record, rows, [one.stamp_ns or 0 for one in planned])
 
 
 def _flat(view: View, points_w: Floats) -> list[float]:
@@ -121,7 +117,7 @@ def _nodes(record: RunRecord, row: int) -> Floats:
     return nodes[:, :2]
 
 
-def _latest(record: RunRecord, rows: NDArray[np.intp], messages: Sequence[Told]) -> list[Told | None]:
+def _latest(record: RunRecord, rows: NDArray[np.intp], messages: Sequence[MessageT]) -> list[MessageT | None]:
     """What was said last before each row, unless that is long ago."""
     before = _last_before(record, rows, [one.stamp_ns for one in messages])
     newest = [messages[i] if i >= 0 else None for i in before]

@@ -16,10 +16,7 @@ from snakesim_operator.results.summary import RunSummary
 MOVED_M = 0.02  # less than this is no locomotion
 MIN_STOP_S = 0.5  # a shorter stop at the end is not worth a word
 RESTING_SHARE = 0.02  # of all its way: what is so near to the end of it has arrived, but for who moves to the last,
-REST_SHARE, REST_S = (
-    0.1,
-    5.0,
-)  # which is distinguished from a rest by how long it takes: a tenth of the run, or so many seconds
+REST_SHARE, REST_S = 0.1, 5.0  # which differs from a rest by how long it takes: a tenth of the run, or so many seconds
 POOR_SHARE = 0.5  # a run that stood still for more of its time than this, up to its end, is no good one
 SHOWN_HANDOVERS = 8
 Kind = Literal["good", "poor", "bad"]

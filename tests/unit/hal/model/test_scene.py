@@ -122,13 +122,13 @@ def test_a_random_field_keeps_its_clearances(seed: int, clearance_m: float, rout
     route = route_of(made)
     assert route is not None
     pegs = [item.obstacle for item in place(made, SNAKE)]
-    strewn = pegs[1:]
-    assert len(strewn) == round(5.0 * 4.0)
-    for i, peg in enumerate(strewn):
+    placed = pegs[1:]
+    assert len(placed) == round(5.0 * 4.0)
+    for i, peg in enumerate(placed):
         centre = np.array(peg.position_w[:2])
         assert 0.02 <= peg.radius_m <= 0.05
         assert -1e-9 <= centre[0] <= 2 and -1 <= centre[1] <= 1
-        for other in [pegs[0], *strewn[:i]]:
+        for other in [pegs[0], *placed[:i]]:
             assert outline_distance_m(other, centre) - peg.radius_m >= clearance_m - 1e-9
         assert LINKS.distance_m(centre).min() - peg.radius_m >= clearance_m - 1e-9
         dense = route.position_w(np.linspace(0, route.length_m, 2000))

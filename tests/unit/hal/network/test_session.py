@@ -5,6 +5,8 @@ import socket
 import sys
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -247,6 +249,17 @@ def test_a_router_wants_a_file_that_says_so(tmp_path: Path) -> None:
         wait_until(lambda: arrived, "the sample through the router")
 
 
+@contextmanager
+def often_switching() -> Iterator[None]:
+    """Threads take turns at almost every step."""
+    before_s = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(before_s)
+
+
 def test_threads_may_open_sessions_at_once_and_the_environment_of_children_stays_as_it_was() -> None:
     endpoint, before, failed = free_endpoint(), dict(os.environ), list[BaseException]()
 
@@ -260,14 +273,11 @@ def test_threads_may_open_sessions_at_once_and_the_environment_of_children_stays
             failed.append(error)
             start.abort()
 
-    switch_s = sys.getswitchinterval()
-    sys.setswitchinterval(1e-6)
-    with open_session(Link(endpoint, "worm", listen=True)):
+    with often_switching(), open_session(Link(endpoint, "worm", listen=True)):
         together = threading.Barrier(8)
         threads = [threading.Thread(target=open_often, args=(together,)) for _ in range(8)]
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join()
-    sys.setswitchinterval(switch_s)
     assert not failed and dict(os.environ) == before, failed
