@@ -21,6 +21,7 @@ from snakesim_hal.safety.gate import Applied, Floats, JointLimits, Measured
 from snakesim_hal.wire.messages import Fault, JointState, Mode
 
 Mask = NDArray[np.bool_]
+Columns = tuple[list[float], list[float], list[float]]  # angle, velocity, torque
 
 SPEED_MARGIN = 2.0  # an external load may turn a joint faster than its motor
 SLACK_RAD = 0.05  # for noise
@@ -47,6 +48,7 @@ class PlausibilityCheck:
         self._columns = np.zeros((3, count))  # angle, velocity, torque: the last good ones
         self._good_s = np.zeros((2, count))  # when they were taken, by both clocks
         self._known: Mask = np.zeros(count, dtype=np.bool_)  # whether there ever were any
+        self._ordinary: Columns | None = None  # the last state, if all of it was good and no joint had jumped
         self._jumps = _JumpDetector(count, SPEED_MARGIN * limits.speed_rad_s)
         self._frozen = _FrozenDetector(limits)
 
@@ -70,13 +72,19 @@ class PlausibilityCheck:
             )
         ages_ns = np.array(joints.age_ns, dtype=np.float64)
         taken_s = (np.array([[joints.stamp_ns], [now_ns]], dtype=np.float64) - ages_ns) * 1e-9
-        columns = np.array((joints.angle_rad, joints.velocity_rad_s, joints.torque_nm))
+        newest: Columns = (joints.angle_rad, joints.velocity_rad_s, joints.torque_nm)
+        columns = np.array(newest)
+        if self._is_ordinary(joints):
+            self._columns, self._good_s, self._ordinary = columns, taken_s, newest
+            self._frozen.moved(columns, applied)
+            return None
         fresh = ages_ns <= self._limits.oldest_state_ns
         sound: Mask = np.isfinite(columns).all(axis=0) & fresh & np.array(joints.valid)
         elapsed_s = (taken_s - self._good_s).max(axis=0)
         jump_rad = np.where(sound, columns[0], 0.0) - self._columns[0]
         jumped = sound & self._known & (np.abs(jump_rad) > self._jumps.reach_rad(elapsed_s))
         settled = self._jumps.settled(jumped, columns[0], taken_s)
+        self._ordinary = newest if sound.all() and not jumped.any() else None
         if applied is None:
             jumped &= ~settled
         good = sound & ~jumped
@@ -101,6 +109,22 @@ class PlausibilityCheck:
                 joints.tick, "joint_frozen", "the same state repeated while its target moves: ", frozen
             )
         return None
+
+    def _is_ordinary(self, joints: JointState) -> bool:
+        """Whether every joint is fresh, near its last angle and new, as nearly always: then no check can fail.
+
+        On plain numbers: for a dozen joints that is several times faster than on vectors.
+        """
+        if self._ordinary is None or not all(joints.valid) or max(joints.age_ns) > self._limits.oldest_state_ns:
+            return False
+        for angle, velocity, torque, last, last_velocity, last_torque in zip(
+            joints.angle_rad, joints.velocity_rad_s, joints.torque_nm, *self._ordinary, strict=True
+        ):
+            if not (abs(angle - last) <= SLACK_RAD and math.isfinite(velocity) and math.isfinite(torque)):
+                return False
+            if angle == last and velocity == last_velocity and torque == last_torque:
+                return False
+        return True
 
     def _implausible(
         self, tick: int, what: str, words: str, which: Mask, tails: list[str] | None = None
@@ -171,18 +195,24 @@ class _FrozenDetector:
         self._never_s = np.full(count, np.inf)
         self._far_since_s = self._never_s  # since when a target has been far from where it was at the start
 
+    def moved(self, columns: Floats, applied: Applied | None) -> None:
+        """Take states of which none repeats the one before, (3, n_joints), and what was applied."""
+        self._columns = columns
+        if applied is None:
+            self._followed = np.zeros_like(self._followed)
+            return
+        self._followed = applied.mode == Mode.POSITION
+        self._low_rad = self._high_rad = applied.target
+        self._far_since_s = self._never_s
+
     def look(self, columns: Floats, taken_s: Floats, applied: Applied | None) -> Mask:
         """Take the newest states, (3, n_joints), and what was applied; returns which joints are frozen."""
         follows = np.zeros_like(self._followed) if applied is None else applied.mode == Mode.POSITION
         same = (columns == self._columns).all(axis=0) & follows & self._followed
-        self._columns, self._followed = columns, follows
-        if applied is None:
+        if applied is None or not np.count_nonzero(same):
+            self.moved(columns, applied)
             return same
-        target = applied.target
-        if not np.count_nonzero(same):
-            self._low_rad = self._high_rad = target
-            self._far_since_s = self._never_s
-            return same
+        self._columns, self._followed, target = columns, follows, applied.target
         self._low_rad = np.where(same, np.minimum(self._low_rad, target), target)
         self._high_rad = np.where(same, np.maximum(self._high_rad, target), target)
         far = same & (self._high_rad - self._low_rad > self._far_rad)

@@ -1,5 +1,8 @@
 """Which joint states are believed: glitches, lost and late samples, and sensors that are stuck."""
 
+import math
+import random
+from collections.abc import Iterator
 from typing import Any
 
 import msgspec
@@ -8,7 +11,7 @@ import pytest
 
 from snakesim_hal.safety.gate import FRESH_PERIODS, Applied, JointLimits
 from snakesim_hal.safety.plausibility import Mask, PlausibilityCheck, readable
-from snakesim_hal.wire.messages import Fault, Mode
+from snakesim_hal.wire.messages import Fault, JointState, Mode
 from tests.unit.hal.rig import LEASE_NS, PERIOD_NS, description, state
 
 ROBOT = description()
@@ -329,3 +332,62 @@ def test_a_sample_that_is_only_old_is_not_frozen() -> None:
     bench = Bench(torque=0.5)
     for k in range(1, FRESH_PERIODS + 1):
         assert bench.see(0.0, 0.0, 0.5, applied=targets(0.1 * k), age_ns=[k * PERIOD_NS] * JOINTS) is None
+
+
+# --- the shortcut for ordinary states ----------------------------------------------------------------------------
+
+
+class Whole(PlausibilityCheck):
+    """The checks without the shortcut."""
+
+    def _is_ordinary(self, joints: JointState) -> bool:
+        del joints
+        return False
+
+
+def walk(rng: random.Random, length: int) -> Iterator[tuple[JointState, Applied | None]]:
+    """States at the edges of every check, in which at most one joint is not like the others; and what was applied."""
+    stamp_ns, target, angle = 0, 0.0, [0.4] * JOINTS
+    limit_ns = LIMITS.oldest_state_ns
+    for _ in range(length):
+        stamp_ns += rng.choice((0, PERIOD_NS, PERIOD_NS, PERIOD_NS, LEASE_NS))
+        target += rng.choice((0.0, 0.08))
+        velocity, torque = [rng.choice((0.5, 0.6))] * JOINTS, [rng.choice((0.5, 0.6))] * JOINTS
+        ages, valid = [0] * JOINTS, [True] * JOINTS
+        odd = rng.randrange(JOINTS)
+        match rng.choice(("angle", "angle", "angle", "mirrored", "velocity", "torque", "age", "valid", "none", "none")):
+            case "angle":
+                angle[odd] += rng.choice((0.05, -0.05, 0.3, -0.3, 2.0))
+            case "mirrored":
+                angle = [-at for at in angle]
+            case "velocity":
+                velocity[odd] = rng.choice((0.0, math.nan, math.inf))
+            case "torque":
+                torque[odd] = rng.choice((0.0, math.nan, math.inf))
+            case "age":
+                ages[odd] = rng.choice((limit_ns, limit_ns + 1))
+            case "valid":
+                valid[odd] = False
+            case _:
+                pass
+        count = 0 if rng.random() < 0.02 else JOINTS
+        seen = state(ROBOT, angle[:count], velocity, torque, stamp_ns=stamp_ns, age_ns=ages, valid=valid)
+        yield seen, targets(target) if rng.random() < 0.9 else None
+
+
+def test_ordinary_states_are_judged_as_by_the_whole_check() -> None:
+    rng = random.Random(5)
+    for _ in range(300):
+        quick, whole = PlausibilityCheck(LIMITS), Whole(LIMITS)
+        for seen, applied in walk(rng, 24):
+            taken = [one.take(seen, now_ns=seen.stamp_ns, applied=applied, aside=NOBODY) for one in (quick, whole)]
+            assert repr(taken[0]) == repr(taken[1])
+            for good, expected in zip(vars(quick.measured).values(), vars(whole.measured).values(), strict=True):
+                assert good.tolist() == expected.tolist()
+
+
+@pytest.mark.parametrize("check", [PlausibilityCheck, Whole])
+def test_an_angle_may_differ_by_the_noise_at_once(check: type[PlausibilityCheck]) -> None:
+    watch = check(LIMITS)
+    for angle in (0.0, 0.05):
+        assert watch.take(state(ROBOT, angle), now_ns=0, applied=targets(), aside=NOBODY) is None
