@@ -120,9 +120,7 @@ class BlackBox:
             self._pose = [*pose.position_w, *pose.orientation_wxyz]
         contacts = samples.others.get(keys.CONTACTS)
         if isinstance(contacts, Contacts):
-            squares = [f[0] * f[0] + f[1] * f[1] + f[2] * f[2] for f in (c.force_l for c in contacts.contacts)]
-            self._contact_peak_n = max(squares, default=0.0) ** 0.5
-            self._contact_count = len({c.obstacle for c in contacts.contacts})
+            self._contact_peak_n, self._contact_count = touching(contacts)
         joints, points = samples.joints, decision.set_points
         self._pack_into(
             self._memory,
@@ -166,6 +164,12 @@ class BlackBox:
             rows = bytes(memoryview(self._memory)[at * size : (at + count) * size])
             if self._rows - first < self._capacity:  # else overwritten meanwhile
                 return first, rows
+
+
+def touching(contacts: Contacts) -> tuple[float, int]:
+    """The force of the strongest contact in N, and how many obstacles are touched."""
+    squares = [f[0] * f[0] + f[1] * f[1] + f[2] * f[2] for f in (contact.force_l for contact in contacts.contacts)]
+    return max(squares, default=0.0) ** 0.5, len({contact.obstacle for contact in contacts.contacts})
 
 
 def read_black_box(path: Path) -> tuple[Layout, dict[str, NDArray[Any]]]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.errors import ConfigError, WireError
-from snakesim_hal.host.black_box import digest_of
+from snakesim_hal.host.black_box import digest_of, touching
 from snakesim_hal.host_process import HostRecord
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
@@ -101,8 +101,7 @@ class Contents:
             if tick in poses:
                 pose = [*poses[tick].position_w, *poses[tick].orientation_wxyz]
             if tick in contacts:
-                forces = [float(np.linalg.norm(one.force_l)) for one in contacts[tick].contacts]
-                peak_n, touched = max(forces, default=0.0), len({one.obstacle for one in contacts[tick].contacts})
+                peak_n, touched = touching(contacts[tick])
             state, points, clock = joints.get(tick), applied.get(tick), clocks.get(tick)
             if state is None or points is None or clock is None or not clock.arming or not state.is_of(count):
                 continue
