@@ -4,6 +4,8 @@ import os
 import signal
 import sys
 
+from snakesim_hal.arithmetic import pin
+
 
 def main() -> int:
     """The command's exit code.
@@ -17,6 +19,7 @@ def main() -> int:
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), "w" if number else "r"))
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not if the shell ignores it
         signal.signal(signal.SIGINT, signal.SIG_DFL)
+    pin()  # before NumPy is imported
     from snakesim_operator.cli import main as command
 
     return command()

@@ -5,6 +5,7 @@ the tail end, x forward. Every other body's frame is the link frame of `model.ki
 Bodies, hinges and motors are therefore in the order of the robot description.
 """
 
+import math
 from dataclasses import dataclass
 
 import mujoco
@@ -142,7 +143,9 @@ def _add_snake(spec: mujoco.MjSpec, robot: RobotFile, settings: Settings) -> Non
     _add_foot(body, f"foot_{len(lengths)}", lengths[-1], robot)
     for i in range(len(lengths)):
         for j in range(i + 2, len(lengths)):
-            if sum(lengths[i + 1 : j]) < 2.05 * robot.module.radius_m:  # they would touch when the snake is straight
+            if (
+                math.fsum(lengths[i + 1 : j]) < 2.05 * robot.module.radius_m
+            ):  # they would touch when the snake is straight
                 spec.add_exclude(bodyname1=f"link_{i}", bodyname2=f"link_{j}")
 
 

@@ -1,5 +1,6 @@
 """The body model of controllers: a planar chain that bends at its yaw joints, computed once from the description."""
 
+import math
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Sequence
@@ -26,7 +27,7 @@ class PlanarBody:
         self.names = [joint.name for joint in robot.joints]
         self.torque_limit_nm = [joint.torque_limit_nm for joint in robot.joints]
         self.radius_m = max(link.radius_m for link in robot.links)
-        self.weight_n = GRAVITY_M_S2 * sum(link.mass_kg for link in robot.links)
+        self.weight_n = GRAVITY_M_S2 * math.fsum(link.mass_kg for link in robot.links)
         self.bends = [i for i, axis in enumerate(axes) if axis == "yaw"]
         self.segments_m = yaw_segments_m(axes, lengths)
         self.node_s_m: list[float] = [0.0, *np.cumsum(self.segments_m).tolist()]

@@ -17,6 +17,7 @@ from typing import Any, Literal
 
 import msgspec
 
+from snakesim_hal.arithmetic import measured
 from snakesim_hal.backend import Backend, Samples
 from snakesim_hal.errors import BackendError, WireError
 from snakesim_hal.faults.host_faults import HostFaults
@@ -90,7 +91,7 @@ class Host:
         starter: the private channel to the process that started this host.
         realtime_warnings: real-time measures that the system refused.
         """
-        described = msgspec.structs.replace(backend.describe(), host=secrets.token_hex(8))
+        described = msgspec.structs.replace(backend.describe(), host=secrets.token_hex(8), arithmetic=measured())
         self.description: Description = proven(described, own_run_key())
         self.authority = Authority(self.description, first_epoch=time.time_ns() // 1_000_000)
         self.black_box = BlackBox(self.description)

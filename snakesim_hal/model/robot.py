@@ -5,6 +5,7 @@ long as the others. A robot whose links differ otherwise lists them in `[[links]
 """
 
 import hashlib
+import math
 from typing import Annotated
 
 from msgspec import Meta
@@ -141,7 +142,7 @@ class RobotFile(FileStruct, frozen=True, kw_only=True):
     def length_m(self) -> float:
         """Length of the straight robot, without the caps of tail and head."""
         if self.links:
-            return sum(self.link_lengths_m)
+            return math.fsum(self.link_lengths_m)
         return self.chain.modules * self.module.length_m
 
     @property

@@ -354,6 +354,11 @@ class Description(Message, frozen=True, kw_only=True):
     ] = ""
     host: Annotated[q.Name | None, HOST] = None
     proof: Annotated[str, Meta(max_length=64), about("for the run that started the host; of no use to others")] = ""
+    arithmetic: Annotated[
+        dict[q.Name, q.Name],
+        Meta(max_length=8),
+        about("hashes of what the host's BLAS, NumPy and C library compute: where they are equal, digests can be"),
+    ] = {}
     joints: Annotated[list[JointDescription], Meta(min_length=1, max_length=q.MAX_JOINTS), about("tail to head")]
     links: Annotated[
         list[LinkDescription],

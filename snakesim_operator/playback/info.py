@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from snakesim_hal.arithmetic import digest_text, foreign
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.terminal import Say
 from snakesim_hal.wire import keys
@@ -57,6 +58,7 @@ class RecordingInfo(msgspec.Struct, kw_only=True):
     duration_s: float
     ticks: int
     command_digest: str | None
+    own_arithmetic: list[str]  # what rounds otherwise than on most computers: then the digest is its computer's own
     lifecycle: str | None
     dropped: dict[str, int]
     keys: dict[str, dict[str, float]]
@@ -106,6 +108,7 @@ def _summed_up(path: Path, reader: RecordingReader, found: dict[str, KeyInfo], c
         duration_s=duration_s,
         ticks=0 if host is None else host.ticks,
         command_digest=None if host is None or not host.ticks else host.command_digest,
+        own_arithmetic=[] if robot is None else foreign(robot.arithmetic),
         lifecycle=None if status is None else f"{status.lifecycle}: {_why(status)}",
         dropped=reader.about.get("dropped", {}),
         keys={key: _numbers(one, duration_s, regular=key not in irregular) for key, one in sorted(found.items())},
@@ -139,7 +142,8 @@ def show(given: Path, say: Say, *, as_json: bool = False) -> int:
     say(f"  robot     {info.robot or 'unknown'}, backend {info.backend or 'unknown'}, {info.pace or 'unknown pace'}")
     say(f"  scenario  {info.scenario or 'unknown'}, controller {info.controller or 'none'}, seed {info.seed}")
     say(f"  ended     {info.lifecycle or 'unknown'}")
-    say(f"  commands  {info.ticks} ticks applied, digest {(info.command_digest or 'none')[:16]}")
+    digest = digest_text(info.command_digest, info.own_arithmetic) if info.command_digest else "none"
+    say(f"  commands  {info.ticks} ticks applied, digest {digest}")
     say(f"  {'key':<26}{'messages':>9}{'rate':>11}{'mean size':>12}{'gaps':>7}")
     for key, one in info.keys.items():
         mean = one["bytes"] / one["count"]

@@ -7,6 +7,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
+from snakesim_hal.arithmetic import foreign
 from snakesim_hal.wire.messages import Fault, Mode, Pace
 from snakesim_operator.results.advance import Advance, energy_j, energy_j_per_m, work_j
 from snakesim_operator.results.record import RunRecord
@@ -89,6 +90,9 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     restarts: Annotated[list[Restart], Meta(description="processes that ended and were restarted")] = []
     ended: Annotated[str, Meta(description="complete, interrupted, or what failed")]
     lacks: Annotated[list[str], Meta(description="gaps of the record; numbers are computed from the rest")] = []
+    own_arithmetic: Annotated[
+        list[str], Meta(description="what rounds otherwise here than on most computers: then the digest is its own")
+    ] = []
     config: Annotated[dict[str, Any], Meta(description="the effective configuration; repeats the run")]
 
 
@@ -153,6 +157,7 @@ def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), h
         restarts=list(restarts),
         ended=ended,
         lacks=record.lacks,
+        own_arithmetic=foreign(record.description.arithmetic),
         config=msgspec.to_builtins(config),
     )
 

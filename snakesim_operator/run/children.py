@@ -12,6 +12,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
+from snakesim_hal import arithmetic
+
 STOP_LIMIT_S = 5.0
 LINES_SHOWN, LAST_BYTES = 15, 16384
 PIPE_BYTES = 2**20  # of output, while this process is frozen
@@ -81,7 +83,14 @@ def start(
     It gets a session of its own, so that Ctrl-C reaches only the supervisor, which then ends its children in order.
     A SIGINT that comes while its interpreter starts waits until it has a handler.
     """
-    environment = {**os.environ, **ONE_THREAD, "PYTHONUNBUFFERED": "1", "PYTHONHASHSEED": "0", **more}
+    environment = {
+        **os.environ,
+        **arithmetic.environment(),
+        **ONE_THREAD,
+        "PYTHONUNBUFFERED": "1",
+        "PYTHONHASHSEED": "0",
+        **more,
+    }
     ours, theirs = os.pipe()
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited
     try:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import msgspec
 
+from snakesim_hal.arithmetic import digest_text
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.host.latch import ESTOP
 from snakesim_hal.host_process import HostRecord
@@ -148,7 +149,7 @@ def _print_summary(summary: RunSummary) -> None:
         ("peak joint torque", number(summary.peak_joint_torque_nm, "N·m")),
         ("peak contact force", number(summary.peak_contact_force_n, "N", 1)),
         ("last state", f"{summary.last_state or 'unknown'}: {summary.last_reason or ''}"),
-        ("command digest", summary.command_digest[:16]),
+        ("command digest", digest_text(summary.command_digest, summary.own_arithmetic)),
     ]
     if summary.faults:
         count = len(summary.faults) + summary.faults_left_out

@@ -18,6 +18,7 @@ from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from snakesim_hal.arithmetic import is_pinned
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.host.recorder import Recorder
 from snakesim_hal.host_process import record_of
@@ -36,6 +37,7 @@ from snakesim_operator.results.recorded import SERVICE_STREAMS
 from snakesim_operator.results.summary import RunSummary
 from snakesim_operator.run.conclusion import Outcome, conclude, explain, leave
 from snakesim_operator.run.ending import Ending, interruptible
+from snakesim_operator.run.pinned_process import simulate_pinned
 from snakesim_operator.run.progress import Progress
 from snakesim_operator.run.run import opened_files
 from snakesim_operator.run.run_files import RunFiles
@@ -61,7 +63,13 @@ def simulate(
     until_goal: a run whose mission has a goal is complete soon after that is reached; give_up_s: and after so much
     robot time without 3 cm of advance towards it.
     Raises SnakesimError when it cannot begin. A run that ends early is a result like others.
+
+    A program that has imported NumPy already may have bound it to other processor code than `snakesim run` has; then
+    the run is computed in a child process, so that its digest is the same. `snakesim_hal.arithmetic.pin()` before the
+    first import of NumPy keeps it in this process.
     """
+    if not is_pinned():
+        return simulate_pinned(config=config, out=out, until_goal=until_goal, give_up_s=give_up_s)
     config, ending = check_plugins(config), Ending()
     with contextlib.ExitStack() as opened:
         if out is None:

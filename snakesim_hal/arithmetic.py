@@ -1,0 +1,150 @@
+"""The arithmetic that a run is computed with: which processor code rounds its sums, powers and sines.
+
+OpenBLAS, NumPy and the C library each choose code for the processor that they find, and the last bits differ from one
+choice to the next. One seed gives one digest where all choose alike. That is called the common arithmetic here: the
+code for processors with AVX2 and FMA, which nearly every x86-64 computer can run, wider ones too. `pin` asks for it,
+before NumPy is loaded. What came of it is measured, not guessed: `measured` hashes the bits of known computations.
+
+NumPy is not imported at the top here, as `pin` must come before it.
+"""
+
+import hashlib
+import math
+import os
+import random
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+COMMON: Mapping[str, str] = {
+    "BLAS": "2a293bd2",
+    "NumPy": "fe21ebdf",
+    "C library": "e4139a39",
+}
+"""What `measured` finds in the common arithmetic; `make golden` prints it."""
+NEEDED = {"avx2", "fma"}  # flags of the processor
+# The code in NumPy for wider processors, as NumPy 2.4 and earlier versions call it; each ignores the other's names.
+WIDER = "X86_V4 AVX512_ICL AVX512_SPR AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_KNL AVX512_KNM"
+CPUINFO = Path("/proc/cpuinfo")
+
+
+@cache
+def environment() -> Mapping[str, str]:
+    """Variables that make a process compute in the common arithmetic; none for a processor that cannot."""
+    if os.uname().machine != "x86_64" or not (flags := _processor_flags()) >= NEEDED:
+        return {}
+    wider = WIDER if "avx512f" in flags else ""
+    # Empty is as good as unset; NumPy refuses to be told what to enable and what to disable.
+    return {"OPENBLAS_CORETYPE": "Haswell", "NPY_DISABLE_CPU_FEATURES": wider, "NPY_ENABLE_CPU_FEATURES": ""}
+
+
+def pin() -> None:
+    """Compute in the common arithmetic, here and in child processes. Too late, and without effect, after NumPy."""
+    if "numpy" not in sys.modules:
+        os.environ.update(environment())
+
+
+def is_pinned() -> bool:
+    """Whether this process computes in the common arithmetic, or nothing could make it: a child would be no better."""
+    wanted = environment().items()
+    return wanted <= os.environ.items() or not {"BLAS", "NumPy"} & {*foreign(measured())}
+
+
+def foreign(parts: Mapping[str, str]) -> list[str]:
+    """The parts of a measured arithmetic that differ from the common one."""
+    return [part for part, digest in COMMON.items() if part in parts and parts[part] != digest]
+
+
+def digest_text(digest: str, differing: Sequence[str]) -> str:
+    """A run's digest for people. differing: what `foreign` says of the arithmetic in which it was computed."""
+    own = f", its computer's own: {' and '.join(differing)} round otherwise there than on most" if differing else ""
+    return digest[:16] + own
+
+
+@cache
+def measured() -> dict[str, str]:
+    """The arithmetic of this process: for each part a hash of the bits that it gives. Takes about 10 ms, once."""
+    from threadpoolctl import threadpool_limits
+
+    drawn = random.Random(22)
+    numbers = [drawn.uniform(-3.0, 3.0) for _ in range(2000)]
+    with threadpool_limits(1):
+        return {
+            "BLAS": _digest(_linear(numbers)),
+            "NumPy": _digest(_elementwise(numbers)),
+            "C library": _digest(_functions(numbers)),
+        }
+
+
+def _linear(numbers: list[float]) -> Iterable[Any]:
+    """What goes through BLAS and LAPACK, in the sizes of a robot."""
+    import numpy as np
+
+    for size in (2, 3, 4, 8, 13, 30):
+        a = np.array(numbers[: size * size]).reshape(size, size)
+        b = np.array(numbers[-size * 3 :]).reshape(size, 3)
+        tall, square = np.vstack([a, b.T]), a @ a.T + size * np.eye(size)
+        yield from (a @ b, a.T @ b, b.T @ a, a @ b[:, 0], b[:, 0] @ a, b[:, 0] @ b[:, 1], np.linalg.norm(b))
+        yield from (np.linalg.solve(square, b), np.linalg.inv(square), np.linalg.cholesky(square), square)
+        yield from (np.linalg.eigvalsh(square), np.linalg.lstsq(tall, tall[:, 0] ** 2, rcond=None)[0])
+        yield from (np.linalg.pinv(tall), np.linalg.cond(a))
+
+
+def _elementwise(numbers: list[float]) -> Iterable[Any]:
+    """NumPy's own loops, of which it has several for each processor."""
+    import numpy as np
+
+    x, y = np.array(numbers), np.array(numbers[::-1])
+    yield from (
+        np.exp(x),
+        np.arctan2(x, y),
+        np.tanh(x),
+        np.log(np.abs(x)),
+        np.abs(x) ** y,
+        np.arctan(x),
+        np.expm1(x),
+        np.sinh(x),
+    )
+    yield from (np.sin(x), np.cos(x), np.hypot(x, y), np.sqrt(np.abs(x)), np.arccos(x / 3.0), np.tan(x))
+    yield from (
+        x.sum(),
+        x[:13].sum(),
+        x.reshape(-1, 4).sum(axis=0),
+        x.mean(),
+        x.std(),
+        np.cumsum(x),
+        np.einsum("i,i", x, y),
+    )
+    yield from (np.abs(x + 1j * y), (x + 1j * y) * (y - 1j * x), np.angle(x + 1j * y), np.exp(1j * x))
+    yield from (np.argsort(np.round(x, 1)), np.sin(x.astype(np.float32)), np.exp(x.astype(np.float32)))
+
+
+def _functions(numbers: list[float]) -> Iterable[Any]:
+    """Functions of the C library, as MuJoCo and Python call them; Python has a `hypot` of its own."""
+    for function in (math.sin, math.cos, math.tan, math.exp, math.atan, math.tanh):
+        yield [function(x) for x in numbers]
+    yield [math.log(abs(x)) for x in numbers]
+    yield [math.acos(x / 3.0) for x in numbers] + [math.asin(x / 3.0) for x in numbers]
+    yield [math.atan2(x, y) for x, y in zip(numbers, numbers[::-1], strict=True)]
+    yield [math.pow(abs(x), y) for x, y in zip(numbers, numbers[::-1], strict=True)]
+    yield [math.hypot(*numbers[i : i + 3]) for i in range(len(numbers) - 3)]
+
+
+def _digest(results: Iterable[Any]) -> str:
+    import numpy as np
+
+    digest = hashlib.sha256()
+    for result in results:
+        digest.update(np.ascontiguousarray(result).tobytes())
+    return digest.hexdigest()[:8]
+
+
+def _processor_flags() -> set[str]:
+    """What the processor can do, as the kernel calls it; empty where that is not known."""
+    try:
+        lines = CPUINFO.read_text(errors="replace").splitlines()
+    except OSError:
+        return set()
+    return {flag for line in lines if line.startswith("flags") for flag in line.partition(":")[2].split()}

@@ -1,0 +1,68 @@
+"""`simulate` in a child process, which computes in the common arithmetic (`snakesim_hal/arithmetic.py`).
+
+For programs that imported NumPy before it could be told which processor code to choose.
+"""
+
+import contextlib
+import os
+import pickle
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+from snakesim_hal import errors
+from snakesim_hal.arithmetic import environment
+from snakesim_hal.process import die_with_parent
+
+if TYPE_CHECKING:
+    from snakesim_operator.run.in_process import Result
+
+ASKED, ANSWER = "asked", "answer"
+LOOK_S = 1.0  # Python code runs again after so long, so that an exception can be raised into the caller's thread
+
+
+def simulate_pinned(**asked: Any) -> "Result":
+    """Call `simulate` with these arguments in a process of its own. Raises as it does."""
+    with TemporaryDirectory(prefix="snakesim-") as folder:
+        (Path(folder) / ASKED).write_bytes(pickle.dumps(asked))
+        process = subprocess.Popen(
+            [sys.executable, "-m", "snakesim_operator.run.pinned_process", folder, str(os.getpid())],
+            env={**os.environ, **environment(), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            stdin=subprocess.DEVNULL,
+        )
+        try:
+            while process.poll() is None:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(LOOK_S)
+        finally:
+            process.kill()
+            process.wait()
+        if process.returncode:
+            raise errors.SnakesimError(f"the process of the run ended with exit code {process.returncode}; see above")
+        answer = pickle.loads((Path(folder) / ANSWER).read_bytes())
+    if isinstance(answer, tuple):
+        kind, lines = answer
+        raise getattr(errors, kind, errors.SnakesimError)(*lines)
+    return answer
+
+
+def main() -> int:
+    """The child: the arguments are the folder and the parent's process id."""
+    folder, parent = Path(sys.argv[1]), int(sys.argv[2])
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C reaches both; the parent tells of it
+    die_with_parent(parent)
+    from snakesim_operator.run.in_process import simulate
+
+    try:
+        answer: Any = simulate(**pickle.loads((folder / ASKED).read_bytes()))
+    except errors.SnakesimError as error:
+        answer = type(error).__name__, error.lines
+    (folder / ANSWER).write_bytes(pickle.dumps(answer))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

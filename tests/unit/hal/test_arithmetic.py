@@ -1,0 +1,74 @@
+"""Which processor code a process computes with, and what is said where it is another."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from snakesim_hal import arithmetic
+
+INTEL = "processor : 0\nflags\t\t: fpu sse2 fma avx2 avx512f\n"
+
+
+@pytest.fixture
+def computer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """What the kernel says of another processor."""
+    monkeypatch.setattr(arithmetic, "CPUINFO", tmp_path / "cpuinfo")
+    arithmetic.environment.cache_clear()
+    yield tmp_path / "cpuinfo"
+    arithmetic.environment.cache_clear()
+
+
+@pytest.mark.skipif(os.uname().machine != "x86_64", reason="about processors of that family")
+def test_a_wide_processor_computes_as_a_usual_one(computer: Path) -> None:
+    computer.write_text(INTEL)
+    wanted = arithmetic.environment()
+    assert wanted["OPENBLAS_CORETYPE"] == "Haswell" and "X86_V4" in wanted["NPY_DISABLE_CPU_FEATURES"]
+
+
+@pytest.mark.skipif(os.uname().machine != "x86_64", reason="about processors of that family")
+def test_what_was_set_before_has_no_effect(computer: Path) -> None:
+    computer.write_text(INTEL.replace(" avx512f", ""))
+    wanted = arithmetic.environment()
+    assert wanted["NPY_DISABLE_CPU_FEATURES"] == wanted["NPY_ENABLE_CPU_FEATURES"] == ""
+
+
+@pytest.mark.parametrize("flags", ["flags : fpu sse2\n", "Features : fp asimd\n", ""])
+def test_a_processor_that_cannot_is_left_alone(computer: Path, flags: str) -> None:
+    """Code for AVX2 would crash there."""
+    computer.write_text(flags)
+    assert arithmetic.environment() == {} and arithmetic.is_pinned()
+
+
+def test_without_knowledge_of_the_processor_it_is_left_alone(computer: Path) -> None:
+    assert not computer.exists() and arithmetic.environment() == {}
+
+
+def measured_with(code: str, **more: str) -> dict[str, str]:
+    show = "import json; from snakesim_hal import arithmetic; {}; print(json.dumps(arithmetic.measured()))"
+    unset = {name: value for name, value in os.environ.items() if name not in arithmetic.environment()}
+    done = subprocess.run(
+        [sys.executable, "-c", show.format(code)], env={**unset, **more}, capture_output=True, check=True
+    )
+    return json.loads(done.stdout)
+
+
+def test_what_a_process_computes_with_is_measured() -> None:
+    if not arithmetic.environment():
+        pytest.skip("this processor has no AVX2 and FMA, so nothing can be chosen")
+    old = {"OPENBLAS_CORETYPE": "Nehalem", "NPY_DISABLE_CPU_FEATURES": "X86_V3"}
+    assert arithmetic.foreign(measured_with("pass", **old)) == ["BLAS", "NumPy"]
+    assert measured_with("arithmetic.pin()", **old) == arithmetic.measured()
+    assert measured_with("import numpy; arithmetic.pin()", **old) == measured_with("pass", **old)
+
+
+def test_a_digest_of_other_arithmetic_is_said_to_be_the_computers_own() -> None:
+    other = {**arithmetic.COMMON, "BLAS": "00000000", "C library": "00000000"}
+    assert arithmetic.foreign(other) == ["BLAS", "C library"]
+    said = arithmetic.digest_text("0123456789abcdef01", arithmetic.foreign(other))
+    assert said == "0123456789abcdef, its computer's own: BLAS and C library round otherwise there than on most"
+    assert arithmetic.digest_text("0123456789abcdef01", arithmetic.foreign({})) == "0123456789abcdef"
