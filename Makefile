@@ -26,7 +26,7 @@ packages := $(wildcard snakesim_*)
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test test-all test-here test-vcan attack faults mutation fuzz soak kills check links bench bench-peers bench-paths schemas docs lock clean FORCE
+.PHONY: help setup demo test test-all test-here test-vcan attack faults mutation fuzz soak kills check links bench bench-peers bench-paths golden schemas docs lock clean FORCE
 
 help: ## List these targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' Makefile
@@ -94,6 +94,9 @@ links: $(stamp) ## Measure bad links between a robot and its controller, and wri
 
 bench-paths: $(stamp) ## Measure the loop over routers, mTLS and a slow link beside raw Zenoh (root)
 	$(bin)/python -m benchmarks.paths $(ARGS)
+
+golden: $(stamp) ## Write tests/golden.json again, after a change that is meant to change what robots do
+	$(bin)/python -m tests.golden
 
 schemas: $(stamp) ## Regenerate what is made from the code: JSON Schemas, key space, table of faults
 	$(bin)/snakesim schemas --write schemas
