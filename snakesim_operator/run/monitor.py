@@ -12,6 +12,7 @@ from snakesim_hal.wire.messages import ControlState, Description, LifecycleReque
 from snakesim_operator.recording.process import RECORDER
 from snakesim_operator.run.ending import Ending
 from snakesim_operator.run.process_faults import ProcessFaults
+from snakesim_operator.run.processor_waits import ProcessorWaits
 from snakesim_operator.run.progress import Progress
 from snakesim_operator.run.supervisor import Supervisor
 
@@ -20,6 +21,9 @@ POLL_S = 0.05
 ARM_LIMIT_S = 10.0
 RECORDER_LIMIT_S = 20.0  # once everything else is ready
 WHO = "snakesim run"
+AT_WORK = ("host", "control")  # between them a lease expires
+KEEPS_UP = 0.95  # share of real time
+LATE_TICKS = 10  # a process that was stopped for a while makes few of them
 
 
 class RunMonitor:
@@ -45,6 +49,7 @@ class RunMonitor:
         session.on_alive(self._recorder_came, keys.alive(RECORDER))
         self._faults = ProcessFaults(config, session, supervisor, say)
         self._progress = Progress(config)
+        self._waits = ProcessorWaits(config.lease_ns * 1e-9)
         self._status: Status | None = None
         self._robot: Description | None = None
         self._armed = False  # once, by this run or by a person
@@ -78,6 +83,8 @@ class RunMonitor:
     def _take_in(self) -> None:
         """Process arrived messages."""
         self._supervisor.take_in()
+        if self._ending.reason is None:
+            self._waits.look({name: pid for name, pid in self._supervisor.pids().items() if name in AT_WORK})
         if self._hosts != self._supervisor.hosts:
             self._hosts = self._supervisor.hosts
             self._may_arm = False
@@ -105,6 +112,19 @@ class RunMonitor:
             self._tell(status)
         elif stopping := [fault for fault in status.faults if fault.reach == "robot"]:
             self._ending.because(stopping[0].cause)
+            if stopping[0].what == "lease_expired" and (slow := self._too_slow(status)):
+                self._ending.because(slow, first=True)
+
+    def _too_slow(self, status: Status) -> str | None:
+        """That this computer is too slow for the run, by what was measured; None: it is not, or nothing shows it."""
+        shown: list[str] = []
+        if (wait := self._waits.longest()) is not None:
+            name, waited_s, lasted_s = wait
+            shown.append(f"{name} waited for a processor for {1e3 * waited_s:.0f} of {1e3 * lasted_s:.0f} ms")
+        factor = status.real_time_factor
+        if status.overruns >= LATE_TICKS and status.speed == 1.0 and factor is not None and factor < KEEPS_UP:
+            shown.append(f"{status.overruns} ticks were late, and robot time passed at {factor:.2f} of real time")
+        return f"this computer is too slow: {', '.join(shown)}" if shown else None
 
     def _over_before_it_began(self) -> bool:
         return not self._armed and not self._may_arm

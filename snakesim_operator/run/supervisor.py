@@ -151,6 +151,10 @@ class Supervisor:
         """Send a signal to a process of the run; one that has ended gets none."""
         self._parts[name].child.process.send_signal(number)
 
+    def pids(self) -> dict[str, int]:
+        """The process id of each process that runs now, by name."""
+        return {name: part.child.process.pid for name, part in self._parts.items() if part.again_s is None}
+
     def host_runs(self) -> bool:
         """Whether the host runs now."""
         return self._parts[HOST].child.process.poll() is None
