@@ -35,8 +35,7 @@ def show_record(folder: Path, at_s: float, port: int | None, say: Say = say) -> 
     _check_installed()
     from snakesim_operator.console.console import show_recorded
 
-    show_recorded(folder, at_s, open_port(port), _until_signal(), say)
-    return 0
+    return show_recorded(folder, at_s, open_port(port), _until_signal(), say)
 
 
 def _surroundings(link: Link):

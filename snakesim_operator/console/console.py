@@ -51,15 +51,19 @@ def show_live(
                 page.show(snapshot)
 
 
-def show_recorded(folder: Path, at_s: float, listening: socket.socket, stop: threading.Event, say: Say) -> None:
-    """Show a run's record until `stop` is set. Raises ConfigError when the folder has none."""
+def show_recorded(folder: Path, at_s: float, listening: socket.socket, stop: threading.Event, say: Say) -> int:
+    """Show a run's record until `stop` is set. Returns the exit code. Raises ConfigError when the folder has none."""
     # What only recordings need would delay the page of a run that starts.
     from snakesim_operator.console.recorded import Recorded
+    from snakesim_operator.results.incomplete import exit_code
     from snakesim_operator.results.record import RunRecord
 
-    recorded = Recorded(RunRecord.load(folder))
+    recorded, log = Recorded(RunRecord.load(folder)), Log()
+    for lack in recorded.record.lacks:
+        log.write(f"the record lacks {lack}")
+    code = exit_code(folder, recorded.record.lacks)
     with page_server(listening) as (server, address):
-        page = Page(server, Surroundings(recorded.record.config), None, Log(), recorded=folder.name)
+        page = Page(server, Surroundings(recorded.record.config), None, log, recorded=folder.name)
         player = Player(server, recorded.span_s, at_s)
         say(f"console: {address}")
         shown_s = None
@@ -70,6 +74,7 @@ def show_recorded(folder: Path, at_s: float, listening: socket.socket, stop: thr
             if time_s != shown_s:
                 page.show(recorded.at(time_s))
                 shown_s = time_s
+    return code
 
 
 def frames(stop: threading.Event) -> Iterator[None]:

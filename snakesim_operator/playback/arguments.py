@@ -39,7 +39,8 @@ def add_commands(commands: Any) -> None:
     replay = commands.add_parser(
         "replay",
         help="play a recording on Zenoh, or its sensors into guidance, navigation and control",
-        epilog="Exit code of --control: 0 the commands are the same to the bit, or a setting was changed; 1 otherwise.",
+        epilog="Exit code of --control: 0 the commands are the same to the bit, or a setting was changed; 1 otherwise. "
+        "3: done, but the recording lacks something.",
     )
     _add_recording(replay)
     replay.add_argument(
@@ -53,6 +54,12 @@ def add_commands(commands: Any) -> None:
     )
     replay.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", help="with --control: change a setting; repeatable"
+    )
+    replay.add_argument("--controller", metavar="NAME", help="with --control: another controller, as of `snakesim run`")
+    replay.add_argument(
+        "--run-recorded-code",
+        action="store_true",
+        help="with --control: run Python files that the recording names, as they are on this computer now",
     )
     replay.add_argument("--out", type=Path, metavar="DIR", help="with --control: folder for a run that compare reads")
     replay.set_defaults(act=_replay)
@@ -94,7 +101,9 @@ def _info(arguments: argparse.Namespace) -> int:
 
 
 def _report(arguments: argparse.Namespace) -> int:
-    from snakesim_hal.model.whole_file import write_whole
+    from snakesim_hal.model.textfiles import write_text
+    from snakesim_operator.results.ended import ended
+    from snakesim_operator.results.incomplete import exit_code
     from snakesim_operator.results.record import REPORT, RunRecord
     from snakesim_operator.results.report import page
     from snakesim_operator.results.summary import summarise
@@ -102,9 +111,9 @@ def _report(arguments: argparse.Namespace) -> int:
     given: Path = arguments.recording
     record = RunRecord.load(given)
     out = arguments.out or (given / REPORT if given.is_dir() else given.with_suffix(".html"))
-    write_whole(out, page(record, summarise(record, record.host.ended)).encode())
+    write_text(out, page(record, summarise(record, ended(record))))
     say(str(out))
-    return 0
+    return exit_code(given, record.lacks)
 
 
 def _compare(arguments: argparse.Namespace) -> int:
@@ -130,16 +139,23 @@ def _export(arguments: argparse.Namespace) -> int:
 
 
 def _replay(arguments: argparse.Namespace) -> int:
-    from snakesim_hal.model.scenario import parse_set
+    from snakesim_hal.model.scenario import Override, parse_set
     from snakesim_operator.playback.control import replay_control
     from snakesim_operator.playback.info import recording_of
     from snakesim_operator.playback.play import PlayRequest, play
 
     path = recording_of(arguments.recording)
     if arguments.control:
-        return replay_control(path, [parse_set(text) for text in arguments.set], arguments.out, say)
-    if arguments.set or arguments.out:
-        raise ConfigError("--set and --out are for --control, which runs the services; add it, or leave them out")
+        overrides = [parse_set(text) for text in arguments.set]
+        if arguments.controller is not None:
+            overrides.append(Override("controller", arguments.controller, "--controller"))
+        trusted = arguments.run_recorded_code
+        return replay_control(path, overrides, arguments.out, say, run_recorded_code=trusted)
+    if arguments.set or arguments.out or arguments.controller or arguments.run_recorded_code:
+        raise ConfigError(
+            "--set, --controller, --run-recorded-code and --out are for --control, which runs the services; add it, or "
+            "leave them out"
+        )
     if arguments.endpoint is not None:
         check_endpoint(arguments.endpoint, "--endpoint")
     if arguments.namespace is not None:

@@ -15,8 +15,8 @@ from typing import Any
 import msgspec
 from threadpoolctl import threadpool_limits
 
-from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.plugins import SERVICES, find_plugin
+from snakesim_hal.errors import ConfigError, SnakesimError, short
+from snakesim_hal.model.plugins import SERVICES, find_plugin, in_file
 from snakesim_hal.model.scenario import Override, RunConfig, load, write, written
 from snakesim_hal.network.local_network import LocalNetwork
 from snakesim_hal.network.session import Arrival, Publisher, Question
@@ -28,6 +28,7 @@ from snakesim_hal.wire.messages import Answer, AppliedCommand, Clock, Configurat
 from snakesim_operator.playback.order import in_robot_order
 from snakesim_operator.recording.reader import RECORDING, Recorded, RecordingReader
 from snakesim_operator.recording.recording import Recording
+from snakesim_operator.results.incomplete import exit_code
 from snakesim_operator.results.record import CONFIG
 from snakesim_operator.results.recorded import Contents, read_recording
 
@@ -57,6 +58,10 @@ class Comparison:
         unlike = {tick for tick in self.common if not same(self.recorded[tick], self.replayed[tick])}
         return sorted(unlike | (self.recorded.keys() ^ self.replayed.keys()))
 
+    def end_at(self, tick: int) -> None:
+        """Leave out what comes later."""
+        self.recorded = {at: command for at, command in self.recorded.items() if at <= tick}
+
     def largest(self) -> tuple[int, int, float] | None:
         """Tick, joint and size of the largest difference of a target; None when there is none."""
         sizes = [
@@ -73,27 +78,44 @@ def same(a: JointCommand, b: JointCommand) -> bool:
     return (a.arming, a.mode, a.target, a.torque_limit_nm) == (b.arming, b.mode, b.target, b.torque_limit_nm)
 
 
-def config_of(contents: Contents, overrides: list[Override]) -> RunConfig:
-    """The configuration of a recording, with changes. Raises ConfigError."""
+def config_of(contents: Contents, overrides: list[Override], *, run_recorded_code: bool = False) -> RunConfig:
+    """The configuration of a recording, with changes. Raises ConfigError.
+
+    run_recorded_code: otherwise a controller in a Python file is refused, unless `overrides` name it.
+    """
     if contents.config is None:
         raise ConfigError(f"{contents.path}: holds no hal/config, so it is not known which controller was at work")
     with TemporaryDirectory(prefix="snakesim-") as folder:
         path = Path(folder) / "config.json"
         path.write_text(contents.config.content)
-        return load(str(path), overrides).config
+        config = load(str(path), overrides).config
+    named_here = any(override.key == "controller" for override in overrides)
+    if in_file(config.controller) and not (named_here or run_recorded_code):  # no other file's code is replayed
+        raise ConfigError(
+            f"{contents.path}: the recording names {short(config.controller)!r} as its controller, and would have that "
+            "Python file run on this computer. If you trust the file, name it yourself, with --controller "
+            f"{short(config.controller)}, or run what the recording names with --run-recorded-code; else choose an "
+            "installed controller with --controller NAME"
+        )
+    return config
 
 
 class Replay:
     """Services that believe to be in the run of a recording."""
 
-    def __init__(self, path: Path, overrides: list[Override], out: Path | None = None) -> None:
+    def __init__(
+        self, path: Path, overrides: list[Override], out: Path | None = None, *, run_recorded_code: bool = False
+    ) -> None:
         """out: a recording of the replay. Raises ConfigError."""
         contents = read_recording(path, (keys.DESCRIPTION, keys.CONFIG, keys.CLOCK))
-        self.config = config_of(contents, overrides)
+        self.lacks = contents.lacks
+        self.config = config_of(contents, overrides, run_recorded_code=run_recorded_code)
+        self.changed = bool(overrides) and self.config != config_of(contents, [], run_recorded_code=True)
         if contents.description is None:
             raise ConfigError(f"{path}: holds no hal/description")
         self.robot: Description = contents.description
         self.pace = self.config.pace
+        self.stopped = ""  # why it could not go on to the end of a recording that lacks something
         self.comparison = Comparison()
         self._path, self._network = path, LocalNetwork()
         self._session = self._network.session()
@@ -126,11 +148,20 @@ class Replay:
                 loop = ServiceLoop(find_plugin(SERVICES, name), self.config, self._network.session())
                 opened.callback(loop.close)
                 self._loops.append(loop)
-            for turn, recorded in enumerate(in_robot_order(RecordingReader(self._path))):
-                self._take(recorded)
-                if self._recording is not None and turn % 1000 == 0:
-                    self._recording.flush_when_due()
+            try:
+                self._play()
+            except SnakesimError as error:
+                if not self.lacks:
+                    raise
+                self.stopped = str(error)  # it waits for what is lost
+                self.comparison.end_at(max(self.comparison.replayed, default=-1))
         return self.comparison
+
+    def _play(self) -> None:
+        for turn, recorded in enumerate(in_robot_order(RecordingReader(self._path))):
+            self._take(recorded)
+            if self._recording is not None and turn % 1000 == 0:
+                self._recording.flush_when_due()
 
     def _take(self, recorded: Recorded) -> None:
         message = keys.message_at(recorded.key)
@@ -182,31 +213,36 @@ class Replay:
         question.reply(Answer(ok=True, reason="replayed", epoch=epoch, host=self.robot.host))
 
 
-def replay_control(path: Path, overrides: list[Override], out: Path | None, say: Say) -> int:
+def replay_control(
+    path: Path, overrides: list[Override], out: Path | None, say: Say, *, run_recorded_code: bool = False
+) -> int:
     """`snakesim replay --control`. out: a folder for a run that `compare` reads. Exit code 1: the commands differ.
 
-    That is no failure where a setting was changed.
+    That is no failure where a setting was changed. 3: the recording lacks something.
     """
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
     try:
-        replay = Replay(path, overrides, None if out is None else out / RECORDING)
+        recording = None if out is None else out / RECORDING
+        replay = Replay(path, overrides, recording, run_recorded_code=run_recorded_code)
     except FileExistsError:
         raise ConfigError(f"--out {out}: holds a recording already; choose another folder") from None
     found = replay.run()
     if out is not None:
         write(replay.config, out / CONFIG)
         say(f"replayed: {out}; `snakesim compare {path} {out}` shows the difference")
-    if not found.recorded:
+    if replay.stopped:
+        say(f"replayed up to tick {max(found.replayed, default=0)} only: {replay.stopped}")
+    elif not found.recorded:
         raise ConfigError(f"{path}: holds no commands, on {keys.JOINT_COMMAND}")
     different, count = found.different, len(found.recorded.keys() | found.replayed.keys())
     if not different:
         say(f"{count} commands, the same to the bit")
-        return 0
+        return exit_code(path, replay.lacks)
     say(f"{len(different)} of {count} commands differ, the first answers tick {different[0]}")
     if (largest := found.largest()) is not None:
         tick, joint, size = largest
         say(f"largest difference of a target: {size:.4g} at {replay.robot.joints[joint].name}, tick {tick}")
     if replay.pace != "lockstep":
         say(f"the run was {replay.pace}: there a service acts on what has arrived, which only lockstep repeats")
-    return 0 if overrides else 1
+    return exit_code(path, replay.lacks, 0 if replay.changed or replay.lacks else 1)

@@ -1,10 +1,12 @@
 """`snakesim export`: a run as a table (CSV, Parquet), as arrays (NumPy), as a LeRobot dataset, or a whole MCAP file.
 
 A table has a row for each tick since the first arming. Its columns have the units in their names, and what they are of
-behind a dot: `angle_rad.joint_1`, `position_w_m.x`. What is not known is empty (CSV, Parquet) or NaN.
+behind a dot: `angle_rad.joint_1`, `position_w_m.x`. What is not known is empty (CSV, Parquet) or NaN. What the record
+lacks is told in each format's own way.
 """
 
 import csv
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,12 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.terminal import Say
+from snakesim_hal.terminal import Say, printable
 from snakesim_operator.playback.info import recording_of
 from snakesim_operator.playback.lerobot import write_lerobot
 from snakesim_operator.recording.recover import recover
+from snakesim_operator.results.incomplete import exit_code
 from snakesim_operator.results.record import RunRecord
 
+LACKS = b"snakesim.lacks"  # metadata of a Parquet file: JSON
 FORMATS = ("csv", "parquet", "npz", "lerobot", "mcap")
 OF_JOINTS = ("angle_rad", "velocity_rad_s", "torque_nm", "mode", "target", "torque_limit_nm")
 
@@ -28,32 +32,35 @@ def export(runs: Sequence[Path], form: str, out: Path | None, say: Say) -> int:
     if len(runs) > 1 and form != "lerobot":
         raise ConfigError(f"--format {form}: one run at a time; several make a dataset, with --format lerobot")
     path = out or _beside(runs[0], form)
-    if path.exists():
-        raise ConfigError(f"{path}: there is such a file already; choose another one with --out")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch()  # before the work of minutes
+        path.touch(exist_ok=False)  # before the work of minutes; not through a link, wherever it leads
         path.unlink()
+    except FileExistsError:
+        what = "a symbolic link" if path.is_symlink() else "such a file"
+        raise ConfigError(f"{path}: there is {what} already; choose another one with --out") from None
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written: {error.strerror}; choose another one with --out") from None
     if form == "mcap":
-        say(f"{recover(recording_of(runs[0]), path)} messages: {path}")
-        return 0
+        count, lacks = recover(recording_of(runs[0]), path)
+        say(f"{count} messages: {path}")
+        return exit_code(runs[0], lacks)
     records = [RunRecord.load(run) for run in runs]
     if form == "lerobot":
         frames = write_lerobot(records, path, write_parquet)
         say(f"{len(records)} episodes, {frames} frames: {path}")
-        return 0
+        return max(exit_code(run, record.lacks) for run, record in zip(runs, records, strict=True))
     record = records[0]
     if form == "npz":
-        content: dict[str, Any] = {**arrays(record), "joints": np.array([j.name for j in record.description.joints])}
-        np.savez_compressed(path, **content)
+        names: dict[str, Any] = {"joints": np.array([joint.name for joint in record.description.joints])}
+        np.savez_compressed(path, **arrays(record), **names, lacks=np.array(record.lacks, dtype=str))
     elif form == "csv":
-        _write_csv(table(record), path)
+        _write_csv(table(record), path, record.lacks)
     else:
-        write_parquet({name: values.tolist() for name, values in table(record).items()}, path)
+        columns = {name: values.tolist() for name, values in table(record).items()}
+        write_parquet(columns, path, {LACKS: json.dumps(record.lacks).encode()} if record.lacks else None)
     say(f"{len(record.time_s)} ticks: {path}")
-    return 0
+    return exit_code(runs[0], record.lacks)
 
 
 def _beside(run: Path, form: str) -> Path:
@@ -80,8 +87,10 @@ def table(record: RunRecord) -> dict[str, NDArray[Any]]:
     return found
 
 
-def _write_csv(columns: dict[str, NDArray[Any]], path: Path) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
+def _write_csv(columns: dict[str, NDArray[Any]], path: Path, lacks: Sequence[str]) -> None:
+    with path.open("x", newline="", encoding="utf-8") as file:
+        for lack in lacks:
+            file.write(f"# incomplete: {printable(lack)}\n")
         writer = csv.writer(file)
         writer.writerow(columns)
         for row in zip(*(values.tolist() for values in columns.values()), strict=True):

@@ -3,6 +3,7 @@
 import json
 from array import array
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,10 @@ from snakesim_hal.errors import ConfigError
 from snakesim_hal.terminal import Say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Status
+from snakesim_operator.recording.losses import Gap
 from snakesim_operator.recording.reader import RECORDING, RecordingReader
+from snakesim_operator.results.gaps import unread
+from snakesim_operator.results.incomplete import exit_code
 from snakesim_operator.results.record import GIVE
 from snakesim_operator.results.recorded import ALL, Contents
 
@@ -48,7 +52,8 @@ class RecordingInfo(msgspec.Struct, kw_only=True):
     file: str
     size_bytes: int
     finished: bool
-    failure: str
+    lacks: list[str]
+    gaps: list[Gap]  # what of it is lost in between, by time and key
     robot: str | None
     backend: str | None
     scenario: str | None
@@ -98,7 +103,8 @@ def _summed_up(path: Path, reader: RecordingReader, found: dict[str, KeyInfo], c
         file=str(path),
         size_bytes=path.stat().st_size,
         finished=reader.finished,
-        failure=reader.failure,
+        lacks=[*reader.lacks, *_skipped(found, reader.losses.lost, irregular), *unread(contents.refused)],
+        gaps=[gap for gap in reader.losses.gaps if gap.lost],
         robot=None if robot is None else robot.robot,
         backend=None if robot is None else robot.backend,
         scenario=config.get("name"),
@@ -110,7 +116,7 @@ def _summed_up(path: Path, reader: RecordingReader, found: dict[str, KeyInfo], c
         command_digest=None if host is None or not host.ticks else host.command_digest,
         own_arithmetic=[] if robot is None else foreign(robot.arithmetic),
         lifecycle=None if status is None else f"{status.lifecycle}: {_why(status)}",
-        dropped=reader.about.get("dropped", {}),
+        dropped=reader.losses.dropped,
         keys={key: _numbers(one, duration_s, regular=key not in irregular) for key, one in sorted(found.items())},
     )
 
@@ -132,36 +138,28 @@ def _numbers(one: KeyInfo, duration_s: float, *, regular: bool) -> dict[str, flo
 
 
 def show(given: Path, say: Say, *, as_json: bool = False) -> int:
-    """Print what a recording holds. Exit code 1 when it lacks something."""
+    """Print what a recording holds. Exit code 3 when it lacks something."""
     info = inspect_recording(recording_of(given))
-    lacks = lacking(info)
     if as_json:
         say(msgspec.json.encode(info).decode())
-        return 1 if lacks else 0
+        return exit_code(given, info.lacks)
     say(f"{info.file}: {info.size_bytes / 1e6:.2f} MB, {info.duration_s:.2f} s of robot time")
     say(f"  robot     {info.robot or 'unknown'}, backend {info.backend or 'unknown'}, {info.pace or 'unknown pace'}")
     say(f"  scenario  {info.scenario or 'unknown'}, controller {info.controller or 'none'}, seed {info.seed}")
     say(f"  ended     {info.lifecycle or 'unknown'}")
     digest = digest_text(info.command_digest, info.own_arithmetic) if info.command_digest else "none"
-    say(f"  commands  {info.ticks} ticks applied, digest {digest}")
+    of_what = " of these ticks alone" if info.lacks else ""
+    say(f"  commands  {info.ticks} ticks applied, digest {digest}{of_what}")
     say(f"  {'key':<26}{'messages':>9}{'rate':>11}{'mean size':>12}{'gaps':>7}")
     for key, one in info.keys.items():
         mean = one["bytes"] / one["count"]
         say(f"  {key:<26}{one['count']:>9.0f}{one['rate_hz']:>8.1f} Hz{mean:>10.0f} B{one['gaps']:>7.0f}")
-    for lack in lacks:
+    for lack in info.lacks:
         say(f"  lacks: {lack}")
-    return 1 if lacks else 0
+    return exit_code(given, info.lacks)
 
 
-def lacking(info: RecordingInfo) -> list[str]:
-    """What a recording lacks, as text."""
-    found: list[str] = []
-    if info.failure:
-        found.append(f"damaged from there on: {info.failure}")
-    elif not info.finished:
-        found.append("its end: the recorder was killed or the disk was full, so the last second may be missing")
-    counts = Counter(info.dropped)
-    found += [f"{count} messages on {key}, dropped because the disk was too slow" for key, count in counts.items()]
-    gaps = {key: one["gaps"] for key, one in info.keys.items() if one["gaps"]}
-    found += [f"{gap:.0f} messages on {key}, between the first and the last" for key, gap in gaps.items()]
-    return found
+def _skipped(found: dict[str, KeyInfo], lost: Counter[str], irregular: Sequence[str]) -> list[str]:
+    """Messages that the recorder never got, as text."""
+    gaps = {key: one.gaps - lost[key] for key, one in sorted(found.items()) if key not in irregular}
+    return [f"{gap} messages on {key}, between the first and the last" for key, gap in gaps.items() if gap > 0]

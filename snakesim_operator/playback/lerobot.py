@@ -24,6 +24,7 @@ from snakesim_hal.model.textfiles import write_text
 from snakesim_operator.results.record import RunRecord
 
 VERSION = "v3.0"
+LACKS = "meta/lacks.json"  # of each episode that lacks something; not a file of LeRobot's
 FILES_A_CHUNK = 1000
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 DATA, EPISODES = f"data/{FILE}", f"meta/episodes/{FILE}".format(chunk_index=0, file_index=0)
@@ -78,6 +79,9 @@ def write_lerobot(records: Sequence[RunRecord], folder: Path, write_table: Write
     write_table(columns, folder / "meta" / "tasks.parquet", {b"pandas": json.dumps(_PANDAS).encode()})
     stats = {name: _stats(np.concatenate([frames[name] for frames in all_frames])) for name in all_frames[0]}
     write_text(folder / "meta" / "stats.json", json.dumps(stats, indent=2) + "\n")
+    lacks = {episode: record.lacks for episode, record in enumerate(records) if record.lacks}
+    if lacks:
+        write_text(folder / LACKS, json.dumps(lacks, indent=2) + "\n")
     info = _info(records[0], rate_hz, posed=posed) | {
         "total_episodes": len(records),
         "total_frames": index,

@@ -17,7 +17,10 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES, encoding_of
 from snakesim_operator.playback.order import in_robot_order
 from snakesim_operator.recording.reader import Recorded, RecordingReader
+from snakesim_operator.results.incomplete import exit_code
 from snakesim_operator.results.recorded import read_recording
+
+LONGEST_PAUSE_S = 10.0  # between two messages, whatever their times are
 
 
 @dataclass(frozen=True)
@@ -38,7 +41,8 @@ def play(request: PlayRequest, lines: Iterator[str], say: Say) -> int:
     robot = read_recording(request.path, (keys.DESCRIPTION,)).description
     namespace = request.namespace or (robot.robot if robot is not None else "recording")
     link = Link(request.endpoint or DEFAULT_ENDPOINT, namespace, listen=True, largest_bytes=MAX_IMAGE_BYTES)
-    messages = in_robot_order(RecordingReader(request.path))
+    reader = RecordingReader(request.path)
+    messages = in_robot_order(reader)
     with open_session(link) as session:
         how = "Enter plays a tick" if request.step else f"{request.rate:g} x real time"
         say(f"playing {request.path} on {link.endpoint}, namespace {namespace}: {how}; Ctrl-C ends it")
@@ -51,11 +55,18 @@ def play(request: PlayRequest, lines: Iterator[str], say: Say) -> int:
                     break
             else:
                 began = began or (time.monotonic(), time_ns)
-                time.sleep(max(began[0] + (time_ns - began[1]) * 1e-9 / request.rate - time.monotonic(), 0.0))
+                began = _waited(began, time_ns, request.rate)
             for recorded in together:
                 player.put(recorded)
         say(f"{player.count} messages played")
-    return 0
+    return exit_code(request.path, reader.lacks)
+
+
+def _waited(began: tuple[float, int], time_ns: int, rate: float) -> tuple[float, int]:
+    """Wait until a robot time is due. Returns when it began; a longer pause, as of lost messages, makes that later."""
+    wait_s = began[0] + (time_ns - began[1]) * 1e-9 / rate - time.monotonic()
+    time.sleep(min(max(wait_s, 0.0), LONGEST_PAUSE_S))
+    return began if wait_s <= LONGEST_PAUSE_S else (time.monotonic(), time_ns)
 
 
 class _Player:

@@ -21,6 +21,7 @@ from snakesim_operator.recording.robot_time import RobotTime
 
 FLUSH_S = 0.5
 ABOUT = "snakesim"  # the name of the metadata record
+COPIED = "lacked_before_copy"  # in it: what the recording lacked that this one was copied from
 
 Show = Callable[[FoxgloveMessage, int], None]  # and the robot time in ns
 

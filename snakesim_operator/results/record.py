@@ -57,6 +57,8 @@ class RunRecord:
     contact_count: Floats  # (n,) obstacles touched
     lacks: list[str] = field(default_factory=list[str])  # missing data, as text
     replay_of: str = ""  # the recording whose sensors its services were given; empty: a run
+    alone: bool = False  # `folder` is a recording, without the run's other files
+    whole: bool = True  # that recording has an end
 
     @staticmethod
     def load(folder: Path, host: HostRecord | None = None) -> "RunRecord":
@@ -100,7 +102,8 @@ class RunRecord:
         contents = read_recording(path)
         description = contents.description
         if description is None or contents.config is None:
-            raise ConfigError(f"{path}: holds no hal/description and hal/config; was it recorded beside a HAL host?")
+            why = "; ".join(contents.lacks) or "was it recorded beside a HAL host?"
+            raise ConfigError(f"{path}: holds no hal/description and hal/config; {why}")
         try:
             config = msgspec.json.decode(contents.config.content, type=RunConfig)
         except UNDECODABLE as error:
@@ -134,6 +137,8 @@ class RunRecord:
             **known,
             lacks=lacks + unwritten(host) + contents.lacks,
             replay_of=contents.replay_of,
+            alone=folder == contents.path,
+            whole=contents.whole,
         )
 
     @cached_property

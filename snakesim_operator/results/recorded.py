@@ -57,6 +57,7 @@ class Contents:
     armed_wall_ns: list[int] = field(default_factory=list[int])  # wall clock at each clock since the first arming
     refused: Counter[str] = field(default_factory=Counter[str])  # messages that cannot be decoded, by key and reason
     lacks: list[str] = field(default_factory=list[str])
+    whole: bool = True  # the file has an end
     replay_of: str = ""  # the recording whose sensors these are
     _decoders: dict[str, Decoder[Any]] = field(default_factory=dict[str, Decoder[Any]])
 
@@ -131,7 +132,8 @@ class Contents:
         """The host's statistics, as far as the recording shows."""
         status, armed = self.status, {t for t, clock in self.at[keys.CLOCK].items() if clock.lifecycle == "armed"}
         if status is None:
-            raise ConfigError(f"{self.path}: holds no hal/status, so it is not known what became of the run")
+            why = "; ".join(["", *self.lacks])
+            raise ConfigError(f"{self.path}: holds no hal/status, so it is not known what became of the run{why}")
         return HostRecord(
             ticks=len(columns["tick"]),
             wall_s=(self.armed_wall_ns[-1] - self.armed_wall_ns[0]) * 1e-9 if self.armed_wall_ns else 0.0,
@@ -158,12 +160,12 @@ def read_recording(path: Path, wanted: Collection[str] = ALL) -> Contents:
     for recorded in reader.messages(wanted):
         contents.take(recorded)
     contents.lacks += unread(contents.refused)
-    if reader.failure:
-        contents.lacks.append(f"recording: damaged from there on: {reader.failure}")
-    contents.replay_of = str(reader.about.get("replay_of", ""))
-    dropped = sum(reader.about.get("dropped", {}).values())
-    if dropped:
-        contents.lacks.append(f"recording: {dropped} messages were dropped, because the disk was too slow")
+    contents.lacks += [f"recording: {lack}" for lack in reader.lacks]
+    contents.whole = reader.finished
+    contents.replay_of = str(reader.about.get("replay_of", ""))[:500]
+    if reader.losses.misplaced:
+        for messages in contents.streams.values():
+            messages.sort(key=lambda message: message.stamp_ns or 0)
     return contents
 
 

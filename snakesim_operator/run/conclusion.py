@@ -15,7 +15,9 @@ from snakesim_hal.network.local_registry import robot_folder
 from snakesim_hal.terminal import say
 from snakesim_hal.wire.messages import Description
 from snakesim_operator.results import last_run
+from snakesim_operator.results.ended import COMPLETE, ended_early
 from snakesim_operator.results.gaps import unwritten
+from snakesim_operator.results.incomplete import INCOMPLETE
 from snakesim_operator.results.record import REPORT, SUMMARY, RunRecord
 from snakesim_operator.results.report.verdict import distance_m
 from snakesim_operator.results.summary import Restart, RunSummary, summarise
@@ -23,7 +25,7 @@ from snakesim_operator.run.ending import Ending
 from snakesim_operator.run.run_files import RunFiles
 
 JOINTS_SHOWN = 8
-DONE, FAILED, INCOMPLETE, INTERRUPTED = 0, 1, 3, 130
+DONE, FAILED, INTERRUPTED = 0, 1, 130
 
 
 @dataclass(frozen=True)
@@ -63,17 +65,13 @@ def explain(ending: Ending, host: HostRecord, config: RunConfig, *, stay: bool =
     for fault in () if stay else host.faults:
         if fault.reach == "robot":
             ending.because(fault.cause)
-    done = f"after {host.armed_ticks / config.rate_hz:.1f} of {config.duration_s:g} s"
-    if host.ended == "running":
-        ending.because(f"the record ends {done}, and may lack the last second")
-    elif ending.reason is None and host.ended in ("stopped", "finished"):
-        ending.because(f"the host was {host.ended} {host.ended_why} {done}")
-    elif ending.reason is None and host.ended != "complete":
-        ending.because(f"the run ended {done}: {host.ended_why}")
+    why = ended_early(host, config)
+    if why and (host.ended == "running" or ending.reason is None):
+        ending.because(why)
 
 
 def _ended(ending: Ending) -> str:
-    return "interrupted" if ending.interrupted else ending.reason or "complete"
+    return "interrupted" if ending.interrupted else ending.reason or COMPLETE
 
 
 def _leave(files: RunFiles, ending: Ending, outcome: Outcome, host: HostRecord) -> list[str]:

@@ -1,7 +1,7 @@
 """`snakesim video`: a film of a recorded run, as MP4 or GIF, rendered by MuJoCo without a screen."""
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.plugins import FILMS, find_plugin
 from snakesim_hal.terminal import Say, say
+from snakesim_operator.results.incomplete import exit_code
 from snakesim_operator.results.record import RunRecord
 
 Floats = NDArray[np.float64]
@@ -23,6 +24,7 @@ M_PER_N, MIN_FORCE_N = 0.008, 0.3
 WORLD_LIMIT_S = 0.3  # older contacts are not drawn
 COLOURS = 48  # of a GIF
 TOLD_SHARE = 0.25
+LONGEST_COMMENT = 250  # bytes, in a GIF
 
 
 class Film(Protocol):
@@ -51,7 +53,7 @@ def video(
     record = RunRecord.load(run)
     times = _times(record, fps, speed, span_s)
     film: Film = find_plugin(FILMS, "mujoco")(record.config, *size)
-    with contextlib.closing(film), _written(out, size, fps) as write:
+    with contextlib.closing(film), _written(out, size, fps, record.lacks) as write:
         middle = _centre(record, record.row_at(times[0]))
         for i, time_s in enumerate(times):
             row = record.row_at(time_s)
@@ -61,7 +63,7 @@ def video(
             if (i + 1) % max(round(TOLD_SHARE * len(times)), 1) == 0:
                 say(f"{100 * (i + 1) // len(times)} %: {i + 1} of {len(times)} pictures")
     say(f"{out}: {len(times) / fps:.1f} s, {out.stat().st_size / 1e6:.2f} MB")
-    return 0
+    return exit_code(run, record.lacks)
 
 
 def _centre(record: RunRecord, row: int) -> Floats:
@@ -98,16 +100,20 @@ def _forces(record: RunRecord, time_s: float) -> list[Floats]:
 
 
 @contextlib.contextmanager
-def _written(out: Path, size: tuple[int, int], fps: float) -> Iterator[Write]:
+def _written(out: Path, size: tuple[int, int], fps: float, lacks: Sequence[str]) -> Iterator[Write]:
     try:
         import imageio_ffmpeg
         from PIL import Image
     except ModuleNotFoundError as error:
         raise ConfigError(f"{NEEDS} ({error})") from error
     out.parent.mkdir(parents=True, exist_ok=True)
+    comment = f"incomplete: {'; '.join(lacks)}" if lacks else ""
     if out.suffix == ".mp4":
         rate: Any = fps  # annotated as int, but any number will do
-        writer: Any = imageio_ffmpeg.write_frames(str(out), size, fps=rate, macro_block_size=2, quality=7)
+        said = ["-metadata", f"comment={comment}"] if comment else None
+        writer: Any = imageio_ffmpeg.write_frames(
+            str(out), size, fps=rate, macro_block_size=2, quality=7, output_params=said
+        )
         writer.send(None)
         try:
             yield lambda picture: writer.send(np.ascontiguousarray(picture))
@@ -124,4 +130,12 @@ def _written(out: Path, size: tuple[int, int], fps: float) -> Iterator[Write]:
         pictures.append(image.quantize(palette=palette[0], dither=Image.Dither.NONE))
 
     yield keep
-    pictures[0].save(out, save_all=True, append_images=pictures[1:], duration=1000 / fps, loop=0, optimize=True)
+    pictures[0].save(
+        out,
+        save_all=True,
+        append_images=pictures[1:],
+        duration=1000 / fps,
+        loop=0,
+        optimize=True,
+        comment=comment.encode()[:LONGEST_COMMENT],
+    )

@@ -56,4 +56,4 @@ def test_a_changed_gain_shows_in_compare(recorded: Path, tmp_path: Path) -> None
 
 def test_changes_that_need_the_services_are_refused_without_them(recorded: Path, tmp_path: Path) -> None:
     ended = snakesim("replay", str(recorded), "--set", "control.propulsion_n=20", cwd=tmp_path)
-    assert ended.code == 2 and "--set and --out are for --control" in ended.err
+    assert ended.code == 2 and "--set, --controller, --run-recorded-code and --out are for --control" in ended.err

@@ -9,6 +9,7 @@ from snakesim_operator.results.compare.difference import differ
 from snakesim_operator.results.compare.page import page
 from snakesim_operator.results.compare.table import for_scripts, table
 from snakesim_operator.results.compare.verdict import within
+from snakesim_operator.results.incomplete import exit_code
 from snakesim_operator.results.record import RunRecord
 
 PAGE = "compare.html"
@@ -17,7 +18,10 @@ PAGE = "compare.html"
 def compare(
     run_a: Path, run_b: Path, out: Path | None = None, within_percent: float | None = None, *, as_json: bool = False
 ) -> int:
-    """Returns 0; 1 when the distances differ by more than `within_percent`. Raises ConfigError on wrong input."""
+    """Returns 0; 1 when the distances differ by more than `within_percent`; else 3 when a record lacks something.
+
+    Raises ConfigError on wrong input.
+    """
     if within_percent is not None and not 0 <= within_percent < float("inf"):
         raise ConfigError(f"--within {within_percent:g}: give a percentage that is not negative, such as --within 10")
     difference = differ(RunRecord.load(run_a.resolve()), RunRecord.load(run_b.resolve()))
@@ -34,11 +38,8 @@ def compare(
         raise ConfigError(f"{error}; name another file with --out FILE.html") from None
     if as_json:
         say_json({**for_scripts(difference), "page": str(path), "within": asked})
-        return 0 if asked is None or asked.holds else 1
-    for line in table(difference):
-        say(line)
-    say(f"page: {path}")
-    if asked is None:
-        return 0
-    say(asked.words)
-    return 0 if asked.holds else 1
+    else:
+        for line in [*table(difference), f"page: {path}", *([asked.words] if asked is not None else [])]:
+            say(line)
+    code = 0 if asked is None or asked.holds else 1
+    return max(exit_code(given, record.lacks, code) for given, record in ((run_a, difference.a), (run_b, difference.b)))

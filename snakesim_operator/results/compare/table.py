@@ -37,6 +37,7 @@ def for_scripts(difference: Difference) -> dict[str, Any]:
     advance, names, parted = difference.advance, difference.joints, difference.parted
     return {
         "identical": difference.identical,
+        "lacks": {"a": difference.a.lacks, "b": difference.b.lacks},
         "command_digest": {"a": difference.a.host.command_digest, "b": difference.b.host.command_digest},
         "settings": {one.key: {"a": one.a, "b": one.b} for one in difference.settings},
         "time_s": float(difference.aligned.time_s[-1]),

@@ -31,10 +31,12 @@ def within(difference: Difference, percent: float) -> ToleranceCheck | None:
 
 def sentences(difference: Difference) -> list[str]:
     """How far, since when apart, and who propelled."""
+    partial = _partial(difference)
     if difference.identical:
-        return [f"The runs are the same, joint by joint, for all of their {_common(difference)}."]
+        how_long = "in what both records hold:" if partial else "for all of their"
+        return [*partial, f"The runs are the same, joint by joint, {how_long} {_common(difference)}."]
     advance = difference.advance
-    said = [*_untold(difference)]
+    said = [*partial, *_untold(difference)]
     for run, record in (("A", difference.a), ("B", difference.b)):
         if record.replay_of:
             said.append(
@@ -59,6 +61,15 @@ def sentences(difference: Difference) -> list[str]:
     if hand_overs.a or hand_overs.b:
         said.append(f"{_capital(who_propelled(difference))}.")
     return said
+
+
+def _partial(difference: Difference) -> list[str]:
+    """That not all of the runs is compared, where a record lacks something."""
+    lacking = [run for run, record in (("A", difference.a), ("B", difference.b)) if record.lacks]
+    if not lacking:
+        return []
+    who = "A and B" if len(lacking) == 2 else lacking[0]
+    return [f"Only a part of the runs is compared, because the record of {who} is incomplete."]
 
 
 def _untold(difference: Difference) -> list[str]:

@@ -105,6 +105,9 @@ def _numbers(summary: RunSummary) -> list[tuple[str, Any, str, str]]:
 
 
 def _config_file(record: RunRecord) -> Path:
+    """A recording alone has none beside it: its configuration stands on the page."""
+    if record.alone:
+        return Path(CONFIG)
     here = Path.cwd()
     folder = record.folder.relative_to(here) if record.folder.is_relative_to(here) else record.folder
     return folder / CONFIG

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
+from snakesim_operator.results.ended import COMPLETE, UNKNOWN
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.timeline import (
     came_to_rest_s,
@@ -45,7 +46,7 @@ def verdict(record: RunRecord, summary: RunSummary) -> Verdict:
         before = ", ".join([moved[0].lower() + moved[1:], *_refused(summary)])
         return Verdict("bad", f"{what}{said} Before that: {before}.")
     harm = _harm(summary)
-    ending = "" if summary.ended == "complete" else f" The run ended early: {_sentence(summary.ended)}"
+    ending = _ending(summary.ended)
     distance = distance_m(summary)
     if distance is None:
         return Verdict("poor", f"{moved}; {_handed_over(record, summary)}{harm}.{ending}")
@@ -64,6 +65,14 @@ def verdict(record: RunRecord, summary: RunSummary) -> Verdict:
     jam = "it jammed on the way; " if summary.jammed else ""
     good: Kind = "poor" if ending or distance < 0 else "good"
     return Verdict(good, f"{moved}; {_handed_over(record, summary)}{jam}{harm}.{stopped}{ending}")
+
+
+def _ending(ended: str) -> str:
+    if ended == COMPLETE:
+        return ""
+    if ended.startswith(UNKNOWN):
+        return f" How the run ended is not known: {_sentence(ended.removeprefix(UNKNOWN))}"
+    return f" The run ended early: {_sentence(ended)}"
 
 
 def _harm(summary: RunSummary) -> str:

@@ -1,0 +1,271 @@
+"""A damaged recording: every command goes on behind the damage, tells what is lost, and ends with exit code 3."""
+
+import csv
+import json
+import struct
+import zlib
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import Chunk
+from mcap.writer import MCAP0_MAGIC
+
+from snakesim_hal.model.scenario import load, parse_set
+from snakesim_hal.wire import keys
+from snakesim_operator.recording import mcap_file
+from snakesim_operator.recording.reader import RECORDING, RecordingReader
+from snakesim_operator.results.record import RunRecord
+from snakesim_operator.run.in_process import simulate
+from tests.whole.command import snakesim
+from tests.whole.damaged import chunks, flipped, spans, written
+
+INCOMPLETE = 3
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of many small chunks, as a long recording has them."""
+    out = tmp_path_factory.mktemp("recorded") / "run"
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(mcap_file, "CHUNK_BYTES", 100_000)
+        simulate(load("peg_row", [parse_set("duration_s=1.5")]).config, out)
+    return out
+
+
+@pytest.fixture(scope="module")
+def whole(run: Path) -> bytes:
+    content = (run / RECORDING).read_bytes()
+    assert len(chunks(content)) >= 5
+    return content
+
+
+def lost(whole_path: Path, path: Path) -> dict[str, int]:
+    """By key, by comparison with the file as it was."""
+    counts = [dict[str, int](), dict[str, int]()]
+    for count, reader in zip(counts, (RecordingReader(whole_path), RecordingReader(path)), strict=True):
+        for recorded in reader.messages():
+            count[recorded.key] = count.get(recorded.key, 0) + 1
+    missing = {key: number - counts[1].get(key, 0) for key, number in counts[0].items()}
+    return {key: number for key, number in missing.items() if number}
+
+
+def test_one_flipped_bit_costs_one_chunk_and_the_loss_is_counted_by_time_and_key(
+    run: Path, whole: bytes, tmp_path: Path
+) -> None:
+    second, third = chunks(whole)[1:3]
+    path = written(tmp_path / "a.mcap", flipped(whole, (second.begin + second.end) // 2))
+    reader = RecordingReader(path)
+    kept = list(reader.messages())
+    truth = lost(run / RECORDING, path)
+    assert truth[keys.JOINTS] >= 5 and len(kept) > 500
+    assert {key: count for key, count in reader.losses.lost.items() if not key.startswith("foxglove/")} == truth
+    (gap,) = [gap for gap in reader.losses.gaps if gap.lost]
+    clocks = [one.time_ns for one in kept if one.key == keys.CLOCK]
+    hole = next((a, b) for a, b in pairwise(clocks) if b - a > 20_000_000)
+    assert gap.end_ns is not None and hole[0] <= gap.begin_ns < gap.end_ns <= hole[1]
+    assert reader.finished and third.begin  # what follows was read
+
+
+def test_each_chunk_may_be_the_damaged_one(run: Path, whole: bytes, tmp_path: Path) -> None:
+    for chunk in chunks(whole):
+        for at in (chunk.begin, chunk.begin + 2, chunk.begin + 45, chunk.end - 5):  # kind, length, name, data
+            path = written(tmp_path / "a.mcap", flipped(whole, at))
+            reader = RecordingReader(path)
+            kept = list(reader.messages())
+            ours = {key: n for key, n in reader.losses.lost.items() if not key.startswith("foxglove/")}
+            assert kept and reader.finished and ours == lost(run / RECORDING, path), (chunk, at, reader.lacks)
+
+
+COMMANDS = [
+    ["info", "a.mcap"],
+    ["report", "a.mcap"],
+    ["compare", "whole.mcap", "a.mcap"],
+    ["compare", "a.mcap", "whole.mcap", "--json"],
+    ["export", "a.mcap", "--format", "csv", "--out", "a.csv"],
+    ["export", "a.mcap", "--format", "npz", "--out", "a.npz"],
+    ["export", "a.mcap", "--format", "mcap", "--out", "copy.mcap"],
+    ["replay", "a.mcap", "--control"],
+]
+
+
+@pytest.mark.parametrize("damage", ["flipped", "halved", "taken out"])
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: "-".join(command[:1] + command[3:4]))
+def test_every_command_tells_of_the_damage_and_ends_with_3(
+    whole: bytes, tmp_path: Path, command: list[str], damage: str
+) -> None:
+    second = chunks(whole)[1]
+    damaged = {
+        "flipped": flipped(whole, (second.begin + second.end) // 2),
+        "halved": whole[: len(whole) // 2],
+        "taken out": whole[: second.begin] + whole[second.end :],
+    }[damage]
+    written(tmp_path / "whole.mcap", whole)
+    written(tmp_path / "a.mcap", damaged)
+    ended = snakesim(*command, cwd=tmp_path)
+    assert ended.code == INCOMPLETE, ended
+    assert ended.err.startswith("snakesim: incomplete: a.mcap lacks ") and len(ended.err.splitlines()) == 1
+    assert ("breaks off at" if damage == "halved" else "sensor/joints") in ended.err
+    if "--json" in command:
+        assert json.loads(ended.out)["lacks"]["a"] and not json.loads(ended.out)["lacks"]["b"]
+
+
+def test_a_whole_recording_says_nothing_of_it(whole: bytes, tmp_path: Path) -> None:
+    for name in ("whole.mcap", "a.mcap"):
+        written(tmp_path / name, whole)
+    for command in COMMANDS:
+        ended = snakesim(*command, cwd=tmp_path)
+        assert ended.code == 0 and not ended.err, ended
+    page = (tmp_path / "a.html").read_text()
+    assert "The run ended early" not in page and "The record lacks" not in page
+
+
+def test_a_copy_keeps_what_is_intact_and_says_what_it_lacks(run: Path, whole: bytes, tmp_path: Path) -> None:
+    first = chunks(whole)[0]
+    written(tmp_path / "a.mcap", flipped(whole, (first.begin + first.end) // 2))
+    ended = snakesim("export", "a.mcap", "--format", "mcap", "--out", "copy.mcap", cwd=tmp_path)
+    count = len(list(RecordingReader(tmp_path / "a.mcap").messages()))
+    assert ended.code == INCOMPLETE and int(ended.out.split()[0]) > count > 500  # and those for Foxglove
+    reader = RecordingReader(tmp_path / "copy.mcap")
+    assert len(list(reader.messages())) == count and reader.finished
+    told = snakesim("info", "copy.mcap", cwd=tmp_path)
+    assert told.code == INCOMPLETE and "before it was copied: damaged in 1 place" in told.err
+    assert "sensor/joints" in told.err
+
+
+def test_tables_and_arrays_carry_what_is_lost(whole: bytes, tmp_path: Path) -> None:
+    written(tmp_path / "a.mcap", whole[: len(whole) // 2])
+    for form in ("csv", "npz"):
+        snakesim("export", "a.mcap", "--format", form, "--out", f"a.{form}", cwd=tmp_path)
+    with (tmp_path / "a.csv").open() as file:
+        assert next(file).startswith("# incomplete: recording: its end: it breaks off at ")
+        rows = list(csv.DictReader(file))
+    with np.load(tmp_path / "a.npz") as arrays:
+        assert "its end" in str(arrays["lacks"][0]) and len(arrays["time_s"]) == len(rows) > 20
+
+
+def test_who_reads_parquet_and_datasets_finds_it_too(whole: bytes, tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `export`")
+    written(tmp_path / "a.mcap", whole[: len(whole) // 2])
+    for form, out in (("parquet", "a.parquet"), ("lerobot", "set")):
+        assert snakesim("export", "a.mcap", "--format", form, "--out", out, cwd=tmp_path).code == INCOMPLETE
+    assert b"its end" in parquet.read_table(tmp_path / "a.parquet").schema.metadata[b"snakesim.lacks"]
+    assert "its end" in json.loads((tmp_path / "set" / "meta" / "lacks.json").read_text())["0"][0]
+
+
+def test_of_a_recording_that_breaks_off_nobody_says_how_the_run_ended(whole: bytes, tmp_path: Path) -> None:
+    written(tmp_path / "whole.mcap", whole)
+    written(tmp_path / "a.mcap", whole[: len(whole) // 2])
+    snakesim("report", "a.mcap", cwd=tmp_path)
+    page = (tmp_path / "a.html").read_text()
+    assert "How the run ended is not known: the recording breaks off after 0." in page and "ended early" not in page
+    assert "The record lacks something. recording: its end" in page
+    compared = snakesim("compare", "whole.mcap", "a.mcap", cwd=tmp_path)
+    assert "Only a part of the runs is compared, because the record of B is incomplete." in compared.out
+    assert "in what both records hold: " in compared.out and "for all of their" not in compared.out
+
+
+def test_the_command_that_repeats_a_run_names_a_file_that_can_be(run: Path, whole: bytes, tmp_path: Path) -> None:
+    written(tmp_path / "a.mcap", whole)
+    snakesim("report", "a.mcap", cwd=tmp_path)
+    page = (tmp_path / "a.html").read_text()
+    assert "snakesim run config.json --backend sim" in page and "a.mcap/config.json" not in page
+    assert "Save the effective configuration below as <code>config.json</code>" in page
+
+
+def test_an_export_does_not_follow_a_link(whole: bytes, tmp_path: Path) -> None:
+    written(tmp_path / "a.mcap", whole)
+    for form in ("csv", "npz", "mcap"):
+        out = tmp_path / ("b.mcap" if form == "mcap" else f"a.{form}")
+        out.symlink_to(tmp_path / "elsewhere")
+        wanted = ["--out", "b.mcap"] if form == "mcap" else []
+        ended = snakesim("export", "a.mcap", "--format", form, *wanted, cwd=tmp_path)
+        assert ended.code == 2 and "there is a symbolic link already; choose another one with --out" in ended.err
+        assert not (tmp_path / "elsewhere").exists()
+
+
+def test_what_a_full_disk_or_a_slow_one_cost_is_told(whole: bytes, tmp_path: Path) -> None:
+    end = next(span for span in spans(whole) if span.opcode == Opcode.METADATA)
+    path = written(tmp_path / "a.mcap", whole[: end.begin] + whole[end.end :])  # nothing of a robot is lost
+    reader = RecordingReader(path)
+    assert list(reader.messages()) and reader.finished and not reader.lacks
+
+
+def packed(content: bytes, name: str = "zstd", size: int | None = None, data: bytes | None = None) -> bytes:
+    """A chunk record. size: what it claims to unpack to."""
+    builder = RecordBuilder()
+    body = zstandard.compress(content) if data is None else data
+    Chunk(name, body, 0, 0, zlib.crc32(content), len(content) if size is None else size).write(builder)
+    return builder.end()
+
+
+def test_a_bad_lz4_chunk_and_an_impossible_time_are_damage_as_any_other(whole: bytes, tmp_path: Path) -> None:
+    first, second = chunks(whole)[:2]
+    bad = packed(b"abc", "lz4", data=b"no lz4 at all")
+    reader = RecordingReader(written(tmp_path / "a.mcap", whole[: first.end] + bad + whole[first.end :]))
+    assert len(list(reader.messages())) > 500 and "a chunk that cannot be unpacked" in reader.lacks[0]
+    (channel,) = struct.unpack("<H", b"\x01\x00")
+    late = struct.pack("<BQHIQQ", Opcode.MESSAGE, 22, channel, 10**6, 2**63, 0)
+    reader = RecordingReader(written(tmp_path / "a.mcap", whole[: second.begin] + packed(late) + whole[second.begin :]))
+    assert max(one.time_ns for one in reader.messages()) < 2**62 and reader.lacks
+    assert snakesim("info", "a.mcap", cwd=tmp_path).code == INCOMPLETE
+
+
+def test_a_record_of_absurd_length_is_damage(whole: bytes, tmp_path: Path) -> None:
+    second = chunks(whole)[1]
+    for opcode in (Opcode.CHUNK, Opcode.METADATA, Opcode.MESSAGE, Opcode.ATTACHMENT):
+        absurd = struct.pack("<BQ", opcode, 2**63) + b"x" * 50
+        reader = RecordingReader(written(tmp_path / "a.mcap", whole[: second.begin] + absurd + whole[second.begin :]))
+        list(reader.messages())
+        assert reader.finished and not reader.losses.lost and reader.losses.places == 1
+
+
+def test_a_bomb_is_refused_in_one_line(tmp_path: Path) -> None:
+    bomb = packed(bytes(60_000_000))
+    assert len(bomb) < 10_000
+    written(tmp_path / "bomb.mcap", MCAP0_MAGIC + bomb * 20)
+    for command in (["info", "bomb.mcap"], ["export", "bomb.mcap", "--format", "mcap", "--out", "o.mcap"]):
+        ended = snakesim(*command, cwd=tmp_path)
+        assert ended.code == 2 and len(ended.err.splitlines()) == 1, ended
+        assert "bomb.mcap is not a recording" in ended.err and "which no messages of a robot do" in ended.err
+
+
+@pytest.mark.parametrize("way", ["recorded", "named", "flag", "other"])
+def test_code_that_a_recording_names_runs_only_when_its_user_says_so(tmp_path: Path, way: str) -> None:
+    (tmp_path / "mine.py").write_text(
+        "from pathlib import Path\n"
+        "from snakesim_gnc.control.hold import Hold\n"
+        "(Path(__file__).parent / 'ran').touch()\n"
+        "class Mine(Hold):\n    pass\n"
+    )
+    begin = ["run", "triplet", "--in-process", "--duration", "0.2", "--out", "run", "--controller", "./mine.py:Mine"]
+    ended = snakesim(*begin, cwd=tmp_path)
+    assert ended.code == 0, ended
+    (tmp_path / "ran").unlink()
+    more = {
+        "recorded": [],
+        "named": ["--controller", "./mine.py:Mine"],
+        "flag": ["--run-recorded-code"],
+        "other": ["--controller", "hold"],
+    }[way]
+    replayed = snakesim("replay", "run", "--control", *more, cwd=tmp_path)
+    assert (tmp_path / "ran").exists() == (way in ("named", "flag"))
+    if way == "recorded":
+        assert replayed.code == 2 and "the recording names './mine.py:Mine' as its controller" in replayed.err
+        assert "--run-recorded-code" in replayed.err and "--controller ./mine.py:Mine" in replayed.err
+    else:
+        assert replayed.code == 0 and "the same to the bit" in replayed.out, replayed
+
+
+def test_a_folder_with_a_black_box_tells_of_its_recording_too(run: Path, whole: bytes, tmp_path: Path) -> None:
+    for path in run.iterdir():
+        if path.is_file():
+            written(tmp_path / path.name, path.read_bytes())
+    written(tmp_path / RECORDING, whole[: len(whole) // 2])
+    ended = snakesim("report", ".", cwd=tmp_path)
+    assert ended.code == INCOMPLETE and "its end: it breaks off" in ended.err
+    assert len(RunRecord.load(tmp_path).time_s) == 150  # the rows are the black box's
