@@ -1,6 +1,7 @@
 """Entry point of the `snakesim` command."""
 
 import os
+import resource
 import signal
 import sys
 
@@ -20,9 +21,17 @@ def main() -> int:
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not if the shell ignores it
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     pin()  # before NumPy is imported
-    from snakesim_operator.cli import main as command
+    try:
+        from snakesim_operator.cli import main as command
 
-    return command()
+        return command()
+    except (MemoryError, ImportError) as error:
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        if isinstance(error, ImportError) and limit == resource.RLIM_INFINITY:  # no library failed for lack of memory
+            raise
+        allowed = "this computer has" if limit == resource.RLIM_INFINITY else f"`ulimit -v` allows, {limit // 2**20} MB"
+        sys.stderr.write(f"snakesim: this command needs more memory than {allowed}\n")
+        return 1
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ import zenoh
 from snakesim_hal.errors import ConfigError, short
 from snakesim_hal.model.textfiles import check_brackets, read_text
 from snakesim_hal.network.endpoint import check_endpoint, check_namespace
+from snakesim_hal.network.private_keys import warn_of_readable_keys
 
 # Values that a file may leave out, except the mode, which is `peer` when left out.
 REQUIRED: dict[str, Any] = {
@@ -68,9 +69,11 @@ def read_zenoh_file(path: Path) -> tuple[str, zenoh.Config]:
     text = read_text(path)
     check_brackets(text, str(path))
     try:
-        return text, zenoh.Config.from_json5(text)
+        settings = zenoh.Config.from_json5(text)
     except zenoh.ZError as error:
         raise refused_by_zenoh(path, error) from error
+    warn_of_readable_keys(settings)
+    return text, settings
 
 
 def refused_by_zenoh(path: Path, error: zenoh.ZError) -> ConfigError:

@@ -7,6 +7,7 @@ their owner may read them, and nothing here prints them.
 
 import os
 import secrets
+import stat
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from ipaddress import ip_address
@@ -20,6 +21,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.textfiles import read_bytes
+from snakesim_hal.network.private_keys import readable_by_all
 from snakesim_operator.lab.identities import Identity, identities
 from snakesim_operator.lab.lab_file import Lab
 
@@ -41,8 +43,7 @@ def make_authority(folder: Path, lab: Lab) -> Issuer:
     at_certificate, at_key = folder / f"{AUTHORITY}.pem", folder / f"{AUTHORITY}.key"
     if at_certificate.exists() or at_key.exists():
         return _read_authority(at_certificate, at_key)
-    folder.mkdir(parents=True, exist_ok=True)
-    folder.chmod(0o700)
+    _make_private(folder)
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, f"{lab.file.name} authority")])
     usage = x509.KeyUsage(
@@ -68,7 +69,26 @@ def make_authority(folder: Path, lab: Lab) -> Issuer:
     return Issuer(certificate, key)
 
 
+def _make_private(folder: Path) -> None:
+    """A new folder that is its owner's alone. One that is there stays as it is, and must be so already."""
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(mode=0o700)
+    except FileExistsError:
+        if not folder.is_dir():
+            raise ConfigError(f"--authority {folder}: is a file; name a folder") from None
+        mode = stat.S_IMODE(folder.stat().st_mode)
+        if mode & 0o077:
+            raise ConfigError(
+                f"--authority {folder}: others may look or write into this folder (mode {mode:o}), and who has the "
+                f"authority's key controls the lab. Name a new folder, or make it yours alone: chmod 700 {folder}"
+            ) from None
+
+
 def _read_authority(at_certificate: Path, at_key: Path) -> Issuer:
+    warned = readable_by_all(at_key)
+    if warned:
+        raise ConfigError(f"{warned}; as this is the lab's authority, anybody may have joined: better make a new one")
     try:
         certificate = x509.load_pem_x509_certificate(read_bytes(at_certificate))
         key = serialization.load_pem_private_key(read_bytes(at_key), None)

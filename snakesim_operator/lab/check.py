@@ -18,6 +18,7 @@ from typing import Any
 from cryptography import x509
 
 from snakesim_hal.errors import ConfigError, NotConnectedError
+from snakesim_hal.network.private_keys import readable_by_all
 from snakesim_hal.network.probe import open_probe
 from snakesim_hal.network.process_entries import HOST, differences
 from snakesim_hal.network.session import Link, Session, open_session
@@ -90,6 +91,8 @@ def _check_certificate(identity: Identity, folder: Path, found: Findings) -> Non
         found.failed(f"{identity.common_name}: {error}")
         return
     _check_end(identity.common_name, certificate, "run `snakesim deploy certs` and install it", found)
+    if wrong := readable_by_all(at.with_suffix(".key")):
+        found.failed(f"{identity.common_name}: {wrong}, and renew it with `snakesim deploy certs --rotate`")
 
 
 def _check_end(what: str, certificate: x509.Certificate, remedy: str, found: Findings) -> None:
