@@ -33,7 +33,7 @@ from snakesim_operator.recording.recording import ABOUT, COPIED
 
 RECORDING = "recording.mcap"
 LATEST_NS = 2**62  # 146 years: no robot time is later
-MOST_RATIO, FREE_BYTES = 100, 64 * 1024 * 1024  # a file may unpack to so many times its size, and to so much more
+MOST_RATIO, FREE_BYTES = 100, 32 * 1024 * 1024  # a file may unpack to so many times its size, and to so much more
 _SCANNED_BYTES = 1024 * 1024
 _NEXT_BYTES = 64  # of what _NEXT matches, at most
 _NEXT = re.compile(  # a chunk of a known compression, our metadata, or the end of the messages

@@ -10,7 +10,7 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from tests.fuzz import bus, inputs, network
+from tests.fuzz import bus, inputs, network, recordings
 from tests.fuzz.run import run
 
 GROWTH_MB = 16.0  # more than what an allocator keeps back
@@ -43,8 +43,13 @@ def over_network(asked: argparse.Namespace) -> int:
 
 
 def in_process(asked: argparse.Namespace) -> int:
-    """Every decoder, and a HAL without a network; of the payloads a tenth more goes to files, and a tenth to a bus."""
+    """Every decoder, and a HAL without a network; of the payloads a tenth more goes to files, and a tenth to a bus.
+
+    For every 10,000 a damaged recording goes into each command that reads one.
+    """
     beside_the_wire(asked.payloads // 10, asked.seed)
+    if harmed := of_recordings(asked.payloads // 10_000, asked.seed):
+        return harmed
     started = time.monotonic()
     report = run(asked.payloads, asked.seed)
     total: Counter[str] = Counter()
@@ -59,6 +64,14 @@ def in_process(asked: argparse.Namespace) -> int:
         f"{report.resident_mb[-1]:.0f} MB at the end, {report.peak_mb:.0f} MB at most"
     )
     return 0 if report.growth_mb <= GROWTH_MB else 1
+
+
+def of_recordings(copies: int, seed: int) -> int:
+    """Damaged copies of a recording. 1 when a command did what it must not."""
+    with tempfile.TemporaryDirectory(prefix="snakesim-fuzz-") as folder:
+        verdict = recordings.fuzz(Path(folder), copies, seed)
+    print(recordings.table(verdict))
+    return 1 if verdict.violations else 0
 
 
 def beside_the_wire(payloads: int, seed: int) -> None:
