@@ -122,7 +122,7 @@ def forged(chance: random.Random, content: bytes) -> bytes:
         elif what == 1:
             struct.pack_into("<I", data, at + 2, chance.choice(ABSURD) % 2**32)
         elif what == 2:
-            struct.pack_into("<Q", data, at + 6, chance.choice((*ABSURD, 10**9)))
+            struct.pack_into("<Q", data, at + 6, chance.choice((*ABSURD, 10**9, 2**61)))
         else:
             length = HEAD.unpack_from(data, at - HEAD.size)[1]
             for _ in range(chance.choice((1, 8))):

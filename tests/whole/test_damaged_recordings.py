@@ -252,6 +252,8 @@ def test_code_that_a_recording_names_runs_only_when_its_user_says_so(tmp_path: P
         "flag": ["--run-recorded-code"],
         "other": ["--controller", "hold"],
     }[way]
+    for other in (["info", "run"], ["report", "run"], ["export", "run", "--format", "csv"], ["compare", "run", "run"]):
+        assert snakesim(*other, cwd=tmp_path).code == 0 and not (tmp_path / "ran").exists()
     replayed = snakesim("replay", "run", "--control", *more, cwd=tmp_path)
     assert (tmp_path / "ran").exists() == (way in ("named", "flag"))
     if way == "recorded":

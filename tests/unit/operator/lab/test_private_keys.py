@@ -12,7 +12,9 @@ import pytest
 from snakesim_hal.network.private_keys import _warn
 from snakesim_hal.network.session_file import read_session
 from snakesim_operator.cli import main
-from snakesim_operator.lab.lab_file import EXAMPLE
+from snakesim_operator.lab.check import Findings, _check_certificate
+from snakesim_operator.lab.identities import identities
+from snakesim_operator.lab.lab_file import EXAMPLE, load_lab
 
 SNAKESIM = [sys.executable, "-m", "snakesim_operator"]
 
@@ -68,6 +70,17 @@ def test_a_session_names_a_key_that_everybody_may_read_and_goes_on(
     assert read_session(path).endpoints and read_session(path).endpoints
     said = capsys.readouterr().err.splitlines()
     assert len(said) == 1 and f"warning: {key}: every user of this computer may read this private key" in said[0]
+
+
+def test_a_check_of_the_lab_marks_such_a_key(tmp_path: Path) -> None:
+    assert certs(tmp_path) == 0
+    said, identity = list[str](), next(identities(load_lab(EXAMPLE)))
+    found = Findings(said.append)
+    _check_certificate(identity, tmp_path, found)
+    assert not found.wrong
+    (tmp_path / identity.machine / "tls" / f"{identity.label}.key").chmod(0o604)
+    _check_certificate(identity, tmp_path, found)
+    assert found.wrong == 1 and "every user of this computer may read this private key (mode 604)" in said[-1]
 
 
 @pytest.mark.parametrize("most_mb", [20, 30, 40, 100])
