@@ -20,7 +20,7 @@ from mcap.records import Chunk
 from mcap.writer import MCAP0_MAGIC
 
 from snakesim_hal.model.scenario import load, parse_set
-from snakesim_operator.recording import mcap_file
+from snakesim_operator.recording import mcap_file, recording
 from snakesim_operator.recording.chunks import HEAD, unpack
 from snakesim_operator.recording.reader import RECORDING
 from snakesim_operator.run.in_process import simulate
@@ -175,6 +175,7 @@ def record(out: Path) -> None:
     """A short run, in many small chunks."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(mcap_file, "CHUNK_BYTES", 40_000)
+        patched.setattr(recording, "FLUSH_S", 3600.0)  # chunks by size alone, however busy the machine
         simulate(load("peg_row", [parse_set("duration_s=0.6")]).config, out)
 
 

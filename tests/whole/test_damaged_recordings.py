@@ -17,7 +17,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_hal.wire import keys
-from snakesim_operator.recording import mcap_file
+from snakesim_operator.recording import mcap_file, recording
 from snakesim_operator.recording.reader import RECORDING, RecordingReader
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.run.in_process import simulate
@@ -33,6 +33,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("recorded") / "run"
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(mcap_file, "CHUNK_BYTES", 100_000)
+        patched.setattr(recording, "FLUSH_S", 3600.0)  # chunks by size alone, however busy the machine
         simulate(load("peg_row", [parse_set("duration_s=1.5")]).config, out)
     return out
 

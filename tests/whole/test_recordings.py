@@ -50,7 +50,7 @@ def test_info_tells_what_is_in_it_and_what_is_missing(run: Path, tmp_path: Path)
     content = (run / RECORDING).read_bytes()
     (tmp_path / "torn.mcap").write_bytes(content[: len(content) * 2 // 3])
     result = snakesim("info", "torn.mcap", cwd=tmp_path)
-    assert result.code == 3 and "lacks: its end: it breaks off at 1." in result.out
+    assert result.code == 3 and "lacks: its end: it breaks off at " in result.out
 
 
 def test_a_page_is_made_of_a_recording_alone(run: Path, tmp_path: Path) -> None:
