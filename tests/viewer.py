@@ -38,7 +38,7 @@ class Viewer:
 
     async def come(self) -> None:
         """What a page says first: from then on it counts as a viewer."""
-        await self._say(CAMERA)
+        await self.say(CAMERA)
 
     async def batch(self) -> list[dict[str, Any]]:
         """The next messages."""
@@ -58,7 +58,7 @@ class Viewer:
         for message in batch:
             if message["type"] == ASKED:
                 reported = {"value": None, "error": None, "request_uuid": message["request_uuid"]}
-                await self._say({"type": "LocalStorageGetItemResponseMessage", **reported})
+                await self.say({"type": "LocalStorageGetItemResponseMessage", **reported})
 
     async def watch(self) -> None:
         """Show all that comes, until the connection ends."""
@@ -76,16 +76,18 @@ class Viewer:
 
     async def click(self, button: str) -> None:
         """Press a button."""
-        await self._say({"type": "GuiUpdateMessage", "uuid": self._named(button), "updates": {"value": True}})
+        await self.say({"type": "GuiUpdateMessage", "uuid": self.named(button), "updates": {"value": True}})
 
     async def trigger(self, command: str) -> None:
         """Press the key of a command."""
-        await self._say({"type": "CommandTriggerMessage", "uuid": self._named(command)})
+        await self.say({"type": "CommandTriggerMessage", "uuid": self.named(command)})
 
-    def _named(self, label: str) -> str:
+    def named(self, label: str) -> str:
+        """The id of what has a label."""
         return next(uuid for uuid, props in self._of.items() if props.get("label") == label)
 
-    async def _say(self, message: dict[str, Any]) -> None:
+    async def say(self, message: dict[str, Any]) -> None:
+        """Send any message."""
         await self._socket.send(msgspec.msgpack.encode(message))
 
 

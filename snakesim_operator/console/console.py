@@ -36,8 +36,13 @@ def show_live(
     expected: what to show until there is a robot.
     """
     log = Log()
-    with page_server(listening) as (server, address):
-        operations = Operations(link, log)
+    operations = Operations(link, log)
+
+    def report(line: str) -> None:
+        log.write(line)
+        say(line)
+
+    with page_server(listening, report, lambda: operations.estop("a page's second stop")) as (server, address):
         page = Page(server, around, operations, log)
         say(f"console: {address}")
         page.show(expected)
@@ -62,7 +67,7 @@ def show_recorded(folder: Path, at_s: float, listening: socket.socket, stop: thr
     for lack in recorded.record.lacks:
         log.write(f"the record lacks {lack}")
     code = exit_code(folder, recorded.record.lacks)
-    with page_server(listening) as (server, address):
+    with page_server(listening, say) as (server, address):
         page = Page(server, Surroundings(recorded.record.config), None, log, recorded=folder.name)
         player = Player(server, recorded.span_s, at_s)
         say(f"console: {address}")

@@ -1,6 +1,7 @@
 """The controls of one viewer. Only the viewer in control can use them; everybody can stop the robot."""
 
 import math
+import threading
 import time
 from collections.abc import Callable
 from typing import Literal
@@ -12,6 +13,7 @@ from snakesim_hal.model.injection import KINDS, TargetType
 from snakesim_hal.model.kinematics import rotation_from_quaternion, yaw_of
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlSettings
+from snakesim_operator.console.admission import Admission
 from snakesim_operator.console.operations import BUTTON_NS, KEY_NS, Operations
 from snakesim_operator.console.settings_form import SettingsForm
 from snakesim_operator.console.snapshot import RobotSnapshot
@@ -26,6 +28,7 @@ FAULTS: dict[str, tuple[str, TargetType]] = {
 }
 TARGETS: dict[TargetType, str] = {"process": "control", "key": keys.JOINTS, "joint": "joint_3", "bus": "bus_1"}
 DRIVE_HZ = 10.0
+ACTS_AT_ONCE, STOPS_AT_ONCE = 4, 2  # of one viewer
 FASTEST_M_S = 0.5
 Key = Literal["I", "J", "K", "L"]
 KEYS: dict[str, Key] = {"Ahead": "I", "Backwards": "K", "Left": "J", "Right": "L"}  # viser's arrows turn the view
@@ -44,11 +47,13 @@ class Controls:
         snapshot: Callable[[], RobotSnapshot | None],
         settings_tab: viser.GuiFolderHandle,
         changed: Callable[[], None],
+        admission: Admission,
     ) -> None:
         """folder, settings_tab: places on the page; snapshot: the newest; changed: called when the token has moved."""
-        self._client, self._token, self._operations = client, token, operations
+        self.client, self._token, self._operations = client, token, operations
         self._moment, self._changed = snapshot, changed
-        self._settings_tab = settings_tab
+        self._settings_tab, self._admission = settings_tab, admission
+        self._acts, self._stops = threading.Semaphore(ACTS_AT_ONCE), threading.Semaphore(STOPS_AT_ONCE)
         self._form: SettingsForm | None = None
         self._way, self._driven_s = 1, -math.inf  # by keys: ahead or backwards, and when last
         self.viewer = client.client_id
@@ -70,12 +75,27 @@ class Controls:
                 self._target = client.gui.add_text("Target", TARGETS["joint"])
                 inject = client.gui.add_button_group("Fault", ("Inject", "End it"))
             self._dark = client.gui.add_checkbox("Dark page", initial_value=False)
+        for control in (self._take, self._dark):
+            admission.admit(control, self.viewer)
+        for control in (
+            self._lifecycle,
+            time_buttons,
+            self._time_speed,
+            self._heading,
+            self._speed,
+            self._kind,
+            inject,
+        ):
+            admission.admit(control, self.viewer, self._in_control)
+        admission.admit(self._target, self.viewer, self._in_control)
+        admission.admit(self._drive, self.viewer, self._in_control, DRIVE_HZ)
         self._take.on_click(lambda _: self._take_or_release())
         self._lifecycle.on_click(lambda event: self._ask(event.target.value))
         time_buttons.on_click(lambda event: self._change_time(event.target.value.lower()))
         self._time_speed.on_update(lambda _: self._change_time("speed"))
         with settings_tab:
             self._apply = client.gui.add_button("Apply", visible=False, order=0)
+        admission.admit(self._apply, self.viewer, self._in_control)
         self._kind.on_update(lambda _: self._suggest_target())
         inject.on_click(lambda event: self._inject(end=event.target.value == "End it"))
         self._drive.on_hold(lambda _: self._go(), callback_hz=DRIVE_HZ)
@@ -111,14 +131,18 @@ class Controls:
         """Show the settings in force."""
         if self._form is None or not self._form.show(settings):
             if self._form is not None:
+                for one in self._form.inputs:
+                    self._admission.forget(one)
                 self._form.remove()
-            self._form = SettingsForm(self._client.gui, self._settings_tab, settings)
+            self._form = SettingsForm(self.client.gui, self._settings_tab, settings)
+            for one in self._form.inputs:
+                self._admission.admit(one, self.viewer, self._in_control)
         self._apply.visible = True
         self.show()
 
     def tell(self, title: str, text: str, *, bad: bool = False) -> None:
         """Show a message to this viewer."""
-        self._client.add_notification(title, text, auto_close_seconds=TOLD_S, color="red" if bad else "green")
+        self.client.add_notification(title, text, auto_close_seconds=TOLD_S, color="red" if bad else "green")
 
     def _take_or_release(self) -> None:
         if not self._token.release(self.viewer):
@@ -198,12 +222,22 @@ class Controls:
         if form is not None and self._in_control():
             self.do("Settings", lambda: self._operations.configure(self.who, form.controller, form.asked()))
 
-    def do(self, title: str, call: Callable[[], str]) -> None:
-        """Do something, and show its outcome."""
+    def do(self, title: str, call: Callable[[], str], at_once: threading.Semaphore | None = None) -> None:
+        """Do something, and show its outcome. Few at once, so that a viewer keeps no other one's click waiting."""
+        at_once = at_once or self._acts
+        if not at_once.acquire(blocking=False):
+            self.tell(title, "not done: what you asked for before is still under way", bad=True)
+            return
         try:
             self.tell(title, call())
         except SnakesimError as error:
             self.tell(title, str(error), bad=True)
+        finally:
+            at_once.release()
+
+    def estop(self) -> None:
+        """Which what else is under way does not keep waiting."""
+        self.do("Emergency stop", lambda: self._operations.estop(self.who), self._stops)
 
 
 def _degrees(angle_rad: float) -> int:

@@ -109,10 +109,12 @@ class Operations:
     def _do(self, what: str, call: Callable[[Callable[[str], None]], int]) -> str:
         lines: list[str] = []
         try:
-            call(lines.append)
+            failed = call(lines.append) != 0
+            said = "; ".join(lines)
+            if failed:
+                raise RefusedError(said)
         except SnakesimError as error:
             self._log.write(f"{what}: {error}")
             raise
-        said = "; ".join(lines)
         self._log.write(f"{what}: {said}")
         return said

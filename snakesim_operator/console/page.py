@@ -6,6 +6,7 @@ before (`pacing`), so a slow browser gets fewer frames, and never makes the loop
 
 import contextlib
 import threading
+from collections.abc import Iterator
 from functools import partial
 
 import viser
@@ -20,6 +21,7 @@ from snakesim_operator.console.drawing import Surroundings, draw
 from snakesim_operator.console.operations import Log, Operations
 from snakesim_operator.console.pictures import picture
 from snakesim_operator.console.polygon import force_polygon
+from snakesim_operator.console.server import PageServer
 from snakesim_operator.console.snapshot import RobotSnapshot
 from snakesim_operator.console.stage import Stage
 from snakesim_operator.console.token import ControlToken
@@ -43,7 +45,7 @@ class Page:
 
     def __init__(
         self,
-        server: viser.ViserServer,
+        server: PageServer,
         around: Surroundings | None,
         operations: Operations | None,
         log: Log,
@@ -75,10 +77,12 @@ class Page:
         if self._operations is not None:
             stop = gui.add_button("EMERGENCY STOP  (Esc)", color="red", icon=viser.Icon.HAND_STOP, order=1)
             stop.on_click(lambda event: self._estop(event.client_id))
-            key = gui.add_command("Emergency stop", hotkey="escape")
+            admit = self._server.admission.admit
+            admit(stop)
+            key = admit(gui.add_command("Emergency stop", hotkey="escape"))
             key.on_trigger(lambda event: self._estop(event.client_id))
             for what, hotkey in KEYS.items():
-                drive = gui.add_command(f"Drive: {what.lower()}", hotkey=hotkey)
+                drive = admit(gui.add_command(f"Drive: {what.lower()}", hotkey=hotkey))
                 drive.on_trigger(partial(self._press, what))
             self._control_folder = gui.add_folder("Control", order=2)
         tabs = gui.add_tab_group(order=4)
@@ -109,6 +113,16 @@ class Page:
     # --- viewers ---------------------------------------------------------------------------------------------
 
     def _came(self, client: viser.ClientHandle) -> None:
+        """In a thread of viser's: the viewer may be gone before it ends."""
+        with self._of_who_is_there(client):
+            self._give_controls(client)
+            if self._moment is not None:
+                _aim(client, self._moment.robot)
+            self._log.write(f"{name_of(client.client_id)} came")
+        if client.client_id not in self._server.get_clients():
+            self._forget(client.client_id)
+
+    def _give_controls(self, client: viser.ClientHandle) -> None:
         assert self._operations is not None
         with self._lock:
             controls = Controls(
@@ -119,38 +133,49 @@ class Page:
                 lambda: self._moment,
                 self._settings_tab,
                 self._control_changed,
+                self._server.admission,
             )
             if self._moment is not None and self._moment.settings is not None:
                 controls.show_settings(self._moment.settings)
             self._controls[client.client_id] = controls
-        if self._moment is not None:
-            _aim(client, self._moment.robot)
-        self._log.write(f"{name_of(client.client_id)} came")
 
     def _went(self, client: viser.ClientHandle) -> None:
         """Control returns with the page that had it."""
-        with self._lock:
-            self._controls.pop(client.client_id, None)
+        self._forget(client.client_id)
         had = self._token.release(client.client_id)
         self._log.write(f"{name_of(client.client_id)} left{', and with it control' if had else ''}")
         self._control_changed()
+
+    def _forget(self, viewer: int) -> None:
+        with self._lock:
+            self._controls.pop(viewer, None)
+        self._server.admission.forget_viewer(viewer)
+
+    @contextlib.contextmanager
+    def _of_who_is_there(self, client: viser.ClientHandle) -> Iterator[None]:
+        """What a viewer's page shows can be changed until it closes, which may be now: then viser raises."""
+        try:
+            yield
+        except RuntimeError:
+            if client.client_id in self._server.get_clients():
+                raise
 
     def _control_changed(self) -> None:
         with self._lock:
             everybody = list(self._controls.values())
         for controls in everybody:
-            controls.show()
+            with self._of_who_is_there(controls.client):
+                controls.show()
 
     def _estop(self, viewer: int | None) -> None:
         assert self._operations is not None
         with self._lock:
             controls = None if viewer is None else self._controls.get(viewer)
-        call = partial(self._operations.estop, name_of(viewer))
         if controls is not None:
-            controls.do("Emergency stop", call)
+            controls.estop()
         else:
             with contextlib.suppress(SnakesimError):  # the log has it
-                call()
+                self._operations.estop(name_of(viewer))
 
     def _press(self, key: str, event: viser.CommandEvent) -> None:
         with self._lock:
@@ -210,7 +235,8 @@ class Page:
     def _show_settings(self, settings: ControlSettings) -> None:
         with self._lock:
             for controls in self._controls.values():
-                controls.show_settings(settings)
+                with self._of_who_is_there(controls.client):
+                    controls.show_settings(settings)
         if settings.who is not None:
             self._log.write(f"settings of {settings.controller} in force, as {settings.who} asked")
 
@@ -221,6 +247,8 @@ class Page:
         holder = self._token.holder
         viewers = len(self._server.get_clients())
         control = f"{name_of(holder)} has control; {viewers} viewer{'' if viewers == 1 else 's'}"
+        if dropped := self._server.admission.dropped.total():
+            control += f"; {dropped} message{'' if dropped == 1 else 's'} of browsers dropped"
         self._header.content = texts.header(snapshot, control=control)
         if snapshot is not None:
             self._state.content = texts.state_table(snapshot)

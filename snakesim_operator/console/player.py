@@ -5,6 +5,7 @@ import time
 import viser
 
 from snakesim_operator.console.controls import set_appearance
+from snakesim_operator.console.server import PageServer
 
 SPEEDS = ("0.1x", "0.25x", "0.5x", "1x", "2x", "4x")
 SLIDER_EVERY_S = 0.1
@@ -13,7 +14,7 @@ SLIDER_EVERY_S = 0.1
 class Player:
     """Where in the recording the page is."""
 
-    def __init__(self, server: viser.ViserServer, span_s: tuple[float, float], at_s: float = 0.0) -> None:
+    def __init__(self, server: PageServer, span_s: tuple[float, float], at_s: float = 0.0) -> None:
         """span_s: first and last instant; at_s: where to begin, seconds after the first."""
         self._begin_s, self._end_s = span_s
         self.time_s = min(max(self._begin_s + at_s, self._begin_s), self._end_s)
@@ -26,6 +27,8 @@ class Player:
             self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY)
             self._speed = gui.add_dropdown("Speed", SPEEDS, initial_value="1x")
             dark = gui.add_checkbox("Dark page", initial_value=False)
+        for control in (self._slider, self._play, self._speed, dark):
+            server.admission.admit(control)
         self.playing = False
         self._play.on_click(lambda _: self._toggle())
         self._slider.on_update(lambda event: self._jump() if event.client is not None else None)

@@ -1,27 +1,42 @@
-"""The web server of the console: viser, on loopback only, and closed to pages of other sites."""
+"""The web server of the console: viser, on loopback only, closed to other pages, and behind our checks.
 
-import asyncio
+`front` accepts, and has the second stop; `admission` decides what viser gets to read.
+"""
+
 import contextlib
+import dataclasses
 import io
-import re
+import logging
 import socket
-import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextvars import ContextVar
+from pathlib import Path
 from typing import Any
 
 import viser
 import websockets.asyncio.server
+from websockets.asyncio.server import ServerConnection
+from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
 
+from snakesim_operator.console.admission import Admission
+from snakesim_operator.console.browser import MOST_BYTES, Browser
+from snakesim_operator.console.front import Front, HandedOn
 from snakesim_operator.console.pacing import pace
 from snakesim_operator.console.port import LOOPBACK, address_of
+from snakesim_operator.page_origin import why_refused
 
-# A browser names the page that opens a connection. Any site could connect to loopback from the operator's browser, and
-# arm the robot; so only pages that came from this computer may (through an SSH tunnel too, under any port).
-OUR_PAGES = re.compile(r"https?://(127\.0\.0\.1|localhost|\[::1\])(:\d+)?")
+MOST_VIEWERS = 64
+PAGES = ("/", "/index.html")
+SECOND_STOP = Path(__file__).with_name("second_stop.html")
+Answer = Callable[[ServerConnection, Request], Response | None]
+_connecting: ContextVar[Browser] = ContextVar("connecting")
 
 
 class PageServer(viser.ViserServer):
     """Without viser's tunnel to the public internet, which any viewer could open."""
+
+    admission: Admission
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         """Refused."""
@@ -29,38 +44,99 @@ class PageServer(viser.ViserServer):
 
 
 @contextlib.contextmanager
-def page_server(listening: socket.socket) -> Iterator[tuple[PageServer, str]]:
-    """The server on a socket of `port.open_port`, and its address."""
-    complete = threading.Event()
-    with _on_our_terms(listening, complete), contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
-        server = PageServer(LOOPBACK, listening.getsockname()[1], label="SnakeSIM", verbose=False)
+def page_server(
+    listening: socket.socket, report: Callable[[str], None] = lambda _: None, stop: Callable[[], str] | None = None
+) -> Iterator[tuple[PageServer, str]]:
+    """The server on a socket of `port.open_port`, and its address.
+
+    report: told what was refused, once of each kind; stop: of the pages' second stop, None for a recording.
+    """
+    admission, handed_on = Admission(report), HandedOn(listening.getsockname())
+    with _on_our_terms(handed_on, admission, stop is not None), contextlib.redirect_stdout(io.StringIO()):
+        server = PageServer(LOOPBACK, listening.getsockname()[1], label="SnakeSIM", verbose=False)  # prints a banner
+    server.admission = admission
+    server._websock_server.on_client_connect(_number)
     pace(server)
-    complete.set()
-    try:
-        yield server, address_of(listening)
-    finally:
-        with contextlib.redirect_stdout(io.StringIO()):
-            server.stop()
+    with Front(listening, handed_on, stop, lambda why: admission.drop(None, "another origin", why)):
+        try:
+            yield server, address_of(listening)
+        finally:
+            with contextlib.redirect_stdout(io.StringIO()):
+                server.stop()
 
 
 @contextlib.contextmanager
-def _on_our_terms(listening: socket.socket, complete: threading.Event) -> Iterator[None]:
-    """Have viser's server use the open socket, and check where a page came from; viser has no option for either.
-
-    Pages that have waited at the socket are let in when the server is complete: viser begins to listen before it is.
-    """
+def _on_our_terms(handed_on: HandedOn, admission: Admission, stops: bool) -> Iterator[None]:
+    """Have viser's server take connections from the front, with our checks; viser has no option for either."""
     serve = websockets.asyncio.server.serve
+    quiet = logging.getLogger(f"{__name__}.websockets")  # a stranger's bytes are counted, and are no errors of ours
+    quiet.addHandler(logging.NullHandler())
+    quiet.propagate = False
 
     def serve_here(handler: Any, _host: str, _port: int, **options: Any) -> Any:
-        async def let_in(connection: Any) -> None:
-            while not complete.is_set():
-                await asyncio.sleep(0.01)
-            await handler(connection)
+        viewers: set[Browser] = set()
 
-        return serve(let_in, sock=listening, origins=[OUR_PAGES, None], **options)
+        async def let_in(connection: Browser) -> None:
+            if len(viewers) >= MOST_VIEWERS:
+                admission.drop(None, "too many viewers", f"more than {MOST_VIEWERS} pages are open")
+                await connection.close(1013, f"more than {MOST_VIEWERS} pages are open")
+                return
+            viewers.add(connection)
+            _connecting.set(connection)
+            try:
+                await handler(connection)
+            finally:
+                viewers.discard(connection)
+
+        def made(*arguments: Any, **more: Any) -> Browser:
+            return Browser(admission, *arguments, **more)
+
+        ours = {
+            "max_size": MOST_BYTES,
+            "create_connection": made,
+            "logger": quiet,
+            "process_request": _checked(options["process_request"], admission, stops),
+        }
+        return serve(let_in, sock=handed_on, **(options | ours))
 
     websockets.asyncio.server.serve = serve_here  # pyright: ignore[reportAttributeAccessIssue]
     try:
         yield
     finally:
         websockets.asyncio.server.serve = serve  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _number(viewer: Any) -> None:
+    """viser has numbered a viewer: until then nothing that its browser says is passed on."""
+    _connecting.get().viewer = viewer.client_id
+
+
+def _checked(answer: Answer, admission: Admission, stops: bool) -> Answer:
+    """Answer requests of our own pages only. viser's page gets the second stop, and cannot be framed by others."""
+
+    def check(connection: ServerConnection, request: Request) -> Response | None:
+        why = why_refused(request.headers.get("Host"), request.headers.get("Origin"))
+        if why is not None:
+            admission.drop(None, "another origin", why)
+            return connection.respond(403, f"{why}\n")
+        if request.path.partition("?")[0] not in PAGES or "Upgrade" in request.headers:
+            return answer(connection, request)
+        page = answer(connection, dataclasses.replace(request, headers=Headers()))  # as it is, without compression
+        assert page is not None
+        return _with_second_stop(page) if stops else page
+
+    return check
+
+
+def _with_second_stop(page: Response) -> Response:
+    """First of all in the page: then nothing of viser's can keep it from running."""
+    before, head, after = page.body.partition(b"<head>")
+    body = before + head + SECOND_STOP.read_bytes() + after if head else SECOND_STOP.read_bytes() + page.body
+    headers = Headers(
+        {
+            "Content-Type": page.headers["Content-Type"],
+            "Content-Length": str(len(body)),
+            "Content-Security-Policy": "frame-ancestors 'none'",
+        }
+    )
+    return dataclasses.replace(page, headers=headers, body=body)

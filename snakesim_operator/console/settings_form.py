@@ -80,6 +80,11 @@ class SettingsForm:
             for field in fields_of(settings):
                 self._inputs[field.name] = _input(gui, field)
 
+    @property
+    def inputs(self) -> list[Any]:
+        """What the viewer can set."""
+        return list(self._inputs.values())
+
     def enable(self, enabled: bool) -> None:
         """Whether the viewer may change them."""
         for one in self._inputs.values():

@@ -19,6 +19,7 @@ from snakesim_operator.console.port import address_of, open_port
 from snakesim_operator.console.server import page_server
 from snakesim_operator.console.snapshot import RobotSnapshot, expected_of
 from snakesim_operator.console.token import ControlToken
+from snakesim_operator.page_origin import why_refused
 from tests.e2e.command import wait_until
 from tests.unit.hal.rig import description, status
 from tests.viewer import watch
@@ -32,12 +33,24 @@ def test_a_page_of_another_site_cannot_connect():
             "https://example.org",
             "http://localhost.example.org",
             f"http://example.org:{server.get_port()}",
+            "http://localhost:9000",  # another program of this computer
+            f"http://localhost:{server.get_port()}",  # another name: another origin
+            "null",
         ):
             with pytest.raises(InvalidStatus) as refused:
                 connect(socket, origin=theirs, proxy=None)  # pyright: ignore[reportArgumentType]
             assert refused.value.response.status_code == 403
-        for ours in (address, address.replace("127.0.0.1", "localhost"), "http://localhost:9000"):
-            connect(socket, origin=ours, proxy=None).close()  # pyright: ignore[reportArgumentType]
+        connect(socket, origin=address, proxy=None).close()  # pyright: ignore[reportArgumentType]
+        assert server.admission.dropped["another origin"] == 6
+
+
+def test_a_page_is_of_the_same_host_and_port_or_refused():
+    for host in ("127.0.0.1:8080", "localhost:9000", "[::1]:8080", "localhost"):  # a tunnel has another port
+        assert why_refused(host, f"http://{host}") is None and why_refused(host, None) is None
+        assert why_refused(host, "http://evil.example") and why_refused(host, "null") and why_refused(host, "")
+    assert "http://localhost:8081" in (why_refused("localhost:8080", "http://localhost:8081") or "")
+    assert "has to be a name of this computer" in (why_refused("evil.example:8080", "http://evil.example:8080") or "")
+    assert why_refused("localhost:8080", "https://mine.example", also=["https://mine.example"]) is None
 
 
 def test_a_port_that_is_taken_is_an_error_and_no_other_port():
