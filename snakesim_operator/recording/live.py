@@ -1,23 +1,25 @@
-"""A live server for Foxglove: what a recording holds for it, as it is written. On loopback only."""
+"""A live server for Foxglove: what a recording holds for it, as it is written. On loopback only, for no other pages."""
 
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 from snakesim_hal.errors import ConfigError, NotConnectedError
 from snakesim_operator.recording.foxglove import ALWAYS, FoxgloveMessage, Kind, schema_of
+from snakesim_operator.recording.origin_relay import HOST, OriginRelay, hidden_host
 
 if TYPE_CHECKING:
     import foxglove
-
-HOST = "127.0.0.1"
 
 
 class LiveServer:
     """Hands messages to every viewer that has subscribed to their topic; a slow one loses the oldest."""
 
-    def __init__(self, robot: str, port: int) -> None:
-        """port: 0 takes any. Raises ConfigError without the extra, NotConnectedError when the port is in use."""
+    def __init__(self, robot: str, port: int, origins: Collection[str], report: Callable[[str], None]) -> None:
+        """port: 0 takes any; origins: of web pages that may read the robot; report: told of those that may not.
+
+        Raises ConfigError without the extra, NotConnectedError when the port is in use."""
         try:
             import foxglove
         except ImportError as error:
@@ -27,11 +29,13 @@ class LiveServer:
         self._channels: dict[str, foxglove.Channel] = {}
         for topic, kind in ALWAYS.items():  # before the first viewer: it subscribes in vain to one made as it connects
             self._add(topic, kind)
+        host = hidden_host()
         try:
-            self._server = foxglove.start_server(name=robot, host=HOST, port=port, context=self._context)
+            self._server = foxglove.start_server(name=robot, host=host, port=0, context=self._context)
         except RuntimeError as error:
-            raise NotConnectedError(f"cannot serve Foxglove on port {port}: {error}; choose another") from error
-        self.address = f"ws://{HOST}:{self._server.port}"
+            raise NotConnectedError(f"cannot serve Foxglove: {error}") from error
+        self._relay = OriginRelay(port, (host, self._server.port), origins, report)
+        self.address = f"ws://{HOST}:{self._relay.port}"
 
     def show(self, shown: FoxgloveMessage, time_ns: int) -> None:
         """Hand on one message. time_ns: robot time."""
@@ -51,5 +55,6 @@ class LiveServer:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._relay.__exit__(kind, error, trace)
         with suppress(RuntimeError):  # it ends with its process in any case
             self._server.stop()

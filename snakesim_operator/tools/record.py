@@ -2,6 +2,7 @@
 
 import signal
 import time
+from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from datetime import datetime
@@ -16,11 +17,16 @@ from snakesim_operator.tools.targets import RobotSelection, only_robot
 
 
 def record_robot(
-    where: RobotSelection, out: Path | None, duration_s: float | None, foxglove_port: int | None = None, say: Say = say
+    where: RobotSelection,
+    out: Path | None,
+    duration_s: float | None,
+    foxglove_port: int | None = None,
+    foxglove_origins: Sequence[str] = (),
+    say: Say = say,
 ) -> int:
     """Record until Ctrl-C, or for a time by the wall clock. Exit code 1 when the disk took no more.
 
-    foxglove_port: serve viewers there meanwhile.
+    foxglove_port: serve viewers there meanwhile; foxglove_origins: of web pages that may be such viewers.
     """
     link = replace(only_robot(where, "record"), largest_bytes=MAX_IMAGE_BYTES)
     path = out or Path(f"{link.namespace}-{datetime.now():%Y%m%d-%H%M%S}.mcap")
@@ -29,7 +35,11 @@ def record_robot(
     on_stop_signal(lambda: stopped.append(True))
     began = time.monotonic()
     try:
-        with nullcontext() if foxglove_port is None else LiveServer(link.namespace or "robot", foxglove_port) as live:
+        with (
+            nullcontext()
+            if foxglove_port is None
+            else LiveServer(link.namespace or "robot", foxglove_port, foxglove_origins, say) as live
+        ):
             end = "" if duration_s else "; Ctrl-C ends it"
             say(f"recording {link.namespace} on {link.endpoint} into {path}{end}")
             if live is not None:

@@ -41,6 +41,13 @@ def add_commands(commands: Any) -> None:
         metavar="PORT",
         help="serve Foxglove live as well, at ws://127.0.0.1:PORT (8765)",
     )
+    record.add_argument(
+        "--foxglove-origin",
+        action="append",
+        default=[],
+        metavar="ORIGIN",
+        help="a web page that may read the robot there, such as https://app.foxglove.dev; may be repeated",
+    )
     add_network(record)
     record.set_defaults(act=_record)
 
@@ -74,7 +81,9 @@ def _echo(arguments: argparse.Namespace) -> int:
 def _record(arguments: argparse.Namespace) -> int:
     from snakesim_operator.tools.record import record_robot
 
-    return record_robot(selection_of(arguments), arguments.out, arguments.duration, arguments.foxglove)
+    return record_robot(
+        selection_of(arguments), arguments.out, arguments.duration, arguments.foxglove, arguments.foxglove_origin
+    )
 
 
 def _preview(arguments: argparse.Namespace) -> int:

@@ -11,8 +11,9 @@ from pathlib import Path
 
 import pytest
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
-from websockets.typing import Subprotocol
+from websockets.typing import Origin, Subprotocol
 
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
@@ -25,6 +26,7 @@ from tests.whole import command
 
 pytestmark = pytest.mark.e2e
 
+TRUSTED = "https://app.foxglove.dev"
 LONG = ["triplet", "--controller", "hold", "--duration", "7", "--pace", "realtime", "--set", "rate_hz=50"]
 
 
@@ -39,9 +41,10 @@ def test_in_lockstep_the_recording_has_every_tick(tmp_path: Path) -> None:
     assert replayed.out == "200 commands, the same to the bit\n", replayed.out + replayed.err
 
 
-def sighted_live(address: str) -> list[str]:
-    """The frames that a viewer of Foxglove's is told of."""
-    with connect(address, subprotocols=[Subprotocol("foxglove.sdk.v1")]) as viewer:
+def sighted_live(address: str, origin: str | None = None) -> list[str]:
+    """The frames that a viewer of Foxglove's is told of. origin: of the page that it is, if it is one."""
+    of = None if origin is None else Origin(origin)
+    with connect(address, origin=of, subprotocols=[Subprotocol("foxglove.sdk.v1")], proxy=None) as viewer:
         frames: dict[str, str] | None = None
         while frames is None:
             reported = viewer.recv(10.0)
@@ -62,17 +65,24 @@ def test_a_run_goes_on_without_its_recorder_and_another_records_beside_it(tmp_pa
         time.sleep(1.0)
         os.kill(run.part("recorder"), signal.SIGKILL)
         typed = [*SNAKESIM, "record", "--endpoint", run.endpoint, "--out", "beside.mcap"]
+        served = [*typed, "--foxglove", "0", "--foxglove-origin", TRUSTED]
         with subprocess.Popen(
-            [*typed, "--foxglove", "0"], cwd=tmp_path, env=environment(tmp_path), stdout=subprocess.PIPE, text=True
+            served, cwd=tmp_path, env=environment(tmp_path), stdout=subprocess.PIPE, text=True
         ) as beside:
             assert beside.stdout is not None
             address = next(line for line in beside.stdout if "Foxglove" in line).rpartition(" ")[2].strip()
             file = tmp_path / "beside.mcap"
             wait_until(lambda: file.exists() and file.stat().st_size > 10_000, "the first second of the recording")
             links = sighted_live(address)
+            assert sighted_live(address, address.replace("ws", "http")) == sighted_live(address, TRUSTED) == links
+            for theirs in ("http://evil.example", "null", "file://", "http://localhost:8080"):
+                with pytest.raises(InvalidStatus, match="403"):
+                    sighted_live(address, theirs)
             time.sleep(1.0)
             beside.send_signal(signal.SIGINT)
-            assert "messages in" in beside.stdout.read() and beside.wait(20) == 0
+            said = beside.stdout.read()
+            assert "messages in" in said and beside.wait(20) == 0
+            assert said.count("refused a viewer") == 4 and "http://evil.example" in said, said
         assert links == [f"link_{i}" for i in range(14)]
         assert run.end() == 3, run.said()  # complete, but the record lacks something
     nothing_left(tmp_path / "run")
