@@ -1,9 +1,9 @@
 """Which web pages may open a connection to a server of ours on loopback: its own, and no other. Pure.
 
-A browser lets any page connect to loopback, and names the page's origin (scheme, host, port). So a page of another site,
-and of another port of this computer, is refused. A name that a foreign site points at loopback (DNS rebinding) shows in
-`Host`, which has to be a name of this computer; its port may be another one, as behind an SSH tunnel. A client that
-names no origin is no web page: browsers always do.
+A browser lets any page connect to loopback, and names the page's origin (scheme, host, port). So a page of another
+site, and of another port of this computer, is refused. A name that a foreign site points at loopback (DNS rebinding)
+shows in `Host`, which has to be a name of this computer; its port may be another one, as behind an SSH tunnel. A client
+that names no origin is no web page: browsers always do.
 """
 
 import re

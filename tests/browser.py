@@ -74,7 +74,7 @@ class Tab:
 
     def text(self) -> str:
         """All visible text."""
-        return self.value("document.body.innerText") or ""
+        return self.value("document.documentElement.innerText") or ""
 
     def wait_for(self, text: str, limit_s: float = 60.0) -> float:
         """Until the page shows a text; returns how long it took in seconds."""
@@ -87,7 +87,7 @@ class Tab:
     def click(self, label: str, hold_s: float = 0.0) -> None:
         """Press what has a label, and let go. A disabled button does nothing, as for a person."""
         # Not at a place on the screen, and in one go: the page moves and replaces things while it changes.
-        find = f"[...document.querySelectorAll('body *')].findLast(e => e.innerText?.trim() === {json.dumps(label)})"
+        find = f"[...document.querySelectorAll('html *')].findLast(e => e.innerText?.trim() === {json.dumps(label)})"
         event = "{bubbles: true, pointerId: 1, clientX: r.x + 1, clientY: r.y + 1}"
         found = self.send(
             "Runtime.evaluate",

@@ -31,7 +31,7 @@ class _Message(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, ta
     pass
 
 
-class Camera(_Message, tag="ViewerCameraMessage"):
+class Camera(_Message, frozen=True, tag="ViewerCameraMessage"):
     """Where the viewer looks from."""
 
     wxyz: tuple[Number, Number, Number, Number]
@@ -51,27 +51,27 @@ class Value(Struct, frozen=True, forbid_unknown_fields=True):
     value: bool | int | Number | Text
 
 
-class Update(_Message, tag="GuiUpdateMessage"):
+class Update(_Message, frozen=True, tag="GuiUpdateMessage"):
     """A control has another value, or a button was pressed."""
 
     uuid: Identifier
     updates: Value
 
 
-class Hold(_Message, tag="GuiButtonHoldMessage"):
+class Hold(_Message, frozen=True, tag="GuiButtonHoldMessage"):
     """A button is held; repeated at that frequency."""
 
     uuid: Identifier
     frequency: Number
 
 
-class Trigger(_Message, tag="CommandTriggerMessage"):
+class Trigger(_Message, frozen=True, tag="CommandTriggerMessage"):
     """The key of a command was pressed."""
 
     uuid: Identifier
 
 
-class Shown(_Message, tag="LocalStorageGetItemResponseMessage"):
+class Shown(_Message, frozen=True, tag="LocalStorageGetItemResponseMessage"):
     """The answer that `pacing` asks for."""
 
     request_uuid: Identifier
@@ -104,7 +104,7 @@ class Admission:
     def admit(
         self, handle: HandleT, viewer: int | None = None, may: Callable[[], bool] = lambda: True, hold_hz: float = 0.0
     ) -> HandleT:
-        """Let viewers use a control, and return it. viewer: who alone has it; may: whether now; hold_hz: of a button."""
+        """Let viewers use a control; returns it. viewer: who alone has it; may: whether now; hold_hz: of a button."""
         control: Any = handle
         name = control.label if isinstance(control, viser.GuiButtonHandle) else type(handle).__name__
         with self._lock:

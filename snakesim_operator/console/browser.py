@@ -1,4 +1,4 @@
-"""The connection of one browser: what it sends is checked before viser reads it, and read no faster than a page sends."""
+"""The connection of one browser: what it sends is checked before viser reads it, and at a bounded rate."""
 
 import asyncio
 import time
@@ -25,7 +25,7 @@ class Browser(ServerConnection):
         self._admission = admission
         self._allowance, self._since_s = AT_ONCE, time.monotonic()
 
-    async def recv(self, decode: bool | None = None) -> bytes:
+    async def recv(self, decode: bool | None = None) -> Any:
         """The next message that the viewer may send. Raises ConnectionClosed."""
         while True:
             try:

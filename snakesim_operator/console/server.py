@@ -76,7 +76,7 @@ def _on_our_terms(handed_on: HandedOn, admission: Admission, stops: bool) -> Ite
     def serve_here(handler: Any, _host: str, _port: int, **options: Any) -> Any:
         viewers: set[Browser] = set()
 
-        async def let_in(connection: Browser) -> None:
+        async def let_in(connection: Any) -> None:  # a Browser, as made below
             if len(viewers) >= MOST_VIEWERS:
                 admission.drop(None, "too many viewers", f"more than {MOST_VIEWERS} pages are open")
                 await connection.close(1013, f"more than {MOST_VIEWERS} pages are open")

@@ -1,4 +1,4 @@
-"""C1 to C6: a stranger in a browser. Nothing that a page says keeps the stop from anybody, or commands the robot."""
+"""C1 to C7: a stranger in a browser. Nothing that a page says keeps the stop from anybody, or commands the robot."""
 
 import re
 import socket

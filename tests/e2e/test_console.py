@@ -1,5 +1,7 @@
 """The console of a run, as people use it: in a browser."""
 
+import os
+import signal
 import time
 from collections import deque
 from pathlib import Path
@@ -10,12 +12,13 @@ from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlSettings, JointState, Status
 from tests.browser import CHROMIUM, MISSING, Tab, chromium
-from tests.e2e.command import Running, nothing_left, running, wait_until
+from tests.e2e.command import Running, nothing_left, processes_of, running, wait_until
 
 pytestmark = [pytest.mark.e2e, pytest.mark.skipif(CHROMIUM is None, reason=MISSING)]
 
 RUN = ("triplet", "--controller", "lateral_undulation", "--duration", "600", "--stay", "--console")
 STOP_LIMIT_S = 10.0  # from the key to motors that are off: far above what it takes when no other tests run beside
+SILENT = "THE STOP DOES NOT ANSWER"
 COAST_LIMIT_S = 2.0  # of robot time, until joints without torque are at rest
 SMALL = 800, 400, 0.25  # width, height, pixels a dot: the browser draws without a graphics card here
 GROUND = {"x": 0, "y": 200, "width": 370, "height": 200, "scale": 1}  # of the page: scene without notices
@@ -46,6 +49,26 @@ def test_a_page_shows_the_snake_as_it_moves_and_its_escape_key_stops_it(tmp_path
         )
         page.wait_for("ESTOP")
         assert not page.errors, page.errors
+
+
+def test_a_page_says_when_its_second_stop_does_not_answer_and_stops_by_it(tmp_path: Path) -> None:
+    with chromium() as browser, running(tmp_path / "run", *RUN) as run:
+        page = browser.open(run.console(), *SMALL)
+        page.wait_for("armed by snakesim run")
+        page.wait_for("SECOND STOP")
+        assert SILENT not in page.text()
+        console = next(pid for pid, line in processes_of(run.out) if "snakesim_operator.console" in line)
+        os.kill(console, signal.SIGSTOP)
+        try:
+            page.wait_for(SILENT)
+        finally:
+            os.kill(console, signal.SIGCONT)
+        wait_until(lambda: SILENT not in page.text(), "a second stop that answers")
+        page.value("WebSocket.prototype.send = () => { throw new Error('no way'); }")  # the other way is dead
+        page.click("SECOND STOP")
+        page.wait_for("planar13: stopped")
+        with open_session(Link(run.endpoint, "planar13")) as session:
+            assert session.latest(keys.STATUS, Status, 10.0, lambda one: one.lifecycle == "estop") is not None
 
 
 @pytest.mark.slow
