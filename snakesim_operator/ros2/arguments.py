@@ -50,6 +50,7 @@ def add_commands(commands: Any) -> None:
 
 
 def _ros2(arguments: argparse.Namespace) -> int:
+    check(arguments)
     from snakesim_operator.ros2.join import join
     from snakesim_operator.tools.robot_selection import selection_of
 

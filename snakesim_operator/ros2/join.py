@@ -12,7 +12,6 @@ from snakesim_hal.terminal import say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_hal.wire.messages import Description
-from snakesim_operator.ros2.arguments import check
 from snakesim_operator.ros2.bridge import Bridge, Options, adds_up
 from snakesim_operator.ros2.graph import Node, NodeName
 from snakesim_operator.tools.targets import RobotSelection, only_robot
@@ -23,7 +22,6 @@ DESCRIBED_S = 5.0
 
 def join(arguments: argparse.Namespace, where: RobotSelection) -> int:
     """Run the bridge until Ctrl-C. Raises ConfigError, NotConnectedError."""
-    check(arguments)
     link = only_robot(where, "ros2")
     if link.endpoint == arguments.ros_router:
         raise ConfigError(

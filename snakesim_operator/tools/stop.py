@@ -6,27 +6,17 @@ network is even imported, which takes seconds on a machine that is busy.
 """
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from snakesim_hal.errors import NotConnectedError
 from snakesim_hal.network.stop_port import ask_to_stop, stop_address
 from snakesim_hal.process import user_name
 from snakesim_hal.terminal import Say, say
 from snakesim_operator.tools.robot_selection import RobotSelection
+from snakesim_operator.tools.stop_result import StopResult
 
 LIMIT_S = 5.0
 Address = tuple[str, int]  # of a stop port
-
-
-@dataclass(frozen=True)
-class StopResult:
-    """The result for one robot."""
-
-    name: str
-    endpoint: str
-    stopped: bool
-    text: str
-    in_doubt: bool = False  # an impostor may answer in its name
 
 
 def estop(where: RobotSelection, say: Say = say) -> int:

@@ -10,7 +10,7 @@ from snakesim_hal.process import user_name
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, EstopRequest, Status
 from snakesim_operator.tools.command import judge
-from snakesim_operator.tools.stop import StopResult
+from snakesim_operator.tools.stop_result import StopResult
 from snakesim_operator.tools.targets import CONNECT_S, namespace_of, robots_on
 
 ASK_S = 1.0

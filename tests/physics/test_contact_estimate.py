@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.contacts import score
+from tests.physics.contact_score import score
 
 
 @pytest.mark.parametrize("scenario", ["triplet", "peg_row"])

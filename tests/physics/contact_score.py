@@ -1,0 +1,141 @@
+"""How far the contact estimate is from the truth: the simulator's, or the force sensors' of emulated modules.
+
+True contacts of one side within 8 cm are one push, because the estimate cannot tell them apart. With `backend=can` the
+estimate gets the IMU readings of the tick.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from snakesim_gnc.guidance.contact_estimate import FeltContact, estimate
+from snakesim_hal.backend import Samples
+from snakesim_hal.in_process import InProcessRun
+from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion
+from snakesim_hal.model.plugins import BACKENDS, find_plugin, offered
+from snakesim_hal.model.scenario import load, parse_set
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Contacts, Description, Imu, Pose
+from snakesim_sim_backend.backend import SimBackend
+from snakesim_sim_backend.truth import TrueState
+
+NEAR_M, MIN_FORCE_N = 0.08, 2.0
+FROM_TICK, EVERY = 30, 2
+Push = tuple[float, int, float]  # place along the body in m, side (1: left), force in N
+
+
+@dataclass
+class Score:
+    """Errors over a run, for true pushes of at least MIN_FORCE_N."""
+
+    true_n: list[float] = field(default_factory=list[float])
+    share: list[float] = field(default_factory=list[float])  # error / true force; 1 where nothing was found
+    place_m: list[float] = field(default_factory=list[float])  # of those found
+    ghosts: int = 0  # found, at least MIN_FORCE_N, and nothing there
+
+    def add(self, true: list[Push], felt: list[Push]) -> None:
+        """One tick."""
+        left = list(felt)
+        for place, side, force in true:
+            mine = [push for push in left if push[1] == side and abs(push[0] - place) < NEAR_M]
+            left = [push for push in left if push not in mine]
+            if force < MIN_FORCE_N:
+                continue
+            found = sum(push[2] for push in mine)
+            self.true_n.append(force)
+            self.share.append(abs(found - force) / force)
+            if mine:
+                self.place_m.append(abs(sum(push[0] * push[2] for push in mine) / found - place))
+        self.ghosts += sum(push[2] >= MIN_FORCE_N for push in left)
+
+    def row(self, name: str) -> str:
+        """A line of the table."""
+        share, force = np.array(self.share), np.array(self.true_n)
+        return (
+            f"| {name} | {len(share)} | {np.median(share):.1%} | {np.percentile(share, 75):.0%} | "
+            f"{np.median(share[force >= 10]) if (force >= 10).any() else np.nan:.1%} | "
+            f"{(len(share) - len(self.place_m)) / len(share):.0%} | {self.ghosts} | "
+            f"{1e3 * np.median(self.place_m):.0f} mm |"
+        )
+
+
+def score(scenario: str, *settings: str, seconds: float = 5.0, with_pose: bool = True) -> Score:
+    """Run a scenario in the simulator, and estimate as it goes."""
+    config = load(scenario, [parse_set(text) for text in (f"duration_s={seconds}", *settings)]).config
+    factory, result, seen = find_plugin(BACKENDS, config.backend), Score(), list[tuple[Samples, list[Push]]]()
+
+    class Watched(factory):
+        """The backend, with a look at what is true."""
+
+        def sample(self, tick: int, stamp_ns: int) -> Samples:
+            samples = super().sample(tick, stamp_ns)
+            if tick >= FROM_TICK and tick % EVERY == 0:
+                seen.append((samples, self.truth(samples)))
+            return samples
+
+        def truth(self, samples: Samples) -> list[Push]:
+            if isinstance(self, SimBackend):
+                return true_pushes(self.describe(), self.true_state())
+            touched = samples.others[keys.CONTACTS]
+            assert isinstance(touched, Contacts)
+            return felt_pushes(self.describe(), touched)
+
+    with offered(BACKENDS, config.backend, Watched), InProcessRun(config) as run:
+        for _ in run.turns():
+            pass
+        robot = run.host.description
+    nothing = Imu(tick=0, stamp_ns=0, link=[], angular_velocity_rad_s=[], acceleration_m_s2=[])
+    for samples, true in seen:
+        imu, pose, reported = samples.others.get(keys.IMU, nothing), samples.others.get(keys.POSE), samples.joints
+        assert isinstance(imu, Imu) and isinstance(pose, Pose | None)
+        felt = estimate(
+            robot, reported.angle_rad, reported.velocity_rad_s, reported.torque_nm, imu, pose if with_pose else None
+        )
+        result.add(true, pushes(robot, felt))
+    return result
+
+
+def pushes(robot: Description, felt: list[FeltContact]) -> list[Push]:
+    """Where along the body."""
+    starts = np.append(0.0, np.cumsum([link.length_m for link in robot.links]))
+    return [(starts[c.link] + c.along_m, -int(np.sign(c.normal_l[1])), c.force_n) for c in felt]
+
+
+def true_pushes(robot: Description, truth: TrueState) -> list[Push]:
+    """The simulator's contacts, tail to head."""
+    lengths = [link.length_m for link in robot.links]
+    starts = np.append(0.0, np.cumsum(lengths))
+    base = rotation_from_quaternion(truth.base_orientation_wxyz)
+    axes = [joint.axis for joint in robot.joints]
+    rear_w, frames = link_frames(truth.base_position_w, base, truth.angles_rad, axes, lengths)
+    found: list[Push] = []
+    for contact in truth.contacts:
+        force_n = float(np.linalg.norm(contact.force_w))
+        along, across = (frames[contact.link].T @ (contact.position_w - rear_w[contact.link]))[:2]
+        found.append((float(starts[contact.link] + along), 1 if across > 0 else -1, force_n))
+    return together(found)
+
+
+def felt_pushes(robot: Description, reported: Contacts) -> list[Push]:
+    """The contacts that sensors report."""
+    starts = np.append(0.0, np.cumsum([link.length_m for link in robot.links]))
+    return together(
+        [
+            (float(starts[c.link]) + c.position_l[0], 1 if c.position_l[1] > 0 else -1, float(np.hypot(*c.force_l[:2])))
+            for c in reported.contacts
+        ]
+    )
+
+
+def together(found: list[Push]) -> list[Push]:
+    """Neighbours on one side are added up."""
+    merged: list[Any] = []
+    for place, side, force in sorted(found):
+        same = [push for push in merged if push[1] == side and place - push[0] < NEAR_M]
+        if same and force + same[-1][2] > 0:
+            total = same[-1][2] + force
+            same[-1][0], same[-1][2] = (same[-1][0] * same[-1][2] + place * force) / total, total
+        else:
+            merged.append([place, side, force])
+    return [(place, side, force) for place, side, force in merged]
