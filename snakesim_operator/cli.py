@@ -1,4 +1,9 @@
-"""The `snakesim` command. Each room adds its own commands, and imports what they need when they are called."""
+"""The `snakesim` command: its own commands, and those that entry points in the group `snakesim.commands` add.
+
+An entry point names `add_commands(commands)`, beside which `TASK` says where the help lists them, or `main(argv)` of a
+command that parses its own words. They are looked up only for the help, completion, and a command not known here: an
+emergency stop does not wait for them.
+"""
 
 import argparse
 import re
@@ -8,16 +13,12 @@ from typing import Any, NoReturn
 
 from snakesim_hal.errors import ConfigError, SnakesimError, did_you_mean, short
 from snakesim_hal.terminal import discard, print_stderr, report_error, say
-from snakesim_operator.console import arguments as console
-from snakesim_operator.evaluate import arguments as evaluate
-from snakesim_operator.lab import arguments as lab
 from snakesim_operator.playback import arguments as playback
-from snakesim_operator.robots import arguments as robots
-from snakesim_operator.ros2 import arguments as ros2
 from snakesim_operator.run import arguments as run
 from snakesim_operator.tools import commanding, setup, watching
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
+ADDS = "add_commands"  # the name of an entry point's function that adds to the parser
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -40,21 +41,27 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _act(given: list[str]) -> int:
-    ours = parser()
     if not given:
-        ours.print_help()
+        parser().print_help()
         return OK
     name = given[0]
     for before, word in zip(["", *given], given, strict=False):
         if not word or (word.startswith("--") and word.endswith("=")):  # as of a variable that is not set
             raise ConfigError(f"{word.rstrip('=') or before or 'the command'}: empty; give a value, or leave it out")
-    if not name.startswith("-") and name not in ours.commands.choices:
+    ours = Commands()
+    if name.startswith("-"):
+        ours.add_installed()
+    elif name not in ours.commands.choices:
         from snakesim_hal.model.plugins import COMMANDS, find_plugin, installed
 
         if name in installed(COMMANDS):
-            return find_plugin(COMMANDS, name)(given[1:])
-        meant = did_you_mean(name, [*ours.commands.choices, *installed(COMMANDS)])
-        raise ConfigError(f"no command {short(name)!r}; {meant}`snakesim` alone lists all")
+            found = find_plugin(COMMANDS, name)
+            if getattr(found, "__name__", "") != ADDS:
+                return found(given[1:])
+        ours.add_installed()
+        if name not in ours.commands.choices:
+            meant = did_you_mean(name, [*ours.commands.choices, *installed(COMMANDS)])
+            raise ConfigError(f"no command {short(name)!r}; {meant}`snakesim` alone lists all")
     arguments, unknown = ours.parse_known_args(given)
     if unknown:
         _refuse(unknown[0], ours.of(given))
@@ -99,10 +106,29 @@ class Commands(Command):
                 add(self.commands)
             self._tasks[task] = self.commands._choices_actions[before:]
 
+    def add_installed(self) -> None:
+        """Add the commands of entry points. One that cannot be loaded is reported, and keeps no other from its work."""
+        from snakesim_hal.model.plugins import COMMANDS, find_plugin, installed
+
+        for name in installed(COMMANDS):
+            if name in self.commands.choices:  # another of the same `add_commands`
+                continue
+            try:
+                found = find_plugin(COMMANDS, name)
+            except ConfigError as error:
+                report_error(error, "snakesim")
+                continue
+            if getattr(found, "__name__", "") == ADDS:
+                before = len(self.commands._choices_actions)
+                found(self.commands)
+                task = getattr(sys.modules[found.__module__], "TASK", "more")
+                self._tasks.setdefault(task, []).extend(self.commands._choices_actions[before:])
+
     def format_help(self) -> str:
         """The commands by task, and those of installed packages by name."""
         from snakesim_hal.model.plugins import COMMANDS, installed
 
+        others = [name for name in installed(COMMANDS) if name not in self.commands.choices]
         formatter = self._get_formatter()
         formatter.add_usage(self.usage, self._actions, self._mutually_exclusive_groups)
         formatter.add_text(self.description)
@@ -111,7 +137,7 @@ class Commands(Command):
             formatter.add_arguments(actions)
             formatter.end_section()
         formatter.start_section("from installed backends")
-        formatter.add_text(f"{', '.join(installed(COMMANDS)) or 'none'}; see their --help")
+        formatter.add_text(f"{', '.join(others) or 'none'}; see their --help")
         formatter.end_section()
         formatter.add_text(self.epilog)
         return formatter.format_help()
@@ -136,8 +162,10 @@ class _Version(argparse.Action):
 
 
 def parser() -> Commands:
-    """The command's arguments."""
-    return Commands()
+    """The arguments of all commands, those of entry points among them."""
+    made = Commands()
+    made.add_installed()
+    return made
 
 
 def _add_completion(commands: Any) -> None:
@@ -155,10 +183,10 @@ def _completion(arguments: argparse.Namespace) -> int:
 
 
 TASKS: Mapping[str, tuple[Callable[[Any], None], ...]] = {
-    "run": (run.add_commands, evaluate.add_commands),
-    "watch": (watching.add_commands, console.add_commands, ros2.add_commands),
+    "run": (run.add_commands,),
+    "watch": (watching.add_commands,),
     "command": (commanding.add_commands,),
     "results": (playback.add_commands,),
-    "scenarios, robots, labs": (setup.add_files, robots.add_commands, lab.add_commands),
+    "scenarios, robots, labs": (setup.add_files,),
     "this computer": (setup.add_commands, _add_completion),
 }

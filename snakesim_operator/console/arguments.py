@@ -7,6 +7,8 @@ from typing import Any
 
 from snakesim_hal.arguments import add_network, number
 
+TASK = "watch"  # under which `snakesim --help` lists it
+
 
 def add_commands(commands: Any) -> None:
     """Add it to the parser of `snakesim`."""

@@ -11,6 +11,7 @@ from snakesim_hal.arguments import number
 from snakesim_hal.errors import ConfigError
 
 EXTRA = ("distributed", "optuna", "pyarrow")
+TASK = "run"  # under which `snakesim --help` lists it
 
 
 def add_commands(commands: Any) -> None:

@@ -8,6 +8,7 @@ from snakesim_hal.errors import ConfigError
 from snakesim_hal.terminal import say
 
 AUTHORITY = "authority"
+TASK = "scenarios, robots, labs"  # under which `snakesim --help` lists it
 
 
 def add_commands(commands: Any) -> None:

@@ -6,6 +6,8 @@ from typing import Any
 
 from snakesim_hal.arguments import add_json
 
+TASK = "scenarios, robots, labs"  # under which `snakesim --help` lists it
+
 
 def add_commands(commands: Any) -> None:
     """Add both to the parser of `snakesim`."""

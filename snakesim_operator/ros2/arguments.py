@@ -11,6 +11,7 @@ from snakesim_hal.network.endpoint import check_endpoint
 ROS_ROUTER = "tcp/127.0.0.1:7447"  # where `ros2 run rmw_zenoh_cpp rmw_zenohd` listens
 LAST_DOMAIN = 232  # as with DDS
 MAX_HZ = 200.0
+TASK = "watch"  # under which `snakesim --help` lists it
 
 
 def add_commands(commands: Any) -> None:

@@ -97,7 +97,7 @@ def _walk(parser: argparse.ArgumentParser, path: str) -> Iterator[Command]:
             here.options += action.option_strings
             here.values |= dict.fromkeys(action.option_strings, choices)
     if not path:
-        for name in installed(COMMANDS):
+        for name in sorted({*installed(COMMANDS)} - {*here.words}):
             here.words.append(name)
             below += _of_package(name)
     yield here

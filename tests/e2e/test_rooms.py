@@ -1,0 +1,69 @@
+"""A room of the operator's tools that nothing imports can be left out: the rest starts, lists its commands and runs."""
+
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from tests.e2e.command import environment
+
+pytestmark = pytest.mark.e2e
+
+REPOSITORY = Path(__file__).parents[2]
+COMMANDS = {"evaluate": ("evaluate", "sweep", "optimise"), "lab": ("deploy",), "robots": ("robot",), "ros2": ("ros2",)}
+IMPORT_ALL = (
+    "import importlib, pkgutil, snakesim_operator as top\n"
+    "for found in pkgutil.walk_packages(top.__path__, 'snakesim_operator.'):\n"
+    "    found.name.endswith('__main__') or importlib.import_module(found.name)\n"
+    "print(top.__file__)\n"
+)
+
+
+def without(room: str, folder: Path) -> Path:
+    """A copy of the packages without a room and its entry points, with metadata that hides the installed ones."""
+    for package in REPOSITORY.glob("snakesim_*"):
+        shutil.copytree(package, folder / package.name, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.rmtree(folder / "snakesim_operator" / room)
+    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
+    metadata = folder / f"snakesim-{project['version']}.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text(f"Metadata-Version: 2.4\nName: snakesim\nVersion: {project['version']}\n")
+    lines: list[str] = []
+    for group, entries in project["entry-points"].items():
+        lines.append(f"[{group}]")
+        lines += [f"{n} = {at}" for n, at in entries.items() if not at.startswith(f"snakesim_operator.{room}.")]
+    (metadata / "entry_points.txt").write_text("\n".join(lines) + "\n")
+    return folder
+
+
+@pytest.mark.parametrize("room", COMMANDS)
+def test_all_else_works_without(room: str, tmp_path: Path) -> None:
+    library, work = without(room, tmp_path / "library"), tmp_path / "work"
+    work.mkdir()
+
+    def run(*words: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, *words],
+            cwd=work,
+            env={**environment(work), "PYTHONPATH": str(library)},
+            capture_output=True,
+            text=True,
+            timeout=100,
+            check=False,
+        )
+
+    imported = run("-c", IMPORT_ALL)
+    assert imported.returncode == 0 and str(library) in imported.stdout, imported.stdout + imported.stderr
+    shown = run("-m", "snakesim_operator", "--help")
+    assert shown.returncode == 0 and not shown.stderr, shown.stderr
+    listed = {words[0] for line in shown.stdout.splitlines() if (words := line.split())}
+    left = {name for other, names in COMMANDS.items() if other != room for name in names}
+    assert left | {"run", "estop", "console"} <= listed
+    assert not listed & {*COMMANDS[room]}
+    refused = run("-m", "snakesim_operator", COMMANDS[room][0])
+    assert refused.returncode == 2 and "no command" in refused.stderr, refused.stderr
+    ran = run("-m", "snakesim_operator", "run", "triplet", "--in-process", "--set", "duration_s=0.2")
+    assert ran.returncode == 0, ran.stdout + ran.stderr
