@@ -6,6 +6,7 @@ import signal
 import sys
 
 from snakesim_hal.arithmetic import pin
+from snakesim_hal.terminal import print_stderr
 
 
 def main() -> int:
@@ -30,7 +31,7 @@ def main() -> int:
         if isinstance(error, ImportError) and limit == resource.RLIM_INFINITY:  # no library failed for lack of memory
             raise
         allowed = "this computer has" if limit == resource.RLIM_INFINITY else f"`ulimit -v` allows, {limit // 2**20} MB"
-        sys.stderr.write(f"snakesim: this command needs more memory than {allowed}\n")
+        print_stderr(f"snakesim: this command needs more memory than {allowed}")
         return 1
 
 

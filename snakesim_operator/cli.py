@@ -58,8 +58,9 @@ def _act(given: list[str]) -> int:
             found = find_plugin(COMMANDS, name)
             if getattr(found, "__name__", "") != ADDS:
                 return found(given[1:])
-        ours.add_installed()
-        if name not in ours.commands.choices:
+            found(ours.commands)
+        else:
+            ours.add_installed()
             meant = did_you_mean(name, [*ours.commands.choices, *installed(COMMANDS)])
             raise ConfigError(f"no command {short(name)!r}; {meant}`snakesim` alone lists all")
     arguments, unknown = ours.parse_known_args(given)

@@ -37,7 +37,7 @@ from snakesim_operator.results.recorded import SERVICE_STREAMS
 from snakesim_operator.results.summary import RunSummary
 from snakesim_operator.run.conclusion import Outcome, conclude, explain, leave
 from snakesim_operator.run.ending import Ending, interruptible
-from snakesim_operator.run.pinned_process import simulate_pinned
+from snakesim_operator.run.pinned_process import call_pinned
 from snakesim_operator.run.progress import Progress
 from snakesim_operator.run.run import opened_files
 from snakesim_operator.run.run_files import RunFiles
@@ -69,7 +69,7 @@ def simulate(
     first import of NumPy keeps it in this process.
     """
     if not is_pinned():
-        return simulate_pinned(config=config, out=out, until_goal=until_goal, give_up_s=give_up_s)
+        return call_pinned(simulate, config=config, out=out, until_goal=until_goal, give_up_s=give_up_s)
     config, ending = check_plugins(config), Ending()
     with contextlib.ExitStack() as opened:
         if out is None:

@@ -1,4 +1,4 @@
-"""`simulate` in a child process, which computes in the common arithmetic (`snakesim_hal/arithmetic.py`).
+"""A function in a child process, which computes in the common arithmetic (`snakesim_hal/arithmetic.py`).
 
 For programs that imported NumPy before it could be told which processor code to choose.
 """
@@ -9,25 +9,24 @@ import pickle
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any, TypeVar
 
 from snakesim_hal import errors
 from snakesim_hal.arithmetic import environment
 from snakesim_hal.process import die_with_parent
 
-if TYPE_CHECKING:
-    from snakesim_operator.run.in_process import Result
-
+ResultT = TypeVar("ResultT")
 ASKED, ANSWER = "asked", "answer"
 LOOK_S = 1.0  # Python code runs again after so long, so that an exception can be raised into the caller's thread
 
 
-def simulate_pinned(**asked: Any) -> "Result":
-    """Call `simulate` with these arguments in a process of its own. Raises as it does."""
+def call_pinned(function: Callable[..., ResultT], **asked: Any) -> ResultT:
+    """Call a function of a module with these arguments in a process of its own. Raises as it does."""
     with TemporaryDirectory(prefix="snakesim-") as folder:
-        (Path(folder) / ASKED).write_bytes(pickle.dumps(asked))
+        (Path(folder) / ASKED).write_bytes(pickle.dumps((function, asked)))
         process = subprocess.Popen(
             [sys.executable, "-m", "snakesim_operator.run.pinned_process", folder, str(os.getpid())],
             env={**os.environ, **environment(), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
@@ -54,10 +53,9 @@ def main() -> int:
     folder, parent = Path(sys.argv[1]), int(sys.argv[2])
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C reaches both; the parent tells of it
     die_with_parent(parent)
-    from snakesim_operator.run.in_process import simulate
-
+    function, asked = pickle.loads((folder / ASKED).read_bytes())
     try:
-        answer: Any = simulate(**pickle.loads((folder / ASKED).read_bytes()))
+        answer: Any = function(**asked)
     except errors.SnakesimError as error:
         answer = type(error).__name__, error.lines
     (folder / ANSWER).write_bytes(pickle.dumps(answer))
