@@ -85,13 +85,14 @@ def hanging(monkeypatch: pytest.MonkeyPatch) -> Iterator[Event]:
 
 def test_a_stop_is_answered_although_the_disk_hangs(tmp_path: Path, hanging: Event) -> None:
     answers: SimpleQueue[str | None] = SimpleQueue()
+    threads = threading.active_count()
     latch, began = EstopLatch(tmp_path), time.monotonic()
     for _ in range(1000):  # a flood, too
         latch.engage("anna", 7, answers.put)
     for _ in range(1000):
         said = answers.get(timeout=5)
         assert said is not None and "not stored yet" in said and str(tmp_path / ESTOP) in said
-    assert time.monotonic() - began < 2.0 and threading.active_count() < 50
+    assert time.monotonic() - began < 2.0 and threading.active_count() <= threads + 2
     latch.close()
     assert time.monotonic() - began < 2.0
     hanging.set()
