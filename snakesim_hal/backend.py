@@ -33,6 +33,7 @@ class Samples:
 
     joints: JointState
     others: Mapping[str, Message] = field(default_factory=dict[str, Message])
+    encoded: Mapping[str, bytes] = field(default_factory=dict[str, bytes])  # `others`; filled in by the host
 
 
 class Backend(Protocol):

@@ -5,6 +5,7 @@ possible, or refused.
 """
 
 import time
+from dataclasses import replace
 
 import msgspec
 
@@ -45,7 +46,7 @@ class FaultyBackend:
         """The backend's samples, with the active faults applied."""
         samples = self._inner.sample(tick, stamp_ns)
         if self._on:
-            samples = Samples(self._disturbed(samples.joints), samples.others)
+            samples = replace(samples, joints=self._disturbed(samples.joints))
         self._last = samples.joints
         return samples
 

@@ -267,7 +267,7 @@ class Host:
         self._outbox.put(keys.JOINTS, self.authority.readable(samples.joints))
         self._newest[keys.JOINTS] = tick
         for key, message in samples.others.items():
-            self._outbox.put(key, message)
+            self._outbox.put(key, message, samples.encoded[key])
             self._newest[key] = tick
         for name, participant in self.participants.items():
             self._newest[name] = participant.service.counting_at(tick)

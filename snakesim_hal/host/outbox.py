@@ -78,10 +78,10 @@ class Outbox:
         if description.host is not None:
             session.declare_token(keys.host(description.host))
 
-    def put(self, key: str, message: Message) -> None:
-        """Publish it."""
+    def put(self, key: str, message: Message, encoded: bytes | None = None) -> None:
+        """Publish it. encoded: its bytes, if it has been encoded already."""
         sender = self._images if isinstance(message, IMAGES) else self._streams
-        self._send(sender, lambda: self._publisher(key, type(message)).put(message))
+        self._send(sender, lambda: self._publisher(key, type(message)).put(message, encoded))
 
     def put_status(self, status: Status) -> None:
         """Publish the status."""

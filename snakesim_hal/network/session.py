@@ -84,9 +84,9 @@ class Publisher(Generic[MessageT]):
         self.send, self.heard = send, heard
         self._put = send
 
-    def put(self, message: MessageT) -> None:
-        """Send it; waits for a slow subscriber only when the publisher was declared lossless."""
-        self._put(encode(message))
+    def put(self, message: MessageT, encoded: bytes | None = None) -> None:
+        """Send it; waits for a slow subscriber only when the publisher was declared lossless. encoded: its bytes."""
+        self._put(encode(message) if encoded is None else encoded)
 
     def reroute(self, put: Callable[[bytes], None] | None) -> None:
         """Pass payloads to `put` instead of sending them; None: send directly again."""

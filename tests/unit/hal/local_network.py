@@ -29,6 +29,7 @@ from snakesim_hal.wire.messages import (
     LifecycleState,
     Message,
     Mode,
+    SensorDescription,
     Status,
 )
 from tests.unit.hal.rig import pose
@@ -69,9 +70,9 @@ class LagBackend:
         self.next_faults: list[Fault] = []
 
     def describe(self) -> Description:
-        """From the robot file."""
+        """From the robot file, and the pose."""
         config = self._config
-        return describe(
+        described = describe(
             config.robot,
             backend="lag",
             period_ns=config.period_ns,
@@ -79,6 +80,10 @@ class LagBackend:
             config_hash=config_hash(config),
             simulated_time=True,
         )
+        if any(sensor.key == keys.POSE for sensor in described.sensors):
+            return described
+        pose_sensor = SensorDescription(key=keys.POSE, rate_hz=0.2e9 / config.period_ns, delay_s=0.0)
+        return msgspec.structs.replace(described, sensors=[*described.sensors, pose_sensor])
 
     def sample(self, tick: int, stamp_ns: int) -> Samples:
         """Joints every tick, the pose every fifth."""

@@ -1,15 +1,21 @@
 """Whatever a backend raises stops the robot, with a record of what it was."""
 
+import math
+from collections.abc import Mapping
 from typing import Any
 
+import msgspec
+import numpy as np
 import pytest
 
 from snakesim_hal.backend import Samples, SetPoints
 from snakesim_hal.errors import BackendError, SnakesimError
 from snakesim_hal.host.guarded_backend import GuardedBackend
-from snakesim_hal.wire.messages import Fault, LifecycleState
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Fault, LifecycleState, Pace
 from tests.unit.hal.local_network import Follower, LagBackend, following, running, wait_until
 from tests.unit.hal.network.test_client_host import run_config
+from tests.unit.hal.rig import pose, power
 
 
 class Clumsy(LagBackend):
@@ -49,6 +55,44 @@ def test_an_error_anywhere_is_a_latched_fault(where: str, monkeypatch: pytest.Mo
         assert run.host.ended == "failed" and run.host.authority.state == "fault"
         causes = {fault.what: fault.cause for fault in run.host.authority.since_start.kept}
         assert causes["backend_failed"] == f"Clumsy.{where} failed: OSError: [Errno 19] No such device"
+
+
+class Wrong(LagBackend):
+    """Has a wrong sample in it from some tick on."""
+
+    wrong: Mapping[str, Any] = {}
+
+    def sample(self, tick: int, stamp_ns: int) -> Samples:
+        right = super().sample(tick, stamp_ns)
+        joints = msgspec.structs.replace(right.joints, **self.wrong.get(keys.JOINTS, {}))
+        return Samples(joints, {**right.others, **{key: one for key, one in self.wrong.items() if key != keys.JOINTS}})
+
+
+@pytest.mark.parametrize("pace", ["realtime", "lockstep"])
+@pytest.mark.parametrize(
+    ("key", "sample", "why"),
+    [
+        (keys.POSE, pose(position_w=np.zeros(3)), "TypeError: Encoding objects of type numpy.ndarray is unsupported"),
+        (keys.POSE, pose(position_w=[0.0, math.nan, 0.0]), "malformed: Pose: Expected `float`"),
+        (keys.POSE, {"position_w": [0.0, 0.0, 0.0]}, "a dict is no message"),
+        (keys.POSE, power(), "unknown_message: got 'application/msgpack;snakesim.Power/1'"),
+        (keys.POWER, power(), f"not a sensor of its description, which has {keys.JOINTS}, {keys.POSE}"),
+        ("sensor/pose2", pose(), f"not a sensor of its description, which has {keys.JOINTS}, {keys.POSE}"),
+        (keys.JOINTS, {"angle_rad": np.zeros(3)}, "TypeError: Encoding objects of type numpy.ndarray is unsupported"),
+    ],
+)
+def test_a_sample_that_no_reader_would_accept_is_a_latched_fault_that_names_it(
+    pace: Pace, key: str, sample: Any, why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tests.unit.hal.local_network.LagBackend", Wrong)
+    with running(run_config(pace=pace)) as run, following(run.link, Follower()):
+        run.arm()
+        backend: Any = run.backend
+        backend.wrong = {key: sample}
+        wait_until(run.ended, "the end of the host")
+        assert run.host.ended == "failed" and run.host.authority.state == "fault"
+        cause = next(fault.cause for fault in run.host.authority.since_start.kept if fault.what == "backend_failed")
+        assert cause.startswith(f"Wrong.sample: {key} cannot be published: {why}"), cause
 
 
 def test_our_own_errors_stay_as_they_are() -> None:
