@@ -93,7 +93,11 @@ class Host:
         """
         described = msgspec.structs.replace(backend.describe(), host=secrets.token_hex(8), arithmetic=measured())
         self.description: Description = proven(described, own_run_key())
-        self.authority = Authority(self.description, first_epoch=time.time_ns() // 1_000_000)
+        self.authority = Authority(
+            self.description,
+            first_epoch=time.time_ns() // 1_000_000,
+            awaits_reports=config.pace == "realtime",
+        )
         self.black_box = BlackBox(self.description)
         self.statistics = RunStatistics()
         self.requests: list[str] = []  # who requested to arm, disarm, clear, finish or stop, and the result

@@ -48,8 +48,11 @@ class Decision:
 class Authority:
     """Lifecycle, lease and gate of one robot."""
 
-    def __init__(self, description: Description, *, first_epoch: int = 0) -> None:
-        """first_epoch: different from that of any earlier host, so that commands for another host are rejected."""
+    def __init__(self, description: Description, *, first_epoch: int = 0, awaits_reports: bool = False) -> None:
+        """first_epoch: different from that of any earlier host, so that commands for another host are rejected.
+
+        awaits_reports: whether arming waits until every module has reported its supply.
+        """
         self.description = description
         self.limits = JointLimits.of(description)
         self.state: LifecycleState = "disarmed"
@@ -70,7 +73,7 @@ class Authority:
         self._armed_tick = -1  # of the state that was the newest at the last arming
         self._isolation = Isolation(description)
         self._implausible: ImplausibleState | None = self._unknown("no joint state yet")
-        self._derating = Derating(description)
+        self._derating = Derating(description, awaits_reports=awaits_reports)
         self._command: JointCommand | None = None
         self._command_ns = 0  # when it was received
         self._counting: JointCommand | None = None  # command of the last decision since arming
@@ -299,7 +302,9 @@ class Authority:
 
     def _unready(self, now_ns: int) -> list[str]:
         against = [] if self._implausible is None else [self._implausible.fault.cause]
-        against += [fault.cause for fault in self._derating.wrong if not self._is_aside(fault)]
+        wrong = [fault for fault in self._derating.wrong if not self._is_aside(fault)]
+        against += [fault.cause for fault in wrong if fault.what != "undervoltage"]
+        against += self._derating.against_arming(now_ns)
         if self.arming and not self._stop_sent:
             against.append("the motors have not received the stop yet; ask again in a period")
         if not self.lease.live(now_ns):

@@ -3,8 +3,9 @@
 From `derate_from_c` on the torque limit falls linearly, to a fifth at `stop_at_c`: by `thermal.HeatLimits`, which
 the motors apply themselves as well. At `stop_at_c`, with water inside, or with a supply below `least_voltage_v` for
 50 ms, the robot is stopped, and cannot be armed before the winding has cooled below `derate_from_c`. Heat concerns
-only its joint; a leak or a weak supply concerns the whole robot. Values that a module has not reported for some seconds
-are unknown: this is noted, and they are ignored.
+only its joint; a leak or a weak supply concerns the whole robot. It is not armed with a weak supply, however short it
+has been weak, nor in real time before every module has reported its supply. Values that a module has not reported for
+some seconds are unknown: this is noted, and they are ignored.
 """
 
 import math
@@ -20,12 +21,15 @@ from snakesim_hal.wire.messages import Description, Fault, JointDescription, Pow
 LOW_FOR_NS = 50_000_000
 KNOWN_FOR_NS = 3_000_000_000
 LONGEST_CAUSE = 400
+FIELD = "`least_voltage_v` under [limits] in the robot file"
 
 
 class Derating:
     """Torque share and health of every joint, from power samples."""
 
-    def __init__(self, description: Description) -> None:
+    def __init__(self, description: Description, *, awaits_reports: bool = False) -> None:
+        """awaits_reports: before an arming; False where time may stand until then."""
+        self._robot, self._awaits_reports = description.robot, awaits_reports
         self._healths = [_Health(joint) for joint in description.joints]
         self._expected = any(sensor.key == keys.POWER for sensor in description.sensors)
         self._began_ns: int | None = None
@@ -67,6 +71,24 @@ class Derating:
         fresh = [fault for fault in self.wrong if (fault.what, fault.joint) not in before]
         return fresh, self._newly_silent(now_ns, tick)
 
+    def against_arming(self, now_ns: int) -> list[str]:
+        """What is to be done about the supply before the robot is armed; empty when nothing."""
+        against: list[str] = []
+        if low := [health for health in self._healths if health.known(now_ns) and health.low_since_ns is not None]:
+            weakest = min(low, key=lambda health: health.voltage_v)
+            against.append(
+                f"the supply is at {weakest.voltage_v:.1f} V at {weakest.joint.name}, which needs "
+                f"{weakest.joint.least_voltage_v:g} V{_and_others(len(low) - 1)}: check the supply, or set {FIELD} "
+                f"of {self._robot!r}"
+            )
+        if self._awaits_reports and self._expected:
+            unheard = [
+                one.joint.name for one in self._healths if one.heard_ns is None and one.joint.name not in self._silent
+            ]
+            if unheard:
+                against.append(f"{unheard[0]} has not reported its supply yet{_and_others(len(unheard) - 1)}")
+        return against
+
     def derated(self) -> dict[str, float]:
         """Derated joints, and the share of their torque that is left."""
         shares = zip(self._healths, self.share.tolist(), strict=True)
@@ -82,6 +104,10 @@ class Derating:
         cause = f"supply and heat are unknown, and ignored, for {', '.join(fresh)}"[:LONGEST_CAUSE]
         joint = fresh[0] if len(fresh) == 1 else None
         return Fault(tick=tick, what="power_unknown", cause=cause, joint=joint)
+
+
+def _and_others(count: int) -> str:
+    return f", and {count} more" if count else ""
 
 
 @dataclass
@@ -135,6 +161,7 @@ class _Health:
         if self.leak:
             found.append(("leak", f"{joint.name} reports water inside"))
         if self.low_since_ns is not None and now_ns - self.low_since_ns >= LOW_FOR_NS:
-            cause = f"the supply of {joint.name} is at {self.voltage_v:.1f} V, it needs {joint.least_voltage_v:g} V"
+            needs = f"it needs {joint.least_voltage_v:g} V: {FIELD}"
+            cause = f"the supply of {joint.name} is at {self.voltage_v:.1f} V, {needs}"
             found.append(("undervoltage", cause))
         return found

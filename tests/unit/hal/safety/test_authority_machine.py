@@ -304,8 +304,11 @@ class Everything(Model):
     )
     def arm(self, robot: str | None, backend: str | None, config_hash: str | None) -> None:
         ready = self.state == "disarmed" and self.known and self.live and self.heard is not None
-        wrong = self.wrong - {("overheated", i) for i in self.aside}
-        ready = ready and not wrong and (self.reported or self.arming == 0)
+        wrong = {
+            (word, i) for word, i in self.wrong if word == "leak" or (word == "overheated" and i not in self.aside)
+        }
+        weak = any(health.low_since_ns is not None and health.known(self.now_ns) for health in self.healths)
+        ready = ready and not wrong and not weak and (self.reported or self.arming == 0)
         if ready and self.heard is not None:
             heard_ns, asked = self.heard
             ready = self.now_ns - heard_ns <= LEASE_NS and all(

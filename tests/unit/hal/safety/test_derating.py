@@ -5,7 +5,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from snakesim_hal.safety.derating import Derating
+from snakesim_hal.safety.derating import FIELD, KNOWN_FOR_NS, Derating
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Fault, SensorDescription
 from tests.unit.hal.rig import description, power
@@ -19,11 +19,11 @@ S = 1000 * MS
 class Bench:
     """A derating and its clock."""
 
-    def __init__(self, *, expected: bool = False, **robot: Any) -> None:
+    def __init__(self, *, expected: bool = False, awaits_reports: bool = False, **robot: Any) -> None:
         sensor = SensorDescription(key=keys.POWER, rate_hz=2.0, delay_s=0.0)
         plain = description(**robot)
         sensors = [*plain.sensors, sensor] if expected else plain.sensors
-        self.derating = Derating(msgspec.structs.replace(plain, sensors=sensors))
+        self.derating = Derating(msgspec.structs.replace(plain, sensors=sensors), awaits_reports=awaits_reports)
         self.now_ns = 5 * S
         self.notes: list[Fault] = []
 
@@ -38,6 +38,10 @@ class Bench:
         wrong, note = self.derating.look(self.now_ns, 3)
         self.notes += [] if note is None else [note]
         return wrong
+
+    @property
+    def against_arming(self) -> list[str]:
+        return self.derating.against_arming(self.now_ns)
 
     @property
     def shares(self) -> list[float]:
@@ -99,9 +103,40 @@ def test_a_weak_supply_stops_the_robot_after_50_ms() -> None:
     assert bench.look(50 * MS - 1) == []
     (fault,) = bench.look(1)
     assert (fault.what, fault.joint) == ("undervoltage", "joint_2")
-    assert fault.cause == "the supply of joint_2 is at 17.9 V, it needs 18 V"
+    assert fault.cause == f"the supply of joint_2 is at 17.9 V, it needs 18 V: {FIELD}"
     assert bench.look(1) == [] and len(bench.derating.wrong) == 1
     assert bench.receive() == [] and bench.derating.wrong == []
+
+
+WAY_OUT = "check the supply, or set `least_voltage_v` under [limits] in the robot file of 'worm'"
+
+
+def test_a_weak_supply_keeps_the_robot_from_arming_at_once() -> None:
+    bench = Bench()
+    assert bench.receive(voltage_v=[24.0, 17.9, 18.0]) == []
+    assert bench.against_arming == [f"the supply is at 17.9 V at joint_2, which needs 18 V: {WAY_OUT}"]
+    bench.receive(voltage_v=[12.5, 17.9, 12.0])
+    assert bench.against_arming == [f"the supply is at 12.0 V at joint_3, which needs 18 V, and 2 more: {WAY_OUT}"]
+    bench.look(KNOWN_FOR_NS)
+    assert bench.against_arming != []
+    bench.look(1)
+    assert bench.against_arming == []  # what it was that long ago is not known to be so still
+    bench.receive(voltage_v=[12.5, 17.9, 12.0])
+    bench.receive()
+    assert bench.against_arming == []
+
+
+def test_a_robot_is_not_armed_before_its_supply_is_known() -> None:
+    bench = Bench(expected=True, awaits_reports=True)
+    assert bench.against_arming == ["joint_1 has not reported its supply yet, and 2 more"]
+    bench.receive(valid=[True, False, True])
+    assert bench.against_arming == ["joint_2 has not reported its supply yet"]
+    bench.look(KNOWN_FOR_NS)
+    assert bench.against_arming == ["joint_2 has not reported its supply yet"]
+    bench.look(1)
+    assert bench.against_arming == [] and bench.notes != []  # it is noted, and ignored from now on
+    for other in (Bench(expected=True), Bench(awaits_reports=True)):  # whose time may stand; without such a sensor
+        assert other.against_arming == []
 
 
 def test_a_dip_of_the_supply_is_forgiven() -> None:
