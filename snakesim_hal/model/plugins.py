@@ -53,18 +53,29 @@ def find_plugin(group: str, name: str) -> Any:
         return _offered[group, name]
     if in_file(name):
         return _from_file(name, kind)
-    found: dict[str, EntryPoint] = {entry.name: entry for entry in entry_points(group=group)}
-    if name not in found:
+    found = list(entry_points(group=group, name=name))
+    if not found:
         raise ConfigError(
-            f"no {kind} called {short(name)!r} is installed; installed are {', '.join(sorted(found)) or 'none'}. "
+            f"no {kind} called {short(name)!r} is installed; installed are {', '.join(installed(group)) or 'none'}. "
             f"A package adds one by an entry point in the group {group!r}"
         )
+    entry = found[0]
+    if len({one.value for one in found}) > 1:
+        packages = " and ".join(f"{_package(one)} ({one.value})" for one in found)
+        raise ConfigError(
+            f"{kind} {name!r} is in several installed packages: {packages}; uninstall all but one, or name a file "
+            f"and a class in it, ./file.py:Class"
+        )
     try:
-        return found[name].load()
+        return entry.load()
     except ModuleNotFoundError as error:
-        raise ConfigError(f"{kind} {name!r} cannot be loaded: {error}.{_extras_of(found[name])}") from error
+        raise ConfigError(f"{kind} {name!r} cannot be loaded: {error}.{_extras_of(entry)}") from error
     except (ImportError, AttributeError) as error:
-        raise ConfigError(f"{kind} {name!r} ({found[name].value}) cannot be loaded: {error}") from error
+        raise ConfigError(f"{kind} {name!r} ({entry.value}) cannot be loaded: {error}") from error
+
+
+def _package(entry: EntryPoint) -> str:
+    return entry.dist.name if entry.dist is not None else "an unknown package"
 
 
 def _extras_of(entry: EntryPoint) -> str:

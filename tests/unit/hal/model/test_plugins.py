@@ -212,3 +212,18 @@ def test_a_wrong_import_is_found_at_every_level(copy_of_the_packages: Path) -> N
         planted = f"{folder.replace('/', '.')}.planted"
         assert re.search(rf"{re.escape(planted)} -> {re.escape(module)}\b|{re.escape(planted)}.*{module}", said), said
     assert "in_no_room" in said
+
+
+def test_two_packages_with_a_plugin_of_one_name_are_refused_by_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for package in ("waves", "gaits"):
+        metadata = tmp_path / f"{package}-1.0.dist-info"
+        metadata.mkdir()
+        (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
+        (metadata / "entry_points.txt").write_text(f"[snakesim.controllers]\nwave = {package}:Wave\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ConfigError, match="controller 'wave' is in several installed packages: ") as raised:
+        find_plugin(CONTROLLERS, "wave")
+    assert {"waves (waves:Wave)", "gaits (gaits:Wave)"} <= set(re.split(": | and |; ", str(raised.value)))
+    assert find_plugin(CONTROLLERS, "hold").__name__ == "Hold"
