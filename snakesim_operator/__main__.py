@@ -26,9 +26,9 @@ def main() -> int:
         from snakesim_operator.cli import main as command
 
         return command()
-    except (MemoryError, ImportError) as error:
+    except (MemoryError, ImportError, SystemError) as error:
         limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-        if isinstance(error, ImportError) and limit == resource.RLIM_INFINITY:  # no library failed for lack of memory
+        if not isinstance(error, MemoryError) and limit == resource.RLIM_INFINITY:  # not for lack of memory
             raise
         allowed = "this computer has" if limit == resource.RLIM_INFINITY else f"`ulimit -v` allows, {limit // 2**20} MB"
         print_stderr(f"snakesim: this command needs more memory than {allowed}")
