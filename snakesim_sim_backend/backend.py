@@ -27,6 +27,7 @@ from snakesim_sim_backend.tether import Rope
 from snakesim_sim_backend.truth import TrueContact, TrueState
 
 NAME = "sim"
+CLOSED = "the simulation is closed; open a new backend"
 OFF: tuple[LifecycleState, ...] = ("disarmed", "estop")
 
 
@@ -89,6 +90,8 @@ class SimBackend:
 
     def sample(self, tick: int, stamp_ns: int) -> Samples:
         """Sensor samples at `tick`; after a divergence, of the last good state."""
+        if not self._open:
+            raise BackendError(CLOSED)
         return self._sensors.sample(tick, stamp_ns)
 
     def enact(self, set_points: SetPoints, lifecycle: LifecycleState) -> None:
@@ -101,7 +104,7 @@ class SimBackend:
     def advance(self) -> None:
         """Step the physics through one control period. Raises BackendError when it has diverged."""
         if not self._open:
-            raise BackendError("the simulation is closed; open a new backend")
+            raise BackendError(CLOSED)
         self._motors.before_steps()
         self._tick += 1
         try:

@@ -27,7 +27,7 @@ FIELD = "`least_voltage_v` under [limits] in the robot file"
 class Derating:
     """Torque share and health of every joint, from power samples."""
 
-    def __init__(self, description: Description, *, awaits_reports: bool = False) -> None:
+    def __init__(self, description: Description, *, awaits_reports: bool) -> None:
         """awaits_reports: before an arming; False where time may stand until then."""
         self._robot, self._awaits_reports = description.robot, awaits_reports
         self._healths = [_Health(joint) for joint in description.joints]

@@ -1,10 +1,13 @@
 """Who may move the robot: what stops it, and what a stop leaves."""
 
+import msgspec
 import pytest
 
-from snakesim_hal.safety.authority import COMMANDS_KEPT
+from snakesim_hal.safety.authority import COMMANDS_KEPT, Authority
+from snakesim_hal.safety.derating import FIELD
 from snakesim_hal.safety.fault_log import MAX_FAULTS_KEPT
-from snakesim_hal.wire.messages import Fault, JointCommand, LifecycleState, Mode
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Fault, JointCommand, LifecycleState, Mode, SensorDescription
 from tests.unit.hal.rig import PERIOD_NS, command, state
 from tests.unit.hal.safety.authority_rig import CLEAR, DISARM, ESTOP, FINISH, JOINTS, Rig, armed, modes, receive
 
@@ -288,6 +291,33 @@ def test_a_weak_supply_stops_an_armed_robot_within_50_ms() -> None:
         rig.send(0.1)
         rig.pass_tick()
     assert {fault.what for fault in rig.authority.faults} == {"undervoltage"}
+
+
+def test_a_weak_supply_stands_against_arming_once_with_the_field_to_change() -> None:
+    rig = Rig()
+    rig.acquire()
+    for _ in range(7):
+        receive(rig, [20.0] * JOINTS, volts=12.0)
+        rig.send(0.1)
+        rig.pass_tick()
+    rig.authority.on_lifecycle(CLEAR, rig.now_ns)
+    rig.acquire()
+    rig.send(0.1)
+    rig.pass_tick()
+    answer = rig.arm()
+    assert answer.refusal == "not_ready" and answer.reason.count("12.0 V") == 1 and FIELD in answer.reason
+
+
+def test_time_may_stand_still_until_a_robot_is_armed_so_no_report_is_awaited() -> None:
+    power = SensorDescription(key=keys.POWER, rate_hz=2.0, delay_s=0.0)
+    rig = Rig()
+    rig.authority = Authority(msgspec.structs.replace(rig.robot, sensors=[*rig.robot.sensors, power]))
+    rig.observe(0.1)
+    rig.acquire()
+    rig.send(0.1)
+    rig.pass_tick()
+    rig.send(0.1)
+    assert rig.arm().ok
 
 
 # --- what is told ----------------------------------------------------------------------------------------------

@@ -50,7 +50,7 @@ class Bench:
 
 def test_nothing_is_derated_before_anything_is_known() -> None:
     bench = Bench()
-    assert bench.shares == [1.0] * JOINTS
+    assert bench.shares == [1.0] * JOINTS and bench.derating.wrong == []
     assert bench.look(0) == [] and bench.shares == [1.0] * JOINTS and bench.derating.derated() == {}
 
 
