@@ -6,6 +6,7 @@ emergency stop does not wait for them.
 """
 
 import argparse
+import errno
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -36,6 +37,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         discard(sys.stdout)
         if isinstance(error, BrokenPipeError):  # the reader of a pipe has closed it
             return OK
+        if error.errno == errno.ENOMEM:
+            raise MemoryError from error
         print_stderr(f"snakesim: {f'{error.filename}: ' if error.filename else ''}{error.strerror or error}")
         return FAILED
 
