@@ -17,6 +17,7 @@ from snakesim_hal.wire.messages import Description, Fault, LifecycleState, Pace
 from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.contacts import TouchReader
 from snakesim_sim_backend.divergence import MAX_SPEED, DivergenceWatch, log_warnings
+from snakesim_sim_backend.flat_ground import Physics
 from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS, SimModel, build
 from snakesim_sim_backend.sensors.frames import rotate
 from snakesim_sim_backend.sensors.registry import check_models
@@ -63,8 +64,9 @@ class SimBackend:
         log_warnings()
         self._sim = build(config, settings)
         self._data = mujoco.MjData(self._sim.model)
+        self._physics = Physics(self._sim.model, self._data, self._sim.soles)
         self._motors = Motors(self._sim.model, self._data, config.robot, config.period_ns * 1e-9)
-        place_robot(self._sim, self._data, config, self._motors, settings.settle_s)
+        place_robot(self._sim, self._data, self._physics, config, self._motors, settings.settle_s)
         self._rope = None
         if settings.tether is not None:
             self._rope = Rope(self._sim.model, self._data, settings.tether)
@@ -75,11 +77,11 @@ class SimBackend:
         )
         self._heats, self._period_s = config.robot.sensors.power is not None, config.period_ns * 1e-9
         self._sensors = Sensors(self._sim, self._data, config, self._motors, self._windings)
-        self._watch = DivergenceWatch(self._sim.model, self._data, self._sim.steps_per_tick)
-        self._model, self._option = self._sim.model, self._sim.model.opt
+        self._watch = DivergenceWatch(self._sim.model, self._data, self._physics, self._sim.steps_per_tick)
+        self._option = self._sim.model.opt
         self._with_sensors = int(self._option.disableflags)
         self._without_sensors = self._with_sensors | int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
-        self._unread_steps = self._sim.steps_per_tick - 1 if self._model.nsensor else 0
+        self._unread_steps = self._sim.steps_per_tick - 1 if self._sim.model.nsensor else 0
         self._read_steps = self._sim.steps_per_tick - self._unread_steps
         self._tick = 0
         self._open = True
@@ -118,12 +120,12 @@ class SimBackend:
                 self._motors.derate(share_left)
 
     def _step(self) -> None:
-        model, data, option = self._model, self._data, self._option
+        option = self._option
         if self._unread_steps:  # IMUs cost time, and only their values in the last step are read
             option.disableflags = self._without_sensors
-            mujoco.mj_step(model, data, self._unread_steps)
+            self._physics.step(self._unread_steps)
             option.disableflags = self._with_sensors
-        mujoco.mj_step(model, data, self._read_steps)
+        self._physics.step(self._read_steps)
 
     def faults(self) -> list[Fault]:
         """Samples that came too late in real time; they stop nothing. A divergence is raised by `advance`."""
@@ -158,6 +160,11 @@ class SimBackend:
     def sim(self) -> SimModel:
         """The compiled model."""
         return self._sim
+
+    @property
+    def physics(self) -> Physics:
+        """The steps of the simulation, and the forces of flat ground."""
+        return self._physics
 
     @property
     def data(self) -> mujoco.MjData:

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 
 from snakesim_hal.errors import BackendError
+from snakesim_sim_backend.flat_ground import Physics
 from snakesim_sim_backend.model import FREE_DOFS
 
 _log = logging.getLogger("snakesim.sim")
@@ -15,7 +16,7 @@ MAX_SPEED = 1e3  # m/s or rad/s
 MAX_ACCELERATION = 1e9  # m/s² or rad/s²
 BASE = ["the base along x", "the base along y", "the base along z"] + ["the base, turning,"] * 3
 WHOLE = int(mujoco.mjtState.mjSTATE_INTEGRATION)  # plain numbers: the binding converts an enumeration at every call
-INPUTS = int(mujoco.mjtState.mjSTATE_USER)
+INPUTS = int(mujoco.mjtState.mjSTATE_USER) & ~int(mujoco.mjtState.mjSTATE_USERDATA)  # the feet's is no input
 
 
 def log_warnings() -> None:
@@ -26,9 +27,12 @@ def log_warnings() -> None:
 class DivergenceWatch:
     """Checks the state once a tick, or once per other counted unit."""
 
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, steps: int, counted: str = "tick") -> None:
+    def __init__(
+        self, model: mujoco.MjModel, data: mujoco.MjData, physics: Physics, steps: int, counted: str = "tick"
+    ) -> None:
         """steps: from one check to the next, under the same inputs; counted: unit of a check's number."""
-        self._model, self._data, self._steps, self._counted = model, data, steps, counted
+        self._model, self._data, self._physics = model, data, physics
+        self._steps, self._counted = steps, counted
         self._good = np.empty(mujoco.mj_stateSize(model, WHOLE))
         self._qpos, self._qvel, self._qacc = data.qpos, data.qvel, data.qacc
         self._warnings = data.warning.number
@@ -48,7 +52,7 @@ class DivergenceWatch:
                 f"`timestep_s` or the gains in [motor]; stiff gains need armature"
             )
             self._go_back()
-            mujoco.mj_forward(self._model, self._data)
+            self._physics.forward()
         raise BackendError(self._why)
 
     def _is_good(self) -> bool:
@@ -77,7 +81,7 @@ class DivergenceWatch:
         self._go_back()
         mujoco.mj_setState(model, data, inputs, INPUTS)
         for _ in range(self._steps):
-            mujoco.mj_step(model, data)
+            self._physics.step(1)
             bad = self._worst() or bad
             if not self._is_good():
                 return bad

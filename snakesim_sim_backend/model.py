@@ -18,6 +18,7 @@ from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig, place_all
 from snakesim_hal.wire.messages import Axis
 from snakesim_sim_backend.actuators import add_motor
+from snakesim_sim_backend.flat_ground import KEPT, Soles, soles_of
 from snakesim_sim_backend.ground import GROUND, add_ground
 from snakesim_sim_backend.imu import add_imus
 from snakesim_sim_backend.obstacles import OBSTACLE, add_obstacle
@@ -40,6 +41,7 @@ class SimModel:
     steps_per_tick: int
     first_link_body: int  # bodies of the links are consecutive
     obstacle_of_geom: list[str | None]  # (ngeom,); None: link, ground or step
+    soles: Soles | None  # None: MuJoCo has the contacts with the ground, which is not flat
 
 
 def build(config: RunConfig, settings: Settings, *, motors: bool = True) -> SimModel:
@@ -58,6 +60,7 @@ def build(config: RunConfig, settings: Settings, *, motors: bool = True) -> SimM
     _set_options(spec, step_s, settings)
     _add_scene(spec, config, settings)
     _add_snake(spec, config.robot, settings)
+    spec.nuserdata = KEPT * (config.robot.chain.modules + 2)
     if motors:
         check_gains(config.robot)
         for i in range(config.robot.chain.modules):
@@ -70,13 +73,18 @@ def build(config: RunConfig, settings: Settings, *, motors: bool = True) -> SimM
         model = spec.compile()
     except ValueError as error:
         raise ConfigError(f"MuJoCo cannot build robot {config.robot.name!r} in this scene: {error}") from error
+    first_link_body, ground = model.body("link_0").id, config.scene.ground
+    soles = None
+    if ground.uneven is None:
+        soles = soles_of(model, first_link_body, config.robot.module.radius_m, ground.friction)
     names = [model.geom(i).name for i in range(model.ngeom)]
     obstacles = [name.removeprefix(OBSTACLE) if name.startswith(OBSTACLE) else None for name in names]
     return SimModel(
         model=model,
         steps_per_tick=steps,
-        first_link_body=model.body("link_0").id,
+        first_link_body=first_link_body,
         obstacle_of_geom=obstacles,
+        soles=soles,
     )
 
 
@@ -96,14 +104,17 @@ def _set_options(spec: mujoco.MjSpec, step_s: float, settings: Settings) -> None
 def _add_scene(spec: mujoco.MjSpec, config: RunConfig, settings: Settings) -> None:
     """Ground and obstacles, paired with the links that are added later.
 
-    A plane supports a chain of capsules only at the spheres around joints and ends. Each sphere is there once,
+    Level ground supports a chain of capsules only at the spheres around joints and ends. Each sphere is there once,
     while capsules would have two of them at every joint. Hills, steps and obstacles have contacts with the capsules.
+    Flat ground has no contacts in MuJoCo: see flat_ground.py.
     """
     scene, robot = config.scene, config.robot
     hills_m = scene.ground.uneven.height_m if scene.ground.uneven else 0.0
     links = [f"link_{i}" for i in range(robot.chain.modules + 1)]
     feet = [f"foot_{i}" for i in range(robot.chain.modules + 2)]
     for name in add_ground(spec, scene.ground):
+        if scene.ground.uneven is None:
+            continue
         sole = grip(scene.ground.friction, settings, bears_weight=True)
         _pair(spec, name, feet if name == GROUND else links, sole)
     for placed in place_all(config):

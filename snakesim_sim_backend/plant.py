@@ -16,6 +16,7 @@ from snakesim_hal.model.sensors import ImuSensor, PoseSensor
 from snakesim_hal.wire.messages import Imu, Pose
 from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.divergence import MAX_ACCELERATION, DivergenceWatch, log_warnings
+from snakesim_sim_backend.flat_ground import Physics
 from snakesim_sim_backend.loads import LoadReader
 from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS, SimModel, build
 from snakesim_sim_backend.sensors.imu import ImuReader
@@ -48,12 +49,13 @@ class MujocoPlant:
         model, data = self._model, self._data
         self.step_s: float = model.opt.timestep
         data.qpos[:] = _rest(config, settings)
-        mujoco.mj_forward(model, data)
+        self._physics = Physics(model, data, self._sim.soles)
+        self._physics.begin()
         if settings.tether is not None:
             Rope(model, data, settings.tether).tighten()
         count = config.robot.chain.modules
         self._angles, self._velocities = data.qpos[FREE_QPOS:], data.qvel[FREE_DOFS:]
-        self._torques, self._passive = data.qfrc_applied[FREE_DOFS:], data.qfrc_passive[FREE_DOFS:]
+        self._torques, self._passive = data.qfrc_applied[FREE_DOFS:], data.qfrc_damper[FREE_DOFS:]
         self._qacc, self._accelerations = data.qacc, data.qacc[FREE_DOFS:]
         self._armature = model.dof_armature[FREE_DOFS:]
         # Of all constraints MuJoCo lists equalities first, of which there are none, then the friction of the joints.
@@ -67,7 +69,7 @@ class MujocoPlant:
         self._flags = int(model.opt.disableflags)
         model.opt.disableflags = self._flags | NO_SENSORS  # IMUs cost more than all else here; see `imu`
         self._steps, self._unchecked, self._diverged = 0, 0, False
-        self._watch = DivergenceWatch(model, data, STEPS_PER_CHECK, "step")
+        self._watch = DivergenceWatch(model, data, self._physics, STEPS_PER_CHECK, "step")
 
     def advance(self, torque_nm: Floats) -> None:
         """One physics step under these motor torques, (n_joints,).
@@ -80,7 +82,7 @@ class MujocoPlant:
         self._speeds_before[:] = self._speeds
         self._steps += 1
         try:
-            mujoco.mj_step(self._model, self._data)
+            self._physics.step(1)
         except mujoco.FatalError as error:
             raise BackendError(f"MuJoCo cannot go on at step {self._steps}: {error}") from error
         self._unchecked += 1
@@ -173,5 +175,6 @@ def _rest(config: RunConfig, settings: PlantSettings) -> Floats:
     step_s = min(Settings().timestep_s, settings.contact_time_s / 2)
     sim = build(config, msgspec.structs.replace(settings, timestep_s=step_s))
     data = mujoco.MjData(sim.model)
-    place_robot(sim, data, config, Motors(sim.model, data, config.robot, config.period_ns * 1e-9), settings.settle_s)
+    motors = Motors(sim.model, data, config.robot, config.period_ns * 1e-9)
+    place_robot(sim, data, Physics(sim.model, data, sim.soles), config, motors, settings.settle_s)
     return data.qpos

@@ -8,6 +8,7 @@ from snakesim_hal.model.kinematics import link_frames, quaternion_from_yaw, rota
 from snakesim_hal.model.scenario import RunConfig, StartPose, start_of
 from snakesim_hal.wire.messages import Mode
 from snakesim_sim_backend.actuators import Motors
+from snakesim_sim_backend.flat_ground import Physics
 from snakesim_sim_backend.ground import GROUND_GROUP, PLANE_GROUP
 from snakesim_sim_backend.model import FREE_QPOS, SimModel
 
@@ -19,7 +20,9 @@ GRIP = np.array([2.0, 2.0, 0.1, 0.1, 0.1])
 ALL_FRICTION = 6  # condim with which all three act
 
 
-def place_robot(sim: SimModel, data: mujoco.MjData, config: RunConfig, motors: Motors, settle_s: float) -> None:
+def place_robot(
+    sim: SimModel, data: mujoco.MjData, physics: Physics, config: RunConfig, motors: Motors, settle_s: float
+) -> None:
     """Put the snake at its start pose, at rest at time 0 with motors off.
 
     It is placed above the highest ground under it and falls; the motors hold its start angles meanwhile. If it has
@@ -31,14 +34,15 @@ def place_robot(sim: SimModel, data: mujoco.MjData, config: RunConfig, motors: M
     data.qpos[3:FREE_QPOS] = quaternion_from_yaw(pose.yaw_rad)
     data.qpos[FREE_QPOS:] = pose.angles_rad
     data.qpos[2] = highest_ground_m(model, data, config, pose) + config.robot.module.radius_m
-    _settle(model, data, config, motors, pose, settle_s)
+    physics.begin()
+    _settle(model, data, physics, config, motors, pose, settle_s)
     data.qvel[:] = 0.0
     data.act[:] = 0.0
     data.qacc_warmstart[:] = 0.0
     data.time = 0.0
     data.warning.number[:] = 0
     motors.switch_off()
-    mujoco.mj_forward(model, data)
+    physics.begin()
 
 
 def highest_ground_m(model: mujoco.MjModel, data: mujoco.MjData, config: RunConfig, pose: StartPose) -> float:
@@ -64,18 +68,26 @@ def highest_ground_m(model: mujoco.MjModel, data: mujoco.MjData, config: RunConf
 
 
 def _settle(
-    model: mujoco.MjModel, data: mujoco.MjData, config: RunConfig, motors: Motors, pose: StartPose, settle_s: float
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    physics: Physics,
+    config: RunConfig,
+    motors: Motors,
+    pose: StartPose,
+    settle_s: float,
 ) -> None:
     count = motors.count
     limits = [config.robot.limits.torque_nm] * count
     motors.enact(SetPoints([Mode.POSITION] * count, pose.angles_rad.tolist(), limits))
     friction, condim = model.pair_friction.copy(), model.pair_dim.copy()
     model.pair_friction[:], model.pair_dim[:] = np.maximum(friction, GRIP), ALL_FRICTION
+    physics.friction = max(flat_friction := physics.friction, GRIP[0])
     steps = max(round(ROUND_S / model.opt.timestep), 1)
     at_rest = 0
     for _ in range(round(settle_s / (steps * model.opt.timestep))):
-        mujoco.mj_step(model, data, steps)
+        physics.step(steps)
         at_rest = at_rest + 1 if np.abs(data.qvel).max() < REST else 0
         if at_rest == REST_ROUNDS:
             break
     model.pair_friction[:], model.pair_dim[:] = friction, condim
+    physics.friction = flat_friction

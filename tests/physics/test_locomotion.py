@@ -13,7 +13,7 @@ from tests.whole_run import Run, configure, run
 
 TRIPLET = "controllers.obstacle_triplet"
 STARTED = 50  # ticks until the body has moved far enough to be seen moving
-FADE_MAX = 0.13  # period / blend_s + speed * period / blend_m at 0.5 m/s
+FADE_MAX = 0.2  # period / blend_s + speed * period / blend_m at 0.9 m/s
 
 
 @cache

@@ -56,11 +56,11 @@ def test_nothing_moves_after_closing():
 
 
 def test_what_mujoco_cannot_do_is_an_error_of_the_backend():
-    run = Run(make_config())
+    run = Run(make_config({"motor": {"friction_nm": 0.1}}))
     run.go(0.1)
-    run.sim.sim.model.opt.integrator = 99
+    run.sim.sim.model.opt.solver = 99
     for tick in (11, 12):
-        with pytest.raises(BackendError, match=f"MuJoCo cannot go on at tick {tick}: mj_step: invalid integrator"):
+        with pytest.raises(BackendError, match=f"MuJoCo cannot go on at tick {tick}: .*solver"):
             run.go()
 
 

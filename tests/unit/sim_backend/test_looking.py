@@ -12,6 +12,7 @@ from snakesim_hal.model.kinematics import rotation_from_quaternion
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder, encode, encoding_of
 from snakesim_hal.wire.messages import ColourImage, DepthImage, Ranges
+from snakesim_sim_backend.flat_ground import SINK_M
 from tests.unit.sim_backend.rig import Run, make_config
 
 NOSE_M = 13 * 0.11 + 0.04
@@ -58,7 +59,7 @@ def test_a_post_ahead_is_as_far_and_as_wide_as_geometry_says():
 def test_the_ground_is_as_far_as_height_and_pitch_say():
     image = seen(looking(position_m=[0.095, 0.0, 0.03], pitch_rad=0.3))
     depth_m = metres(image)
-    height_m = 0.04 + 0.03
+    height_m = 0.04 + 0.03 - SINK_M
     up = (image.cy_px - np.arange(image.height)) / image.fy_px
     with np.errstate(divide="ignore"):
         wanted = height_m / (np.sin(0.3) - up * np.cos(0.3))

@@ -69,7 +69,7 @@ def test_neighbours_pass_through_each_other_and_distant_links_do_not():
     config = make_config({"chain": {"modules": 8}, "limits": {"angle_rad": 1.5}})
     run = Run(config)
     data, model = run.sim.data, run.sim.sim.model
-    assert not any(data.contact.geom.min(axis=1) > 0)  # straight: only touches of the ground, which is geom 0
+    assert not any(data.contact.geom.min(axis=1) > 0)
     data.qpos[7:] = 1.0  # rolled up: far more than a full turn
     mujoco.mj_forward(model, data)
     pairs = {tuple(sorted(pair)) for pair in data.contact.geom.tolist() if min(pair) > 0}
@@ -78,7 +78,7 @@ def test_neighbours_pass_through_each_other_and_distant_links_do_not():
 
 
 @pytest.mark.parametrize("walls", [[0.0, 0.7], [0.7, 0.0]])
-def test_each_pair_of_surfaces_has_the_friction_of_the_ground_or_the_obstacle(walls):
+def test_each_obstacle_has_its_friction(walls):
     boxes = [
         {"position_m": [0.5, side * 0.0901], "size_m": [0.4, 0.1, 0.2], "friction": mu}
         for side, mu in zip((-1, 1), walls, strict=True)
@@ -91,9 +91,9 @@ def test_each_pair_of_surfaces_has_the_friction_of_the_ground_or_the_obstacle(wa
         mujoco.mj_forward(model, data)
         for contact in data.contact:
             name = next(n for n in (model.geom(g).name for g in contact.geom) if not n.startswith("link"))
-            mu = {"ground": 0.3, "obstacle:box_0": walls[0], "obstacle:box_1": walls[1]}[name]
+            mu = {"obstacle:box_0": walls[0], "obstacle:box_1": walls[1]}[name]
             assert contact.dim == (3 if mu else 1)
             if mu:
                 assert contact.friction[:2] == pytest.approx(mu)
             seen.add(name)
-    assert seen == {"ground", "obstacle:box_0", "obstacle:box_1"}
+    assert seen == {"obstacle:box_0", "obstacle:box_1"}

@@ -7,6 +7,7 @@ import pytest
 from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion
 from snakesim_hal.model.scenario import load, start_of
 from snakesim_hal.wire.messages import Mode
+from snakesim_sim_backend.flat_ground import SINK_M
 from snakesim_sim_backend.ground import hills
 from tests.unit.sim_backend.rig import Run, make_config
 
@@ -39,7 +40,7 @@ def test_on_flat_ground_it_lies_at_its_start_at_rest_at_time_0():
     run = Run(config)
     state, pose = run.sim.true_state(), start_of(config)
     assert state.time_s == 0.0
-    assert state.base_position_w == pytest.approx([*pose.position_w, config.robot.module.radius_m], abs=1e-4)
+    assert state.base_position_w == pytest.approx([*pose.position_w, config.robot.module.radius_m], abs=1.1 * SINK_M)
     assert state.angles_rad == pytest.approx(pose.angles_rad, abs=1e-3)
     assert not state.base_velocity_w.any()
     assert not state.velocities_rad_s.any()
