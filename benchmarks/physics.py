@@ -5,8 +5,6 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
-import mujoco
-
 from snakesim_hal.backend import Samples, SetPoints
 from snakesim_hal.model.plugins import BACKENDS, find_plugin, plugin_settings
 from snakesim_hal.model.scenario import RunConfig, load, parse_set
@@ -77,19 +75,19 @@ class Publishing:
 
 
 class BareLoop:
-    """The same motion on the same model, computed by nothing but `mj_step`."""
+    """The same motion on the same model, computed by the physics alone."""
 
     def __init__(self, config: RunConfig) -> None:
         self._backend = open_simulator(config)
 
     def tick_us(self, points: Sequence[SetPoints]) -> float:
         """Mean time of a control period over these set-points; handing them over is not counted."""
-        model, data, steps = self._backend.sim.model, self._backend.data, self._backend.sim.steps_per_tick
+        physics, steps = self._backend.physics, self._backend.sim.steps_per_tick
         spent = 0.0
         for now in points:
             self._backend.enact(now, "armed")
             begin = time.perf_counter()
-            mujoco.mj_step(model, data, steps)
+            physics.step(steps)
             spent += time.perf_counter() - begin
         return spent / len(points) * 1e6
 

@@ -101,7 +101,7 @@ class FlatGround:
             )
         )
         beyond = wrenches[:, ::-1].cumsum(axis=1)[:, ::-1]  # a joint turns all that is nearer to the head
-        self._out[:6] += self._axes[:6] @ beyond[:, 0]
+        self._out[:6] += np.einsum("ij,j->i", self._axes[:6], beyond[:, 0])
         self._out[6:] += np.einsum("ij,ji->i", self._axes[6:], beyond[:, 1:-1])
 
 

@@ -1,10 +1,11 @@
-"""Friction and softness of surfaces: the contact parameters of everything that a link can touch.
+"""Friction and softness of what MuJoCo has contacts for: obstacles, links, hills, steps. Flat ground: flat_ground.py.
 
 MuJoCo relaxes friction to a convex problem, with a side effect: a contact that slides at speed v is also pushed apart,
 with an acceleration of friction * 2 v / (time in which slip is corrected). If that exceeds what the softness of the
 contact can absorb, a sliding body hops by micrometres, hundreds of times a second, and its IMUs and contact forces
 are noisy. So slip is corrected slowly, and sliding contacts are softer than frictionless ones. Creep at rest stays
-small, because `friction_hold` makes friction much stiffer than normals.
+small, because `friction_hold` makes friction much stiffer than normals. The price: friction that is corrected slowly
+follows changes of speed rather than opposing speed, so undulation on hills drifts by up to 20 mm/s towards the tail.
 """
 
 from typing import TypedDict

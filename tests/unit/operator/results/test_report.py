@@ -23,7 +23,7 @@ from snakesim_operator.results.report.view import nodes_xy_w
 from snakesim_operator.results.summary import RunSummary, summarise
 from tests.unit.operator.results.recorded import LOST, SECONDS, Reader, changed, read
 
-HAND_OVERS_S = (0.0, 0.28, 1.26, 2.5, 3.7, 4.88, 6.0, 6.32)
+HAND_OVERS_S = (0.0, 0.28, 1.28, 2.42, 3.56, 4.72, 5.78, 6.1)
 INTERVALS_S = {9 - k: interval for k, interval in enumerate(itertools.pairwise(HAND_OVERS_S))}  # 9 is joint_10
 
 
@@ -37,11 +37,11 @@ def page(record: RunRecord) -> Reader:
 
 def test_the_verdict_tells_distance_and_hand_over(page: Reader) -> None:
     said = (
-        "Moved 0.63 m along the path in 10.0 s; propulsion handed over joint_10 → joint_9 → joint_8 → joint_7 → "
+        "Moved 0.62 m along the path in 10.0 s; propulsion handed over joint_10 → joint_9 → joint_8 → joint_7 → "
         "joint_6 → joint_5 → joint_4; no fault, 2 commands refused (stale)."
     )
     assert said in page.text
-    assert f"Locomotion ended at 6.3 s of 10.0 s: {LOST}; no three neighbours on alternating sides." in page.text
+    assert f"Locomotion ended at 6.1 s of 10.0 s: {LOST}; no three neighbours on alternating sides." in page.text
 
 
 def test_playback_moves_the_snake_over_a_map(record: RunRecord, page: Reader) -> None:
