@@ -28,7 +28,7 @@ class Settings(FileStruct, frozen=True, kw_only=True):
     timestep_s: Annotated[float, Meta(ge=1e-5, le=0.01, extra_json_schema={"unit": "s"})] = 0.002
     # How fast a penetration is pushed out; softer contacts are more forgiving at long steps. At least two steps.
     contact_time_s: Annotated[float, Meta(ge=1e-4, le=0.1, extra_json_schema={"unit": "s"})] = 0.005
-    # How fast friction of obstacles, hills and steps brings slip to rest. Short times make sliding bodies hop: surface.py.
+    # How fast friction of obstacles, hills and steps brings slip to rest. Short: sliding bodies hop, see surface.py.
     slip_time_s: Annotated[float, Meta(ge=1e-4, le=1, extra_json_schema={"unit": "s"})] = 0.03
     # How much stiffer friction holds than normals push: higher values slide less at rest, and cost time.
     friction_hold: Annotated[float, Meta(ge=1, le=1000, extra_json_schema={"unit": "1"})] = 100.0
