@@ -68,6 +68,8 @@ def load_scenario(arguments: argparse.Namespace) -> "Loaded":
         "seed": arguments.seed,
     }
     overrides = [parse_set(text) for text in arguments.set]
+    if getattr(arguments, "until_goal", False):
+        overrides.append(Override("mission.until_goal", True, "--until-goal"))
     for key, value in flags.items():
         if value is not None:
             flag = f"--{key.removesuffix('_s')} {short(str(value))}"

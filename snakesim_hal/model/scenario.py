@@ -63,13 +63,16 @@ class Mission(FileStruct, frozen=True, kw_only=True):
 
     speed_m_s: Annotated[float, Meta(ge=0, le=10, extra_json_schema={"unit": "m/s"})] = 0.2
     goal: HeadingGoal | WaypointGoal | None = None
+    until_goal: bool = False  # the run ends when the goal is reached, rather than with its time
     map: Literal["known", "perceived"] = "known"  # the scene's obstacles as from a survey, or only what sensors measure
     localisation: Literal["pose_sensor", "dead_reckoning"] = "pose_sensor"  # or joints, IMU and contacts, and the map
 
     def __post_init__(self) -> None:
-        """Dead reckoning is part of perception."""
+        """Dead reckoning is part of perception; only a goal can be reached."""
         if self.localisation == "dead_reckoning" and self.map == "known":
             raise ValueError('localisation = "dead_reckoning" needs map = "perceived"')
+        if self.until_goal and self.goal is None:
+            raise ValueError("this mission has no goal to reach; give it one in [mission.goal]")
 
 
 class Service(FileStruct, frozen=True, kw_only=True):

@@ -5,6 +5,7 @@ from snakesim_hal.model.scenario import RunConfig
 from snakesim_operator.results.record import RunRecord
 
 COMPLETE = "complete"
+AT_GOAL = "snakesim run, at the goal"  # who asks the host to finish a run that lasts until its goal
 UNKNOWN = "unknown: "  # how a sentence begins that says why nobody knows
 
 
@@ -34,6 +35,8 @@ def ended_early(host: HostRecord, config: RunConfig) -> str:
             return ""
         case "running":
             return f"the record ends {done}, and may lack the last second"
+        case "finished" if config.mission.until_goal and host.ended_why.endswith(AT_GOAL):
+            return ""
         case "stopped" | "finished":
             return f"the host was {host.ended} {host.ended_why} {done}"
         case _:

@@ -42,6 +42,7 @@ def add_commands(commands: Any) -> None:
         action="store_true",
         help="run in one process, without a network: lockstep, and faster; nothing can connect, arm or stop it",
     )
+    run.add_argument("--until-goal", action="store_true", help="end when the mission's goal is reached")
     run.add_argument("--no-record", action="store_true", help="keep no recording of the messages")
     run.add_argument(
         "--console",

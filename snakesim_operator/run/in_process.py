@@ -132,7 +132,7 @@ def _go(
                         recording.flush_when_due()
                     if progress is not None and host.authority.arming:  # before that there is nothing to wait for
                         progress.show(host.status(), control.newest(lambda _state: True), armed=True)
-                    if until_goal and watch.over(host.black_box):
+                    if (until_goal or config.mission.until_goal) and watch.over(host.black_box):
                         host.complete()
                 if ending.interrupted:
                     run.stop()

@@ -8,8 +8,9 @@ from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Session
 from snakesim_hal.service import START_LIMIT_S
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import ControlState, Description, LifecycleRequest, Status
+from snakesim_hal.wire.messages import ControlState, Description, LifecycleRequest, Status, Trajectory
 from snakesim_operator.recording.process import RECORDER
+from snakesim_operator.results.ended import AT_GOAL
 from snakesim_operator.run.ending import Ending
 from snakesim_operator.run.process_faults import ProcessFaults
 from snakesim_operator.run.processor_waits import ProcessorWaits
@@ -43,6 +44,7 @@ class RunMonitor:
         self._session, self._supervisor = session, supervisor
         self._ending, self._say, self._stay = ending, say, stay
         self._control = session.reader(keys.CONTROL_STATE, ControlState)
+        self._trajectory = session.reader(keys.TRAJECTORY, Trajectory) if config.mission.until_goal else None
         self._state: ControlState | None = None
         self._recorder_is_there = RECORDER not in supervisor.names
         self._recorder_due_s: float | None = None
@@ -70,6 +72,7 @@ class RunMonitor:
                     if self._ending.reason is not None and self._over_before_it_began():
                         break
                     self._arm_once()
+                    self._finish_at_goal()
                     if not self._armed and self._may_arm and time.monotonic() > give_up:
                         why = self._status.why if self._status else "no status"
                         self._ending.because(f"not ready to arm within {START_LIMIT_S:.0f} s: {why}")
@@ -148,6 +151,15 @@ class RunMonitor:
         if self._waits_for_recorder():
             return
         self._ask_to_arm(status, self._robot)
+
+    def _finish_at_goal(self) -> None:
+        """Ask once, when navigation says that the goal of a run that lasts until then is reached."""
+        host = self._supervisor.host
+        if self._trajectory is None or not self._armed or host is None:
+            return
+        if self._trajectory.newest(lambda trajectory: trajectory.finished) is not None:
+            host.ask(LifecycleRequest(action="finish", who=AT_GOAL))
+            self._trajectory = None
 
     def _waits_for_recorder(self) -> bool:
         """A recording has every tick, unless the recorder does not come."""

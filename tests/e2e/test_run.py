@@ -1,5 +1,6 @@
 """The main job, with real processes: it runs, it moves, and it repeats itself, however busy the machine is."""
 
+import json
 import multiprocessing
 import os
 import re
@@ -119,6 +120,15 @@ def test_other_paces_complete(tmp_path: Path, pace: str) -> None:
     if pace == "realtime" and not ended.code:
         assert summary.overruns or summary.real_time_factor == pytest.approx(1.0, abs=0.05)
         assert summary.state_to_command_us["p50"] is not None
+
+
+def test_a_run_in_processes_may_end_with_its_mission(tmp_path: Path) -> None:
+    short = ["--until-goal", "--set", "mission.goal.distance_m=0.4", "--duration", "8", "--pace", "lockstep"]
+    ended = snakesim("run", "surveyed_clutter", *short, "--out", "run", cwd=tmp_path, limit_s=120.0)
+    assert ended.code == 0, ended.out + ended.err
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["ended"] == "complete" and 1.0 < summary["duration_s"] < 7.0
+    assert "on request by snakesim run, at the goal" in (tmp_path / "run" / "host.json").read_text()
 
 
 def test_wrong_input_starts_nothing(tmp_path: Path) -> None:

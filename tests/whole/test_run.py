@@ -72,6 +72,19 @@ def test_run_from_a_file_of_ones_own_in_another_folder(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "report.html").is_file()
 
 
+def test_a_run_may_end_with_its_mission(tmp_path: Path) -> None:
+    short = ["--until-goal", "--set", "mission.goal.distance_m=0.4", "--duration", "6"]
+    ended, summary = run_to_summary(tmp_path / "run", "surveyed_clutter", *short)
+    assert ended.code == 0, ended.out + ended.err
+    assert summary.ended == "complete" and 1.0 < summary.duration_s < 5.0
+    assert "reached after" in ended.out
+
+
+def test_a_mission_without_a_goal_has_no_end(tmp_path: Path) -> None:
+    ended = snakesim("run", "triplet", "--until-goal", "--in-process", cwd=tmp_path)
+    assert ended.code == 2 and "until_goal" in ended.err and "this mission has no goal to reach" in ended.err
+
+
 def test_at_its_goal_the_snake_stands_still_whatever_it_touches() -> None:
     record = simulate(
         load("surveyed_clutter", [parse_set("mission.goal.distance_m=0.4"), parse_set("duration_s=6")]).config
