@@ -119,12 +119,12 @@ def test_a_run_that_jammed(record: RunRecord) -> None:
 def test_a_run_that_moved_and_then_jammed_is_called_jammed(record: RunRecord) -> None:
     stuck = [
         msgspec.structs.replace(state, jammed=True, reason="jammed: wedged")
-        if state.stamp_ns > (ARMED_S + 6.3) * 1e9
+        if state.stamp_ns > (ARMED_S + 6.09) * 1e9
         else state
         for state in record.control
     ]
     page = read(changed(record, control=stuck))
-    assert "Jammed at 6.3 s of 10.0 s: wedged. Moved 0.62 m along the path" in page.text
+    assert "Jammed at 6.1 s of 10.0 s: wedged. Moved 0.62 m along the path" in page.text
 
 
 def stopped_at(record: RunRecord, at_s: float, **state: Any) -> RunRecord:
