@@ -136,18 +136,27 @@ class GoalWatch:
         """Take the newest row. True from LASTING_S after the goal, and when it is stuck."""
         if self._goal is None or not black_box.ticks:
             return False
-        row = black_box.layout.arrays(black_box.rows_from(black_box.ticks - 1)[1])
-        pose = [row[name][-1] for name in ("position_w", "orientation_wxyz", "angle_rad")]
-        if not all(np.isfinite(one).all() for one in pose):
+        if not self._time_s:  # advance counts from the first pose
+            self._take(black_box, 0)
+        if not self._take(black_box, black_box.ticks - 1):
             return False
-        self._time_s.append(float(row["time_s"][-1]))
-        self._nodes.append(nodes_w(self._robot, *pose))
         advance = Advance.along(self._goal, self._robot, np.array(self._time_s), np.array(self._nodes))
         if advance.crossed_s is not None:
             return self._time_s[-1] > advance.crossed_s + LASTING_S
         since = int(np.argmax(advance.along_m > advance.along_m[-1] - GIVE_UP_M))
         self.gave_up = self._give_up_s is not None and self._time_s[-1] - self._time_s[since] >= self._give_up_s
         return self.gave_up
+
+    def _take(self, black_box: BlackBox, number: int) -> bool:
+        """Take the first row from that number on in which the pose is known; False when there is none."""
+        rows = black_box.layout.arrays(black_box.rows_from(number)[1])
+        poses = [rows[name] for name in ("position_w", "orientation_wxyz", "angle_rad")]
+        for i, pose in enumerate(zip(*poses, strict=True)):
+            if all(np.isfinite(one).all() for one in pose):
+                self._time_s.append(float(rows["time_s"][i]))
+                self._nodes.append(nodes_w(self._robot, *pose))
+                return True
+        return False
 
 
 def energy_j_per_m(record: RunRecord, advance: Advance) -> float | None:
