@@ -57,7 +57,7 @@ class Bench:
     def config(self) -> RunConfig:
         """The scenario with the backend, at the pace of the bench. Raises ConfigError."""
         backend = self._backend if isinstance(self._backend, str) else self.name
-        overrides = [Override("backend", backend, "--backend"), *map(parse_set, self._sets)]
+        overrides = [Override("backend", backend, "--snakesim-backend"), *map(parse_set, self._sets)]
         config = load(self._scenario, overrides).config
         # The tests' own controller is the only service.
         return msgspec.structs.replace(config, pace=self.pace_of(config), services={HOLDER: Service()})

@@ -1,6 +1,6 @@
 """The pytest plugin: options, fixtures and the table at the end. It does nothing until a contract test runs.
 
-Options of its own: --backend, --scenario, --set, --mute, --contract-table. A repository with several benches implements
+Options of its own: --snakesim-backend, -scenario, -set, -mute, -table. A repository with several benches implements
 `pytest_snakesim_benches` in a conftest.py and imports the tests; see docs/backends.md.
 """
 
@@ -32,7 +32,7 @@ class Hooks:
 
     @staticmethod
     def pytest_snakesim_benches(config: pytest.Config) -> "list[Bench] | None":  # pyright: ignore[reportReturnType]
-        """Benches that the contract tests below this folder run on, when no --backend is given."""
+        """Benches that the contract tests below this folder run on, when no --snakesim-backend is given."""
 
 
 def pytest_addhooks(pluginmanager: pytest.PytestPluginManager) -> None:
@@ -43,15 +43,19 @@ def pytest_addhooks(pluginmanager: pytest.PytestPluginManager) -> None:
 def pytest_addoption(parser: pytest.Parser) -> None:
     """The options."""
     group = parser.getgroup("snakesim", "contract tests of SnakeSIM backends (--pyargs snakesim_hal.conformance)")
-    group.addoption("--backend", metavar="NAME", help="backend to test: an installed one, or ./file.py:Class")
-    group.addoption("--scenario", metavar="FILE", help="scenario instead of the shipped bench; a name or a path")
-    group.addoption("--set", action="append", default=[], metavar="KEY=VALUE", help="change a value of the scenario")
+    group.addoption("--snakesim-backend", metavar="NAME", help="backend to test: an installed one, or ./file.py:Class")
     group.addoption(
-        "--mute",
+        "--snakesim-scenario", metavar="FILE", help="scenario instead of the shipped bench; a name or a path"
+    )
+    group.addoption(
+        "--snakesim-set", action="append", default=[], metavar="KEY=VALUE", help="change a value of the scenario"
+    )
+    group.addoption(
+        "--snakesim-mute",
         metavar="./FILE.py:FUNCTION",
         help="function(backend, joint) that silences a joint's module",
     )
-    group.addoption("--contract-table", metavar="FILE.md", help="write the table of tests and benches as Markdown")
+    group.addoption("--snakesim-table", metavar="FILE.md", help="write the table of tests and benches as Markdown")
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -71,7 +75,9 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if not benches:
         benches = _from_hook(metafunc)
     if not benches:
-        raise pytest.UsageError("contract tests need a backend: give --backend NAME or --backend ./file.py:Class")
+        raise pytest.UsageError(
+            "contract tests need a backend: give --snakesim-backend NAME or --snakesim-backend ./file.py:Class"
+        )
     metafunc.parametrize("bench", benches, ids=[bench.name for bench in benches], indirect=True, scope="session")
 
 
@@ -90,7 +96,7 @@ def _module_of(item: pytest.Item) -> str:
 
 
 _benches = pytest.StashKey["dict[str, Bench]"]()
-COMMAND_LINE = "--backend"
+COMMAND_LINE = "--snakesim-backend"
 
 
 def _from_hook(metafunc: pytest.Metafunc) -> "list[Bench]":
@@ -101,7 +107,7 @@ def _from_hook(metafunc: pytest.Metafunc) -> "list[Bench]":
 
 
 def _from_options(config: pytest.Config) -> "list[Bench]":
-    backend = config.getoption("--backend")
+    backend = config.getoption("--snakesim-backend")
     if not backend:
         return []
     known = config.stash[_benches]
@@ -110,13 +116,13 @@ def _from_options(config: pytest.Config) -> "list[Bench]":
         from snakesim_hal.errors import ConfigError
         from snakesim_hal.model.plugins import BACKENDS, find_plugin
 
-        sets: list[str] = config.getoption("--set") or []
+        sets: list[str] = config.getoption("--snakesim-set") or []
         try:
-            mute: Any = config.getoption("--mute")
+            mute: Any = config.getoption("--snakesim-mute")
             bench = Bench(
                 backend.rpartition(":")[2],
                 backend,
-                scenario=str(config.getoption("--scenario") or SCENARIO),
+                scenario=str(config.getoption("--snakesim-scenario") or SCENARIO),
                 sets=tuple(sets),
                 mute=find_plugin(BACKENDS, mute) if mute else None,
             )
@@ -243,7 +249,7 @@ class Outcomes:
             terminalreporter.write_line(line)
         for reason in reasons:
             terminalreporter.write_line(f"skipped: {reason}")
-        if path := config.getoption("--contract-table"):
+        if path := config.getoption("--snakesim-table"):
             Path(path).write_text(markdown(benches, lines, reasons))
             terminalreporter.write_line(f"written to {path}")
 

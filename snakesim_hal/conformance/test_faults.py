@@ -51,7 +51,7 @@ def test_a_silent_joint_grows_old_and_the_robot_stops(bench: Bench, rig: Rig) ->
     The others stay fresh. Faults that the backend reports besides have a word and a cause, and each is reported once.
     """
     if bench.mute is None:
-        pytest.skip("this bench cannot silence a joint; give --mute")
+        pytest.skip("this bench cannot silence a joint; give --snakesim-mute")
     rig.cruise()
     rig.spoiled = True
     began = rig.tick

@@ -217,21 +217,6 @@ def real_time() -> Iterator[Finding]:
     yield Finding(what="open files", state="warn" if few else "ok", detail=f"{soft}, at most {hard}", fix=fix)
 
 
-def shared_memory() -> Iterator[Finding]:
-    """Zenoh passes images by it."""
-    folder = Path("/dev/shm")
-    try:
-        free = shutil.disk_usage(folder).free
-    except OSError as error:
-        yield Finding(
-            what="shared memory", state="warn", detail=f"{folder}: {error.strerror}; images go through sockets"
-        )
-        return
-    little = free < 64 * MB
-    fix = ["sudo mount -o remount,size=512M /dev/shm    # of a container: --shm-size=512m"] if little else []
-    yield Finding(what="shared memory", state="warn" if little else "ok", detail=f"{free / MB:.0f} MB free", fix=fix)
-
-
 def disk() -> Iterator[Finding]:
     """Where runs are recorded: `runs/` here, or any `--out`."""
     here = Path.cwd()

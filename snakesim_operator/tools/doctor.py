@@ -18,7 +18,6 @@ CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
     computer.kvm,
     computer.clock,
     computer.real_time,
-    computer.shared_memory,
     computer.disk,
 )
 

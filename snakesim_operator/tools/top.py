@@ -17,7 +17,7 @@ from snakesim_operator.tools.traffic import KeyTraffic, Latency, Traffic
 
 PERIOD_S = 1.0
 ONCE_S = 2.0  # long enough for two samples of the slowest key that repeats itself
-HEAD = f"{'key':<30}{'writer':<18}{'Hz':>8}{'jitter':>9}{'max gap':>9}{'bytes':>9}{'age':>9}{'heard':>9}"
+HEAD = f"{'key':<29} {'writer':<17} {'Hz':>7} {'jitter':>9} {'max gap':>9} {'bytes':>8} {'age':>8} {'heard':>8}"
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ def _row(line: KeyTraffic) -> str:
     writer = line.writer or "STRANGER"
     failure = f"  {line.failure}" if line.failure else ""
     return (
-        f"{line.key[:29]:<30}{writer[:17]:<18}{number(line.rate_hz, '.1f', ''):>8}"
-        f"{number(line.jitter_ms, '.2f', ' ms'):>9}{number(line.gap_max_ms, '.1f', ' ms'):>9}{line.bytes:>9}"
-        f"{number(line.age_ms, '.0f', ' ms'):>9}{number(line.heard_ago_s, '.1f', ' s'):>9}{failure}"
+        f"{line.key[:29]:<29} {writer[:17]:<17} {number(line.rate_hz, '.1f', ''):>7} "
+        f"{number(line.jitter_ms, '.2f', ' ms'):>9} {number(line.gap_max_ms, '.1f', ' ms'):>9} {line.bytes:>8} "
+        f"{number(line.age_ms, '.0f', ' ms'):>8} {number(line.heard_ago_s, '.1f', ' s'):>8}{failure}"
     )

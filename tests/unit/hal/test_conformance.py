@@ -72,7 +72,14 @@ def test_a_backend_that_breaks_a_clause_fails_it(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_the_example_of_the_docs_passes_from_anywhere(tmp_path) -> None:
     (tmp_path / "workbench.py").write_text(text_of_the_example())
-    given = ["--backend", "./workbench.py:Workbench", "--mute", "./workbench.py:mute", "--contract-table", "table.md"]
+    given = [
+        "--snakesim-backend",
+        "./workbench.py:Workbench",
+        "--snakesim-mute",
+        "./workbench.py:mute",
+        "--snakesim-table",
+        "table.md",
+    ]
     ran = run_suite(*given, "-q", cwd=tmp_path)
     assert ran.returncode == 0, ran.stdout
     assert "skipped" not in ran.stdout
@@ -82,13 +89,13 @@ def test_the_example_of_the_docs_passes_from_anywhere(tmp_path) -> None:
 
 @pytest.mark.slow
 def test_a_backend_that_is_late_coarse_and_slow_to_wake_passes() -> None:
-    ran = run_suite("--backend", f"{BUS}:BusWorkbench", "--mute", f"{BUS}:mute", "-q")
+    ran = run_suite("--snakesim-backend", f"{BUS}:BusWorkbench", "--snakesim-mute", f"{BUS}:mute", "-q")
     assert ran.returncode == 0, ran.stdout
 
 
 @pytest.mark.slow
 def test_a_backend_that_keeps_real_time_only_passes() -> None:
-    ran = run_suite("--backend", f"{BUS}:RealTimeWorkbench", "--mute", f"{BUS}:mute", "-q")
+    ran = run_suite("--snakesim-backend", f"{BUS}:RealTimeWorkbench", "--snakesim-mute", f"{BUS}:mute", "-q")
     assert ran.returncode == 0, ran.stdout
     assert "is not exactly repeatable" in ran.stdout
 
@@ -96,13 +103,13 @@ def test_a_backend_that_keeps_real_time_only_passes() -> None:
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        pytest.param((), "give --backend", marks=pytest.mark.slow),
+        pytest.param((), "give --snakesim-backend", marks=pytest.mark.slow),
         pytest.param(
-            ("--backend", "nothing_of_that_name"),
+            ("--snakesim-backend", "nothing_of_that_name"),
             "no backend called 'nothing_of_that_name' is installed",
             marks=pytest.mark.slow,
         ),
-        (("--backend", "sim", "--set", "robot.limits.torque_nm=-1"), "robot.limits.torque_nm"),
+        (("--snakesim-backend", "sim", "--snakesim-set", "robot.limits.torque_nm=-1"), "robot.limits.torque_nm"),
     ],
 )
 def test_a_wrong_call_is_said_once(given, said) -> None:
@@ -110,6 +117,24 @@ def test_a_wrong_call_is_said_once(given, said) -> None:
     assert ran.returncode != 0
     assert said in ran.stdout + ran.stderr
     assert " failed" not in ran.stdout
+
+
+def test_a_project_beside_ours_may_have_options_of_the_usual_names(tmp_path: Path) -> None:
+    names = ["--backend", "--scenario", "--set", "--mute"]
+    (tmp_path / "conftest.py").write_text(
+        f"def pytest_addoption(parser):\n    for name in {names}:\n        parser.addoption(name)\n"
+    )
+    (tmp_path / "test_it.py").write_text(
+        "def test_it(pytestconfig):\n    assert pytestconfig.getoption('--backend') == 'x'\n"
+    )
+    ran = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--backend", "x"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ran.returncode == 0, ran.stdout + ran.stderr
 
 
 def test_the_plugin_loads_nothing_of_ours_until_it_is_used() -> None:

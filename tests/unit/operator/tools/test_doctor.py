@@ -22,7 +22,7 @@ def test_it_checks_everything_and_leaves_this_process_as_it_was(capsys: pytest.C
     assert not reported["ok"] and reported["findings"][-1]["state"] == "fail"
     for finding in reported["findings"]:
         assert finding["state"] in ("ok", "warn", "fail") and finding["detail"]
-        assert finding["state"] == "ok" or finding["fix"] or finding["what"] in ("KVM", "shared memory")
+        assert finding["state"] == "ok" or finding["fix"] or finding["what"] == "KVM"
     assert os.sched_getscheduler(0) == before
 
 
