@@ -28,6 +28,7 @@ CONFIG = "config.json"
 SUMMARY = "summary.json"
 REPORT = "report.html"
 GIVE = "give the folder that `snakesim run` left, such as runs/demo, or a recording"
+UNRECORDED = "without a recording, what control, navigation and guidance reported is unknown"
 
 DAMAGED = (*UNDECODABLE, OSError, MemoryError)
 Floats = NDArray[np.float64]
@@ -93,7 +94,7 @@ class RunRecord:
         if host.ended == "running":
             host = msgspec.structs.replace(host, ticks=len(columns["tick"]), command_digest=digest_of(columns))
         path = folder / RECORDING
-        contents = read_recording(path, SERVICE_STREAMS) if path.is_file() else Contents(path)
+        contents = read_recording(path, SERVICE_STREAMS) if path.is_file() else Contents(path, lacks=[UNRECORDED])
         return RunRecord._of(folder, config, description, host, contents, columns)
 
     @staticmethod

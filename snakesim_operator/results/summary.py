@@ -53,7 +53,9 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
         float | None, _number("m/s", "path distance (or displacement) over the time in which it is known")
     ]
     locomoting_fraction: Annotated[float | None, _number("1", "share of the time in state Locomoting")]
-    propulsion_joints: Annotated[list[str], Meta(description="in order of use")]
+    propulsion_joints: Annotated[
+        list[str] | None, Meta(description="one at a time, in order of use; null: control reported nothing")
+    ]
     jammed: Annotated[bool, Meta(description="whether the controller reported a jam at any time")]
     last_state: str | None
     last_reason: str | None
@@ -128,7 +130,7 @@ def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), h
         net_displacement_m=net_m,
         mean_speed_m_s=moved_m / known_s if moved_m is not None else None,
         locomoting_fraction=_locomoting_fraction(record),
-        propulsion_joints=propulsion_sequence(record),
+        propulsion_joints=propulsion_sequence(record) if record.control else None,
         jammed=any(state.jammed for state in record.control),
         last_state=last.state if last else None,
         last_reason=last.reason if last else None,

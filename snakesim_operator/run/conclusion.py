@@ -146,7 +146,7 @@ def _print_summary(summary: RunSummary) -> None:
         ("propulsion joints", _in_short(summary.propulsion_joints)),
         ("peak joint torque", number(summary.peak_joint_torque_nm, "N·m")),
         ("peak contact force", number(summary.peak_contact_force_n, "N", 1)),
-        ("last state", f"{summary.last_state or 'unknown'}: {summary.last_reason or ''}"),
+        ("last state", f"{summary.last_state}: {summary.last_reason}" if summary.last_state else "unknown"),
         ("command digest", digest_text(summary.command_digest, summary.own_arithmetic)),
     ]
     if summary.faults:
@@ -165,7 +165,9 @@ def _print_summary(summary: RunSummary) -> None:
         say(f"  {name:<22}{value}")
 
 
-def _in_short(joints: Sequence[str]) -> str:
+def _in_short(joints: Sequence[str] | None) -> str:
+    if joints is None:
+        return "unknown"
     if len(joints) <= JOINTS_SHOWN:
-        return " -> ".join(joints) or "none"
+        return " -> ".join(joints) or "no joint alone"
     return f"{' -> '.join(joints[:JOINTS_SHOWN])} -> ... ({len(joints)} hand-overs in all)"

@@ -26,7 +26,7 @@ def test_triplet_moves_forward_and_hands_over_backward(tmp_path: Path) -> None:
     ended, summary = run_to_summary(tmp_path / "run", "triplet", "--duration", "10", "--pace", "lockstep")
     assert ended.code == 0, ended.out + ended.err
     assert summary.path_distance_m is not None and summary.path_distance_m >= 0.5
-    joints = [int(name.removeprefix("joint_")) for name in summary.propulsion_joints]
+    joints = [int(name.removeprefix("joint_")) for name in summary.propulsion_joints or []]
     assert len(joints) >= 4 and joints == sorted(joints, reverse=True)
     assert summary.ticks == 1000 and summary.rejected_commands == {} and summary.faults == []
     assert summary.answered_fraction == 1.0

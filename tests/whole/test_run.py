@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from snakesim_hal.model.scenario import load, parse_set
+from snakesim_operator.results.record import UNRECORDED
 from snakesim_operator.results.report.playback import playback
 from snakesim_operator.run.in_process import simulate
 from tests.whole.command import run_to_summary, snakesim
@@ -78,6 +79,19 @@ def test_a_run_may_end_with_its_mission(tmp_path: Path) -> None:
     assert ended.code == 0, ended.out + ended.err
     assert summary.ended == "complete" and 1.0 < summary.duration_s < 5.0
     assert "reached after" in ended.out
+
+
+def test_what_was_not_recorded_is_unknown_and_not_none(tmp_path: Path) -> None:
+    short = ["triplet", "--in-process", "--duration", "1"]
+    told = snakesim("run", *short, "--out", "told", cwd=tmp_path)
+    untold = snakesim("run", *short, "--no-record", "--out", "untold", cwd=tmp_path)
+    assert told.code == untold.code == 0, untold.out + untold.err
+    said = {line.split("  ")[1]: line.split("  ")[-1].strip() for line in untold.out.splitlines() if line[:2] == "  "}
+    assert {said["locomoting"], said["propulsion joints"], said["last state"]} == {"unknown"}
+    assert said["not known"] == UNRECORDED
+    compared = snakesim("compare", "told", "untold", cwd=tmp_path)
+    assert "propulsion joints" in compared.out and "nothing that control reported in B was recorded" in compared.out
+    assert "with none" not in compared.out and UNRECORDED in compared.out + compared.err
 
 
 def test_a_mission_without_a_goal_has_no_end(tmp_path: Path) -> None:

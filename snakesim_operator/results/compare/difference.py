@@ -108,6 +108,7 @@ class HandOvers:
 
     a: list[HandOver]
     b: list[HandOver]
+    unknown: str = ""  # why they cannot be compared
 
     @property
     def agreed(self) -> int:
@@ -150,7 +151,8 @@ class Difference:
     @property
     def identical(self) -> bool:
         """Whether all that was measured, commanded and reported is the same for all of the common time."""
-        if not self.hand_overs.same_order or any(abs(later) > SAME_INSTANT_S for later in self.hand_overs.later_s):
+        both = self.hand_overs
+        if not both.unknown and (not both.same_order or any(abs(later) > SAME_INSTANT_S for later in both.later_s)):
             return False
         if self.advance is not None and abs(self.advance.difference_m) >= STOOD_M:
             return False
@@ -190,7 +192,7 @@ def differ(a: RunRecord, b: RunRecord, apart_rad: float = APART_RAD) -> Differen
         targets=targets,
         other_mode=float(1 - same_mode.mean()),
         tracking_rad=(_tracking_rad(on_a), _tracking_rad(on_b)),
-        hand_overs=HandOvers(_hand_overs(a, until_s), _hand_overs(b, until_s)),
+        hand_overs=HandOvers(_hand_overs(a, until_s), _hand_overs(b, until_s), _unreported(a, b)),
         apart_rad=apart_rad,
         parted=_parted(time_s, angle.difference, apart_rad),
     )
@@ -270,6 +272,11 @@ def _advance(a: RunRecord, b: RunRecord, at_s: float) -> Advance | None:
             ends = (float(np.interp(at_s, series.time_s, series.value)) for series in (of_a, of_b))
             return Advance(of_a.what, of_a, of_b, at_s, *ends)
     return None
+
+
+def _unreported(a: RunRecord, b: RunRecord) -> str:
+    silent = [run for run, record in (("A", a), ("B", b)) if not record.control]
+    return f"unknown, because nothing that control reported in {' and '.join(silent)} was recorded" if silent else ""
 
 
 def _hand_overs(record: RunRecord, until_s: float) -> list[HandOver]:

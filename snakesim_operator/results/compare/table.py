@@ -101,6 +101,8 @@ def _distance(difference: Difference) -> list[str]:
 
 def _hand_overs(difference: Difference) -> list[str]:
     both, names = difference.hand_overs, difference.joints
+    if both.unknown:
+        return [f"  {'propulsion joints':<{NAME}}{both.unknown}"]
     if not both.a and not both.b:
         return ["  no joint propelled in either"]
     lines = [_row("propulsion joints", f"{len(both.a)} in a row", f"{len(both.b)} in a row")]

@@ -58,7 +58,7 @@ def sentences(difference: Difference) -> list[str]:
             f"when {joint} is first more than {difference.apart_rad:g} rad apart."
         )
     hand_overs = difference.hand_overs
-    if hand_overs.a or hand_overs.b:
+    if hand_overs.a or hand_overs.b or hand_overs.unknown:
         said.append(f"{_capital(who_propelled(difference))}.")
     return said
 
@@ -102,6 +102,8 @@ def relation(advance: Advance) -> str:
 def who_propelled(difference: Difference) -> str:
     """Whether propulsion was handed over in the same order, and if not, from where on."""
     both, names = difference.hand_overs, difference.joints
+    if both.unknown:
+        return f"which joints propelled in both is {both.unknown}"
     if both.same_order:
         return f"propulsion is handed over in the same order, {len(both.a)} joints one after another"
     next_ones = [
