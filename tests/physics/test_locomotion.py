@@ -146,11 +146,11 @@ def test_other_noise_gives_the_same_picture(seed):
 # --- the controls: what must not move -------------------------------------------------------------------------
 
 
-def test_two_newtons_are_below_the_drag_and_said_to_be():
+def test_two_newtons_are_too_little_and_said_to_be():
     whole = run(configure("triplet", f"{TRIPLET}.propulsion_n=2"))
     assert abs(whole.moved_m) < 0.02
     assert whole.states[-1] == "NotLocomoting"
-    assert "below the drag" in whole.reasons[-1]
+    assert "too little against the friction" in whole.reasons[-1]
     assert not any(report.jammed for report in whole.reports)
 
 

@@ -42,20 +42,23 @@ class StallWatch:
 def explain(
     *,
     force_n: float,
-    contact_force_n: float,
+    contact_force_n: float | None,
     weight_n: float,
     saturated: str | None,
     swung: str | None,
     jam_force_n: float,
     drag_share: float,
 ) -> Stall:
-    """The cause of a stall: wedged between obstacles, motor saturated, held by friction, or too little push.
+    """The cause of a stall, as far as what is measured shows it.
 
-    force_n: propulsion from the speed alone. saturated, swung: name of the propulsion joint if it is at
-    its torque limit, or has swung out so far that the propulsion was reduced.
+    force_n: propulsion from the speed alone. contact_force_n: the strongest measured; 0 when nothing touches the body,
+    None when no sensor tells. saturated, swung: name of the propulsion joint if it is at its torque limit, or has swung
+    out so far that the propulsion was reduced.
     """
     pushing = f"standing still with {force_n:.1f} N of propulsion"
-    if contact_force_n > jam_force_n:
+    if contact_force_n == 0.0:
+        return Stall(False, f"{pushing}, and no obstacle touches the body, so there is nothing to push off")
+    if contact_force_n is not None and contact_force_n > jam_force_n:
         return Stall(True, f"jammed: {pushing} and a contact force of {contact_force_n:.0f} N")
     if saturated is not None:
         return Stall(True, f"jammed: {pushing} and {saturated} at its limit of torque")
@@ -64,4 +67,6 @@ def explain(
         return Stall(True, f"jammed: {pushing}, {share:.2f} of the weight; no sliding on the ground takes so much")
     if swung is not None:
         return Stall(True, f"jammed: {pushing}; {swung} swings out instead of moving the body")
-    return Stall(False, f"{pushing}: below the drag of the ground; raise propulsion_n")
+    return Stall(
+        False, f"{pushing}: too little against the friction of the ground, or what is in the way; raise propulsion_n"
+    )

@@ -108,6 +108,7 @@ class Stage:
             base_orientation_wxyz=quaternion_from_yaw(seen.heading_rad),
             base_confidence=1.0,
             contacts=contacts or [],
+            contacts_stamp_ns=None if contacts is None else stamp_of(tick - world_age_ticks),
             obstacles=self.pegs,
         )
         count = len(axes)

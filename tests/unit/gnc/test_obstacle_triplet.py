@@ -190,7 +190,7 @@ def test_too_little_propulsion_is_told_apart():
     stage = make_stage()
     report = stay(make_controller(stage, propulsion_n=2.0), stage, 150).report
     assert not report.jammed
-    assert "below the drag" in report.why
+    assert "too little against the friction" in report.why
     assert report.propulsion_joint is not None
 
 

@@ -48,7 +48,18 @@ def cause(**more):
 def test_too_little_push_is_no_jam():
     stall = cause(force_n=2.0)
     assert not stall.jammed
-    assert "below the drag" in stall.why
+    assert "too little against the friction" in stall.why
+
+
+@pytest.mark.parametrize("force_n", [8.0, 35.0, 300.0])
+def test_a_body_that_touches_nothing_is_not_jammed(force_n):
+    stall = cause(force_n=force_n, contact_force_n=0.0, weight_n=40.0)
+    assert not stall.jammed and "no obstacle touches the body" in stall.why
+
+
+def test_without_a_sensor_of_contacts_the_rest_still_tells():
+    assert cause(contact_force_n=None, weight_n=40.0).jammed
+    assert "too little" in cause(contact_force_n=None, force_n=8.0).why
 
 
 @pytest.mark.parametrize(
