@@ -8,6 +8,8 @@ from snakesim_hal.wire.messages import Description
 class Hold:
     """Keeps the pose."""
 
+    NEEDS = "joints"
+
     class Settings(FileStruct, frozen=True):
         """No settings."""
 

@@ -1,12 +1,17 @@
 """Everything that a configuration names is installed, and its settings are valid."""
 
+from typing import Any
+
 import msgspec
 
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.fault_plan import check_planned
 from snakesim_hal.model.files import Table
 from snakesim_hal.model.plugins import BACKENDS, CONTROLLERS, SERVICES, find_installed, find_plugin, plugin_settings
-from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.model.scenario import CONTROL, RunConfig
+
+GUIDANCE = "guidance"
+BY_POSE = {GUIDANCE, "navigation"}
 
 
 def check_plugins(config: RunConfig, table: Table | None = None, *, run_files: bool = True) -> RunConfig:
@@ -21,10 +26,26 @@ def check_plugins(config: RunConfig, table: Table | None = None, *, run_files: b
     if controller is not None:
         origin = table.origin if table is not None else None
         plugin_settings(controller, config.control_settings, source, config.control_section, origin)
+        config = _with_what_it_needs(config, controller)
     for service in config.own_services:
         find(SERVICES, service)
     check_planned(config, table)
     return check_backend(config, table, run_files=run_files)
+
+
+def _with_what_it_needs(config: RunConfig, controller: Any) -> RunConfig:
+    """Without a pose, and nobody else to tell it, a controller of joints runs without guidance and navigation."""
+    posed = config.robot.sensors.pose is not None or config.mission.localisation != "pose_sensor"
+    if posed or GUIDANCE not in config.own_services or not config.own_services.keys() <= {*BY_POSE, CONTROL}:
+        return config
+    if getattr(controller, "NEEDS", "world") == "joints":
+        left = {name: service for name, service in config.services.items() if name not in BY_POSE}
+        return msgspec.structs.replace(config, services=left)
+    raise ConfigError(
+        f"robot {config.robot.name!r} has no [sensors.pose], and without one guidance cannot tell controller "
+        f"{config.controller!r} where the body is. Add the sensor; or set mission.map=perceived and "
+        f"mission.localisation=dead_reckoning; or choose a controller that needs joints alone, such as hold"
+    )
 
 
 def check_backend(config: RunConfig, table: Table | None = None, *, run_files: bool = True) -> RunConfig:

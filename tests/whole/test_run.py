@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from snakesim_hal.model.files import SHIPPED
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_operator.results.record import UNRECORDED
 from snakesim_operator.results.report.playback import playback
@@ -92,6 +93,18 @@ def test_what_was_not_recorded_is_unknown_and_not_none(tmp_path: Path) -> None:
     compared = snakesim("compare", "told", "untold", cwd=tmp_path)
     assert "propulsion joints" in compared.out and "nothing that control reported in B was recorded" in compared.out
     assert "with none" not in compared.out and UNRECORDED in compared.out + compared.err
+
+
+def test_without_a_pose_sensor_a_controller_of_joints_runs_and_any_other_is_refused(tmp_path: Path) -> None:
+    robot = (SHIPPED / "robots" / "planar13.toml").read_text()
+    bare = "\n[".join(part for part in robot.split("\n[") if not part.startswith("sensors.pose]"))
+    (tmp_path / "bare.toml").write_text(bare)
+    short = ["triplet", "--in-process", "--duration", "1", "--set", "robot=./bare.toml"]
+    assert snakesim("run", *short, "--controller", "hold", "--out", "held", cwd=tmp_path).code == 0
+    refused = snakesim("run", *short, "--out", "refused", cwd=tmp_path)
+    assert refused.code == 2 and not (tmp_path / "refused").exists()
+    for named in ("[sensors.pose]", "obstacle_triplet", "mission.localisation=dead_reckoning", "hold"):
+        assert named in refused.err
 
 
 def test_a_mission_without_a_goal_has_no_end(tmp_path: Path) -> None:
