@@ -20,7 +20,7 @@ from typing import Any
 
 COMMON: Mapping[str, str] = {
     "BLAS": "2a293bd2",
-    "NumPy": "fe21ebdf",
+    "NumPy": "072d8a45",
     "C library": "e4139a39",
 }
 """What `measured` finds in the common arithmetic; `make golden` prints it."""
@@ -93,7 +93,7 @@ def _linear(numbers: list[float]) -> Iterable[Any]:
 
 
 def _elementwise(numbers: list[float]) -> Iterable[Any]:
-    """NumPy's own loops, of which it has several for each processor."""
+    """NumPy's own loops, of which it has several for each processor. Sorting that is stable, as ours is, has but one."""
     import numpy as np
 
     x, y = np.array(numbers), np.array(numbers[::-1])
@@ -118,7 +118,7 @@ def _elementwise(numbers: list[float]) -> Iterable[Any]:
         np.einsum("i,i", x, y),
     )
     yield from (np.abs(x + 1j * y), (x + 1j * y) * (y - 1j * x), np.angle(x + 1j * y), np.exp(1j * x))
-    yield from (np.argsort(np.round(x, 1)), np.sin(x.astype(np.float32)), np.exp(x.astype(np.float32)))
+    yield from (np.sin(x.astype(np.float32)), np.exp(x.astype(np.float32)))
 
 
 def _functions(numbers: list[float]) -> Iterable[Any]:
