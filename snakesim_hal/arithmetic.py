@@ -93,7 +93,7 @@ def _linear(numbers: list[float]) -> Iterable[Any]:
 
 
 def _elementwise(numbers: list[float]) -> Iterable[Any]:
-    """NumPy's own loops, of which it has several for each processor. Sorting that is stable, as ours is, has but one."""
+    """NumPy's own loops, of which it has several for each processor (but one for a stable sort, as ours is)."""
     import numpy as np
 
     x, y = np.array(numbers), np.array(numbers[::-1])
