@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from snakesim_hal.errors import ConfigError, NotConnectedError
 from snakesim_hal.network.foreign_network import open_foreign_network
-from snakesim_hal.network.session import open_session
+from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.terminal import say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
@@ -17,12 +17,12 @@ from snakesim_operator.ros2.graph import Node, NodeName
 from snakesim_operator.tools.targets import RobotSelection, only_robot
 
 MAX_IN_BYTES = 65536  # of a message from ROS; a Twist has 52
-DESCRIBED_S = 5.0
+STARTING_S = 60.0  # a robot may take so long to start
 
 
 def join(arguments: argparse.Namespace, where: RobotSelection) -> int:
     """Run the bridge until Ctrl-C. Raises ConfigError, NotConnectedError."""
-    link = only_robot(where, "ros2")
+    link = _started(where)
     if link.endpoint == arguments.ros_router:
         raise ConfigError(
             f"--ros-router {arguments.ros_router}: {link.namespace} itself is on this endpoint, and ROS nodes are not "
@@ -30,9 +30,9 @@ def join(arguments: argparse.Namespace, where: RobotSelection) -> int:
             "`snakesim run`; this command finds it there"
         )
     with open_session(replace(link, largest_bytes=MAX_IMAGE_BYTES)) as session:
-        robot = session.latest(keys.DESCRIPTION, Description, DESCRIBED_S, adds_up)
+        robot = session.latest(keys.DESCRIPTION, Description, STARTING_S, adds_up)
         if robot is None:
-            raise NotConnectedError(f"{link.namespace} does not describe itself within {DESCRIBED_S:g} s")
+            raise NotConnectedError(f"{link.namespace} does not describe itself within {STARTING_S:g} s")
         wall_time = not robot.emulated if arguments.stamps is None else arguments.stamps == "wall"
         options = Options(
             namespace=arguments.ros_namespace or "",
@@ -60,3 +60,18 @@ def join(arguments: argparse.Namespace, where: RobotSelection) -> int:
                 made.turn()
                 due_s = max(due_s + 1.0 / arguments.hz, time.monotonic())
                 time.sleep(max(0.0, due_s - time.monotonic()))
+
+
+def _started(where: RobotSelection) -> Link:
+    """The robot, also one that is starting just now."""
+    until_s, told = time.monotonic() + STARTING_S, False
+    while True:
+        try:
+            return only_robot(where, "ros2")
+        except NotConnectedError as error:
+            if time.monotonic() > until_s:
+                raise
+            if not told:
+                say(f"{error}. Waiting for it up to {STARTING_S:g} s")
+            told = True
+            time.sleep(0.5)

@@ -107,6 +107,17 @@ def test_a_robot_among_ros_nodes(tmp_path: Path) -> None:
             wait_until(lambda: not RosSide(session).tokens(), "the node gone from the ROS graph", 10.0)
 
 
+def test_the_bridge_waits_for_a_robot_that_is_starting(tmp_path: Path) -> None:
+    at, endpoint = free_endpoint(), free_endpoint()
+    (tmp_path / "ros.json5").write_text(ROUTER % at)
+    late = ("run", "triplet", "--pace", "lockstep", "--duration", "600", "--no-record", "--endpoint", endpoint)
+    bridge = ("ros2", "--endpoint", endpoint, "--ros-router", at)
+    with command(tmp_path, "router", "ros.json5"), session_at(at) as session, command(tmp_path, *bridge) as waiting:
+        assert waiting.stdout is not None and "Waiting for it up to 60 s" in waiting.stdout.readline()
+        with command(tmp_path, *late):
+            RosSide(session).first("joint_states", "sensor_msgs/msg/JointState")
+
+
 def _sees(ros: RosSide) -> None:
     described = ros.first("robot_description", "std_msgs/msg/String", latched=True)
     assert described.data.count("<joint") == 14
