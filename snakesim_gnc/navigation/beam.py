@@ -1,5 +1,8 @@
 """The search for a path ahead of the head: layers of short arcs, all expanded at once, the best few kept. Pure.
 
+A search is a generator, with the path as its return value. It yields what its next step costs, in nodes to expand,
+before it does it: so whoever drives it decides how much is done when, and the path does not depend on that.
+
 Each node knows what the whole body would touch with its head there: the last contacts as wrenches, and the integral of
 the drag's wrench, first along the measured body and then along the path. So every node has the propulsion margin of the
 body. Cost, per metre of path:
@@ -8,6 +11,7 @@ body. Cost, per metre of path:
       + weak max(0, 1 - F*/F_wanted) + bend |change of curvature| - progress along the goal's direction g
 """
 
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +20,7 @@ from numpy.typing import NDArray
 from snakesim_gnc.control.planar import wrenches
 from snakesim_gnc.navigation.line import back_from_end
 from snakesim_gnc.navigation.margin import margins_n
-from snakesim_gnc.navigation.obstacle_map import NONE, ObstacleMap
+from snakesim_gnc.navigation.obstacle_map import NONE, ROUGH_M, ObstacleMap
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -72,7 +76,8 @@ class Layer:
     touch_s: Floats  # (n, CONTACTS) arc length of the touch
     touch_gap: Floats
     push: Floats  # (n, CONTACTS, 3) wrench of a unit push
-    drag: Floats  # (n, arcs of a body, 3) wrench of the tangent over each arc, the newest last
+    drag: Floats  # (n, 3) wrench of the tangent, over the whole body
+    arc: Floats  # (n, 3) of that, over the arc that led here
     margin_n: Floats
     s_m: float
 
@@ -93,6 +98,9 @@ class PlannedPath:
     cost: float
 
 
+PathSearch = Generator[int, None, PlannedPath | None]  # nodes of each step; returns the path, or None: there is none
+
+
 class Beam:
     """Searches from a body's head towards a direction."""
 
@@ -107,35 +115,38 @@ class Beam:
         self._end = np.stack([chord * np.cos(half), chord * np.sin(half)])
         self._middle = np.stack([chord_mid * np.cos(0.5 * half), chord_mid * np.sin(0.5 * half)])
 
-    def ahead(self, body_w: Floats, goal_rad: float, steps: int) -> PlannedPath | None:
+    def ahead(self, body_w: Floats, goal_rad: float, steps: int) -> PathSearch:
         """The best path of a number of steps ahead of the head, or of as many as there is room for; None: none at all.
 
         body_w: (n, 2) the body's curve, tail to head.
         """
         self._aim(body_w[-1], goal_rad)
         self._corridor = None
-        return self._grow(self._lying(body_w), steps)
+        start = self._lying(body_w)
+        return (yield from self._grow(start, steps))
 
     def whole(
         self, body_w: Floats, goal_rad: float, steps: int, reach_m: float, failed_w: Floats | None = None
-    ) -> PlannedPath | None:
+    ) -> PathSearch:
         """The best path of the whole body, from the tail, and of a number of steps beyond: within reach of the body.
 
         failed_w: (k, 2) points of paths on which the body got stuck here; other ways round are preferred.
         """
         self._aim(body_w[-1], goal_rad)
         self._corridor, self._reach_m, self._failed = back_from_end(body_w, STEP_M, self._arcs), reach_m, failed_w
-        return self._grow(self._at_tail(), self._arcs + steps)
+        self._first_arcs = np.zeros((self._arcs, 3))
+        return (yield from self._grow(self._at_tail(), self._arcs + steps))
 
     def _aim(self, origin: Floats, goal_rad: float) -> None:
         self._origin = origin
         self._goal = np.array([np.cos(goal_rad), np.sin(goal_rad)])
         self._goal_rad = goal_rad
 
-    def _grow(self, start: Layer, steps: int) -> PlannedPath | None:
+    def _grow(self, start: Layer, steps: int) -> PathSearch:
         layers = [start]
         for _ in range(steps):
-            after = self._expand(layers[-1])
+            yield len(layers[-1].x)
+            after = self._expand(layers)
             if after is None:
                 break
             layers.append(after)
@@ -150,7 +161,8 @@ class Beam:
         tangents = chords / np.maximum(np.hypot(*chords.T), 1e-9)[:, None]
         middles = 0.5 * (at[1:] + at[:-1])
         node = self._blank(body_w[-1:], np.arctan2(*(body_w[-1:] - body_w[-2:-1]).T[::-1]))
-        node.drag = (STEP_M * wrenches(middles - self._origin, tangents))[None]
+        self._first_arcs = STEP_M * wrenches(middles - self._origin, tangents)
+        node.drag = self._first_arcs.sum(axis=0)[None]
         for k in range(self._arcs):
             self._touch(node, middles[None, k], tangents[None, k], -STEP_M * (self._arcs - k - 0.5))
         node.margin_n = self._margins(node)
@@ -178,7 +190,8 @@ class Beam:
             touch_s=np.full((count, CONTACTS), -np.inf),
             touch_gap=np.full((count, CONTACTS), np.inf),
             push=np.zeros((count, CONTACTS, 3)),
-            drag=np.zeros((count, self._arcs, 3)),
+            drag=np.zeros((count, 3)),
+            arc=np.zeros((count, 3)),
             margin_n=np.zeros(count),
             s_m=0.0,
         )
@@ -211,11 +224,20 @@ class Beam:
         tail_s = nodes.s_m - self._set.body_length_m + self._set.loose_tail_m
         alive = (nodes.touch_s >= tail_s) & (nodes.touch_s <= nodes.s_m - self._set.loose_head_m)
         contacts = np.where(alive[..., None], nodes.push, 0.0)
-        return margins_n(contacts, nodes.drag.sum(axis=1) / self._set.body_length_m)
+        return margins_n(contacts, nodes.drag / self._set.body_length_m)
 
-    def _expand(self, layer: Layer) -> Layer | None:
-        """All children that do not collide, thinned out, with their cost."""
-        config, count = self._set, len(self._bends)
+    def _left_behind(self, layers: Sequence[Layer], parents: Ints) -> Floats:
+        """Drag over the arc that the tail leaves when these nodes of the newest layer get children."""
+        if len(layers) <= self._arcs:
+            return self._first_arcs[len(layers) - 1]
+        rows = parents
+        for older in reversed(layers[len(layers) - self._arcs + 1 :]):
+            rows = older.parent[rows]
+        return layers[-self._arcs].arc[rows]
+
+    def _expand(self, layers: Sequence[Layer]) -> Layer | None:
+        """All children of the newest layer that do not collide, thinned out, with their cost."""
+        layer, config, count = layers[-1], self._set, len(self._bends)
         c, s = np.cos(layer.heading)[:, None], np.sin(layer.heading)[:, None]
         x0, y0 = layer.x[:, None], layer.y[:, None]
         xm, ym = x0 + c * self._middle[0] - s * self._middle[1], y0 + s * self._middle[0] + c * self._middle[1]
@@ -240,8 +262,9 @@ class Beam:
         rows = np.flatnonzero(free.ravel())
         if not len(rows):
             return None
-        rows = rows[_one_a_cell(x1.ravel()[rows], y1.ravel()[rows], heading.ravel()[rows], cost.ravel()[rows])]
-        rows = rows[np.argsort(cost.ravel()[rows], kind="stable")[: 3 * config.width]]
+        rows = rows[np.argsort(cost.ravel()[rows], kind="stable")]
+        cells = _cells(x1.ravel()[rows], y1.ravel()[rows], heading.ravel()[rows], CELL_M, CELL_RAD)
+        rows = rows[np.sort(np.unique(cells, return_index=True)[1])[: 3 * config.width]]  # the cheapest of each cell
         parents = rows // count
         nodes = layer.take(parents)
         nodes.parent = parents
@@ -255,9 +278,8 @@ class Beam:
         lying = lies is not None and nodes.s_m < config.body_length_m - 0.5 * STEP_M
         reward = config.grip if lying else config.reward
         nodes.cost += STEP_M * np.where(pushes > 0, -reward * pushes, -config.harm * pushes)
-        nodes.drag = np.concatenate(
-            [nodes.drag[:, 1:], STEP_M * wrenches(middle - self._origin, tangents)[:, None]], axis=1
-        )
+        nodes.arc = STEP_M * wrenches(middle - self._origin, tangents)
+        nodes.drag += nodes.arc - self._left_behind(layers, parents)
         nodes.margin_n = self._margins(nodes)
         if not lying:
             weak = np.clip(1.0 - nodes.margin_n / config.wanted_n, 0.0, 1.0)
@@ -269,11 +291,16 @@ class Beam:
 
     def _fits(self, x: Floats, y: Floats, heading: Floats) -> NDArray[np.bool_]:
         """Whether the body clears everything; x, y, heading: (n, curvatures)."""
-        near = self._map.near(x, y)
-        left = np.cos(heading) * near.normal_w[..., 1] - np.sin(heading) * near.normal_w[..., 0]
-        inner = left * np.sign(self._bends) < 0  # the obstacle is on the side towards which the path bends
-        cut = np.where(inner, self._set.segment_m**2 * np.abs(self._bends) / 8, 0.0)
-        return near.distance_m >= self._set.radius_m + self._set.clearance_m + cut
+        cuts, clear_m = self._set.segment_m**2 * np.abs(self._bends) / 8, self._set.radius_m + self._set.clearance_m
+        rough_m = self._map.roughly_m(x, y)
+        fits = rough_m >= clear_m + cuts + ROUGH_M
+        unsure = np.nonzero(~fits & (rough_m >= clear_m - ROUGH_M))
+        near = self._map.near(x[unsure], y[unsure])
+        at, curve = heading[unsure], unsure[1]
+        left = np.cos(at) * near.normal_w[:, 1] - np.sin(at) * near.normal_w[:, 0]
+        inner = left * np.sign(self._bends[curve]) < 0  # the obstacle is on the side towards which the path bends
+        fits[unsure] = near.distance_m >= clear_m + np.where(inner, cuts[curve], 0.0)
+        return fits
 
     def _trace(self, layers: list[Layer]) -> PlannedPath:
         row = int(np.argmin(layers[-1].cost))
@@ -287,14 +314,6 @@ class Beam:
             [(n.x[r], n.y[r], n.heading[r], n.bend[r], n.margin_n[r]) for n, r in picked]
         ).T
         return PlannedPath(np.stack([x, y], axis=-1), heading, bend[1:], margin, cost)
-
-
-def _one_a_cell(x: Floats, y: Floats, heading: Floats, cost: Floats) -> Ints:
-    """The cheapest of those in the same cell of place and heading."""
-    key = _cells(x, y, heading, CELL_M, CELL_RAD)
-    order = np.lexsort((cost, key))
-    first = np.concatenate(([True], np.diff(key[order]) != 0))
-    return order[first]
 
 
 def _cells(x: Floats, y: Floats, heading: Floats, size_m: float, size_rad: float) -> NDArray[np.int64]:

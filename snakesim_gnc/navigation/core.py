@@ -17,7 +17,7 @@ class KnownPath:
     """Follows one route at the speed that is wished for."""
 
     def __init__(self, route: Route, obstacles: Sequence[Obstacle]) -> None:
-        self._route = route
+        self.route = route
         self._path = [(float(x), float(y)) for x, y in route.points_w]
         found: list[tuple[float, str]] = []
         for obstacle in obstacles:
@@ -31,8 +31,8 @@ class KnownPath:
         """The trajectory from where the body was by this world model; its stamp is the world model's."""
         if world is not None:
             tail = np.array(world.base_position_w[:2])
-            self._tail_s_m = self._route.project(tail, self._tail_s_m)
-        finished = self._tail_s_m is not None and self._tail_s_m >= self._route.length_m
+            self._tail_s_m = self.route.project(tail, self._tail_s_m)
+        finished = self._tail_s_m is not None and self._tail_s_m >= self.route.length_m
         return Trajectory(
             tick=tick,
             stamp_ns=None if world is None else world.stamp_ns,

@@ -1,6 +1,6 @@
 """The obstacles around the body as arrays: the nearest one to each of many points, at once. Pure."""
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,8 +13,10 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 
 CELL_M = 0.01
+ROUGH_M = CELL_M * 0.5**0.5  # from a cell's centre to its corner
 REACH_M = 0.30  # beyond this distance from every surface a point counts as free
 NONE = -1
+STEP_OBSTACLES = 20
 
 
 @dataclass(frozen=True)
@@ -33,12 +35,23 @@ class ObstacleMap:
     """
 
     def __init__(self, obstacles: Sequence[Obstacle]) -> None:
+        for _ in self._marking(obstacles):
+            pass
+
+    @classmethod
+    def in_steps(cls, obstacles: Sequence[Obstacle]) -> "Generator[int, None, ObstacleMap]":
+        """The same, made step by step; yields how many obstacles a step takes in, before it does."""
+        made = cls.__new__(cls)
+        yield from made._marking(obstacles)
+        return made
+
+    def _marking(self, obstacles: Sequence[Obstacle]) -> Generator[int, None, None]:
         self.obstacles = list(obstacles)
         self.outlines = outlines = Outlines.of(self.obstacles)
         reach = outlines.reach_m + REACH_M
         if not len(outlines):
             self._low, self._shape = np.zeros(2), (1, 1)
-            self._nearest = np.full(1, NONE, dtype=np.intp)
+            self._nearest, self._least_m = np.full(1, NONE, dtype=np.intp), np.full(1, REACH_M)
             return
         self._low = (outlines.centre_w - reach[:, None]).min(axis=0)
         high = (outlines.centre_w + reach[:, None]).max(axis=0)
@@ -47,6 +60,8 @@ class ObstacleMap:
         nearest = np.full((nx, ny), NONE, dtype=np.intp)
         least = np.full((nx, ny), REACH_M)
         for i, (centre, around) in enumerate(zip(outlines.centre_w, reach, strict=True)):
+            if i % STEP_OBSTACLES == 0:
+                yield min(STEP_OBSTACLES, len(outlines) - i)
             first = np.maximum(((centre - around - self._low) / CELL_M).astype(int), 0)
             last = np.minimum(((centre + around - self._low) / CELL_M).astype(int) + 2, (nx, ny))
             x = self._low[0] + CELL_M * np.arange(first[0], last[0])
@@ -57,17 +72,27 @@ class ObstacleMap:
             nearer = distance < least[window]
             least[window][nearer] = distance[nearer]
             nearest[window][nearer] = i
-        self._nearest = nearest.ravel()
+        self._nearest, self._least_m = nearest.ravel(), least.ravel()
+
+    def roughly_m(self, x: Floats, y: Floats) -> Floats:
+        """Distance to the nearest surface at most ROUGH_M too great or small; REACH_M and more are free."""
+        inside, cell = self._cell(x, y)
+        return np.where(inside, self._least_m[cell], REACH_M)
 
     def near(self, x: Floats, y: Floats) -> NearestObstacles:
         """The nearest obstacle to points; x and y of one shape."""
         shape = np.shape(x)
-        cell_x = ((x - self._low[0]) / CELL_M + 0.5).astype(int)
-        cell_y = ((y - self._low[1]) / CELL_M + 0.5).astype(int)
-        inside = (cell_x >= 0) & (cell_y >= 0) & (cell_x < self._shape[0]) & (cell_y < self._shape[1])
-        found = np.where(inside, self._nearest[np.where(inside, cell_x * self._shape[1] + cell_y, 0)], NONE)
+        inside, cell = self._cell(x, y)
+        found = np.where(inside, self._nearest[cell], NONE)
         distance, normal = np.full(shape, REACH_M), np.zeros((*shape, 2))
         some = found >= 0
         if some.any():
             distance[some], normal[some] = self.outlines.towards(np.stack([x[some], y[some]], axis=-1), found[some])
         return NearestObstacles(found, distance, normal)
+
+    def _cell(self, x: Floats, y: Floats) -> tuple[NDArray[np.bool_], Ints]:
+        """Whether points are in the grid, and the index of their cell, 0 for the others."""
+        cell_x = ((x - self._low[0]) / CELL_M + 0.5).astype(int)
+        cell_y = ((y - self._low[1]) / CELL_M + 0.5).astype(int)
+        inside = (cell_x >= 0) & (cell_y >= 0) & (cell_x < self._shape[0]) & (cell_y < self._shape[1])
+        return inside, np.where(inside, cell_x * self._shape[1] + cell_y, 0)

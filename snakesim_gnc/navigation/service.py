@@ -9,6 +9,7 @@ from snakesim_gnc.navigation.core import KnownPath
 from snakesim_gnc.navigation.intents import Intents
 from snakesim_hal.model.route import Route
 from snakesim_hal.model.scenario import HeadingGoal, RunConfig, place_all, start_of
+from snakesim_hal.model.scenario import Service as Schedule
 from snakesim_hal.model.scene import route_of
 from snakesim_hal.network.client import Client
 from snakesim_hal.service import Service
@@ -22,7 +23,7 @@ class Navigation(Service):
     """Mission and intent to trajectory.
 
     Along the scene's route, or a straight line from where the snake starts. A mission with a goal, or an intent with a
-    heading, is for the planner, which finds a path of its own.
+    heading, is for the planner, which finds a path of its own, a little each turn: no turn waits for a plan.
     """
 
     name = "navigation"
@@ -46,8 +47,12 @@ class Navigation(Service):
         search = Search(
             body_length_m=self._body.length_m, radius_m=self._body.radius_m, segment_m=max(self._body.segments_m)
         )
+        turn = config.services.get(self.name, Schedule())
         self._planner = ClutterPlanner(
-            config.mission.goal or HeadingGoal(), known if config.mission.map == "known" else None, search=search
+            config.mission.goal or HeadingGoal(),
+            known if config.mission.map == "known" else None,
+            search=search,
+            turn_s=min(turn.every_ticks, turn.lag_ticks) / config.rate_hz,
         )
 
     def outputs(self, clock: Clock) -> list[tuple[str, Message]] | None:
@@ -57,11 +62,16 @@ class Navigation(Service):
         if joints is not None:
             self._recent.put(joints.stamp_ns, joints.angle_rad)
         if self._along is not None and desired.heading_w_rad is None:
-            return [(keys.TRAJECTORY, self._along.update(clock.tick, world, desired))]
+            trajectory = self._along.update(clock.tick, world, desired)
+            self._planner.follow(self._along.route, trajectory.push_points)
+            return [(keys.TRAJECTORY, trajectory)]
         if world is None or not self._recent:
             return None
         nodes = self._body.nodes_w(world, self._recent.at(pose_instant_ns(world)))
-        return [(keys.TRAJECTORY, self._planner.update(clock.tick, world, nodes.T, desired))]
+        trajectory = self._planner.update(clock.tick, world, nodes.T, desired)
+        if not self._planner.ready and clock.pace == "lockstep" and clock.arming == 0:
+            return None  # time stands until the robot is armed, and nobody arms it before there is a path
+        return [(keys.TRAJECTORY, trajectory)]
 
 
 def _along_route(config: RunConfig, known: list[Obstacle]) -> KnownPath:

@@ -75,16 +75,16 @@ def _least_of_obstacle(obstacle: NDArray[np.intp], gap: Floats) -> NDArray[np.bo
 
 def _solve(path: Floats, left: Floats, shift: Floats, weight: Floats, fit: Fit) -> Floats:
     """Least squares: third differences of the moved path, being moved at all, and the wanted shifts."""
-    count = len(path)
-    third = np.zeros((count - 3, count))
-    rows = np.arange(count - 3)
-    for k, value in enumerate((-1.0, 3.0, -3.0, 1.0)):
-        third[rows, rows + k] = value
+    count, factors = len(path), (-1.0, 3.0, -3.0, 1.0)
     stiff = (fit.smooth_m / SPACING_M) ** 6
     matrix = np.diag(1.0 + weight)
     right = weight * shift
+    rows = np.arange(count - 3)
     for axis in (0, 1):
-        bent = third * left[:, axis]
-        matrix += stiff * bent.T @ bent
-        right -= stiff * bent.T @ (third @ path[:, axis])
+        bent = [factor * left[k : count - 3 + k, axis] for k, factor in enumerate(factors)]  # of the moved path
+        third = sum(factor * path[k : count - 3 + k, axis] for k, factor in enumerate(factors))
+        for k, row in enumerate(bent):
+            right[k : count - 3 + k] -= stiff * row * third
+            for j, column in enumerate(bent):
+                matrix[rows + k, rows + j] += stiff * row * column
     return np.asarray(np.linalg.solve(matrix, right), dtype=np.float64)

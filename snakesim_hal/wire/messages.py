@@ -611,6 +611,10 @@ class Trajectory(Message, frozen=True, kw_only=True):
     ]
     finished: Annotated[bool, about("the end of the path is reached")]
     reason: Annotated[q.Reason, about("why the speed is not that of the mission; empty: it is")] = ""
+    searching: Annotated[
+        q.Reason, about("why another path is being searched, while this one is followed; empty: none is")
+    ] = ""
+    searched_nodes: Annotated[q.Count, about("work on that search in this turn, in nodes that were expanded")] = 0
 
 
 class ControlState(Message, frozen=True, kw_only=True):

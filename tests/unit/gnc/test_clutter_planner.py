@@ -1,16 +1,18 @@
 """The planner through clutter: what it plans is free, pushes, is the same again, and changes when it must."""
 
+import time
+
 import numpy as np
 import pytest
 
 from snakesim_gnc.control.body_on_path import chain_nodes
-from snakesim_gnc.navigation.beam import Beam, Search
-from snakesim_gnc.navigation.clutter import ClutterPlanner
+from snakesim_gnc.navigation.beam import Beam, PathSearch, PlannedPath, Search
+from snakesim_gnc.navigation.clutter import NODES_PER_S, ClutterPlanner
 from snakesim_gnc.navigation.intents import DesiredMotion
 from snakesim_gnc.navigation.obstacle_map import NONE, REACH_M, ObstacleMap
 from snakesim_hal.model.kinematics import quaternion_from_yaw
 from snakesim_hal.model.outlines import outline_distance_m
-from snakesim_hal.model.route import yaw_segments_m
+from snakesim_hal.model.route import Route, yaw_segments_m
 from snakesim_hal.model.scenario import HeadingGoal, RunConfig, WaypointGoal, load, parse_set, place_all, start_of
 from snakesim_hal.wire.messages import Obstacle, Trajectory, World
 
@@ -56,7 +58,22 @@ def planned(
     seen: list[Obstacle] | None = None,
     heading_rad: float | None = None,
 ) -> Trajectory:
-    return made.update(round(100 * at_s), world(at_s, seen or []), body, DesiredMotion(0.2, heading_w_rad=heading_rad))
+    """The trajectory of a turn and, without the body or time going on, of those until it is no longer searched."""
+    desired = DesiredMotion(0.2, heading_w_rad=heading_rad)
+    tick = round(100 * at_s)
+    found = made.update(tick, world(at_s, seen or []), body, desired)
+    while found.searching:
+        tick += 1
+        found = made.update(tick, world(at_s, seen or []), body, desired)
+    return found
+
+
+def path_of(search: PathSearch) -> PlannedPath | None:
+    while True:
+        try:
+            next(search)
+        except StopIteration as done:
+            return done.value
 
 
 def test_the_map_knows_the_nearest_obstacle_and_its_distance() -> None:
@@ -78,7 +95,7 @@ def test_the_map_knows_the_nearest_obstacle_and_its_distance() -> None:
 def test_a_path_runs_through_no_obstacle_and_its_body_can_push(density: float) -> None:
     config = field(density=density)
     body, made = body_of(config), ObstacleMap(obstacles_of(config))
-    found = Beam(made, SEARCH).ahead(body, 0.0, 60)
+    found = path_of(Beam(made, SEARCH).ahead(body, 0.0, 60))
     assert found is not None and len(found.points_w) == 61
     near = made.near(found.points_w[1:, 0], found.points_w[1:, 1])
     assert near.distance_m.min() >= SEARCH.radius_m + SEARCH.clearance_m
@@ -153,3 +170,81 @@ def test_a_heading_that_is_asked_for_counts_and_not_the_mission(heading_rad: flo
     assert np.arctan2(way[1], way[0]) == pytest.approx(reached, abs=0.45)  # as obstacles let it
     assert planned(made, moved, 0.4, heading_rad=heading_rad + 0.1).path_id == turned.path_id
     assert planned(made, moved, 0.6).finished  # the mission again
+
+
+def turns(made: ClutterPlanner, body: np.ndarray, count: int, heading_rad: float | None = None) -> list[Trajectory]:
+    """Turns of 0.2 s, in which the body stays where it is."""
+    desired = DesiredMotion(0.2, heading_w_rad=heading_rad)
+    return [made.update(20 * k, world(0.01 * k, []), body, desired) for k in range(count)]
+
+
+def test_no_turn_does_more_than_its_share_and_the_path_before_is_followed_until_the_plan_is_there() -> None:
+    config = field()
+    made, body = planner(obstacles_of(config)), body_of(config)
+    route = Route(np.concatenate([body, body[-1] + np.array([[1.0, 0.0], [5.0, 0.0]])]))
+    made.follow(route, ["peg"])
+    seen = turns(made, body, 6, heading_rad=0.7)
+    waiting = [one for one in seen if one.searching]
+    assert 1 <= len(waiting) <= 3
+    assert all(one.searched_nodes <= 0.2 * NODES_PER_S for one in seen)
+    for one in waiting:
+        assert one.searching == "the direction has changed"
+        assert one.searched_nodes > 0.1 * NODES_PER_S
+        assert (one.path_id, one.speed_m_s, one.push_points) == (0, 0.2, ["peg"])
+        assert np.array_equal(one.path_w, route.points_w)
+    after = seen[len(waiting) :]
+    assert {one.path_id for one in after} == {1} and after[1].searched_nodes == 0
+    begin = np.array(after[0].path_w)
+    ahead = route.position_w(route.length_m - 6.0 + np.arange(0.02, 0.1, 0.02))
+    assert max(np.hypot(*(begin - point).T).min() for point in ahead) < 0.01  # it begins with the path before
+
+
+def test_a_plan_is_the_same_in_however_many_slices() -> None:
+    config = field()
+    made = [
+        ClutterPlanner(HeadingGoal(), obstacles_of(config), search=SEARCH, turn_s=turn_s) for turn_s in (0.08, 0.2, 0.5)
+    ]
+    ends = [turns(one, body_of(config), 40)[-1] for one in made]
+    assert ends[0].path_id == 1 and ends[0].path_w == ends[1].path_w == ends[2].path_w
+
+
+def test_nothing_moves_before_the_first_path_is_there() -> None:
+    config = field()
+    made, body = planner(obstacles_of(config)), body_of(config)
+    first = turns(made, body, 1)[0]
+    assert not made.ready
+    assert (first.speed_m_s, first.searching) == (0.0, "the first path")
+    assert first.reason == "the first path: a path is being searched"
+    moving = turns(made, body, 30)[-1]
+    assert made.ready and (moving.speed_m_s, moving.searching, moving.reason) == (0.2, "", "")
+
+
+def test_a_tick_that_is_shown_again_is_one_turn() -> None:
+    config = field()
+    made, body, desired = planner(None), body_of(config), DesiredMotion(0.2)
+    assert planned(made, body).path_id == 1
+    obstacles = obstacles_of(config)
+    shown = [made.update(400, world(4.0, obstacles), body, desired) for _ in range(20)]
+    assert shown[0].searching == "the map has changed" and shown[-1] == shown[0]
+
+
+@pytest.mark.parametrize("turn_s", [0.02, 0.2])
+@pytest.mark.parametrize("seen", [True, False])
+def test_the_work_of_a_turn_is_bounded_whatever_is_planned(turn_s: float, seen: bool) -> None:
+    """Counted, and in CPU time: five times what the rate allows, so that a slow computer passes."""
+    config = field(density=12.0)
+    obstacles, body = obstacles_of(config), body_of(config)
+    made = ClutterPlanner(HeadingGoal(), None if seen else obstacles, search=SEARCH, turn_s=turn_s)
+    done, paths, took_s = [], set(), []
+    for k in range(round(12.0 / turn_s)):  # it stands: stuck paths, backing out, and a turn to the left
+        desired = DesiredMotion(0.2, heading_w_rad=None if k * turn_s < 8.0 else 0.7)
+        began = time.thread_time()
+        found = made.update(k, world(k * turn_s, obstacles), body, desired)
+        took_s.append(time.thread_time() - began)
+        done.append(found.searched_nodes)
+        paths.add(found.path_id)
+    assert len(paths) > 3
+    largest_step = 8000  # the fit of the longest path
+    assert max(done) <= max(NODES_PER_S * turn_s, largest_step)
+    assert all(sum(done[: k + 1]) <= NODES_PER_S * turn_s * (k + 1) for k in range(len(done)))
+    assert max(took_s) < 5 * max(turn_s, largest_step / NODES_PER_S)
