@@ -14,10 +14,10 @@ from snakesim_gnc.control.state_reports import StateReports
 from snakesim_hal.errors import ControllerError
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.client import Client, Commander
-from snakesim_hal.service import Service
+from snakesim_hal.service import SILENCE_S, Service
 from snakesim_hal.terminal import print_stderr
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Clock, ControlState, Description, JointState, Message, Trajectory, World
+from snakesim_hal.wire.messages import Clock, ControlState, Description, JointState, Message, Status, Trajectory, World
 
 
 class Control(Service):
@@ -34,6 +34,7 @@ class Control(Service):
         self._joints = client.subscribe(keys.JOINTS, JointState)
         self._world = client.subscribe(keys.WORLD, World)
         self._trajectory = client.subscribe(keys.TRAJECTORY, Trajectory)
+        self._statuses = client.session.reader(keys.STATUS, Status)
         self._arming = -1
         self._armed_at_ns = 0
         self._noted: set[str] = set()  # streams that are too old, as the log has it
@@ -50,6 +51,7 @@ class Control(Service):
     def outputs(self, clock: Clock) -> list[tuple[str, Message]] | None:
         """Command the robot: while armed by the controller, otherwise to hold its pose."""
         self._last_clock = clock
+        self._statuses.drain()  # those found in a silence have come after the last clock
         if self._settings.turn(clock):
             self._controller = None
         joints = self._client.read(self._joints)
@@ -78,10 +80,17 @@ class Control(Service):
             self._controller = None
 
     def silence(self) -> list[tuple[str, Message]]:
-        """The HAL is gone, or delayed by a slow computer: PowerOff. The next tick decides about the controller."""
-        if self._last_clock is None:
+        """Time stands, or the HAL is silent altogether: PowerOff. The next tick decides about the controller."""
+        clock = self._last_clock
+        if clock is None:
             return []
-        return _state_messages(self._reports.state(self._last_clock, answers=False))
+        statuses = self._statuses.drain()
+        if not statuses:
+            silent = f"neither clock nor status from the HAL for {SILENCE_S:g} s, after tick {clock.tick}"
+            return _state_messages(self._reports.state(clock, silent=silent))
+        stands = statuses[-1].held_up or f"no tick for {SILENCE_S:g} s, after tick {clock.tick}"
+        armed = statuses[-1].lifecycle == "armed"
+        return _state_messages(self._reports.state(clock, armed=armed, stands=f"time stands: {stands}"))
 
     def _act(self, clock: Clock, joints: JointState) -> list[tuple[str, Message]]:
         """Call the controller, with world and trajectory as far as they are fresh."""

@@ -32,20 +32,23 @@ class StateReports:
         clock: Clock,
         report: Report | None = None,
         *,
-        answers: bool = True,
+        silent: str = "",
+        stands: str = "",
         armed: bool = False,
         missing: str = "",
         rests: str = "",
     ) -> ControlState | None:
         """The message, or None when nothing has changed and the last one is recent. See `locomotion_state`.
 
+        silent, stands: why no clock comes; then the message is always due, for its stamp does not age.
+
         Raises ValueError when the report contains an invalid value.
         """
         report = report or Report()
         state, reason = locomotion_state(
-            hal_answers=answers,
+            silent=silent,
             armed=armed,
-            missing=missing,
+            missing=missing or stands,
             rests=rests,
             usable_push_points=report.usable_push_points,
             obstacle=report.why,
@@ -53,7 +56,7 @@ class StateReports:
             advanced_m=self._advance.metres,
         )
         mark = (state, bool(missing), rests, report.propulsion_joint, report.jammed, clock.lifecycle, clock.arming)
-        if mark == self._last and clock.stamp_ns < self._next_ns:
+        if not (silent or stands) and mark == self._last and clock.stamp_ns < self._next_ns:
             return None
         self._last, self._next_ns = mark, clock.stamp_ns + round(TELEMETRY_S * 1e9)
         return self._message(clock, state, reason, report)

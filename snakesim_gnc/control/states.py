@@ -8,7 +8,7 @@ PUSH_POINTS_NEEDED = 3
 
 def locomotion_state(
     *,
-    hal_answers: bool = True,
+    silent: str = "",
     armed: bool = True,
     missing: str = "",
     rests: str = "",
@@ -19,14 +19,15 @@ def locomotion_state(
 ) -> tuple[LocomotionState, str]:
     """The state, and its reason as text. Locomoting means intended and measured motion.
 
-    missing: inputs that control lacks, such as a fresh pose. rests: why no motion is intended.
+    silent: how the HAL says nothing at all any more. missing: inputs that control lacks, such as a fresh pose.
+    rests: why no motion is intended.
     usable_push_points: None for a controller that does not push off obstacles.
     obstacle: what prevents motion according to the controller (no feasible triplet, a jam), else empty.
     still: why it stands, if it should turn out to stand, though nothing prevents motion for certain; else empty.
     advanced_m: displacement of the body within the last second; None when it is not measured.
     """
-    if not hal_answers:
-        return "PowerOff", "no clock from the HAL: no backend, or it is without power"
+    if silent:
+        return "PowerOff", silent
     if not armed:
         return "Idle", f"the robot is not armed; {missing}" if missing else "the robot is not armed"
     if missing:

@@ -59,6 +59,7 @@ Ending = Literal["running", "complete", "finished", "stopped", "failed", "reset"
 STATUS_PERIOD_NS = 200_000_000
 STANDBY_PERIOD_NS = 20_000_000
 STANDING_PERIOD_NS = 50_000_000  # between signs of life while a simulator is paused
+HELD_UP_NS = 500_000_000  # that a tick has waited for answers until the status says so
 STATUS_GAP_NS = 10_000_000  # between status messages for frequent changes, such as a contested lease
 TAKEN_SHARE = 0.25  # of a period, for late arrivals: a flood must not take all of it
 MAX_REQUESTS_KEPT = 256
@@ -120,6 +121,7 @@ class Host:
         self._deadlines = Deadlines(config.period_ns)
         self._published = PublishTimes()
         self._published_arming = 0
+        self._waiting_since_ns: int | None = None  # for the services' answers that end this tick
         self._newest: dict[str, int] = {}
         self._last_armed_tick = 0
         self._other_hosts: set[str] = set()
@@ -345,7 +347,8 @@ class Host:
         self._inbox.take_all(inf if self._pace == "lockstep" else TAKEN_SHARE * self._period_ns)
 
     def _wait_for_participants(self, samples: Samples) -> None:
-        give_up_ns = time.monotonic_ns() + round(self._config.stall_limit_s * 1e9)
+        self._waiting_since_ns = time.monotonic_ns()
+        give_up_ns = self._waiting_since_ns + round(self._config.stall_limit_s * 1e9)
         while (behind := self.participants.behind(self._tick)) and not self._stopping:
             left_ns = give_up_ns - time.monotonic_ns()
             if self._published_arming != self.authority.arming:  # armed in this tick: publish it
@@ -359,6 +362,7 @@ class Host:
                 self.participants[name].given_up = True
                 cause = f"{name} is {self._config.stall_limit_s:g} s late with tick {self._tick}; no longer waited for"
                 self.authority.note(Fault(tick=self._tick, what="service_stalled", cause=cause))
+        self._waiting_since_ns = None
 
     # --- inputs --------------------------------------------------------------------------------------------
 
@@ -503,7 +507,15 @@ class Host:
             overruns=self.statistics.overruns,
             realtime_warnings=self._realtime_warnings,
             injected=self.faults.on,
+            held_up=self._held_up(),
         )
+
+    def _held_up(self) -> str:
+        """What lockstep has been waiting for, if for longer than HELD_UP_NS."""
+        waited_ns = 0 if self._waiting_since_ns is None else time.monotonic_ns() - self._waiting_since_ns
+        if waited_ns < HELD_UP_NS:
+            return ""
+        return f"tick {self._tick} waits for {self.participants.awaited(self._tick)}, for {waited_ns * 1e-9:.1f} s"
 
     def _show_status(self, *, force: bool = False) -> None:
         """Publish the status: at once when the lifecycle changed, else a few times a second."""

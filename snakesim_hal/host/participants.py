@@ -30,6 +30,12 @@ class Participants(dict[str, Participant]):
         """Services for which the end of `tick` has to wait."""
         return [name for name, participant in self.items() if participant.behind(tick)]
 
+    def awaited(self, tick: int) -> str:
+        """Whose answer to which tick the end of `tick` has to wait for, as text."""
+        return ", ".join(
+            f"{name}'s answer to tick {self[name].service.counting_at(tick + 1)}" for name in self.behind(tick)
+        )
+
     def missing(self, *, must_have_answered: bool) -> list[str]:
         """Services that are not connected, or on request those that have not answered any tick yet."""
         return [n for n, p in self.items() if not p.present or (must_have_answered and p.done_tick < 0)]

@@ -32,6 +32,7 @@ def status_message(
     overruns: int,
     realtime_warnings: list[str],
     injected: list[str],
+    held_up: str,
 ) -> Status:
     """The status of the robot. missing: the services that arming waits for; differing: how others are set up."""
     description = authority.description
@@ -68,4 +69,5 @@ def status_message(
         paused_by=time.paused_by if time.stands else None,
         speed=time.speed,
         real_time_factor=time.factor,
+        held_up=held_up[:500],
     )

@@ -430,6 +430,9 @@ class Status(Message, frozen=True, kw_only=True):
         Annotated[float, q.from_zero(1e6, "1")] | None,
         about("robot time per wall time over the last second; null: not measured, such as in a pause"),
     ] = None
+    held_up: Annotated[
+        q.Reason, about("which answer to which tick lockstep has been waiting for, if longer than half a second")
+    ] = ""
 
 
 class LeaseRequest(Message, frozen=True, kw_only=True):

@@ -1,6 +1,7 @@
 """`snakesim teleop` in a pseudo-terminal, with a run: keys move the robot, and whoever loses the operator stops."""
 
 import contextlib
+import itertools
 import math
 import os
 import pty
@@ -14,9 +15,10 @@ from pathlib import Path
 
 import pytest
 
+from snakesim_gnc.navigation.clutter import NODES_PER_S
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Intent, Status, Trajectory
+from snakesim_hal.wire.messages import ControlState, Intent, Status, Trajectory
 from tests.e2e.command import SNAKESIM, Running, environment, running, wait_until
 
 pytestmark = pytest.mark.e2e
@@ -52,7 +54,11 @@ class Terminal:
         os.write(self.ours, data)
 
     def shows(self, words: str) -> None:
-        wait_until(lambda: words in self._said.decode(errors="replace"), f"{words!r} in the terminal")
+        wait_until(lambda: words in self.said, f"{words!r} in the terminal")
+
+    @property
+    def said(self) -> str:
+        return self._said.decode(errors="replace")
 
     @property
     def given_back(self) -> bool:
@@ -124,3 +130,70 @@ def test_keys_move_it_and_a_lost_operator_stops_it(tmp_path: Path) -> None:
                 wait_until(lambda: lifecycle(session) == "estop", "the emergency stop", 5.0)
                 stops.process.send_signal(signal.SIGTERM)
                 assert stops.process.wait(10) == 0 and stops.given_back
+
+
+@contextlib.contextmanager
+def busy_computer(hogs: int = 12) -> Iterator[None]:
+    """Processes that want every core for themselves."""
+    started = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(hogs)]
+    try:
+        yield
+    finally:
+        for hog in started:
+            hog.kill()
+            hog.wait(10)
+
+
+def test_a_first_turn_keeps_nobody_waiting_on_a_busy_computer(tmp_path: Path) -> None:
+    """Up, up, left: navigation answers each turn with a bounded share of the search, and the old path in between."""
+    with running(tmp_path / "run", "peg_row", "--duration", "60", "--set", "stall_limit_s=10") as run:
+        run.wait_for("Locomoting")
+        seen: list[Trajectory] = []
+        with open_session(Link(run.endpoint, "planar13")) as session:
+            trajectories = session.reader(keys.TRAJECTORY, Trajectory)
+            with at_the_keyboard(run, tmp_path) as operator, busy_computer():
+                operator.type(2 * UP)
+                operator.shows("asked: +0.10 m/s")
+                operator.type(LEFT)
+
+                def turned() -> bool:
+                    seen.extend(trajectories.drain())
+                    return any(one.path_id > 0 for one in seen)
+
+                wait_until(turned, "navigation to have found a path in the new direction")
+            status = session.latest(keys.STATUS, Status, 5.0)
+        assert status is not None and [fault.what for fault in status.faults] == []
+    before = [one for one in seen if one.searching == "the direction has changed"]
+    assert before and {one.path_id for one in before} == {0}
+    assert {later.tick - one.tick for one, later in itertools.pairwise(seen)} == {20}
+    assert max(one.searched_nodes for one in seen) <= 0.2 * NODES_PER_S
+
+
+def test_an_operator_is_told_what_a_clock_that_stands_waits_for(tmp_path: Path) -> None:
+    """By the robot's own account; it has not gone."""
+    why = " waits for navigation's answer to tick "
+    with running(tmp_path / "run", "peg_row", "--duration", "300", "--set", "stall_limit_s=60") as run:
+        run.wait_for("Locomoting")
+        with open_session(Link(run.endpoint, "planar13")) as session, at_the_keyboard(run, tmp_path) as operator:
+            operator.type(UP)
+            operator.shows("asked: +0.05 m/s")
+            states, found = session.reader(keys.CONTROL_STATE, ControlState), list[ControlState]()
+            os.kill(run.part("navigation"), signal.SIGSTOP)
+            operator.shows(why)
+
+            def told() -> bool:
+                found.extend(states.drain())
+                return any(one.state == "NotLocomoting" and why in one.reason for one in found)
+
+            wait_until(told, "control to say so, too")
+            assert "PowerOff" not in {one.state for one in found}
+
+
+def test_an_operator_is_told_that_the_robot_says_nothing_any_more(tmp_path: Path) -> None:
+    with running(tmp_path / "run", "peg_row", "--duration", "300") as run:
+        run.wait_for("Locomoting")
+        with at_the_keyboard(run, tmp_path) as operator:
+            operator.shows("armed: ")
+            os.kill(run.part("host"), signal.SIGSTOP)
+            operator.shows("the robot has given no clock for ")
+            operator.shows("s ago)")

@@ -74,7 +74,9 @@ class Teleop:
         self._clock_s = time.monotonic()
         self._sent_ns = -1
         self._status: Status | None = None
+        self._status_s = 0.0
         self._control: ControlState | None = None
+        self._control_s = 0.0
         self._body_w_rad: float | None = None
         self._other = ""
         self._ending = ""  # why it ends
@@ -148,8 +150,10 @@ class Teleop:
     def _read_robot(self) -> None:
         if clocks := self._clocks.drain():
             self._clock, self._clock_s = clocks[-1], time.monotonic()
-        self._status = (self._statuses.drain() or [self._status])[-1]
-        self._control = (self._states.drain() or [self._control])[-1]
+        if statuses := self._statuses.drain():
+            self._status, self._status_s = statuses[-1], time.monotonic()
+        if states := self._states.drain():
+            self._control, self._control_s = states[-1], time.monotonic()
         for world in self._worlds.drain()[-1:]:
             self._body_w_rad = yaw_of(rotation_from_quaternion(world.base_orientation_wxyz))
         for intent in self._others.drain():
@@ -168,10 +172,14 @@ class Teleop:
 
     def _screen_lines(self) -> list[str]:
         status, control, steering = self._status, self._control, self._steering
-        robot = "no status yet" if status is None else f"{status.lifecycle}: {status.why}"
+        robot = "no status yet" if status is None else f"{status.lifecycle}: {status.why}{_heard(self._status_s)}"
         backend = "" if status is None else f" ({status.backend})"
         lines = [f"{self._link.namespace}{backend}: {robot}"]
-        lines.append("control: nothing heard" if control is None else f"control: {control.state}: {control.reason}")
+        lines.append(
+            "control: nothing heard"
+            if control is None
+            else f"control: {control.state}: {control.reason}{_heard(self._control_s)}"
+        )
         towards = "the mission's way" if steering.heading_w_rad is None else _degrees(steering.heading_w_rad)
         body = "unknown" if self._body_w_rad is None else _degrees(self._body_w_rad)
         asked = f"asked: {steering.speed_m_s:+.2f} m/s, {towards}; body: {body}"
@@ -179,12 +187,19 @@ class Teleop:
         if self._stopped:
             asked = f"EMERGENCY STOP: {'; '.join(self._stopping) or 'sent'}. Then: snakesim clear, snakesim arm"
         elif silent_s > SILENT_S:
-            asked = f"the robot's clock is silent for {silent_s:.0f} s: nothing can be asked for"
+            held_up = "" if status is None or _heard(self._status_s) else status.held_up
+            asked = f"{held_up or f'the robot has given no clock for {silent_s:.0f} s'}: nothing can be asked for"
         elif steering.touched_s is None:
             asked = "nothing asked for yet: the mission goes on"
         elif self._stick is None and time.monotonic() - steering.touched_s > KEY_AGE_S:
             asked = f"no key for {KEY_AGE_S:.0f} s: stopped; press one to go on"
         return [*lines, asked, f"also steering: {self._other}" if self._other else "", HELP]
+
+
+def _heard(at_s: float) -> str:
+    """How old what was heard is, if it is old."""
+    age_s = time.monotonic() - at_s
+    return f" (heard {age_s:.0f} s ago)" if age_s > SILENT_S else ""
 
 
 def _degrees(angle_rad: float) -> str:

@@ -26,7 +26,7 @@ READY = {"usable_push_points": 3, "advanced_m": 0.1}
         ({"rests": "speed zero"}, "Idle", "no motion intended: speed zero"),
         ({"armed": False}, "Idle", "the robot is not armed"),
         ({"armed": False, "missing": "sensor/joints is old"}, "Idle", "not armed; sensor/joints is old"),
-        ({"hal_answers": False}, "PowerOff", "no clock"),
+        ({"silent": "no clock from the HAL for 1 s"}, "PowerOff", "no clock from the HAL for 1 s"),
     ],
 )
 def test_state_and_reason(change, state, word):
