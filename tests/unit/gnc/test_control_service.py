@@ -15,7 +15,7 @@ from tests.unit.gnc.services import Stage, stage
 from tests.unit.hal.local_network import wait_until
 
 PERIOD_NS = 20_000_000
-SEEN = 10  # views in a row
+SEEN = 3  # views in a row
 
 
 @pytest.fixture(autouse=True)
@@ -76,18 +76,21 @@ def test_a_command_names_the_joint_state_that_it_answers(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
-    ("key", "what", "words"),
+    ("sender", "key", "what", "words"),
     [
-        (keys.POSE, "world", "sensor/pose is 0."),
-        (keys.WORLD, "world", "guidance/world is 0."),
-        (keys.TRAJECTORY, "trajectory", "navigation/trajectory is 0."),
+        ("hal", keys.POSE, "world", "sensor/pose is "),
+        ("guidance", keys.WORLD, "world", "guidance/world is "),
+        ("navigation", keys.TRAJECTORY, "trajectory", "navigation/trajectory is "),
     ],
 )
-def test_a_stream_that_stops_is_withheld_named_and_given_again(tmp_path: Path, key: str, what: str, words: str) -> None:
+def test_a_stream_that_stops_is_withheld_named_and_given_again(
+    tmp_path: Path, sender: str, key: str, what: str, words: str
+) -> None:
     limits = {"pose_s": 0.3, "world_s": 0.2, "trajectory_s": 0.5}
-    with stage(tmp_path, faults=[f"drop:{key}@0.5-2"], max_age=limits) as made:
+    with stage(tmp_path, max_age=limits) as made:
         made.run.arm()
         wait_until(lambda: sighted(made), "views with everything in them")
+        assert made.run.ask(keys.fault(sender), FaultRequest(kind="drop", target=key)).ok
         wait_until(lambda: blind(made, what), f"views without a {what}")
         reported = made.tells(words)
         assert (
@@ -95,6 +98,7 @@ def test_a_stream_that_stops_is_withheld_named_and_given_again(tmp_path: Path, k
             and f"at most {limits[key.partition('/')[2] + '_s']:.3g} s" in reported.reason
         )
         since = len(made.views)
+        assert made.run.ask(keys.fault(sender), FaultRequest(kind="drop", target=key, end=True)).ok
         wait_until(lambda: sighted(made, since), "views with everything again")
         wait_until(lambda: words not in (made.state() or reported).reason, "another reason")
         assert made.run.status.lifecycle == "armed" and not made.run.status.faults
