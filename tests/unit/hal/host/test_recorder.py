@@ -162,7 +162,7 @@ def test_no_tick_and_no_end_waits_for_a_disk_that_hangs(
     disk = Disk(monkeypatch, memory, 2**30)
     monkeypatch.setattr(under_test, "CLOSE_LIMIT_S", 0.3)
     with (
-        running(run_config(pace="realtime", rate_hz=50.0), max_ticks=75) as run,
+        running(run_config(pace="lockstep"), max_ticks=75) as run,
         following(run.link, Follower()),
     ):
         with Recorder(run.host.black_box, run.host.description, partial(record_of, run.host), tmp_path, memory):
@@ -170,9 +170,7 @@ def test_no_tick_and_no_end_waits_for_a_disk_that_hangs(
             wait_until(lambda: len(ticks_on_disk(tmp_path)) > 5, "the first rows")
             disk.hangs = True
             wait_until(run.ended, "the end of the run")
-            began = time.monotonic()
-        assert time.monotonic() - began < 2.0
-        assert run.host.wall_s < 3.0  # 1.5 s on a quiet machine; the disk hangs until the end of the test
+        assert not disk.goes_on.is_set()  # neither the run nor its recorder's end waited for it
         assert run.host.ended == "complete" and not run.host.authority.faults
     last = msgspec.json.decode(os.pread(memory, 2**20, 0), type=HostRecord)
     assert last.ended == "complete" and last.armed_ticks == 75
