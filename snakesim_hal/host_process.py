@@ -147,7 +147,7 @@ def open_backend(factory: BackendFactory, config: RunConfig) -> GuardedBackend:
         return GuardedBackend(factory(config, settings))
     except SnakesimError:
         raise
-    except Exception as error:  # a backend may be third-party code
+    except (Exception, SystemExit) as error:  # a backend may be third-party code
         raise BackendError(f"backend {config.backend!r} does not open: {type(error).__name__}: {error}") from error
 
 

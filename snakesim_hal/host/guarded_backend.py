@@ -29,7 +29,7 @@ def _guarded(method: MethodT) -> MethodT:
             return method(self, *arguments, **named)
         except SnakesimError:
             raise
-        except Exception as error:  # third-party code, which must not end the host
+        except (Exception, SystemExit) as error:  # third-party code, which must not end the host
             where = f"{self.name}.{method.__name__}"
             raise BackendError(f"{where} failed: {type(error).__name__}: {error}") from error
 

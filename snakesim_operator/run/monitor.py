@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 from snakesim_hal.errors import NotConnectedError, RefusedError
 from snakesim_hal.model.scenario import RunConfig
@@ -15,7 +16,7 @@ from snakesim_operator.run.ending import Ending
 from snakesim_operator.run.process_faults import ProcessFaults
 from snakesim_operator.run.processor_waits import ProcessorWaits
 from snakesim_operator.run.progress import Progress
-from snakesim_operator.run.supervisor import Supervisor
+from snakesim_operator.run.supervisor import HOST, Supervisor
 
 AFTER_FAULT_S = 1.5
 POLL_S = 0.05
@@ -24,6 +25,8 @@ RECORDER_LIMIT_S = 20.0  # once everything else is ready
 WHO = "snakesim run"
 AT_WORK = ("host", "control")  # between them a lease expires
 KEEPS_UP = 0.95  # share of real time
+SILENT_S = 10.0  # of the host, which says five times a second how it is
+SILENCES = {"T": "was stopped by a signal", "R": "computes", "S": "waits in a call", "D": "waits for a device"}
 LATE_TICKS = 10  # a process that was stopped for a while makes few of them
 
 
@@ -53,6 +56,7 @@ class RunMonitor:
         self._progress = Progress(config)
         self._waits = ProcessorWaits(config.lease_ns * 1e-9)
         self._status: Status | None = None
+        self._silent_polls = 0  # since the last status: a run that was stopped itself does not count
         self._robot: Description | None = None
         self._armed = False  # once, by this run or by a person
         self._may_arm = config.has_own_control  # until the first fault: then a person does
@@ -60,6 +64,7 @@ class RunMonitor:
         self._hosts = supervisor.hosts
         self._asked_at: float | None = None
         self._last_latched: str | None = None
+        self._silent = ""  # how, if it is
 
     def go(self) -> None:
         """Until the run is over. Raises SnakesimError when it cannot go on."""
@@ -69,7 +74,7 @@ class RunMonitor:
                 while self._supervisor.goes_on() and not self._ending.interrupted:
                     self._take_in()
                     self._see_to_faults()
-                    if self._ending.reason is not None and self._over_before_it_began():
+                    if self._ending.reason is not None and (self._over_before_it_began() or self._silent):
                         break
                     self._arm_once()
                     self._finish_at_goal()
@@ -93,8 +98,9 @@ class RunMonitor:
             self._may_arm = False
             self._progress.start_over()
             self._asked_at = None
-        host = self._supervisor.host
+        host, before = self._supervisor.host, self._status
         self._status, self._robot = (None, None) if host is None else (host.status, host.description)
+        self._silent_polls = self._silent_polls + 1 if self._status is not None and self._status is before else 0
         self._state = self._control.newest(lambda _state: True) or self._state
         self._progress.show(self._status, self._state, armed=self._armed)
 
@@ -111,8 +117,13 @@ class RunMonitor:
         if status.lifecycle in ("fault", "estop"):
             self._may_arm = False
         self._armed |= status.lifecycle == "armed"
+        before, self._silent = self._silent, self._silence(status)
         if self._stay:
+            if self._silent and not before:
+                self._say(self._silent)
             self._tell(status)
+        elif self._silent:
+            self._ending.because(self._silent)
         elif stopping := [fault for fault in status.faults if fault.reach == "robot"]:
             self._ending.because(stopping[0].cause)
             if stopping[0].what == "lease_expired" and (slow := self._too_slow(status)):
@@ -128,6 +139,14 @@ class RunMonitor:
         if status.overruns >= LATE_TICKS and status.speed == 1.0 and factor is not None and factor < KEEPS_UP:
             shown.append(f"{status.overruns} ticks were late, and robot time passed at {factor:.2f} of real time")
         return f"this computer is too slow: {', '.join(shown)}" if shown else None
+
+    def _silence(self, status: Status) -> str:
+        """That the host's process lives and says nothing; empty: it speaks, or has ended."""
+        if self._silent_polls * POLL_S < SILENT_S or not self._supervisor.host_runs():
+            return ""
+        stat = Path(f"/proc/{self._supervisor.pids()[HOST]}/stat").read_text()
+        how = SILENCES.get(stat.rpartition(")")[2].split()[0], "is there")
+        return f"the host has said nothing for {SILENT_S:g} s, since tick {status.tick}; its process {how}"
 
     def _over_before_it_began(self) -> bool:
         return not self._armed and not self._may_arm

@@ -15,6 +15,7 @@ from typing import Literal
 from snakesim_hal.model.whole_file import write_whole
 
 MEMORY_BYTES = 8 * 2**20
+FILE_BYTES = 64 * 2**20  # of a log: a part that floods does not fill the disk
 TOGETHER_BYTES = 2**16  # pending appends are merged up to this size
 RETRY_S = 0.5
 LIMIT_S = 5.0  # for a disk that hangs
@@ -46,6 +47,7 @@ class RunFiles:
         self._lost = ""  # why data was lost
         self._tasks: deque[_Task] = deque()
         self._waiting_bytes = 0
+        self._appended: dict[str, int] = {}  # bytes, by name
         self._handles: dict[str, int] = {}
         self._closing = False
         self._changed = threading.Condition()
@@ -53,7 +55,12 @@ class RunFiles:
         self._thread.start()
 
     def append(self, name: str, content: bytes) -> None:
-        """Append to a file. With too much pending data, it is lost."""
+        """Append to a file. With too much pending data, or in the file, it is lost."""
+        taken = self._appended.get(name, 0) + len(content)
+        if taken > FILE_BYTES:
+            self._lost = self._lost or f"{name} is longer than {FILE_BYTES >> 20} MiB: the rest of it is lost"
+            return
+        self._appended[name] = taken
         self._ask(_Task("append", name, content))
 
     def put(self, name: str, content: bytes) -> None:
@@ -62,6 +69,7 @@ class RunFiles:
 
     def rename(self, name: str, to: str) -> None:
         """Rename an appended file; later appends begin a new one."""
+        self._appended.pop(name, None)
         self._ask(_Task("rename", name, to.encode()))
 
     def warn(self, failure: str) -> None:

@@ -200,7 +200,7 @@ class Supervisor:
     def _host_is_done(self) -> bool:
         """Whether the host has ended with a complete record."""
         record = self.host_record()
-        if record is None or self._parts[HOST].child.process.returncode not in (0, 1):
+        if record is None or record.ended == "running" or self._parts[HOST].child.process.returncode not in (0, 1):
             return False
         return not self._stay or record.ended in ("complete", "finished")
 

@@ -131,3 +131,14 @@ def test_without_a_folder_nothing_is_kept() -> None:
     files.put("whole.json", b"{}")
     files.settle()
     assert files.close() == ""
+
+
+def test_a_log_that_floods_is_cut_and_the_record_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(under_test, "FILE_BYTES", 2 * 2**20)
+    files = RunFiles(tmp_path, lambda _: None)
+    for _ in range(300):
+        files.append("a.log", b"x" * 10_000)
+        files.settle()
+    files.append("b.log", b"x")
+    assert files.close() == "a.log is longer than 2 MiB: the rest of it is lost"
+    assert (tmp_path / "a.log").stat().st_size == 2_090_000 and (tmp_path / "b.log").read_bytes() == b"x"
