@@ -46,7 +46,7 @@ from snakesim_hal.wire.messages import Obstacle, Trajectory, World
 
 Floats = NDArray[np.float64]
 
-NODES_PER_S = 125_000  # of robot time: two fifths of what a core expands, see docs/poal.md
+NODES_PER_S = 250_000  # of robot time: two fifths of what a core expands, see docs/poal.md
 ENDS_SOON_M = 0.6
 SEEN_M, SAME_M = 1.5, 0.005  # obstacles within this distance of the head; a change that matters
 LOST_M = 0.12  # median of the body's points; then no correction leads back
