@@ -163,10 +163,9 @@ def test_a_first_turn_keeps_nobody_waiting_on_a_busy_computer(tmp_path: Path) ->
                 wait_until(turned, "navigation to have found a path in the new direction")
             status = session.latest(keys.STATUS, Status, 5.0)
         assert status is not None and [fault.what for fault in status.faults] == []
-    before = [one for one in seen if one.searching == "the direction has changed"]
-    assert before and {one.path_id for one in before} == {0}
+    assert {one.path_id for one in seen if one.searching == "the direction has changed"} <= {0}
     assert {later.tick - one.tick for one, later in itertools.pairwise(seen)} == {20}
-    assert max(one.searched_nodes for one in seen) <= 0.2 * NODES_PER_S
+    assert 0 < max(one.searched_nodes for one in seen) <= 0.2 * NODES_PER_S
 
 
 def test_an_operator_is_told_what_a_clock_that_stands_waits_for(tmp_path: Path) -> None:
