@@ -21,7 +21,8 @@ from snakesim_hal.errors import ConfigError, RefusedError, SnakesimError
 from snakesim_hal.host.host import Host
 from snakesim_hal.host_process import open_backend
 from snakesim_hal.model.fault_plan import planned
-from snakesim_hal.model.plugins import BACKENDS, SERVICES, find_plugin
+from snakesim_hal.model.plugin_check import find_service
+from snakesim_hal.model.plugins import BACKENDS, find_plugin
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.local_network import LocalNetwork
 from snakesim_hal.service import ServiceLoop
@@ -94,7 +95,7 @@ class InProcessRun:
             part = self._parts[name] = opened.enter_context(ExitStack())
             session = self.network.session()
             part.callback(session.close)
-            loop = self._loops[name] = ServiceLoop(find_plugin(SERVICES, name), config, session)
+            loop = self._loops[name] = ServiceLoop(find_service(config, name), config, session)
             part.callback(loop.close)
 
     def turns(self) -> Generator[None]:

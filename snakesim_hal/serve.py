@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 
 from snakesim_hal.arguments import add_service, link_of, load_scenario
 from snakesim_hal.errors import ConfigError, NotConnectedError, SnakesimError
-from snakesim_hal.model.plugins import SERVICES, find_plugin
+from snakesim_hal.model.plugin_check import find_service
 from snakesim_hal.model.scenario import Loaded, RunConfig
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.process import (
@@ -65,7 +65,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def run(arguments: argparse.Namespace) -> int:
     """Run the service that the arguments name. Returns the exit code."""
     try:
-        serve(find_plugin(SERVICES, arguments.name), process_options(arguments))
+        given = process_options(arguments)
+        serve(find_service(given.config, arguments.name), given)
     except ConfigError as error:
         report_error(error, f"snakesim {arguments.name}")
         return 2

@@ -1,10 +1,11 @@
 """Everything that a configuration names is installed, and its settings are valid."""
 
+from collections.abc import Callable
 from typing import Any
 
 import msgspec
 
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.errors import ConfigError, short
 from snakesim_hal.model.fault_plan import check_planned
 from snakesim_hal.model.files import Table
 from snakesim_hal.model.plugins import BACKENDS, CONTROLLERS, SERVICES, find_installed, find_plugin, plugin_settings
@@ -12,6 +13,7 @@ from snakesim_hal.model.scenario import CONTROL, RunConfig
 
 GUIDANCE = "guidance"
 BY_POSE = {GUIDANCE, "navigation"}
+SERVICE_HAS = ("name", "urgent", "configure", "outputs", "silence", "pause")
 
 
 def check_plugins(config: RunConfig, table: Table | None = None, *, run_files: bool = True) -> RunConfig:
@@ -28,9 +30,33 @@ def check_plugins(config: RunConfig, table: Table | None = None, *, run_files: b
         plugin_settings(controller, config.control_settings, source, config.control_section, origin)
         config = _with_what_it_needs(config, controller)
     for service in config.own_services:
-        find(SERVICES, service)
+        find_service(config, service, find)
     check_planned(config, table)
     return check_backend(config, table, run_files=run_files)
+
+
+def find_service(config: RunConfig, name: str, find: Callable[[str, str], Any] = find_plugin) -> Any:
+    """The class of a service: of the scenario, installed, or `./file.py:Class`. Raises ConfigError.
+
+    find: or `find_installed`, which returns None for a file, and runs none of it.
+    """
+    section = config.services.get(name)
+    code = (section.code if section is not None else "") or name
+    service = find(SERVICES, code)
+    if service is None:
+        return None
+    lacks = [part for part in SERVICE_HAS if not hasattr(service, part)]
+    if lacks:
+        raise ConfigError(
+            f"service {short(code)!r} has no {', '.join(lacks)}; write its class as in snakesim_hal/service.py, "
+            "or derive it from Service there"
+        )
+    if section is not None and service.name != name:
+        raise ConfigError(
+            f"service {short(code)!r} calls itself {service.name!r}, but is that of services.{short(name)}, and both "
+            f"have one name. Write [services.{service.name}] with code = {short(code)!r}, or change the class's `name`"
+        )
+    return service
 
 
 def _with_what_it_needs(config: RunConfig, controller: Any) -> RunConfig:

@@ -87,6 +87,7 @@ class Service(FileStruct, frozen=True, kw_only=True):
     lag_ticks: Annotated[int, Meta(ge=1, le=1000)] = 1
     restart: bool = True  # with `snakesim run --stay`, when its process ends; false: the run ends with it
     external: bool = False  # a process that the run waits for, but does not start
+    code: str = ""  # an installed service, or ./file.py:Class; empty: the installed service of the section's name
 
     def counting_at(self, tick: int) -> int:
         """The newest tick whose output is used at `tick`. That of tick 0 is used from the start."""

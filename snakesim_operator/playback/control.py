@@ -16,7 +16,8 @@ import msgspec
 from threadpoolctl import threadpool_limits
 
 from snakesim_hal.errors import ConfigError, SnakesimError, short
-from snakesim_hal.model.plugins import SERVICES, find_plugin, in_file
+from snakesim_hal.model.plugin_check import find_service
+from snakesim_hal.model.plugins import in_file
 from snakesim_hal.model.scenario import Override, RunConfig, load, write, written
 from snakesim_hal.network.local_network import LocalNetwork
 from snakesim_hal.network.session import Arrival, Publisher, Question
@@ -81,7 +82,7 @@ def same(a: JointCommand, b: JointCommand) -> bool:
 def config_of(contents: Contents, overrides: list[Override], *, run_recorded_code: bool = False) -> RunConfig:
     """The configuration of a recording, with changes. Raises ConfigError.
 
-    run_recorded_code: otherwise a controller in a Python file is refused, unless `overrides` name it.
+    run_recorded_code: otherwise a controller or service in a Python file is refused, unless `overrides` name it.
     """
     if contents.config is None:
         raise ConfigError(f"{contents.path}: holds no hal/config, so it is not known which controller was at work")
@@ -89,15 +90,25 @@ def config_of(contents: Contents, overrides: list[Override], *, run_recorded_cod
         path = Path(folder) / "config.json"
         path.write_text(contents.config.content)
         config = load(str(path), overrides).config
-    named_here = any(override.key == "controller" for override in overrides)
-    if in_file(config.controller) and not (named_here or run_recorded_code):  # no other file's code is replayed
-        raise ConfigError(
-            f"{contents.path}: the recording names {short(config.controller)!r} as its controller, and would have that "
-            "Python file run on this computer. If you trust the file, name it yourself, with --controller "
-            f"{short(config.controller)}, or run what the recording names with --run-recorded-code; else choose an "
-            "installed controller with --controller NAME"
-        )
+    if not run_recorded_code:
+        _refuse_its_files(contents.path, config, {override.key for override in overrides})
     return config
+
+
+def _refuse_its_files(path: Path, config: RunConfig, named_here: set[str]) -> None:
+    """named_here: what the command line says itself. The backend and other services are not replayed."""
+    named = [("controller", "--controller ", "its controller", config.controller)]
+    for name in MADE_BY:
+        key = f"services.{name}.code"
+        code = config.services[name].code if name in config.own_services else ""
+        named.append((key, f"--set {key}=", f"its service {name}", code))
+    for key, flag, what, code in named:
+        if in_file(code) and key not in named_here:
+            raise ConfigError(
+                f"{path}: the recording names {short(code)!r} as {what}, and would have that Python file run on this "
+                f"computer. If you trust the file, name it yourself, with {flag}{short(code)}, or run what the "
+                f"recording names with --run-recorded-code; else choose an installed one with {flag}NAME"
+            )
 
 
 class Replay:
@@ -145,7 +156,7 @@ class Replay:
             self._session.latched_publisher(keys.CONFIG, Configuration).put(effective)
             self._session.latched_publisher(keys.DESCRIPTION, Description).put(self.robot)
             for name in self._names:
-                loop = ServiceLoop(find_plugin(SERVICES, name), self.config, self._network.session())
+                loop = ServiceLoop(find_service(self.config, name), self.config, self._network.session())
                 opened.callback(loop.close)
                 self._loops.append(loop)
             try:

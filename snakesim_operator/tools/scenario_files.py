@@ -45,6 +45,7 @@ def show_config(loaded: Loaded, *, as_json: bool) -> int:
     for section, name in (
         (loaded.config.control_section, loaded.config.controller),
         (loaded.config.backend_section, loaded.config.backend),
+        *((f"services.{name}", service.code) for name, service in loaded.config.own_services.items()),
     ):
         if in_file(name):
             say(f"{section}: not checked, because that would run {name}; `snakesim run` checks it")

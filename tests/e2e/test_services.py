@@ -1,0 +1,126 @@
+"""Services of one's own, in a file: named by path as controllers are, in processes and in one."""
+
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from snakesim_hal.model.files import SHIPPED
+from snakesim_hal.wire import keys
+from snakesim_operator.results.record import RECORDING
+from snakesim_operator.results.recorded import read_recording
+from snakesim_operator.results.summary import RunSummary
+from tests.e2e.command import SNAKESIM, Ended, environment, free_endpoint, nothing_left, run_to_summary
+from tests.e2e.documents import REPOSITORY, sections
+from tests.whole import command as in_process
+
+pytestmark = pytest.mark.e2e
+
+PAGE = REPOSITORY / "docs" / "sensors.md"
+SERVICE = next(section.files["mocap.py"] for section in sections(PAGE) if "mocap.py" in section.files)
+MORE = """
+
+class Another(MotionCapture):
+    name = "another"
+
+
+class Bare:
+    name = "sensor"
+
+
+from pathlib import Path
+(Path(__file__).parent / "ran").touch()
+"""
+NAMED = "services.sensor.code=./lab/mocap.py:MotionCapture"
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Path:
+    """A robot without a pose sensor, and a service that has one."""
+    robot = (SHIPPED / "robots" / "planar13.toml").read_text()
+    bare = "\n[".join(part for part in robot.split("\n[") if not part.startswith("sensors.pose]"))
+    (tmp_path / "bare.toml").write_text(bare)
+    (tmp_path / "lab").mkdir()
+    (tmp_path / "lab" / "mocap.py").write_text(SERVICE + MORE)
+    return tmp_path
+
+
+SHORT = ["triplet", "--duration", "0.5", "--set", "robot=./bare.toml"]
+
+
+def digest_of(home: Path, out: str, run: Callable[..., tuple[Ended, RunSummary]]) -> str | None:
+    """Of a run in which guidance knows the pose from the service alone."""
+    ended, summary = run(home / out, *SHORT, "--set", NAMED)
+    assert ended.code == 0, ended.out + ended.err
+    recorded = read_recording(home / out / RECORDING, (keys.POSE, keys.WORLD))
+    assert set(range(50)) <= recorded.at[keys.POSE].keys() and recorded.streams[keys.WORLD]
+    return summary.command_digest
+
+
+def test_a_service_of_a_file_publishes_a_pose_in_processes_and_in_one(home: Path) -> None:
+    assert digest_of(home, "many", run_to_summary) == digest_of(home, "one", in_process.run_to_summary)
+    nothing_left(home / "many")
+
+
+WRONG = {
+    "no such class": ("MotionCaptuer", "no 'MotionCaptuer', as in", "classes in it are MotionCapture, Another, Bare"),
+    "another name": ("Another", "calls itself 'another'", "[services.another]"),
+    "no service": ("Bare", "has no urgent, configure, outputs, silence, pause", "snakesim_hal/service.py"),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_a_file_without_that_service_is_refused_before_anything_starts(home: Path, wrong: str) -> None:
+    name, *words = WRONG[wrong]
+    code = f"services.sensor.code=./lab/mocap.py:{name}"
+    ended = in_process.snakesim("run", *SHORT, "--set", code, "--out", "run", cwd=home)
+    assert ended.code == 2 and not (home / "run").exists()
+    assert all(word in ended.err for word in ("./lab/mocap.py", *words)), ended.err
+
+
+def test_showing_a_configuration_runs_none_of_its_services(home: Path) -> None:
+    shown = in_process.snakesim("config", "triplet", "--set", NAMED, cwd=home)
+    assert shown.code == 0 and not (home / "lab" / "ran").exists()
+    assert "services.sensor: not checked, because that would run ./lab/mocap.py:MotionCapture" in shown.out
+
+
+def test_a_service_of_a_file_is_started_alone_by_its_path_or_its_name(home: Path) -> None:
+    """It waits for a host, of which there is none, and says under which name."""
+    for name in ("./lab/mocap.py:MotionCapture", "sensor"):
+        command = [*SNAKESIM, "service", name, "triplet", "--set", NAMED, "--endpoint", free_endpoint()]
+        with subprocess.Popen(command, cwd=home, env=environment(home), stderr=subprocess.PIPE, text=True) as service:
+            assert service.stderr is not None
+            said = service.stderr.readline()
+            service.terminate()
+        assert said.startswith("sensor: waiting for the network")
+
+
+@pytest.mark.parametrize("way", ["recorded", "named", "flag", "other"])
+def test_a_service_that_a_recording_names_runs_only_when_its_user_says_so(home: Path, way: str) -> None:
+    (home / "mine.py").write_text(
+        "from pathlib import Path\n"
+        "from snakesim_gnc.navigation.service import Navigation\n"
+        "(Path(__file__).parent / 'ran').touch()\n"
+        "class Mine(Navigation):\n    pass\n"
+    )
+    code = "services.navigation.code="
+    begin = ["run", "triplet", "--in-process", "--duration", "0.2", "--out", "run", "--set", f"{code}./mine.py:Mine"]
+    ended = in_process.snakesim(*begin, cwd=home)
+    assert ended.code == 0, ended
+    (home / "ran").unlink()
+    more = {
+        "recorded": ["--controller", "hold"],
+        "named": ["--set", f"{code}./mine.py:Mine"],
+        "flag": ["--run-recorded-code"],
+        "other": ["--set", f"{code}navigation"],
+    }[way]
+    for other in (["info", "run"], ["report", "run"], ["export", "run", "--format", "csv"], ["compare", "run", "run"]):
+        assert in_process.snakesim(*other, cwd=home).code == 0 and not (home / "ran").exists()
+    replayed = in_process.snakesim("replay", "run", "--control", *more, cwd=home)
+    assert (home / "ran").exists() == (way in ("named", "flag"))
+    if way == "recorded":
+        assert replayed.code == 2 and "the recording names './mine.py:Mine' as its service navigation" in replayed.err
+        assert "--run-recorded-code" in replayed.err and f"--set {code}./mine.py:Mine" in replayed.err
+    else:
+        assert replayed.code == 0 and "the same to the bit" in replayed.out, replayed
