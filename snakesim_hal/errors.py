@@ -21,12 +21,13 @@ class ConfigError(SnakesimError, ValueError):
 class WireError(SnakesimError, ValueError):
     """A sample from the network is rejected: malformed, out of bounds, or of an unknown version.
 
-    `reason` is a short word to count by: `unknown_message`, `unknown_version`, `malformed`.
+    `reason` is a short word to count by: `unknown_message`, `unknown_version`, `malformed`; of what does not fit the
+    robot `wrong_length`, `no_rotation`, `no_path`. `detail` says the rest.
     """
 
     def __init__(self, reason: str, detail: str) -> None:
         super().__init__(f"{reason}: {detail}")
-        self.reason = reason
+        self.reason, self.detail = reason, detail
 
 
 class NotConnectedError(SnakesimError, ConnectionError):
@@ -41,12 +42,25 @@ class ControllerError(SnakesimError, RuntimeError):
     """A controller raised, or returned an invalid action: names the controller, field, value, and what is allowed."""
 
 
+class ServiceError(SnakesimError, RuntimeError):
+    """A service raised, or said what no reader accepts: names service, key, tick, field, value, what is allowed."""
+
+
 class BackendError(SnakesimError, RuntimeError):
     """A backend cannot go on: a diverged simulation, a dead bus. The host reports it and goes safe."""
 
 
 class RefusedError(SnakesimError, PermissionError):
     """The HAL refused a request, with its reason: a lease held by another, an arming condition not met."""
+
+
+def raised(error: BaseException) -> str:
+    """An exception of code that is not ours, in a line: what, and where."""
+    import traceback  # as in `nearest`
+
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    what = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+    return f"raised {what} ({last.filename.rpartition('/')[2]} line {last.lineno})"
 
 
 def short(text: str, most: int = 120) -> str:

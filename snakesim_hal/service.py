@@ -1,9 +1,11 @@
 """What a service is, and the loop around it: join, act on ticks, publish what the service says, report it done."""
 
-from collections.abc import Callable
+import contextlib
+import traceback
+from collections.abc import Callable, Iterator
 from typing import Protocol
 
-from snakesim_hal.errors import NotConnectedError
+from snakesim_hal.errors import NotConnectedError, ServiceError, SnakesimError, WireError, raised
 from snakesim_hal.faults.injector import Injector
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.scenario import Service as Schedule
@@ -60,10 +62,13 @@ class ServiceLoop:
         """
         name = service_type.name
         schedule = config.services.get(name, Schedule())
+        self._who = f"service {schedule.code or name} (class {getattr(service_type, '__name__', service_type)})"
         self._client = client = Client(session, name, every_ticks=schedule.every_ticks, pace=config.pace)
-        self.service = service_type(client, config)
+        with self._named("__init__"):
+            self.service = service_type(client, config)
         robot = _met(client, goes_on)
-        self.service.configure(robot)
+        with self._named("configure"):
+            self.service.configure(robot)
         self._injector = Injector(name, config, session, newest=lambda: client.newest_clock)
         self._injector.allow(emulated=robot.emulated, faults_allowed=config.faults_allowed)
         self._due = client.ticks(0.0, pauses=True)
@@ -84,8 +89,9 @@ class ServiceLoop:
                 self._act(clock)
                 continue
             self._injector.idle()
-            for key, message in self.service.silence():
-                self._client.put(key, message)
+            with self._named("silence"):
+                for key, message in self.service.silence():
+                    self._client.put(key, message)
 
     def act(self) -> None:
         """Act on the ticks that are due now, and return."""
@@ -100,18 +106,34 @@ class ServiceLoop:
         """A tick that is shown again, because the robot is not armed yet, is answered again."""
         if clock.paused:
             self._injector.idle()
-            self.service.pause(clock)
+            with self._named("pause"):
+                self.service.pause(clock)
             return
         self._injector.turn(clock.stamp_ns, clock.arming, clock.lifecycle)
         robot = self._client.new_description()
         if robot is not None:
-            self.service.configure(robot)
-        outputs = self.service.outputs(clock)
-        if outputs is None:
-            return
-        for key, message in outputs:
-            self._client.put(key, message)
+            with self._named("configure"):
+                self.service.configure(robot)
+        with self._named("outputs"):
+            outputs = self.service.outputs(clock)
+            if outputs is None:
+                return
+            for key, message in outputs:
+                self._client.put(key, message)
         self._client.done(clock.tick)
+
+    @contextlib.contextmanager
+    def _named(self, method: str) -> Iterator[None]:
+        """Turn exceptions of a method into errors that name the service, which may be third-party code."""
+        try:
+            yield
+        except WireError as error:
+            raise ServiceError(f"{self._who}: {error.detail}") from None
+        except SnakesimError:
+            raise
+        except (Exception, SystemExit) as error:
+            traceback.print_exc()
+            raise ServiceError(f"{self._who}: {method}() {raised(error)}") from error
 
 
 def _met(client: Client, goes_on: Callable[[], bool]) -> Description:

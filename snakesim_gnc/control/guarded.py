@@ -12,7 +12,7 @@ from typing import Any
 
 from snakesim_gnc.control.controller import Action, Controller, Report, View
 from snakesim_hal.backend import SetPoints
-from snakesim_hal.errors import ControllerError
+from snakesim_hal.errors import ControllerError, raised
 from snakesim_hal.wire.messages import Description, Mode
 from snakesim_hal.wire.quantities import MAX_TARGET
 
@@ -51,10 +51,7 @@ class Guarded:
             yield
         except (Exception, SystemExit) as error:
             traceback.print_exc()
-            last = traceback.extract_tb(error.__traceback__)[-1]
-            raised = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-            where = f"{last.filename.rpartition('/')[2]} line {last.lineno}"
-            raise self.wrong(f"{method}() raised {raised} ({where})") from error
+            raise self.wrong(f"{method}() {raised(error)}") from error
 
 
 def check(action: Action, joints: Sequence[str]) -> None:

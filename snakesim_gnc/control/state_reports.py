@@ -6,6 +6,7 @@ from snakesim_gnc.control.advance import Advance
 from snakesim_gnc.control.controller import Report
 from snakesim_gnc.control.states import locomotion_state
 from snakesim_hal.wire.messages import Clock, ControlState, Description, LocomotionState, World
+from snakesim_hal.wire.outgoing import what_is_wrong
 
 TELEMETRY_S = 0.05
 LONGEST = 500  # characters of a reason
@@ -89,17 +90,4 @@ class StateReports:
         try:
             return self._decoder.decode(msgspec.msgpack.encode(message))
         except (TypeError, msgspec.ValidationError) as error:
-            raise ValueError(_what_is_wrong(message) or str(error)) from None
-
-
-def _what_is_wrong(message: ControlState) -> str:
-    """The field of the report that cannot be sent, with its value."""
-    for field in msgspec.structs.fields(ControlState):
-        value = getattr(message, field.name)
-        try:
-            msgspec.msgpack.decode(msgspec.msgpack.encode(value), type=field.type)
-        except msgspec.ValidationError as error:
-            return f"Report.{field.name} is {value!r:.100}: {error}"
-        except TypeError:
-            return f"Report.{field.name} is {value!r:.100}, must be plain Python numbers: use float() or .tolist()"
-    return ""
+            raise ValueError(what_is_wrong(message, "Report") or str(error)) from None

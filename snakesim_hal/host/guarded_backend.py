@@ -16,8 +16,8 @@ from snakesim_hal.backend import Backend, Injectable, Samples, SetPoints
 from snakesim_hal.errors import BackendError, SnakesimError, WireError
 from snakesim_hal.model.injection import Injection
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import Decoder, encode, encoding_of
-from snakesim_hal.wire.messages import VERSIONS, Description, Fault, LifecycleState, Message
+from snakesim_hal.wire.messages import Description, Fault, LifecycleState
+from snakesim_hal.wire.outgoing import checked, packed
 
 MethodT = TypeVar("MethodT", bound=Callable[..., Any])
 
@@ -42,7 +42,7 @@ class GuardedBackend:
     def __init__(self, inner: Backend) -> None:
         self._inner = inner
         self.name = type(inner).__name__
-        self._decoders: dict[str, Decoder[Any]] = {}
+        self._keys: list[str] | None = None
 
     @_guarded
     def describe(self) -> Description:
@@ -53,15 +53,16 @@ class GuardedBackend:
     def sample(self, tick: int, stamp_ns: int) -> Samples:
         """As the backend does, with the bytes of every message beside the joints."""
         samples = self._inner.sample(tick, stamp_ns)
-        self._encode(keys.JOINTS, samples.joints)  # whether their values are plausible is judged joint by joint
-        encoded: dict[str, bytes] = {}
-        for key, message in samples.others.items():
-            payload = encoded[key] = self._encode(key, message)
-            decoder = self._decoder(key)
-            try:
-                decoder.decode(payload, encoding_of(type(message)))
-            except WireError as error:
-                raise self._wrong(key, str(error)) from None
+        key, encoded = keys.JOINTS, dict[str, bytes]()
+        try:
+            packed(samples.joints)  # whether their values are plausible is judged joint by joint
+            for key, message in samples.others.items():
+                if key not in self._described():
+                    known = ", ".join(self._described())
+                    raise WireError("unknown_key", f"not a sensor of its description, which has {known}")
+                encoded[key] = checked(key, message)
+        except WireError as error:
+            raise BackendError(f"{self.name}.sample: {key} cannot be published: {error.detail}") from None
         return replace(samples, encoded=encoded)
 
     @_guarded
@@ -89,23 +90,8 @@ class GuardedBackend:
         """As the backend does, if it injects faults itself."""
         return isinstance(self._inner, Injectable) and self._inner.inject(injection, begins=begins)
 
-    def _encode(self, key: str, message: Message) -> bytes:
-        if type(message) not in VERSIONS:
-            raise self._wrong(key, f"a {type(message).__name__} is no message")
-        try:
-            return encode(message)
-        except (TypeError, ValueError, OverflowError, RecursionError) as error:
-            raise self._wrong(key, f"{type(error).__name__}: {error}") from None
-
-    def _decoder(self, key: str) -> Decoder[Any]:
-        """Of a described sensor's key."""
-        if key not in self._decoders:
-            described = [sensor.key for sensor in self._inner.describe().sensors]
-            message = keys.message_at(key)
-            if key not in described or message is None:
-                raise self._wrong(key, f"not a sensor of its description, which has {', '.join(described)}")
-            self._decoders[key] = Decoder(message)
-        return self._decoders[key]
-
-    def _wrong(self, key: str, why: str) -> BackendError:
-        return BackendError(f"{self.name}.sample: {key} cannot be published: {why}")
+    def _described(self) -> list[str]:
+        """Keys of its sensors."""
+        if self._keys is None:
+            self._keys = [sensor.key for sensor in self._inner.describe().sensors]
+        return self._keys

@@ -11,7 +11,7 @@ from queue import Empty
 from typing import Any, Generic
 
 from snakesim_hal.backend import SetPoints
-from snakesim_hal.errors import NotConnectedError, StalledError, WireError
+from snakesim_hal.errors import NotConnectedError, StalledError, WireError, short
 from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.robot_mismatch import mismatch
 from snakesim_hal.network.run_key import is_proven, own_run_key
@@ -30,6 +30,7 @@ from snakesim_hal.wire.messages import (
     Mode,
     Pace,
 )
+from snakesim_hal.wire.outgoing import checked
 
 KEPT_PER_KEY = 32
 NO_TICK = -1  # of messages without a tick, such as an intent: only the newest is kept
@@ -120,10 +121,10 @@ class Client:
 
     def _fits(self, message: Message) -> bool:
         """Whether a message fits our robot, as far as it is known; others are counted."""
-        reason = None if self._robot is None else mismatch(message, self._robot)
-        if reason is not None:
-            self.session.rejected[reason] += 1
-        return reason is None
+        wrong = None if self._robot is None else mismatch(message, self._robot)
+        if wrong is not None:
+            self.session.rejected[wrong.reason] += 1
+        return wrong is None
 
     def announce(self) -> None:
         """Declare the service's liveliness token. A lockstep run waits for it from now on."""
@@ -239,13 +240,21 @@ class Client:
         raise StalledError(f"{feed.key} of tick {wanted} was named by the clock of tick {clock.tick} and never came")
 
     def put(self, key: str, message: Message) -> None:
-        """Publish an output of this service."""
+        """Publish an output of this service. Raises WireError, and sends nothing, when no reader would accept it."""
+        try:
+            payload = checked(key, message)
+            wrong = None if self._robot is None else mismatch(message, self._robot)
+            if wrong is not None:
+                raise wrong
+        except WireError as error:
+            tick = "" if (at := getattr(message, "tick", None)) is None else f" of tick {short(str(at), 20)}"
+            raise WireError(error.reason, f"{key}{tick} cannot be published: {error.detail}") from None
         publisher = self._publishers.get(key)
         if publisher is None:
             lossless = self._clock is not None and self._clock.pace == "lockstep"
             publisher = self.session.publisher(key, type(message), lossless=lossless)
             self._publishers[key] = publisher
-        publisher.put(message)
+        publisher.put(message, payload)
 
     def done(self, tick: int) -> None:
         """Report that all output for a tick is published. A command that answers the tick implies it."""

@@ -160,7 +160,7 @@ class Watch:
                 if key == keys.DESCRIPTION:
                     self._meet(message)
                 elif self.robot is not None and (wrong := mismatch(message, self.robot)) is not None:
-                    self.rejected[wrong] += 1
+                    self.rejected[wrong.reason] += 1
                 else:
                     self._keep(key, message)
         self._count()

@@ -1,5 +1,6 @@
 """Services of one's own, in a file: named by path as controllers are, in processes and in one."""
 
+import re
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +12,7 @@ from snakesim_hal.wire import keys
 from snakesim_operator.results.record import RECORDING
 from snakesim_operator.results.recorded import read_recording
 from snakesim_operator.results.summary import RunSummary
+from snakesim_operator.run.in_process import WORDS
 from tests.e2e.command import SNAKESIM, Ended, environment, free_endpoint, nothing_left, run_to_summary
 from tests.e2e.documents import REPOSITORY, sections
 from tests.whole import command as in_process
@@ -124,3 +126,50 @@ def test_a_service_that_a_recording_names_runs_only_when_its_user_says_so(home: 
         assert "--run-recorded-code" in replayed.err and f"--set {code}./mine.py:Mine" in replayed.err
     else:
         assert replayed.code == 0 and "the same to the bit" in replayed.out, replayed
+
+
+MALFORMED = {
+    "number": ("position_w=(0.0, float('nan'), 0.0)", "Pose.position_w[1] is nan, must be `float` >= -"),
+    "array": ("position_w=np.zeros(3)", "Pose.position_w is array([0., 0., 0.]), must be plain Python numbers, "),
+    "rotation": ("orientation_wxyz=(0.5, 0.0, 0.0, 0.0)", "(0.5, 0.0, 0.0, 0.0) of norm 0.5, must be a rotation"),
+}
+LOST = """
+
+class Lost(MotionCapture):
+    def outputs(self, clock):
+        said = super().outputs(clock)
+        if said is None or clock.lifecycle != "armed":
+            return said
+        return [(key, msgspec.structs.replace(pose, {})) for key, pose in said]
+"""
+
+
+@pytest.mark.parametrize(
+    ("pace", "wrong"), [("lockstep", "array"), ("realtime", "number"), ("one", "number"), ("one", "rotation")]
+)
+def test_a_malformed_message_is_named_in_the_services_log_and_by_the_run(home: Path, pace: str, wrong: str) -> None:
+    field, words = MALFORMED[wrong]
+    lost = LOST.replace("{}", field)
+    (home / "lab" / "lost.py").write_text(f"import msgspec\nimport numpy as np\n{SERVICE}{lost}")
+    code = [*SHORT, "--duration", "60", "--set", "services.sensor.code=./lab/lost.py:Lost"]
+    if pace == "one":
+        ended, summary = in_process.run_to_summary(home / "run", *code)
+        log = (home / "run" / WORDS).read_text()
+    else:
+        ended, summary = run_to_summary(home / "run", *code, "--pace", pace)
+        log = (home / "run" / "sensor.log").read_text()
+        nothing_left(home / "run")
+    assert ended.code == 1 and summary.duration_s < 5.0  # it ends at once
+    said = re.compile(
+        r"service ./lab/lost.py:Lost \(class Lost\): sensor/pose of tick \d+ cannot be published: .*" + re.escape(words)
+    )
+    assert all(said.search(text) for text in (log, summary.ended, ended.out)), f"{log}\n{summary.ended}\n{ended.out}"
+
+
+def test_a_service_that_raises_ends_the_run_with_its_name(home: Path) -> None:
+    lost = LOST.replace("{}", "position_w=1 / 0")
+    (home / "lab" / "lost.py").write_text(f"import msgspec\n{SERVICE}{lost}")
+    code = [*SHORT, "--set", "services.sensor.code=./lab/lost.py:Lost"]
+    ended, summary = in_process.run_to_summary(home / "run", *code)
+    said = "(class Lost): outputs() raised ZeroDivisionError: division by zero (lost.py line "
+    assert ended.code == 1 and said in summary.ended and said in (home / "run" / WORDS).read_text()
