@@ -42,11 +42,11 @@ class HandOver:
         self._offset *= max(0.0, 1.0 - fade)
         self._share = min(1.0, self._share + fade)
 
-    def pass_to(self, turn: int | None, joints: JointState, reference_rad: Floats) -> None:
-        """Hand propulsion over to a joint, or to none."""
-        if turn == self._turn:
+    def pass_to(self, turn: int | None, joints: JointState, reference_rad: Floats, *, anew: bool = False) -> None:
+        """Hand propulsion over to a joint, or to none. anew: the wanted torque may have jumped, even of the same."""
+        if turn == self._turn and not anew:
             return
-        if self._turn is not None:
+        if self._turn is not None and turn != self._turn:
             i = self._turn
             push = joints.torque_nm[i] + self._damping[i] * joints.velocity_rad_s[i]
             self._offset[i] = joints.angle_rad[i] + push / self._stiffness[i] - reference_rad[i]

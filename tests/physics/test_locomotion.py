@@ -3,9 +3,11 @@
 from functools import cache
 from itertools import groupby, pairwise
 
+import msgspec
 import numpy as np
 import pytest
 
+from snakesim_hal.model.scene import Cylinder, route_of
 from snakesim_hal.safety.gate import bumpless_target
 from snakesim_hal.wire.messages import Mode
 from tests.unit.gnc.stage import known
@@ -141,6 +143,35 @@ def test_other_noise_gives_the_same_picture(seed):
     turns = propelled(whole)
     assert whole.moved_m >= 0.5
     assert turns == [turns[0] - k for k in range(len(turns))]
+
+
+# --- triplets that are not neighbours -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("clearance_m", [0.02, 0.05])
+def test_obstacles_that_brake_between_the_push_points_do_not_keep_it_from_pushing(clearance_m: float):
+    config = configure("triplet")
+    route = known(route_of(config.scene))
+    way_m = 0.04 + clearance_m + 0.05
+    behind, middle, ahead = route.inflections_s_m()[1:4]
+    places = (0.3 * behind + 0.7 * middle, 0.7 * middle + 0.3 * ahead, 0.4 * middle + 0.6 * ahead)
+    pegs: list[Cylinder] = []
+    for s, side in zip(places, (1, 1, -1), strict=True):
+        (x, y), (along_x, along_y) = route.at(s), route.tangent_w(s).tolist()
+        pegs.append(Cylinder(position_m=(x - side * along_y * way_m, y + side * along_x * way_m), radius_m=0.05))
+    scene = msgspec.structs.replace(config.scene, cylinder=pegs)
+    whole = run(msgspec.structs.replace(config, scene=scene), duration_s=8.0)
+    assert whole.moved_m > 0.5
+    assert ["peg_0_1", "peg_0_2", "peg_0_3"] in [[p.obstacle for p in report.push_points] for report in whole.reports]
+
+
+def test_on_a_wave_too_steep_for_neighbours_contacts_further_apart_push():
+    whole = run(configure("peg_row", "scene.route.amplitude_m=0.05"), duration_s=8.0)  # 34.9 degrees
+    assert whole.moved_m > 1.0
+    assert set(whole.states[STARTED:]) == {"Locomoting"} and not any(report.jammed for report in whole.reports)
+    turns = propelled(whole)
+    assert len(turns) < 2 * whole.moved_m / whole.record.config.robot.module.length_m
+    assert not whole.record.host.limited_commands
 
 
 # --- the controls: what must not move -------------------------------------------------------------------------

@@ -1,6 +1,6 @@
 """The obstacle-triplet controller: one joint pushes with a torque, all others keep the body on its path.
 
-For each new world model it finds the push-points of the body, solves every triplet of neighbours
+For each new world model it finds the push-points of the body, solves every triplet on alternating sides
 among them, and chooses one; its propulsion joint is the first joint ahead of o_2. As the body moves forward, o_2 passes
 joint after joint towards the tail, and with it the propulsion joint, until the triplet's last obstacle is lost.
 
@@ -89,7 +89,7 @@ class ObstacleTriplet:
         located = self._progress.update(view)
         if isinstance(located, str):
             return self._wait(view, located)
-        body_pose = self._follow(view, located)
+        body_pose, before = self._follow(view, located), self._choice
         if located.trajectory.speed_m_s <= 0:
             self._choice = None
             self._stall_watch.forget()
@@ -99,7 +99,8 @@ class ObstacleTriplet:
         self._guard(view, body_pose)
         choice, set_ = self._choice, self._set
         turn = None if choice is None else self._body.bends[choice.joint]
-        self._hand_over.pass_to(turn, view.joints, self._reference)
+        anew = choice is not None and before is not None and choice.triplet.names != before.triplet.names
+        self._hand_over.pass_to(turn, view.joints, self._reference, anew=anew)
         self._hand_over.fade(view.period_s / set_.blend_s + abs(located.speed_m_s) * view.period_s / set_.blend_m)
         targets: list[float] = self._hand_over.positions_rad(self._reference).tolist()
         mode = [Mode.POSITION] * len(targets)
@@ -254,7 +255,7 @@ class ObstacleTriplet:
         if self._stall is not None:
             why = self._stall[0].why
         elif speed_m_s > 0:
-            why = "; ".join(self._refused) or "no three neighbours on alternating sides"
+            why = "; ".join(self._refused) or "no three push-points on alternating sides"
         else:
             why = "" if speed_m_s == 0 else "cannot go backward"
         return Report(

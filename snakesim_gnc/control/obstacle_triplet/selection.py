@@ -1,13 +1,14 @@
 """The choice of three push-points and a joint for propulsion. Pure.
 
-Only neighbours on alternating sides make a triplet: from the middle contact, the nearest one on the other side behind
-it and the nearest one on the other side ahead of it. So a body of thirty modules has few candidates, and the
-choice moves along the body instead of jumping between all combinations.
+Any three on alternating sides are a triplet, with others between them or not: on a steep wave, and beside obstacles
+that brake, neighbours cannot push, and contacts further apart can. The best one needs the least torque for a newton of
+propulsion, so that a joint's limit allows the most. Neighbours mostly do: their levers are short.
 """
 
 from bisect import bisect_right
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ from snakesim_gnc.control.planar import wrenches
 
 Floats = NDArray[np.float64]
 Names = tuple[str, str, str]
+Three = tuple[PlannedContact, PlannedContact, PlannedContact]
 
 
 @dataclass(frozen=True)
@@ -31,11 +33,16 @@ class Triplet:
     """Three planned contacts, solved once; independent of the body's position."""
 
     names: Names
-    contacts: tuple[PlannedContact, PlannedContact, PlannedContact]
+    contacts: Three
     unit: UnitForces
-    unit_wrenches: Floats  # (3, 3): of the three contacts for 1 N, the tether's at o_1 included
     unit_force_3: float
     torque_per_n: float  # the most that a joint between o_2 and o_3 needs: with its lever from o_2 on; absolute
+
+    @cached_property
+    def unit_wrenches(self) -> Floats:
+        """(3, 3): of the three contacts for 1 N, the tether's at o_1 included."""
+        points, normals = (np.array([getattr(c, name) for c in self.contacts]) for name in ("point_w", "normal_w"))
+        return wrenches(points, loads(self.unit.forces, normals, -np.array(self.contacts[0].tangent_w)))
 
 
 @dataclass(frozen=True)
@@ -48,36 +55,40 @@ class Choice:
     torque_per_n: float  # N·m/N, on the part ahead of that joint
 
 
-def solve(contacts: tuple[PlannedContact, PlannedContact, PlannedContact], *, condition_max: float) -> Triplet:
-    """Unit forces of three contacts, tail to head."""
-    points = np.array([c.point_w for c in contacts])
-    normals = np.array([c.normal_w for c in contacts])
-    unit = unit_forces(points, normals, np.array(contacts[0].tangent_w), condition_max=condition_max)
-    tangent = np.array(contacts[0].tangent_w)
-    unit_force_3 = float(unit.forces[2])
-    return Triplet(
-        names=(contacts[0].obstacle, contacts[1].obstacle, contacts[2].obstacle),
-        contacts=contacts,
-        unit=unit,
-        unit_wrenches=wrenches(points, loads(unit.forces, normals, -tangent)),
-        unit_force_3=unit_force_3,
-        torque_per_n=abs(torque_per_newton(unit_force_3, points[2], normals[2], points[1])),
+def solve(threes: Sequence[Three], *, condition_max: float) -> list[Triplet]:
+    """Unit forces of each three contacts, tail to head."""
+    if not threes:
+        return []
+    units = unit_forces(
+        np.array([[c.point_w for c in three] for three in threes]),
+        np.array([[c.normal_w for c in three] for three in threes]),
+        np.array([three[0].tangent_w for three in threes]),
+        condition_max=condition_max,
     )
+    return [_triplet(three, unit) for three, unit in zip(threes, units, strict=True)]
+
+
+def _triplet(three: Three, unit: UnitForces) -> Triplet:
+    (_, middle, ahead), unit_force_3 = three, float(unit.forces[2])
+    torque = torque_per_newton(unit_force_3, ahead.point_w, ahead.normal_w, middle.point_w)
+    return Triplet(_names(three), three, unit, unit_force_3, abs(torque))
+
+
+def _names(three: Three) -> Names:
+    return three[0].obstacle, three[1].obstacle, three[2].obstacle
 
 
 def alternating(sides: Sequence[int]) -> list[tuple[int, int, int]]:
-    """Index triples of neighbours on alternating sides, by their middle, tail to head."""
-    found: list[tuple[int, int, int]] = []
-    last: dict[int, int] = {}  # side -> the newest contact on it
-    waiting: list[tuple[int, int]] = []  # (behind, middle) of triples that lack their third
-    for k, side in enumerate(sides):
-        found += [(i, j, k) for i, j in waiting if sides[j] != side]
-        waiting = [(i, j) for i, j in waiting if sides[j] == side]
-        behind = last.get(-side)
-        if behind is not None:
-            waiting.append((behind, k))
-        last[side] = k
-    return found
+    """Index triples on alternating sides, by their middle, tail to head."""
+    n = len(sides)
+    return [
+        (i, j, k)
+        for j in range(1, n - 1)
+        for i in range(j)
+        if sides[i] != sides[j]
+        for k in range(j + 1, n)
+        if sides[k] != sides[j]
+    ]
 
 
 def propulsion_joint(
@@ -144,8 +155,9 @@ class Triplets:
         """Every triplet that can propel with some joint, and why the others cannot. nodes_w: (2, n_nodes)."""
         found: list[Choice] = []
         refused: list[str] = []
-        for i, j, k in alternating([p.contact.side for p in points]):
-            triplet = self._solve((points[i].contact, points[j].contact, points[k].contact))
+        threes = alternating([p.contact.side for p in points])
+        triplets = self._solve([(points[i].contact, points[j].contact, points[k].contact) for i, j, k in threes])
+        for (i, j, k), triplet in zip(threes, triplets, strict=True):
             places = (points[i].body_s_m, points[j].body_s_m, points[k].body_s_m)
             turn = present.joint if present is not None and present.triplet is triplet else None
             choice = self._choice(triplet, places, nodes_w, node_body_s_m, turn, barred_joint)
@@ -181,9 +193,14 @@ class Triplets:
             triplet, places_m, joint, torque_per_newton(triplet.unit_force_3, ahead.point_w, ahead.normal_w, spot)
         )
 
-    def _solve(self, contacts: tuple[PlannedContact, PlannedContact, PlannedContact]) -> Triplet:
-        names = (contacts[0].obstacle, contacts[1].obstacle, contacts[2].obstacle)
-        known = self._solved.get(names)
-        if known is None or known.contacts != contacts:
-            known = self._solved[names] = solve(contacts, condition_max=self._condition_max)
-        return known
+    def _solve(self, threes: Sequence[Three]) -> list[Triplet]:
+        """Those that are new are solved, those that are gone forgotten."""
+        before, after = self._solved, dict[Names, Triplet]()
+        for three in threes:
+            known = before.get(_names(three))
+            if known is not None and known.contacts == three:
+                after[known.names] = known
+        new = [three for three in threes if _names(three) not in after]
+        after |= {triplet.names: triplet for triplet in solve(new, condition_max=self._condition_max)}
+        self._solved = after
+        return [after[_names(three)] for three in threes]

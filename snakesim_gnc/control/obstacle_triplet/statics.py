@@ -80,7 +80,7 @@ def solve_triplet(
             raise ValueError(f"{name} must be unit vectors; their lengths are {sizes.tolist()}")
     if not (math.isfinite(propulsion_n) and propulsion_n > 0):
         raise ValueError(f"propulsion_n = {propulsion_n} N must be a finite force above 0")
-    unit = unit_forces(points, normals, tangent, condition_max=condition_max)
+    (unit,) = unit_forces(points[None], normals[None], tangent[None], condition_max=condition_max)
     forces = propulsion_n * unit.forces
     torque = propulsion_n * torque_per_newton(unit.forces[2], points[2], normals[2], joint)
     reason = unit.reason or no_authority(points[2], normals[2], joint, authority_min)
@@ -88,25 +88,34 @@ def solve_triplet(
 
 
 def unit_forces(
-    points_w: Floats, normals_w: Floats, tangent_1_w: Floats, *, condition_max: float = CONDITION_MAX
-) -> UnitForces:
-    """The contact forces for 1 N of propulsion; arguments as in `solve_triplet`, and not checked."""
-    unknown = np.full(3, np.nan)
-    centre = points_w.mean(axis=0)
-    span = float(np.hypot(*(points_w[2] - points_w[0])))
-    if span <= 0.0:
-        return UnitForces(unknown, math.inf, "o_1 and o_3 are the same point")
-    arms = (points_w - centre) / span
-    balance = np.vstack([normals_w.T, cross(arms, normals_w)])
-    condition = float(np.linalg.cond(balance))
+    points_w: Floats, normals_w: Floats, tangents_1_w: Floats, *, condition_max: float = CONDITION_MAX
+) -> list[UnitForces]:
+    """The contact forces for 1 N of propulsion of m triplets at once.
+
+    points_w, normals_w: (m, 3, 2). tangents_1_w: (m, 2). Otherwise as in `solve_triplet`, and not checked.
+    """
+    spans = np.hypot(*(points_w[:, 2] - points_w[:, 0]).T)
+    arms = (points_w - points_w.mean(axis=1, keepdims=True)) / np.where(spans > 0.0, spans, 1.0)[:, None, None]
+    balance = np.concatenate([normals_w.swapaxes(1, 2), cross(arms, normals_w)[:, None]], axis=1)
+    conditions = np.where(spans > 0.0, np.linalg.cond(balance), np.inf)
+    pull = np.concatenate([tangents_1_w, cross(arms[:, 0], tangents_1_w)[:, None]], axis=1)
+    forces, solvable = np.full((len(spans), 3), np.nan), conditions <= condition_max
+    forces[solvable] = np.linalg.solve(balance[solvable], pull[solvable, :, None])[..., 0]
+    return [
+        UnitForces(unit, condition, _why_not(span, condition, condition_max, unit.tolist()))
+        for unit, condition, span in zip(forces, conditions.tolist(), spans.tolist(), strict=True)
+    ]
+
+
+def _why_not(span_m: float, condition: float, condition_max: float, forces: list[float]) -> str:
+    """Why three contacts cannot propel; empty when they can."""
+    if span_m <= 0.0:
+        return "o_1 and o_3 are the same point"
     if not condition <= condition_max:
-        why = f"ill-conditioned: the three normals (nearly) meet in a point or are parallel (condition {condition:.3g})"
-        return UnitForces(unknown, condition, why)
-    pull = np.append(tangent_1_w, cross(arms[0], tangent_1_w))
-    forces = np.asarray(np.linalg.solve(balance, pull), dtype=np.float64)
-    pulling = [f"lambda_{i + 1} = {force:.3g} N/N" for i, force in enumerate(forces.tolist()) if force <= 0.0]
-    reason = f"a contact would have to pull: {', '.join(pulling)}" if pulling else ""
-    return UnitForces(forces, condition, reason)
+        why = f"the three normals (nearly) meet in a point or are parallel (condition {condition:.3g})"
+        return f"ill-conditioned: {why}"
+    pulling = [f"lambda_{i + 1} = {force:.3g} N/N" for i, force in enumerate(forces) if force <= 0.0]
+    return f"a contact would have to pull: {', '.join(pulling)}" if pulling else ""
 
 
 def torque_per_newton(unit_force_3: float, point_3_w: Planar, normal_3_w: Planar, joint_w: Planar) -> float:

@@ -136,6 +136,27 @@ def test_without_a_world_model_it_holds_and_says_so():
     assert torque_joints(blind) == []
 
 
+def test_the_torque_does_not_step_when_another_triplet_takes_over_the_same_joint():
+    stage = make_stage()
+    stage.pegs, tail_s_m = stage.pegs[:5], 0.2
+    controller = make_controller(stage, stall_s=5.0)
+    reports, torque_nm = [], 0.0
+    for tick in range(200):
+        if tick == 100:
+            stage.pegs = [peg for peg in stage.pegs if peg.name != "peg_2"]
+        reports.append(controller.update(stage.view(tick, tail_s_m, torque_nm=torque_nm)).report)
+        torque_nm = known(reports[-1].propulsion_torque_nm)
+    before, after = reports[99], reports[199]
+    assert [[p.obstacle for p in report.push_points] for report in (before, after)] == [
+        ["peg_0", "peg_1", "peg_2"],
+        ["peg_0", "peg_1", "peg_4"],
+    ]
+    assert before.propulsion_joint == after.propulsion_joint
+    torques = np.array([known(report.propulsion_torque_nm) for report in reports[99:]])
+    assert abs(torques[-1] - torques[0]) > 1.0
+    assert np.abs(np.diff(torques)).max() < 0.1 * abs(torques[-1] - torques[0])
+
+
 def test_nobody_wants_to_move():
     stage = make_stage()
     controller = make_controller(stage)

@@ -1,6 +1,7 @@
 """Push-points and the choice of a triplet and a joint."""
 
 import math
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -107,14 +108,10 @@ def test_contacts_at_the_tips_do_not_count():
 
 
 @given(st.lists(st.sampled_from([-1, 1]), max_size=10))
-def test_triples_alternate_and_are_neighbours(sides):
+def test_every_three_on_alternating_sides_are_a_triple(sides):
     found = alternating(sides)
-    for i, j, k in found:
-        assert i < j < k
-        assert sides[i] == -sides[j] == sides[k]
-        assert all(side == sides[j] for side in sides[i + 1 : k])
-    middles = [j for j in range(len(sides)) if -sides[j] in sides[:j] and -sides[j] in sides[j + 1 :]]
-    assert [j for _, j, _ in sorted(found, key=lambda t: t[1])] == middles
+    threes = combinations(range(len(sides)), 3)
+    assert sorted(found) == [(i, j, k) for i, j, k in threes if sides[i] == -sides[j] == sides[k]]
 
 
 @given(st.floats(0.0, 1.2), st.floats(0.05, 0.5), st.one_of(st.none(), st.integers(0, 12)))
@@ -138,7 +135,7 @@ def test_noise_does_not_pass_the_turn_to_and_fro():
 
 def choices_in_row(count=7):
     row = planned_row()
-    triplets = [solve((row[i], row[i + 1], row[i + 2]), condition_max=100.0) for i in range(count)]
+    triplets = solve([(row[i], row[i + 1], row[i + 2]) for i in range(count)], condition_max=100.0)
     return [Choice(t, (0.1 + 0.3 * i, 0.4 + 0.3 * i, 0.7 + 0.3 * i), 3 + i, 0.1) for i, t in enumerate(triplets)]
 
 
@@ -164,23 +161,36 @@ def test_points_become_choices_with_a_joint_each():
     points, lie = points_at(0.2)
     triplets = Triplets(condition_max=100.0, authority_min=0.02, hold_on_m=0.003)
     found, refused = triplets.choices(points, lie.nodes_w, NODE_S, None, None)
-    names = [f"peg_{i}" for i in range(5)]
-    assert [c.triplet.names for c in found] == [tuple(names[i : i + 3]) for i in range(3)]
-    assert not refused
+    threes = [[int(name[-1]) for name in c.triplet.names] for c in found]
+    assert threes == [[0, 1, 2], [0, 1, 4], [1, 2, 3], [2, 3, 4]]
+    assert len(refused) == 1 and "peg_0/peg_3/peg_4: a contact would have to pull: lambda_1" in refused[0]
     for choice in found:
         assert choice.body_s_m[1] < NODE_S[choice.joint + 1] < choice.body_s_m[2]
         assert abs(choice.torque_per_n) <= choice.triplet.torque_per_n + 1e-9
     barred, why = triplets.choices(points, lie.nodes_w, NODE_S, None, found[0].joint)
-    assert [c.joint for c in barred] == [c.joint for c in found[1:]]
-    assert len(why) == 1
+    assert [c.joint for c in barred] == [c.joint for c in found if c.joint != found[0].joint]
+    assert len(barred) + len(why) == len(found) + len(refused)
+
+
+def choices_on_wave(amplitude_m: float, pegs: int):
+    route = make_route(amplitude_m)
+    planned = [plan_contact(route, peg, BODY_RADIUS_M, **NEAR) for peg in make_pegs(route)[:pegs]]
+    points = [PushPoint(contact, 0.1 + 0.3 * i, 0.0) for i, contact in enumerate(planned)]
+    triplets = Triplets(condition_max=100.0, authority_min=0.02, hold_on_m=0.003)
+    return triplets.choices(points, BodyOnPath(route, SEGMENTS).at(0.2).nodes_w, NODE_S, None, None)
+
+
+@pytest.mark.parametrize(
+    ("slope_deg", "pushes"), [(29.5, ["012", "014", "123", "234"]), (30.5, ["014"]), (37.5, ["014"]), (38.0, [])]
+)
+def test_the_steepest_wave_depends_on_the_spacing(slope_deg: float, pushes: list[str]):
+    """On a row of pegs at distances a and b along a wave of slope alpha, lambda_1 > 0 where cos 2 alpha > a/(a + b)."""
+    found, _ = choices_on_wave(math.tan(math.radians(slope_deg)) * 0.6 / math.tau, pegs=5)
+    assert ["".join(name[-1] for name in c.triplet.names) for c in found] == pushes
 
 
 def test_a_steep_row_is_refused_with_the_contact_that_would_pull():
-    route = make_route(amplitude_m=0.08)
-    planned = [plan_contact(route, peg, BODY_RADIUS_M, **NEAR) for peg in make_pegs(route)[:3]]
-    points = [PushPoint(contact, 0.2 + 0.3 * i, 0.0) for i, contact in enumerate(planned)]
-    triplets = Triplets(condition_max=100.0, authority_min=0.02, hold_on_m=0.003)
-    found, refused = triplets.choices(points, BodyOnPath(route, SEGMENTS).at(0.2).nodes_w, NODE_S, None, None)
+    found, refused = choices_on_wave(0.08, pegs=3)
     assert not found
     assert "lambda_1" in refused[0]
     assert "peg_0/peg_1/peg_2" in refused[0]

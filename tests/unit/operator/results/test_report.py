@@ -41,7 +41,7 @@ def test_the_verdict_tells_distance_and_hand_over(page: Reader) -> None:
         "joint_6 → joint_5 → joint_4; no fault, 2 commands refused (stale)."
     )
     assert said in page.text
-    assert f"Locomotion ended at 6.1 s of 10.0 s: {LOST}; no three neighbours on alternating sides." in page.text
+    assert f"Locomotion ended at 6.1 s of 10.0 s: {LOST}; no three push-points on alternating sides." in page.text
 
 
 def test_playback_moves_the_snake_over_a_map(record: RunRecord, page: Reader) -> None:
