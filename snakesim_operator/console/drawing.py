@@ -12,8 +12,9 @@ from snakesim_hal.model.hills import hills
 from snakesim_hal.model.kinematics import link_frames, quaternions_from_rotations, rotation_from_quaternion
 from snakesim_hal.model.scenario import RunConfig, place_all
 from snakesim_hal.model.scene import route_of
-from snakesim_hal.wire.messages import ColourImage, DepthImage, Obstacle, World
+from snakesim_hal.wire.messages import ColourImage, DepthImage, Obstacle, World, WorldContact
 from snakesim_operator.console.snapshot import RobotSnapshot
+from snakesim_operator.results.felt import is_felt
 
 Floats = NDArray[np.float64]
 
@@ -95,7 +96,8 @@ class Drawing:
     normals: Floats = field(default_factory=_no_arrows)  # (n, 2, 3) from, to; as all arrows
     tangents: Floats = field(default_factory=_no_arrows)
     forces: Floats = field(default_factory=_no_arrows)  # measured, on the body
-    solved: Floats = field(default_factory=_no_arrows)  # as the controller expects them at its push-points
+    solved: Floats = field(default_factory=_no_arrows)  # as the controller expects them where it feels its push-points
+    asked: Floats = field(default_factory=_no_arrows)  # likewise, where no contact is felt
     resultant: Floats = field(default_factory=_no_arrows)  # of the measured forces, at the centre
     path_w: Floats = field(default_factory=_nothing)
     perceived: tuple[Obstacle, ...] = ()  # by guidance
@@ -113,7 +115,7 @@ def draw(snapshot: RobotSnapshot, around: Surroundings | None) -> Drawing | None
     axes, lengths = [joint.axis for joint in robot.joints], [link.length_m for link in robot.links]
     origins, rotations = link_frames(position_w, rotation_from_quaternion(wxyz), body.angle_rad, axes, lengths)
     middles = origins + rotations[:, :, 0] * (np.array(lengths)[:, None] / 2)
-    control, trajectory, status = snapshot.control, snapshot.trajectory, snapshot.status
+    trajectory, status = snapshot.trajectory, snapshot.status
     lost = set[str | None]() if status is None else {*status.isolated, *(fault.joint for fault in status.faults)}
     return Drawing(
         centre_w=middles.mean(axis=0),
@@ -125,7 +127,7 @@ def draw(snapshot: RobotSnapshot, around: Surroundings | None) -> Drawing | None
         pushing=pushing_joint(snapshot),
         path_w=_on_ground(np.array(trajectory.path_w), around) if trajectory is not None else _nothing(),
         perceived=_perceived(snapshot.world),
-        pushed=frozenset(c.obstacle for c in control.push_points if c.obstacle) if control is not None else frozenset(),
+        pushed=_pushed(snapshot),
         ahead=frozenset(trajectory.push_points) if trajectory is not None else frozenset(),
         cameras=tuple(_camera(key, image, origins, rotations) for key, image in snapshot.images.items()),
         **_forces(snapshot, middles.mean(axis=0)),
@@ -152,10 +154,19 @@ def _perceived(world: World | None) -> tuple[Obstacle, ...]:
     return () if world is None else tuple(o for o in world.obstacles if o.last_seen_ns is not None or o.felt)
 
 
+def _felt(snapshot: RobotSnapshot) -> list[WorldContact]:
+    return snapshot.world.contacts if snapshot.world is not None else []
+
+
+def _pushed(snapshot: RobotSnapshot) -> frozenset[str]:
+    points = snapshot.control.push_points if snapshot.control is not None else []
+    return frozenset(one.obstacle for one in points if one.obstacle and is_felt(one, _felt(snapshot)))
+
+
 def _forces(snapshot: RobotSnapshot, centre_w: Floats) -> dict[str, Floats]:
     """Contacts and forces; at most as long as the body's contacts are known."""
     found: dict[str, Floats] = {}
-    contacts = snapshot.world.contacts if snapshot.world is not None else []
+    contacts = _felt(snapshot)
     if contacts:
         at = np.array([c.position_w for c in contacts])
         force = np.array([c.force_w for c in contacts])
@@ -173,7 +184,9 @@ def _forces(snapshot: RobotSnapshot, centre_w: Floats) -> dict[str, Floats]:
     if control is not None and control.push_points and len(control.push_points) == len(control.solved_force_n):
         at = np.array([c.position_w for c in control.push_points])
         normal = np.array([c.normal_w for c in control.push_points])
-        found["solved"] = _forces_above(snapshot, at, np.array(control.solved_force_n)[:, None] * normal)
+        solved = _forces_above(snapshot, at, np.array(control.solved_force_n)[:, None] * normal)
+        there = np.array([is_felt(point, contacts) for point in control.push_points])
+        found |= {"solved": solved[there], "asked": solved[~there]}
     return found
 
 

@@ -34,7 +34,7 @@ LEGEND = (
     ("pushed off", stage.PUSHED),
     ("push-point ahead", stage.AHEAD),
     ("contact force", stage.FELT),
-    ("solved force", stage.SOLVED),
+    ("solved force; dashed: no contact felt there", stage.SOLVED),
     ("resultant", stage.RESULTANT),
     ("propulsion joint", stage.PUSHED),
 )

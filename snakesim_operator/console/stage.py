@@ -48,6 +48,7 @@ def colour(name: str, *, dark: bool = False) -> Colour:
 LINK, LINK_EDGE, HEAD = (52, 92, 138), (70, 112, 160), (22, 46, 84)
 HINGE, LOST = (52, 58, 66), colour("bad")
 PEG, PUSHED, AHEAD, SEEN = (176, 152, 112), (226, 88, 12), (232, 168, 56), (0, 200, 170)
+DASHES = np.arange(10.0).reshape(5, 2) / 9  # shares of a dashed line: from, to
 FELT, SOLVED, RESULTANT = colour("measured"), colour("commanded"), (20, 160, 90)
 
 
@@ -75,6 +76,9 @@ class Stage:
         )
         self._trail_line = scene.add_line_segments(
             "/world/trail", np.zeros((1, 2, 3)), colour("measured"), thickness=2.5, thickness_units="screen"
+        )
+        self._asked = scene.add_line_segments(
+            "/world/forces/asked", np.zeros((1, 2, 3)), SOLVED, thickness=3.0, thickness_units="screen", visible=False
         )
         self._show_ground()
         if around is not None:
@@ -160,6 +164,7 @@ class Stage:
         self._show_arrows("contacts/tangents", drawing.tangents, (170, 178, 186), 0.08)
         self._show_arrows("forces/measured", drawing.forces, FELT, 0.22)
         self._show_arrows("forces/solved", drawing.solved, SOLVED, 0.16)
+        self._show_dashes(drawing.asked)
         self._show_arrows("forces/resultant", drawing.resultant, RESULTANT, 0.30)
         self._show_path(drawing.path_w)
         hoop = {"opacity": 1.0, "grown": 1.05, "side": "double", "cast_shadow": False}
@@ -202,6 +207,14 @@ class Stage:
         arrows.visible = len(points) > 0
         if len(points):
             arrows.points = _single(points)
+
+    def _show_dashes(self, spans: Floats) -> None:
+        """Forces that are asked for, and not there: no arrows, so that nobody takes them for contact forces."""
+        start, along = spans[:, None, None, 0], spans[:, None, None, 1] - spans[:, None, None, 0]
+        dashes = (start + DASHES[..., None] * along).reshape(-1, 2, 3)
+        if len(dashes):
+            self._asked.points = _single(dashes)
+        self._asked.visible = len(dashes) > 0
 
     def _show_path(self, path_w: Floats) -> None:
         if len(path_w) < 2 or (self._path_w is not None and np.array_equal(path_w, self._path_w)):

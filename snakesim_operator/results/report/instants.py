@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.wire.messages import ControlState, World, WorldContact
+from snakesim_operator.results.felt import is_felt
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.timeline import reported_at_s
 
@@ -46,8 +47,14 @@ class Balance:
 
     def felt_n(self, felt: list[WorldContact], index: int) -> float | None:
         """The measured force at a push-point; None when none was felt there."""
-        there = [np.hypot(*one.force_w[:2]) for one in felt if one.obstacle == self.contacts[index].obstacle]
+        there = [np.hypot(*one.force_w[:2]) for one in felt if is_felt(self.contacts[index], [one])]
         return float(sum(there)) if there else None
+
+    def kinds(self, felt: list[WorldContact]) -> list[str]:
+        """How each contact force and last the resultant is drawn: as asked for unless felt, the sum if all are felt."""
+        there = [is_felt(contact, felt) for contact in self.contacts]
+        asked = ["" if one else " asked" for one in (*there, all(there))]
+        return [*(f"solved{one}" for one in asked[:-1]), f"resultant{asked[-1]}"]
 
     @property
     def corners_n(self) -> Floats:
@@ -139,5 +146,4 @@ def unfelt(instant: Instant) -> int:
     """How many solved contacts no sensor felt."""
     if instant.balance is None:
         return 0
-    touched = {contact.obstacle for contact in instant.felt}
-    return sum(contact.obstacle not in touched for contact in instant.balance.contacts)
+    return sum(not is_felt(contact, instant.felt) for contact in instant.balance.contacts)

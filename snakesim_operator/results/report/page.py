@@ -82,7 +82,7 @@ def _instants(record: RunRecord, found: list[Event]) -> list[dict[str, Any]]:
         ahead = nodes[-1] - nodes[0]
         if instant.balance is not None:
             scale = units_per_n(balances, *POLYGON, upright=view.upright)
-            polygon = Markup(force_polygon(instant.balance, *POLYGON, scale, upright=view.upright))
+            polygon = Markup(force_polygon(instant.balance, instant.felt, *POLYGON, scale, upright=view.upright))
             ahead = instant.balance.resultant_n
         pushed_n = felt_along_n(instant, ahead)
         drawn = Markup(top_view(record, instant, view))

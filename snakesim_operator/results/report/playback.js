@@ -12,7 +12,7 @@
   const arrow = ([x1, y1, x2, y2], kind) => {
     const length = Math.hypot(x2 - x1, y2 - y1);
     if (length < 2) return "";
-    const ux = (x2 - x1) / length, uy = (y2 - y1) / length, head = Math.min(kind === "resultant" ? 14 : 10, length);
+    const ux = (x2 - x1) / length, uy = (y2 - y1) / length, head = Math.min(kind.startsWith("resultant") ? 14 : 10, length);
     const bx = x2 - ux * head, by = y2 - uy * head, w = 0.38 * head;
     return `<line class="${kind} shaft" x1="${x1}" y1="${y1}" x2="${bx}" y2="${by}"/>`
       + `<polygon class="${kind} head" points="${x2},${y2} ${bx - uy * w},${by + ux * w} ${bx + uy * w},${by - ux * w}"/>`;
@@ -23,7 +23,7 @@
   const show = () => {
     let i = frames.findIndex((frame) => frame[0] > time);
     i = i < 0 ? frames.length - 1 : Math.max(i - 1, 0);
-    const [t, nodes, propels, what, solved, felt, map, path] = frames[i];
+    const [t, nodes, propels, what, solved, felt, map, path, kinds] = frames[i];
     const [later, ahead] = frames[Math.min(i + 1, frames.length - 1)];
     const share = later > t ? Math.min(Math.max((time - t) / (later - t), 0), 1) : 0;
     const at = nodes.map((value, k) => value + share * (ahead[k] - value));
@@ -38,10 +38,8 @@
     });
     perceived.innerHTML = (maps[map] ?? []).map((outline) => `<polygon class="seen" points="${outline}"/>`).join("")
       + (paths[path] ? `<polyline class="planned" points="${paths[path]}"/>` : "");
-    const last = solved.length - 4;
     forces.innerHTML = pieces(felt).map((one) => arrow(one, "felt")).join("")
-      + pieces(solved.slice(0, Math.max(last, 0))).map((one) => arrow(one, "solved")).join("")
-      + (last > 0 ? arrow(solved.slice(last), "resultant") : "");
+      + pieces(solved).map((one, k) => arrow(one, kinds[k])).join("");
     words.innerHTML = `<b>${time.toFixed(2)} s</b> ${propels < 0 ? "" : `<b>${joints[propels]} propels.</b> `}${said[what]}`;
     slider.value = time;
   };

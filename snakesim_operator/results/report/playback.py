@@ -12,7 +12,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from snakesim_hal.wire.messages import ControlState, World
+from snakesim_hal.wire.messages import ControlState, World, WorldContact
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.instants import balance_of
 from snakesim_operator.results.report.labels import Labels
@@ -61,14 +61,24 @@ def playback(record: RunRecord) -> Playback | None:
     frames: list[list[Any]] = []
     for i, (row, body_w, state, world) in enumerate(zip(rows, nodes, states, worlds, strict=True)):
         joint = state.propulsion_joint if state is not None else None
-        solved, felt = _solved(view, state, units), _felt(view, world, units)
+        solved, kinds, felt = *_solved(view, state, world, units), _felt(view, world, units)
         words = f"{in_words(state.state)}: {state.reason}" if state is not None else "the controller says nothing"
         if words not in said:
             said.append(words)
         time_s = float(record.time_s[row]) - zero_s(record)
         propels = names.index(joint) if joint in names else -1
         frames.append(
-            [round(time_s, 3), _flat(view, body_w), propels, said.index(words), solved, felt, map_of[i], path_of[i]]
+            [
+                round(time_s, 3),
+                _flat(view, body_w),
+                propels,
+                said.index(words),
+                solved,
+                felt,
+                map_of[i],
+                path_of[i],
+                kinds,
+            ]
         )
     labels = Labels(view.width, view.height)
     snake = element("g", body(record, view, nodes[0], labels), class_="snake")
@@ -136,19 +146,23 @@ def _units_per_n(states: Sequence[ControlState | None], worlds: Sequence[World |
     return LONGEST_ARROW / usual if usual > 0 else 0.0
 
 
-def _solved(view: View, state: ControlState | None, units: float) -> list[float]:
-    """The solved forces, and last their resultant: four numbers each, from where to where."""
+def _solved(view: View, state: ControlState | None, world: World | None, units: float) -> tuple[list[float], list[str]]:
+    """The solved forces, and last their resultant: four numbers each, from where to where; and how each is drawn."""
     balance = balance_of(state) if state is not None else None
     if balance is None:
-        return []
+        return [], []
     feet = [view.at(contact.position_w) for contact in balance.contacts]
     pairs = list(zip([*feet, feet[0]], [*balance.contact_n, balance.resultant_n], strict=True))
-    return _arrows(view, pairs, units)
+    return _arrows(view, pairs, units), balance.kinds(_contacts(world))
 
 
 def _felt(view: View, world: World | None, units: float) -> list[float]:
-    contacts = world.contacts if world is not None else []
-    return _arrows(view, [(view.at(one.position_w), np.array(one.force_w[:2])) for one in contacts], units)
+    felt = _contacts(world)
+    return _arrows(view, [(view.at(one.position_w), np.array(one.force_w[:2])) for one in felt], units)
+
+
+def _contacts(world: World | None) -> list[WorldContact]:
+    return world.contacts if world is not None else []
 
 
 def _arrows(view: View, forces: list[tuple[Point, Floats]], units: float) -> list[float]:

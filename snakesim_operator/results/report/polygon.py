@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesim_hal.wire.messages import WorldContact
 from snakesim_operator.results.report.instants import Balance
 from snakesim_operator.results.report.labels import Labels
 from snakesim_operator.results.report.svg import Point, arrow, element, figure, points_text, round_below, scale_bar
@@ -20,8 +21,11 @@ def units_per_n(balances: list[Balance], width: float, height: float, *, upright
     return float(min((width - 2 * EDGE) / across, (height - 2 * EDGE * 0.7) / tall))
 
 
-def force_polygon(balance: Balance, width: float, height: float, scale: float, *, upright: bool = False) -> str:
-    """A drawing. scale: units per newton; upright: turned by a quarter, as the top view beside it."""
+def force_polygon(
+    balance: Balance, felt: list[WorldContact], width: float, height: float, scale: float, *, upright: bool = False
+) -> str:
+    """A drawing. felt: measured then; scale: units per newton; upright: turned by a quarter, as the view beside it."""
+    *kinds, sum_kind = balance.kinds(felt)
     corners_n = _turned(balance, upright)
     middle = (corners_n.min(axis=0) + corners_n.max(axis=0)) / 2
     corners: list[Point] = [
@@ -34,9 +38,9 @@ def force_polygon(balance: Balance, width: float, height: float, scale: float, *
     ring = corners[:-1] if balance.gap_n * scale < 2 else corners
     parts = [element("polygon", points=points_text(ring), class_="polygon-fill")]
     parts.append(arrow(corners[1], corners[0], "commanded", head=11))
-    for a, b in pairwise(corners[1:]):
-        parts.append(arrow(a, b, "solved", head=11))
-    parts.append(_resultant(corners, labels))
+    for (a, b), kind in zip(pairwise(corners[1:]), kinds, strict=True):
+        parts.append(arrow(a, b, kind, head=11))
+    parts.append(_resultant(corners, sum_kind, labels))
     names = ["F", *(pretty(f"f_{i + 1}") for i in range(len(balance.contacts)))]
     inside = (sum(x for x, _ in corners) / len(corners), sum(y for _, y in corners) / len(corners))
     sizes = [balance.commanded_n, *balance.size_n]
@@ -62,7 +66,7 @@ def pretty(name: str) -> str:
     return base + index.translate(digits)
 
 
-def _resultant(corners: list[Point], labels: Labels) -> str:
+def _resultant(corners: list[Point], kind: str, labels: Labels) -> str:
     """From the first contact force to the end of the last; set off to the outside, for it lies on the commanded one."""
     start, end = corners[1], corners[-1]
     length = math.hypot(end[0] - start[0], end[1] - start[1])
@@ -75,4 +79,4 @@ def _resultant(corners: list[Point], labels: Labels) -> str:
     a = (start[0] + off * normal[0], start[1] + off * normal[1])
     b = (end[0] + off * normal[0], end[1] + off * normal[1])
     labels.keep_off_line(a, b, 6, 2.0)
-    return arrow(a, b, "resultant", head=14)
+    return arrow(a, b, kind, head=14)

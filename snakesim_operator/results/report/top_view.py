@@ -122,15 +122,16 @@ def _solved(instant: Instant, view: View, labels: Labels) -> str:
     if instant.balance is None:
         return ""
     parts: list[str] = []
-    for contact, force in zip(instant.balance.contacts, instant.balance.contact_n, strict=True):
+    *kinds, sum_kind = instant.balance.kinds(instant.felt)
+    for contact, force, kind in zip(instant.balance.contacts, instant.balance.contact_n, kinds, strict=True):
         at = view.at(contact.position_w)
         tip = view.along(at, force, view.force_scale)
-        parts.append(arrow(at, tip, "solved", head=11))
+        parts.append(arrow(at, tip, kind, head=11))
         labels.keep_off_line(at, tip, 5)
     start = view.at(instant.balance.contacts[0].position_w)
     tip = view.along(start, instant.balance.resultant_n, view.force_scale)
     labels.keep_off_line(start, tip, 7, 2.0)
-    parts.append(arrow(start, tip, "resultant under", head=14) + arrow(start, tip, "resultant", head=14))
+    parts.append(arrow(start, tip, "resultant under", head=14) + arrow(start, tip, sum_kind, head=14))
     return "".join(parts)
 
 

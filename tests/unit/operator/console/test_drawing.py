@@ -68,6 +68,25 @@ def test_forces_and_their_resultant():
     assert spans[2][0] == pytest.approx([0.0, 20 * M_PER_N, 0.0])
 
 
+def test_a_force_that_is_asked_for_where_nothing_touches_is_no_contact_force():
+    points = [
+        WorldContact(
+            link=0, obstacle=peg, body_s_m=0.1, position_w=(x, 0.0, 0.0), normal_w=(0.0, 1.0, 0.0),
+            tangent_w=(1.0, 0.0, 0.0), force_w=(0.0, 10.0, 0.0),
+        )
+        for peg, x in (("felt", 0.1), ("clear", 0.3))
+    ]  # fmt: skip
+    control = ControlState(
+        tick=1, stamp_ns=1, controller="any", state="Locomoting", reason="", push_points=points,
+        solved_force_n=[20.0, 30.0],
+    )  # fmt: skip
+    snapshot = RobotSnapshot(robot=ROBOT, body=joints(), world=world(points[:1], []), control=control)
+    drawing = draw(snapshot, None)
+    assert drawing is not None and drawing.pushed == {"felt"}
+    assert drawing.solved[:, 0, 0] == pytest.approx([0.1]) and drawing.asked[:, 0, 0] == pytest.approx([0.3])
+    assert drawing.asked[0, 1] - drawing.asked[0, 0] == pytest.approx([0.0, LONGEST_M, 0.0])
+
+
 def test_a_strong_force_has_an_arrow_of_limited_length_above_the_body():
     contact = WorldContact(
         link=0, obstacle="peg", body_s_m=0.1, position_w=(0.1, 0.0, 0.0), normal_w=(0.0, 1.0, 0.0),

@@ -1,13 +1,36 @@
 """What guidance perceives is drawn about where it believes it to be, beside the truth."""
 
-from snakesim_hal.wire.messages import Obstacle, World
-from snakesim_operator.console.drawing import draw
+import pytest
+
+from snakesim_hal.wire.messages import ControlState, Obstacle, World, WorldContact
+from snakesim_operator.console.drawing import M_PER_N, draw
 from snakesim_operator.console.port import open_port
 from snakesim_operator.console.server import page_server
 from snakesim_operator.console.snapshot import RobotSnapshot
 from snakesim_operator.console.stage import Stage
 from tests.unit.hal.rig import description
-from tests.unit.operator.console.test_drawing import joints
+from tests.unit.operator.console.test_drawing import joints, world
+
+
+def test_a_force_without_a_contact_is_dashed_and_goes_when_it_is_felt():
+    point = WorldContact(
+        link=0, obstacle="peg", body_s_m=0.1, position_w=(0.1, 0.0, 0.0), normal_w=(0.0, 1.0, 0.0),
+        tangent_w=(1.0, 0.0, 0.0), force_w=(0.0, 10.0, 0.0),
+    )  # fmt: skip
+    control = ControlState(
+        tick=1, stamp_ns=1, controller="any", state="Locomoting", reason="", push_points=[point], solved_force_n=[10.0]
+    )
+    with page_server(open_port(None)) as (server, _):
+        stage = Stage(server.scene, description(), None)
+        for felt in ([], [point], []):
+            snapshot = RobotSnapshot(robot=description(), body=joints(), world=world(felt, []), control=control)
+            drawing = draw(snapshot, None)
+            assert drawing is not None
+            stage.show(drawing)
+            solved = stage._arrows.get("forces/solved")
+            assert stage._asked.visible is not bool(felt) and (solved is not None and solved.visible) is bool(felt)
+        ends = stage._asked.points.reshape(-1, 3)
+        assert len(ends) == 10 and ends[-1] - ends[0] == pytest.approx([0.0, 10 * M_PER_N, 0.0], abs=1e-6)
 
 
 def test_every_shape_that_is_perceived_is_drawn_and_goes_when_it_is_forgotten():

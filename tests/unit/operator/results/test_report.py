@@ -113,6 +113,19 @@ def test_all_polygons_have_one_scale_and_show_the_commanded_force(page: Reader, 
     assert math.dist(ring[0][0], ring[-1][1]) == pytest.approx(lengths[0], abs=0.5)
 
 
+def test_a_solved_force_where_nothing_is_felt_is_drawn_as_asked_for(record: RunRecord) -> None:
+    clear = changed(record, worlds=[msgspec.structs.replace(one, contacts=[]) for one in record.worlds])
+    kinds = [{kind for frame in read(one).film["frames"] for kind in frame[8]} for one in (record, clear)]
+    assert {"solved", "resultant", "solved asked", "resultant asked"} == kinds[0]
+    assert {"solved asked", "resultant asked"} == kinds[1]
+    html = report_page(clear, summarise(clear, "complete"))
+    drawings = re.findall(r'<svg viewBox="[^"]*" class="figure" role.*?</svg>', html)
+    classes = {found for svg in drawings for found in re.findall(r'class="((?:solved|resultant)[^"]*)"', svg)}
+    assert {"solved asked shaft", "solved asked head", "resultant asked shaft"} <= classes
+    assert not {"solved shaft", "solved head", "resultant shaft", "resultant head"} & classes
+    assert "asked for, and no contact felt there" in read(clear).text
+
+
 def test_no_text_of_a_drawing_covers_another_and_no_obstacle_is_cut(record: RunRecord) -> None:
     html = report_page(record, summarise(record, "complete"))
     drawings = [
