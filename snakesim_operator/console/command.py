@@ -14,7 +14,7 @@ from snakesim_hal.network.session import Link
 from snakesim_hal.process import on_stop_signal
 from snakesim_hal.serve import process_options
 from snakesim_hal.terminal import Say, say
-from snakesim_operator.console.port import open_port
+from snakesim_operator.console_port import open_port
 from snakesim_operator.tools.targets import RobotSelection, only_robot
 
 NEEDS = "the console needs viser; install it with: pip install 'snakesim[console]'"

@@ -23,7 +23,7 @@ from snakesim_operator.console.admission import Admission
 from snakesim_operator.console.browser import MOST_BYTES, Browser
 from snakesim_operator.console.front import Front, HandedOn
 from snakesim_operator.console.pacing import pace
-from snakesim_operator.console.port import LOOPBACK, address_of
+from snakesim_operator.console_port import LOOPBACK, address_of
 from snakesim_operator.page_origin import why_refused
 
 MOST_VIEWERS = 64

@@ -6,17 +6,18 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
 from snakesim_hal.errors import ConfigError
-from snakesim_operator.console.port import address_of, open_port
+from snakesim_operator.console_port import address_of, open_port
 from snakesim_operator.run import children
 from snakesim_operator.run.run_files import RunFiles
 
+CONSOLE = "snakesim_operator.console"
 LOG = "console.log"
 
 
 def check_console() -> None:
-    """Raise ConfigError when the console is not installed."""
-    if importlib.util.find_spec("viser") is None:
-        raise ConfigError("--console needs viser; install it with: pip install 'snakesim[console]', or leave it out")
+    """Raise ConfigError when the console, or what it needs, is not installed."""
+    if importlib.util.find_spec(CONSOLE) is None or importlib.util.find_spec("viser") is None:
+        raise ConfigError("--console needs the console: pip install 'snakesim[console]', or leave it out")
 
 
 @contextlib.contextmanager
@@ -24,7 +25,7 @@ def console_beside(common: Sequence[str], files: RunFiles, say: Callable[[str], 
     """Show the run in the browser for as long as the context lives. common: the arguments of each of its processes."""
     with open_port(None) as listening:  # only the console keeps it open: when that has ended, browsers are told at once
         handle = listening.fileno()
-        arguments = ["snakesim_operator.console", *common, "--listening", str(handle)]
+        arguments = [CONSOLE, *common, "--listening", str(handle)]
         child = children.start("console", arguments, partial(files.append, LOG), inherits=[handle])
         say(f"console: {address_of(listening)}")
     try:

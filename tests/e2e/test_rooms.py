@@ -13,7 +13,13 @@ from tests.e2e.command import environment
 pytestmark = pytest.mark.e2e
 
 REPOSITORY = Path(__file__).parents[2]
-COMMANDS = {"evaluate": ("evaluate", "sweep", "optimise"), "lab": ("deploy",), "robots": ("robot",), "ros2": ("ros2",)}
+COMMANDS = {
+    "console": ("console",),
+    "evaluate": ("evaluate", "sweep", "optimise"),
+    "lab": ("deploy",),
+    "robots": ("robot",),
+    "ros2": ("ros2",),
+}
 IMPORT_ALL = (
     "import importlib, pkgutil, snakesim_operator as top\n"
     "for found in pkgutil.walk_packages(top.__path__, 'snakesim_operator.'):\n"
@@ -61,9 +67,12 @@ def test_all_else_works_without(room: str, tmp_path: Path) -> None:
     assert shown.returncode == 0 and not shown.stderr, shown.stderr
     listed = {words[0] for line in shown.stdout.splitlines() if (words := line.split())}
     left = {name for other, names in COMMANDS.items() if other != room for name in names}
-    assert left | {"run", "estop", "console"} <= listed
+    assert left | {"run", "estop"} <= listed
     assert not listed & {*COMMANDS[room]}
     refused = run("-m", "snakesim_operator", COMMANDS[room][0])
     assert refused.returncode == 2 and "no command" in refused.stderr, refused.stderr
+    if room == "console":
+        beside = run("-m", "snakesim_operator", "run", "triplet", "--console")
+        assert beside.returncode == 2 and "snakesim[console]" in beside.stderr, beside.stderr
     ran = run("-m", "snakesim_operator", "run", "triplet", "--in-process", "--set", "duration_s=0.2")
     assert ran.returncode == 0, ran.stdout + ran.stderr

@@ -15,10 +15,10 @@ from snakesim_hal.model.scenario import capsules_at_start, load
 from snakesim_hal.wire.messages import Status
 from snakesim_operator.console import texts
 from snakesim_operator.console.drawing import draw
-from snakesim_operator.console.port import address_of, open_port
 from snakesim_operator.console.server import page_server
 from snakesim_operator.console.snapshot import RobotSnapshot, expected_of
 from snakesim_operator.console.token import ControlToken
+from snakesim_operator.console_port import address_of, open_port
 from snakesim_operator.page_origin import why_refused
 from tests.e2e.command import wait_until
 from tests.unit.hal.rig import description, status

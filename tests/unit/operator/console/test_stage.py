@@ -4,10 +4,10 @@ import pytest
 
 from snakesim_hal.wire.messages import ControlState, Obstacle, World, WorldContact
 from snakesim_operator.console.drawing import M_PER_N, draw
-from snakesim_operator.console.port import open_port
 from snakesim_operator.console.server import page_server
 from snakesim_operator.console.snapshot import RobotSnapshot
 from snakesim_operator.console.stage import Stage
+from snakesim_operator.console_port import open_port
 from tests.unit.hal.rig import description
 from tests.unit.operator.console.test_drawing import joints, world
 
