@@ -15,7 +15,7 @@ from pathlib import Path
 import msgspec
 
 from benchmarks.table import HEADER, compare
-from snakesim_operator.recording.reader import RECORDING
+from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.results.record import SUMMARY
 from snakesim_operator.results.summary import RunSummary
 

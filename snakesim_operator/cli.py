@@ -33,6 +33,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SnakesimError as error:
         report_error(error, "snakesim")
         return FAILED
+    except ModuleNotFoundError as error:
+        from snakesim_operator.extras import explained
+
+        if (why := explained(error)) is None:
+            raise
+        report_error(why, "snakesim")
+        return BAD_INPUT
     except OSError as error:  # such as a full disk under what is printed
         discard(sys.stdout)
         if isinstance(error, BrokenPipeError):  # the reader of a pipe has closed it
@@ -112,21 +119,22 @@ class Commands(Command):
 
     def add_installed(self) -> None:
         """Add the commands of entry points. One that cannot be loaded is reported, and keeps no other from its work."""
-        from snakesim_hal.model.plugins import COMMANDS, find_plugin, installed
+        from importlib.metadata import entry_points
 
-        for name in installed(COMMANDS):
-            if name in self.commands.choices:  # another of the same `add_commands`
+        from snakesim_hal.model.plugins import COMMANDS, find_plugin
+
+        for entry in sorted(entry_points(group=COMMANDS)):
+            if entry.attr != ADDS or entry.name in self.commands.choices:  # another of the same `add_commands`
                 continue
             try:
-                found = find_plugin(COMMANDS, name)
+                found = find_plugin(COMMANDS, entry.name)
             except ConfigError as error:
                 report_error(error, "snakesim")
                 continue
-            if getattr(found, "__name__", "") == ADDS:
-                before = len(self.commands._choices_actions)
-                found(self.commands)
-                task = getattr(sys.modules[found.__module__], "TASK", "more")
-                self._tasks.setdefault(task, []).extend(self.commands._choices_actions[before:])
+            before = len(self.commands._choices_actions)
+            found(self.commands)
+            task = getattr(sys.modules[found.__module__], "TASK", "more")
+            self._tasks.setdefault(task, []).extend(self.commands._choices_actions[before:])
 
     def format_help(self) -> str:
         """The commands by task, and those of installed packages by name."""

@@ -79,11 +79,15 @@ def _package(entry: EntryPoint) -> str:
 
 
 def _extras_of(entry: EntryPoint) -> str:
-    """How to install a plugin's optional dependencies."""
-    extras = entry.dist.metadata.get_all("Provides-Extra") if entry.dist is not None else None
-    if entry.dist is None or not extras:
+    """How to install what a plugin needs, if its entry point names its extras: `module:Class [extra]`."""
+    if entry.dist is None or not entry.extras:
         return ""
-    return f" Install it with: {sys.executable} -m pip install '{entry.dist.name}[{','.join(extras)}]'"
+    return f" Install it with: {pip_install(*entry.extras, package=entry.dist.name)}"
+
+
+def pip_install(*extras: str, package: str = "snakesim") -> str:
+    """The command that adds extras to this very environment."""
+    return f"{sys.executable} -m pip install '{package}[{','.join(extras)}]'"
 
 
 def in_file(name: str) -> bool:

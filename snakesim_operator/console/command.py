@@ -14,15 +14,14 @@ from snakesim_hal.network.session import Link
 from snakesim_hal.process import on_stop_signal
 from snakesim_hal.serve import process_options
 from snakesim_hal.terminal import Say, say
+from snakesim_operator import extras
 from snakesim_operator.console_port import open_port
 from snakesim_operator.tools.targets import RobotSelection, only_robot
-
-NEEDS = "the console needs viser; install it with: pip install 'snakesim[console]'"
 
 
 def console(where: RobotSelection, port: int | None, say: Say = say) -> int:
     """Show a running robot until Ctrl-C. Raises NotConnectedError when there is none."""
-    _check_installed()
+    extras.check("console", "the console")
     from snakesim_operator.console.console import show_live
 
     link = only_robot(where, "console")
@@ -32,7 +31,7 @@ def console(where: RobotSelection, port: int | None, say: Say = say) -> int:
 
 def show_record(folder: Path, at_s: float, port: int | None, say: Say = say) -> int:
     """Show a recorded run until Ctrl-C. Raises ConfigError when the folder is not one of a run."""
-    _check_installed()
+    extras.check("console", "the console")
     from snakesim_operator.console.console import show_recorded
 
     return show_recorded(folder, at_s, open_port(port), _until_signal(), say)
@@ -51,13 +50,6 @@ def _surroundings(link: Link):
     return None
 
 
-def _check_installed() -> None:
-    try:
-        import viser  # noqa: F401
-    except ModuleNotFoundError as error:
-        raise ConfigError(f"{NEEDS} ({error})") from error
-
-
 def _until_signal() -> threading.Event:
     stop = threading.Event()
     on_stop_signal(stop.set)
@@ -72,7 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     add_parent(parser)
     parser.add_argument("--listening", type=int, required=True, help=argparse.SUPPRESS)  # inherited socket
     given = process_options(parser.parse_args(argv))
-    _check_installed()
+    extras.check("console", "the console")
     from snakesim_operator.console.console import show_live
     from snakesim_operator.console.drawing import Surroundings
     from snakesim_operator.console.snapshot import expected_of

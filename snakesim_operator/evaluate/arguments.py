@@ -3,14 +3,11 @@
 import argparse
 import dataclasses
 import shlex
-import sys
 from pathlib import Path
 from typing import Any
 
 from snakesim_hal.arguments import number
-from snakesim_hal.errors import ConfigError
 
-EXTRA = ("distributed", "optuna", "pyarrow")
 TASK = "run"  # under which `snakesim --help` lists it
 
 
@@ -117,11 +114,6 @@ def _optimise(arguments: argparse.Namespace) -> int:
 
 
 def _check_extra() -> None:
-    from importlib.util import find_spec
+    from snakesim_operator import extras
 
-    missing = [name for name in EXTRA if find_spec(name) is None]
-    if missing:
-        raise ConfigError(
-            f"this command needs {', '.join(missing)}, which a plain install leaves out; install it with: "
-            f"{sys.executable} -m pip install 'snakesim[evaluate]'"
-        )
+    extras.check("evaluate", "this command")

@@ -4,7 +4,6 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from snakesim_hal.errors import ConfigError
 from snakesim_hal.terminal import say
 
 AUTHORITY = "authority"
@@ -53,6 +52,7 @@ def _example(_arguments: argparse.Namespace) -> int:
 
 
 def _render(arguments: argparse.Namespace) -> int:
+    _need_extra()
     from snakesim_operator.lab.lab_file import load_lab
     from snakesim_operator.lab.render import render
 
@@ -89,7 +89,6 @@ def _check(arguments: argparse.Namespace) -> int:
 
 
 def _need_extra() -> None:
-    from importlib.util import find_spec
+    from snakesim_operator import extras
 
-    if find_spec("cryptography") is None:
-        raise ConfigError('certificates need the package `cryptography`: pip install "snakesim[lab]"')
+    extras.check("lab", "`snakesim deploy`")

@@ -133,6 +133,10 @@ def _video(arguments: argparse.Namespace) -> int:
 
 
 def _export(arguments: argparse.Namespace) -> int:
+    from snakesim_operator import extras
+
+    if arguments.format in ("parquet", "lerobot"):
+        extras.check("export", f"--format {arguments.format}")
     from snakesim_operator.playback.export import export
 
     return export(arguments.recordings, arguments.format, arguments.out, say)

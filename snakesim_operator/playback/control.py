@@ -27,7 +27,8 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder, encode, encoding_of
 from snakesim_hal.wire.messages import Answer, AppliedCommand, Clock, Configuration, Description, JointCommand
 from snakesim_operator.playback.order import in_robot_order
-from snakesim_operator.recording.reader import RECORDING, Recorded, RecordingReader
+from snakesim_operator.recording.message import RECORDING, Recorded
+from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.recording.recording import Recording
 from snakesim_operator.results.incomplete import exit_code
 from snakesim_operator.results.record import CONFIG

@@ -98,11 +98,9 @@ def _write_csv(columns: dict[str, NDArray[Any]], path: Path, lacks: Sequence[str
 
 
 def write_parquet(columns: dict[str, Any], path: Path, metadata: dict[bytes, bytes] | None = None) -> None:
-    """Columns as a Parquet file. metadata: of the schema. Raises ConfigError without the extra."""
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError:
-        raise ConfigError("this format needs pyarrow: pip install 'snakesim[export]'") from None
+    """Columns as a Parquet file. metadata: of the schema. Needs the extra `export`."""
+    import pyarrow
+    import pyarrow.parquet
+
     path.parent.mkdir(parents=True, exist_ok=True)
     pyarrow.parquet.write_table(pyarrow.table(columns).replace_schema_metadata(metadata), path)

@@ -17,7 +17,8 @@ from snakesim_hal.terminal import Say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Status
 from snakesim_operator.recording.losses import Gap
-from snakesim_operator.recording.reader import RECORDING, RecordingReader
+from snakesim_operator.recording.message import RECORDING
+from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.results.gaps import unread
 from snakesim_operator.results.incomplete import exit_code
 from snakesim_operator.results.record import GIVE

@@ -5,7 +5,8 @@ from collections.abc import Iterator
 from itertools import count
 
 from snakesim_hal.wire import keys
-from snakesim_operator.recording.reader import Recorded, RecordingReader
+from snakesim_operator.recording.message import Recorded
+from snakesim_operator.recording.reader import RecordingReader
 
 WINDOW_NS = 1_000_000_000  # messages are no further out of order: an image may come long after the clock that names it
 LAST = {keys.CLOCK: 1, keys.APPLIED: 2}

@@ -16,7 +16,8 @@ from snakesim_hal.terminal import Say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES, encoding_of
 from snakesim_operator.playback.order import in_robot_order
-from snakesim_operator.recording.reader import Recorded, RecordingReader
+from snakesim_operator.recording.message import Recorded
+from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.results.incomplete import exit_code
 from snakesim_operator.results.recorded import read_recording
 

@@ -5,7 +5,7 @@ from contextlib import suppress
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
-from snakesim_hal.errors import ConfigError, NotConnectedError
+from snakesim_hal.errors import NotConnectedError
 from snakesim_operator.recording.foxglove import ALWAYS, FoxgloveMessage, Kind, schema_of
 from snakesim_operator.recording.origin_relay import HOST, OriginRelay, hidden_host
 
@@ -19,11 +19,9 @@ class LiveServer:
     def __init__(self, robot: str, port: int, origins: Collection[str], report: Callable[[str], None]) -> None:
         """port: 0 takes any; origins: of web pages that may read the robot; report: told of those that may not.
 
-        Raises ConfigError without the extra, NotConnectedError when the port is in use."""
-        try:
-            import foxglove
-        except ImportError as error:
-            raise ConfigError("--foxglove needs: pip install 'snakesim[foxglove]'") from error
+        Raises NotConnectedError when the port is in use."""
+        import foxglove  # needs the extra `foxglove`
+
         self._new_channel, self._schema = foxglove.Channel, foxglove.Schema
         self._context = foxglove.Context()
         self._channels: dict[str, foxglove.Channel] = {}

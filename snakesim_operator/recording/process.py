@@ -28,11 +28,11 @@ from snakesim_hal.terminal import print_stderr, report_error
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import Description
-from snakesim_operator.recording.reader import RECORDING
+from snakesim_hal.wire.roles import RECORDER
+from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.recording import Recording, Show
 from snakesim_operator.recording.tap import Tap
 
-RECORDER = "recorder"
 TURN_S = 0.02
 NICE = 10  # a robot's own processes come first
 MAX_HOSTS = 100  # files: one for each host that a robot had

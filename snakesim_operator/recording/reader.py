@@ -29,9 +29,9 @@ from snakesim_operator.recording.chunks import (
 )
 from snakesim_operator.recording.losses import ELSEWHERE, MOST_GAPS, Losses
 from snakesim_operator.recording.mcap_file import PROFILE
+from snakesim_operator.recording.message import Recorded
 from snakesim_operator.recording.recording import ABOUT, COPIED
 
-RECORDING = "recording.mcap"
 LATEST_NS = 2**62  # 146 years: no robot time is later
 MOST_RATIO, FREE_BYTES = 100, 32 * 1024 * 1024  # a file may unpack to so many times its size, and to so much more
 _SCANNED_BYTES = 1024 * 1024
@@ -43,17 +43,6 @@ _NEXT = re.compile(  # a chunk of a known compression, our metadata, or the end 
 _DATA_END = HEAD.pack(Opcode.DATA_END, 4)  # and a CRC
 _FOOTER = HEAD.size + 20 + len(MCAP0_MAGIC)  # bytes at the end: a record of two offsets and a CRC, and the magic
 _READ = (Opcode.CHANNEL, Opcode.HEADER, Opcode.METADATA, Opcode.SCHEMA, Opcode.MESSAGE)
-
-
-@dataclass(frozen=True)
-class Recorded:
-    """One message of a recording."""
-
-    key: str
-    payload: bytes
-    encoding: str  # on the wire
-    time_ns: int  # robot time
-    wall_ns: int  # at the recorder
 
 
 @dataclass

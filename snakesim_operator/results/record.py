@@ -20,7 +20,7 @@ from snakesim_hal.model.scene import Placed, route_of
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import ControlState, Description, Trajectory, World
-from snakesim_operator.recording.reader import RECORDING
+from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.results.gaps import cleaned, unwritten
 from snakesim_operator.results.recorded import SERVICE_STREAMS, Contents, read_recording
 

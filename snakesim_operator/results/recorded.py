@@ -28,7 +28,7 @@ from snakesim_hal.wire.messages import (
     Trajectory,
     World,
 )
-from snakesim_operator.recording.reader import Recorded, RecordingReader
+from snakesim_operator.recording.message import Recorded
 from snakesim_operator.results.gaps import unread
 
 SERVICE_STREAMS: dict[str, type[Message]] = {
@@ -156,6 +156,8 @@ class Contents:
 
 def read_recording(path: Path, wanted: Collection[str] = ALL) -> Contents:
     """Read a recording's messages at these keys. Raises ConfigError for a file that is none."""
+    from snakesim_operator.recording.reader import RecordingReader  # needs the extra `record`
+
     contents, reader = Contents(path), RecordingReader(path)
     for recorded in reader.messages(wanted):
         contents.take(recorded)

@@ -98,6 +98,11 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     config: Annotated[dict[str, Any], Meta(description="the effective configuration; repeats the run")]
 
 
+def distance_m(summary: RunSummary) -> float | None:
+    """Along the path, else as the crow flies."""
+    return summary.path_distance_m if summary.path_distance_m is not None else summary.net_displacement_m
+
+
 def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), hosts: int = 1) -> RunSummary:
     """Work out the numbers of a run."""
     config, host = record.config, record.host

@@ -60,10 +60,9 @@ def _ros2(arguments: argparse.Namespace) -> int:
 
 def check(arguments: argparse.Namespace) -> None:
     """Raises ConfigError for what cannot be meant."""
-    from importlib.util import find_spec
+    from snakesim_operator import extras
 
-    if find_spec("xxhash") is None:
-        raise ConfigError("`snakesim ros2` needs packages that are not installed: pip install 'snakesim[ros2]'")
+    extras.check("ros2", "`snakesim ros2`")
     check_endpoint(arguments.ros_router, "--ros-router")
     name = arguments.ros_namespace
     if name is not None and not re.fullmatch(r"[A-Za-z_]\w*(/[A-Za-z_]\w*)*", name, re.ASCII):

@@ -10,17 +10,18 @@ from snakesim_hal.arithmetic import digest_text
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.host.latch import ESTOP
 from snakesim_hal.host_process import HostRecord
+from snakesim_hal.model.plugins import pip_install
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.local_registry import robot_folder
 from snakesim_hal.terminal import say
 from snakesim_hal.wire.messages import Description
+from snakesim_operator import extras
 from snakesim_operator.results import last_run
 from snakesim_operator.results.ended import COMPLETE, ended_early
 from snakesim_operator.results.gaps import unwritten
 from snakesim_operator.results.incomplete import INCOMPLETE
 from snakesim_operator.results.record import REPORT, SUMMARY, RunRecord
-from snakesim_operator.results.report.verdict import distance_m
-from snakesim_operator.results.summary import Restart, RunSummary, summarise
+from snakesim_operator.results.summary import Restart, RunSummary, distance_m, summarise
 from snakesim_operator.run.ending import Ending
 from snakesim_operator.run.run_files import RunFiles
 
@@ -96,7 +97,7 @@ def leave(
     record = RunRecord.load(folder, outcome.host)
     summary = summarise(record, _ended(ending), outcome.restarts, outcome.hosts)
     files.put(SUMMARY, msgspec.json.format(msgspec.json.encode(summary), indent=2))
-    if report:
+    if report and extras.has("report"):
         from snakesim_operator.results.report import page  # templates take a while to import, which no start waits for
 
         files.put(REPORT, page(record, summary).encode())
@@ -108,6 +109,8 @@ def _print_end(files: RunFiles, ending: Ending, outcome: Outcome, lacks: Sequenc
     for what, name in (("summary", SUMMARY), ("report", REPORT)):
         if out is not None and (out / name).is_file():
             say(f"{what + ':':<9}{out / name}")
+    if out is not None and (out / SUMMARY).is_file() and not extras.has("report"):
+        say(f"report:  not written; {pip_install('report')}, then `snakesim report {out}`")
     if host is None:
         said = f"; the logs of its processes are in {out}" if out is not None else ""
         say(f"the run left no record: {ending.reason or 'the host ended early'}{said}")

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
 from snakesim_hal.errors import ConfigError
+from snakesim_operator import extras
 from snakesim_operator.console_port import address_of, open_port
 from snakesim_operator.run import children
 from snakesim_operator.run.run_files import RunFiles
@@ -16,8 +17,9 @@ LOG = "console.log"
 
 def check_console() -> None:
     """Raise ConfigError when the console, or what it needs, is not installed."""
-    if importlib.util.find_spec(CONSOLE) is None or importlib.util.find_spec("viser") is None:
-        raise ConfigError("--console needs the console: pip install 'snakesim[console]', or leave it out")
+    if importlib.util.find_spec(CONSOLE) is None:
+        raise ConfigError("--console: this installation is one without the console; leave it out")
+    extras.check("console", "--console", "; or leave it out")
 
 
 @contextlib.contextmanager

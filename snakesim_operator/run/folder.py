@@ -11,7 +11,7 @@ from pathlib import Path
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.host.recorder import BLACK_BOX, HOST_RECORD
 from snakesim_hal.model.whole_file import PARTIAL
-from snakesim_operator.recording.reader import RECORDING
+from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.results.record import CONFIG, REPORT, SUMMARY
 
 LOCK = "run.lock"  # holds the process id of the run that is writing here

@@ -17,6 +17,7 @@ from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 
 from snakesim_hal.arithmetic import is_pinned
 from snakesim_hal.errors import ConfigError
@@ -29,8 +30,8 @@ from snakesim_hal.network.session import Session
 from snakesim_hal.terminal import print_stderr, say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlState
-from snakesim_operator.recording.reader import RECORDING
-from snakesim_operator.recording.recording import Recording
+from snakesim_operator import extras
+from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.results.advance import GoalWatch
 from snakesim_operator.results.record import CONFIG, RunRecord
 from snakesim_operator.results.recorded import SERVICE_STREAMS
@@ -39,8 +40,11 @@ from snakesim_operator.run.conclusion import Outcome, conclude, explain, leave
 from snakesim_operator.run.ending import Ending, interruptible
 from snakesim_operator.run.pinned_process import call_pinned
 from snakesim_operator.run.progress import Progress
-from snakesim_operator.run.run import opened_files
+from snakesim_operator.run.run import check_recorder, opened_files
 from snakesim_operator.run.run_files import RunFiles
+
+if TYPE_CHECKING:
+    from snakesim_operator.recording.recording import Recording
 
 WORDS = "run.log"  # what the parts of the run say
 TAKEN_EVERY = 50  # turns
@@ -70,6 +74,7 @@ def simulate(
     """
     if not is_pinned():
         return call_pinned(simulate, config=config, out=out, until_goal=until_goal, give_up_s=give_up_s)
+    extras.check("record", "`simulate`, whose results are read from a recording,")
     config, ending = check_plugins(config), Ending()
     with contextlib.ExitStack() as opened:
         if out is None:
@@ -97,6 +102,7 @@ def run_in_process(
 ) -> int:
     """`snakesim run --in-process`. Exit code: as of a run in processes. until_goal, give_up_s: as of `simulate`."""
     check(config)
+    check_recorder(record=record)
     ending = Ending()
     with opened_files(config, out) as (files, _):
         say(f"{config.name}: {config.robot.name} in {config.scene.name}, {config.commander}, in one process")
@@ -143,11 +149,13 @@ def _go(
 
 
 @contextlib.contextmanager
-def _recording(session: Session, files: RunFiles, recorded: Iterable[str]) -> Iterator[Recording | None]:
+def _recording(session: Session, files: RunFiles, recorded: Iterable[str]) -> "Iterator[Recording | None]":
     """Record what is published at these keys; None when there are none, or no file can be made."""
     recording = None
     try:
         if files.folder is not None and recorded:
+            from snakesim_operator.recording.recording import Recording  # needs the extra `record`
+
             recording = Recording(files.folder / RECORDING)
             for key in recorded:
                 session.on_latched_arrival(key, recording.take)

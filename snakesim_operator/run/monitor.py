@@ -10,7 +10,7 @@ from snakesim_hal.network.session import Session
 from snakesim_hal.service import START_LIMIT_S
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlState, Description, LifecycleRequest, Status, Trajectory
-from snakesim_operator.recording.process import RECORDER
+from snakesim_hal.wire.roles import RECORDER
 from snakesim_operator.results.ended import AT_GOAL
 from snakesim_operator.run.ending import Ending
 from snakesim_operator.run.process_faults import ProcessFaults

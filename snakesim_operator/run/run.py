@@ -23,7 +23,8 @@ from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.network.session_file import SessionFile
 from snakesim_hal.service import START_LIMIT_S
 from snakesim_hal.terminal import say
-from snakesim_operator.recording.process import RECORDER
+from snakesim_hal.wire.roles import RECORDER
+from snakesim_operator import extras
 from snakesim_operator.results.record import CONFIG
 from snakesim_operator.run.console_child import check_console, console_beside
 from snakesim_operator.run.ending import Ending, interruptible
@@ -70,6 +71,7 @@ def run(request: RunRequest) -> int:
     """Run it. Returns 0, 1 on a fault or an early end, 3 when the record lacks something, 130 when interrupted."""
     request = replace(request, config=check_plugins(request.config))
     _check_router(request)
+    check_recorder(record=request.record)
     if request.console:
         check_console()
     if request.endpoint is not None:
@@ -115,6 +117,12 @@ def opened_files(config: RunConfig, out: Path | None) -> Iterator[tuple[RunFiles
             yield RunFiles(None, _warn), Path(f"/proc/{os.getpid()}/fd/{memory}")
         else:
             yield RunFiles(folder, _warn), folder / CONFIG
+
+
+def check_recorder(*, record: bool) -> None:
+    """Raise ConfigError when a recording is wanted that cannot be written: what a run did cannot be had again."""
+    if record:
+        extras.check("record", "a recording of the run", "; or run with --no-record")
 
 
 def _warn(failure: str) -> None:

@@ -110,6 +110,8 @@ def _of_package(name: str) -> list[Command]:
     try:
         parser = getattr(import_module(entry.module), "parser", None)
     except ImportError as error:
+        if entry.extras and isinstance(error, ModuleNotFoundError):  # left out on purpose
+            return [Command(f" {name}")]
         print_stderr(f"snakesim {name} cannot be completed: {error}")
         return []
     return list(_walk(parser(), f" {name}")) if parser is not None else [Command(f" {name}")]

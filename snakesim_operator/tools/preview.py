@@ -22,6 +22,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_hal.wire.messages import ColourImage, DepthImage, Description, Preview
 from snakesim_hal.wire.quantities import MAX_PREVIEW_BYTES
+from snakesim_operator import extras
 from snakesim_operator.tools.targets import RobotSelection, only_robot
 
 MAX_HZ = 10.0
@@ -51,10 +52,7 @@ def preview(where: RobotSelection, hz: float, width: int, say: Say = say) -> int
 
 
 def _check(hz: float, width: int) -> None:
-    try:
-        import PIL.Image  # noqa: F401
-    except ModuleNotFoundError:
-        raise ConfigError("`snakesim preview` needs Pillow: pip install 'snakesim[preview]'") from None
+    extras.check("preview", "`snakesim preview`")
     if not 0.01 <= hz <= MAX_HZ:
         raise ConfigError(f"--hz {hz:g}: give from 0.01 to {MAX_HZ:g} Hz")
     if not NARROWEST <= width <= WIDEST:

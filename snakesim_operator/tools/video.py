@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.plugins import FILMS, find_plugin
 from snakesim_hal.terminal import Say, say
+from snakesim_operator import extras
 from snakesim_operator.results.incomplete import exit_code
 from snakesim_operator.results.record import RunRecord
 
@@ -18,7 +19,6 @@ Floats = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 Write = Callable[[Picture], None]
 
-NEEDS = "a film needs imageio-ffmpeg and Pillow; install them with: pip install 'snakesim[video]'"
 FOLLOW_S = 0.8  # how slowly the view follows the snake
 M_PER_N, MIN_FORCE_N = 0.008, 0.3
 WORLD_LIMIT_S = 0.3  # older contacts are not drawn
@@ -50,6 +50,7 @@ def video(
     """Film a run. Raises ConfigError for one without poses, and when something that it needs is not installed."""
     if out.suffix not in (".mp4", ".gif"):
         raise ConfigError(f"--out {out}: give a file that ends in .mp4 or .gif")
+    extras.check("video", "a film")
     record = RunRecord.load(run)
     times = _times(record, fps, speed, span_s)
     film: Film = find_plugin(FILMS, "mujoco")(record.config, *size)
@@ -101,11 +102,9 @@ def _forces(record: RunRecord, time_s: float) -> list[Floats]:
 
 @contextlib.contextmanager
 def _written(out: Path, size: tuple[int, int], fps: float, lacks: Sequence[str]) -> Iterator[Write]:
-    try:
-        import imageio_ffmpeg
-        from PIL import Image
-    except ModuleNotFoundError as error:
-        raise ConfigError(f"{NEEDS} ({error})") from error
+    import imageio_ffmpeg
+    from PIL import Image
+
     out.parent.mkdir(parents=True, exist_ok=True)
     comment = f"incomplete: {'; '.join(lacks)}" if lacks else ""
     if out.suffix == ".mp4":

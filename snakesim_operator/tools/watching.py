@@ -79,6 +79,10 @@ def _echo(arguments: argparse.Namespace) -> int:
 
 
 def _record(arguments: argparse.Namespace) -> int:
+    from snakesim_operator import extras
+
+    if arguments.foxglove is not None:
+        extras.check("foxglove", "--foxglove")
     from snakesim_operator.tools.record import record_robot
 
     return record_robot(

@@ -1,6 +1,6 @@
 """Installed without make: from a wheel or the sources, into an environment, a folder or a person's home.
 
-No network: what SnakeSIM depends on is lent by the environment that runs the tests.
+What SnakeSIM depends on is lent by the environment that runs the tests, without a network; only the sizes need one.
 """
 
 import os
@@ -8,12 +8,18 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+import threading
+import tomllib
 from collections.abc import Callable
+from importlib.metadata import distribution, packages_distributions
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
-from tests.e2e.command import environment, free_endpoint
+from snakesim_operator.extras import BRINGS
+from tests.contract.workbench import text_of_the_example
+from tests.e2e.command import Ended, environment, free_endpoint, wait_until
 
 pytestmark = pytest.mark.e2e
 
@@ -25,6 +31,12 @@ needs_uv = pytest.mark.skipif(not UV.is_file(), reason="`make setup` has put no 
 
 
 def run(*command: object, cwd: Path, **more: str) -> str:
+    done = ended(*command, cwd=cwd, **more)
+    assert done.code == 0, done.out + done.err
+    return done.out
+
+
+def ended(*command: object, cwd: Path, **more: str) -> Ended:
     done = subprocess.run(
         [str(word) for word in command],
         cwd=cwd,
@@ -34,8 +46,7 @@ def run(*command: object, cwd: Path, **more: str) -> str:
         timeout=100,
         check=False,
     )
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
+    return Ended(done.returncode, done.stdout, done.stderr)
 
 
 @pytest.fixture(scope="module")
@@ -129,3 +140,164 @@ def check(installed: Installed, dependencies: Path, home: Path) -> None:
     flags = ("--controller", "hold", "--duration", "0.2", "--out", "run", "--endpoint", free_endpoint())
     run(command, "run", "triplet", *flags, cwd=work, **more)
     assert (work / "run" / "report.html").is_file()
+
+
+ALONE = """
+robot = "planar13"
+scene = "flat"
+controller = "hold"
+pace = "lockstep"
+duration_s = 0.3
+
+[start]
+on_route = false
+
+[services.control]
+"""
+WORKBENCH = ("alone.toml", "--backend", "./workbench.py:Workbench")
+Run = Callable[..., Ended]  # of one command, in an environment of its own
+
+
+def lent(extra: str, wheel: Path, home: Path) -> tuple[Run, Path]:
+    """The wheel, and of the packages here only those that it asks for by itself and by an extra."""
+    command, library, _ = into_an_environment(wheel, home)
+    folder = home / "lent"
+    folder.mkdir()
+    for name in required(extra):
+        for top in {file.parts[0] for file in distribution(name).files or () if not file.parts[0].startswith(".")}:
+            here = Path(sysconfig.get_path("purelib")) / top
+            if here.exists() and not (folder / top).exists():
+                (folder / top).symlink_to(here)
+    return at_work(command, home, PYTHONPATH=str(folder)), library
+
+
+def required(extra: str) -> set[str]:
+    """Names of all distributions."""
+    found, left = set[str](), [Requirement(f"snakesim[{extra}]" if extra else "snakesim")]
+    seen = set[str]()
+    while left:
+        asked = left.pop()
+        if str(asked) in seen:
+            continue
+        seen.add(str(asked))
+        found.add(asked.name)
+        for line in distribution(asked.name).requires or ():
+            needed = Requirement(line)
+            if needed.marker is None or any(needed.marker.evaluate({"extra": one}) for one in asked.extras or {""}):
+                needed.marker = None
+                left.append(needed)
+    return found - {"snakesim"}
+
+
+def fetched(extra: str, wheel: Path, home: Path) -> tuple[Run, Path]:
+    """As `pip install` does it, from a package index."""
+    run(UV, "venv", "--python", sys.executable, home / "env", cwd=home)
+    python = home / "env" / "bin" / "python"
+    what = f"{wheel}[{extra}]" if extra else wheel
+    install = (UV, "pip", "install", "--quiet", "--python", python, "--constraint", REPOSITORY / "requirements.lock")
+    done = ended(*install, what, cwd=home, UV_OFFLINE="0")
+    if done.code != 0 and ("error sending request" in done.err or "Failed to fetch" in done.err):
+        pytest.skip("no package index can be reached")
+    assert done.code == 0, done.err
+    library = run(python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", cwd=home).strip()
+    return at_work(home / "env" / "bin" / "snakesim", home), Path(library)
+
+
+def at_work(command: Path, home: Path, **more: str) -> Run:
+    work = home / "work"
+    work.mkdir()
+    (work / "alone.toml").write_text(ALONE)
+    (work / "workbench.py").write_text(text_of_the_example())
+    return lambda *words: ended(command, *words, cwd=work, **more)
+
+
+def stops_and_arms(snakesim: Run) -> None:
+    """Host and controller with a backend from a file, and a person at it."""
+    ran = snakesim("run", *WORKBENCH, "--no-record", "--out", "run", "--endpoint", free_endpoint())
+    assert ran.code == 0 and "report:  not written" in ran.out and "snakesim[report]" in ran.out, ran
+    at = ("--endpoint", free_endpoint())
+    stays = threading.Thread(
+        target=snakesim, args=("run", *WORKBENCH, "--pace", "realtime", "--duration", "8", "--stay", "--no-record", *at)
+    )
+    stays.start()
+    wait_until(lambda: "armed" in snakesim("status", *at).out.replace("disarmed", ""), "an armed robot")
+    assert snakesim("estop", *at).code == 0
+    wait_until(lambda: snakesim("clear", *at).code == 0, "a cleared stop")
+    wait_until(lambda: snakesim("arm", "planar13", "Workbench", *at).code == 0, "an armed robot again")
+    stays.join()
+
+
+def drives_modules(snakesim: Run) -> None:
+    """The driver, on a bus with emulated modules."""
+    assert "together" in snakesim("can", "load", "triplet").out
+    drives = ("--backend", "can", "--set", "backend.plant=inertia", "--no-record", "--endpoint", free_endpoint())
+    ran = snakesim("run", "alone.toml", *drives)
+    assert ran.code == 0, ran
+
+
+def simulates(snakesim: Run) -> None:
+    """A robot among obstacles, in one process."""
+    ran = snakesim("run", "triplet", "--in-process", "--no-record", "--set", "duration_s=2")
+    assert ran.code == 0, ran
+
+
+JOBS: dict[str, Callable[[Run], None]] = {"": stops_and_arms, "can": drives_modules, "sim": simulates}
+LARGEST_MB = {"": 110, "can": 130, "sim": 190}
+
+
+@needs_uv
+@pytest.mark.slow
+@pytest.mark.parametrize("extra", JOBS, ids=["core", "can", "sim"])
+def test_what_an_extra_is_for_works_with_that_extra_alone(extra: str, wheel: Path, tmp_path: Path) -> None:
+    snakesim, library = fetched(extra, wheel, tmp_path)
+    size_mb = sum(file.lstat().st_size for file in library.rglob("*") if file.is_file()) / 1e6
+    ours_mb = sum(f.lstat().st_size for own in library.glob("snakesim*") for f in own.rglob("*") if f.is_file()) / 1e6
+    print(f"\nsnakesim{f'[{extra}]' if extra else ''}: {size_mb:.0f} MB, of which {ours_mb:.0f} MB SnakeSIM")
+    assert size_mb < LARGEST_MB[extra]
+    JOBS[extra](snakesim)
+
+
+NEEDS: dict[str, tuple[str, ...]] = {
+    "sim": ("run", "triplet"),
+    "record": ("run", *WORKBENCH),
+    "report": ("report", "run"),
+    "can": ("can", "load", "triplet"),
+    "console": ("console", "run"),
+    "export": ("export", "run", "--format", "parquet"),
+    "evaluate": ("evaluate", "clutter"),
+    "foxglove": ("record", "--foxglove", "0"),
+    "lab": ("deploy", "render", "lab.toml", "--out", "lab"),
+    "preview": ("preview",),
+    "ros2": ("ros2",),
+    "video": ("video", "run", "--out", "film.mp4"),
+}
+
+
+@needs_uv
+def test_the_core_alone_drives_a_robot_and_every_command_says_which_extra_it_lacks(wheel: Path, tmp_path: Path) -> None:
+    snakesim, _ = lent("", wheel, tmp_path)
+    listed = snakesim("--help")
+    assert listed.code == 0 and not listed.err and " estop " in listed.out and "can, modules" in listed.out, listed
+    completed = snakesim("completion", "bash")
+    assert completed.code == 0 and not completed.err
+    stops_and_arms(snakesim)
+    said = {extra: snakesim(*words) for extra, words in NEEDS.items()}
+    unsaid = {extra: done for extra, done in said.items() if f"-m pip install 'snakesim[{extra}]'" not in done.err}
+    assert not unsaid and {(done.code, done.err.count("\n")) for done in said.values()} == {(2, 1)}, said
+    assert "--no-record" in snakesim("run", *WORKBENCH).err
+
+
+def test_each_extra_brings_what_is_said_of_it() -> None:
+    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
+    asked = project["optional-dependencies"]
+    imported_of: dict[str, set[str]] = {}
+    for package, names in packages_distributions().items():
+        for name in names:
+            imported_of.setdefault(name.lower(), set()).add(package)
+    assert {*Requirement(asked["all"][0]).extras} == {*asked} - {"all"} == {*BRINGS}
+    for extra, packages in BRINGS.items():
+        needed = [one for line in asked[extra] if (one := Requirement(line)).name != "snakesim"]
+        names = {name.lower() for one in needed for name in (one.name, *one.extras)}  # dask[distributed]
+        unknown = [package for package in packages if not any(package in imported_of[name] for name in names)]
+        unsaid = [name for name in names if not imported_of[name] & {*packages}]
+        assert not unknown and not unsaid, extra

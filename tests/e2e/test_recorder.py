@@ -19,7 +19,8 @@ from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, Description
 from snakesim_operator.playback.play import PlayRequest, play
-from snakesim_operator.recording.reader import RECORDING, RecordingReader
+from snakesim_operator.recording.message import RECORDING
+from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.results.record import RunRecord
 from tests.e2e.command import SNAKESIM, environment, free_endpoint, nothing_left, run_to_summary, running, wait_until
 from tests.whole import command

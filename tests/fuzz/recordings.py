@@ -22,7 +22,7 @@ from mcap.writer import MCAP0_MAGIC
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_operator.recording import mcap_file, recording
 from snakesim_operator.recording.chunks import HEAD, unpack
-from snakesim_operator.recording.reader import RECORDING
+from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.run.in_process import simulate
 from tests.e2e.command import free_endpoint
 from tests.fuzz.forked import Forked, forked

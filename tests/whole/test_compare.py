@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.errors import ConfigError
-from snakesim_operator.recording.reader import RECORDING
+from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.results.compare.command import compare
 from snakesim_operator.results.incomplete import INCOMPLETE
 from snakesim_operator.results.page.html import LIBRARY

@@ -18,7 +18,8 @@ from mcap.writer import MCAP0_MAGIC
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_hal.wire import keys
 from snakesim_operator.recording import mcap_file, recording
-from snakesim_operator.recording.reader import RECORDING, RecordingReader
+from snakesim_operator.recording.message import RECORDING
+from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.run.in_process import simulate
 from tests.whole.command import snakesim

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from snakesim_hal.model.scenario import load, parse_set
-from snakesim_operator.recording.reader import RECORDING
+from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.run.in_process import simulate
 from tests.whole.command import snakesim

@@ -7,9 +7,9 @@ import numpy as np
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.instants import Instant, balanced_instants, instant_at, unfelt
 from snakesim_operator.results.report.timeline import end_s, jam_bands, propulsion_intervals
-from snakesim_operator.results.report.verdict import distance_m, stop_of
+from snakesim_operator.results.report.verdict import stop_of
 from snakesim_operator.results.report.view import nodes_xy_w
-from snakesim_operator.results.summary import RunSummary
+from snakesim_operator.results.summary import RunSummary, distance_m
 
 HAND_OVERS_DRAWN, HAND_OVERS_LISTED = 4, 8
 SETTLED_S = 0.6  # so soon after a hand-over the forces are drawn that belong to it

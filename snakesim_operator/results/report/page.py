@@ -26,9 +26,9 @@ from snakesim_operator.results.report.timeline import (
     zero_s,
 )
 from snakesim_operator.results.report.top_view import top_view
-from snakesim_operator.results.report.verdict import distance_m, verdict
+from snakesim_operator.results.report.verdict import verdict
 from snakesim_operator.results.report.view import nodes_xy_w, views
-from snakesim_operator.results.summary import RunSummary
+from snakesim_operator.results.summary import RunSummary, distance_m
 
 HERE = Path(__file__).parent
 VIEW_WIDTH = 500.0

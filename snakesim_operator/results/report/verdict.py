@@ -12,7 +12,7 @@ from snakesim_operator.results.report.timeline import (
     reported_at_s,
     state_bands,
 )
-from snakesim_operator.results.summary import RunSummary
+from snakesim_operator.results.summary import RunSummary, distance_m
 
 MOVED_M = 0.02  # less than this is no locomotion
 MIN_STOP_S = 0.5  # a shorter stop at the end is not worth a word
@@ -89,11 +89,6 @@ def _refused(summary: RunSummary) -> list[str]:
     reasons = {reason: count for reason, count in summary.rejected_commands.items() if count}
     count = sum(reasons.values())
     return [f"{count} {'command' if count == 1 else 'commands'} refused ({', '.join(reasons)})"] if reasons else []
-
-
-def distance_m(summary: RunSummary) -> float | None:
-    """Along the path, else as the crow flies."""
-    return summary.path_distance_m if summary.path_distance_m is not None else summary.net_displacement_m
 
 
 def _moved(summary: RunSummary) -> str:

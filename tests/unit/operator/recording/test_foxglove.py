@@ -22,7 +22,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode
 from snakesim_hal.wire.messages import ControlState
 from snakesim_operator.recording.foxglove import FoxgloveChannels
-from snakesim_operator.recording.reader import RECORDING
+from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.recover import recover
 from snakesim_operator.recording.state_messages import StateMessages
 from snakesim_operator.results.record import RunRecord

@@ -19,7 +19,7 @@ from snakesim_hal.model.scenario import write
 from snakesim_hal.network.session import Arrival
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encoding_of
-from snakesim_operator.recording.reader import RECORDING
+from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.recording import Recording
 from snakesim_operator.results.compare import page as compare_page
 from snakesim_operator.results.compare.difference import differ
