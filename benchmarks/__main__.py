@@ -10,7 +10,7 @@ from benchmarks.bus import FULLEST_FRAMES_PER_S, frame_costs, saturated_share
 from benchmarks.cycle import cycle, load_table
 from benchmarks.echo import echo_us
 from benchmarks.physics import BareLoop, config_of, motion, sensing, wire_bytes
-from benchmarks.size import core_install_mb
+from benchmarks.size import install_mb
 from benchmarks.table import HEADER, compare
 from benchmarks.whole import highest_rate_hz, latency_us, lockstep_tick_us
 
@@ -70,10 +70,12 @@ def main() -> int:
     say(f"Highest rate at which 99 % of ticks get their command within the tick: {best} Hz ({listed}).")
     say("\n## CAN\n")
     tell_bus(say)
-    total, sizes = core_install_mb()
-    largest = sorted(sizes.items(), key=lambda item: -item[1])[:6]
-    listed = ", ".join(f"{name} {size:.0f}" for name, size in largest)
-    say(f"\n## Size\n\nCore install: {total:.0f} MB of 400 MB allowed ({listed}).")
+    say("\n## Size\n\n| installed | MB, without SnakeSIM's own | the largest |\n|---|---|---|")
+    for extra in ("", "can", "sim", "record", "report", "console", "evaluate", "all"):
+        sizes = install_mb(extra)
+        largest = sorted(sizes.items(), key=lambda item: -item[1])[:6]
+        listed = ", ".join(f"{name} {size:.0f}" for name, size in largest)
+        say(f"| `{f'snakesim[{extra}]' if extra else 'snakesim'}` | {sum(sizes.values()):.0f} | {listed} |")
     if write:
         RESULTS.write_text("\n".join(text) + "\n", encoding="utf-8")
     return 0

@@ -1,29 +1,14 @@
-"""How large an installation without extras is: the files of the core dependencies, and theirs."""
+"""How large an installation is: the files of its dependencies."""
 
-import re
-from importlib.metadata import PackageNotFoundError, distribution
+from importlib.metadata import distribution
 
-_NAME = re.compile(r"^[A-Za-z0-9._-]+")
+from tests.distributions import required
 
 
-def core_install_mb() -> tuple[float, dict[str, float]]:
-    """Total, and by distribution, in megabytes."""
+def install_mb(extra: str = "") -> dict[str, float]:
+    """By distribution, in megabytes. extra: empty for a plain install."""
     sizes: dict[str, float] = {}
-    pending = ["snakesim"]
-    while pending:
-        name = re.sub(r"[-_.]+", "-", pending.pop()).lower()
-        if name in sizes:
-            continue
-        try:
-            found = distribution(name)
-        except PackageNotFoundError:
-            continue
-        files = [] if name == "snakesim" else found.files or []
-        paths = [file.locate() for file in files]
+    for name in required(extra):
+        paths = [file.locate() for file in distribution(name).files or ()]
         sizes[name] = sum(path.stat().st_size for path in paths if path.is_file()) / 1e6  # pyright: ignore
-        for requirement in found.requires or []:
-            if "extra ==" not in requirement:
-                match = _NAME.match(requirement)
-                if match is not None:
-                    pending.append(match[0])
-    return sum(sizes.values()), sizes
+    return sizes

@@ -19,6 +19,7 @@ from packaging.requirements import Requirement
 
 from snakesim_operator.extras import BRINGS
 from tests.contract.workbench import text_of_the_example
+from tests.distributions import required
 from tests.e2e.command import Ended, environment, free_endpoint, wait_until
 
 pytestmark = pytest.mark.e2e
@@ -169,24 +170,6 @@ def lent(extra: str, wheel: Path, home: Path) -> tuple[Run, Path]:
             if here.exists() and not (folder / top).exists():
                 (folder / top).symlink_to(here)
     return at_work(command, home, PYTHONPATH=str(folder)), library
-
-
-def required(extra: str) -> set[str]:
-    """Names of all distributions."""
-    found, left = set[str](), [Requirement(f"snakesim[{extra}]" if extra else "snakesim")]
-    seen = set[str]()
-    while left:
-        asked = left.pop()
-        if str(asked) in seen:
-            continue
-        seen.add(str(asked))
-        found.add(asked.name)
-        for line in distribution(asked.name).requires or ():
-            needed = Requirement(line)
-            if needed.marker is None or any(needed.marker.evaluate({"extra": one}) for one in asked.extras or {""}):
-                needed.marker = None
-                left.append(needed)
-    return found - {"snakesim"}
 
 
 def fetched(extra: str, wheel: Path, home: Path) -> tuple[Run, Path]:
