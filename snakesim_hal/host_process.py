@@ -15,6 +15,7 @@ from typing import Any
 
 import msgspec
 
+from snakesim_hal.allowed_faults import faults_of_host
 from snakesim_hal.arguments import add_host
 from snakesim_hal.backend import BackendFactory
 from snakesim_hal.errors import BackendError, ConfigError, RefusedError, SnakesimError
@@ -109,6 +110,7 @@ def _run(given: ProcessOptions, config: RunConfig) -> Host:
         session = opened.enter_context(open_session(given.link) if given.link.listen else joined(given.link, "host"))
         refuse_second_host(session, given.link)
         described = backend.describe()
+        backend, faults = faults_of_host(config, backend, session)
         host = Host(
             config,
             backend,
@@ -119,6 +121,7 @@ def _run(given: ProcessOptions, config: RunConfig) -> Host:
             latch=EstopLatch(robot_folder(described.robot, described.backend, described.hardware)),
             starter=HostEnd.of(wanted.channel),
             realtime_warnings=realtime_warnings,
+            faults=faults,
         )
         serve_stops(stop_port, given.link.namespace or described.robot, host.take_stop)
         on_stop_signal(host.stop)

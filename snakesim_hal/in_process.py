@@ -17,6 +17,7 @@ from typing import Self
 
 from threadpoolctl import threadpool_limits
 
+from snakesim_hal.allowed_faults import faults_of_host
 from snakesim_hal.errors import ConfigError, RefusedError, SnakesimError
 from snakesim_hal.host.host import Host
 from snakesim_hal.host_process import open_backend
@@ -87,8 +88,15 @@ class InProcessRun:
         ticks = round(config.duration_s * config.rate_hz)
         session = self.network.session()
         opened.callback(session.close)
+        faulty, faults = faults_of_host(config, backend, session)
         self.host = Host(
-            config, backend, session, max_ticks=ticks, end_after_fault_s=AFTER_FAULT_S, pace_after_fault="free"
+            config,
+            faulty,
+            session,
+            max_ticks=ticks,
+            end_after_fault_s=AFTER_FAULT_S,
+            pace_after_fault="free",
+            faults=faults,
         )
         self.network.answer = self.host.take_in
         for name in config.services:

@@ -5,8 +5,8 @@ import traceback
 from collections.abc import Callable, Iterator
 from typing import Protocol
 
+from snakesim_hal.allowed_faults import faults_of_service
 from snakesim_hal.errors import NotConnectedError, ServiceError, SnakesimError, WireError, raised
-from snakesim_hal.faults.injector import Injector
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.scenario import Service as Schedule
 from snakesim_hal.network.client import Client
@@ -69,8 +69,7 @@ class ServiceLoop:
         robot = _met(client, goes_on)
         with self._named("configure"):
             self.service.configure(robot)
-        self._injector = Injector(name, config, session, newest=lambda: client.newest_clock)
-        self._injector.allow(emulated=robot.emulated, faults_allowed=config.faults_allowed)
+        self._faults = faults_of_service(name, config, session, robot, lambda: client.newest_clock)
         self._due = client.ticks(0.0, pauses=True)
         self._session, self._entry = session, own_entry(name, config)
 
@@ -78,7 +77,7 @@ class ServiceLoop:
         """Show that the service is here. From now on the robot may be armed, perhaps before the first tick here."""
         clock = self._client.wait_for_clock(SILENCE_S)
         if clock is not None:
-            self._injector.turn(clock.stamp_ns, clock.arming, clock.lifecycle)
+            self._faults.turn(clock.stamp_ns, clock.arming, clock.lifecycle)
         show_process(self._session, self._entry)
         self._client.announce()
 
@@ -88,7 +87,7 @@ class ServiceLoop:
             if clock is not None:
                 self._act(clock)
                 continue
-            self._injector.idle()
+            self._faults.idle()
             with self._named("silence"):
                 for key, message in self.service.silence():
                     self._client.put(key, message)
@@ -100,16 +99,16 @@ class ServiceLoop:
 
     def close(self) -> None:
         """Send nothing more that is late."""
-        self._injector.close()
+        self._faults.close()
 
     def _act(self, clock: Clock) -> None:
         """A tick that is shown again, because the robot is not armed yet, is answered again."""
         if clock.paused:
-            self._injector.idle()
+            self._faults.idle()
             with self._named("pause"):
                 self.service.pause(clock)
             return
-        self._injector.turn(clock.stamp_ns, clock.arming, clock.lifecycle)
+        self._faults.turn(clock.stamp_ns, clock.arming, clock.lifecycle)
         robot = self._client.new_description()
         if robot is not None:
             with self._named("configure"):

@@ -5,7 +5,7 @@ times are relative to the first arming. A part that was restarted while the robo
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import inf
 from queue import Empty, SimpleQueue
 
@@ -23,7 +23,6 @@ from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import Answer, Clock, FaultRequest, LifecycleState
 
 HALF_A_NANOSECOND = 0.5e-9
-HOW_TO_ALLOW = "something real moves here; to allow it set `faults_allowed = true` in the scenario"
 
 CarryOut = Callable[[Injection, bool], None]  # the second: whether it begins, or ends. Raises ConfigError
 
@@ -50,17 +49,17 @@ class Injector:
         carry_out: CarryOut = no_action,
         newest: Callable[[], Clock | None] | None = None,
         note: Callable[[str, float], None] = print_note,
-        refused: Callable[[str], None] = lambda _text: None,
     ) -> None:
-        """Declares the part's key; nothing is allowed before a call of `allow`.
+        """Declares the part's key.
 
         newest: the newest clock, also while this part hangs; None: this part is the clock, and wall time is used.
-        note: called with each begin and end, and its time; refused: called with planned faults that are not possible.
+        note: called with each begin and end, and its time.
         """
         self.part = part
         self._messages = MessageFaults(session, config.seed)
-        self._carry_out, self._newest, self._note, self._refused = carry_out, newest, note, refused
-        self._allowed = False
+        self._carry_out, self._newest, self._note = carry_out, newest, note
+        self.noted: list[str] = []  # the host's have their tick
+        self._refused: list[str] = []  # planned, and not possible
         self._planned = Plan(injection for injection in planned(config) if injection.part == part)
         self._ends: list[tuple[float, Injection]] = []  # when requested faults end
         self._on: dict[tuple[str, str], Injection] = {}
@@ -76,14 +75,8 @@ class Injector:
         """Active injected faults."""
         return [str(injection) for injection in self._on.values()]
 
-    def allow(self, *, emulated: bool, faults_allowed: bool) -> None:
-        """Allow faults where nothing real moves, or if the run allows them. Raises ConfigError for planned ones."""
-        self._allowed = emulated or faults_allowed
-        if not self._allowed and self._planned.next_s() != inf:
-            raise ConfigError(f"`faults` are planned, and {HOW_TO_ALLOW}; otherwise leave them out")
-
-    def turn(self, stamp_ns: int, arming: int, lifecycle: LifecycleState) -> None:
-        """At a tick: begin and end due faults, answer requests, and hang if requested."""
+    def turn(self, stamp_ns: int, arming: int, lifecycle: LifecycleState) -> Sequence[str]:
+        """At a tick: begin and end due faults, answer requests, and hang if requested. Returns planned ones refused."""
         now_s = stamp_ns / 1e9
         self._lifecycle = lifecycle
         if arming and self._first_armed_s is None:
@@ -94,6 +87,8 @@ class Injector:
         self._change(now_s)
         if self._hangs():
             self._hang(now_s)
+        refused, self._refused = self._refused, []
+        return refused
 
     def idle(self) -> None:
         """Answer requests while no tick comes."""
@@ -132,7 +127,7 @@ class Injector:
                     self._end(change.injection, now_s)
             except (ConfigError, BackendError) as error:
                 self._note(f"{change.injection} is refused: {error}", now_s)
-                self._refused(f"{change.injection} is refused: {error}")
+                self._refused.append(f"{change.injection} is refused: {error}")
 
     # --- requests --------------------------------------------------------------------------------------------
 
@@ -152,8 +147,6 @@ class Injector:
             question.reply(msgspec.structs.replace(answer, lifecycle=self._lifecycle))
 
     def _answer(self, request: FaultRequest, now_s: float) -> Answer:
-        if not self._allowed:
-            return self._no(f"fault injection is not allowed: {HOW_TO_ALLOW}", "not_allowed")
         start_s, for_s = self._since_arming_s(now_s), inf if request.for_s is None else request.for_s
         injection = checked(Injection(request.kind, request.target, start_s, start_s + for_s, request.amount))
         if injection.part != self.part:

@@ -17,10 +17,10 @@ from typing import Any, Literal
 
 import msgspec
 
+from snakesim_hal.allowed_faults import Faults, NoFaults
 from snakesim_hal.arithmetic import measured
 from snakesim_hal.backend import Backend, Samples
 from snakesim_hal.errors import BackendError, WireError
-from snakesim_hal.faults.host_faults import HostFaults
 from snakesim_hal.host.black_box import BlackBox
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.inbox import Inbox, Request
@@ -31,6 +31,7 @@ from snakesim_hal.host.run_statistics import RunStatistics
 from snakesim_hal.host.simulated_time import Refusal, SimulatedTime
 from snakesim_hal.host.status_messages import applied_message, status_message
 from snakesim_hal.host.timing import Deadlines, PublishTimes
+from snakesim_hal.model.injection import HAL
 from snakesim_hal.model.scenario import RunConfig, written
 from snakesim_hal.network.private_channel import HostEnd, ToStarter
 from snakesim_hal.network.process_entries import HOST, ProcessEntries, own_entry, show_process
@@ -82,6 +83,7 @@ class Host:
         latch: EstopLatch | None = None,
         starter: HostEnd | None = None,
         realtime_warnings: Sequence[str] = (),
+        faults: Faults | None = None,
     ) -> None:
         """max_ticks: end this many ticks after the first arming; None: go on until asked to finish.
 
@@ -91,6 +93,7 @@ class Host:
         latch: stores an emergency stop for later hosts.
         starter: the private channel to the process that started this host.
         realtime_warnings: real-time measures that the system refused.
+        faults: injected ones, of `faults_of_host`, as the backend is then; None: refused on request.
         """
         described = msgspec.structs.replace(backend.describe(), host=secrets.token_hex(8), arithmetic=measured())
         self.description: Description = proven(described, own_run_key())
@@ -104,8 +107,8 @@ class Host:
         self.requests: list[str] = []  # who requested to arm, disarm, clear, finish or stop, and the result
         self.participants = Participants(config.services)
         self._config = config
-        self.faults = HostFaults(config, GuardedBackend(backend), session, self.authority)
-        self._backend = self.faults.backend
+        self.faults: Faults = faults or NoFaults(HAL, config, session)
+        self._backend = GuardedBackend(backend)
         self._max_ticks = max_ticks
         self._end_after_fault_s = end_after_fault_s
         self._pace_after_fault: Pace = pace_after_fault
@@ -180,7 +183,7 @@ class Host:
         self._deadlines.begin(0)
         try:
             while not self._over():
-                self.faults.turn(self._tick)
+                self._inject()
                 self._change_time()
                 if self._stands():
                     yield
@@ -236,6 +239,11 @@ class Host:
         if isinstance(power, Power):
             self.authority.observe_power(power, now_ns)
         return samples
+
+    def _inject(self) -> None:
+        """Faults on request, where they are allowed."""
+        for why in self.faults.turn(self._tick * self._period_ns, self.authority.arming, self.authority.state):
+            self.authority.note(Fault(tick=self._tick, what="injection_refused", cause=why))
 
     def _stands(self) -> bool:
         """Whether the next tick has to wait. In lockstep tick 0 is shown until it is armed, also in a pause."""
@@ -355,7 +363,7 @@ class Host:
                 self._publish(samples)
             if left_ns > 0:
                 self._inbox.take(min(left_ns * 1e-9, 0.5))
-                self.faults.turn(self._tick)
+                self._inject()
                 self._show_status()
                 continue
             for name in behind:
@@ -506,7 +514,7 @@ class Host:
             differing=self._differing(),
             overruns=self.statistics.overruns,
             realtime_warnings=self._realtime_warnings,
-            injected=self.faults.on,
+            injected=list(self.faults.on),
             held_up=self._held_up(),
         )
 

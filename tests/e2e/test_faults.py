@@ -8,7 +8,7 @@ import pytest
 
 from snakesim_hal.host_process import HostRecord
 from snakesim_operator.results.record import RunRecord
-from tests.e2e.command import Running, nothing_left, run_to_summary, running, snakesim, wait_until
+from tests.e2e.command import Running, free_endpoint, nothing_left, run_to_summary, running, snakesim, wait_until
 from tests.whole import command
 
 pytestmark = pytest.mark.e2e
@@ -112,13 +112,26 @@ def test_a_busy_interpreter_loses_the_lease_although_it_is_alive(tmp_path: Path)
 def test_where_something_real_moves_faults_are_not_allowed(tmp_path: Path) -> None:
     """A backend that does not say that it is emulated counts as real."""
     (tmp_path / "bench.py").write_text(
-        "import msgspec\n"
+        "import sys\nfrom pathlib import Path\n\nimport msgspec\n"
+        "from snakesim_gnc.control.hold import Hold\n"
         "from snakesim_sim_backend.backend import SimBackend\n\n"
+        "def tell(part):\n"
+        "    loaded = [name for name in sys.modules if name.startswith('snakesim_hal.faults')]\n"
+        f"    Path({str(tmp_path)!r}, part).write_text(' '.join(loaded))\n\n"
         "class Bench(SimBackend):\n"
         "    def describe(self):\n"
         "        return msgspec.structs.replace(super().describe(), emulated=False)\n"
+        "    def advance(self):\n"
+        "        super().advance()\n"
+        "        tell('host')\n\n"
+        "class Telling(Hold):\n"
+        "    def update(self, view):\n"
+        "        tell('control')\n"
+        "        return super().update(view)\n"
     )
-    arguments = ["triplet", "--backend", "./bench.py:Bench", "--controller", "hold", "--pace", "realtime"]
+    arguments = ["triplet", "--backend", "./bench.py:Bench", "--controller", "./bench.py:Telling"]
+    arguments += ["--pace", "realtime"]
+    loaded = [tmp_path / part for part in ("host", "control")]
     with running(tmp_path / "run", *arguments, "--duration", "600") as run:
         run.wait_for(" s  ")
         for words in (("mute", "joint_3"), ("hang", "control")):
@@ -126,6 +139,10 @@ def test_where_something_real_moves_faults_are_not_allowed(tmp_path: Path) -> No
             assert result.code == 1 and "fault injection is not allowed: something real moves here" in result.err
         run.process.terminate()
         run.end()
+    assert [file.read_text() for file in loaded] == ["", ""], "no process has the code that carries them out"
+    allowed = ("--set", "faults_allowed=true", "--duration", "0.5", "--out", str(tmp_path / "allowed"))
+    snakesim("run", *arguments, *allowed, "--endpoint", free_endpoint(), cwd=tmp_path)
+    assert all("snakesim_hal.faults.injector" in file.read_text() for file in loaded)
     ended = snakesim("run", *arguments, "--fault", "mute:joint_3@1", "--out", str(tmp_path / "other"), cwd=tmp_path)
     assert ended.code == 1 and "`faults` are planned, and something real moves here" in ended.out
     wait_until(lambda: not list((tmp_path / "other").glob("host.json")), "no record of it")

@@ -11,6 +11,7 @@ from typing import Any
 
 import msgspec
 
+from snakesim_hal.allowed_faults import faults_of_host
 from snakesim_hal.backend import Samples, SetPoints
 from snakesim_hal.errors import BackendError
 from snakesim_hal.host.host import Host
@@ -226,7 +227,8 @@ def running(config: RunConfig, **host: Any) -> Iterator[Running]:
     endpoint, backend = free_endpoint(), LagBackend(config)
     link = Link(endpoint, "lab/worm")
     with open_session(Link(endpoint, "lab/worm", listen=True)) as own, open_session(link) as watcher:
-        made = Host(config, backend, own, **host)
+        faulty, faults = faults_of_host(config, backend, own)
+        made = Host(config, faulty, own, faults=faults, **host)
         thread = threading.Thread(target=made.run, name="host")
         statuses = watcher.latched_reader(keys.STATUS, Status)
         thread.start()

@@ -141,7 +141,6 @@ def test_a_service_that_is_started_anew_does_not_repeat_what_was_planned() -> No
     with open_session(Link(free_endpoint(), "worm", listen=True)) as session:
         for first_arming, expected in ((0, ["drop:actuator/joints@0.1=1"]), (1, [])):
             injector = Injector("control", config, session, note=lambda _text, _now_s: None)
-            injector.allow(emulated=False, faults_allowed=True)
             turn(injector, 0, first_arming)
             for tick in range(1, 15):
                 turn(injector, tick, 1)
@@ -154,7 +153,6 @@ def test_a_newer_fault_of_a_kind_takes_the_place_of_the_one_before() -> None:
     notes: list[str] = []
     with open_session(Link(free_endpoint(), "worm", listen=True)) as session:
         injector = Injector("control", config, session, note=lambda text, now_s: notes.append(f"{now_s:g} {text}"))
-        injector.allow(emulated=True, faults_allowed=False)
         for tick in range(50):
             turn(injector, tick, int(tick > 0))
         injector.close()
