@@ -22,7 +22,7 @@ unexport PYTHONDONTWRITEBYTECODE
 bin := .venv/bin
 stamp := .venv/.setup
 bootstrap := $(or $(PYTHON),python3) deploy/bootstrap.py
-packages := $(wildcard snakesim_*)
+packages := snakesim $(wildcard snakesim_*)
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:

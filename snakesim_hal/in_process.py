@@ -83,7 +83,8 @@ class InProcessRun:
         opened.callback(backend.close)
         if not backend.describe().emulated:
             raise RefusedError(
-                f"backend {config.backend!r} moves real hardware, which could not be stopped from outside"
+                f"backend {config.backend!r} moves real hardware, which nobody could stop from outside: run it in "
+                "processes of their own"
             )
         ticks = round(config.duration_s * config.rate_hz)
         session = self.network.session()

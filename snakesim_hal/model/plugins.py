@@ -15,7 +15,7 @@ from typing import Any
 
 import msgspec
 
-from snakesim_hal.errors import ConfigError, short
+from snakesim_hal.errors import ConfigError, did_you_mean, short
 from snakesim_hal.model.files import Table, decode, expanded
 from snakesim_hal.model.textfiles import read_bytes
 
@@ -41,6 +41,11 @@ def offered(group: str, name: str, plugin: Any) -> Iterator[None]:
         _offered.update(before)
 
 
+def anything_offered() -> bool:
+    """Whether this process has a plugin that no other one could find."""
+    return bool(_offered)
+
+
 def installed(group: str) -> list[str]:
     """Names of all installed plugins of a group."""
     return sorted({entry.name for entry in entry_points(group=group)})
@@ -56,7 +61,8 @@ def find_plugin(group: str, name: str) -> Any:
     found = list(entry_points(group=group, name=name))
     if not found:
         raise ConfigError(
-            f"no {kind} called {short(name)!r} is installed; installed are {', '.join(installed(group)) or 'none'}. "
+            f"no {kind} called {short(name)!r} is installed; {did_you_mean(name, installed(group))}installed are "
+            f"{', '.join(installed(group)) or 'none'}. "
             f"A package adds one by an entry point in the group {group!r}"
         )
     entry = found[0]

@@ -25,6 +25,7 @@ from snakesim_hal.host.recorder import Recorder
 from snakesim_hal.host_process import record_of
 from snakesim_hal.in_process import InProcessRun, check
 from snakesim_hal.model.plugin_check import check_plugins
+from snakesim_hal.model.plugins import anything_offered
 from snakesim_hal.model.scenario import RunConfig, write
 from snakesim_hal.network.session import Session
 from snakesim_hal.terminal import print_stderr, say
@@ -70,9 +71,14 @@ def simulate(
 
     A program that has imported NumPy already may have bound it to other processor code than `snakesim run` has; then
     the run is computed in a child process, so that its digest is the same. `snakesim_hal.arithmetic.pin()` before the
-    first import of NumPy keeps it in this process.
+    first import of NumPy keeps it in this process. So does a plugin that the program offers itself: then the digest may
+    be its computer's own (`summary.own_arithmetic`).
     """
-    if not is_pinned():
+    if not isinstance(config, RunConfig):
+        raise ConfigError(
+            f"simulate() takes a RunConfig, not {config!r:.60}; `snakesim.run` takes a scenario's name or path"
+        )
+    if not is_pinned() and not anything_offered():  # what this program offers, a child would not have
         return call_pinned(simulate, config=config, out=out, until_goal=until_goal, give_up_s=give_up_s)
     extras.check("record", "`simulate`, whose results are read from a recording,")
     config, ending = check_plugins(config), Ending()

@@ -48,23 +48,30 @@ def video(
     run: Path, out: Path, *, size: tuple[int, int], fps: float, speed: float, span_s: Span, say: Say = say
 ) -> int:
     """Film a run. Raises ConfigError for one without poses, and when something that it needs is not installed."""
+    record = RunRecord.load(run)
+    film(record, out, size=size, fps=fps, speed=speed, span_s=span_s, say=say)
+    return exit_code(run, record.lacks)
+
+
+def film(
+    record: RunRecord, out: Path, *, size: tuple[int, int], fps: float, speed: float, span_s: Span, say: Say
+) -> None:
+    """Film a record. Raises ConfigError, as `video` does."""
     if out.suffix not in (".mp4", ".gif"):
         raise ConfigError(f"--out {out}: give a file that ends in .mp4 or .gif")
     extras.check("video", "a film")
-    record = RunRecord.load(run)
     times = _times(record, fps, speed, span_s)
-    film: Film = find_plugin(FILMS, "mujoco")(record.config, *size)
-    with contextlib.closing(film), _written(out, size, fps, record.lacks) as write:
+    camera: Film = find_plugin(FILMS, "mujoco")(record.config, *size)
+    with contextlib.closing(camera), _written(out, size, fps, record.lacks) as write:
         middle = _centre(record, record.row_at(times[0]))
         for i, time_s in enumerate(times):
             row = record.row_at(time_s)
             pose = record.position_w[row], record.orientation_wxyz[row], record.angle_rad[row]
             middle = middle + (_centre(record, row) - middle) * min(speed / fps / FOLLOW_S, 1.0)
-            write(film.picture(*pose, middle, _forces(record, time_s)))
+            write(camera.picture(*pose, middle, _forces(record, time_s)))
             if (i + 1) % max(round(TOLD_SHARE * len(times)), 1) == 0:
                 say(f"{100 * (i + 1) // len(times)} %: {i + 1} of {len(times)} pictures")
     say(f"{out}: {len(times) / fps:.1f} s, {out.stat().st_size / 1e6:.2f} MB")
-    return exit_code(run, record.lacks)
 
 
 def _centre(record: RunRecord, row: int) -> Floats:

@@ -30,7 +30,7 @@ IMPORT_ALL = (
 
 def without(room: str, folder: Path) -> Path:
     """A copy of the packages without a room and its entry points, with metadata that hides the installed ones."""
-    for package in REPOSITORY.glob("snakesim_*"):
+    for package in REPOSITORY.glob("snakesim*"):
         shutil.copytree(package, folder / package.name, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.rmtree(folder / "snakesim_operator" / room)
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]

@@ -7,7 +7,7 @@ import grimp
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = sorted(path.name for path in ROOT.glob("snakesim_*"))
+PACKAGES = ["snakesim", *sorted(path.name for path in ROOT.glob("snakesim_*"))]
 
 
 def test_benchmarks_may_use_what_tests_use_and_no_test_needs_a_benchmark() -> None:

@@ -19,15 +19,23 @@ KEPT = "\n\u202f\u00a0"  # line breaks of a configuration, and the blanks in lar
 MINUS = str.maketrans({"-": "−"})
 
 
-def render(template: Path, coloured_joints: int, *, styles: list[Path], scripts: list[Path], **values: Any) -> str:
-    """A whole page that needs no other file. coloured_joints: how many need a colour."""
+def render(
+    template: Path,
+    coloured_joints: int,
+    *,
+    styles: list[Path],
+    scripts: list[Path],
+    charts: bool = True,
+    **values: Any,
+) -> str:
+    """A whole page that needs no other file. coloured_joints: how many need a colour; charts: whether it has any."""
     return (
         _pages(template.parent)
         .get_template(template.name)
         .render(
             style=Markup(themes(coloured_joints) + _text(HERE / "page.css", *styles)),
-            library=Markup(_text(LIBRARY)),
-            script=Markup(_text(HERE / "charts.js", *scripts)),
+            library=Markup(_text(LIBRARY) if charts else ""),
+            script=Markup(_text(*([HERE / "charts.js"] if charts else []), *scripts)),
             **values,
         )
     )

@@ -4,6 +4,6 @@
 its forces, `figures` names the charts; `page` and the template `report.html` put it together. Imports the HAL only.
 """
 
-from snakesim_operator.results.report.page import page
+from snakesim_operator.results.report.page import page, playback_page
 
-__all__ = ["page"]
+__all__ = ["page", "playback_page"]

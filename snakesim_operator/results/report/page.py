@@ -53,6 +53,7 @@ def page(record: RunRecord, summary: RunSummary) -> str:
         pretty=pretty,
         in_words=in_words,
         film=playback(record),
+        names=[joint.name for joint in record.description.joints],
         events=listed(found),
         instants=_instants(record, found),
         pushing=pushing(record),
@@ -68,6 +69,22 @@ def page(record: RunRecord, summary: RunSummary) -> str:
         numbers=_numbers(summary),
         config_file=_config_file(record),
         config=msgspec.json.format(msgspec.json.encode(summary.config), indent=2).decode(),
+    )
+
+
+def playback_page(record: RunRecord, summary: RunSummary) -> str:
+    """Verdict and playback alone, without charts: small enough for a notebook."""
+    return render(
+        HERE / "playback.html",
+        len(record.description.joints),
+        styles=[HERE / "figure.css"],
+        scripts=[HERE / "playback.js"],
+        charts=False,
+        title=record.config.title or summary.scenario,
+        verdict=verdict(record, summary),
+        film=playback(record),
+        events=listed(events(record, summary)),
+        names=[joint.name for joint in record.description.joints],
     )
 
 

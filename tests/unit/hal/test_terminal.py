@@ -45,7 +45,7 @@ def test_what_is_said_is_harmless(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_nothing_else_prints() -> None:
     """`make check` refuses `print`; nor does anything write to the streams directly."""
-    for package in REPOSITORY.glob("snakesim_*"):
+    for package in REPOSITORY.glob("snakesim*"):
         for path in package.rglob("*.py"):
             for node in ast.walk(ast.parse(path.read_bytes())):
                 if isinstance(node, ast.Attribute) and node.attr in ("write", "writelines"):

@@ -163,7 +163,7 @@ def lint(folder: Path) -> subprocess.CompletedProcess[str]:
 def copy_of_the_packages(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("packages")
     shutil.copy(REPOSITORY / "pyproject.toml", folder)
-    for package in REPOSITORY.glob("snakesim_*"):
+    for package in REPOSITORY.glob("snakesim*"):
         if package.is_dir():
             shutil.copytree(package, folder / package.name, ignore=shutil.ignore_patterns("__pycache__"))
     return folder

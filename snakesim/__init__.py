@@ -1,0 +1,70 @@
+"""SnakeSIM for programs and notebooks: run scenarios, look at what came of them, and steer robots that run.
+
+    import snakesim
+
+    result = snakesim.run("triplet", duration=8, set={"control.propulsion_n": 35})
+    result["angle_rad"], result.metrics["path_distance_m"], result.plot("torque_nm")
+
+`run` and `Result` are for whole runs. `View`, `Action`, `Report`, `positions` and `Settings` are for controllers.
+`docs/python.md` is the reference. Nothing of SnakeSIM imports this package.
+
+Names are loaded when they are first used. A program that imports this package before NumPy computes as `snakesim run`
+does, so that one seed gives one digest; one that has imported NumPy already gets its runs from a child process.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from snakesim_hal.arithmetic import pin
+from snakesim_hal.errors import (
+    ConfigError,
+    ControllerError,
+    NotConnectedError,
+    RefusedError,
+    SnakesimError,
+    StalledError,
+)
+
+if TYPE_CHECKING:
+    from snakesim.result import Result
+    from snakesim.runs import run
+    from snakesim_gnc.control.controller import Action, Report, View, positions
+    from snakesim_hal.model.files import FileStruct as Settings
+
+__all__ = [
+    "Action",
+    "ConfigError",
+    "ControllerError",
+    "NotConnectedError",
+    "RefusedError",
+    "Report",
+    "Result",
+    "Settings",
+    "SnakesimError",
+    "StalledError",
+    "View",
+    "positions",
+    "run",
+]
+CONTROLLER = "snakesim_gnc.control.controller"
+LAZY = {
+    "Action": (CONTROLLER, "Action"),
+    "Report": (CONTROLLER, "Report"),
+    "Result": ("snakesim.result", "Result"),
+    "Settings": ("snakesim_hal.model.files", "FileStruct"),
+    "View": (CONTROLLER, "View"),
+    "positions": (CONTROLLER, "positions"),
+    "run": ("snakesim.runs", "run"),
+}
+pin()
+
+
+def __getattr__(name: str) -> Any:
+    if name not in LAZY:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it has {', '.join(__all__)}")
+    module, attribute = LAZY[name]
+    return getattr(import_module(module), attribute)
+
+
+def __dir__() -> list[str]:
+    return __all__

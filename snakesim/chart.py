@@ -1,0 +1,40 @@
+"""Figures on a page of their own, for a notebook or a file."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+
+from snakesim_hal.model.textfiles import write_text
+from snakesim_operator.results.page.charts import Figure
+from snakesim_operator.results.page.html import render
+
+PAGE = Path(__file__).with_name("plot.html")
+MARGIN_PX = 60
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Figures over time, which a notebook shows."""
+
+    title: str
+    figures: Sequence[Figure]
+    joints: int
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write one page of HTML, which needs no network and no other file."""
+        write_text(Path(path), self._page())
+        return Path(path)
+
+    def _repr_html_(self) -> str:
+        return framed(self._page(), sum(figure["layout"]["height"] + MARGIN_PX for figure in self.figures))
+
+    def _page(self) -> str:
+        return render(PAGE, self.joints, styles=[], scripts=[], title=self.title, figures=self.figures)
+
+
+def framed(page: str, height_px: int) -> str:
+    """A page within another one."""
+    style = f"width:100%;height:{height_px}px;border:0"
+    return f'<iframe style="{style}" sandbox="allow-scripts allow-downloads" srcdoc="{escape(page)}"></iframe>'

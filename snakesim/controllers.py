@@ -1,0 +1,64 @@
+"""What a program may give as a controller: a shipped name, `./file.py:Class`, a class, or a function."""
+
+import inspect
+import os
+import re
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from snakesim_gnc.control.controller import Action, Report, View, positions
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.files import FileStruct
+from snakesim_hal.wire.messages import Description, JointState
+
+JointFunction = Callable[[float, JointState], Sequence[float]]
+"""From the time since arming in s, and the joints' state, to an angle in rad for each joint, tail to head."""
+Given = str | os.PathLike[str] | type[Any] | JointFunction
+TAKES = "a shipped name, a path './file.py:Class', a class, or a function f(time_s, joints) -> angles_rad"
+
+
+def named(controller: Given) -> tuple[str, Any | None]:
+    """Its name in a configuration, and the class that the name stands for; None where the name says it all.
+
+    Raises ConfigError for anything else.
+    """
+    if isinstance(controller, str | os.PathLike):
+        return os.fspath(controller), None
+    name = re.sub(r"\W+", "", getattr(controller, "__name__", type(controller).__name__)) or "function"
+    if isinstance(controller, type):
+        if not callable(getattr(controller, "update", None)):
+            raise ConfigError(f"controller={name}: a controller class needs a method update(view); see docs/python.md")
+        return f"program:{name}", controller
+    if callable(getattr(controller, "update", None)):
+        raise ConfigError(f"controller={controller!r:.60}: give its class; every arming makes an object of it")
+    if not callable(controller):
+        raise ConfigError(f"controller={controller!r:.60}: give {TAKES}")
+    try:
+        inspect.signature(controller).bind(0.0, None)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"controller={name}: is called as f(time_s, joints), which does not fit: {error}") from None
+    return f"program:{name}", _class_of(controller, name)
+
+
+def _class_of(function: JointFunction, name: str) -> Any:
+    class OfFunction:
+        NEEDS = "joints"
+
+        class Settings(FileStruct, frozen=True):
+            """A function has none."""
+
+        def __init__(self, robot: Description, settings: Settings) -> None:
+            self._robot = robot
+
+        def update(self, view: View) -> Action:
+            answered = function(view.time_s, view.joints)
+            angles_rad, count = np.asarray(answered, dtype=float), len(self._robot.joints)
+            if angles_rad.shape != (count,):
+                raise ValueError(f"{name}() returned {answered!r:.60}, must return {count} angles in rad, tail to head")
+            asked = angles_rad.tolist()
+            return Action(positions(self._robot, asked), Report(why=f"{name} moves the joints", reference_rad=asked))
+
+    OfFunction.__name__ = name
+    return OfFunction

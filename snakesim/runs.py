@@ -1,0 +1,112 @@
+"""Runs of scenarios: in this process, or in processes of their own, as `snakesim run` has them."""
+
+import contextlib
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import msgspec
+
+from snakesim.controllers import Given, named
+from snakesim.result import Result
+from snakesim_hal.errors import ConfigError, ControllerError, SnakesimError, short
+from snakesim_hal.model.plugin_check import check_plugins
+from snakesim_hal.model.plugins import CONTROLLERS, offered
+from snakesim_hal.model.scenario import Override, RunConfig, load
+from snakesim_operator.results.record import SUMMARY, RunRecord
+from snakesim_operator.results.summary import RunSummary
+from snakesim_operator.run.conclusion import INTERRUPTED
+from snakesim_operator.run.in_process import simulate
+from snakesim_operator.run.run import RunRequest
+from snakesim_operator.run.run import run as run_processes
+
+FAILED = "control ended: "  # how a run's end names a controller that could not go on
+
+
+def run(
+    scenario: str | os.PathLike[str],
+    *,
+    controller: Given | None = None,
+    duration: float | None = None,
+    seed: int | None = None,
+    backend: str | None = None,
+    set: Mapping[str, Any] | None = None,
+    out: str | os.PathLike[str] | None = None,
+    processes: bool = False,
+) -> Result:
+    """Run a scenario and return what came of it, also if that is a fault: `Result.ended` says how it ended.
+
+    scenario: shipped name, or path of a scenario or of a run's config.json. duration: s of robot time. set: any other
+    value by its dotted key, as `--set` takes them. out: folder for what `snakesim run` leaves; None keeps nothing.
+    processes: host and services in processes of their own, at any pace; a backend that moves a real robot needs it.
+
+    Raises ConfigError for wrong input, before anything runs; ControllerError when the controller raises, or answers
+    what is not allowed; SnakesimError when a run cannot begin.
+    """
+    if not isinstance(scenario, str | os.PathLike):
+        raise ConfigError(f"run({scenario!r:.60}): give a scenario's name, such as 'triplet', or the path of its file")
+    overrides = _overrides(set, duration_s=duration, seed=seed, backend=backend)
+    with contextlib.ExitStack() as opened:
+        if controller is not None:
+            name, plugin = named(controller)
+            overrides.insert(0, Override("controller", name, f"controller={short(name)}"))
+            if plugin is not None:
+                if processes:
+                    raise ConfigError(
+                        f"controller={name.removeprefix('program:')}: processes of their own cannot reach an object of "
+                        "this program; save it in a file, and give its path, such as controller='./mine.py:Mine'"
+                    )
+                opened.enter_context(offered(CONTROLLERS, name, plugin))
+        config = _checked(os.fspath(scenario), overrides, processes=processes)
+        folder = None if out is None else Path(out)
+        return _in_processes(config, folder) if processes else _in_this_process(config, folder)
+
+
+def _overrides(given: Mapping[str, Any] | None, **arguments: Any) -> list[Override]:
+    if given is not None and not (isinstance(given, Mapping) and all(isinstance(key, str) for key in given)):
+        raise ConfigError(f"set={given!r:.60}: give a mapping of dotted keys, such as {{'control.propulsion_n': 35}}")
+    values = {key: value for key, value in arguments.items() if value is not None}
+    found = [Override(key, _plain(value), f"{key.removesuffix('_s')}={value!r:.60}") for key, value in values.items()]
+    return found + [
+        Override(key, _plain(value), f"set={{{key!r}: {value!r:.60}}}") for key, value in (given or {}).items()
+    ]
+
+
+def _plain(value: Any) -> Any:
+    """Of a NumPy number or array the Python one; of a path its text."""
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    return value.tolist() if hasattr(value, "tolist") else value
+
+
+def _checked(scenario: str, overrides: list[Override], *, processes: bool) -> RunConfig:
+    pace = next((override for override in overrides if override.key == "pace"), None)
+    if pace is None and not processes:  # the only one there is in one process
+        overrides = [*overrides, Override("pace", "lockstep", "one process")]
+    loaded = load(scenario, overrides)
+    if pace is not None and not processes and loaded.config.pace != "lockstep":
+        raise ConfigError(f"{pace.flag}: in one process the pace is lockstep; leave it out, or add processes=True")
+    config = check_plugins(loaded.config, loaded.table)
+    if pace is not None and config.pace != pace.value:
+        raise ConfigError(f"{pace.flag}: backend {config.backend!r} cannot keep this pace, only {config.pace}")
+    return config
+
+
+def _in_this_process(config: RunConfig, out: Path | None) -> Result:
+    found = simulate(config, out)
+    if FAILED in found.summary.ended:
+        raise ControllerError(found.summary.ended.partition(FAILED)[2])
+    return Result(found.record, found.summary)
+
+
+def _in_processes(config: RunConfig, out: Path | None) -> Result:
+    with TemporaryDirectory(prefix="snakesim-") as kept:
+        folder = out or Path(kept) / "run"
+        if run_processes(RunRequest(config, out=folder)) == INTERRUPTED:
+            raise KeyboardInterrupt
+        if not (folder / SUMMARY).is_file():
+            raise SnakesimError("the run left no record; what its processes said stands above")
+        summary = msgspec.json.decode((folder / SUMMARY).read_bytes(), type=RunSummary)
+        return Result(RunRecord.load(folder), summary)

@@ -1,0 +1,176 @@
+"""`import snakesim`: runs from a program, with what it gives as a controller, and what comes of them."""
+
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import snakesim
+from snakesim.result import UNITS
+from snakesim_hal.model.scenario import load, parse_set
+from snakesim_operator.run.in_process import simulate
+from tests.e2e.documents import REPOSITORY, sections
+
+needs_pandas = pytest.mark.skipif(importlib.util.find_spec("pandas") is None, reason="pandas is not installed")
+
+
+def wave(time_s, joints):
+    return [0.2 * min(time_s, 1.0) * np.sin(3 * time_s - 0.9 * i) for i in range(len(joints.angle_rad))]
+
+
+class Nod:
+    NEEDS = "joints"
+
+    class Settings(snakesim.Settings, frozen=True):
+        by_rad: float = 0.0
+
+    def __init__(self, robot, settings):
+        self.robot, self.by_rad = robot, settings.by_rad
+
+    def update(self, view):
+        return snakesim.Action(snakesim.positions(self.robot, [self.by_rad] * len(self.robot.joints)))
+
+
+@pytest.fixture(scope="module")
+def result() -> snakesim.Result:
+    return snakesim.run("triplet", duration=1)
+
+
+def test_a_run_is_that_of_the_command(result: snakesim.Result) -> None:
+    same = simulate(load("triplet", [parse_set("duration_s=1")]).config)
+    assert result.digest == same.summary.command_digest and result.complete
+    assert result.metrics["path_distance_m"] == same.summary.path_distance_m
+
+
+def test_signals_have_names_units_and_time(result: snakesim.Result) -> None:
+    assert result["angle_rad"].shape == (100, 13) and result.time_s.shape == (100,)
+    assert np.array_equal(result["angle_rad.joint_3"], result["angle_rad"][:, result.joints.index("joint_3")])
+    assert result.units["torque_nm.joint_1"] == "N·m" and result.units["position_w_m.x"] == "m"
+    assert set(result.arrays) <= set(UNITS) and set(result.units) == set(result.names)
+    with pytest.raises(snakesim.ConfigError, match="no signal 'angle_rd'; did you mean `angle_rad`"):
+        result["angle_rd"]
+
+
+@pytest.mark.parametrize("controller", [wave, lambda time_s, joints: wave(time_s, joints)])
+def test_a_function_is_a_controller(controller) -> None:
+    found = snakesim.run("triplet", controller=controller, duration=1)
+    assert found.complete and found.summary.controller.startswith("program:")
+    assert np.ptp(found["target.joint_5"]) > 0.1
+
+
+def test_a_class_is_a_controller_and_takes_settings() -> None:
+    found = snakesim.run("triplet", controller=Nod, duration=1, set={"control.by_rad": np.float64(0.3)})
+    assert found["target.joint_5"][-1] == 0.3
+    with pytest.raises(snakesim.ConfigError, match=r"set=\{'control.by_rd': 1\}: .* did you mean `by_rad`"):
+        snakesim.run("triplet", controller=Nod, set={"control.by_rd": 1})
+
+
+def test_a_path_and_a_shipped_name_are_controllers_too(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text("from snakesim_gnc.control.hold import Hold\n\n\nclass Mine(Hold):\n    pass\n")
+    mine = snakesim.run("triplet", controller=f"{tmp_path}/mine.py:Mine", duration=0.5)
+    assert mine.digest == snakesim.run("triplet", controller="hold", duration=0.5).digest
+
+
+WRONG = [
+    (("triplett",), {}, "no scenario called 'triplett'; did you mean `triplet`"),
+    ((3,), {}, r"run\(3\): give a scenario's name"),
+    (("triplet",), {"controller": "hodl"}, "no controller called 'hodl' is installed; did you mean `hold`"),
+    (("triplet",), {"set": {"control.lead": 1}}, r"set=\{'control.lead': 1\}: unknown field"),
+    (("triplet",), {"set": ["control.lead"]}, "give a mapping of dotted keys"),
+    (("triplet",), {"duration": -1}, r"duration=-1: `duration_s` = -1 s is not allowed; expected a number > 0"),
+    (("triplet",), {"seed": "a"}, r"seed='a': `seed` = 'a' is not allowed"),
+    (("triplet",), {"backend": "simm"}, "no backend called 'simm' is installed; did you mean `sim`"),
+    (("triplet",), {"controller": lambda time_s: 0}, r"is called as f\(time_s, joints\)"),
+    (("triplet",), {"controller": 5}, "controller=5: give a shipped name"),
+    (("triplet",), {"controller": int}, r"controller=int: a controller class needs a method update\(view\)"),
+    (("triplet",), {"controller": wave, "processes": True}, "controller=wave: processes .* save it in a file"),
+    (("triplet",), {"set": {"pace": "realtime"}}, "in one process the pace is lockstep"),
+]
+
+
+@pytest.mark.parametrize(("given", "more", "words"), WRONG, ids=[words for _, _, words in WRONG])
+def test_wrong_input_is_answered_at_the_call(given, more, words: str) -> None:
+    with pytest.raises(snakesim.ConfigError, match=words):
+        snakesim.run(*given, **more)
+
+
+def test_simulate_says_what_it_takes() -> None:
+    with pytest.raises(snakesim.ConfigError, match=r"takes a RunConfig, not 'triplet'; `snakesim.run` takes"):
+        simulate("triplet")  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize(
+    ("controller", "words"),
+    [
+        (lambda time_s, joints: [0.0] * 3, r"returned \[0.0, 0.0, 0.0\], must return 13 angles in rad"),
+        (lambda time_s, joints: 1 / 0, r"raised ZeroDivisionError: division by zero \(test_python.py line \d+\)"),
+    ],
+)
+def test_a_controller_that_fails_is_an_error_that_names_it(controller, words: str) -> None:
+    with pytest.raises(snakesim.ControllerError, match=words):
+        snakesim.run("triplet", controller=controller, duration=1)
+
+
+def test_pages_plots_and_films_need_no_folder(result: snakesim.Result, tmp_path: Path) -> None:
+    report = result.report(tmp_path / "report.html").read_text()
+    assert "Save the effective configuration below as <code>config.json</code>" in report
+    shown = result._repr_html_()
+    assert shown.startswith("<iframe") and "class=&quot;player card&quot;" in shown and len(shown) < 500_000
+    plot = result.plot("angle_rad", "torque_nm.joint_3")
+    assert "torque_nm.joint_3, N·m" in plot.save(tmp_path / "plot.html").read_text()
+    assert plot._repr_html_().startswith("<iframe")
+    film = result.video(tmp_path / "run.gif", width=64, height=48, fps=5)
+    assert film.read_bytes().startswith(b"GIF8")
+
+
+def test_without_pandas_it_says_what_to_install(result: snakesim.Result, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(snakesim.ConfigError, match=r"needs pandas .* -m pip install pandas"):
+        result.to_pandas()
+
+
+@needs_pandas
+def test_a_data_frame_has_the_columns_and_their_units(result: snakesim.Result) -> None:
+    frame = result.to_pandas()
+    assert frame.index.name == "time_s" and np.array_equal(frame["angle_rad.joint_3"], result["angle_rad.joint_3"])
+    assert frame.attrs["units"]["angle_rad.joint_3"] == "rad"
+
+
+@pytest.mark.e2e
+def test_in_processes_it_is_the_same_run(tmp_path: Path) -> None:
+    apart = snakesim.run("triplet", duration=1, processes=True, out=tmp_path / "run")
+    assert apart.complete and apart.digest == snakesim.run("triplet", duration=1).digest
+    assert (tmp_path / "run" / "report.html").is_file()
+
+
+def test_an_unknown_name_lists_what_there_is() -> None:
+    with pytest.raises(AttributeError, match=r"module 'snakesim' has no attribute 'runn'; it has .* run"):
+        snakesim.runn  # noqa: B018  # pyright: ignore[reportAttributeAccessIssue]
+    assert {name for name in snakesim.__all__ if getattr(snakesim, name) is None} == set()
+
+
+def test_importing_it_loads_neither_numpy_nor_a_simulator() -> None:
+    code = "import sys, snakesim; print(sorted({'numpy', 'mujoco', 'zenoh'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=REPOSITORY)
+    assert done.stdout == "[]\n"
+
+
+def test_the_study_in_the_documents_as_printed(tmp_path: Path) -> None:
+    """Run, plot, sweep a gain, take the best, run it on emulated modules, compare."""
+    study = next(s for s in sections(REPOSITORY / "docs" / "python.md") if "study.py" in s.files).files["study.py"]
+    assert len(study.splitlines()) <= 25
+    (tmp_path / "study.py").write_text(study)
+    done = subprocess.run(
+        [sys.executable, "study.py"],
+        cwd=tmp_path,
+        env={"PYTHONPATH": str(REPOSITORY), "PATH": ""},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "first.html").is_file()
+    assert "0.5 rad: " in done.stdout and "sim -> can" in done.stdout and "A moved" in done.stdout
