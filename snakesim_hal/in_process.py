@@ -112,7 +112,8 @@ class InProcessRun:
 
         The joints are safe at the end, also when this generator is closed early.
         """
-        joined, give_up = False, time.monotonic() + ARM_LIMIT_S
+        joined, limit_s = False, min(ARM_LIMIT_S, self.config.start_limit_s)
+        give_up = time.monotonic() + limit_s
         with closing(self.host.turns()) as turns:
             for turn, _ in enumerate(turns):
                 if not joined:
@@ -121,7 +122,8 @@ class InProcessRun:
                     joined = True
                 self._let_act()
                 if not self.host.authority.arming and not self.failed:
-                    self._arm(too_late=turn > ARM_LIMIT_TURNS and time.monotonic() > give_up)
+                    too_late = turn > ARM_LIMIT_TURNS and time.monotonic() > give_up
+                    self._arm(given_up_after_s=limit_s if too_late else None)
                 yield
 
     def stop(self) -> None:
@@ -138,10 +140,10 @@ class InProcessRun:
                 del self._loops[name]
                 self._parts[name].close()
 
-    def _arm(self, *, too_late: bool) -> None:
+    def _arm(self, *, given_up_after_s: float | None) -> None:
         status, robot = self.host.status(), self.host.description
-        if too_late:
-            raise RefusedError(f"not ready to arm within {ARM_LIMIT_S:g} s: {status.why}")
+        if given_up_after_s is not None:
+            raise RefusedError(f"not ready to arm within {given_up_after_s:g} s: {status.why}")
         if status.ready_to_arm:
             request = LifecycleRequest(
                 action="arm",

@@ -5,6 +5,8 @@ import traceback
 from collections.abc import Callable, Iterator
 from typing import Protocol
 
+import msgspec
+
 from snakesim_hal.allowed_faults import faults_of_service
 from snakesim_hal.errors import NotConnectedError, ServiceError, SnakesimError, WireError, raised
 from snakesim_hal.model.scenario import RunConfig
@@ -15,6 +17,7 @@ from snakesim_hal.network.session import Session
 from snakesim_hal.wire.messages import Clock, Description, Message
 
 SILENCE_S = 1.0
+MOST_SHOWN = 16  # keys
 TRY_S = 2.0  # to meet the robot
 START_LIMIT_S = 600.0  # until a part of a run is there: MuJoCo starts slowly in an emulated machine on a busy one
 
@@ -78,7 +81,7 @@ class ServiceLoop:
         clock = self._client.wait_for_clock(SILENCE_S)
         if clock is not None:
             self._faults.turn(clock.stamp_ns, clock.arming, clock.lifecycle)
-        show_process(self._session, self._entry)
+        self._shown = show_process(self._session, self._entry)
         self._client.announce()
 
     def run(self) -> None:
@@ -115,11 +118,19 @@ class ServiceLoop:
                 self.service.configure(robot)
         with self._named("outputs"):
             outputs = self.service.outputs(clock)
+            if clock.lifecycle != "armed":
+                self._show_waiting([] if outputs is not None else sorted(self._client.lacks)[:MOST_SHOWN])
             if outputs is None:
                 return
             for key, message in outputs:
                 self._client.put(key, message)
         self._client.done(clock.tick)
+
+    def _show_waiting(self, keys: list[str]) -> None:
+        """Tell the host what this service waits for, so that whoever waits for the service knows it."""
+        if keys != self._entry.waits_for:
+            self._entry = msgspec.structs.replace(self._entry, waits_for=keys)
+            self._shown.put(self._entry)
 
     @contextlib.contextmanager
     def _named(self, method: str) -> Iterator[None]:

@@ -57,7 +57,7 @@ class _Surveyed:
     def __init__(self, client: Client, config: RunConfig) -> None:
         self._known: Sequence[Obstacle] = [placed.obstacle for placed in place_all(config) if not placed.walkable]
         self._joints = client.subscribe(keys.JOINTS, JointState)
-        self._contacts = client.subscribe(keys.CONTACTS, Contacts)
+        self._contacts = client.subscribe(keys.CONTACTS, Contacts) if config.robot.sensors.contacts else None
         self._pose = client.subscribe(keys.POSE, Pose)
         self._client = client
         self._model: WorldModel | None = None
@@ -69,7 +69,7 @@ class _Surveyed:
         joints, pose = self._client.read(self._joints), self._client.read(self._pose)
         if self._model is None or joints is None or pose is None:
             return None
-        contacts = self._client.read(self._contacts)
+        contacts = self._client.read(self._contacts) if self._contacts else None
         return self._model.update(clock.tick, clock.stamp_ns, joints, contacts, pose)
 
 
@@ -83,8 +83,8 @@ class _Perceived:
         sensed = robot.sensors.pose
         self._noise = PoseNoise() if sensed is None else PoseNoise(sensed.position_noise_m, sensed.angle_noise_rad)
         self._joints = client.subscribe(keys.JOINTS, JointState)
-        self._contacts = client.subscribe(keys.CONTACTS, Contacts)
-        self._imu = client.subscribe(keys.IMU, Imu)
+        self._contacts = client.subscribe(keys.CONTACTS, Contacts) if robot.sensors.contacts else None
+        self._imu = client.subscribe(keys.IMU, Imu) if robot.sensors.imu else None
         by_pose = config.mission.localisation == "pose_sensor"
         self._pose = client.subscribe(keys.POSE, Pose) if by_pose else None
         self._depth = [(client.subscribe(keys.depth(c.name), DepthImage), _noise(c)) for c in robot.sensors.depth]
@@ -102,8 +102,8 @@ class _Perceived:
         joints = read(self._joints)
         if model is None or joints is None:
             return None
-        contacts = read(self._contacts)
-        model.take_joints(joints, contacts, read(self._imu))
+        contacts = read(self._contacts) if self._contacts else None
+        model.take_joints(joints, contacts, read(self._imu) if self._imu else None)
         pose = None if self._pose is None else read(self._pose)
         if pose is not None:
             model.take_pose(pose)

@@ -511,6 +511,7 @@ class Host:
             pace=self._pace,
             time=self._time,
             missing=self._missing(),
+            waits=self._processes.waits(),
             differing=self._differing(),
             overruns=self.statistics.overruns,
             realtime_warnings=self._realtime_warnings,

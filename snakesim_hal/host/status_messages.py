@@ -1,9 +1,18 @@
 """Builds the host's status messages. Pure."""
 
+from collections.abc import Mapping, Sequence
+
 from snakesim_hal.host.participants import Participants
 from snakesim_hal.host.simulated_time import SimulatedTime
 from snakesim_hal.safety.authority import Authority, Decision
+from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import AppliedCommand, Description, Pace, Status
+
+WITHOUT = {
+    keys.POSE: "mission.map=perceived with mission.localisation=dead_reckoning does without; so does a controller of "
+    "joints alone, as hold, on a robot without [sensors.pose]"
+}
+"""How a run can do without a message."""
 
 
 def applied_message(description: Description, tick: int, decision: Decision) -> AppliedCommand:
@@ -20,6 +29,13 @@ def applied_message(description: Description, tick: int, decision: Decision) -> 
     )
 
 
+def _waiting(service: str, lacks: Sequence[str]) -> str:
+    if not lacks:
+        return f"waiting for {service}"
+    ways_out = "".join(f" ({WITHOUT[key]})" for key in lacks if key in WITHOUT)
+    return f"waiting for {service}, which has no {', '.join(lacks)} yet{ways_out}"
+
+
 def status_message(
     authority: Authority,
     participants: Participants,
@@ -28,18 +44,22 @@ def status_message(
     pace: Pace,
     time: SimulatedTime,
     missing: list[str],
+    waits: Mapping[str, Sequence[str]],
     differing: list[str],
     overruns: int,
     realtime_warnings: list[str],
     injected: list[str],
     held_up: str,
 ) -> Status:
-    """The status of the robot. missing: the services that arming waits for; differing: how others are set up."""
+    """The status of the robot.
+
+    missing: the services that arming waits for; waits: for which keys they wait; differing: how others are set up.
+    """
     description = authority.description
     against = authority.against_arming(time.safety_ns(tick))
     why = authority.why
     if authority.state == "disarmed" and (against or missing or differing):
-        why = "; ".join([why, *differing, *(f"waiting for {name}" for name in missing), *against])[:500]
+        why = "; ".join([why, *differing, *(_waiting(name, waits.get(name, ())) for name in missing), *against])[:500]
     return Status(
         tick=tick,
         stamp_ns=tick * description.period_ns,

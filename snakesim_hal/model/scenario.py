@@ -129,6 +129,7 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
     faults: list[str] = []  # injected faults, at times since the first arming: see snakesim_hal.model.injection
     faults_allowed: bool = False  # also where something real moves
     stall_limit_s: Annotated[float, Meta(gt=0, le=600, extra_json_schema={"unit": "s"})] = 10.0
+    start_limit_s: Annotated[float, Meta(gt=0, le=3600, extra_json_schema={"unit": "s"})] = 60.0
     start: Start = Start()
     mission: Mission = Mission()
     services: dict[str, Service]

@@ -103,6 +103,7 @@ class Client:
         self._started_over = False
         self._host_left = False
         self.commanded_tick = -1
+        self.lacks: set[str] = set()  # keys that were read at this tick, and had nothing
         session.on_urgent_arrival(keys.CLOCK, self._take_clock)
         session.on_alive(self._take_host, keys.HOST_ALL)
 
@@ -151,6 +152,7 @@ class Client:
                 for feed in self._feeds.values():
                     feed.clear()
             self._clock, self.commanded_tick = clock, -1
+            self.lacks.clear()
             for feed in self._feeds.values():
                 feed.take_in(newest_only=clock.pace != "lockstep")
             yield clock
@@ -217,6 +219,12 @@ class Client:
 
         Raises StalledError when in lockstep the clock names a sample that does not come.
         """
+        found = self._read(feed)
+        if found is None:
+            self.lacks.add(feed.key)
+        return found
+
+    def _read(self, feed: Feed[MessageT]) -> MessageT | None:
         clock = self._clock
         if clock is None:
             return None

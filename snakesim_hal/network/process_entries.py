@@ -10,7 +10,7 @@ from importlib.metadata import version
 from snakesim_hal.errors import WireError
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.shared_settings import shared_settings
-from snakesim_hal.network.session import Arrival, Session
+from snakesim_hal.network.session import Arrival, Publisher, Session
 from snakesim_hal.process import user_name
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
@@ -34,11 +34,16 @@ def own_entry(name: str, config: RunConfig | None = None) -> Process:
     )
 
 
-def show_process(session: Session, entry: Process) -> None:
-    """Show an entry for as long as the session lives. The token comes first, so that a host waits for the entry."""
+def show_process(session: Session, entry: Process) -> Publisher[Process]:
+    """Show an entry for as long as the session lives. The token comes first, so that a host waits for the entry.
+
+    Returns the publisher, for later changes.
+    """
     key = keys.process(entry.name, secrets.token_hex(4))
     session.declare_token(key)
-    session.latched_publisher(key, Process).put(entry)
+    shown = session.latched_publisher(key, Process)
+    shown.put(entry)
+    return shown
 
 
 def differences(one: Process, other: Process) -> list[str]:
@@ -85,6 +90,11 @@ class ProcessEntries:
             else:
                 found += differences(entry, own)
         return found
+
+    def waits(self) -> dict[str, list[str]]:
+        """What processes that are present wait for: name -> keys."""
+        entries = [self._entries[key] for key in sorted(self._alive.copy()) if key in self._entries]
+        return {entry.name: entry.waits_for for entry in entries if entry.waits_for}
 
     def _take_token(self, key: str, present: bool) -> None:
         if present and len(self._alive) < MAX_ENTRIES:

@@ -534,6 +534,9 @@ class Process(Message, frozen=True, kw_only=True):
         Meta(max_length=64),
         about("messages that it knows; empty: unknown"),
     ] = {}
+    waits_for: Annotated[
+        list[q.Name], Meta(max_length=16), about("keys of which it has no message yet, without which it says nothing")
+    ] = []
 
 
 # --- guidance, navigation, control -----------------------------------------------------------------------------

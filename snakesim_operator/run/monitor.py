@@ -13,6 +13,7 @@ from snakesim_hal.wire.messages import ControlState, Description, LifecycleReque
 from snakesim_hal.wire.roles import RECORDER
 from snakesim_operator.results.ended import AT_GOAL
 from snakesim_operator.run.ending import Ending
+from snakesim_operator.run.patience import Patience
 from snakesim_operator.run.process_faults import ProcessFaults
 from snakesim_operator.run.processor_waits import ProcessorWaits
 from snakesim_operator.run.progress import Progress
@@ -54,6 +55,7 @@ class RunMonitor:
         session.on_alive(self._recorder_came, keys.alive(RECORDER))
         self._faults = ProcessFaults(config, session, supervisor, say)
         self._progress = Progress(config)
+        self._patience = Patience(config.services, config.start_limit_s)
         self._waits = ProcessorWaits(config.lease_ns * 1e-9)
         self._status: Status | None = None
         self._silent_polls = 0  # since the last status: a run that was stopped itself does not count
@@ -78,15 +80,22 @@ class RunMonitor:
                         break
                     self._arm_once()
                     self._finish_at_goal()
-                    if not self._armed and self._may_arm and time.monotonic() > give_up:
-                        why = self._status.why if self._status else "no status"
-                        self._ending.because(f"not ready to arm within {START_LIMIT_S:.0f} s: {why}")
+                    if not self._armed and self._may_arm and (tired := self._tired(give_up)):
+                        self._ending.because(tired)
                         break
                     time.sleep(POLL_S)
                 if self._ending.reason is not None and self._armed and not self._ending.interrupted:
                     self._let_it_settle()
             finally:
                 self._faults.undo()
+
+    def _tired(self, give_up: float) -> str | None:
+        """Why the run no longer waits to be armed; None: it does."""
+        now, why = time.monotonic(), self._status.why if self._status else "no status"
+        if self._patience.ends(self._status, now):
+            limit_s = self._patience.limit_s
+            return f"not ready to arm within {limit_s:g} s (start_limit_s) with every service there: {why}"
+        return f"not ready to arm within {START_LIMIT_S:.0f} s: {why}" if now > give_up else None
 
     def _take_in(self) -> None:
         """Process arrived messages."""

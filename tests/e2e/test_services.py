@@ -173,3 +173,34 @@ def test_a_service_that_raises_ends_the_run_with_its_name(home: Path) -> None:
     ended, summary = in_process.run_to_summary(home / "run", *code)
     said = "(class Lost): outputs() raised ZeroDivisionError: division by zero (lost.py line "
     assert ended.code == 1 and said in summary.ended and said in (home / "run" / WORDS).read_text()
+
+
+SILENT = """
+
+class Silent(MotionCapture):
+    def outputs(self, clock):
+        return []
+"""
+
+
+def test_a_run_names_what_never_comes_and_gives_up_after_a_stated_time(home: Path) -> None:
+    (home / "lab" / "silent.py").write_text(SERVICE + SILENT)
+    flags = [*SHORT, "--set", "services.sensor.code=./lab/silent.py:Silent", "--set", "start_limit_s=3"]
+    ended, summary = run_to_summary(home / "run", *flags)
+    why = "waiting for guidance, which has no sensor/pose yet (mission.map=perceived with mission.localisation="
+    given_up = "not ready to arm within 3 s"
+    for said in (summary.ended, ended.out):
+        assert f"{given_up} (start_limit_s) with every service there: " in said and why in said, ended.out
+    assert ended.code == 1 and summary.duration_s == 0.0
+    nothing_left(home / "run")
+    alone = in_process.snakesim("run", *flags, "--in-process", "--out", "one", cwd=home)
+    assert alone.code != 0 and given_up in alone.err and why in alone.err, alone
+
+
+def test_a_service_for_the_pose_brings_no_contacts_and_nobody_waits_for_them(home: Path) -> None:
+    """On a robot whose file has no contact sensors."""
+    robot = (home / "bare.toml").read_text()
+    bare = "\n[".join(part for part in robot.split("\n[") if not part.startswith("sensors.contacts]"))
+    (home / "bare.toml").write_text(bare)
+    ended, _ = in_process.run_to_summary(home / "run", *SHORT, "--set", NAMED)
+    assert ended.code == 0, ended.out

@@ -40,7 +40,7 @@ class Showing(Hold):
 """
 
 
-class StopError(Exception):
+class StopError(BaseException):
     """The test is over."""
 
 

@@ -1,0 +1,50 @@
+"""How long a run waits for a robot that is on: in robot time where it passes, and never for a slow computer."""
+
+from collections.abc import Sequence
+
+import msgspec
+
+from snakesim_hal.wire.messages import Status
+from snakesim_operator.run.patience import Patience
+from tests.unit.hal.strategies import plain_example
+
+ALL = ("guidance", "control")
+
+
+def status(
+    tick: int = 0, *, alive: Sequence[str] = ALL, ready: bool = False, waiting_for: Sequence[str] = ("guidance",)
+) -> Status:
+    plain = {**plain_example(Status), "tick": tick, "stamp_ns": tick * 10_000_000, "ready_to_arm": ready}
+    return msgspec.convert({**plain, "alive": alive, "waiting_for": waiting_for}, Status)
+
+
+def test_robot_time_is_counted_where_it_passes_however_slowly_the_computer_shows_it() -> None:
+    patience = Patience(ALL, 60.0)
+    assert not any(patience.ends(status(tick), now_s=100.0 * tick) for tick in range(1, 6001, 100))
+    assert patience.ends(status(6102), now_s=0.0)
+
+
+def test_where_time_stands_still_only_that_counts_in_which_the_host_is_heard() -> None:
+    patience = Patience(ALL, 60.0)
+    assert not any(patience.ends(status(), now_s=3600.0 * hour) for hour in range(60))
+    same = status()
+    assert not any(patience.ends(same, now_s=3600.0 * hour) for hour in range(60, 160))
+    assert not patience.ends(None, now_s=1e6)
+    assert any(patience.ends(status(), now_s=1e6 + 0.5 * half) for half in range(10))
+
+
+def test_it_starts_again_with_whatever_comes() -> None:
+    patience = Patience(ALL, 60.0)
+    steps = [
+        status(0),
+        status(5000),
+        status(9000, waiting_for=["control"]),
+        status(14000, waiting_for=["control"]),
+        status(19000, waiting_for=["control"], ready=True),
+        status(24000, waiting_for=["control"], alive=["control"]),
+        status(50000, waiting_for=["control"], alive=["control"]),
+        status(55000, waiting_for=["control"]),
+        status(60000, waiting_for=["control"]),
+    ]
+    assert not any(patience.ends(step, now_s=0.0) for step in steps)
+    assert patience.ends(status(62000, waiting_for=["control"]), now_s=0.0)
