@@ -19,6 +19,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from snakesim_gnc.control.bumpless import BumplessReference
+from snakesim_gnc.control.carried import measured
 from snakesim_gnc.control.contact_search import ContactSearch, Patience
 from snakesim_gnc.control.controller import Action, Report, View
 from snakesim_gnc.control.planar_body import PlanarBody
@@ -156,10 +157,12 @@ class ObstacleAided:
         if abs(located.speed_m_s) > STANDS_M_S:
             self._moved_at_s = view.time_s
         stands, found, force_n = view.time_s - self._moved_at_s > STANDS_S, self._last_push, self._force_n
-        points, standing = [], "standing still: backing out along its own path"
+        points, jammed, standing = [], False, "standing still: backing out along its own path"
         if found is not None:
             points = push_points(self._body, found.world, found.touches, found.push, force_n)
-            standing = why_it_stands(found.touches, found.push, force_n, self._max_force_n)
+            names = [point.obstacle for point in points if point.obstacle is not None]
+            carried = measured(found.world, (located.nodes_w[:, -1] - located.nodes_w[:, 0]).tolist())
+            jammed, standing = why_it_stands(found.touches, found.push, force_n, self._max_force_n, carried, names)
         why = standing if stands and found is not None else ""
         return Report(
             why=why,
@@ -172,7 +175,7 @@ class ObstacleAided:
             reference_rad=reference.tolist(),
             torque_headroom_nm=self._set.largest_torque_nm - float(np.abs(self._torques_nm).max()),
             saturated=0.0 < self._max_force_n <= force_n,
-            jammed=why.startswith("jam"),
+            jammed=bool(why) and jammed,
         )
 
     def _look_ahead_m(self, located: Located, period_s: float) -> float:

@@ -1,7 +1,10 @@
 """Report of the forces on obstacles: where, how much, and why the body stands. Pure."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
+from snakesim_gnc.control.carried import Carried, what_holds
 from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_gnc.control.push import Push, Touches
 from snakesim_hal.wire.messages import World, WorldContact
@@ -33,13 +36,19 @@ def push_points(body: PlanarBody, world: World, touches: Touches, push: Push, fo
     return points[:MAX_REPORTED]
 
 
-def why_it_stands(touches: Touches, push: Push, force_n: float, max_force_n: float) -> str:
-    """The class of a stall. force_n: wanted along the body; max_force_n: what torques and contacts allow."""
+def why_it_stands(
+    touches: Touches, push: Push, force_n: float, max_force_n: float, carried: Carried | None, names: Sequence[str]
+) -> tuple[bool, str]:
+    """Whether it is jammed, and the class of the stall.
+
+    force_n: wanted along the body; max_force_n: what torques and contacts allow. carried: what contacts really do along
+    it; None when no sensor tells. names: of the obstacles that are to be pushed off.
+    """
     if not len(touches):
-        return "standing still: no obstacle is near enough to push off"
+        return False, "standing still: no obstacle is near enough to push off"
     if not push.balanced:
         beside = "the obstacle" if len(touches) == 1 else f"the {len(touches)} obstacles"
-        return f"standing still: contacts lost, {beside} beside the body cannot push it forward"
+        return False, f"standing still: contacts lost, {beside} beside the body cannot push it forward"
     if force_n >= max_force_n:
-        return f"standing still: torques and contacts allow no more than {max_force_n:.1f} N along the body"
-    return f"jam: stands still although it pushes with {force_n:.1f} N along the body"
+        return False, f"standing still: torques and contacts allow no more than {max_force_n:.1f} N along the body"
+    return what_holds(force_n, carried, names)

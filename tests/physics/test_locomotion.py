@@ -185,6 +185,23 @@ def test_two_newtons_are_too_little_and_said_to_be():
     assert not any(report.jammed for report in whole.reports)
 
 
+def test_what_contacts_carry_is_told_and_not_what_is_asked_for():
+    """Of 8 N, twice the drag of 3.9 N: a push-point that is not touched keeps a part away."""
+    whole = run(configure("peg_row", f"{TRIPLET}.propulsion_n=8"), duration_s=5.0)
+    assert whole.states[-1] == "NotLocomoting" and not any(report.jammed for report in whole.reports)
+    carried, missing = whole.reasons[-1].split("contacts push it on with ")[1].split(" N ", 1)
+    assert 1.0 <= float(carried) <= 3.9
+    assert missing.startswith("(no contact at peg_0_") and "too little against the friction of the ground" in missing
+
+
+def test_a_body_that_is_clear_of_every_peg_is_not_called_jammed():
+    thin = ("robot.chain.modules=10", "robot.module.length_m=0.09", "robot.module.radius_m=0.025")
+    whole = run(configure("peg_row", *thin), duration_s=4.0)
+    assert not any(report.jammed for report in whole.reports)
+    assert whole.states[-1] == "NotLocomoting"
+    assert "no obstacle touches the body" in whole.reasons[-1] and "has swung out" in whole.reasons[-1]
+
+
 def test_holding_does_not_move():
     whole = run(configure("triplet", "controller=hold"))
     assert abs(whole.moved_m) < 0.02

@@ -10,7 +10,8 @@ follow it no faster than the mission's speed, which brakes a body that is too fa
 
 Between push-points the propulsion joint swings freely until its contacts carry load. It is damped, the force is reduced
 as it swings out, and a joint that has left its reference too far returns to position mode. A body that stands still
-while it pushes is reported with the cause; in a jam, the triplet is released for a while and others are tried.
+while it pushes is reported with the cause; where that strains joint or contacts, the triplet is released for a while
+and others are tried.
 
 Nothing jumps at a hand-over. In the tick of a change of mode, a position target is within `fade` times the joint's
 angle from its reference, and a torque target within `fade` times (measured torque - propulsion torque), of the target
@@ -25,12 +26,13 @@ from numpy.typing import NDArray
 
 from snakesim_gnc.control.body_on_path import BodyPose
 from snakesim_gnc.control.bumpless import HandOver
+from snakesim_gnc.control.carried import measured
 from snakesim_gnc.control.controller import Action, Report, View, positions
 from snakesim_gnc.control.obstacle_triplet.contacts import PlannedContact, PushPoint, plan_contact, push_points
 from snakesim_gnc.control.obstacle_triplet.selection import Choice, Names, Triplets, choose
 from snakesim_gnc.control.obstacle_triplet.settings import Settings
 from snakesim_gnc.control.obstacle_triplet.stall import Stall, StallWatch, explain
-from snakesim_gnc.control.obstacle_triplet.telemetry import bending, largest_contact_force_n, planned_contacts
+from snakesim_gnc.control.obstacle_triplet.telemetry import bending, planned_contacts
 from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_gnc.control.progress import Located, Progress
 from snakesim_hal.backend import SetPoints
@@ -215,23 +217,24 @@ class ObstacleTriplet:
             self._choice = None
 
     def _watch_progress(self, view: View, located: Located, choice: Choice, push: Push) -> None:
-        """Detect standing still; release a jammed triplet."""
+        """Detect standing still; let go of a triplet that strains and does not move."""
         if not self._stall_watch.stands(view.time_s, located.tail_s_m, push.wanted_n):
             return
         self._stall_watch.forget()
         name = self._body.names[push.turn]
         stall = explain(
-            force_n=push.wanted_n,
-            contact_force_n=largest_contact_force_n(located.world),
+            wanted_n=push.wanted_n,
+            force_n=push.force_n,
+            carried=measured(located.world, choice.triplet.contacts[0].tangent_w),
+            push_points=choice.triplet.names,
             weight_n=self._body.weight_n,
             saturated=name if push.saturated else None,
             swung=name if push.swung else None,
             jam_force_n=self._set.jam_force_n,
             drag_share=self._set.drag_share,
         )
-        if self._stall is None or stall.jammed:
-            self._stall = (stall, located.tail_s_m)
-        if stall.jammed:
+        self._stall = (stall, located.tail_s_m)
+        if stall.lets_go:
             self._banned[choice.triplet.names] = located.tail_s_m
             self._position_until_s = view.time_s + self._set.release_s
 

@@ -45,8 +45,8 @@ class Settings(FileStruct, frozen=True, kw_only=True):
     # Standing still: less progress than this, in this time, while pushing with more than half of the propulsion.
     stall_m: Annotated[float, above(1, "m")] = 0.005
     stall_s: Annotated[float, above(60, "s")] = 1.0
-    # It is a jam, and not just too little propulsion, when a contact force exceeds this, or the propulsion exceeds this
-    # share of the robot's weight (no ground holds a sliding snake so well), or the joint is at its limit of torque.
+    # A triplet that stands is let go of when a contact force exceeds this, or the propulsion this share of the robot's
+    # weight (hardly any ground holds a sliding snake so well), or its joint is at its limit of torque or swings out.
     jam_force_n: Annotated[float, above(1e6, "N")] = 120.0
     drag_share: Annotated[float, above(10, "1 (of the weight)")] = 0.5
     # Then all joints go to position mode for this long, and the same triplet waits until the body has moved.

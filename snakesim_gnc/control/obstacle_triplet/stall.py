@@ -1,14 +1,18 @@
 """Detects standing still although pushing, and its cause. Pure except for its own state."""
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
+
+from snakesim_gnc.control.carried import Carried, what_holds
 
 
 @dataclass(frozen=True)
 class Stall:
     """Why the snake stands."""
 
-    jammed: bool  # False: the propulsion is simply too little
+    jammed: bool  # obstacles hold it back, by what its contacts measure
+    lets_go: bool  # whatever it is, another triplet may do better
     why: str
 
 
@@ -41,8 +45,10 @@ class StallWatch:
 
 def explain(
     *,
+    wanted_n: float,
     force_n: float,
-    contact_force_n: float | None,
+    carried: Carried | None,
+    push_points: Sequence[str],
     weight_n: float,
     saturated: str | None,
     swung: str | None,
@@ -51,22 +57,18 @@ def explain(
 ) -> Stall:
     """The cause of a stall, as far as what is measured shows it.
 
-    force_n: propulsion from the speed alone. contact_force_n: the strongest measured; 0 when nothing touches the body,
-    None when no sensor tells. saturated, swung: name of the propulsion joint if it is at its torque limit, or has swung
-    out so far that the propulsion was reduced.
+    wanted_n: propulsion from the speed alone; force_n: what is commanded of it. carried: along the path, by contacts;
+    None when no sensor tells. push_points: obstacles of the triplet. saturated, swung: name of the propulsion joint if
+    it is at its torque limit, or has swung out so far that the propulsion was reduced.
     """
-    pushing = f"standing still with {force_n:.1f} N of propulsion"
-    if contact_force_n == 0.0:
-        return Stall(False, f"{pushing}, and no obstacle touches the body, so there is nothing to push off")
-    if contact_force_n is not None and contact_force_n > jam_force_n:
-        return Stall(True, f"jammed: {pushing} and a contact force of {contact_force_n:.0f} N")
-    if saturated is not None:
-        return Stall(True, f"jammed: {pushing} and {saturated} at its limit of torque")
-    if force_n > drag_share * weight_n:
-        share = force_n / weight_n
-        return Stall(True, f"jammed: {pushing}, {share:.2f} of the weight; no sliding on the ground takes so much")
+    strongest_n = None if carried is None else carried.strongest_n
+    strained = saturated is not None or swung is not None or wanted_n > drag_share * weight_n
+    lets_go = strongest_n != 0.0 and (strained or (strongest_n is not None and strongest_n > jam_force_n))
+    jammed, why = what_holds(force_n, carried, push_points)
     if swung is not None:
-        return Stall(True, f"jammed: {pushing}; {swung} swings out instead of moving the body")
-    return Stall(
-        False, f"{pushing}: too little against the friction of the ground, or what is in the way; raise propulsion_n"
-    )
+        why += f"; {swung} has swung out and leaves no more of the {wanted_n:.1f} N wanted"
+    elif saturated is not None:
+        why += f"; {saturated} at its limit of torque gives no more of the {wanted_n:.1f} N wanted"
+    elif carried is not None and not jammed and strongest_n != 0.0:
+        why += "; raise propulsion_n"
+    return Stall(jammed, lets_go, why)

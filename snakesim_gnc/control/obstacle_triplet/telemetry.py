@@ -1,6 +1,5 @@
 """Telemetry of the obstacle-triplet controller: triplet, forces and torques. Pure."""
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -37,10 +36,3 @@ def planned_contacts(body: PlanarBody, world: World, choice: Choice, forces_n: S
             )
         )
     return points
-
-
-def largest_contact_force_n(world: World) -> float | None:
-    """Magnitude of the strongest measured contact force; 0 when nothing touches, None when no sensor tells."""
-    if world.contacts_stamp_ns is None:
-        return None
-    return max((math.hypot(*contact.force_w) for contact in world.contacts), default=0.0)

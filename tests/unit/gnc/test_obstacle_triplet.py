@@ -178,26 +178,31 @@ def test_fewer_than_three_push_points_do_not_push(pegs):
     assert action.report.why
 
 
-def test_standing_still_is_told_and_a_jam_is_let_go_of():
-    stage = make_stage()
-    controller = make_controller(stage, stall_s=0.5, release_s=0.2)
-    touch = WorldContact(
+def touch(obstacle: str, force_n: float) -> WorldContact:
+    """A contact that pushes the body forward with a force, or holds it back."""
+    return WorldContact(
         link=3,
-        obstacle="peg_1",
+        obstacle=obstacle,
         body_s_m=0.4,
         position_w=(0.0, 0.0, 0.0),
         normal_w=(1.0, 0.0, 0.0),
         tangent_w=(0.0, 1.0, 0.0),
-        force_w=(400.0, 0.0, 0.0),
+        force_w=(force_n, 0.0, 0.0),
     )
+
+
+def test_standing_still_is_told_and_a_jam_is_let_go_of():
+    stage = make_stage()
+    controller = make_controller(stage, stall_s=0.5, release_s=0.2)
+    contacts = [touch("peg_1", 400.0), touch("peg_2", -390.0)]
     pushed, released, jams = 0, 0, []
     for tick in range(200):
-        report = controller.update(stage.view(tick, TAIL_S_M, contacts=[touch])).report
+        report = controller.update(stage.view(tick, TAIL_S_M, contacts=contacts)).report
         if report.jammed:
             jams.append(report.why)
             pushed += report.propulsion_joint is not None
             released += report.propulsion_joint is None
-    assert "400 N" in jams[0]
+    assert jams[0].startswith("jammed: standing still") and jams[0].endswith("peg_2 most")
     assert pushed
     assert released
     moved = stay(controller, stage, 3)
@@ -209,7 +214,7 @@ def test_standing_still_is_told_and_a_jam_is_let_go_of():
 
 def test_too_little_propulsion_is_told_apart():
     stage = make_stage()
-    report = stay(make_controller(stage, propulsion_n=2.0), stage, 150).report
+    report = stay(make_controller(stage, propulsion_n=2.0), stage, 150, contacts=[touch("peg_1", 1.0)]).report
     assert not report.jammed
     assert "too little against the friction" in report.why
     assert report.propulsion_joint is not None

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from snakesim_gnc.control.carried import Carried
 from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_gnc.control.push import find_touches, push_forward
 from snakesim_gnc.control.push_report import push_points, why_it_stands
@@ -55,8 +56,17 @@ def test_the_told_forces_push_the_body_with_the_force_that_is_wanted() -> None:
         ((), 5.0, 0.0, "no obstacle is near enough to push off"),
         ((peg("a", 0.3, -1),), 5.0, 0.0, "contacts lost, the obstacle beside the body cannot push it forward"),
         ((peg("a", 0.3, -1), peg("b", 0.6, 1), peg("c", 0.9, -1)), 3.0, 3.0, "allow no more than 3.0 N"),
-        ((peg("a", 0.3, -1), peg("b", 0.6, 1), peg("c", 0.9, -1)), 9.0, 30.0, "jam: stands still although it pushes"),
+        ((peg("a", 0.3, -1), peg("b", 0.6, 1), peg("c", 0.9, -1)), 9.0, 30.0, "no obstacle touches the body"),
     ],
 )
 def test_a_stall_has_a_class(pegs: tuple[Obstacle, ...], force_n: float, max_force_n: float, words: str) -> None:
-    assert words in why_it_stands(*pushing(seen(*pegs)), force_n, max_force_n)
+    nothing = Carried(strongest_n=0.0, ahead_n=0.0, back_n=0.0, holder="", touched=frozenset())
+    jammed, why = why_it_stands(*pushing(seen(*pegs)), force_n, max_force_n, nothing, ["a", "b", "c"])
+    assert not jammed and words in why
+
+
+def test_a_jam_is_what_contacts_hold_back() -> None:
+    pegs = peg("a", 0.3, -1), peg("b", 0.6, 1), peg("c", 0.9, -1)
+    felt = Carried(strongest_n=40.0, ahead_n=20.0, back_n=17.0, holder="c", touched=frozenset({"a", "b", "c"}))
+    jammed, why = why_it_stands(*pushing(seen(*pegs)), 9.0, 30.0, felt, ["a", "b", "c"])
+    assert jammed and why.endswith("obstacles push it on with 20 N and hold it back with 17 N, c most")

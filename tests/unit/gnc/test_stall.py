@@ -2,7 +2,10 @@
 
 import pytest
 
+from snakesim_gnc.control.carried import Carried, measured
 from snakesim_gnc.control.obstacle_triplet.stall import StallWatch, explain
+from snakesim_hal.wire.messages import World, WorldContact
+from tests.unit.gnc.stage import known
 
 
 def watch() -> StallWatch:
@@ -32,47 +35,91 @@ def test_forgetting_starts_a_new_window():
     assert stands_after(stall_watch, 0.9) is None
 
 
+def along(*forces: tuple[str, float, float]) -> Carried:
+    """What contacts with these forces along and across the direction do."""
+    contacts = [
+        WorldContact(
+            link=0, obstacle=name, body_s_m=0.1, position_w=(0.0, 0.0, 0.0), normal_w=(0.0, 1.0, 0.0),
+            tangent_w=(1.0, 0.0, 0.0), force_w=(ahead_n, across_n, 0.0),
+        )
+        for name, ahead_n, across_n in forces
+    ]  # fmt: skip
+    world = World(
+        tick=1, stamp_ns=1, base_position_w=(0.0, 0.0, 0.0), base_orientation_wxyz=(1.0, 0.0, 0.0, 0.0),
+        base_confidence=1.0, contacts=contacts, contacts_stamp_ns=1, obstacles=[],
+    )  # fmt: skip
+    return known(measured(world, (2.0, 0.0)))
+
+
+PUSHED = (("peg_0", 0.0, 8.0), ("peg_1", 30.0, -40.0), ("peg_2", -0.5, 20.0))  # as a triplet of 30 N is
+
+
 def cause(**more):
-    known = {
-        "force_n": 35.0,
-        "contact_force_n": 20.0,
+    given = {
+        "wanted_n": 35.0,
+        "force_n": 30.0,
+        "carried": along(*PUSHED),
+        "push_points": ("peg_0", "peg_1", "peg_2"),
         "weight_n": 400.0,
         "saturated": None,
         "swung": None,
         "jam_force_n": 120.0,
         "drag_share": 0.5,
     }
-    return explain(**{**known, **more})
+    return explain(**{**given, **more})
 
 
-def test_too_little_push_is_no_jam():
-    stall = cause(force_n=2.0)
+def test_contacts_that_carry_are_no_jam_and_their_push_is_told():
+    stall = cause()
+    assert not stall.jammed and not stall.lets_go
+    assert stall.why == (
+        "standing still with 30.0 N of propulsion; contacts push it on with 29.5 N, too little against the friction of "
+        "the ground; raise propulsion_n"
+    )
+
+
+def test_a_push_point_that_is_not_felt_is_named():
+    stall = cause(carried=along(PUSHED[0], ("peg_1", 3.2, -4.0)))
     assert not stall.jammed
-    assert "too little against the friction" in stall.why
+    assert "contacts push it on with 3.2 N (no contact at peg_2), too little" in stall.why
 
 
-@pytest.mark.parametrize("force_n", [8.0, 35.0, 300.0])
-def test_a_body_that_touches_nothing_is_not_jammed(force_n):
-    stall = cause(force_n=force_n, contact_force_n=0.0, weight_n=40.0)
-    assert not stall.jammed and "no obstacle touches the body" in stall.why
+@pytest.mark.parametrize("saturated", [None, "joint_7"])
+@pytest.mark.parametrize("wanted_n", [8.0, 35.0, 300.0])
+def test_a_body_that_touches_nothing_is_not_jammed(wanted_n, saturated):
+    stall = cause(wanted_n=wanted_n, carried=along(), weight_n=40.0, saturated=saturated)
+    assert not stall.jammed and not stall.lets_go and "no obstacle touches the body" in stall.why
 
 
-def test_without_a_sensor_of_contacts_the_rest_still_tells():
-    assert cause(contact_force_n=None, weight_n=40.0).jammed
-    assert "too little" in cause(contact_force_n=None, force_n=8.0).why
+def test_without_a_sensor_of_contacts_the_cause_is_unknown():
+    stall = cause(carried=None, weight_n=40.0)
+    assert not stall.jammed and stall.lets_go
+    assert stall.why.endswith("what holds it is unknown without a sensor of contacts")
+
+
+def test_a_jam_is_what_obstacles_hold_back():
+    stall = cause(carried=along(*PUSHED, ("post", -28.0, 60.0)))
+    assert stall.jammed
+    assert stall.why == (
+        "jammed: standing still with 30.0 N of propulsion; obstacles push it on with 30 N and hold it back with 28 N, "
+        "post most"
+    )
 
 
 @pytest.mark.parametrize(
-    ("known", "word"),
+    ("given", "words"),
     [
-        ({"contact_force_n": 300.0}, "300 N"),
-        ({"saturated": "joint_7"}, "joint_7"),
-        ({"weight_n": 40.0}, "of the weight"),
-        ({"swung": "joint_5"}, "swings out"),
+        ({"carried": along(*PUSHED, ("post", 0.0, 300.0))}, ""),
+        (
+            {"saturated": "joint_7"},
+            "contacts push it on with 29.5 N, too little against the friction of the ground; "
+            "joint_7 at its limit of torque gives no more of the 35.0 N wanted",
+        ),
+        ({"weight_n": 40.0}, ""),
+        ({"swung": "joint_5"}, "joint_5 has swung out and leaves no more of the 35.0 N wanted"),
     ],
 )
-def test_a_jam_has_a_cause(known, word):
-    stall = cause(**known)
-    assert stall.jammed
-    assert stall.why.startswith("jammed")
-    assert word in stall.why
+def test_what_strains_and_does_not_move_is_let_go_of_and_not_called_a_jam(given, words):
+    stall = cause(**given)
+    assert stall.lets_go and not stall.jammed
+    assert words in stall.why and not stall.why.startswith("jam")
