@@ -16,6 +16,7 @@ from snakesim_gnc.control.bumpless import BumplessReference
 from snakesim_gnc.control.controller import Action, Report, View, motion_wanted
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.quantities import about
 
 Floats = NDArray[np.float64]
 
@@ -64,11 +65,13 @@ class Sidewinding(_Gait):
     class Settings(FileStruct, frozen=True, kw_only=True):
         """Two waves, a quarter of a period apart; a negative `pitch_rad` travels to the other side."""
 
-        yaw_rad: Swing = 0.6
-        pitch_rad: Swing = 0.2
-        lag_rad: Lag = 0.45  # from one joint to the next
-        period_s: Seconds = 2.0
-        blend_s: Seconds = 1.0
+        yaw_rad: Annotated[Swing, about("amplitude of the joints that turn left and right")] = 0.6
+        pitch_rad: Annotated[
+            Swing, about("amplitude of the joints that turn up and down; negative: to the other side")
+        ] = 0.2
+        lag_rad: Annotated[Lag, about("phase of a joint behind the one ahead of it")] = 0.45
+        period_s: Annotated[Seconds, about("of the wave")] = 2.0
+        blend_s: Annotated[Seconds, about("over which the command changes smoothly to a new reference")] = 1.0
 
     def _shape(self, reference: Floats, phase_rad: float) -> None:
         lag_rad = self._set.lag_rad
@@ -82,9 +85,9 @@ class Rolling(_Gait):
     class Settings(FileStruct, frozen=True, kw_only=True):
         """The arc; a negative `bend_rad` of the pitch joints rolls to the other side."""
 
-        bend_rad: Swing = 0.25
-        period_s: Seconds = 2.0
-        blend_s: Seconds = 1.0
+        bend_rad: Annotated[Swing, about("bend of every joint; negative: to the other side")] = 0.25
+        period_s: Annotated[Seconds, about("of a turn")] = 2.0
+        blend_s: Annotated[Seconds, about("over which the command changes smoothly to a new reference")] = 1.0
 
     def _shape(self, reference: Floats, phase_rad: float) -> None:
         reference[self._yaw] = abs(self._set.bend_rad) * math.sin(phase_rad)
@@ -102,12 +105,16 @@ class RaisedHead(_Gait):
     class Settings(FileStruct, frozen=True, kw_only=True):
         """How high, and how far to each side."""
 
-        lift_rad: Annotated[float, Meta(ge=0, le=1.5, extra_json_schema={"unit": "rad"})] = 0.6
-        look_rad: Swing = 0.4  # of the foremost yaw joint
-        stance_rad: Swing = 0.5  # of the other yaw joints
-        lag_rad: Lag = 0.6
-        period_s: Seconds = 6.0
-        blend_s: Seconds = 2.0
+        lift_rad: Annotated[
+            float,
+            Meta(ge=0, le=1.5, extra_json_schema={"unit": "rad"}),
+            about("angle of the joint that lifts the head"),
+        ] = 0.6
+        look_rad: Annotated[Swing, about("how far the foremost yaw joint looks to each side")] = 0.4
+        stance_rad: Annotated[Swing, about("amplitude of the wave in which the body behind lies")] = 0.5
+        lag_rad: Annotated[Lag, about("phase of that wave from joint to joint")] = 0.6
+        period_s: Annotated[Seconds, about("of looking to both sides")] = 6.0
+        blend_s: Annotated[Seconds, about("over which the command changes smoothly to a new reference")] = 2.0
 
     def _shape(self, reference: Floats, phase_rad: float) -> None:
         if len(self._pitch) > 1:

@@ -30,6 +30,7 @@ from snakesim_gnc.control.undulation import HeadSteeredUndulation
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Description, World
+from snakesim_hal.wire.quantities import about
 
 Floats = NDArray[np.float64]
 
@@ -57,33 +58,103 @@ class ObstacleAided:
     class Settings(FileStruct, frozen=True, kw_only=True):
         """Look-ahead l = lead_s (v_wanted - v) + integral; its bound limits how hard the body is pushed."""
 
-        lead_s: Annotated[float, Meta(ge=0, le=5, extra_json_schema={"unit": "s"})] = 0.2
-        integral_per_s: Annotated[float, Meta(ge=0, le=50, extra_json_schema={"unit": "1/s"})] = 0.4
-        largest_look_ahead_m: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "m"})] = 0.05
-        fresh_look_ahead_m: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "m"})] = 0.01  # on a new path
-        push_scale: Annotated[float, Meta(ge=-1, le=1)] = 1.0  # for control experiments, of both terms; < 0: backward
-        push_sign_s: Annotated[float, Meta(ge=0, le=100, extra_json_schema={"unit": "s"})] = (
-            0.0  # likewise: their sign is drawn at random after each such time; 0: never
-        )
-        push_ns_m: Annotated[float, Meta(ge=0, le=1000, extra_json_schema={"unit": "N*s/m"})] = 40.0
-        push_n_m: Annotated[float, Meta(ge=0, le=1000, extra_json_schema={"unit": "N/m"})] = 120.0
-        largest_push_n: Annotated[float, Meta(ge=0, le=1000, extra_json_schema={"unit": "N"})] = 60.0
-        largest_torque_nm: Annotated[float, Meta(ge=0, le=1000, extra_json_schema={"unit": "N*m"})] = 5.0
-        largest_contact_n: Annotated[float, Meta(gt=0, le=1000, extra_json_schema={"unit": "N"})] = 60.0
-        reach_m: Annotated[float, Meta(gt=0, le=1, extra_json_schema={"unit": "m"})] = (
-            0.03  # of the push, to an obstacle
-        )
-        loose_m: Annotated[float, Meta(gt=0, le=1, extra_json_schema={"unit": "m"})] = 0.005  # a gap that counts half
-        torque_filter_s: Annotated[float, Meta(gt=0, le=5, extra_json_schema={"unit": "s"})] = 0.1
-        peg_friction: Annotated[float, Meta(ge=0, le=5, extra_json_schema={"unit": "1 (Coulomb coefficient)"})] = 0.0
-        search_after_s: Annotated[float, Meta(ge=0, le=1000, extra_json_schema={"unit": "s"})] = (
-            2.0  # of standing with nothing that can push; 0: never undulate in search of it
-        )
-        search_s: Annotated[float, Meta(gt=0, le=1000, extra_json_schema={"unit": "s"})] = 4.0
-        search_swing_rad: Annotated[float, Meta(ge=0, le=2, extra_json_schema={"unit": "rad"})] = 0.5
-        search_until_n: Annotated[float, Meta(ge=0, le=1000, extra_json_schema={"unit": "N"})] = 12.0
-        blend_s: Annotated[float, Meta(gt=0, le=10, extra_json_schema={"unit": "s"})] = 0.3
-        speed_filter_s: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "s"})] = 0.05
+        lead_s: Annotated[
+            float,
+            Meta(ge=0, le=5, extra_json_schema={"unit": "s"}),
+            about("look-ahead of the shape for each m/s that the speed is too low"),
+        ] = 0.2
+        integral_per_s: Annotated[
+            float,
+            Meta(ge=0, le=50, extra_json_schema={"unit": "1/s"}),
+            about("how fast the look-ahead grows while the speed stays too low"),
+        ] = 0.4
+        largest_look_ahead_m: Annotated[
+            float,
+            Meta(ge=0, le=1, extra_json_schema={"unit": "m"}),
+            about("bound of the look-ahead: how far ahead on its path the shape is at most"),
+        ] = 0.05
+        fresh_look_ahead_m: Annotated[
+            float,
+            Meta(ge=0, le=1, extra_json_schema={"unit": "m"}),
+            about("look-ahead with which it begins on a new path"),
+        ] = 0.01
+        push_scale: Annotated[
+            float, Meta(ge=-1, le=1), about("factor of both pushing terms, for control experiments; below 0: backward")
+        ] = 1.0
+        push_sign_s: Annotated[
+            float,
+            Meta(ge=0, le=100, extra_json_schema={"unit": "s"}),
+            about("for control experiments: after each such time the sign of the push is drawn at random; 0: never"),
+        ] = 0.0
+        push_ns_m: Annotated[
+            float,
+            Meta(ge=0, le=1000, extra_json_schema={"unit": "N*s/m"}),
+            about("push on obstacles for each m/s that the speed is too low"),
+        ] = 40.0
+        push_n_m: Annotated[
+            float,
+            Meta(ge=0, le=1000, extra_json_schema={"unit": "N/m"}),
+            about("push on obstacles for each metre that the body has fallen behind"),
+        ] = 120.0
+        largest_push_n: Annotated[
+            float, Meta(ge=0, le=1000, extra_json_schema={"unit": "N"}), about("bound of the push along the path")
+        ] = 60.0
+        largest_torque_nm: Annotated[
+            float,
+            Meta(ge=0, le=1000, extra_json_schema={"unit": "N*m"}),
+            about("bound of a joint's torque for pushing"),
+        ] = 5.0
+        largest_contact_n: Annotated[
+            float,
+            Meta(gt=0, le=1000, extra_json_schema={"unit": "N"}),
+            about("bound of the force that is asked of one contact"),
+        ] = 60.0
+        reach_m: Annotated[
+            float, Meta(gt=0, le=1, extra_json_schema={"unit": "m"}), about("an obstacle so near to the body is pushed")
+        ] = 0.03
+        loose_m: Annotated[
+            float,
+            Meta(gt=0, le=1, extra_json_schema={"unit": "m"}),
+            about("gap to an obstacle at which a contact counts half"),
+        ] = 0.005
+        torque_filter_s: Annotated[
+            float,
+            Meta(gt=0, le=5, extra_json_schema={"unit": "s"}),
+            about("time constant of the filter of the pushing torques"),
+        ] = 0.1
+        peg_friction: Annotated[
+            float,
+            Meta(ge=0, le=5, extra_json_schema={"unit": "1 (Coulomb coefficient)"}),
+            about("friction of the obstacles, as the push reckons with it"),
+        ] = 0.0
+        search_after_s: Annotated[
+            float,
+            Meta(ge=0, le=1000, extra_json_schema={"unit": "s"}),
+            about("of standing with nothing that can push, until it undulates in search of contacts; 0: never"),
+        ] = 2.0
+        search_s: Annotated[
+            float,
+            Meta(gt=0, le=1000, extra_json_schema={"unit": "s"}),
+            about("how long it undulates in search of contacts"),
+        ] = 4.0
+        search_swing_rad: Annotated[
+            float, Meta(ge=0, le=2, extra_json_schema={"unit": "rad"}), about("amplitude of that undulation")
+        ] = 0.5
+        search_until_n: Annotated[
+            float,
+            Meta(ge=0, le=1000, extra_json_schema={"unit": "N"}),
+            about("it ends when contacts allow such a push"),
+        ] = 12.0
+        blend_s: Annotated[
+            float,
+            Meta(gt=0, le=10, extra_json_schema={"unit": "s"}),
+            about("over which the command changes smoothly to a new reference"),
+        ] = 0.3
+        speed_filter_s: Annotated[
+            float,
+            Meta(ge=0, le=1, extra_json_schema={"unit": "s"}),
+            about("time constant of the filter of the speed along the path; 0: none"),
+        ] = 0.05
 
     def __init__(self, robot: Description, settings: Settings) -> None:
         self._robot = robot

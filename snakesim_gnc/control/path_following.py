@@ -14,6 +14,7 @@ from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_gnc.control.progress import Progress
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.quantities import about
 
 
 class PathFollowing:
@@ -22,9 +23,21 @@ class PathFollowing:
     class Settings(FileStruct, frozen=True, kw_only=True):
         """Too little look-ahead does not overcome the drag; too much wedges the body between tight obstacles."""
 
-        look_ahead_m: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "m"})] = 0.03
-        blend_s: Annotated[float, Meta(gt=0, le=10, extra_json_schema={"unit": "s"})] = 0.3
-        speed_filter_s: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "s"})] = 0.03
+        look_ahead_m: Annotated[
+            float,
+            Meta(ge=0, le=1, extra_json_schema={"unit": "m"}),
+            about("how far ahead on its path the shape is at most"),
+        ] = 0.03
+        blend_s: Annotated[
+            float,
+            Meta(gt=0, le=10, extra_json_schema={"unit": "s"}),
+            about("over which the command changes smoothly to a new reference"),
+        ] = 0.3
+        speed_filter_s: Annotated[
+            float,
+            Meta(ge=0, le=1, extra_json_schema={"unit": "s"}),
+            about("time constant of the filter of the speed along the path; 0: none"),
+        ] = 0.03
 
     def __init__(self, robot: Description, settings: Settings) -> None:
         self._set = settings

@@ -17,6 +17,7 @@ from snakesim_gnc.control.controller import Action, Report, View, motion_wanted
 from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.quantities import about
 
 AIM_M = 1.0  # how far ahead on the path the head steers for
 
@@ -27,11 +28,25 @@ class LateralUndulation:
     class Settings(FileStruct, frozen=True, kw_only=True):
         """The wave, and how much it is bent towards the goal."""
 
-        amplitude_rad: Annotated[float, Meta(ge=0, le=2, extra_json_schema={"unit": "rad"})] = 0.5
-        period_s: Annotated[float, Meta(gt=0, le=100, extra_json_schema={"unit": "s"})] = 2.0
-        lag_rad: Annotated[float, Meta(ge=0, le=3.2, extra_json_schema={"unit": "rad"})] = 0.9
-        steering: Annotated[float, Meta(ge=0, le=2, extra_json_schema={"unit": "1"})] = 0.0
-        blend_s: Annotated[float, Meta(gt=0, le=10, extra_json_schema={"unit": "s"})] = 1.0
+        amplitude_rad: Annotated[
+            float, Meta(ge=0, le=2, extra_json_schema={"unit": "rad"}), about("swing of every joint to each side")
+        ] = 0.5
+        period_s: Annotated[float, Meta(gt=0, le=100, extra_json_schema={"unit": "s"}), about("of the wave")] = 2.0
+        lag_rad: Annotated[
+            float,
+            Meta(ge=0, le=3.2, extra_json_schema={"unit": "rad"}),
+            about("phase of a joint behind the one ahead of it"),
+        ] = 0.9
+        steering: Annotated[
+            float,
+            Meta(ge=0, le=2, extra_json_schema={"unit": "1"}),
+            about("bend of all joints for each radian that the path leads aside; 0: it goes where it goes"),
+        ] = 0.0
+        blend_s: Annotated[
+            float,
+            Meta(gt=0, le=10, extra_json_schema={"unit": "s"}),
+            about("over which the command changes smoothly to a new reference"),
+        ] = 1.0
 
     def __init__(self, robot: Description, settings: Settings) -> None:
         self._robot, self._set, self._body = robot, settings, PlanarBody(robot)
@@ -79,7 +94,11 @@ class HeadSteeredUndulation(LateralUndulation):
     class Settings(LateralUndulation.Settings, frozen=True, kw_only=True):
         """As of lateral undulation, with steering."""
 
-        steering: Annotated[float, Meta(ge=0, le=2, extra_json_schema={"unit": "1"})] = 0.8
+        steering: Annotated[
+            float,
+            Meta(ge=0, le=2, extra_json_schema={"unit": "1"}),
+            about("bend of all joints for each radian that the path leads aside; 0: it goes where it goes"),
+        ] = 0.8
 
 
 class CompliantUndulation(HeadSteeredUndulation):
@@ -91,8 +110,14 @@ class CompliantUndulation(HeadSteeredUndulation):
     class Settings(HeadSteeredUndulation.Settings, frozen=True, kw_only=True):
         """As of head-steered undulation, with a softness."""
 
-        softness_rad_per_nm: Annotated[float, Meta(ge=0, le=10, extra_json_schema={"unit": "rad/(N*m)"})] = 0.05
-        yield_s: Annotated[float, Meta(gt=0, le=10, extra_json_schema={"unit": "s"})] = 0.2
+        softness_rad_per_nm: Annotated[
+            float,
+            Meta(ge=0, le=10, extra_json_schema={"unit": "rad/(N*m)"}),
+            about("how far the amplitude yields to the torque that obstacles put on the wave"),
+        ] = 0.05
+        yield_s: Annotated[
+            float, Meta(gt=0, le=10, extra_json_schema={"unit": "s"}), about("time constant with which it yields")
+        ] = 0.2
 
     def __init__(self, robot: Description, settings: Settings) -> None:
         super().__init__(robot, settings)

@@ -109,6 +109,13 @@ class LocalQuery:
     def drop(self) -> None:
         """Nothing to let go of."""
 
+    def answered(self) -> Answer | None:
+        """The next answer, if it is there."""
+        if self.answers.empty():
+            return None
+        _, payload, encoding = self.answers.get_nowait()
+        return Decoder(Answer).decode(payload, encoding)
+
 
 class LocalSession(Session):
     """A session of a `LocalNetwork`."""
@@ -198,14 +205,25 @@ class LocalSession(Session):
         self._declared.append(declared)
         return declared
 
-    def _answers(self, pattern: str, request: Message, timeout_s: float) -> Iterator[tuple[str, Answer | WireError]]:
-        query, decoder = LocalQuery(Mailbox()), Decoder(Answer)
+    def put_question(self, pattern: str, request: Message) -> LocalQuery:
+        """Ask, without waiting: whoever answers may have to take a turn first."""
+        query = LocalQuery(Mailbox())
+        self._put_question(pattern, request, query)
+        return query
+
+    def _put_question(self, pattern: str, request: Message, query: LocalQuery) -> int:
+        """Returns how many have been asked."""
         asked = [(key, take) for key, take in self._network.askable if intersects(pattern, key)]
         for key, take in asked:
             take(Question(key, encode(request), encoding_of(type(request)), query))
+        return len(asked)
+
+    def _answers(self, pattern: str, request: Message, timeout_s: float) -> Iterator[tuple[str, Answer | WireError]]:
+        query, decoder = LocalQuery(Mailbox()), Decoder(Answer)
+        asked = self._put_question(pattern, request, query)
         self._network.answer()
         deadline = time.monotonic() + timeout_s
-        for _ in asked:
+        for _ in range(asked):
             try:
                 key, payload, encoding = query.answers.get(deadline - time.monotonic())
             except Empty:

@@ -3,7 +3,6 @@
 The schema comes from the network: it decides what is shown, and nothing else; control checks every value again.
 """
 
-import json
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -12,9 +11,7 @@ import msgspec
 import viser
 
 from snakesim_hal.wire.messages import ControlSettings
-
-MAX_FIELDS = 100
-LONGEST_LABEL = 40
+from snakesim_operator.tools.parameters import Parameter, parameters_of
 
 
 @dataclass(frozen=True)
@@ -28,45 +25,31 @@ class Field:
     low: float = 0.0
     high: float = 0.0
     step: float = 0.0
+    hint: str = ""
 
 
 def fields_of(settings: ControlSettings) -> list[Field]:
     """The settings that can be changed here; others keep their value. Nothing for a schema that cannot be read."""
-    try:
-        schema, values = json.loads(settings.schema), msgspec.json.decode(settings.settings, type=dict[str, Any])
-        properties = _resolved(schema, schema)["properties"]
-        described = [(name, _resolved(schema, properties.get(name, {})), value) for name, value in values.items()]
-        found = [_field(name[:LONGEST_LABEL], of, value) for name, of, value in described[:MAX_FIELDS]]
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError, msgspec.DecodeError):
-        return []
+    found = [_field(parameter) for parameter in parameters_of(settings)]
     return [field for field in found if field is not None]
 
 
-def _resolved(schema: dict[str, Any], part: dict[str, Any]) -> dict[str, Any]:
-    reference = part.get("$ref")
-    return part if reference is None else schema["$defs"][reference.rpartition("/")[2]]
-
-
-def _field(name: str, of: dict[str, Any], value: Any) -> Field | None:
-    choices = of.get("enum")
+def _field(of: Parameter) -> Field | None:
+    name, value = of.name, of.value
+    hint = "; ".join(filter(None, (of.about, of.range and f"{of.range} {of.unit}".removesuffix(" 1").strip())))
     if isinstance(value, bool):
-        return Field(name, value)
-    if isinstance(value, str) and isinstance(choices, list) and value in choices:
-        return Field(name, value, choices=tuple(str(choice) for choice in choices))
+        return Field(name, value, hint=of.about)
+    if isinstance(value, str) and value in of.choices:
+        return Field(name, value, choices=of.choices, hint=of.about)
     if not isinstance(value, int | float) or not math.isfinite(value):
         return None
-    least, most = _number(of, "minimum", "exclusiveMinimum"), _number(of, "maximum", "exclusiveMaximum")
     reach = 4.0 * abs(value) or 1.0
-    low, high = max(-reach if least is None else least, -reach), min(reach if most is None else most, reach)
+    low = -reach if of.least is None else max(of.least, -reach)
+    high = reach if of.most is None else min(of.most, reach)
     step = 1.0 if isinstance(value, int) else 10.0 ** math.floor(math.log10(max(high - low, 1e-9) / 100))
-    if low == of.get("exclusiveMinimum"):
+    if of.above_least and low == of.least:
         low += step
-    unit = str(of.get("unit", ""))[:LONGEST_LABEL]
-    return Field(name, value, unit, low=min(low, value), high=max(high, value), step=step)
-
-
-def _number(of: dict[str, Any], *names: str) -> float | None:
-    return next((float(of[name]) for name in names if isinstance(of.get(name), int | float)), None)
+    return Field(name, value, of.unit, low=min(low, value), high=max(high, value), step=step, hint=hint)
 
 
 class SettingsForm:
@@ -113,9 +96,9 @@ class SettingsForm:
 def _input(gui: viser.GuiApi, field: Field) -> Any:
     label = f"{field.name}, {field.unit}" if field.unit not in ("", "1") else field.name
     if isinstance(field.value, bool):
-        return gui.add_checkbox(label, field.value)
+        return gui.add_checkbox(label, field.value, hint=field.hint)
     if isinstance(field.value, str):
-        return gui.add_dropdown(label, field.choices, initial_value=field.value)
+        return gui.add_dropdown(label, field.choices, initial_value=field.value, hint=field.hint)
     if isinstance(field.value, int):
-        return gui.add_number(label, field.value, min=math.ceil(field.low), step=1)
-    return gui.add_slider(label, field.low, field.high, field.step, field.value)
+        return gui.add_number(label, field.value, min=math.ceil(field.low), step=1, hint=field.hint)
+    return gui.add_slider(label, field.low, field.high, field.step, field.value, hint=field.hint)

@@ -3,7 +3,8 @@
 The services are those of a run, on a network within this process; the recording stands in for the host. They get the
 recorded bytes, tick by tick, and a lease of the recorded number. From a run in lockstep the commands come out the same
 to the bit. With a changed setting they differ, but the robot moves as it did: it shows what another gain would have
-commanded in the situations of the recording, not where that would have led.
+commanded in the situations of the recording, not where that would have led. Settings that somebody changed during the
+run are changed in the same tick again.
 """
 
 from contextlib import ExitStack
@@ -18,14 +19,23 @@ from threadpoolctl import threadpool_limits
 from snakesim_hal.errors import ConfigError, SnakesimError, short
 from snakesim_hal.model.plugin_check import find_service
 from snakesim_hal.model.plugins import in_file
-from snakesim_hal.model.scenario import Override, RunConfig, load, write, written
-from snakesim_hal.network.local_network import LocalNetwork
+from snakesim_hal.model.scenario import CHOSEN, Override, RunConfig, load, write, written
+from snakesim_hal.network.local_network import LocalNetwork, LocalQuery
 from snakesim_hal.network.session import Arrival, Publisher, Question
 from snakesim_hal.service import ServiceLoop
 from snakesim_hal.terminal import Say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder, encode, encoding_of
-from snakesim_hal.wire.messages import Answer, AppliedCommand, Clock, Configuration, Description, JointCommand
+from snakesim_hal.wire.messages import (
+    Answer,
+    AppliedCommand,
+    Clock,
+    Configuration,
+    ControlSettings,
+    Description,
+    JointCommand,
+    SettingsRequest,
+)
 from snakesim_operator.playback.order import in_robot_order
 from snakesim_operator.recording.message import RECORDING, Recorded
 from snakesim_operator.recording.reader import RecordingReader
@@ -37,7 +47,7 @@ from snakesim_operator.results.recorded import Contents, read_recording
 MADE_BY = {
     "guidance": (keys.WORLD,),
     "navigation": (keys.TRAJECTORY,),
-    "control": (keys.JOINT_COMMAND, keys.CONTROL_STATE),
+    "control": (keys.JOINT_COMMAND, keys.CONTROL_STATE, keys.SETTINGS_IN_FORCE),
 }
 """What the replayed services publish: these messages are made again."""
 
@@ -141,6 +151,9 @@ class Replay:
         self._joined = False
         self._by_sequence: dict[int, JointCommand] = {}  # of the recording
         self._commands, self._applied = Decoder(JointCommand), Decoder(AppliedCommand)
+        self._settings = Decoder(ControlSettings)
+        self._kept = {o.key.removeprefix(CHOSEN[0]): o.value for o in overrides if o.key.startswith(CHOSEN[0])}
+        self._asked: list[tuple[ControlSettings, LocalQuery]] = []  # changes of settings without an answer yet
         self._recording = Recording(out) if out is not None else None
 
     def run(self) -> Comparison:
@@ -183,6 +196,8 @@ class Replay:
         if recorded.key == keys.JOINT_COMMAND:
             command = self._commands.decode(recorded.payload, recorded.encoding)
             self._by_sequence[command.sequence] = self.comparison.recorded[command.tick] = command
+        if recorded.key == keys.SETTINGS_IN_FORCE and recorded.key in self._made:
+            self._change_settings(self._settings.decode(recorded.payload, recorded.encoding))
         if recorded.key in self._made or recorded.key in (keys.CONFIG, keys.DESCRIPTION):
             return
         payload = recorded.payload
@@ -202,6 +217,24 @@ class Replay:
             self._joined = True
         for loop in self._loops:
             loop.act()
+        for changed, query in [*self._asked]:
+            if (answer := query.answered()) is None:
+                continue
+            self._asked.remove((changed, query))
+            if not answer.ok:
+                raise ConfigError(f"{self._path}: what {changed.who} set at tick {changed.tick}: {answer.reason}")
+
+    def _change_settings(self, recorded: ControlSettings) -> None:
+        """As in the recording; it comes before its tick's clock. What is set for the replay stays."""
+        if recorded.who is None or recorded.controller != self.config.controller[-64:]:
+            return
+        values = msgspec.json.decode(recorded.settings, type=dict[str, Any])
+        request = SettingsRequest(
+            who=recorded.who,
+            controller=recorded.controller,
+            settings=msgspec.json.encode({**values, **self._kept}).decode(),
+        )
+        self._asked.append((recorded, self._session.put_question(keys.SETTINGS, request)))
 
     def _as_applied(self, recorded: Recorded) -> bytes:
         """As in the recording where the command is the same; else the replayed command, without the gate's limits."""

@@ -1,10 +1,12 @@
 """`snakesim info`: what a recording holds, and what it lacks."""
 
+import contextlib
 import json
 from array import array
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +14,11 @@ import msgspec
 import numpy as np
 
 from snakesim_hal.arithmetic import digest_text, foreign
-from snakesim_hal.errors import ConfigError
+from snakesim_hal.errors import ConfigError, WireError
 from snakesim_hal.terminal import Say
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Status
+from snakesim_hal.wire.codec import Decoder
+from snakesim_hal.wire.messages import ControlSettings, Status
 from snakesim_operator.recording.losses import Gap
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.reader import RecordingReader
@@ -23,6 +26,7 @@ from snakesim_operator.results.gaps import unread
 from snakesim_operator.results.incomplete import exit_code
 from snakesim_operator.results.record import GIVE
 from snakesim_operator.results.recorded import ALL, Contents
+from snakesim_operator.tools.parameters import PREFIX, differing
 
 IRREGULAR = (
     keys.CONTROL_STATE,
@@ -47,6 +51,14 @@ class KeyInfo:
         return int((np.round(steps / np.median(steps)) - 1).clip(0).sum())
 
 
+class SettingsChange(msgspec.Struct, kw_only=True):
+    """What somebody has set while the controller ran."""
+
+    time_s: float
+    who: str
+    changed: dict[str, tuple[Any, Any]]  # name -> before, then
+
+
 class RecordingInfo(msgspec.Struct, kw_only=True):
     """What `--json` prints."""
 
@@ -66,6 +78,7 @@ class RecordingInfo(msgspec.Struct, kw_only=True):
     command_digest: str | None
     own_arithmetic: list[str]  # what rounds otherwise than on most computers: then the digest is its computer's own
     lifecycle: str | None
+    settings: list[SettingsChange]
     dropped: dict[str, int]
     keys: dict[str, dict[str, float]]
 
@@ -81,16 +94,38 @@ def recording_of(given: Path) -> Path:
 def inspect_recording(path: Path) -> RecordingInfo:
     """Read a recording once. Raises ConfigError for a file that is none."""
     reader, found, contents = RecordingReader(path), dict[str, KeyInfo](), Contents(path)
+    decoder, in_force = Decoder(ControlSettings), list[ControlSettings]()
     for recorded in reader.messages():
         one = found.setdefault(recorded.key, KeyInfo())
         one.time_ns.append(recorded.time_ns)
         one.bytes += len(recorded.payload)
         if recorded.key in ALL:
             contents.take(recorded)
-    return _summed_up(path, reader, found, contents)
+        if recorded.key == keys.SETTINGS_IN_FORCE:
+            with contextlib.suppress(WireError):
+                in_force.append(decoder.decode(recorded.payload, recorded.encoding))
+    return _summed_up(path, reader, found, contents, _changes(in_force))
 
 
-def _summed_up(path: Path, reader: RecordingReader, found: dict[str, KeyInfo], contents: Contents) -> RecordingInfo:
+def _changes(in_force: Sequence[ControlSettings]) -> list[SettingsChange]:
+    return [
+        SettingsChange(
+            time_s=now.stamp_ns * 1e-9,
+            who=now.who,
+            changed={PREFIX + one.name: (was.value, one.value) for was, one in differing(before, now)},
+        )
+        for before, now in pairwise(in_force)
+        if now.who is not None and now.changes != before.changes
+    ]
+
+
+def _summed_up(
+    path: Path,
+    reader: RecordingReader,
+    found: dict[str, KeyInfo],
+    contents: Contents,
+    settings: list[SettingsChange],
+) -> RecordingInfo:
     robot, status = contents.description, contents.status
     config: dict[str, Any] = json.loads(contents.config.content) if contents.config is not None else {}
     # Not since the oldest message: latched values, such as the description, are older than a recording that began late.
@@ -117,6 +152,7 @@ def _summed_up(path: Path, reader: RecordingReader, found: dict[str, KeyInfo], c
         command_digest=None if host is None or not host.ticks else host.command_digest,
         own_arithmetic=[] if robot is None else foreign(robot.arithmetic),
         lifecycle=None if status is None else f"{status.lifecycle}: {_why(status)}",
+        settings=settings,
         dropped=reader.losses.dropped,
         keys={key: _numbers(one, duration_s, regular=key not in irregular) for key, one in sorted(found.items())},
     )
@@ -151,6 +187,9 @@ def show(given: Path, say: Say, *, as_json: bool = False) -> int:
     digest = digest_text(info.command_digest, info.own_arithmetic) if info.command_digest else "none"
     of_what = " of these ticks alone" if info.lacks else ""
     say(f"  commands  {info.ticks} ticks applied, digest {digest}{of_what}")
+    for change in info.settings:
+        said = ", ".join(f"{name}: {was} -> {value}" for name, (was, value) in change.changed.items())
+        say(f"  set       at {change.time_s:.2f} s by {change.who}: {said}")
     say(f"  {'key':<26}{'messages':>9}{'rate':>11}{'mean size':>12}{'gaps':>7}")
     for key, one in info.keys.items():
         mean = one["bytes"] / one["count"]

@@ -1,4 +1,4 @@
-"""Arguments of the commands to a running robot: `snakesim arm`, `disarm`, `clear`, `estop`, `teleop`, `sim`, ..."""
+"""Arguments of the commands to a running robot: `snakesim arm`, `disarm`, `clear`, `estop`, `param`, ..."""
 
 import argparse
 import contextlib
@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from snakesim_hal.arguments import add_network
-from snakesim_operator.tools.robot_selection import selection_of
+from snakesim_hal.errors import ConfigError
+from snakesim_operator.tools.robot_selection import RobotSelection, selection_of
 from snakesim_operator.tools.simulator_order import add_command as add_sim
 from snakesim_operator.tools.simulator_order import order_of
 
@@ -43,6 +44,8 @@ def add_commands(commands: Any) -> None:
     add_network(teleop)
     teleop.set_defaults(act=_teleop)
 
+    _add_param(commands)
+
     sim = add_sim(commands)
     add_network(sim)
     sim.set_defaults(act=_sim)
@@ -57,6 +60,24 @@ def add_commands(commands: Any) -> None:
     fault.add_argument("--end", action="store_true", help="end it")
     add_network(fault)
     fault.set_defaults(act=_fault)
+
+
+def _add_param(commands: Any) -> None:
+    param = commands.add_parser("param", help="list, get and set parameters of the running controller")
+    verbs = param.add_subparsers(dest="verb", required=True, metavar="VERB")
+    for verb, act, about in (
+        ("list", _param_list, "all of them: value, unit, range, what each is"),
+        ("get", _param_get, "the value of one"),
+        ("set", _param_set, "change them, all or none; the controller goes on with them, and they are recorded"),
+    ):
+        command = verbs.add_parser(verb, help=about)
+        command.add_argument("robot", metavar="ROBOT", help="its namespace, as printed by `snakesim status`")
+        if verb == "get":
+            command.add_argument("name", metavar="NAME", help="such as control.lead_s")
+        if verb == "set":
+            command.add_argument("values", nargs="+", metavar="NAME=VALUE", help="such as control.lead_s=0.3")
+        add_network(command)
+        command.set_defaults(act=act)
 
 
 def _arm(arguments: argparse.Namespace) -> int:
@@ -105,3 +126,29 @@ def _fault(arguments: argparse.Namespace) -> int:
 
     order = FaultOrder(arguments.kind, arguments.target, arguments.for_s, arguments.amount, arguments.end)
     return fault(order, selection_of(arguments))
+
+
+def _param_list(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.parameters import list_parameters
+
+    return list_parameters(_robot_of(arguments))
+
+
+def _param_get(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.parameters import get_parameter
+
+    return get_parameter(arguments.name, _robot_of(arguments))
+
+
+def _param_set(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.tools.parameters import set_parameters
+
+    return set_parameters(arguments.values, _robot_of(arguments))
+
+
+def _robot_of(arguments: argparse.Namespace) -> RobotSelection:
+    """The robot that is named, by its namespace."""
+    if arguments.namespace not in (None, arguments.robot):
+        raise ConfigError(f"{arguments.robot} and --namespace {arguments.namespace}: name one robot; leave one out")
+    arguments.namespace = arguments.robot
+    return selection_of(arguments)

@@ -6,7 +6,7 @@ from snakesim_hal.wire.messages import ControlSettings
 from snakesim_operator.console.settings_form import Field, fields_of
 
 SCHEMA = """{"$ref": "#/$defs/S", "$defs": {"S": {"properties": {
-    "push_n": {"type": "number", "unit": "N", "exclusiveMinimum": 0, "maximum": 10000},
+    "push_n": {"type": "number", "unit": "N", "description": "a bound", "exclusiveMinimum": 0, "maximum": 10000},
     "share": {"type": "number", "minimum": 0, "maximum": 1},
     "bend_rad": {"type": "number"},
     "mode": {"enum": ["a", "b"]},
@@ -21,7 +21,7 @@ def settings(values: str, schema: str) -> ControlSettings:
 
 def test_each_setting_has_an_input_within_its_bounds():
     push, share, bend, mode, on = fields_of(settings(VALUES, SCHEMA))
-    assert push == Field("push_n", 10.0, "N", low=0.1, high=40.0, step=0.1)
+    assert push == Field("push_n", 10.0, "N", low=0.1, high=40.0, step=0.1, hint="a bound; > 0, <= 10000 N")
     assert (share.low, share.high) == (0.0, 1.0)
     assert (bend.low, bend.high) == (-0.8, 0.8)
     assert mode.choices == ("a", "b") and on.value is True
