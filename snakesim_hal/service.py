@@ -14,6 +14,7 @@ from snakesim_hal.model.scenario import Service as Schedule
 from snakesim_hal.network.client import Client
 from snakesim_hal.network.process_entries import own_entry, show_process
 from snakesim_hal.network.session import Session
+from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, Description, Message
 
 SILENCE_S = 1.0
@@ -119,6 +120,8 @@ class ServiceLoop:
         with self._named("outputs"):
             outputs = self.service.outputs(clock)
             if clock.lifecycle != "armed":
+                if keys.JOINTS in self._client.lacks:
+                    outputs = None  # they come every tick; once armed it would be too late to hear of them
                 self._show_waiting([] if outputs is not None else sorted(self._client.lacks)[:MOST_SHOWN])
             if outputs is None:
                 return
@@ -126,10 +129,10 @@ class ServiceLoop:
                 self._client.put(key, message)
         self._client.done(clock.tick)
 
-    def _show_waiting(self, keys: list[str]) -> None:
+    def _show_waiting(self, lacks: list[str]) -> None:
         """Tell the host what this service waits for, so that whoever waits for the service knows it."""
-        if keys != self._entry.waits_for:
-            self._entry = msgspec.structs.replace(self._entry, waits_for=keys)
+        if lacks != self._entry.waits_for:
+            self._entry = msgspec.structs.replace(self._entry, waits_for=lacks)
             self._shown.put(self._entry)
 
     @contextlib.contextmanager

@@ -1,0 +1,44 @@
+"""The loop around a service: when it says that it is there, and what it waits for."""
+
+from typing import Any
+
+from snakesim_hal.network.local_network import LocalNetwork
+from snakesim_hal.service import Service, ServiceLoop
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Clock, Description, Done, JointState, Message, Process
+from tests.unit.hal.network.test_strangers import CLOCK, ROBOT
+from tests.unit.hal.rig import run_config, state
+
+
+class Undemanding(Service):
+    """Answers whether it has joints or not."""
+
+    name = "navigation"
+
+    def __init__(self, client: Any, config: Any) -> None:
+        self.client, self.joints = client, client.subscribe(keys.JOINTS, JointState)
+
+    def configure(self, robot: Description) -> None: ...
+
+    def outputs(self, clock: Clock) -> list[tuple[str, Message]]:
+        self.client.read(self.joints)
+        return []
+
+
+def test_nobody_is_there_before_it_hears_the_joints_because_once_armed_they_are_not_sent_again() -> None:
+    network = LocalNetwork()
+    hal = network.session()
+    hal.latched_publisher(keys.DESCRIPTION, Description).put(ROBOT)
+    clocks, felt = hal.publisher(keys.CLOCK, Clock), hal.publisher(keys.JOINTS, JointState)
+    done = hal.reader(keys.done("navigation"), Done)
+    loop = ServiceLoop(Undemanding, run_config(pace=CLOCK.pace), network.session())
+    clocks.put(CLOCK)
+    loop.join()
+    entries = hal.latched_reader(keys.PROCESS_ALL, Process)
+    loop.act()
+    assert done.drain() == [] and entries.drain()[-1].waits_for == [keys.JOINTS]
+    felt.put(state(ROBOT, 0.1, tick=CLOCK.tick))
+    clocks.put(CLOCK)
+    loop.act()
+    assert [one.tick for one in done.drain()] == [CLOCK.tick] and entries.drain()[-1].waits_for == []
+    loop.close()
