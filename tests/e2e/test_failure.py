@@ -8,10 +8,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from snakesim_hal.wire.messages import Mode
+from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Mode, Status
 from snakesim_operator.results.record import SUMMARY, RunRecord
 from snakesim_operator.results.summary import RunSummary
-from tests.e2e.command import nothing_left, run_to_summary, running, snakesim
+from tests.e2e.command import nothing_left, run_to_summary, running, snakesim, wait_until
 
 pytestmark = pytest.mark.e2e
 
@@ -23,12 +25,11 @@ def test_killed_controller_means_safe_joints_a_reason_and_a_failed_run(tmp_path:
     with running(tmp_path / "run", *LONG, "--pace", pace) as run:
         run.wait_for("network:")
         run.wait_for(" s  ")  # the first line of progress: armed
-        os.kill(run.part("control"), signal.SIGKILL)
-        words = ""
-        while "lease of control expired" not in words:
-            assert run.process.poll() is None, "the run ended before the status could be asked: " + words
-            words = snakesim("status", "--endpoint", run.endpoint, cwd=tmp_path).out
-        assert "fault" in words and "control is gone" in words
+        with open_session(Link(run.endpoint, "planar13")) as session:
+            statuses = session.reader(keys.STATUS, Status)
+            wait_until(lambda: bool(statuses.drain()), "a status")
+            os.kill(run.part("control"), signal.SIGKILL)
+            wait_until(lambda: any("lease of control expired" in one.why for one in statuses.drain()), "the reason")
         assert run.end() == 1
     nothing_left(tmp_path / "run")
     summary = msgspec.json.decode((tmp_path / "run" / SUMMARY).read_bytes(), type=RunSummary)

@@ -232,7 +232,7 @@ def test_a_tick_that_is_shown_again_is_one_turn() -> None:
 @pytest.mark.parametrize("turn_s", [0.02, 0.2])
 @pytest.mark.parametrize("seen", [True, False])
 def test_the_work_of_a_turn_is_bounded_whatever_is_planned(turn_s: float, seen: bool) -> None:
-    """Counted, and in CPU time: five times what the rate allows, so that a slow computer passes."""
+    """Counted, and in CPU time: ten times what the rate allows, so that a slow computer passes."""
     config = field(density=12.0)
     obstacles, body = obstacles_of(config), body_of(config)
     made = ClutterPlanner(HeadingGoal(), None if seen else obstacles, search=SEARCH, turn_s=turn_s)
@@ -248,4 +248,4 @@ def test_the_work_of_a_turn_is_bounded_whatever_is_planned(turn_s: float, seen: 
     largest_step = 8000  # the fit of the longest path
     assert max(done) <= max(NODES_PER_S * turn_s, largest_step)
     assert all(sum(done[: k + 1]) <= NODES_PER_S * turn_s * (k + 1) for k in range(len(done)))
-    assert max(took_s) < 5 * max(turn_s, largest_step / NODES_PER_S)
+    assert max(took_s) < 10 * max(turn_s, largest_step / NODES_PER_S)
