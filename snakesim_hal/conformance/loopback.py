@@ -11,6 +11,7 @@ from typing import Any
 
 from snakesim_hal.backend import Backend, Samples, SetPoints
 from snakesim_hal.conformance.rig import HOLDER, JointTargets
+from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.client import Client, Commander
@@ -156,7 +157,7 @@ class Hosted:
         sys.setswitchinterval(0.0005)  # host and controller share one interpreter here; otherwise they are processes
         try:
             own = self._open.enter_context(open_session(self._own_link))
-            self.host = Host(self.config, self.backend, own)
+            self.host = Host(self.config, GuardedBackend(self.backend), own)
             self.robot = self.host.description
             self.session: Session = self._open.enter_context(open_session(self._link))
             self._commands = self.session.publisher(keys.JOINT_COMMAND, JointCommand)

@@ -22,7 +22,6 @@ from snakesim_hal.arithmetic import measured
 from snakesim_hal.backend import Backend, Samples
 from snakesim_hal.errors import BackendError, WireError
 from snakesim_hal.host.black_box import BlackBox
-from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.inbox import Inbox, Request
 from snakesim_hal.host.latch import EstopLatch, replying
 from snakesim_hal.host.outbox import Outbox
@@ -85,7 +84,9 @@ class Host:
         realtime_warnings: Sequence[str] = (),
         faults: Faults | None = None,
     ) -> None:
-        """max_ticks: end this many ticks after the first arming; None: go on until asked to finish.
+        """backend: guarded, as by `open_backend`.
+
+        max_ticks: end this many ticks after the first arming; None: go on until asked to finish.
 
         end_after_fault_s: end after so much robot time in a fault; None: stay, so that a person can clear it.
         pace_after_fault: of ticks that wait for no service.
@@ -108,7 +109,7 @@ class Host:
         self.participants = Participants(config.services)
         self._config = config
         self.faults: Faults = faults or NoFaults(HAL, config, session)
-        self._backend = GuardedBackend(backend)
+        self._backend = backend
         self._max_ticks = max_ticks
         self._end_after_fault_s = end_after_fault_s
         self._pace_after_fault: Pace = pace_after_fault

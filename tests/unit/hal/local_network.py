@@ -14,6 +14,7 @@ import msgspec
 from snakesim_hal.allowed_faults import faults_of_host
 from snakesim_hal.backend import Samples, SetPoints
 from snakesim_hal.errors import BackendError
+from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host
 from snakesim_hal.model.robot import describe
 from snakesim_hal.model.scenario import RunConfig, config_hash
@@ -227,7 +228,7 @@ def running(config: RunConfig, **host: Any) -> Iterator[Running]:
     endpoint, backend = free_endpoint(), LagBackend(config)
     link = Link(endpoint, "lab/worm")
     with open_session(Link(endpoint, "lab/worm", listen=True)) as own, open_session(link) as watcher:
-        faulty, faults = faults_of_host(config, backend, own)
+        faulty, faults = faults_of_host(config, GuardedBackend(backend), own)
         made = Host(config, faulty, own, faults=faults, **host)
         thread = threading.Thread(target=made.run, name="host")
         statuses = watcher.latched_reader(keys.STATUS, Status)

@@ -9,6 +9,7 @@ import pytest
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.faults.injector import Injector
 from snakesim_hal.faults.message_faults import MessageFaults
+from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host
 from snakesim_hal.model.injection import parse
 from snakesim_hal.network.session import Link, open_session
@@ -91,7 +92,7 @@ def test_where_something_real_moves_nothing_goes_wrong_on_request() -> None:
         open_session(Link(free_endpoint(), "worm", listen=True)) as own,
         pytest.raises(ConfigError, match="something real moves here"),
     ):
-        Host(config, LagBackend(config), own)
+        Host(config, GuardedBackend(LagBackend(config)), own)
 
 
 def test_what_was_planned_and_cannot_be_done_is_told_as_a_fault_of_the_run() -> None:

@@ -12,6 +12,7 @@ import pytest
 import zenoh
 
 from snakesim_hal.backend import SetPoints
+from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host
 from snakesim_hal.host.inbox import LIMITS, SAMPLES
 from snakesim_hal.network.client import Client
@@ -256,7 +257,7 @@ def test_a_strangers_command_neither_moves_the_robot_nor_passes_for_the_holders_
     """In lockstep a tick ends when the holder has answered; a refused command of somebody else is no answer."""
     endpoint = free_endpoint()
     with open_session(Link(endpoint, "worm", listen=True)) as session:
-        host = Host(run_config(), LagBackend(run_config()), session)
+        host = Host(run_config(), GuardedBackend(LagBackend(run_config())), session)
         host.authority.observe(state(host.description))
         host.authority.on_lease(LeaseRequest(action="acquire", holder="control"), 0)
         own = host.authority.lease.epoch
@@ -272,7 +273,7 @@ def test_a_flood_of_commands_does_not_keep_an_estop_out() -> None:
     endpoint, limit = free_endpoint(), LIMITS[SAMPLES] or 0
     config = run_config(pace="realtime")
     with open_session(Link(endpoint, "worm", listen=True)) as own, open_session(Link(endpoint, "worm")) as stranger:
-        host = Host(config, LagBackend(config), own)
+        host = Host(config, GuardedBackend(LagBackend(config)), own)
         publisher = stranger.publisher(keys.JOINT_COMMAND, JointCommand, lossless=True)
         for sequence in range(limit + 500):
             publisher.put(command(host.description, sequence=sequence))

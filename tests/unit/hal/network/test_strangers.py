@@ -8,6 +8,7 @@ import pytest
 import zenoh
 
 from snakesim_hal.errors import NotConnectedError
+from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host
 from snakesim_hal.model.route import Route
 from snakesim_hal.network.client import Client, Commander
@@ -218,7 +219,7 @@ def test_large_images_arrive_where_they_are_expected() -> None:
 def test_a_lease_that_has_run_out_is_a_fault_even_when_somebody_asks_for_it_at_that_moment() -> None:
     config, answers = run_config(pace="realtime", services={}), list[Answer]()
     with open_session(Link(free_endpoint(), "worm", listen=True)) as session:
-        host = Host(config, LagBackend(config), session)  # between two ticks
+        host = Host(config, GuardedBackend(LagBackend(config)), session)  # between two ticks
         host.answer(LeaseRequest(action="acquire", holder="control"), answers.append)
         host.authority.observe(state(ROBOT))
         host.authority.state = "armed"
