@@ -5,8 +5,8 @@
     result = snakesim.run("triplet", duration=8, set={"control.propulsion_n": 35})
     result["angle_rad"], result.metrics["path_distance_m"], result.plot("torque_nm")
 
-`run` and `Result` are for whole runs. `View`, `Action`, `Report`, `positions` and `Settings` are for controllers.
-`docs/python.md` is the reference. Nothing of SnakeSIM imports this package.
+`run` and `Result` are for whole runs, `Robot` for one that is there already. `View`, `Action`, `Report`, `positions`
+and `Settings` are for controllers. `docs/python.md` is the reference. Nothing of SnakeSIM imports this package.
 
 Names are loaded when they are first used. A program that imports this package before NumPy computes as `snakesim run`
 does, so that one seed gives one digest; one that has imported NumPy already gets its runs from a child process.
@@ -27,6 +27,7 @@ from snakesim_hal.errors import (
 
 if TYPE_CHECKING:
     from snakesim.result import Result
+    from snakesim.robot import Robot
     from snakesim.runs import run
     from snakesim_gnc.control.controller import Action, Report, View, positions
     from snakesim_hal.model.files import FileStruct as Settings
@@ -39,6 +40,7 @@ __all__ = [
     "RefusedError",
     "Report",
     "Result",
+    "Robot",
     "Settings",
     "SnakesimError",
     "StalledError",
@@ -51,6 +53,7 @@ LAZY = {
     "Action": (CONTROLLER, "Action"),
     "Report": (CONTROLLER, "Report"),
     "Result": ("snakesim.result", "Result"),
+    "Robot": ("snakesim.robot", "Robot"),
     "Settings": ("snakesim_hal.model.files", "FileStruct"),
     "View": (CONTROLLER, "View"),
     "positions": (CONTROLLER, "positions"),
