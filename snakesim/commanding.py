@@ -12,6 +12,7 @@ from snakesim_hal.errors import RefusedError, StalledError
 from snakesim_hal.model.injection import CONTROL
 from snakesim_hal.network.client import Client, Commander, Feed
 from snakesim_hal.network.session import Session
+from snakesim_hal.process import tune_garbage_collector
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, Contacts, Description, JointState, Message, Pace, Pose
 
@@ -38,6 +39,7 @@ class Commanding:
         self._last: SetPoints | None = None
         self.clock: Clock | None = None
         self._mine = False  # the lease, at this tick
+        tune_garbage_collector()  # looking through all objects of a notebook may take longer than a lease
         self._client.announce()
         self.turn_until(self._lent, LEASE_S, lambda: f"no right to command {robot.robot}: {self._commander.refusal}")
 

@@ -183,7 +183,7 @@ class Robot:
         """Take the lease, and have the robot hold its pose until the first command. Raises RefusedError."""
         control = self._commanding()
         control.turn_until(lambda: self.status.ready_to_arm, READY_S, lambda: f"not armed: {self.status.why}")
-        robot = self.description
+        robot, before = self.description, self._clock.arming
         request = LifecycleRequest(
             action="arm",
             who=user_name(),
@@ -193,7 +193,9 @@ class Robot:
             config_hash=robot.config_hash,
         )
         self._ask(request, "armed")
-        control.turn_until(lambda: self._clock.lifecycle == "armed", READY_S, lambda: f"not armed: {self.status.why}")
+        control.turn_until(lambda: self._clock.arming > before, READY_S, lambda: f"not armed: {self.status.why}")
+        if self._clock.lifecycle != "armed":
+            raise RefusedError(f"not armed any more, but {self._clock.lifecycle}: {self.status.why}")
         self._armed = True
 
     def disarm(self) -> None:

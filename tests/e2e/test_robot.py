@@ -36,8 +36,25 @@ def driven(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
         yield started
 
 
+STUMBLED = "lease of control expired: no accepted command"
+TRIES = 4
+
+
 def script(text: str, run: Running, folder: Path) -> subprocess.CompletedProcess[str]:
-    """Run a script, as urgent as a run's own control where that is allowed: a busy machine holds it up otherwise."""
+    """Run a script; again, where this machine has held it up for longer than a lease."""
+    for _ in range(TRIES - 1):
+        settled(run)
+        done = called(text, run, folder)
+        if STUMBLED not in done.stdout + done.stderr:
+            return done
+        for left in folder.glob("*.mcap"):
+            left.unlink()
+    settled(run)
+    return called(text, run, folder)
+
+
+def called(text: str, run: Running, folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run a script once, as urgent as a run's own control where that is allowed."""
     (folder / "script.py").write_text(textwrap.dedent(text))
     return subprocess.run(
         [sys.executable, "script.py", run.endpoint],
@@ -59,7 +76,6 @@ def settled(run: Running) -> None:
 
 
 def test_the_script_of_the_documents_turns_a_joint_and_records(waiting: Running, tmp_path: Path) -> None:
-    settled(waiting)
     nod = next(s for s in sections(REPOSITORY / "docs" / "python.md") if "nod.py" in s.files).files["nod.py"]
     ended = script(nod, waiting, tmp_path)
     assert ended.returncode == 0, ended.stderr
@@ -72,7 +88,6 @@ def test_the_script_of_the_documents_turns_a_joint_and_records(waiting: Running,
 
 
 def test_an_exception_disarms_what_was_armed(waiting: Running, tmp_path: Path) -> None:
-    settled(waiting)
     failing = """
         import sys, snakesim
         with snakesim.Robot.connect(sys.argv[1]) as robot:
@@ -87,7 +102,6 @@ def test_an_exception_disarms_what_was_armed(waiting: Running, tmp_path: Path) -
 
 
 def test_a_stop_by_somebody_else_ends_the_wait(waiting: Running, tmp_path: Path) -> None:
-    settled(waiting)
     stopped = """
         import sys, snakesim
         with snakesim.Robot.connect(sys.argv[1]) as robot:
