@@ -11,7 +11,7 @@ from snakesim_operator.results.page.charts import Figure
 from snakesim_operator.results.page.html import render
 
 PAGE = Path(__file__).with_name("plot.html")
-MARGIN_PX = 60
+MARGIN_PX, PADDING_PX = 30, 160  # of each figure, of the page
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,8 @@ class Chart:
         return Path(path)
 
     def _repr_html_(self) -> str:
-        return framed(self._page(), sum(figure["layout"]["height"] + MARGIN_PX for figure in self.figures))
+        heights = [figure["layout"]["height"] + MARGIN_PX for figure in self.figures]
+        return framed(self._page(), sum(heights) + PADDING_PX)
 
     def _page(self) -> str:
         return render(PAGE, self.joints, styles=[], scripts=[], title=self.title, figures=self.figures)

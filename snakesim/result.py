@@ -38,7 +38,7 @@ UNITS = {
     "contact_peak_n": "N",
     "contact_count": "1",
 }
-PLAYBACK_PX = 640
+PLAYBACK_PX = 580
 SPAN_S = (0.0, math.inf)
 
 
