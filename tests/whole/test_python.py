@@ -162,6 +162,7 @@ def test_the_study_in_the_documents_as_printed(tmp_path: Path) -> None:
     """Run, plot, sweep a gain, take the best, run it on emulated modules, compare."""
     study = next(s for s in sections(REPOSITORY / "docs" / "python.md") if "study.py" in s.files).files["study.py"]
     assert len(study.splitlines()) <= 25
+    assert f"```python\n{study}```" in (REPOSITORY / "README.md").read_text()
     (tmp_path / "study.py").write_text(study)
     done = subprocess.run(
         [sys.executable, "study.py"],
