@@ -31,7 +31,7 @@ common = pytest.mark.skipif(
     reason=f"the digests of this computer are its own: {' and '.join(OWN) or 'without AVX2 and FMA'}",
 )
 OF_THIS_PROCESS = ["tests/whole/test_recordings.py", "tests/whole/test_compare.py"]
-IN_REAL_TIME = ["tests/e2e/test_run.py", "tests/e2e/test_record.py"]
+IN_REAL_TIME = ["tests/e2e/test_run.py", "tests/e2e/test_record.py", "-k", "not no_slow_computer"]
 
 PROGRAM = """
 import sys

@@ -64,7 +64,7 @@ def test_one_flipped_bit_costs_one_chunk_and_the_loss_is_counted_by_time_and_key
     reader = RecordingReader(path)
     kept = list(reader.messages())
     truth = lost(run / RECORDING, path)
-    assert truth[keys.JOINTS] >= 5 and len(kept) > 500
+    assert truth[keys.JOINTS] >= 2 and len(kept) > 500
     assert {key: count for key, count in reader.losses.lost.items() if not key.startswith("foxglove/")} == truth
     (gap,) = [gap for gap in reader.losses.gaps if gap.lost]
     clocks = [one.time_ns for one in kept if one.key == keys.CLOCK]
