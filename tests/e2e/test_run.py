@@ -102,12 +102,12 @@ def test_a_computer_that_is_too_slow_is_named_before_the_lease_that_expires(tmp_
 
 def test_a_service_that_is_frozen_is_no_slow_computer(tmp_path: Path) -> None:
     arguments = ["triplet", "--controller", "hold", "--duration", "60", "--pace", "realtime", "--set", "rate_hz=50"]
-    for trial in "abc":  # a computer that stutters may be too slow just then, and says so
-        ended, summary = run_to_summary(tmp_path / trial, *arguments, "--fault", "freeze:control@1")
+    said = [TOO_SLOW]
+    while TOO_SLOW in said[-1] and len(said) < 4:  # a computer that stutters may be too slow just then, and says so
+        ended, summary = run_to_summary(tmp_path / str(len(said)), *arguments, "--fault", "freeze:control@1")
         assert ended.code == 1 and "lease of control expired" in summary.ended
-        if TOO_SLOW not in summary.ended:
-            return
-    pytest.fail(summary.ended)
+        said.append(summary.ended)
+    assert TOO_SLOW not in said[-1]
 
 
 @pytest.mark.parametrize("pace", ["realtime", "free"])
