@@ -66,7 +66,7 @@ BY_BACKEND = {
     "stops": "its process was stopped by a signal",
     "interrupts": "by ",  # SIGINT, or its handler in the host if that comes first
 }
-QUICK = {"hangs", "closes", "exits"}
+QUICK = {"hangs", "closes"}
 DEEDS = [
     (who, deed, words)
     for who, deeds in (("controller", BY_CONTROLLER), ("backend", BY_BACKEND))
