@@ -32,17 +32,12 @@ def claimed(out: Path, say: Callable[[str], None]) -> Iterator[Path]:
 
     Raises ConfigError when another run has locked it or it is not usable, OSError when it is not writable.
     """
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError) as error:
-        raise ConfigError(f"--out {out}: {error.strerror}: {error.filename}; choose another folder") from error
     out = out.resolve()
     with contextlib.ExitStack() as held:
         held.enter_context(_lock(out))
         if any((out / name).exists() for name in LEFT):
             aside = _move_aside(out)
             say(f"{out} held an earlier run: moved to {aside}")
-            out.mkdir(exist_ok=True)
             held.enter_context(_lock(out))
         try:
             yield out
@@ -56,21 +51,27 @@ def claimed(out: Path, say: Callable[[str], None]) -> Iterator[Path]:
 def _lock(out: Path) -> Iterator[None]:
     path = out / LOCK
     while True:
-        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
+        folder = _opened(out)
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if os.path.samestat(os.fstat(handle), path.stat()):
+            handle = os.open(LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644, dir_fd=folder)
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                holder = os.pread(handle, 20, 0).decode(errors="replace").strip()
+                os.close(handle)
+                raise ConfigError(
+                    f"--out {out}: another run is writing there, process {holder or 'unknown'}; "
+                    "choose another folder, or end that run"
+                ) from None
+            if _is(handle, path):
                 break
-        except BlockingIOError:
-            holder = os.pread(handle, 20, 0).decode(errors="replace").strip()
+            # The run that had locked it has just ended, or has moved this folder aside: it is an earlier run's now.
+            with contextlib.suppress(OSError):
+                if os.path.samestat(os.fstat(handle), os.stat(LOCK, dir_fd=folder)):
+                    os.unlink(LOCK, dir_fd=folder)
             os.close(handle)
-            raise ConfigError(
-                f"--out {out}: another run is writing there, process {holder or 'unknown'}; "
-                "choose another folder, or end that run"
-            ) from None
-        except FileNotFoundError:
-            pass  # the run that had locked it has just ended, or has renamed it
-        os.close(handle)
+        finally:
+            os.close(folder)
     try:
         with contextlib.suppress(OSError):  # a full disk: the lock is valid, but without the process id
             os.ftruncate(handle, 0)
@@ -78,9 +79,29 @@ def _lock(out: Path) -> Iterator[None]:
         yield
     finally:
         with contextlib.suppress(OSError):
-            if os.path.samestat(os.fstat(handle), path.stat()):
+            if _is(handle, path):
                 path.unlink()
         os.close(handle)
+
+
+def _opened(out: Path) -> int:
+    """The folder, made if it is not there."""
+    attempts = 10
+    while True:
+        attempts -= 1
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+            return os.open(out, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
+        except (FileExistsError, NotADirectoryError, FileNotFoundError) as error:
+            if not attempts or not isinstance(error, FileNotFoundError):  # it may have been moved aside in between
+                raise ConfigError(f"--out {out}: {error.strerror}: {error.filename}; choose another folder") from error
+
+
+def _is(handle: int, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(handle), path.stat())
+    except FileNotFoundError:
+        return False
 
 
 def _move_aside(out: Path) -> Path:

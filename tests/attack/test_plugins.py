@@ -1,11 +1,13 @@
 """Controllers and backends that misbehave: the robot stops, the run names what is known, and nothing is left of it."""
 
+import json
 from pathlib import Path
 
 import pytest
 
+from tests.attack.command import free_endpoint, processes, snakesim
 from tests.attack.effort import FULL
-from tests.e2e.command import nothing_left, run_to_summary
+from tests.attack.stranger import until
 
 BAD = """
 import os
@@ -35,14 +37,14 @@ class Controller(Hold):
     def update(self, view):
         Controller.calls += 1
         if Controller.calls == 30:
-            DEEDS[os.environ["DEED"]]()
+            DEEDS["%s"]()
         return super().update(view)
 
 
 class Backend(SimBackend):
     def sample(self, tick, stamp_ns):
         if tick == 30:
-            DEEDS[os.environ["DEED"]]()
+            DEEDS["%s"]()
         return super().sample(tick, stamp_ns)
 """
 GONE, LATE = "control is gone", "lease of control expired"
@@ -77,15 +79,17 @@ DEEDS = [
 
 @pytest.mark.parametrize(("who", "deed", "words"), DEEDS, ids=[f"{who}-{deed}" for who, deed, _ in DEEDS])
 def test_a_plugin_that_misbehaves_stops_its_robot_only(tmp_path: Path, who: str, deed: str, words: str) -> None:
-    (tmp_path / "bad.py").write_text(BAD)
+    (tmp_path / "bad.py").write_text(BAD.replace("%s", deed))
     chosen = {"controller": "hold", "backend": "sim"} | {who: f"./bad.py:{who.capitalize()}"}
-    ended, summary = run_to_summary(
-        tmp_path / "out",
-        *("triplet", "--controller", chosen["controller"], "--backend", chosen["backend"]),
+    out = tmp_path / "out"
+    ended = snakesim(
+        tmp_path,
+        *("run", "triplet", "--controller", chosen["controller"], "--backend", chosen["backend"]),
         *("--pace", "realtime", "--set", "rate_hz=50", "--duration", "60"),
-        DEED=deed,
+        *("--out", str(out), "--endpoint", free_endpoint()),
     )
-    assert ended.code == 1 and words in summary.ended, ended.out + ended.err
-    assert summary.duration_s < 60
-    nothing_left(tmp_path / "out")
-    assert sum(file.stat().st_size for file in (tmp_path / "out").iterdir()) < 200 * 2**20
+    summary = json.loads((out / "summary.json").read_bytes())
+    assert ended.code == 1 and words in summary["ended"], ended.said
+    assert summary["duration_s"] < 60
+    until(lambda: not processes(out), "no process of the run left")
+    assert sum(file.stat().st_size for file in out.iterdir()) < 200 * 2**20

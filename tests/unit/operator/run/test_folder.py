@@ -119,6 +119,27 @@ def test_many_that_want_one_folder_at_once(tmp_path: Path) -> None:
             assert b"Traceback" not in err or b"ConfigError" in err
 
 
+def test_nothing_is_written_into_a_folder_that_was_just_moved_aside(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, aside, open_file = tmp_path / "run", tmp_path / "aside", os.open
+    leave(out, notes_txt="mine")
+
+    def late(path: str, *args: int, dir_fd: int | None = None) -> int:
+        if path == LOCK and not aside.exists():
+            out.rename(aside)
+        return open_file(path, *args, dir_fd=dir_fd)
+
+    monkeypatch.setattr(os, "open", late)
+    with claimed(out, pytest.fail):
+        assert content(out) == {LOCK: str(os.getpid())} and content(aside) == {"notes.txt": "mine"}
+
+
+def test_a_place_that_takes_no_folder_is_wrong_input() -> None:
+    with pytest.raises(ConfigError, match=r"--out /proc/run: No such file or directory.*; choose another folder"):
+        claimed(Path("/proc/run"), pytest.fail).__enter__()
+
+
 @pytest.mark.parametrize("out", ["file", "file/run"])
 def test_what_cannot_be_a_folder_is_wrong_input(tmp_path: Path, out: str) -> None:
     (tmp_path / "file").write_text("mine")
