@@ -12,7 +12,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Generic
@@ -346,7 +346,8 @@ class Session:
     def close(self) -> None:
         """Undeclare everything, then close."""
         for declared in reversed(self._declared):
-            declared.undeclare()
+            with suppress(RuntimeError):  # another thread is publishing with it: the session undeclares it
+                declared.undeclare()
         self._declared.clear()
         if self._for_images is not None:
             self._for_images.close()

@@ -68,12 +68,12 @@ BY_BACKEND = {
     "stops": "its process was stopped by a signal",
     "interrupts": "by ",  # SIGINT, or its handler in the host if that comes first
 }
-QUICK = {"hangs", "closes"}
+QUICK = {("controller", "hangs"), ("controller", "closes"), ("backend", "exits")}
 DEEDS = [
     (who, deed, words)
     for who, deeds in (("controller", BY_CONTROLLER), ("backend", BY_BACKEND))
     for deed, words in deeds.items()
-    if FULL or deed in QUICK
+    if FULL or (who, deed) in QUICK
 ]
 
 

@@ -100,6 +100,7 @@ def test_a_computer_that_is_too_slow_is_named_before_the_lease_that_expires(tmp_
     assert "; lease of control expired: " in ended and f"fault: {TOO_SLOW}" in run.said()
 
 
+@pytest.mark.slow
 def test_a_service_that_is_frozen_is_no_slow_computer(tmp_path: Path) -> None:
     arguments = ["triplet", "--controller", "hold", "--duration", "60", "--pace", "realtime", "--set", "rate_hz=50"]
     said = [TOO_SLOW]
