@@ -17,27 +17,13 @@ from numpy.typing import NDArray
 from snakesim.chart import Chart, framed
 from snakesim_hal.errors import ConfigError, did_you_mean, short
 from snakesim_hal.model.textfiles import write_text
-from snakesim_operator.playback.export import OF_JOINTS, arrays, table
+from snakesim_operator.playback.export import OF_JOINTS, UNITS, arrays, table
 from snakesim_operator.results.ended import COMPLETE
 from snakesim_operator.results.page.charts import Line, lines
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.verdict import distance_m
 from snakesim_operator.results.summary import RunSummary
 
-UNITS = {
-    "time_s": "s",
-    "angle_rad": "rad",
-    "velocity_rad_s": "rad/s",
-    "torque_nm": "N·m",
-    "mode": "1",
-    "target": "rad, rad/s or N·m, by mode",
-    "torque_limit_nm": "N·m",
-    "position_w": "m",
-    "position_w_m": "m",
-    "orientation_wxyz": "1",
-    "contact_peak_n": "N",
-    "contact_count": "1",
-}
 PLAYBACK_PX = 580
 SPAN_S = (0.0, math.inf)
 

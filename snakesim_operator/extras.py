@@ -18,6 +18,7 @@ BRINGS = {  # as imported; the first extra that brings a package is the one to n
     "evaluate": ("dask", "distributed", "optuna", "pyarrow"),
     "foxglove": ("foxglove",),
     "lab": ("cryptography", "jinja2"),
+    "plot": ("matplotlib",),
     "preview": ("PIL",),
     "ros2": ("xxhash",),
     "video": ("imageio_ffmpeg", "PIL"),

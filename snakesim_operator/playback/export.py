@@ -25,6 +25,20 @@ from snakesim_operator.results.record import RunRecord
 LACKS = b"snakesim.lacks"  # metadata of a Parquet file: JSON
 FORMATS = ("csv", "parquet", "npz", "lerobot", "mcap")
 OF_JOINTS = ("angle_rad", "velocity_rad_s", "torque_nm", "mode", "target", "torque_limit_nm")
+UNITS = {
+    "time_s": "s",
+    "angle_rad": "rad",
+    "velocity_rad_s": "rad/s",
+    "torque_nm": "N·m",
+    "mode": "1",
+    "target": "rad, rad/s or N·m, by mode",
+    "torque_limit_nm": "N·m",
+    "position_w": "m",
+    "position_w_m": "m",
+    "orientation_wxyz": "1",
+    "contact_peak_n": "N",
+    "contact_count": "1",
+}
 
 
 def export(runs: Sequence[Path], form: str, out: Path | None, say: Say) -> int:

@@ -16,6 +16,7 @@ REPOSITORY = Path(__file__).parents[2]
 COMMANDS = {
     "console": ("console",),
     "evaluate": ("evaluate", "sweep", "optimise"),
+    "figures": ("plot",),
     "lab": ("deploy",),
     "robots": ("robot",),
     "ros2": ("ros2",),
