@@ -43,7 +43,9 @@ def add_commands(commands: Any) -> None:
         "--trials", type=number(1, 100_000), default=50, metavar="N", help="in the file at the end (50)"
     )
     searched.add_argument("--seeds", type=number(1, 100_000), default=1, metavar="N", help="runs for each trial (1)")
-    searched.add_argument("--storage", type=Path, required=True, metavar="FILE", help="SQLite file; an old one goes on")
+    searched.add_argument(
+        "--storage", type=Path, metavar="FILE", help="SQLite file; an old one goes on (default: a new one in runs/)"
+    )
     _add_set(searched)
     _add_workers(searched)
     searched.set_defaults(act=_optimise)
@@ -109,8 +111,10 @@ def _shared(arguments: argparse.Namespace, again: list[str]) -> dict[str, Any]:
 def _optimise(arguments: argparse.Namespace) -> int:
     _check_extra()
     from snakesim_operator.evaluate.optimise import Request, optimise
+    from snakesim_operator.run.folder import named_after
 
-    return optimise(Request(**{one.name: getattr(arguments, one.name) for one in dataclasses.fields(Request)}))
+    given = {one.name: getattr(arguments, one.name) for one in dataclasses.fields(Request)}
+    return optimise(Request(**{**given, "storage": arguments.storage or named_after("optimise").with_suffix(".db")}))
 
 
 def _check_extra() -> None:

@@ -1,5 +1,6 @@
 """`snakesim optimise`: searches settings for the best mean of a number, with Optuna; a file keeps all trials."""
 
+import shlex
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,11 +15,11 @@ from optuna.study import Study
 from optuna.trial import Trial, TrialState
 
 from snakesim_hal.errors import ConfigError, short
-from snakesim_hal.model.scenario import parse_set
+from snakesim_hal.model.scenario import compose, parse_set
 from snakesim_hal.terminal import say
 from snakesim_operator.evaluate.case import Case, Outcome
 from snakesim_operator.evaluate.cluster import size, solve, workers
-from snakesim_operator.evaluate.suite import Suite, cases_of
+from snakesim_operator.evaluate.suite import Suite, cases_of, seeds_of
 from snakesim_operator.results.summary import RunSummary
 from snakesim_operator.run.progress import in_minutes
 
@@ -35,7 +36,7 @@ class Request:
     trials: int
     seeds: int
     seed: int
-    storage: Path
+    storage: Path  # SQLite
     cluster: str | None = None
     workers: int | None = None
 
@@ -51,8 +52,8 @@ def optimise(request: Request) -> int:
         _cases(request, {key: getattr(one, end) for key, one in space.items()})
     study = _study(request)
     have = len(study.get_trials(states=(TrialState.COMPLETE,)))
-    if have:
-        say(f"{request.storage} holds {have} trials already")
+    already = f"holds {have} trials already" if have else "keeps all trials"
+    say(f"{request.storage} {already}; --storage {request.storage} goes on with them")
     if left := max(request.trials - have, 0):
         began, todo = time.monotonic(), left
         with workers(request.cluster, request.workers) as client:
@@ -110,8 +111,11 @@ def _conclude(request: Request, study: Study) -> int:
         return 1
     best = study.best_trial
     say(f"best {request.goal}: {best.value:.4g}, trial {best.number}")
-    flags = " ".join(f"--set {key}={value:.6g}" for key, value in best.params.items())
-    say(f"  snakesim run {request.scenario} {flags}")
+    seeds = seeds_of(compose(request.scenario, list(map(parse_set, request.set))))
+    found = {**best.params, **dict.fromkeys(seeds, request.seed)}
+    chosen = [*request.set, *(f"{key}={value!r}" for key, value in found.items())]
+    words = ["snakesim", "run", request.scenario, "--pace", "lockstep", "--until-goal"]
+    say("  " + shlex.join([*words, *(word for one in chosen for word in ("--set", one))]))
     return 0
 
 

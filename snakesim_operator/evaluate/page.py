@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from snakesim_operator.evaluate.table import HEAD, Line, best_of, wilson
+from snakesim_operator.evaluate.table import Line, best_of, columns, wilson
 from snakesim_operator.results.page.charts import Figure
 from snakesim_operator.results.page.html import render
 
@@ -17,6 +17,7 @@ Point = tuple[float, float, float]  # middle, lower and upper end
 def page(title: str, about: str, lines: Sequence[Line], worst: Sequence[tuple[str, str, str]]) -> str:
     """The whole page. worst: the name of a case, why it failed, and the command that opens it."""
     controllers = list(dict.fromkeys(line.controller for line in lines))
+    head, *rows = columns(lines)
     return render(
         Path(__file__).parent / "evaluation.html",
         len(controllers),
@@ -32,8 +33,9 @@ def page(title: str, about: str, lines: Sequence[Line], worst: Sequence[tuple[st
             _figure("Advance, m", lines, controllers, _spread("advance_m")),
             _figure("Stood still, s", lines, controllers, _spread("stalled_s")),
         ],
-        head=HEAD,
-        rows=[line.cells for line in lines],
+        goals=any(line.crossed is not None for line in lines),
+        head=head,
+        rows=rows,
         worst=worst,
         best=best_of(lines),
     )

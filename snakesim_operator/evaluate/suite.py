@@ -155,12 +155,17 @@ def _check(config: RunConfig, table: Table, where: str) -> None:
         raise ConfigError(f"{where}: {error}") from None
 
 
-def _on_field(table: Table, field: int) -> RunConfig:
-    table.put("seed", field, "--seed")
+def seeds_of(table: Table) -> list[str]:
+    """The settings that a field's number stands for."""
     scene = table.values.get("scene")
     random_fields = scene.get("random_field") if isinstance(scene, dict) else None
-    for i in range(len(random_fields) if isinstance(random_fields, list) else 0):
-        table.put(f"scene.random_field.{i}.seed", field, "--seed")
+    count = len(random_fields) if isinstance(random_fields, list) else 0
+    return ["seed", *(f"scene.random_field.{i}.seed" for i in range(count))]
+
+
+def _on_field(table: Table, field: int) -> RunConfig:
+    for key in seeds_of(table):
+        table.put(key, field, "--seed")
     return decode(table, RunConfig)
 
 

@@ -78,14 +78,20 @@ def lines_of(cases: Sequence[Case], done: Results) -> list[Line]:
     return list(found.values())
 
 
-def table(lines: Sequence[Line]) -> list[str]:
-    """For a terminal. Speed, energy and time are medians of the runs that crossed, the others of all runs."""
+def columns(lines: Sequence[Line]) -> list[list[str]]:
+    """HEAD, and the cells of each line, without the columns of which nothing is known."""
     rows = [list(HEAD), *(line.cells for line in lines)]
     keep = [i for i in range(len(HEAD)) if i < 2 or any(row[i].strip(UNKNOWN) for row in rows[1:])]
-    widths = [max(len(row[i]) for row in rows) for i in keep]
+    return [[row[i] for i in keep] for row in rows]
+
+
+def table(lines: Sequence[Line]) -> list[str]:
+    """For a terminal. Speed, energy and time are medians of the runs that crossed, the others of all runs."""
+    rows = columns(lines)
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     texts: list[str] = []
     for row in rows:
-        cells = [row[i].ljust(width) if i < 2 else row[i].rjust(width) for i, width in zip(keep, widths, strict=True)]
+        cells = [cell.ljust(w) if i < 2 else cell.rjust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True))]
         texts.append("  ".join(cells).rstrip())
     return texts
 

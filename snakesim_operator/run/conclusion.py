@@ -82,6 +82,10 @@ def _leave(files: RunFiles, ending: Ending, outcome: Outcome, host: HostRecord) 
         return ["nothing was recorded"]
     try:
         record, summary = leave(files, files.folder, ending, outcome)
+        if extras.has("report"):
+            from snakesim_operator.results.report.verdict import verdict
+
+            say(verdict(record, summary).words)
         _print_summary(summary)
     except ConfigError as error:
         _print_host(host)

@@ -2,6 +2,8 @@
 
 import json
 import os
+import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -13,7 +15,7 @@ import pytest
 
 from snakesim_hal.host.recorder import HOST_RECORD
 from snakesim_operator.results.record import REPORT
-from tests.e2e.command import SNAKESIM, Ended, environment, free_endpoint, snakesim, wait_until
+from tests.e2e.command import SNAKESIM, Ended, environment, free_endpoint, run_to_summary, snakesim, wait_until
 
 pytestmark = pytest.mark.e2e
 
@@ -106,6 +108,7 @@ def test_the_table_tells_what_was_crossed(undisturbed: tuple[Ended, Path]) -> No
     assert done(out) == CASES and all((out / name).is_file() for name in TABLES)
 
 
+@pytest.mark.slow
 def test_it_can_be_repeated(home: Path, undisturbed: tuple[Ended, Path]) -> None:
     again = evaluate(home, "again", "--workers", "1")
     assert table_of(again) == table_of(undisturbed[0])
@@ -197,6 +200,8 @@ def test_a_sweep_runs_every_value(home: Path) -> None:
     ended = snakesim("sweep", "peg_row", *given, "--out", "sweep", cwd=home)
     assert ended.code == 0, ended.out + ended.err
     assert [line.split()[1] for line in table_of(ended).splitlines()[1:4]] == ["0.02", "0.04", "0.06"]
+    page = re.sub(r"<(script|style).*?</\1>", "", (home / "sweep" / "evaluation.html").read_text(), flags=re.DOTALL)
+    assert "goal" not in ended.out and "goal" not in page and "crossed" not in ended.out + page  # it has none
 
 
 def test_a_search_goes_on_where_it_ended(home: Path) -> None:
@@ -206,4 +211,16 @@ def test_a_search_goes_on_where_it_ended(home: Path) -> None:
     assert first.code == 0 and first.out.count("trial ") >= 3, first.out + first.err
     more = snakesim(*given, "--trials", "4", cwd=home)
     assert "holds 2 trials already" in more.out and "trial 3:" in more.out, more.out + more.err
-    assert "snakesim run peg_row --set control.propulsion_n=" in more.out
+
+
+def test_what_a_search_prints_can_be_run(home: Path) -> None:
+    given = ["optimise", "clutter", "--set", "duration_s=0.5", "--set", "controller=path_following", "--seed", "2"]
+    given += ["--vary", "controllers.path_following.look_ahead_m=0.02:0.1", "--goal", "advance_m", "--trials", "1"]
+    found = snakesim(*given, cwd=home)
+    (kept,) = (home / "runs").glob("optimise-*.db")
+    assert f"runs/{kept.name} keeps all trials" in found.out, found.out + found.err
+    _, said = found.out.split("best advance_m: ")
+    command = shlex.split(said.splitlines()[1])
+    assert command.pop(0) == "snakesim"
+    again, summary = run_to_summary(home / "again", *command[1:])
+    assert again.code == 0 and f"{summary.advance_m:.4g}" == said.split(",")[0], again.out + again.err
