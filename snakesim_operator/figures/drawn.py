@@ -3,41 +3,27 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from snakesim_hal.errors import ConfigError, did_you_mean, short
 from snakesim_hal.terminal import say
 from snakesim_hal.wire.messages import Mode
+from snakesim_operator.figures.lines import STYLE, Floats, over_time
+from snakesim_operator.figures.paper import figures
 from snakesim_operator.playback.export import UNITS, arrays, table
 from snakesim_operator.results.incomplete import exit_code
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.timeline import zero_s
 
 FORMATS = (".pdf", ".svg", ".png")
-STYLE: Any = {
-    "font.size": 8.0,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.linewidth": 0.6,
-    "lines.linewidth": 1.0,
-    "legend.frameon": False,
-    "legend.fontsize": 7.0,
-    "pdf.fonttype": 42,  # text stays text: journals ask for it
-    "svg.fonttype": "none",
-    "savefig.dpi": 300.0,
-    "figure.constrained_layout.use": True,
-}
 AXES_IN = 1.5  # height of a pair of axes
 MODE_OF = {"rad": Mode.POSITION, "rad/s": Mode.VELOCITY, "N·m": Mode.TORQUE}  # by the unit of its target
 MANY = 6  # lines, from which on the legend stands beside the axes
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -77,11 +63,6 @@ def signals(record: RunRecord, names: Sequence[str], width_in: float, span_s: tu
         _draw(axes, record, given.split(","))
     _limit(every[-1], record, span_s)
     return figure
-
-
-def over_time(axes: Axes, record: RunRecord, values: Floats, name: str = "", **look: str | float) -> None:
-    """A line, (ticks,), from the first tick on."""
-    axes.plot(record.time_s - zero_s(record), values, label=name, **look)  # pyright: ignore[reportArgumentType]
 
 
 def written(figure: Figure, path: Path) -> None:
@@ -143,8 +124,6 @@ def _limit(axes: Axes, record: RunRecord, span_s: tuple[float, float]) -> None:
 
 
 def _write_paper(request: Request, record: RunRecord) -> None:
-    from snakesim_operator.figures.paper import figures
-
     folder = request.out or _within(request.run)
     if folder.suffix in FORMATS:
         raise ConfigError(f"--out {folder}: the paper's figures are several files; give a folder")

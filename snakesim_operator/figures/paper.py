@@ -14,10 +14,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon
-from numpy.typing import NDArray
 
 from snakesim_hal.errors import ConfigError
-from snakesim_operator.figures.drawn import over_time
+from snakesim_operator.figures.lines import Floats, over_time
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.instants import Balance, Instant, balanced_instants
 from snakesim_operator.results.report.timeline import (
@@ -35,7 +34,6 @@ MOMENTS = 4
 ARROW_M = 0.25  # of the strongest force
 BODY, OBSTACLE, SOLVED, COMMANDED, RESULTANT = "#9aa5b1", "#d9dde2", "#c0392b", "#2c6fbb", "black"
 MEASURED, REFERENCE = "#2c6fbb", "#c0392b"
-Floats = NDArray[np.float64]
 
 
 def figures(record: RunRecord, width_in: float, span_s: tuple[float, float]) -> dict[str, Figure]:

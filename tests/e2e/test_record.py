@@ -37,6 +37,12 @@ SHORT = ["triplet", "--duration", "5", "--seed", "7"]
 RATE_HZ = 50
 
 
+def handles(pid: int, number: signal.Signals) -> bool:
+    """Whether a process has a handler for a signal."""
+    status = Path(f"/proc/{pid}/status").read_text()
+    return bool(int(status.partition("SigCgt:")[2].split()[0], 16) >> (number - 1) & 1)
+
+
 def summary_of(out: Path) -> RunSummary:
     return msgspec.json.decode((out / SUMMARY).read_bytes(), type=RunSummary)
 
@@ -95,7 +101,9 @@ def test_a_host_that_is_stopped_is_no_complete_run(tmp_path: Path, when: str) ->
         run.wait_for("network:")
         if when == "armed":
             run.wait_for(" s  ")
-        os.kill(run.part("host"), signal.SIGTERM)
+        host = run.part("host")
+        wait_until(lambda: handles(host, signal.SIGTERM), "a host that takes signals")
+        os.kill(host, signal.SIGTERM)
         assert run.end() == 1, run.said()
     summary = summary_of(tmp_path / "run")
     assert summary.ended.startswith("the host was stopped by a signal after ") and " of 30 s" in summary.ended

@@ -94,7 +94,7 @@ def test_a_host_that_is_started_again_leaves_the_record_of_the_one_before(tmp_pa
 
 
 class Disk:
-    """A disk that takes so many bytes of rows, or hangs; everything else goes its way."""
+    """A disk that takes so many bytes of rows, and is then full, or hangs; everything else goes its way."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, memory: int, space: int) -> None:
         self.space, self.hangs, self.goes_on = space, False, Event()
@@ -105,10 +105,10 @@ class Disk:
     def pwrite(self, handle: int, content: bytes, offset: int) -> int:
         if handle == self._memory:
             return self._pwrite(handle, content, offset)
-        if self.hangs:
-            self.goes_on.wait(30)
         room = max(self.space - offset, 0)
         if room == 0 and content:
+            if self.hangs:
+                self.goes_on.wait(30)
             raise OSError(errno.ENOSPC, "No space left on device")
         return self._pwrite(handle, content[:room], offset)
 
@@ -166,9 +166,9 @@ def test_no_tick_and_no_end_waits_for_a_disk_that_hangs(
         following(run.link, Follower()),
     ):
         with Recorder(run.host.black_box, run.host.description, partial(record_of, run.host), tmp_path, memory):
+            layout = run.host.black_box.layout
+            disk.space, disk.hangs = len(layout.header()) + 6 * layout.row_bytes, True
             run.arm()
-            wait_until(lambda: len(ticks_on_disk(tmp_path)) > 5, "the first rows")
-            disk.hangs = True
             wait_until(run.ended, "the end of the run")
         assert not disk.goes_on.is_set()  # neither the run nor its recorder's end waited for it
         assert run.host.ended == "complete" and not run.host.authority.faults
