@@ -5,8 +5,10 @@ from collections.abc import Iterator, Sequence
 from math import ceil
 from pathlib import Path
 
-from snakesim_can_backend.bus.bus import SocketCanWire, Wire
+from snakesim_can_backend.bus.adapter import open_wire
+from snakesim_can_backend.bus.bus import Wire
 from snakesim_can_backend.bus.load import (
+    BIT_RATE,
     MAX_LOAD,
     MIN_RATE_HZ,
     Reports,
@@ -14,6 +16,7 @@ from snakesim_can_backend.bus.load import (
     busiest_s,
     fits,
     load,
+    mbit,
     on_bus,
     reports_at,
     reports_of,
@@ -26,6 +29,7 @@ from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.definitions import FIRST_NODE, LAST_NODE, Opcode
 from snakesim_can_backend.protocol.expanded import EXPANDED, expanded_dbc
 from snakesim_can_backend.settings import Settings
+from snakesim_hal.arguments import number
 from snakesim_hal.model.files import Table, decode
 from snakesim_hal.model.scenario import Loaded, Override, RunConfig, parse_set
 from snakesim_hal.model.scenario import load as load_scenario
@@ -62,7 +66,10 @@ def parser() -> argparse.ArgumentParser:
     answering = commands.add_parser(
         "scan", help="list every module that answers; sends only identify, and changes nothing"
     )
-    answering.add_argument("channel", nargs="+", help="SocketCAN interface, such as can0")
+    answering.add_argument("channel", nargs="+", help="SocketCAN interface such as can0, or slcan:/dev/ttyACM0")
+    answering.add_argument(
+        "--bit-rate", type=number(10_000, 1_000_000, "bit/s"), default=BIT_RATE, help="of an adapter (1000000)"
+    )
     answering.add_argument("--seconds", type=_seconds, default=1.0, help="how long to listen on each (default: 1)")
     answering.set_defaults(act=_scan)
 
@@ -122,7 +129,8 @@ def table(
         cells = [_cell(ceil(count / buses), reports_at(rate, config, settings)) for rate in rates]
         yield f"{count:6}" + "".join(f"{cell:>16}" for cell in cells)
     on = "one bus" if buses == 1 else f"the fullest of {buses} buses"
-    yield f"Worst-case load of {on}, 1 Mbit/s; above {MAX_LOAD:.0%}, or with too long a period, it is refused."
+    of = mbit(settings.bit_rate)
+    yield f"Worst-case load of {on}, {of}; above {MAX_LOAD:.0%}, or with too long a period, it is refused."
 
 
 def _cell(joints: int, reports: Reports) -> str:
@@ -135,7 +143,7 @@ def _cell(joints: int, reports: Reports) -> str:
 def _scan(arguments: argparse.Namespace) -> int:
     found = 0
     for channel in arguments.channel:
-        wire = SocketCanWire(channel)
+        wire = open_wire(channel, bit_rate=arguments.bit_rate)
         try:
             rows = scan(wire, arguments.seconds)
         finally:

@@ -12,8 +12,11 @@ from snakesim_hal.wire.quantities import from_zero
 class Settings(FileStruct, frozen=True, kw_only=True):
     """Buses, modules on them, and their reports."""
 
-    # SocketCAN interfaces, tail to head. Empty: a virtual bus in this process, with module twins on it.
-    channels: Annotated[list[Annotated[str, Meta(min_length=1, max_length=15)]], Meta(max_length=8)] = []
+    # Buses, tail to head: SocketCAN interfaces such as can0, or INTERFACE:CHANNEL of python-can, such as
+    # slcan:/dev/ttyACM0. Empty: a virtual bus in this process, with module twins on it.
+    channels: Annotated[list[Annotated[str, Meta(min_length=1, max_length=127)]], Meta(max_length=8)] = []
+    # Of the buses: loads are computed for it, and adapters set to it. A kernel interface has that of `ip link`.
+    bit_rate: Annotated[int, Meta(ge=10_000, le=1_000_000, extra_json_schema={"unit": "bit/s"})] = 1_000_000
     # Number of joints of each channel, tail to head. Empty: distributed evenly.
     joints_per_channel: Annotated[list[Annotated[int, Meta(ge=1, le=LAST_NODE)]], Meta(max_length=8)] = []
     # Where module twins run: `here` (virtual bus), as a `process` that this one starts, or `none`: real modules, or

@@ -12,6 +12,7 @@ Kind = Literal[
     "interface_down",
     "interface_up",
     "queue_full",
+    "not_sent",
     "receive_overflow",
     "error_frames",
 ]

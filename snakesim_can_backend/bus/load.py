@@ -23,6 +23,11 @@ FRAME_BITS = 47
 STUFFED_FROM = 34
 
 
+def mbit(bit_rate: int) -> str:
+    """In words."""
+    return f"{bit_rate / 1e6:g} Mbit/s"
+
+
 def worst_bits(length: int) -> int:
     """Bits of a frame with `length` bytes, with the maximum of stuff bits."""
     return FRAME_BITS + 8 * length + (STUFFED_FROM + 8 * length - 1) // 4
@@ -36,6 +41,7 @@ class Reports:
     contact_every: int = 1  # Syncs; 0: never
     imu_every: int = 20
     tail: bool = True  # a module on the bus sends TailContact
+    bit_rate: int = BIT_RATE
 
 
 @dataclass(frozen=True)
@@ -72,14 +78,14 @@ def streams(joints: int, reports: Reports) -> list[Stream]:
 
 def load(joints: int, reports: Reports) -> float:
     """Worst-case load of a bus, as a share of its time."""
-    return sum(stream.bits_per_s for stream in streams(joints, reports)) / BIT_RATE
+    return sum(stream.bits_per_s for stream in streams(joints, reports)) / reports.bit_rate
 
 
 def busiest_s(joints: int, reports: Reports) -> float:
     """Bus time of one period in which forces are reported: Sync, all answers, all set-points, at worst."""
     once = streams(joints, Reports(1.0, min(reports.contact_every, 1), 0, reports.tail))
     each_period = (Opcode.SYNC, Opcode.SET_POINT, Opcode.JOINT_STATE, Opcode.CONTACT, Opcode.TAIL_CONTACT)
-    return sum(stream.bits_per_s for stream in once if stream.opcode in each_period) / BIT_RATE
+    return sum(stream.bits_per_s for stream in once if stream.opcode in each_period) / reports.bit_rate
 
 
 def fits(joints: int, reports: Reports) -> bool:
@@ -104,7 +110,7 @@ def reports_at(rate_hz: float, config: RunConfig, settings: Settings) -> Reports
     if sensors.contacts is not None:
         contact_hz = sensors.contacts.rate_hz if settings.contact_rate_hz is None else settings.contact_rate_hz
     imu_hz = min(settings.imu_rate_hz, sensors.imu.rate_hz) if sensors.imu is not None else 0.0
-    return Reports(rate_hz, every(rate_hz, contact_hz), every(rate_hz, imu_hz))
+    return Reports(rate_hz, every(rate_hz, contact_hz), every(rate_hz, imu_hz), bit_rate=settings.bit_rate)
 
 
 def shares(config: RunConfig, settings: Settings) -> list[int]:
@@ -166,10 +172,13 @@ def arithmetic(joints: int, reports: Reports) -> list[str]:
             bits = worst_bits(layout.length)
             lines.append(
                 f"  {layout.name:<14}{stream.frames_per_s:7.0f} frames/s x {bits:3d} bits ({layout.length} bytes)"
-                f" = {100 * stream.bits_per_s / BIT_RATE:5.1f} %"
+                f" = {100 * stream.bits_per_s / reports.bit_rate:5.1f} %"
             )
     total = 100 * load(joints, reports)
-    return [*lines, f"  together {total:.1f} % of 1 Mbit/s at worst-case stuffing; at most {MAX_LOAD:.0%}"]
+    return [
+        *lines,
+        f"  together {total:.1f} % of {mbit(reports.bit_rate)} at worst-case stuffing; at most {MAX_LOAD:.0%}",
+    ]
 
 
 def what_fits(joints: Sequence[int], config: RunConfig, settings: Settings) -> str:

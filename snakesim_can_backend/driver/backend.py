@@ -12,9 +12,10 @@ from pathlib import Path
 
 import msgspec
 
-from snakesim_can_backend.bus.bus import OtherEnd, SocketCanWire, VirtualWire, Wire, check_interface, wait
+from snakesim_can_backend.bus.adapter import check_channel, open_wire
+from snakesim_can_backend.bus.bus import OtherEnd, VirtualWire, Wire, wait
 from snakesim_can_backend.bus.bus_errors import BusError
-from snakesim_can_backend.bus.load import BIT_RATE, Reports, check_load, reports_of, shares, worst_bits
+from snakesim_can_backend.bus.load import Reports, check_load, reports_of, shares, worst_bits
 from snakesim_can_backend.bus.log import LoggedWire, open_log
 from snakesim_can_backend.driver.bring_up import Bus, configure, discovery_errors, find
 from snakesim_can_backend.driver.mocap import MocapReceiver, check_pose, pose_address
@@ -71,7 +72,7 @@ class CanBackend:
         check_twins(config, settings)
         check_faults(config, settings)
         for channel in settings.channels:
-            check_interface(channel)
+            check_channel(channel)
         return ("realtime",) if settings.twins_run == "none" else ("lockstep", "realtime")
 
     def __init__(self, config: RunConfig, settings: Settings) -> None:
@@ -260,7 +261,7 @@ class CanBackend:
         names = settings.channels or [f"virtual-{uuid.uuid4().hex[:8]}"]
         for name in names:
             if settings.channels:
-                self._wires.append(SocketCanWire(name))
+                self._wires.append(open_wire(name, bit_rate=settings.bit_rate))
             else:
                 self._local_twins = twins_here(self._config, settings, name, pose, stepped=self._lockstep)
                 self._wires.append(VirtualWire(name, self._local_twins))
@@ -427,5 +428,5 @@ class CanBackend:
 def _answer_time_s(buses: list[Bus], reports: Reports) -> float:
     """How long all answers to a Sync may take on the fullest bus; the rest of the period is for the controller."""
     frames = max(len(bus.nodes) for bus in buses) * (1 + (reports.contact_every > 0)) + reports.tail
-    bus_s = frames * worst_bits(8) / BIT_RATE
+    bus_s = frames * worst_bits(8) / reports.bit_rate
     return min(ANSWER_MARGIN * bus_s + ANSWER_SLACK_S, MAX_OF_PERIOD / reports.rate_hz)

@@ -7,7 +7,7 @@
 `motors`      all motors as vectors; their heat is `snakesim_hal.model.thermal`
 `module_sensors`  sensor readings, with their noise; `reports` rounds them as the bus does; `frames` are the layouts
 `module_slot` a module's place on a bus, and its injected faults
-`bus_time`    timing of a bus of 1 Mbit/s: arbitration, and load
+`bus_time`    timing of a bus: arbitration, and load
 `faults`      injected faults
 `inertia`     a plant without physics: every joint an inertia of its own
 

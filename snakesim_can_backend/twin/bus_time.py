@@ -1,4 +1,4 @@
-"""Emulates the timing of a bus of 1 Mbit/s for frames on a bus without a bit rate.
+"""Emulates the timing of a bus for frames on a bus without a bit rate.
 
 Every frame takes as long as with the maximum of stuff bits. A module's frames wait in its order;
 whenever the bus is free the lowest id among the first of all modules wins it. The host's frames are seen only after
@@ -14,8 +14,6 @@ from snakesim_can_backend.bus.load import BIT_RATE, worst_bits
 from snakesim_can_backend.protocol.definitions import NODE_BITS, Frame, Opcode
 
 OPCODES = 32
-US_PER_BIT = 1e6 / BIT_RATE
-FRAME_US = [worst_bits(length) * US_PER_BIT for length in range(9)]
 MAX_AHEAD_US = 20_000.0  # of frames that the host sends faster than any bus could carry
 IN_ORDER = frozenset((Opcode.PARAMETER_ANSWER,))  # each answers another question: none replaces another
 MAX_ANSWERS = 64
@@ -27,20 +25,21 @@ class Traffic:
 
     now_us: float
     frames: tuple[int, ...]
-    bits: tuple[float, ...]
+    busy_us: tuple[float, ...]
     replaced: int  # frames that were replaced by newer ones before the bus was free
     late_us: float  # the longest that a frame waited for the bus
 
     def load_since(self, before: "Traffic") -> float:
         """Load of the bus, as a share of time."""
         took = self.now_us - before.now_us
-        return (sum(self.bits) - sum(before.bits)) * US_PER_BIT / took if took > 0 else 0.0
+        return (sum(self.busy_us) - sum(before.busy_us)) / took if took > 0 else 0.0
 
 
 class BusTime:
     """One bus. Times are microseconds, and must not go backward."""
 
-    def __init__(self) -> None:
+    def __init__(self, bit_rate: int = BIT_RATE) -> None:
+        self.frame_us = [worst_bits(length) * 1e6 / bit_rate for length in range(9)]
         self._free_us = 0.0
         self._waiting: dict[int, dict[int, tuple[Frame, float]]] = {}  # sender -> slot -> frame, since when
         self._first: list[tuple[int, int, int]] = []  # heap: id, sender, slot of the first frame of every sender
@@ -48,13 +47,13 @@ class BusTime:
         self._through: list[Frame] = []
         self._answers = 0
         self._endless: dict[int, Frame] = {}
-        self._frames, self._bits = [0] * OPCODES, [0.0] * OPCODES
+        self._frames, self._busy_us = [0] * OPCODES, [0.0] * OPCODES
         self._replaced, self._late_us = 0, 0.0
 
     def heard(self, frame: Frame, now_us: float) -> None:
         """A frame of the host has arrived."""
         self._proceed(now_us)
-        took = FRAME_US[len(frame.data)]
+        took = self.frame_us[len(frame.data)]
         self._free_us = min(max(self._free_us, now_us) + took, now_us + MAX_AHEAD_US)
         self._count(frame, took)
 
@@ -87,11 +86,11 @@ class BusTime:
         if not self._first:
             return inf
         frame, since = self._waiting[self._first[0][1]][self._first[0][2]]
-        return max(self._free_us, since) + FRAME_US[len(frame.data)]
+        return max(self._free_us, since) + self.frame_us[len(frame.data)]
 
     def count(self, frame: Frame) -> None:
         """Add the bus time of a frame that is not delivered."""
-        self._count(frame, FRAME_US[len(frame.data)])
+        self._count(frame, self.frame_us[len(frame.data)])
 
     def babble(self, sender: int, frame: Frame | None, now_us: float) -> None:
         """From now on a module repeats a frame, as often as the bus allows; None ends that."""
@@ -104,7 +103,7 @@ class BusTime:
 
     def traffic(self, now_us: float) -> Traffic:
         """Traffic of the bus until now."""
-        return Traffic(now_us, tuple(self._frames), tuple(self._bits), self._replaced, self._late_us)
+        return Traffic(now_us, tuple(self._frames), tuple(self._busy_us), self._replaced, self._late_us)
 
     def _proceed(self, now_us: float) -> None:
         """Run the bus until now; a frame that would begin now waits for others that are offered now."""
@@ -128,7 +127,7 @@ class BusTime:
     def _begin(self, sender: int, slot: int, frame: Frame, since_us: float, start_us: float) -> None:
         queue = self._waiting[sender]
         del queue[slot]
-        took = FRAME_US[len(frame.data)]
+        took = self.frame_us[len(frame.data)]
         if sender in self._endless and slot == self._endless[sender].id:
             queue[slot] = (self._endless[sender], start_us + took)
         if queue:
@@ -142,14 +141,14 @@ class BusTime:
     def _count(self, frame: Frame, took_us: float) -> None:
         opcode = frame.id >> NODE_BITS
         self._frames[opcode] += 1
-        self._bits[opcode] += took_us / US_PER_BIT
+        self._busy_us[opcode] += took_us
 
 
 def by_opcode(before: Traffic, after: Traffic) -> list[tuple[Opcode, int, float]]:
     """Traffic between two points in time: message, frames, share of time; only messages that occurred."""
     took_us = max(after.now_us - before.now_us, 1.0)
     return [
-        (opcode, frames, (after.bits[opcode] - before.bits[opcode]) * US_PER_BIT / took_us)
+        (opcode, frames, (after.busy_us[opcode] - before.busy_us[opcode]) / took_us)
         for opcode in Opcode
         if (frames := after.frames[opcode] - before.frames[opcode])
     ]

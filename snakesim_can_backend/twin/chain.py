@@ -16,7 +16,7 @@ import msgspec
 from snakesim_can_backend.bus.load import shares
 from snakesim_can_backend.protocol.definitions import BROADCAST, FROM_HOST, Frame, Opcode, Parameter, node_of, opcode_of
 from snakesim_can_backend.settings import Settings
-from snakesim_can_backend.twin.bus_time import FRAME_US, BusTime, Traffic
+from snakesim_can_backend.twin.bus_time import BusTime, Traffic
 from snakesim_can_backend.twin.faults import parse
 from snakesim_can_backend.twin.firmware import BOOT_US, Module
 from snakesim_can_backend.twin.frames import LENGTHS, read_sync
@@ -59,7 +59,7 @@ class ModuleChain:
         self._heat_limits = HeatLimits(robot.limits.derate_from_c, robot.limits.stop_at_c)
         self.motors = Motors(robot, plant.step_s)
         self.thermal = Thermal(self.count, robot.limits.torque_nm, self._heat_limits)
-        self.buses = [BusTime() for _ in self.counts]
+        self.buses = [BusTime(settings.bit_rate) for _ in self.counts]
         self.now_us = 0.0  # module time: since the twins were started
         self.skipped_us = 0.0  # time in which this process did not run
         self.refused = 0  # frames that no host sends
@@ -143,9 +143,10 @@ class ModuleChain:
             due_us = min(due_us, slot.module.poll(now_us))
             self._follow_up(slot)
         for slot, since_us in self._babblers.items():
-            burst = int((now_us - since_us) / FRAME_US[8])
+            frame_us = self.buses[slot.channel].frame_us[8]
+            burst = int((now_us - since_us) / frame_us)
             self._out[slot.channel].extend([slot.module.heartbeat(now_us)] * burst)
-            self._babblers[slot] = since_us + burst * FRAME_US[8]
+            self._babblers[slot] = since_us + burst * frame_us
         self._due_us = now_us if self._babblers else due_us
 
     # --- frames from the bus -------------------------------------------------------------------------------

@@ -9,8 +9,9 @@ from contextlib import ExitStack
 
 import msgspec
 
-from snakesim_can_backend.bus.bus import SocketCanWire, wait
-from snakesim_can_backend.bus.load import shares
+from snakesim_can_backend.bus.adapter import is_emulated, open_wire
+from snakesim_can_backend.bus.bus import Wire, wait
+from snakesim_can_backend.bus.load import mbit, shares
 from snakesim_can_backend.protocol.definitions import FROM_HOST
 from snakesim_can_backend.settings import Settings
 from snakesim_can_backend.twin.bus_time import Traffic, by_opcode
@@ -26,7 +27,6 @@ from snakesim_hal.terminal import report_error, say
 OK, FAILED, BAD_INPUT = 0, 1, 2
 DEFAULT_CHANNEL = "vcan0"
 DEFAULT_POSE, NO_POSE = "127.0.0.1:7450", "none"
-VIRTUAL = "vcan"
 STATS_EVERY_S = 1.0
 LONGEST_PAUSE_S = 0.5  # until a stop signal is checked
 
@@ -57,7 +57,12 @@ def parser() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add("scenario", help="name of a shipped scenario, or path of a scenario file or a run's config.json")
-    add("--channel", action="append", metavar="vcan0", help="interface; repeat for several buses, tail to head")
+    add(
+        "--channel",
+        action="append",
+        metavar="vcan0",
+        help="interface, or INTERFACE:CHANNEL of python-can; repeat, tail to head",
+    )
     add("--plant", help="body that the motors move: mujoco, inertia, or ./file.py:Class")
     add("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change any value; may be repeated")
     add("--fault", action="append", default=[], metavar="KIND:JOINT@START[-END]", help="inject a fault, at this time")
@@ -88,13 +93,13 @@ def _serve(arguments: argparse.Namespace, open_things: ExitStack) -> int:
     if arguments.pose != NO_POSE:
         send_pose = PoseSender(arguments.pose)
         open_things.callback(send_pose.close)
-    wires: list[SocketCanWire] = []
+    wires: list[Wire] = []
     for channel in settings.channels:
-        wires.append(SocketCanWire(channel, FROM_HOST))
+        wires.append(open_wire(channel, FROM_HOST, settings.bit_rate))
         open_things.callback(wires[-1].close)
     plant = make_plant(loaded.config, settings)
     chain = ModuleChain(loaded.config, settings, plant, stepped=arguments.stepped, send_pose=send_pose)
-    loop = Loop(TwinServer(wires, chain), arguments)
+    loop = Loop(TwinServer(wires, chain), arguments, settings.bit_rate)
     on_stop_signal(loop.stop)
     tune_garbage_collector()
     count = loaded.config.robot.chain.modules
@@ -126,17 +131,18 @@ def _settings(arguments: argparse.Namespace, loaded: Loaded) -> Settings:
 
 def _check_channels(channels: Sequence[str], *, on_real_bus: bool) -> None:
     for channel in channels:
-        if not channel.startswith(VIRTUAL) and not on_real_bus:
+        if not is_emulated(channel) and not on_real_bus:
             raise ConfigError(
                 f"--channel {channel}: this does not look like a virtual bus, and emulated modules beside real ones "
-                f"with the same node ids are dangerous. Use an interface called {VIRTUAL}..., or add --on-real-bus"
+                "with the same node ids are dangerous. Use an interface called vcan..., or add --on-real-bus"
             )
 
 
 class Loop:
     """Serves until it is stopped, and keeps count."""
 
-    def __init__(self, server: TwinServer, arguments: argparse.Namespace) -> None:
+    def __init__(self, server: TwinServer, arguments: argparse.Namespace, bit_rate: int) -> None:
+        self._bit_rate = bit_rate
         self._server, self._chain = server, server.chain
         self._duration_s, self._stats = arguments.duration, arguments.stats
         self._interactive = arguments.interactive
@@ -175,8 +181,8 @@ class Loop:
         for wire, before, after in zip(self._server.wires, self._start, self._chain.traffic(), strict=True):
             frames = sum(after.frames) - sum(before.frames)
             lines.append(
-                f"{wire.channel}: {frames} frames, {after.load_since(before):.1%} of 1 Mbit/s; longest wait for the "
-                f"bus {after.late_us / 1e3:.1f} ms, {after.replaced} frames replaced by newer ones"
+                f"{wire.channel}: {frames} frames, {after.load_since(before):.1%} of {mbit(self._bit_rate)}; "
+                f"longest wait for the bus {after.late_us / 1e3:.1f} ms, {after.replaced} frames replaced by newer ones"
             )
             lines += [f"  {op.name.lower():<18}{n:8d} frames {share:7.2%}" for op, n, share in by_opcode(before, after)]
         if self._server.unsent:

@@ -156,7 +156,7 @@ def test_a_module_that_only_says_who_it_is_has_nothing_made_up() -> None:
 
 
 def test_scan_of_an_empty_bus_is_a_failure(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(can_command, "SocketCanWire", VirtualWire)
+    monkeypatch.setattr(can_command, "open_wire", lambda name, bit_rate: VirtualWire(name))
     assert main(["scan", f"scan-{uuid.uuid4().hex[:8]}", "--seconds", "0.05"]) == 1
     assert "no module answers" in capsys.readouterr().out
 

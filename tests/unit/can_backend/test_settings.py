@@ -10,7 +10,8 @@ from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.files import Table, decode
 
 GOOD: dict[str, Any] = {
-    "channels": ["can0", "can1"],
+    "channels": ["can0", "slcan:/dev/ttyACM0"],
+    "bit_rate": 500_000,
     "joints_per_channel": [6, 7],
     "twins": "process",
     "plant": "mujoco",
@@ -53,7 +54,8 @@ def test_where_twins_run(section: dict[str, Any], where: str) -> None:
     ("key", "value", "wanted"),
     [
         ("channels", "can0", "array"),
-        ("channels", ["an_interface_name_that_is_long"], "15"),
+        ("channels", [""], "at least 1"),
+        ("bit_rate", 2_000_000, "bit/s"),
         ("channels", [f"can{i}" for i in range(9)], "8"),
         ("joints_per_channel", [63], "62"),
         ("joints_per_channel", [6.5], "int"),

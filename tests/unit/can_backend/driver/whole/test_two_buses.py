@@ -67,8 +67,8 @@ def two_buses(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[list[int]],
     real = Settings(channels=channels, joints_per_channel=[3, 1], twins="process", plant="inertia")
     chain = ModuleChain(run, real, InertiaPlant(run, InertiaSettings()), stepped=True)
     end = OneChain(TwinServer([VirtualWire(name) for name in channels], chain))
-    monkeypatch.setattr(backend_module, "check_interface", lambda _channel: None)
-    monkeypatch.setattr(backend_module, "SocketCanWire", lambda name: RecordedWire(name, end))
+    monkeypatch.setattr(backend_module, "check_channel", lambda _channel: None)
+    monkeypatch.setattr(backend_module, "open_wire", lambda name, bit_rate: RecordedWire(name, end))
     monkeypatch.setattr(backend_module, "TwinProcess", NoProcess)
     opened: list[CanBackend] = []
 

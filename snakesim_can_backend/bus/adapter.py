@@ -1,0 +1,143 @@
+"""A bus through any adapter that python-can opens, and which of the wires a channel is.
+
+A channel is a SocketCAN interface (`can0`), or `INTERFACE:CHANNEL` of python-can: `slcan:/dev/ttyACM0`,
+`pcan:PCAN_USBBUS1`, `kvaser:0`, `gs_usb:0`, `udp_multicast:239.74.163.2`. Its adapter is configured to the bit rate; a
+kernel interface has that of `ip link`.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Iterable
+from typing import Any
+
+import can
+
+from snakesim_can_backend.bus.bus import IO_ERRORS, MAX_AT_ONCE, SocketCanWire, Wire, check_interface
+from snakesim_can_backend.bus.bus_errors import BusError
+from snakesim_can_backend.bus.load import BIT_RATE
+from snakesim_can_backend.protocol.definitions import NODE_BITS, Frame, Opcode
+from snakesim_hal.errors import BackendError, ConfigError, did_you_mean
+
+LOCAL = ("udp_multicast", "virtual")  # interfaces without an adapter, and without a bit rate
+POLL_S = 0.0005  # of an adapter that cannot be waited for
+
+
+def open_wire(channel: str, only: Iterable[Opcode] | None = None, bit_rate: int = BIT_RATE) -> Wire:
+    """The end of a bus. only: messages to receive; None: all. Raises ConfigError and BackendError."""
+    interface, name = _parted(channel)
+    return SocketCanWire(name, only) if interface == "socketcan" else AdapterWire(channel, only, bit_rate)
+
+
+def check_channel(channel: str) -> None:
+    """Raise ConfigError unless python-can knows the interface, and the kernel the one that it is to have."""
+    interface, name = _parted(channel)
+    if interface == "socketcan":
+        check_interface(name)
+
+
+def is_emulated(channel: str) -> bool:
+    """Whether no real module can be on a bus of this name."""
+    interface, name = _parted(channel)
+    return interface in LOCAL or (interface == "socketcan" and name.startswith("vcan"))
+
+
+def _parted(channel: str) -> tuple[str, str]:
+    interface, colon, name = channel.partition(":")
+    if not colon:
+        return "socketcan", channel
+    if interface not in can.VALID_INTERFACES:
+        known = sorted(can.VALID_INTERFACES)
+        raise ConfigError(
+            f"channel {channel!r}: python-can has no interface {interface!r}; {did_you_mean(interface, known)}it has "
+            f"{', '.join(known)}"
+        )
+    if not name:
+        raise ConfigError(f"channel {channel!r}: give INTERFACE:CHANNEL, such as slcan:/dev/ttyACM0")
+    return interface, name
+
+
+class AdapterWire:
+    """One end of a bus, through python-can. Frames that are no classic data frames of 11 bits are dropped."""
+
+    def __init__(self, channel: str, only: Iterable[Opcode] | None, bit_rate: int) -> None:
+        """Raises BackendError when it cannot be opened."""
+        self.channel = channel
+        interface, name = _parted(channel)
+        settings: dict[str, Any] = {} if interface in LOCAL else {"bitrate": bit_rate}
+        if interface == "udp_multicast":
+            settings["fd"] = False
+        self._only = None if only is None else frozenset(int(opcode) for opcode in only)
+        try:
+            self._bus = can.Bus(interface=interface, channel=name, **settings)
+        except (*IO_ERRORS, ImportError, TypeError) as error:  # the last two: of a library that is missing, or too old
+            raise BackendError(f"{channel}: cannot be opened: {error}") from error
+        self._file = self._descriptor()
+        self._echoes: Counter[Frame] | None = Counter() if interface == "udp_multicast" else None  # of own frames
+        self._found: list[BusError] = []
+
+    def send(self, frame: Frame) -> bool:
+        """Send a frame; False when the adapter did not take it."""
+        try:
+            self._bus.send(can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False), timeout=0)
+        except can.CanError as error:
+            self._found.append(BusError("not_sent", self.channel, str(error)))
+            return False
+        except (OSError, ValueError) as error:
+            raise BackendError(f"{self.channel}: cannot send: {error}") from error
+        if self._echoes is not None:
+            self._echoes[frame] += 1
+        return True
+
+    def receive(self) -> list[Frame]:
+        """All received frames."""
+        frames: list[Frame] = []
+        try:
+            for _ in range(MAX_AT_ONCE):
+                if (message := self._bus.recv(0)) is None:
+                    break
+                if message.is_error_frame:
+                    self._found.append(BusError("error_frames", self.channel, "an error frame"))
+                elif self._is_wanted(message, frame := Frame(message.arbitration_id, bytes(message.data))):
+                    frames.append(frame)
+        except IO_ERRORS as error:
+            raise BackendError(f"{self.channel}: cannot receive: {error}") from error
+        return frames
+
+    def errors(self) -> list[BusError]:
+        """Error frames, and frames that were not sent, since the last call."""
+        found, self._found = self._found, []
+        return found
+
+    def fileno(self) -> int | None:
+        """Its file, where it has one."""
+        return self._file
+
+    def idle(self) -> float | None:
+        """The other end runs by itself."""
+        return math.inf if self._file is not None else POLL_S
+
+    def inject(self, kind: str, *, begins: bool) -> None:
+        """Nothing can be injected from this end."""
+        raise ConfigError(f"{self.channel}: the fault {kind} can be injected on a virtual bus or on vcan, not here")
+
+    def close(self) -> None:
+        """Close the adapter."""
+        try:
+            self._bus.shutdown()
+        except IO_ERRORS as error:
+            raise BackendError(f"{self.channel}: cannot be closed: {error}") from error
+
+    def _is_wanted(self, message: can.Message, frame: Frame) -> bool:
+        if message.is_extended_id or message.is_remote_frame or message.is_fd:
+            return False
+        if self._echoes and self._echoes[frame] > 0:  # UDP returns what one sends, and does not say whose it was
+            self._echoes[frame] -= 1
+            return False
+        return self._only is None or message.arbitration_id >> NODE_BITS in self._only
+
+    def _descriptor(self) -> int | None:
+        try:
+            number = self._bus.fileno()
+        except NotImplementedError:
+            return None
+        return number if number >= 0 else None

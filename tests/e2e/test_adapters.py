@@ -1,0 +1,58 @@
+"""A bus through python-can: two processes over UDP multicast, on the loopback of a machine of its own."""
+
+import json
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from tests.e2e.command import wait_until
+from tests.machines import Machine
+
+pytestmark = [pytest.mark.e2e, pytest.mark.skipif(os.geteuid() != 0, reason="makes a network namespace: needs root")]
+pytest.importorskip("msgpack", reason="python-can's UDP bus needs it")
+
+CHANNEL = "udp_multicast:239.74.163.2"
+SNAKESIM = str(Path(sys.executable).with_name("snakesim"))
+
+
+@pytest.fixture
+def machine() -> Iterator[Machine]:
+    with ExitStack() as stack:
+        one = Machine(stack)
+        one.run("ip", "link", "set", "lo", "multicast", "on")
+        one.run("ip", "route", "add", "239.0.0.0/8", "dev", "lo")
+        yield one
+
+
+def run(machine: Machine, folder: Path, *arguments: str) -> str:
+    where = ("--set", f'backend.channels=["{CHANNEL}"]', "--out", str(folder / "run"))
+    robot = ("triplet", "--backend", "can", "--set", "rate_hz=50", *where)
+    return machine.run(SNAKESIM, "run", *robot, *arguments, check=False, cwd=folder)
+
+
+def test_modules_of_another_program_are_found_and_driven_in_real_time(machine: Machine, tmp_path: Path) -> None:
+    log = tmp_path / "modules.log"
+    modules = machine.start(SNAKESIM, "modules", "triplet", "--channel", CHANNEL, log=log)
+    try:
+        wait_until(lambda: "modules ready: 13" in log.read_text(), "the modules")
+        found = machine.run(SNAKESIM, "can", "scan", CHANNEL)
+        assert found.count(CHANNEL) == 13, found
+        listening = ("--set", 'backend.pose_listen="127.0.0.1:7450"')
+        hold = ("--controller", "hold", "--pace", "realtime", "--duration", "2", *listening)
+        said = [""]
+        while "(exit code 0)" not in said[-1] and len(said) < 5:  # a computer that stutters stops a robot now and then
+            said.append(run(machine, tmp_path, *hold))
+        assert "(exit code 0)" in said[-1], "\n".join(said)
+    finally:
+        modules.terminate()
+        modules.wait(10)
+
+
+def test_its_own_modules_move_in_lockstep_as_on_any_bus(machine: Machine, tmp_path: Path) -> None:
+    said = run(machine, tmp_path, "--pace", "lockstep", "--duration", "2", "--set", 'backend.twins="process"')
+    assert "(exit code 0)" in said, said
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["path_distance_m"] > 0.02
