@@ -17,7 +17,7 @@ class Progress:
 
     def __init__(self, total: int) -> None:
         self._total = total
-        self._done = self._crossed = self._errors = self._shown = 0
+        self._done = self._with_goal = self._crossed = self._errors = self._shown = 0
         self._began = time.monotonic()
         self._next = self._began + PLAIN_PERIOD_S
         self._terminal = sys.stdout.isatty()
@@ -34,6 +34,7 @@ class Progress:
     def done(self, outcome: Outcome) -> None:
         """One more."""
         self._done += 1
+        self._with_goal += isinstance(outcome.numbers.get("crossed"), bool)
         self._crossed += outcome.numbers.get("crossed") is True
         self._errors += outcome.error is not None
         now = time.monotonic()
@@ -46,7 +47,9 @@ class Progress:
     def _text(self, now: float) -> str:
         passed_s = now - self._began
         left_s = passed_s / self._done * (self._total - self._done)
-        parts = [f"{self._done} of {self._total} cases", f"{self._crossed} crossed"]
+        parts = [f"{self._done} of {self._total} cases"]
+        if self._with_goal:
+            parts.append(f"{self._crossed} crossed")
         if self._errors:
             parts.append(f"{self._errors} could not run")
         return "  ".join([*parts, f"{in_minutes(passed_s)} passed, about {in_minutes(left_s)} left"])

@@ -151,9 +151,8 @@ def test_c4_who_says_too_much_is_hung_up_on(robot: Robot, at: str) -> None:
     robot.unharmed(health)
 
 
-@pytest.mark.parametrize(
-    "kind", [pytest.param("camera", marks=pytest.mark.slow), pytest.param("unknown", marks=pytest.mark.slow), "stop"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["camera", "unknown", "stop"])
 def test_c5_a_flood_costs_nobody_the_stop(
     robot: Robot, at: str, kind: str, record_property: Callable[[str, object], None]
 ) -> None:

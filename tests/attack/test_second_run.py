@@ -83,6 +83,7 @@ def test_a1_two_runs_that_start_at_once_have_a_network_each(tmp_path: Path, _tim
         assert one.endpoint != two.endpoint, f"both met at {one.endpoint}"
 
 
+@pytest.mark.slow
 def test_a14_a_stop_without_arguments_names_every_robot_of_the_machine_stopped_or_not_reached(tmp_path: Path) -> None:
     with (
         machine_of_its_own() as machine,

@@ -51,6 +51,7 @@ def test_a_page_shows_the_snake_as_it_moves_and_its_escape_key_stops_it(tmp_path
         assert not page.errors, page.errors
 
 
+@pytest.mark.slow
 def test_a_page_says_when_its_second_stop_does_not_answer_and_stops_by_it(tmp_path: Path) -> None:
     with chromium() as browser, running(tmp_path / "run", *RUN) as run:
         page = browser.open(run.console(), *SMALL)

@@ -56,6 +56,7 @@ def busy_machine() -> Iterator[None]:
             process.join(10)
 
 
+@pytest.mark.slow
 def test_a_busy_machine_and_a_host_that_is_held_up_cost_no_determinism(tmp_path: Path) -> None:
     """Control hears nothing for more than a second of wall-clock time; in lockstep no robot time passes meanwhile."""
     arguments = ["triplet", "--duration", "3", "--pace", "lockstep", "--seed", "7"]

@@ -144,6 +144,7 @@ def busy_computer(hogs: int = 12) -> Iterator[None]:
             hog.wait(10)
 
 
+@pytest.mark.slow
 def test_a_first_turn_keeps_nobody_waiting_on_a_busy_computer(tmp_path: Path) -> None:
     """Up, up, left: navigation answers each turn with a bounded share of the search, and the old path in between."""
     with running(tmp_path / "run", "peg_row", "--duration", "60", "--set", "stall_limit_s=10") as run:

@@ -61,6 +61,7 @@ def test_every_clause_has_a_backend_that_breaks_it() -> None:
     assert broken == clauses()
 
 
+@pytest.mark.slow
 def test_a_backend_that_breaks_a_clause_fails_it(tmp_path: Path) -> None:
     """One test, so that workers side by side do not run the suite several times."""
     outcomes = mutant_outcomes(tmp_path / "report.xml")
