@@ -54,7 +54,7 @@ def test_where_twins_run(section: dict[str, Any], where: str) -> None:
     ("key", "value", "wanted"),
     [
         ("channels", "can0", "array"),
-        ("channels", [""], "at least 1"),
+        ("channels", [""], "length >= 1"),
         ("bit_rate", 2_000_000, "bit/s"),
         ("channels", [f"can{i}" for i in range(9)], "8"),
         ("joints_per_channel", [63], "62"),
