@@ -13,16 +13,13 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
-import msgspec
-
 from snakesim_hal.allowed_faults import faults_of_host
 from snakesim_hal.arguments import add_host
 from snakesim_hal.backend import BackendFactory
 from snakesim_hal.errors import BackendError, ConfigError, RefusedError, SnakesimError
 from snakesim_hal.host.guarded_backend import GuardedBackend
-from snakesim_hal.host.host import Ending, Host
+from snakesim_hal.host.host import Host
 from snakesim_hal.host.latch import EstopLatch
-from snakesim_hal.host.recorder import Recorder
 from snakesim_hal.model.fault_plan import check_without_run
 from snakesim_hal.model.plugin_check import check_backend
 from snakesim_hal.model.plugins import BACKENDS, find_plugin, plugin_settings
@@ -32,37 +29,13 @@ from snakesim_hal.network.private_channel import HostEnd
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.network.stop_port import open_stop_port, serve_stops, stop_address
 from snakesim_hal.process import HOST_PRIORITY, enter_realtime, on_stop_signal, restart_process, tune_garbage_collector
+from snakesim_hal.record.host_record import HostRecord
+from snakesim_hal.record.recorder import Recorder
 from snakesim_hal.serve import ProcessOptions, joined, process_options
 from snakesim_hal.terminal import report_error
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Fault
 
 GONE_LIMIT_S = 3.0  # until the token of a dead host has vanished: longer than the lease of its connection
-
-
-class HostRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """`host.json`: the host's statistics of the run, written twice a second while it runs, and at the end."""
-
-    ticks: int  # recorded: from the first arming on
-    wall_s: float
-    overruns: int
-    answered_ticks: int
-    armed_ticks: int
-    command_digest: str
-    state_to_command_us: dict[str, float | None]
-    rejected_commands: dict[str, int]
-    limited_commands: dict[str, int]
-    faults: list[Fault]
-    lifecycle: str
-    why: str
-    ended: Ending = "complete"
-    ended_why: str = ""  # unless complete
-    lost_ticks: int = 0  # missing from the black box on disk
-    failure: str = ""  # which files could not be written, and why
-    faults_left_out: int = 0  # of `faults`, in the middle
-    injected: list[str] = []  # injected faults, each begin and end
-    requests: list[str] = []  # to arm, disarm, clear, finish or stop: by whom, and the result
-    isolated: list[str] = []  # joints that were isolated at the end
 
 
 def main(argv: Sequence[str] | None = None) -> int:

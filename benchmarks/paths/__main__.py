@@ -25,8 +25,8 @@ import numpy as np
 
 from benchmarks.paths.ways import Lab, Way
 from benchmarks.physics import config_of, wire_bytes
-from snakesim_hal.host_process import HostRecord
 from snakesim_hal.network.private_channel import StarterEnd, socket_pair
+from snakesim_hal.record.host_record import HostRecord
 from snakesim_hal.wire.messages import LifecycleRequest
 
 LOOP = Path(__file__).parents[1] / "peers" / "loop.toml"

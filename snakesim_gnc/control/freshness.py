@@ -16,8 +16,8 @@ A stamp that is further ahead of the clock than its limit is rejected as well: i
 from dataclasses import dataclass
 
 from snakesim_hal.model.scenario import RunConfig, Service
-from snakesim_hal.safety.gate import JointLimits
 from snakesim_hal.wire import keys
+from snakesim_hal.wire.freshness import oldest_state_ns
 from snakesim_hal.wire.messages import Description, JointState, Trajectory, World
 
 MISSED = 3
@@ -57,7 +57,7 @@ class Limits:
             ages_s = [sensor.delay_s + turn_s + lag_s + _margin_s(1.0 / sensor.rate_hz) for sensor in looking]
             sensors_s[DEPTH] = own.depth_s or min(ages_s)
         return Limits(
-            joints_s=own.joints_s or JointLimits.of(robot).oldest_state_ns * 1e-9,
+            joints_s=own.joints_s or oldest_state_ns(robot) * 1e-9,
             world_s=own.world_s or lag_s + _margin_s(turn_s),
             trajectory_s=own.trajectory_s or planned_s + _margin_s(plan_s),
             sensors_s=sensors_s,

@@ -2,6 +2,6 @@
 
 `host`               the loop           `inbox`, `outbox`   priority queues for input, threads for output
 `participants`       services: present, and due in lockstep     `timing`   deadlines, ages of answers
-`black_box`, `recorder`, `run_statistics`, `status_messages`    records and reports
+`run_statistics`, `status_messages`    reports
 `latch`              the emergency stop that outlives the process; `guarded_backend` turns exceptions into faults
 """

@@ -13,7 +13,7 @@ import secrets
 import time
 from collections.abc import Callable, Generator, Sequence
 from math import inf
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
 
@@ -21,7 +21,6 @@ from snakesim_hal.allowed_faults import Faults, NoFaults
 from snakesim_hal.arithmetic import measured
 from snakesim_hal.backend import Backend, Samples
 from snakesim_hal.errors import BackendError, WireError
-from snakesim_hal.host.black_box import BlackBox
 from snakesim_hal.host.inbox import Inbox, Request
 from snakesim_hal.host.latch import EstopLatch, replying
 from snakesim_hal.host.outbox import Outbox
@@ -36,6 +35,8 @@ from snakesim_hal.network.private_channel import HostEnd, ToStarter
 from snakesim_hal.network.process_entries import HOST, ProcessEntries, own_entry, show_process
 from snakesim_hal.network.run_key import own_run_key, proven
 from snakesim_hal.network.session import Session
+from snakesim_hal.record.black_box import BlackBox
+from snakesim_hal.record.host_record import Ending
 from snakesim_hal.safety.authority import Authority
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (
@@ -53,9 +54,6 @@ from snakesim_hal.wire.messages import (
     Status,
 )
 
-# Not yet; after the requested armed ticks; on request (`finish`); by a signal; by a fault, or too little armed time;
-# for another host that starts over.
-Ending = Literal["running", "complete", "finished", "stopped", "failed", "reset"]
 STATUS_PERIOD_NS = 200_000_000
 STANDBY_PERIOD_NS = 20_000_000
 STANDING_PERIOD_NS = 50_000_000  # between signs of life while a simulator is paused

@@ -3,7 +3,7 @@
 from snakesim_hal.wire.messages import Fault
 
 MAX_FAULTS_KEPT = 32
-FIRST_KEPT = MAX_FAULTS_KEPT // 2
+FIRST_KEPT = MAX_FAULTS_KEPT // 2  # as the report takes it
 
 
 class FaultLog:

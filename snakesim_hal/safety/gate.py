@@ -23,13 +23,12 @@ from numpy.typing import NDArray
 
 from snakesim_hal.backend import SetPoints
 from snakesim_hal.safety.lease import Lease
-from snakesim_hal.wire import keys
+from snakesim_hal.wire.freshness import oldest_state_ns
 from snakesim_hal.wire.messages import Description, JointCommand, JointDescription, Mode
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-FRESH_PERIODS, FRESH_NS = 3, 30_000_000  # maximum age of a joint state, the longer of the two, plus its delay
 REACTION_PERIODS = 4  # the minimum that keeps joints from overshooting their end, with two periods of latency on a bus
 
 
@@ -78,7 +77,7 @@ class JointLimits:
             max_step_rad=description.max_step_rad,
             period_s=description.period_ns * 1e-9,
             lease_ns=description.lease_ns,
-            oldest_state_ns=_oldest_state_ns(description),
+            oldest_state_ns=oldest_state_ns(description),
             layout=description.layout,
             joints=tuple(joints),
         )
@@ -86,13 +85,6 @@ class JointLimits:
     def inside(self, angle_rad: Floats) -> Floats:
         """Angles clamped to the angle limits, (n_joints,)."""
         return np.clip(angle_rad, self.angle_min_rad, self.angle_max_rad)
-
-
-def _oldest_state_ns(description: Description) -> int:
-    """Shorter than the lease, so that a silent joint is a fault within the lease."""
-    delay_s = next((sensor.delay_s for sensor in description.sensors if sensor.key == keys.JOINTS), 0.0)
-    fresh_ns = max(FRESH_PERIODS * description.period_ns, FRESH_NS)
-    return min(fresh_ns + round(delay_s * 1e9), description.lease_ns)
 
 
 @dataclass(frozen=True)

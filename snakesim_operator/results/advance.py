@@ -6,8 +6,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.host.black_box import BlackBox
 from snakesim_hal.model.scenario import HeadingGoal, RunConfig, WaypointGoal
+from snakesim_hal.record.black_box import BlackBox
 from snakesim_hal.wire.messages import Description, Mode
 from snakesim_operator.results.record import RunRecord, nodes_w
 

@@ -10,13 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.host.black_box import Layout, digest_of, read_black_box
-from snakesim_hal.host.recorder import BLACK_BOX, DESCRIPTION, HOST_RECORD
-from snakesim_hal.host_process import HostRecord
 from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion
 from snakesim_hal.model.route import Route
 from snakesim_hal.model.scenario import RunConfig, place_all, read
 from snakesim_hal.model.scene import Placed, route_of
+from snakesim_hal.record.black_box import Layout, digest_of, read_black_box
+from snakesim_hal.record.host_record import BLACK_BOX, DESCRIPTION, HOST_RECORD, HostRecord
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import ControlState, Description, Trajectory, World

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.errors import ConfigError, WireError
-from snakesim_hal.host.black_box import digest_of, touching
-from snakesim_hal.host_process import HostRecord
+from snakesim_hal.record.black_box import digest_of, touching
+from snakesim_hal.record.host_record import HostRecord
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import (

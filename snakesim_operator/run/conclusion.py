@@ -9,10 +9,10 @@ import msgspec
 from snakesim_hal.arithmetic import digest_text
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.host.latch import ESTOP
-from snakesim_hal.host_process import HostRecord
 from snakesim_hal.model.plugins import pip_install
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.local_registry import robot_folder
+from snakesim_hal.record.host_record import HostRecord
 from snakesim_hal.terminal import say
 from snakesim_hal.wire.messages import Description
 from snakesim_operator import extras

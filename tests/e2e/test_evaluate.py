@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal.host.recorder import HOST_RECORD
+from snakesim_hal.record.host_record import HOST_RECORD
 from snakesim_operator.results.record import REPORT
 from tests.e2e.command import SNAKESIM, Ended, environment, free_endpoint, run_to_summary, snakesim, wait_until
 

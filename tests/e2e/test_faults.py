@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal.host_process import HostRecord
+from snakesim_hal.record.host_record import HostRecord
 from snakesim_operator.results.record import RunRecord
 from tests.e2e.command import Running, free_endpoint, nothing_left, run_to_summary, running, snakesim, wait_until
 from tests.whole import command

@@ -10,9 +10,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from snakesim_hal.host_process import HostRecord
 from snakesim_hal.network.session import Arrival, Link, open_session
 from snakesim_hal.network.session_file import read_session
+from snakesim_hal.record.host_record import HostRecord
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import AppliedCommand, JointCommand, JointState

@@ -9,8 +9,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from snakesim_hal.host_process import HostRecord
 from snakesim_hal.network.session_file import read_session
+from snakesim_hal.record.host_record import HostRecord
 from tests.e2e.command import SNAKESIM, Ended, environment, free_endpoint, wait_until
 from tests.whole import command
 

@@ -17,10 +17,9 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from snakesim_hal.host.black_box import read_black_box
-from snakesim_hal.host.recorder import BLACK_BOX, HOST_RECORD
-from snakesim_hal.host_process import HostRecord
 from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.record.black_box import read_black_box
+from snakesim_hal.record.host_record import BLACK_BOX, HOST_RECORD, HostRecord
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Mode, Status
 from tests.e2e.command import LIMIT_S, Running, processes_of, running, wait_until

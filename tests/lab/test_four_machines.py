@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from snakesim_hal.host_process import HostRecord
+from snakesim_hal.record.host_record import HostRecord
 from snakesim_operator.lab.lab_file import EXAMPLE
 from snakesim_operator.results.record import SUMMARY
 from snakesim_operator.results.summary import RunSummary

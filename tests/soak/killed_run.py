@@ -14,10 +14,9 @@ from typing import Literal
 import msgspec
 
 from snakesim_hal.errors import NotConnectedError
-from snakesim_hal.host.recorder import HOST_RECORD
-from snakesim_hal.host_process import HostRecord
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.network.stop_port import ask_to_stop
+from snakesim_hal.record.host_record import HOST_RECORD, HostRecord
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, EstopRequest, LifecycleRequest, Status
 from snakesim_operator.results.record import SUMMARY

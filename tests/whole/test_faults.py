@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from snakesim_hal.host_process import HostRecord
+from snakesim_hal.record.host_record import HostRecord
 from snakesim_hal.wire.messages import Mode
 from snakesim_operator.results.record import RunRecord
 from tests.whole.command import run_to_summary, snakesim

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.host.recorder import BLACK_BOX
+from snakesim_hal.record.host_record import BLACK_BOX
 from snakesim_hal.wire.messages import Mode
 from snakesim_operator.results.compare.alignment import SAME_INSTANT_S, Aligned, Joints, align
 from snakesim_operator.results.compare.settings import Setting, differences, identity

@@ -7,7 +7,6 @@ import msgspec
 from markupsafe import Markup
 from msgspec import Meta
 
-from snakesim_hal.safety.fault_log import FIRST_KEPT
 from snakesim_operator.results.page.html import render
 from snakesim_operator.results.record import CONFIG, RunRecord
 from snakesim_operator.results.report import figures
@@ -65,7 +64,7 @@ def page(record: RunRecord, summary: RunSummary) -> str:
         propelled=len({one.joint for one in intervals}),
         figures=figures,
         begin_s=zero_s(record),
-        first_kept=FIRST_KEPT,
+        first_kept=len(summary.faults) // 2,  # of a log that left some out, the first half are the first ones
         numbers=_numbers(summary),
         config_file=_config_file(record),
         config=msgspec.json.format(msgspec.json.encode(summary.config), indent=2).decode(),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from snakesim_hal.safety.authority import Authority
-from snakesim_hal.safety.gate import FRESH_NS
+from snakesim_hal.wire.freshness import FRESH_NS
 from snakesim_hal.wire.messages import Fault, JointCommand, LeaseRequest, LifecycleRequest, Mode
 from tests.unit.hal.rig import LEASE_NS
 from tests.unit.hal.safety.authority_rig import ARM, CLEAR, DISARM, ESTOP, JOINTS, ROBOT, Rig, armed, modes

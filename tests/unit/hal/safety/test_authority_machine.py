@@ -16,8 +16,8 @@ from hypothesis.stateful import initialize, invariant, precondition, rule, run_s
 from snakesim_hal.safety import authority as under_test
 from snakesim_hal.safety.authority import Authority
 from snakesim_hal.safety.fault_log import MAX_FAULTS_KEPT
-from snakesim_hal.safety.gate import FRESH_NS
 from snakesim_hal.safety.lease import Lease
+from snakesim_hal.wire.freshness import FRESH_NS
 from snakesim_hal.wire.messages import EstopRequest, Fault, JointCommand, LeaseRequest, LifecycleRequest, Mode
 from tests.unit.hal.rig import LEASE_NS, PERIOD_NS, command, description, power, state
 from tests.unit.hal.safety.authority_model import (

@@ -9,8 +9,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from snakesim_hal.safety.gate import FRESH_PERIODS, Applied, JointLimits
+from snakesim_hal.safety.gate import Applied, JointLimits
 from snakesim_hal.safety.plausibility import Mask, PlausibilityCheck, readable
+from snakesim_hal.wire.freshness import FRESH_PERIODS
 from snakesim_hal.wire.messages import Fault, JointState, Mode
 from tests.unit.hal.rig import LEASE_NS, PERIOD_NS, description, state
 

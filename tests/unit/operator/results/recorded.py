@@ -9,8 +9,8 @@ from typing import Any
 
 import msgspec
 
-from snakesim_hal.host_process import HostRecord
 from snakesim_hal.model.scenario import load
+from snakesim_hal.record.host_record import HostRecord
 from snakesim_operator.results.page.html import LIBRARY
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report import page as report_page

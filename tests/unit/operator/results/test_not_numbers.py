@@ -13,10 +13,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from snakesim_hal.host.black_box import Layout
-from snakesim_hal.host.recorder import BLACK_BOX, DESCRIPTION, HOST_RECORD
 from snakesim_hal.model.scenario import write
 from snakesim_hal.network.session import Arrival
+from snakesim_hal.record.black_box import Layout
+from snakesim_hal.record.host_record import BLACK_BOX, DESCRIPTION, HOST_RECORD
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encoding_of
 from snakesim_operator.recording.message import RECORDING

@@ -16,14 +16,12 @@ from typing import Protocol, Self
 
 import msgspec
 
-from snakesim_hal.host.black_box import BlackBox
 from snakesim_hal.model.whole_file import write_whole
+from snakesim_hal.record.black_box import BlackBox
+from snakesim_hal.record.host_record import BLACK_BOX, DESCRIPTION, HOST_RECORD
 from snakesim_hal.terminal import print_stderr
 from snakesim_hal.wire.messages import Description
 
-BLACK_BOX = "blackbox.rows"
-DESCRIPTION = "description.json"
-HOST_RECORD = "host.json"
 PERIOD_S = 0.5
 CLOSE_LIMIT_S = 2.0  # for a disk that hangs
 

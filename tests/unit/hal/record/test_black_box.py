@@ -10,7 +10,7 @@ import pytest
 
 from snakesim_hal.backend import Samples, SetPoints
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.host.black_box import BlackBox, digest_of, read_black_box
+from snakesim_hal.record.black_box import BlackBox, digest_of, read_black_box
 from snakesim_hal.safety.authority import Decision
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Contact, Contacts, Mode
