@@ -9,12 +9,12 @@ from typing import Any
 
 import msgspec
 
+from snakesim.configuration import checked, overrides_of
 from snakesim.controllers import Given, named
 from snakesim.result import Result
 from snakesim_hal.errors import ConfigError, ControllerError, SnakesimError, short
-from snakesim_hal.model.plugin_check import check_plugins
 from snakesim_hal.model.plugins import CONTROLLERS, offered
-from snakesim_hal.model.scenario import Override, RunConfig, load
+from snakesim_hal.model.scenario import Override, RunConfig
 from snakesim_operator.results.record import SUMMARY, RunRecord
 from snakesim_operator.results.summary import RunSummary
 from snakesim_operator.run.conclusion import INTERRUPTED
@@ -47,7 +47,7 @@ def run(
     """
     if not isinstance(scenario, str | os.PathLike):
         raise ConfigError(f"run({scenario!r:.60}): give a scenario's name, such as 'triplet', or the path of its file")
-    overrides = _overrides(set, duration_s=duration, seed=seed, backend=backend)
+    overrides = overrides_of(set, duration_s=duration, seed=seed, backend=backend)
     with contextlib.ExitStack() as opened:
         if controller is not None:
             name, plugin = named(controller)
@@ -59,39 +59,9 @@ def run(
                         "this program; save it in a file, and give its path, such as controller='./mine.py:Mine'"
                     )
                 opened.enter_context(offered(CONTROLLERS, name, plugin))
-        config = _checked(os.fspath(scenario), overrides, processes=processes)
+        config = checked(os.fspath(scenario), overrides, processes=processes)
         folder = None if out is None else Path(out)
         return _in_processes(config, folder) if processes else _in_this_process(config, folder)
-
-
-def _overrides(given: Mapping[str, Any] | None, **arguments: Any) -> list[Override]:
-    if given is not None and not (isinstance(given, Mapping) and all(isinstance(key, str) for key in given)):
-        raise ConfigError(f"set={given!r:.60}: give a mapping of dotted keys, such as {{'control.propulsion_n': 35}}")
-    values = {key: value for key, value in arguments.items() if value is not None}
-    found = [Override(key, _plain(value), f"{key.removesuffix('_s')}={value!r:.60}") for key, value in values.items()]
-    return found + [
-        Override(key, _plain(value), f"set={{{key!r}: {value!r:.60}}}") for key, value in (given or {}).items()
-    ]
-
-
-def _plain(value: Any) -> Any:
-    """Of a NumPy number or array the Python one; of a path its text."""
-    if isinstance(value, os.PathLike):
-        return os.fspath(value)
-    return value.tolist() if hasattr(value, "tolist") else value
-
-
-def _checked(scenario: str, overrides: list[Override], *, processes: bool) -> RunConfig:
-    pace = next((override for override in overrides if override.key == "pace"), None)
-    if pace is None and not processes:  # the only one there is in one process
-        overrides = [*overrides, Override("pace", "lockstep", "one process")]
-    loaded = load(scenario, overrides)
-    if pace is not None and not processes and loaded.config.pace != "lockstep":
-        raise ConfigError(f"{pace.flag}: in one process the pace is lockstep; leave it out, or add processes=True")
-    config = check_plugins(loaded.config, loaded.table)
-    if pace is not None and config.pace != pace.value:
-        raise ConfigError(f"{pace.flag}: backend {config.backend!r} cannot keep this pace, only {config.pace}")
-    return config
 
 
 def _in_this_process(config: RunConfig, out: Path | None) -> Result:

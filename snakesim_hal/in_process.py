@@ -107,8 +107,10 @@ class InProcessRun:
             loop = self._loops[name] = ServiceLoop(find_service(config, name), config, session)
             part.callback(loop.close)
 
-    def turns(self) -> Generator[None]:
+    def turns(self, *, before_services: bool = False) -> Generator[None]:
         """Run. Yields after each turn of all parts, also before the arming. Raises SnakesimError when it cannot begin.
+
+        before_services: yields instead when the samples of a tick are out, and no service has acted on them.
 
         The joints are safe at the end, also when this generator is closed early.
         """
@@ -120,11 +122,14 @@ class InProcessRun:
                     for loop in self._loops.values():
                         loop.join()
                     joined = True
+                if before_services:
+                    yield
                 self._let_act()
                 if not self.host.authority.arming and not self.failed:
                     too_late = turn > ARM_LIMIT_TURNS and time.monotonic() > give_up
                     self._arm(given_up_after_s=limit_s if too_late else None)
-                yield
+                if not before_services:
+                    yield
 
     def stop(self) -> None:
         """End the run in order."""

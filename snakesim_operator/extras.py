@@ -17,6 +17,7 @@ BRINGS = {  # as imported; the first extra that brings a package is the one to n
     "export": ("pyarrow",),
     "evaluate": ("dask", "distributed", "optuna", "pyarrow"),
     "foxglove": ("foxglove",),
+    "gym": ("gymnasium",),
     "lab": ("cryptography", "jinja2"),
     "plot": ("matplotlib",),
     "preview": ("PIL",),

@@ -138,6 +138,7 @@ def check(installed: Installed, dependencies: Path, home: Path) -> None:
     assert names == wanted and all(path.is_file() for path in published)
     for package in PACKAGES:
         assert (library / package / "py.typed").is_file(), package
+    assert (library / "snakesim" / "environments" / "__init__.py").is_file()
     flags = ("--controller", "hold", "--duration", "0.2", "--out", "run", "--endpoint", free_endpoint())
     run(command, "run", "triplet", *flags, cwd=work, **more)
     assert (work / "run" / "report.html").is_file()
