@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Mapping, Sequence
+from operator import mul
 from typing import Any
 
 import gymnasium
@@ -240,4 +241,4 @@ def _box(low: Sequence[float], high: Sequence[float]) -> spaces.Box:
 
 def _power_w(joints: JointState) -> float:
     """Sum over joints of |torque x velocity|."""
-    return sum(abs(t * v) for t, v in zip(joints.torque_nm, joints.velocity_rad_s, strict=True))
+    return sum(map(abs, map(mul, joints.torque_nm, joints.velocity_rad_s)))

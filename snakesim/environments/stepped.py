@@ -5,6 +5,8 @@ Lifecycle, lease, limits and the latency of commands are those of a run in locks
 
 from typing import Protocol
 
+import msgspec
+
 from snakesim_hal.allowed_faults import Faults, faults_of_host
 from snakesim_hal.backend import Backend, Samples, SetPoints
 from snakesim_hal.errors import BackendError, ConfigError, RefusedError
@@ -85,6 +87,7 @@ class SteppedRobot:
                     f"fault {str(injection)!r} is one of a {injection.target_type}: without a controller there are "
                     f"only faults of {', '.join(INJECTED)}; take action='residual:...', or leave it out"
                 )
+        config = _without_looking_around(config)
         factory = find_plugin(BACKENDS, config.backend)
         self._backend: Backend = factory(config, backend_settings(config, factory))
         self.description = self._backend.describe()
@@ -206,3 +209,9 @@ class SteppedRobot:
             self._authority.fault(fault)
         elif fault.reach == "robot":
             self._failed = fault.cause
+
+
+def _without_looking_around(config: RunConfig) -> RunConfig:
+    """Without cameras and lidars, which nobody reads here. Each has noise of its own, so all else stays as it is."""
+    sensors = msgspec.structs.replace(config.robot.sensors, depth=[], range=[])
+    return msgspec.structs.replace(config, robot=msgspec.structs.replace(config.robot, sensors=sensors))

@@ -85,12 +85,16 @@ def test_every_number_has_a_name_a_unit_and_bounds() -> None:
     assert torque.action_units[0] == "N·m" and made(action="velocity").action_units[0] == "rad/s"
 
 
-@pytest.mark.parametrize("more", [{}, {"set": {"backend": "can"}}], ids=["sim", "can"])
+@pytest.mark.parametrize(
+    "more",
+    [{}, {"set": {"backend": "can"}}, {"set": {"robot": "planar13_camera"}}],
+    ids=["simulator", "emulated modules", "with a camera"],
+)
 def test_an_episode_is_the_run_of_its_actions(more: dict[str, Any]) -> None:
     """To the bit, behind the same gate and with the same latency."""
-    env = made(frame_skip=1, **more)
-    info = episode(env)
-    run = snakesim.run("triplet", controller=wave, duration=1, seed=1, **more)
+    info = episode(made(frame_skip=1, **more), action=lambda time_s: 8.0 * wave(time_s))
+    run = snakesim.run("triplet", controller=lambda time_s, _: 8.0 * wave(time_s), duration=1, seed=1, **more)
+    assert "limited" in info
     assert info["ended"] == "time" and info["digest"] == run.digest
 
 
@@ -172,13 +176,27 @@ def test_waypoints_lead_to_a_goal() -> None:
     assert -0.5 < info["advance_m"] < 1.0
 
 
-def test_many_at_once() -> None:
-    envs = gymnasium.make_vec("SnakeSIM/PegRow-v0", num_envs=2, vectorization_mode="async", duration=0.1)
+def test_many_at_once_are_what_each_is_alone() -> None:
+    many = {"num_envs": 2, "vectorization_mode": "async", "scenario": "triplet", "duration": 0.1}
+    envs = gymnasium.make_vec("SnakeSIM/Scenario-v0", **many)
     envs.reset(seed=1)
-    envs.step(envs.action_space.sample())
-    seen, rewards, _, truncated, infos = envs.step(envs.action_space.sample())
-    assert seen.shape[0] == 2 and rewards.shape == (2,) and truncated.all() and len(infos["digest"]) == 2
+    envs.step(np.zeros((2, 13)))
+    seen, rewards, _, truncated, infos = envs.step(np.zeros((2, 13)))
     envs.close()
+    assert seen.shape[0] == 2 and rewards.shape == (2,) and truncated.all()
+    alone = [episode(made(duration=0.1), seed=seed, action=lambda _: np.zeros(13))["digest"] for seed in (1, 2)]
+    assert list(infos["digest"]) == alone and alone[0] != alone[1]
+
+
+def test_two_in_one_process_do_not_disturb_each_other() -> None:
+    envs = [made(action="residual:obstacle_triplet", duration=0.3) for _ in range(3)]
+    alone = episode(envs.pop(), action=lambda _: np.zeros(13))["digest"]
+    for env in envs:
+        env.reset(seed=1)
+    infos = [env.step(np.zeros(13))[4] for _ in range(6) for env in envs]
+    assert [info["digest"] for info in infos[-2:]] == [alone, alone]
+    for env in envs:
+        env.close()
 
 
 def test_a_picture_of_it() -> None:
