@@ -6,8 +6,8 @@
     env = gymnasium.make("SnakeSIM/Clutter-v0", action="velocity", frame_skip=5)
 
 Importing this package registers the names; it needs the extra `gym`, and nothing else of SnakeSIM imports it.
-`environment` has the environment, `stepped` and `assisted` the robot in it, `observations` and `rewards` what is seen
-and paid. `docs/environments.md` is the reference.
+`environment` has the environment, `vector` many of them, `stepped` and `assisted` the robot in it, `observations` and
+`rewards` what is seen and paid. `docs/environments.md` is the reference.
 """
 
 from snakesim_operator import extras
@@ -17,11 +17,12 @@ extras.check("gym", "`snakesim.environments`")
 from gymnasium.envs.registration import register  # noqa: E402 - after the check
 
 from snakesim.environments.environment import SnakeEnv  # noqa: E402
+from snakesim.environments.vector import SnakeVectorEnv  # noqa: E402
 
-__all__ = ["SCENARIOS", "SnakeEnv"]
+__all__ = ["SCENARIOS", "SnakeEnv", "SnakeVectorEnv"]
 SCENARIOS = {"Clutter": "surveyed_clutter", "PegRow": "peg_row", "Flat": "mamba_flat", "Hills": "mamba_hills"}
 """By environment; `SnakeSIM/Scenario-v0` takes any."""
-ENTRY = "snakesim.environments.environment:SnakeEnv"
+ENTRY, MANY = "snakesim.environments.environment:SnakeEnv", "snakesim.environments.vector:SnakeVectorEnv"
 for name, scenario in SCENARIOS.items():
-    register(f"SnakeSIM/{name}-v0", ENTRY, kwargs={"scenario": scenario})
-register("SnakeSIM/Scenario-v0", ENTRY)
+    register(f"SnakeSIM/{name}-v0", ENTRY, kwargs={"scenario": scenario}, vector_entry_point=MANY)
+register("SnakeSIM/Scenario-v0", ENTRY, vector_entry_point=MANY)

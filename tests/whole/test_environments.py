@@ -13,7 +13,7 @@ from gymnasium.utils.env_checker import check_env
 
 import snakesim
 import snakesim.environments
-from snakesim.environments import SCENARIOS, SnakeEnv
+from snakesim.environments import SCENARIOS, SnakeEnv, SnakeVectorEnv
 from snakesim.environments.rewards import TERMS
 from snakesim_hal.model.scenario import write
 from snakesim_operator.extras import BRINGS
@@ -176,16 +176,37 @@ def test_waypoints_lead_to_a_goal() -> None:
     assert -0.5 < info["advance_m"] < 1.0
 
 
-def test_many_at_once_are_what_each_is_alone() -> None:
-    many = {"num_envs": 2, "vectorization_mode": "async", "scenario": "triplet", "duration": 0.1}
-    envs = gymnasium.make_vec("SnakeSIM/Scenario-v0", **many)
+@pytest.mark.parametrize("mode", [None, "async"], ids=["ours", "that of Gymnasium"])
+def test_many_at_once_are_what_each_is_alone(mode: str | None) -> None:
+    envs = gymnasium.make_vec(
+        "SnakeSIM/Scenario-v0", num_envs=3, vectorization_mode=mode, scenario="triplet", duration=0.1
+    )
     envs.reset(seed=1)
-    envs.step(np.zeros((2, 13)))
-    seen, rewards, _, truncated, infos = envs.step(np.zeros((2, 13)))
+    envs.step(np.zeros((3, 13)))
+    seen, rewards, _, truncated, infos = envs.step(np.zeros((3, 13)))
+    again, nothing, _, truncated_again, after = envs.step(np.zeros((3, 13)))
     envs.close()
-    assert seen.shape[0] == 2 and rewards.shape == (2,) and truncated.all()
-    alone = [episode(made(duration=0.1), seed=seed, action=lambda _: np.zeros(13))["digest"] for seed in (1, 2)]
-    assert list(infos["digest"]) == alone and alone[0] != alone[1]
+    assert seen.shape == (3, 56) and envs.observation_space.contains(seen)
+    assert rewards.shape == (3,) and rewards.all() and truncated.all()
+    alone = [episode(made(duration=0.1), seed=seed, action=lambda _: np.zeros(13))["digest"] for seed in (1, 2, 3)]
+    assert list(infos["digest"]) == alone and len({*alone}) == 3
+    assert not truncated_again.any() and not nothing.any() and not after["time_s"].any()  # reset, as by Gymnasium's own
+    assert again.shape == seen.shape
+
+
+def test_many_say_what_is_wrong() -> None:
+    many: dict[str, Any] = {"num_envs": 2, "duration": 0.1}
+    with pytest.raises(snakesim.ConfigError, match="no scenario called 'triplett'"):
+        gymnasium.make_vec("SnakeSIM/Scenario-v0", scenario="triplett", **many)
+    envs = SnakeVectorEnv(scenario="peg_row", flat=False, **many)
+    parts, _ = envs.reset(seed=[4, 4])
+    assert np.array_equal(parts["angle_rad"][0], parts["angle_rad"][1])
+    with pytest.raises(ValueError, match="actions has 3 rows, must have 2"):
+        envs.step(np.zeros((3, 13)))
+    with pytest.raises(ValueError, match=r"action\[0\] \(joint_1\) is nan"):
+        envs.step(np.full((2, 13), np.nan))
+    envs.step(np.zeros((2, 13)))  # it goes on
+    envs.close()
 
 
 def test_two_in_one_process_do_not_disturb_each_other() -> None:
