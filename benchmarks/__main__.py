@@ -12,7 +12,7 @@ from benchmarks.echo import echo_us
 from benchmarks.physics import BareLoop, config_of, motion, sensing, wire_bytes
 from benchmarks.size import install_mb
 from benchmarks.table import HEADER, compare
-from benchmarks.whole import highest_rate_hz, latency_us, lockstep_tick_us
+from benchmarks.whole import BESIDE, highest_rate_hz, latency_us, lockstep_tick_us
 
 RESULTS = Path(__file__).parent / "RESULTS.md"
 REPEATS = 3
@@ -55,19 +55,24 @@ def main() -> int:
         say(compare(f"the same without a recording (`--no-record`); {physics}", bare, unrecorded, floors, 1.5).row())
 
     latencies: list[float] = []
+    beside: list[float] = []
     echoes: list[float] = []
     for _ in range(LATENCY_REPEATS):
         latencies.append(latency_us())
+        beside.append(latency_us(*BESIDE))
         echoes.append(echo_us(state, command, rounds=300, period_s=config.period_ns * 1e-9))
     what = "realtime state-to-command, p50, controller included"
     say(compare(what, "raw echo of the same bytes at the same 100 Hz", latencies, echoes, 2.0).row())
+    say(compare(f"{what}, beside the driver", "the same raw echo", beside, echoes, 1.5).row())
+    say(compare("the same, beside the driver", "control in a process of its own", beside, latencies, 1.0).row())
 
     period_us = config.period_ns / 1000
     factors = [f"{period_us / statistics.median(ticks[s]):.1f} (steps of {float(s) * 1000:g} ms)" for s in STEPS]
     say(f"\nLockstep, 13 joints at 100 Hz, times real time: {', '.join(factors)}.")
-    best, shares = highest_rate_hz()
-    listed = ", ".join(f"{rate} Hz {100 * share:.1f} %" for rate, share in shares.items())
-    say(f"Highest rate at which 99 % of ticks get their command within the tick: {best} Hz ({listed}).")
+    for where, arguments in (("", ()), (", beside the driver", BESIDE)):
+        best, shares = highest_rate_hz(*arguments)
+        listed = ", ".join(f"{rate} Hz {100 * share:.1f} %" for rate, share in shares.items())
+        say(f"Highest rate at which 99 % of ticks get their command within the tick{where}: {best} Hz ({listed}).")
     say("\n## CAN\n")
     tell_bus(say)
     say("\n## Size\n\n| installed | MB, without SnakeSIM's own | the largest |\n|---|---|---|")

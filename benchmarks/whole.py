@@ -32,19 +32,22 @@ def lockstep_tick_us(timestep_s: str, *more: str) -> float:
     return summary.wall_s / summary.ticks * 1e6
 
 
-def latency_us(duration_s: float = 5.0) -> float:
+BESIDE = ("--set", "services.control.place=host")
+
+
+def latency_us(*arguments: str, duration_s: float = 5.0) -> float:
     """State published to command received, median, in real time."""
-    found = run("--pace", "realtime", "--duration", str(duration_s)).state_to_command_us["p50"]
+    found = run("--pace", "realtime", "--duration", str(duration_s), *arguments).state_to_command_us["p50"]
     assert found is not None
     return found
 
 
-def highest_rate_hz(seconds: float = 3.0, share: float = 0.99) -> tuple[int, dict[int, float]]:
+def highest_rate_hz(*arguments: str, seconds: float = 3.0, share: float = 0.99) -> tuple[int, dict[int, float]]:
     """The highest control rate at which this share of the ticks got their command within the tick."""
     shares: dict[int, float] = {}
     best = 0
     for rate in RATES_HZ:
-        summary = run("--pace", "realtime", "--duration", str(seconds), "--set", f"rate_hz={rate}")
+        summary = run("--pace", "realtime", "--duration", str(seconds), "--set", f"rate_hz={rate}", *arguments)
         shares[rate] = summary.answered_fraction or 0.0
         if shares[rate] < share:
             break

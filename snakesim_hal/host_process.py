@@ -101,6 +101,10 @@ def _run(given: ProcessOptions, config: RunConfig) -> Host:
         tune_garbage_collector()
         memory = wanted.memory and os.open(wanted.memory, os.O_WRONLY)
         with Recorder(host.black_box, host.description, partial(record_of, host), wanted.out, memory):
+            if config.beside:  # loaded for those who want it: it is not in the production host's way
+                from snakesim_hal.beside import Beside
+
+                opened.enter_context(Beside(config, session))
             host.run()
     return host
 

@@ -85,9 +85,11 @@ class ServiceLoop:
         self._shown = show_process(self._session, self._entry)
         self._client.announce()
 
-    def run(self) -> None:
-        """Act on every tick that is due, for as long as this process lives."""
+    def run(self, over: Callable[[], bool] = lambda: False) -> None:
+        """Act on every tick that is due, for as long as this process lives; over: or until it is true."""
         for clock in self._client.ticks(SILENCE_S, pauses=True):
+            if over():
+                return
             if clock is not None:
                 self._act(clock)
                 continue

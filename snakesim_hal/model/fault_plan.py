@@ -55,6 +55,11 @@ def _check(config: RunConfig, table: Table | None, buses: int) -> list[Injection
     for i, injection in enumerate(found):
         try:
             check_targets([injection], services=config.own_services, joints=config.robot.chain.modules, buses=buses)
+            if injection.part == RUN and injection.target in config.beside:
+                raise ConfigError(
+                    f"fault {str(injection)!r}: {injection.target} is no process of its own; it is beside the driver "
+                    f'(services.{injection.target}.place = "host")'
+                )
         except ConfigError as error:
             raise ConfigError(f"{_place(config, i, table)}: {error}") from None
     return found

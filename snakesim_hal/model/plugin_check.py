@@ -31,6 +31,11 @@ def check_plugins(config: RunConfig, table: Table | None = None, *, run_files: b
         config = _with_what_it_needs(config, controller)
     for service in config.own_services:
         find_service(config, service, find)
+    if others := [name for name in config.beside if name != CONTROL]:
+        raise ConfigError(
+            f'{source}: `services.{others[0]}.place` = "host": beside the driver there is room for control alone, for '
+            'what plans or looks would keep the host from its ticks; leave it at "process"'
+        )
     check_planned(config, table)
     return check_backend(config, table, run_files=run_files)
 

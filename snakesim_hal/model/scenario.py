@@ -87,6 +87,7 @@ class Service(FileStruct, frozen=True, kw_only=True):
     lag_ticks: Annotated[int, Meta(ge=1, le=1000)] = 1
     restart: bool = True  # with `snakesim run --stay`, when its process ends; false: the run ends with it
     external: bool = False  # a process that the run waits for, but does not start
+    place: Literal["process", "host"] = "process"  # `host`: beside the driver, in a thread of the host's process
     code: str = ""  # an installed service, or ./file.py:Class; empty: the installed service of the section's name
 
     def counting_at(self, tick: int) -> int:
@@ -161,6 +162,11 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
     def own_services(self) -> dict[str, Service]:
         """The services that the run starts itself."""
         return {name: service for name, service in self.services.items() if not service.external}
+
+    @property
+    def beside(self) -> list[str]:
+        """Those of them that run in the host's process."""
+        return [name for name, service in self.own_services.items() if service.place == "host"]
 
     @property
     def has_own_control(self) -> bool:

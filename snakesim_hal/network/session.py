@@ -154,7 +154,7 @@ class Session:
 
     def __init__(self, zenoh_session: Any, open_for_images: Callable[[], Any] | None = None) -> None:
         """open_for_images: opens a connection for images alone; None: they take the one of everything else."""
-        self._zenoh = zenoh_session
+        self._zenoh, self._is_part = zenoh_session, False
         self._open_for_images, self._for_images = open_for_images, None
         self._declared: list[Any] = []
         self._publishers: dict[str, Publisher[Any]] = {}
@@ -343,6 +343,12 @@ class Session:
 
         self._declared.append(self._zenoh.liveliness().declare_subscriber(key, handle, history=True))
 
+    def part(self) -> "Session":
+        """Another session over the same connection; closing it ends only what it has declared."""
+        part = Session(self._zenoh)
+        part._is_part = True
+        return part
+
     def close(self) -> None:
         """Undeclare everything, then close."""
         for declared in reversed(self._declared):
@@ -351,7 +357,8 @@ class Session:
         self._declared.clear()
         if self._for_images is not None:
             self._for_images.close()
-        self._zenoh.close()
+        if not self._is_part:
+            self._zenoh.close()
 
 
 def depth_of(message: type[Message]) -> int:

@@ -169,6 +169,8 @@ def _conduct(
             supervisor.start(ROUTER, ["snakesim_hal.router_process", *common, *meeting, *listening])
         supervisor.start(HOST, host_arguments)
         for name, service in config.own_services.items():
+            if name in config.beside:
+                continue
             supervisor.start(name, ["snakesim_hal.serve", name, *common, *meeting], may_restart=service.restart)
         if request.record and files.folder is not None:
             recorder = ["snakesim_operator.recording.process", *common, *meeting, "--out", str(files.folder)]

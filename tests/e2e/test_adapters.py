@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.e2e.command import wait_until
+from tests.e2e.test_beside import BAD
 from tests.machines import Machine
 
 pytestmark = [pytest.mark.e2e, pytest.mark.skipif(os.geteuid() != 0, reason="makes a network namespace: needs root")]
@@ -47,6 +48,26 @@ def test_modules_of_another_program_are_found_and_driven_in_real_time(machine: M
         while "(exit code 0)" not in said[-1] and len(said) < 5:  # a computer that stutters stops a robot now and then
             said.append(run(machine, tmp_path, *hold))
         assert "(exit code 0)" in said[-1], "\n".join(said)
+    finally:
+        modules.terminate()
+        modules.wait(10)
+
+
+def test_modules_stop_by_themselves_when_the_controller_holds_the_hosts_interpreter(
+    machine: Machine, tmp_path: Path
+) -> None:
+    """Beside the driver compiled code without end stops the host: what is left is the modules' own watchdog."""
+    (tmp_path / "bad.py").write_text(BAD.replace("%s", "holds the interpreter"))
+    log = tmp_path / "modules.log"
+    modules = machine.start(SNAKESIM, "modules", "triplet", "--channel", CHANNEL, log=log)
+    try:
+        wait_until(lambda: "modules ready: 13" in log.read_text(), "the modules")
+        beside = ("--set", "services.control.place=host", "--set", 'backend.pose_listen="127.0.0.1:7450"')
+        bad = ("--controller", "./bad.py:Controller", "--pace", "realtime", "--duration", "60", *beside)
+        said = run(machine, tmp_path, *bad)
+        assert "(exit code 1)" in said, said
+        found = machine.run(SNAKESIM, "can", "scan", CHANNEL)
+        assert found.count("watchdog") == 13 and " armed" not in found, said + found
     finally:
         modules.terminate()
         modules.wait(10)

@@ -1,0 +1,98 @@
+"""Control beside the driver: the same commands as from a process of its own, and what a bad controller can do there."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.e2e.command import nothing_left, run_to_summary, running, snakesim, wait_until
+
+pytestmark = pytest.mark.e2e
+
+BESIDE = ("--set", "services.control.place=host")
+# 50 Hz has the longest lease, 100 ms: a busy test machine may well forget a process for 50 ms.
+REALTIME = ("triplet", "--pace", "realtime", "--set", "rate_hz=50", "--duration", "60", *BESIDE)
+BAD = """
+import ctypes
+import os
+import time
+
+from snakesim_gnc.control.hold import Hold
+
+DEEDS = {
+    "raises": lambda: 1 / 0,
+    "hangs": lambda: time.sleep(1e6),
+    "spins": lambda: [None for _ in iter(int, 1)],
+    "holds the interpreter": lambda: ctypes.PyDLL(None).sleep(1000),
+    "ends the process": lambda: os._exit(0),
+}
+
+
+class Controller(Hold):
+    calls = 0
+
+    def update(self, view):
+        Controller.calls += 1
+        if Controller.calls == 30:
+            DEEDS["%s"]()
+        return super().update(view)
+"""
+
+
+def test_it_drives_the_motors_alike(tmp_path: Path) -> None:
+    arguments = ("triplet", "--duration", "2", "--pace", "lockstep")
+    _, apart = run_to_summary(tmp_path / "apart", *arguments)
+    ended, beside = run_to_summary(tmp_path / "beside", *arguments, *BESIDE)
+    assert ended.code == 0 and beside.command_digest == apart.command_digest
+
+
+@pytest.mark.parametrize(
+    ("backend", "deed", "words"),
+    [
+        ("sim", "raises", "update() raised ZeroDivisionError"),
+        ("can", "hangs", "lease of control expired"),
+        ("sim", "spins", "lease of control expired"),
+        ("can", "ends the process", "host ended with exit code 0"),
+    ],
+)
+def test_a_bad_controller_stops_its_robot(tmp_path: Path, backend: str, deed: str, words: str) -> None:
+    (tmp_path / "bad.py").write_text(BAD.replace("%s", deed))
+    given = (*REALTIME, "--controller", "./bad.py:Controller", "--backend", backend)
+    ended, summary = run_to_summary(tmp_path / "out", *given)
+    assert ended.code == 1 and words in ended.out + summary.ended and summary.duration_s < 60, ended.out
+    nothing_left(tmp_path / "out")
+
+
+def test_a_stop_is_answered_while_it_hangs(tmp_path: Path) -> None:
+    (tmp_path / "bad.py").write_text(BAD.replace("%s", "hangs"))
+    with running(tmp_path / "out", *REALTIME, "--controller", "./bad.py:Controller", "--stay") as run:
+        run.wait_for("lease of control expired")
+        stopped = snakesim("estop", "--endpoint", run.endpoint, cwd=tmp_path)
+        assert stopped.code == 0 and "planar13: stopped" in stopped.out, stopped.out + stopped.err
+        shown = snakesim("status", "--json", "--endpoint", run.endpoint, cwd=tmp_path)
+        assert "estop" in json.dumps(shown.out)
+
+
+def test_one_that_failed_is_begun_again_and_waits_to_be_armed(tmp_path: Path) -> None:
+    (tmp_path / "bad.py").write_text(BAD.replace("%s", "raises"))
+    with running(tmp_path / "out", *REALTIME, "--controller", "./bad.py:Controller", "--stay") as run:
+        run.wait_for("fault: ")
+
+        def armed() -> bool:
+            asked = (("clear",), ("arm", "planar13", "sim"))
+            return [snakesim(*one, "--endpoint", run.endpoint, cwd=tmp_path).code for one in asked][-1] == 0
+
+        wait_until(armed, "a robot that is armed again")
+
+
+@pytest.mark.parametrize(
+    ("given", "why"),
+    [
+        (("--set", "services.navigation.place=host"), "there is room for control alone"),
+        ((*BESIDE, "--fault", "kill:control@1"), "control is no process of its own"),
+        (("--set", "services.control.place=driver"), "services.control.place"),
+    ],
+)
+def test_what_cannot_be_is_refused(tmp_path: Path, given: tuple[str, ...], why: str) -> None:
+    ended = snakesim("run", "triplet", *given, cwd=tmp_path)
+    assert ended.code == 2 and why in ended.err, ended.err
