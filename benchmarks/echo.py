@@ -1,7 +1,6 @@
 """A raw Zenoh echo between two processes: the least that any exchange of state and command can cost."""
 
 import json
-import socket
 import statistics
 import subprocess
 import sys
@@ -9,6 +8,8 @@ import time
 from collections.abc import Sequence
 
 import zenoh
+
+from tests.harness.endpoint import free_endpoint
 
 REQUEST, REPLY = "bench/request", "bench/reply"
 
@@ -41,9 +42,7 @@ def echo_times_us(
     request: bytes, reply: bytes, rounds: int, period_s: float, prefix: Sequence[str] = ()
 ) -> list[float]:
     """Every round trip. prefix: of the command that starts the other process."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = free_endpoint()
     with zenoh.open(_config(endpoint, listen=True)) as session:
         publisher = _publisher(session, REQUEST)
         replies = session.declare_subscriber(REPLY, zenoh.handlers.RingChannel(4))

@@ -1,6 +1,5 @@
 """The simulator in this process: with everything published, and as a bare loop of `mj_step`."""
 
-import socket
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -13,6 +12,7 @@ from snakesim_hal.wire.codec import encode
 from snakesim_hal.wire.keys import CLOCK, JOINTS
 from snakesim_hal.wire.messages import Clock, JointCommand, Mode
 from snakesim_sim_backend.backend import SimBackend
+from tests.harness.endpoint import free_endpoint
 from tests.whole_run import run as run_in_process
 
 TICKS_A_BLOCK = 50
@@ -41,9 +41,7 @@ def holding(backend: SimBackend) -> SetPoints:
 @contextmanager
 def listened_session() -> Iterator[tuple[Session, Session]]:
     """A listening session and one that is connected to it, so that what is published really goes over the wire."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = free_endpoint()
     with open_session(Link(endpoint, "bench", True)) as host, open_session(Link(endpoint, "bench")) as other:
         yield host, other
 

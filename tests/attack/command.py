@@ -4,7 +4,6 @@ import contextlib
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -13,7 +12,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.attack.stranger import until
+from tests.harness.endpoint import free_endpoint
+from tests.harness.processes import processes_of
+from tests.harness.wait import wait_until
 
 SNAKESIM = str(Path(sys.executable).with_name("snakesim"))
 LIMIT_S = 60.0
@@ -95,7 +96,7 @@ class Run:
 
     def says(self, text: str, limit_s: float = LIMIT_S) -> None:
         """Wait until it has said something."""
-        until(lambda: text in self.said() or self.process.poll() is not None, f"{text!r} from the run", limit_s)
+        wait_until(lambda: text in self.said() or self.process.poll() is not None, f"{text!r} from the run", limit_s)
         assert text in self.said(), f"the run ended with {self.process.returncode}: {self.said()[-2000:]}"
 
     def tell(self, *arguments: str, limit_s: float = LIMIT_S) -> Ended:
@@ -105,12 +106,12 @@ class Run:
     def part(self, name: str) -> int:
         """Process id of one of its processes: host, guidance, navigation, control."""
         wanted = "host_process" if name == "host" else f"\0{name}\0"
-        return next(pid for pid, line in processes(self.out) if wanted in line)
+        return next(pid for pid, line in processes_of(self.out) if wanted in line)
 
     def parts(self) -> dict[str, int]:
         """Process ids of those of its host and services that live."""
         found: dict[str, int] = {}
-        for pid, line in processes(self.out):
+        for pid, line in processes_of(self.out):
             for name in ("guidance", "navigation", "control"):
                 if f"\0{name}\0" in line:
                     found[name] = pid
@@ -153,33 +154,12 @@ def running(
     try:
         yield run
     finally:
-        for pid, _ in processes(out):
+        for pid, _ in processes_of(out):
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGCONT)
         if process.poll() is None:
             process.kill()
             process.wait(10)
-
-
-def processes(out: Path) -> list[tuple[int, str]]:
-    """(pid, NUL-separated command line) of every live process of a run's folder."""
-    found: list[tuple[int, str]] = []
-    for entry in Path("/proc").iterdir():
-        if not entry.name.isdigit():
-            continue
-        with contextlib.suppress(OSError, IndexError):
-            line = (entry / "cmdline").read_bytes().decode(errors="replace")
-            state = (entry / "stat").read_text().rpartition(")")[2].split()[0]
-            if f"{out}/config.json" in line and state != "Z":
-                found.append((int(entry.name), line))
-    return found
-
-
-def free_endpoint() -> str:
-    """A loopback endpoint that nobody listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def address(endpoint: str) -> tuple[str, int]:

@@ -10,7 +10,8 @@ from pathlib import Path
 import zenoh
 
 from tests.attack.command import STANDING, Run, running
-from tests.attack.stranger import LONG_S, Stranger, until
+from tests.attack.stranger import LONG_S, Stranger
+from tests.harness.wait import wait_until
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ def joined(run: Run, limit_s: float = LONG_S) -> Stranger:
             found.append(Stranger(run.endpoint, timeout_s=0.5))
         return bool(found) or run.process.poll() is not None
 
-    until(join, f"a network at {run.endpoint}", limit_s)
+    wait_until(join, f"a network at {run.endpoint}", limit_s)
     assert found, f"the run ended with {run.process.returncode}: {run.said()[-2000:]}"
     found[0].receive("hal/status", "hal/clock", "hal/applied", "hal/description")
     return found[0]

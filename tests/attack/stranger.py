@@ -13,6 +13,7 @@ import zenoh
 from zenoh import ext  # pyright: ignore[reportMissingModuleSource]
 
 from tests.attack.means import wire
+from tests.harness.wait import wait_until
 
 KEPT = 2000
 LONG_S = 20.0
@@ -136,7 +137,7 @@ class Stranger:
 
     def until(self, condition: Callable[[], Any], what: str, limit_s: float = LONG_S) -> None:
         """Poll a condition until a deadline."""
-        until(condition, what, limit_s)
+        wait_until(condition, what, limit_s)
 
     # --- speaking ---------------------------------------------------------------------------------------------
 
@@ -272,7 +273,7 @@ class Stranger:
             return len(seen - {None}) >= commands
 
         with contextlib.suppress(AssertionError):
-            until(enough, "commands are applied", limit_s)
+            wait_until(enough, "commands are applied", limit_s)
             return self.lifecycle() == "armed"
         return False
 
@@ -304,7 +305,7 @@ class Stranger:
                 )
             return bool(seen)
 
-        until(look, "an emergency stop", limit_s)
+        wait_until(look, "an emergency stop", limit_s)
         return min(seen)
 
 
@@ -328,11 +329,3 @@ class HostTime:
 
     def _offset(self, operator: Stranger) -> float:
         return min(heard.at_s - heard.message["tick"] * self._period_s for heard in operator.heard("hal/clock"))
-
-
-def until(condition: Callable[[], Any], what: str, limit_s: float = LONG_S) -> None:
-    """Poll a condition until a deadline."""
-    deadline = time.monotonic() + limit_s
-    while not condition():
-        assert time.monotonic() < deadline, f"not within {limit_s:g} s: {what}"
-        time.sleep(0.01)

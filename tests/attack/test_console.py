@@ -12,10 +12,11 @@ from typing import Any
 import pytest
 from websockets.exceptions import InvalidStatus
 
-from tests.attack.command import address, processes
+from tests.attack.command import address
 from tests.attack.effort import effort
 from tests.attack.means.page import CAMERA, STOP, Page, ask, flood
 from tests.attack.robot import Robot, Victim
+from tests.harness.processes import processes_of
 
 STOP_S = 10.0  # from a click to the stop; far above what it takes
 FLOOD_S = float(effort(2, 20))
@@ -183,7 +184,7 @@ def test_c5_a_flood_costs_nobody_the_stop(
 
 def console_mb(robot: Robot) -> float:
     """Resident memory of the console."""
-    pid = next(pid for pid, line in processes(robot.run.out) if "snakesim_operator.console" in line)
+    pid = next(pid for pid, line in processes_of(robot.run.out) if "snakesim_operator.console" in line)
     found = re.search(r"VmRSS:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text())
     assert found is not None
     return int(found[1]) / 1000

@@ -6,9 +6,10 @@ import socket
 import time
 from pathlib import Path
 
-from tests.attack.command import STANDING, address, free_endpoint
+from tests.attack.command import STANDING, address
 from tests.attack.effort import effort
 from tests.attack.robot import standing
+from tests.harness.endpoint import free_endpoint
 
 POSE = {"stamp_ns": 0, "position_w": [0.0, 0.0, 0.0], "orientation_wxyz": [1.0, 0.0, 0.0, 0.0]}
 

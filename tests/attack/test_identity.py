@@ -11,11 +11,12 @@ from typing import Any
 import pytest
 import zenoh
 
-from tests.attack.command import STANDING, free_endpoint, running, snakesim
+from tests.attack.command import STANDING, running, snakesim
 from tests.attack.effort import FULL, effort
 from tests.attack.means import datagrams
 from tests.attack.robot import Robot, joined
 from tests.attack.stranger import Stranger, settings
+from tests.harness.endpoint import free_endpoint
 
 TIMES = range(effort(1, 5))
 

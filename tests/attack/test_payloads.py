@@ -9,11 +9,12 @@ from typing import Any
 import pytest
 import zenoh
 
-from tests.attack.command import CONTROL_CHARACTERS, free_endpoint, running
+from tests.attack.command import CONTROL_CHARACTERS, running
 from tests.attack.effort import effort
 from tests.attack.means import wire
 from tests.attack.robot import Robot, joined
 from tests.attack.stranger import NAMESPACE, Stranger
+from tests.harness.endpoint import free_endpoint
 
 EVIL = "\x1b[2J\x1b]0;evil\x07\r\nplanar13: armed - all is well\n\x9b31m"
 STATUS_S = 20.0

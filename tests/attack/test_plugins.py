@@ -5,9 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from tests.attack.command import free_endpoint, processes, snakesim
+from tests.attack.command import snakesim
 from tests.attack.effort import FULL
-from tests.attack.stranger import until
+from tests.harness.endpoint import free_endpoint
+from tests.harness.processes import nothing_left
 
 BAD = """
 import os
@@ -91,5 +92,5 @@ def test_a_plugin_that_misbehaves_stops_its_robot_only(tmp_path: Path, who: str,
     summary = json.loads((out / "summary.json").read_bytes())
     assert ended.code == 1 and words in summary["ended"], ended.said
     assert summary["duration_s"] < 60
-    until(lambda: not processes(out), "no process of the run left")
+    nothing_left(out, 20.0)
     assert sum(file.stat().st_size for file in out.iterdir()) < 200 * 2**20

@@ -5,11 +5,13 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from tests.attack.command import STANDING, Run, free_endpoint, running, snakesim
+from tests.attack.command import STANDING, Run, running, snakesim
 from tests.attack.effort import effort
 from tests.attack.machine import Machine, machine_of_its_own
 from tests.attack.robot import Robot, joined
-from tests.attack.stranger import LONG_S, Stranger, settings, until
+from tests.attack.stranger import LONG_S, Stranger, settings
+from tests.harness.endpoint import free_endpoint
+from tests.harness.wait import wait_until
 
 SHORT = ("triplet", "--controller", "hold", "--pace", "realtime", "--set", "rate_hz=50", "--duration", "1")
 TIMES = range(effort(1, 4))
@@ -111,4 +113,4 @@ def named(run: Run, said: str) -> bool:
 
 
 def is_armed(machine: Machine, run: Run) -> None:
-    until(lambda: machine.lifecycles(run.endpoint) == ["armed"], f"{run.out.name} armed", LONG_S)
+    wait_until(lambda: machine.lifecycles(run.endpoint) == ["armed"], f"{run.out.name} armed", LONG_S)

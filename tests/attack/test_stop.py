@@ -8,12 +8,13 @@ from contextlib import AbstractContextManager, contextmanager
 
 import pytest
 
-from tests.attack.command import CONTROL_CHARACTERS, free_endpoint, snakesim
+from tests.attack.command import CONTROL_CHARACTERS, snakesim
 from tests.attack.effort import FULL, effort
 from tests.attack.means import datagrams
 from tests.attack.means.floods import Flooder, flood, half_open
 from tests.attack.robot import Robot
 from tests.attack.stranger import HostTime
+from tests.harness.endpoint import free_endpoint
 
 COMMAND_S = 5.0  # from typing `snakesim estop` to the stop, the start of a Python process included
 QUERY_S = 0.5  # from a query, or a datagram, to the stop

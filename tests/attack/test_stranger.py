@@ -1,4 +1,4 @@
-"""The suite itself: it knows nothing of ours but `schemas/` and the `snakesim` command."""
+"""The suite and its harness: they know nothing of ours but `schemas/` and the `snakesim` command."""
 
 import ast
 import re
@@ -10,7 +10,7 @@ import pytest
 from tests.attack.means import wire
 
 HERE = Path(__file__).parent
-FILES = sorted([*HERE.glob("*.py"), *HERE.glob("means/*.py")])
+FILES = sorted([*HERE.glob("*.py"), *HERE.glob("means/*.py"), *(HERE.parent / "harness").rglob("*.py")])
 ALLOWED = {"zenoh", "msgspec.msgpack", "pytest", "websockets", "zstandard"}
 
 
@@ -29,7 +29,7 @@ def imports(path: Path) -> set[str]:
 def test_nothing_of_ours_is_imported(path: Path) -> None:
     for name in imports(path):
         root = name.partition(".")[0]
-        ours = name.startswith("tests.attack.") and not name.startswith("tests.attack.data.")
+        ours = name.startswith(("tests.attack.", "tests.harness.")) and not name.startswith("tests.attack.data.")
         allowed = any(f"{name}.".startswith(f"{module}.") for module in ALLOWED)
         assert root in sys.stdlib_module_names or allowed or ours, f"{path.name} imports {name}"
     code = path.read_text(encoding="utf-8")

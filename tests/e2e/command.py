@@ -2,11 +2,9 @@
 
 import os
 import signal
-import socket
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +13,9 @@ import msgspec
 
 from snakesim_operator.results.record import SUMMARY
 from snakesim_operator.results.summary import RunSummary
+from tests.harness.endpoint import free_endpoint
+from tests.harness.processes import processes_of
+from tests.harness.wait import wait_until
 
 SNAKESIM = [sys.executable, "-m", "snakesim_operator"]
 LIMIT_S = 90.0
@@ -50,13 +51,6 @@ def snakesim(*arguments: str, cwd: Path, limit_s: float = LIMIT_S, more: dict[st
         check=False,
     )
     return Ended(done.returncode, done.stdout, done.stderr)
-
-
-def free_endpoint() -> str:
-    """A loopback endpoint that nobody listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def run_to_summary(out: Path, *arguments: str, **more: str) -> tuple[Ended, RunSummary]:
@@ -123,32 +117,3 @@ def running(out: Path, *arguments: str) -> Iterator[Running]:
         if process.poll() is None:
             process.send_signal(signal.SIGKILL)
             process.wait(10)
-
-
-def processes_of(out: Path) -> list[tuple[int, str]]:
-    """(pid, NUL-separated command line) of every live process that was started for a run's folder."""
-    found: list[tuple[int, str]] = []
-    for entry in Path("/proc").iterdir():
-        if not entry.name.isdigit():
-            continue
-        try:
-            line = (entry / "cmdline").read_bytes().decode(errors="replace")
-            state = (entry / "stat").read_text().rpartition(")")[2].split()[0]
-        except OSError:
-            continue
-        if f"{out}/config.json" in line and state != "Z":
-            found.append((int(entry.name), line))
-    return found
-
-
-def nothing_left(out: Path, limit_s: float = 10.0) -> None:
-    """Fail unless every process of a run is gone soon."""
-    wait_until(lambda: not processes_of(out), f"no process of {out} left", limit_s)
-
-
-def wait_until(condition: Callable[[], bool], what: str, limit_s: float = LIMIT_S) -> None:
-    """Poll a condition until a deadline."""
-    deadline = time.monotonic() + limit_s
-    while not condition():
-        assert time.monotonic() < deadline, f"not within {limit_s:.0f} s: {what}"
-        time.sleep(0.02)

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.e2e.command import wait_until
 from tests.e2e.test_beside import BAD
+from tests.harness.wait import wait_until
 from tests.machines import Machine
 
 pytestmark = [pytest.mark.e2e, pytest.mark.skipif(os.geteuid() != 0, reason="makes a network namespace: needs root")]

@@ -5,7 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.e2e.command import nothing_left, run_to_summary, running, snakesim, wait_until
+from tests.e2e.command import run_to_summary, running, snakesim
+from tests.harness.processes import nothing_left
+from tests.harness.wait import wait_until
 
 pytestmark = pytest.mark.e2e
 

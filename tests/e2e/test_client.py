@@ -12,7 +12,8 @@ from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.process import SERVICE_PRIORITY, set_realtime_priority
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import JointState, Status
-from tests.e2e.command import Ended, Running, running, wait_until
+from tests.e2e.command import Ended, Running, running
+from tests.harness.wait import wait_until
 
 pytestmark = pytest.mark.e2e
 

@@ -12,8 +12,9 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal import arithmetic
-from tests.e2e.command import SNAKESIM, Ended, environment, free_endpoint
+from tests.e2e.command import SNAKESIM, Ended, environment
 from tests.golden import GOLDEN, SECONDS
+from tests.harness.endpoint import free_endpoint
 
 pytestmark = pytest.mark.e2e
 

@@ -12,7 +12,9 @@ from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlSettings, JointState, Status
 from tests.browser import CHROMIUM, MISSING, Tab, chromium
-from tests.e2e.command import Running, nothing_left, processes_of, running, wait_until
+from tests.e2e.command import Running, running
+from tests.harness.processes import nothing_left, processes_of
+from tests.harness.wait import wait_until
 
 pytestmark = [pytest.mark.e2e, pytest.mark.skipif(CHROMIUM is None, reason=MISSING)]
 

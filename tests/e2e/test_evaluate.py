@@ -15,7 +15,9 @@ import pytest
 
 from snakesim_hal.record.host_record import HOST_RECORD
 from snakesim_operator.results.record import REPORT
-from tests.e2e.command import SNAKESIM, Ended, environment, free_endpoint, run_to_summary, snakesim, wait_until
+from tests.e2e.command import SNAKESIM, Ended, environment, run_to_summary, snakesim
+from tests.harness.endpoint import free_endpoint
+from tests.harness.wait import wait_until
 
 pytestmark = pytest.mark.e2e
 

@@ -13,7 +13,9 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Mode, Status
 from snakesim_operator.results.record import SUMMARY, RunRecord
 from snakesim_operator.results.summary import RunSummary
-from tests.e2e.command import nothing_left, run_to_summary, running, snakesim, wait_until
+from tests.e2e.command import run_to_summary, running, snakesim
+from tests.harness.processes import nothing_left
+from tests.harness.wait import wait_until
 
 pytestmark = pytest.mark.e2e
 

@@ -8,7 +8,10 @@ import pytest
 
 from snakesim_hal.record.host_record import HostRecord
 from snakesim_operator.results.record import RunRecord
-from tests.e2e.command import Running, free_endpoint, nothing_left, run_to_summary, running, snakesim, wait_until
+from tests.e2e.command import Running, run_to_summary, running, snakesim
+from tests.harness.endpoint import free_endpoint
+from tests.harness.processes import nothing_left
+from tests.harness.wait import wait_until
 from tests.whole import command
 
 pytestmark = pytest.mark.e2e

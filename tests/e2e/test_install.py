@@ -20,7 +20,9 @@ from packaging.requirements import Requirement
 from snakesim_operator.extras import BRINGS
 from tests.contract.workbench import text_of_the_example
 from tests.distributions import required
-from tests.e2e.command import Ended, environment, free_endpoint, wait_until
+from tests.e2e.command import Ended, environment
+from tests.harness.endpoint import free_endpoint
+from tests.harness.wait import wait_until
 
 pytestmark = pytest.mark.e2e
 

@@ -16,8 +16,8 @@ from snakesim_hal.record.host_record import HostRecord
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import AppliedCommand, JointCommand, JointState
-from tests.e2e.command import wait_until
 from tests.e2e.test_programs import Lab
+from tests.harness.wait import wait_until
 from tests.whole import command
 
 pytestmark = pytest.mark.e2e

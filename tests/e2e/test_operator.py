@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.host.latch import ESTOP
-from tests.e2e.command import Ended, Running, nothing_left, running, wait_until
+from tests.e2e.command import Ended, Running, running
+from tests.harness.processes import nothing_left
+from tests.harness.wait import wait_until
 from tests.whole import command
 
 pytestmark = pytest.mark.e2e

@@ -11,7 +11,9 @@ import pytest
 
 from snakesim_hal.network.session_file import read_session
 from snakesim_hal.record.host_record import HostRecord
-from tests.e2e.command import SNAKESIM, Ended, environment, free_endpoint, wait_until
+from tests.e2e.command import SNAKESIM, Ended, environment
+from tests.harness.endpoint import free_endpoint
+from tests.harness.wait import wait_until
 from tests.whole import command
 
 pytestmark = pytest.mark.e2e

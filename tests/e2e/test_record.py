@@ -16,17 +16,10 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import EstopRequest, LifecycleRequest, Status
 from snakesim_operator.results.record import REPORT, SUMMARY, RunRecord
 from snakesim_operator.results.summary import RunSummary
-from tests.e2e.command import (
-    SNAKESIM,
-    Ended,
-    environment,
-    free_endpoint,
-    nothing_left,
-    run_to_summary,
-    running,
-    snakesim,
-    wait_until,
-)
+from tests.e2e.command import SNAKESIM, Ended, environment, run_to_summary, running, snakesim
+from tests.harness.endpoint import free_endpoint
+from tests.harness.processes import nothing_left
+from tests.harness.wait import wait_until
 from tests.whole import command
 
 pytestmark = pytest.mark.e2e

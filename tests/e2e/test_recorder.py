@@ -22,7 +22,10 @@ from snakesim_operator.playback.play import PlayRequest, play
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.results.record import RunRecord
-from tests.e2e.command import SNAKESIM, environment, free_endpoint, nothing_left, run_to_summary, running, wait_until
+from tests.e2e.command import SNAKESIM, environment, run_to_summary, running
+from tests.harness.endpoint import free_endpoint
+from tests.harness.processes import nothing_left
+from tests.harness.wait import wait_until
 from tests.whole import command
 
 pytestmark = pytest.mark.e2e

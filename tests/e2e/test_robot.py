@@ -11,8 +11,9 @@ import pytest
 import snakesim
 from snakesim_hal.process import SERVICE_PRIORITY, set_realtime_priority
 from snakesim_operator.playback.info import inspect_recording
-from tests.e2e.command import Running, environment, running, wait_until
+from tests.e2e.command import Running, environment, running
 from tests.e2e.documents import REPOSITORY, sections
+from tests.harness.wait import wait_until
 
 pytestmark = pytest.mark.e2e
 

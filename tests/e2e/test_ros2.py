@@ -21,7 +21,9 @@ from zenoh import ext, handlers  # pyright: ignore[reportMissingModuleSource]
 from snakesim_hal.network.session import Link, Reader, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, Intent, Trajectory
-from tests.e2e.command import SNAKESIM, environment, free_endpoint, running, snakesim, wait_until
+from tests.e2e.command import SNAKESIM, environment, running, snakesim
+from tests.harness.endpoint import free_endpoint
+from tests.harness.wait import wait_until
 
 pytestmark = pytest.mark.e2e
 

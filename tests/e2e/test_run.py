@@ -16,7 +16,8 @@ import pytest
 
 from snakesim_operator.results.record import REPORT, SUMMARY
 from snakesim_operator.results.summary import RunSummary
-from tests.e2e.command import nothing_left, run_to_summary, running, snakesim
+from tests.e2e.command import run_to_summary, running, snakesim
+from tests.harness.processes import nothing_left
 from tests.whole import command
 
 pytestmark = pytest.mark.e2e

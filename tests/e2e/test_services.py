@@ -13,8 +13,10 @@ from snakesim_operator.results.record import RECORDING
 from snakesim_operator.results.recorded import read_recording
 from snakesim_operator.results.summary import RunSummary
 from snakesim_operator.run.in_process import WORDS
-from tests.e2e.command import SNAKESIM, Ended, environment, free_endpoint, nothing_left, run_to_summary
+from tests.e2e.command import SNAKESIM, Ended, environment, run_to_summary
 from tests.e2e.documents import REPOSITORY, sections
+from tests.harness.endpoint import free_endpoint
+from tests.harness.processes import nothing_left
 from tests.whole import command as in_process
 
 pytestmark = pytest.mark.e2e

@@ -12,7 +12,9 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import SimulatorRequest, Status
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.run.in_process import simulate
-from tests.e2e.command import nothing_left, running, snakesim, wait_until
+from tests.e2e.command import running, snakesim
+from tests.harness.processes import nothing_left
+from tests.harness.wait import wait_until
 
 pytestmark = pytest.mark.e2e
 

@@ -7,7 +7,8 @@ import pytest
 
 from snakesim_hal.wire.messages import Mode
 from snakesim_operator.results.record import REPORT, RunRecord
-from tests.e2e.command import nothing_left, run_to_summary
+from tests.e2e.command import run_to_summary
+from tests.harness.processes import nothing_left
 
 pytestmark = pytest.mark.e2e
 

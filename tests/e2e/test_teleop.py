@@ -19,7 +19,8 @@ from snakesim_gnc.navigation.clutter import NODES_PER_S
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlState, Intent, Status, Trajectory
-from tests.e2e.command import SNAKESIM, Running, environment, running, wait_until
+from tests.e2e.command import SNAKESIM, Running, environment, running
+from tests.harness.wait import wait_until
 
 pytestmark = pytest.mark.e2e
 STEER = Path(__file__).parents[2] / "docs" / "steer.py"

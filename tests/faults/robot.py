@@ -15,10 +15,10 @@ from snakesim_hal.model.scenario import Override, RunConfig, load, write
 from snakesim_hal.network.session import Link, open_session
 from snakesim_operator.run import children
 from snakesim_operator.run.children import Child
-from tests.e2e.command import free_endpoint
 from tests.faults.host_watch import HostWatch, urgently
 from tests.faults.observer import Observer, TrialError
 from tests.faults.row import Request, Trial
+from tests.harness.endpoint import free_endpoint
 
 START_LIMIT_S = 240.0 if os.environ.get("SNAKESIM_VCAN") == "guest" else 60.0  # an emulated machine is slow
 MOVING_S = 0.25  # from arming to the injection

@@ -22,9 +22,11 @@ from snakesim_hal.record.black_box import read_black_box
 from snakesim_hal.record.host_record import BLACK_BOX, HOST_RECORD, HostRecord
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Mode, Status
-from tests.e2e.command import LIMIT_S, Running, processes_of, running, wait_until
+from tests.e2e.command import LIMIT_S, Running, running
 from tests.fuzz.vitals import Vitals, complaints, parts, vitals
 from tests.fuzz.writer import Sent
+from tests.harness.processes import processes_of
+from tests.harness.wait import wait_until
 
 ROBOT = "planar13"
 SCENARIO = ("triplet", "--controller", "hold", "--pace", "realtime", "--duration", "86400")

@@ -24,8 +24,8 @@ from snakesim_operator.recording import mcap_file, recording
 from snakesim_operator.recording.chunks import HEAD, unpack
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.run.in_process import simulate
-from tests.e2e.command import free_endpoint
 from tests.fuzz.forked import Forked, forked
+from tests.harness.endpoint import free_endpoint
 from tests.whole.damaged import Span, chunks, flipped, spans
 
 SPOILT, WHOLE, OUT = "spoilt.mcap", "whole.mcap", "made"

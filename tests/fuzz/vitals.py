@@ -5,7 +5,7 @@ import resource
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.e2e.command import processes_of
+from tests.harness.processes import processes_of
 
 COMPLAINTS = re.compile(r"Traceback|Exception|panicked|RuntimeWarning|[A-Z]\w+Error\b", re.MULTILINE)
 _PAGE_MB = resource.getpagesize() / 2**20

@@ -4,7 +4,6 @@ import json
 import os
 import re
 import signal
-import socket
 import subprocess
 import time
 from collections.abc import Iterator
@@ -23,6 +22,7 @@ from snakesim_operator.lab.lab_file import Lab, load_lab
 from snakesim_operator.lab.render import render
 from snakesim_operator.lab.zenoh_files import session_settings
 from tests.e2e.command import SNAKESIM, environment
+from tests.harness.endpoint import free_port
 
 OWN, OTHER = "planar13", "second"
 LIMIT_S = 20.0
@@ -98,9 +98,7 @@ def opened(settings: dict[str, Any]) -> zenoh.Session:
 @contextmanager
 def small_lab(folder: Path) -> Iterator[SmallLab]:
     """Made and running."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     (folder / "lab.toml").write_text(lab_text(folder, port))
     lab = load_lab(folder / "lab.toml")
     write_certificates(lab, folder, folder / "authority")

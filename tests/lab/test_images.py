@@ -10,8 +10,8 @@ from snakesim_hal.network.session_file import read_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import DepthImage
 from snakesim_hal.wire.roles import Role
+from tests.harness.wait import wait_until
 from tests.lab.small_lab import OWN, SmallLab
-from tests.unit.hal.local_network import wait_until
 
 KEY = keys.depth("head")
 # The largest that a robot may have: it is sent in many pieces, each of which waits for the one before it.

@@ -18,6 +18,7 @@ from cryptography.hazmat.primitives.serialization import load_pem_private_key
 from snakesim_hal.wire.roles import Role
 from snakesim_operator.lab.certificates import Issuer, issue, make_authority
 from snakesim_operator.lab.identities import Identity
+from tests.harness.endpoint import free_port
 from tests.lab.small_lab import OTHER, OWN, SmallLab, opened
 from tests.lab.test_matrix import eventually, settle
 
@@ -129,9 +130,7 @@ def test_bytes_that_are_sent_again_command_nothing(lab: SmallLab) -> None:
 def test_a_role_cannot_pose_as_the_router(lab: SmallLab) -> None:
     """A viewer's certificate at the router's address: nobody gives it a command."""
     viewer, gnc = lab.who(Role.VIEWER, OWN), lab.who(Role.GNC, OWN)
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tls/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = f"tls/127.0.0.1:{free_port()}"
     settings = lab.settings(viewer, mode="router", listen={"endpoints": [endpoint]}, connect={"endpoints": []})
     tls = settings["transport"]["link"]["tls"]
     tls.update(listen_certificate=tls["connect_certificate"], listen_private_key=tls["connect_private_key"])

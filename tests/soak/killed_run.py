@@ -21,8 +21,9 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, EstopRequest, LifecycleRequest, Status
 from snakesim_operator.results.record import SUMMARY
 from snakesim_operator.results.summary import RunSummary
-from tests.e2e.command import SNAKESIM, environment, free_endpoint
+from tests.e2e.command import SNAKESIM, environment
 from tests.fuzz.vitals import parts
+from tests.harness.endpoint import free_endpoint
 
 Moment = Literal["starting", "arming", "armed", "stopping", "clearing", "interrupted", "ending"]
 MOMENTS: tuple[Moment, ...] = ("starting", "arming", "armed", "stopping", "clearing", "interrupted", "ending")

@@ -13,10 +13,11 @@ import msgspec
 from snakesim_hal.errors import NotConnectedError
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, LifecycleRequest, Status
-from tests.e2e.command import processes_of, wait_until
 from tests.faults.observer import TrialError
 from tests.fuzz.network import running_and_joined
 from tests.fuzz.vitals import complaints
+from tests.harness.processes import processes_of
+from tests.harness.wait import wait_until
 from tests.soak.faults import Dice, Event
 from tests.soak.health import Health
 from tests.soak.watch import Watch

@@ -7,9 +7,10 @@ import pytest
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import AppliedCommand, Description, Fault, Mode, Status
+from tests.harness.endpoint import free_endpoint
+from tests.harness.wait import wait_until
 from tests.soak.faults import Dice
 from tests.soak.watch import Watch
-from tests.unit.hal.local_network import free_endpoint, wait_until
 from tests.unit.hal.rig import description, state, status
 
 ROBOT = description()  # 5 rad/s at 100 Hz, and 0.3 rad from the measured angle at most

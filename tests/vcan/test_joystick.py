@@ -18,7 +18,7 @@ from snakesim_operator.tools.teleop.joystick import (
     Joystick,
     open_joystick,
 )
-from tests.unit.hal.local_network import wait_until
+from tests.harness.wait import wait_until
 
 UINPUT = Path("/dev/uinput")
 BTN_SOUTH, KEY_A, BUS_USB = 0x130, 30, 3

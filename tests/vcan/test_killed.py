@@ -25,7 +25,9 @@ from snakesim_hal.model.scenario import Override, RunConfig, load, write
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, LifecycleRequest, Status
-from tests.e2e.command import environment, free_endpoint, snakesim, wait_until
+from tests.e2e.command import environment, snakesim
+from tests.harness.endpoint import free_endpoint
+from tests.harness.wait import wait_until
 from tests.unit.hal.rig import write_files
 from tests.vcan.link import FRAME
 

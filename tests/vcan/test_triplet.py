@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from snakesim_operator.results.record import RunRecord
-from tests.e2e.command import free_endpoint, snakesim
+from tests.e2e.command import snakesim
+from tests.harness.endpoint import free_endpoint
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 

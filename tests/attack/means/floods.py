@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from tests.attack.command import address
-from tests.attack.stranger import until
+from tests.harness.wait import wait_until
 
 REPOSITORY = Path(__file__).parents[3]
 READY_S = 30.0
@@ -48,7 +48,7 @@ class Flooder:
 
     def is_ready(self) -> None:
         """Wait until it is at work."""
-        until(
+        wait_until(
             lambda: "ready" in self._said.read_text(errors="replace") or self.process.poll() is not None,
             f"{self._said.stem} at work",
             READY_S,

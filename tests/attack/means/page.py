@@ -13,7 +13,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.typing import Origin, Subprotocol
 
-from tests.attack.stranger import until
+from tests.harness.wait import wait_until
 
 CAMERA = {
     "type": "ViewerCameraMessage",
@@ -63,7 +63,7 @@ class Page:
 
     def find(self, label: str) -> str:
         """The id of the control with a label, once it is there."""
-        until(lambda: self._found(label) is not None, f"{label!r} on the page", 60.0)
+        wait_until(lambda: self._found(label) is not None, f"{label!r} on the page", 60.0)
         found = self._found(label)
         assert found is not None
         return found

@@ -18,7 +18,8 @@ from snakesim_hal.network.session import Link, Reader, Session, open_session
 from snakesim_hal.service import Service, ServiceLoop
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlState, Trajectory
-from tests.unit.hal.local_network import Running, running, wait_until
+from tests.harness.wait import wait_until
+from tests.unit.hal.local_network import Running, running
 from tests.unit.hal.rig import run_config
 
 SERVICES: dict[str, type[Service]] = {"guidance": Guidance, "navigation": Navigation, "control": Control}

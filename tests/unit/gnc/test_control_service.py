@@ -11,8 +11,8 @@ from snakesim_gnc.control.controller import Action, Report, positions
 from snakesim_hal.errors import ControllerError
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, FaultRequest, Intent, JointCommand, JointState
+from tests.harness.wait import wait_until
 from tests.unit.gnc.services import Stage, stage
-from tests.unit.hal.local_network import wait_until
 
 PERIOD_NS = 20_000_000
 SEEN = 3  # views in a row

@@ -1,10 +1,8 @@
 """A real backend of first-order joints, a host that runs it in a thread, and a client in another, over real Zenoh."""
 
 import math
-import socket
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -34,24 +32,11 @@ from snakesim_hal.wire.messages import (
     SensorDescription,
     Status,
 )
+from tests.harness.endpoint import free_endpoint
+from tests.harness.wait import wait_until
 from tests.unit.hal.rig import pose
 
 LIMIT_S = 20.0
-
-
-def wait_until(happened: Callable[[], Any], what: str, limit_s: float = LIMIT_S) -> None:
-    """Until a condition holds; fails with its name when it does not in time."""
-    deadline = time.monotonic() + limit_s
-    while not happened():
-        assert time.monotonic() < deadline, f"not within {limit_s} s: {what}"
-        time.sleep(0.002)
-
-
-def free_endpoint() -> str:
-    """A loopback endpoint that nobody listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 class LagBackend:

@@ -15,15 +15,9 @@ from snakesim_hal.model.injection import parse
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, Clock, FaultRequest, JointState
-from tests.unit.hal.local_network import (
-    Follower,
-    LagBackend,
-    Running,
-    following,
-    free_endpoint,
-    running,
-    wait_until,
-)
+from tests.harness.endpoint import free_endpoint
+from tests.harness.wait import wait_until
+from tests.unit.hal.local_network import Follower, LagBackend, Running, following, running
 from tests.unit.hal.rig import description, run_config, state
 
 ALLOWED: dict[str, Any] = {"pace": "realtime", "rate_hz": 100, "faults_allowed": True}

@@ -13,7 +13,8 @@ from snakesim_hal.errors import BackendError, SnakesimError
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Fault, LifecycleState, Pace
-from tests.unit.hal.local_network import Follower, LagBackend, following, running, wait_until
+from tests.harness.wait import wait_until
+from tests.unit.hal.local_network import Follower, LagBackend, following, running
 from tests.unit.hal.network.test_client_host import run_config
 from tests.unit.hal.rig import pose, power
 

@@ -13,7 +13,8 @@ from snakesim_hal.host import latch as under_test
 from snakesim_hal.host.latch import ESTOP, EstopLatch
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import EstopRequest
-from tests.unit.hal.local_network import running, wait_until
+from tests.harness.wait import wait_until
+from tests.unit.hal.local_network import running
 from tests.unit.hal.network.test_client_host import run_config
 
 

@@ -10,7 +10,8 @@ import pytest
 from snakesim_hal.host.simulated_time import Refusal, SimulatedTime
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import EstopRequest, Pace, SimulatorRequest
-from tests.unit.hal.local_network import Follower, Running, following, running, wait_until
+from tests.harness.wait import wait_until
+from tests.unit.hal.local_network import Follower, Running, following, running
 from tests.unit.hal.rig import description, run_config
 
 PATIENT: dict[str, Any] = {"rate_hz": 50.0}  # with the longest lease, 100 ms

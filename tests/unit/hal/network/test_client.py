@@ -10,7 +10,8 @@ from snakesim_hal.network.client import Client
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, Done, Pose
-from tests.e2e.command import free_endpoint, wait_until
+from tests.harness.endpoint import free_endpoint
+from tests.harness.wait import wait_until
 from tests.unit.hal.rig import clock, pose
 
 

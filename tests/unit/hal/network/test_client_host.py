@@ -31,7 +31,9 @@ from snakesim_hal.wire.messages import (
     Mode,
     Pose,
 )
-from tests.unit.hal.local_network import Follower, LagBackend, following, free_endpoint, running, wait_until
+from tests.harness.endpoint import free_endpoint
+from tests.harness.wait import wait_until
+from tests.unit.hal.local_network import Follower, LagBackend, following, running
 from tests.unit.hal.rig import command, description, run_config, state
 
 

@@ -10,7 +10,9 @@ from snakesim_hal.network.client import Client, Commander, Feed
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, JointState, LeaseRequest
-from tests.unit.hal.local_network import free_endpoint, running, wait_until
+from tests.harness.endpoint import free_endpoint
+from tests.harness.wait import wait_until
+from tests.unit.hal.local_network import running
 from tests.unit.hal.rig import clock, description, run_config, state
 
 # --- the client alone ------------------------------------------------------------------------------------------

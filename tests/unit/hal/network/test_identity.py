@@ -19,7 +19,8 @@ from snakesim_hal.network.run_key import RUN_KEY, is_proven, new_run_key, proven
 from snakesim_hal.network.session import open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, LifecycleRequest
-from tests.unit.hal.local_network import Follower, following, running, wait_until
+from tests.harness.wait import wait_until
+from tests.unit.hal.local_network import Follower, following, running
 from tests.unit.hal.network.test_client_host import run_config
 
 

@@ -11,7 +11,8 @@ from snakesim_hal.network.process_entries import ProcessEntries, own_entry, show
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Process
-from tests.e2e.command import free_endpoint, wait_until
+from tests.harness.endpoint import free_endpoint
+from tests.harness.wait import wait_until
 
 
 def config(*sets: str) -> RunConfig:

@@ -18,7 +18,8 @@ from snakesim_hal.network.session import Arrival, Link, Publisher, Question, ope
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import ENCODING_PREFIX, encode
 from snakesim_hal.wire.messages import Answer, Done, EstopRequest, JointState, LeaseRequest
-from tests.unit.hal.local_network import free_endpoint, wait_until
+from tests.harness.endpoint import free_endpoint
+from tests.harness.wait import wait_until
 from tests.unit.hal.rig import description, state
 
 ROBOT = description()

@@ -10,7 +10,8 @@ from snakesim_hal.errors import ConfigError, NotConnectedError
 from snakesim_hal.network.router import open_router
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.network.session_file import read_session
-from tests.e2e.command import free_endpoint, wait_until
+from tests.harness.endpoint import free_endpoint
+from tests.harness.wait import wait_until
 
 QUIET = "scouting: {multicast: {enabled: false}, gossip: {enabled: false}}"
 

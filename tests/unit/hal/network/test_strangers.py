@@ -33,7 +33,9 @@ from snakesim_hal.wire.messages import (
     WorldContact,
 )
 from snakesim_hal.wire.quantities import Quaternion
-from tests.unit.hal.local_network import LagBackend, free_endpoint, wait_until
+from tests.harness.endpoint import free_endpoint
+from tests.harness.wait import wait_until
+from tests.unit.hal.local_network import LagBackend
 from tests.unit.hal.rig import clock, description, pose, power, run_config, state
 
 ROBOT = description()  # three joints, four links

@@ -20,7 +20,8 @@ from snakesim_hal.record.host_record import BLACK_BOX, DESCRIPTION, HOST_RECORD,
 from snakesim_hal.record.recorder import Recorder
 from snakesim_hal.safety.authority import Decision
 from snakesim_hal.wire.messages import Description, Mode
-from tests.unit.hal.local_network import Follower, following, running, wait_until
+from tests.harness.wait import wait_until
+from tests.unit.hal.local_network import Follower, following, running
 from tests.unit.hal.rig import description, run_config, state
 
 ROBOT = description()

@@ -20,7 +20,7 @@ from snakesim_operator.console.snapshot import RobotSnapshot, expected_of
 from snakesim_operator.console.token import ControlToken
 from snakesim_operator.console_port import address_of, open_port
 from snakesim_operator.page_origin import why_refused
-from tests.e2e.command import wait_until
+from tests.harness.wait import wait_until
 from tests.unit.hal.rig import description, status
 from tests.viewer import watch
 

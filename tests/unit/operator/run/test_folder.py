@@ -11,7 +11,7 @@ import pytest
 
 from snakesim_hal.errors import ConfigError
 from snakesim_operator.run.folder import LOCK, claimed, named_after
-from tests.unit.hal.local_network import wait_until
+from tests.harness.wait import wait_until
 
 HOLD = """
 import sys, time

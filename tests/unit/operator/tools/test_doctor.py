@@ -9,7 +9,7 @@ import pytest
 from snakesim_operator.cli import main
 from snakesim_operator.tools.network_findings import ports, routers
 from snakesim_operator.tools.targets import RobotSelection
-from tests.unit.hal.local_network import free_endpoint
+from tests.harness.endpoint import free_endpoint
 
 WHAT = {"Python", "packages", "OpenGL", "CAN", "KVM", "wake-ups", "wall clock", "priority", "memory lock", "disk"}
 

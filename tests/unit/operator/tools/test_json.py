@@ -9,7 +9,7 @@ from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Status
 from snakesim_operator.cli import main
-from tests.unit.hal.local_network import free_endpoint
+from tests.harness.endpoint import free_endpoint
 from tests.unit.hal.rig import status
 
 

@@ -10,7 +10,8 @@ from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ColourImage, DepthImage, Preview, SensorDescription
 from snakesim_operator.tools.preview import cameras_of, preview_of
-from tests.unit.hal.local_network import free_endpoint, wait_until
+from tests.harness.endpoint import free_endpoint
+from tests.harness.wait import wait_until
 from tests.unit.hal.rig import description
 
 CAMERA = {

@@ -17,7 +17,8 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode
 from snakesim_hal.wire.messages import DepthImage, Description, Done, JointCommand, JointState, Mode
 from snakesim_operator.tools.schemas import contract
-from tests.unit.hal.local_network import free_endpoint, wait_until
+from tests.harness.endpoint import free_endpoint
+from tests.harness.wait import wait_until
 from tests.unit.hal.rig import description
 
 REPOSITORY = Path(__file__).parents[4]

@@ -13,7 +13,7 @@ from snakesim_hal.wire.messages import Clock, JointState, Message
 from snakesim_operator.tools.targets import RobotSelection
 from snakesim_operator.tools.top import TopRequest, table_of, top
 from snakesim_operator.tools.traffic import KEPT, MAX_KEYS, Traffic
-from tests.unit.hal.local_network import free_endpoint
+from tests.harness.endpoint import free_endpoint
 from tests.unit.hal.rig import command, description, state
 
 MS = 1_000_000

@@ -14,7 +14,8 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, Intent
 from snakesim_operator.tools.teleop.command import Teleop, TeleopRequest
 from snakesim_operator.tools.teleop.joystick import ABS_Y, EV_ABS, EVENT, Axis, Joystick
-from tests.unit.hal.local_network import free_endpoint, wait_until
+from tests.harness.endpoint import free_endpoint
+from tests.harness.wait import wait_until
 
 
 @pytest.fixture(autouse=True)
