@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tests.harness.endpoint import free_endpoint
-from tests.harness.processes import processes_of
+from tests.harness.processes import parts_of, processes_of
 from tests.harness.wait import wait_until
 
 SNAKESIM = str(Path(sys.executable).with_name("snakesim"))
@@ -105,19 +105,12 @@ class Run:
 
     def part(self, name: str) -> int:
         """Process id of one of its processes: host, guidance, navigation, control."""
-        wanted = "host_process" if name == "host" else f"\0{name}\0"
-        return next(pid for pid, line in processes_of(self.out) if wanted in line)
+        return parts_of(self.out)[name]
 
     def parts(self) -> dict[str, int]:
         """Process ids of those of its host and services that live."""
-        found: dict[str, int] = {}
-        for pid, line in processes_of(self.out):
-            for name in ("guidance", "navigation", "control"):
-                if f"\0{name}\0" in line:
-                    found[name] = pid
-            if "host_process" in line:
-                found["host"] = pid
-        return found
+        own = ("host", "guidance", "navigation", "control")
+        return {name: pid for name, pid in parts_of(self.out).items() if name in own}
 
     def wait(self, limit_s: float = LIMIT_S) -> int:
         """Its exit code."""

@@ -14,7 +14,7 @@ import msgspec
 from snakesim_operator.results.record import SUMMARY
 from snakesim_operator.results.summary import RunSummary
 from tests.harness.endpoint import free_endpoint
-from tests.harness.processes import processes_of
+from tests.harness.processes import parts_of
 from tests.harness.wait import wait_until
 
 SNAKESIM = [sys.executable, "-m", "snakesim_operator"]
@@ -71,13 +71,7 @@ class Running:
 
     def part(self, name: str) -> int:
         """Process id of one of its parts: `host`, `control`, ..."""
-        own = {
-            "host": "snakesim_hal.host_process",
-            "router": "snakesim_hal.router_process",
-            "recorder": "snakesim_operator.recording.process",
-        }
-        wanted = own.get(name, f"snakesim_hal.serve\0{name}\0")
-        return next(pid for pid, line in processes_of(self.out) if wanted in line)
+        return parts_of(self.out)[name]
 
     def wait_for(self, what: str, limit_s: float = LIMIT_S) -> None:
         """Until the run's output contains a text."""

@@ -23,9 +23,9 @@ from snakesim_hal.record.host_record import BLACK_BOX, HOST_RECORD, HostRecord
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Mode, Status
 from tests.e2e.command import LIMIT_S, Running, running
-from tests.fuzz.vitals import Vitals, complaints, parts, vitals
+from tests.fuzz.vitals import Vitals, complaints, vitals
 from tests.fuzz.writer import Sent
-from tests.harness.processes import processes_of
+from tests.harness.processes import parts_of, processes_of
 from tests.harness.wait import wait_until
 
 ROBOT = "planar13"
@@ -86,7 +86,7 @@ class Watcher:
     def __init__(self, session: Session, out: Path) -> None:
         self._statuses = session.latched_reader(keys.STATUS, Status)
         self._out = out
-        self._parts = parts(out)
+        self._parts = parts_of(out)
         self._status: Status | None = None
         wait_until(lambda: self.status() is not None, "a status")
 

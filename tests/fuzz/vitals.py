@@ -5,11 +5,8 @@ import resource
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.harness.processes import processes_of
-
 COMPLAINTS = re.compile(r"Traceback|Exception|panicked|RuntimeWarning|[A-Z]\w+Error\b", re.MULTILINE)
 _PAGE_MB = resource.getpagesize() / 2**20
-_SERVICE = re.compile(r"snakesim_hal\.serve\0(\w+)\0")
 
 
 @dataclass(frozen=True)
@@ -20,27 +17,6 @@ class Vitals:
     resident_mb: float
     threads: int
     files: int
-
-
-def name_of(command_line: str) -> str:
-    """The part of a run that a NUL-separated command line starts."""
-    service = _SERVICE.search(command_line)
-    if service is not None:
-        return service[1]
-    if "snakesim_hal.host_process" in command_line:
-        return "host"
-    if "snakesim_hal.router_process" in command_line:
-        return "router"
-    return "twins" if "snakesim_can_backend.twin" in command_line else "run"
-
-
-def parts(out: Path) -> dict[str, int]:
-    """Process ids of a run's parts, by name; a second process of the same name is `NAME again`."""
-    found: dict[str, int] = {}
-    for pid, line in sorted(processes_of(out)):
-        name = name_of(line)
-        found[f"{name} again" if name in found else name] = pid
-    return found
 
 
 def vitals(pid: int) -> Vitals | None:

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.fuzz.vitals import Vitals, parts, vitals
+from tests.fuzz.vitals import Vitals, vitals
+from tests.harness.processes import parts_of
 
 EVERY_S = 2.0
 WARM_UP_S = 20.0  # of a process: until then, anything may grow
@@ -41,7 +42,7 @@ class Health:
         if now < self._due_s:
             return
         self._due_s = now + EVERY_S
-        found = parts(self._out)
+        found = parts_of(self._out)
         for name, pid in found.items():
             seen = vitals(pid)
             if seen is not None:

@@ -22,8 +22,8 @@ from snakesim_hal.wire.messages import Clock, EstopRequest, LifecycleRequest, St
 from snakesim_operator.results.record import SUMMARY
 from snakesim_operator.results.summary import RunSummary
 from tests.e2e.command import SNAKESIM, environment
-from tests.fuzz.vitals import parts
 from tests.harness.endpoint import free_endpoint
+from tests.harness.processes import parts_of, processes_with
 
 Moment = Literal["starting", "arming", "armed", "stopping", "clearing", "interrupted", "ending"]
 MOMENTS: tuple[Moment, ...] = ("starting", "arming", "armed", "stopping", "clearing", "interrupted", "ending")
@@ -224,7 +224,7 @@ class KilledRun:
             self._outcome.interrupted |= name == SUPERVISOR and number in (signal.SIGINT, signal.SIGTERM)
 
     def _pid(self, name: str) -> int | None:
-        return self._process.pid if name == SUPERVISOR else parts(self._out).get(name)
+        return self._process.pid if name == SUPERVISOR else parts_of(self._out).get(name)
 
     def _interrupt(self) -> None:
         self._signal(SUPERVISOR, signal.SIGCONT)
@@ -271,10 +271,10 @@ class KilledRun:
             self._process.kill()
             self._process.wait()
         deadline = time.monotonic() + GONE_LIMIT_S
-        while (left := marked(self._mark)) and time.monotonic() < deadline:
+        while (left := processes_with("environ", f"{MARK}={self._mark}\0")) and time.monotonic() < deadline:
             time.sleep(0.02)
         for pid, line in left:
-            self._outcome.left_behind.append(f"{pid} {line[:200]}")
+            self._outcome.left_behind.append(f"{pid} {line[:200]}".replace("\0", " "))
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
 
@@ -288,17 +288,3 @@ class KilledRun:
         with contextlib.suppress(FileNotFoundError):
             outcome.summary = msgspec.json.decode((self._out / SUMMARY).read_bytes(), type=RunSummary)
         outcome.stop_kept = any(self._folder.glob("snakesim/robots/*/estop.json"))
-
-
-def marked(mark: str) -> list[tuple[int, str]]:
-    """(pid, command line) of every live process with this mark in its environment."""
-    found: list[tuple[int, str]] = []
-    for entry in Path("/proc").iterdir():
-        if not entry.name.isdigit():
-            continue
-        with contextlib.suppress(OSError, IndexError):
-            state = (entry / "stat").read_text().rpartition(")")[2].split()[0]
-            if state != "Z" and f"{MARK}={mark}\0".encode() in (entry / "environ").read_bytes():
-                line = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
-                found.append((int(entry.name), line))
-    return found
