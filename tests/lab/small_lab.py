@@ -5,7 +5,6 @@ import os
 import re
 import signal
 import subprocess
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ from snakesim_operator.lab.render import render
 from snakesim_operator.lab.zenoh_files import session_settings
 from tests.e2e.command import SNAKESIM, environment
 from tests.harness.endpoint import free_port
+from tests.harness.wait import wait_until
 
 OWN, OTHER = "planar13", "second"
 LIMIT_S = 20.0
@@ -114,10 +114,8 @@ def small_lab(folder: Path) -> Iterator[SmallLab]:
             preexec_fn=lambda: die_with_parent(parent),
         )
     try:
-        deadline = time.monotonic() + LIMIT_S
-        while "router running" not in log.read_text():
-            assert router.poll() is None and time.monotonic() < deadline, log.read_text()
-            time.sleep(0.05)
+        wait_until(lambda: "router running" in log.read_text() or router.poll() is not None, "a router", LIMIT_S)
+        assert router.poll() is None, log.read_text()
         yield SmallLab(lab, folder, log)
     finally:
         router.send_signal(signal.SIGTERM)

@@ -14,6 +14,7 @@ from snakesim_can_backend.settings import Settings
 from snakesim_can_backend.twin.server import InProcessTwins
 from snakesim_hal.errors import BackendError, ConfigError
 from snakesim_hal.model.injection import Injection
+from tests.harness.wait import wait_until
 from tests.unit.can_backend.loop import config
 
 RUN = config()
@@ -141,9 +142,7 @@ def test_a_child_that_ends_by_itself_is_noticed(tmp_path: Path, monkeypatch: pyt
     child(tmp_path, monkeypatch, "print('modules ready: 4', flush=True)\ntime.sleep(0.3)\nsys.exit(3)\n")
     twins = TwinProcess(RUN, Settings(channels=VCAN, twins="process"), None, stepped=False)
     assert twins.how_it_ended() is None
-    end = time.monotonic() + 5.0
-    while twins.how_it_ended() is None and time.monotonic() < end:
-        time.sleep(0.01)
+    wait_until(twins.how_it_ended, "the end of the child")
     assert twins.how_it_ended() == "the module twins have ended, with exit code 3"
     twins.stop()
 
@@ -156,9 +155,7 @@ def test_a_child_is_told_what_goes_wrong_as_in_a_terminal(tmp_path: Path, monkey
     assert "--interactive" in json.loads(noted.read_text())["arguments"]
     twins.inject(Injection("mute", "joint_3", 1.0, 2.0), begins=True)
     twins.inject(Injection("mute", "joint_3", 1.0, 2.0), begins=False)
-    end = time.monotonic() + 5.0
-    while not (heard.exists() and heard.read_text().endswith("off\n")) and time.monotonic() < end:
-        time.sleep(0.01)
+    wait_until(lambda: heard.exists() and heard.read_text().endswith("off\n"), "the end told to the child")
     assert heard.read_text() == "mute joint_3\nmute joint_3 off\n"
     twins.stop()
     with pytest.raises(BackendError, match=r"do not accept leak:joint_1@0"):
