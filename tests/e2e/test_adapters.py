@@ -53,6 +53,7 @@ def test_modules_of_another_program_are_found_and_driven_in_real_time(machine: M
         modules.wait(10)
 
 
+@pytest.mark.slow
 def test_modules_stop_by_themselves_when_the_controller_holds_the_hosts_interpreter(
     machine: Machine, tmp_path: Path
 ) -> None:

@@ -197,4 +197,4 @@ def test_an_operator_is_told_that_the_robot_says_nothing_any_more(tmp_path: Path
             operator.shows("armed: ")
             os.kill(run.part("host"), signal.SIGSTOP)
             operator.shows("the robot has given no clock for ")
-            operator.shows("s ago)")
+            operator.shows("s ago): ")  # before what may be cut off at the edge
