@@ -7,7 +7,8 @@ import pytest
 
 from snakesim_hal.wire.messages import Mode
 from snakesim_operator.results.record import REPORT, RunRecord
-from tests.e2e.command import run_to_summary
+from snakesim_operator.results.summary import RunSummary
+from tests.e2e.command import Ended, run_to_summary
 from tests.harness.processes import nothing_left
 
 pytestmark = pytest.mark.e2e
@@ -16,12 +17,29 @@ FROM_S, TO_S = 2.0, 3.4
 FADED_S = 0.9  # after the push has ended: three time constants of the fade
 
 
+TRIES = 4
+
+
+def undisturbed(out: Path, fault: str) -> tuple[Ended, RunSummary]:
+    """A run with a fault; again when a computer that stutters has ended its lease of 50 ms before the fault came."""
+    for left in reversed(range(TRIES)):
+        flags = ("--pace", "realtime", "--duration", "6", "--fault", fault)
+        ended, summary = run_to_summary(out, "triplet", *flags)
+        if not left or not summary.faults or stopped_after_s(out, summary) > FROM_S:
+            return ended, summary
+    raise AssertionError
+
+
+def stopped_after_s(out: Path, summary: RunSummary) -> float:
+    return float(summary.faults[0].tick / summary.rate_hz - RunRecord.load(out).time_s[0])
+
+
 def test_without_joints_the_robot_stops_and_the_reason_is_told(tmp_path: Path) -> None:
-    flags = ["--pace", "realtime", "--duration", "6", "--fault", f"drop:sensor/joints@{FROM_S}"]
-    ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
+    ended, summary = undisturbed(tmp_path / "run", f"drop:sensor/joints@{FROM_S}")
     assert ended.code == 1 and summary.faults[0].what == "lease_expired"
-    after_s = (summary.faults[0].tick - RunRecord.load(tmp_path / "run").time_s[0] * summary.rate_hz) / summary.rate_hz
-    assert FROM_S < after_s < FROM_S + 0.2  # a state may be 30 ms old, a lease lasts 50 ms
+    assert (
+        FROM_S < stopped_after_s(tmp_path / "run", summary) < FROM_S + 0.2
+    )  # a state may be 30 ms old, a lease lasts 50 ms
     assert "sensor/joints is 0.0" in (tmp_path / "run" / "control.log").read_text()
     assert "at most 0.03 s: no commands" in (tmp_path / "run" / "control.log").read_text()
     assert "Control said: sensor/joints is 0.0" in (tmp_path / "run" / REPORT).read_text()
@@ -38,8 +56,7 @@ def test_without_joints_the_robot_stops_and_the_reason_is_told(tmp_path: Path) -
     ],
 )
 def test_without_another_stream_it_holds_and_goes_on_when_it_is_back(tmp_path: Path, key: str, limit_s: float) -> None:
-    flags = ["--pace", "realtime", "--duration", "5", "--fault", f"drop:{key}@{FROM_S}-{TO_S}"]
-    ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
+    ended, summary = undisturbed(tmp_path / "run", f"drop:{key}@{FROM_S}-{TO_S}")
     assert ended.code == 0 and summary.faults == [] and summary.ended == "complete", ended.out
     record = RunRecord.load(tmp_path / "run")
     time_s = record.time_s - record.time_s[0]
