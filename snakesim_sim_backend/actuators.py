@@ -15,14 +15,12 @@ import math
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.backend import SetPoints
 from snakesim_hal.model.motor import roll_off
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.wire.messages import Mode
-
-Floats = NDArray[np.float64]
 
 # Indices of a dcmotor's parameters in actuator_gainprm; checked against the compiled model in `Motors`.
 KP, KD, MAX_VOLTS = 4, 6, 7

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.model.plugins import plugin_settings
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_sim_backend.ground import GROUND, HILLS, PLANE_GROUP
@@ -16,7 +17,6 @@ from snakesim_sim_backend.model import FOOT_GROUP, build
 from snakesim_sim_backend.sensors.rendered import opened_context
 from snakesim_sim_backend.settings import Settings
 
-Floats = NDArray[np.float64]
 Picture = NDArray[np.uint8]  # (height, width, 3)
 
 AZIMUTH_DEG, ELEVATION_DEG = 60.0, -58.0

@@ -20,7 +20,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from snakesim_hal.arrays import Floats
 
 SINK_M = 2e-4  # of a foot under its share of the weight
 MAX_PHASE = 0.7  # of that spring's vibration in one physics step; long steps get softer ground

@@ -7,8 +7,8 @@ at a time, and reads back its encoders, strain gauges and force sensors.
 import msgspec
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.errors import BackendError
 from snakesim_hal.model.plant import LinkLoad
 from snakesim_hal.model.scenario import RunConfig
@@ -24,8 +24,6 @@ from snakesim_sim_backend.sensors.pose import PoseReader
 from snakesim_sim_backend.settings import PlantSettings, Settings
 from snakesim_sim_backend.start import place_robot
 from snakesim_sim_backend.tether import Rope
-
-Floats = NDArray[np.float64]
 
 STEPS_PER_CHECK = 10  # the search for the cause repeats them under the last torques
 MAX_SQUARED = MAX_ACCELERATION**2

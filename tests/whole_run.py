@@ -8,15 +8,13 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from snakesim_gnc.control.controller import Action, Controller, Report, View
+from snakesim_hal.arrays import Floats
 from snakesim_hal.model.plugins import CONTROLLERS, find_plugin, offered
 from snakesim_hal.model.scenario import RunConfig, load, parse_set
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.run.in_process import simulate
-
-Floats = NDArray[np.float64]
 
 
 @dataclass

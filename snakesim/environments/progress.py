@@ -3,13 +3,10 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from snakesim_hal.model.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
 from snakesim_hal.model.scenario import HeadingGoal, RunConfig, WaypointGoal, start_of
 from snakesim_hal.wire.messages import Description, JointState, Pose
-
-Floats = NDArray[np.float64]
 
 
 class Progress:

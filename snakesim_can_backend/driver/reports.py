@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.definitions import (
@@ -26,8 +25,8 @@ from snakesim_can_backend.protocol.definitions import (
     node_of,
     opcode_of,
 )
+from snakesim_hal.arrays import Floats
 
-Floats = NDArray[np.float64]
 TOLD_WITHIN = 3  # Syncs from a module's fault to its heartbeat, at most
 ONE_CLOCK_MS = 350  # two heartbeats whose uptimes differ by no more are of the same module
 LATE_SYNCS = 3  # a state this many Syncs late is still accepted, with its age; older counts are wrong

@@ -7,16 +7,14 @@ from typing import Annotated
 
 import numpy as np
 from msgspec import Meta
-from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.errors import BackendError
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.plant import LinkLoad
 from snakesim_hal.model.scenario import RunConfig, start_of
 from snakesim_hal.wire.messages import Imu, Pose
 from snakesim_hal.wire.quantities import from_zero
-
-Floats = NDArray[np.float64]
 
 MIN_INERTIA_KG_M2 = 1e-6
 

@@ -23,11 +23,10 @@ from snakesim_can_backend.twin.reports import (
     Readings,
     touch,
 )
+from snakesim_hal.arrays import Floats
 from snakesim_hal.model.plant import LinkLoad, Plant
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.sensors import PoseSensor
-
-Floats = NDArray[np.float64]
 
 
 class ModuleSensors:

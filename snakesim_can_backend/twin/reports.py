@@ -5,13 +5,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from snakesim_can_backend.protocol.codec import Signal, codec
 from snakesim_can_backend.protocol.definitions import Opcode
+from snakesim_hal.arrays import Floats
 from snakesim_hal.model.plant import LinkLoad
 
-Floats = NDArray[np.float64]
 UNTOUCHED = (0, 0, 0, 0, 0, 0)
 
 

@@ -6,11 +6,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.model.route import Route, next_on_route
-
-Floats = NDArray[np.float64]
 
 SPACING_M = 0.01  # of the rows; the interpolation error is 0.005 rad on paths that bend once in 0.15 m
 CHORD_SPACING_M = 0.005

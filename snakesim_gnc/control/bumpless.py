@@ -6,13 +6,11 @@ present torque, and the propulsion torque fades in. Both fades move by `fade` a 
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from snakesim_gnc.control.controller import Action, Report, View, positions
+from snakesim_hal.arrays import Floats
 from snakesim_hal.backend import SetPoints
 from snakesim_hal.wire.messages import Description, JointState
-
-Floats = NDArray[np.float64]
 
 
 class HandOver:

@@ -8,13 +8,11 @@ plans a new path from wherever that is.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from snakesim_gnc.control.controller import View
 from snakesim_gnc.control.undulation import HeadSteeredUndulation
+from snakesim_hal.arrays import Floats
 from snakesim_hal.wire.messages import Description
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

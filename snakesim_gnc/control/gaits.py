@@ -10,15 +10,13 @@ from typing import Annotated, Any
 
 import numpy as np
 from msgspec import Meta
-from numpy.typing import NDArray
 
 from snakesim_gnc.control.bumpless import BumplessReference
 from snakesim_gnc.control.controller import Action, Report, View, motion_wanted
+from snakesim_hal.arrays import Floats
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
 from snakesim_hal.wire.quantities import about
-
-Floats = NDArray[np.float64]
 
 Swing = Annotated[float, Meta(ge=-2, le=2, extra_json_schema={"unit": "rad"})]
 Lag = Annotated[float, Meta(ge=-3.2, le=3.2, extra_json_schema={"unit": "rad"})]

@@ -16,7 +16,6 @@ from typing import Annotated
 
 import numpy as np
 from msgspec import Meta
-from numpy.typing import NDArray
 
 from snakesim_gnc.control.bumpless import BumplessReference
 from snakesim_gnc.control.carried import measured
@@ -27,12 +26,11 @@ from snakesim_gnc.control.progress import Located, Progress
 from snakesim_gnc.control.push import Push, Touches, find_touches, push_forward
 from snakesim_gnc.control.push_report import push_points, why_it_stands
 from snakesim_gnc.control.undulation import HeadSteeredUndulation
+from snakesim_hal.arrays import Floats
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Description, World
 from snakesim_hal.wire.quantities import about
-
-Floats = NDArray[np.float64]
 
 ANOTHER_SHAPE_RAD = 0.1
 SLOPE_M = 0.02  # over which theta' is taken

@@ -1,9 +1,8 @@
 """Vectors in the plane of the ground. Pure."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from snakesim_hal.arrays import Floats
 
 
 def cross(a: Floats, b: Floats) -> Floats:

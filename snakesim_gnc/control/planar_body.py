@@ -6,14 +6,12 @@ from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from snakesim_gnc.control.body_on_path import BodyPose, chain_nodes, heading_of
+from snakesim_hal.arrays import Floats
 from snakesim_hal.model.route import yaw_segments_m
 from snakesim_hal.model.scene import GRAVITY_M_S2
 from snakesim_hal.wire.messages import Description, World
-
-Floats = NDArray[np.float64]
 
 TICKS_KEPT = 128
 

@@ -3,15 +3,13 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from snakesim_gnc.control.body_on_path import BodyOnPath
 from snakesim_gnc.control.controller import View
 from snakesim_gnc.control.planar_body import PlanarBody, RecentAngles, pose_instant_ns
+from snakesim_hal.arrays import Floats
 from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import Trajectory, World
-
-Floats = NDArray[np.float64]
 
 AGAIN_STEPS = 8  # to localise a body again that may have slid meanwhile
 

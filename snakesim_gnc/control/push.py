@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_gnc.control.planar import cross
+from snakesim_hal.arrays import Floats
 from snakesim_hal.model.outlines import Outlines
-
-Floats = NDArray[np.float64]
 
 SAMPLES = 5  # of each link
 BUMP = 0.6  # |n.t| of a contact: beyond, something stands before the head

@@ -6,12 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.model.kinematics import link_frames
 from snakesim_hal.wire.messages import Description
 
-Floats = NDArray[np.float64]
 KEPT_NS = 1_000_000_000
 AHEAD_NS = 50_000_000  # a sensor may be this far ahead of the newest joint state, which is then used
 AXIS_STEP_M = 0.02

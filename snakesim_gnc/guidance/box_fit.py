@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_gnc.guidance.circle_fit import OUTLIER_SD, softened
+from snakesim_hal.arrays import Floats
 
-Floats = NDArray[np.float64]
 DEPTH_M, DEPTH_SD_M = 0.10, 0.04  # of a box of which one face was seen
 WALL_M = 0.45  # a longer face is a wall,
 THICKNESS_M = 0.05  # which is this thick unless its other side was seen

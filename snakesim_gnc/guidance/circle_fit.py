@@ -7,9 +7,9 @@ centre and radius; a short arc leaves both uncertain along the line of sight, an
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from snakesim_hal.arrays import Floats
+
 RADIUS_M, RADIUS_SD_M = 0.05, 0.03  # prior: what stands around, before it was looked at
 SMALLEST_M, LARGEST_M = 0.01, 0.5
 STEPS = 5

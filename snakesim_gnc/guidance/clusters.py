@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from snakesim_gnc.guidance.scan import Scan
 
-Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
 GRAZING_RAD = 0.26  # a surface seen flatter than this falls apart (adaptive breakpoint detector, Borges 2004)
 MIN_JUMP_M = 0.02

@@ -23,12 +23,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion
 from snakesim_hal.model.scene import GRAVITY_M_S2
 from snakesim_hal.wire.messages import Description, Imu, Pose
 from snakesim_hal.wire.quantities import Vector
-
-Floats = NDArray[np.float64]
 
 SLIP_M_S = 0.01  # slower links are held by friction as much as they are braked
 # Standard deviations of what goes in; of the shipped robots.

@@ -3,11 +3,9 @@
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.wire.messages import Contact, WorldContact
-
-Floats = NDArray[np.float64]
 
 
 def contact_w(

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from snakesim_gnc.guidance.ground import NEAR_M, refined, tolerance_m
 from snakesim_gnc.guidance.scan import BAND_M, MAX_RANGE_M, Noise, Scan
+from snakesim_hal.arrays import Floats
 from snakesim_hal.wire.messages import DepthImage
 
-Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 CELL_M = 0.02  # of range near the camera; a surface is sought cell by cell,
 STRETCH_M = 1.0  # and cells grow beyond this, as noise does

@@ -9,14 +9,13 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from snakesim_gnc.guidance.body_history import Base, BodyHistory, about_z, wrapped
 from snakesim_gnc.guidance.odometry import Odometry, Step
+from snakesim_hal.arrays import Floats
 from snakesim_hal.model.kinematics import rotation_from_quaternion, yaw_of
 from snakesim_hal.wire.messages import Contacts, Description, Imu, JointState, Pose
 
-Floats = NDArray[np.float64]
 MessageT = TypeVar("MessageT", Contacts, Imu)
 GATE = 25.0  # squared Mahalanobis distance
 JUMP_S = 0.3  # a pose that is refused for longer than this was right: the robot has been carried

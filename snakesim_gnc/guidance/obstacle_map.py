@@ -17,10 +17,10 @@ from snakesim_gnc.guidance.clusters import clusters_of
 from snakesim_gnc.guidance.scan import MAX_RANGE_M, Scan
 from snakesim_gnc.guidance.surfaces import MAX_DOUBTS
 from snakesim_gnc.guidance.tracks import BELIEVED, GONE, HIT, MISS, TOUCH, Track, fit, outlines_of, position_sd_m
+from snakesim_hal.arrays import Floats
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Obstacle
 
-Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
 GATE_M = 0.02  # from an outline, beside what its sd and the point's allow
 WIDEST_GATE_M = 0.08

@@ -14,12 +14,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.model.kinematics import link_frames
 from snakesim_hal.wire.messages import Contact, Contacts, Description, Imu, JointState
 
-Floats = NDArray[np.float64]
 ALONG_NORMAL_M_S = 0.005
 SIDEWAYS_M_S = 0.02  # at rest,
 SIDEWAYS_PER_RAD_S = 0.02  # and for each rad/s of the joints

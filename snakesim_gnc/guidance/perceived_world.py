@@ -8,7 +8,6 @@ import math
 from collections import Counter
 
 import numpy as np
-from numpy.typing import NDArray
 
 from snakesim_gnc.guidance.body_history import Base, Body
 from snakesim_gnc.guidance.contacts_w import contact_w
@@ -18,6 +17,7 @@ from snakesim_gnc.guidance.localisation import Localiser, PoseNoise
 from snakesim_gnc.guidance.obstacle_map import ObstacleMap
 from snakesim_gnc.guidance.scan import Noise, Scan, scan_of_ranges
 from snakesim_gnc.guidance.scan_match import matched
+from snakesim_hal.arrays import Floats
 from snakesim_hal.model.kinematics import rotation_from_quaternion
 from snakesim_hal.wire.messages import (
     Contacts,
@@ -31,7 +31,6 @@ from snakesim_hal.wire.messages import (
 )
 from snakesim_hal.wire.quantities import MAX_CONTACTS, Vector
 
-Floats = NDArray[np.float64]
 TOUCH_EVERY_NS = 50_000_000  # the body slides a few millimetres meanwhile
 OWN_BODY_M = 0.01  # beyond its radius
 SURE_SD_M = 0.05  # of the position, at which the confidence in it is one half

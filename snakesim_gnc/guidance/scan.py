@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.wire.messages import Ranges
 
-Floats = NDArray[np.float64]
 BAND_M = (0.02, 0.12)  # height above the ground of what a snake's body can touch
 MAX_RANGE_M = 4.0  # farther surfaces are too coarse to be worth mapping
 

@@ -8,12 +8,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from snakesim_gnc.guidance.scan import Scan
 from snakesim_gnc.guidance.tracks import Track, outlines_of, position_sd_m
+from snakesim_hal.arrays import Floats
 
-Floats = NDArray[np.float64]
 GATE_M = 0.05
 MIN_POINTS = 8
 MIN_BELIEF = 1.0  # log odds: seen a few times

@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from snakesim_hal.arrays import Floats
+
 CELL_M = 0.01
 MAX_CELLS = 48
 MAX_INFORMATION = 1.0 / 0.0015**2  # errors of pose and mount are common to all points, and do not average out

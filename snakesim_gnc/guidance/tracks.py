@@ -10,15 +10,14 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from snakesim_gnc.guidance.box_fit import fit_boxes
 from snakesim_gnc.guidance.circle_fit import RADIUS_M, fit_circles
 from snakesim_gnc.guidance.surfaces import Surface, batched
+from snakesim_hal.arrays import Floats
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Obstacle
 
-Floats = NDArray[np.float64]
 BOX_FROM = 5  # cells; fewer are a circle
 ROUND_LIMIT_M = 0.16  # rounder things are boxes
 ROUND_MISFIT = 0.8  # a cell: what a circle explains this well need not be tried as a box

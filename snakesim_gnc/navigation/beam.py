@@ -21,8 +21,8 @@ from snakesim_gnc.control.planar import wrenches
 from snakesim_gnc.navigation.line import back_from_end
 from snakesim_gnc.navigation.margin import margins_n
 from snakesim_gnc.navigation.obstacle_map import NONE, ROUGH_M, ObstacleMap
+from snakesim_hal.arrays import Floats
 
-Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 
 STEP_M = 0.05

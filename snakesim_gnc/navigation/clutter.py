@@ -15,7 +15,6 @@ from collections import deque
 from collections.abc import Generator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from snakesim_gnc.navigation.beam import STEP_M, Search
 from snakesim_gnc.navigation.intents import DesiredMotion
@@ -39,12 +38,11 @@ from snakesim_gnc.navigation.plan import (
     straight_on,
     within_reach,
 )
+from snakesim_hal.arrays import Floats
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.model.route import Route
 from snakesim_hal.model.scenario import HeadingGoal, WaypointGoal
 from snakesim_hal.wire.messages import Obstacle, Trajectory, World
-
-Floats = NDArray[np.float64]
 
 NODES_PER_S = 250_000  # of robot time: two fifths of what a core expands, see docs/poal.md
 ENDS_SOON_M = 0.6

@@ -1,9 +1,8 @@
 """Points along a line on the ground. Pure."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from snakesim_hal.arrays import Floats
 
 SPACING_M = 0.01
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Obstacle
 
-Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 
 CELL_M = 0.01

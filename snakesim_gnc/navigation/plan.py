@@ -9,16 +9,14 @@ from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from snakesim_gnc.navigation.beam import MIN_PUSH, STEP_M, Beam, PathSearch, PlannedPath, Search
 from snakesim_gnc.navigation.line import SPACING_M, evenly
 from snakesim_gnc.navigation.obstacle_map import NONE, ObstacleMap
 from snakesim_gnc.navigation.snap import Fit, snap
+from snakesim_hal.arrays import Floats
 from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import Obstacle
-
-Floats = NDArray[np.float64]
 
 START, STANDS, BACKED_OUT = "the first path", "the body stands", "the body has backed out"
 ENDS_SOON, MAP_CHANGED, TURNED = "the path ends soon", "the map has changed", "the direction has changed"

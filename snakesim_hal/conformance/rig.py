@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.backend import Backend, Samples, SetPoints
 from snakesim_hal.conformance import tolerances as t
 from snakesim_hal.safety.authority import Authority
@@ -26,7 +26,6 @@ from snakesim_hal.wire.messages import (
     Power,
 )
 
-Floats = NDArray[np.float64]
 JointTargets = Mapping[int, tuple[Mode, float]]  # joint index -> mode and target
 HOLDER = "control"
 REANCHOR_PERIODS = 10

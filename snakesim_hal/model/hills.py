@@ -1,11 +1,9 @@
 """The heights of uneven ground, as the simulator builds it and viewers draw it. Pure."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.model.scene import Uneven
-
-Floats = NDArray[np.float64]
 
 SAMPLES_PER_WAVE = 12
 MAX_SAMPLES = 500  # along an edge

@@ -8,11 +8,10 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.wire.quantities import Vector
-
-Floats = NDArray[np.float64]
 
 
 def rotation_from_quaternion(wxyz: ArrayLike) -> Floats:

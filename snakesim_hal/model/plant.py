@@ -8,16 +8,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.wire.messages import Imu, Pose
 from snakesim_hal.wire.quantities import Vector
 
 if TYPE_CHECKING:
     from snakesim_hal.model.scenario import RunConfig
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -7,15 +7,12 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta
 from numpy.random import Generator
-from numpy.typing import NDArray
 
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.outlines import Capsule, Clearance, Friction, Outlines, Point, Size, gaps_m
 from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import Obstacle
-
-Floats = NDArray[np.float64]
 
 MAX_RANDOM_OBSTACLES = 1000
 TRIES = 200  # for each obstacle that is wanted

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from snakesim_hal.arrays import Floats
 
 
 def is_line(points_w: Floats) -> bool:

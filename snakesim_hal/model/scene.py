@@ -10,7 +10,6 @@ from typing import Annotated
 
 import numpy as np
 from msgspec import Meta
-from numpy.typing import NDArray
 
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.files import FileStruct
@@ -29,7 +28,6 @@ from snakesim_hal.model.route import Route, sine_points
 from snakesim_hal.wire.messages import Obstacle
 from snakesim_hal.wire.quantities import Name
 
-Floats = NDArray[np.float64]
 GRAVITY_M_S2 = 9.81  # as in MuJoCo, unless configured otherwise
 
 

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from snakesim_hal.arrays import Floats
+
 Number = TypeVar("Number", float, Floats)
 
 AMBIENT_C = 20.0

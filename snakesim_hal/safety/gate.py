@@ -21,12 +21,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.backend import SetPoints
 from snakesim_hal.safety.lease import Lease
 from snakesim_hal.wire.freshness import oldest_state_ns
 from snakesim_hal.wire.messages import Description, JointCommand, JointDescription, Mode
 
-Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 REACTION_PERIODS = 4  # the minimum that keeps joints from overshooting their end, with two periods of latency on a bus

@@ -5,14 +5,12 @@ from typing import Any
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.wire.messages import Description, Mode
 from snakesim_operator.console.drawing import pushing_joint
 from snakesim_operator.console.snapshot import RobotSnapshot
 from snakesim_operator.results.page.palette import joint_colours
-
-Floats = NDArray[np.float64]
 
 HISTORY_S = 10.0
 SAMPLES_MOST = 400

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.model.hills import hills
 from snakesim_hal.model.kinematics import link_frames, quaternions_from_rotations, rotation_from_quaternion
 from snakesim_hal.model.scenario import RunConfig, place_all
@@ -15,8 +15,6 @@ from snakesim_hal.model.scene import route_of
 from snakesim_hal.wire.messages import ColourImage, DepthImage, Obstacle, World, WorldContact
 from snakesim_operator.console.snapshot import RobotSnapshot
 from snakesim_operator.results.felt import is_felt
-
-Floats = NDArray[np.float64]
 
 M_PER_N, LONGEST_M = 0.02, 0.5  # of a force arrow
 ABOVE_M = 0.02  # forces are drawn above the body, which would hide most of them at the height of the contacts

@@ -13,13 +13,13 @@ import numpy as np
 import viser
 from numpy.typing import ArrayLike, NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.model.kinematics import quaternion_from_yaw
 from snakesim_hal.wire.messages import Description, Obstacle
 from snakesim_operator.console.drawing import Camera, Drawing, Surroundings
 from snakesim_operator.console.meshes import Mesh, box, capsule, circle, cylinder, hoops, sphere
 from snakesim_operator.results.page.palette import DARK, LIGHT
 
-Floats = NDArray[np.float64]
 Colour = tuple[int, int, int]
 
 TRAIL_STEP_M, TRAIL_MOST = 0.02, 1000

@@ -2,14 +2,12 @@
 
 from typing import Any
 
-import numpy as np
 from matplotlib.axes import Axes
-from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.timeline import zero_s
 
-Floats = NDArray[np.float64]
 STYLE: Any = {
     "font.size": 8.0,
     "axes.spines.top": False,

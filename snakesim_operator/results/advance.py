@@ -6,12 +6,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.model.scenario import HeadingGoal, RunConfig, WaypointGoal
 from snakesim_hal.record.black_box import BlackBox
 from snakesim_hal.wire.messages import Description, Mode
 from snakesim_operator.results.record import RunRecord, nodes_w
 
-Floats = NDArray[np.float64]
 SAMPLE_S = 0.1
 STOOD_M, STOOD_S = 0.02, 1.0  # it stands while the body's centre has moved less than this within this time
 LASTING_S = 0.5  # noise may take it back over the line

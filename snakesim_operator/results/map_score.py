@@ -11,12 +11,11 @@ from dataclasses import dataclass, field
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.model.outlines import Outlines
 from snakesim_hal.wire.messages import Obstacle
 
-Floats = NDArray[np.float64]
 NEAR_M = 1.0
 VIEW_RAD = math.pi / 2
 NEAREST_M = 0.15  # a camera sees nothing nearer

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion
 from snakesim_hal.model.route import Route
@@ -30,7 +31,6 @@ GIVE = "give the folder that `snakesim run` left, such as runs/demo, or a record
 UNRECORDED = "without a recording, what control, navigation and guidance reported is unknown"
 
 DAMAGED = (*UNDECODABLE, OSError, MemoryError)
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,16 +4,14 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.files import Table
 from snakesim_hal.model.links import capsule_inertia
 from snakesim_operator.robots.imported import UPS, Imported, Order
 from snakesim_operator.robots.urdf_tree import Body, Joint, Row
 from snakesim_operator.robots.xml_tree import Element
-
-Floats = NDArray[np.float64]
 
 DIGITS_M = 9  # lengths are rounded to a nanometre, which removes the noise of adding transforms
 OFF_LINE = 0.05  # of the mean distance between joints: a joint further beside the line is an error

@@ -4,14 +4,12 @@ import struct
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.errors import ConfigError
 
 MAX_BYTES = 64 * 1024 * 1024
 STL_HEADER, STL_TRIANGLE = 84, 50
-
-Floats = NDArray[np.float64]
 
 
 def find_mesh(name: str, urdf: Path) -> Path | None:

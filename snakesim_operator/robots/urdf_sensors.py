@@ -10,8 +10,8 @@ from typing import Any
 from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.errors import short
 from snakesim_hal.model.files import Table
 from snakesim_hal.model.robot import RobotFile
@@ -19,7 +19,6 @@ from snakesim_hal.model.sensors import DepthCamera
 from snakesim_operator.robots.urdf_tree import Row, rotation
 from snakesim_operator.robots.xml_tree import Element
 
-Floats = NDArray[np.float64]
 Warn = Callable[[str], None]
 
 EVERYWHERE = {"imu": "imu", "contact": "contacts"}

@@ -9,13 +9,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.errors import ConfigError, short
 from snakesim_operator.robots.meshes import find_mesh, vertices
 from snakesim_operator.robots.xml_tree import Element
 
-Floats = NDArray[np.float64]
 Warn = Callable[[str], None]
 TURNING = ("revolute", "continuous")
 RIM = 32  # points of a cylinder's rim

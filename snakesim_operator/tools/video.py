@@ -8,6 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.plugins import FILMS, find_plugin
 from snakesim_hal.terminal import Say, say
@@ -15,7 +16,6 @@ from snakesim_operator import extras
 from snakesim_operator.results.incomplete import exit_code
 from snakesim_operator.results.record import RunRecord
 
-Floats = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 Write = Callable[[Picture], None]
 

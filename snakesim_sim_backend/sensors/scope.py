@@ -6,8 +6,8 @@ from typing import Protocol
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.thermal import Thermal
@@ -15,7 +15,6 @@ from snakesim_hal.wire.messages import Message
 from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.model import SimModel
 
-Floats = NDArray[np.float64]
 Normal = Callable[[int], Floats]  # n -> (n,) standard normal numbers
 
 

@@ -9,14 +9,12 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_sim_backend.flat_ground import Physics
 from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS, build
 from snakesim_sim_backend.settings import Settings
 from tests.unit.sim_backend.rig import G, make_config
-
-Floats = NDArray[np.float64]
 
 MU = 0.1
 SERVO = (300.0, 10.0)  # N·m/rad and N·m·s/rad

@@ -11,13 +11,12 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from snakesim_gnc.control.body_on_path import BodyPose
+from snakesim_hal.arrays import Floats
 from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import Obstacle
 
-Floats = NDArray[np.float64]
 Planar = tuple[float, float]
 
 COARSE_M = 0.005

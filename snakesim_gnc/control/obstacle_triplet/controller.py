@@ -22,7 +22,6 @@ with which the motor keeps its torque; `fade = period / blend_s + |speed| period
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from snakesim_gnc.control.body_on_path import BodyPose
 from snakesim_gnc.control.bumpless import HandOver
@@ -37,8 +36,6 @@ from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_gnc.control.progress import Located, Progress
 from snakesim_hal.backend import SetPoints
 from snakesim_hal.wire.messages import Description, Mode, Obstacle
-
-Floats = NDArray[np.float64]
 
 PLAN_WINDOW_M = 1.0  # beyond the body's ends: where the path may pass an obstacle that is near the body
 

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from snakesim_gnc.control.obstacle_triplet.contacts import PlannedContact, PushPoint
 from snakesim_gnc.control.obstacle_triplet.statics import (
@@ -22,8 +21,8 @@ from snakesim_gnc.control.obstacle_triplet.statics import (
     unit_forces,
 )
 from snakesim_gnc.control.planar import wrenches
+from snakesim_hal.arrays import Floats
 
-Floats = NDArray[np.float64]
 Names = tuple[str, str, str]
 Three = tuple[PlannedContact, PlannedContact, PlannedContact]
 

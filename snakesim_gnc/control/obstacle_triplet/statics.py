@@ -16,11 +16,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from snakesim_gnc.control.planar import cross, wrenches
+from snakesim_hal.arrays import Floats
 
-Floats = NDArray[np.float64]
 Planar = tuple[float, float] | Floats
 
 CONDITION_MAX = 100.0

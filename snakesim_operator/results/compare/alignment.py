@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.timeline import zero_s
 
-Floats = NDArray[np.float64]
 SAME_INSTANT_S = 1e-6
 
 

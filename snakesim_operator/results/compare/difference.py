@@ -7,6 +7,7 @@ from itertools import takewhile
 import numpy as np
 from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.record.host_record import BLACK_BOX
 from snakesim_hal.wire.messages import Mode
@@ -15,7 +16,6 @@ from snakesim_operator.results.compare.settings import Setting, differences, ide
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.timeline import Series, distance, propulsion_intervals, reported_distance
 
-Floats = NDArray[np.float64]
 APART_RAD = 0.05  # three degrees: a hundred times the noise of a joint's sensor, a fifth of a strong bend
 STOOD_M = 0.001  # who moved less did not move: no percentage is made of that
 TARGETS = (

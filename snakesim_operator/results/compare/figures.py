@@ -1,13 +1,12 @@
 """The charts of a comparison: A thick, B thin above it."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_operator.results.compare.difference import Advance, Difference, Gap
 from snakesim_operator.results.page.charts import Bar, Figure, Line, Mark, bars, joint_map, lines
 from snakesim_operator.results.report.timeline import propulsion_intervals
 
-Floats = NDArray[np.float64]
 A, B = "--measured", "--reference"
 
 

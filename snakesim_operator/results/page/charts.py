@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from snakesim_hal.arrays import Floats
+
 Figure = dict[str, Any]
 BUCKETS = 500  # of time; each keeps its smallest and its largest value
 MAP_COLUMNS = 480

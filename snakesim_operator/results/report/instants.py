@@ -9,14 +9,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.wire.messages import ControlState, World, WorldContact
 from snakesim_operator.results.felt import is_felt
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.timeline import reported_at_s
 
-Floats = NDArray[np.float64]
 NEEDED = 3
 WORLD_WITHIN_S = 0.021  # measured forces this far from the solved ones still count as simultaneous
 

@@ -12,6 +12,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.wire.messages import ControlState, World, WorldContact
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.instants import balance_of
@@ -21,7 +22,6 @@ from snakesim_operator.results.report.timeline import end_s, in_words, zero_s
 from snakesim_operator.results.report.top_view import body, ground, outline_w, scales
 from snakesim_operator.results.report.view import FELT_SHARE, LONGEST_ARROW, View, map_view
 
-Floats = NDArray[np.float64]
 MessageT = TypeVar("MessageT", ControlState, World)
 FRAMES = 300
 MAPS, PATH_POINTS = 80, 60  # of a whole run; of a path

@@ -4,8 +4,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.model.scene import GRAVITY_M_S2
 from snakesim_hal.wire.messages import WorldContact
 from snakesim_operator.results.map_score import MapScore, score
@@ -13,7 +13,6 @@ from snakesim_operator.results.page.charts import Bar, Figure, Line, bars, lines
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.timeline import end_s, reported_at_s, reported_spans, zero_s
 
-Floats = NDArray[np.float64]
 MAX_OBSTACLES = 24  # that get a row of their own: those that gave most
 MIN_FORCE_N = 0.5  # a smaller wanted force is none
 STOOD_S = 0.5  # a shorter stop is not worth a line

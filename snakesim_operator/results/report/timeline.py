@@ -4,13 +4,12 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.wire.messages import ControlState, Mode
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.summary import arc_position_m
 
-Floats = NDArray[np.float64]
 POSE_SAMPLES = 400
 STATES = {"Locomoting": "moving as meant", "NotLocomoting": "not moving", "Idle": "idle", "PowerOff": "power off"}
 

@@ -3,8 +3,8 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.model.scene import Placed
 from snakesim_hal.wire.messages import Obstacle, WorldContact
 from snakesim_operator.results.record import RunRecord
@@ -25,7 +25,6 @@ from snakesim_operator.results.report.svg import (
 )
 from snakesim_operator.results.report.view import EDGE, FELT_SHARE, FOOT, LONGEST_ARROW, View, nodes_xy_w, reach_m
 
-Floats = NDArray[np.float64]
 MAX_POINTS = 1500  # of the route
 ROUND = 12  # corners of a circle
 

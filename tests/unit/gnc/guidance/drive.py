@@ -5,12 +5,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from snakesim_gnc.guidance.body_history import Base
 from snakesim_gnc.guidance.localisation import PoseNoise
 from snakesim_gnc.guidance.perceived_world import PerceivedWorld
 from snakesim_gnc.guidance.scan import Noise
+from snakesim_hal.arrays import Floats
 from snakesim_hal.model.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
 from snakesim_hal.model.outlines import outline_distance_m
 from snakesim_hal.model.route import Route, lay_chain, sine_points, yaw_segments_m
@@ -18,7 +18,6 @@ from snakesim_hal.wire.messages import DepthImage, Imu, JointState, Obstacle, Po
 from tests.unit.gnc.guidance.rendered import Eye, Ground, box, cylinder, depth_image, flat
 from tests.unit.gnc.stage import BODY_RADIUS_M, make_robot
 
-Floats = NDArray[np.float64]
 STEP_NS = 20_000_000  # guidance's turn
 IMAGE_EVERY = 3  # turns
 DELAY_TURNS = 2

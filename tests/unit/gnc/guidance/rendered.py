@@ -5,12 +5,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from snakesim_gnc.guidance.depth_scan import Intrinsics
+from snakesim_hal.arrays import Floats
 from snakesim_hal.wire.messages import DepthImage, Obstacle, Ranges
 
-Floats = NDArray[np.float64]
 Ground = Callable[[Floats, Floats], Floats]
 INTRINSICS = Intrinsics(width=160, height=120, fx_px=90.0, fy_px=90.0, cx_px=79.5, cy_px=59.5)
 RANGE_M = (0.05, 3.0)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.model.kinematics import (
     joint_rotation,
     link_frames,
@@ -16,7 +16,6 @@ from snakesim_hal.model.kinematics import (
     yaw_of,
 )
 
-Floats = NDArray[np.float64]
 ANGLE = st.floats(-3, 3)
 SHARE = st.floats(-1, 1)
 

@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from snakesim_hal.arrays import Floats
 from snakesim_hal.model.route import Route, chain_angles, lay_chain, next_on_route, sine_points, yaw_segments_m
-
-Floats = NDArray[np.float64]
 
 
 @st.composite
