@@ -106,8 +106,8 @@ schemas: $(stamp) ## Regenerate what is made from the code: JSON Schemas, key sp
 	$(bin)/snakesim schemas --write schemas
 	$(bin)/python -m tests.kinds_table
 
-docs: $(stamp) ## Write the API reference into build/docs
-	PDOC_ALLOW_EXEC=1 $(bin)/python -m pdoc --output-directory build/docs $(packages)
+docs: $(stamp) ## Write the documentation as a site into build/docs, searchable, also without a network
+	$(bin)/python docs/site/build.py
 
 lock: ## Resolve the lock files again (UPGRADE=1 for newer versions)
 	$(bootstrap) lock $(if $(UPGRADE),--upgrade)

@@ -1,0 +1,85 @@
+"""Builds the documentation site into build/docs: `make docs`. Pages are taken as they stand, in the repository's tree.
+
+So a link that works in the repository works on the site. Commands and the Python API are written from the code.
+"""
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pdoc
+
+import snakesim  # before NumPy
+from snakesim_operator.cli import parser
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+PAGES = ROOT / "build" / "site"
+SITE = ROOT / "build" / "docs"
+SHOWN = ("README.md", "CHANGELOG.md", "LICENSE", "docs", "schemas", "benchmarks", "deploy", "snakesim_gnc/guidance")
+PACKAGES = [path.name for path in sorted(ROOT.glob("snakesim*")) if (path / "__init__.py").exists()]
+
+
+def main() -> None:
+    """Collect the pages, write the command reference, then build the site and the API's pages."""
+    shutil.rmtree(PAGES, ignore_errors=True)
+    for file in shown_files():
+        (PAGES / file).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(ROOT / file, PAGES / file)
+    (PAGES / "docs" / "commands.md").write_text(command_reference(), encoding="utf-8")
+    (PAGES / "assets").mkdir()
+    shutil.copy(ROOT / "docs" / "site" / "iframe-worker.js", PAGES / "assets")
+    write_api(PAGES / "api")
+    config = str(ROOT / "docs" / "site" / "mkdocs.yml")
+    run("mkdocs", "build", "--strict", "--quiet", "--clean", "--config-file", config, NO_MKDOCS_2_WARNING="1")
+    print(f"open {SITE.relative_to(ROOT)}/index.html")
+
+
+def write_api(folder: Path) -> None:
+    """The pages of the Python API, with the names that `snakesim` loads only when they are used."""
+    os.environ["PDOC_ALLOW_EXEC"] = "1"
+    for name in snakesim.__all__:
+        setattr(snakesim, name, getattr(snakesim, name))
+    pdoc.pdoc(*PACKAGES, output_directory=folder)
+
+
+def shown_files() -> Iterator[Path]:
+    """Every tracked or new file of the folders that pages link to."""
+    command = ("git", "ls-files", "--cached", "--others", "--exclude-standard", "--", *SHOWN)
+    for name in subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.splitlines():
+        if (ROOT / name).is_file() and not name.startswith("docs/site/"):
+            yield Path(name)
+
+
+def command_reference() -> str:
+    """What `snakesim COMMAND --help` says, of every command and part of one."""
+    os.environ["COLUMNS"] = "80"
+    os.environ["NO_COLOR"] = "1"
+    text = ["# Commands", "", "Written from the code: what `snakesim COMMAND --help` says.", ""]
+    for command in commands(parser()):
+        level = "#" * min(command.prog.count(" ") + 2, 4)
+        text += [f"{level} {command.prog}", "", "```text", command.format_help().rstrip(), "```", ""]
+    return "\n".join(text)
+
+
+def commands(command: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+    """A command, and all below it."""
+    yield command
+    for action in command._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for name in sorted(action.choices):
+                yield from commands(action.choices[name])
+
+
+def run(module: str, *arguments: str, **variables: str) -> None:
+    """Run a module of this environment's Python, and end with it if it fails."""
+    command = (sys.executable, "-m", module, *arguments)
+    if (ended := subprocess.run(command, cwd=ROOT, env={**os.environ, **variables})).returncode:
+        sys.exit(f"docs: {module} {' '.join(arguments)} exited with {ended.returncode}")
+
+
+if __name__ == "__main__":
+    main()
