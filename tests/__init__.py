@@ -1,6 +1,7 @@
 import atexit
 import os
 import shutil
+import signal
 import tempfile
 
 from snakesim_hal.arithmetic import pin
@@ -12,3 +13,7 @@ if "SNAKESIM_UNPINNED" not in os.environ:  # set by tests/e2e/test_computers.py
 _state = tempfile.mkdtemp(prefix="snakesim-tests-")
 os.environ["XDG_STATE_HOME"] = _state
 atexit.register(shutil.rmtree, _state, ignore_errors=True)
+
+# What a shell starts in the background ignores Ctrl-C, and so would all that tests start and interrupt.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
