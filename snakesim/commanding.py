@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 from snakesim_hal.backend import SetPoints
 from snakesim_hal.errors import RefusedError, StalledError
-from snakesim_hal.model.injection import CONTROL
+from snakesim_hal.injection import CONTROL
 from snakesim_hal.network.client import Client, Commander, Feed
 from snakesim_hal.network.session import Session
 from snakesim_hal.process import tune_garbage_collector

@@ -3,7 +3,10 @@
 From the ground up:
 
 `wire`      what crosses the network: quantities, messages, keys, codec
-`model`     what people write in files (robot, scene, scenario), and its geometry and physics
+`injection` the words for faults that are injected
+`model`     what people write in files (robot, scene, scenario), and its geometry
+`fault_plan`, `plugin_check`   whether a scenario's faults and plug-ins can be
+`physics`   heat, motor, plant, hills: for simulators, emulated modules and viewers
 `backend`   the one protocol that a simulator or a driver implements
 `safety`    who may move the robot, by how much, and what stops it; pure
 `network`   Zenoh, and nothing else imports it: sessions, the client of controllers, the stop port

@@ -9,8 +9,8 @@ from typing import Protocol
 
 from snakesim_hal.backend import Backend
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.fault_plan import planned
-from snakesim_hal.model.injection import HAL
+from snakesim_hal.fault_plan import planned
+from snakesim_hal.injection import HAL
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Question, Session
 from snakesim_hal.wire import keys

@@ -17,9 +17,9 @@ from typing import Self
 from threadpoolctl import threadpool_limits
 
 from snakesim_hal.errors import SnakesimError
-from snakesim_hal.model.plugin_check import find_service
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Session
+from snakesim_hal.plugin_check import find_service
 from snakesim_hal.process import SERVICE_PRIORITY, set_realtime_priority
 from snakesim_hal.service import ServiceLoop
 from snakesim_hal.terminal import report_error

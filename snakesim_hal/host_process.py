@@ -17,17 +17,17 @@ from snakesim_hal.allowed_faults import faults_of_host
 from snakesim_hal.arguments import add_host
 from snakesim_hal.backend import BackendFactory
 from snakesim_hal.errors import BackendError, ConfigError, RefusedError, SnakesimError
+from snakesim_hal.fault_plan import check_without_run
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host
 from snakesim_hal.host.latch import EstopLatch
-from snakesim_hal.model.fault_plan import check_without_run
-from snakesim_hal.model.plugin_check import check_backend
 from snakesim_hal.model.plugins import BACKENDS, find_plugin, plugin_settings
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.local_registry import LocalRobot, registered, robot_folder
 from snakesim_hal.network.private_channel import HostEnd
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.network.stop_port import open_stop_port, serve_stops, stop_address
+from snakesim_hal.plugin_check import check_backend
 from snakesim_hal.process import HOST_PRIORITY, enter_realtime, on_stop_signal, restart_process, tune_garbage_collector
 from snakesim_hal.record.host_record import HostRecord
 from snakesim_hal.record.recorder import Recorder

@@ -19,13 +19,13 @@ from threadpoolctl import threadpool_limits
 
 from snakesim_hal.allowed_faults import faults_of_host
 from snakesim_hal.errors import ConfigError, RefusedError, SnakesimError
+from snakesim_hal.fault_plan import planned
 from snakesim_hal.host.host import Host
 from snakesim_hal.host_process import open_backend
-from snakesim_hal.model.fault_plan import planned
-from snakesim_hal.model.plugin_check import find_service
 from snakesim_hal.model.plugins import BACKENDS, find_plugin
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.local_network import LocalNetwork
+from snakesim_hal.plugin_check import find_service
 from snakesim_hal.service import ServiceLoop
 from snakesim_hal.terminal import report_error
 from snakesim_hal.wire.messages import LifecycleRequest

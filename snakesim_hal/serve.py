@@ -15,9 +15,9 @@ from threadpoolctl import threadpool_limits
 
 from snakesim_hal.arguments import add_service, link_of, load_scenario
 from snakesim_hal.errors import ConfigError, NotConnectedError, SnakesimError
-from snakesim_hal.model.plugin_check import find_service
 from snakesim_hal.model.scenario import Loaded, RunConfig
 from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.plugin_check import find_service
 from snakesim_hal.process import (
     SERVICE_PRIORITY,
     accept_interrupts,

@@ -18,8 +18,8 @@ import numpy as np
 
 from snakesim_hal.arrays import Floats
 from snakesim_hal.backend import SetPoints
-from snakesim_hal.model.motor import roll_off
 from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.physics.motor import roll_off
 from snakesim_hal.wire.messages import Mode
 
 # Indices of a dcmotor's parameters in actuator_gainprm; checked against the compiled model in `Motors`.

@@ -7,12 +7,12 @@ import numpy as np
 
 from snakesim_hal.backend import Samples, SetPoints
 from snakesim_hal.errors import BackendError
-from snakesim_hal.model.fault_plan import check_backend_can
-from snakesim_hal.model.injection import Injection
-from snakesim_hal.model.motor import check_gains
+from snakesim_hal.fault_plan import check_backend_can
+from snakesim_hal.injection import Injection
 from snakesim_hal.model.robot import describe
 from snakesim_hal.model.scenario import RunConfig, config_hash
-from snakesim_hal.model.thermal import HeatLimits, Thermal
+from snakesim_hal.physics.motor import check_gains
+from snakesim_hal.physics.thermal import HeatLimits, Thermal
 from snakesim_hal.wire.messages import Description, Fault, LifecycleState, Pace
 from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.contacts import TouchReader

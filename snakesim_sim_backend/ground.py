@@ -4,8 +4,8 @@ from typing import Any
 
 import mujoco
 
-from snakesim_hal.model.hills import hills
 from snakesim_hal.model.scene import Ground
+from snakesim_hal.physics.hills import hills
 
 GROUND, HILLS = "ground", "hills"
 GROUND_GROUP = 1  # MuJoCo geom group of everything that the snake may lie on, including steps

@@ -13,9 +13,9 @@ import numpy as np
 
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.links import Link
-from snakesim_hal.model.motor import check_gains
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig, place_all
+from snakesim_hal.physics.motor import check_gains
 from snakesim_hal.wire.messages import Axis
 from snakesim_sim_backend.actuators import add_motor
 from snakesim_sim_backend.flat_ground import KEPT, Soles, soles_of

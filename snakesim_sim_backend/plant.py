@@ -10,9 +10,9 @@ import numpy as np
 
 from snakesim_hal.arrays import Floats
 from snakesim_hal.errors import BackendError
-from snakesim_hal.model.plant import LinkLoad
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.sensors import ImuSensor, PoseSensor
+from snakesim_hal.physics.plant import LinkLoad
 from snakesim_hal.wire.messages import Imu, Pose
 from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.divergence import MAX_ACCELERATION, DivergenceWatch, log_warnings
@@ -31,7 +31,7 @@ NO_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 
 
 class MujocoPlant:
-    """A `snakesim_hal.model.plant.Plant` on MuJoCo. Deterministic: start and torques decide every byte.
+    """A `snakesim_hal.physics.plant.Plant` on MuJoCo. Deterministic: start and torques decide every byte.
 
     Angles, velocities and the pose are present values. Loads, shaft torques and IMU readings are forces and
     accelerations, so they are those of the last step; before the first one, of the start.

@@ -29,10 +29,10 @@ from snakesim_can_backend.protocol.definitions import Action, Frame, ModuleState
 from snakesim_can_backend.settings import Settings
 from snakesim_hal.backend import Samples, SetPoints
 from snakesim_hal.errors import BackendError, ConfigError
-from snakesim_hal.model.injection import Injection
-from snakesim_hal.model.motor import check_gains
+from snakesim_hal.injection import Injection
 from snakesim_hal.model.robot import describe
 from snakesim_hal.model.scenario import RunConfig, config_hash
+from snakesim_hal.physics.motor import check_gains
 from snakesim_hal.wire.messages import Description, Fault, LifecycleState, Pace
 
 NAME = "can"

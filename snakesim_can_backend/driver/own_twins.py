@@ -14,8 +14,8 @@ import msgspec
 from snakesim_can_backend.bus.bus import OtherEnd
 from snakesim_can_backend.settings import Settings
 from snakesim_hal.errors import BackendError, ConfigError
-from snakesim_hal.model.fault_plan import check_backend_can
-from snakesim_hal.model.injection import KINDS, Injection
+from snakesim_hal.fault_plan import check_backend_can
+from snakesim_hal.injection import KINDS, Injection
 from snakesim_hal.model.scenario import RunConfig, write
 from snakesim_hal.service import START_LIMIT_S
 from snakesim_hal.terminal import print_stderr

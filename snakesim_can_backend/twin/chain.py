@@ -24,10 +24,10 @@ from snakesim_can_backend.twin.module_sensors import ModuleSensors, PoseCamera
 from snakesim_can_backend.twin.module_slot import ModuleSlot
 from snakesim_can_backend.twin.motors import Motors
 from snakesim_can_backend.twin.parameters import Parameters, from_factory
-from snakesim_hal.model.injection import Change, Injection, Plan
-from snakesim_hal.model.plant import Plant
+from snakesim_hal.injection import Change, Injection, Plan
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.model.thermal import HeatLimits, Thermal
+from snakesim_hal.physics.plant import Plant
+from snakesim_hal.physics.thermal import HeatLimits, Thermal
 from snakesim_hal.wire.messages import Mode
 
 MAX_AT_ONCE_US = 200_000.0  # after a longer delay of this process, the modules skip the rest of it

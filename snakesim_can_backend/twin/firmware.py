@@ -47,7 +47,7 @@ from snakesim_can_backend.twin.frames import (
 )
 from snakesim_can_backend.twin.parameters import Parameters
 from snakesim_can_backend.twin.reports import ModuleHealth, Readings, health
-from snakesim_hal.model.thermal import MIN_VOLTAGE_V, HeatLimits
+from snakesim_hal.physics.thermal import MIN_VOLTAGE_V, HeatLimits
 from snakesim_hal.wire.messages import Mode
 
 BOOT_US = 100_000

@@ -11,8 +11,8 @@ from msgspec import Meta
 from snakesim_hal.arrays import Floats
 from snakesim_hal.errors import BackendError
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.model.plant import LinkLoad
 from snakesim_hal.model.scenario import RunConfig, start_of
+from snakesim_hal.physics.plant import LinkLoad
 from snakesim_hal.wire.messages import Imu, Pose
 from snakesim_hal.wire.quantities import from_zero
 

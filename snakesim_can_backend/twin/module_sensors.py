@@ -24,9 +24,9 @@ from snakesim_can_backend.twin.reports import (
     touch,
 )
 from snakesim_hal.arrays import Floats
-from snakesim_hal.model.plant import LinkLoad, Plant
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.sensors import PoseSensor
+from snakesim_hal.physics.plant import LinkLoad, Plant
 
 
 class ModuleSensors:

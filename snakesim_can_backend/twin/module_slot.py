@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from snakesim_can_backend.protocol.definitions import Frame, Opcode, checksum, opcode_of
 from snakesim_can_backend.twin.firmware import Demand, Module
-from snakesim_hal.model.thermal import MIN_VOLTAGE_V, SUPPLY_V, board_c, current_a
+from snakesim_hal.physics.thermal import MIN_VOLTAGE_V, SUPPLY_V, board_c, current_a
 
 SAGGED_V = MIN_VOLTAGE_V - 6.0
 

@@ -17,10 +17,10 @@ from snakesim_can_backend.protocol.definitions import NODE_BITS, Frame, Opcode
 from snakesim_can_backend.settings import Settings
 from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.injection import Injection
-from snakesim_hal.model.plant import Plant
+from snakesim_hal.injection import Injection
 from snakesim_hal.model.plugins import PLANTS, find_plugin, plugin_settings
 from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.physics.plant import Plant
 
 IN_STEP_US = 2000.0  # the plant lags now by at most this, so that a Sync needs little computing
 FINEST_US = 200.0  # frames are released in groups of this length, for fewer wake-ups

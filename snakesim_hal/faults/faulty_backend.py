@@ -11,7 +11,7 @@ import msgspec
 
 from snakesim_hal.backend import Backend, Injectable, Samples, SetPoints
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.injection import Injection
+from snakesim_hal.injection import Injection
 from snakesim_hal.wire.messages import Description, Fault, JointState, LifecycleState
 
 NO_NUMBER = float("nan")

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from math import inf
 
 from snakesim_hal.faults.disturbance import Disturbance
-from snakesim_hal.model.injection import Injection
+from snakesim_hal.injection import Injection
 from snakesim_hal.network.session import Session
 
 SHORTEST_PAUSE_S = 0.001  # floods are sent in bursts, so that the thread does not block the interpreter

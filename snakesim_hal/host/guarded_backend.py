@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 
 from snakesim_hal.backend import Backend, Injectable, Samples, SetPoints
 from snakesim_hal.errors import BackendError, SnakesimError, WireError
-from snakesim_hal.model.injection import Injection
+from snakesim_hal.injection import Injection
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Fault, LifecycleState
 from snakesim_hal.wire.outgoing import checked, packed

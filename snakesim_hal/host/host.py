@@ -29,7 +29,7 @@ from snakesim_hal.host.run_statistics import RunStatistics
 from snakesim_hal.host.simulated_time import Refusal, SimulatedTime
 from snakesim_hal.host.status_messages import applied_message, status_message
 from snakesim_hal.host.timing import Deadlines, PublishTimes
-from snakesim_hal.model.injection import HAL
+from snakesim_hal.injection import HAL
 from snakesim_hal.model.scenario import RunConfig, written
 from snakesim_hal.network.private_channel import HostEnd, ToStarter
 from snakesim_hal.network.process_entries import HOST, ProcessEntries, own_entry, show_process

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from snakesim_hal.model.injection import HAL
+from snakesim_hal.injection import HAL
 from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.session import Publisher, Question, Session
 from snakesim_hal.terminal import print_stderr

@@ -17,8 +17,8 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from snakesim_hal.errors import ConfigError, short
+from snakesim_hal.injection import CONTROL
 from snakesim_hal.model.files import FileStruct, Table, decode, find, leaves, read_part, read_table
-from snakesim_hal.model.injection import CONTROL
 from snakesim_hal.model.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
 from snakesim_hal.model.outlines import Capsule, Heading, Point, Size
 from snakesim_hal.model.robot import RobotFile
@@ -127,7 +127,7 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
     rate_hz: Annotated[float, Meta(ge=20, le=5000, extra_json_schema={"unit": "Hz"})] = 100.0
     duration_s: Annotated[float, Meta(gt=0, le=86400, extra_json_schema={"unit": "s"})] = 10.0
     seed: Annotated[int, Meta(ge=0, le=2**31)] = 1
-    faults: list[str] = []  # injected faults, at times since the first arming: see snakesim_hal.model.injection
+    faults: list[str] = []  # injected faults, at times since the first arming: see snakesim_hal.injection
     faults_allowed: bool = False  # also where something real moves
     stall_limit_s: Annotated[float, Meta(gt=0, le=600, extra_json_schema={"unit": "s"})] = 10.0
     start_limit_s: Annotated[float, Meta(gt=0, le=3600, extra_json_schema={"unit": "s"})] = 60.0

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from snakesim_hal.model.thermal import HeatLimits
+from snakesim_hal.physics.thermal import HeatLimits
 from snakesim_hal.safety.gate import Floats
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Fault, JointDescription, Power

@@ -9,7 +9,7 @@ from typing import Literal
 import viser
 
 from snakesim_hal.errors import SnakesimError
-from snakesim_hal.model.injection import KINDS, TargetType
+from snakesim_hal.injection import KINDS, TargetType
 from snakesim_hal.model.kinematics import rotation_from_quaternion, yaw_of
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlSettings

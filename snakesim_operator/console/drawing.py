@@ -8,10 +8,10 @@ from functools import cached_property
 import numpy as np
 
 from snakesim_hal.arrays import Floats
-from snakesim_hal.model.hills import hills
 from snakesim_hal.model.kinematics import link_frames, quaternions_from_rotations, rotation_from_quaternion
 from snakesim_hal.model.scenario import RunConfig, place_all
 from snakesim_hal.model.scene import route_of
+from snakesim_hal.physics.hills import hills
 from snakesim_hal.wire.messages import ColourImage, DepthImage, Obstacle, World, WorldContact
 from snakesim_operator.console.snapshot import RobotSnapshot
 from snakesim_operator.results.felt import is_felt

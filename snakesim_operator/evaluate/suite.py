@@ -31,9 +31,9 @@ from msgspec import Meta
 
 from snakesim_hal.errors import ConfigError, short
 from snakesim_hal.model.files import FileStruct, Table, decode, find, read_table
-from snakesim_hal.model.plugin_check import check_plugins
 from snakesim_hal.model.scenario import Override, RunConfig, check, compose, written
 from snakesim_hal.model.textfiles import parse_toml
+from snakesim_hal.plugin_check import check_plugins
 from snakesim_operator.evaluate.case import Case, case_id
 
 MAX_CASES = 200_000

@@ -74,7 +74,7 @@ def add_commands(commands: Any) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from snakesim_hal.model.plugin_check import check_plugins
+    from snakesim_hal.plugin_check import check_plugins
 
     check_network(arguments)
     loaded = load_scenario(arguments)

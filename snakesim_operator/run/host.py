@@ -4,8 +4,8 @@ import argparse
 import contextlib
 
 from snakesim_hal.host_process import host
-from snakesim_hal.model.plugin_check import check_backend
 from snakesim_hal.model.scenario import write
+from snakesim_hal.plugin_check import check_backend
 from snakesim_hal.serve import process_options
 from snakesim_hal.terminal import say
 from snakesim_operator.results.record import CONFIG

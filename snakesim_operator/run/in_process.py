@@ -23,10 +23,10 @@ from snakesim_hal.arithmetic import is_pinned
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.host_process import record_of
 from snakesim_hal.in_process import InProcessRun, check
-from snakesim_hal.model.plugin_check import check_plugins
 from snakesim_hal.model.plugins import anything_offered
 from snakesim_hal.model.scenario import RunConfig, write
 from snakesim_hal.network.session import Session
+from snakesim_hal.plugin_check import check_plugins
 from snakesim_hal.record.recorder import Recorder
 from snakesim_hal.terminal import print_stderr, say
 from snakesim_hal.wire import keys

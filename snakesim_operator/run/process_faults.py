@@ -11,8 +11,8 @@ from math import inf
 from queue import SimpleQueue
 
 from snakesim_hal.errors import ConfigError, RefusedError, WireError
-from snakesim_hal.model.fault_plan import planned
-from snakesim_hal.model.injection import RUN, Injection, Plan, checked
+from snakesim_hal.fault_plan import planned
+from snakesim_hal.injection import RUN, Injection, Plan, checked
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Question, Session
 from snakesim_hal.process import step_wall_clock

@@ -12,15 +12,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from snakesim_hal.errors import ConfigError, NotConnectedError, SnakesimError
-from snakesim_hal.model.fault_plan import planned
-from snakesim_hal.model.injection import ROUTER
-from snakesim_hal.model.plugin_check import check_plugins
+from snakesim_hal.fault_plan import planned
+from snakesim_hal.injection import ROUTER
 from snakesim_hal.model.scenario import RunConfig, written
 from snakesim_hal.model.whole_file import write_whole
 from snakesim_hal.network.endpoint import check_guarded
 from snakesim_hal.network.local_registry import registered
 from snakesim_hal.network.session import Link, Session, open_session
 from snakesim_hal.network.session_file import SessionFile
+from snakesim_hal.plugin_check import check_plugins
 from snakesim_hal.service import START_LIMIT_S
 from snakesim_hal.terminal import say
 from snakesim_hal.wire.roles import RECORDER

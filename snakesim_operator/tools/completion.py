@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from importlib.metadata import entry_points
 
+from snakesim_hal.injection import KINDS
 from snakesim_hal.model.files import shipped
-from snakesim_hal.model.injection import KINDS
 from snakesim_hal.model.plugins import BACKENDS, COMMANDS, CONTROLLERS, installed
 from snakesim_hal.terminal import print_stderr
 from snakesim_hal.wire import keys

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from math import inf
 
 from snakesim_hal.errors import ConfigError, NotConnectedError, RefusedError, did_you_mean, short
-from snakesim_hal.model.injection import KINDS, Injection, checked, explain
+from snakesim_hal.injection import KINDS, Injection, checked, explain
 from snakesim_hal.network.session import open_session
 from snakesim_hal.terminal import Say, say
 from snakesim_hal.wire import keys

@@ -6,9 +6,9 @@ import msgspec
 
 from snakesim_hal.errors import short
 from snakesim_hal.model.files import leaves, read_part, shipped
-from snakesim_hal.model.plugin_check import check_plugins
 from snakesim_hal.model.plugins import BACKENDS, CONTROLLERS, find_installed, in_file, plugin_settings
 from snakesim_hal.model.scenario import Loaded
+from snakesim_hal.plugin_check import check_plugins
 from snakesim_hal.terminal import say, say_json
 
 ABOUT = {"scenarios": "title", "robots": "about", "scenes": "about", "suites": "title"}  # where each says what it is

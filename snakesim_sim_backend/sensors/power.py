@@ -2,7 +2,7 @@
 
 import mujoco
 
-from snakesim_hal.model.thermal import SUPPLY_V, Thermal, board_c, current_a
+from snakesim_hal.physics.thermal import SUPPLY_V, Thermal, board_c, current_a
 from snakesim_hal.wire.messages import Power
 from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.model import FREE_DOFS

@@ -10,7 +10,7 @@ import numpy as np
 from snakesim_hal.arrays import Floats
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.model.thermal import Thermal
+from snakesim_hal.physics.thermal import Thermal
 from snakesim_hal.wire.messages import Message
 from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.model import SimModel

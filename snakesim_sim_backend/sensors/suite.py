@@ -11,7 +11,7 @@ import numpy as np
 from snakesim_hal.backend import Samples
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.sensors import AnySensor, DepthCamera, Mounted, RangeSensor
-from snakesim_hal.model.thermal import Thermal
+from snakesim_hal.physics.thermal import Thermal
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Message
 from snakesim_sim_backend.actuators import Motors

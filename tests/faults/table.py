@@ -3,7 +3,7 @@
 import signal
 from dataclasses import dataclass
 
-from snakesim_hal.model.injection import KINDS
+from snakesim_hal.injection import KINDS
 from snakesim_hal.wire import keys
 from tests.faults.row import Backend, Measure, Place, Row
 from tests.faults.rows import (

@@ -19,9 +19,10 @@ import pytest
 
 from snakesim_can_backend.driver.mocap import MAX_BYTES, MocapReceiver
 from snakesim_can_backend.twin import faults as twin_faults
+from snakesim_hal import injection
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.host.latch import ESTOP, EstopLatch
-from snakesim_hal.model import files, injection, scenario
+from snakesim_hal.model import files, scenario
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scene import SceneFile
 from snakesim_hal.network.local_registry import LocalRobot, local_robots

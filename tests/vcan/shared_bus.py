@@ -19,7 +19,7 @@ from snakesim_can_backend.settings import Settings
 from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_can_backend.twin.server import TwinServer, make_plant
 from snakesim_hal.backend import SetPoints
-from snakesim_hal.model.plant import Plant
+from snakesim_hal.physics.plant import Plant
 from tests.unit.can_backend.loop import Loop, config
 
 ANSWER_LIMIT_S = 2.0  # of this machine's time; the modules' ends the wait before

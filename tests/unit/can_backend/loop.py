@@ -13,8 +13,8 @@ from snakesim_can_backend.protocol.definitions import ModuleState
 from snakesim_can_backend.settings import Settings
 from snakesim_can_backend.twin.server import InProcessTwins
 from snakesim_hal.backend import Samples, SetPoints
-from snakesim_hal.model.plant import Plant
 from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.physics.plant import Plant
 from snakesim_hal.wire.messages import Fault, LifecycleState, Mode
 from tests.unit.hal.rig import run_config
 

@@ -14,7 +14,7 @@ from snakesim_can_backend.protocol.definitions import Action, Frame, ModuleState
 from snakesim_can_backend.protocol.expanded import expanded_dbc
 from snakesim_can_backend.settings import Settings
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.injection import Injection
+from snakesim_hal.injection import Injection
 from snakesim_hal.model.scenario import load as load_scenario
 from snakesim_hal.model.scenario import parse_set
 

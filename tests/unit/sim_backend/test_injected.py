@@ -6,7 +6,7 @@ import pytest
 from snakesim_hal.backend import Injectable
 from snakesim_hal.errors import BackendError, ConfigError
 from snakesim_hal.faults.faulty_backend import FaultyBackend
-from snakesim_hal.model.injection import parse
+from snakesim_hal.injection import parse
 from snakesim_hal.model.scenario import Override, load
 from snakesim_hal.wire.messages import Pace
 from snakesim_sim_backend.backend import SimBackend

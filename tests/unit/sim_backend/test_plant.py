@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike
 
 from snakesim_hal.errors import BackendError
 from snakesim_hal.model.kinematics import rotation_from_quaternion
-from snakesim_hal.model.plant import LinkLoad, Plant
 from snakesim_hal.model.scenario import load, start_of
+from snakesim_hal.physics.plant import LinkLoad, Plant
 from snakesim_hal.wire.messages import Mode
 from snakesim_sim_backend.flat_ground import Physics
 from snakesim_sim_backend.plant import MujocoPlant

@@ -5,7 +5,7 @@ from math import inf
 import pytest
 
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.injection import Injection
+from snakesim_hal.injection import Injection
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Mode, Power, SensorDescription
 from snakesim_sim_backend.backend import SimBackend

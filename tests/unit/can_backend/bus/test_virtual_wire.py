@@ -13,7 +13,7 @@ from snakesim_can_backend.bus import bus as wire_module
 from snakesim_can_backend.bus.bus import VirtualWire, wait
 from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_hal.errors import BackendError
-from snakesim_hal.model.injection import Injection
+from snakesim_hal.injection import Injection
 from tests.unit.can_backend.bus.test_wire import can_frame
 
 # --- virtual buses, and waiting ----------------------------------------------------------------------------

@@ -35,7 +35,7 @@ from snakesim_can_backend.protocol.definitions import (
 from snakesim_can_backend.settings import Settings
 from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_hal.errors import BackendError
-from snakesim_hal.model.injection import Injection
+from snakesim_hal.injection import Injection
 from tests.unit.can_backend.frames import heartbeat
 from tests.unit.can_backend.loop import config
 from tests.unit.can_backend.twin import rig

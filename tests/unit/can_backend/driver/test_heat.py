@@ -13,8 +13,8 @@ from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.settings import Settings as CanSettings
 from snakesim_can_backend.twin.server import InProcessTwins
 from snakesim_hal.conformance.rig import Rig
-from snakesim_hal.model import thermal
-from snakesim_hal.model.thermal import Thermal
+from snakesim_hal.physics import thermal
+from snakesim_hal.physics.thermal import Thermal
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Mode, Power
 from snakesim_sim_backend.backend import SimBackend

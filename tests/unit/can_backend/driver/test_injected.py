@@ -16,7 +16,7 @@ from snakesim_can_backend.settings import Settings
 from snakesim_can_backend.twin.faults import ABOUT
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.faults.faulty_backend import FaultyBackend
-from snakesim_hal.model.injection import parse
+from snakesim_hal.injection import parse
 from tests.unit.can_backend.loop import Loop, armed, cleared_and_armed_again, config, loop
 
 PERIOD_MS, LEASE_MS = 10, 50

@@ -19,7 +19,7 @@ from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_can_backend.twin.firmware import PASSIVE
 from snakesim_can_backend.twin.server import InProcessTwins
 from snakesim_hal.conformance.rig import Rig
-from snakesim_hal.model.injection import parse
+from snakesim_hal.injection import parse
 from snakesim_hal.wire.messages import LifecycleRequest, Mode
 from tests.unit.can_backend.driver.test_faults_seen import MODULE_FAULTS
 from tests.unit.can_backend.loop import JOINTS, config

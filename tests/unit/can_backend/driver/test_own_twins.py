@@ -13,7 +13,7 @@ from snakesim_can_backend.driver.own_twins import TwinProcess, check_twins, twin
 from snakesim_can_backend.settings import Settings
 from snakesim_can_backend.twin.server import InProcessTwins
 from snakesim_hal.errors import BackendError, ConfigError
-from snakesim_hal.model.injection import Injection
+from snakesim_hal.injection import Injection
 from tests.harness.wait import wait_until
 from tests.unit.can_backend.loop import config
 

@@ -20,8 +20,8 @@ from snakesim_can_backend.settings import Settings
 from snakesim_can_backend.twin.frames import write_contact, write_tail_contact
 from snakesim_can_backend.twin.reports import touch
 from snakesim_hal.backend import Samples
-from snakesim_hal.model.plant import LinkLoad
 from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.physics.plant import LinkLoad
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Contacts, Imu, Pose, Power
 from snakesim_hal.wire.quantities import Vector

@@ -25,7 +25,7 @@ from snakesim_can_backend.settings import Settings
 from snakesim_can_backend.twin.firmware import BOOT_US, Module
 from snakesim_can_backend.twin.parameters import Parameters, from_factory
 from snakesim_hal.model.scenario import load as load_scenario
-from snakesim_hal.model.thermal import HeatLimits
+from snakesim_hal.physics.thermal import HeatLimits
 
 TEXT = (Path(__file__).parents[4] / "docs" / "can-protocol.md").read_text(encoding="utf-8")
 NODE = 5

@@ -23,7 +23,7 @@ from snakesim_can_backend.twin.inertia import InertiaPlant, InertiaSettings
 from snakesim_can_backend.twin.parameters import Parameters, from_factory
 from snakesim_can_backend.twin.reports import Readings
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.model.thermal import HeatLimits
+from snakesim_hal.physics.thermal import HeatLimits
 from snakesim_hal.wire.messages import Mode
 from tests.unit.hal.rig import run_config
 

@@ -10,7 +10,7 @@ from snakesim_can_backend.protocol.definitions import Action, ModuleState, Opcod
 from snakesim_can_backend.protocol.mocap_sample import MocapSample
 from snakesim_can_backend.twin.chain import MAX_AT_ONCE_US
 from snakesim_can_backend.twin.reports import ALONG, ANGLE, FORCE
-from snakesim_hal.model.plant import LinkLoad
+from snakesim_hal.physics.plant import LinkLoad
 from snakesim_hal.wire.messages import Imu, Mode
 from tests.unit.can_backend.twin.rig import Host, chain, command, config, only, set_point, sync
 from tests.unit.hal.rig import pose

@@ -5,7 +5,7 @@ import pytest
 from snakesim_can_backend.protocol.definitions import Action, ModuleState, Opcode, node_of, opcode_of
 from snakesim_can_backend.twin.faults import ABOUT, explain, parse, parse_typed, typed
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.injection import KINDS, Injection
+from snakesim_hal.injection import KINDS, Injection
 from tests.unit.can_backend.twin.rig import Host, chain, command, only
 
 

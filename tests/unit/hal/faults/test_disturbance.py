@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from snakesim_hal.errors import WireError
 from snakesim_hal.faults.disturbance import MAX_AT_ONCE, Disturbance, corrupted
-from snakesim_hal.model.injection import Injection, checked
+from snakesim_hal.injection import Injection, checked
 from snakesim_hal.wire.codec import Decoder, encode, encoding_of
 from snakesim_hal.wire.messages import JointCommand
 from tests.unit.hal.rig import command, description

@@ -11,7 +11,7 @@ from snakesim_hal.faults.injector import Injector
 from snakesim_hal.faults.message_faults import MessageFaults
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host
-from snakesim_hal.model.injection import parse
+from snakesim_hal.injection import parse
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, Clock, FaultRequest, JointState

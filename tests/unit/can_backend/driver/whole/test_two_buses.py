@@ -15,7 +15,7 @@ from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_can_backend.twin.inertia import InertiaPlant, InertiaSettings
 from snakesim_can_backend.twin.server import TwinServer
 from snakesim_hal.errors import BackendError
-from snakesim_hal.model.injection import Injection
+from snakesim_hal.injection import Injection
 from snakesim_hal.model.scenario import RunConfig
 from tests.unit.can_backend.driver.whole.recorded import WIRES, RecordedWire, go, is_action, is_set_point, words
 from tests.unit.can_backend.loop import Loop, config

@@ -6,7 +6,7 @@ from typing import Any
 import msgspec
 
 from snakesim_hal.errors import ConfigError, short
-from snakesim_hal.model.fault_plan import check_planned
+from snakesim_hal.fault_plan import check_planned
 from snakesim_hal.model.files import Table
 from snakesim_hal.model.plugins import BACKENDS, CONTROLLERS, SERVICES, find_installed, find_plugin, plugin_settings
 from snakesim_hal.model.scenario import CONTROL, RunConfig

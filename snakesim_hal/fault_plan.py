@@ -3,8 +3,8 @@
 from collections.abc import Collection
 
 from snakesim_hal.errors import ConfigError
+from snakesim_hal.injection import HAL, RUN, Injection, check_targets, parse
 from snakesim_hal.model.files import Table
-from snakesim_hal.model.injection import HAL, RUN, Injection, check_targets, parse
 from snakesim_hal.model.scenario import RunConfig
 
 MAX_BUSES = 8

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.fault_plan import check_backend_can, check_planned, check_without_run, planned
-from snakesim_hal.model.injection import (
+from snakesim_hal.fault_plan import check_backend_can, check_planned, check_without_run, planned
+from snakesim_hal.injection import (
     KINDS,
     Injection,
     Plan,

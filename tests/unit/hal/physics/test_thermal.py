@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from snakesim_hal.model import thermal
-from snakesim_hal.model.thermal import HeatLimits, Thermal
+from snakesim_hal.physics import thermal
+from snakesim_hal.physics.thermal import HeatLimits, Thermal
 
 LIMITS = HeatLimits(derate_from_c=80.0, stop_at_c=105.0)
 

@@ -1,0 +1,6 @@
+"""Physics that simulators, emulated modules and viewers share. Pure; no controller, host or network needs it.
+
+`thermal`   heat of joint modules; its derating curve is also that of `safety`
+`motor`     a joint's actuator      `plant`   a model of joints that turn under torques, as module twins use it
+`hills`     heights of uneven ground
+"""
