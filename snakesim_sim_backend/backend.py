@@ -76,7 +76,7 @@ class SimBackend:
             self._motors.count, limits.torque_nm, HeatLimits(limits.derate_from_c, limits.stop_at_c)
         )
         self._heats, self._period_s = config.robot.sensors.power is not None, config.period_ns * 1e-9
-        self._sensors = Sensors(self._sim, self._data, config, self._motors, self._windings)
+        self._sensors = Sensors(self._sim, self._data, config, self._motors, self._physics, self._windings)
         self._watch = DivergenceWatch(self._sim.model, self._data, self._physics, self._sim.steps_per_tick)
         self._option = self._sim.model.opt
         self._with_sensors = int(self._option.disableflags)

@@ -4,6 +4,7 @@ Ground, steps and the snake's own links are skipped by number before anything is
 physics has flushed the processor's caches, and then a few plain floats cost less than a chain of numpy calls.
 """
 
+import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -40,6 +41,22 @@ class TouchReader:
                 yield self._touch(i, second, self._obstacles[first], 1.0)
             elif second in struck:
                 yield self._touch(i, first, self._obstacles[second], -1.0)
+
+    def sizes_n(self) -> dict[object, float]:
+        """Size of the force between each link and each obstacle that it touches; for every physics step, so quick."""
+        contact = self._contact
+        if not len(contact):
+            return {}
+        found: dict[object, float] = {}
+        forces = self._data.efc_force
+        rows = zip(contact.geom.tolist(), contact.efc_address.tolist(), contact.dim.tolist(), strict=True)
+        for (first, second), start, size in rows:
+            if start >= 0 and (first in self._struck or second in self._struck):
+                push_n = float(forces[start])
+                if size > 1:
+                    push_n = math.hypot(push_n, forces[start + 1], forces[start + 2])
+                found[first, second] = found.get((first, second), 0.0) + push_n
+        return found
 
     def _touch(self, i: int, link: int, obstacle: str | None, into_body: float) -> Touch:
         """MuJoCo's frame has the normal from the first geom to the second, then two tangents, as rows."""

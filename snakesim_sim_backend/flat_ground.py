@@ -14,6 +14,7 @@ What it remembers is in MuJoCo's `userdata`, so a saved state is whole.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import mujoco
@@ -111,6 +112,7 @@ class Physics:
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, soles: Soles | None) -> None:
         """soles: None where MuJoCo has the contacts with the ground."""
         self._model, self._data = model, data
+        self.after_step: Callable[[], None] | None = None  # of a sensor that misses no step
         self.ground = None if soles is None else FlatGround(model, data, soles)
 
     @property
@@ -139,10 +141,15 @@ class Physics:
 
     def step(self, count: int) -> None:
         """That many physics steps under the present inputs."""
-        if self.ground is None:
+        if self.ground is None and self.after_step is None:
             mujoco.mj_step(self._model, self._data, count)
             return
         for _ in range(count):
-            mujoco.mj_step1(self._model, self._data)
-            self.ground.apply()
-            mujoco.mj_step2(self._model, self._data)
+            if self.ground is None:
+                mujoco.mj_step(self._model, self._data)
+            else:
+                mujoco.mj_step1(self._model, self._data)
+                self.ground.apply()
+                mujoco.mj_step2(self._model, self._data)
+            if self.after_step is not None:
+                self.after_step()

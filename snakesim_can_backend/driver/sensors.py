@@ -12,6 +12,7 @@ from snakesim_can_backend.driver.reports import Reading
 from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.definitions import HEALTH_PERIOD_S, Opcode
 from snakesim_hal.backend import Samples
+from snakesim_hal.model.felt_force import FeltForce
 from snakesim_hal.model.kinematics import tangents
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire import keys
@@ -31,6 +32,7 @@ class Sensors:
         self._period_ns, self._lease_ns = config.period_ns, config.lease_ns
         self._radius_m, self._lengths_m = config.robot.module.radius_m, config.robot.link_lengths_m
         self._threshold_n = config.robot.sensors.contacts.threshold_n if config.robot.sensors.contacts else 0.0
+        self._felt = FeltForce(max(reports.contact_every, 1) * config.period_ns * 1e-9)
         layouts = codec().layouts
         contact = layouts[Opcode.CONTACT].signals
         self._contact_scales = [contact[name].scale for name in ("force_x", "along", "bearing")]
@@ -76,7 +78,8 @@ class Sensors:
     def _contacts(self, tick: int, stamp_ns: int) -> Contacts:
         felt = [self._contact(link, raw) for link, raw in self._reading.links_touched()]
         strong = [contact for contact in felt if math.hypot(*contact.force_l) >= self._threshold_n]
-        return Contacts(tick=tick, stamp_ns=stamp_ns, contacts=strong)
+        self._felt.add({contact.link: math.hypot(*contact.force_l) for contact in felt})
+        return Contacts(tick=tick, stamp_ns=stamp_ns, contacts=strong, felt_n=self._felt.largest_n)
 
     def _contact(self, link: int, raw: tuple[int, ...]) -> Contact:
         newton, metre, radian = self._contact_scales

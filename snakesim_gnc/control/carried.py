@@ -1,13 +1,16 @@
-"""What measured contacts do to a body that stands: whether they push it on, or hold it back. Pure.
+"""What measured contacts do to a body that stands: whether they push it on, or hold it back.
 
 Of a body that stands, all forces are in balance: what its contacts push it on with in sum, the ground's friction takes.
+Forces are means over the last 50 ms: those of one instant depend on how hard the surfaces are (`felt_force`).
 """
 
 import math
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from snakesim_hal.wire.messages import World
+from snakesim_hal.model.felt_force import FELT_OVER_S
+from snakesim_hal.wire.messages import World, WorldContact
 
 HELD_SHARE = 0.5  # of the push: contacts that hold a body back with more than that jam it
 
@@ -23,22 +26,45 @@ class Carried:
     touched: frozenset[str | None]
 
 
-def measured(world: World, direction_w: Sequence[float]) -> Carried | None:
-    """The contacts of a world model; None when no sensor tells. direction_w: (2,) of any length."""
-    if world.contacts_stamp_ns is None:
-        return None
-    size = math.hypot(*direction_w)
-    along = [
-        (contact.force_w[0] * direction_w[0] + contact.force_w[1] * direction_w[1]) / size for contact in world.contacts
-    ]
-    least = min(range(len(along)), key=lambda i: along[i], default=None)
-    return Carried(
-        strongest_n=max((math.hypot(*contact.force_w) for contact in world.contacts), default=0.0),
-        ahead_n=math.fsum(force for force in along if force > 0.0),
-        back_n=-math.fsum(force for force in along if force < 0.0),
-        holder="" if least is None else world.contacts[least].obstacle or "an obstacle without a name",
-        touched=frozenset(contact.obstacle for contact in world.contacts),
-    )
+class FeltContacts:
+    """The contacts of the newest world models."""
+
+    def __init__(self) -> None:
+        self._last: deque[tuple[int, Sequence[WorldContact]]] = deque()  # with the stamp of the sensor
+
+    def take(self, world: World) -> None:
+        """A newer world model, or again the last one."""
+        stamp_ns = world.contacts_stamp_ns
+        if stamp_ns is None:
+            self._last.clear()
+            return
+        if self._last and stamp_ns == self._last[-1][0]:
+            return
+        self._last.append((stamp_ns, world.contacts))
+        while not 0 <= stamp_ns - self._last[0][0] < round(FELT_OVER_S * 1e9):
+            self._last.popleft()
+
+    def along(self, direction_w: Sequence[float]) -> Carried | None:
+        """What they do along a direction, (2,) of any length; None when no sensor tells."""
+        if not self._last:
+            return None
+        share, size = 1.0 / len(self._last), math.hypot(*direction_w)
+        along: dict[tuple[int, str | None], float] = {}
+        strength: dict[tuple[int, str | None], float] = {}
+        for _, contacts in self._last:
+            for contact in contacts:
+                at, force = (contact.link, contact.obstacle), contact.force_w
+                ahead_n = (force[0] * direction_w[0] + force[1] * direction_w[1]) / size
+                along[at] = along.get(at, 0.0) + share * ahead_n
+                strength[at] = strength.get(at, 0.0) + share * math.hypot(*force)
+        holder = min(along, key=lambda at: along[at], default=None)
+        return Carried(
+            strongest_n=max(strength.values(), default=0.0),
+            ahead_n=math.fsum(force for force in along.values() if force > 0.0),
+            back_n=-math.fsum(force for force in along.values() if force < 0.0),
+            holder="" if holder is None else holder[1] or "an obstacle without a name",
+            touched=frozenset(obstacle for _, obstacle in along),
+        )
 
 
 def what_holds(force_n: float, carried: Carried | None, push_points: Sequence[str]) -> tuple[bool, str]:

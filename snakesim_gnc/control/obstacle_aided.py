@@ -18,7 +18,7 @@ import numpy as np
 from msgspec import Meta
 
 from snakesim_gnc.control.bumpless import BumplessReference
-from snakesim_gnc.control.carried import measured
+from snakesim_gnc.control.carried import FeltContacts
 from snakesim_gnc.control.contact_search import ContactSearch, Patience
 from snakesim_gnc.control.controller import Action, Report, View
 from snakesim_gnc.control.planar_body import PlanarBody
@@ -159,6 +159,7 @@ class ObstacleAided:
         self._set = settings
         self._body = PlanarBody(robot)
         self._progress = Progress(self._body, speed_filter_s=settings.speed_filter_s)
+        self._felt = FeltContacts()
         self._bumpless = BumplessReference(robot, settings.blend_s)
         self._stiffness = np.array([joint.stiffness_nm_per_rad for joint in robot.joints])
         self._integral_m = 0.0
@@ -182,6 +183,7 @@ class ObstacleAided:
         if isinstance(located, str):
             self._waits = True
             return self._bumpless.hold(view, located)
+        self._felt.take(located.world)
         if located.trajectory.speed_m_s == 0.0:  # whatever path is planned meanwhile
             return self._rest(view)
         if self._search.active:
@@ -230,7 +232,7 @@ class ObstacleAided:
         if found is not None:
             points = push_points(self._body, found.world, found.touches, found.push, force_n)
             names = [point.obstacle for point in points if point.obstacle is not None]
-            carried = measured(found.world, (located.nodes_w[:, -1] - located.nodes_w[:, 0]).tolist())
+            carried = self._felt.along((located.nodes_w[:, -1] - located.nodes_w[:, 0]).tolist())
             jammed, standing = why_it_stands(found.touches, found.push, force_n, self._max_force_n, carried, names)
         why = standing if stands and found is not None else ""
         return Report(

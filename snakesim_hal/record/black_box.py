@@ -167,9 +167,15 @@ class BlackBox:
 
 
 def touching(contacts: Contacts) -> tuple[float, int]:
-    """The force of the strongest contact in N, and how many obstacles are touched."""
+    """The force of the strongest contact in N, and how many obstacles are touched.
+
+    The force is a mean over 50 ms, see `felt_force`; of a sensor that does not tell it, that of the instant.
+    """
+    touched = len({contact.obstacle for contact in contacts.contacts})
+    if contacts.felt_n is not None:
+        return contacts.felt_n, touched
     squares = [f[0] * f[0] + f[1] * f[1] + f[2] * f[2] for f in (contact.force_l for contact in contacts.contacts)]
-    return max(squares, default=0.0) ** 0.5, len({contact.obstacle for contact in contacts.contacts})
+    return max(squares, default=0.0) ** 0.5, touched
 
 
 def read_black_box(path: Path) -> tuple[Layout, dict[str, NDArray[Any]]]:

@@ -96,6 +96,12 @@ class Contacts(Message, frozen=True, kw_only=True):
     tick: q.Tick
     stamp_ns: q.Stamp
     contacts: Annotated[list[Contact], Meta(max_length=q.MAX_CONTACTS)]
+    felt_n: Annotated[
+        q.Force | None,
+        about(
+            "largest force of one obstacle on one link, as a mean over the last 50 ms; null: the sensor does not tell"
+        ),
+    ] = None
 
 
 class Imu(Message, frozen=True, kw_only=True):

@@ -53,7 +53,7 @@ class RunRecord:
     torque_limit_nm: Floats
     position_w: Floats  # (n, 3) of the base; NaN when unknown, as all values here
     orientation_wxyz: Floats  # (n, 4)
-    contact_peak_n: Floats  # (n,) strongest contact
+    contact_peak_n: Floats  # (n,) strongest contact, mean over 50 ms
     contact_count: Floats  # (n,) obstacles touched
     lacks: list[str] = field(default_factory=list[str])  # missing data, as text
     replay_of: str = ""  # the recording whose sensors its services were given; empty: a run

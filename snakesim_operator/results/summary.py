@@ -61,7 +61,10 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     last_reason: str | None
     peak_joint_torque_nm: Annotated[float | None, _number("N·m", "largest torque of any joint")]
     torque_saturated_fraction: Annotated[float | None, _number("1", "ticks with a joint at its torque limit")]
-    peak_contact_force_n: Annotated[float | None, _number("N", "largest force of one contact")]
+    peak_contact_force_n: Annotated[
+        float | None,
+        _number("N", "largest force of one contact, mean over 50 ms; where a sensor does not tell that, at an instant"),
+    ]
     energy_j: Annotated[float | None, _number("J", "sum over joints of |torque x velocity| over time")]
     torque_joints_j: Annotated[
         float | None, _number("J", "work of the joints in torque mode on the body, less what they took")

@@ -4,35 +4,48 @@ import math
 
 import mujoco
 
+from snakesim_hal.model.felt_force import FeltForce
 from snakesim_hal.model.kinematics import tangents
 from snakesim_hal.model.sensors import ContactSensor
 from snakesim_hal.wire.messages import Contact, Contacts
 from snakesim_hal.wire.quantities import MAX_CONTACTS
 from snakesim_sim_backend.contacts import Touch, TouchReader
+from snakesim_sim_backend.flat_ground import Physics
 from snakesim_sim_backend.model import SimModel
 from snakesim_sim_backend.sensors.frames import into
 from snakesim_sim_backend.sensors.scope import Normal
 
+LARGEST_N = 1e7  # as a message may carry
 NO_TORQUE = (0.0, 0.0, 0.0)  # a point contact carries no moment about its own point
 
 
 class ContactReader:
     """Contacts with obstacles, in the frames of the links."""
 
-    def __init__(self, sim: SimModel, data: mujoco.MjData, sensor: ContactSensor, noise: Normal) -> None:
+    def __init__(
+        self, sim: SimModel, data: mujoco.MjData, sensor: ContactSensor, noise: Normal, physics: Physics
+    ) -> None:
         self._touches = TouchReader(sim, data)
         self._first_body = sim.first_link_body
         self._origins, self._rotations = data.xpos, data.xmat  # (nbody, 3), (nbody, 9)
         self._threshold_n = sensor.threshold_n
         self._sigma_m, self._sigma_n = sensor.position_noise_m, sensor.force_noise_n
         self._noise = noise if self._sigma_m or self._sigma_n else None
+        self._felt = FeltForce(sim.model.opt.timestep)
+        physics.after_step = self._feel
 
     def read(self, tick: int, stamp_ns: int) -> Contacts:
         """All contacts above the threshold."""
         found = [
             self._in_link(touch) for touch in self._touches.read() if math.hypot(*touch.force_w) >= self._threshold_n
         ]
-        return Contacts(tick=tick, stamp_ns=stamp_ns, contacts=found[:MAX_CONTACTS])
+        felt_n = self._felt.largest_n
+        if not felt_n < LARGEST_N:  # also what is no number: of the steps in which a simulation diverged
+            felt_n = None
+        return Contacts(tick=tick, stamp_ns=stamp_ns, contacts=found[:MAX_CONTACTS], felt_n=felt_n)
+
+    def _feel(self) -> None:
+        self._felt.add(self._touches.sizes_n())
 
     def _in_link(self, touch: Touch) -> Contact:
         rotation = self._rotations[touch.body].tolist()  # world_from_link, row by row

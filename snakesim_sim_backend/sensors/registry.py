@@ -27,7 +27,7 @@ from snakesim_sim_backend.sensors.rendered import RenderedColour, RenderedDepth
 from snakesim_sim_backend.sensors.scope import BodyScope, Reader, Scope
 
 WITHIN_TICK: dict[type[Message], Callable[[Any, BodyScope], Reader]] = {
-    Contacts: lambda sensor, at: ContactReader(at.sim, at.data, sensor, at.noise.standard_normal),
+    Contacts: lambda sensor, at: ContactReader(at.sim, at.data, sensor, at.noise.standard_normal, at.physics),
     Imu: lambda sensor, at: ImuReader(at.data, sensor, at.config.robot.chain.modules + 1, at.noise.standard_normal),
     Pose: lambda sensor, at: PoseReader(at.data, sensor, at.noise.standard_normal),
     Power: lambda _, at: PowerReader(at.data, at.motors, at.windings, at.config.robot.limits.torque_nm),

@@ -13,6 +13,7 @@ from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.physics.thermal import Thermal
 from snakesim_hal.wire.messages import Message
 from snakesim_sim_backend.actuators import Motors
+from snakesim_sim_backend.flat_ground import Physics
 from snakesim_sim_backend.model import SimModel
 
 Normal = Callable[[int], Floats]  # n -> (n,) standard normal numbers
@@ -33,6 +34,7 @@ class BodyScope(Scope):
     """What a sensor of the body gets: the state itself, and the noise that they all share."""
 
     motors: Motors
+    physics: Physics
     windings: Thermal
 
 

@@ -15,6 +15,7 @@ from snakesim_hal.physics.thermal import Thermal
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Message
 from snakesim_sim_backend.actuators import Motors
+from snakesim_sim_backend.flat_ground import Physics
 from snakesim_sim_backend.model import SimModel
 from snakesim_sim_backend.sensors.joints import JointReader
 from snakesim_sim_backend.sensors.registry import WITHIN_TICK, mounted_reader, own_noise
@@ -39,10 +40,16 @@ class Sensors:
     """
 
     def __init__(
-        self, sim: SimModel, data: mujoco.MjData, config: RunConfig, motors: Motors, windings: Thermal
+        self,
+        sim: SimModel,
+        data: mujoco.MjData,
+        config: RunConfig,
+        motors: Motors,
+        physics: Physics,
+        windings: Thermal,
     ) -> None:
         """Raises ConfigError when a sensor cannot be made."""
-        scope = BodyScope(config, sim, data, np.random.default_rng(config.seed), motors, windings)
+        scope = BodyScope(config, sim, data, np.random.default_rng(config.seed), motors, physics, windings)
         has = config.robot.sensors
         self._joints = JointReader(data, has.joints, motors, scope.noise.standard_normal, config.period_ns)
         self.late: Counter[str] = Counter()  # samples that were dropped because they were not ready in time, by key

@@ -68,8 +68,10 @@ class Settings(FileStruct, frozen=True, kw_only=True):
     stall_m: Annotated[float, above(1, "m"), about("less progress than this while pushing is standing still")] = 0.005
     stall_s: Annotated[float, above(60, "s"), about("time over which that progress is measured")] = 1.0
     jam_force_n: Annotated[
-        float, above(1e6, "N"), about("a triplet that stands with a larger contact force is let go of")
-    ] = 120.0
+        float,
+        above(1e6, "N"),
+        about("a triplet that stands with a larger contact force, as a mean over 50 ms, is let go of"),
+    ] = 60.0
     # Hardly any ground holds a sliding snake so well. A joint at its torque limit, or far out, ends it, too.
     drag_share: Annotated[
         float,

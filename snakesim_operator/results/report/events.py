@@ -41,7 +41,11 @@ def events(record: RunRecord, summary: RunSummary) -> list[Event]:
     forces = record.contact_peak_n
     if np.nanmax(forces, initial=0.0) > 0:
         row = int(np.nanargmax(forces))
-        found.append(Event(float(record.time_s[row] - record.time_s[0]), f"Largest contact force, {forces[row]:.0f} N"))
+        found.append(
+            Event(
+                float(record.time_s[row] - record.time_s[0]), f"Largest contact force over 50 ms, {forces[row]:.0f} N"
+            )
+        )
     found += [Event(band.start_s, "Jam") for band in jam_bands(record)[:1]]
     moved_m = distance_m(summary)
     stop = stop_of(record, abs(moved_m)) if moved_m else None

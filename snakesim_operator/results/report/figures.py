@@ -112,7 +112,7 @@ def contacts(record: RunRecord) -> list[Figure]:
     count = [_line(record, "obstacles touched", record.contact_count, "--measured", shape="hv")]
     levels = [(3, "three carry it")]
     return [
-        _lines(record, "Strongest contact force over time", "force, N", force, height=190),
+        _lines(record, "Strongest contact force over time, mean over 50 ms", "force, N", force, height=190),
         _lines(record, "Obstacles touched over time", "touched", count, levels=levels, height=160, from_zero=True),
     ]
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from snakesim_gnc.control.carried import Carried, measured
+from snakesim_gnc.control.carried import Carried, FeltContacts
 from snakesim_gnc.control.obstacle_triplet.stall import StallWatch, explain
 from snakesim_hal.wire.messages import World, WorldContact
 from tests.unit.gnc.stage import known
@@ -35,8 +35,8 @@ def test_forgetting_starts_a_new_window():
     assert stands_after(stall_watch, 0.9) is None
 
 
-def along(*forces: tuple[str, float, float]) -> Carried:
-    """What contacts with these forces along and across the direction do."""
+def world_with(*forces: tuple[str, float, float], stamp_ns: int = 1) -> World:
+    """Contacts with these forces in x and y."""
     contacts = [
         WorldContact(
             link=0, obstacle=name, body_s_m=0.1, position_w=(0.0, 0.0, 0.0), normal_w=(0.0, 1.0, 0.0),
@@ -44,11 +44,17 @@ def along(*forces: tuple[str, float, float]) -> Carried:
         )
         for name, ahead_n, across_n in forces
     ]  # fmt: skip
-    world = World(
+    return World(
         tick=1, stamp_ns=1, base_position_w=(0.0, 0.0, 0.0), base_orientation_wxyz=(1.0, 0.0, 0.0, 0.0),
-        base_confidence=1.0, contacts=contacts, contacts_stamp_ns=1, obstacles=[],
+        base_confidence=1.0, contacts=contacts, contacts_stamp_ns=stamp_ns, obstacles=[],
     )  # fmt: skip
-    return known(measured(world, (2.0, 0.0)))
+
+
+def along(*forces: tuple[str, float, float]) -> Carried:
+    """What contacts with these forces along and across the direction do."""
+    felt = FeltContacts()
+    felt.take(world_with(*forces))
+    return known(felt.along((2.0, 0.0)))
 
 
 PUSHED = (("peg_0", 0.0, 8.0), ("peg_1", 30.0, -40.0), ("peg_2", -0.5, 20.0))  # as a triplet of 30 N is
@@ -63,7 +69,7 @@ def cause(**more):
         "weight_n": 400.0,
         "saturated": None,
         "swung": None,
-        "jam_force_n": 120.0,
+        "jam_force_n": 60.0,
         "drag_share": 0.5,
     }
     return explain(**{**given, **more})
@@ -123,3 +129,11 @@ def test_what_strains_and_does_not_move_is_let_go_of_and_not_called_a_jam(given,
     stall = cause(**given)
     assert stall.lets_go and not stall.jammed
     assert words in stall.why and not stall.why.startswith("jam")
+
+
+def test_forces_are_judged_as_means_over_50_ms():
+    felt = FeltContacts()
+    for turn in range(9):
+        felt.take(world_with(("peg_0", 50.0 if turn % 5 == 0 else 0.0, 0.0), stamp_ns=turn * 10_000_000))
+    carried = known(felt.along((1.0, 0.0)))
+    assert carried.strongest_n == pytest.approx(10.0) and carried.ahead_n == pytest.approx(10.0)

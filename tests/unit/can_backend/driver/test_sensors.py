@@ -97,7 +97,7 @@ def test_nothing_touched_is_an_empty_list() -> None:
     reading, sensors = sensors_of(config(**EVERYTHING))
     begin(reading, contacts=True)
     reading.take(contact(2, reading.sync, touched=False, force_x=9.0))
-    assert contacts_of(sensors.sample(3, 30)) == Contacts(tick=3, stamp_ns=30, contacts=[])
+    assert contacts_of(sensors.sample(3, 30)) == Contacts(tick=3, stamp_ns=30, contacts=[], felt_n=0.0)
 
 
 def test_a_touch_is_told_in_the_frame_of_its_link() -> None:

@@ -190,3 +190,10 @@ def test_a_tick_costs_the_same_after_any_time_and_keeps_no_memory() -> None:
     kept = tracemalloc.get_traced_memory()[0] - before - 36 * len(peaks)
     tracemalloc.stop()
     assert max(peaks) < 20_000 and kept < 2_000
+
+
+def test_the_force_over_50_ms_is_kept_where_the_sensor_tells_it() -> None:
+    box = BlackBox(ROBOT)
+    touches = Contacts(tick=0, stamp_ns=0, contacts=[contact("a", (3.0, 4.0, 0.0))], felt_n=1.5)
+    box.record(0, 0, Samples(state(ROBOT, 0.0, 0.0, 0.0), {keys.CONTACTS: touches}), decision())
+    assert all_rows(box)["contact_peak_n"].tolist() == [1.5]

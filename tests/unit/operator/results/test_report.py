@@ -63,7 +63,7 @@ def test_every_series_of_the_run_is_a_chart(page: Reader) -> None:
         *(f"{what} of joint_{n} over time" for n in (9, 8, 7, 6, 5, 4) for what in ("Angle", "Torque")),
         "Torque of every joint over time",
         "Largest torque of any joint as a share of its limit",
-        "Strongest contact force over time",
+        "Strongest contact force over time, mean over 50 ms",
         "Obstacles touched over time",
     ]
     torque = page.charts["Torque of joint_7 over time"]
