@@ -28,7 +28,7 @@ from snakesim_hal.host.participants import Participant, Participants
 from snakesim_hal.host.run_statistics import RunStatistics
 from snakesim_hal.host.simulated_time import Refusal, SimulatedTime
 from snakesim_hal.host.status_messages import applied_message, status_message
-from snakesim_hal.host.timing import Deadlines, PublishTimes
+from snakesim_hal.host.timing import BackendTime, Deadlines, PublishTimes
 from snakesim_hal.injection import HAL
 from snakesim_hal.model.scenario import RunConfig, written
 from snakesim_hal.network.private_channel import HostEnd, ToStarter
@@ -129,7 +129,7 @@ class Host:
         self._other_hosts: set[str] = set()
         self._network_faults: set[str] = set()
         self._answered = -1  # newest tick that an accepted command answered
-        self._advance_ns = 0.0  # duration of the backend's `advance`, smoothed
+        self._backend_time = BackendTime(self.description.backend, self._period_ns)
         self._stopping = False
         self.ended: Ending = "running"
         self.ended_why = ""
@@ -227,8 +227,10 @@ class Host:
         """Samples of this tick. While waiting at tick 0 the same sample is used again."""
         if last is not None and self._published.last_tick == self._tick:
             return last
+        started = time.monotonic_ns()
         try:
             samples = self._backend.sample(self._tick, self._tick * self._period_ns)
+            self._backend_time.read(started)
         except BackendError as error:
             self._backend_failed(error)
             return None
@@ -323,7 +325,7 @@ class Host:
                 self.authority.fault(fault)
         except BackendError as error:
             self._backend_failed(error)
-        self._advance_ns += 0.1 * (time.monotonic_ns() - started - self._advance_ns)
+        self._backend_time.written(started)
         self._tick += 1
         self._watch_network()
         self._watch_fault()
@@ -344,7 +346,7 @@ class Host:
         if self._pace == "lockstep":
             self._wait_for_participants(samples)
         elif self._pace == "realtime":
-            give_up_ns = self._deadlines.of(self._tick + 1) - 1.5 * self._advance_ns - 50_000
+            give_up_ns = self._deadlines.of(self._tick + 1) - 1.5 * self._backend_time.write_ns - 50_000
             if self._time.speed > 1.0 and self.authority.state == "armed":  # as much time as at speed 1, if need be
                 give_up_ns = max(give_up_ns, self._published.of(self._tick)[1] + self._period_ns)
             while self._answered < self._tick and not self._stopping:
@@ -514,6 +516,7 @@ class Host:
             differing=self._differing(),
             overruns=self.statistics.overruns,
             realtime_warnings=self._realtime_warnings,
+            slow_backend=self._backend_time.too_slow() if self._pace == "realtime" else [],
             injected=list(self.faults.on),
             held_up=self._held_up(),
         )

@@ -48,18 +48,22 @@ def status_message(
     differing: list[str],
     overruns: int,
     realtime_warnings: list[str],
+    slow_backend: list[str],
     injected: list[str],
     held_up: str,
 ) -> Status:
     """The status of the robot.
 
-    missing: the services that arming waits for; waits: for which keys they wait; differing: how others are set up.
+    missing: the services that arming waits for; waits: for which keys they wait; differing: how others are set up;
+    slow_backend: that it takes too much of a tick.
     """
     description = authority.description
     against = authority.against_arming(time.safety_ns(tick))
     why = authority.why
     if authority.state == "disarmed" and (against or missing or differing):
-        why = "; ".join([why, *differing, *(_waiting(name, waits.get(name, ())) for name in missing), *against])[:500]
+        why = "; ".join(
+            [why, *slow_backend, *differing, *(_waiting(name, waits.get(name, ())) for name in missing), *against]
+        )[:500]
     return Status(
         tick=tick,
         stamp_ns=tick * description.period_ns,
@@ -80,7 +84,7 @@ def status_message(
         alive=participants.present(),
         waiting_for=missing,
         overruns=overruns,
-        realtime_warnings=[*realtime_warnings, *time.slow()],
+        realtime_warnings=[*realtime_warnings, *slow_backend, *time.slow()],
         injected=injected,
         ready_to_arm=not against and not missing and not differing,
         derated=authority.derated,

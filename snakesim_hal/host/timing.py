@@ -1,4 +1,4 @@
-"""Deadline of each tick of a host, and publish time of each recent tick. On the monotonic clock."""
+"""Deadline of each tick of a host, what its backend takes of it, and publish times. On the monotonic clock."""
 
 import time
 from collections import deque
@@ -6,6 +6,9 @@ from collections import deque
 REANCHOR_PERIODS = 1  # if later, all deadlines are shifted: ticks that catch up in a burst would break rate limits
 KEPT = 4096
 LONG_AGO_NS = -(2**60)
+SMOOTHING = 0.1
+SETTLED_TICKS = 30
+MOST_SHARE = 0.8  # of a period; the rest is for answers
 
 
 class Deadlines:
@@ -31,6 +34,36 @@ class Deadlines:
         if late_ns > REANCHOR_PERIODS * self._period_ns:
             self._anchor_ns += late_ns
         return late_ns > 0
+
+
+class BackendTime:
+    """How long the backend's calls take in a tick, smoothed over some ten of them."""
+
+    def __init__(self, backend: str, period_ns: int) -> None:
+        self._backend, self._period_ns = backend, period_ns
+        self.read_ns = self.write_ns = 0.0
+        self._ticks = 0
+
+    def read(self, since_ns: int) -> None:
+        """It has been sampled, since then."""
+        self.read_ns += SMOOTHING * (time.monotonic_ns() - since_ns - self.read_ns)
+        self._ticks += 1
+
+    def written(self, since_ns: int) -> None:
+        """It has taken the set-points, and done what it does between two ticks, since then."""
+        self.write_ns += SMOOTHING * (time.monotonic_ns() - since_ns - self.write_ns)
+
+    def too_slow(self) -> list[str]:
+        """That its calls leave a tick no time for anything else, and the rate that would hold; empty: they do."""
+        taken_ns = self.read_ns + self.write_ns
+        if self._ticks < SETTLED_TICKS or taken_ns < MOST_SHARE * self._period_ns:
+            return []
+        holds_hz = MOST_SHARE * 1e9 / taken_ns
+        read_ms, write_ms, period_ms = (ns / 1e6 for ns in (self.read_ns, self.write_ns, self._period_ns))
+        return [
+            f"backend {self._backend!r} takes {read_ms:.3g} ms to read and {write_ms:.3g} ms to write, of a tick of"
+            f" {period_ms:.3g} ms; it would hold {holds_hz:.2g} Hz (the scenario's rate_hz)"
+        ]
 
 
 class PublishTimes:

@@ -2,6 +2,7 @@
 
 import math
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -54,6 +55,7 @@ class LagBackend:
         self.enacted: list[SetPoints] = []
         self.advanced = 0
         self.fails_in: str | None = None  # sample, enact or advance
+        self.read_s = 0.0  # what a sample takes
         self.next_faults: list[Fault] = []
 
     def describe(self) -> Description:
@@ -75,6 +77,7 @@ class LagBackend:
     def sample(self, tick: int, stamp_ns: int) -> Samples:
         """Joints every tick, the pose every fifth."""
         self._fail("sample")
+        time.sleep(self.read_s)
         count = len(self.angles)
         joints = JointState(
             tick=tick,

@@ -324,6 +324,17 @@ def test_realtime_goes_on_with_the_last_command_for_one_lease_term_only() -> Non
         assert run.backend.enacted[-2].mode == [Mode.VELOCITY] * 3
 
 
+def test_a_backend_too_slow_for_its_rate_is_named_with_the_rate_that_would_hold() -> None:
+    """Also where nothing is armed: arming may be what its old samples prevent."""
+    with running(run_config(pace="realtime", rate_hz=50.0)) as run:
+        run.backend.read_s = 0.03
+        slow = "backend 'lag' takes 3"
+        wait_until(lambda: any(slow in warning for warning in run.status.realtime_warnings), "a warning")
+        assert "ms to read" in run.status.why and "of a tick of 20 ms; it would hold 2" in run.status.why
+        run.backend.read_s = 0.0
+        wait_until(lambda: not run.status.realtime_warnings, "no warning")
+
+
 def test_free_waits_for_nobody() -> None:
     with running(run_config(pace="free")) as run:
         wait_until(lambda: run.backend.advanced > 200, "two hundred ticks without anybody")
