@@ -152,6 +152,7 @@ def _print_summary(summary: RunSummary) -> None:
         ),
         ("propulsion joints", _in_short(summary.propulsion_joints)),
         ("peak joint torque", number(summary.peak_joint_torque_nm, "N·m")),
+        ("energy per metre", number(summary.energy_j_per_m, "J/m", 1)),
         ("contact over 50 ms", number(summary.peak_contact_force_n, "N", 1)),
         ("last state", f"{summary.last_state}: {summary.last_reason}" if summary.last_state else "unknown"),
         ("command digest", digest_text(summary.command_digest, summary.own_arithmetic)),
