@@ -21,7 +21,7 @@ BRINGS = {  # as imported; the first extra that brings a package is the one to n
     "lab": ("cryptography", "jinja2"),
     "plot": ("matplotlib",),
     "preview": ("PIL",),
-    "ros2": ("xxhash",),
+    "ros2": ("rosbags", "xxhash"),
     "video": ("imageio_ffmpeg", "PIL"),
 }
 

@@ -3,8 +3,8 @@
 `arguments.py` has those, `join.py` the two sessions, `bridge.py` the loop: it reads the robot's keys as a viewer
 does, and publishes what they say. `robot_in_ros.py` translates message by message, `frames.py` names and places frames,
 `urdf.py` describes the robot, `steering.py` turns /cmd_vel into intents, `relay.py` bounds rates. Below them `graph.py`
-knows rmw_zenoh's keys, liveliness tokens and attachments, `messages.py` the layout of each ROS message, `cdr.py` how a
-number lies on the wire.
+knows rmw_zenoh's keys, liveliness tokens and attachments, `messages.py` the layout of each ROS message; rosbags encodes
+them.
 
 It must not import zenoh (that is `snakesim_hal.network.foreign_network`), and sends the robot nothing but intents.
 """

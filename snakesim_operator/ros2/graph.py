@@ -23,18 +23,13 @@ class RosType:
     """A ROS message type, and the hash of its definition (REP 2016)."""
 
     name: str  # such as std_msgs/msg/String
-    rihs01: str
+    type_hash: str  # as rmw_zenoh writes it: RIHS01_ and 64 digits
 
     @property
     def dds_name(self) -> str:
         """As rmw_zenoh writes it, such as `std_msgs::msg::dds_::String_`."""
         package, kind, name = self.name.split("/")
         return f"{package}::{kind}::dds_::{name}_"
-
-    @property
-    def type_hash(self) -> str:
-        """As rmw_zenoh writes it."""
-        return f"RIHS01_{self.rihs01}"
 
 
 @dataclass(frozen=True)

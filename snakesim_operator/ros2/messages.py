@@ -1,29 +1,36 @@
-"""The ROS messages that the bridge sends, field by field in the order of their definitions, and the types' hashes.
+"""The ROS messages that the bridge sends, field by field in the order of their definitions; rosbags encodes them.
 
 Frames, units and conventions: REP 103. A stamp is in nanoseconds. Quaternions come as wxyz, and ROS has them as xyzw.
-The hashes are the same in Jazzy, Kilted and Rolling; a test computes them from the definitions.
+Definitions are those of Jazzy; a test compares the types' hashes with later distributions.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from snakesim_operator.ros2.cdr import Cdr
+import numpy as np
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, get_typestore
+
 from snakesim_operator.ros2.graph import RosType
 
-JOINT_STATE = RosType("sensor_msgs/msg/JointState", "a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e")
-TRANSFORMS = RosType("tf2_msgs/msg/TFMessage", "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087")
-MARKERS = RosType(
-    "visualization_msgs/msg/MarkerArray", "86cb8800b6fb05b5eff1abd7a56f62a5641d3ae9a1c29e78e67e704f1d067dcf"
-)
-IMAGE = RosType("sensor_msgs/msg/Image", "d31d41a9a4c4bc8eae9be757b0beed306564f7526c88ea6a4588fb9582527d47")
-CAMERA_INFO = RosType("sensor_msgs/msg/CameraInfo", "b3dfd68ff46c9d56c80fd3bd4ed22c7a4ddce8c8348f2f59c299e73118e7e275")
-LASER_SCAN = RosType("sensor_msgs/msg/LaserScan", "64c191398013af96509d518dac71d5164f9382553fce5c1f8cca5be7924bd828")
-STRING = RosType("std_msgs/msg/String", "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18")
-CLOCK = RosType("rosgraph_msgs/msg/Clock", "692f7a66e93a3c83e71765d033b60349ba68023a8c689a79e48078bcb5c58564")
-TWIST = RosType("geometry_msgs/msg/Twist", "9c45bf16fe0983d80e3cfe750d6835843d265a9a6c46bd2e609fcddde6fb8d2a")
-DIAGNOSTICS = RosType(
-    "diagnostic_msgs/msg/DiagnosticArray", "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e"
-)
+STORE = get_typestore(Stores.ROS2_JAZZY)
+
+
+def _type(name: str) -> RosType:
+    return RosType(name, STORE.hash_rihs01(name))
+
+
+JOINT_STATE = _type("sensor_msgs/msg/JointState")
+TRANSFORMS = _type("tf2_msgs/msg/TFMessage")
+MARKERS = _type("visualization_msgs/msg/MarkerArray")
+IMAGE = _type("sensor_msgs/msg/Image")
+CAMERA_INFO = _type("sensor_msgs/msg/CameraInfo")
+LASER_SCAN = _type("sensor_msgs/msg/LaserScan")
+STRING = _type("std_msgs/msg/String")
+CLOCK = _type("rosgraph_msgs/msg/Clock")
+TWIST = _type("geometry_msgs/msg/Twist")
+DIAGNOSTICS = _type("diagnostic_msgs/msg/DiagnosticArray")
 TYPES = (JOINT_STATE, TRANSFORMS, MARKERS, IMAGE, CAMERA_INFO, LASER_SCAN, STRING, CLOCK, TWIST, DIAGNOSTICS)
 
 Triple = tuple[float, float, float]
@@ -34,7 +41,6 @@ ADD, DELETE_ALL = 0, 3  # actions of a marker
 OK, WARN, ERROR = 0, 1, 2  # levels of a diagnostic status
 PLUMB_BOB = "plumb_bob"  # distortion model, here without distortion
 LAST_SECOND = 2**31 - 1  # of ROS; a robot's clock may say anything
-ROW_MAJOR_UNIT = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -60,27 +66,51 @@ class Marker:
     points_m: tuple[Triple, ...] = ()
 
 
-def _time(cdr: Cdr, stamp_ns: int) -> Cdr:
-    return cdr.numbers("i", min(stamp_ns // 10**9, LAST_SECOND)).numbers("I", stamp_ns % 10**9)
+def _sent(kind: RosType, *fields: Any) -> bytes:
+    return bytes(STORE.serialize_cdr(_made(kind.name, *fields), kind.name))
 
 
-def _header(cdr: Cdr, stamp_ns: int, frame: str) -> Cdr:
-    return _time(cdr, stamp_ns).text(frame)
+def _made(name: str, *fields: Any) -> Any:
+    known: Any = STORE.types
+    return known[name](*fields)
 
 
-def _pose(cdr: Cdr, position_m: Triple, orientation_wxyz: Wxyz) -> Cdr:
-    w, x, y, z = orientation_wxyz
-    return cdr.numbers("d", *position_m, x, y, z, w)
+def _time(stamp_ns: int) -> Any:
+    return _made("builtin_interfaces/msg/Time", min(stamp_ns // 10**9, LAST_SECOND), stamp_ns % 10**9)
+
+
+def _header(stamp_ns: int, frame: str) -> Any:
+    return _made("std_msgs/msg/Header", _time(stamp_ns), frame)
+
+
+def _vector(xyz: Triple) -> Any:
+    return _made("geometry_msgs/msg/Vector3", *xyz)
+
+
+def _point(xyz: Triple) -> Any:
+    return _made("geometry_msgs/msg/Point", *xyz)
+
+
+def _quaternion(wxyz: Wxyz) -> Any:
+    return _made("geometry_msgs/msg/Quaternion", *wxyz[1:], wxyz[0])
+
+
+def _doubles(values: Sequence[float]) -> np.ndarray:
+    return np.array(values, dtype=np.float64)
+
+
+def _octets(raw: bytes) -> np.ndarray:
+    return np.frombuffer(raw, dtype=np.uint8)
 
 
 def clock(stamp_ns: int) -> bytes:
     """rosgraph_msgs/Clock."""
-    return _time(Cdr(), stamp_ns).done()
+    return _sent(CLOCK, _time(stamp_ns))
 
 
 def string(text: str) -> bytes:
     """std_msgs/String."""
-    return Cdr().text(text).done()
+    return _sent(STRING, text)
 
 
 def joint_state(
@@ -91,53 +121,52 @@ def joint_state(
     torques_nm: Sequence[float],
 ) -> bytes:
     """sensor_msgs/JointState; it has no frame."""
-    cdr = _header(Cdr(), stamp_ns, "").texts(names)
-    return cdr.sequence("d", angles_rad).sequence("d", velocities_rad_s).sequence("d", torques_nm).done()
+    numbers = map(_doubles, (angles_rad, velocities_rad_s, torques_nm))
+    return _sent(JOINT_STATE, _header(stamp_ns, ""), names, *numbers)
 
 
 def transforms(stamp_ns: int, all_of_them: Sequence[Transform]) -> bytes:
     """tf2_msgs/TFMessage."""
-    cdr = Cdr().numbers("I", len(all_of_them))
-    for one in all_of_them:
-        _header(cdr, stamp_ns, one.parent).text(one.child)
-        _pose(cdr, one.position_m, one.orientation_wxyz)
-    return cdr.done()
+    return _sent(TRANSFORMS, [_transform(stamp_ns, one) for one in all_of_them])
+
+
+def _transform(stamp_ns: int, one: Transform) -> Any:
+    pose = _made("geometry_msgs/msg/Transform", _vector(one.position_m), _quaternion(one.orientation_wxyz))
+    return _made("geometry_msgs/msg/TransformStamped", _header(stamp_ns, one.parent), one.child, pose)
 
 
 def markers(stamp_ns: int, frame: str, shapes: Sequence[Marker]) -> bytes:
     """visualization_msgs/MarkerArray that replaces everything on its topic."""
-    cdr = Cdr().numbers("I", len(shapes) + 1)
-    _marker(cdr, stamp_ns, frame, 0, DELETE_ALL, Marker("", ARROW, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)))
-    for number, shape in enumerate(shapes):
-        _marker(cdr, stamp_ns, frame, number, ADD, shape)
-    return cdr.done()
+    header = _header(stamp_ns, frame)
+    cleared = _marker(header, 0, DELETE_ALL, Marker("", ARROW, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)))
+    return _sent(MARKERS, [cleared, *(_marker(header, number, ADD, shape) for number, shape in enumerate(shapes))])
 
 
-def _marker(cdr: Cdr, stamp_ns: int, frame: str, number: int, action: int, shape: Marker) -> None:
-    _header(cdr, stamp_ns, frame).text(shape.group).numbers("i", number, shape.shape, action)
-    _pose(cdr, shape.position_m, shape.orientation_wxyz).numbers("d", *shape.size_m).numbers("f", *shape.rgba)
-    cdr.numbers("i", 0).numbers("I", 0)  # lifetime: until it is replaced
-    cdr.numbers("?", False)  # not locked to its frame
-    cdr.numbers("I", len(shape.points_m)).numbers("d", *(number for point in shape.points_m for number in point))
-    cdr.numbers("I", 0)  # colours of the points
-    _header(cdr.text(""), 0, "").text("").octets(b"")  # no texture: resource, then a compressed image
-    cdr.numbers("I", 0)  # its coordinates
-    cdr.text("").text("").text("").octets(b"").numbers("?", False)  # text; mesh: resource, file, materials
+def _marker(header: Any, number: int, action: int, shape: Marker) -> Any:
+    pose = _made("geometry_msgs/msg/Pose", _point(shape.position_m), _quaternion(shape.orientation_wxyz))
+    colour = _made("std_msgs/msg/ColorRGBA", *shape.rgba)
+    until_replaced = _made("builtin_interfaces/msg/Duration", 0, 0)
+    drawn = (pose, _vector(shape.size_m), colour, until_replaced, False, [_point(xyz) for xyz in shape.points_m], [])
+    no_texture = ("", _made("sensor_msgs/msg/CompressedImage", _header(0, ""), "", _octets(b"")), [])
+    no_mesh = ("", _made("visualization_msgs/msg/MeshFile", "", _octets(b"")), False)
+    what = (shape.group, number, shape.shape, action)
+    return _made("visualization_msgs/msg/Marker", header, *what, *drawn, *no_texture, "", *no_mesh)
 
 
 def image(stamp_ns: int, frame: str, width: int, height: int, encoding: str, pixels: bytes) -> bytes:
     """sensor_msgs/Image. encoding: 16UC1 (mm), 32FC1 (m) or rgb8; rows without padding, little endian."""
-    cdr = _header(Cdr(), stamp_ns, frame).numbers("I", height, width).text(encoding).numbers("B", 0)
-    return cdr.numbers("I", len(pixels) // height).octets(pixels).done()
+    header = _header(stamp_ns, frame)
+    return _sent(IMAGE, header, height, width, encoding, 0, len(pixels) // height, _octets(pixels))
 
 
 def camera_info(stamp_ns: int, frame: str, width: int, height: int, k: tuple[float, float, float, float]) -> bytes:
     """sensor_msgs/CameraInfo of a camera without distortion. k: fx, fy, cx, cy in pixels."""
     fx, fy, cx, cy = k
-    cdr = _header(Cdr(), stamp_ns, frame).numbers("I", height, width).text(PLUMB_BOB).sequence("d", [0.0] * 5)
-    cdr.numbers("d", fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0).numbers("d", *ROW_MAJOR_UNIT)
-    cdr.numbers("d", fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0)
-    return cdr.numbers("I", 0, 0, 0, 0, 0, 0).numbers("?", False).done()  # binning; region of interest: all of it
+    matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    projection = np.hstack([matrix, np.zeros((3, 1))])
+    whole = _made("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
+    numbers = (np.zeros(5), matrix.ravel(), np.eye(3).ravel(), projection.ravel())
+    return _sent(CAMERA_INFO, _header(stamp_ns, frame), height, width, PLUMB_BOB, *numbers, 0, 0, whole)
 
 
 def laser_scan(
@@ -149,15 +178,22 @@ def laser_scan(
     range_m: Sequence[float],
 ) -> bytes:
     """sensor_msgs/LaserScan, all beams at one instant. range_m: infinite where there is nothing (REP 117)."""
-    last_rad = first_rad + step_rad * (len(range_m) - 1)
-    cdr = _header(Cdr(), stamp_ns, frame).numbers("f", first_rad, last_rad, step_rad, 0.0, 0.0, *limits_m)
-    return cdr.sequence("f", range_m).numbers("I", 0).done()
+    angles = (first_rad, first_rad + step_rad * (len(range_m) - 1), step_rad)
+    beams, no_intensities = np.array(range_m, dtype=np.float32), np.array([], dtype=np.float32)
+    return _sent(LASER_SCAN, _header(stamp_ns, frame), *angles, 0.0, 0.0, *limits_m, beams, no_intensities)
 
 
 def diagnostics(stamp_ns: int, level: int, name: str, message: str, values: Mapping[str, str]) -> bytes:
     """diagnostic_msgs/DiagnosticArray with one status."""
-    cdr = _header(Cdr(), stamp_ns, "").numbers("I", 1).numbers("B", level).text(name).text(message).text(name)
-    cdr.numbers("I", len(values))
-    for key, value in values.items():
-        cdr.text(key).text(value)
-    return cdr.done()
+    pairs = [_made("diagnostic_msgs/msg/KeyValue", key, value) for key, value in values.items()]
+    status = _made("diagnostic_msgs/msg/DiagnosticStatus", level, name, message, name, pairs)
+    return _sent(DIAGNOSTICS, _header(stamp_ns, ""), [status])
+
+
+def six_doubles(twist: bytes) -> tuple[float, ...] | None:
+    """A Twist's numbers, of either byte order; None: it is none."""
+    try:
+        found: Any = STORE.deserialize_cdr(twist, TWIST.name)
+    except SerdeError:
+        return None
+    return tuple(getattr(part, axis) for part in (found.linear, found.angular) for axis in "xyz")

@@ -7,7 +7,7 @@ robot. Every Twist becomes one intent of short validity, so a ROS side that fall
 import math
 
 from snakesim_hal.wire.messages import Intent
-from snakesim_operator.ros2.cdr import six_doubles
+from snakesim_operator.ros2.messages import six_doubles
 
 VALID_NS = 500_000_000  # of an intent in robot time; teleop_twist_keyboard and joysticks repeat at 10 Hz and more
 FASTEST_M_S = 10.0  # as navigation's limit of an intent
