@@ -39,10 +39,7 @@ def robot(shown: Victim) -> Robot:
 @pytest.fixture
 def at(robot: Robot) -> str:
     """The console's address."""
-    robot.run.says("console: http")
-    found = re.search(r"console: (http://\S+)", robot.run.said())
-    assert found is not None
-    return found[1]
+    return robot.run.console()
 
 
 def stops(robot: Robot, act: Callable[[], object]) -> float:

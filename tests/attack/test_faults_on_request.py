@@ -79,5 +79,5 @@ def test_a3_faults_are_for_runs_on_a_simulator_only_by_who_may_ask(robot: Robot)
     with Stranger(robot.endpoint) as stranger:
         assert stranger.ask("fault/run", {"kind": "kill", "target": "guidance"})[0]["ok"]
         assert not stranger.ask("fault/run", {"kind": "kill", "target": "no such process"})[0]["ok"]
-    robot.run.says("guidance was ended by SIGKILL")
+    robot.run.wait_for("guidance was ended by SIGKILL")
     robot.operator.recover()

@@ -31,7 +31,7 @@ def test_a12_a_run_that_a_stranger_finishes_is_not_complete(tmp_path: Path) -> N
         operator.until(lambda: operator.lifecycle() == "armed", "armed")
         with Stranger(run.endpoint) as stranger:
             answer = stranger.request("finish", who="mallory")
-        code = run.wait()
+        code = run.end()
         summary = json.loads((run.out / "summary.json").read_text()) if (run.out / "summary.json").is_file() else {}
     assert code == 1, f"exit code {code}, answered {answer}: {run.said()}"
     assert summary.get("ended") != "complete", summary.get("ended")

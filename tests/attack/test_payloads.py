@@ -234,5 +234,5 @@ def test_a_host_that_is_none_does_not_end_a_run(tmp_path: Path) -> None:
         operator.until(lambda: operator.lifecycle() == "armed", "armed")
         with Stranger(run.endpoint) as stranger:
             stranger.seem_alive("hal/host/another")
-            code = run.wait()
+            code = run.end()
     assert code == 0, f"exit code {code}: {run.said()[-600:]}"

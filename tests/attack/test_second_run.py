@@ -80,7 +80,7 @@ def test_a1_two_runs_that_start_at_once_have_a_network_each(tmp_path: Path, _tim
         running(tmp_path, *SHORT, name="one", endpoint=None, inside=machine.prefix) as one,
         running(tmp_path, *SHORT, name="two", endpoint=None, inside=machine.prefix) as two,
     ):
-        codes = one.wait(), two.wait()
+        codes = one.end(), two.end()
         assert codes == (0, 0), one.said() + two.said()
         assert one.endpoint != two.endpoint, f"both met at {one.endpoint}"
 
