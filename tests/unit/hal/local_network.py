@@ -4,7 +4,7 @@ import math
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -38,6 +38,15 @@ from tests.harness.wait import wait_until
 from tests.unit.hal.rig import pose
 
 LIMIT_S = 20.0
+
+
+@contextmanager
+def meeting(*namespaces: str | None) -> Iterator[list[Session]]:
+    """Sessions on a network of their own; the first one listens."""
+    with ExitStack() as stack:
+        endpoint = free_endpoint()
+        links = [Link(endpoint, name, listen=not i) for i, name in enumerate(namespaces)]
+        yield [stack.enter_context(open_session(each)) for each in links]
 
 
 class LagBackend:

@@ -12,12 +12,10 @@ from snakesim_hal.faults.message_faults import MessageFaults
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host
 from snakesim_hal.injection import parse
-from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, Clock, FaultRequest, JointState
-from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until
-from tests.unit.hal.local_network import Follower, LagBackend, Running, following, running
+from tests.unit.hal.local_network import Follower, LagBackend, Running, following, meeting, running
 from tests.unit.hal.rig import description, run_config, state
 
 ALLOWED: dict[str, Any] = {"pace": "realtime", "rate_hz": 100, "faults_allowed": True}
@@ -83,7 +81,7 @@ def test_where_something_real_moves_nothing_goes_wrong_on_request() -> None:
         assert not answer.ok and answer.refusal == "not_allowed" and "faults_allowed = true" in answer.reason
     config = run_config(faults=["mute:joint_1@1"])
     with (
-        open_session(Link(free_endpoint(), "worm", listen=True)) as own,
+        meeting("worm") as (own,),
         pytest.raises(ConfigError, match="something real moves here"),
     ):
         Host(config, GuardedBackend(LagBackend(config)), own)
@@ -133,7 +131,7 @@ def turn(injector: Injector, tick: int, arming: int) -> None:
 
 def test_a_service_that_is_started_anew_does_not_repeat_what_was_planned() -> None:
     config = run_config(faults=["drop:actuator/joints@0.1"], faults_allowed=True)
-    with open_session(Link(free_endpoint(), "worm", listen=True)) as session:
+    with meeting("worm") as (session,):
         for first_arming, expected in ((0, ["drop:actuator/joints@0.1=1"]), (1, [])):
             injector = Injector("control", config, session, note=lambda _text, _now_s: None)
             turn(injector, 0, first_arming)
@@ -146,7 +144,7 @@ def test_a_service_that_is_started_anew_does_not_repeat_what_was_planned() -> No
 def test_a_newer_fault_of_a_kind_takes_the_place_of_the_one_before() -> None:
     config = run_config(faults=["drop:actuator/joints@0.1-0.3=0.5", "drop:actuator/joints@0.2-0.4"])
     notes: list[str] = []
-    with open_session(Link(free_endpoint(), "worm", listen=True)) as session:
+    with meeting("worm") as (session,):
         injector = Injector("control", config, session, note=lambda text, now_s: notes.append(f"{now_s:g} {text}"))
         for tick in range(50):
             turn(injector, tick, int(tick > 0))
@@ -162,8 +160,7 @@ def test_a_newer_fault_of_a_kind_takes_the_place_of_the_one_before() -> None:
 
 
 def test_messages_are_late_and_the_thread_that_sends_them_goes_when_it_is_not_needed() -> None:
-    endpoint = free_endpoint()
-    with open_session(Link(endpoint, listen=True)) as here, open_session(Link(endpoint)) as there:
+    with meeting(None, None) as (here, there):
         arrived: list[float] = []
         there.on_arrival(keys.CLOCK, lambda arrival: arrived.append(arrival.monotonic_ns * 1e-9))
         publisher = here.publisher(keys.CLOCK, Clock)
@@ -189,8 +186,7 @@ def test_messages_are_late_and_the_thread_that_sends_them_goes_when_it_is_not_ne
 
 
 def test_a_publisher_that_is_declared_later_is_disturbed_too_and_a_flood_ends_with_the_faults() -> None:
-    endpoint = free_endpoint()
-    with open_session(Link(endpoint, listen=True)) as here, open_session(Link(endpoint)) as there:
+    with meeting(None, None) as (here, there):
         arrived: list[bytes] = []
         there.on_arrival(keys.JOINTS, lambda arrival: arrived.append(arrival.payload))
         faults = MessageFaults(here, 1)

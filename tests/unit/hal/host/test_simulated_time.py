@@ -1,8 +1,6 @@
 """A simulator's time: it stands, passes by single ticks or at another speed. A real host, and a client that follows."""
 
-import sys
 import time
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -18,13 +16,7 @@ PATIENT: dict[str, Any] = {"rate_hz": 50.0}  # with the longest lease, 100 ms
 MANY_LEASES_S = 0.5
 
 
-@pytest.fixture(autouse=True)
-def quick_threads() -> Iterator[None]:
-    """Host and client share one interpreter here; in real life they are processes."""
-    before = sys.getswitchinterval()
-    sys.setswitchinterval(0.0005)
-    yield
-    sys.setswitchinterval(before)
+pytestmark = pytest.mark.usefixtures("quick_threads")
 
 
 def ask(run: Running, action: Any, **more: Any) -> str:

@@ -1,26 +1,15 @@
 """What a service sees of the clock."""
 
 from collections.abc import Iterator
-from contextlib import ExitStack
 
 import msgspec
-import pytest
 
 from snakesim_hal.network.client import Client
-from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.session import Session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, Done, Pose
-from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until
 from tests.unit.hal.rig import clock, pose
-
-
-@pytest.fixture
-def sessions() -> Iterator[tuple[Session, Session]]:
-    with ExitStack() as stack:
-        endpoint = free_endpoint()
-        host = stack.enter_context(open_session(Link(endpoint, "robot", listen=True)))
-        yield host, stack.enter_context(open_session(Link(endpoint, "robot")))
 
 
 def shown(sessions: tuple[Session, Session], clocks: list[Clock]) -> Iterator[Clock | None]:

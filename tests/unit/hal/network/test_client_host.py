@@ -1,10 +1,8 @@
 """A client and a host, in one process but over real Zenoh: ticks, leases, stops, and strangers on the network."""
 
 import itertools
-import sys
 import threading
 import time
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -16,7 +14,7 @@ from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host
 from snakesim_hal.host.inbox import LIMITS, SAMPLES
 from snakesim_hal.network.client import Client
-from snakesim_hal.network.session import Arrival, Link, open_session
+from snakesim_hal.network.session import Arrival, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import ENCODING_PREFIX, Decoder, encode, encoding_of
 from snakesim_hal.wire.messages import (
@@ -31,19 +29,11 @@ from snakesim_hal.wire.messages import (
     Mode,
     Pose,
 )
-from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until
-from tests.unit.hal.local_network import Follower, LagBackend, following, running
+from tests.unit.hal.local_network import Follower, LagBackend, following, meeting, running
 from tests.unit.hal.rig import command, description, run_config, state
 
-
-@pytest.fixture(autouse=True)
-def quick_threads() -> Iterator[None]:
-    """Host and client share one interpreter here; in real life they are processes."""
-    before = sys.getswitchinterval()
-    sys.setswitchinterval(0.0005)
-    yield
-    sys.setswitchinterval(before)
+pytestmark = pytest.mark.usefixtures("quick_threads")
 
 
 def passive(points: SetPoints) -> bool:
@@ -257,8 +247,7 @@ def test_nothing_that_is_put_on_the_network_ends_the_host_and_all_of_it_is_count
 
 def test_a_strangers_command_neither_moves_the_robot_nor_passes_for_the_holders_answer() -> None:
     """In lockstep a tick ends when the holder has answered; a refused command of somebody else is no answer."""
-    endpoint = free_endpoint()
-    with open_session(Link(endpoint, "worm", listen=True)) as session:
+    with meeting("worm") as (session,):
         host = Host(run_config(), GuardedBackend(LagBackend(run_config())), session)
         host.authority.observe(state(host.description))
         host.authority.on_lease(LeaseRequest(action="acquire", holder="control"), 0)
@@ -272,9 +261,9 @@ def test_a_strangers_command_neither_moves_the_robot_nor_passes_for_the_holders_
 
 
 def test_a_flood_of_commands_does_not_keep_an_estop_out() -> None:
-    endpoint, limit = free_endpoint(), LIMITS[SAMPLES] or 0
+    limit = LIMITS[SAMPLES] or 0
     config = run_config(pace="realtime")
-    with open_session(Link(endpoint, "worm", listen=True)) as own, open_session(Link(endpoint, "worm")) as stranger:
+    with meeting("worm", "worm") as (own, stranger):
         host = Host(config, GuardedBackend(LagBackend(config)), own)
         publisher = stranger.publisher(keys.JOINT_COMMAND, JointCommand, lossless=True)
         for sequence in range(limit + 500):

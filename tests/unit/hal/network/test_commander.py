@@ -6,12 +6,11 @@ import pytest
 
 from snakesim_hal.errors import StalledError
 from snakesim_hal.network.client import Client, Commander, Feed
-from snakesim_hal.network.session import Link, open_session
+from snakesim_hal.network.session import open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, JointState, LeaseRequest
-from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until
-from tests.unit.hal.local_network import running
+from tests.unit.hal.local_network import meeting, running
 from tests.unit.hal.rig import clock, description, run_config, state
 
 # --- the client alone ------------------------------------------------------------------------------------------
@@ -52,9 +51,9 @@ def naming(tick: int, joints_tick: int, arming: int = 1) -> Clock:
 def test_a_client_reads_what_the_clock_names_waits_for_it_and_reports_what_never_comes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    endpoint, robot = free_endpoint(), description()
+    robot = description()
     monkeypatch.setattr("snakesim_hal.network.client.MISSING_LIMIT_S", 0.1)
-    with open_session(Link(endpoint, "worm", listen=True)) as hal, open_session(Link(endpoint, "worm")) as session:
+    with meeting("worm", "worm") as (hal, session):
         client = Client(session, "control")
         feed = client.subscribe(keys.JOINTS, JointState)
         clocks = hal.publisher(keys.CLOCK, Clock, lossless=True)

@@ -1,30 +1,18 @@
 """Processes of one robot that are set up differently do not arm it, and say where the difference is."""
 
-from collections.abc import Iterator
-from contextlib import ExitStack
-
 import msgspec
 import pytest
 
 from snakesim_hal.model.scenario import RunConfig, load, parse_set
 from snakesim_hal.network.process_entries import ProcessEntries, own_entry, show_process
-from snakesim_hal.network.session import Link, Session, open_session
+from snakesim_hal.network.session import Session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Process
-from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until
 
 
 def config(*sets: str) -> RunConfig:
     return load("triplet", [parse_set(text) for text in sets]).config
-
-
-@pytest.fixture
-def sessions() -> Iterator[tuple[Session, Session]]:
-    endpoint = free_endpoint()
-    with ExitStack() as stack:
-        here = stack.enter_context(open_session(Link(endpoint, "worm", listen=True)))
-        yield here, stack.enter_context(open_session(Link(endpoint, "worm")))
 
 
 @pytest.mark.parametrize(

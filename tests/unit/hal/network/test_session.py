@@ -20,6 +20,7 @@ from snakesim_hal.wire.codec import ENCODING_PREFIX, encode
 from snakesim_hal.wire.messages import Answer, Done, EstopRequest, JointState, LeaseRequest
 from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until
+from tests.unit.hal.local_network import meeting
 from tests.unit.hal.rig import description, state
 
 ROBOT = description()
@@ -69,8 +70,7 @@ def test_a_stream_is_not_given_to_those_who_come_late() -> None:
 
 
 def test_a_reader_keeps_the_newest_and_counts_what_it_cannot_take() -> None:
-    endpoint = free_endpoint()
-    with open_session(Link(endpoint, "worm", listen=True)) as hal, open_session(Link(endpoint, "worm")) as session:
+    with meeting("worm", "worm") as (hal, session):
         reader = session.reader(keys.JOINTS, JointState, depth=4)
         publisher = hal.publisher(keys.JOINTS, JointState, lossless=True)
         wait_until(publisher.heard, "the subscription")
@@ -118,12 +118,7 @@ def test_a_session_closes_while_urgent_samples_arrive() -> None:
 
 
 def test_robots_of_two_namespaces_do_not_hear_each_other_and_a_tool_hears_both() -> None:
-    endpoint = free_endpoint()
-    with (
-        open_session(Link(endpoint, "lab/a", listen=True)) as a,
-        open_session(Link(endpoint, "lab/b")) as b,
-        open_session(Link(endpoint)) as tool,
-    ):
+    with meeting("lab/a", "lab/b", None) as (a, b, tool):
         heard: dict[str, list[Arrival]] = {"a": [], "b": [], "tool": []}
         a.on_arrival(keys.DONE_ALL, heard["a"].append)
         b.on_arrival(keys.DONE_ALL, heard["b"].append)
@@ -143,23 +138,21 @@ def test_robots_of_two_namespaces_do_not_hear_each_other_and_a_tool_hears_both()
 
 
 def test_questions_are_answered() -> None:
-    endpoint = free_endpoint()
     request = LeaseRequest(action="acquire", holder="control")
 
     def answer(question: Question) -> None:
         assert question.payload == encode(request) and question.encoding.endswith("LeaseRequest/1")
         question.reply(Answer(ok=False, reason="held by teleop", epoch=3, lifecycle="armed"))
 
-    with open_session(Link(endpoint, "worm", listen=True)) as hal, open_session(Link(endpoint, "worm")) as session:
+    with meeting("worm", "worm") as (hal, session):
         hal.on_question(keys.LEASE, answer)
         wanted = Answer(ok=False, reason="held by teleop", epoch=3, lifecycle="armed")
         assert session.ask(keys.LEASE, request) == wanted
 
 
 def test_a_question_by_pattern_is_about_the_key_that_was_declared() -> None:
-    endpoint = free_endpoint()
     questions: list[Question] = []
-    with open_session(Link(endpoint, "worm", listen=True)) as hal, open_session(Link(endpoint)) as tool:
+    with meeting("worm", None) as (hal, tool):
         hal.on_question(keys.ESTOP, questions.append)
         for pattern in ("**", "worm/hal/*"):
             replies = tool._zenoh.get(pattern, timeout=5.0)

@@ -35,7 +35,7 @@ from snakesim_hal.wire.messages import (
 from snakesim_hal.wire.quantities import Quaternion
 from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until
-from tests.unit.hal.local_network import LagBackend
+from tests.unit.hal.local_network import LagBackend, meeting
 from tests.unit.hal.rig import clock, description, pose, power, run_config, state
 
 ROBOT = description()  # three joints, four links
@@ -138,8 +138,7 @@ def served(hal: Session) -> None:
 
 
 def test_an_intent_is_of_no_tick_and_what_does_not_fit_is_counted_and_left_out() -> None:
-    endpoint = free_endpoint()
-    with open_session(Link(endpoint, "worm", listen=True)) as hal, open_session(Link(endpoint, "worm")) as session:
+    with meeting("worm", "worm") as (hal, session):
         served(hal)
         client = Client(session, "navigation")
         intents, joints = client.subscribe(keys.INTENT, Intent), client.subscribe(keys.JOINTS, JointState)
@@ -165,8 +164,7 @@ def test_an_intent_is_of_no_tick_and_what_does_not_fit_is_counted_and_left_out()
 
 
 def test_an_answer_that_cannot_be_read_is_no_answer() -> None:
-    endpoint = free_endpoint()
-    with open_session(Link(endpoint, "worm", listen=True)) as rogue, open_session(Link(endpoint, "worm")) as session:
+    with meeting("worm", "worm") as (rogue, session):
         served(rogue)
         network: Any = rogue._zenoh  # pyright: ignore[reportPrivateUsage] - a rogue does not keep to our session
         stranger = network.declare_queryable(
@@ -183,12 +181,7 @@ def test_an_answer_that_cannot_be_read_is_no_answer() -> None:
 
 
 def test_what_is_longer_than_any_message_never_arrives_and_the_link_stays() -> None:
-    endpoint = free_endpoint()
-    with (
-        open_session(Link(endpoint, "worm", listen=True)) as hal,
-        open_session(Link(endpoint, "worm")) as session,
-        open_session(Link(endpoint, "worm")) as stranger,
-    ):
+    with meeting("worm", "worm", "worm") as (hal, session, stranger):
         heard: list[int] = []
         for listener in (hal, session):
             listener.on_arrival(keys.JOINTS, lambda arrival: heard.append(len(arrival.payload)))
@@ -220,7 +213,7 @@ def test_large_images_arrive_where_they_are_expected() -> None:
 
 def test_a_lease_that_has_run_out_is_a_fault_even_when_somebody_asks_for_it_at_that_moment() -> None:
     config, answers = run_config(pace="realtime", services={}), list[Answer]()
-    with open_session(Link(free_endpoint(), "worm", listen=True)) as session:
+    with meeting("worm") as (session,):
         host = Host(config, GuardedBackend(LagBackend(config)), session)  # between two ticks
         host.answer(LeaseRequest(action="acquire", holder="control"), answers.append)
         host.authority.observe(state(ROBOT))
@@ -232,8 +225,7 @@ def test_a_lease_that_has_run_out_is_a_fault_even_when_somebody_asks_for_it_at_t
 
 
 def test_a_flood_is_dropped_unread_but_for_the_newest_that_is_wanted() -> None:
-    endpoint = free_endpoint()
-    with open_session(Link(endpoint, "worm", listen=True)) as hal, open_session(Link(endpoint, "worm")) as session:
+    with meeting("worm", "worm") as (hal, session):
         reader, asked = session.reader(keys.JOINTS, JointState), list[int]()
         joints, after = hal.publisher(keys.JOINTS, JointState, lossless=True), session.reader(keys.CLOCK, Clock)
         clocks = hal.publisher(keys.CLOCK, Clock, lossless=True)
