@@ -32,7 +32,7 @@ BROKEN_AT_IMPORT = int(pytest.ExitCode.INTERRUPTED)
 
 def place_of(file: str) -> Path:
     """Of a file that is tried, in the repository."""
-    return Path("snakesim_hal", "model" if file == "thermal.py" else "safety", file)
+    return Path("snakesim_hal", "physics" if file == "thermal.py" else "safety", file)
 
 
 def module_of(file: str) -> str:
