@@ -1,7 +1,7 @@
 """The HAL host: runs any backend, tick by tick, and is the only process that touches it.
 
-A tick: sample the sensors, publish them, publish the clock, wait for the command that answers them, let the authority
-decide, hand the set-points to the backend, let a period pass. The pace decides how long it waits:
+A tick: sample the sensors, publish them, publish the clock, judge the samples, wait for the command that answers them,
+let the authority decide, hand the set-points to the backend, let a period pass. The pace decides how long it waits:
 
 realtime  until the tick's deadline on the monotonic clock; an old command stays active until its lease ends
 lockstep  until every participant whose output is due has delivered; stays at tick 0 until the first arming
@@ -188,10 +188,12 @@ class Host:
                     yield
                     self._stand_still()
                     continue
-                last = self._sample(last)
+                before, last = last, self._sample(last)
                 if last is None:
                     break
                 self._publish(last)
+                if last is not before:
+                    self._judge(last)
                 yield
                 if self._pace == "lockstep" and self.authority.arming == 0:
                     self._inbox.take_until(time.monotonic_ns() + STANDBY_PERIOD_NS)
@@ -234,12 +236,15 @@ class Host:
         except BackendError as error:
             self._backend_failed(error)
             return None
+        return samples
+
+    def _judge(self, samples: Samples) -> None:
+        """The authority's view of new samples, before any answer to them is taken in; services compute meanwhile."""
         now_ns = self._safety_now()
         self.authority.observe(samples.joints, now_ns)
         power = samples.others.get(keys.POWER)
         if isinstance(power, Power):
             self.authority.observe_power(power, now_ns)
-        return samples
 
     def _inject(self) -> None:
         """Faults on request, where they are allowed."""
