@@ -4,10 +4,16 @@ import csv
 import json
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap.records import Schema
+from mcap_protobuf.decoder import DecoderFactory as ProtobufDecoder
 
 from snakesim_hal.model.scenario import load, parse_set
+from snakesim_hal.wire import keys
+from snakesim_operator.recording.decoder import DecoderFactory
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.run.in_process import simulate
@@ -115,3 +121,21 @@ def test_what_is_no_recording_is_named(tmp_path: Path, command: str) -> None:
     (tmp_path / "notes.txt").write_text("mine")
     assert "notes.txt is not a recording" in snakesim(command, "notes.txt", cwd=tmp_path).err
     assert "gone" in snakesim(command, "gone", cwd=tmp_path).err
+
+
+def test_a_stock_reader_gets_our_messages_by_their_fields(run: Path) -> None:
+    """Beside Foxglove's, each by its own decoder."""
+    with (run / RECORDING).open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory(), ProtobufDecoder()])
+        decoded = [(channel.topic, message) for _, channel, _, message in reader.iter_decoded_messages()]
+    angles = {message.tick: message.angle_rad for topic, message in decoded if topic == keys.JOINTS}
+    assert np.array_equal([angles[tick] for tick in range(200)], RunRecord.load(run).angle_rad)
+    assert {"foxglove/joints", keys.CLOCK} <= {topic for topic, _ in decoded}
+
+
+def test_a_message_of_a_later_version_is_decoded_as_it_stands() -> None:
+    later = DecoderFactory().decoder_for(
+        "msgpack", Schema(id=1, name="snakesim.Whisker", encoding="jsonschema", data=b"{}")
+    )
+    assert later is not None and later(msgspec.msgpack.encode({"bend_rad": 0.1})) == {"bend_rad": 0.1}
+    assert DecoderFactory().decoder_for("msgpack", None) is None
