@@ -10,11 +10,13 @@ from snakesim_hal.arrays import Floats
 from snakesim_hal.wire.messages import Description, Mode
 from snakesim_operator.console.drawing import pushing_joint
 from snakesim_operator.console.snapshot import RobotSnapshot
+from snakesim_operator.console.stage import PROPELS
 from snakesim_operator.results.page.palette import joint_colours
 
 HISTORY_S = 10.0
 SAMPLES_MOST = 400
-ANGLE, REFERENCE, LIMIT, PUSH = "#0067b0", "#c8321f", "#8b95a1", "#e87420"
+ANGLE, REFERENCE, LIMIT = "#0067b0", "#c8321f", "#8b95a1"
+PUSH = "#" + bytes(PROPELS).hex()
 
 
 class JointCharts:

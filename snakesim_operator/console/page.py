@@ -36,7 +36,7 @@ LEGEND = (
     ("contact force", stage.FELT),
     ("solved force; dashed: no contact felt there", stage.SOLVED),
     ("resultant", stage.RESULTANT),
-    ("propulsion joint", stage.PUSHED),
+    ("propulsion joint", stage.PROPELS),
 )
 
 

@@ -47,6 +47,7 @@ def colour(name: str, *, dark: bool = False) -> Colour:
 
 LINK, LINK_EDGE, HEAD = (52, 92, 138), (70, 112, 160), (22, 46, 84)
 HINGE, LOST = (52, 58, 66), colour("bad")
+PROPELS = (64, 190, 255)  # against PUSHED: blue and orange, for any kind of colour vision
 PEG, PUSHED, AHEAD, SEEN = (176, 152, 112), (226, 88, 12), (232, 168, 56), (0, 200, 170)
 DASHES = np.arange(10.0).reshape(5, 2) / 9  # shares of a dashed line: from, to
 FELT, SOLVED, RESULTANT = colour("measured"), colour("commanded"), (20, 160, 90)
@@ -187,7 +188,7 @@ class Stage:
         for i in drawing.failed:
             colours[i], scales[i] = LOST, 1.25
         if drawing.pushing is not None:
-            colours[drawing.pushing], scales[drawing.pushing] = PUSHED, (1.9, 1.9, 1.25)
+            colours[drawing.pushing], scales[drawing.pushing] = PROPELS, (1.9, 1.9, 1.25)
         self._hinges.batched_colors, self._hinges.batched_scales = _shades(colours), scales
 
     def _show_arrows(self, name: str, points: Floats, of: Colour, thick: float) -> None:

@@ -15,6 +15,7 @@ from snakesim_hal.model.scenario import capsules_at_start, load
 from snakesim_hal.wire.messages import Status
 from snakesim_operator.console import texts
 from snakesim_operator.console.drawing import draw
+from snakesim_operator.console.page import LEGEND
 from snakesim_operator.console.server import page_server
 from snakesim_operator.console.snapshot import RobotSnapshot, expected_of
 from snakesim_operator.console.token import ControlToken
@@ -128,3 +129,7 @@ def test_a_robot_that_is_only_expected_is_drawn_at_its_start_and_called_nothing_
 def test_the_page_says_what_moves(backend: str, emulated: bool, words: str):
     robot = msgspec.structs.replace(description(), backend=backend, emulated=emulated)
     assert f">{words}<" in texts.header(RobotSnapshot(robot=robot))
+
+
+def test_the_legend_has_a_colour_for_each_thing():
+    assert len({colour for _, colour in LEGEND}) == len(LEGEND)
