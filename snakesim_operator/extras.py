@@ -20,6 +20,7 @@ BRINGS = {  # as imported; the first extra that brings a package is the one to n
     "gym": ("gymnasium",),
     "lab": ("cryptography", "jinja2"),
     "plot": ("matplotlib",),
+    "policy": ("onnxruntime",),
     "preview": ("PIL",),
     "ros2": ("rosbags", "xxhash"),
     "video": ("imageio_ffmpeg", "PIL"),

@@ -1,0 +1,148 @@
+"""A learned policy as a controller: an ONNX model from what the joints say to a target for every joint.
+
+The model says in its metadata what it takes and gives; units are in the names. All of that is checked when it is made.
+"""
+
+import contextlib
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Any
+
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from snakesim_gnc.control.controller import Action, Report, View
+from snakesim_hal.backend import SetPoints
+from snakesim_hal.errors import ConfigError, short
+from snakesim_hal.model.files import FileStruct, expanded
+from snakesim_hal.model.plugins import pip_install
+from snakesim_hal.model.textfiles import read_bytes
+from snakesim_hal.wire.messages import Description, Mode
+from snakesim_hal.wire.quantities import about
+
+RUNTIME: Any = None
+with contextlib.suppress(ModuleNotFoundError):  # as this file is loaded: an arming, which makes the policy, cannot wait
+    import onnxruntime
+
+    RUNTIME = onnxruntime
+
+OBSERVATIONS, ACTION = "snakesim.observations", "snakesim.action"
+JOINTS, FRAME_SKIP = "snakesim.joints", "snakesim.frame_skip"
+PARTS: dict[str, Callable[[View], Sequence[float]]] = {
+    "angle_rad": lambda view: view.joints.angle_rad,
+    "velocity_rad_s": lambda view: view.joints.velocity_rad_s,
+    "torque_nm": lambda view: view.joints.torque_nm,
+    "time_s": lambda view: [view.time_s],
+}
+MODES = {"position": Mode.POSITION, "velocity": Mode.VELOCITY, "torque": Mode.TORQUE}
+MAX_FRAME_SKIP = 1000
+
+
+class Policy:
+    """Asks the model every `snakesim.frame_skip` ticks, and holds its targets meanwhile."""
+
+    NEEDS = "joints"
+
+    class Settings(FileStruct, frozen=True, kw_only=True):
+        """The model."""
+
+        model: Annotated[
+            str, Meta(min_length=1, max_length=1024), about("path of an ONNX file with metadata; docs/environments.md")
+        ]
+
+    def __init__(self, robot: Description, settings: Settings) -> None:
+        """Raises ConfigError that names the file, the field, its value and what is expected."""
+        self._session, given = _opened(settings.model)
+        fields = _Metadata(settings.model, given)
+        self._parts = fields.parts()
+        self._mode = MODES[fields.one_of(ACTION, MODES)]
+        self._frame_skip = fields.whole(FRAME_SKIP, MAX_FRAME_SKIP, "ticks")
+        count = len(robot.joints)
+        joints = fields.whole(JOINTS)
+        if joints != count:
+            raise fields.wrong(JOINTS, joints, f"{count}, the number of joints of robot {robot.robot!r}")
+        width = sum(1 if part == "time_s" else count for part in self._parts)
+        self._input = _only("input", self._session.get_inputs(), width, f"{', '.join(self._parts)}", settings.model)
+        self._output = _only("output", self._session.get_outputs(), count, "a target for each joint", settings.model)
+        self._torque_limit_nm = [joint.torque_limit_nm for joint in robot.joints]
+        self._target = [0.0] * count
+        self._asked: int | None = None  # the tick of the last question
+
+    def update(self, view: View) -> Action:
+        """The model's targets; the gate limits them."""
+        if self._asked is None or view.tick - self._asked >= self._frame_skip:
+            observed = [value for part in self._parts for value in PARTS[part](view)]
+            given: NDArray[np.float32] = np.array([observed], dtype=np.float32)
+            self._target = self._session.run([self._output], {self._input: given})[0][0].tolist()
+            self._asked = view.tick
+        points = SetPoints([self._mode] * len(self._target), list(self._target), list(self._torque_limit_nm))
+        reference = self._target if self._mode is Mode.POSITION else ()
+        return Action(points, Report(why="a policy moves the joints", reference_rad=reference))
+
+
+class _Metadata:
+    """The metadata properties of a model, as texts."""
+
+    def __init__(self, file: str, given: Mapping[str, str]) -> None:
+        self._file, self._given = short(file), given
+
+    def parts(self) -> list[str]:
+        """The names of the observation's parts, in order."""
+        text = self._text(OBSERVATIONS, f"names out of {', '.join(PARTS)}, with commas between")
+        parts = [part.strip() for part in text.split(",")]
+        if not set(parts) <= set(PARTS) or len(set(parts)) < len(parts):
+            raise self.wrong(OBSERVATIONS, text, f"names out of {', '.join(PARTS)}, each once, with commas between")
+        return parts
+
+    def one_of(self, field: str, allowed: Mapping[str, Any]) -> str:
+        wanted = f"one of {', '.join(allowed)}"
+        text = self._text(field, wanted).strip()
+        if text not in allowed:
+            raise self.wrong(field, text, wanted)
+        return text
+
+    def whole(self, field: str, most: int | None = None, unit: str = "") -> int:
+        wanted = f"a whole number{f' of {unit}' if unit else ''} from 1{f' to {most}' if most else ''}"
+        text = self._text(field, wanted).strip()
+        if not (text.isascii() and text.isdigit() and len(text) < 10 and 1 <= int(text) <= (most or int(text))):
+            raise self.wrong(field, text, wanted)
+        return int(text)
+
+    def wrong(self, field: str, value: object, wanted: str) -> ConfigError:
+        return ConfigError(f"{self._file}: metadata `{field}` is {short(str(value))!r}, must be {wanted}")
+
+    def _text(self, field: str, wanted: str) -> str:
+        if field not in self._given:
+            there = ", ".join(sorted(self._given)) or "no metadata"
+            raise ConfigError(
+                f"{self._file}: has no metadata `{field}`, which must be {wanted}; there is {short(there, 200)}"
+            )
+        return self._given[field]
+
+
+def _opened(file: str) -> tuple[Any, Mapping[str, str]]:
+    """A session with the model of a file, and its metadata."""
+    data = read_bytes(expanded(file))
+    if RUNTIME is None:
+        raise ConfigError(f"controller policy needs onnxruntime: {pip_install('policy')}")
+    options = RUNTIME.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1  # the same sums in the same order, whatever the CPU
+    options.log_severity_level = 3  # errors are raised, and told once
+    try:
+        session = RUNTIME.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # of many kinds, which have no name in common
+        raise ConfigError(f"{short(file)}: cannot be loaded as an ONNX model: {short(str(error), 300)}") from error
+    return session, session.get_modelmeta().custom_metadata_map
+
+
+def _only(what: str, found: Sequence[Any], width: int, of: str, file: str) -> str:
+    """The name of a model's one input or output, if it is float32 of shape (1, width); the 1 may be left open."""
+    names = [f"{one.name} {one.type} {tuple(one.shape)}" for one in found]
+    fits = len(found) == 1 and found[0].type == "tensor(float)" and len(found[0].shape) == 2
+    first, second = found[0].shape if fits else (None, None)
+    if not fits or second != width or (isinstance(first, int) and first != 1):
+        there = short("; ".join(names) or "none", 200)
+        raise ConfigError(
+            f"{short(file)}: {what} is {there}, must be one tensor(float), that is float32, of shape (1, {width}): {of}"
+        )
+    return found[0].name
