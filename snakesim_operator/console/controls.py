@@ -74,9 +74,7 @@ class Controls:
                 self._kind = client.gui.add_dropdown("Kind", tuple(FAULTS), initial_value="mute (joint)")
                 self._target = client.gui.add_text("Target", TARGETS["joint"])
                 inject = client.gui.add_button_group("Fault", ("Inject", "End it"))
-            self._dark = client.gui.add_checkbox("Dark page", initial_value=False)
-        for control in (self._take, self._dark):
-            admission.admit(control, self.viewer)
+        admission.admit(self._take, self.viewer)
         for control in (
             self._lifecycle,
             time_buttons,
@@ -100,7 +98,6 @@ class Controls:
         inject.on_click(lambda event: self._inject(end=event.target.value == "End it"))
         self._drive.on_hold(lambda _: self._go(), callback_hz=DRIVE_HZ)
         self._apply.on_click(lambda _: self._configure())
-        self._dark.on_update(lambda _: set_appearance(client.gui, dark=self._dark.value))
         self.show()
 
     @property
@@ -255,3 +252,11 @@ def set_appearance(gui: viser.GuiApi, *, dark: bool) -> None:
     gui.configure_theme(
         dark_mode=dark, show_logo=False, show_share_button=False, control_width="large", brand_color=(0, 103, 176)
     )
+
+
+def add_appearance(client: viser.ClientHandle, admission: Admission, *, dark: bool) -> None:
+    """The viewer's own choice of a dark page; dark: what its browser prefers, until the viewer chooses."""
+    chosen = client.gui.add_checkbox("Dark page", initial_value=dark, order=2.5)
+    admission.admit(chosen, client.client_id)
+    chosen.on_update(lambda _: set_appearance(client.gui, dark=chosen.value))
+    set_appearance(client.gui, dark=dark)

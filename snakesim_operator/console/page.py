@@ -16,7 +16,7 @@ from snakesim_hal.wire.messages import ControlSettings, Description
 from snakesim_hal.wire.quantities import Vector
 from snakesim_operator.console import stage, texts
 from snakesim_operator.console.charts import JointCharts
-from snakesim_operator.console.controls import KEYS, Controls, name_of, set_appearance
+from snakesim_operator.console.controls import KEYS, Controls, add_appearance, name_of, set_appearance
 from snakesim_operator.console.drawing import Surroundings, draw
 from snakesim_operator.console.operations import Log, Operations
 from snakesim_operator.console.pictures import picture
@@ -64,9 +64,8 @@ class Page:
         self._shown_log = -1
         self._pictures: dict[str, viser.GuiImageHandle] = {}
         self._lay_out()
-        if operations is not None:
-            server.on_client_connect(self._came)
-            server.on_client_disconnect(self._went)
+        server.on_client_connect(self._came)
+        server.on_client_disconnect(self._went)
 
     def _lay_out(self) -> None:
         gui = self._server.gui
@@ -115,7 +114,10 @@ class Page:
     def _came(self, client: viser.ClientHandle) -> None:
         """In a thread of viser's: the viewer may be gone before it ends."""
         with self._of_who_is_there(client):
-            self._give_controls(client)
+            with self._lock:
+                add_appearance(client, self._server.admission, dark=self._server.prefers_dark(client.client_id))
+            if self._operations is not None:
+                self._give_controls(client)
             if self._moment is not None:
                 _aim(client, self._moment.robot)
             self._log.write(f"{name_of(client.client_id)} came")

@@ -4,7 +4,6 @@ import time
 
 import viser
 
-from snakesim_operator.console.controls import set_appearance
 from snakesim_operator.console.server import PageServer
 
 SPEEDS = ("0.1x", "0.25x", "0.5x", "1x", "2x", "4x")
@@ -26,13 +25,11 @@ class Player:
             self._slider = gui.add_slider("Time, s", 0.0, round(last_s, 2), 0.01, round(self.time_s - self._begin_s, 2))
             self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY)
             self._speed = gui.add_dropdown("Speed", SPEEDS, initial_value="1x")
-            dark = gui.add_checkbox("Dark page", initial_value=False)
-        for control in (self._slider, self._play, self._speed, dark):
+        for control in (self._slider, self._play, self._speed):
             server.admission.admit(control)
         self.playing = False
         self._play.on_click(lambda _: self._toggle())
         self._slider.on_update(lambda event: self._jump() if event.client is not None else None)
-        dark.on_update(lambda _: set_appearance(gui, dark=dark.value))
 
     def turn(self) -> tuple[float, bool]:
         """The time to show now, and whether it has jumped."""

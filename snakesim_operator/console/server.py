@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
+from weakref import WeakValueDictionary
 
 import viser
 import websockets.asyncio.server
@@ -28,7 +29,12 @@ from snakesim_operator.page_origin import why_refused
 
 MOST_VIEWERS = 64
 PAGES = ("/", "/index.html")
-SECOND_STOP = Path(__file__).with_name("second_stop.html")
+SECOND_STOP = Path(__file__).with_name("second_stop.html").read_bytes()
+DARK = "snakesim-dark=true"  # a cookie, which the browser sends as it connects: viser's page has no message for this
+PREFERENCE = (
+    b'<script>document.cookie = "snakesim-dark=" + matchMedia("(prefers-color-scheme: dark)").matches'
+    b' + "; path=/; SameSite=Strict"</script>'
+)
 Answer = Callable[[ServerConnection, Request], Response | None]
 _connecting: ContextVar[Browser] = ContextVar("connecting")
 
@@ -37,6 +43,24 @@ class PageServer(viser.ViserServer):
     """Without viser's tunnel to the public internet, which any viewer could open."""
 
     admission: Admission
+
+    def __init__(self, *arguments: Any, **more: Any) -> None:
+        super().__init__(*arguments, **more)
+        self._browsers: WeakValueDictionary[int, Browser] = WeakValueDictionary()
+        self._websock_server.on_client_connect(self._number)
+
+    def _number(self, viewer: Any) -> None:
+        """viser has numbered a viewer: until then nothing that its browser says is passed on."""
+        browser = _connecting.get()
+        browser.viewer = viewer.client_id
+        self._browsers[viewer.client_id] = browser
+
+    def prefers_dark(self, viewer: int) -> bool:
+        """Whether a viewer's browser or system is set to dark pages, as it said when it connected."""
+        browser = self._browsers.get(viewer)
+        if browser is None or browser.request is None:
+            return False
+        return DARK in "; ".join(browser.request.headers.get_all("Cookie")).split("; ")
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         """Refused."""
@@ -55,7 +79,6 @@ def page_server(
     with _on_our_terms(handed_on, admission, stop is not None), contextlib.redirect_stdout(io.StringIO()):
         server = PageServer(LOOPBACK, listening.getsockname()[1], label="SnakeSIM", verbose=False)  # prints a banner
     server.admission = admission
-    server._websock_server.on_client_connect(_number)
     pace(server)
     with Front(listening, handed_on, stop, lambda why: admission.drop(None, "another origin", why)):
         try:
@@ -106,13 +129,8 @@ def _on_our_terms(handed_on: HandedOn, admission: Admission, stops: bool) -> Ite
         websockets.asyncio.server.serve = serve  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def _number(viewer: Any) -> None:
-    """viser has numbered a viewer: until then nothing that its browser says is passed on."""
-    _connecting.get().viewer = viewer.client_id
-
-
 def _checked(answer: Answer, admission: Admission, stops: bool) -> Answer:
-    """Answer requests of our own pages only. viser's page gets the second stop, and cannot be framed by others."""
+    """Answer requests of our own pages only. viser's page gets our scripts, and cannot be framed by others."""
 
     def check(connection: ServerConnection, request: Request) -> Response | None:
         why = why_refused(request.headers.get("Host"), request.headers.get("Origin"))
@@ -123,15 +141,15 @@ def _checked(answer: Answer, admission: Admission, stops: bool) -> Answer:
             return answer(connection, request)
         page = answer(connection, dataclasses.replace(request, headers=Headers()))  # as it is, without compression
         assert page is not None
-        return _with_second_stop(page) if stops else page
+        return _with(SECOND_STOP + PREFERENCE if stops else PREFERENCE, page)
 
     return check
 
 
-def _with_second_stop(page: Response) -> Response:
+def _with(ours: bytes, page: Response) -> Response:
     """First of all in the page: then nothing of viser's can keep it from running."""
     before, head, after = page.body.partition(b"<head>")
-    body = before + head + SECOND_STOP.read_bytes() + after if head else SECOND_STOP.read_bytes() + page.body
+    body = before + head + ours + after if head else ours + page.body
     headers = Headers(
         {
             "Content-Type": page.headers["Content-Type"],

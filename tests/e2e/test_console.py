@@ -11,6 +11,10 @@ import pytest
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlSettings, JointState, Status
+from snakesim_operator.console.operations import Log
+from snakesim_operator.console.page import Page
+from snakesim_operator.console.server import page_server
+from snakesim_operator.console_port import open_port
 from tests.browser import CHROMIUM, MISSING, Tab, chromium
 from tests.e2e.command import Running, running
 from tests.harness.processes import nothing_left, processes_of
@@ -23,6 +27,7 @@ STOP_LIMIT_S = 10.0  # from the key to motors that are off: far above what it ta
 SILENT = "THE STOP DOES NOT ANSWER"
 COAST_LIMIT_S = 2.0  # of robot time, until joints without torque are at rest
 SMALL = 800, 400, 0.25  # width, height, pixels a dot: the browser draws without a graphics card here
+LOOK = "document.documentElement.dataset.mantineColorScheme"
 GROUND = {"x": 0, "y": 200, "width": 370, "height": 200, "scale": 1}  # of the page: scene without notices
 
 
@@ -51,6 +56,19 @@ def test_a_page_shows_the_snake_as_it_moves_and_its_escape_key_stops_it(tmp_path
         )
         page.wait_for("ESTOP")
         assert not page.errors, page.errors
+
+
+def test_a_page_is_dark_if_its_browser_prefers_that_until_the_viewer_chooses() -> None:
+    with page_server(open_port(None)) as (server, address), chromium() as browser:
+        Page(server, None, None, Log(), recorded="a run")
+        page = browser.open("about:blank", *SMALL)
+        for prefers in ("light", "dark"):
+            page.send("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": prefers}])
+            page.send("Page.navigate", url=address)
+            page.wait_for("Dark page")
+            wait_until(lambda prefers=prefers: page.value(LOOK) == prefers, f"a {prefers} page")
+        page.click("Dark page")
+        wait_until(lambda: page.value(LOOK) == "light", "the viewer's choice")
 
 
 @pytest.mark.slow
