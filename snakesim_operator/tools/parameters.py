@@ -48,6 +48,8 @@ class Parameter:
         """What values it may have, in words."""
         if self.choices:
             return " or ".join(self.choices)
+        if isinstance(self.value, str):
+            return "a text"
         sign = ">" if self.above_least else ">="
         low = "" if self.least is None else f"{sign} {self.least:g}"
         high = "" if self.most is None else f"<= {self.most:g}"

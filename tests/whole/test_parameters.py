@@ -56,6 +56,9 @@ def test_what_is_set_for_the_replay_stays(tuned: Path, tmp_path: Path) -> None:
     assert first < CHANGED_AT, "differs before the change, and not after it alone"
 
 
+MUST_BE_SET = {"policy": {"model": "a.onnx"}}
+
+
 @pytest.mark.parametrize("name", installed(CONTROLLERS))
 def test_every_shipped_parameter_says_what_it_is(name: str) -> None:
     settings = find_plugin(CONTROLLERS, name).Settings
@@ -63,13 +66,13 @@ def test_every_shipped_parameter_says_what_it_is(name: str) -> None:
         tick=0,
         stamp_ns=0,
         controller=name,
-        settings=msgspec.json.encode(settings()).decode(),
+        settings=msgspec.json.encode(settings(**MUST_BE_SET.get(name, {}))).decode(),
         schema=msgspec.json.encode(msgspec.json.schema(settings)).decode(),
     )
     found = parameters_of(in_force)
     assert len(found) == len(msgspec.structs.fields(settings))
     for one in found:
-        assert one.about and one.range and (one.unit or one.name == "push_scale"), one
+        assert one.about and one.range and (one.unit or one.name in ("push_scale", "model")), one
 
 
 def test_ranges_are_told_in_words() -> None:
