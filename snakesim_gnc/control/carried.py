@@ -44,6 +44,18 @@ class FeltContacts:
         while not 0 <= stamp_ns - self._last[0][0] < round(FELT_OVER_S * 1e9):
             self._last.popleft()
 
+    def at(self, obstacles: Sequence[str | None]) -> list[float | None]:
+        """How hard each obstacle pushes the body, 0 where none is felt; empty when no sensor tells."""
+        if not self._last:
+            return []
+        sums: dict[str | None, tuple[float, float]] = {}
+        for _, contacts in self._last:
+            for contact in contacts:
+                x, y = sums.get(contact.obstacle, (0.0, 0.0))
+                sums[contact.obstacle] = (x + contact.force_w[0], y + contact.force_w[1])
+        count = len(self._last)
+        return [None if name is None else math.hypot(*sums.get(name, (0.0, 0.0))) / count for name in obstacles]
+
     def along(self, direction_w: Sequence[float]) -> Carried | None:
         """What they do along a direction, (2,) of any length; None when no sensor tells."""
         if not self._last:

@@ -645,6 +645,14 @@ class ControlState(Message, frozen=True, kw_only=True):
     propulsion_n: Annotated[q.Force | None, about("commanded force along the path; null: none")] = None
     push_points: Annotated[list[WorldContact], Meta(max_length=64), about("obstacles that the body pushes off")] = []
     solved_force_n: Annotated[list[q.Force], Meta(max_length=64), about("expected at each of `push_points`")] = []
+    felt_force_n: Annotated[
+        list[q.Force | None],
+        Meta(max_length=64),
+        about(
+            "measured at the obstacle of each of `push_points`, mean over 50 ms; null: that has no name; or empty: no "
+            "sensor of contacts"
+        ),
+    ] = []
     propulsion_torque_nm: Annotated[q.Torque | None, about("of `propulsion_joint`; null: none pushes")] = None
     bending_torque_nm: Annotated[q.Torques, about("of every joint, for the solved forces; or empty")] = []
     reference_rad: Annotated[q.Angles, about("of every joint, from the path; or empty")] = []

@@ -20,7 +20,7 @@ from snakesim_operator.console.controls import KEYS, Controls, add_appearance, n
 from snakesim_operator.console.drawing import Surroundings, draw
 from snakesim_operator.console.operations import Log, Operations
 from snakesim_operator.console.pictures import picture
-from snakesim_operator.console.polygon import force_polygon
+from snakesim_operator.console.polygon import force_polygon, push_point_table
 from snakesim_operator.console.server import PageServer
 from snakesim_operator.console.snapshot import RobotSnapshot
 from snakesim_operator.console.stage import Stage
@@ -211,7 +211,7 @@ class Page:
             self._charts.take(snapshot)
             if self._frames % CHARTS_EVERY == 1:
                 self._charts.show(snapshot)
-                self._forces.content = force_polygon(snapshot)
+                self._forces.content = force_polygon(snapshot) + push_point_table(snapshot.control)
             if self._frames % PICTURES_EVERY == 1:
                 self._show_pictures(snapshot)
             if snapshot.settings is not None and (before is None or snapshot.settings != before.settings):

@@ -1,9 +1,11 @@
 """The force polygon of a snapshot: the contact forces on the body tail to head, and their resultant, as SVG. Pure."""
 
+from html import escape
 from itertools import pairwise
 
 import numpy as np
 
+from snakesim_hal.wire.messages import ControlState
 from snakesim_operator.console import stage
 from snakesim_operator.console.drawing import MIN_FORCE_N
 from snakesim_operator.console.snapshot import RobotSnapshot
@@ -39,6 +41,21 @@ def force_polygon(snapshot: RobotSnapshot) -> str:
         f"<div style='padding:.2em .6em;font-size:.85em'>Contact forces on the body, tail to head; resultant "
         f"{total_n:.1f} N</div><svg viewBox='0 0 {WIDTH} {HEIGHT}' width='100%'>{''.join(arrows)}{bar}</svg>"
     )
+
+
+def push_point_table(control: ControlState | None) -> str:
+    """Solved and measured force of each push-point, tail to head; empty when the controller solved for none."""
+    if control is None or not len(control.push_points) == len(control.solved_force_n) == len(control.felt_force_n) > 0:
+        return ""
+    rows = "".join(
+        f"<tr><td>{escape(point.obstacle or 'unnamed')}</td><td>{solved_n:.1f}</td>"
+        f"<td>{'unknown' if felt_n is None else f'{felt_n:.1f}'}</td></tr>"
+        for point, solved_n, felt_n in zip(
+            control.push_points, control.solved_force_n, control.felt_force_n, strict=True
+        )
+    )
+    head = "<tr><th>push-point</th><th>solved, N</th><th>measured, N</th></tr>"
+    return f"<table style='padding:.2em .6em;font-size:.85em;text-align:left;width:100%'>{head}{rows}</table>"
 
 
 def _arrow(a: stage.Floats, b: stage.Floats, colour: stage.Colour, px_per_n: float) -> str:

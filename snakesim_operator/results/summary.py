@@ -10,6 +10,7 @@ from msgspec import Meta
 from snakesim_hal.arithmetic import foreign
 from snakesim_hal.wire.messages import Fault, Mode, Pace
 from snakesim_operator.results.advance import Advance, energy_j, energy_j_per_m, work_j
+from snakesim_operator.results.came_true import came_true
 from snakesim_operator.results.record import RunRecord
 
 SATURATED_FROM = 0.99  # of a joint's torque limit
@@ -65,6 +66,12 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
         float | None,
         _number("N", "largest force of one contact, mean over 50 ms; where a sensor does not tell that, at an instant"),
     ]
+    solved_force_correlation: Annotated[
+        float | None,
+        _number("1", "of measured with solved forces at push-points while it locomoted; null: nothing to compare"),
+    ]
+    solved_force_error: Annotated[float | None, _number("1", "|measured - solved| over solved there, median")]
+    empty_push_points: Annotated[float | None, _number("1", "share of those push-points that carried nothing")]
     energy_j: Annotated[float | None, _number("J", "sum over joints of |torque x velocity| over time")]
     torque_joints_j: Annotated[
         float | None, _number("J", "work of the joints in torque mode on the body, less what they took")
@@ -117,7 +124,7 @@ def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), h
     last = record.control[-1] if record.control else None
     limits = np.array([joint.torque_limit_nm for joint in record.description.joints])
     has_power = bool(np.isfinite(record.torque_nm * record.velocity_rad_s).any())
-    advance = Advance.of(record)
+    advance, forces = Advance.of(record), came_true(record.control)
     return RunSummary(
         scenario=config.name,
         robot=config.robot.name,
@@ -147,6 +154,9 @@ def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), h
         if count
         else None,
         peak_contact_force_n=largest(record.contact_peak_n) if has_contacts else None,
+        solved_force_correlation=forces.correlation if forces else None,
+        solved_force_error=forces.median_error if forces else None,
+        empty_push_points=forces.empty if forces else None,
         energy_j=energy_j(record) if has_power else None,
         torque_joints_j=work_j(record, Mode.TORQUE) if has_power else None,
         position_joints_j=work_j(record, Mode.POSITION) if has_power else None,

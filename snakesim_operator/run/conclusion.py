@@ -134,6 +134,15 @@ def _print_host(host: HostRecord) -> None:
         say(f"  {'fault':<22}{fault.cause}")
 
 
+def _came_true(summary: RunSummary) -> str:
+    """How well measured forces follow the solved ones; empty when there was nothing to compare."""
+    error, empty, follows = summary.solved_force_error, summary.empty_push_points, summary.solved_force_correlation
+    if error is None or empty is None:
+        return ""
+    correlation = "of unknown correlation" if follows is None else f"correlation {follows:.2f}"
+    return f"measured: {correlation}, median error {100 * error:.0f} %, {100 * empty:.0f} % of push-points empty"
+
+
 def _print_summary(summary: RunSummary) -> None:
     def number(value: float | None, unit: str, digits: int = 2) -> str:
         return "unknown" if value is None else f"{value:.{digits}f} {unit}"
@@ -154,6 +163,7 @@ def _print_summary(summary: RunSummary) -> None:
         ("peak joint torque", number(summary.peak_joint_torque_nm, "N·m")),
         ("energy per metre", number(summary.energy_j_per_m, "J/m", 1)),
         ("contact over 50 ms", number(summary.peak_contact_force_n, "N", 1)),
+        *([("solved forces", words)] if (words := _came_true(summary)) else []),
         ("last state", f"{summary.last_state}: {summary.last_reason}" if summary.last_state else "unknown"),
         ("command digest", digest_text(summary.command_digest, summary.own_arithmetic)),
     ]

@@ -2,13 +2,14 @@
 
 import math
 
+import msgspec
 import numpy as np
 import pytest
 
 from snakesim_hal.model.kinematics import quaternion_from_yaw, quaternions_from_rotations, rotation_from_quaternion
 from snakesim_hal.wire.messages import ControlState, DepthImage, JointState, Obstacle, World, WorldContact
 from snakesim_operator.console.drawing import LONGEST_M, M_PER_N, draw
-from snakesim_operator.console.polygon import force_polygon
+from snakesim_operator.console.polygon import force_polygon, push_point_table
 from snakesim_operator.console.snapshot import RobotSnapshot
 from tests.unit.hal.rig import description
 
@@ -78,13 +79,16 @@ def test_a_force_that_is_asked_for_where_nothing_touches_is_no_contact_force():
     ]  # fmt: skip
     control = ControlState(
         tick=1, stamp_ns=1, controller="any", state="Locomoting", reason="", push_points=points,
-        solved_force_n=[20.0, 30.0],
+        solved_force_n=[20.0, 30.0], felt_force_n=[17.5, 0.0],
     )  # fmt: skip
     snapshot = RobotSnapshot(robot=ROBOT, body=joints(), world=world(points[:1], []), control=control)
     drawing = draw(snapshot, None)
     assert drawing is not None and drawing.pushed == {"felt"}
     assert drawing.solved[:, 0, 0] == pytest.approx([0.1]) and drawing.asked[:, 0, 0] == pytest.approx([0.3])
     assert drawing.asked[0, 1] - drawing.asked[0, 0] == pytest.approx([0.0, LONGEST_M, 0.0])
+    table = push_point_table(control)
+    assert "<td>felt</td><td>20.0</td><td>17.5</td>" in table and "<td>clear</td><td>30.0</td><td>0.0</td>" in table
+    assert push_point_table(msgspec.structs.replace(control, felt_force_n=[])) == ""
 
 
 def test_a_strong_force_has_an_arrow_of_limited_length_above_the_body():
