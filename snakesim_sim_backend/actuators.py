@@ -18,7 +18,8 @@ import numpy as np
 
 from snakesim_hal.arrays import Floats
 from snakesim_hal.backend import SetPoints
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.robot import Module, RobotFile
 from snakesim_hal.physics.motor import roll_off
 from snakesim_hal.wire.messages import Mode
 
@@ -28,48 +29,54 @@ INPUTS = 3  # position, velocity, feed-forward torque
 INPUT_OF_MODE = {Mode.PASSIVE: 2, Mode.POSITION: 0, Mode.VELOCITY: 1, Mode.TORQUE: 2}
 
 
-def add_motor(spec: mujoco.MjSpec, joint: str, robot: RobotFile, step_s: float) -> None:
+def add_motor(spec: mujoco.MjSpec, joint: Joint, module: Module, step_s: float) -> None:
     """Add the motor of one joint to a model; it starts passive."""
-    limits = robot.limits
-    motor = spec.add_actuator(name=f"motor_{joint}", target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    limits = joint.limits
+    motor = spec.add_actuator(name=f"motor_{joint.name}", target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
     inputs = mujoco.mjtCtrlInput
     motor.set_to_dcmotor(
         motorconst=[1.0, 0.0],
         # With constant 1, volts are rad/s, and torque at rest under full volts is limits.speed / resistance.
-        resistance=limits.speed_rad_s / (roll_off(robot, step_s) * limits.torque_nm),
-        inductance=[0.0, robot.motor.response_time_s],
+        resistance=limits.speed_rad_s / (roll_off(joint, module, step_s) * limits.torque_nm),
+        inductance=[0.0, joint.motor.response_time_s],
         controller=[1.0, 0.0, 1.0, 0.0, 0.0, limits.speed_rad_s],
         saturation=[limits.torque_nm, 0.0, 0.0],
         ctrlspec=int(inputs.mjINPUT_POS | inputs.mjINPUT_VEL | inputs.mjINPUT_FF),
     )
 
 
+def _gains(joint: Joint) -> dict[Mode, tuple[float, float, float]]:
+    """Mode -> kp, kd and volts (0: unbounded)."""
+    motor, speed = joint.motor, joint.limits.speed_rad_s
+    return {
+        Mode.PASSIVE: (0.0, 0.0, 0.0),
+        Mode.POSITION: (motor.stiffness_nm_per_rad, motor.damping_nm_s_per_rad, speed),
+        Mode.VELOCITY: (0.0, motor.velocity_gain_nm_s_per_rad, speed),
+        Mode.TORQUE: (0.0, 0.0, speed),
+    }
+
+
 class Motors:
     """All motors of a compiled model."""
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, robot: RobotFile, period_s: float) -> None:
-        self.count = robot.chain.modules
+        joints = robot.joint_table
+        self.count = len(joints)
         self._gains = model.actuator_gainprm[: self.count]
         self._force_range = model.actuator_forcerange[: self.count]
         self._least, self._most = self._force_range[:, 0], self._force_range[:, 1]
         self._torque = data.act  # empty when the motors have no lag
         self._applied = data.actuator_force[: self.count]
         self._inputs = data.ctrl[: INPUTS * self.count]
-        self._full_limit = np.full(self.count, robot.limits.torque_nm)
+        self._full_limit = np.array([joint.limits.torque_nm for joint in joints])
         self._own_limit = self._full_limit  # after derating
         self._limit = self._full_limit.copy()
         self._limit_asked: list[float] = self._limit.tolist()
         self._fading = False
-        response = robot.motor.response_time_s
-        self._decay = math.exp(-period_s / response) if response > 0 else 0.0
-        motor, speed = robot.motor, robot.limits.speed_rad_s
-        self._gains_of_mode: dict[Mode, tuple[float, float, float]] = {  # kp, kd, volts (0: unbounded)
-            Mode.PASSIVE: (0.0, 0.0, 0.0),
-            Mode.POSITION: (motor.stiffness_nm_per_rad, motor.damping_nm_s_per_rad, speed),
-            Mode.VELOCITY: (0.0, motor.velocity_gain_nm_s_per_rad, speed),
-            Mode.TORQUE: (0.0, 0.0, speed),
-        }
-        assert np.all(self._gains[:, [KP, KD, MAX_VOLTS]] == [1.0, 1.0, speed])
+        lags_s = [joint.motor.response_time_s for joint in joints]
+        self._decay = np.array([math.exp(-period_s / lag_s) if lag_s > 0 else 0.0 for lag_s in lags_s])
+        self._gains_of_mode = [_gains(joint) for joint in joints]
+        assert np.all(self._gains[:, [KP, KD, MAX_VOLTS]] == [[1.0, 1.0, joint.limits.speed_rad_s] for joint in joints])
         self._mode: list[Mode] = []
         self._slots = np.empty(0, dtype=np.intp)
         self.switch_off()
@@ -123,7 +130,9 @@ class Motors:
 
     def _change_modes(self, modes: list[Mode]) -> None:
         self._mode = list(modes)
-        self._gains[:, [KP, KD, MAX_VOLTS]] = [self._gains_of_mode[mode] for mode in modes]
+        self._gains[:, [KP, KD, MAX_VOLTS]] = [
+            gains[mode] for gains, mode in zip(self._gains_of_mode, modes, strict=True)
+        ]
         self._slots = np.array([INPUTS * i + INPUT_OF_MODE[mode] for i, mode in enumerate(modes)], dtype=np.intp)
         self._passive = [INPUTS * i + 2 for i, mode in enumerate(modes) if mode == Mode.PASSIVE]
         self._inputs[:] = 0.0

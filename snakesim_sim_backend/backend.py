@@ -12,7 +12,7 @@ from snakesim_hal.injection import Injection
 from snakesim_hal.model.robot import describe
 from snakesim_hal.model.scenario import RunConfig, config_hash
 from snakesim_hal.physics.motor import check_gains
-from snakesim_hal.physics.thermal import HeatLimits, Thermal
+from snakesim_hal.physics.thermal import Thermal
 from snakesim_hal.wire.messages import Description, Fault, LifecycleState, Pace
 from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.contacts import TouchReader
@@ -71,10 +71,7 @@ class SimBackend:
         if settings.tether is not None:
             self._rope = Rope(self._sim.model, self._data, settings.tether)
             self._rope.tighten()
-        limits = config.robot.limits
-        self._windings = Thermal(
-            self._motors.count, limits.torque_nm, HeatLimits(limits.derate_from_c, limits.stop_at_c)
-        )
+        self._windings = Thermal(config.robot.joint_table)
         self._heats, self._period_s = config.robot.sensors.power is not None, config.period_ns * 1e-9
         self._sensors = Sensors(self._sim, self._data, config, self._motors, self._physics, self._windings)
         self._watch = DivergenceWatch(self._sim.model, self._data, self._physics, self._sim.steps_per_tick)

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.links import Link
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig, place_all
@@ -63,8 +64,8 @@ def build(config: RunConfig, settings: Settings, *, motors: bool = True) -> SimM
     spec.nuserdata = KEPT * (config.robot.chain.modules + 2)
     if motors:
         check_gains(config.robot)
-        for i in range(config.robot.chain.modules):
-            add_motor(spec, f"joint_{i + 1}", config.robot, step_s)
+        for joint in config.robot.joint_table:
+            add_motor(spec, joint, config.robot.module, step_s)
     if config.robot.sensors.imu is not None:
         add_imus(spec, config.robot.link_lengths_m)
     if settings.tether is not None:
@@ -129,7 +130,7 @@ def _pair(spec: mujoco.MjSpec, name: str, others: list[str], with_grip: PairSurf
 
 
 def _add_snake(spec: mujoco.MjSpec, robot: RobotFile, settings: Settings) -> None:
-    lengths, masses, axes = robot.link_lengths_m, robot.link_masses_kg, robot.axes
+    lengths, masses, joints = robot.link_lengths_m, robot.link_masses_kg, robot.joint_table
     skin = link_skin(settings)
     body = spec.worldbody
     for i, (length, mass) in enumerate(zip(lengths, masses, strict=True)):
@@ -138,7 +139,7 @@ def _add_snake(spec: mujoco.MjSpec, robot: RobotFile, settings: Settings) -> Non
         if i == 0:
             body.add_freejoint(name="base")
         else:
-            _add_joint(body, f"joint_{i}", axes[i - 1], robot)
+            _add_joint(body, joints[i - 1])
         if robot.links and robot.links[i].has_inertia:
             _set_inertia(body, robot.links[i], robot.module.radius_m)
         body.add_geom(
@@ -177,14 +178,14 @@ def _add_foot(body: mujoco.MjsBody, name: str, along_m: float, robot: RobotFile)
     )
 
 
-def _add_joint(body: mujoco.MjsBody, name: str, axis: Axis, robot: RobotFile) -> None:
-    motor = robot.motor
+def _add_joint(body: mujoco.MjsBody, joint: Joint) -> None:
+    motor = joint.motor
     body.add_joint(
-        name=name,
+        name=joint.name,
         type=mujoco.mjtJoint.mjJNT_HINGE,
-        axis=AXES[axis],
+        axis=AXES[joint.axis],
         limited=True,
-        range=[-robot.limits.angle_rad, robot.limits.angle_rad],
+        range=[joint.limits.least_rad, joint.limits.most_rad],
         armature=motor.armature_kg_m2,
         damping=motor.viscous_nm_s_per_rad,
         frictionloss=motor.friction_nm,

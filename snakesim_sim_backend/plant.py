@@ -57,7 +57,7 @@ class MujocoPlant:
         self._qacc, self._accelerations = data.qacc, data.qacc[FREE_DOFS:]
         self._armature = model.dof_armature[FREE_DOFS:]
         # Of all constraints MuJoCo lists equalities first, of which there are none, then the friction of the joints.
-        self._rubbing = slice(0, count if config.robot.motor.friction_nm > 0 else 0)
+        self._rubbing = [i for i, joint in enumerate(config.robot.joint_table) if joint.motor.friction_nm > 0]
         self._speeds, self._speeds_before = data.qvel, data.qvel.copy()
         self._loads = LoadReader(self._sim, data)
         self._pose = PoseReader(data, PoseSensor(), np.zeros)
@@ -111,8 +111,8 @@ class MujocoPlant:
         """
         torque = self._torques + self._passive
         torque -= self._armature * self._accelerations
-        if self._rubbing.stop:
-            torque += self._data.efc_force[self._rubbing]
+        if self._rubbing:
+            torque[self._rubbing] += self._data.efc_force[: len(self._rubbing)]
         return torque
 
     def loads(self) -> list[LinkLoad]:

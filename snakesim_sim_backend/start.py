@@ -77,7 +77,7 @@ def _settle(
     settle_s: float,
 ) -> None:
     count = motors.count
-    limits = [config.robot.limits.torque_nm] * count
+    limits = [joint.limits.torque_nm for joint in config.robot.joint_table]
     motors.enact(SetPoints([Mode.POSITION] * count, pose.angles_rad.tolist(), limits))
     friction, condim = model.pair_friction.copy(), model.pair_dim.copy()
     model.pair_friction[:], model.pair_dim[:] = np.maximum(friction, GRIP), ALL_FRICTION

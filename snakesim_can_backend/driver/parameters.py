@@ -16,38 +16,45 @@ SPEED_ROOM = 1.2  # a load may turn a joint faster than its motor, and the bus m
 
 def parameters_of(robot: RobotFile, settings: Settings, reports: Reports) -> dict[int, dict[Parameter, float]]:
     """The parameters to write to each node."""
-    motor, limits = robot.motor, robot.limits
     safe = SafeMotion.DAMP if robot.safety.action == "damp" else SafeMotion.PASSIVE
     common = {
-        Parameter.STIFFNESS: motor.stiffness_nm_per_rad,
-        Parameter.DAMPING: motor.damping_nm_s_per_rad,
-        Parameter.VELOCITY_GAIN: motor.velocity_gain_nm_s_per_rad,
-        Parameter.TORQUE_LIMIT: limits.torque_nm,
-        Parameter.SPEED_LIMIT: limits.speed_rad_s,
-        Parameter.ANGLE_LIMIT: limits.angle_rad,
         Parameter.WATCHDOG: settings.watchdog_s,
         Parameter.SAFE_ACTION: float(safe),
         Parameter.CONTACT_EVERY: float(reports.contact_every),
         Parameter.IMU_EVERY: float(reports.imu_every),
     }
-    count = robot.chain.modules
-    return {node: {**common, Parameter.TAIL: float(node == 1 and reports.tail)} for node in range(1, count + 1)}
+    return {
+        node: {
+            Parameter.STIFFNESS: joint.motor.stiffness_nm_per_rad,
+            Parameter.DAMPING: joint.motor.damping_nm_s_per_rad,
+            Parameter.VELOCITY_GAIN: joint.motor.velocity_gain_nm_s_per_rad,
+            Parameter.TORQUE_LIMIT: joint.limits.torque_nm,
+            Parameter.SPEED_LIMIT: joint.limits.speed_rad_s,
+            Parameter.ANGLE_LIMIT: max(-joint.limits.least_rad, joint.limits.most_rad),  # the gate keeps to each side
+            **common,
+            Parameter.TAIL: float(node == 1 and reports.tail),
+        }
+        for node, joint in enumerate(robot.joint_table, start=1)
+    }
 
 
 def check_ratings(robot: RobotFile, in_force: Mapping[int, Mapping[Parameter, float]] | None = None) -> None:
     """Raise ConfigError or BackendError when the robot file exceeds the protocol's range or a module's rating."""
     signals = codec()[Opcode.JOINT_STATE].signals
-    for what, value, most, unit in (
-        ("limits.angle_rad", robot.limits.angle_rad, signals["angle"].high, "rad"),
-        ("limits.speed_rad_s", robot.limits.speed_rad_s, signals["velocity"].high / SPEED_ROOM, "rad/s"),
-        ("limits.torque_nm", robot.limits.torque_nm, signals["torque"].high, "N·m"),
-        ("limits.stop_at_c", robot.limits.stop_at_c, codec()[Opcode.HEALTH].signals["motor_temperature"].high, "°C"),
-    ):
-        if value > most:
-            raise ConfigError(
-                f"robot {robot.name!r}: `{what}` = {value} {unit} exceeds the range of the bus protocol, which ends at "
-                f"{most:.3g} {unit}"
-            )
+    joints, hottest_c = robot.joint_table, codec()[Opcode.HEALTH].signals["motor_temperature"].high
+    for joint in joints:
+        limits = joint.limits
+        for what, value, most, unit in (
+            ("limits.angle_rad", max(-limits.least_rad, limits.most_rad), signals["angle"].high, "rad"),
+            ("limits.speed_rad_s", limits.speed_rad_s, signals["velocity"].high / SPEED_ROOM, "rad/s"),
+            ("limits.torque_nm", limits.torque_nm, signals["torque"].high, "N·m"),
+            ("limits.stop_at_c", limits.stop_at_c, hottest_c, "°C"),
+        ):
+            if value > most:
+                raise ConfigError(
+                    f"robot {robot.name!r}, {joint.name}: `{what}` = {value} {unit} exceeds the range of the bus "
+                    f"protocol, which ends at {most:.3g} {unit}"
+                )
     reach_m = max(robot.link_lengths_m) + robot.module.radius_m
     along_m = codec()[Opcode.CONTACT].signals["along"].high
     if robot.sensors.contacts is not None and reach_m > along_m:
@@ -62,8 +69,8 @@ def check_ratings(robot: RobotFile, in_force: Mapping[int, Mapping[Parameter, fl
         )
     for node, values in (in_force or {}).items():
         for parameter, asked, unit in (
-            (Parameter.RATED_TORQUE, robot.limits.torque_nm, "N·m"),
-            (Parameter.RATED_SPEED, robot.limits.speed_rad_s, "rad/s"),
+            (Parameter.RATED_TORQUE, joints[node - 1].limits.torque_nm, "N·m"),
+            (Parameter.RATED_SPEED, joints[node - 1].limits.speed_rad_s, "rad/s"),
         ):
             if not values[parameter] >= asked * 0.999:  # also rejects a rating of NaN, which the bus can carry
                 raise BackendError(

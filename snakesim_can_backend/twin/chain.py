@@ -27,7 +27,7 @@ from snakesim_can_backend.twin.parameters import Parameters, from_factory
 from snakesim_hal.injection import Change, Injection, Plan
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.physics.plant import Plant
-from snakesim_hal.physics.thermal import HeatLimits, Thermal
+from snakesim_hal.physics.thermal import Thermal
 from snakesim_hal.wire.messages import Mode
 
 MAX_AT_ONCE_US = 200_000.0  # after a longer delay of this process, the modules skip the rest of it
@@ -56,16 +56,15 @@ class ModuleChain:
         robot, self.stepped, self.plant = config.robot, stepped, plant
         self.count = robot.chain.modules
         self.counts = shares(config, settings)  # modules on each bus
-        self._heat_limits = HeatLimits(robot.limits.derate_from_c, robot.limits.stop_at_c)
         self.motors = Motors(robot, plant.step_s)
-        self.thermal = Thermal(self.count, robot.limits.torque_nm, self._heat_limits)
+        self._joints = robot.joint_table
+        self.thermal = Thermal(self._joints)
         self.buses = [BusTime(settings.bit_rate) for _ in self.counts]
         self.now_us = 0.0  # module time: since the twins were started
         self.skipped_us = 0.0  # time in which this process did not run
         self.refused = 0  # frames that no host sends
         self.happened: list[str] = []  # injected faults, each begin and end
         self._plan = Plan(parse(text, self.count) for text in settings.faults)
-        self._flash = from_factory(robot.limits.torque_nm, robot.limits.speed_rad_s)
         self._step_us, self._steps, self._due_us = plant.step_s * 1e6, 0, 0.0
         self._sync_time: int | None = None
         self._pose_time: int | None = None
@@ -123,7 +122,7 @@ class ModuleChain:
     def _warm(self) -> None:
         self.thermal.pass_time(HEAT_EVERY * self.plant.step_s, self.motors.take_heat())
         self._derate()
-        if self.thermal.winding_c.max() >= self._heat_limits.stop_at_c:
+        if (self.thermal.winding_c >= self.thermal.stop_at_c).any():
             self._due_us = -inf
 
     def _derate(self) -> None:
@@ -134,12 +133,13 @@ class ModuleChain:
         """Everything that depends on time, except physics."""
         for change in self._plan.until(now_us / 1e6):
             self._go_wrong(change, now_us)
-        speeds, torques = self.plant.velocity_rad_s.tolist(), self.motors.torque_nm.tolist()
-        windings, rated = self.thermal.winding_c.tolist(), self.motors.rated_nm
+        speeds = self.plant.velocity_rad_s.tolist()
+        windings, boards = self.thermal.winding_c.tolist(), self.thermal.board_c().tolist()
+        watts = self.thermal.power_w(self.motors.torque_nm, self.plant.velocity_rad_s).tolist()
         due_us = self._plan.next_s() * 1e6
         for slot in self.slots:
             j = slot.joint
-            slot.feel(speeds[j], torques[j], rated, windings[j])
+            slot.feel(speeds[j], watts[j], windings[j], boards[j])
             due_us = min(due_us, slot.module.poll(now_us))
             self._follow_up(slot)
         for slot, since_us in self._babblers.items():
@@ -252,7 +252,7 @@ class ModuleChain:
             slot.joint,
             demand.mode,
             demand.target,
-            min(demand.torque_limit_nm, values[Parameter.TORQUE_LIMIT]) if demand.mode else self.motors.rated_nm,
+            min(demand.torque_limit_nm, values[Parameter.TORQUE_LIMIT]) if demand.mode else inf,
             values[Parameter.STIFFNESS],
             values[damping],
             values[Parameter.SPEED_LIMIT],
@@ -291,10 +291,17 @@ class ModuleChain:
                 slot.end(kind)
 
     def _seat(self, joint: int, channel: int, serial: int, now_us: float, *, drives: bool = True) -> None:
+        built = self._joints[joint]
         module = Module(
-            joint + 1, serial, Parameters(self._flash), self._heat_limits, stepped=self.stepped, now_us=now_us
+            joint + 1,
+            serial,
+            Parameters(from_factory(built.limits.torque_nm, built.limits.speed_rad_s)),
+            self.thermal.limits[joint],
+            least_voltage_v=built.limits.least_voltage_v,
+            stepped=self.stepped,
+            now_us=now_us,
         )
-        self.slots.append(ModuleSlot(len(self.slots), channel, joint, module, drives))
+        self.slots.append(ModuleSlot(len(self.slots), channel, joint, module, built, drives))
 
     def _serial(self, joint: int) -> int:
         return crc32(f"{self._seed}:{joint + 1}".encode())

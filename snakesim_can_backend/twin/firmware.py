@@ -47,7 +47,7 @@ from snakesim_can_backend.twin.frames import (
 )
 from snakesim_can_backend.twin.parameters import Parameters
 from snakesim_can_backend.twin.reports import ModuleHealth, Readings, health
-from snakesim_hal.physics.thermal import MIN_VOLTAGE_V, HeatLimits
+from snakesim_hal.physics.thermal import HeatLimits
 from snakesim_hal.wire.messages import Mode
 
 BOOT_US = 100_000
@@ -80,10 +80,15 @@ class Module:
         parameters: Parameters,
         heat: HeatLimits,
         *,
+        least_voltage_v: float = 18.0,
         stepped: bool = False,
         now_us: float = 0.0,
     ) -> None:
-        """heat: temperature of its winding that stops it, and below which a clear is possible again."""
+        """heat: temperature of its winding that stops it, and below which a clear is possible again.
+
+        least_voltage_v: of its supply, below which it stops.
+        """
+        self._least_voltage_v = least_voltage_v
         self.node, self.serial, self.parameters, self.heat = node, serial, parameters, heat
         self.frames: list[Frame] = []
         self.inside = ModuleHealth()
@@ -281,7 +286,7 @@ class Module:
         return (
             (inside.winding_c >= hot) << ModuleFault.OVERHEAT
             | inside.leak << ModuleFault.LEAK
-            | (inside.voltage_v < MIN_VOLTAGE_V) << ModuleFault.VOLTAGE
+            | (inside.voltage_v < self._least_voltage_v) << ModuleFault.VOLTAGE
         )
 
     def _watch_conditions(self, now_us: float) -> None:

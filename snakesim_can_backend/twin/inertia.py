@@ -34,15 +34,20 @@ class InertiaPlant:
 
     def __init__(self, config: RunConfig, settings: InertiaSettings) -> None:
         """At the run's start pose, at rest. The step is shortened so that a control period is a multiple of it."""
-        robot, motor = config.robot, config.robot.motor
+        robot, joints = config.robot, config.robot.joint_table
         period_s = config.period_ns * 1e-9
         self.step_s = period_s / max(int(np.ceil(period_s / settings.timestep_s - 1e-9)), 1)
         links = [mass * length**2 / 12 for mass, length in zip(robot.link_masses_kg, robot.link_lengths_m, strict=True)]
-        inertia = np.maximum(motor.armature_kg_m2 + np.array(links[1:]), MIN_INERTIA_KG_M2)
+        inertia = np.maximum(
+            np.array([joint.motor.armature_kg_m2 for joint in joints]) + np.array(links[1:]), MIN_INERTIA_KG_M2
+        )
         self._speed_per_nm = self.step_s / inertia
-        self._keep = 1.0 / (1.0 + self._speed_per_nm * motor.viscous_nm_s_per_rad)  # implicit: stable at any friction
-        self._rubbed_off = self._speed_per_nm * (motor.friction_nm + settings.drag_nm)
-        self._most = robot.limits.angle_rad
+        viscous = np.array([joint.motor.viscous_nm_s_per_rad for joint in joints])
+        self._keep = 1.0 / (1.0 + self._speed_per_nm * viscous)  # implicit: stable at any friction
+        dry_nm = np.array([joint.motor.friction_nm for joint in joints]) + settings.drag_nm
+        self._rubbed_off = self._speed_per_nm * dry_nm
+        self._least = np.array([joint.limits.least_rad for joint in joints])
+        self._most = np.array([joint.limits.most_rad for joint in joints])
         self._angle: Floats = np.array(start_of(config).angles_rad, dtype=np.float64)
         self._velocity = np.zeros(len(self._angle))
         self._torque = np.zeros(len(self._angle))
@@ -59,8 +64,10 @@ class InertiaPlant:
         velocity -= change
         np.multiply(velocity, self.step_s, out=change)
         angle += change
-        if np.abs(angle, out=change).max() > self._most:
-            self._stop()
+        np.clip(angle, self._least, self._most, out=change)
+        change -= angle
+        if change.any():  # also for NaN
+            self._stop(change)
 
     @property
     def angle_rad(self) -> Floats:
@@ -88,10 +95,8 @@ class InertiaPlant:
         """No world, no pose."""
         return None
 
-    def _stop(self) -> None:
+    def _stop(self, back_rad: Floats) -> None:
         if not np.isfinite(self._angle).all():
             raise BackendError("inertia plant: a joint angle is NaN or infinite, because a torque was")
-        beyond = np.abs(self._angle) > self._most
-        outward = beyond & (self._velocity * self._angle > 0)
-        self._velocity[outward] = 0.0
-        np.clip(self._angle, -self._most, self._most, out=self._angle)
+        self._velocity[self._velocity * back_rad < 0] = 0.0
+        np.clip(self._angle, self._least, self._most, out=self._angle)

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 from snakesim_can_backend.protocol.definitions import Frame, Opcode, checksum, opcode_of
 from snakesim_can_backend.twin.firmware import Demand, Module
-from snakesim_hal.physics.thermal import MIN_VOLTAGE_V, SUPPLY_V, board_c, current_a
+from snakesim_hal.model.joints import Joint
 
-SAGGED_V = MIN_VOLTAGE_V - 6.0
+SAGGED = 2 / 3  # of the least voltage
 
 
 @dataclass(slots=True, eq=False)
@@ -17,11 +17,16 @@ class ModuleSlot:
     channel: int
     joint: int  # 0 at the tail
     module: Module
+    built: Joint
     drives: bool = True  # False: it has no motor of its own; a duplicate
     driven: Demand | None = None  # the last demand applied to its motor
     mute: bool = False
     wrong_count: bool = False
     wrong_checksum: bool = False
+
+    def __post_init__(self) -> None:
+        """Under its supply."""
+        self.module.inside.voltage_v = self.built.supply.voltage_v
 
     def begin(self, kind: str, now_us: float) -> None:
         """Begin a fault of this module."""
@@ -46,16 +51,17 @@ class ModuleSlot:
             case "leak":
                 self.module.inside.leak = wrong
             case "undervoltage":
-                self.module.inside.voltage_v = SAGGED_V if wrong else SUPPLY_V
+                sagged_v = SAGGED * self.built.limits.least_voltage_v
+                self.module.inside.voltage_v = sagged_v if wrong else self.built.supply.voltage_v
             case _:
                 pass
 
-    def feel(self, speed_rad_s: float, torque_nm: float, rated_nm: float, winding_c: float) -> None:
+    def feel(self, speed_rad_s: float, power_w: float, winding_c: float, board_c: float) -> None:
         """Update its internal measurements."""
         inside = self.module.inside
         inside.speed_rad_s, inside.winding_c = speed_rad_s, winding_c
-        inside.board_c = board_c(winding_c)
-        inside.current_a = current_a(torque_nm, speed_rad_s, rated_nm, inside.voltage_v)
+        inside.board_c = board_c
+        inside.current_a = self.built.supply.idle_a + power_w / inside.voltage_v
 
     def outgoing(self) -> list[Frame]:
         """The module's frames to send, with faults applied; each frame once."""

@@ -5,7 +5,7 @@ At every step of the plant
     demand = kp (position - angle) + kd (velocity - speed) + feed-forward       the mode chooses the gains
     demand is limited by the line that falls from a multiple of full torque at rest to 0 at the speed limit
     torque follows the demand as a first-order lag of `response_time_s`, integrated exactly
-    torque is clipped to the smallest of the set-point's limit, the parameter's, and the derated rated torque
+    torque is clipped to the smallest of the set-point's limit, the parameter's, and the derated full torque
 
 The torque is the motor's state, and a change of mode or limit changes only the demand, so torque never jumps. Torque is
 updated before the joint moves under it, which keeps explicit steps stable far beyond 1 ms.
@@ -26,20 +26,22 @@ class Motors:
     """The power stages of all modules. All passive at first."""
 
     def __init__(self, robot: RobotFile, step_s: float) -> None:
-        count = robot.chain.modules
-        response = robot.motor.response_time_s
-        self.rated_nm = robot.limits.torque_nm
-        self._decay = math.exp(-step_s / response) if response > 0 else 0.0
-        limits = robot.limits
-        self._fading = roll_off(robot, step_s) * limits.torque_nm / limits.speed_rad_s  # N·m less a rad/s
+        joints = robot.joint_table
+        count = len(joints)
+        lags_s = [joint.motor.response_time_s for joint in joints]
+        self.full_nm: Floats = np.array([joint.limits.torque_nm for joint in joints])
+        self._decay = np.array([math.exp(-step_s / lag_s) if lag_s > 0 else 0.0 for lag_s in lags_s])
+        speeds = np.array([joint.limits.speed_rad_s for joint in joints])
+        steepness = np.array([roll_off(joint, robot.module, step_s) for joint in joints])
+        self._fading = steepness * self.full_nm / speeds  # N·m less a rad/s
         self.torque_nm: Floats = np.zeros(count)
         self.heat: Floats = np.zeros(count)  # sum of torque squared over the steps since `take_heat`
         self._steps = 0
         self._kp, self._kd = np.zeros(count), np.zeros(count)
         self._position, self._velocity, self._feed = np.zeros(count), np.zeros(count), np.zeros(count)
         self._slope, self._top = np.zeros(count), np.full(count, np.inf)
-        self._asked_limit = np.full(count, self.rated_nm)
-        self._own_limit = np.full(count, self.rated_nm)
+        self._asked_limit = self.full_nm.copy()
+        self._own_limit = self.full_nm.copy()
         self._limit = self._asked_limit.copy()
         self._demand, self._cap, self._spare = np.zeros(count), np.zeros(count), np.zeros(count)
 
@@ -56,14 +58,14 @@ class Motors:
         self._position[i] = target if mode == Mode.POSITION else 0.0
         self._velocity[i] = target if mode == Mode.VELOCITY else 0.0
         self._feed[i] = target if mode == Mode.TORQUE else 0.0
-        self._slope[i] = self._fading if on else 0.0
-        self._top[i] = self._fading * speed if on else math.inf
-        self._asked_limit[i] = min(limit_nm, self.rated_nm)
+        self._slope[i] = self._fading[i] if on else 0.0
+        self._top[i] = self._fading[i] * speed if on else math.inf
+        self._asked_limit[i] = min(limit_nm, self.full_nm[i])
         self._limit[i] = min(self._asked_limit[i], self._own_limit[i])
 
     def derate(self, share_left: Floats) -> None:
-        """Limit torque to this share of rated torque, (n_joints,), from 0 to 1; lower demands are not reduced."""
-        np.multiply(self.rated_nm, share_left, out=self._own_limit)
+        """Limit torque to this share of full torque, (n_joints,), from 0 to 1; lower demands are not reduced."""
+        np.multiply(self.full_nm, share_left, out=self._own_limit)
         np.minimum(self._asked_limit, self._own_limit, out=self._limit)
 
     def derated(self) -> NDArray[np.bool_]:

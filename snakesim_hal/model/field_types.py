@@ -115,6 +115,8 @@ def _alternatives(info: inspect.Type | None) -> list[inspect.Type]:
 
 def unit_of(info: inspect.Type | None) -> str:
     """The unit of a number; empty when it has none."""
+    if isinstance(info, inspect.UnionType):
+        return next(filter(None, map(unit_of, info.types)), "")
     if isinstance(info, inspect.Metadata):
         return str((info.extra_json_schema or {}).get("unit", ""))
     return ""

@@ -211,6 +211,10 @@ def _explain(violation: Violation, table: Table, under: str) -> str:
     unit, value = unit_of(info), violation.value
     origin = table.origin_of(dotted)
     origin = table.file_of(dotted) if origin == "default" else origin
+    if isinstance(value, dict) and not violation.why.startswith(
+        "Expected"
+    ):  # each field is right, together they are not
+        return f"{origin}: `{dotted}`: {violation.why}" if dotted else f"{origin}: {violation.why}"
     shown = f"{short(_repr(value))}{' ' + unit if unit and isinstance(value, int | float) else ''}"
     why = "" if violation.why.startswith(("Expected `int", "Expected `float")) else f": {short(_lower(violation.why))}"
     return f"{origin}: `{dotted}` = {shown} is not allowed{why}; expected {in_words(info)}."

@@ -11,6 +11,7 @@ from typing import Annotated
 from msgspec import Meta
 
 from snakesim_hal.model.files import FileStruct
+from snakesim_hal.model.joints import Drive, Heat, Joint, JointExceptions, Limits, Motor, Supply, table
 from snakesim_hal.model.links import Link
 from snakesim_hal.model.sensors import LinkName, Mounted, Sensors
 from snakesim_hal.wire import keys
@@ -22,7 +23,7 @@ from snakesim_hal.wire.messages import (
     SafeAction,
     SensorDescription,
 )
-from snakesim_hal.wire.quantities import MAX_JOINTS, above, from_zero
+from snakesim_hal.wire.quantities import MAX_JOINTS, above
 
 
 class Chain(FileStruct, frozen=True, kw_only=True):
@@ -38,39 +39,6 @@ class Module(FileStruct, frozen=True, kw_only=True):
     length_m: Annotated[float, above(2, "m")]
     radius_m: Annotated[float, above(1, "m")]
     mass_kg: Annotated[float, above(100, "kg")]
-
-
-class Limits(FileStruct, frozen=True, kw_only=True):
-    """Limits of a joint; enforced by the gate and by the motor."""
-
-    angle_rad: Annotated[float, above(3.14159, "rad")]  # to either side
-    speed_rad_s: Annotated[float, above(100, "rad/s")]
-    acceleration_rad_s2: Annotated[float, above(1e5, "rad/s²")]
-    torque_nm: Annotated[float, above(1000, "N·m")]
-    torque_rate_nm_s: Annotated[float, above(1e5, "N·m/s")]
-    derate_from_c: Annotated[float, above(300, "°C")] = 80.0  # of the winding: above it torque is derated
-    stop_at_c: Annotated[float, above(300, "°C")] = 105.0  # a fifth of the torque is left, and the robot stops
-    least_voltage_v: Annotated[float, from_zero(1000, "V")] = 18.0  # below it the robot stops
-
-    def __post_init__(self) -> None:
-        """Derating must begin before the robot stops. Raises ValueError, which the file reader explains."""
-        if self.stop_at_c <= self.derate_from_c:
-            raise ValueError(
-                f"`stop_at_c` = {self.stop_at_c:g} °C must be above `derate_from_c` = {self.derate_from_c:g} °C, "
-                f"so that torque is derated before the robot stops"
-            )
-
-
-class Motor(FileStruct, frozen=True, kw_only=True):
-    """Motor parameters of a joint."""
-
-    stiffness_nm_per_rad: Annotated[float, above(1e5, "N·m/rad")]  # position mode
-    damping_nm_s_per_rad: Annotated[float, from_zero(1e4, "N·m·s/rad")]  # position mode
-    velocity_gain_nm_s_per_rad: Annotated[float, above(1e4, "N·m·s/rad")]  # velocity mode
-    response_time_s: Annotated[float, from_zero(1, "s")]  # first-order lag of the torque
-    armature_kg_m2: Annotated[float, from_zero(10, "kg·m²")]  # rotor inertia seen at the joint
-    friction_nm: Annotated[float, from_zero(100, "N·m")] = 0.0
-    viscous_nm_s_per_rad: Annotated[float, from_zero(100, "N·m·s/rad")] = 0.0
 
 
 class Safety(FileStruct, frozen=True, kw_only=True):
@@ -89,13 +57,18 @@ class RobotFile(FileStruct, frozen=True, kw_only=True):
     chain: Chain
     module: Module
     links: Annotated[list[Link], Meta(max_length=MAX_JOINTS + 1)] = []  # tail to head; none: made of the modules
-    limits: Limits
+    limits: Limits  # from here to `supply`: of all joints, but for `joints`
     motor: Motor
+    drive: Drive = Drive()
+    heat: Heat = Heat()
+    supply: Supply = Supply()
+    joints: Annotated[dict[str, JointExceptions], Meta(max_length=MAX_JOINTS)] = {}  # name -> what differs in it
     safety: Safety = Safety()
     sensors: Sensors = Sensors()
 
     def __post_init__(self) -> None:
-        """Links must be as many as there are; sensors must sit on one, and not inside of it. Raises ValueError."""
+        """Links and joints must be those there are; sensors sit on a link, and not inside of it. Raises ValueError."""
+        _ = self.joint_table
         last = self.chain.modules
         if self.links and len(self.links) != last + 1:
             raise ValueError(
@@ -123,6 +96,11 @@ class RobotFile(FileStruct, frozen=True, kw_only=True):
         """Axis of every joint, tail to head."""
         pattern = self.chain.axes
         return [pattern[i % len(pattern)] for i in range(self.chain.modules)]
+
+    @property
+    def joint_table(self) -> list[Joint]:
+        """Every joint as built, tail to head."""
+        return table(self.axes, self.joints, self.limits, self.motor, self.drive, self.heat, self.supply)
 
     @property
     def link_lengths_m(self) -> list[float]:
@@ -164,26 +142,25 @@ def describe(
 
     emulated: nothing real moves; simulated_time: and between two ticks any time may pass.
     """
-    axes = robot.axes
     joints = [
         JointDescription(
-            name=f"joint_{i + 1}",
-            axis=axis,
-            angle_min_rad=-robot.limits.angle_rad,
-            angle_max_rad=robot.limits.angle_rad,
-            speed_limit_rad_s=robot.limits.speed_rad_s,
-            acceleration_limit_rad_s2=robot.limits.acceleration_rad_s2,
-            torque_limit_nm=robot.limits.torque_nm,
-            torque_rate_limit_nm_s=robot.limits.torque_rate_nm_s,
-            stiffness_nm_per_rad=robot.motor.stiffness_nm_per_rad,
-            damping_nm_s_per_rad=robot.motor.damping_nm_s_per_rad,
-            velocity_gain_nm_s_per_rad=robot.motor.velocity_gain_nm_s_per_rad,
-            rotor_kg_m2=robot.motor.armature_kg_m2,
-            derate_from_c=robot.limits.derate_from_c,
-            stop_at_c=robot.limits.stop_at_c,
-            least_voltage_v=robot.limits.least_voltage_v,
+            name=joint.name,
+            axis=joint.axis,
+            angle_min_rad=joint.limits.least_rad,
+            angle_max_rad=joint.limits.most_rad,
+            speed_limit_rad_s=joint.limits.speed_rad_s,
+            acceleration_limit_rad_s2=joint.limits.acceleration_rad_s2,
+            torque_limit_nm=joint.limits.torque_nm,
+            torque_rate_limit_nm_s=joint.limits.torque_rate_nm_s,
+            stiffness_nm_per_rad=joint.motor.stiffness_nm_per_rad,
+            damping_nm_s_per_rad=joint.motor.damping_nm_s_per_rad,
+            velocity_gain_nm_s_per_rad=joint.motor.velocity_gain_nm_s_per_rad,
+            rotor_kg_m2=joint.motor.armature_kg_m2,
+            derate_from_c=joint.limits.derate_from_c,
+            stop_at_c=joint.limits.stop_at_c,
+            least_voltage_v=joint.limits.least_voltage_v,
         )
-        for i, axis in enumerate(axes)
+        for joint in robot.joint_table
     ]
     links = [
         LinkDescription(name=f"link_{i}", length_m=length, radius_m=robot.module.radius_m, mass_kg=mass)

@@ -271,11 +271,19 @@ def check(config: RunConfig) -> None:
             f"set start.on_route = false with position_m and yaw_rad, or add a [route] to the scene"
         )
     angles = start_of(config).angles_rad
-    worst = int(np.argmax(np.abs(angles)))
-    if abs(angles[worst]) > config.robot.limits.angle_rad:
+    for joint, angle_rad in zip(config.robot.joint_table, angles.tolist(), strict=True):
+        if joint.limits.least_rad <= angle_rad <= joint.limits.most_rad:
+            continue
+        if not start.on_route:
+            raise ConfigError(
+                f"robot {config.robot.name!r}: {joint.name} may turn from {joint.limits.least_rad:g} to "
+                f"{joint.limits.most_rad:g} rad, and the robot starts straight, at 0; let its limits include that, or "
+                f"start it on a route that suits them"
+            )
         raise ConfigError(
-            f"scenario {config.name!r}: lying on the route, joint_{worst + 1} would start at {angles[worst]:.2f} rad; "
-            f"robot {config.robot.name!r} allows +-{config.robot.limits.angle_rad} rad. Choose a smoother route"
+            f"scenario {config.name!r}: lying on the route, {joint.name} would start at {angle_rad:.2f} rad; robot "
+            f"{config.robot.name!r} allows {joint.limits.least_rad:g} to {joint.limits.most_rad:g} rad. Choose a "
+            f"smoother route"
         )
     place_all(config)
 

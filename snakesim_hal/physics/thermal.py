@@ -4,31 +4,24 @@ First order: copper losses are proportional to torque squared, and the housing d
 
     time constant * d(temperature)/dt = ambient + rise * (torque / rated)^2 - temperature
 
-No module was measured; the numbers are typical of a small geared servo: rated torque is available at stall for seconds,
-half of it continuously (80 °C at 20 °C ambient, so 240 K at rated torque), and the time constant is a minute.
+The robot file's `[heat]` has the numbers, by default typical of a small geared servo: rated torque is available at
+stall for seconds, half of it continuously (80 °C at 20 °C ambient, so 240 K at rated torque); the time constant is a
+minute.
 
 `HeatLimits` is the only derating curve: the host uses it, and so do the simulator's motors and emulated modules.
 Each is an upper bound of the torque, so the lower one applies; they never multiply.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 
 from snakesim_hal.arrays import Floats
+from snakesim_hal.model.joints import Joint
 
-Number = TypeVar("Number", float, Floats)
-
-AMBIENT_C = 20.0
-RISE_AT_RATED_K = 240.0
-TIME_CONSTANT_S = 60.0
-LOSS_AT_RATED_W = 48.0  # 5 K/W from winding to water, a guess of the right order for a housing of 100 mm
 MIN_SHARE = 0.2  # of its torque, left to the hottest winding
 INJECTED_ABOVE_STOP_K = 5.0  # by an injected fault
-SUPPLY_V, MIN_VOLTAGE_V = 24.0, 18.0
-IDLE_A = 0.05
-BOARD_OVER_AMBIENT = 0.3  # of the winding's temperature rise, a guess
 
 
 @dataclass(frozen=True)
@@ -45,45 +38,46 @@ class HeatLimits:
 
 
 class Thermal:
-    """Winding temperatures of all motors."""
+    """Winding temperatures of all motors, and the power that they take."""
 
-    def __init__(self, count: int, rated_nm: float, limits: HeatLimits) -> None:
-        self.limits = limits
-        self.winding_c: Floats = np.full(count, AMBIENT_C)
-        self._held = np.zeros(count, dtype=np.bool_)
+    def __init__(self, joints: Sequence[Joint]) -> None:
+        self.limits = [HeatLimits(joint.limits.derate_from_c, joint.limits.stop_at_c) for joint in joints]
+        self.stop_at_c: Floats = np.array([limits.stop_at_c for limits in self.limits])
+        self._derate_from_c = np.array([limits.derate_from_c for limits in self.limits])
+        self._ambient_c = np.array([joint.heat.ambient_c for joint in joints])
+        self.winding_c: Floats = self._ambient_c.copy()
+        self._held = np.zeros(len(joints), dtype=np.bool_)
         self._derates = False
-        self._rise = RISE_AT_RATED_K / rated_nm**2
+        self._rated_nm = np.array([joint.rated_nm for joint in joints])
+        self._rise = np.array([joint.heat.rise_at_rated_k / joint.rated_nm**2 for joint in joints])
+        self._minus_time_s = np.array([-joint.heat.time_constant_s for joint in joints])
+        self._loss_w = np.array([joint.heat.loss_at_rated_w for joint in joints])
+        self._board_share = np.array([joint.heat.board_share for joint in joints])
 
     def pass_time(self, seconds: float, torque_squared: Floats) -> None:
         """Heat and cool, under a mean square of torque, N²·m², (n_joints,). Exact for a constant torque."""
-        settles_at = AMBIENT_C + self._rise * torque_squared
-        self.winding_c += (settles_at - self.winding_c) * -np.expm1(-seconds / TIME_CONSTANT_S)
-        np.copyto(self.winding_c, self._injected_c, where=self._held)
+        settles_at = self._ambient_c + self._rise * torque_squared
+        self.winding_c += (settles_at - self.winding_c) * -np.expm1(seconds / self._minus_time_s)
+        np.copyto(self.winding_c, self.stop_at_c + INJECTED_ABOVE_STOP_K, where=self._held)
 
     def inject(self, motor: int, *, heat: bool, hold: bool) -> None:
         """Heat one winding as an injected fault; hold: keep that temperature until the fault ends."""
         if heat:
-            self.winding_c[motor] = self._injected_c
+            self.winding_c[motor] = self.stop_at_c[motor] + INJECTED_ABOVE_STOP_K
         self._held[motor] = hold
 
     def share_left(self) -> Floats | None:
-        """Share of its rated torque that each motor may use, (n_joints,); None while all are cool."""
-        derated, self._derates = self._derates, bool(self.winding_c.max() > self.limits.derate_from_c)
+        """Share of its torque that each motor may use, (n_joints,); None while all are cool."""
+        derated, self._derates = self._derates, bool((self.winding_c > self._derate_from_c).any())
         if not (self._derates or derated):
             return None
-        return np.array([self.limits.share_left(celsius) for celsius in self.winding_c.tolist()])
+        shares = [of.share_left(celsius) for of, celsius in zip(self.limits, self.winding_c.tolist(), strict=True)]
+        return np.array(shares)
 
-    @property
-    def _injected_c(self) -> float:
-        return self.limits.stop_at_c + INJECTED_ABOVE_STOP_K
+    def board_c(self) -> Floats:
+        """Temperatures of the electronics beside the windings, (n_joints,)."""
+        return self._ambient_c + self._board_share * (self.winding_c - self._ambient_c)
 
-
-def board_c(winding_c: Number) -> Number:
-    """Temperature of the electronics beside a winding."""
-    return AMBIENT_C + BOARD_OVER_AMBIENT * (winding_c - AMBIENT_C)
-
-
-def current_a(torque_nm: Number, speed_rad_s: Number, rated_nm: float, voltage_v: float) -> Number:
-    """Supply current of a module: mechanical power, copper losses, and a small idle current."""
-    watts = torque_nm * speed_rad_s + LOSS_AT_RATED_W * (torque_nm / rated_nm) ** 2
-    return IDLE_A + watts / voltage_v
+    def power_w(self, torque_nm: Floats, speed_rad_s: Floats) -> Floats:
+        """What the motors take, (n_joints,): mechanical power and copper losses; `Supply.idle_a` comes on top."""
+        return torque_nm * speed_rad_s + self._loss_w * (torque_nm / self._rated_nm) ** 2

@@ -30,7 +30,7 @@ WITHIN_TICK: dict[type[Message], Callable[[Any, BodyScope], Reader]] = {
     Contacts: lambda sensor, at: ContactReader(at.sim, at.data, sensor, at.noise.standard_normal, at.physics),
     Imu: lambda sensor, at: ImuReader(at.data, sensor, at.config.robot.chain.modules + 1, at.noise.standard_normal),
     Pose: lambda sensor, at: PoseReader(at.data, sensor, at.noise.standard_normal),
-    Power: lambda _, at: PowerReader(at.data, at.motors, at.windings, at.config.robot.limits.torque_nm),
+    Power: lambda _, at: PowerReader(at.data, at.motors, at.windings, at.config.robot.joint_table),
 }
 BESIDE_TICK: dict[tuple[type[Message], str], Any] = {
     (DepthImage, "rays"): RayCamera,

@@ -12,7 +12,7 @@ import pytest
 
 from snakesim_gnc.control.obstacle_triplet import TripletSolution, solve_triplet
 from snakesim_hal.backend import SetPoints
-from snakesim_hal.model.robot import Limits, Motor
+from snakesim_hal.model.joints import Limits, Motor
 from snakesim_hal.model.route import Route, lay_chain, sine_points
 from snakesim_hal.model.scenario import RunConfig, Start
 from snakesim_hal.model.scene import Cylinder, Ground, SceneFile, WaypointRoute

@@ -7,8 +7,9 @@ import numpy as np
 
 from snakesim_gnc.control.body_on_path import chain_nodes
 from snakesim_gnc.control.controller import View
+from snakesim_hal.model.joints import Limits, Motor
 from snakesim_hal.model.kinematics import quaternion_from_yaw
-from snakesim_hal.model.robot import Chain, Limits, Module, Motor, RobotFile, describe
+from snakesim_hal.model.robot import Chain, Module, RobotFile, describe
 from snakesim_hal.model.route import Route, chain_angles, lay_chain, sine_points, yaw_segments_m
 from snakesim_hal.wire.messages import Axis, Description, JointState, Obstacle, Trajectory, World, WorldContact
 

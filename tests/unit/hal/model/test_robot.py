@@ -8,11 +8,14 @@ from hypothesis import strategies as st
 
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.files import Table, decode, read_part, shipped
+from snakesim_hal.model.joints import Drive, Heat, JointExceptions, Limits, Motor, Supply
 from snakesim_hal.model.robot import RobotFile, describe, layout_hash
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder, encode, encoding_of
 from snakesim_hal.wire.messages import Description
 from tests.unit.hal.rig import LEASE_NS, PERIOD_NS, ROBOT, changed, description, robot_file
+
+SECTIONS = ("limits", "motor", "drive", "heat", "supply")
 
 
 @pytest.mark.parametrize("name", shipped("robots"))
@@ -53,6 +56,34 @@ def test_the_description_says_what_the_file_says() -> None:
     assert joint.stiffness_nm_per_rad == motor["stiffness_nm_per_rad"]
     assert joint.damping_nm_s_per_rad == motor["damping_nm_s_per_rad"]
     assert (described.safe_action, described.max_step_rad) == ("damp", 0.3)
+
+
+def test_one_joint_may_differ_in_every_field_that_the_sections_give_to_all() -> None:
+    own = {
+        "id": 17, "sign": -1, "zero_rad": 0.3, "gear": 2.0, "port": "can1", "family": "odrive",
+        "angle_min_rad": -0.4, "angle_max_rad": 1.2, "speed_rad_s": 2.0, "torque_nm": 3.0, "derate_from_c": 60.0,
+        "armature_kg_m2": 0.02, "torque_constant_nm_per_a": 0.08, "rated_nm": 1.0, "peak_nm": 3.5, "voltage_v": 25.2,
+        "rise_at_rated_k": 90.0,
+    }  # fmt: skip
+    robot = robot_file(joints={"joint_2": own}, drive__gear=9.0, limits__angle_max_rad=1.0)
+    first, second, third = robot.joint_table
+    for field, value in own.items():
+        found = [part for part in (second, *(getattr(second, s) for s in SECTIONS)) if hasattr(part, field)]
+        assert {getattr(part, field) for part in found} == {value}, field
+    assert (first.id, third.id, first.drive.gear, first.supply.voltage_v) == (1, 3, 9.0, 24.0)
+    assert (first.limits.least_rad, first.limits.most_rad) == (-1.5, 1.0) == (third.limits.least_rad, 1.0)
+    joints = description(joints={"joint_2": own}, limits__angle_max_rad=1.0).joints
+    assert [(joint.angle_min_rad, joint.angle_max_rad) for joint in joints] == [(-1.5, 1.0), (-0.4, 1.2), (-1.5, 1.0)]
+    assert [joint.torque_limit_nm for joint in joints] == [4.0, 3.0, 4.0]
+    assert [joint.speed_limit_rad_s for joint in joints] == [5.0, 2.0, 5.0]
+    assert [joint.derate_from_c for joint in joints] == [80.0, 60.0, 80.0]
+    either = robot_file(joints={"joint_2": {"angle_rad": 0.2}}, limits__angle_max_rad=1.0).joint_table[1].limits
+    assert (either.least_rad, either.most_rad) == (-0.2, 0.2), "to either side, whatever the others' sides are"
+
+
+def test_every_field_of_the_sections_may_be_said_for_one_joint() -> None:
+    said = {field for section in (Limits, Motor, Drive, Heat, Supply) for field in section.__struct_fields__}
+    assert said - set(JointExceptions.__struct_fields__) == {"ambient_c"}, "the water is the same for all"
 
 
 def test_only_the_sensors_that_a_robot_has_are_described_and_none_is_faster_than_the_loop() -> None:
@@ -112,6 +143,29 @@ def test_the_layout_tells_robots_apart_that_take_other_vectors() -> None:
 
 
 WRONG = {
+    "a joint that is not there": (
+        {"joints": {"joint_4": {"sign": -1}}},
+        ["[joints.joint_4]: this robot has joint_1 to joint_3"],
+    ),
+    "a sign that is none": ({"joints": {"joint_2": {"sign": 2}}}, ["`joints.joint_2.sign` = 2", "one of -1, 1"]),
+    "a side in degrees": (
+        {"joints": {"joint_2": {"angle_max_rad": 90}}},
+        ["`joints.joint_2.angle_max_rad` = 90 rad", "<= 3.14159 in rad"],
+    ),
+    "no travel": (
+        {"joints": {"joint_2": {"angle_min_rad": 1.0, "angle_max_rad": 0.5}}},
+        ["joint_2: it may turn from 1 to 0.5 rad", "`angle_min_rad`"],
+    ),
+    "more than the motor can": (
+        {"joints": {"joint_3": {"peak_nm": 3.0}}},
+        ["joint_3: `torque_nm` = 4 N·m", "`peak_nm` = 3 N·m", "lower it"],
+    ),
+    "two of an id": ({"joints": {"joint_3": {"id": 1}}}, ["joint_1, joint_3: all have the id 1 on one bus"]),
+    "a supply that stops it": (
+        {"supply__voltage_v": 12},
+        ["`supply.voltage_v` = 12 V", "`limits.least_voltage_v` = 18 V"],
+    ),
+    "lag of some": ({"joints": {"joint_2": {"response_time_s": 0}}}, ["joint_2: `response_time_s` = 0 s"]),
     "no axes": ({"chain__axes": []}, ["`chain.axes` = []", "a list"]),
     "unknown axis": ({"chain__axes": ["yaw", "roll"]}, ["`chain.axes.1` = 'roll'", "'pitch'", "'yaw'"]),
     "length in mm": ({"module__length_m": 110}, ["`module.length_m` = 110 m", "<= 2 in m"]),

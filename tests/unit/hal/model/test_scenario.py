@@ -262,7 +262,7 @@ SCENES = {
     "overlap": ("position_m = [1.0, 1.0]", "position_m = [0.2, 0.0]", ["'cylinder_0' overlaps link_", "mm", "[start]"]),
     "no route": ('[route]\nkind = "sine"\namplitude_m = 0.05\nwavelength_m = 0.8\nlength_m = 2.0\n', "",
                  ["`start.on_route` is true", "'bend' has no route", "start.on_route = false"]),
-    "too sharp": ("wavelength_m = 0.8", "wavelength_m = 0.1", ["joint_", "rad", "+-1.5 rad", "smoother route"]),
+    "too sharp": ("wavelength_m = 0.8", "wavelength_m = 0.1", ["joint_", "rad", "-1.5 to 1.5 rad", "smoother route"]),
 }  # fmt: skip
 
 

@@ -1,23 +1,31 @@
 """Heat: how fast it comes, what it takes from the torque, and that torque fades before the robot stops."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
-from snakesim_hal.physics import thermal
 from snakesim_hal.physics.thermal import HeatLimits, Thermal
+from tests.unit.hal.rig import robot_file
 
 LIMITS = HeatLimits(derate_from_c=80.0, stop_at_c=105.0)
 
 
+def windings(count: int = 1, **exceptions: Any) -> Thermal:
+    joints = {"joint_1": exceptions} if exceptions else {}
+    robot = robot_file(chain__modules=count, limits__torque_nm=4.0, joints=joints)
+    return Thermal(robot.joint_table)
+
+
 def test_half_of_rated_torque_is_held_for_ever_at_80_degrees() -> None:
-    heat = Thermal(1, 4.0, LIMITS)
+    heat = windings()
     heat.pass_time(3600.0, np.array([2.0**2]))
     assert heat.winding_c[0] == pytest.approx(80.0)
     assert heat.share_left() is None
 
 
 def test_it_is_exact_whatever_the_step() -> None:
-    fine, coarse = Thermal(1, 4.0, LIMITS), Thermal(1, 4.0, LIMITS)
+    fine, coarse = windings(), windings()
     for _ in range(1000):
         fine.pass_time(0.01, np.array([9.0]))
     coarse.pass_time(10.0, np.array([9.0]))
@@ -32,7 +40,7 @@ def test_derating_is_linear(celsius: float, share: float) -> None:
 
 
 def test_a_share_is_told_while_one_winding_is_hot_and_once_more_when_it_has_cooled() -> None:
-    heat = Thermal(2, 4.0, LIMITS)
+    heat = windings(2)
     for celsius, reported in ((80.0, False), (80.1, True), (100.0, True), (79.0, True), (79.0, False)):
         heat.winding_c[1] = celsius
         share = heat.share_left()
@@ -41,7 +49,7 @@ def test_a_share_is_told_while_one_winding_is_hot_and_once_more_when_it_has_cool
 
 
 def test_a_motor_at_stall_fades_and_never_overheats() -> None:
-    heat = Thermal(1, 4.0, LIMITS)
+    heat = windings()
     shares: list[float] = []
     for _ in range(60_000):
         shares.append(LIMITS.share_left(float(heat.winding_c[0])))
@@ -51,7 +59,7 @@ def test_a_motor_at_stall_fades_and_never_overheats() -> None:
 
 
 def test_injected_heat_stays_only_while_it_is_held() -> None:
-    heat = Thermal(2, 4.0, LIMITS)
+    heat = windings(2)
     heat.inject(0, heat=True, hold=False)
     heat.inject(1, heat=True, hold=True)
     assert heat.winding_c.tolist() == [110.0, 110.0], "5 K above where the robot stops"
@@ -64,8 +72,18 @@ def test_injected_heat_stays_only_while_it_is_held() -> None:
 
 
 def test_a_warm_module_at_work_takes_more_from_its_supply() -> None:
-    assert thermal.board_c(20.0) == 20.0 and thermal.board_c(80.0) == pytest.approx(38.0)
-    assert thermal.current_a(0.0, 5.0, 4.0, 24.0) == 0.05
-    assert thermal.current_a(4.0, 0.0, 4.0, 24.0) == pytest.approx(0.05 + 2.0)
-    both = thermal.current_a(np.array([2.0, -2.0]), np.array([3.0, 3.0]), 4.0, 24.0)
-    assert both == pytest.approx([0.05 + 18.0 / 24.0, 0.05 + 6.0 / 24.0])
+    heat = windings(4)
+    heat.winding_c[1] = 80.0
+    assert heat.board_c() == pytest.approx([20.0, 38.0, 20.0, 20.0])
+    watts = heat.power_w(np.array([0.0, 4.0, 2.0, -2.0]), np.array([5.0, 0.0, 3.0, 3.0]))
+    assert watts == pytest.approx([0.0, 48.0, 18.0, 6.0])
+
+
+def test_one_motor_may_warm_up_otherwise_than_the_others() -> None:
+    heat = windings(2, rated_nm=2.0, rise_at_rated_k=100.0, time_constant_s=30.0, derate_from_c=50.0, board_share=0.5)
+    heat.pass_time(30.0, np.array([4.0, 4.0]))
+    assert heat.winding_c == pytest.approx([20 + 100 * (1 - np.exp(-1)), 20 + 60 * (1 - np.exp(-0.5))])
+    share = heat.share_left()
+    assert share is not None and share[0] < 1.0 and share[1] == 1.0, "each by its own limits"
+    assert (heat.board_c() - 20) / (heat.winding_c - 20) == pytest.approx([0.5, 0.3])
+    assert heat.power_w(np.array([2.0, 2.0]), np.zeros(2)) == pytest.approx([48.0, 12.0])

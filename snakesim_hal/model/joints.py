@@ -1,0 +1,272 @@
+"""The joints of a robot file: sections for all of them, and a table of exceptions for single ones.
+
+`[limits]`, `[motor]`, `[drive]`, `[heat]` and `[supply]` hold for every joint; `[joints.joint_3]` says what differs in
+one, by the same names. `table` puts them together: one `Joint` each, tail to head.
+"""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Literal, TypeVar
+
+import msgspec
+from msgspec import Meta
+
+from snakesim_hal.model.files import FileStruct
+from snakesim_hal.wire.messages import Axis
+from snakesim_hal.wire.quantities import above, from_zero
+
+MAX_TURN_RAD = 3.14159
+
+
+def _between(low: float, high: float, unit: str) -> Meta:
+    return Meta(ge=low, le=high, extra_json_schema={"unit": unit})
+
+
+Travel = Annotated[float, above(MAX_TURN_RAD, "rad")]
+Side = Annotated[float, _between(-MAX_TURN_RAD, MAX_TURN_RAD, "rad")]
+Speed = Annotated[float, above(100, "rad/s")]
+Acceleration = Annotated[float, above(1e5, "rad/s²")]
+Torque = Annotated[float, above(1000, "N·m")]
+TorqueRate = Annotated[float, above(1e5, "N·m/s")]
+Celsius = Annotated[float, above(300, "°C")]
+Kelvin = Annotated[float, above(1000, "K")]
+LeastVolts = Annotated[float, from_zero(1000, "V")]
+Stiffness = Annotated[float, above(1e5, "N·m/rad")]
+Damping = Annotated[float, from_zero(1e4, "N·m·s/rad")]
+VelocityGain = Annotated[float, above(1e4, "N·m·s/rad")]
+Lag = Annotated[float, from_zero(1, "s")]
+RotorInertia = Annotated[float, from_zero(10, "kg·m²")]
+Friction = Annotated[float, from_zero(100, "N·m")]
+Viscosity = Annotated[float, from_zero(100, "N·m·s/rad")]
+TorqueConstant = Annotated[float, above(1000, "N·m/A")]
+Text = Annotated[str, Meta(max_length=100)]
+DriveId = Annotated[int, Meta(ge=0, lt=2**29)]
+Sign = Literal[1, -1]
+Zero = Annotated[float, _between(-1e4, 1e4, "rad")]
+Gear = Annotated[float, above(1e4, "1")]
+HeatTime = Annotated[float, above(1e5, "s")]
+Watts = Annotated[float, from_zero(1e5, "W")]
+Share = Annotated[float, from_zero(1, "1")]
+Volts = Annotated[float, above(1000, "V")]
+Amperes = Annotated[float, from_zero(1000, "A")]
+
+
+class Limits(FileStruct, frozen=True, kw_only=True):
+    """Limits of a joint; enforced by the gate and by the motor."""
+
+    angle_rad: Travel  # to either side
+    angle_min_rad: Side | None = None  # of a side that differs
+    angle_max_rad: Side | None = None
+    speed_rad_s: Speed
+    acceleration_rad_s2: Acceleration
+    torque_nm: Torque
+    torque_rate_nm_s: TorqueRate
+    derate_from_c: Celsius = 80.0  # of the winding: above it torque is derated
+    stop_at_c: Celsius = 105.0  # a fifth of the torque is left, and the robot stops
+    least_voltage_v: LeastVolts = 18.0  # below it the robot stops
+
+    def __post_init__(self) -> None:
+        """Derating must begin before the robot stops, and a joint must turn. Raises ValueError, for the file reader."""
+        if self.stop_at_c <= self.derate_from_c:
+            raise ValueError(
+                f"`stop_at_c` = {self.stop_at_c:g} °C must be above `derate_from_c` = {self.derate_from_c:g} °C, "
+                f"so that torque is derated before the robot stops"
+            )
+        if self.least_rad >= self.most_rad:
+            raise ValueError(
+                f"it may turn from {self.least_rad:g} to {self.most_rad:g} rad, which leaves no travel: "
+                f"`angle_min_rad` (or minus `angle_rad`) must be below `angle_max_rad` (or `angle_rad`)"
+            )
+
+    @property
+    def least_rad(self) -> float:
+        """The joint's lowest angle."""
+        return -self.angle_rad if self.angle_min_rad is None else self.angle_min_rad
+
+    @property
+    def most_rad(self) -> float:
+        """The joint's highest angle."""
+        return self.angle_rad if self.angle_max_rad is None else self.angle_max_rad
+
+
+class Motor(FileStruct, frozen=True, kw_only=True):
+    """Motor of a joint, as seen at the joint: behind the gear."""
+
+    stiffness_nm_per_rad: Stiffness  # position mode
+    damping_nm_s_per_rad: Damping  # position mode
+    velocity_gain_nm_s_per_rad: VelocityGain  # velocity mode
+    response_time_s: Lag  # first-order lag of the torque
+    armature_kg_m2: RotorInertia  # rotor inertia seen at the joint
+    friction_nm: Friction = 0.0
+    viscous_nm_s_per_rad: Viscosity = 0.0
+    torque_constant_nm_per_a: TorqueConstant | None = None  # of the drive's shaft, before a `gear`; none: not known
+    rated_nm: Torque | None = None  # that heats it as [heat] says; none: `limits.torque_nm`
+    peak_nm: Torque | None = None  # that it can give at all: no limit may be above it; none: not known
+
+
+class Drive(FileStruct, frozen=True, kw_only=True):
+    """How a joint's drive is connected and mounted: drive angle = zero_rad + sign * gear * joint angle."""
+
+    family: Text = ""  # of its protocol, such as dynamixel; empty: the backend's only one
+    port: Text = ""  # bus or serial port, such as can0; empty: as the backend's settings say
+    sign: Sign = 1  # -1: mounted the other way round, so that the drive turns against the joint
+    zero_rad: Zero = 0.0  # what the drive measures at the joint's zero
+    gear: Gear = 1.0  # turns of the drive's shaft in one turn of the joint
+
+
+class Heat(FileStruct, frozen=True, kw_only=True):
+    """How a motor warms up. The defaults are typical of a small geared servo; none was measured."""
+
+    ambient_c: Annotated[float, _between(-50, 100, "°C")] = 20.0
+    rise_at_rated_k: Kelvin = 240.0  # of the winding, at rest under the rated torque, for ever
+    time_constant_s: HeatTime = 60.0
+    loss_at_rated_w: Watts = 48.0  # 5 K/W from winding to water, a guess of the right order for a housing of 100 mm
+    board_share: Share = 0.3  # of the winding's rise, in the electronics beside it; a guess
+
+
+class Supply(FileStruct, frozen=True, kw_only=True):
+    """Electrical supply of a joint."""
+
+    voltage_v: Volts = 24.0
+    idle_a: Amperes = 0.05
+
+
+class JointExceptions(FileStruct, frozen=True, kw_only=True):
+    """What differs in one joint from the sections for all: their fields, and the drive's id."""
+
+    id: DriveId | None = None  # on its bus; none: the joint's number
+    # [limits]
+    angle_rad: Travel | None = None
+    angle_min_rad: Side | None = None
+    angle_max_rad: Side | None = None
+    speed_rad_s: Speed | None = None
+    acceleration_rad_s2: Acceleration | None = None
+    torque_nm: Torque | None = None
+    torque_rate_nm_s: TorqueRate | None = None
+    derate_from_c: Celsius | None = None
+    stop_at_c: Celsius | None = None
+    least_voltage_v: LeastVolts | None = None
+    # [motor]
+    stiffness_nm_per_rad: Stiffness | None = None
+    damping_nm_s_per_rad: Damping | None = None
+    velocity_gain_nm_s_per_rad: VelocityGain | None = None
+    response_time_s: Lag | None = None
+    armature_kg_m2: RotorInertia | None = None
+    friction_nm: Friction | None = None
+    viscous_nm_s_per_rad: Viscosity | None = None
+    torque_constant_nm_per_a: TorqueConstant | None = None
+    rated_nm: Torque | None = None
+    peak_nm: Torque | None = None
+    # [drive]
+    family: Text | None = None
+    port: Text | None = None
+    sign: Sign | None = None
+    zero_rad: Zero | None = None
+    gear: Gear | None = None
+    # [heat]
+    rise_at_rated_k: Kelvin | None = None
+    time_constant_s: HeatTime | None = None
+    loss_at_rated_w: Watts | None = None
+    board_share: Share | None = None
+    # [supply]
+    voltage_v: Volts | None = None
+    idle_a: Amperes | None = None
+
+
+SectionT = TypeVar("SectionT", Limits, Motor, Drive, Heat, Supply)
+
+
+@dataclass(frozen=True)
+class Joint:
+    """One joint as built: the sections for all joints, with its exceptions in them."""
+
+    name: str
+    axis: Axis
+    id: int
+    limits: Limits
+    motor: Motor
+    drive: Drive
+    heat: Heat
+    supply: Supply
+
+    @property
+    def rated_nm(self) -> float:
+        """The torque that heats its motor as `heat` says."""
+        return self.limits.torque_nm if self.motor.rated_nm is None else self.motor.rated_nm
+
+
+def table(
+    axes: Sequence[Axis],
+    exceptions: Mapping[str, JointExceptions],
+    limits: Limits,
+    motor: Motor,
+    drive: Drive,
+    heat: Heat,
+    supply: Supply,
+) -> list[Joint]:
+    """Every joint, tail to head; raises ValueError, which names the joint, for what no joint can be."""
+    names = [f"joint_{i + 1}" for i in range(len(axes))]
+    for name in exceptions:
+        if name not in names:
+            raise ValueError(f"[joints.{name}]: this robot has {names[0]} to {names[-1]}, by [chain]")
+    joints: list[Joint] = []
+    for i, (name, axis) in enumerate(zip(names, axes, strict=True)):
+        own = exceptions.get(name, JointExceptions())
+        try:
+            joint = Joint(
+                name=name,
+                axis=axis,
+                id=i + 1 if own.id is None else own.id,
+                limits=_limits(limits, own),
+                motor=_with(motor, own),
+                drive=_with(drive, own),
+                heat=_with(heat, own),
+                supply=_with(supply, own),
+            )
+            _check(joint)
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from None
+        joints.append(joint)
+    _check_all(joints)
+    return joints
+
+
+def _limits(common: Limits, own: JointExceptions) -> Limits:
+    if own.angle_rad is not None:  # to either side, whatever those of all are
+        common = msgspec.structs.replace(common, angle_rad=own.angle_rad, angle_min_rad=None, angle_max_rad=None)
+    return _with(common, own)
+
+
+def _with(section: SectionT, own: JointExceptions) -> SectionT:
+    """A section with one joint's exceptions."""
+    said = {name: getattr(own, name, None) for name in section.__struct_fields__}
+    differs = {name: value for name, value in said.items() if value is not None}
+    return msgspec.structs.replace(section, **differs) if differs else section
+
+
+def _check(joint: Joint) -> None:
+    limits, peak_nm = joint.limits, joint.motor.peak_nm
+    if peak_nm is not None and limits.torque_nm > peak_nm:
+        raise ValueError(
+            f"`torque_nm` = {limits.torque_nm:g} N·m is more than its motor's `peak_nm` = {peak_nm:g} N·m; lower it"
+        )
+    if joint.supply.voltage_v <= limits.least_voltage_v:
+        raise ValueError(
+            f"`supply.voltage_v` = {joint.supply.voltage_v:g} V is not above `limits.least_voltage_v` = "
+            f"{limits.least_voltage_v:g} V, where the robot stops: it could never be armed"
+        )
+
+
+def _check_all(joints: Sequence[Joint]) -> None:
+    lags = [joint.motor.response_time_s > 0 for joint in joints]
+    if any(lags) and not all(lags):
+        raise ValueError(
+            f"{joints[lags.index(False)].name}: `response_time_s` = 0 s, and other joints have more; give all of them "
+            f"some, or none"
+        )
+    for (port, number), count in Counter((joint.drive.port, joint.id) for joint in joints).items():
+        if count > 1:
+            same = ", ".join(joint.name for joint in joints if (joint.drive.port, joint.id) == (port, number))
+            where = f"port {port!r}" if port else "one bus"
+            raise ValueError(f"{same}: all have the id {number} on {where}; without an `id` a joint has its number")
