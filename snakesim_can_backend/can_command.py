@@ -1,4 +1,4 @@
-"""`snakesim can`: bus load of a configuration, modules that answer on a bus, and the expanded DBC file."""
+"""`snakesim can`: bus load of a configuration, modules that answer on a bus, a log replayed, the expanded DBC file."""
 
 import argparse
 from collections.abc import Iterator, Sequence
@@ -23,7 +23,9 @@ from snakesim_can_backend.bus.load import (
     shares,
     what_fits,
 )
+from snakesim_can_backend.driver.backend import answer_limit_s
 from snakesim_can_backend.driver.bring_up import Bus, Identity, find
+from snakesim_can_backend.driver.offline import Replay, against_record, messages
 from snakesim_can_backend.driver.reports import Module, Reading
 from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.definitions import FIRST_NODE, LAST_NODE, Opcode
@@ -34,6 +36,8 @@ from snakesim_hal.model.files import Table, decode
 from snakesim_hal.model.scenario import Loaded, Override, RunConfig, parse_set
 from snakesim_hal.model.scenario import load as load_scenario
 from snakesim_hal.model.textfiles import write_text
+from snakesim_hal.record.black_box import read_black_box
+from snakesim_hal.record.host_record import BLACK_BOX
 from snakesim_hal.terminal import say
 
 OK, FAILED = 0, 1
@@ -72,6 +76,13 @@ def parser() -> argparse.ArgumentParser:
     )
     answering.add_argument("--seconds", type=_seconds, default=1.0, help="how long to listen on each (default: 1)")
     answering.set_defaults(act=_scan)
+
+    again = commands.add_parser(
+        "replay", help="read a log of the bus as the driver does, and compare its joint states with the run's record"
+    )
+    again.add_argument("run", type=Path, help="folder of the run, with config.json and its black box")
+    again.add_argument("log", type=Path, help="log of its bus: .log (candump; backends.can.log of a run), .asc, .blf")
+    again.set_defaults(act=_replay)
 
     expand = commands.add_parser("expand", help="write the DBC file with every message of every node")
     expand.add_argument("--out", type=Path, default=Path(EXPANDED), metavar="FILE", help=f"(default: {EXPANDED})")
@@ -210,6 +221,33 @@ def _inside(raw: Sequence[int] | None) -> dict[str, str]:
 def _shaft(raw: int | None) -> str:
     """Known only while a host sends Syncs, and modules report their IMUs."""
     return UNKNOWN if raw is None else f"{codec()[Opcode.SHAFT_LOAD].signals['torque'].value(raw):.3f} N·m"
+
+
+# --- replay ------------------------------------------------------------------------------------------------
+
+
+def _replay(arguments: argparse.Namespace) -> int:
+    loaded = load_scenario(str(arguments.run / "config.json"), [])
+    layout, rows = read_black_box(arguments.run / BLACK_BOX)
+    settings = settings_of(loaded)
+    limit_s = answer_limit_s(loaded.config, settings)
+    done = Replay(len(layout.joints), reports_of(loaded.config, settings), limit_s)
+    done.take(messages(arguments.log))
+    if not done.joints:
+        say(f"{arguments.log}: {done.frames} frames, and no Sync among them: the log of another bus")
+        return FAILED
+    say(f"{arguments.log}: {done.frames} frames, {len(done.joints)} Syncs")
+    for name, silent in zip(layout.joints, done.silent, strict=True):
+        if silent:
+            say(f"  {name} did not answer {silent} Syncs in time")
+    for node, count in sorted(done.reading.strangers.items()):
+        say(f"  {count} frames of node {node}, which is not of this robot")
+    verdict = against_record(done, layout, rows)
+    if verdict.first_wrong:
+        say(f"joint states differ from {arguments.run}: {verdict.first_wrong}")
+        return FAILED
+    say(f"joint states of {verdict.compared} ticks are those of the record, to the bit")
+    return OK
 
 
 # --- expand ------------------------------------------------------------------------------------------------

@@ -1,4 +1,7 @@
-"""A log of all frames on the wires, in candump's format: `(1700000000.000000) can0 105#00112233`."""
+"""A log of all frames on the wires, in candump's format: `(1700000000.000000) can0 105#00112233 R`.
+
+R was received, T transmitted. Frames that were read from the wire together have one time.
+"""
 
 import contextlib
 import logging
@@ -36,14 +39,14 @@ class LoggedWire:
         """Send, and log accepted frames."""
         taken = self._wire.send(frame)
         if taken:
-            self._write(frame)
+            self._write([frame], "T")
         return taken
 
     def receive(self) -> list[Frame]:
         """Receive, and log all frames."""
         frames = self._wire.receive()
-        for frame in frames:
-            self._write(frame)
+        if frames:
+            self._write(frames, "R")
         return frames
 
     def errors(self) -> list[BusError]:
@@ -68,11 +71,13 @@ class LoggedWire:
             self._log.flush()
         self._wire.close()
 
-    def _write(self, frame: Frame) -> None:
+    def _write(self, frames: list[Frame], direction: str) -> None:
         if self._full:
             return
+        place = f"({time.time():.6f}) {self.channel}"
         try:
-            self._log.write(f"({time.time():.6f}) {self.channel} {frame.id:03X}#{frame.data.hex().upper()}\n")
+            for frame in frames:
+                self._log.write(f"{place} {frame.id:03X}#{frame.data.hex().upper()} {direction}\n")
         except OSError as error:  # a full disk ends the log, and nothing else
             self._full = True
             _log.warning("the bus log ends here: %s", error.strerror)

@@ -15,7 +15,7 @@ import msgspec
 from snakesim_can_backend.bus.adapter import check_channel, open_wire
 from snakesim_can_backend.bus.bus import OtherEnd, VirtualWire, Wire, wait
 from snakesim_can_backend.bus.bus_errors import BusError
-from snakesim_can_backend.bus.load import Reports, check_load, reports_of, shares, worst_bits
+from snakesim_can_backend.bus.load import check_load, reports_of, shares, worst_bits
 from snakesim_can_backend.bus.log import LoggedWire, open_log
 from snakesim_can_backend.driver.bring_up import Bus, configure, discovery_errors, find
 from snakesim_can_backend.driver.mocap import MocapReceiver, check_pose, pose_address
@@ -113,7 +113,7 @@ class CanBackend:
         self._pending: frozenset[int] = frozenset()  # joints just reported as failed, whose isolation is expected
         self._unsent: list[str] = []
         self._arming = Arming()
-        self._answer_limit_s = LOCKSTEP_ANSWER_S if self._lockstep else _answer_time_s(self._buses, self._reports)
+        self._answer_limit_s = answer_limit_s(config, settings)
         self._tick = 0
 
     def describe(self) -> Description:
@@ -425,8 +425,11 @@ class CanBackend:
                 _log.warning("after a clear: %s", error)
 
 
-def _answer_time_s(buses: list[Bus], reports: Reports) -> float:
+def answer_limit_s(config: RunConfig, settings: Settings) -> float:
     """How long all answers to a Sync may take on the fullest bus; the rest of the period is for the controller."""
-    frames = max(len(bus.nodes) for bus in buses) * (1 + (reports.contact_every > 0)) + reports.tail
+    if config.pace == "lockstep":
+        return LOCKSTEP_ANSWER_S
+    reports = reports_of(config, settings)
+    frames = max(shares(config, settings)) * (1 + (reports.contact_every > 0)) + reports.tail
     bus_s = frames * worst_bits(8) / reports.bit_rate
     return min(ANSWER_MARGIN * bus_s + ANSWER_SLACK_S, MAX_OF_PERIOD / reports.rate_hz)

@@ -12,7 +12,7 @@ from snakesim_can_backend.bus.log import LoggedWire, open_log
 from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_hal.errors import ConfigError
 
-LINE = re.compile(r"\((\d+\.\d{6})\) (\S+) ([0-9A-F]{3})#([0-9A-F]*)\n")
+LINE = re.compile(r"\((\d+\.\d{6})\) (\S+) ([0-9A-F]{3})#([0-9A-F]*) ([RT])\n")
 
 
 class FakeWire:
@@ -58,10 +58,10 @@ def test_what_is_taken_and_what_comes_is_logged_in_order() -> None:
     assert wire.receive() == []
     lines = [LINE.fullmatch(line) for line in log.getvalue().splitlines(keepends=True)]
     assert all(lines)
-    assert [(m[2], m[3], m[4]) for m in lines if m] == [
-        ("can3", "105", "00112233"),
-        ("can3", "007", ""),
-        ("can3", "7FF", "0000000000000000"),
+    assert [(m[2], m[3], m[4], m[5]) for m in lines if m] == [
+        ("can3", "105", "00112233", "T"),
+        ("can3", "007", "", "R"),
+        ("can3", "7FF", "0000000000000000", "R"),
     ]
     stamps = [float(m[1]) for m in lines if m]
     assert stamps == sorted(stamps)
@@ -87,7 +87,7 @@ def test_everything_else_is_the_wires_own(tmp_path: Path) -> None:
     assert wire.errors() == inner.errors()
     wire.send(Frame(0x105, b"\x01"))
     wire.close()
-    assert inner.closed and (tmp_path / "bus.log").read_text().endswith("105#01\n")
+    assert inner.closed and (tmp_path / "bus.log").read_text().endswith("105#01 T\n")
     log.close()
 
 

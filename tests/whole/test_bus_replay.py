@@ -1,0 +1,62 @@
+"""`snakesim can replay`: the log of a bus gives the joint states that were recorded, to the bit."""
+
+from pathlib import Path
+
+import can
+import pytest
+
+from snakesim_can_backend.protocol.definitions import Opcode, frame_id
+from snakesim_operator.cli import main
+
+DURATION_S = "0.5"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run on emulated modules, with the log of its bus."""
+    folder = tmp_path_factory.mktemp("bus") / "run"
+    log = folder.with_name("bus.log")
+    more = ("--duration", DURATION_S, "--set", f"backends.can.log={log}", "--out", str(folder))
+    assert main(["run", "triplet", "--backend", "can", "--in-process", *more]) == 0
+    return folder
+
+
+@pytest.mark.parametrize("suffix", [".log", ".blf", ".asc"])
+def test_the_log_gives_the_recorded_states(run: Path, suffix: str, capsys: pytest.CaptureFixture[str]) -> None:
+    log = run.with_name("bus.log")
+    if suffix != ".log":
+        with can.LogReader(log) as frames, can.Logger(run.with_name(f"other{suffix}")) as other:
+            for frame in frames:
+                other(frame)
+        log = run.with_name(f"other{suffix}")
+    capsys.readouterr()
+    assert main(["can", "replay", str(run), str(log)]) == 0
+    said = capsys.readouterr().out
+    assert "joint states of 50 ticks are those of the record, to the bit" in said
+    assert "did not answer" not in said
+
+
+def test_a_lost_answer_is_found(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lines = run.with_name("bus.log").read_text().splitlines(keepends=True)
+    answers = [i for i, line in enumerate(lines) if f" {frame_id(Opcode.JOINT_STATE, 4):03X}#" in line]
+    del lines[answers[30]]
+    log = tmp_path / "lost.log"
+    log.write_text("".join(lines))
+    capsys.readouterr()
+    assert main(["can", "replay", str(run), str(log)]) == 1
+    said = capsys.readouterr().out
+    assert "joint_4 did not answer 1 Syncs in time" in said
+    assert "joint_4, " in said and "1 of 50 ticks differ" in said
+
+
+@pytest.mark.parametrize(
+    ("name", "content"), [("bus.log", "not a frame\n"), ("bus.blf", "LOGG damaged"), ("bus.txt", ""), ("bus.asc", None)]
+)
+def test_what_is_no_log_is_refused(
+    run: Path, tmp_path: Path, name: str, content: str | None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = tmp_path / name
+    if content is not None:
+        log.write_text(content)
+    assert main(["can", "replay", str(run), str(log)]) == 2
+    assert "cannot be read as a log of a CAN bus (.log, .asc, .blf)" in capsys.readouterr().err
