@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 
-from snakesim_can_backend.bus.bus import OtherEnd, VirtualWire
-from snakesim_can_backend.bus.load import Reports
+from snakesim_can_backend.bus.bus import OtherEnd
 from snakesim_can_backend.driver import backend as backend_module
-from snakesim_can_backend.driver.backend import CanBackend, _answer_time_s
-from snakesim_can_backend.driver.bring_up import Bus
+from snakesim_can_backend.driver.backend import CanBackend, answer_limit_s
 from snakesim_can_backend.protocol.definitions import (
     BROADCAST,
     Action,
@@ -24,7 +22,8 @@ from snakesim_can_backend.twin.firmware import Module
 from snakesim_can_backend.twin.server import InProcessTwins, here
 from snakesim_hal.backend import SetPoints
 from snakesim_hal.errors import BackendError, ConfigError
-from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.model.scenario import RunConfig, parse_set
+from snakesim_hal.model.scenario import load as load_scenario
 from snakesim_hal.wire.messages import Mode
 from tests.unit.can_backend.driver.whole.recorded import (
     DISARMED,
@@ -150,11 +149,10 @@ def test_it_describes_robot_and_sensors_and_delivers_them() -> None:
 
 
 def test_answers_are_waited_for_as_long_as_the_fullest_bus_takes() -> None:
-    wire = VirtualWire("answers")
-    buses = [Bus(wire, range(1, 14)), Bus(wire, range(14, 20))]
-    wire.close()
-    assert _answer_time_s(buses, Reports(100.0)) == pytest.approx(1.25 * 27 * 135e-6 + 0.002)
-    assert _answer_time_s(buses, Reports(100.0, 0, tail=False)) == pytest.approx(1.25 * 13 * 135e-6 + 0.002)
+    triplet = load_scenario("triplet", [parse_set("pace=realtime")]).config
+    assert answer_limit_s(triplet, Settings()) == pytest.approx(1.25 * 27 * 135e-6 + 0.002)
+    two = Settings(channels=["can0", "can1"])
+    assert answer_limit_s(triplet, two) == pytest.approx(1.25 * 15 * 135e-6 + 0.002)
 
 
 # --- a period ----------------------------------------------------------------------------------------------
