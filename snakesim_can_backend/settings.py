@@ -6,7 +6,16 @@ from msgspec import Meta
 
 from snakesim_can_backend.protocol.definitions import LAST_NODE
 from snakesim_hal.model.files import FileStruct
+from snakesim_hal.model.joints import Gear, Sign, Zero
 from snakesim_hal.wire.quantities import from_zero
+
+
+class Mounted(FileStruct, frozen=True, kw_only=True):
+    """How an emulated module is really mounted, where that is not what the robot file says."""
+
+    sign: Sign | None = None
+    zero_rad: Zero | None = None
+    gear: Gear | None = None
 
 
 class Settings(FileStruct, frozen=True, kw_only=True):
@@ -24,6 +33,8 @@ class Settings(FileStruct, frozen=True, kw_only=True):
     twins: Literal["here", "process", "none"] | None = None
     plant: str = "mujoco"  # body that the twins' motors move: an entry point in the group `snakesim.plants`
     plant_settings: dict[str, Any] = {}
+    # Of the twins: joint -> how its module is mounted in truth, to see what a wrong robot file does.
+    mounted: dict[str, Mounted] = {}
     faults: list[str] = []  # of the twins, such as "mute:joint_3@2"; `snakesim modules --help` lists them
     contact_rate_hz: Annotated[float, from_zero(1e4, "Hz")] | None = None  # default: the robot file's
     imu_rate_hz: Annotated[float, from_zero(1e4, "Hz")] = 5.0

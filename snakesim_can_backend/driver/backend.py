@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import msgspec
+import numpy as np
 
 from snakesim_can_backend.bus.adapter import check_channel, open_wire
 from snakesim_can_backend.bus.bus import OtherEnd, VirtualWire, Wire, wait
@@ -21,13 +22,14 @@ from snakesim_can_backend.driver.bring_up import Bus, configure, discovery_error
 from snakesim_can_backend.driver.mocap import MocapReceiver, check_pose, pose_address
 from snakesim_can_backend.driver.module_monitor import ARM_GRACE, Finding, Watch
 from snakesim_can_backend.driver.own_twins import TwinProcess, check_faults, check_twins, modules_know, twins_here
-from snakesim_can_backend.driver.parameters import check_ratings, check_watchdog, parameters_of
+from snakesim_can_backend.driver.parameters import check_drives, check_ratings, check_watchdog, parameters_of
 from snakesim_can_backend.driver.reports import Reading
 from snakesim_can_backend.driver.sensors import Sensors, contacts_due, described
 from snakesim_can_backend.protocol import commands
 from snakesim_can_backend.protocol.definitions import Action, Frame, ModuleState
 from snakesim_can_backend.settings import Settings
 from snakesim_hal.backend import Samples, SetPoints
+from snakesim_hal.drivers.mounting import Mounting
 from snakesim_hal.errors import BackendError, ConfigError
 from snakesim_hal.injection import Injection
 from snakesim_hal.model.robot import describe
@@ -66,6 +68,7 @@ class CanBackend:
         """Real modules support real time only; twins that this backend starts support lockstep. Raises ConfigError."""
         check_load(config, settings)
         check_gains(config.robot)
+        check_drives(config.robot, settings)
         check_ratings(config.robot)
         check_watchdog(config, settings)
         check_pose(config, settings)
@@ -106,6 +109,7 @@ class CanBackend:
         except BaseException:
             self.close()
             raise
+        self._mounting = Mounting(config.robot.joint_table)
         self._sensors = Sensors(config, self._reports, self._reading, self._mocap)
         self._set_points = commands.SetPointWriter(joints)
         self._lifecycle: LifecycleState = "disarmed"
@@ -147,7 +151,7 @@ class CanBackend:
         self._lifecycle = lifecycle
         if lifecycle != "armed":
             return
-        for i, frame in enumerate(self._set_points.frames(set_points)):
+        for i, frame in enumerate(self._set_points.frames(_at_the_shafts(self._mounting, set_points))):
             if i in self._isolated:
                 continue
             if self._wire_of[i].send(frame):
@@ -423,6 +427,13 @@ class CanBackend:
                 self._configure(CONFIGURE_LIMIT_S)
             except BackendError as error:
                 _log.warning("after a clear: %s", error)
+
+
+def _at_the_shafts(mounting: Mounting, points: SetPoints) -> SetPoints:
+    """Set-points of the joints -> of the modules."""
+    targets = mounting.drive_targets(points.mode, points.target).tolist()
+    limits = mounting.drive_torque_limit_nm(np.array(points.torque_limit_nm)).tolist()
+    return SetPoints(points.mode, targets, limits, points.isolated)
 
 
 def answer_limit_s(config: RunConfig, settings: Settings) -> float:

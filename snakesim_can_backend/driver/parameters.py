@@ -7,6 +7,7 @@ from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.definitions import Opcode, Parameter, SafeMotion
 from snakesim_can_backend.settings import Settings
 from snakesim_hal.errors import BackendError, ConfigError
+from snakesim_hal.model.joints import Drive, Joint
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig
 
@@ -23,19 +24,49 @@ def parameters_of(robot: RobotFile, settings: Settings, reports: Reports) -> dic
         Parameter.CONTACT_EVERY: float(reports.contact_every),
         Parameter.IMU_EVERY: float(reports.imu_every),
     }
-    return {
-        node: {
-            Parameter.STIFFNESS: joint.motor.stiffness_nm_per_rad,
-            Parameter.DAMPING: joint.motor.damping_nm_s_per_rad,
-            Parameter.VELOCITY_GAIN: joint.motor.velocity_gain_nm_s_per_rad,
-            Parameter.TORQUE_LIMIT: joint.limits.torque_nm,
-            Parameter.SPEED_LIMIT: joint.limits.speed_rad_s,
-            Parameter.ANGLE_LIMIT: max(-joint.limits.least_rad, joint.limits.most_rad),  # the gate keeps to each side
+    found: dict[int, dict[Parameter, float]] = {}
+    for node, joint in enumerate(robot.joint_table, start=1):
+        motor, gear = joint.motor, joint.drive.gear
+        found[node] = {
+            Parameter.STIFFNESS: motor.stiffness_nm_per_rad / gear**2,
+            Parameter.DAMPING: motor.damping_nm_s_per_rad / gear**2,
+            Parameter.VELOCITY_GAIN: motor.velocity_gain_nm_s_per_rad / gear**2,
+            Parameter.TORQUE_LIMIT: joint.limits.torque_nm / gear,
+            Parameter.SPEED_LIMIT: joint.limits.speed_rad_s * gear,
+            Parameter.ANGLE_LIMIT: _furthest_rad(joint),  # the gate keeps to the nearer side
             **common,
             Parameter.TAIL: float(node == 1 and reports.tail),
         }
-        for node, joint in enumerate(robot.joint_table, start=1)
-    }
+    return found
+
+
+def _furthest_rad(joint: Joint) -> float:
+    """Of the module's shaft, from its own zero."""
+    drive = joint.drive
+    ends = (drive.zero_rad + drive.sign * drive.gear * end for end in (joint.limits.least_rad, joint.limits.most_rad))
+    return max(map(abs, ends))
+
+
+def check_drives(robot: RobotFile, settings: Settings) -> None:
+    """Raise ConfigError for joints whose `[drive]` is not how this backend finds modules."""
+    for number, joint in enumerate(robot.joint_table, start=1):
+        if joint.id != number:
+            raise ConfigError(
+                f"robot {robot.name!r}: `joints.{joint.name}.id` = {joint.id}: modules on CAN have their joint's "
+                f"number as node id, here {number}; give the module that one, and leave `id` out"
+            )
+        if joint.drive.port and joint.drive.port not in settings.channels:
+            raise ConfigError(
+                f"robot {robot.name!r}, {joint.name}: `port` = {joint.drive.port!r} is not among "
+                f"`backends.can.channels` = {settings.channels}"
+            )
+    for name in settings.mounted:
+        if name not in (joint.name for joint in robot.joint_table):
+            raise ConfigError(
+                f"`backends.can.mounted.{name}`: robot {robot.name!r} has joint_1 to joint_{robot.chain.modules}"
+            )
+    if settings.mounted and settings.twins_run == "none":
+        raise ConfigError("`backends.can.mounted` is for twins; the modules on this bus are mounted as they are")
 
 
 def check_ratings(robot: RobotFile, in_force: Mapping[int, Mapping[Parameter, float]] | None = None) -> None:
@@ -43,17 +74,18 @@ def check_ratings(robot: RobotFile, in_force: Mapping[int, Mapping[Parameter, fl
     signals = codec()[Opcode.JOINT_STATE].signals
     joints, hottest_c = robot.joint_table, codec()[Opcode.HEALTH].signals["motor_temperature"].high
     for joint in joints:
-        limits = joint.limits
+        limits, gear = joint.limits, joint.drive.gear
         for what, value, most, unit in (
-            ("limits.angle_rad", max(-limits.least_rad, limits.most_rad), signals["angle"].high, "rad"),
-            ("limits.speed_rad_s", limits.speed_rad_s, signals["velocity"].high / SPEED_ROOM, "rad/s"),
-            ("limits.torque_nm", limits.torque_nm, signals["torque"].high, "N·m"),
+            ("limits.angle_rad", _furthest_rad(joint), signals["angle"].high, "rad"),
+            ("limits.speed_rad_s", limits.speed_rad_s * gear, signals["velocity"].high / SPEED_ROOM, "rad/s"),
+            ("limits.torque_nm", limits.torque_nm / gear, signals["torque"].high, "N·m"),
             ("limits.stop_at_c", limits.stop_at_c, hottest_c, "°C"),
         ):
             if value > most:
+                behind = "" if joint.drive == Drive() else " at the module's shaft, by `gear` and `zero_rad`,"
                 raise ConfigError(
-                    f"robot {robot.name!r}, {joint.name}: `{what}` = {value} {unit} exceeds the range of the bus "
-                    f"protocol, which ends at {most:.3g} {unit}"
+                    f"robot {robot.name!r}, {joint.name}: `{what}` = {value} {unit}{behind} exceeds the range of the "
+                    f"bus protocol, which ends at {most:.3g} {unit}"
                 )
     reach_m = max(robot.link_lengths_m) + robot.module.radius_m
     along_m = codec()[Opcode.CONTACT].signals["along"].high
@@ -69,8 +101,8 @@ def check_ratings(robot: RobotFile, in_force: Mapping[int, Mapping[Parameter, fl
         )
     for node, values in (in_force or {}).items():
         for parameter, asked, unit in (
-            (Parameter.RATED_TORQUE, joints[node - 1].limits.torque_nm, "N·m"),
-            (Parameter.RATED_SPEED, joints[node - 1].limits.speed_rad_s, "rad/s"),
+            (Parameter.RATED_TORQUE, joints[node - 1].limits.torque_nm / joints[node - 1].drive.gear, "N·m"),
+            (Parameter.RATED_SPEED, joints[node - 1].limits.speed_rad_s * joints[node - 1].drive.gear, "rad/s"),
         ):
             if not values[parameter] >= asked * 0.999:  # also rejects a rating of NaN, which the bus can carry
                 raise BackendError(

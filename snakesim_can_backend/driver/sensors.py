@@ -12,6 +12,7 @@ from snakesim_can_backend.driver.reports import Reading
 from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.definitions import HEALTH_PERIOD_S, Opcode
 from snakesim_hal.backend import Samples
+from snakesim_hal.drivers.mounting import Mounting
 from snakesim_hal.model.felt_force import FeltForce
 from snakesim_hal.model.kinematics import tangents
 from snakesim_hal.model.scenario import RunConfig
@@ -29,6 +30,7 @@ class Sensors:
 
     def __init__(self, config: RunConfig, reports: Reports, reading: Reading, mocap: MocapReceiver | None) -> None:
         self._reading, self._reports, self._mocap = reading, reports, mocap
+        self._mounting = Mounting(config.robot.joint_table)
         self._period_ns, self._lease_ns = config.period_ns, config.lease_ns
         self._radius_m, self._lengths_m = config.robot.module.radius_m, config.robot.link_lengths_m
         self._threshold_n = config.robot.sensors.contacts.threshold_n if config.robot.sensors.contacts else 0.0
@@ -60,7 +62,7 @@ class Sensors:
 
     def _joints(self, tick: int, stamp_ns: int) -> JointState:
         reading = self._reading
-        angle, velocity, torque = reading.joints().tolist()
+        angle, velocity, torque = reading.joints()
         ages = [
             (reading.sync - module.sync) * self._period_ns if module.sync >= 0 else LONG_AGO_NS
             for module in reading.modules
@@ -68,9 +70,9 @@ class Sensors:
         return JointState(
             tick=tick,
             stamp_ns=stamp_ns,
-            angle_rad=angle,
-            velocity_rad_s=velocity,
-            torque_nm=torque,
+            angle_rad=self._mounting.joint_angle_rad(angle).tolist(),
+            velocity_rad_s=self._mounting.joint_velocity_rad_s(velocity).tolist(),
+            torque_nm=self._mounting.joint_torque_nm(torque).tolist(),
             valid=[age <= self._lease_ns for age in ages],
             age_ns=ages,
         )

@@ -23,7 +23,9 @@ from snakesim_can_backend.twin.frames import LENGTHS, read_sync
 from snakesim_can_backend.twin.module_sensors import ModuleSensors, PoseCamera
 from snakesim_can_backend.twin.module_slot import ModuleSlot
 from snakesim_can_backend.twin.motors import Motors
+from snakesim_can_backend.twin.mounted import built, joint_target
 from snakesim_can_backend.twin.parameters import Parameters, from_factory
+from snakesim_hal.drivers.mounting import Mounting
 from snakesim_hal.injection import Change, Injection, Plan
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.physics.plant import Plant
@@ -57,7 +59,7 @@ class ModuleChain:
         self.count = robot.chain.modules
         self.counts = shares(config, settings)  # modules on each bus
         self.motors = Motors(robot, plant.step_s)
-        self._joints = robot.joint_table
+        self._joints = built(robot, settings)
         self.thermal = Thermal(self._joints)
         self.buses = [BusTime(settings.bit_rate) for _ in self.counts]
         self.now_us = 0.0  # module time: since the twins were started
@@ -75,7 +77,7 @@ class ModuleChain:
             for joint in range(starts[channel], starts[channel] + count):
                 self._seat(joint, channel, self._serial(joint), -BOOT_US if stepped else 0.0)
         self._senses = [
-            ModuleSensors(robot, plant, start, count, (config.seed, channel))
+            ModuleSensors(robot, plant, Mounting(self._joints[start : start + count]), start, (config.seed, channel))
             for channel, (start, count) in enumerate(zip(starts, self.counts, strict=False))
         ]
         self._send_pose = send_pose
@@ -248,14 +250,15 @@ class ModuleChain:
         slot.driven = demand
         values = slot.module.parameters.values
         damping = Parameter.DAMPING if demand.mode == Mode.POSITION else Parameter.VELOCITY_GAIN
+        mount = slot.built.drive
         self.motors.drive(
             slot.joint,
             demand.mode,
-            demand.target,
-            min(demand.torque_limit_nm, values[Parameter.TORQUE_LIMIT]) if demand.mode else inf,
-            values[Parameter.STIFFNESS],
-            values[damping],
-            values[Parameter.SPEED_LIMIT],
+            joint_target(mount, demand.mode, demand.target),
+            min(demand.torque_limit_nm, values[Parameter.TORQUE_LIMIT]) * mount.gear if demand.mode else inf,
+            values[Parameter.STIFFNESS] * mount.gear**2,
+            values[damping] * mount.gear**2,
+            values[Parameter.SPEED_LIMIT] / mount.gear,
         )
 
     # --- injected faults -----------------------------------------------------------------------------------
@@ -290,18 +293,20 @@ class ModuleChain:
             case kind:
                 slot.end(kind)
 
-    def _seat(self, joint: int, channel: int, serial: int, now_us: float, *, drives: bool = True) -> None:
-        built = self._joints[joint]
+    def _seat(self, number: int, channel: int, serial: int, now_us: float, *, drives: bool = True) -> None:
+        joint = self._joints[number]
         module = Module(
-            joint + 1,
+            number + 1,
             serial,
-            Parameters(from_factory(built.limits.torque_nm, built.limits.speed_rad_s)),
-            self.thermal.limits[joint],
-            least_voltage_v=built.limits.least_voltage_v,
+            Parameters(
+                from_factory(joint.limits.torque_nm / joint.drive.gear, joint.limits.speed_rad_s * joint.drive.gear)
+            ),
+            self.thermal.limits[number],
+            least_voltage_v=joint.limits.least_voltage_v,
             stepped=self.stepped,
             now_us=now_us,
         )
-        self.slots.append(ModuleSlot(len(self.slots), channel, joint, module, built, drives))
+        self.slots.append(ModuleSlot(len(self.slots), channel, number, module, joint, drives))
 
     def _serial(self, joint: int) -> int:
         return crc32(f"{self._seed}:{joint + 1}".encode())

@@ -24,6 +24,7 @@ from snakesim_can_backend.twin.reports import (
     touch,
 )
 from snakesim_hal.arrays import Floats
+from snakesim_hal.drivers.mounting import Mounting
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.sensors import PoseSensor
 from snakesim_hal.physics.plant import LinkLoad, Plant
@@ -32,9 +33,10 @@ from snakesim_hal.physics.plant import LinkLoad, Plant
 class ModuleSensors:
     """Sensors of neighbouring modules on one bus, with a noise generator of their own."""
 
-    def __init__(self, robot: RobotFile, plant: Plant, first: int, count: int, seed: Sequence[int]) -> None:
-        """first: index of their first joint, 0 at the tail."""
-        self._plant, self._first, self._count = plant, first, count
+    def __init__(self, robot: RobotFile, plant: Plant, mounting: Mounting, first: int, seed: Sequence[int]) -> None:
+        """mounting: of these modules; first: index of their first joint, 0 at the tail."""
+        count = len(mounting.sign)
+        self._plant, self._mounting, self._first, self._count = plant, mounting, first, count
         self._noise = np.random.default_rng(seed).standard_normal
         joints = robot.sensors.joints
         sigma = [joints.angle_noise_rad, joints.velocity_noise_rad_s, joints.torque_noise_nm]
@@ -49,10 +51,12 @@ class ModuleSensors:
         joints = np.stack((self._plant.angle_rad[here], self._plant.velocity_rad_s[here], torque_nm[here]))
         if self._noisy:
             joints += self._joint_sigma * self._noise((3, self._count))
+        angles = self._mounting.drive_angle_rad(joints[0])
+        velocities, torques = self._mounting.drive_velocity_rad_s(joints[1]), self._mounting.drive_torque_nm(joints[2])
         readings = [
             Readings(angle, velocity, torque, bool(hot))
             for angle, velocity, torque, hot in zip(
-                ANGLE.many(joints[0]), VELOCITY.many(joints[1]), TORQUE.many(joints[2]), derated[here], strict=True
+                ANGLE.many(angles), VELOCITY.many(velocities), TORQUE.many(torques), derated[here], strict=True
             )
         ]
         self._feel(readings)
@@ -84,7 +88,8 @@ class ModuleSensors:
 
     def _weigh(self, readings: list[Readings], due: Sequence[bool]) -> None:
         shaft = self._plant.shaft_torque_nm()[self._first : self._first + self._count]
-        shafts = SHAFT_LOAD.many(shaft + self._torque_sigma * self._noise(self._count))
+        noise = self._torque_sigma * self._noise(self._count)
+        shafts = SHAFT_LOAD.many(self._mounting.drive_torque_nm(shaft + noise))
         imu = self._plant.imu() if self._imu is not None else None
         for i, reading in enumerate(readings):
             if not due[i]:

@@ -71,6 +71,7 @@ def put_body(found: Imported, row: Row, order: Order, urdf: Element) -> list[Flo
             found.names.append(f"{name}: {', '.join(body.links)}")
     for name, joint, axis in zip(ours[1], row.joints, axes, strict=True):
         turned = float((turn @ joint.axis)[2 if axis == "yaw" else 1]) < 0
+        found.negated.append(turned)
         if joint.name != name or turned:
             found.names.append(f"{name}: {joint.name}, {axis}{', its angle negated' if turned else ''}")
     return frames

@@ -50,14 +50,15 @@ def _by_section(values: dict[str, Any], within: str = "") -> Iterator[tuple[str,
 
 
 def _joint(robot: RobotFile, number: int, from_rear_m: float) -> list[str]:
-    limits, motor = robot.limits, robot.motor
+    joint = robot.joint_table[number - 1]
+    limits, motor = joint.limits, joint.motor
     return [
         f'  <joint name="joint_{number}" type="revolute">',
         f'    <parent link="link_{number - 1}"/>',
         f'    <child link="link_{number}"/>',
         f'    <origin xyz="{from_rear_m!r} 0 0" rpy="0 0 0"/>',
-        f'    <axis xyz="{AXES[robot.axes[number - 1]]}"/>',
-        f'    <limit lower="{-limits.angle_rad!r}" upper="{limits.angle_rad!r}" effort="{limits.torque_nm!r}" '
+        f'    <axis xyz="{AXES[joint.axis]}"/>',
+        f'    <limit lower="{limits.least_rad!r}" upper="{limits.most_rad!r}" effort="{limits.torque_nm!r}" '
         f'velocity="{limits.speed_rad_s!r}"/>',
         f'    <dynamics damping="{motor.viscous_nm_s_per_rad!r}" friction="{motor.friction_nm!r}"/>',
         "  </joint>",

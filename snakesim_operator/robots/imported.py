@@ -24,6 +24,7 @@ class Imported:
 
     table: Table
     names: list[str] = field(default_factory=list[str])  # ours, and those of the URDF
+    negated: list[bool] = field(default_factory=list[bool])  # for each joint: our angle is minus the URDF's
     changed: list[str] = field(default_factory=list[str])
     left_out: list[str] = field(default_factory=list[str])
 

@@ -34,8 +34,10 @@ def robot_of(file: Path, order: Order) -> Imported:
     found = Imported(_rest(urdf, order))
     row = row_of(urdf, file, tail=order.tail, warn=found.left_out.append)
     frames = put_body(found, row, order, urdf)
-    put_limits(found.table, row.joints, str(file), found.changed.append)
-    if urdf.first("snakesim") is not None:  # of a <snakesim> element; the others say the same, in fewer words
+    found.table.put("name", _name(urdf.get("name", file.stem)), str(file))
+    own = urdf.first("snakesim") is not None
+    put_limits(found.table, row.joints, found.negated, str(file), found.changed.append, own=own)
+    if own:  # of a <snakesim> element; the others say the same, in fewer words
         for gazebo in urdf.all("gazebo"):
             gazebo.read_all()
     else:
@@ -43,7 +45,6 @@ def robot_of(file: Path, order: Order) -> Imported:
         found.changed.append(
             f"not in the file, so as of robot {order.like!r}: gains, rates of change, heat, safety, noise"
         )
-    found.table.put("name", _name(urdf.get("name", file.stem)), str(file))
     found.table.values = dict(sorted(found.table.values.items(), key=lambda item: SECTIONS.get(item[0], len(SECTIONS))))
     _warn_unread(found, urdf)
     if found.table.values["name"] in shipped("robots"):
@@ -60,7 +61,8 @@ def _rest(urdf: Element, order: Order) -> Table:
     own = urdf.all("snakesim")
     if not own:
         table = read_part(order.like, "robots")
-        table.values.pop("links", None)
+        for of_another_body in ("links", "joints"):
+            table.values.pop(of_another_body, None)
         for mounted in ("depth", "range"):  # their places fit another body
             table.values.get("sensors", {}).pop(mounted, None)
         table.put("about", f"Imported from {Path(urdf.source).name}.", urdf.source)

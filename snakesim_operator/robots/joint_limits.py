@@ -1,75 +1,101 @@
-"""Limits and friction of a URDF's joints. A robot file has one set for all joints: the tightest, which is reported."""
+"""Limits and friction of a URDF's joints: what most of them have holds for all, the others have exceptions."""
 
+from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass
 
-from snakesim_hal.model.files import Table
+from snakesim_hal.model.files import Table, decode
+from snakesim_hal.model.joints import MAX_TURN_RAD
+from snakesim_hal.model.robot import RobotFile
 from snakesim_operator.robots.urdf_tree import Joint
 
-FULL_TURN_RAD = 3.14159
+SAID = (  # element, attribute, and where a robot file has it
+    ("limit", "velocity", "limits", "speed_rad_s"),
+    ("limit", "effort", "limits", "torque_nm"),
+    ("dynamics", "damping", "motor", "viscous_nm_s_per_rad"),
+    ("dynamics", "friction", "motor", "friction_nm"),
+)
 
 
-def put_limits(table: Table, joints: list[Joint], source: str, warn: Callable[[str], None]) -> None:
-    """Put what the joints say into a robot file's values; what they do not say stays. Raises ConfigError."""
+@dataclass(frozen=True)
+class Turning:
+    """How far a joint turns, by our sign."""
+
+    least_rad: float
+    most_rad: float
+
+
+def put_limits(
+    table: Table, joints: list[Joint], negated: list[bool], source: str, warn: Callable[[str], None], *, own: bool
+) -> None:
+    """Put what the joints say into a robot file's values; what they do not say stays. Raises ConfigError.
+
+    negated: whether our angle is minus theirs. own: the values are those of the same robot, as exported; then only what
+    the joints say otherwise is put.
+    """
     endless = [joint.name for joint in joints if joint.element.get("type") == "continuous"]
     if endless:
-        warn(f"{', '.join(endless)}: continuous; here they turn by {FULL_TURN_RAD} rad to either side")
-    angles = {joint.name: _angle(joint, warn) for joint in joints}
-    _put(table, "limits.angle_rad", angles, min, source, warn)
-    said: dict[str, dict[str, float]] = {
-        "speed_rad_s": {},
-        "torque_nm": {},
-        "viscous_nm_s_per_rad": {},
-        "friction_nm": {},
-    }
-    for joint in joints:
-        for tag, attribute, key in (
-            ("limit", "velocity", "speed_rad_s"),
-            ("limit", "effort", "torque_nm"),
-            ("dynamics", "damping", "viscous_nm_s_per_rad"),
-            ("dynamics", "friction", "friction_nm"),
-        ):
-            element = joint.element.first(tag)
-            if element is not None and element.has(attribute):
-                value = element.number(attribute)
-                if value > 0 or tag == "dynamics":
-                    said[key][joint.name] = value
-    for key, values in said.items():
-        dotted = f"{'limits' if key in ('speed_rad_s', 'torque_nm') else 'motor'}.{key}"
-        if values:
-            _put(table, dotted, values, min if dotted.startswith("limits") else max, source, warn)
-        elif dotted.startswith("limits"):
-            kept = table.values.get("limits", {}).get(key)
-            warn(f"no joint says its `{'effort' if key == 'torque_nm' else 'velocity'}`; {dotted} stays {kept}")
+        warn(f"{', '.join(endless)}: continuous; here they turn by {MAX_TURN_RAD} rad to either side")
+    angles = [_turning(joint, turned) for joint, turned in zip(joints, negated, strict=True)]
+    said = {key: [_number(joint, tag, attribute) for joint in joints] for tag, attribute, _, key in SAID}
+    if not own:
+        _put_common_angles(table, angles, source)
+    for _, attribute, section, key in SAID:
+        known = [value for value in said[key] if value is not None]
+        if known and not own:
+            table.put(f"{section}.{key}", Counter(known).most_common(1)[0][0], source)
+        elif not known and section == "limits":
+            kept = table.values.get(section, {}).get(key)
+            warn(f"no joint says its `{attribute}`; {section}.{key} stays {kept}")
+    differ: dict[str, list[str]] = {}
+    for i, built in enumerate(decode(table, RobotFile).joint_table):
+        found = {
+            "angle_min_rad": (angles[i].least_rad, built.limits.least_rad, "rad"),
+            "angle_max_rad": (angles[i].most_rad, built.limits.most_rad, "rad"),
+            "speed_rad_s": (said["speed_rad_s"][i], built.limits.speed_rad_s, "rad/s"),
+            "torque_nm": (said["torque_nm"][i], built.limits.torque_nm, "N·m"),
+            "viscous_nm_s_per_rad": (said["viscous_nm_s_per_rad"][i], built.motor.viscous_nm_s_per_rad, "N·m·s/rad"),
+            "friction_nm": (said["friction_nm"][i], built.motor.friction_nm, "N·m"),
+        }
+        for key, (theirs, ours, unit) in found.items():
+            if theirs is not None and theirs != ours:
+                table.put(f"joints.{built.name}.{key}", theirs, source)
+                differ.setdefault(key, []).append(f"{built.name} ({joints[i].name}) {theirs:g} {unit}")
+    for key, values in differ.items():
+        more = f" and {len(values) - 8} more" if len(values) > 8 else ""
+        warn(f"{key} differs from that of the others: {', '.join(values[:8])}{more}")
 
 
-def _angle(joint: Joint, warn: Callable[[str], None]) -> float:
-    """To either side of zero."""
+def _turning(joint: Joint, negated: bool) -> Turning:
+    """As the URDF says, at most half a turn to either side."""
     if joint.element.get("type") == "continuous":
-        return FULL_TURN_RAD
+        return Turning(-MAX_TURN_RAD, MAX_TURN_RAD)
     limit = joint.element.first("limit")
     if limit is None:
         raise joint.element.wrong("is revolute and has no <limit>; add lower and upper")
     lower, upper = limit.number("lower", "0"), limit.number("upper", "0")
     if not lower < 0 < upper:
         raise limit.wrong(f"is {lower:g} to {upper:g} rad; a joint must be able to turn to either side of zero")
-    if abs(lower + upper) > 1e-9:
-        warn(
-            f"joint {joint.name!r} turns from {lower:g} to {upper:g} rad; here by {min(-lower, upper):g} to either side"
-        )
-    return min(-lower, upper, FULL_TURN_RAD)
+    lower, upper = max(lower, -MAX_TURN_RAD), min(upper, MAX_TURN_RAD)
+    return Turning(-upper, -lower) if negated else Turning(lower, upper)
 
 
-def _put(
-    table: Table,
-    dotted: str,
-    values: dict[str, float],
-    choose: Callable[..., float],
-    source: str,
-    warn: Callable[[str], None],
-) -> None:
-    chosen = choose(values.values())
-    others = [f"{name!r} {value:g}" for name, value in values.items() if value != chosen]
-    if others:
-        shown = ", ".join(others[:8]) + (f" and {len(others) - 8} more" if len(others) > 8 else "")
-        warn(f"{dotted} = {chosen:g} for all joints; the file has {shown}")
-    table.put(dotted, chosen, source)
+def _number(joint: Joint, tag: str, attribute: str) -> float | None:
+    element = joint.element.first(tag)
+    if element is None or not element.has(attribute):
+        return None
+    value = element.number(attribute)
+    return value if value > 0 or tag == "dynamics" else None
+
+
+def _put_common_angles(table: Table, angles: list[Turning], source: str) -> None:
+    """`angle_rad`, and the sides where they differ."""
+    common = Counter(angles).most_common(1)[0][0]
+    limits = table.values.get("limits", {})
+    for side in ("angle_min_rad", "angle_max_rad"):
+        limits.pop(side, None)
+    table.put("limits.angle_rad", max(-common.least_rad, common.most_rad), source)
+    if -common.least_rad < common.most_rad:
+        table.put("limits.angle_min_rad", common.least_rad, source)
+    if -common.least_rad > common.most_rad:
+        table.put("limits.angle_max_rad", common.most_rad, source)

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from snakesim_can_backend.protocol.definitions import PARAMETERS, Parameter
-from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.settings import Mounted, Settings
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.files import Table, decode
 
@@ -16,6 +16,7 @@ GOOD: dict[str, Any] = {
     "twins": "process",
     "plant": "mujoco",
     "plant_settings": {"anything": 1},
+    "mounted": {"joint_2": {"sign": -1, "gear": 9.0}},
     "faults": ["mute:joint_3@2"],
     "contact_rate_hz": 50.0,
     "imu_rate_hz": 0.0,
@@ -33,7 +34,8 @@ def read(section: dict[str, Any]) -> Settings:
 def test_everything_can_be_set_and_nothing_must() -> None:
     assert set(GOOD) == set(Settings.__struct_fields__)
     settings = read(GOOD)
-    assert {name: getattr(settings, name) for name in GOOD} == GOOD
+    wanted = {**GOOD, "mounted": {"joint_2": Mounted(sign=-1, gear=9.0)}}
+    assert {name: getattr(settings, name) for name in GOOD} == wanted
     assert read({}) == Settings()
 
 

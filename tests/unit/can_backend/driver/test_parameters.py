@@ -6,12 +6,13 @@ import msgspec
 import pytest
 
 from snakesim_can_backend.bus.load import Reports
-from snakesim_can_backend.driver.parameters import SPEED_ROOM, check_ratings, parameters_of
+from snakesim_can_backend.driver.parameters import SPEED_ROOM, check_drives, check_ratings, parameters_of
 from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.definitions import PARAMETERS, Opcode, Parameter, SafeMotion
-from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.settings import Mounted, Settings
 from snakesim_hal.errors import BackendError, ConfigError
 from snakesim_hal.model.files import decode, read_part, shipped
+from snakesim_hal.model.joints import JointExceptions
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import load
 
@@ -55,6 +56,40 @@ def test_values_are_those_of_the_robot_file_and_of_the_settings() -> None:
         Parameter.IMU_EVERY: 17.0,
         Parameter.TAIL: 1.0,
     }
+
+
+def test_a_module_behind_a_gear_is_told_what_its_own_shaft_does() -> None:
+    own = JointExceptions(sign=-1, gear=2.0, zero_rad=0.5, angle_min_rad=-0.4, angle_max_rad=1.2, torque_nm=6.0)
+    robot = msgspec.structs.replace(ROBOT, joints={"joint_2": own})
+    first, second = (parameters_of(robot, Settings(), Reports(100.0))[node] for node in (1, 2))
+    assert first[Parameter.TORQUE_LIMIT] == 7.0 and first[Parameter.ANGLE_LIMIT] == 1.5708
+    assert second[Parameter.STIFFNESS] == first[Parameter.STIFFNESS] / 4
+    assert (second[Parameter.TORQUE_LIMIT], second[Parameter.SPEED_LIMIT]) == (3.0, 15.0)
+    assert second[Parameter.ANGLE_LIMIT] == pytest.approx(1.9), "from 0.5 - 2.4 to 0.5 + 0.8 rad"
+    check_ratings(robot, {2: {Parameter.RATED_TORQUE: 3.0, Parameter.RATED_SPEED: 15.0}})
+
+
+MISPLACED = {
+    "an id": (JointExceptions(id=25), {}, ["`joints.joint_2.id` = 25", "here 2", "leave `id` out"]),
+    "a port": (JointExceptions(port="can3"), {}, ["joint_2: `port` = 'can3'", "`backends.can.channels`"]),
+    "a zero": (JointExceptions(zero_rad=2.5), {}, ["joint_2: `limits.angle_rad` = 4.07", "at the module's shaft"]),
+    "a joint": (JointExceptions(), {"mounted": {"joint_99": Mounted(sign=-1)}}, ["mounted.joint_99", "to joint_13"]),
+    "no twins": (
+        JointExceptions(),
+        {"mounted": {"joint_2": Mounted(sign=-1)}, "twins": "none", "channels": ["can0"]},
+        ["is for twins"],
+    ),
+}
+
+
+@pytest.mark.parametrize("wrong", MISPLACED)
+def test_drives_that_the_bus_cannot_have_are_refused(wrong: str) -> None:
+    own, settings, words = MISPLACED[wrong]
+    robot = msgspec.structs.replace(ROBOT, joints={"joint_2": own})
+    with pytest.raises(ConfigError) as caught:
+        check_drives(robot, Settings(**settings))
+        check_ratings(robot)
+    assert all(word in str(caught.value) for word in words), str(caught.value)
 
 
 @pytest.mark.parametrize("tail", [True, False])

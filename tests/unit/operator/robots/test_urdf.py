@@ -69,6 +69,37 @@ def test_every_shipped_robot_comes_back_as_it_was(name: str, tmp_path: Path) -> 
     assert decode(read_part(str(back), "robots"), RobotFile) == decode(read_part(name, "robots"), RobotFile)
 
 
+def test_each_joint_keeps_its_own_limits_and_friction_on_the_way_there_and_back(tmp_path: Path) -> None:
+    own, back, edited = tmp_path / "own.toml", tmp_path / "back.toml", tmp_path / "edited.urdf"
+    own.write_text(
+        'extends = "planar13"\nname = "own"\n[drive]\ngear = 1.5\n'
+        "[joints.joint_2]\nsign = -1\nzero_rad = 0.3\nangle_min_rad = -0.4\nspeed_rad_s = 3.0\n"
+        "[joints.joint_5]\nangle_rad = 0.8\ntorque_nm = 2.5\nfriction_nm = 0.1\nvoltage_v = 22.0\n"
+    )
+    export_robot(str(own), tmp_path / "own.urdf")
+    import_robot(tmp_path / "own.urdf", Order(), back)
+    robot = decode(read_part(str(own), "robots"), RobotFile)
+    assert decode(read_part(str(back), "robots"), RobotFile) == robot
+    theirs = by_mujoco(urdf_of(robot))
+    assert theirs.joint("joint_2").range == pytest.approx([-0.4, 1.5708])
+    assert theirs.joint("joint_5").range == pytest.approx([-0.8, 0.8])
+    assert theirs.joint("joint_5").frictionloss[0] == 0.1 and theirs.joint("joint_4").frictionloss[0] == 0.0
+    text = (tmp_path / "own.urdf").read_text()
+    assert text.count('lower="-0.4"') == 1
+    edited.write_text(text.replace('lower="-0.4"', 'lower="-0.7"'))
+    found = robot_of(edited, Order())
+    assert found.robot.joint_table[1].limits.least_rad == -0.7, "what was changed in the URDF counts"
+    assert "angle_min_rad differs from that of the others: joint_2 (joint_2) -0.7 rad" in found.changed
+
+
+def test_a_robot_from_elsewhere_has_exceptions_only_where_its_joints_differ() -> None:
+    slider, hexa = robot_of(SLIDER, Order()).robot, robot_of(HEXA, HEXA_ORDER).robot
+    assert slider.limits.torque_nm == 4.1 and len(slider.joints) == 1
+    assert [joint.limits.torque_nm for joint in slider.joint_table].count(3.8) == 1
+    sides = [(joint.limits.least_rad, joint.limits.most_rad) for joint in hexa.joint_table]
+    assert sides == [(-1.5, 1.5), (-1.4, 1.6), *[(-1.5, 1.5)] * 4], "its angle is negated"
+
+
 def test_a_robot_that_was_exported_and_imported_runs_to_the_same_digest(tmp_path: Path) -> None:
     export_robot("planar13", tmp_path / "robot.urdf")
     import_robot(tmp_path / "robot.urdf", Order(), tmp_path / "robot.toml")
@@ -96,7 +127,8 @@ def test_mujocos_own_importer_reads_the_same_bodies_joints_and_shapes(name: str)
     for i, axis in enumerate(robot.axes):
         joint = theirs.joint(f"joint_{i + 1}")
         assert joint.axis.tolist() == ([0, 0, 1] if axis == "yaw" else [0, 1, 0])
-        assert joint.range == pytest.approx([-robot.limits.angle_rad, robot.limits.angle_rad])
+        limits = robot.joint_table[i].limits
+        assert joint.range == pytest.approx([limits.least_rad, limits.most_rad])
 
 
 def test_a_planar_snake_from_elsewhere_has_the_inertia_that_mujoco_reads(tmp_path: Path) -> None:
@@ -155,9 +187,10 @@ def test_what_cannot_be_carried_over_is_named_with_its_lines() -> None:
     for words in (
         "hinge02",
         "continuous",
-        "'hinge01' 4.1",
+        "torque_nm differs from that of the others: joint_",
+        ") 3.8 N·m",
         "link_3 has an inertia that no body has",
-        "-1.6 to 1.4 rad",
+        "angle_max_rad differs from that of the others: joint_2 (b_c) 1.6 rad",  # -1.6 to 1.4, and negated
     ):
         assert words in changed
     assert (
