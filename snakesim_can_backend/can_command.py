@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from math import ceil
 from pathlib import Path
 
-from snakesim_can_backend.bus.adapter import open_wire
+from snakesim_can_backend.bus.adapter import check_channel, open_bus, open_wire
 from snakesim_can_backend.bus.bus import Wire
 from snakesim_can_backend.bus.load import (
     BIT_RATE,
@@ -23,6 +23,7 @@ from snakesim_can_backend.bus.load import (
     shares,
     what_fits,
 )
+from snakesim_can_backend.bus.strangers import Stranger, strangers
 from snakesim_can_backend.driver.backend import answer_limit_s
 from snakesim_can_backend.driver.bring_up import Bus, Identity, find
 from snakesim_can_backend.driver.offline import Replay, against_record, messages
@@ -41,6 +42,7 @@ from snakesim_hal.record.host_record import BLACK_BOX
 from snakesim_hal.terminal import say
 
 OK, FAILED = 0, 1
+LISTEN_S = 0.3  # for others on a bus; most devices say something five times a second or more
 MAX_RATE_HZ = 5000  # of a scenario
 COLUMNS = (
     *("channel", "node", "serial", "firmware", "protocol", "emulated", "state", "faults", "uptime"),
@@ -68,13 +70,14 @@ def parser() -> argparse.ArgumentParser:
     asked.set_defaults(act=_load)
 
     answering = commands.add_parser(
-        "scan", help="list every module that answers; sends only identify, and changes nothing"
+        "scan", help="list every module that answers; sends only identify, and nothing where others use the bus"
     )
     answering.add_argument("channel", nargs="+", help="SocketCAN interface such as can0, or slcan:/dev/ttyACM0")
     answering.add_argument(
         "--bit-rate", type=number(10_000, 1_000_000, "bit/s"), default=BIT_RATE, help="of an adapter (1000000)"
     )
     answering.add_argument("--seconds", type=_seconds, default=1.0, help="how long to listen on each (default: 1)")
+    answering.add_argument("--anyway", action="store_true", help="send identify also where others use the bus")
     answering.set_defaults(act=_scan)
 
     again = commands.add_parser(
@@ -154,6 +157,11 @@ def _cell(joints: int, reports: Reports) -> str:
 def _scan(arguments: argparse.Namespace) -> int:
     found = 0
     for channel in arguments.channel:
+        if not arguments.anyway and (others := overheard(channel, arguments.bit_rate)):
+            say(f"{channel}: others use this bus, and nothing was sent; to ask for modules all the same add --anyway")
+            for other in others:
+                say(f"  {other}")
+            continue
         wire = open_wire(channel, bit_rate=arguments.bit_rate)
         try:
             rows = scan(wire, arguments.seconds)
@@ -163,6 +171,16 @@ def _scan(arguments: argparse.Namespace) -> int:
             say(line)
         found += len(rows)
     return OK if found else FAILED
+
+
+def overheard(channel: str, bit_rate: int) -> list[Stranger]:
+    """Who else is on a bus. Sends nothing."""
+    check_channel(channel)
+    bus = open_bus(channel, bit_rate)
+    try:
+        return strangers(bus, LISTEN_S)
+    finally:
+        bus.shutdown()
 
 
 def scan(wire: Wire, seconds: float) -> list[dict[str, str]]:

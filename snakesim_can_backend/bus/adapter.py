@@ -56,23 +56,30 @@ def _parted(channel: str) -> tuple[str, str]:
     return interface, name
 
 
+def open_bus(channel: str, bit_rate: int) -> can.BusABC:
+    """python-can's bus of a channel. Raises BackendError when it cannot be opened."""
+    interface, name = _parted(channel)
+    settings: dict[str, Any] = {} if interface in (*LOCAL, "socketcan") else {"bitrate": bit_rate}
+    if interface == "udp_multicast":
+        settings["fd"] = False
+    try:
+        return can.Bus(interface=interface, channel=name, **settings)
+    except (*IO_ERRORS, ImportError, TypeError) as error:  # the last two: of a library that is missing, or too old
+        raise BackendError(f"{channel}: cannot be opened: {error}") from error
+
+
 class AdapterWire:
     """One end of a bus, through python-can. Frames that are no classic data frames of 11 bits are dropped."""
 
     def __init__(self, channel: str, only: Iterable[Opcode] | None, bit_rate: int) -> None:
         """Raises BackendError when it cannot be opened."""
         self.channel = channel
-        interface, name = _parted(channel)
-        settings: dict[str, Any] = {} if interface in LOCAL else {"bitrate": bit_rate}
-        if interface == "udp_multicast":
-            settings["fd"] = False
         self._only = None if only is None else frozenset(int(opcode) for opcode in only)
-        try:
-            self._bus = can.Bus(interface=interface, channel=name, **settings)
-        except (*IO_ERRORS, ImportError, TypeError) as error:  # the last two: of a library that is missing, or too old
-            raise BackendError(f"{channel}: cannot be opened: {error}") from error
+        self._bus = open_bus(channel, bit_rate)
         self._file = self._descriptor()
-        self._echoes: Counter[Frame] | None = Counter() if interface == "udp_multicast" else None  # of own frames
+        self._echoes: Counter[Frame] | None = (
+            Counter() if channel.startswith("udp_multicast:") else None
+        )  # of own frames
         self._found: list[BusError] = []
 
     def send(self, frame: Frame) -> bool:

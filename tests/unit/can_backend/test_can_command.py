@@ -1,11 +1,12 @@
 """`snakesim can`: the sum of a bus, who answers on it, and the spelled-out DBC file."""
 
+import re
 import uuid
 from pathlib import Path
 
+import can
 import pytest
 
-from snakesim_can_backend import can_command
 from snakesim_can_backend.bus.bus import VirtualWire
 from snakesim_can_backend.bus.load import check_load, load, reports_at
 from snakesim_can_backend.can_command import COLUMNS, UNKNOWN, aligned, main, scan, settings_of
@@ -155,12 +156,45 @@ def test_a_module_that_only_says_who_it_is_has_nothing_made_up() -> None:
         assert {row[name] for name in ("state", "faults", "uptime", "voltage", "motor", "shaft")} == {UNKNOWN}
 
 
-def test_scan_of_an_empty_bus_is_a_failure(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(can_command, "open_wire", lambda name, bit_rate: VirtualWire(name))
-    assert main(["scan", f"scan-{uuid.uuid4().hex[:8]}", "--seconds", "0.05"]) == 1
+def test_scan_of_an_empty_bus_is_a_failure(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["scan", f"virtual:scan-{uuid.uuid4().hex[:8]}", "--seconds", "0.05"]) == 1
     assert "no module answers" in capsys.readouterr().out
 
 
 def test_scan_of_an_interface_that_is_not_there() -> None:
     with pytest.raises(ConfigError, match="nocan7"):
         main(["scan", "nocan7"])
+
+
+def test_scan_of_a_bus_of_strangers_says_whose_and_sends_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    channel = f"scan-{uuid.uuid4().hex[:8]}"
+    theirs = [
+        can.Message(arbitration_id=0x705, data=b"\x05", is_extended_id=False),
+        can.Message(arbitration_id=0x061, data=bytes([0, 0, 0, 0, 8, 0, 0, 0]), is_extended_id=False),
+        can.Message(arbitration_id=0x1234567, data=bytes(8)),
+        can.Message(arbitration_id=0x7FF, data=bytes(3), is_extended_id=False),
+        codec_message(codec()[Opcode.HEARTBEAT].frame(4, state=ModuleState.DISARMED)),
+    ]
+    with can.Bus(interface="virtual", channel=channel) as bus:
+        chatter = [bus.send_periodic(message, 0.01) for message in theirs]
+        said_no = main(["scan", f"virtual:{channel}", "--seconds", "0.05"])
+        assert bus.recv(0) is None, "something was sent"
+        assert main(["scan", f"virtual:{channel}", "--seconds", "0.05", "--anyway"]) == 1
+        heard = [bus.recv(0.5)]
+        for task in chatter:
+            task.stop()
+    assert said_no == 1 and heard[0] is not None
+    said = capsys.readouterr().out
+    for line in (
+        r"virtual:\S+: others use this bus, and nothing was sent; .*--anyway",
+        r"  0x061  8 bytes  \d+ frames  as ODrive's heartbeat of node 3\n",
+        r"  0x705  1 bytes  \d+ frames  as CANopen's heartbeat of node 5, operational\n",
+        r"  0x7FF  3 bytes  \d+ frames  unknown\n",
+        r"  0x01234567  8 bytes  \d+ frames  29-bit id\n",
+    ):
+        assert re.search(line, said), f"{line} is not in {said}"
+    assert "0x1C4" not in said  # a heartbeat of ours
+
+
+def codec_message(frame: Frame) -> can.Message:
+    return can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False)
