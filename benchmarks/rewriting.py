@@ -1,6 +1,6 @@
 """`python -m benchmarks.rewriting RUN...`: what a recorder costs and an hour takes, by writing recordings again.
 
-CPU time, so that a busy machine matters little. Channels for Foxglove are made again, or left out. The share of a core
+CPU time, so that a busy machine matters little. Topics for viewers are made again, or left out. The share of a core
 is that of the writing alone, without what receiving the messages costs.
 """
 
@@ -9,22 +9,19 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from contextlib import nullcontext
 from pathlib import Path
-from unittest.mock import patch
 
 from snakesim_hal.network.session import Arrival
 from snakesim_operator.playback.info import recording_of
-from snakesim_operator.recording.foxglove import FoxgloveChannels
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.recording.recording import FLUSH_S, Recording
 
 TIMES = 5
 
 
-def rewrite(arrivals: Sequence[Arrival], path: Path) -> tuple[float, int]:
+def rewrite(arrivals: Sequence[Arrival], path: Path, shown_as: str | None) -> tuple[float, int]:
     """CPU seconds and bytes of a recording of these messages, in chunks as in real time."""
-    recording, began_s = Recording(path), time.process_time()
+    recording, began_s = Recording(path, shown_as), time.process_time()
     flush_ns = 0
     for arrival in arrivals:
         recording.take(arrival)
@@ -36,7 +33,7 @@ def rewrite(arrivals: Sequence[Arrival], path: Path) -> tuple[float, int]:
 
 
 def main() -> int:
-    """Print a row for each recording, with and without channels for Foxglove."""
+    """Print a row for each recording, with and without topics for viewers."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="folders of runs, or MCAP files")
     print("| recording | messages/s | CPU a message | of a core | an hour on disk |\n|---|---|---|---|---|")
@@ -45,12 +42,9 @@ def main() -> int:
         arrivals = [Arrival(one.key, one.payload, one.encoding, one.time_ns) for one in found]
         times_ns = [one.time_ns for one in found if one.time_ns]
         lasted_s = (max(times_ns) - min(times_ns)) * 1e-9
-        for what, without in (
-            ("", nullcontext()),
-            (", without Foxglove's channels", patch.object(FoxgloveChannels, "take", lambda *_: [])),
-        ):
-            with tempfile.TemporaryDirectory() as folder, without:
-                written = [rewrite(arrivals, Path(folder) / f"{i}.mcap") for i in range(TIMES)]
+        for what, shown_as in (("", "robot"), (", `--raw-only`", None)):
+            with tempfile.TemporaryDirectory() as folder:
+                written = [rewrite(arrivals, Path(folder) / f"{i}.mcap", shown_as) for i in range(TIMES)]
             cpu_s, size = min(written)
             print(
                 f"| {run}{what} | {len(found) / lasted_s:.0f} | {cpu_s / len(found) * 1e6:.1f} us "

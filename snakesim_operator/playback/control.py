@@ -154,7 +154,7 @@ class Replay:
         self._settings = Decoder(ControlSettings)
         self._kept = {o.key.removeprefix(CHOSEN[0]): o.value for o in overrides if o.key.startswith(CHOSEN[0])}
         self._asked: list[tuple[ControlSettings, LocalQuery]] = []  # changes of settings without an answer yet
-        self._recording = Recording(out) if out is not None else None
+        self._recording = Recording(out, self.config.robot.name) if out is not None else None
 
     def run(self) -> Comparison:
         """Replay it all. Raises SnakesimError when a service fails."""

@@ -26,7 +26,7 @@ class DecoderFactory(McapDecoderFactory):
         """The decoder of a channel; None if it is not one of ours."""
         if schema is None or not schema.name.startswith(PREFIX):
             return None
-        if message_encoding == "json":  # made for viewers, such as `foxglove/state`
+        if message_encoding == "json":  # made for viewers, such as `/planar13/state`
             return msgspec.json.decode
         known = self._decoders.get(schema.name)
         return msgspec.msgpack.decode if known is None else known.decode

@@ -1,10 +1,13 @@
-"""Channels that Foxglove and Rerun show as they are, made of the newest messages a few times a second.
+"""Channels that Foxglove, PlotJuggler and Rerun show as they are, beside the raw ones, named as ROS users expect.
 
-They are beside the raw ones, in Foxglove's protobuf schemas: `foxglove/tf` (a chain: each link in the frame of the
-one behind it), `foxglove/joints`, `foxglove/reference`, `foxglove/pose`, `foxglove/scene/...` (body, obstacles, map,
-forces, path), `foxglove/log`, `foxglove/depth/<name>` and `foxglove/colour/<name>`; `foxglove/state` is JSON.
+Numbers at the rate of the messages that they are made of: `/ROBOT/joint_states`, `/ROBOT/joint_references`,
+`/ROBOT/contact_forces`, `/ROBOT/state`, and `/ROBOT/log` of its changes. What is drawn, a few times a second:
+`/ROBOT/tf` (a chain: each link in the frame of the one behind it), `/ROBOT/pose`, `/ROBOT/scene/...` (body, obstacles,
+map, forces, path), `/ROBOT/CAMERA/depth/image_raw` and `color`.
+Forces and state are JSON with a schema, all else Foxglove's protobuf.
 """
 
+import re
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import cache
@@ -28,6 +31,7 @@ from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import (
     ColourImage,
     Configuration,
+    Contacts,
     DepthImage,
     Description,
     JointState,
@@ -38,12 +42,12 @@ from snakesim_hal.wire.messages import (
 )
 from snakesim_operator.recording import shapes
 from snakesim_operator.recording.body_frames import BodyFrames
-from snakesim_operator.recording.state_messages import State, StateMessages
+from snakesim_operator.recording.state_messages import ContactForces, State, StateMessages
 
 MOVING_NS = 100_000_000  # 10 Hz: viewers interpolate transforms
 IMAGES_NS = 200_000_000  # 5 Hz: all images are in the raw channels
-TOPICS = "foxglove/"
 SILENCE_NS = 5_000_000_000  # older messages are not shown as if they were current
+_STATE = "state"  # a name in what is due
 STILL_NS = 1_000_000_000  # what seldom changes, so that it is there wherever one begins to look
 
 
@@ -59,6 +63,7 @@ _decoders: dict[type[Any], Any] = {
     message: msgspec.msgpack.Decoder(message)
     for message in (
         JointState,
+        Contacts,
         Pose,
         PoseAndContacts,
         World,
@@ -70,20 +75,23 @@ _decoders: dict[type[Any], Any] = {
     )
 }
 
-Kind = type[Protobuf] | type[State]
-ALWAYS: dict[str, Kind] = {  # topics but for those of images, of which a robot may have none
-    TOPICS + name: kind
-    for name, kind in {
-        "tf": FrameTransforms,
-        "joints": JointStates,
-        "reference": JointStates,
-        "state": State,
-        "log": Log,
-        "pose": PoseInFrame,
-        **{f"scene/{part}": SceneUpdate for part in ("body", "obstacles", "map", "forces", "path")},
-    }.items()
+Kind = type[Protobuf] | type[State] | type[ContactForces]
+ALWAYS: dict[str, Kind] = {  # topics below the robot's, but for those of images, of which a robot may have none
+    "tf": FrameTransforms,
+    "joint_states": JointStates,
+    "joint_references": JointStates,
+    "contact_forces": ContactForces,
+    "state": State,
+    "log": Log,
+    "pose": PoseInFrame,
+    **{f"scene/{part}": SceneUpdate for part in ("body", "obstacles", "map", "forces", "path")},
 }
 _KEPT = (keys.JOINTS, keys.POSE, keys.WORLD, keys.TRAJECTORY, keys.STATUS, keys.CONTROL_STATE)
+
+
+def topic(robot: str, name: str) -> str:
+    """A topic as ROS would name it. name: such as `joint_states`, below the robot's."""
+    return f"/{_ros_name(robot)}/{name}"
 
 
 class FoxgloveMessage(NamedTuple):
@@ -106,7 +114,7 @@ class FoxgloveSchema(NamedTuple):
 @cache
 def schema_of(kind: Kind) -> FoxgloveSchema:
     """As MCAP wants it: of a protobuf message its file and all that it imports."""
-    if issubclass(kind, State):
+    if issubclass(kind, State | ContactForces):
         schema = msgspec.json.schema(kind)["$defs"][kind.__name__]
         return FoxgloveSchema(f"snakesim.shown.{kind.__name__}", "json", "jsonschema", msgspec.json.encode(schema))
     files: dict[str, Any] = {}
@@ -124,9 +132,12 @@ def schema_of(kind: Kind) -> FoxgloveSchema:
 
 
 class FoxgloveChannels:
-    """Keeps the newest payload of each key, and makes messages of them when the clock says that they are due."""
+    """Makes messages of numbers as they come, and of the newest payloads when the clock says that they are due."""
 
-    def __init__(self) -> None:
+    def __init__(self, robot: str) -> None:
+        """robot: its name in the topics."""
+        self._named = robot
+        self._topics: dict[str, str] = {}
         self._newest: dict[str, tuple[bytes, int]] = {}  # payload and its robot time in ns
         self._due_ns: dict[str, int] = {}
         self._robot: Description | None = None
@@ -138,7 +149,11 @@ class FoxgloveChannels:
         """What is due with this message. One that cannot be decoded makes nothing."""
         if key in _KEPT:
             self._newest[key] = payload, time_ns
-            return []
+            if key == keys.JOINTS:
+                return self._joint_states(payload, time_ns)
+            return list(self._state(time_ns, key)) if key in (keys.STATUS, keys.CONTROL_STATE) else []
+        if key == keys.CONTACTS:
+            return self._contact_forces(payload)
         if key == keys.CLOCK:
             return self._at_clock(time_ns) if self._is_due("moving", time_ns, MOVING_NS) else []
         if key.startswith(("sensor/depth/", "sensor/colour/")):
@@ -179,36 +194,49 @@ class FoxgloveChannels:
         seen: PoseAndContacts | None = self._read(keys.WORLD, PoseAndContacts, time_ns)
         if robot is None or frames is None or joints is None or not joints.is_of(len(robot.joints)):
             return []
-        made = [_protobuf("joints", frames.joint_states(joints, time_ns))]
         base = self._base(seen, time_ns)
-        made.append(_protobuf("tf", frames.transforms(joints.angle_rad, base, time_ns)))
+        made = [self._protobuf("tf", frames.transforms(joints.angle_rad, base, time_ns))]
         if base is not None:
-            made.append(_protobuf("pose", _pose(*base, time_ns)))
+            made.append(self._protobuf("pose", _pose(*base, time_ns)))
         if seen is not None:
-            made.append(_scene("forces", [shapes.forces(seen.contacts, time_ns)]))
-        return [*made, *self._state(frames, time_ns), *self._still(robot, time_ns)]
+            made.append(self._scene("forces", [shapes.forces(seen.contacts, time_ns)]))
+        silent = self._state(time_ns, keys.CLOCK) if self._due_ns.get(_STATE, 0) <= time_ns else ()
+        return [*made, *silent, *self._still(robot, time_ns)]
 
-    def _state(self, frames: BodyFrames, time_ns: int) -> Iterator[FoxgloveMessage]:
+    def _joint_states(self, payload: bytes, time_ns: int) -> list[FoxgloveMessage]:
+        joints: JointState | None = _decoded(JointState, payload)
+        if self._frames is None or joints is None or not joints.is_of(self._frames.joints):
+            return []
+        return [self._protobuf("joint_states", self._frames.joint_states(joints, time_ns))]
+
+    def _contact_forces(self, payload: bytes) -> list[FoxgloveMessage]:
+        felt: Contacts | None = _decoded(Contacts, payload)
+        if self._robot is None or felt is None:
+            return []
+        return [self._json("contact_forces", ContactForces.of(felt, len(self._robot.links)))]
+
+    def _state(self, time_ns: int, at: str) -> Iterator[FoxgloveMessage]:
+        self._due_ns[_STATE] = time_ns + MOVING_NS  # then again, if host and controller have fallen silent
         status, control = (self._fresh(key, time_ns) for key in (keys.STATUS, keys.CONTROL_STATE))
         state, logged, wanted_rad = self._state_messages.of(status, control, time_ns)
-        yield FoxgloveMessage(f"{TOPICS}state", State, msgspec.json.encode(state))
-        yield from (_protobuf("log", one) for one in logged)
-        if len(wanted_rad) == frames.joints:
-            yield _protobuf("reference", frames.reference(wanted_rad, time_ns))
+        yield self._json("state", state)
+        yield from (self._protobuf("log", one) for one in logged)
+        if at == keys.CONTROL_STATE and self._frames is not None and len(wanted_rad) == self._frames.joints:
+            yield self._protobuf("joint_references", self._frames.reference(wanted_rad, time_ns))
 
     def _still(self, robot: Description, time_ns: int) -> Iterator[FoxgloveMessage]:
         if self._is_due("body", time_ns, STILL_NS):
-            yield _scene("body", shapes.body(robot, time_ns))
+            yield self._scene("body", shapes.body(robot, time_ns))
             self._truth.timestamp.CopyFrom(shapes.stamp(time_ns))
-            yield _scene("obstacles", [self._truth])
+            yield self._scene("obstacles", [self._truth])
         if keys.WORLD in self._newest and self._is_due(keys.WORLD, time_ns, STILL_NS):
             world: World | None = self._read(keys.WORLD, World, time_ns)
             if world is not None:
-                yield _scene("map", [shapes.obstacles(world.obstacles, "map", shapes.MAP, time_ns)])
+                yield self._scene("map", [shapes.obstacles(world.obstacles, "map", shapes.MAP, time_ns)])
         if keys.TRAJECTORY in self._newest and self._is_due(keys.TRAJECTORY, time_ns, STILL_NS):
             trajectory: Trajectory | None = self._read(keys.TRAJECTORY, Trajectory, time_ns)
             if trajectory is not None:
-                yield _scene("path", [shapes.path(trajectory.path_w, time_ns)])
+                yield self._scene("path", [shapes.path(trajectory.path_w, time_ns)])
 
     def _base(self, seen: PoseAndContacts | None, time_ns: int) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
         """Position and orientation of link 0: as measured, else as guidance believes."""
@@ -222,13 +250,29 @@ class FoxgloveChannels:
         image: Any = _decoded(DepthImage if key.startswith("sensor/depth/") else ColourImage, payload)
         if robot is None or image is None or image.link >= len(robot.links):
             return
-        name = key.removeprefix("sensor/")
-        frame_id = f"{TOPICS}{name}"
+        _, kind, camera = key.split("/", 2)
+        kind, camera = {"colour": "color"}.get(kind, kind), _ros_name(camera)
+        frame_id = f"{camera}_{kind}_optical_frame"
         turned = shapes.optical(image.orientation_l_wxyz)
         mount = shapes.frame(time_ns, robot.links[image.link].name, frame_id, image.position_l, turned)
-        yield _protobuf("tf", FrameTransforms(transforms=[mount]))
-        yield _protobuf(name, shapes.raw_image(image, frame_id, time_ns))
-        yield _protobuf(f"{name}/calibration", shapes.calibration(image, frame_id, time_ns))
+        yield self._protobuf("tf", FrameTransforms(transforms=[mount]))
+        yield self._protobuf(f"{camera}/{kind}/image_raw", shapes.raw_image(image, frame_id, time_ns))
+        yield self._protobuf(f"{camera}/{kind}/camera_info", shapes.calibration(image, frame_id, time_ns))
+
+    def _topic(self, name: str) -> str:
+        made = self._topics.get(name)
+        if made is None:
+            made = self._topics[name] = topic(self._named, name)
+        return made
+
+    def _scene(self, name: str, entities: list[SceneEntity]) -> FoxgloveMessage:
+        return self._protobuf(f"scene/{name}", SceneUpdate(entities=entities))
+
+    def _protobuf(self, name: str, message: Protobuf) -> FoxgloveMessage:
+        return FoxgloveMessage(self._topic(name), type(message), message.SerializeToString())
+
+    def _json(self, name: str, message: State | ContactForces) -> FoxgloveMessage:
+        return FoxgloveMessage(self._topic(name), type(message), msgspec.json.encode(message))
 
 
 def _decoded(message: type[Any], payload: bytes | None) -> Any:
@@ -245,9 +289,5 @@ def _pose(position: tuple[float, ...], wxyz: tuple[float, ...], time_ns: int) ->
     return made
 
 
-def _scene(name: str, entities: list[SceneEntity]) -> FoxgloveMessage:
-    return _protobuf(f"scene/{name}", SceneUpdate(entities=entities))
-
-
-def _protobuf(name: str, message: Protobuf) -> FoxgloveMessage:
-    return FoxgloveMessage(TOPICS + name, type(message), message.SerializeToString())
+def _ros_name(text: str) -> str:
+    return re.sub(r"\W", "_", text, flags=re.ASCII)

@@ -6,7 +6,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 from snakesim_hal.errors import NotConnectedError
-from snakesim_operator.recording.foxglove import ALWAYS, FoxgloveMessage, Kind, schema_of
+from snakesim_operator.recording.foxglove import ALWAYS, FoxgloveMessage, Kind, schema_of, topic
 from snakesim_operator.recording.origin_relay import HOST, OriginRelay, hidden_host
 
 if TYPE_CHECKING:
@@ -25,8 +25,8 @@ class LiveServer:
         self._new_channel, self._schema = foxglove.Channel, foxglove.Schema
         self._context = foxglove.Context()
         self._channels: dict[str, foxglove.Channel] = {}
-        for topic, kind in ALWAYS.items():  # before the first viewer: it subscribes in vain to one made as it connects
-            self._add(topic, kind)
+        for name, kind in ALWAYS.items():  # before the first viewer: it subscribes in vain to one made as it connects
+            self._add(topic(robot, name), kind)
         host = hidden_host()
         try:
             self._server = foxglove.start_server(name=robot, host=host, port=0, context=self._context)
@@ -40,11 +40,11 @@ class LiveServer:
         channel = self._channels.get(shown.topic) or self._add(shown.topic, shown.kind)
         channel.log(shown.payload, log_time=time_ns)
 
-    def _add(self, topic: str, kind: Kind) -> "foxglove.Channel":
+    def _add(self, of: str, kind: Kind) -> "foxglove.Channel":
         name, message_encoding, encoding, data = schema_of(kind)
         schema = self._schema(name=name, encoding=encoding, data=data)
-        channel = self._new_channel(topic, schema=schema, message_encoding=message_encoding, context=self._context)
-        self._channels[topic] = channel
+        channel = self._new_channel(of, schema=schema, message_encoding=message_encoding, context=self._context)
+        self._channels[of] = channel
         return channel
 
     def __enter__(self) -> Self:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 KEYS_SHOWN, GAPS_SHOWN = 8, 3
 MOST_GAPS = 1000  # kept apart; what is lost behind them is counted with the last
-SHOWN_ONLY = "foxglove/"  # made of the others
+SHOWN_ONLY = ("/", "foxglove/")  # made of the others; `foxglove/` in older recordings
 ELSEWHERE = "keys that are not known"  # whose channel is lost too
 
 

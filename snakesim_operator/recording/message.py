@@ -1,8 +1,9 @@
-"""A message of a recording, and the name of the file in a run's folder: known without what reads and writes MCAP."""
+"""A message of a recording, its file's name, words for an option: known without what reads and writes MCAP."""
 
 from dataclasses import dataclass
 
 RECORDING = "recording.mcap"
+RAW_ONLY = "record messages as on the wire alone, without topics for Foxglove and PlotJuggler"
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import Description
 from snakesim_hal.wire.roles import RECORDER
-from snakesim_operator.recording.message import RECORDING
+from snakesim_operator.recording.message import RAW_ONLY, RECORDING
 from snakesim_operator.recording.recording import Recording, Show
 from snakesim_operator.recording.tap import Tap
 
@@ -42,11 +42,12 @@ FULL = 4  # exit code: the disk took no more
 class Recorder:
     """Writes what a tap takes; a file for each host that the robot has, one after the other."""
 
-    def __init__(self, path: Path, show: Show | None = None) -> None:
-        """Raises OSError when the file cannot be made."""
+    def __init__(self, path: Path, shown_as: str | None, show: Show | None = None) -> None:
+        """Arguments as of Recording. Raises OSError when the file cannot be made."""
         self.path = path
+        self._shown_as = shown_as
         self._show = show
-        self.recording = Recording(path, show)
+        self.recording = Recording(path, shown_as, show)
         self._latched: dict[str, Arrival] = {}
         self._host: str | None = None
         self._new_host = False
@@ -87,15 +88,19 @@ class Recorder:
         self._hosts += 1
         self.close({})
         self.path.rename(next(p for n in count(1) if not (p := self.path.with_stem(f"{self.path.stem}-{n}")).exists()))
-        self.recording = Recording(self.path, self._show)
+        self.recording = Recording(self.path, self._shown_as, self._show)
         for arrival in (*self._latched.values(), clock):
             self.recording.take(arrival)
 
 
-def record(link: Link, path: Path, goes_on: Callable[[], bool], show: Show | None = None) -> Recorder:
-    """Record a robot for as long as `goes_on` says. Raises NotConnectedError, ConfigError for a file that exists."""
+def record(
+    link: Link, path: Path, goes_on: Callable[[], bool], show: Show | None = None, *, raw_only: bool = False
+) -> Recorder:
+    """Record a robot for as long as `goes_on` says. Raises NotConnectedError, ConfigError for a file that exists.
+
+    raw_only: without topics for viewers, of which `show` would be told."""
     try:
-        recorder = Recorder(path, show)
+        recorder = Recorder(path, None if raw_only else link.namespace or "robot", show)
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}; choose another file") from error
     with open_session(link, connect_timeout_s=START_LIMIT_S) as session:
@@ -127,6 +132,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Record a run into its folder until told to end. Exit code 1 when it could not go on."""
     parser = argparse.ArgumentParser(description="Record a run.")
     parser.add_argument("--out", type=Path, default=Path(), help="folder of the run")
+    parser.add_argument("--raw-only", action="store_true", help=RAW_ONLY)
     add_scenario(parser)
     add_network(parser, "")
     add_parent(parser)
@@ -136,7 +142,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     os.nice(NICE)
     os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))  # its threads, woken by each message, displace nobody
     try:
-        recorder = record(given.link, given.arguments.out / RECORDING, lambda: not ended)
+        file, raw_only = given.arguments.out / RECORDING, given.arguments.raw_only
+        recorder = record(given.link, file, lambda: not ended, raw_only=raw_only)
     except SnakesimError as error:
         report_error(error, f"snakesim {RECORDER}")
         return 1

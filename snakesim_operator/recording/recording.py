@@ -29,14 +29,18 @@ Show = Callable[[FoxgloveMessage, int], None]  # and the robot time in ns
 class Recording:
     """A file that is written. A disk that takes no more ends it, and nothing else."""
 
-    def __init__(self, path: Path, show: Show | None = None) -> None:
-        """show: gets what is made for Foxglove, too. Raises OSError, FileExistsError when there is such a file."""
+    def __init__(self, path: Path, shown_as: str | None = None, show: Show | None = None) -> None:
+        """Raises OSError, FileExistsError when there is such a file.
+
+        shown_as: the robot's name in topics for viewers; None: only the messages as on the wire, and no such topics.
+        show: gets what is made for viewers, too.
+        """
         self.path = path
         self._show = show
         self.failure = ""  # why nothing is written any more
         self.counts: Counter[str] = Counter()  # messages written, by key
         self.time = RobotTime()
-        self._foxglove = FoxgloveChannels()
+        self._foxglove = None if shown_as is None else FoxgloveChannels(shown_as)
         self._shown: Counter[str] = Counter()  # messages made for Foxglove, by topic
         self._file = GrowingFile(path)
         self._mcap = McapFile(self._file)
@@ -57,6 +61,8 @@ class Recording:
         self.counts[arrival.key] += 1
         wall_ns = arrival.monotonic_ns + self._wall_ns
         self._mcap.add(channel, at_ns, wall_ns, self.counts[arrival.key], arrival.payload)
+        if self._foxglove is None:
+            return
         for shown in self._foxglove.take(arrival.key, arrival.payload, at_ns):
             self._shown[shown.topic] += 1
             channel = self._channels.get(shown.topic) or self._open_shown(shown)

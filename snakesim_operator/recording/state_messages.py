@@ -1,22 +1,23 @@
-"""The state of host and controller for Foxglove: state as JSON, a log of its changes, joint references."""
+"""What Foxglove has no schema for, as JSON: state of host and controller, a log of its changes, forces of contact."""
 
 import re
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import msgspec
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from snakesim_hal.wire import quantities as q
 from snakesim_hal.wire.codec import UNDECODABLE
+from snakesim_hal.wire.messages import Contacts
 from snakesim_operator.recording.shapes import stamp
 
 Maybe = float | msgspec.UnsetType
 
 
 class State(msgspec.Struct, frozen=True, kw_only=True):
-    """`foxglove/state`, in JSON: Foxglove has no protobuf schema of states. What is unknown is empty, or left out."""
+    """`/ROBOT/state`. What is unknown is empty, or left out."""
 
     lifecycle: str
     why: str
@@ -30,6 +31,25 @@ class State(msgspec.Struct, frozen=True, kw_only=True):
     propulsion_n: Maybe = msgspec.UNSET
     propulsion_torque_nm: Maybe = msgspec.UNSET
     torque_headroom_nm: Maybe = msgspec.UNSET
+
+
+class ContactForces(msgspec.Struct, frozen=True, kw_only=True):
+    """`/ROBOT/contact_forces`: on each link in its own frame, tail to head, summed over its contacts."""
+
+    along_n: list[float]
+    left_n: list[float]
+    up_n: list[float]
+
+    @classmethod
+    def of(cls, felt: Contacts, links: int) -> Self:
+        """Of a sample, for a robot of so many links."""
+        along_n, left_n, up_n = ([0.0] * links for _ in range(3))
+        for contact in felt.contacts:
+            if contact.link < links:
+                along_n[contact.link] += contact.force_l[0]
+                left_n[contact.link] += contact.force_l[1]
+                up_n[contact.link] += contact.force_l[2]
+        return cls(along_n=along_n, left_n=left_n, up_n=up_n)
 
 
 class _StatusFields(msgspec.Struct, frozen=True):

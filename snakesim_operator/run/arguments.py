@@ -16,6 +16,7 @@ from snakesim_hal.arguments import (
 )
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.terminal import output_may_fail
+from snakesim_operator.recording.message import RAW_ONLY
 
 
 def add_commands(commands: Any) -> None:
@@ -44,6 +45,7 @@ def add_commands(commands: Any) -> None:
     )
     run.add_argument("--until-goal", action="store_true", help="end when the mission's goal is reached")
     run.add_argument("--no-record", action="store_true", help="keep no recording of the messages")
+    run.add_argument("--raw-only", action="store_true", help=RAW_ONLY)
     run.add_argument(
         "--console",
         action=argparse.BooleanOptionalAction,
@@ -86,7 +88,7 @@ def _run(arguments: argparse.Namespace) -> int:
             if getattr(arguments, flag):
                 raise ConfigError(f"--in-process and --{flag.replace('_', '-')}: there is no network; leave one out")
         with output_may_fail():
-            return run_in_process(config, arguments.out, record=not arguments.no_record)
+            return run_in_process(config, arguments.out, record=not arguments.no_record, raw_only=arguments.raw_only)
 
     from snakesim_operator.run.run import RunRequest, run
 
@@ -101,6 +103,7 @@ def _run(arguments: argparse.Namespace) -> int:
         with_router=arguments.with_router,
         insecure=arguments.insecure,
         record=not arguments.no_record,
+        raw_only=arguments.raw_only,
         console=arguments.console,
     )
     with output_may_fail():

@@ -93,7 +93,9 @@ def simulate(
             raise ConfigError(f"{out} cannot be written to; choose another folder")
         opened.callback(files.close)
         recorded = SERVICE_STREAMS if out is None else [row.key for row in keys.SPACE]
-        run, outcome, gave_up = _go(config, files, ending, None, recorded, until_goal=until_goal, give_up_s=give_up_s)
+        run, outcome, gave_up = _go(
+            config, files, ending, None, recorded, until_goal=until_goal, give_up_s=give_up_s, raw_only=out is None
+        )
         explain(ending, record_of(run.host), config)
         return Result(*leave(files, files.folder, ending, outcome, report=out is not None), gave_up)
 
@@ -105,8 +107,11 @@ def run_in_process(
     until_goal: bool = False,
     give_up_s: float | None = None,
     record: bool = True,
+    raw_only: bool = False,
 ) -> int:
-    """`snakesim run --in-process`. Exit code: as of a run in processes. until_goal, give_up_s: as of `simulate`."""
+    """`snakesim run --in-process`. Exit code: as of a run in processes. until_goal, give_up_s: as of `simulate`.
+
+    raw_only: the recording is without topics for viewers."""
     check(config)
     check_recorder(record=record)
     ending = Ending()
@@ -114,7 +119,9 @@ def run_in_process(
         say(f"{config.name}: {config.robot.name} in {config.scene.name}, {config.commander}, in one process")
         with interruptible(ending), Progress(config) as progress:
             recorded = [row.key for row in keys.SPACE] if record else []
-            _, outcome, _ = _go(config, files, ending, progress, recorded, until_goal=until_goal, give_up_s=give_up_s)
+            _, outcome, _ = _go(
+                config, files, ending, progress, recorded, until_goal=until_goal, give_up_s=give_up_s, raw_only=raw_only
+            )
         return conclude(config, files, ending, outcome)
 
 
@@ -127,6 +134,7 @@ def _go(
     *,
     until_goal: bool,
     give_up_s: float | None,
+    raw_only: bool,
 ) -> tuple[InProcessRun, Outcome, bool]:
     """recorded: keys, which may have wildcards. Also returns whether it was given up."""
     words = _LogWriter(files)
@@ -136,7 +144,7 @@ def _go(
         watch = GoalWatch(config, host.description, give_up_s)
         with (
             Recorder(host.black_box, host.description, partial(record_of, host), files.folder),
-            _recording(session, files, recorded) as recording,
+            _recording(session, files, recorded, None if raw_only else config.robot.name) as recording,
         ):
             for turn, _ in enumerate(run.turns()):
                 if turn % TAKEN_EVERY == 0:
@@ -155,14 +163,16 @@ def _go(
 
 
 @contextlib.contextmanager
-def _recording(session: Session, files: RunFiles, recorded: Iterable[str]) -> "Iterator[Recording | None]":
+def _recording(
+    session: Session, files: RunFiles, recorded: Iterable[str], shown_as: str | None
+) -> "Iterator[Recording | None]":
     """Record what is published at these keys; None when there are none, or no file can be made."""
     recording = None
     try:
         if files.folder is not None and recorded:
             from snakesim_operator.recording.recording import Recording  # needs the extra `record`
 
-            recording = Recording(files.folder / RECORDING)
+            recording = Recording(files.folder / RECORDING, shown_as)
             for key in recorded:
                 session.on_latched_arrival(key, recording.take)
     except OSError as error:

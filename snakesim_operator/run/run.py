@@ -52,6 +52,7 @@ class RunRequest:
     with_router: bool = False  # the run's parts meet at a router of its own
     insecure: bool = False  # listen even where other machines can connect
     record: bool = True  # every message, in recording.mcap
+    raw_only: bool = False  # in it: without topics for viewers
     console: bool = False  # show it in the browser
 
     @property
@@ -174,6 +175,7 @@ def _conduct(
             supervisor.start(name, ["snakesim_hal.serve", name, *common, *meeting], may_restart=service.restart)
         if request.record and files.folder is not None:
             recorder = ["snakesim_operator.recording.process", *common, *meeting, "--out", str(files.folder)]
+            recorder += ["--raw-only"] if request.raw_only else []
             supervisor.start(RECORDER, recorder, vital=False)
         with _session_of_run(link, supervisor, ending) as session:
             say(f"{config.name}: {config.robot.name} in {config.scene.name}, {config.commander}, {config.pace}")

@@ -23,10 +23,13 @@ def record_robot(
     foxglove_port: int | None = None,
     foxglove_origins: Sequence[str] = (),
     say: Say = say,
+    *,
+    raw_only: bool = False,
 ) -> int:
     """Record until Ctrl-C, or for a time by the wall clock. Exit code 1 when the disk took no more.
 
-    foxglove_port: serve viewers there meanwhile; foxglove_origins: of web pages that may be such viewers.
+    foxglove_port: serve viewers there meanwhile; foxglove_origins: of web pages that may be such viewers;
+    raw_only: the file is without topics for viewers.
     """
     link = replace(only_robot(where, "record"), largest_bytes=MAX_IMAGE_BYTES)
     path = out or Path(f"{link.namespace}-{datetime.now():%Y%m%d-%H%M%S}.mcap")
@@ -49,6 +52,7 @@ def record_robot(
                 path,
                 lambda: not stopped and (duration_s is None or time.monotonic() < began + duration_s),
                 live.show if live is not None else None,
+                raw_only=raw_only,
             )
     finally:
         for number in stop_signals():

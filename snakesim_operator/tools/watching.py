@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from snakesim_hal.arguments import add_json, add_network, number
+from snakesim_operator.recording.message import RAW_ONLY
 from snakesim_operator.tools.robot_selection import selection_of
 
 
@@ -33,7 +34,9 @@ def add_commands(commands: Any) -> None:
     record.add_argument(
         "--duration", type=number(0.0, 1e9, "s"), metavar="S", help="end after this time by the wall clock"
     )
-    record.add_argument(
+    viewers = record.add_mutually_exclusive_group()
+    viewers.add_argument("--raw-only", action="store_true", help=RAW_ONLY)
+    viewers.add_argument(
         "--foxglove",
         type=number(0, 65535),
         nargs="?",
@@ -86,7 +89,12 @@ def _record(arguments: argparse.Namespace) -> int:
     from snakesim_operator.tools.record import record_robot
 
     return record_robot(
-        selection_of(arguments), arguments.out, arguments.duration, arguments.foxglove, arguments.foxglove_origin
+        selection_of(arguments),
+        arguments.out,
+        arguments.duration,
+        arguments.foxglove,
+        arguments.foxglove_origin,
+        raw_only=arguments.raw_only,
     )
 
 

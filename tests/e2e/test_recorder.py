@@ -53,7 +53,7 @@ def sighted_live(address: str, origin: str | None = None) -> list[str]:
         while frames is None:
             reported = viewer.recv(10.0)
             if isinstance(reported, str) and (message := json.loads(reported))["op"] == "advertise":
-                frames = next((row for row in message["channels"] if row["topic"] == "foxglove/tf"), None)
+                frames = next((row for row in message["channels"] if row["topic"] == "/planar13/tf"), None)
         assert frames["encoding"] == frames["schemaEncoding"] == "protobuf"
         viewer.send(json.dumps({"op": "subscribe", "subscriptions": [{"id": 1, "channelId": frames["id"]}]}))
         while isinstance(reported := viewer.recv(10.0), str):

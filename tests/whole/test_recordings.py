@@ -130,7 +130,7 @@ def test_a_stock_reader_gets_our_messages_by_their_fields(run: Path) -> None:
         decoded = [(channel.topic, message) for _, channel, _, message in reader.iter_decoded_messages()]
     angles = {message.tick: message.angle_rad for topic, message in decoded if topic == keys.JOINTS}
     assert np.array_equal([angles[tick] for tick in range(200)], RunRecord.load(run).angle_rad)
-    assert {"foxglove/joints", keys.CLOCK} <= {topic for topic, _ in decoded}
+    assert {"/planar13_camera/joint_states", keys.CLOCK} <= {topic for topic, _ in decoded}
 
 
 def test_a_message_of_a_later_version_is_decoded_as_it_stands() -> None:

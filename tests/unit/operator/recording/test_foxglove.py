@@ -4,6 +4,7 @@ import json
 import math
 import subprocess
 import sys
+from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -20,16 +21,19 @@ from snakesim_hal.model.kinematics import rotation_from_quaternion
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode
-from snakesim_hal.wire.messages import ControlState
+from snakesim_hal.wire.messages import Contacts, ControlState
 from snakesim_operator.recording.foxglove import FoxgloveChannels
 from snakesim_operator.recording.message import RECORDING
+from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.recording.recover import recover
 from snakesim_operator.recording.state_messages import StateMessages
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.run.in_process import simulate
+from tests.harness.command import snakesim
 from tests.unit.hal.rig import description
 from tests.unit.hal.rig import state as joint_state
 
+ROBOT = "/planar13_camera"
 LAYOUT = Path(__file__).parents[4] / "docs" / "foxglove-layout.json"
 
 
@@ -42,6 +46,7 @@ class Json:
         )
 
 
+CONTACTS = msgspec.msgpack.Decoder(Contacts)
 FACTORIES = [DecoderFactory(), Json()]
 
 
@@ -57,9 +62,10 @@ def shown(path: Path) -> dict[str, list[tuple[int, Any]]]:
     found: dict[str, list[tuple[int, Any]]] = {}
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
-        names = ("tf", "joints", "reference", "pose", "log", "depth/head", "depth/head/calibration")
-        topics = [f"foxglove/{name}" for name in names]
-        scene = [f"foxglove/scene/{name}" for name in ("body", "obstacles", "map", "forces", "path")]
+        camera = ("head/depth/image_raw", "head/depth/camera_info")
+        names = ("tf", "joint_states", "joint_references", "pose", "log", *camera)
+        topics = [f"{ROBOT}/{name}" for name in names]
+        scene = [f"{ROBOT}/scene/{name}" for name in ("body", "obstacles", "map", "forces", "path")]
         for _, channel, message, decoded in reader.iter_decoded_messages(topics=topics + scene):
             found.setdefault(channel.topic, []).append((message.log_time, decoded))
     assert sorted(found) == sorted(topics + scene)
@@ -79,8 +85,8 @@ def in_the_world(chain: Any) -> tuple[Any, Any]:
 
 def test_transforms_and_joints_are_those_of_the_robot(run: Path) -> None:
     found, record = shown(run / RECORDING), RunRecord.load(run)
-    at_ns, update = found["foxglove/tf"][-1]
-    moving = [(at, one) for at, one in found["foxglove/tf"] if len(one.transforms) > 1]
+    at_ns, update = found[f"{ROBOT}/tf"][-1]
+    moving = [(at, one) for at, one in found[f"{ROBOT}/tf"] if len(one.transforms) > 1]
     at_ns, update = moving[-1]
     row = record.row_at(at_ns * 1e-9)
     nodes = record.nodes_w(row)
@@ -91,9 +97,36 @@ def test_transforms_and_joints_are_those_of_the_robot(run: Path) -> None:
     assert np.allclose(reported, nodes[:-1], atol=1e-9)
     towards = (nodes[-1] - nodes[-2]) / record.description.links[-1].length_m
     assert np.allclose(forward, towards, atol=1e-6)
-    states = dict(found["foxglove/joints"])[at_ns]
+    states = dict(found[f"{ROBOT}/joint_states"])[at_ns]
     assert [joint.position for joint in states.joints] == record.angle_rad[row].tolist()
     assert [joint.name for joint in states.joints] == [joint.name for joint in record.description.joints]
+
+
+def test_joints_forces_and_state_come_as_often_as_the_robot_tells_them(run: Path) -> None:
+    raw = list(RecordingReader(run / RECORDING).messages())
+    wire = Counter(one.key for one in raw)
+    with (run / RECORDING).open("rb") as file:
+        read = list(make_reader(file, decoder_factories=FACTORIES).iter_decoded_messages())
+    topics = Counter(channel.topic for _, channel, *_ in read)
+    assert topics[f"{ROBOT}/joint_states"] == wire[keys.JOINTS] > 80
+    assert topics[f"{ROBOT}/contact_forces"] == wire[keys.CONTACTS] > 80
+    assert topics[f"{ROBOT}/joint_references"] <= wire[keys.CONTROL_STATE] <= topics[f"{ROBOT}/state"]
+    forces = {at.log_time: one for _, channel, at, one in read if channel.topic == f"{ROBOT}/contact_forces"}
+    touching = [one for one in raw if one.key == keys.CONTACTS and CONTACTS.decode(one.payload).contacts][-1]
+    felt, contacts = forces[touching.time_ns], CONTACTS.decode(touching.payload).contacts
+    for axis, name in enumerate(("along_n", "left_n", "up_n")):
+        links = [sum(c.force_l[axis] for c in contacts if c.link == link) for link in range(14)]
+        assert felt[name] == pytest.approx(links)
+
+
+def test_raw_only_leaves_out_what_is_for_viewers(tmp_path: Path) -> None:
+    given = ["run", "triplet", "--in-process", "--duration", "0.2", "--raw-only", "--out", "raw"]
+    assert snakesim(*given, cwd=tmp_path).code == 0
+    with (tmp_path / "raw" / RECORDING).open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    topics = {channel.topic for channel in summary.channels.values()}
+    assert keys.JOINTS in topics and not {topic for topic in topics if topic.startswith("/")}
 
 
 def test_the_scene_has_body_obstacles_map_forces_and_path(run: Path) -> None:
@@ -104,33 +137,33 @@ def test_the_scene_has_body_obstacles_map_forces_and_path(run: Path) -> None:
     truth = scene["obstacles"][0]
     assert len(truth.cylinders) + len(truth.cubes) + len(truth.spheres) == len(record.placed)
     assert len(scene["path"][0].lines[0].points) in {len(reported.path_w) for reported in record.trajectories}
-    arrows = [arrow for _, update in found["foxglove/scene/forces"] for arrow in update.entities[0].arrows]
+    arrows = [arrow for _, update in found[f"{ROBOT}/scene/forces"] for arrow in update.entities[0].arrows]
     turns = [arrow.pose.orientation for arrow in arrows]
     assert arrows and all(math.hypot(q.w, q.x, q.y, q.z) == pytest.approx(1.0) for q in turns)
 
 
 def test_images_come_with_their_camera(run: Path) -> None:
     found = shown(run / RECORDING)
-    at_ns, image = found["foxglove/depth/head"][-1]
-    pinhole = dict(found["foxglove/depth/head/calibration"])[at_ns]
+    at_ns, image = found[f"{ROBOT}/head/depth/image_raw"][-1]
+    pinhole = dict(found[f"{ROBOT}/head/depth/camera_info"])[at_ns]
     assert image.encoding == "16UC1" and len(image.data) == image.step * image.height == 2 * image.width * image.height
     assert (pinhole.width, pinhole.height) == (image.width, image.height) and pinhole.K[0] == pinhole.P[0] > 0
-    mount = next(t for at, one in found["foxglove/tf"] if at == at_ns for t in one.transforms
+    mount = next(t for at, one in found[f"{ROBOT}/tf"] if at == at_ns for t in one.transforms
                  if t.child_frame_id == image.frame_id)  # fmt: skip
     q = mount.rotation  # the camera looks along its z, which is nearly the link's x
     assert 2 * (q.x * q.z + q.w * q.y) > 0.9 and mount.parent_frame_id == "link_13"
 
 
 def test_state_and_log_tell_what_host_and_control_told(run: Path) -> None:
-    record, logged = RunRecord.load(run), [one for _, one in shown(run / RECORDING)["foxglove/log"]]
+    record, logged = RunRecord.load(run), [one for _, one in shown(run / RECORDING)[f"{ROBOT}/log"]]
     with (run / RECORDING).open("rb") as file:
-        read = list(make_reader(file).iter_messages(topics=["foxglove/state"]))
+        read = list(make_reader(file).iter_messages(topics=[f"{ROBOT}/state"]))
     schema, channel, _ = read[0]
     assert schema is not None and (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
     states = [json.loads(message.data) for *_, message in read]
     wanted = json.loads(schema.data)
     assert all(set(wanted["required"]) <= set(state) <= set(wanted["properties"]) for state in states)
-    assert [one["lifecycle"] for one in states[-2:]] == ["armed", "armed"] and states[-1]["path_s_m"] > 0
+    assert [one["lifecycle"] for one in states[-2:]] == ["armed", "disarmed"] and states[-2]["path_s_m"] > 0
     assert {one["locomotion"] for one in states} <= {reported.state for reported in record.control} | {""}
     assert any(one.name == "hal" and one.message.startswith("armed: armed by") for one in logged)
     assert any(one.name == "control" and one.message.startswith("Locomoting: ") for one in logged)
@@ -140,8 +173,8 @@ def test_the_layout_shows_fields_that_a_recording_has(run: Path) -> None:
     layout, newest = json.loads(LAYOUT.read_text()), {}
     with (run / RECORDING).open("rb") as file:
         for _, channel, _, one in make_reader(file, decoder_factories=FACTORIES).iter_decoded_messages():
-            if channel.topic.startswith("foxglove/"):
-                newest[channel.topic] = one
+            if channel.topic.startswith("/"):
+                newest[channel.topic.replace(ROBOT, "/planar13")] = one  # as docs/recordings.md tells
     panels, text = layout["configById"], json.dumps(layout["layout"])
     assert all(f'"{name}"' in text for name in panels) and text.count("!") == len(panels)
     paths = [path["value"] for panel in panels.values() for path in panel.get("paths", [])]
@@ -165,7 +198,7 @@ from pathlib import Path
 from snakesim_hal.network.session import Arrival
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.recording.recording import Recording
-recording = Recording(Path(sys.argv[2]))
+recording = Recording(Path(sys.argv[2]), "planar13_camera")
 for number, one in enumerate(RecordingReader(Path(sys.argv[1])).messages()):
     recording.take(Arrival(one.key, one.payload, one.encoding, time.monotonic_ns()))
     if number % 100 == 0:
@@ -185,11 +218,11 @@ def test_what_a_killed_recorder_leaves_has_transforms_joints_and_images(run: Pat
         reader = NonSeekingReader(file, validate_crcs=True, decoder_factories=FACTORIES)
         for _, channel, _, one in reader.iter_decoded_messages(log_time_order=False):
             found[channel.topic] = one
-    assert len(found["foxglove/joints"].joints) == 13 and found["foxglove/tf"].transforms
-    assert len(found["foxglove/depth/head"].data) > 1000
+    assert len(found[f"{ROBOT}/joint_states"].joints) == 13 and found[f"{ROBOT}/tf"].transforms
+    assert len(found[f"{ROBOT}/head/depth/image_raw"].data) > 1000
     count, lacks = recover(torn, tmp_path / "whole.mcap")  # for readers that want an index
     whole = shown(tmp_path / "whole.mcap")
-    assert count > 500 and len(whole["foxglove/tf"]) > 10
+    assert count > 500 and len(whole[f"{ROBOT}/tf"]) > 10
     alone = RunRecord.load(tmp_path / "whole.mcap")
     assert len(alone.time_s) > 20 and alone.lacks == [f"recording: before it was copied: {lacks[0]}"]
 
@@ -203,15 +236,15 @@ def test_a_reason_in_which_only_a_number_changes_is_logged_once() -> None:
 
 
 def test_the_state_of_a_controller_that_fell_silent_is_not_shown_as_current() -> None:
-    channels, robot = FoxgloveChannels(), description()
+    channels, robot = FoxgloveChannels("snake"), description()
     control = ControlState(tick=0, stamp_ns=0, controller="hold", state="Locomoting", reason="pushes")
     seen: list[tuple[str, list[str]]] = []
     channels.take(keys.DESCRIPTION, encode(robot), 0)
-    channels.take(keys.CONTROL_STATE, encode(control), 0)
     for time_s in (0, 4, 6, 8):
-        channels.take(keys.JOINTS, encode(joint_state(robot)), time_s * 10**9)
-        made = channels.take(keys.CLOCK, b"", time_s * 10**9)
-        (state,) = (json.loads(one.payload)["locomotion"] for one in made if one.topic == "foxglove/state")
-        seen.append((state, [Log.FromString(one.payload).message for one in made if one.topic == "foxglove/log"]))
+        made = channels.take(keys.CONTROL_STATE, encode(control), 0) if time_s == 0 else []
+        made += channels.take(keys.JOINTS, encode(joint_state(robot)), time_s * 10**9)
+        made += channels.take(keys.CLOCK, b"", time_s * 10**9)
+        (state,) = (json.loads(one.payload)["locomotion"] for one in made if one.topic == "/snake/state")
+        seen.append((state, [Log.FromString(one.payload).message for one in made if one.topic == "/snake/log"]))
     silent = "silent: the state of control is no longer published"
     assert seen == [("Locomoting", ["Locomoting: pushes"]), ("Locomoting", []), ("", [silent]), ("", [])]
