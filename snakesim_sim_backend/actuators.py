@@ -45,13 +45,13 @@ def add_motor(spec: mujoco.MjSpec, joint: Joint, module: Module, step_s: float) 
     )
 
 
-def _gains(joint: Joint) -> dict[Mode, tuple[float, float, float]]:
+def _gains(joint: Joint, scale: float) -> dict[Mode, tuple[float, float, float]]:
     """Mode -> kp, kd and volts (0: unbounded)."""
     motor, speed = joint.motor, joint.limits.speed_rad_s
     return {
         Mode.PASSIVE: (0.0, 0.0, 0.0),
-        Mode.POSITION: (motor.stiffness_nm_per_rad, motor.damping_nm_s_per_rad, speed),
-        Mode.VELOCITY: (0.0, motor.velocity_gain_nm_s_per_rad, speed),
+        Mode.POSITION: (scale * motor.stiffness_nm_per_rad, scale * motor.damping_nm_s_per_rad, speed),
+        Mode.VELOCITY: (0.0, scale * motor.velocity_gain_nm_s_per_rad, speed),
         Mode.TORQUE: (0.0, 0.0, speed),
     }
 
@@ -59,7 +59,9 @@ def _gains(joint: Joint) -> dict[Mode, tuple[float, float, float]]:
 class Motors:
     """All motors of a compiled model."""
 
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, robot: RobotFile, period_s: float) -> None:
+    def __init__(
+        self, model: mujoco.MjModel, data: mujoco.MjData, robot: RobotFile, period_s: float, gain_scale: float = 1.0
+    ) -> None:
         joints = robot.joint_table
         self.count = len(joints)
         self._gains = model.actuator_gainprm[: self.count]
@@ -75,7 +77,7 @@ class Motors:
         self._fading = False
         lags_s = [joint.motor.response_time_s for joint in joints]
         self._decay = np.array([math.exp(-period_s / lag_s) if lag_s > 0 else 0.0 for lag_s in lags_s])
-        self._gains_of_mode = [_gains(joint) for joint in joints]
+        self._gains_of_mode = [_gains(joint, gain_scale) for joint in joints]
         assert np.all(self._gains[:, [KP, KD, MAX_VOLTS]] == [[1.0, 1.0, joint.limits.speed_rad_s] for joint in joints])
         self._mode: list[Mode] = []
         self._slots = np.empty(0, dtype=np.intp)

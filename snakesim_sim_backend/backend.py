@@ -65,7 +65,9 @@ class SimBackend:
         self._sim = build(config, settings)
         self._data = mujoco.MjData(self._sim.model)
         self._physics = Physics(self._sim.model, self._data, self._sim.soles)
-        self._motors = Motors(self._sim.model, self._data, config.robot, config.period_ns * 1e-9)
+        self._motors = Motors(
+            self._sim.model, self._data, config.robot, config.period_ns * 1e-9, settings.motor_gain_scale
+        )
         place_robot(self._sim, self._data, self._physics, config, self._motors, settings.settle_s)
         self._rope = None
         if settings.tether is not None:

@@ -141,13 +141,13 @@ def _add_snake(spec: mujoco.MjSpec, robot: RobotFile, settings: Settings) -> Non
         else:
             _add_joint(body, joints[i - 1])
         if robot.links and robot.links[i].has_inertia:
-            _set_inertia(body, robot.links[i], robot.module.radius_m)
+            _set_inertia(body, robot.links[i], robot.module.radius_m, settings.mass_scale)
         body.add_geom(
             name=f"link_{i}",
             type=mujoco.mjtGeom.mjGEOM_CAPSULE,
             size=[robot.module.radius_m, 0.0, 0.0],
             fromto=[0.0, 0.0, 0.0, length, 0.0, 0.0],
-            mass=mass,
+            mass=mass * settings.mass_scale,
             rgba=ORANGE,
             **skin,
         )
@@ -161,12 +161,12 @@ def _add_snake(spec: mujoco.MjSpec, robot: RobotFile, settings: Settings) -> Non
                 spec.add_exclude(bodyname1=f"link_{i}", bodyname2=f"link_{j}")
 
 
-def _set_inertia(body: mujoco.MjsBody, link: Link, radius_m: float) -> None:
+def _set_inertia(body: mujoco.MjsBody, link: Link, radius_m: float, scale: float) -> None:
     """The robot file's, in place of the capsule's."""
     body.explicitinertial = True
-    body.mass = link.mass_kg
+    body.mass = scale * link.mass_kg
     body.ipos = list(link.center)
-    body.fullinertia = list(link.inertia(radius_m))
+    body.fullinertia = [scale * value for value in link.inertia(radius_m)]
 
 
 def _add_foot(body: mujoco.MjsBody, name: str, along_m: float, robot: RobotFile) -> None:

@@ -34,6 +34,9 @@ class Settings(FileStruct, frozen=True, kw_only=True):
     friction_hold: Annotated[float, Meta(ge=1, le=1000, extra_json_schema={"unit": "1"})] = 100.0
     # Between links of the snake itself.
     self_friction: Annotated[float, Meta(ge=0, le=5, extra_json_schema={"unit": "1 (Coulomb coefficient)"})] = 0.3
+    # What the simulated body has, over what the robot file says, which everybody else goes by.
+    mass_scale: Annotated[float, Meta(ge=0.1, le=10, extra_json_schema={"unit": "1"})] = 1.0  # of every link
+    motor_gain_scale: Annotated[float, Meta(ge=0.1, le=10, extra_json_schema={"unit": "1"})] = 1.0
     # Longest time that the snake may take to come to rest before the run begins.
     settle_s: Annotated[float, Meta(ge=0, le=60, extra_json_schema={"unit": "s"})] = 3.0
     tether: Tether | None = None
@@ -43,3 +46,8 @@ class PlantSettings(Settings, frozen=True, kw_only=True):
     """The same for the physics under emulated joint modules, whose firmware sets the pace: one step at a time."""
 
     timestep_s: Annotated[float, Meta(ge=1e-5, le=0.01, extra_json_schema={"unit": "s"})] = 0.001
+
+    def __post_init__(self) -> None:
+        """The motors are the firmware's."""
+        if self.motor_gain_scale != 1.0:
+            raise ValueError("`motor_gain_scale` is of motors in the simulator; those of emulated modules are firmware")

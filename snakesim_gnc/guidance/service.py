@@ -9,7 +9,7 @@ from snakesim_gnc.guidance.core import WorldModel
 from snakesim_gnc.guidance.localisation import PoseNoise
 from snakesim_gnc.guidance.perceived_world import PerceivedWorld
 from snakesim_gnc.guidance.scan import Noise
-from snakesim_hal.model.scenario import RunConfig, place_all, start_of
+from snakesim_hal.model.scenario import RunConfig, start_of, surveyed
 from snakesim_hal.model.sensors import DepthCamera, RangeSensor
 from snakesim_hal.network.client import Client
 from snakesim_hal.service import Service
@@ -55,7 +55,7 @@ class _Surveyed:
     """The map is the scene's, the pose that of the sensor."""
 
     def __init__(self, client: Client, config: RunConfig) -> None:
-        self._known: Sequence[Obstacle] = [placed.obstacle for placed in place_all(config) if not placed.walkable]
+        self._known: Sequence[Obstacle] = surveyed(config)
         self._joints = client.subscribe(keys.JOINTS, JointState)
         self._contacts = client.subscribe(keys.CONTACTS, Contacts) if config.robot.sensors.contacts else None
         self._pose = client.subscribe(keys.POSE, Pose)

@@ -8,7 +8,7 @@ from snakesim_gnc.navigation.clutter import ClutterPlanner
 from snakesim_gnc.navigation.core import KnownPath
 from snakesim_gnc.navigation.intents import Intents
 from snakesim_hal.model.route import Route
-from snakesim_hal.model.scenario import HeadingGoal, RunConfig, place_all, start_of
+from snakesim_hal.model.scenario import HeadingGoal, RunConfig, start_of, surveyed
 from snakesim_hal.model.scenario import Service as Schedule
 from snakesim_hal.model.scene import route_of
 from snakesim_hal.network.client import Client
@@ -42,10 +42,13 @@ class Navigation(Service):
         config = self._config
         self._intents.start_over()
         self._body, self._recent = PlanarBody(robot), RecentAngles()
-        known = [placed.obstacle for placed in place_all(config) if not placed.walkable]
+        known = surveyed(config)
         self._along = _along_route(config, known) if config.mission.goal is None else None
         search = Search(
-            body_length_m=self._body.length_m, radius_m=self._body.radius_m, segment_m=max(self._body.segments_m)
+            body_length_m=self._body.length_m,
+            radius_m=self._body.radius_m,
+            segment_m=max(self._body.segments_m),
+            peg_friction=config.mission.peg_friction,
         )
         turn = config.services.get(self.name, Schedule())
         self._planner = ClutterPlanner(

@@ -26,9 +26,10 @@ from snakesim_hal.model.route import chain_angles, lay_chain, yaw_segments_m
 from snakesim_hal.model.scene import Placed, SceneFile, check_clear, place, route_of
 from snakesim_hal.model.textfiles import parse_toml
 from snakesim_hal.model.whole_file import write_whole
-from snakesim_hal.wire.messages import Pace
+from snakesim_hal.wire.messages import Obstacle, Pace
 from snakesim_hal.wire.quantities import above
 
+SURVEY = 0x5EED  # tells the survey's random numbers from others of the same seed
 CHOSEN = (
     "control.",
     "backend.",
@@ -65,12 +66,18 @@ class Mission(FileStruct, frozen=True, kw_only=True):
     goal: HeadingGoal | WaypointGoal | None = None
     until_goal: bool = False  # the run ends when the goal is reached, rather than with its time
     map: Literal["known", "perceived"] = "known"  # the scene's obstacles as from a survey, or only what sensors measure
+    # Of a known map: standard deviation of each obstacle's place, drawn from the run's seed, once for all services.
+    map_error_m: Annotated[float, Meta(ge=0, le=0.1, extra_json_schema={"unit": "m"})] = 0.0
+    # Of obstacles, as navigation reckons with it where it plans.
+    peg_friction: Annotated[float, Meta(ge=0, le=2, extra_json_schema={"unit": "1 (Coulomb coefficient)"})] = 0.0
     localisation: Literal["pose_sensor", "dead_reckoning"] = "pose_sensor"  # or joints, IMU and contacts, and the map
 
     def __post_init__(self) -> None:
         """Dead reckoning is part of perception; only a goal can be reached."""
         if self.localisation == "dead_reckoning" and self.map == "known":
             raise ValueError('localisation = "dead_reckoning" needs map = "perceived"')
+        if self.map_error_m > 0 and self.map == "perceived":
+            raise ValueError('`map_error_m` is of a survey; with map = "perceived" there is none')
         if self.until_goal and self.goal is None:
             raise ValueError("this mission has no goal to reach; give it one in [mission.goal]")
 
@@ -329,6 +336,20 @@ def place_all(config: RunConfig) -> list[Placed]:
     placed = place(config.scene, snake)
     check_clear(config.scene, placed, snake)
     return placed
+
+
+def surveyed(config: RunConfig) -> list[Obstacle]:
+    """The obstacles that stand in the way, where the survey has them: off by the map's error."""
+    known = [placed.obstacle for placed in place_all(config) if not placed.walkable]
+    error_m = config.mission.map_error_m
+    if error_m == 0.0:
+        return known
+    found: list[Obstacle] = []
+    errors = np.random.default_rng((config.seed, SURVEY)).normal(0.0, error_m, (len(known), 2))
+    for obstacle, (off_x, off_y) in zip(known, errors.tolist(), strict=True):
+        x, y, z = obstacle.position_w
+        found.append(msgspec.structs.replace(obstacle, position_w=(x + off_x, y + off_y, z)))
+    return found
 
 
 def config_hash(config: RunConfig) -> str:

@@ -19,8 +19,11 @@ def add_commands(commands: Any) -> None:
         epilog="Exit code: 0 all cases ran, whatever came of them; 1 some could not; 2 wrong input, nothing was run.",
     )
     tried.add_argument("suite", help="name of a shipped suite, or path of a suite file")
-    tried.add_argument("--controllers", metavar="A,B,...", help="installed controllers, or ./file.py:Class")
+    tried.add_argument(
+        "--controllers", "--controller", metavar="A,B,...", help="installed controllers, or ./file.py:Class"
+    )
     tried.add_argument("--fields", type=number(1, 100_000), metavar="N", help="fields for each row and controller")
+    tried.add_argument("--rows", metavar="1,2,...", help="only these rows of the table, by number")
     _add_shared(tried)
     tried.set_defaults(act=_evaluate)
 
@@ -66,7 +69,9 @@ def _add_shared(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_workers(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--seed", type=int, default=1, metavar="S", help="the first field; the next is S + 1 (1)")
+    parser.add_argument(
+        "--seed", type=int, metavar="S", help="the first field; the next is S + 1 (1, or drawn by the suite)"
+    )
     parser.add_argument(
         "--cluster", metavar="tcp://HOST:PORT", help="scheduler of a Dask cluster (default: this computer)"
     )
@@ -83,9 +88,23 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     suite, source = read_suite(arguments.suite)
     controllers = [name.strip() for name in (arguments.controllers or "").split(",") if name.strip()]
     again = ["evaluate", arguments.suite, *(["--controllers", ",".join(controllers)] if controllers else [])]
+    if arguments.rows:
+        again += ["--rows", arguments.rows]
     fields = arguments.fields or suite.fields
     chosen = controllers or suite.controllers
-    return go(Request(suite, source, Path(arguments.suite).stem, chosen, fields, **_shared(arguments, again)))
+    rows = _numbers(arguments.rows or "", "--rows")
+    name = Path(arguments.suite).stem
+    return go(Request(suite, source, name, chosen, fields, rows=rows, **_shared(arguments, again)))
+
+
+def _numbers(text: str, flag: str) -> list[int]:
+    """Raises ConfigError."""
+    from snakesim_hal.errors import ConfigError
+
+    words = [word.strip() for word in text.split(",") if word.strip()]
+    if not all(word.isdecimal() and len(word) < 7 for word in words):
+        raise ConfigError(f"{flag} {text[:60]}: give whole numbers, such as {flag} 1,2")
+    return [int(word) for word in words]
 
 
 def _sweep(arguments: argparse.Namespace) -> int:
@@ -114,6 +133,7 @@ def _optimise(arguments: argparse.Namespace) -> int:
     from snakesim_operator.run.folder import named_after
 
     given = {one.name: getattr(arguments, one.name) for one in dataclasses.fields(Request)}
+    given["seed"] = 1 if arguments.seed is None else arguments.seed
     return optimise(Request(**{**given, "storage": arguments.storage or named_after("optimise").with_suffix(".db")}))
 
 

@@ -1,6 +1,7 @@
 """Runs the cases of a suite, keeps what is done, prints the table and draws the page."""
 
 import re
+import secrets
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,6 +23,7 @@ from snakesim_operator.evaluate.table import best_of, lines_of, table, worst
 from snakesim_operator.run.folder import named_after
 from snakesim_operator.run.in_process import run_in_process
 
+FRESH = (1_000_000, 2_000_000_000)  # fields that a suite draws: beyond any that settings were tuned on
 PAGE = "evaluation.html"
 
 
@@ -35,7 +37,8 @@ class Request:
     controllers: Sequence[str]  # none: the scenario's
     fields: int
     again: str  # the command for one case, but for `--only`
-    seed: int = 1
+    seed: int | None = None  # None: 1, or fields that the suite draws
+    rows: Sequence[int] = ()  # none: all
     only: str | None = None
     out: Path | None = None
     resume: bool = False
@@ -50,7 +53,11 @@ def go(request: Request) -> int:
         return _run_one(request, request.only)
     if request.resume and request.out is None:
         raise ConfigError("--resume: name the folder of the evaluation with --out")
-    cases = cases_of(request.suite, request.source, request.controllers, request.fields, request.seed)
+    seed = first_field(request)
+    cases = cases_of(request.suite, request.source, request.controllers, request.fields, seed)
+    if wrong := next((row for row in request.rows if row not in {case.row for case in cases}), None):
+        raise ConfigError(f"--rows {wrong}: {request.source} has rows 1 to {cases[-1].row}")
+    cases = [case for case in cases if not request.rows or case.row in request.rows]
     out = request.out or named_after(request.name)
     with store.opened(out, resume=request.resume) as kept:
         todo = list({case.id: case for case in cases if case.id not in kept.done}.values())
@@ -60,6 +67,17 @@ def go(request: Request) -> int:
             _run(request, todo, kept, out)
         _finish(request, cases, kept.done, out)
         return 1 if any(kept.done[case.id].error is not None for case in cases) else 0
+
+
+def first_field(request: Request) -> int:
+    """As asked for, else 1, or drawn now and said. Raises ConfigError."""
+    if request.seed is not None or not request.suite.fresh:
+        return 1 if request.seed is None else request.seed
+    if request.resume:
+        raise ConfigError("--resume: this suite draws its fields; name with --seed those that were printed as drawn")
+    seed = secrets.randbelow(FRESH[1] - FRESH[0]) + FRESH[0]
+    say(f"fields {seed} to {seed + request.fields - 1}, drawn now; --seed {seed} takes them again")
+    return seed
 
 
 def _run_one(request: Request, only: str) -> int:

@@ -17,6 +17,12 @@
     name = "no pose sensor"
     set.robot.safety.action = "hold"
     unset = ["robot.sensors.pose"]                  # what the file may leave out, left out
+    without = ["scene.ground.friction"]             # no draw of these
+
+    [[draw]]                                        # in every case, evenly between two numbers, one draw a field:
+    set = ["scene.ground.friction"]                 # the same for every row and controller, and for all keys listed
+    low = 0.1
+    high = 0.4
 
 A field is a number: the run's seed, and that of every random field in the scene.
 """
@@ -27,6 +33,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
+import msgspec
+import numpy as np
 from msgspec import Meta
 
 from snakesim_hal.errors import ConfigError, short
@@ -46,6 +54,20 @@ class Row(FileStruct, frozen=True, kw_only=True):
     name: Annotated[str, Meta(min_length=1, max_length=80)]
     set: dict[str, Any] = {}
     unset: list[str] = []
+    without: list[str] = []
+
+
+class Draw(FileStruct, frozen=True, kw_only=True):
+    """A number that each field has of its own, whatever row and controller: what a lab does not choose."""
+
+    set: Annotated[list[str], Meta(min_length=1)]
+    low: float
+    high: float
+
+    def on_field(self, field: int) -> list[Override]:
+        """Evenly distributed; by the field's number and the first key, so that a draw more changes no other."""
+        number = np.random.default_rng([field, *self.set[0].encode()]).uniform(self.low, self.high)
+        return [Override(key, round(float(number), 6), "[[draw]]") for key in self.set]
 
 
 class Suite(FileStruct, frozen=True, kw_only=True):
@@ -61,6 +83,8 @@ class Suite(FileStruct, frozen=True, kw_only=True):
     unset: list[str] = []
     vary: dict[str, list[Any] | str] = {}
     row: list[Row] = []
+    draw: list[Draw] = []
+    fresh: bool = False  # fields that nobody has seen are drawn, unless --seed says which
 
 
 @dataclass(frozen=True)
@@ -70,6 +94,7 @@ class Setting:
     name: str
     overrides: list[Override]
     value: float | None = None  # of what is varied, if that is one number
+    draws: Sequence[Draw] = ()
 
 
 def read_suite(name: str) -> tuple[Suite, str]:
@@ -87,12 +112,13 @@ def settings_of(suite: Suite, source: str) -> list[Setting]:
     for row in suite.row or [None]:
         where = f"{source}: row {row.name!r}" if row is not None else source
         own = [*_overrides(row.set, where), *_left_out(row.unset, where)] if row is not None else []
+        draws = _draws(suite, [] if row is None else row.without, where)
         for values in itertools.product(*varied.values()):
             parts = [f"{words[key]} {_short_text(value)}" for key, value in zip(varied, values, strict=True)]
             name = ", ".join([*([row.name] if row is not None else []), *parts]) or "as it is"
             here = [Override(key, v, f"{source}: [vary]") for key, v in zip(varied, values, strict=True)]
             number = values[0] if len(values) == 1 and row is None and _is_number(values[0]) else None
-            found.append(Setting(name, [*always, *own, *here], number))
+            found.append(Setting(name, [*always, *own, *here], number, draws))
     twice = {one.name for one in found if sum(other.name == one.name for other in found) > 1}
     if twice:
         raise ConfigError(f"{source}: two rows are called {min(twice)!r}; rename one")
@@ -115,7 +141,7 @@ def cases_of(suite: Suite, source: str, controllers: Sequence[str], fields: int,
             pace = Override("pace", "lockstep", "--pace lockstep")
             table = compose(suite.scenario, [pace, *chosen, *setting.overrides])
             for field in range(seed, seed + fields):
-                config = _on_field(table, field)
+                config = _on_field(table, field, setting.draws)
                 if field == seed:
                     _check(config, table, f"{source}, row {number} ({setting.name}), field {field}")
                 found.append(
@@ -163,10 +189,22 @@ def seeds_of(table: Table) -> list[str]:
     return ["seed", *(f"scene.random_field.{i}.seed" for i in range(count))]
 
 
-def _on_field(table: Table, field: int) -> RunConfig:
+def _on_field(table: Table, field: int, draws: Sequence[Draw] = ()) -> RunConfig:
     for key in seeds_of(table):
         table.put(key, field, "--seed")
+    for draw in draws:
+        for override in draw.on_field(field):
+            table.put(override.key, override.value, override.flag)
     return decode(table, RunConfig)
+
+
+def _draws(suite: Suite, without: Sequence[str], where: str) -> list[Draw]:
+    """Those of the suite that a row keeps. Raises ConfigError."""
+    drawn = {key for draw in suite.draw for key in draw.set}
+    if wrong := next((key for key in without if key not in drawn), None):
+        raise ConfigError(f"{where}: `without` names {wrong!r}, which no [[draw]] sets")
+    kept = [[key for key in draw.set if key not in without] for draw in suite.draw]
+    return [msgspec.structs.replace(draw, set=keys) for draw, keys in zip(suite.draw, kept, strict=True) if keys]
 
 
 def _overrides(given: dict[str, Any], origin: str, prefix: str = "") -> Iterator[Override]:

@@ -5,6 +5,8 @@ import pytest
 
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.wire.messages import Mode
+from snakesim_sim_backend.model import build
+from snakesim_sim_backend.settings import Settings
 from tests.unit.sim_backend.rig import Run, make_config
 
 RESPONSE_S = 0.01
@@ -184,3 +186,15 @@ def test_very_stiff_joints_are_stable(response_s, torque_nm, speed):
 def test_gains_that_swing_up_are_refused():
     with pytest.raises(ConfigError, match=r"damping_nm_s_per_rad` above 0\.9"):
         Run(make_config({"motor": {"response_time_s": 0.015, "damping_nm_s_per_rad": 0.5}}))
+
+
+def test_a_body_that_is_not_as_its_file_says():
+    """Twice as heavy, motors twice as stiff; and a description that knows nothing of it."""
+    plain, other = (fast_run(HEAVY_ROTOR, mass_scale=scale, motor_gain_scale=scale) for scale in (1.0, 2.0))
+    for run in (plain, other):
+        run.command(Mode.POSITION, 0.01)
+        run.go()
+    assert torque(other) == pytest.approx(2 * torque(plain), rel=1e-3) and torque(plain) > 0.01
+    assert other.sim.describe() == plain.sim.describe()
+    light, heavy = (build(make_config(), Settings(mass_scale=scale)).model.body_mass.sum() for scale in (1.0, 2.0))
+    assert heavy == pytest.approx(2 * light)

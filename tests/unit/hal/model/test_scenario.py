@@ -28,6 +28,7 @@ from snakesim_hal.model.scenario import (
     place_all,
     read,
     start_of,
+    surveyed,
     write,
 )
 from snakesim_hal.model.scene import route_of
@@ -57,6 +58,17 @@ def test_a_flag_makes_another_field_or_another_goal() -> None:
     assert points.config.mission.goal == WaypointGoal(points_m=[(3.0, 0.0), (5.0, 0.5)])
     with pytest.raises(ConfigError, match=r"mission\.map"):
         with_flags("clutter", "mission.map=guessed")
+
+
+def test_a_survey_is_off_by_its_error_and_by_the_same_for_everybody() -> None:
+    exact, off = (with_flags("surveyed_clutter", f"mission.map_error_m={sd}").config for sd in (0.0, 0.005))
+    truth = np.array([placed.obstacle.position_w for placed in place_all(off)])
+    assert np.array_equal([one.position_w for one in surveyed(exact)], truth)
+    errors_m = np.array([one.position_w for one in surveyed(off)]) - truth
+    assert 0.003 < errors_m[:, :2].std() < 0.007 and not errors_m[:, 2].any()
+    assert surveyed(off) == surveyed(off)
+    with pytest.raises(ConfigError, match="map_error_m"):
+        with_flags("clutter", "mission.map_error_m=0.005")
 
 
 def test_parts_stand_beside_the_scenario_or_are_shipped_and_flags_name_them_from_here(tmp_path: Path) -> None:

@@ -152,3 +152,31 @@ def test_there_is_a_limit_of_cases(tmp_path: Path) -> None:
     suite, source = read(tmp_path, 'scenario = "jam"\n[vary]\nseed = "1:1000:1000"')
     with pytest.raises(ConfigError, match="300000 cases"):
         cases_of(suite, source, [], 300, 1)
+
+
+LAB = """
+scenario = "surveyed_clutter"
+[[draw]]
+set = ["scene.random_field.0.friction", "scene.pegs_along_route.0.friction"]
+low = 0.1
+high = 0.3
+[[row]]
+name = "as drawn"
+[[row]]
+name = "a launch row of ice"
+without = ["scene.pegs_along_route.0.friction"]
+"""
+
+
+def test_a_field_has_its_own_draw_whoever_crosses_it(tmp_path: Path) -> None:
+    suite, source = read(tmp_path, LAB)
+    cases = cases_of(suite, source, ["hold", "path_following"], 3, seed=7)
+    drawn = [(case.field, config(case).scene) for case in cases]
+    of_field = {field: scene.random_field[0].friction for field, scene in drawn}
+    assert len(set(of_field.values())) == 3 and all(0.1 <= one <= 0.3 for one in of_field.values())
+    assert all(scene.random_field[0].friction == of_field[field] for field, scene in drawn)
+    launch = [scene.pegs_along_route[0].friction for _, scene in drawn]
+    assert launch == [of_field[field] for field, _ in drawn[:6]] + [0.0] * 6
+    wrong, source = read(tmp_path, LAB.replace('without = ["scene.pegs', 'without = ["pegs'))
+    with pytest.raises(ConfigError, match=r"no \[\[draw\]\] sets"):
+        settings_of(wrong, source)
