@@ -30,7 +30,7 @@ class Stranger:
 
     def __str__(self) -> str:
         digits = f"0x{self.id:08X}" if self.extended else f"0x{self.id:03X}"
-        return f"{digits}  {self.length} bytes  {self.frames} frames  {self.told or 'unknown'}"
+        return f"{digits}  {self.length} B  {self.frames} frames  {self.told or 'unknown'}"
 
 
 def strangers(bus: can.BusABC, seconds: float) -> list[Stranger]:

@@ -24,7 +24,7 @@ TYPED: dict[str, tuple[list[str], set[str]]] = {
     "controller": (["run", "--controller", ""], set(installed(CONTROLLERS))),
     "free value": (["run", "--duration", ""], set()),
     "after a free value": (["run", "--duration", "3", "pe"], {"peg_row"}),
-    "of an installed package": (["can", ""], {"load", "scan", "expand"}),
+    "of an installed package": (["can", ""], {"load", "scan", "replay", "expand"}),
     "its argument": (["can", "load", "pe"], {"peg_row"}),
     "its flag": (["can", "load", "peg_row", "--j"], {"--joints"}),
     "key": (["echo", "sensor/j"], {"sensor/joints"}),

@@ -187,10 +187,10 @@ def test_scan_of_a_bus_of_strangers_says_whose_and_sends_nothing(capsys: pytest.
     said = capsys.readouterr().out
     for line in (
         r"virtual:\S+: others use this bus, and nothing was sent; .*--anyway",
-        r"  0x061  8 bytes  \d+ frames  as ODrive's heartbeat of node 3\n",
-        r"  0x705  1 bytes  \d+ frames  as CANopen's heartbeat of node 5, operational\n",
-        r"  0x7FF  3 bytes  \d+ frames  unknown\n",
-        r"  0x01234567  8 bytes  \d+ frames  29-bit id\n",
+        r"  0x061  8 B  \d+ frames  as ODrive's heartbeat of node 3\n",
+        r"  0x705  1 B  \d+ frames  as CANopen's heartbeat of node 5, operational\n",
+        r"  0x7FF  3 B  \d+ frames  unknown\n",
+        r"  0x01234567  8 B  \d+ frames  29-bit id\n",
     ):
         assert re.search(line, said), f"{line} is not in {said}"
     assert "0x1C4" not in said  # a heartbeat of ours
