@@ -72,7 +72,7 @@ def main() -> int:
     parser.add_argument("--fields", type=int, default=5, help="random fields, of the seeds 1001, 1002, ...")
     parser.add_argument("--seconds", type=float, default=8.0, help="of each run")
     arguments = parser.parse_args()
-    PerceivedWorld.take_depth = Timed(PerceivedWorld.take_depth)  # pyright: ignore[reportAttributeAccessIssue]
+    PerceivedWorld.take_look = Timed(PerceivedWorld.take_look)  # pyright: ignore[reportAttributeAccessIssue]
     given = PerceivedWorld.take_pose
     fields = [f"scene.random_field.0.seed={1001 + k}" for k in range(arguments.fields)]
     print(HEADER, flush=True)

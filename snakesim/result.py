@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from snakesim.chart import Chart, framed
 from snakesim_hal.errors import ConfigError, did_you_mean, short
 from snakesim_hal.model.textfiles import write_text
-from snakesim_operator.playback.export import OF_JOINTS, UNITS, arrays, table
+from snakesim_operator.playback.export import OF_JOINTS, arrays, table, unit_of
 from snakesim_operator.results.ended import COMPLETE
 from snakesim_operator.results.page.charts import Line, lines
 from snakesim_operator.results.record import RunRecord
@@ -56,7 +56,7 @@ class Result:
     @cached_property
     def units(self) -> dict[str, str]:
         """Of each signal, SI; "1" for plain numbers."""
-        return {name: UNITS[name.partition(".")[0]] for name in self.names}
+        return {name: unit_of(name, self.record) for name in self.names}
 
     @property
     def joints(self) -> list[str]:

@@ -24,6 +24,7 @@ from snakesim_hal.process import user_name
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_hal.wire.messages import Clock, Contacts, Description, JointState, LifecycleRequest, Message, Pose, Status
+from snakesim_hal.wire.own_sample import message_of
 from snakesim_operator.recording.process import record
 from snakesim_operator.tools.command import ask_host
 from snakesim_operator.tools.parameters import Parameter, change, in_force, parameters_of
@@ -154,6 +155,7 @@ class Robot:
         if message is None or "*" in key:
             known = [row.key for row in keys.SPACE if row.kind in ("stream", "latched")]
             raise ConfigError(f"no key {key!r} in the key space; {did_you_mean(key, known)}see schemas/keys.md")
+        message = message_of(key, self.description) or message
         first = key not in self._readers and self._control is None
         return self._taken(key, message, FIRST_S if first else 0.0)
 

@@ -15,7 +15,7 @@ from snakesim_gnc.guidance.depth_scan import DepthScanner, Intrinsics, metres_of
 from snakesim_gnc.guidance.ground import plane_under
 from snakesim_gnc.guidance.localisation import Localiser, PoseNoise
 from snakesim_gnc.guidance.obstacle_map import ObstacleMap
-from snakesim_gnc.guidance.scan import Noise, Scan, scan_of_ranges
+from snakesim_gnc.guidance.scan import Look, Noise, Scan, scan_of_ranges
 from snakesim_gnc.guidance.scan_match import matched
 from snakesim_hal.arrays import Floats
 from snakesim_hal.model.kinematics import rotation_from_quaternion
@@ -26,7 +26,6 @@ from snakesim_hal.wire.messages import (
     Imu,
     JointState,
     Pose,
-    Ranges,
     World,
 )
 from snakesim_hal.wire.quantities import MAX_CONTACTS, Vector
@@ -92,27 +91,22 @@ class PerceivedWorld:
                 touches.append((position[:2], normal[:2] / math.hypot(*normal[:2])))
         self.map.take_touches(touches, contacts.stamp_ns)
 
-    def take_depth(self, image: DepthImage, noise: Noise) -> None:
-        """A depth image, of any camera. noise: of its distances."""
-        body = self._body_of(image.stamp_ns, "image")
-        if body is None or image.link >= len(body.origins_w):
+    def take_look(self, look: Look, noise: Noise) -> None:
+        """An image or a scan, of any camera, lidar or range finder. noise: of its distances."""
+        body = self._body_of(look.stamp_ns, "image" if isinstance(look, DepthImage) else "ranges")
+        if body is None or look.link >= len(body.origins_w):
             return
-        kind = (Intrinsics.of(image), noise)
-        scanner = self._scanners.get(kind)
-        if scanner is None:
-            scanner = self._scanners[kind] = DepthScanner(*kind)
-        position, rotation = _mount(body, image)
+        position, rotation = _mount(body, look)
         plane = plane_under(self._bottoms(body), position[:2])
-        self._take(scanner.scan(metres_of(image), image.stamp_ns, position, rotation, plane), body)
-
-    def take_ranges(self, ranges: Ranges, noise: Noise) -> None:
-        """Beams of a lidar or a range finder."""
-        body = self._body_of(ranges.stamp_ns, "ranges")
-        if body is None or ranges.link >= len(body.origins_w):
-            return
-        position, rotation = _mount(body, ranges)
-        ground_z_m = float(plane_under(self._bottoms(body), position[:2])[0])
-        self._take(scan_of_ranges(ranges, position, rotation, ground_z_m, noise), body)
+        if isinstance(look, DepthImage):
+            kind = (Intrinsics.of(look), noise)
+            scanner = self._scanners.get(kind)
+            if scanner is None:
+                scanner = self._scanners[kind] = DepthScanner(*kind)
+            scan = scanner.scan(metres_of(look), look.stamp_ns, position, rotation, plane)
+        else:
+            scan = scan_of_ranges(look, position, rotation, float(plane[0]), noise)
+        self._take(scan, body)
 
     def world(self, tick: int, now_ns: int) -> World | None:
         """The world now; None before the first joint state. tick, now_ns: of the clock."""
@@ -209,7 +203,7 @@ def quaternion_of(rotation: Floats) -> tuple[float, float, float, float]:
     return (w, x, y, z)
 
 
-def _mount(body: Body, sensor: DepthImage | Ranges) -> tuple[Floats, Floats]:
+def _mount(body: Body, sensor: Look) -> tuple[Floats, Floats]:
     """Position (3,) and rotation (3, 3) world_from_sensor."""
     rotation = body.rotations[sensor.link]
     position = body.origins_w[sensor.link] + rotation @ np.array(sensor.position_l)

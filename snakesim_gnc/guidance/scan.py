@@ -10,10 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.arrays import Floats
-from snakesim_hal.wire.messages import Ranges
+from snakesim_hal.wire.messages import DepthImage, Ranges
 
 BAND_M = (0.02, 0.12)  # height above the ground of what a snake's body can touch
 MAX_RANGE_M = 4.0  # farther surfaces are too coarse to be worth mapping
+
+
+Look = DepthImage | Ranges  # what the map is made of
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """The guidance process: sensors in, `guidance/world` out."""
 
 from collections.abc import Sequence
+from typing import Any, get_args
 
 import numpy as np
 
@@ -8,23 +9,21 @@ from snakesim_gnc.guidance.body_history import Base
 from snakesim_gnc.guidance.core import WorldModel
 from snakesim_gnc.guidance.localisation import PoseNoise
 from snakesim_gnc.guidance.perceived_world import PerceivedWorld
-from snakesim_gnc.guidance.scan import Noise
+from snakesim_gnc.guidance.scan import Look, Noise
 from snakesim_hal.model.scenario import RunConfig, start_of, surveyed
-from snakesim_hal.model.sensors import DepthCamera, RangeSensor
+from snakesim_hal.model.sensors import DepthCamera, Looking
 from snakesim_hal.network.client import Client
 from snakesim_hal.service import Service
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (
     Clock,
     Contacts,
-    DepthImage,
     Description,
     Imu,
     JointState,
     Message,
     Obstacle,
     Pose,
-    Ranges,
     World,
 )
 
@@ -87,8 +86,11 @@ class _Perceived:
         self._imu = client.subscribe(keys.IMU, Imu) if robot.sensors.imu else None
         by_pose = config.mission.localisation == "pose_sensor"
         self._pose = client.subscribe(keys.POSE, Pose) if by_pose else None
-        self._depth = [(client.subscribe(keys.depth(c.name), DepthImage), _noise(c)) for c in robot.sensors.depth]
-        self._ranges = [(client.subscribe(keys.ranges(r.name), Ranges), _noise(r)) for r in robot.sensors.range]
+        self._looks = [
+            (client.subscribe(key, kind), _noise(sensor))
+            for key, sensor in robot.sensors.mounted()
+            if isinstance(sensor, Looking) and (kind := keys.message_at(key)) is not None and kind in get_args(Look)
+        ]
         self._client = client
         self._model: PerceivedWorld | None = None
         self._taken: dict[str, int] = {}  # stamp of the newest sample used, by key
@@ -109,14 +111,10 @@ class _Perceived:
             model.take_pose(pose)
         if contacts is not None and self._is_new(keys.CONTACTS, contacts.stamp_ns):
             model.take_contacts(contacts)
-        for feed, noise in self._depth:
-            image = read(feed)
-            if image is not None and self._is_new(feed.key, image.stamp_ns):
-                model.take_depth(image, noise)
-        for feed, noise in self._ranges:
-            ranges = read(feed)
-            if ranges is not None and self._is_new(feed.key, ranges.stamp_ns):
-                model.take_ranges(ranges, noise)
+        for feed, noise in self._looks:
+            look: Any = read(feed)
+            if look is not None and self._is_new(feed.key, look.stamp_ns):
+                model.take_look(look, noise)
         return model.world(clock.tick, clock.stamp_ns)
 
     def _is_new(self, key: str, stamp_ns: int) -> bool:
@@ -125,7 +123,7 @@ class _Perceived:
         return new
 
 
-def _noise(sensor: DepthCamera | RangeSensor) -> Noise:
+def _noise(sensor: Looking) -> Noise:
     """As the robot's file has it. One without noise is not trusted without end."""
     per_m2 = sensor.noise_m_per_m2 if isinstance(sensor, DepthCamera) else 0.0
     return Noise(max(sensor.noise_m, MIN_NOISE_M), per_m2)

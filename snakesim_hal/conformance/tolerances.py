@@ -44,4 +44,3 @@ TORQUE_NM = 0.06  # besides: friction between motor and gauge, noise, quantisati
 # these speeds that is a tenth. A target that is not bumpless, or a motor that restarts, makes several tenths.
 BUMP_SHARE = 0.25
 RATE_SHARE = 0.3  # of a sensor's stated rate
-RANGE_SHARE = 0.05  # of the stated range, for noise at its ends

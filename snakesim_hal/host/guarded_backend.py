@@ -18,6 +18,7 @@ from snakesim_hal.injection import Injection
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Fault, LifecycleState
 from snakesim_hal.wire.outgoing import checked, packed
+from snakesim_hal.wire.own_sample import OwnKind, own_kinds
 
 MethodT = TypeVar("MethodT", bound=Callable[..., Any])
 
@@ -43,6 +44,7 @@ class GuardedBackend:
         self._inner = inner
         self.name = type(inner).__name__
         self._keys: list[str] | None = None
+        self._own: dict[str, OwnKind] = {}
 
     @_guarded
     def describe(self) -> Description:
@@ -60,7 +62,7 @@ class GuardedBackend:
                 if key not in self._described():
                     known = ", ".join(self._described())
                     raise WireError("unknown_key", f"not a sensor of its description, which has {known}")
-                encoded[key] = checked(key, message)
+                encoded[key] = checked(key, message, self._own.get(key))
         except WireError as error:
             raise BackendError(f"{self.name}.sample: {key} cannot be published: {error.detail}") from None
         return replace(samples, encoded=encoded)
@@ -93,5 +95,6 @@ class GuardedBackend:
     def _described(self) -> list[str]:
         """Keys of its sensors."""
         if self._keys is None:
-            self._keys = [sensor.key for sensor in self._inner.describe().sensors]
+            robot = self._inner.describe()
+            self._keys, self._own = [sensor.key for sensor in robot.sensors], own_kinds(robot)
         return self._keys

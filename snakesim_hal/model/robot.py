@@ -10,10 +10,12 @@ from typing import Annotated
 
 from msgspec import Meta
 
+from snakesim_hal.errors import short
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.joints import Drive, Heat, Joint, JointExceptions, Limits, Motor, Supply, table
 from snakesim_hal.model.links import Link
-from snakesim_hal.model.sensors import LinkName, Mounted, Sensors
+from snakesim_hal.model.plugins import SENSORS, find_plugin
+from snakesim_hal.model.sensors import LinkName, Mounted, OwnSensor, Sensors
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (
     Axis,
@@ -23,6 +25,7 @@ from snakesim_hal.wire.messages import (
     SafeAction,
     SensorDescription,
 )
+from snakesim_hal.wire.own_sample import schema_of
 from snakesim_hal.wire.quantities import MAX_JOINTS, above
 
 
@@ -75,7 +78,7 @@ class RobotFile(FileStruct, frozen=True, kw_only=True):
                 f"[[links]] has {len(self.links)} entries, and {last} joints connect {last + 1} links; list each, "
                 f"tail to head, or none"
             )
-        for sensor in (*self.sensors.depth, *self.sensors.range):
+        for sensor in (*self.sensors.depth, *self.sensors.range, *self.sensors.own):
             link = self.link_index(sensor.link)
             if link > last:
                 raise ValueError(
@@ -138,7 +141,7 @@ def describe(
     emulated: bool = False,
     simulated_time: bool = False,
 ) -> Description:
-    """The description that the HAL publishes, from a robot file.
+    """The description that the HAL publishes, from a robot file. Raises ConfigError for the class of a sensor in it.
 
     emulated: nothing real moves; simulated_time: and between two ticks any time may pass.
     """
@@ -186,7 +189,14 @@ def describe(
         joints=joints,
         links=links,
         sensors=sensors,
+        own={keys.own(sensor.name): _own_schema(sensor) for sensor in robot.sensors.own},
     )
+
+
+def _own_schema(sensor: OwnSensor) -> str:
+    """Of the message that the sensor's class names. Raises ConfigError."""
+    model = find_plugin(SENSORS, sensor.model)
+    return schema_of(getattr(model, "message", None), f"sensor {sensor.name!r}: model {short(sensor.model)}")
 
 
 def layout_hash(joints: list[JointDescription]) -> str:

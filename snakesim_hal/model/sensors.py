@@ -8,11 +8,20 @@ from msgspec import Meta
 
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.quantities import MAX_BEAMS, MAX_IMAGE_HEIGHT, MAX_IMAGE_WIDTH, MAX_JOINTS, above, from_zero
+from snakesim_hal.wire.quantities import (
+    MAX_BEAMS,
+    MAX_IMAGE_HEIGHT,
+    MAX_IMAGE_WIDTH,
+    MAX_JOINTS,
+    MAX_OWN_SENSORS,
+    above,
+    from_zero,
+)
 
-MAX_MOUNTED = 8  # cameras, and as many lidars and range finders: a description has room for 32 keys
+MAX_MOUNTED = 8  # cameras, and as many lidars and range finders: a description has room for 48 keys
 Angle = Annotated[float, Meta(ge=-math.pi, le=math.pi, extra_json_schema={"unit": "rad"})]
 Offset = Annotated[float, Meta(ge=-10, le=10, extra_json_schema={"unit": "m"})]
+Model = Annotated[str, Meta(min_length=1, max_length=500)]
 LinkName = Literal["head", "tail"] | Annotated[int, Meta(ge=0, le=MAX_JOINTS)]
 
 
@@ -61,7 +70,7 @@ class PowerSensor(FileStruct, frozen=True, kw_only=True):
 
 
 class Mounted(FileStruct, frozen=True, kw_only=True):
-    """A sensor that looks from a place on a link. Several of a kind are told apart by their names.
+    """A sensor at a place on a link. Several of a kind are told apart by their names.
 
     What it measures arrives after `delay_s`, and at least a period later.
     """
@@ -73,13 +82,18 @@ class Mounted(FileStruct, frozen=True, kw_only=True):
     pitch_rad: Angle = 0.0  # then about y, positive downwards
     rate_hz: Annotated[float, above(1000, "Hz")] = 20.0
     delay_s: Annotated[float, from_zero(1, "s")] = 0.03
+    settings: dict[str, Any] = {}  # of its model, checked by it
+
+
+class Looking(Mounted, frozen=True, kw_only=True):
+    """A sensor that measures distances from there."""
+
     noise_m: Annotated[float, from_zero(1, "m")] = 0.0
     dropout: Annotated[float, Meta(ge=0, le=1, extra_json_schema={"unit": "1"})] = 0.0  # share that measures nothing
-    model: Annotated[str, Meta(min_length=1, max_length=500)] = "rays"  # by which the simulator makes its samples
-    settings: dict[str, Any] = {}  # of that model, checked by it
+    model: Model = "rays"  # by which the simulator makes its samples
 
 
-class DepthCamera(Mounted, frozen=True, kw_only=True):
+class DepthCamera(Looking, frozen=True, kw_only=True):
     """Distances along the optical axis, in an image of square pixels without distortion."""
 
     width: Annotated[int, Meta(ge=1, le=MAX_IMAGE_WIDTH)] = 160
@@ -100,7 +114,7 @@ class DepthCamera(Mounted, frozen=True, kw_only=True):
         return self.width / 2 / math.tan(self.view_rad / 2)
 
 
-class RangeSensor(Mounted, frozen=True, kw_only=True):
+class RangeSensor(Looking, frozen=True, kw_only=True):
     """Distances along beams in a plane: a 2-D lidar; or with one beam a range finder."""
 
     beams: Annotated[int, Meta(ge=1, le=MAX_BEAMS)] = 1
@@ -117,12 +131,19 @@ class RangeSensor(Mounted, frozen=True, kw_only=True):
             )
 
 
+class OwnSensor(Mounted, frozen=True, kw_only=True):
+    """A sensor with a message of its own, which the class in `model` has: see docs/sensors.md."""
+
+    model: Model
+
+
 def _check_range(min_m: float, max_m: float) -> None:
     if min_m >= max_m:
         raise ValueError(f"`range_min_m` = {min_m:g} m must be below `range_max_m` = {max_m:g} m")
 
 
-AnySensor = ContactSensor | ImuSensor | PoseSensor | PowerSensor | DepthCamera | RangeSensor
+AnyMounted = DepthCamera | RangeSensor | OwnSensor
+AnySensor = ContactSensor | ImuSensor | PoseSensor | PowerSensor | AnyMounted
 
 
 class Sensors(FileStruct, frozen=True, kw_only=True):
@@ -135,10 +156,11 @@ class Sensors(FileStruct, frozen=True, kw_only=True):
     power: PowerSensor | None = None
     depth: Annotated[list[DepthCamera], Meta(max_length=MAX_MOUNTED)] = []
     range: Annotated[list[RangeSensor], Meta(max_length=MAX_MOUNTED)] = []
+    own: Annotated[list[OwnSensor], Meta(max_length=MAX_OWN_SENSORS)] = []
 
     def __post_init__(self) -> None:
         """Names must tell sensors apart. Raises ValueError, which the file reader explains."""
-        for kind, sensors in (("depth", self.depth), ("range", self.range)):
+        for kind, sensors in (("depth", self.depth), ("range", self.range), ("own", self.own)):
             names = [sensor.name for sensor in sensors]
             for name in names:
                 if names.count(name) > 1:
@@ -156,14 +178,16 @@ class Sensors(FileStruct, frozen=True, kw_only=True):
                 yield key, sensor
         yield from self.mounted()
 
-    def mounted(self) -> Iterator[tuple[str, DepthCamera | RangeSensor]]:
-        """The sensors that look around, with their keys. A camera with colour is there twice."""
+    def mounted(self) -> Iterator[tuple[str, AnyMounted]]:
+        """The sensors at places on links, with their keys. A camera with colour is there twice."""
         for camera in self.depth:
             yield keys.depth(camera.name), camera
             if camera.colour:
                 yield keys.colour(camera.name), camera
         for sensor in self.range:
             yield keys.ranges(sensor.name), sensor
+        for sensor in self.own:
+            yield keys.own(sensor.name), sensor
 
     @property
     def largest_image_bytes(self) -> int:

@@ -31,6 +31,7 @@ from snakesim_hal.wire.messages import (
     Pace,
 )
 from snakesim_hal.wire.outgoing import checked
+from snakesim_hal.wire.own_sample import own_kind_at
 
 KEPT_PER_KEY = 32
 NO_TICK = -1  # of messages without a tick, such as an intent: only the newest is kept
@@ -250,7 +251,7 @@ class Client:
     def put(self, key: str, message: Message) -> None:
         """Publish an output of this service. Raises WireError, and sends nothing, when no reader would accept it."""
         try:
-            payload = checked(key, message)
+            payload = checked(key, message, None if self._robot is None else own_kind_at(key, self._robot))
             wrong = None if self._robot is None else mismatch(message, self._robot)
             if wrong is not None:
                 raise wrong

@@ -19,9 +19,9 @@ from snakesim_hal.wire.messages import (
     Imu,
     JointState,
     Message,
+    MountedSample,
     Pose,
     Power,
-    Ranges,
     Trajectory,
     World,
 )
@@ -53,7 +53,7 @@ def mismatch(message: Message, robot: Description) -> WireError | None:
             else:
                 wrong = _lengths(message, ("rgb",), 3 * pixels, "three bytes a pixel")
             return wrong or _mounted(message, last_link)
-        case Ranges():
+        case MountedSample():
             return _mounted(message, last_link)
         case World():
             turned = message.base_orientation_wxyz
@@ -82,7 +82,7 @@ def _touching(message: Contacts | World, last_link: int) -> WireError | None:
     return _beyond(f"{type(message).__name__}.contacts: link", furthest, last_link)
 
 
-def _mounted(message: DepthImage | ColourImage | Ranges, last_link: int) -> WireError | None:
+def _mounted(message: MountedSample, last_link: int) -> WireError | None:
     name = type(message).__name__
     wrong = _beyond(f"{name}.link", message.link, last_link)
     return wrong or _no_rotation(f"{name}.orientation_l_wxyz", message.orientation_l_wxyz)

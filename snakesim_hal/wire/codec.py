@@ -8,7 +8,7 @@ from typing import Generic, TypeVar
 import msgspec
 
 from snakesim_hal.errors import WireError
-from snakesim_hal.wire.messages import VERSIONS, ColourImage, DepthImage, Message
+from snakesim_hal.wire.messages import VERSIONS, ColourImage, DepthImage, Message, OwnSample
 
 MessageT = TypeVar("MessageT", bound=Message)
 
@@ -26,7 +26,8 @@ encode = _encoder.encode
 
 def encoding_of(message: type[Message]) -> str:
     """The Zenoh encoding of a message type, such as `application/msgpack;snakesim.Clock/1`."""
-    return f"{ENCODING_PREFIX}{message.__name__}/{VERSIONS[message]}"
+    known = OwnSample if issubclass(message, OwnSample) else message  # its further fields are in the description
+    return f"{ENCODING_PREFIX}{known.__name__}/{VERSIONS[known]}"
 
 
 class Decoder(Generic[MessageT]):

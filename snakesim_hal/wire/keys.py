@@ -12,6 +12,7 @@ POWER = "sensor/power"
 DEPTH_ALL = "sensor/depth/*"
 COLOUR_ALL = "sensor/colour/*"
 RANGE_ALL = "sensor/range/*"
+OWN_ALL = "sensor/own/*"
 PREVIEW_DEPTH_ALL = "preview/depth/*"
 PREVIEW_COLOUR_ALL = "preview/colour/*"
 JOINT_COMMAND = "actuator/joints"
@@ -65,6 +66,7 @@ SPACE: tuple[Row, ...] = (
     Row(DEPTH_ALL, m.DepthImage, "HAL", "stream", _SENSOR, "distances that a camera sees"),
     Row(COLOUR_ALL, m.ColourImage, "HAL", "stream", _SENSOR, "what a camera sees, in colour"),
     Row(RANGE_ALL, m.Ranges, "HAL", "stream", _SENSOR, "distances along the beams of a lidar or a range finder"),
+    Row(OWN_ALL, m.OwnSample, "HAL", "stream", _SENSOR, "what a sensor with a message of its own says"),
     Row(
         PREVIEW_DEPTH_ALL, m.Preview, "preview", "stream", _LOOKED_AT, "small PNG of a depth image, for remote viewers"
     ),
@@ -110,6 +112,11 @@ def ranges(sensor: str) -> str:
     return f"sensor/range/{sensor}"
 
 
+def own(sensor: str) -> str:
+    """Key of a sensor with a message of its own."""
+    return f"sensor/own/{sensor}"
+
+
 def preview(image_key: str) -> str:
     """Key of the preview of an image: `sensor/depth/head` -> `preview/depth/head`."""
     return f"preview/{image_key.partition('/')[2]}"
@@ -149,6 +156,12 @@ def row_at(key: str) -> Row | None:
     """The line of the key space that a key with a message belongs to; None for other keys."""
     start, _, name = key.rpartition("/")
     return ROW_AT.get(key) or (ROW_AT.get(f"{start}/*") if name else None)
+
+
+def row_key(key: str) -> str:
+    """The key or pattern of its line in the key space; empty for other keys."""
+    row = row_at(key)
+    return "" if row is None else row.key
 
 
 def message_at(key: str) -> type[m.Message] | None:

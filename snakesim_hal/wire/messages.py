@@ -25,6 +25,7 @@ Axis = Literal["yaw", "pitch"]
 
 A_JOINT = "one entry a joint"
 MAX_CONFIG = 500_000  # characters
+RANGE_SHARE = 0.05  # of the stated range of a camera or lidar: room for noise at its ends
 PACE = about("realtime: by the wall clock; lockstep: each tick waits for all services; free: without waiting")
 LIFECYCLE = about("motors follow commands only in armed; fault and estop stay until a clear")
 HOST = about("random id of the host process, new at each start; null: unknown")
@@ -140,14 +141,23 @@ class Power(Message, frozen=True, kw_only=True):
     valid: Annotated[q.Flags, about("false: the state of this module is unknown")]
 
 
-class CameraImage(Message, frozen=True, kw_only=True):
-    """What every image says of its camera, a pinhole: see DepthImage."""
+class MountedSample(Message, frozen=True, kw_only=True):
+    """What every sensor says that sits at a place of its own on a link."""
 
     tick: q.Tick
-    stamp_ns: Annotated[q.Stamp, about("of the exposure; `tick` is later by the delay")]
-    link: Annotated[q.LinkIndex, about("that carries the camera, from 0 at the tail")]
-    position_l: Annotated[q.Vector, about("of the camera")]
-    orientation_l_wxyz: Annotated[q.Quaternion, about("of the camera frame in that of the link")]
+    stamp_ns: Annotated[q.Stamp, about("of the measurement; `tick` is later by the delay")]
+    link: Annotated[q.LinkIndex, about("that carries the sensor, from 0 at the tail")]
+    position_l: Annotated[q.Vector, about("of the sensor")]
+    orientation_l_wxyz: Annotated[q.Quaternion, about("of the sensor's frame in that of the link")]
+
+    def contradiction(self) -> str:
+        """What in it cannot be, though each number is within its bounds; empty: nothing. The contract suite asks."""
+        return ""
+
+
+class CameraImage(MountedSample, frozen=True, kw_only=True):
+    """What every image says of its camera, a pinhole: see DepthImage."""
+
     width: Annotated[int, Meta(ge=1, le=q.MAX_IMAGE_WIDTH), about("pixels in a row")]
     height: Annotated[int, Meta(ge=1, le=q.MAX_IMAGE_HEIGHT), about("rows")]
     fx_px: q.FocalLength
@@ -175,6 +185,11 @@ class DepthImage(CameraImage, frozen=True, kw_only=True):
         ),
     ]
 
+    def contradiction(self) -> str:
+        """Distances beyond the range that it states."""
+        counts = set(memoryview(self.depth[: len(self.depth) // 2 * 2]).cast("H")) - {0}
+        return _beyond_range(self.range_min_m, self.range_max_m, [count * self.scale_m for count in counts])
+
 
 class ColourImage(CameraImage, frozen=True, kw_only=True):
     """`sensor/colour/<name>`: what a camera sees, in colour. Frame and pixels are as in DepthImage."""
@@ -184,18 +199,13 @@ class ColourImage(CameraImage, frozen=True, kw_only=True):
     ]
 
 
-class Ranges(Message, frozen=True, kw_only=True):
+class Ranges(MountedSample, frozen=True, kw_only=True):
     """`sensor/range/<name>`: distances along the beams of a 2-D lidar, or along the one of a range finder.
 
     Beams lie in the xy plane of the sensor's frame; beam i is turned by `angle_min_rad` + i x `angle_step_rad` from x,
     positive to the left.
     """
 
-    tick: q.Tick
-    stamp_ns: Annotated[q.Stamp, about("of the measurement; `tick` is later by the delay")]
-    link: Annotated[q.LinkIndex, about("that carries the sensor, from 0 at the tail")]
-    position_l: Annotated[q.Vector, about("of the sensor")]
-    orientation_l_wxyz: Annotated[q.Quaternion, about("of the sensor's frame in that of the link")]
     angle_min_rad: Annotated[q.Angle, about("of the first beam")]
     angle_step_rad: Annotated[q.Angle, about("from one beam to the next")]
     range_min_m: Annotated[q.Distance, about("along the beam; what is nearer is null")]
@@ -205,6 +215,23 @@ class Ranges(Message, frozen=True, kw_only=True):
         Meta(min_length=1, max_length=q.MAX_BEAMS),
         about("one entry a beam; null: nothing within range, or the beam dropped out"),
     ]
+
+    def contradiction(self) -> str:
+        """Distances beyond the range that it states."""
+        found_m = [distance_m for distance_m in self.range_m if distance_m is not None]
+        return _beyond_range(self.range_min_m, self.range_max_m, found_m)
+
+
+def _beyond_range(least_m: float, most_m: float, found_m: list[float]) -> str:
+    slack_m = RANGE_SHARE * most_m
+    if least_m < most_m and all(least_m - slack_m <= distance_m <= most_m + slack_m for distance_m in found_m):
+        return ""
+    found = f"{min(found_m)} to {max(found_m)} m" if found_m else "nothing"
+    return f"{found} was measured, and its range is {least_m} to {most_m} m"
+
+
+class OwnSample(MountedSample, frozen=True, kw_only=True):
+    """`sensor/own/<name>`: of a sensor with a message of its own, which has more fields: those of `Description.own`."""
 
 
 class Preview(Message, frozen=True, kw_only=True):
@@ -371,7 +398,12 @@ class Description(Message, frozen=True, kw_only=True):
         Meta(min_length=2, max_length=q.MAX_JOINTS + 1),
         about("tail to head: joint i, from 0, connects link i and link i + 1"),
     ]
-    sensors: Annotated[list[SensorDescription], Meta(max_length=32)]
+    sensors: Annotated[list[SensorDescription], Meta(max_length=48)]
+    own: Annotated[
+        dict[q.Name, Annotated[str, Meta(max_length=q.MAX_OWN_SCHEMA)]],
+        Meta(max_length=q.MAX_OWN_SENSORS),
+        about("key -> JSON Schema of its message, of each sensor with a message of its own, whoever publishes it"),
+    ] = {}
 
 
 class Configuration(Message, frozen=True, kw_only=True):
@@ -711,6 +743,7 @@ VERSIONS: dict[type[Message], int] = dict.fromkeys(
         DepthImage,
         ColourImage,
         Ranges,
+        OwnSample,
         Preview,
         JointCommand,
         AppliedCommand,

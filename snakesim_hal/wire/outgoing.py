@@ -12,7 +12,8 @@ import msgspec
 from snakesim_hal.errors import WireError, did_you_mean, short
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder, encode, encoding_of
-from snakesim_hal.wire.messages import VERSIONS, Message
+from snakesim_hal.wire.messages import VERSIONS, Message, OwnSample
+from snakesim_hal.wire.own_sample import OwnKind
 
 NOT_PLAIN = (TypeError, ValueError, OverflowError, RecursionError)  # what the encoder raises
 LONGEST_VALUE = 100
@@ -21,13 +22,18 @@ STEP = re.compile(r"\.(\w+)|\[(\d+)\]")  # of the path in an error of msgspec
 _decoder = cache(Decoder[Any])
 
 
-def checked(key: str, message: Message) -> bytes:
-    """The bytes of a message that readers of `key` accept. Raises WireError: field, value, and what is allowed."""
+def checked(key: str, message: Message, own: OwnKind | None = None) -> bytes:
+    """The bytes of a message that readers of `key` accept. Raises WireError: field, value, and what is allowed.
+
+    own: what the robot's description says of the message, if that is a sensor's own; None: its class says it.
+    """
     wanted = keys.message_at(key)
     if wanted is None:
         known = did_you_mean(key, keys.ROW_AT)
         raise WireError("unknown_key", f"there is no such key; {known}`snakesim echo` lists them")
-    if type(message) is not wanted:
+    if wanted is OwnSample and isinstance(message, OwnSample):
+        wanted = type(message) if own is None else own.message
+    elif type(message) is not wanted:
         raise WireError("unknown_message", f"a {type(message).__name__}, must be a {wanted.__name__}")
     payload = packed(message)
     try:
@@ -39,7 +45,7 @@ def checked(key: str, message: Message) -> bytes:
 
 def packed(message: Message) -> bytes:
     """The bytes of a message, within bounds or not. Raises WireError for values that no message can carry."""
-    if type(message) not in VERSIONS:
+    if type(message) not in VERSIONS and not isinstance(message, OwnSample):
         raise WireError("unknown_message", f"a {type(message).__name__} is no message")
     try:
         return encode(message)

@@ -15,11 +15,13 @@ MAX_IMAGE_WIDTH, MAX_IMAGE_HEIGHT = 1280, 960
 MAX_PIXELS = MAX_IMAGE_WIDTH * MAX_IMAGE_HEIGHT
 MAX_BEAMS = 4096
 MAX_SETTINGS, MAX_SCHEMA = 8192, 65536  # characters
+MAX_OWN_SENSORS, MAX_OWN_SCHEMA = 16, 8192  # of sensors with a message of their own; characters
 MAX_PREVIEW_BYTES = 128 * 1024
 MAX_TARGET = 1e5  # of a set-point or a torque limit, in the unit of its mode
 
 
-def _bounded(low: float, high: float, unit: str) -> Meta:
+def bounded(low: float, high: float, unit: str) -> Meta:
+    """Of a number with a unit."""
     return Meta(ge=low, le=high, extra_json_schema={"unit": unit})
 
 
@@ -38,26 +40,26 @@ def about(text: str) -> Meta:
     return Meta(description=text)
 
 
-Angle = Annotated[float, _bounded(-1e4, 1e4, "rad")]
-AngularVelocity = Annotated[float, _bounded(-1e5, 1e5, "rad/s")]
-Torque = Annotated[float, _bounded(-1e5, 1e5, "N·m")]
-Force = Annotated[float, _bounded(-1e7, 1e7, "N")]
-Length = Annotated[float, _bounded(-1e6, 1e6, "m")]
-Velocity = Annotated[float, _bounded(-1e5, 1e5, "m/s")]
-Acceleration = Annotated[float, _bounded(-1e7, 1e7, "m/s²")]
-Voltage = Annotated[float, _bounded(-1e3, 1e3, "V")]
-Current = Annotated[float, _bounded(-1e4, 1e4, "A")]
-Temperature = Annotated[float, _bounded(-273.15, 1e4, "°C")]
-Unit = Annotated[float, _bounded(-1.001, 1.001, "1")]
-Scalar = Annotated[float, _bounded(-1e12, 1e12, "1")]
-Pixels = Annotated[float, _bounded(-1e5, 1e5, "px")]
+Angle = Annotated[float, bounded(-1e4, 1e4, "rad")]
+AngularVelocity = Annotated[float, bounded(-1e5, 1e5, "rad/s")]
+Torque = Annotated[float, bounded(-1e5, 1e5, "N·m")]
+Force = Annotated[float, bounded(-1e7, 1e7, "N")]
+Length = Annotated[float, bounded(-1e6, 1e6, "m")]
+Velocity = Annotated[float, bounded(-1e5, 1e5, "m/s")]
+Acceleration = Annotated[float, bounded(-1e7, 1e7, "m/s²")]
+Voltage = Annotated[float, bounded(-1e3, 1e3, "V")]
+Current = Annotated[float, bounded(-1e4, 1e4, "A")]
+Temperature = Annotated[float, bounded(-273.15, 1e4, "°C")]
+Unit = Annotated[float, bounded(-1.001, 1.001, "1")]
+Scalar = Annotated[float, bounded(-1e12, 1e12, "1")]
+Pixels = Annotated[float, bounded(-1e5, 1e5, "px")]
 FocalLength = Annotated[float, above(1e5, "px")]
 Distance = Annotated[float, from_zero(1e4, "m")]
-Speed = Annotated[float, _bounded(0.1, 10.0, "1")]  # of robot time, beside the wall clock
-Fraction = Annotated[float, _bounded(0.0, 1.0, "1")]
+Speed = Annotated[float, bounded(0.1, 10.0, "1")]  # of robot time, beside the wall clock
+Fraction = Annotated[float, bounded(0.0, 1.0, "1")]
 
-Target = Annotated[float, _bounded(-MAX_TARGET, MAX_TARGET, "rad, rad/s or N·m, as the joint's mode says")]
-TorqueLimit = Annotated[float, _bounded(0.0, MAX_TARGET, "N·m")]
+Target = Annotated[float, bounded(-MAX_TARGET, MAX_TARGET, "rad, rad/s or N·m, as the joint's mode says")]
+TorqueLimit = Annotated[float, bounded(0.0, MAX_TARGET, "N·m")]
 
 Count = Annotated[int, Meta(ge=0, le=MAX_COUNT)]
 Tick = Annotated[int, Meta(ge=0, le=MAX_COUNT), about("number of a control period, from 0 at the start of the host")]

@@ -32,7 +32,7 @@ class JointCharts:
         unknown = np.full(count, np.nan)
         self._angles = gui.add_uplot(
             (self._number, unknown, unknown),
-            ({"label": "joint"}, _line("measured", ANGLE, dots=True), _line("reference", REFERENCE, dash=True)),
+            ({"label": "joint"}, line("measured", ANGLE, dots=True), line("reference", REFERENCE, dash=True)),
             title="Angle of each joint, rad (tail to head)",
             height=190,
             scales={"x": {"time": False}, "y": _range(angles)},
@@ -41,17 +41,17 @@ class JointCharts:
             (self._number, unknown, self._limits, -self._limits, unknown),
             (
                 {"label": "joint"},
-                _line("measured", ANGLE, dots=True),
-                _line("limit", LIMIT, dash=True),
-                _line("-limit", LIMIT, dash=True),
-                _line("propulsion", PUSH, dots=True, size=12),
+                line("measured", ANGLE, dots=True),
+                line("limit", LIMIT, dash=True),
+                line("-limit", LIMIT, dash=True),
+                line("propulsion", PUSH, dots=True, size=12),
             ),
             title="Torque of each joint, N·m",
             height=190,
             scales={"x": {"time": False}, "y": _range(self._limits)},
         )
         colours = list(joint_colours(count, dark=True).values())
-        lines = tuple(_line(name, colour) for name, colour in zip(self._names, colours, strict=True))
+        lines = tuple(line(name, colour) for name, colour in zip(self._names, colours, strict=True))
         empty = (np.zeros(1), *[np.full(1, np.nan)] * count)
         self._angles_then, self._torques_then = (
             gui.add_uplot(
@@ -126,7 +126,8 @@ def _range(most: Floats) -> Any:
     return {"range": (-1.05 * float(most.max()), 1.05 * float(most.max()))}
 
 
-def _line(label: str, stroke: str, *, dash: bool = False, dots: bool = False, size: int = 5) -> Any:
+def line(label: str, stroke: str, *, dash: bool = False, dots: bool = False, size: int = 5) -> Any:
+    """One line of a chart."""
     series: dict[str, Any] = {"label": label, "stroke": stroke, "width": 1.5, "points": {"show": False}}
     if dash:
         series["dash"] = [5, 4]

@@ -19,6 +19,7 @@ from snakesim_operator.console.charts import JointCharts
 from snakesim_operator.console.controls import KEYS, Controls, add_appearance, name_of, set_appearance
 from snakesim_operator.console.drawing import Surroundings, draw
 from snakesim_operator.console.operations import Log, Operations
+from snakesim_operator.console.own_sensors import OwnSensors
 from snakesim_operator.console.pictures import picture
 from snakesim_operator.console.polygon import force_polygon, push_point_table
 from snakesim_operator.console.server import PageServer
@@ -61,6 +62,7 @@ class Page:
         self._moment: RobotSnapshot | None = None
         self._stage: Stage | None = None
         self._charts: JointCharts | None = None
+        self._own_sensors: OwnSensors | None = None
         self._shown_log = -1
         self._pictures: dict[str, viser.GuiImageHandle] = {}
         self._lay_out()
@@ -104,6 +106,8 @@ class Page:
             self._cameras_tab = gui.add_folder(None)
             with self._cameras_tab:
                 self._no_camera = gui.add_html("<div style='padding:.3em .6em;opacity:.7'>no image yet</div>")
+        with tabs.add_tab("Sensors"):
+            self._sensors_tab = gui.add_folder(None)
         with tabs.add_tab("Settings"):
             self._settings_tab = gui.add_folder(None)
         with tabs.add_tab("Log"):
@@ -209,9 +213,13 @@ class Page:
                 with self._server.atomic():
                     self._stage.show(drawing)
             self._charts.take(snapshot)
+            if self._own_sensors is not None:
+                self._own_sensors.take(snapshot)
             if self._frames % CHARTS_EVERY == 1:
                 self._charts.show(snapshot)
                 self._forces.content = force_polygon(snapshot) + push_point_table(snapshot.control)
+                if self._own_sensors is not None:
+                    self._own_sensors.show(snapshot)
             if self._frames % PICTURES_EVERY == 1:
                 self._show_pictures(snapshot)
             if snapshot.settings is not None and (before is None or snapshot.settings != before.settings):
@@ -233,6 +241,12 @@ class Page:
             if self._charts is not None:
                 self._charts.remove()
             self._charts = JointCharts(self._server.gui, robot)
+        if self._own_sensors is not None:
+            self._own_sensors.remove()
+            self._own_sensors = None
+        if robot.own and self._operations is not None:
+            with self._sensors_tab:
+                self._own_sensors = OwnSensors(self._server.gui)
 
     def _show_settings(self, settings: ControlSettings) -> None:
         with self._lock:

@@ -14,6 +14,7 @@ from snakesim_hal.wire.messages import (
     DepthImage,
     Description,
     JointState,
+    OwnSample,
     Power,
     Status,
     Trajectory,
@@ -50,6 +51,7 @@ class RobotSnapshot:
     settings: ControlSettings | None = None
     power: Power | None = None
     images: dict[str, DepthImage | ColourImage] = field(default_factory=dict)  # by key
+    own: dict[str, OwnSample] = field(default_factory=dict[str, OwnSample])  # of own sensors, by key
     streams: dict[str, Stream] = field(default_factory=dict)  # by key
     hosts: frozenset[str] = frozenset()  # ids of all that publish a status; more than one: an impostor
 

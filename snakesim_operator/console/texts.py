@@ -108,7 +108,7 @@ def state_table(snapshot: RobotSnapshot) -> str:
         rows += [("isolated", plain(", ".join(status.isolated)))] if status.isolated else []
         rows += [("injected", plain(what)) for what in status.injected]
         rows += [("real time", plain(what)) for what in status.realtime_warnings]
-    return _table([*rows, *_health(snapshot)]) + faults(status)
+    return table([*rows, *_health(snapshot)]) + faults(status)
 
 
 def _speed(status: Status) -> str:
@@ -149,7 +149,7 @@ def stream_table(snapshot: RobotSnapshot) -> str:
         (plain(key), f"{stream.rate_hz:.0f} Hz" + (f", {stream.age_s * 1e3:.0f} ms old" if stream.age_s else ""))
         for key, stream in sorted(snapshot.streams.items())
     ]
-    return _table(rows)
+    return table(rows)
 
 
 def log(lines: Iterable[str]) -> str:
@@ -171,7 +171,8 @@ def _counts(numbers: dict[str, int]) -> str:
     return plain(", ".join(f"{word} {number}" for word, number in sorted(numbers.items())) or "none")
 
 
-def _table(rows: Iterable[tuple[str, str]]) -> str:
+def table(rows: Iterable[tuple[str, str]]) -> str:
+    """Names and values, which are HTML."""
     cells = "".join(
         f"<tr><td style='opacity:.7;padding-right:.8em;white-space:nowrap;vertical-align:top'>{name}</td>"
         f"<td style='overflow-wrap:anywhere'>{value}</td></tr>"

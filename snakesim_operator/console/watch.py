@@ -24,12 +24,14 @@ from snakesim_hal.wire.messages import (
     Description,
     JointState,
     Message,
+    OwnSample,
     Pose,
     Power,
     Status,
     Trajectory,
     World,
 )
+from snakesim_hal.wire.own_sample import own_kinds
 from snakesim_operator.console.snapshot import RobotSnapshot, Stream
 
 KEPT, IMAGES_KEPT = 64, 2  # arrivals of a key between two looks
@@ -101,6 +103,7 @@ class Watch:
             session.on_arrival(key, self._inlet(key, message, KEPT).put)
         for key in IMAGES:
             session.on_arrival(key, self._take_image)
+        session.on_arrival(keys.OWN_ALL, self._take_own)
 
     def _inlet(self, key: str, message: type[Message], kept: int) -> KeyBuffer:
         buffer = self._buffers[key] = KeyBuffer(message, kept)
@@ -115,6 +118,11 @@ class Watch:
                 return
             buffer = self._inlet(arrival.key, message, IMAGES_KEPT)
         buffer.put(arrival)
+
+    def _take_own(self, arrival: Arrival) -> None:
+        """In Zenoh's threads: of a sensor that the robot has described."""
+        if (buffer := self._buffers.get(arrival.key)) is not None:
+            buffer.put(arrival)
 
     @property
     def robot(self) -> Description | None:
@@ -146,6 +154,7 @@ class Watch:
             settings=self._get(keys.SETTINGS_IN_FORCE, ControlSettings),
             power=self._get(keys.POWER, Power),
             images={key: found for key, found in self._newest.items() if isinstance(found, DepthImage | ColourImage)},
+            own={key: found for key, found in self._newest.items() if isinstance(found, OwnSample)},
             streams=self._streams(clock),
             hosts=frozenset(host for host, at_s in self._hosts.items() if now_s - at_s < STATUS_LIMIT_S),
         )
@@ -166,6 +175,8 @@ class Watch:
         self._count()
 
     def _keep(self, key: str, message: Any) -> None:
+        if keys.row_key(key) == keys.OWN_ALL and key not in self._buffers:
+            return  # of another host's, which described it
         self._newest[key] = message
         if key == keys.STATUS:
             self._heard_s = time.monotonic()
@@ -179,6 +190,12 @@ class Watch:
             self._newest.clear()
             self._bodies.clear()
             self._hosts.clear()
+        if self.robot is None or self.robot.own != robot.own:
+            for key in [key for key in self._buffers if keys.row_key(key) == keys.OWN_ALL]:
+                del self._buffers[key]
+                self._newest.pop(key, None)
+            for key, kind in own_kinds(robot).items():
+                self._inlet(key, kind.message, KEPT)
         self._newest[keys.DESCRIPTION] = robot
 
     def _body(self, world: World | None) -> tuple[JointState | None, Any]:

@@ -15,7 +15,7 @@ from snakesim_hal.terminal import say
 from snakesim_hal.wire.messages import Mode
 from snakesim_operator.figures.lines import STYLE, Floats, over_time
 from snakesim_operator.figures.paper import figures
-from snakesim_operator.playback.export import UNITS, arrays, table
+from snakesim_operator.playback.export import UNITS, arrays, table, unit_of
 from snakesim_operator.results.incomplete import exit_code
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.timeline import zero_s
@@ -84,7 +84,7 @@ def _draw(axes: Axes, record: RunRecord, names: Sequence[str]) -> None:
                 f"no signal {short(name)!r}; {did_you_mean(name, list(known))}there are {wide}, and columns of them "
                 f"such as angle_rad.{record.description.joints[0].name}"
             )
-    units = {UNITS[name.partition(".")[0]] for name in names}
+    units = {unit_of(name, record) for name in names}
     if len(units) > 1:
         units.discard(UNITS["target"])  # drawn where its mode has the unit of the others
     if len(units) > 1:

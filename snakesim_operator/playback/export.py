@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.terminal import Say, printable
+from snakesim_hal.wire.own_sample import own_kinds
 from snakesim_operator.playback.info import recording_of
 from snakesim_operator.playback.lerobot import write_lerobot
 from snakesim_operator.recording.recover import recover
@@ -27,6 +28,7 @@ FORMATS = ("csv", "parquet", "npz", "lerobot", "mcap")
 OF_JOINTS = ("angle_rad", "velocity_rad_s", "torque_nm", "mode", "target", "torque_limit_nm")
 UNITS = {
     "time_s": "s",
+    "age_s": "s",
     "angle_rad": "rad",
     "velocity_rad_s": "rad/s",
     "torque_nm": "N·m",
@@ -84,7 +86,15 @@ def _beside(run: Path, form: str) -> Path:
 
 def arrays(record: RunRecord) -> dict[str, NDArray[Any]]:
     """Every column as an array, (n,) or (n, width)."""
-    return {name: value for name, value in vars(record).items() if isinstance(value, np.ndarray) and name != "posed"}
+    found = {name: value for name, value in vars(record).items() if isinstance(value, np.ndarray) and name != "posed"}
+    return found | record.own
+
+
+def unit_of(name: str, record: RunRecord) -> str:
+    """Of a column, or of all of a signal."""
+    what = name.partition(".")[0]
+    own = {field: unit for kind in own_kinds(record.description).values() for field, unit in kind.units.items()}
+    return {**own, **UNITS}[what]
 
 
 def table(record: RunRecord) -> dict[str, NDArray[Any]]:

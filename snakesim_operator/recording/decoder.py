@@ -1,15 +1,19 @@
 """Our messages for `mcap`'s own reader: `make_reader(file, decoder_factories=[DecoderFactory()])`."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import msgspec
 from mcap.decoder import DecoderFactory as McapDecoderFactory
 from mcap.records import Schema
 
+from snakesim_hal.errors import WireError
 from snakesim_hal.wire.messages import VERSIONS
+from snakesim_hal.wire.own_sample import own_kind
 
 PREFIX = "snakesim."
+OWN = f"{PREFIX}own."  # of sensors with a message of their own
 
 
 class DecoderFactory(McapDecoderFactory):
@@ -28,5 +32,8 @@ class DecoderFactory(McapDecoderFactory):
             return None
         if message_encoding == "json":  # made for viewers, such as `/planar13/state`
             return msgspec.json.decode
+        if schema.name.startswith(OWN):
+            with suppress(WireError):
+                return msgspec.msgpack.Decoder(own_kind(schema.data.decode(errors="replace")).message).decode
         known = self._decoders.get(schema.name)
         return msgspec.msgpack.decode if known is None else known.decode

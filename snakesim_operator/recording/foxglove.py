@@ -35,11 +35,13 @@ from snakesim_hal.wire.messages import (
     DepthImage,
     Description,
     JointState,
+    OwnSample,
     Pose,
     Trajectory,
     World,
     WorldContact,
 )
+from snakesim_hal.wire.own_sample import OwnKind, own_kinds
 from snakesim_operator.recording import shapes
 from snakesim_operator.recording.body_frames import BodyFrames
 from snakesim_operator.recording.state_messages import ContactForces, State, StateMessages
@@ -75,7 +77,7 @@ _decoders: dict[type[Any], Any] = {
     )
 }
 
-Kind = type[Protobuf] | type[State] | type[ContactForces]
+Kind = type[Protobuf] | type[State] | type[ContactForces] | type[OwnSample]
 ALWAYS: dict[str, Kind] = {  # topics below the robot's, but for those of images, of which a robot may have none
     "tf": FrameTransforms,
     "joint_states": JointStates,
@@ -114,7 +116,7 @@ class FoxgloveSchema(NamedTuple):
 @cache
 def schema_of(kind: Kind) -> FoxgloveSchema:
     """As MCAP wants it: of a protobuf message its file and all that it imports."""
-    if issubclass(kind, State | ContactForces):
+    if issubclass(kind, State | ContactForces | OwnSample):
         schema = msgspec.json.schema(kind)["$defs"][kind.__name__]
         return FoxgloveSchema(f"snakesim.shown.{kind.__name__}", "json", "jsonschema", msgspec.json.encode(schema))
     files: dict[str, Any] = {}
@@ -142,6 +144,7 @@ class FoxgloveChannels:
         self._due_ns: dict[str, int] = {}
         self._robot: Description | None = None
         self._frames: BodyFrames | None = None
+        self._own: dict[str, OwnKind] = {}  # messages of the robot's own sensors, by key
         self._state_messages = StateMessages()
         self._truth = shapes.obstacles([], "obstacles", shapes.TRUTH, 0)
 
@@ -158,6 +161,8 @@ class FoxgloveChannels:
             return self._at_clock(time_ns) if self._is_due("moving", time_ns, MOVING_NS) else []
         if key.startswith(("sensor/depth/", "sensor/colour/")):
             return list(self._image(key, payload, time_ns)) if self._is_due(key, time_ns, IMAGES_NS) else []
+        if key in self._own:
+            return list(self._own_sample(key, payload, time_ns))
         if key in (keys.DESCRIPTION, keys.CONFIG):
             self._meet(key, payload)
         return []
@@ -167,7 +172,7 @@ class FoxgloveChannels:
             if key == keys.DESCRIPTION:
                 robot: Description = _decoders[Description].decode(payload)
                 if len(robot.links) == len(robot.joints) + 1:
-                    self._robot, self._frames = robot, BodyFrames(robot)
+                    self._robot, self._frames, self._own = robot, BodyFrames(robot), own_kinds(robot)
             else:
                 config = msgspec.json.decode(_decoders[Configuration].decode(payload).content, type=RunConfig)
                 placed = place(config.scene, capsules_at_start(config))  # checked when the run began
@@ -271,8 +276,22 @@ class FoxgloveChannels:
     def _protobuf(self, name: str, message: Protobuf) -> FoxgloveMessage:
         return FoxgloveMessage(self._topic(name), type(message), message.SerializeToString())
 
-    def _json(self, name: str, message: State | ContactForces) -> FoxgloveMessage:
+    def _json(self, name: str, message: State | ContactForces | OwnSample) -> FoxgloveMessage:
         return FoxgloveMessage(self._topic(name), type(message), msgspec.json.encode(message))
+
+    def _own_sample(self, key: str, payload: bytes, time_ns: int) -> Iterator[FoxgloveMessage]:
+        """Of an own sensor, with its own schema: as JSON, which viewers plot; and its frame."""
+        robot, kind = self._robot, self._own[key].message
+        with suppress(*UNDECODABLE):
+            sample = msgspec.msgpack.decode(payload, type=kind)
+            if robot is None or sample.link >= len(robot.links):
+                return
+            name = _ros_name(key.rpartition("/")[2])
+            if self._is_due(key, time_ns, MOVING_NS):
+                place = sample.position_l, sample.orientation_l_wxyz
+                mount = shapes.frame(time_ns, robot.links[sample.link].name, f"{name}_frame", *place)
+                yield self._protobuf("tf", FrameTransforms(transforms=[mount]))
+            yield self._json(f"own/{name}", sample)
 
 
 def _decoded(message: type[Any], payload: bytes | None) -> Any:

@@ -18,6 +18,7 @@ from mcap.records import Channel, DataEnd, Header, McapRecord, Message, Metadata
 from mcap.writer import MCAP0_MAGIC
 
 from snakesim_hal.errors import ConfigError
+from snakesim_hal.wire.keys import row_key
 from snakesim_operator.recording.chunks import (
     HEAD,
     LARGEST_BYTES,
@@ -68,12 +69,15 @@ class RecordingReader:
         return self.losses.words()
 
     def messages(self, keys: Collection[str] | None = None) -> Iterator[Recorded]:
-        """Messages at these keys of the robot, or at all. Raises ConfigError for a file that is no recording."""
+        """Messages at these keys of the robot, or at all. Raises ConfigError for a file that is no recording.
+
+        keys: a pattern of the key space stands for its keys.
+        """
         for record in self.records():
             if isinstance(record, Message):
                 channel = self._channels[record.channel_id]
                 encoding = channel.metadata.get("encoding")
-                if encoding is not None and (keys is None or channel.topic in keys):
+                if encoding is not None and (keys is None or channel.topic in keys or row_key(channel.topic) in keys):
                     yield Recorded(channel.topic, record.data, encoding, record.log_time, record.publish_time)
 
     def records(self) -> Iterator[McapRecord]:

@@ -9,11 +9,17 @@ import json
 import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
+
+import msgspec
 
 from snakesim_hal.model.files import SCHEMAS
 from snakesim_hal.network.session import Arrival
 from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import UNDECODABLE
+from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.own_sample import OwnKind, own_kinds
 from snakesim_operator.recording.disk import GrowingFile
 from snakesim_operator.recording.foxglove import FoxgloveChannels, FoxgloveMessage, schema_of
 from snakesim_operator.recording.mcap_file import McapFile
@@ -46,6 +52,7 @@ class Recording:
         self._mcap = McapFile(self._file)
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
+        self._own: dict[str, OwnKind] = {}
         self._flush_at = 0.0
         self._wall_ns = time.time_ns() - time.monotonic_ns()
         self.flush()
@@ -54,6 +61,8 @@ class Recording:
         """Write one message. Those that are not at a key of the key space are left out."""
         if self.failure:
             return
+        if arrival.key == keys.DESCRIPTION:
+            self._meet(arrival.payload)
         channel = self._channels.get(arrival.key)
         if channel is None and (channel := self._open(arrival)) is None:
             return
@@ -69,6 +78,10 @@ class Recording:
             self._mcap.add(channel, at_ns, wall_ns, self._shown[shown.topic], shown.payload)
             if self._show is not None:
                 self._show(shown, at_ns)
+
+    def _meet(self, payload: bytes) -> None:
+        with suppress(*UNDECODABLE):
+            self._own = own_kinds(msgspec.msgpack.decode(payload, type=Description))
 
     def flush_when_due(self) -> None:
         """Write what waits, a few times a second."""
@@ -106,11 +119,17 @@ class Recording:
         if message is None:
             return None
         name = message.__name__
-        if name not in self._schemas:
+        if (own := self._own.get(arrival.key)) is not None:
+            name, content = f"own.{own.message.__name__}", own.schema.encode()
+        elif name in self._schemas:
+            content = b""
+        else:
             content = (SCHEMAS / "messages" / f"{name}.json").read_bytes()
-            self._schemas[name] = self._mcap.add_schema(f"snakesim.{name}", "jsonschema", content)
+        schema = name if own is None else own.schema  # two authors may have one name
+        if schema not in self._schemas:
+            self._schemas[schema] = self._mcap.add_schema(f"snakesim.{name}", "jsonschema", content)
         metadata = {"encoding": arrival.encoding[:200]}
         channel = self._channels[arrival.key] = self._mcap.add_channel(
-            arrival.key, "msgpack", self._schemas[name], metadata
+            arrival.key, "msgpack", self._schemas[schema], metadata
         )
         return channel

@@ -21,8 +21,8 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import ControlState, Description, Trajectory, World
 from snakesim_operator.recording.message import RECORDING
-from snakesim_operator.results.gaps import cleaned, unwritten
-from snakesim_operator.results.recorded import SERVICE_STREAMS, Contents, read_recording
+from snakesim_operator.results.gaps import cleaned, unread, unwritten
+from snakesim_operator.results.recorded import OUTPUTS, Contents, read_recording
 
 CONFIG = "config.json"
 SUMMARY = "summary.json"
@@ -55,6 +55,7 @@ class RunRecord:
     orientation_wxyz: Floats  # (n, 4)
     contact_peak_n: Floats  # (n,) strongest contact, mean over 50 ms
     contact_count: Floats  # (n,) obstacles touched
+    own: dict[str, Floats] = field(default_factory=dict[str, Floats])  # of sensors with a message of their own
     lacks: list[str] = field(default_factory=list[str])  # missing data, as text
     replay_of: str = ""  # the recording whose sensors its services were given; empty: a run
     alone: bool = False  # `folder` is a recording, without the run's other files
@@ -93,7 +94,7 @@ class RunRecord:
         if host.ended == "running":
             host = msgspec.structs.replace(host, ticks=len(columns["tick"]), command_digest=digest_of(columns))
         path = folder / RECORDING
-        contents = read_recording(path, SERVICE_STREAMS) if path.is_file() else Contents(path, lacks=[UNRECORDED])
+        contents = read_recording(path, OUTPUTS) if path.is_file() else Contents(path, lacks=[UNRECORDED])
         return RunRecord._of(folder, config, description, host, contents, columns)
 
     @staticmethod
@@ -126,6 +127,9 @@ class RunRecord:
         control = contents.streams[keys.CONTROL_STATE]
         while control and control[-1].state == "PowerOff":  # the host has ended, so its clock is expected to stop
             control.pop()
+        refused = contents.refused.copy()
+        own = contents.own_columns(description, cleaned_columns["time_s"])
+        lacks += unread(contents.refused - refused)
         known = {name: column for name, column in cleaned_columns.items() if name != "tick"}
         streams = (control, contents.streams[keys.WORLD], contents.streams[keys.TRAJECTORY])
         return RunRecord(
@@ -135,6 +139,7 @@ class RunRecord:
             host,
             *streams,
             **known,
+            own=own,
             lacks=lacks + unwritten(host) + contents.lacks,
             replay_of=contents.replay_of,
             alone=folder == contents.path,

@@ -28,6 +28,7 @@ from snakesim_hal.wire.messages import (
     Trajectory,
     World,
 )
+from snakesim_hal.wire.own_sample import own_kinds
 from snakesim_operator.recording.message import Recorded
 from snakesim_operator.results.gaps import unread
 
@@ -37,9 +38,11 @@ SERVICE_STREAMS: dict[str, type[Message]] = {
     keys.TRAJECTORY: Trajectory,
 }
 """What guidance, navigation and control publish."""
+OUTPUTS = (*SERVICE_STREAMS, keys.OWN_ALL)
+"""What the host's black box does not have."""
 WORLDS_PER_S = 20.0  # as often as control publishes its state
 _TICKED = (keys.CLOCK, keys.JOINTS, keys.APPLIED, keys.POSE, keys.CONTACTS, keys.JOINT_COMMAND)
-ALL: tuple[str, ...] = (*SERVICE_STREAMS, *_TICKED, keys.DESCRIPTION, keys.CONFIG, keys.STATUS)
+ALL: tuple[str, ...] = (*SERVICE_STREAMS, *_TICKED, keys.OWN_ALL, keys.DESCRIPTION, keys.CONFIG, keys.STATUS)
 
 
 @dataclass
@@ -54,6 +57,7 @@ class Contents:
     at: dict[str, dict[int, Any]] = field(
         default_factory=lambda: {key: {} for key in _TICKED}
     )  # key -> tick -> message
+    own: dict[str, list[Recorded]] = field(default_factory=dict[str, list[Recorded]])  # of own sensors, by key
     armed_wall_ns: list[int] = field(default_factory=list[int])  # wall clock at each clock since the first arming
     refused: Counter[str] = field(default_factory=Counter[str])  # messages that cannot be decoded, by key and reason
     lacks: list[str] = field(default_factory=list[str])
@@ -63,6 +67,9 @@ class Contents:
 
     def take(self, recorded: Recorded) -> None:
         """One message at a key of ALL, in the order of the file."""
+        if keys.row_key(recorded.key) == keys.OWN_ALL:
+            self.own.setdefault(recorded.key, []).append(recorded)  # their schema is in the description
+            return
         message_type = keys.message_at(recorded.key)
         if message_type is None:
             return
@@ -128,6 +135,31 @@ class Contents:
                 found[name] = np.array(values, dtype=float).reshape(len(rows), count)
         return found
 
+    def own_columns(self, robot: Description, time_s: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+        """At each row the newest sample of own sensors, `bend_rad.left`, and its age, `age_s.left`; NaN: none yet."""
+        found: dict[str, NDArray[np.float64]] = {}
+        for key, kind in own_kinds(robot).items():
+            decoder, name = Decoder(kind.message), key.rpartition("/")[2]
+            came: dict[int, tuple[int, dict[str, float]]] = {}
+            for recorded in self.own.get(key, ()):
+                try:
+                    sample = decoder.decode(recorded.payload, recorded.encoding)
+                except WireError as error:
+                    self.refused[f"{key}: {error}"[:200]] += 1
+                    continue
+                came[sample.tick] = sample.stamp_ns, kind.numbers(sample)
+            ticks = np.array(sorted(came), dtype=np.int64)
+            row = np.searchsorted(ticks * (robot.period_ns * 1e-9), time_s + 1e-9, side="right") - 1
+            names = dict.fromkeys(at for _, numbers in came.values() for at in numbers) or kind.units
+            values = {at: [came[tick][1].get(at, np.nan) for tick in ticks.tolist()] for at in names}
+            known = row >= 0
+            for at, column in values.items():
+                what, dot, part = at.partition(".")
+                found[f"{what}.{name}{dot}{part}"] = _picked(column, row, known)
+            stamps = _picked([came[tick][0] * 1e-9 for tick in ticks.tolist()], row, known)
+            found[f"age_s.{name}"] = time_s - stamps
+        return found
+
     def host(self, columns: dict[str, NDArray[Any]]) -> HostRecord:
         """The host's statistics, as far as the recording shows."""
         status, armed = self.status, {t for t, clock in self.at[keys.CLOCK].items() if clock.lifecycle == "armed"}
@@ -152,6 +184,12 @@ class Contents:
             ended_why="as far as it was recorded",
             isolated=status.isolated,
         )
+
+
+def _picked(values: list[float], row: NDArray[np.int64], known: NDArray[np.bool_]) -> NDArray[np.float64]:
+    found = np.full(len(row), np.nan)
+    found[known] = np.array(values, dtype=float)[row[known]]
+    return found
 
 
 def read_recording(path: Path, wanted: Collection[str] = ALL) -> Contents:

@@ -8,6 +8,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from snakesim_hal.network.session import Session
 from snakesim_hal.terminal import Say, say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire import messages as m
+from snakesim_hal.wire.own_sample import message_of, own_kinds
 from snakesim_operator.ros2 import messages as ros
 from snakesim_operator.ros2 import robot_in_ros
 from snakesim_operator.ros2.frames import Frames, ros_name
@@ -119,7 +121,12 @@ class Bridge:
             elif key == keys.colour(name):
                 made.append(self._camera(key, name, "color", m.ColourImage, robot_in_ros.colour_image, images))
             elif key == keys.ranges(name):
-                made.append(self._beams(key, name))
+                made.append(self._mounted(key, name, "scan", ros.LASER_SCAN, robot_in_ros.laser_scan))
+        for key, kind in own_kinds(robot).items():
+            _, _, name = key.rpartition("/")
+            for field in kind.units:
+                translate = partial(robot_in_ros.numbers, kind, field)
+                made.append(self._mounted(key, name, field, ros.NUMBERS, translate))
         return made
 
     def _camera(
@@ -143,14 +150,18 @@ class Bridge:
 
         return Relay(self._session, key, message, every, pass_on, lambda: images.heard() or infos.heard())
 
-    def _beams(self, key: str, name: str) -> Relay[Any]:
-        scans = self._publisher(f"{ros_name(name)}/scan", ros.LASER_SCAN)
+    def _mounted(
+        self, key: str, name: str, topic: str, kind: RosType, translate: Callable[[int, str, Any], bytes]
+    ) -> Relay[Any]:
+        """One topic of a sensor at a place on a link, whose frame is known from its first sample on."""
+        publisher = self._publisher(f"{ros_name(name)}/{topic}", kind)
+        message: Any = message_of(key, self._robot)
 
-        def pass_on(seen: m.Ranges) -> None:
-            self._place(key, self._frames.of_beams(name, seen))
-            scans.put(robot_in_ros.laser_scan(self._ros_time.of(seen.stamp_ns), self._frames.beams(name), seen))
+        def pass_on(seen: m.MountedSample) -> None:
+            self._place(key, self._frames.of_mount(name, seen))
+            publisher.put(translate(self._ros_time.of(seen.stamp_ns), self._frames.mount(name), seen))
 
-        return Relay(self._session, key, m.Ranges, 1, pass_on, scans.heard)
+        return Relay(self._session, key, message, 1, pass_on, publisher.heard)
 
     def _place(self, key: str, frames: list[Transform]) -> None:
         """Where a sensor sits: known from its first sample on."""

@@ -10,7 +10,7 @@ Links are named as in the robot's description. An optical frame has z forward, x
 import math
 import re
 
-from snakesim_hal.wire.messages import ColourImage, DepthImage, Description, JointState, Pose, Ranges, World
+from snakesim_hal.wire.messages import ColourImage, DepthImage, Description, JointState, MountedSample, Pose, World
 from snakesim_operator.ros2.messages import Transform, Triple, Wxyz
 
 MAP = "map"
@@ -44,8 +44,8 @@ class Frames:
         """Frame of a camera's images. kind: depth or color."""
         return f"{self._prefix}{ros_name(camera)}_{kind}_optical_frame"
 
-    def beams(self, sensor: str) -> str:
-        """Frame of a lidar or range finder."""
+    def mount(self, sensor: str) -> str:
+        """Frame of a lidar, a range finder, or a sensor with a message of its own."""
         return f"{self._prefix}{ros_name(sensor)}_frame"
 
     def of_base(self, pose: World | Pose) -> Transform:
@@ -71,9 +71,9 @@ class Frames:
         mount = Transform(self.link(seen.link), body, seen.position_l, seen.orientation_l_wxyz)
         return [mount, Transform(body, optical, NOWHERE, OPTICAL_IN_CAMERA)]
 
-    def of_beams(self, sensor: str, seen: Ranges) -> list[Transform]:
-        """A lidar or range finder on its link."""
-        return [Transform(self.link(seen.link), self.beams(sensor), seen.position_l, seen.orientation_l_wxyz)]
+    def of_mount(self, sensor: str, seen: MountedSample) -> list[Transform]:
+        """That sensor on its link."""
+        return [Transform(self.link(seen.link), self.mount(sensor), seen.position_l, seen.orientation_l_wxyz)]
 
 
 def _turned(axis: str, angle_rad: float) -> Wxyz:

@@ -27,11 +27,12 @@ MARKERS = _type("visualization_msgs/msg/MarkerArray")
 IMAGE = _type("sensor_msgs/msg/Image")
 CAMERA_INFO = _type("sensor_msgs/msg/CameraInfo")
 LASER_SCAN = _type("sensor_msgs/msg/LaserScan")
+NUMBERS = _type("std_msgs/msg/Float64MultiArray")
 STRING = _type("std_msgs/msg/String")
 CLOCK = _type("rosgraph_msgs/msg/Clock")
 TWIST = _type("geometry_msgs/msg/Twist")
 DIAGNOSTICS = _type("diagnostic_msgs/msg/DiagnosticArray")
-TYPES = (JOINT_STATE, TRANSFORMS, MARKERS, IMAGE, CAMERA_INFO, LASER_SCAN, STRING, CLOCK, TWIST, DIAGNOSTICS)
+TYPES = (JOINT_STATE, TRANSFORMS, MARKERS, IMAGE, CAMERA_INFO, LASER_SCAN, NUMBERS, STRING, CLOCK, TWIST, DIAGNOSTICS)
 
 Triple = tuple[float, float, float]
 Wxyz = tuple[float, float, float, float]
@@ -111,6 +112,12 @@ def clock(stamp_ns: int) -> bytes:
 def string(text: str) -> bytes:
     """std_msgs/String."""
     return _sent(STRING, text)
+
+
+def numbers(label: str, values: Sequence[float]) -> bytes:
+    """std_msgs/Float64MultiArray of one dimension."""
+    dimension = _made("std_msgs/msg/MultiArrayDimension", label, len(values), len(values))
+    return _sent(NUMBERS, _made("std_msgs/msg/MultiArrayLayout", [dimension], 0), _doubles(values))
 
 
 def joint_state(

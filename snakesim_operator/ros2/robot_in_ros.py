@@ -9,11 +9,13 @@ from snakesim_hal.wire.messages import (
     DepthImage,
     JointState,
     Obstacle,
+    OwnSample,
     Ranges,
     Status,
     World,
     WorldContact,
 )
+from snakesim_hal.wire.own_sample import OwnKind
 from snakesim_operator.ros2 import messages as ros
 from snakesim_operator.ros2.messages import Marker, Rgba, Triple
 
@@ -92,6 +94,12 @@ def laser_scan(stamp_ns: int, frame: str, seen: Ranges) -> bytes:
     metres = [float("inf") if range_m is None else range_m for range_m in seen.range_m]
     limits = (seen.range_min_m, seen.range_max_m)
     return ros.laser_scan(stamp_ns, frame, seen.angle_min_rad, seen.angle_step_rad, limits, metres)
+
+
+def numbers(kind: OwnKind, field: str, _stamp_ns: int, _frame: str, sample: OwnSample) -> bytes:
+    """One field of a sensor's own message: its numbers, each dimension labelled with its name and unit."""
+    found = [value for name, value in kind.numbers(sample).items() if name.partition(".")[0] == field]
+    return ros.numbers(f"{field} [{kind.units[field]}]", found)
 
 
 def diagnostics(stamp_ns: int, status: Status) -> bytes:

@@ -20,6 +20,7 @@ from snakesim_hal.network.session import Arrival, Session, intersects, key_expre
 from snakesim_hal.terminal import Say, print_stderr, say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES, Decoder
+from snakesim_hal.wire.messages import OwnSample
 from snakesim_operator.tools.targets import CONNECT_S, RobotSelection
 
 RATE_PERIOD_S = 1.0
@@ -142,7 +143,10 @@ def _content(arrival: Arrival) -> dict[str, Any]:
     if message is None:
         return {"error": "no message is known on this key"}
     try:
-        return {"message": msgspec.to_builtins(_decoder(message).decode(arrival.payload, arrival.encoding))}
+        decoded = _decoder(message).decode(arrival.payload, arrival.encoding)
+        if message is OwnSample:  # with the fields that only its robot describes, as they were sent
+            return {"message": msgspec.msgpack.decode(arrival.payload)}
+        return {"message": msgspec.to_builtins(decoded)}
     except WireError as error:
         return {"error": str(error)}
 

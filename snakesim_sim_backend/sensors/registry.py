@@ -13,9 +13,9 @@ import numpy as np
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.plugins import SENSORS, find_installed, find_plugin, plugin_settings
 from snakesim_hal.model.robot import RobotFile
-from snakesim_hal.model.sensors import DepthCamera, RangeSensor
+from snakesim_hal.model.sensors import AnyMounted
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import ColourImage, Contacts, DepthImage, Imu, Message, Pose, Power, Ranges
+from snakesim_hal.wire.messages import ColourImage, Contacts, Imu, Message, OwnSample, Pose, Power
 from snakesim_sim_backend.sensors.contacts import ContactReader
 from snakesim_sim_backend.sensors.depth import RayCamera
 from snakesim_sim_backend.sensors.imu import ImuReader
@@ -32,12 +32,9 @@ WITHIN_TICK: dict[type[Message], Callable[[Any, BodyScope], Reader]] = {
     Pose: lambda sensor, at: PoseReader(at.data, sensor, at.noise.standard_normal),
     Power: lambda _, at: PowerReader(at.data, at.motors, at.windings, at.config.robot.joint_table),
 }
+MODELS = {"rays": (RayCamera, RayBeams), "rendered": (RenderedDepth,), "recorded": (Recorded,)}
 BESIDE_TICK: dict[tuple[type[Message], str], Any] = {
-    (DepthImage, "rays"): RayCamera,
-    (DepthImage, "rendered"): RenderedDepth,
-    (DepthImage, "recorded"): Recorded,
-    (ColourImage, "rendered"): RenderedColour,
-    (Ranges, "rays"): RayBeams,
+    (model.message, name): model for name, models in MODELS.items() for model in models
 }
 
 
@@ -47,20 +44,20 @@ def own_noise(key: str, seed: int) -> np.random.Generator:
 
 
 def check_models(robot: RobotFile) -> None:
-    """Whether all sensors that look around can be made. Runs no file of a plugin. Raises ConfigError."""
+    """Whether all sensors at places on links can be made. Runs no file of a plugin. Raises ConfigError."""
     for key, sensor in robot.sensors.mounted():
         model, settings = _model(key, sensor, find_installed)
         if model is not None:
             _settings_of(model, settings, key, sensor)
 
 
-def mounted_reader(key: str, sensor: DepthCamera | RangeSensor, scope: Scope) -> Reader:
-    """The reader of a sensor that looks around. Raises ConfigError."""
+def mounted_reader(key: str, sensor: AnyMounted, scope: Scope) -> Reader:
+    """The reader of a sensor at a place on a link. Raises ConfigError."""
     model, settings = _model(key, sensor, find_plugin)
     return model(sensor, scope, _settings_of(model, settings, key, sensor))
 
 
-def _model(key: str, sensor: DepthCamera | RangeSensor, find: Callable[[str, str], Any]) -> tuple[Any, dict[str, Any]]:
+def _model(key: str, sensor: AnyMounted, find: Callable[[str, str], Any]) -> tuple[Any, dict[str, Any]]:
     """Its class, and its settings as the file has them."""
     message = keys.message_at(key)
     if message is ColourImage:
@@ -70,10 +67,11 @@ def _model(key: str, sensor: DepthCamera | RangeSensor, find: Callable[[str, str
     return own or find(SENSORS, sensor.model), sensor.settings
 
 
-def _settings_of(model: Any, settings: dict[str, Any], key: str, sensor: DepthCamera | RangeSensor) -> Any:
+def _settings_of(model: Any, settings: dict[str, Any], key: str, sensor: AnyMounted) -> Any:
     message = keys.message_at(key)
-    if getattr(model, "message", None) is not message:
-        wanted = "DepthImage" if message is DepthImage else "Ranges"
+    made = getattr(model, "message", None)
+    if message is not OwnSample and made is not message:  # of a sensor with a message of its own the schema is checked
+        wanted = "message" if message is None else message.__name__
         raise ConfigError(
             f"sensor {sensor.name!r}: model {sensor.model!r} does not make a {wanted}, which is what {key} carries; "
             f"its class says in `message` what it makes"

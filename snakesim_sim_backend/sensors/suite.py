@@ -10,7 +10,7 @@ import numpy as np
 
 from snakesim_hal.backend import Samples
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.model.sensors import AnySensor, DepthCamera, Mounted, RangeSensor
+from snakesim_hal.model.sensors import AnyMounted, AnySensor, Mounted
 from snakesim_hal.physics.thermal import Thermal
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Message
@@ -86,7 +86,7 @@ class Sensors:
         if self._snapshots is not None:
             self._snapshots.close()
 
-    def _beside_the_tick(self, key: str, sensor: DepthCamera | RangeSensor, scope: Scope) -> "BesideTick":
+    def _beside_the_tick(self, key: str, sensor: AnyMounted, scope: Scope) -> "BesideTick":
         snapshots = self._snapshots
         assert snapshots is not None
         own = Scope(scope.config, scope.sim, snapshots.data, own_noise(key, scope.config.seed))

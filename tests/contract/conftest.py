@@ -1,6 +1,7 @@
 """The benches that our own backends have to stand on."""
 
 import os
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -17,10 +18,12 @@ IN_AN_EMULATED_MACHINE = (  # an opening takes half a minute there: `-m ""` runs
     "falls_silent",
     "a_closed_backend",
 )
-OF_SENSORS = ("sensor", "sample", "measured_ahead", "listed")  # clauses that a camera may concern
+WHISKER = Path(__file__).parents[2] / "docs" / "whisker.py"
+OF_SENSORS = ("sensor", "sample", "contradicts_itself", "listed")  # clauses that a camera may concern
 LOOKS_AHEAD = (
     'robot.sensors.depth=[{name="head", width=32, height=24, pitch_rad=0.4}]',
     'robot.sensors.range=[{name="front", beams=9, view_rad=2.0}]',
+    f'robot.sensors.own=[{{name="whisker", model="{WHISKER}:WhiskerModel"}}]',
 )
 ON_VCAN = ('backend.channels=["vcan0"]', 'backend.twins="process"')
 

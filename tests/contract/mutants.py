@@ -213,7 +213,7 @@ class OnNoLink(WithSonar):
     link = 99
 
 
-@breaks("what_is_measured_ahead_is_within_the_stated_range")
+@breaks("no_sample_contradicts_itself")
 class SaysTheFurthestForNothing(WithSonar):
     found_m = 65.535
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import snakesim
-from snakesim.result import UNITS
 from snakesim_hal.model.scenario import load, parse_set
+from snakesim_operator.playback.export import UNITS
 from snakesim_operator.run.in_process import simulate
 from tests.e2e.documents import REPOSITORY, sections
 

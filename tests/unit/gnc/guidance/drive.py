@@ -81,7 +81,7 @@ class Drive:
             if images and self.turn % IMAGE_EVERY == 0:
                 self.under_way.append((self.turn + DELAY_TURNS, self.image(here, stamp_ns)))
             while self.under_way and self.under_way[0][0] <= self.turn:
-                self.world.take_depth(self.under_way.pop(0)[1], NOISE)
+                self.world.take_look(self.under_way.pop(0)[1], NOISE)
             self.world.world(self.turn, stamp_ns)
             yield here
         self.turn += 1

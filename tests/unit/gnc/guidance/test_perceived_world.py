@@ -59,12 +59,12 @@ def test_samples_without_a_body_of_their_time_are_counted_and_not_used():
     drive = Drive(random_field(1))
     *_, here = drive.turns(100)
     image, before = drive.image(here, 100 * STEP_NS), reported(drive)
-    drive.world.take_depth(msgspec.structs.replace(image, stamp_ns=STEP_NS), NOISE)  # older than what is in the map
-    drive.world.take_depth(msgspec.structs.replace(image, stamp_ns=900 * STEP_NS), NOISE)  # of the future
+    drive.world.take_look(msgspec.structs.replace(image, stamp_ns=STEP_NS), NOISE)  # older than what is in the map
+    drive.world.take_look(msgspec.structs.replace(image, stamp_ns=900 * STEP_NS), NOISE)  # of the future
     joints = drive.joints(here, here)
     broken = msgspec.structs.replace(joints, stamp_ns=joints.stamp_ns + STEP_NS, valid=[False] * len(joints.valid))
     drive.world.take_joints(broken, None, None)
-    drive.world.take_depth(image, NOISE)
+    drive.world.take_look(image, NOISE)
     assert sum(drive.world.refused.values()) == 3 and len(drive.world.refused) == 3
     after = reported(drive)
     assert after.depth_stamp_ns == before.depth_stamp_ns and len(after.obstacles) == len(before.obstacles)
@@ -118,7 +118,7 @@ def test_a_lidar_maps_as_a_camera_does():
     here = drive.place(0)
     for here in drive.turns(60, images=False):
         beams = lidar(drive.obstacles, here.origins_w[-1], here.rotations[-1], stamp_ns=drive.turn * STEP_NS)
-        drive.world.take_ranges(msgspec.structs.replace(beams, link=len(here.origins_w) - 1), NOISE)
+        drive.world.take_look(msgspec.structs.replace(beams, link=len(here.origins_w) - 1), NOISE)
     total = score(reported(drive).obstacles, drive.obstacles, here.head_w, here.headings_rad[-1])
     assert len(total.position_m) == 2 and max(total.position_m) < 0.005 and not total.ghosts
 

@@ -181,7 +181,7 @@ WRONG = {
     ),
     "unknown sensor": (
         {"sensors__camera": {}},
-        ["unknown field `sensors.camera`", "contacts, depth, imu, joints, pose"],
+        ["unknown field `sensors.camera`", "contacts, depth, imu, joints, own, pose"],
     ),
     "two cameras of a name": (
         {"sensors__depth": [{"name": "head"}, {"name": "head"}]},

@@ -20,7 +20,9 @@ def declared() -> set[type[Message]]:
     return {
         thing
         for thing in found
-        if isinstance(thing, type) and issubclass(thing, Message) and not thing.__subclasses__()
+        if isinstance(thing, type)
+        and issubclass(thing, Message)
+        and not any(one.__module__ == messages.__name__ for one in thing.__subclasses__())
     }
 
 

@@ -19,6 +19,7 @@ from snakesim_hal.record.black_box import Layout
 from snakesim_hal.record.host_record import BLACK_BOX, DESCRIPTION, HOST_RECORD
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encoding_of
+from snakesim_operator.playback.export import arrays
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.recording import Recording
 from snakesim_operator.results.compare import page as compare_page
@@ -85,7 +86,7 @@ def record_messages(folder: Path, payloads: list[tuple[str, bytes]]) -> None:
 def base(tmp_path_factory: pytest.TempPathFactory) -> RunRecord:
     folder = tmp_path_factory.mktemp("base")
     whole = triplet()
-    kept = {name: value[FIRST:LAST] for name, value in vars(whole).items() if isinstance(value, np.ndarray)}
+    kept = {name: value[FIRST:LAST] for name, value in arrays(whole).items()}
     begin_ns, end_ns = (round(kept["time_s"][i] * 1e9) for i in (0, -1))
     record = dataclasses.replace(
         whole,

@@ -9,12 +9,14 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
 from snakesim_hal.wire import messages as m
+from snakesim_hal.wire.own_sample import own_kind, schema_of
 from snakesim_operator.ros2 import messages as ros
 from snakesim_operator.ros2 import robot_in_ros
 from snakesim_operator.ros2.graph import RosType
 from snakesim_operator.ros2.messages import Marker, Transform
 from snakesim_operator.ros2.steering import Steering
 from tests.unit.hal.strategies import messages_of
+from tests.unit.hal.wire.test_own_sample import GOOD, PLACE, Skin
 
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
 STAMP_NS = 12_345_678_901
@@ -149,6 +151,15 @@ def test_scans(sent: m.Ranges) -> None:
     assert seen.angle_min == np.float32(sent.angle_min_rad) and seen.angle_increment == np.float32(sent.angle_step_rad)
     assert seen.angle_max == np.float32(sent.angle_min_rad + sent.angle_step_rad * (len(expected) - 1))
     assert (seen.range_min, seen.range_max) == (np.float32(sent.range_min_m), np.float32(sent.range_max_m))
+
+
+def test_numbers_of_a_sensor_of_ones_own_say_field_and_unit() -> None:
+    kind = own_kind(schema_of(Skin, "skin"))
+    sample: Any = kind.message(**PLACE, **GOOD)
+    seen = read(ros.NUMBERS, robot_in_ros.numbers(kind, "pressed_n", STAMP_NS, "f", sample))
+    assert seen.data.tolist() == pytest.approx([1.5, np.nan], nan_ok=True)
+    (dimension,) = seen.layout.dim
+    assert (dimension.label, dimension.size) == ("pressed_n [N]", 2)
 
 
 @FEW

@@ -1,0 +1,124 @@
+"""Messages of sensors of one's own: their schema says what their class does, and what cannot be one is refused."""
+
+from typing import Annotated, Any, Literal
+
+import msgspec
+import pytest
+from msgspec import Meta
+
+from snakesim_hal.errors import ConfigError, WireError
+from snakesim_hal.wire import quantities as q
+from snakesim_hal.wire.codec import Decoder, encode, encoding_of
+from snakesim_hal.wire.messages import OwnSample
+from snakesim_hal.wire.own_sample import own_kind, schema_of
+
+
+class Skin(OwnSample, frozen=True, kw_only=True):
+    """One of each kind of field."""
+
+    pressed_n: Annotated[list[q.Force | None], Meta(max_length=3)]
+    flow_m_s: q.VelocityVector
+    wet: bool
+    count: Annotated[int, Meta(ge=0, le=9)]
+    state: Literal["cold", "warm"]
+    note: Annotated[str, Meta(max_length=9)] | None = None
+
+
+PLACE: dict[str, Any] = {
+    "tick": 3,
+    "stamp_ns": 2,
+    "link": 1,
+    "position_l": (0.0, 0.1, 0.0),
+    "orientation_l_wxyz": (1.0, 0.0, 0.0, 0.0),
+}
+GOOD: dict[str, Any] = {"pressed_n": [1.5, None], "flow_m_s": (1.0, 2.0, 3.0), "wet": True, "count": 4, "state": "warm"}
+
+
+def test_whoever_has_the_schema_alone_reads_what_the_class_wrote_and_the_rest_reads_where_and_when() -> None:
+    kind, sample = own_kind(schema_of(Skin, "skin")), Skin(**PLACE, **GOOD)
+    decoded = Decoder(kind.message).decode(encode(sample), encoding_of(Skin))
+    assert msgspec.to_builtins(decoded) == msgspec.to_builtins(sample)
+    assert kind.units == {"pressed_n": "N", "flow_m_s": "m/s", "wet": "1", "count": "1"}
+    assert kind.numbers(decoded) == pytest.approx(
+        {"pressed_n.0": 1.5, "pressed_n.1": float("nan"), "wet": 1, "count": 4}
+        | {f"flow_m_s.{i}": i + 1 for i in range(3)},
+        nan_ok=True,
+    )
+    assert Decoder(OwnSample).decode(encode(sample), encoding_of(Skin)) == OwnSample(**PLACE)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"pressed_n": [1e9]},
+        {"pressed_n": [1.0] * 4},
+        {"flow_m_s": (1.0, 2.0)},
+        {"wet": 1},
+        {"count": 10},
+        {"state": "hot"},
+        {"note": "much too long"},
+        {"link": -1},
+    ],
+    ids=lambda wrong: next(iter(wrong)),
+)
+def test_the_schema_refuses_what_the_class_would(wrong: dict[str, Any]) -> None:
+    written = msgspec.msgpack.encode(PLACE | GOOD | wrong)
+    for message in (Skin, own_kind(schema_of(Skin, "skin")).message):
+        with pytest.raises(WireError) as caught:
+            Decoder(message).decode(written, encoding_of(Skin))
+        assert next(iter(wrong)) in str(caught.value)
+
+
+class Unbounded(OwnSample, frozen=True, kw_only=True):
+    bend_rad: float
+
+
+class WithoutUnit(OwnSample, frozen=True, kw_only=True):
+    bend: Annotated[float, Meta(ge=0, le=1)]
+
+
+class Nested(OwnSample, frozen=True, kw_only=True):
+    skin: Skin
+
+
+class Empty(OwnSample, frozen=True, kw_only=True):
+    """Nothing of its own."""
+
+
+@pytest.mark.parametrize(
+    ("message", "words"),
+    [
+        (Unbounded, "Unbounded.bend_rad has no bounds on both sides"),
+        (WithoutUnit, "WithoutUnit.bend has no unit"),
+        (Nested, "Nested.skin is none of: a number"),
+        (Empty, "Empty has 0 fields of its own"),
+        (dict, "must be a class derived from OwnSample"),
+        (None, "must be a class derived from OwnSample"),
+    ],
+)
+def test_a_message_that_others_could_not_judge_is_refused_before_a_start(message: Any, words: str) -> None:
+    with pytest.raises(ConfigError, match="sensor 'skin': model x") as caught:
+        schema_of(message, "sensor 'skin': model x")
+    assert words in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "schema",
+    [
+        "",
+        "[]",
+        "{}",
+        '{"title":"A","properties":5}',
+        '{"title":"a b","properties":{"x":{"type":"boolean"}}}',
+        '{"title":"A","properties":{"__init__":{"type":"boolean"}}}',
+        '{"title":"A","properties":{"contradiction":{"type":"boolean"}}}',
+        '{"title":"A","properties":{"x":{"type":"string","maxLength":5,"pattern":"(a+)+$"},"y":7}}',
+        '{"title":"A","properties":{"x":{"type":"integer","minimum":"a","maximum":2}}}',
+        '{"title":"A","properties":{"x":{"type":"integer","minimum":0,"maximum":1e400}}}',
+        '{"title":"A","properties":{"x":{"type":"array","maxItems":999999999,"items":{"type":"boolean"}}}}',
+        "[" * 9000,
+    ],
+)
+def test_a_schema_of_a_stranger_does_nothing_but_be_refused(schema: str) -> None:
+    with pytest.raises(WireError):
+        own_kind(schema)
