@@ -367,7 +367,7 @@ class ZeroIsNoLimit(Mistold):
 class NoStops(Workbench):
     def __init__(self, config, settings):
         super().__init__(config, settings)
-        self.robot = replace(config.robot, limits=replace(config.robot.limits, angle_rad=3.0))
+        self.least_rad, self.most_rad = np.full_like(self.angle, -3.0), np.full_like(self.angle, 3.0)
 
 
 @breaks("a_mode_switch_makes_no_jump")
