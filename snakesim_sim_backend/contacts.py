@@ -35,12 +35,19 @@ class TouchReader:
 
     def read(self) -> Iterator[Touch]:
         """All contacts, in MuJoCo's order."""
-        struck = self._struck
-        for i, (first, second) in enumerate(self._contact.geom.tolist()):
-            if first in struck:
-                yield self._touch(i, second, self._obstacles[first], 1.0)
-            elif second in struck:
-                yield self._touch(i, first, self._obstacles[second], -1.0)
+        struck, contact = self._struck, self._contact
+        pairs = contact.geom.tolist()
+        found = [i for i, (first, second) in enumerate(pairs) if first in struck or second in struck]
+        if not found:
+            return
+        # Whole columns at once: a view of each contact would cost more.
+        frames, places = contact.frame.tolist(), contact.pos.tolist()
+        starts, sizes = contact.efc_address.tolist(), contact.dim.tolist()
+        for i in found:
+            first, second = pairs[i]
+            forces = self._data.efc_force[starts[i] : starts[i] + sizes[i]].tolist()
+            link, obstacle, sign = (second, first, 1.0) if first in struck else (first, second, -1.0)
+            yield self._touch(frames[i], places[i], forces, link, self._obstacles[obstacle], sign)
 
     def sizes_n(self) -> dict[object, float]:
         """Size of the force between each link and each obstacle that it touches; for every physics step, so quick."""
@@ -58,17 +65,19 @@ class TouchReader:
                 found[first, second] = found.get((first, second), 0.0) + push_n
         return found
 
-    def _touch(self, i: int, link: int, obstacle: str | None, into_body: float) -> Touch:
-        """MuJoCo's frame has the normal from the first geom to the second, then two tangents, as rows."""
-        contact = self._contact[i]
-        nx, ny, nz, ax, ay, az, bx, by, bz = contact.frame.tolist()
-        x, y, z = contact.pos.tolist()
-        start, size = contact.efc_address, contact.dim
-        push, *rub = self._data.efc_force[start : start + size].tolist()
-        push *= into_body
+    def _touch(
+        self, frame: list[float], place: list[float], forces: list[float], link: int, obstacle: str | None, sign: float
+    ) -> Touch:
+        """MuJoCo's frame has the normal from the first geom to the second, then two tangents, as rows.
+
+        sign: 1 if that is from the obstacle into the body, -1 if the other way round.
+        """
+        nx, ny, nz, ax, ay, az, bx, by, bz = frame
+        x, y, z = place
+        push, *rub = forces
+        push *= sign
         fx, fy, fz = push * nx, push * ny, push * nz
         if rub:
-            a, b = into_body * rub[0], into_body * rub[1]
+            a, b = sign * rub[0], sign * rub[1]
             fx, fy, fz = fx + a * ax + b * bx, fy + a * ay + b * by, fz + a * az + b * bz
-        normal = (into_body * nx, into_body * ny, into_body * nz)
-        return Touch(self._bodies[link], obstacle or "", (x, y, z), normal, (fx, fy, fz))
+        return Touch(self._bodies[link], obstacle or "", (x, y, z), (sign * nx, sign * ny, sign * nz), (fx, fy, fz))

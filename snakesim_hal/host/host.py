@@ -498,9 +498,11 @@ class Host:
     def _watch_network(self) -> None:
         """Note problems of the network, once when each begins."""
         # In lockstep a lease counts in simulated time: a slow computer is not a blocked network.
-        held_up_s = 0.0 if self._pace == "lockstep" else self._outbox.held_up_s()
+        held_up = self._pace != "lockstep" and self._outbox.held_up_s() * 1e9 > self._config.lease_ns
+        if not (held_up or self._other_hosts or self._network_faults):
+            return
         wrong = {f"another HAL host has this robot's name: {host}": "second_host" for host in set(self._other_hosts)}
-        if held_up_s * 1e9 > self._config.lease_ns:
+        if held_up:
             wrong["the network accepts no message: it is congested, or under attack"] = "network_held_up"
         for cause in wrong.keys() - self._network_faults:
             self.authority.note(Fault(tick=self._tick, what=wrong[cause], cause=cause, reach="none"))
