@@ -33,7 +33,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Of many small chunks, as a long recording has them."""
     out = tmp_path_factory.mktemp("recorded") / "run"
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(mcap_file, "CHUNK_BYTES", 150_000)
+        patched.setattr(mcap_file, "CHUNK_BYTES", 100_000)
         patched.setattr(recording, "FLUSH_S", 3600.0)  # chunks by size alone, however busy the machine
         simulate(load("peg_row", [parse_set("duration_s=1.5")]).config, out)
     return out
@@ -59,8 +59,8 @@ def lost(whole_path: Path, path: Path) -> dict[str, int]:
 def test_one_flipped_bit_costs_one_chunk_and_the_loss_is_counted_by_time_and_key(
     run: Path, whole: bytes, tmp_path: Path
 ) -> None:
-    second, third = chunks(whole)[1:3]
-    path = written(tmp_path / "a.mcap", flipped(whole, (second.begin + second.end) // 2))
+    damaged, following = chunks(whole)[2:4]
+    path = written(tmp_path / "a.mcap", flipped(whole, (damaged.begin + damaged.end) // 2))
     reader = RecordingReader(path)
     kept = list(reader.messages())
     truth = lost(run / RECORDING, path)
@@ -70,7 +70,7 @@ def test_one_flipped_bit_costs_one_chunk_and_the_loss_is_counted_by_time_and_key
     clocks = [one.time_ns for one in kept if one.key == keys.CLOCK]
     hole = next((a, b) for a, b in pairwise(clocks) if b - a > 20_000_000)
     assert gap.end_ns is not None and hole[0] <= gap.begin_ns < gap.end_ns <= hole[1]
-    assert reader.finished and third.begin  # what follows was read
+    assert reader.finished and following.begin  # what follows was read
 
 
 def test_each_chunk_may_be_the_damaged_one(run: Path, whole: bytes, tmp_path: Path) -> None:
