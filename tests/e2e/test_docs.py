@@ -1,4 +1,4 @@
-"""Everything that the tutorial, the guide to evaluations and the README ask a reader to type is typed here, as printed.
+"""What tutorials, the guide to evaluations and the README ask a reader to type is typed here, as printed.
 
 Of docs/hil.md only what needs no CAN; `make test-vcan` runs the rest of it with commands of its own.
 """
@@ -23,6 +23,12 @@ HIL = [section for section in sections(REPOSITORY / "docs" / "hil.md") if sectio
 EVALUATION = [section for section in sections(REPOSITORY / "docs" / "evaluation.md") if section.has_commands]
 CONTROLLERS = [section for section in sections(REPOSITORY / "docs" / "controllers.md") if section.has_commands]
 ROBOTS = [section for section in sections(REPOSITORY / "docs" / "robots.md") if section.has_commands]
+LESSONS = [
+    section
+    for page in ("first-controller", "train", "your-robot", "your-sensor")
+    for section in sections(REPOSITORY / "docs" / f"{page}.md")
+    if section.has_commands
+]
 README = [section for section in sections(REPOSITORY / "README.md") if section.has_commands]
 UV = REPOSITORY / ".tools" / "bin" / "uv"
 LIMIT_S = 500.0
@@ -68,7 +74,7 @@ def typed(script: str, cwd: Path, prefix: list[str]) -> str:
 
 @needs_uv
 @pytest.mark.slow
-@pytest.mark.parametrize("section", [*TUTORIAL, *HIL, *EVALUATION, *CONTROLLERS, *ROBOTS], ids=named)
+@pytest.mark.parametrize("section", [*TUTORIAL, *HIL, *EVALUATION, *CONTROLLERS, *ROBOTS, *LESSONS], ids=named)
 def test_a_section_as_printed(section: Section, tmp_path: Path) -> None:
     folder = tmp_path / "snakesim"
     documents.clone(folder)
