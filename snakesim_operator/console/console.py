@@ -63,7 +63,7 @@ def show_recorded(folder: Path, at_s: float, listening: socket.socket, stop: thr
     from snakesim_operator.results.incomplete import exit_code
     from snakesim_operator.results.record import RunRecord
 
-    recorded, log = Recorded(RunRecord.load(folder)), Log()
+    recorded, log = Recorded(RunRecord.load(folder), folder), Log()
     for lack in recorded.record.lacks:
         log.write(f"the record lacks {lack}")
     code = exit_code(folder, recorded.record.lacks)

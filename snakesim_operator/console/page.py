@@ -91,6 +91,12 @@ class Page:
             self._joints_tab = gui.add_folder(None)
         with tabs.add_tab("Forces"):
             self._forces = gui.add_html("")
+        with tabs.add_tab("State"):
+            self._state = gui.add_html("")
+            self._streams = None
+            if self._operations is not None:
+                with gui.add_folder("Rates and ages", expand_by_default=False):
+                    self._streams = gui.add_html("")
         if self._operations is not None:
             self._lay_out_live(tabs)
         gui.add_html(texts.legend(LEGEND), order=3)
@@ -98,10 +104,6 @@ class Page:
     def _lay_out_live(self, tabs: viser.GuiTabGroupHandle) -> None:
         """What a recording has no page for."""
         gui = self._server.gui
-        with tabs.add_tab("State"):
-            self._state = gui.add_html("")
-            with gui.add_folder("Rates and ages", expand_by_default=False):
-                self._streams = gui.add_html("")
         with tabs.add_tab("Cameras"):
             self._cameras_tab = gui.add_folder(None)
             with self._cameras_tab:
@@ -257,6 +259,8 @@ class Page:
             self._log.write(f"settings of {settings.controller} in force, as {settings.who} asked")
 
     def _show_texts(self, snapshot: RobotSnapshot | None) -> None:
+        if snapshot is not None:
+            self._state.content = texts.state_table(snapshot)
         if self._operations is None:
             self._header.content = texts.header(snapshot, recorded=self._recorded)
             return
@@ -266,8 +270,7 @@ class Page:
         if dropped := self._server.admission.dropped.total():
             control += f"; {dropped} message{'' if dropped == 1 else 's'} of browsers dropped"
         self._header.content = texts.header(snapshot, control=control)
-        if snapshot is not None:
-            self._state.content = texts.state_table(snapshot)
+        if snapshot is not None and self._streams is not None:
             self._streams.content = texts.stream_table(snapshot)
         if self._log.written != self._shown_log:
             self._shown_log = self._log.written

@@ -2,25 +2,34 @@
 
 from bisect import bisect_right
 from collections.abc import Sequence
-from typing import TypeVar
+from pathlib import Path
+from typing import Any, TypeVar
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.wire.messages import AppliedCommand, ControlState, JointState, Mode, Trajectory, World
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import UNDECODABLE
+from snakesim_hal.wire.messages import AppliedCommand, ControlState, JointState, Mode, Power, Status, Trajectory, World
 from snakesim_hal.wire.quantities import Quaternion, Vector
 from snakesim_operator.console.snapshot import RobotSnapshot
+from snakesim_operator.recording.message import RECORDING
+from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.results.record import RunRecord
 
 CONTROL_LIMIT_S = 0.3  # older states are of before a gap
 MessageT = TypeVar("MessageT", ControlState, World, Trajectory)
+_TOLD: dict[str, type[Any]] = {keys.STATUS: Status, keys.POWER: Power}  # what a record of rows does not have
 
 
 class Recorded:
     """A recorded run, by time."""
 
-    def __init__(self, record: RunRecord) -> None:
+    def __init__(self, record: RunRecord, kept: Path) -> None:
+        """kept: the run's folder, or its recording; a run without one has neither status nor supply."""
         self.record = record
+        self._told = _told(kept / RECORDING if kept.is_dir() else kept)
         self._stamps = {id(messages): [_stamp_s(m) for m in messages] for messages in self._outputs()}
 
     def _outputs(self) -> tuple[Sequence[ControlState], Sequence[World], Sequence[Trajectory]]:
@@ -49,8 +58,15 @@ class Recorded:
             world=self._before(record.worlds, time_s, CONTROL_LIMIT_S),
             trajectory=self._before(record.trajectories, time_s),
             control=control,
+            status=self._newest(keys.STATUS, time_s),
+            power=self._newest(keys.POWER, time_s),
             applied=self._applied(row),
         )
+
+    def _newest(self, key: str, time_s: float) -> Any:
+        times_s, messages = self._told[key]
+        i = bisect_right(times_s, time_s) - 1
+        return messages[i] if i >= 0 else None
 
     def _before(self, messages: Sequence[MessageT], time_s: float, limit_s: float | None = None) -> MessageT | None:
         """The newest message of that time, unless it is older than the limit."""
@@ -91,6 +107,21 @@ class Recorded:
         x, y, z = position.tolist()
         w, i, j, k = wxyz.tolist()
         return (x, y, z), (w, i, j, k)
+
+
+def _told(path: Path) -> dict[str, tuple[list[float], list[Any]]]:
+    """Robot times and messages, by key."""
+    found: dict[str, tuple[list[float], list[Any]]] = {key: ([], []) for key in _TOLD}
+    decoders = {key: msgspec.msgpack.Decoder(message) for key, message in _TOLD.items()}
+    for one in RecordingReader(path).messages(list(_TOLD)) if path.is_file() else ():
+        try:
+            message = decoders[one.key].decode(one.payload)
+        except UNDECODABLE:
+            continue
+        times_s, messages = found[one.key]
+        times_s.append(max(one.time_ns * 1e-9, times_s[-1] if times_s else 0.0))
+        messages.append(message)
+    return found
 
 
 def _stamp_s(message: ControlState | World | Trajectory) -> float:

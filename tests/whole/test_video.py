@@ -61,7 +61,7 @@ def test_what_cannot_be_filmed_is_said(run: Path, more: list[str], said: str) ->
 
 def test_the_console_shows_a_recorded_instant_as_it_was(run: Path) -> None:
     record = RunRecord.load(run)
-    recorded = Recorded(record)
+    recorded = Recorded(record, run)
     begin_s, end_s = recorded.span_s
     assert end_s - begin_s == pytest.approx(0.99, abs=0.03)
     moment = recorded.at(begin_s + 0.5)
