@@ -1,6 +1,6 @@
 """Everything that a configuration names is installed, and its settings are valid."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import msgspec
@@ -9,7 +9,9 @@ from snakesim_hal.errors import ConfigError, short
 from snakesim_hal.fault_plan import check_planned
 from snakesim_hal.model.files import Table
 from snakesim_hal.model.plugins import BACKENDS, CONTROLLERS, SERVICES, find_installed, find_plugin, plugin_settings
+from snakesim_hal.model.robot import described
 from snakesim_hal.model.scenario import CONTROL, RunConfig
+from snakesim_hal.wire.messages import JointDescription, Mode
 
 GUIDANCE = "guidance"
 BY_POSE = {GUIDANCE, "navigation"}
@@ -29,6 +31,8 @@ def check_plugins(config: RunConfig, table: Table | None = None, *, run_files: b
         origin = table.origin if table is not None else None
         plugin_settings(controller, config.control_settings, source, config.control_section, origin)
         config = _with_what_it_needs(config, controller)
+        if (lacks := what_it_lacks(described(config.robot), controller, config.controller)) is not None:
+            raise ConfigError(f"robot {config.robot.name!r}: {lacks}")
     for service in config.own_services:
         find_service(config, service, find)
     if others := [name for name in config.beside if name != CONTROL]:
@@ -62,6 +66,27 @@ def find_service(config: RunConfig, name: str, find: Callable[[str, str], Any] =
             f"have one name. Write [services.{service.name}] with code = {short(code)!r}, or change the class's `name`"
         )
     return service
+
+
+def what_it_lacks(joints: Sequence[JointDescription], controller: Any, name: str) -> str | None:
+    """The first joint, and the capability, that a controller needs and does not find; None: it finds all."""
+    for joint in joints:
+        for mode in getattr(controller, "MODES", ()):
+            if not joint.has(mode):
+                has = ", ".join(one.name.lower() for one in joint.modes if one is not Mode.PASSIVE)
+                return (
+                    f"controller {name!r} needs {mode.name.lower()} mode of every joint, and {joint.name} has {has}. "
+                    f"Choose another controller; or correct `modes` in [drive] or [joints.{joint.name}] of the robot "
+                    f"file"
+                )
+        for measured in getattr(controller, "MEASURES", ()):
+            if measured not in joint.measures:
+                return (
+                    f"controller {name!r} needs the measured {measured} of every joint, and {joint.name} does not "
+                    f"measure it. Choose another controller; or correct `measures` in [drive] or "
+                    f"[joints.{joint.name}] of the robot file"
+                )
+    return None
 
 
 def _with_what_it_needs(config: RunConfig, controller: Any) -> RunConfig:

@@ -18,6 +18,7 @@ import numpy as np
 
 from snakesim_hal.arrays import Floats
 from snakesim_hal.backend import SetPoints
+from snakesim_hal.errors import BackendError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.robot import Module, RobotFile
 from snakesim_hal.physics.motor import roll_off
@@ -48,12 +49,14 @@ def add_motor(spec: mujoco.MjSpec, joint: Joint, module: Module, step_s: float) 
 def _gains(joint: Joint, scale: float) -> dict[Mode, tuple[float, float, float]]:
     """Mode -> kp, kd and volts (0: unbounded)."""
     motor, speed = joint.motor, joint.limits.speed_rad_s
-    return {
+    gains = {
         Mode.PASSIVE: (0.0, 0.0, 0.0),
         Mode.POSITION: (scale * motor.stiffness_nm_per_rad, scale * motor.damping_nm_s_per_rad, speed),
         Mode.VELOCITY: (0.0, scale * motor.velocity_gain_nm_s_per_rad, speed),
         Mode.TORQUE: (0.0, 0.0, speed),
     }
+    has = ("passive", *joint.drive.modes)
+    return {mode: values for mode, values in gains.items() if mode.name.lower() in has}
 
 
 class Motors:
@@ -63,7 +66,8 @@ class Motors:
         self, model: mujoco.MjModel, data: mujoco.MjData, robot: RobotFile, period_s: float, gain_scale: float = 1.0
     ) -> None:
         joints = robot.joint_table
-        self.count = len(joints)
+        self.count, self._names = len(joints), [joint.name for joint in joints]
+        self.without_torque = [i for i, joint in enumerate(joints) if "torque" not in joint.drive.measures]
         self._gains = model.actuator_gainprm[: self.count]
         self._force_range = model.actuator_forcerange[: self.count]
         self._least, self._most = self._force_range[:, 0], self._force_range[:, 1]
@@ -131,6 +135,9 @@ class Motors:
         self._least[:] = -limit_nm
 
     def _change_modes(self, modes: list[Mode]) -> None:
+        for gains, mode, name in zip(self._gains_of_mode, modes, self._names, strict=True):
+            if mode not in gains:
+                raise BackendError(f"{name} was given a set-point in {mode.name.lower()} mode, which its drive lacks")
         self._mode = list(modes)
         self._gains[:, [KP, KD, MAX_VOLTS]] = [
             gains[mode] for gains, mode in zip(self._gains_of_mode, modes, strict=True)

@@ -60,7 +60,8 @@ class Controller(Protocol):
     """The object of an entry point in the group `snakesim.controllers`, or of `./file.py:Name`."""
 
     Settings: type[msgspec.Struct]  # the scenario's [control] section
-    # It may have NEEDS = "joints": it asks for no world, and so runs on a robot without a pose sensor.
+    # It may have NEEDS = "joints": it asks for no world, and so runs on a robot without a pose sensor; and what it
+    # needs of every joint, or a run does not begin: MODES = (Mode.POSITION, Mode.TORQUE), MEASURES = ("torque",).
 
     def __init__(self, robot: Description, settings: Any) -> None: ...
 

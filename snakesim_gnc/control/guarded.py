@@ -13,7 +13,7 @@ from typing import Any
 from snakesim_gnc.control.controller import Action, Controller, Report, View
 from snakesim_hal.backend import SetPoints
 from snakesim_hal.errors import ControllerError, raised
-from snakesim_hal.wire.messages import Description, Mode
+from snakesim_hal.wire.messages import Description, JointDescription, Mode
 from snakesim_hal.wire.quantities import MAX_TARGET
 
 NUMBERS = {float, int}  # exactly: a NumPy number or a bool cannot be sent
@@ -26,7 +26,7 @@ class Guarded:
     def __init__(self, name: str, plugin: type[Controller], robot: Description, settings: Any) -> None:
         """name: as configured: an entry point, or `./file.py:Class`."""
         self._who = f"controller {name} (class {getattr(plugin, '__name__', plugin)})"
-        self._joints = [joint.name for joint in robot.joints]
+        self._joints = robot.joints
         with self._named("__init__"):
             self._controller = plugin(robot, settings)
 
@@ -54,10 +54,11 @@ class Guarded:
             raise self.wrong(f"{method}() {raised(error)}") from error
 
 
-def check(action: Action, joints: Sequence[str]) -> None:
-    """Raises ValueError with the field, its value and what is allowed. joints: names, tail to head."""
+def check(action: Action, described: Sequence[JointDescription]) -> None:
+    """Raises ValueError with the field, its value and what is allowed. described: the joints, tail to head."""
     if not isinstance(action, Action):
         raise ValueError(f"update() returned {_repr(action)}, must return an Action")
+    joints = [joint.name for joint in described]
     points, report = action.set_points, action.report
     if not isinstance(points, SetPoints):
         raise ValueError(f"Action.set_points is {_repr(points)}, must be SetPoints")
@@ -67,6 +68,9 @@ def check(action: Action, joints: Sequence[str]) -> None:
     for i, mode in enumerate(points.mode):
         if type(mode) is not Mode:
             raise ValueError(f"SetPoints.mode[{i}] ({joints[i]}) is {_repr(mode)}, must be one of {MODES}")
+        if not described[i].has(mode):
+            has = ", ".join(f"Mode.{one.name}" for one in described[i].modes)
+            raise ValueError(f"SetPoints.mode[{i}] is Mode.{mode.name}, which {joints[i]} does not have; it has {has}")
     _check_numbers("target", points.target, joints, least=-MAX_TARGET)
     _check_numbers("torque_limit_nm", points.torque_limit_nm, joints, least=0.0)
     _check_report(report, joints)

@@ -33,7 +33,7 @@ class LiveSettings:
     def __init__(self, client: Client, config: RunConfig) -> None:
         """Finds the controller and checks its settings. Raises ConfigError."""
         self._client, self._config = client, config
-        self._plugin: type[Controller] = find_plugin(CONTROLLERS, config.controller)
+        self.plugin: type[Controller] = find_plugin(CONTROLLERS, config.controller)
         self._name = config.controller[-64:]
         self._settings = self._checked(config.control_settings, f"scenario {config.name!r}")
         self._waiting: Mailbox[Question] = Mailbox((MAX_WAITING,))
@@ -91,12 +91,12 @@ class LiveSettings:
         return Answer(ok=True, reason=f"{self._name} has the settings of {request.who}")
 
     def _checked(self, section: dict[str, Any], source: str) -> Any:
-        return plugin_settings(self._plugin, section, source, self._config.control_section)
+        return plugin_settings(self.plugin, section, source, self._config.control_section)
 
     def _made(self, settings: Any) -> Guarded:
         if self._robot is None:
             raise ControllerError("control has not met the robot yet")
-        return Guarded(self._config.controller, self._plugin, self._robot, settings)
+        return Guarded(self._config.controller, self.plugin, self._robot, settings)
 
     def _publish(self, clock: Clock) -> None:
         settings, schema = _in_json(self._settings), _schema(type(self._settings))

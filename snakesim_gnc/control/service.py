@@ -14,6 +14,7 @@ from snakesim_gnc.control.state_reports import StateReports
 from snakesim_hal.errors import ControllerError
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.client import Client, Commander
+from snakesim_hal.plugin_check import what_it_lacks
 from snakesim_hal.service import SILENCE_S, Service
 from snakesim_hal.terminal import print_stderr
 from snakesim_hal.wire import keys
@@ -42,6 +43,8 @@ class Control(Service):
 
     def configure(self, robot: Description) -> None:
         """Get ready to command this robot."""
+        if (lacks := what_it_lacks(robot.joints, self._settings.plugin, self._config.controller)) is not None:
+            raise ControllerError(f"robot {robot.robot!r}: {lacks}")
         self._settings.configure(robot)
         self._commander = Commander(self._client, robot)
         self._limits = Limits.of(self._config, robot)

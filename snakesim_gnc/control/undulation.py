@@ -107,6 +107,8 @@ class CompliantUndulation(HeadSteeredUndulation):
     w_i = dtheta_i/dA is the wave itself, so the sum is the generalized force on A.
     """
 
+    MEASURES = ("torque",)
+
     class Settings(HeadSteeredUndulation.Settings, frozen=True, kw_only=True):
         """As of head-steered undulation, with a softness."""
 

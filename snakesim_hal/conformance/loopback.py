@@ -219,7 +219,7 @@ class Hosted:
             "arming": self.controller.arming,
             "layout": self.robot.layout,
             "valid_for_ns": self.robot.lease_ns,
-            "mode": [Mode.VELOCITY] * count,
+            "mode": [Mode.POSITION] * count,
             "target": [0.5] * count,
         }
         self._commands.put(JointCommand(**(good | wrong)))

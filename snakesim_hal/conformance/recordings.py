@@ -21,7 +21,7 @@ HELD_S = 0.16  # of a mode before the next change
 class Pushing:
     """Joint 0 against its upper stop, joint 1 against its lower one; each phase is the end of a push."""
 
-    torque_mode: Record
+    torque_mode: Record | None  # None: a joint has no torque mode
     asked_nm: float
     limited: Record
     limit_nm: float
@@ -52,14 +52,18 @@ def push(rig: Rig) -> Pushing:
     near = both(Mode.POSITION, t.NEAR_STOP * upper.angle_max_rad, t.NEAR_STOP * lower.angle_min_rad)
     rig.drive(near, rig.periods(t.SETTLE_S))
     asked_nm = t.PUSH_SHARE * upper.torque_limit_nm
-    rig.press(both(Mode.TORQUE, asked_nm, -asked_nm), rig.periods(t.PUSH_S))
-    torque_mode = rig.press(both(Mode.TORQUE, asked_nm, -asked_nm), t.TRANSPORT_PERIODS)
+    torque_mode = None
+    if rig.has(0, Mode.TORQUE) and rig.has(1, Mode.TORQUE):
+        rig.press(both(Mode.TORQUE, asked_nm, -asked_nm), rig.periods(t.PUSH_S))
+        torque_mode = rig.press(both(Mode.TORQUE, asked_nm, -asked_nm), t.TRANSPORT_PERIODS)
     limit_nm = t.LIMIT_SHARE * upper.torque_limit_nm
     speed = min(
         t.DEMAND_SHARE * upper.torque_limit_nm / upper.velocity_gain_nm_s_per_rad, 0.5 * upper.speed_limit_rad_s
     )
     limits = [limit_nm] * rig.count
     fast = both(Mode.VELOCITY, speed, -speed)
+    if not (rig.has(0, Mode.VELOCITY) and rig.has(1, Mode.VELOCITY)):
+        fast = both(Mode.POSITION, upper.angle_max_rad + t.BEYOND_RAD, lower.angle_min_rad - t.BEYOND_RAD)
     rig.press(fast, rig.periods(t.PUSH_S), torque_limit_nm=limits)
     limited = rig.press(fast, t.TRANSPORT_PERIODS, torque_limit_nm=limits)
     rig.must_be_armed()
@@ -86,6 +90,9 @@ def switch(rig: Rig) -> dict[tuple[Mode, Mode], Floats]:
     rig.drive({0: (CIRCUIT[0], home)}, rig.periods(HELD_S))
     torques: dict[tuple[Mode, Mode], Floats] = {}
     for before, after in PAIRS:
+        if not (rig.has(0, before) and rig.has(0, after)):
+            rig.drive({0: (Mode.POSITION, rig.now.angle_rad[0])}, rig.periods(HELD_S))
+            continue
         began = rig.now.torque_nm[0]
         record = rig.drive({0: (after, target[after]())}, rig.periods(HELD_S))
         torques[before, after] = np.array([began, *record.torque_nm[:, 0]])

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import msgspec
 import numpy as np
+import pytest
 
 from snakesim_hal.arrays import Floats
 from snakesim_hal.backend import Backend, Samples, SetPoints
@@ -71,6 +72,7 @@ class Rig:
     closed: bool = False
     tick: int = 0
     late_periods: float = 0.0  # how far this machine fell behind real time at worst
+    _on_the_way: dict[int, float] = field(default_factory=dict[int, float])  # of joints led along by positions
     _found: list[tuple[int, Fault]] = field(default_factory=list[tuple[int, Fault]])
 
     def __post_init__(self) -> None:
@@ -90,6 +92,32 @@ class Rig:
                 break
         self.home_rad = list(self.now.angle_rad)
         self.faults_at_opening = self.faults
+
+    # --- capabilities --------------------------------------------------------------------------------------
+
+    def has(self, joint: int, mode: Mode) -> bool:
+        """Whether a joint is described to have a mode."""
+        return self.robot.joints[joint].has(mode)
+
+    def feels(self, joint: int = 0) -> bool:
+        """Whether a joint is described to measure its torque."""
+        return "torque" in self.robot.joints[joint].measures
+
+    def needs(self, *modes: Mode, torque: bool = False) -> None:
+        """Skip a clause about modes that joints 0 or 1 do not have, or about a torque that they do not measure."""
+        for joint in (0, 1):
+            name = self.robot.joints[joint].name
+            for mode in modes:
+                if not self.has(joint, mode):
+                    pytest.skip(f"{name} is described without {mode.name.lower()} mode")
+            if torque and not self.feels(joint):
+                pytest.skip(f"{name} is described without measured torque")
+
+    def _next_along(self, joint: int, speed_rad_s: float) -> float:
+        """The position a period further."""
+        at = self._on_the_way.get(joint, self.now.angle_rad[joint]) + speed_rad_s * self.period_ns * 1e-9
+        self._on_the_way[joint] = at
+        return at
 
     # --- readings ------------------------------------------------------------------------------------------
 
@@ -148,6 +176,13 @@ class Rig:
             self.idle()
         return self.since(began)
 
+    def offer(self, points: SetPoints) -> Record:
+        """One command as it is, and the period after it."""
+        began = self.tick
+        self._offer(points)
+        self.idle()
+        return self.since(began)
+
     def press(self, asked: JointTargets, periods: int = 1, *, torque_limit_nm: list[float] | None = None) -> Record:
         """The same without the gate, which would not drive a joint against its stop; the lifecycle still applies."""
         began = self.tick
@@ -159,9 +194,15 @@ class Rig:
         return self.since(began)
 
     def points(self, asked: JointTargets, torque_limit_nm: list[float] | None = None) -> SetPoints:
-        """Set-points of all joints; those without a command hold the start pose."""
+        """Set-points of all joints; those without a command hold the start pose.
+
+        A joint without a velocity mode gets the positions that lead along at that speed, one each time.
+        """
         mode, target = [Mode.POSITION] * self.count, list(self.home_rad)
+        self._on_the_way = {joint: at for joint, at in self._on_the_way.items() if joint in asked}
         for joint, (wanted_mode, wanted) in asked.items():
+            if wanted_mode is Mode.VELOCITY and not self.has(joint, Mode.VELOCITY):
+                wanted_mode, wanted = Mode.POSITION, self._next_along(joint, wanted)
             mode[joint], target[joint] = wanted_mode, wanted
         return SetPoints(mode, target, torque_limit_nm or self.full_torque_nm)
 

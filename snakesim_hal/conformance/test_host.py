@@ -32,13 +32,17 @@ def moves_then(silent: bool, hosted: Hosted) -> int:
     """Arm and move a joint for a while; returns for how many ticks."""
     wait_until(lambda: hosted.backend.seen, "a first sample")
     angle = hosted.backend.seen[-1].angle_rad[0]
-    go: JointTargets = {0: (Mode.VELOCITY, -math.copysign(t.CRUISE_RAD_S, angle))}  # away from the nearer stop
+    speed = -math.copysign(t.CRUISE_RAD_S, angle)  # away from the nearer stop
+    by_speed, period_s = hosted.robot.joints[0].has(Mode.VELOCITY), hosted.config.period_ns * 1e-9
     ticks = t.ARMING_PERIODS + math.ceil(t.CRUISE_S * 1e9 / hosted.config.period_ns)
 
     def plan(since_arming: int) -> JointTargets | None:
         if since_arming < t.ARMING_PERIODS:
             return {}
-        return go if since_arming < ticks or not silent else None
+        if silent and since_arming >= ticks:
+            return None
+        along = angle + speed * period_s * (since_arming - t.ARMING_PERIODS)
+        return {0: (Mode.VELOCITY, speed) if by_speed else (Mode.POSITION, along)}
 
     hosted.arm(plan)
     return ticks
@@ -79,7 +83,7 @@ def refuses_bad_commands(hosted: Hosted) -> None:
     wrong: dict[str, dict[str, Any]] = {
         "wrong_epoch": {"lease_epoch": hosted.controller.epoch + 7},
         "wrong_layout": {"layout": "f" * 16},
-        "wrong_length": {"mode": [Mode.VELOCITY] * (count + 1), "target": [0.5] * (count + 1)},
+        "wrong_length": {"mode": [Mode.POSITION] * (count + 1), "target": [0.5] * (count + 1)},
         "malformed": {"target": [math.nan] * count},
         "stale": {"tick": 0},
         "from_the_future": {"tick": hosted.tick + 1_000_000},

@@ -8,8 +8,9 @@ from snakesim_hal.conformance.rig import Rig
 from snakesim_hal.wire.messages import Mode
 
 
-def test_the_torque_limit_of_the_set_points_is_kept(pushing: Pushing) -> None:
-    """Velocity mode against a stop pushes with the limit, and no more."""
+def test_the_torque_limit_of_the_set_points_is_kept(rig: Rig, pushing: Pushing) -> None:
+    """Velocity mode (or else a position beyond it) against a stop pushes with the limit, and no more."""
+    rig.needs(torque=True)
     felt, limit = abs(pushing.limited.torque_nm[-1, :2]), pushing.limit_nm
     assert max(felt) < (1 + t.TORQUE_SHARE) * limit + t.TORQUE_NM, f"{felt} N·m, limit is {limit:.2f} N·m"
     assert min(felt) > (1 - t.TORQUE_SHARE) * limit - t.TORQUE_NM, f"{felt} N·m does not use the limit of {limit:.2f}"

@@ -1,6 +1,7 @@
 """Modes and units: rad, rad/s and N·m, the right joint, the right direction."""
 
 import numpy as np
+import pytest
 
 from snakesim_hal.conformance import tolerances as t
 from snakesim_hal.conformance.recordings import Pushing
@@ -21,6 +22,7 @@ def test_position_mode_turns_the_joint_that_is_asked_and_no_other(rig: Rig) -> N
 
 def test_velocity_mode_turns_at_the_speed_that_is_asked(rig: Rig) -> None:
     """In both directions, in rad/s; friction may reduce a motor's speed."""
+    rig.needs(Mode.VELOCITY)
     rig.arm()
     for speed in (t.CRUISE_RAD_S, -t.CRUISE_RAD_S):
         record = rig.drive({0: (Mode.VELOCITY, speed)}, rig.periods(t.CRUISE_S))
@@ -40,8 +42,10 @@ def test_the_reported_velocity_is_the_change_of_the_reported_angle(rig: Rig) -> 
     assert np.abs(integral - turned).max() < t.INTEGRAL_RAD, f"velocity says {integral} rad, angle says {turned} rad"
 
 
-def test_torque_mode_pushes_with_the_torque_that_is_asked(pushing: Pushing) -> None:
+def test_torque_mode_pushes_with_the_torque_that_is_asked(rig: Rig, pushing: Pushing) -> None:
     """Against a stop the reported torque is the one asked for, in N·m, with its sign."""
+    rig.needs(Mode.TORQUE, torque=True)
+    assert pushing.torque_mode is not None
     felt, asked = pushing.torque_mode.torque_nm[-1], pushing.asked_nm
     slack = t.TORQUE_SHARE * asked + t.TORQUE_NM
     assert abs(felt[0] - asked) < slack, f"asked for {asked:.2f} N·m: {felt[0]:.3f} N·m"
@@ -72,6 +76,7 @@ def test_joints_may_be_in_different_modes_at_once(rig: Rig) -> None:
 
 def test_set_points_hold_until_the_next_ones(rig: Rig) -> None:
     """Without commands for less than a lease the joint keeps its set-point."""
+    rig.needs(Mode.VELOCITY)
     rig.cruise()
     rig.idle(t.LAPSE_PERIODS)
     must_cruise(rig)
@@ -79,10 +84,27 @@ def test_set_points_hold_until_the_next_ones(rig: Rig) -> None:
 
 def test_set_points_hold_without_being_handed_over_again(rig: Rig) -> None:
     """`advance` alone keeps the last set-points active."""
+    rig.needs(Mode.VELOCITY)
     rig.cruise()
     for _ in range(t.HELD_PERIODS):
         rig.let_pass()
     must_cruise(rig)
+
+
+def test_a_mode_that_a_joint_lacks_is_refused_and_moves_nothing(rig: Rig) -> None:
+    """Described without a mode, a joint is never given a set-point in it: the command is refused as a whole."""
+    lacking = [mode for mode in Mode if not rig.has(0, mode)]
+    if not lacking:
+        pytest.skip(f"{rig.robot.joints[0].name} is described with every mode")
+    rig.arm()
+    for mode in lacking:
+        refused = rig.authority.rejected["wrong_mode"]
+        wrong = rig.points({})
+        wrong.mode[0], wrong.target[0] = mode, t.CRUISE_RAD_S
+        record = rig.offer(wrong)
+        assert rig.authority.rejected["wrong_mode"] == refused + 1, f"{mode.name.lower()} mode was accepted"
+        assert np.abs(record.angle_rad - rig.home_rad).max() < t.REACHED_RAD, "it moved"
+        assert all(mode not in points.mode for points in record.set_points)
 
 
 def must_cruise(rig: Rig) -> None:

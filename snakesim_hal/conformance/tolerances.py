@@ -26,6 +26,7 @@ PUSH_S = 0.5  # against a stop: the impact is over
 STEP_RAD = 0.2  # 11 degrees: hundreds of quantisation steps, well inside bench4's 0.6 rad
 CRUISE_RAD_S = 0.5
 NEAR_STOP = 0.8  # of the joint's limit: where a push against the stop begins
+BEYOND_RAD = 1.0  # the stop: the target of a joint that can push only by its position
 PUSH_SHARE = 0.08  # of full torque, in torque mode against the stop
 LIMIT_SHARE = 0.1  # of full torque, as the limit in the set-points...
 DEMAND_SHARE = 0.25  # ... while velocity mode asks for this much

@@ -13,7 +13,7 @@ import msgspec
 from msgspec import Meta
 
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.wire.messages import Axis
+from snakesim_hal.wire.messages import Axis, Measurement
 from snakesim_hal.wire.quantities import above, from_zero
 
 MAX_TURN_RAD = 3.14159
@@ -105,6 +105,11 @@ class Motor(FileStruct, frozen=True, kw_only=True):
     peak_nm: Torque | None = None  # that it can give at all: no limit may be above it; none: not known
 
 
+DriveMode = Literal["position", "velocity", "torque"]
+Modes = Annotated[list[DriveMode], Meta(max_length=3)]
+Measures = Annotated[list[Measurement], Meta(max_length=3)]
+
+
 class Drive(FileStruct, frozen=True, kw_only=True):
     """How a joint's drive is connected and mounted: drive angle = zero_rad + sign * gear * joint angle."""
 
@@ -113,6 +118,16 @@ class Drive(FileStruct, frozen=True, kw_only=True):
     sign: Sign = 1  # -1: mounted the other way round, so that the drive turns against the joint
     zero_rad: Zero = 0.0  # what the drive measures at the joint's zero
     gear: Gear = 1.0  # turns of the drive's shaft in one turn of the joint
+    modes: Modes = msgspec.field(default_factory=lambda: ["position", "velocity", "torque"])  # that it can be in
+    measures: Measures = msgspec.field(default_factory=lambda: ["torque", "temperature", "voltage"])
+
+    def __post_init__(self) -> None:
+        """A robot is armed by holding its pose. Raises ValueError, for the file reader."""
+        if "position" not in self.modes:
+            raise ValueError(
+                f"`modes` = {self.modes} lacks position, in which every joint holds its pose when it is armed; add it, "
+                f"or leave `modes` out"
+            )
 
 
 class Heat(FileStruct, frozen=True, kw_only=True):
@@ -164,6 +179,8 @@ class JointExceptions(FileStruct, frozen=True, kw_only=True):
     sign: Sign | None = None
     zero_rad: Zero | None = None
     gear: Gear | None = None
+    modes: Modes | None = None
+    measures: Measures | None = None
     # [heat]
     rise_at_rated_k: Kelvin | None = None
     time_constant_s: HeatTime | None = None

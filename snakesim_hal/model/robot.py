@@ -6,7 +6,7 @@ long as the others. A robot whose links differ otherwise lists them in `[[links]
 
 import hashlib
 import math
-from typing import Annotated
+from typing import Annotated, get_args
 
 from msgspec import Meta
 
@@ -22,6 +22,8 @@ from snakesim_hal.wire.messages import (
     Description,
     JointDescription,
     LinkDescription,
+    Measurement,
+    Mode,
     SafeAction,
     SensorDescription,
 )
@@ -131,21 +133,9 @@ class RobotFile(FileStruct, frozen=True, kw_only=True):
         return [0.5] + [1.0] * (self.chain.modules - 1) + [0.5]
 
 
-def describe(
-    robot: RobotFile,
-    *,
-    backend: str,
-    period_ns: int,
-    lease_ns: int,
-    config_hash: str,
-    emulated: bool = False,
-    simulated_time: bool = False,
-) -> Description:
-    """The description that the HAL publishes, from a robot file. Raises ConfigError for the class of a sensor in it.
-
-    emulated: nothing real moves; simulated_time: and between two ticks any time may pass.
-    """
-    joints = [
+def described(robot: RobotFile) -> list[JointDescription]:
+    """The joints, tail to head."""
+    return [
         JointDescription(
             name=joint.name,
             axis=joint.axis,
@@ -162,9 +152,28 @@ def describe(
             derate_from_c=joint.limits.derate_from_c,
             stop_at_c=joint.limits.stop_at_c,
             least_voltage_v=joint.limits.least_voltage_v,
+            modes=[Mode.PASSIVE, *(mode for mode in Mode if mode.name.lower() in joint.drive.modes)],
+            measures=[one for one in get_args(Measurement) if one in joint.drive.measures],
         )
         for joint in robot.joint_table
     ]
+
+
+def describe(
+    robot: RobotFile,
+    *,
+    backend: str,
+    period_ns: int,
+    lease_ns: int,
+    config_hash: str,
+    emulated: bool = False,
+    simulated_time: bool = False,
+) -> Description:
+    """The description that the HAL publishes, from a robot file. Raises ConfigError for the class of a sensor in it.
+
+    emulated: nothing real moves; simulated_time: and between two ticks any time may pass.
+    """
+    joints = described(robot)
     links = [
         LinkDescription(name=f"link_{i}", length_m=length, radius_m=robot.module.radius_m, mass_kg=mass)
         for i, (length, mass) in enumerate(zip(robot.link_lengths_m, robot.link_masses_kg, strict=True))

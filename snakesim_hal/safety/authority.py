@@ -345,10 +345,20 @@ class Authority:
         zeros = np.zeros_like(self._measured.angle_rad)
         if self.state != "fault" or self._halt is None or self.description.safe_action == "passive":
             return self._uniform(Mode.PASSIVE, zeros)
-        if self.description.safe_action == "damp":
+        damps = self.limits.damps
+        if self.description.safe_action == "damp" and damps.all():
             return self._uniform(Mode.VELOCITY, zeros)
         self._halt = self._halt.after_a_period(self.limits)
+        if self.description.safe_action == "damp":
+            return self._damped(self._halt)
         return self._uniform(Mode.POSITION, self._halt.target_rad)
+
+    def _damped(self, halt: StopRamp) -> Applied:
+        """A joint that has no velocity mode is brought to rest by its position, and then let go."""
+        damps, rests = self.limits.damps, halt.velocity_rad_s == 0.0
+        modes = np.select([damps, rests], [int(Mode.VELOCITY), int(Mode.PASSIVE)], int(Mode.POSITION))
+        target = np.where(modes == int(Mode.POSITION), halt.target_rad, 0.0)
+        return Applied(modes.astype(np.int64), target, self.limits.torque_nm * self._derating.share)
 
     def _uniform(self, mode: Mode, target: gate.Floats) -> Applied:
         limit_nm = self.limits.torque_nm * self._derating.share

@@ -125,8 +125,10 @@ class _Health:
     def take(self, voltage_v: float, winding_c: float, leak: bool, now_ns: int) -> None:
         """A valid entry of a sample."""
         self.heard_ns, self.voltage_v, self.winding_c, self.leak = now_ns, voltage_v, winding_c, leak
+        if "temperature" not in self.joint.measures:
+            self.winding_c = winding_c = -math.inf
         self.hot = winding_c >= (self.joint.derate_from_c if self.hot else self.joint.stop_at_c)
-        low = voltage_v < self.joint.least_voltage_v
+        low = "voltage" in self.joint.measures and voltage_v < self.joint.least_voltage_v
         self.low_since_ns = (now_ns if self.low_since_ns is None else self.low_since_ns) if low else None
 
     def known(self, now_ns: int) -> bool:

@@ -40,6 +40,7 @@ Refusal = Literal[
     "stale",
     "wrong_layout",
     "wrong_length",
+    "wrong_mode",
     "not_finite",
 ]
 
@@ -59,6 +60,8 @@ class JointLimits:
     oldest_state_ns: int  # an older joint state is rejected
     layout: str
     joints: tuple[JointDescription, ...]  # the same, joint by joint
+    damps: NDArray[np.bool_]  # which joints have a velocity mode, (n_joints,)
+    all_modes: bool  # whether every joint has every mode
 
     @staticmethod
     def of(description: Description) -> "JointLimits":
@@ -80,6 +83,8 @@ class JointLimits:
             oldest_state_ns=oldest_state_ns(description),
             layout=description.layout,
             joints=tuple(joints),
+            damps=np.array([joint.has(Mode.VELOCITY) for joint in joints]),
+            all_modes=all(joint.has(mode) for joint in joints for mode in Mode),
         )
 
     def inside(self, angle_rad: Floats) -> Floats:
@@ -133,6 +138,8 @@ def refuse(
         return "wrong_length"
     if command.torque_limit_nm is not None and len(command.torque_limit_nm) != joints:
         return "wrong_length"
+    if not limits.all_modes and not all(map(JointDescription.has, limits.joints, command.mode)):
+        return "wrong_mode"
     if not all(map(math.isfinite, command.target)):
         return "not_finite"
     if command.torque_limit_nm is not None and not all(map(math.isfinite, command.torque_limit_nm)):

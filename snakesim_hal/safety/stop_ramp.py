@@ -1,5 +1,7 @@
 """The safe action `hold`: the joints are brought to rest, and held there. Pure.
 
+Also how `damp` brings a joint to rest that has no velocity mode; it is let go then.
+
 A reference angle starts from the measured one at the measured velocity, and slows down by the acceleration limit. The
 position target follows it no faster than the speed limit, starting where the motor keeps its torque. Both
 stay inside the angle limits, which takes precedence over the rate of the target.

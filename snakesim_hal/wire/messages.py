@@ -8,7 +8,7 @@ The meaning of a field is its `about`, because the published schemas are generat
 """
 
 from enum import IntEnum
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 import msgspec
 from msgspec import Meta
@@ -22,6 +22,7 @@ LocomotionState = Literal["PowerOff", "Idle", "NotLocomoting", "Locomoting"]
 SafeAction = Literal["passive", "damp", "hold"]
 Reach = Literal["robot", "joint", "none"]
 Axis = Literal["yaw", "pitch"]
+Measurement = Literal["torque", "temperature", "voltage"]
 
 A_JOINT = "one entry a joint"
 MAX_CONFIG = 500_000  # characters
@@ -63,7 +64,10 @@ class JointState(Message, frozen=True, kw_only=True):
     stamp_ns: q.Stamp
     angle_rad: Annotated[q.Angles, about("positive: yaw to the left, pitch downwards, seen towards the head")]
     velocity_rad_s: Annotated[q.AngularVelocities, about(A_JOINT)]
-    torque_nm: Annotated[q.Torques, about("of the motor; positive turns towards positive angles")]
+    torque_nm: Annotated[
+        q.Torques,
+        about("of the motor; positive turns towards positive angles; 0 of a joint that does not measure it"),
+    ]
     valid: Annotated[q.Flags, about("false: its numbers are outdated, and must not be used")]
     age_ns: Annotated[q.Ages, about("how long before `stamp_ns` each joint was measured")]
 
@@ -343,6 +347,18 @@ class JointDescription(Message, frozen=True, kw_only=True):
     derate_from_c: Annotated[q.Temperature, about("of the winding: above it torque is derated")] = 80.0
     stop_at_c: Annotated[q.Temperature, about("of the winding: at it the robot is stopped")] = 105.0
     least_voltage_v: Annotated[q.Voltage, about("below it the robot is stopped")] = 18.0
+    modes: Annotated[
+        list[Mode], Meta(min_length=1, max_length=4), about("in which it may be commanded; passive it always can be")
+    ] = msgspec.field(default_factory=lambda: list(Mode))
+    measures: Annotated[
+        list[Measurement],
+        Meta(max_length=8),
+        about("beside angle and velocity; a torque that is not measured is 0, heat and voltage then stop nothing"),
+    ] = msgspec.field(default_factory=lambda: list(get_args(Measurement)))
+
+    def has(self, mode: Mode) -> bool:
+        """Whether it may be commanded in a mode."""
+        return mode is Mode.PASSIVE or mode in self.modes
 
 
 class LinkDescription(Message, frozen=True, kw_only=True):

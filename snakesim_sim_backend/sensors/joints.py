@@ -22,6 +22,7 @@ class JointReader:
 
     def __init__(self, data: mujoco.MjData, sensor: JointSensor, motors: Motors, noise: Normal, period_ns: int) -> None:
         count = motors.count
+        self._unfelt = [2 * count + i for i in motors.without_torque]
         self._count = count
         self._angles, self._velocities = data.qpos[FREE_QPOS:], data.qvel[FREE_DOFS:]
         self._torques = motors.applied_nm()
@@ -37,6 +38,8 @@ class JointReader:
         count = self._count
         if self._noise is not None:
             values += self._sigma * self._noise(3 * count)
+        if self._unfelt:
+            values[self._unfelt] = 0.0
         self._under_way.append((stamp_ns, values.tolist()))
         taken_ns, numbers = self._under_way[0]
         return JointState(

@@ -25,6 +25,7 @@ LOOKS_AHEAD = (
     'robot.sensors.range=[{name="front", beams=9, view_rad=2.0}]',
     f'robot.sensors.own=[{{name="whisker", model="{WHISKER}:WhiskerModel"}}]',
 )
+POSITION_ONLY = ('robot.drive.modes=["position"]', "robot.drive.measures=[]")
 ON_VCAN = ('backend.channels=["vcan0"]', 'backend.twins="process"')
 
 
@@ -36,6 +37,7 @@ def pytest_snakesim_benches() -> list[Bench]:
     return [
         Bench("sim", "sim"),
         Bench("sim-camera", "sim", sets=LOOKS_AHEAD),
+        Bench("sim-position", "sim", sets=POSITION_ONLY),
         Bench("can-virtual", "can", mute=cut_off),
     ]
 

@@ -348,6 +348,19 @@ class ForgetsAfterAPeriod(Workbench):
         self.mode[:] = Mode.PASSIVE
 
 
+@breaks("a_mode_that_a_joint_lacks_is_refused_and_moves_nothing")
+class MovesAfterAll(Misdescribed):
+    """Has no torque mode, and moves when it is told nothing."""
+
+    def mistold(self, robot):
+        first = replace(robot.joints[0], modes=[Mode.PASSIVE, Mode.POSITION, Mode.VELOCITY])
+        return replace(robot, joints=[first, *robot.joints[1:]])
+
+    def enact(self, set_points, lifecycle):
+        super().enact(set_points, lifecycle)
+        self.angle[0] += 0.05
+
+
 # --- limits and switching --------------------------------------------------------------------------------------
 
 

@@ -55,6 +55,8 @@ class Push:
 class ObstacleTriplet:
     """Obstacle-aided locomotion after the paper's section IV."""
 
+    MODES = (Mode.POSITION, Mode.TORQUE)
+    MEASURES = ("torque",)
     Settings = Settings
 
     def __init__(self, robot: Description, settings: Settings) -> None:

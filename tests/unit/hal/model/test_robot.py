@@ -12,7 +12,7 @@ from snakesim_hal.model.joints import Drive, Heat, JointExceptions, Limits, Moto
 from snakesim_hal.model.robot import RobotFile, describe, layout_hash
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder, encode, encoding_of
-from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.messages import Description, Mode
 from tests.unit.hal.rig import LEASE_NS, PERIOD_NS, ROBOT, changed, description, robot_file
 
 SECTIONS = ("limits", "motor", "drive", "heat", "supply")
@@ -79,6 +79,15 @@ def test_one_joint_may_differ_in_every_field_that_the_sections_give_to_all() -> 
     assert [joint.derate_from_c for joint in joints] == [80.0, 60.0, 80.0]
     either = robot_file(joints={"joint_2": {"angle_rad": 0.2}}, limits__angle_max_rad=1.0).joint_table[1].limits
     assert (either.least_rad, either.most_rad) == (-0.2, 0.2), "to either side, whatever the others' sides are"
+
+
+def test_the_description_says_what_each_joint_can_do_and_measure() -> None:
+    own = {"joint_2": {"modes": ["torque", "position"], "measures": ["torque"]}}
+    first, second, third = description(drive__modes=["position"], drive__measures=[], joints=own).joints
+    assert first.modes == third.modes == [Mode.PASSIVE, Mode.POSITION] and first.measures == []
+    assert second.modes == [Mode.PASSIVE, Mode.POSITION, Mode.TORQUE] and second.measures == ["torque"]
+    assert description().joints[0].modes == list(Mode), "all, where nothing is said"
+    assert description().joints[0].measures == ["torque", "temperature", "voltage"]
 
 
 def test_every_field_of_the_sections_may_be_said_for_one_joint() -> None:
@@ -159,6 +168,10 @@ WRONG = {
     "more than the motor can": (
         {"joints": {"joint_3": {"peak_nm": 3.0}}},
         ["joint_3: `torque_nm` = 4 N·m", "`peak_nm` = 3 N·m", "lower it"],
+    ),
+    "no position mode": (
+        {"drive__modes": ["velocity"]},
+        ["`drive`", "`modes` = ['velocity'] lacks position", "leave `modes` out"],
     ),
     "two of an id": ({"joints": {"joint_3": {"id": 1}}}, ["joint_1, joint_3: all have the id 1 on one bus"]),
     "a supply that stops it": (

@@ -47,6 +47,21 @@ def test_a_fault_takes_the_robots_safe_action(action: str, mode: Mode, target: f
     assert rig.acquire("control").lifecycle != "armed" and not rig.arm().ok
 
 
+def test_a_joint_without_a_velocity_mode_is_damped_by_its_position_and_then_let_go() -> None:
+    rig = armed(joints={"joint_2": {"modes": ["position"]}}, limits__acceleration_rad_s2=50.0)
+    rig.observe(0.1, 1.0)
+    rig.authority.fault(Fault(tick=1, what="hot", cause="joint_1 is hot"))
+    seen: list[tuple[Mode, float]] = []
+    while not seen or seen[-1][0] is not Mode.PASSIVE:
+        points = rig.pass_tick().set_points
+        assert points.mode[0] is points.mode[2] is Mode.VELOCITY and points.target[0] == points.target[2] == 0.0
+        seen.append((points.mode[1], points.target[1]))
+        assert len(seen) < 10
+    on_the_way = [target for mode, target in seen if mode is Mode.POSITION]
+    assert len(on_the_way) == 1, "from 1 rad/s at 50 rad/s² it stands after two periods of 10 ms"
+    assert 0.1 < on_the_way[0] < 0.2 and seen[-1] == (Mode.PASSIVE, 0.0)
+
+
 def test_a_fault_that_reaches_nothing_is_listed_and_stops_nothing() -> None:
     rig = armed()
     rig.authority.fault(Fault(tick=1, what="sample_late", cause="sensor/depth/head", reach="none"))

@@ -54,6 +54,14 @@ def test_nothing_is_derated_before_anything_is_known() -> None:
     assert bench.look(0) == [] and bench.shares == [1.0] * JOINTS and bench.derating.derated() == {}
 
 
+def test_a_joint_that_measures_neither_heat_nor_voltage_is_stopped_by_neither() -> None:
+    bench = Bench(joints={"joint_2": {"measures": ["torque"]}, "joint_3": {"measures": ["voltage"]}})
+    assert bench.receive(motor_c=[0.0, 300.0, 300.0], voltage_v=[24.0, 0.0, 24.0]) == []
+    assert bench.look(100 * MS) == [] and bench.shares == [1.0] * JOINTS and bench.against_arming == []
+    low = bench.receive(motor_c=[0.0, 300.0, 300.0], voltage_v=[24.0, 0.0, 12.0]) + bench.look(100 * MS)
+    assert [(fault.what, fault.joint) for fault in low] == [("undervoltage", "joint_3")]
+
+
 @pytest.mark.parametrize(
     ("celsius", "share"),
     [(-40.0, 1.0), (80.0, 1.0), (85.0, 0.84), (92.5, 0.6), (104.9, 0.2032), (105, 0.2), (300, 0.2)],

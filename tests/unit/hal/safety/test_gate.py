@@ -10,17 +10,19 @@ from snakesim_hal.safety.gate import Applied, JointLimits, Measured, Refusal, as
 from snakesim_hal.safety.lease import Lease
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import JointCommand, Mode, SensorDescription
-from tests.unit.hal.rig import LEASE_NS, command
+from tests.unit.hal.rig import LEASE_NS, command, description
 from tests.unit.hal.safety.gate_rig import COOL, JOINTS, LEASE, LIMITS, ROBOT, applied_for
 
 
 def judge(given: JointCommand, **changes: Any) -> Refusal | None:
     values: dict[str, Any] = {"lease": LEASE, "now_ns": 900, "tick": 5, "last_sequence": 0, "age_ns": 0} | changes
-    return refuse(given, limits=LIMITS, **values)
+    limits = values.pop("limits", LIMITS)
+    return refuse(given, limits=limits, **values)
 
 
 # --- refusals --------------------------------------------------------------------------------------------------
 
+SERVOS = JointLimits.of(description(drive__modes=["position"], joints={"joint_3": {"modes": ["position", "velocity"]}}))
 NAN, INF = float("nan"), float("inf")
 REFUSED: dict[Refusal, list[tuple[dict[str, Any], dict[str, Any]]]] = {
     "no_lease": [({}, {"lease": Lease(epoch=1)}), ({}, {"now_ns": 1001})],
@@ -42,6 +44,10 @@ REFUSED: dict[Refusal, list[tuple[dict[str, Any], dict[str, Any]]]] = {
         ({"torque_limit_nm": [1.0]}, {}),
         ({"torque_limit_nm": []}, {}),
     ],
+    "wrong_mode": [
+        ({"mode": [Mode.POSITION, Mode.TORQUE, Mode.POSITION]}, {"limits": SERVOS}),
+        ({"mode": [Mode.VELOCITY] * JOINTS}, {"limits": SERVOS}),
+    ],
     "not_finite": [
         ({"target": [0.0, NAN, 0.0]}, {}),
         ({"target": [INF, 0.0, 0.0]}, {}),
@@ -59,6 +65,7 @@ def test_a_good_command_passes() -> None:
     assert judge(command(ROBOT, tick=5), now_ns=1000) is None
     assert judge(command(ROBOT, valid_for_ns=10), age_ns=10) is None
     assert judge(command(ROBOT, valid_for_ns=0), age_ns=0) is None
+    assert judge(command(ROBOT, mode=[Mode.PASSIVE, Mode.POSITION, Mode.VELOCITY]), limits=SERVOS) is None
 
 
 @pytest.mark.parametrize(("reason", "case"), [(reason, case) for reason, cases in REFUSED.items() for case in cases])
