@@ -1,5 +1,6 @@
 """Evaluations in real worker processes: the same table however often, wherever, and whatever was killed on the way."""
 
+import contextlib
 import json
 import os
 import re
@@ -80,7 +81,10 @@ def lives(pid: int) -> bool:
 
 def listening(pids: list[int]) -> set[str]:
     """Addresses on which processes take connections, as the kernel writes them."""
-    own = {str(fd.readlink()) for pid in pids for fd in Path(f"/proc/{pid}/fd").iterdir() if fd.is_symlink()}
+    own: set[str] = set()
+    for fd in (fd for pid in pids for fd in Path(f"/proc/{pid}/fd").iterdir()):
+        with contextlib.suppress(FileNotFoundError):  # closed since it was listed
+            own.add(str(fd.readlink()))
     found: set[str] = set()
     for table in ("tcp", "tcp6"):
         for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
