@@ -33,6 +33,7 @@ from snakesim_can_backend.protocol.definitions import FIRST_NODE, LAST_NODE, Opc
 from snakesim_can_backend.protocol.expanded import EXPANDED, expanded_dbc
 from snakesim_can_backend.settings import Settings
 from snakesim_hal.arguments import number
+from snakesim_hal.drivers.mounting import Mounting
 from snakesim_hal.model.files import Table, decode
 from snakesim_hal.model.scenario import Loaded, Override, RunConfig, parse_set
 from snakesim_hal.model.scenario import load as load_scenario
@@ -248,8 +249,8 @@ def _replay(arguments: argparse.Namespace) -> int:
     loaded = load_scenario(str(arguments.run / "config.json"), [])
     layout, rows = read_black_box(arguments.run / BLACK_BOX)
     settings = settings_of(loaded)
-    limit_s = answer_limit_s(loaded.config, settings)
-    done = Replay(len(layout.joints), reports_of(loaded.config, settings), limit_s)
+    mounting, limit_s = Mounting(loaded.config.robot.joint_table), answer_limit_s(loaded.config, settings)
+    done = Replay(mounting, reports_of(loaded.config, settings), limit_s)
     done.take(messages(arguments.log))
     if not done.joints:
         say(f"{arguments.log}: {done.frames} frames, and no Sync among them: the log of another bus")

@@ -14,9 +14,10 @@ import numpy as np
 
 from snakesim_can_backend.bus.load import Reports
 from snakesim_can_backend.driver.reports import Reading
-from snakesim_can_backend.driver.sensors import contacts_due
+from snakesim_can_backend.driver.sensors import contacts_due, joint_values
 from snakesim_can_backend.protocol.definitions import FROM_HOST, Frame, Opcode, opcode_of
 from snakesim_hal.arrays import Floats
+from snakesim_hal.drivers.mounting import Mounting
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.record.black_box import Layout
 
@@ -27,12 +28,13 @@ VALUES = ("angle_rad", "velocity_rad_s", "torque_nm")
 class Replay:
     """A log, read frame by frame as the driver reads a bus."""
 
-    def __init__(self, joints: int, reports: Reports, answer_limit_s: float) -> None:
+    def __init__(self, mounting: Mounting, reports: Reports, answer_limit_s: float) -> None:
         """answer_limit_s: how long the driver waits for the answers to a Sync."""
-        self.reading = Reading(joints)
+        self._mounting = mounting
+        self.reading = Reading(len(mounting.sign))
         self.frames = 0
         self.joints: list[Floats] = []  # by Sync: angle, velocity and torque, (3, n_joints)
-        self.silent = [0] * joints  # Syncs that a joint did not answer in time
+        self.silent = [0] * len(mounting.sign)  # Syncs that a joint did not answer in time
         self._reports, self._answer_limit_s = reports, answer_limit_s
         self._open_until_s: float | None = None  # of the newest Sync, whose sample is not taken yet
 
@@ -62,7 +64,7 @@ class Replay:
             self._open_until_s = time_s + self._answer_limit_s
 
     def _sample(self) -> None:
-        self.joints.append(self.reading.joints())
+        self.joints.append(joint_values(self.reading, self._mounting))
         for joint, module in enumerate(self.reading.modules):
             self.silent[joint] += module.sync != self.reading.sync
         self._open_until_s = None

@@ -186,7 +186,7 @@ class Reading:
     # --- joint states, in SI units ----------------------------------------------------------------------------
 
     def joints(self) -> Floats:
-        """Angle, velocity and torque of every joint, (3, n_joints)."""
+        """Angle, velocity and torque of every module's shaft, (3, n_joints)."""
         return np.array(self._joint).T[:COUNT_AT] * self._state_scale
 
     def links_touched(self) -> list[tuple[int, tuple[int, ...]]]:

@@ -6,11 +6,14 @@ Every value was sampled at the tick's Sync. A missing one keeps its last value, 
 import math
 from collections.abc import Sequence
 
+import numpy as np
+
 from snakesim_can_backend.bus.load import Reports
 from snakesim_can_backend.driver.mocap import MocapReceiver
 from snakesim_can_backend.driver.reports import Reading
 from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.definitions import HEALTH_PERIOD_S, Opcode
+from snakesim_hal.arrays import Floats
 from snakesim_hal.backend import Samples
 from snakesim_hal.drivers.mounting import Mounting
 from snakesim_hal.model.felt_force import FeltForce
@@ -62,7 +65,7 @@ class Sensors:
 
     def _joints(self, tick: int, stamp_ns: int) -> JointState:
         reading = self._reading
-        angle, velocity, torque = reading.joints()
+        angle, velocity, torque = joint_values(reading, self._mounting).tolist()
         ages = [
             (reading.sync - module.sync) * self._period_ns if module.sync >= 0 else LONG_AGO_NS
             for module in reading.modules
@@ -70,9 +73,9 @@ class Sensors:
         return JointState(
             tick=tick,
             stamp_ns=stamp_ns,
-            angle_rad=self._mounting.joint_angle_rad(angle).tolist(),
-            velocity_rad_s=self._mounting.joint_velocity_rad_s(velocity).tolist(),
-            torque_nm=self._mounting.joint_torque_nm(torque).tolist(),
+            angle_rad=angle,
+            velocity_rad_s=velocity,
+            torque_nm=torque,
             valid=[age <= self._lease_ns for age in ages],
             age_ns=ages,
         )
@@ -129,6 +132,17 @@ class Sensors:
                 for row, module in zip(rows, self._reading.modules, strict=True)
             ],
         )
+
+
+def joint_values(reading: Reading, mounting: Mounting) -> Floats:
+    """Angle, velocity and torque of every joint, (3, n_joints): the modules' shafts, behind sign, zero and gear."""
+    angle, velocity, torque = reading.joints()
+    at_joints = (
+        mounting.joint_angle_rad(angle),
+        mounting.joint_velocity_rad_s(velocity),
+        mounting.joint_torque_nm(torque),
+    )
+    return np.stack(at_joints)
 
 
 def contacts_due(reports: Reports, sync: int) -> bool:

@@ -13,11 +13,13 @@ DURATION_S = "0.5"
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a run on emulated modules, with the log of its bus."""
+    """The folder of a run on emulated modules, one of them mounted otherwise, with the log of its bus."""
     folder = tmp_path_factory.mktemp("bus") / "run"
     log = folder.with_name("bus.log")
+    mounted = ("sign=-1", "zero_rad=0.3", "gear=1.5")
+    flags = [word for one in mounted for word in ("--set", f"robot.joints.joint_6.{one}")]
     more = ("--duration", DURATION_S, "--set", f"backends.can.log={log}", "--out", str(folder))
-    assert main(["run", "triplet", "--backend", "can", "--in-process", *more]) == 0
+    assert main(["run", "triplet", "--backend", "can", "--in-process", *flags, *more]) == 0
     return folder
 
 
