@@ -77,9 +77,8 @@ class AdapterWire:
         self._only = None if only is None else frozenset(int(opcode) for opcode in only)
         self._bus = open_bus(channel, bit_rate)
         self._file = self._descriptor()
-        self._echoes: Counter[Frame] | None = (
-            Counter() if channel.startswith("udp_multicast:") else None
-        )  # of own frames
+        echoed = _parted(channel)[0] == "udp_multicast"
+        self._echoes: Counter[Frame] | None = Counter() if echoed else None  # of own frames
         self._found: list[BusError] = []
 
     def send(self, frame: Frame) -> bool:

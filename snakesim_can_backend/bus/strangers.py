@@ -10,7 +10,15 @@ from dataclasses import dataclass
 import can
 
 from snakesim_can_backend.protocol.codec import codec
-from snakesim_can_backend.protocol.definitions import LAST_NODE, WITH_CHECKSUM, Opcode, checksum, node_of, opcode_of
+from snakesim_can_backend.protocol.definitions import (
+    LAST_NODE,
+    WITH_CHECKSUM,
+    Frame,
+    Opcode,
+    intact,
+    node_of,
+    opcode_of,
+)
 from snakesim_hal.errors import BackendError
 
 CANOPEN_HEARTBEAT, CANOPEN_STATES = 0x700, {0: "boot", 4: "stopped", 5: "operational", 127: "pre-operational"}
@@ -48,27 +56,18 @@ def strangers(bus: can.BusABC, seconds: float) -> list[Stranger]:
             newest[key] = message
     except (OSError, ValueError, can.CanError) as error:
         raise BackendError(f"{bus.channel_info}: cannot be listened to: {error}") from error
-    return [
-        Stranger(
-            identifier, extended, len(newest[identifier, extended].data), count, whose(newest[identifier, extended])
-        )
-        for (identifier, extended), count in sorted(heard.items())
-    ]
+    return [Stranger(*key, len(newest[key].data), count, whose(newest[key])) for key, count in sorted(heard.items())]
 
 
 def is_ours(message: can.Message) -> bool:
     """Whether a frame has an id, a length and, where there is one, a checksum of the joint modules' protocol."""
     if message.is_extended_id or message.is_remote_frame or message.is_fd:
         return False
-    opcode, data = opcode_of(message.arbitration_id), bytes(message.data)
-    layouts = codec().layouts
-    if (
-        opcode not in layouts
-        or node_of(message.arbitration_id) > LAST_NODE
-        or len(data) != layouts[Opcode(opcode)].length
-    ):
+    frame = Frame(message.arbitration_id, bytes(message.data))
+    opcode, layouts = opcode_of(frame.id), codec().layouts
+    if opcode not in layouts or node_of(frame.id) > LAST_NODE or len(frame.data) != layouts[Opcode(opcode)].length:
         return False
-    return opcode not in WITH_CHECKSUM or checksum(message.arbitration_id, data[:-1]) == data[-1]
+    return opcode not in WITH_CHECKSUM or intact(frame)
 
 
 def whose(message: can.Message) -> str:

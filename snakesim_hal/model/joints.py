@@ -14,17 +14,12 @@ from msgspec import Meta
 
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Axis, Measurement
-from snakesim_hal.wire.quantities import above, from_zero
+from snakesim_hal.wire.quantities import above, bounded, from_zero
 
 MAX_TURN_RAD = 3.14159
 
-
-def _between(low: float, high: float, unit: str) -> Meta:
-    return Meta(ge=low, le=high, extra_json_schema={"unit": unit})
-
-
 Travel = Annotated[float, above(MAX_TURN_RAD, "rad")]
-Side = Annotated[float, _between(-MAX_TURN_RAD, MAX_TURN_RAD, "rad")]
+Side = Annotated[float, bounded(-MAX_TURN_RAD, MAX_TURN_RAD, "rad")]
 Speed = Annotated[float, above(100, "rad/s")]
 Acceleration = Annotated[float, above(1e5, "rad/s²")]
 Torque = Annotated[float, above(1000, "N·m")]
@@ -43,7 +38,7 @@ TorqueConstant = Annotated[float, above(1000, "N·m/A")]
 Text = Annotated[str, Meta(max_length=100)]
 DriveId = Annotated[int, Meta(ge=0, lt=2**29)]
 Sign = Literal[1, -1]
-Zero = Annotated[float, _between(-1e4, 1e4, "rad")]
+Zero = Annotated[float, bounded(-1e4, 1e4, "rad")]
 Gear = Annotated[float, above(1e4, "1")]
 HeatTime = Annotated[float, above(1e5, "s")]
 Watts = Annotated[float, from_zero(1e5, "W")]
@@ -133,7 +128,7 @@ class Drive(FileStruct, frozen=True, kw_only=True):
 class Heat(FileStruct, frozen=True, kw_only=True):
     """How a motor warms up. The defaults are typical of a small geared servo; none was measured."""
 
-    ambient_c: Annotated[float, _between(-50, 100, "°C")] = 20.0
+    ambient_c: Annotated[float, bounded(-50, 100, "°C")] = 20.0
     rise_at_rated_k: Kelvin = 240.0  # of the winding, at rest under the rated torque, for ever
     time_constant_s: HeatTime = 60.0
     loss_at_rated_w: Watts = 48.0  # 5 K/W from winding to water, a guess of the right order for a housing of 100 mm
