@@ -95,7 +95,7 @@ def shared_bus(channel: str, **dotted: object) -> Iterator[SharedBus]:
     server = TwinServer([modules_end], ModuleChain(run, settings, make_plant(run, settings), stepped=False))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(driver, "open_wire", lambda name, bit_rate: SharedWire(name, server))
-        patch.setattr(driver, "_answer_time_s", lambda *_: ANSWER_LIMIT_S)
+        patch.setattr(driver, "answer_limit_s", lambda *_: ANSWER_LIMIT_S)
         patch.setattr(driver, "FIRST_STATE_PAUSE_S", ANSWER_LIMIT_S)
         try:
             backend = CanBackend(run, settings)
