@@ -13,7 +13,7 @@ from snakesim_hal.model.scenario import RunConfig, load, parse_set
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Mode
 from snakesim_sim_backend.backend import SimBackend
-from snakesim_sim_backend.settings import Settings
+from snakesim_sim_backend.settings import SimSettings
 
 FIELD = """
 name = "field"
@@ -43,7 +43,7 @@ def config_of(robot: str, scene: str, *sets: str) -> RunConfig:
 
 def image_ms(config: RunConfig) -> tuple[float, int]:
     """Median CPU time of an image, and how many geoms there are."""
-    backend, times = SimBackend(config, Settings()), list[float]()
+    backend, times = SimBackend(config, SimSettings()), list[float]()
     for tick in range(IMAGES):
         period = config.period_ns * round(config.rate_hz / 20)
         began = time.process_time()
@@ -57,7 +57,7 @@ def image_ms(config: RunConfig) -> tuple[float, int]:
 
 def ticks(config: RunConfig) -> str:
     """Sample, enact, advance: CPU time of the loop's thread, and of everything; images, and those that were late."""
-    backend, own, images = SimBackend(config, Settings()), list[float](), 0
+    backend, own, images = SimBackend(config, SimSettings()), list[float](), 0
     joints, limit = config.robot.chain.modules, config.robot.limits.torque_nm
     started, all_s = time.perf_counter(), time.process_time()
     for tick in range(TICKS):

@@ -31,7 +31,7 @@ from snakesim_can_backend.driver.reports import Module, Reading
 from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.definitions import FIRST_NODE, LAST_NODE, Opcode
 from snakesim_can_backend.protocol.expanded import EXPANDED, expanded_dbc
-from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.arguments import number
 from snakesim_hal.drivers.mounting import Mounting
 from snakesim_hal.model.files import Table, decode
@@ -112,14 +112,14 @@ def _load(arguments: argparse.Namespace) -> int:
     return OK
 
 
-def settings_of(loaded: Loaded) -> Settings:
+def settings_of(loaded: Loaded) -> CanSettings:
     """The section `backends.can` of a scenario. Raises ConfigError."""
     table = loaded.table
     section = Table(loaded.config.backends.get("can", {}), table.source, table.origin)
-    return decode(section, Settings, "backends.can")
+    return decode(section, CanSettings, "backends.can")
 
 
-def one(config: RunConfig, settings: Settings) -> tuple[list[str], bool]:
+def one(config: RunConfig, settings: CanSettings) -> tuple[list[str], bool]:
     """The sum for every bus as lines, and whether all fit."""
     joints, reports = shares(config, settings), reports_of(config, settings)
     period_ms = 1e3 / config.rate_hz
@@ -134,7 +134,7 @@ def one(config: RunConfig, settings: Settings) -> tuple[list[str], bool]:
 
 
 def table(
-    config: RunConfig, settings: Settings, joints: Sequence[int], rates_hz: Sequence[float] | None = None
+    config: RunConfig, settings: CanSettings, joints: Sequence[int], rates_hz: Sequence[float] | None = None
 ) -> Iterator[str]:
     """The load of the fullest bus for every number of joints and every rate, as lines."""
     buses = max(len(settings.channels), 1)

@@ -18,7 +18,7 @@ class Mounted(FileStruct, frozen=True, kw_only=True):
     gear: Gear | None = None
 
 
-class Settings(FileStruct, frozen=True, kw_only=True):
+class CanSettings(FileStruct, frozen=True, kw_only=True):
     """Buses, modules on them, and their reports."""
 
     # Buses, tail to head: SocketCAN interfaces such as can0, or INTERFACE:CHANNEL of python-can, such as

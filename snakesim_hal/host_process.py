@@ -30,7 +30,7 @@ from snakesim_hal.network.stop_port import open_stop_port, serve_stops, stop_add
 from snakesim_hal.plugin_check import check_backend
 from snakesim_hal.process import HOST_PRIORITY, enter_realtime, on_stop_signal, restart_process, tune_garbage_collector
 from snakesim_hal.record.host_record import HostRecord
-from snakesim_hal.record.recorder import Recorder
+from snakesim_hal.record.recorder import HostRecordWriter
 from snakesim_hal.serve import ProcessOptions, joined, process_options
 from snakesim_hal.terminal import report_error
 from snakesim_hal.wire import keys
@@ -100,7 +100,7 @@ def _run(given: ProcessOptions, config: RunConfig) -> Host:
         on_stop_signal(host.stop)
         tune_garbage_collector()
         memory = wanted.memory and os.open(wanted.memory, os.O_WRONLY)
-        with Recorder(host.black_box, host.description, partial(record_of, host), wanted.out, memory):
+        with HostRecordWriter(host.black_box, host.description, partial(record_of, host), wanted.out, memory):
             if config.beside:  # loaded for those who want it: it is not in the production host's way
                 from snakesim_hal.beside import Beside
 

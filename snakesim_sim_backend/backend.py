@@ -22,7 +22,7 @@ from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS, SimModel, build
 from snakesim_sim_backend.sensors.frames import rotate
 from snakesim_sim_backend.sensors.registry import check_models
 from snakesim_sim_backend.sensors.suite import Sensors
-from snakesim_sim_backend.settings import Settings
+from snakesim_sim_backend.settings import SimSettings
 from snakesim_sim_backend.start import place_robot
 from snakesim_sim_backend.tether import Rope
 from snakesim_sim_backend.truth import TrueContact, TrueState
@@ -35,10 +35,10 @@ OFF: tuple[LifecycleState, ...] = ("disarmed", "estop")
 class SimBackend:
     """A `snakesim_hal.backend.Backend` on MuJoCo. Deterministic: seed and commands decide every byte."""
 
-    Settings = Settings
+    Settings = SimSettings
 
     @staticmethod
-    def check(config: RunConfig, _settings: Settings) -> tuple[Pace, ...]:
+    def check(config: RunConfig, _settings: SimSettings) -> tuple[Pace, ...]:
         """Simulated time supports all paces. Raises ConfigError."""
         check_gains(config.robot)
         check_models(config.robot)
@@ -50,7 +50,7 @@ class SimBackend:
         check_backend_can(config, does=does, buses=0, because=because)
         return ("lockstep", "realtime", "free")
 
-    def __init__(self, config: RunConfig, settings: Settings) -> None:
+    def __init__(self, config: RunConfig, settings: SimSettings) -> None:
         """Build the scene, lay the snake down and let it come to rest. Raises ConfigError."""
         self._description = describe(
             config.robot,

@@ -15,7 +15,7 @@ from snakesim_hal.model.scenario import RunConfig
 from snakesim_sim_backend.ground import GROUND, HILLS, PLANE_GROUP
 from snakesim_sim_backend.model import FOOT_GROUP, build
 from snakesim_sim_backend.sensors.rendered import opened_context
-from snakesim_sim_backend.settings import Settings
+from snakesim_sim_backend.settings import SimSettings
 
 Picture = NDArray[np.uint8]  # (height, width, 3)
 
@@ -133,4 +133,4 @@ class Film:
 class _Sim:
     """Whose settings the scene is built with."""
 
-    Settings = Settings
+    Settings = SimSettings

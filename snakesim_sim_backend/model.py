@@ -23,8 +23,8 @@ from snakesim_sim_backend.flat_ground import KEPT, Soles, soles_of
 from snakesim_sim_backend.ground import GROUND, add_ground
 from snakesim_sim_backend.imu import add_imus
 from snakesim_sim_backend.obstacles import OBSTACLE, add_obstacle
-from snakesim_sim_backend.settings import Settings
-from snakesim_sim_backend.surface import PairSurface, grip, link_skin
+from snakesim_sim_backend.settings import SimSettings
+from snakesim_sim_backend.surface import PairSurface, link_skin, pair_surface
 from snakesim_sim_backend.tether import add_tether
 
 FREE_QPOS = 7  # of the base: position and quaternion
@@ -45,7 +45,7 @@ class SimModel:
     soles: Soles | None  # None: MuJoCo has the contacts with the ground, which is not flat
 
 
-def build(config: RunConfig, settings: Settings, *, motors: bool = True) -> SimModel:
+def build(config: RunConfig, settings: SimSettings, *, motors: bool = True) -> SimModel:
     """Compile the model of a run. Raises ConfigError when settings and robot do not match.
 
     Without motors the joints are only hinges with a rotor's inertia and friction, for external torques.
@@ -89,7 +89,7 @@ def build(config: RunConfig, settings: Settings, *, motors: bool = True) -> SimM
     )
 
 
-def _set_options(spec: mujoco.MjSpec, step_s: float, settings: Settings) -> None:
+def _set_options(spec: mujoco.MjSpec, step_s: float, settings: SimSettings) -> None:
     spec.compiler.degree = False
     option = spec.option
     option.timestep = step_s
@@ -102,7 +102,7 @@ def _set_options(spec: mujoco.MjSpec, step_s: float, settings: Settings) -> None
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET | mujoco.mjtDisableBit.mjDSBL_ISLAND
 
 
-def _add_scene(spec: mujoco.MjSpec, config: RunConfig, settings: Settings) -> None:
+def _add_scene(spec: mujoco.MjSpec, config: RunConfig, settings: SimSettings) -> None:
     """Ground and obstacles, paired with the links that are added later.
 
     Level ground supports a chain of capsules only at the spheres around joints and ends. Each sphere is there once,
@@ -116,12 +116,12 @@ def _add_scene(spec: mujoco.MjSpec, config: RunConfig, settings: Settings) -> No
     for name in add_ground(spec, scene.ground):
         if scene.ground.uneven is None:
             continue
-        sole = grip(scene.ground.friction, settings, bears_weight=True)
+        sole = pair_surface(scene.ground.friction, settings, bears_weight=True)
         _pair(spec, name, feet if name == GROUND else links, sole)
     for placed in place_all(config):
         rough = add_obstacle(spec, placed, settings, body_radius_m=robot.module.radius_m, hills_m=hills_m)
         if rough is not None:
-            _pair(spec, rough, links, grip(placed.friction, settings, bears_weight=placed.walkable))
+            _pair(spec, rough, links, pair_surface(placed.friction, settings, bears_weight=placed.walkable))
 
 
 def _pair(spec: mujoco.MjSpec, name: str, others: list[str], with_grip: PairSurface) -> None:
@@ -129,7 +129,7 @@ def _pair(spec: mujoco.MjSpec, name: str, others: list[str], with_grip: PairSurf
         spec.add_pair(geomname1=name, geomname2=other, **with_grip)
 
 
-def _add_snake(spec: mujoco.MjSpec, robot: RobotFile, settings: Settings) -> None:
+def _add_snake(spec: mujoco.MjSpec, robot: RobotFile, settings: SimSettings) -> None:
     lengths, masses, joints = robot.link_lengths_m, robot.link_masses_kg, robot.joint_table
     skin = link_skin(settings)
     body = spec.worldbody

@@ -8,7 +8,7 @@ from snakesim_hal.model.kinematics import quaternion_from_yaw
 from snakesim_hal.model.scene import Placed
 from snakesim_hal.wire.messages import Obstacle
 from snakesim_sim_backend.ground import GROUND_GROUP, SAND
-from snakesim_sim_backend.settings import Settings
+from snakesim_sim_backend.settings import SimSettings
 from snakesim_sim_backend.surface import frictionless_skin
 
 OBSTACLE = "obstacle:"
@@ -27,7 +27,7 @@ class Shape(TypedDict):
 
 
 def add_obstacle(
-    spec: mujoco.MjSpec, placed: Placed, settings: Settings, *, body_radius_m: float, hills_m: float
+    spec: mujoco.MjSpec, placed: Placed, settings: SimSettings, *, body_radius_m: float, hills_m: float
 ) -> str | None:
     """Add an obstacle to a model; its geom is called `obstacle:<name>`, or `step:<name>` when it is walkable.
 

@@ -21,7 +21,7 @@ from snakesim_sim_backend.loads import LoadReader
 from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS, SimModel, build
 from snakesim_sim_backend.sensors.imu import ImuReader
 from snakesim_sim_backend.sensors.pose import PoseReader
-from snakesim_sim_backend.settings import PlantSettings, Settings
+from snakesim_sim_backend.settings import PlantSettings, SimSettings
 from snakesim_sim_backend.start import place_robot
 from snakesim_sim_backend.tether import Rope
 
@@ -170,7 +170,7 @@ def _rest(config: RunConfig, settings: PlantSettings) -> Floats:
 
     On rough ground it depends on the step by millimetres, so the step is the default one of `SimBackend`.
     """
-    step_s = min(Settings().timestep_s, settings.contact_time_s / 2)
+    step_s = min(SimSettings().timestep_s, settings.contact_time_s / 2)
     sim = build(config, msgspec.structs.replace(settings, timestep_s=step_s))
     data = mujoco.MjData(sim.model)
     motors = Motors(sim.model, data, config.robot, config.period_ns * 1e-9)

@@ -15,7 +15,7 @@ from snakesim_hal.wire.messages import Clock, Description, JointState, Message, 
 from snakesim_sim_backend.model import FREE_QPOS, build
 from snakesim_sim_backend.sensors.registry import mounted_reader, own_noise
 from snakesim_sim_backend.sensors.scope import Reader, Scope
-from snakesim_sim_backend.settings import Settings
+from snakesim_sim_backend.settings import SimSettings
 
 
 class SensorService:
@@ -28,7 +28,7 @@ class SensorService:
         """Raises ConfigError for a sensor that cannot be made."""
         self._client, self._config = client, config
         self._joints, self._pose = client.subscribe(keys.JOINTS, JointState), client.subscribe(keys.POSE, Pose)
-        self._sim = build(config, Settings(), motors=False)
+        self._sim = build(config, SimSettings(), motors=False)
         self._data = mujoco.MjData(self._sim.model)
         self._readers: list[tuple[str, Reader]] = []
 

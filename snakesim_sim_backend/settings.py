@@ -21,7 +21,7 @@ class Tether(FileStruct, frozen=True, kw_only=True):
     reel_in_m_s: Annotated[float, Meta(ge=0, le=10, extra_json_schema={"unit": "m/s"})] = 0.0
 
 
-class Settings(FileStruct, frozen=True, kw_only=True):
+class SimSettings(FileStruct, frozen=True, kw_only=True):
     """Parameters of the physics. The defaults suit robots of centimetres to decimetres and of a few kilograms."""
 
     # The longest physics step; it is shortened so that a control period is a multiple of it.
@@ -42,7 +42,7 @@ class Settings(FileStruct, frozen=True, kw_only=True):
     tether: Tether | None = None
 
 
-class PlantSettings(Settings, frozen=True, kw_only=True):
+class PlantSettings(SimSettings, frozen=True, kw_only=True):
     """The same for the physics under emulated joint modules, whose firmware sets the pace: one step at a time."""
 
     timestep_s: Annotated[float, Meta(ge=1e-5, le=0.01, extra_json_schema={"unit": "s"})] = 0.001

@@ -10,7 +10,7 @@ follows changes of speed rather than opposing speed, so undulation on hills drif
 
 from typing import TypedDict
 
-from snakesim_sim_backend.settings import Settings
+from snakesim_sim_backend.settings import SimSettings
 
 # solimp, see MuJoCo's manual: how hard a contact is at first touch, and 1 mm deeper.
 BARE = [0.95, 0.99, 0.001, 0.5, 2.0]
@@ -38,14 +38,14 @@ class PairSurface(TypedDict):
     solimp: list[float]
 
 
-def frictionless_skin(settings: Settings) -> LinkSurface:
+def frictionless_skin(settings: SimSettings) -> LinkSurface:
     """Of an obstacle that only pushes. Its priority is above the links', or their friction would act."""
     return LinkSurface(
         friction=[0.0, 0.0, 0.0], condim=1, priority=1, solref=[settings.contact_time_s, 1.0], solimp=BARE
     )
 
 
-def link_skin(settings: Settings) -> LinkSurface:
+def link_skin(settings: SimSettings) -> LinkSurface:
     """Of a link; acts only between links."""
     return LinkSurface(
         friction=[settings.self_friction, 0.0, 0.0],
@@ -56,7 +56,7 @@ def link_skin(settings: Settings) -> LinkSurface:
     )
 
 
-def grip(friction: float, settings: Settings, *, bears_weight: bool) -> PairSurface:
+def pair_surface(friction: float, settings: SimSettings, *, bears_weight: bool) -> PairSurface:
     """Between a link and ground, step or rough obstacle. Only a pair of geoms can have a slip time of its own."""
     return PairSurface(
         friction=[friction, friction, 0.0, 0.0, 0.0],

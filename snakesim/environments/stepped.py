@@ -159,7 +159,7 @@ class SteppedRobot:
         if authority.state == "armed":
             self._offer(authority, modes, target)
         authority.expire(self._tick * self._period_ns, self._tick)
-        return authority.decide(self._service.counting_at(self._tick + 1))
+        return authority.decide(self._service.used_output_tick(self._tick + 1))
 
     def _sample(self) -> Samples:
         now_ns = self._tick * self._period_ns

@@ -187,7 +187,7 @@ class SocketCanWire:
         return struct.unpack("=9I", raw)[MEMINFO_DROPS] if len(raw) == MEMINFO_BYTES else 0
 
 
-class OtherEnd(Protocol):
+class VirtualPeer(Protocol):
     """The other end of a virtual bus, in the same process."""
 
     def __call__(self) -> float | None:
@@ -206,10 +206,10 @@ class OtherEnd(Protocol):
 class VirtualWire:
     """One end of python-can's virtual bus."""
 
-    def __init__(self, channel: str, other_end: OtherEnd | None = None) -> None:
-        """other_end: runs the other end whenever this one is idle; returns when its next run is due."""
+    def __init__(self, channel: str, peer: VirtualPeer | None = None) -> None:
+        """peer: runs the other end whenever this one is idle; returns when its next run is due."""
         self.channel = channel
-        self.other_end = other_end
+        self.peer = peer
         self._bus = VirtualBus(channel=channel)
         self._faults = VirtualFaults(channel)
 
@@ -243,7 +243,7 @@ class VirtualWire:
 
     def idle(self) -> float | None:
         """Let the other end run."""
-        pause_s = math.inf if self.other_end is None else self.other_end()
+        pause_s = math.inf if self.peer is None else self.peer()
         return pause_s if self._bus.queue.empty() else 0.0
 
     def inject(self, kind: str, *, begins: bool) -> None:
@@ -252,8 +252,8 @@ class VirtualWire:
 
     def close(self) -> None:
         """Close this end, and the other one if it is run by this one."""
-        if self.other_end is not None:
-            self.other_end.close()
+        if self.peer is not None:
+            self.peer.close()
         try:
             self._bus.shutdown()
         except IO_ERRORS as error:

@@ -11,7 +11,7 @@ from math import ceil
 
 from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.definitions import HEALTH_PERIOD_S, HEARTBEAT_PERIOD_S, LAST_NODE, Opcode
-from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.scenario import RunConfig
 
@@ -98,12 +98,12 @@ def every(rate_hz: float, wanted_hz: float) -> int:
     return 0 if wanted_hz <= 0 else round(min(max(rate_hz / wanted_hz, 1.0), MAX_EVERY))
 
 
-def reports_of(config: RunConfig, settings: Settings) -> Reports:
+def reports_of(config: RunConfig, settings: CanSettings) -> Reports:
     """The reports of a run's modules, and how often."""
     return reports_at(config.rate_hz, config, settings)
 
 
-def reports_at(rate_hz: float, config: RunConfig, settings: Settings) -> Reports:
+def reports_at(rate_hz: float, config: RunConfig, settings: CanSettings) -> Reports:
     """The same for another control rate: rates in Hz are converted to Syncs."""
     sensors = config.robot.sensors
     contact_hz = 0.0
@@ -113,7 +113,7 @@ def reports_at(rate_hz: float, config: RunConfig, settings: Settings) -> Reports
     return Reports(rate_hz, every(rate_hz, contact_hz), every(rate_hz, imu_hz), bit_rate=settings.bit_rate)
 
 
-def shares(config: RunConfig, settings: Settings) -> list[int]:
+def shares(config: RunConfig, settings: CanSettings) -> list[int]:
     """Number of joints of each bus, tail to head. Raises ConfigError."""
     joints, buses = config.robot.chain.modules, max(len(settings.channels), 1)
     if len(set(settings.channels)) < len(settings.channels):
@@ -133,7 +133,7 @@ def shares(config: RunConfig, settings: Settings) -> list[int]:
     return list(given) or [joints // buses + (i < joints % buses) for i in range(buses)]
 
 
-def check_load(config: RunConfig, settings: Settings) -> list[float]:
+def check_load(config: RunConfig, settings: CanSettings) -> list[float]:
     """The load of every bus. Raises ConfigError, with the sum and alternatives that fit, when one is too high.
 
     Too high is more than `MAX_LOAD` of the time, or a single period that is too long.
@@ -159,7 +159,7 @@ def check_load(config: RunConfig, settings: Settings) -> list[float]:
     return loads
 
 
-def _name(settings: Settings, bus: int) -> str:
+def _name(settings: CanSettings, bus: int) -> str:
     return settings.channels[bus] if settings.channels else "the virtual bus"
 
 
@@ -181,7 +181,7 @@ def arithmetic(joints: int, reports: Reports) -> list[str]:
     ]
 
 
-def what_fits(joints: Sequence[int], config: RunConfig, settings: Settings) -> str:
+def what_fits(joints: Sequence[int], config: RunConfig, settings: CanSettings) -> str:
     """Alternatives that fit: a lower rate, more buses, fewer reports."""
     fullest, total = max(joints), sum(joints)
     reports = reports_of(config, settings)
@@ -201,7 +201,7 @@ def what_fits(joints: Sequence[int], config: RunConfig, settings: Settings) -> s
     return "What would fit: " + ("; or ".join(ways) or "nothing on classic CAN") + "."
 
 
-def most_rate_hz(joints: int, config: RunConfig, settings: Settings) -> int | None:
+def most_rate_hz(joints: int, config: RunConfig, settings: CanSettings) -> int | None:
     """The highest integer rate below the run's at which this many joints fit on a bus; None when none does.
 
     Bisection does not work: at some lower rate reports may come at every Sync instead of every second one.

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from snakesim_can_backend.bus.adapter import check_channel, open_wire
-from snakesim_can_backend.bus.bus import OtherEnd, VirtualWire, Wire, wait
+from snakesim_can_backend.bus.bus import VirtualPeer, VirtualWire, Wire, wait
 from snakesim_can_backend.bus.bus_errors import BusError
 from snakesim_can_backend.bus.load import check_load, reports_of, shares, worst_bits
 from snakesim_can_backend.bus.log import LoggedWire, open_log
@@ -27,7 +27,7 @@ from snakesim_can_backend.driver.reports import Reading
 from snakesim_can_backend.driver.sensors import Sensors, contacts_due, described
 from snakesim_can_backend.protocol import commands
 from snakesim_can_backend.protocol.definitions import Action, Frame, ModuleState
-from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.backend import Samples, SetPoints
 from snakesim_hal.drivers.mounting import Mounting
 from snakesim_hal.errors import BackendError, ConfigError
@@ -61,10 +61,10 @@ class Arming:
 class CanBackend:
     """A `snakesim_hal.backend.Backend` on joint modules, real or emulated."""
 
-    Settings = Settings
+    Settings = CanSettings
 
     @staticmethod
-    def check(config: RunConfig, settings: Settings) -> tuple[Pace, ...]:
+    def check(config: RunConfig, settings: CanSettings) -> tuple[Pace, ...]:
         """Real modules support real time only; twins that this backend starts support lockstep. Raises ConfigError."""
         check_load(config, settings)
         check_gains(config.robot)
@@ -78,7 +78,7 @@ class CanBackend:
             check_channel(channel)
         return ("realtime",) if settings.twins_run == "none" else ("lockstep", "realtime")
 
-    def __init__(self, config: RunConfig, settings: Settings) -> None:
+    def __init__(self, config: RunConfig, settings: CanSettings) -> None:
         """Open the buses and find every module; nothing is enabled. Raises ConfigError and BackendError."""
         self.check(config, settings)
         self._config, self._settings = config, settings
@@ -87,7 +87,7 @@ class CanBackend:
         joints = config.robot.chain.modules
         self._mocap: MocapReceiver | None = None
         self._twins: TwinProcess | None = None
-        self._local_twins: OtherEnd | None = None
+        self._local_twins: VirtualPeer | None = None
         self._wires: list[Wire] = []
         self._open = True
         self._ours = (
@@ -436,7 +436,7 @@ def _at_the_shafts(mounting: Mounting, points: SetPoints) -> SetPoints:
     return SetPoints(points.mode, targets, limits, points.isolated)
 
 
-def answer_limit_s(config: RunConfig, settings: Settings) -> float:
+def answer_limit_s(config: RunConfig, settings: CanSettings) -> float:
     """How long all answers to a Sync may take on the fullest bus; the rest of the period is for the controller."""
     if config.pace == "lockstep":
         return LOCKSTEP_ANSWER_S

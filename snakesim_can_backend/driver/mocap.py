@@ -21,7 +21,7 @@ import msgspec
 
 from snakesim_can_backend.driver.mocap_times import CaptureTimes
 from snakesim_can_backend.protocol.mocap_sample import MocapSample
-from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.errors import BackendError, ConfigError
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire import quantities as q
@@ -40,12 +40,12 @@ MAX_SPEED_M_S = 100.0  # of the base; two poses further apart are of two bodies,
 _log = logging.getLogger("snakesim.can")
 
 
-def pose_address(settings: Settings) -> str:
+def pose_address(settings: CanSettings) -> str:
     """UDP address for poses, HOST:PORT; empty: none."""
     return settings.pose_listen or ("" if settings.twins_run == "none" else "127.0.0.1:0")
 
 
-def check_pose(config: RunConfig, settings: Settings) -> None:
+def check_pose(config: RunConfig, settings: CanSettings) -> None:
     """Raise ConfigError for poses without a stated delay."""
     if settings.pose_listen and config.robot.sensors.pose is None:
         raise ConfigError(

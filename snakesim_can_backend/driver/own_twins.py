@@ -11,8 +11,8 @@ from pathlib import Path
 
 import msgspec
 
-from snakesim_can_backend.bus.bus import OtherEnd
-from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.bus.bus import VirtualPeer
+from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.errors import BackendError, ConfigError
 from snakesim_hal.fault_plan import check_backend_can
 from snakesim_hal.injection import KINDS, Injection
@@ -25,7 +25,7 @@ STOP_LIMIT_S = 5.0
 POLL_S = 0.02
 
 
-def check_twins(config: RunConfig, settings: Settings) -> None:
+def check_twins(config: RunConfig, settings: CanSettings) -> None:
     """Raise ConfigError for impossible settings of the twins."""
     from snakesim_can_backend.twin.faults import parse
 
@@ -45,7 +45,7 @@ def check_twins(config: RunConfig, settings: Settings) -> None:
         parse(text, config.robot.chain.modules)
 
 
-def check_faults(config: RunConfig, settings: Settings) -> None:
+def check_faults(config: RunConfig, settings: CanSettings) -> None:
     """Check that the planned faults of joints and buses are possible. Raises ConfigError."""
     from snakesim_can_backend.twin.faults import ABOUT
 
@@ -66,7 +66,9 @@ def modules_know(injection: Injection, joints: int) -> bool:
     return True
 
 
-def twins_here(config: RunConfig, settings: Settings, channel: str, pose: str | None, *, stepped: bool) -> OtherEnd:
+def twins_here(
+    config: RunConfig, settings: CanSettings, channel: str, pose: str | None, *, stepped: bool
+) -> VirtualPeer:
     """Twins at the other end of a virtual bus; the returned function runs them."""
     from snakesim_can_backend.twin.server import here
 
@@ -76,7 +78,7 @@ def twins_here(config: RunConfig, settings: Settings, channel: str, pose: str | 
 class TwinProcess:
     """`snakesim modules` as a child that dies with this process."""
 
-    def __init__(self, config: RunConfig, settings: Settings, pose: str | None, *, stepped: bool) -> None:
+    def __init__(self, config: RunConfig, settings: CanSettings, pose: str | None, *, stepped: bool) -> None:
         """Start it, and wait until its modules are on the bus. Raises BackendError."""
         changed = msgspec.structs.replace(config, backends={**config.backends, "can": msgspec.to_builtins(settings)})
         arguments = ["--parent", str(os.getpid()), "--pose", pose or "none"]

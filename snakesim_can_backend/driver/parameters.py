@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from snakesim_can_backend.bus.load import Reports
 from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.definitions import Opcode, Parameter, SafeMotion
-from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.errors import BackendError, ConfigError
 from snakesim_hal.model.joints import Drive, Joint
 from snakesim_hal.model.robot import RobotFile
@@ -15,7 +15,7 @@ MIN_PERIODS = 2.2  # in a watchdog's time: one set-point may be lost, and the ne
 SPEED_ROOM = 1.2  # a load may turn a joint faster than its motor, and the bus must still represent that
 
 
-def parameters_of(robot: RobotFile, settings: Settings, reports: Reports) -> dict[int, dict[Parameter, float]]:
+def parameters_of(robot: RobotFile, settings: CanSettings, reports: Reports) -> dict[int, dict[Parameter, float]]:
     """The parameters to write to each node."""
     safe = SafeMotion.DAMP if robot.safety.action == "damp" else SafeMotion.PASSIVE
     common = {
@@ -47,7 +47,7 @@ def _furthest_rad(joint: Joint) -> float:
     return max(map(abs, ends))
 
 
-def check_drives(robot: RobotFile, settings: Settings) -> None:
+def check_drives(robot: RobotFile, settings: CanSettings) -> None:
     """Raise ConfigError for joints whose `[drive]` is not how this backend finds modules."""
     for number, joint in enumerate(robot.joint_table, start=1):
         if joint.id != number:
@@ -111,7 +111,7 @@ def check_ratings(robot: RobotFile, in_force: Mapping[int, Mapping[Parameter, fl
                 )
 
 
-def check_watchdog(config: RunConfig, settings: Settings) -> None:
+def check_watchdog(config: RunConfig, settings: CanSettings) -> None:
     """Raise ConfigError if one lost set-point would stop the modules."""
     least_s = MIN_PERIODS / config.rate_hz
     if settings.watchdog_s < least_s:

@@ -15,7 +15,7 @@ import msgspec
 
 from snakesim_can_backend.bus.load import shares
 from snakesim_can_backend.protocol.definitions import BROADCAST, FROM_HOST, Frame, Opcode, Parameter, node_of, opcode_of
-from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.settings import CanSettings
 from snakesim_can_backend.twin.bus_time import BusTime, Traffic
 from snakesim_can_backend.twin.faults import parse
 from snakesim_can_backend.twin.firmware import BOOT_US, Module
@@ -48,7 +48,7 @@ class ModuleChain:
     def __init__(
         self,
         config: RunConfig,
-        settings: Settings,
+        settings: CanSettings,
         plant: Plant,
         *,
         stepped: bool,

@@ -13,7 +13,7 @@ from snakesim_can_backend.bus.adapter import is_emulated, open_wire
 from snakesim_can_backend.bus.bus import Wire, wait
 from snakesim_can_backend.bus.load import mbit, shares
 from snakesim_can_backend.protocol.definitions import FROM_HOST
-from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.settings import CanSettings
 from snakesim_can_backend.twin.bus_time import Traffic, by_opcode
 from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_can_backend.twin.faults import explain, parse, parse_typed
@@ -118,9 +118,9 @@ def _configuration(arguments: argparse.Namespace) -> Loaded:
     return load(arguments.scenario, [Override("backend", "can", "snakesim modules"), *overrides])
 
 
-def _settings(arguments: argparse.Namespace, loaded: Loaded) -> Settings:
+def _settings(arguments: argparse.Namespace, loaded: Loaded) -> CanSettings:
     section = loaded.config.backends.get("can", {})
-    settings: Settings = decode(Table(section, arguments.scenario), Settings, "backends.can")
+    settings: CanSettings = decode(Table(section, arguments.scenario), CanSettings, "backends.can")
     return msgspec.structs.replace(
         settings,
         channels=arguments.channel or settings.channels or [DEFAULT_CHANNEL],

@@ -4,13 +4,13 @@ import dataclasses
 
 import msgspec
 
-from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.model.joints import Drive, Joint
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.wire.messages import Mode
 
 
-def built(robot: RobotFile, settings: Settings) -> list[Joint]:
+def built(robot: RobotFile, settings: CanSettings) -> list[Joint]:
     """Every joint with its module as it is mounted in truth, tail to head."""
     joints = robot.joint_table
     for i, joint in enumerate(joints):

@@ -14,7 +14,7 @@ from typing import Any
 
 from snakesim_can_backend.bus.bus import VirtualWire, Wire
 from snakesim_can_backend.protocol.definitions import NODE_BITS, Frame, Opcode
-from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.settings import CanSettings
 from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.injection import Injection
@@ -106,7 +106,7 @@ class PoseSender:
         self._socket.close()
 
 
-def make_plant(config: RunConfig, settings: Settings) -> Plant:
+def make_plant(config: RunConfig, settings: CanSettings) -> Plant:
     """The plant that the settings name. Raises ConfigError."""
     factory: Any = find_plugin(PLANTS, settings.plant)
     where = "backends.can.plant_settings"
@@ -138,7 +138,7 @@ class InProcessTwins:
 
 def here(
     config: RunConfig,
-    settings: Settings,
+    settings: CanSettings,
     channel: str,
     pose: str | None = None,
     *,

@@ -77,7 +77,7 @@ class ClutterPlanner:
         self._known = None if known is None else ObstacleMap(known)
         self._search = search
         self._nodes_a_turn = max(round(NODES_PER_S * turn_s), 1)
-        again_nodes = round(AGAIN_M / STEP_M) * search.width
+        again_nodes = round(AGAIN_M / STEP_M) * search.kept_nodes
         self._planning_s = (again_nodes / self._nodes_a_turn + 1) * turn_s  # until another path is there, and one turn
         self._planned: Planned | None = None
         self._planned_ns = 0

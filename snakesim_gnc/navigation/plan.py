@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from snakesim_gnc.navigation.beam import MIN_PUSH, STEP_M, Beam, PathSearch, PlannedPath, Search
+from snakesim_gnc.navigation.beam import MIN_TOWARDS, STEP_M, Beam, PathSearch, PlannedPath, Search
 from snakesim_gnc.navigation.line import SPACING_M, evenly
 from snakesim_gnc.navigation.obstacle_map import NONE, ObstacleMap
 from snakesim_gnc.navigation.snap import Fit, snap
@@ -63,7 +63,7 @@ def plan(situation: Situation, search: Search) -> Generator[int, None, Planned]:
     if not isinstance(obstacles, ObstacleMap):
         obstacles = yield from _mapped(obstacles)
     if why == START and known:  # nobody waits for it while something moves
-        search = replace(search, width=FIRST_WIDTH, crowd=FIRST_CROWD)
+        search = replace(search, kept_nodes=FIRST_WIDTH, kept_per_wide_cell=FIRST_CROWD)
     beam, heading_rad = Beam(obstacles, search), within_reach(body, goal)
     begin, kept = body, len(body) - 3
     if why in (ENDS_SOON, MAP_CHANGED, TURNED):
@@ -136,9 +136,9 @@ def _replanned(beam: Beam, situation: Situation, search: Search, heading_rad: fl
         )
         if found is None or len(found.points_w) < arcs + MIN_AHEAD:
             continue
-        if best is None or found.cost < best.cost - 0.1:
+        if best is None or found.cost_m < best.cost_m - 0.1:
             best = found
-        if np.min(found.margins_n[arcs : arcs + 6]) > 0.5 * search.wanted_n:
+        if np.min(found.margins_n[arcs : arcs + 6]) > 0.5 * search.wanted_margin_n:
             break
     return best
 
@@ -146,6 +146,6 @@ def _replanned(beam: Beam, situation: Situation, search: Search, heading_rad: fl
 def _pushed_off(points_w: Floats, obstacles: ObstacleMap, goal: Floats, radius_m: float) -> list[str]:
     """Obstacles that a body on the path touches or nearly does, and that push it on, in order along the path."""
     near = obstacles.near(points_w[:, 0], points_w[:, 1])
-    beside = (near.distance_m < radius_m + Fit.touch_m) & (near.normal_w @ goal > MIN_PUSH)
+    beside = (near.distance_m < radius_m + Fit.touch_m) & (near.normal_w @ goal > MIN_TOWARDS)
     found = dict.fromkeys(near.obstacle[beside & (near.obstacle != NONE)].tolist())
     return [obstacles.obstacles[k].name for k in found][:MAX_REPORTED]

@@ -31,7 +31,7 @@ from snakesim_hal.host.status_messages import applied_message, status_message
 from snakesim_hal.host.timing import BackendTime, Deadlines, PublishTimes
 from snakesim_hal.injection import HAL
 from snakesim_hal.model.scenario import RunConfig, written
-from snakesim_hal.network.private_channel import HostEnd, ToStarter
+from snakesim_hal.network.private_channel import HostEnd, HostMessage
 from snakesim_hal.network.process_entries import HOST, ProcessEntries, own_entry, show_process
 from snakesim_hal.network.run_key import own_run_key, proven
 from snakesim_hal.network.session import Session
@@ -146,7 +146,7 @@ class Host:
         self._processes = ProcessEntries(session)
         self._inbox = Inbox(session, self, config.services, self._outbox.answer)
         session.on_alive(self._another_host, keys.HOST_ALL)
-        self._starter.say(ToStarter(description=self.description))
+        self._starter.say(HostMessage(description=self.description))
         self._starter.serve(self.ask)
 
     def stop(self) -> None:
@@ -184,9 +184,9 @@ class Host:
             while not self._over():
                 self._inject()
                 self._change_time()
-                if self._stands():
+                if self._is_held():
                     yield
-                    self._stand_still()
+                    self._wait_held()
                     continue
                 before, last = last, self._sample(last)
                 if last is None:
@@ -251,11 +251,11 @@ class Host:
         for why in self.faults.turn(self._tick * self._period_ns, self.authority.arming, self.authority.state):
             self.authority.note(Fault(tick=self._tick, what="injection_refused", cause=why))
 
-    def _stands(self) -> bool:
+    def _is_held(self) -> bool:
         """Whether the next tick has to wait. In lockstep tick 0 is shown until it is armed, also in a pause."""
         return self._time.stands and not (self._pace == "lockstep" and self.authority.arming == 0)
 
-    def _stand_still(self) -> None:
+    def _wait_held(self) -> None:
         """Paused: show that the host is there, and take in what comes; physics and robot time stand."""
         if self._published.last_tick is not None:
             self._outbox.put(keys.CLOCK, self._clock(self._published.last_tick, paused=True))
@@ -290,7 +290,7 @@ class Host:
             self._outbox.put(key, message, samples.encoded[key])
             self._newest[key] = tick
         for name, participant in self.participants.items():
-            self._newest[name] = participant.service.counting_at(tick)
+            self._newest[name] = participant.service.used_output_tick(tick)
         clock = self._clock(tick)
         self._published_arming = self.authority.arming
         self._published.put(tick, self._safety_now(), time.monotonic_ns())
@@ -311,7 +311,7 @@ class Host:
 
     def _finish_tick(self, samples: Samples) -> None:
         self.authority.expire(self._safety_now(), self._tick)
-        counting = self._counting_tick()
+        counting = self._used_command_tick()
         decision = self.authority.decide(counting)
         if self.authority.arming:
             self._armed_at_ns = self._armed_at_ns or time.monotonic_ns()
@@ -469,12 +469,12 @@ class Host:
         if holder is not None:
             holder.done_tick = self._answered = -1
 
-    def _counting_tick(self) -> int | None:
+    def _used_command_tick(self) -> int | None:
         """In lockstep: the newest tick whose command is used at the end of this one."""
         holder = self._holder()
         if self._pace != "lockstep" or holder is None:
             return None
-        return holder.service.counting_at(self._tick + 1)
+        return holder.service.used_output_tick(self._tick + 1)
 
     def presence_changed(self, service: str, present: bool) -> None:
         """A service's liveliness token has appeared or vanished."""
@@ -547,7 +547,7 @@ class Host:
         self._status_due_ns = now_ns + STATUS_PERIOD_NS
         status = self.status()
         self._outbox.put_status(status)
-        self._starter.say(ToStarter(status=status))
+        self._starter.say(HostMessage(status=status))
 
     # --- time and endings ----------------------------------------------------------------------------------
 

@@ -17,7 +17,7 @@ class Participant:
 
     def behind(self, tick: int) -> bool:
         """Whether the end of `tick` has to wait for this service."""
-        return self.present and not self.given_up and self.done_tick < self.service.counting_at(tick + 1)
+        return self.present and not self.given_up and self.done_tick < self.service.used_output_tick(tick + 1)
 
 
 class Participants(dict[str, Participant]):
@@ -33,7 +33,7 @@ class Participants(dict[str, Participant]):
     def awaited(self, tick: int) -> str:
         """Whose answer to which tick the end of `tick` has to wait for, as text."""
         return ", ".join(
-            f"{name}'s answer to tick {self[name].service.counting_at(tick + 1)}" for name in self.behind(tick)
+            f"{name}'s answer to tick {self[name].service.used_output_tick(tick + 1)}" for name in self.behind(tick)
         )
 
     def missing(self, *, must_have_answered: bool) -> list[str]:

@@ -97,7 +97,7 @@ class Service(FileStruct, frozen=True, kw_only=True):
     place: Literal["process", "host"] = "process"  # `host`: beside the driver, in a thread of the host's process
     code: str = ""  # an installed service, or ./file.py:Class; empty: the installed service of the section's name
 
-    def counting_at(self, tick: int) -> int:
+    def used_output_tick(self, tick: int) -> int:
         """The newest tick whose output is used at `tick`. That of tick 0 is used from the start."""
         due = max(tick - self.lag_ticks, 0)
         return due - due % self.every_ticks

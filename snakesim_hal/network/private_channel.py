@@ -16,7 +16,7 @@ from snakesim_hal.wire.messages import Answer, Description, LifecycleRequest, St
 MAX_BYTES = 1 << 18
 
 
-class ToStarter(msgspec.Struct, frozen=True, kw_only=True):
+class HostMessage(msgspec.Struct, frozen=True, kw_only=True):
     """A message of the host: one of these at a time."""
 
     description: Description | None = None
@@ -41,7 +41,7 @@ class HostEnd:
         """From the inherited file descriptor."""
         return HostEnd(None if descriptor is None else socket.socket(fileno=descriptor))
 
-    def say(self, message: ToStarter) -> None:
+    def say(self, message: HostMessage) -> None:
         """Send a message to the starter."""
         if self._socket is not None:
             with contextlib.suppress(OSError):
@@ -62,7 +62,7 @@ class HostEnd:
                     return
                 if not request:
                     return
-                take(decoder.decode(request), lambda answer: self.say(ToStarter(answer=answer)))
+                take(decoder.decode(request), lambda answer: self.say(HostMessage(answer=answer)))
 
         threading.Thread(target=listen, name="private channel", daemon=True).start()
 
@@ -73,7 +73,7 @@ class StarterEnd:
     def __init__(self, opened: socket.socket) -> None:
         self._socket = opened
         self._socket.setblocking(False)
-        self._decoder = msgspec.msgpack.Decoder(ToStarter)
+        self._decoder = msgspec.msgpack.Decoder(HostMessage)
         self.description: Description | None = None
         self.status: Status | None = None
         self.answers: list[Answer] = []

@@ -34,7 +34,7 @@ class Numbers(Protocol):
         ...
 
 
-class Recorder:
+class HostRecordWriter:
     """Writes into one run's folder, from `with` on until its end."""
 
     def __init__(

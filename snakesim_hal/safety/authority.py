@@ -173,7 +173,7 @@ class Authority:
         """Arm, disarm or clear. A refused arming lists every condition that is not met."""
         match request.action:
             case "arm":
-                against = self._refusals(now_ns) + lifecycle.mistaken(request, self.description)
+                against = self._refusals(now_ns) + lifecycle.address_mismatches(request, self.description)
                 if against:
                     words = {word for word, _ in against}
                     return self._answer("; ".join(why for _, why in against), min(words, key=lifecycle.ORDER.index))

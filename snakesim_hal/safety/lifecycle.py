@@ -47,7 +47,7 @@ def after(state: LifecycleState, event: Event) -> LifecycleState | None:
 ORDER = ("wrong_robot", "wrong_backend", "wrong_config", "wrong_state", "not_ready")  # the most important first
 
 
-def mistaken(request: LifecycleRequest, description: Description) -> list[tuple[str, str]]:
+def address_mismatches(request: LifecycleRequest, description: Description) -> list[tuple[str, str]]:
     """Names in a request to arm that do not match this robot: (refusal, reason)."""
     found: list[tuple[str, str]] = []
     if request.robot != description.robot:

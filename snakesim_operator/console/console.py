@@ -59,11 +59,11 @@ def show_live(
 def show_recorded(folder: Path, at_s: float, listening: socket.socket, stop: threading.Event, say: Say) -> int:
     """Show a run's record until `stop` is set. Returns the exit code. Raises ConfigError when the folder has none."""
     # What only recordings need would delay the page of a run that starts.
-    from snakesim_operator.console.recorded import Recorded
+    from snakesim_operator.console.recorded import RecordedRun
     from snakesim_operator.results.incomplete import exit_code
     from snakesim_operator.results.record import RunRecord
 
-    recorded, log = Recorded(RunRecord.load(folder), folder), Log()
+    recorded, log = RecordedRun(RunRecord.load(folder), folder), Log()
     for lack in recorded.record.lacks:
         log.write(f"the record lacks {lack}")
     code = exit_code(folder, recorded.record.lacks)

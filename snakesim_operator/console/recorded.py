@@ -23,7 +23,7 @@ MessageT = TypeVar("MessageT", ControlState, World, Trajectory)
 _TOLD: dict[str, type[Any]] = {keys.STATUS: Status, keys.POWER: Power}  # what a record of rows does not have
 
 
-class Recorded:
+class RecordedRun:
     """A recorded run, by time."""
 
     def __init__(self, record: RunRecord, kept: Path) -> None:

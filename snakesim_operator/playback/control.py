@@ -37,7 +37,7 @@ from snakesim_hal.wire.messages import (
     SettingsRequest,
 )
 from snakesim_operator.playback.order import in_robot_order
-from snakesim_operator.recording.message import RECORDING, Recorded
+from snakesim_operator.recording.message import RECORDING, RecordedMessage
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.recording.recording import Recording
 from snakesim_operator.results.incomplete import exit_code
@@ -188,7 +188,7 @@ class Replay:
             if self._recording is not None and turn % 1000 == 0:
                 self._recording.flush_when_due()
 
-    def _take(self, recorded: Recorded) -> None:
+    def _take(self, recorded: RecordedMessage) -> None:
         message = keys.message_at(recorded.key)
         if message is None or recorded.encoding != encoding_of(message):
             return  # of a stranger
@@ -236,7 +236,7 @@ class Replay:
         )
         self._asked.append((recorded, self._session.put_question(keys.SETTINGS, request)))
 
-    def _as_applied(self, recorded: Recorded) -> bytes:
+    def _as_applied(self, recorded: RecordedMessage) -> bytes:
         """As in the recording where the command is the same; else the replayed command, without the gate's limits."""
         applied = self._applied.decode(recorded.payload, recorded.encoding)
         before = self._by_sequence.get(applied.sequence or -1)

@@ -5,16 +5,16 @@ from collections.abc import Iterator
 from itertools import count
 
 from snakesim_hal.wire import keys
-from snakesim_operator.recording.message import Recorded
+from snakesim_operator.recording.message import RecordedMessage
 from snakesim_operator.recording.reader import RecordingReader
 
 WINDOW_NS = 1_000_000_000  # messages are no further out of order: an image may come long after the clock that names it
 LAST = {keys.CLOCK: 1, keys.APPLIED: 2}
 
 
-def in_robot_order(reader: RecordingReader) -> Iterator[Recorded]:
+def in_robot_order(reader: RecordingReader) -> Iterator[RecordedMessage]:
     """All messages. The file has them in the order of their arrival, in which those of one tick may be mixed."""
-    waiting: list[tuple[int, int, int, Recorded]] = []
+    waiting: list[tuple[int, int, int, RecordedMessage]] = []
     number, clock_ns = count(), 0
     for recorded in reader.messages():
         heapq.heappush(waiting, (recorded.time_ns, LAST.get(recorded.key, 0), next(number), recorded))

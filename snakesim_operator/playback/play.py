@@ -16,7 +16,7 @@ from snakesim_hal.terminal import Say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES, encoding_of
 from snakesim_operator.playback.order import in_robot_order
-from snakesim_operator.recording.message import Recorded
+from snakesim_operator.recording.message import RecordedMessage
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.results.incomplete import exit_code
 from snakesim_operator.results.recorded import read_recording
@@ -76,7 +76,7 @@ class _Player:
         self._publishers: dict[str, Publisher[Any]] = {}
         self.count = 0
 
-    def put(self, recorded: Recorded) -> None:
+    def put(self, recorded: RecordedMessage) -> None:
         """Publish it as it was."""
         row = keys.row_at(recorded.key)
         if row is None or row.message is None or recorded.encoding != encoding_of(row.message):

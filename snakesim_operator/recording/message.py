@@ -7,7 +7,7 @@ RAW_ONLY = "record messages as on the wire alone, without topics for Foxglove an
 
 
 @dataclass(frozen=True)
-class Recorded:
+class RecordedMessage:
     """One message of a recording."""
 
     key: str

@@ -30,7 +30,7 @@ from snakesim_operator.recording.chunks import (
 )
 from snakesim_operator.recording.losses import ELSEWHERE, MOST_GAPS, Losses
 from snakesim_operator.recording.mcap_file import PROFILE
-from snakesim_operator.recording.message import Recorded
+from snakesim_operator.recording.message import RecordedMessage
 from snakesim_operator.recording.recording import ABOUT, COPIED
 
 LATEST_NS = 2**62  # 146 years: no robot time is later
@@ -68,7 +68,7 @@ class RecordingReader:
         """What is missing, for people."""
         return self.losses.words()
 
-    def messages(self, keys: Collection[str] | None = None) -> Iterator[Recorded]:
+    def messages(self, keys: Collection[str] | None = None) -> Iterator[RecordedMessage]:
         """Messages at these keys of the robot, or at all. Raises ConfigError for a file that is no recording.
 
         keys: a pattern of the key space stands for its keys.
@@ -78,7 +78,7 @@ class RecordingReader:
                 channel = self._channels[record.channel_id]
                 encoding = channel.metadata.get("encoding")
                 if encoding is not None and (keys is None or channel.topic in keys or row_key(channel.topic) in keys):
-                    yield Recorded(channel.topic, record.data, encoding, record.log_time, record.publish_time)
+                    yield RecordedMessage(channel.topic, record.data, encoding, record.log_time, record.publish_time)
 
     def records(self) -> Iterator[McapRecord]:
         """Every schema, channel, message and metadata that can be read. Raises ConfigError for a file that is no MCAP.

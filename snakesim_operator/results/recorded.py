@@ -29,7 +29,7 @@ from snakesim_hal.wire.messages import (
     World,
 )
 from snakesim_hal.wire.own_sample import own_kinds
-from snakesim_operator.recording.message import Recorded
+from snakesim_operator.recording.message import RecordedMessage
 from snakesim_operator.results.gaps import unread
 
 SERVICE_STREAMS: dict[str, type[Message]] = {
@@ -57,7 +57,9 @@ class Contents:
     at: dict[str, dict[int, Any]] = field(
         default_factory=lambda: {key: {} for key in _TICKED}
     )  # key -> tick -> message
-    own: dict[str, list[Recorded]] = field(default_factory=dict[str, list[Recorded]])  # of own sensors, by key
+    own: dict[str, list[RecordedMessage]] = field(
+        default_factory=dict[str, list[RecordedMessage]]
+    )  # of own sensors, by key
     armed_wall_ns: list[int] = field(default_factory=list[int])  # wall clock at each clock since the first arming
     refused: Counter[str] = field(default_factory=Counter[str])  # messages that cannot be decoded, by key and reason
     lacks: list[str] = field(default_factory=list[str])
@@ -65,7 +67,7 @@ class Contents:
     replay_of: str = ""  # the recording whose sensors these are
     _decoders: dict[str, Decoder[Any]] = field(default_factory=dict[str, Decoder[Any]])
 
-    def take(self, recorded: Recorded) -> None:
+    def take(self, recorded: RecordedMessage) -> None:
         """One message at a key of ALL, in the order of the file."""
         if keys.row_key(recorded.key) == keys.OWN_ALL:
             self.own.setdefault(recorded.key, []).append(recorded)  # their schema is in the description

@@ -44,7 +44,7 @@ class Options:
     wall_time: bool = False
 
 
-def adds_up(robot: m.Description) -> bool:
+def is_consistent(robot: m.Description) -> bool:
     """Whether there is a link at both ends of every joint."""
     return len(robot.links) == len(robot.joints) + 1
 
@@ -227,7 +227,7 @@ class Bridge:
         elif self._heard_s is not None and now_s - self._heard_s > SILENT_S:
             self._say(f"no clock from the robot for {SILENT_S:g} s; waiting for it")
             self._heard_s = None
-        described = self._descriptions.newest(adds_up)
+        described = self._descriptions.newest(is_consistent)
         if described is not None and described != self._robot:
             self._meet(described)
 

@@ -12,7 +12,7 @@ from snakesim_hal.terminal import say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_hal.wire.messages import Description
-from snakesim_operator.ros2.bridge import Bridge, Options, adds_up
+from snakesim_operator.ros2.bridge import Bridge, Options, is_consistent
 from snakesim_operator.ros2.graph import Node, NodeName
 from snakesim_operator.tools.targets import RobotSelection, only_robot
 
@@ -30,7 +30,7 @@ def join(arguments: argparse.Namespace, where: RobotSelection) -> int:
             "`snakesim run`; this command finds it there"
         )
     with open_session(replace(link, largest_bytes=MAX_IMAGE_BYTES)) as session:
-        robot = session.latest(keys.DESCRIPTION, Description, STARTING_S, adds_up)
+        robot = session.latest(keys.DESCRIPTION, Description, STARTING_S, is_consistent)
         if robot is None:
             raise NotConnectedError(f"{link.namespace} does not describe itself within {STARTING_S:g} s")
         wall_time = not robot.emulated if arguments.stamps is None else arguments.stamps == "wall"

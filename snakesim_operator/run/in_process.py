@@ -27,7 +27,7 @@ from snakesim_hal.model.plugins import anything_offered
 from snakesim_hal.model.scenario import RunConfig, write
 from snakesim_hal.network.session import Session
 from snakesim_hal.plugin_check import check_plugins
-from snakesim_hal.record.recorder import Recorder
+from snakesim_hal.record.recorder import HostRecordWriter
 from snakesim_hal.terminal import print_stderr, say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlState
@@ -143,7 +143,7 @@ def _go(
         control = session.reader(keys.CONTROL_STATE, ControlState)
         watch = GoalWatch(config, host.description, give_up_s)
         with (
-            Recorder(host.black_box, host.description, partial(record_of, host), files.folder),
+            HostRecordWriter(host.black_box, host.description, partial(record_of, host), files.folder),
             _recording(session, files, recorded, None if raw_only else config.robot.name) as recording,
         ):
             for turn, _ in enumerate(run.turns()):

@@ -22,7 +22,7 @@ class Line(msgspec.Struct, frozen=True):
     message: DepthImage
 
 
-class Recorded:
+class RecordedDepth:
     """The image that was measured as long after the first one as the robot's time is; from the start at the end."""
 
     class Settings(FileStruct, frozen=True):

@@ -22,18 +22,18 @@ from snakesim_sim_backend.sensors.imu import ImuReader
 from snakesim_sim_backend.sensors.pose import PoseReader
 from snakesim_sim_backend.sensors.power import PowerReader
 from snakesim_sim_backend.sensors.ranges import RayBeams
-from snakesim_sim_backend.sensors.recorded import Recorded
+from snakesim_sim_backend.sensors.recorded import RecordedDepth
 from snakesim_sim_backend.sensors.rendered import RenderedColour, RenderedDepth
 from snakesim_sim_backend.sensors.scope import BodyScope, Reader, Scope
 
-WITHIN_TICK: dict[type[Message], Callable[[Any, BodyScope], Reader]] = {
+SYNCHRONOUS: dict[type[Message], Callable[[Any, BodyScope], Reader]] = {
     Contacts: lambda sensor, at: ContactReader(at.sim, at.data, sensor, at.noise.standard_normal, at.physics),
     Imu: lambda sensor, at: ImuReader(at.data, sensor, at.config.robot.chain.modules + 1, at.noise.standard_normal),
     Pose: lambda sensor, at: PoseReader(at.data, sensor, at.noise.standard_normal),
     Power: lambda _, at: PowerReader(at.data, at.motors, at.windings, at.config.robot.joint_table),
 }
-MODELS = {"rays": (RayCamera, RayBeams), "rendered": (RenderedDepth,), "recorded": (Recorded,)}
-BESIDE_TICK: dict[tuple[type[Message], str], Any] = {
+MODELS = {"rays": (RayCamera, RayBeams), "rendered": (RenderedDepth,), "recorded": (RecordedDepth,)}
+THREADED: dict[tuple[type[Message], str], Any] = {
     (model.message, name): model for name, models in MODELS.items() for model in models
 }
 
@@ -63,7 +63,7 @@ def _model(key: str, sensor: AnyMounted, find: Callable[[str, str], Any]) -> tup
     if message is ColourImage:
         return RenderedColour, {}
     assert message is not None
-    own = BESIDE_TICK.get((message, sensor.model))
+    own = THREADED.get((message, sensor.model))
     return own or find(SENSORS, sensor.model), sensor.settings
 
 

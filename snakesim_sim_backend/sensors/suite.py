@@ -18,7 +18,7 @@ from snakesim_sim_backend.actuators import Motors
 from snakesim_sim_backend.flat_ground import Physics
 from snakesim_sim_backend.model import SimModel
 from snakesim_sim_backend.sensors.joints import JointReader
-from snakesim_sim_backend.sensors.registry import WITHIN_TICK, mounted_reader, own_noise
+from snakesim_sim_backend.sensors.registry import SYNCHRONOUS, mounted_reader, own_noise
 from snakesim_sim_backend.sensors.scope import BodyScope, Reader, Scope
 from snakesim_sim_backend.sensors.snapshots import Snapshots
 from snakesim_sim_backend.sensors.timing import DelayLine, SamplingSchedule, ticks_of
@@ -58,9 +58,9 @@ class Sensors:
         self._snapshots = Snapshots(sim.model) if next(has.mounted(), None) else None
         for key, sensor in has.published():
             if isinstance(sensor, Mounted):
-                channel = self._beside_the_tick(key, sensor, scope)
+                channel = self._threaded(key, sensor, scope)
             else:
-                channel = WithinTick(WITHIN_TICK[_message(key)](sensor, scope), sensor, config)
+                channel = SynchronousSensor(SYNCHRONOUS[_message(key)](sensor, scope), sensor, config)
             self._others.append((key, channel))
 
     def sample(self, tick: int, stamp_ns: int) -> Samples:
@@ -86,15 +86,15 @@ class Sensors:
         if self._snapshots is not None:
             self._snapshots.close()
 
-    def _beside_the_tick(self, key: str, sensor: AnyMounted, scope: Scope) -> "BesideTick":
+    def _threaded(self, key: str, sensor: AnyMounted, scope: Scope) -> "ThreadedSensor":
         snapshots = self._snapshots
         assert snapshots is not None
         own = Scope(scope.config, scope.sim, snapshots.data, own_noise(key, scope.config.seed))
         reader = snapshots.do(lambda: mounted_reader(key, sensor, own))
-        return BesideTick(key, reader, sensor, scope, snapshots, self.late)
+        return ThreadedSensor(key, reader, sensor, scope, snapshots, self.late)
 
 
-class WithinTick:
+class SynchronousSensor:
     """A sensor that is read at once."""
 
     def __init__(self, reader: Reader, sensor: AnySensor, config: RunConfig) -> None:
@@ -108,7 +108,7 @@ class WithinTick:
         return self._line.pass_on(tick, taken)
 
 
-class BesideTick:
+class ThreadedSensor:
     """A sensor that takes long: its samples are made in another thread, and arrive a tick later at the earliest.
 
     In real time a sample that is not ready when it should arrive is dropped and counted. Otherwise it is waited for,

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 
 import msgspec
 
-from snakesim_hal.network.private_channel import MAX_BYTES, ToStarter, socket_pair
+from snakesim_hal.network.private_channel import MAX_BYTES, HostMessage, socket_pair
 from snakesim_hal.wire.messages import Status
 from tests.faults.observer import Heard, TrialError
 
@@ -70,7 +70,7 @@ class HostWatch:
         raise TrialError(f"the host did not say within {LIMIT_S:g} s: {what}; last: {self.lifecycle()}")
 
     def _listen(self) -> None:
-        decoder = msgspec.msgpack.Decoder(ToStarter)
+        decoder = msgspec.msgpack.Decoder(HostMessage)
         while not self._over.is_set():
             try:
                 said = decoder.decode(self._socket.recv(MAX_BYTES))

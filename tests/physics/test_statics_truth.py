@@ -18,7 +18,7 @@ from snakesim_hal.model.scenario import RunConfig, Start
 from snakesim_hal.model.scene import Cylinder, Ground, SceneFile, WaypointRoute
 from snakesim_hal.wire.messages import Mode
 from snakesim_sim_backend.backend import SimBackend
-from snakesim_sim_backend.settings import Settings, Tether
+from snakesim_sim_backend.settings import SimSettings, Tether
 from tests.whole_run import configure
 
 PROPULSION_N = 35.0
@@ -122,7 +122,7 @@ def feasible_benches() -> list[tuple[int, Bench]]:
 
 @pytest.mark.parametrize("bench", [pytest.param(bench, id=f"seed{seed}") for seed, bench in feasible_benches()])
 def test_tension_and_contact_forces_are_those_solved_for(bench: Bench):
-    backend = SimBackend(bench.config, Settings(timestep_s=0.001, tether=bench.tether))
+    backend = SimBackend(bench.config, SimSettings(timestep_s=0.001, tether=bench.tether))
     count = bench.config.robot.chain.modules
     angles = backend.true_state().angles_rad.tolist()
     mode = [Mode.POSITION] * count

@@ -13,7 +13,7 @@ import pytest
 from snakesim_hal.arrays import Floats
 from snakesim_sim_backend.flat_ground import Physics
 from snakesim_sim_backend.model import FREE_DOFS, FREE_QPOS, build
-from snakesim_sim_backend.settings import Settings
+from snakesim_sim_backend.settings import SimSettings
 from tests.unit.sim_backend.rig import G, make_config
 
 MU = 0.1
@@ -83,7 +83,7 @@ class Track:
 def swim(wave: Wave, step_s: float = 0.002, *, yaw_rad: float = 0.0, cone: mujoco.mjtCone | None = None) -> Track:
     """The shipped robot on flat ground, its joints held to the wave by stiff servos."""
     config = make_config(scene={"ground": {"friction": MU}})
-    sim = build(config, Settings(timestep_s=step_s), motors=False)
+    sim = build(config, SimSettings(timestep_s=step_s), motors=False)
     model, data = sim.model, mujoco.MjData(sim.model)
     assert sim.soles is not None
     if cone is not None:

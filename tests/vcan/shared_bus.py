@@ -15,7 +15,7 @@ from snakesim_can_backend.bus.bus import SocketCanWire
 from snakesim_can_backend.driver import backend as driver
 from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.protocol.definitions import FROM_HOST, Frame, ModuleState
-from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.settings import CanSettings
 from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_can_backend.twin.server import TwinServer, make_plant
 from snakesim_hal.backend import SetPoints
@@ -90,7 +90,7 @@ class SharedBus(Loop):
 def shared_bus(channel: str, **dotted: object) -> Iterator[SharedBus]:
     """Open, and close at the end."""
     run = config(pace="realtime", **dotted)
-    settings = Settings(channels=[channel], plant="inertia")
+    settings = CanSettings(channels=[channel], plant="inertia")
     modules_end = SocketCanWire(channel, FROM_HOST)
     server = TwinServer([modules_end], ModuleChain(run, settings, make_plant(run, settings), stepped=False))
     with pytest.MonkeyPatch.context() as patch:

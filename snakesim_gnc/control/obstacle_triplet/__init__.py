@@ -10,7 +10,7 @@ Localisation on the path, and bumpless mode changes, are shared with other contr
 """
 
 from snakesim_gnc.control.obstacle_triplet.controller import ObstacleTriplet
-from snakesim_gnc.control.obstacle_triplet.settings import Settings
+from snakesim_gnc.control.obstacle_triplet.settings import TripletSettings
 from snakesim_gnc.control.obstacle_triplet.statics import TripletSolution, bending_torque_nm, solve_triplet
 
-__all__ = ["ObstacleTriplet", "Settings", "TripletSolution", "bending_torque_nm", "solve_triplet"]
+__all__ = ["ObstacleTriplet", "TripletSettings", "TripletSolution", "bending_torque_nm", "solve_triplet"]

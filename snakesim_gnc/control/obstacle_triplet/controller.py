@@ -29,7 +29,7 @@ from snakesim_gnc.control.carried import FeltContacts
 from snakesim_gnc.control.controller import Action, Report, View, positions
 from snakesim_gnc.control.obstacle_triplet.contacts import PlannedContact, PushPoint, plan_contact, push_points
 from snakesim_gnc.control.obstacle_triplet.selection import Choice, Names, Triplets, choose
-from snakesim_gnc.control.obstacle_triplet.settings import Settings
+from snakesim_gnc.control.obstacle_triplet.settings import TripletSettings
 from snakesim_gnc.control.obstacle_triplet.stall import Stall, StallWatch, explain
 from snakesim_gnc.control.obstacle_triplet.telemetry import bending, planned_contacts
 from snakesim_gnc.control.planar_body import PlanarBody
@@ -57,9 +57,9 @@ class ObstacleTriplet:
 
     MODES = (Mode.POSITION, Mode.TORQUE)
     MEASURES = ("torque",)
-    Settings = Settings
+    Settings = TripletSettings
 
-    def __init__(self, robot: Description, settings: Settings) -> None:
+    def __init__(self, robot: Description, settings: TripletSettings) -> None:
         self._robot = robot
         self._set = settings
         self._body = PlanarBody(robot)

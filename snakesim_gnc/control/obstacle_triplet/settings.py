@@ -8,7 +8,7 @@ from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.quantities import about, above, from_zero
 
 
-class Settings(FileStruct, frozen=True, kw_only=True):
+class TripletSettings(FileStruct, frozen=True, kw_only=True):
     """The defaults suit modules of about 0.1 m and some hundred grams. Speed comes from the mission."""
 
     propulsion_n: Annotated[

@@ -52,12 +52,12 @@ class Gap:
     rms: float | None  # over all joints
     worst: LargestDifference | None
     correlation: float | None  # over all joints and instants; None when one of them never changes
-    untold: float  # share of what is compared that is not a number in one of the runs, or in both
+    unknown_share: float  # share of what is compared that is not a number in one of the runs, or in both
 
     @property
     def same(self) -> bool:
         """Whether every value is known in both runs, and is the same."""
-        return self.untold == 0 and self.worst is not None and not self.worst.difference
+        return self.unknown_share == 0 and self.worst is not None and not self.worst.difference
 
 
 @dataclass(frozen=True)
@@ -237,7 +237,7 @@ def _gap(what: str, unit: str, time_s: Floats, a: Floats, b: Floats, compared: N
         difference = b - a
     known = np.isfinite(difference)
     wanted = known.size if compared is None else int(compared.sum())
-    untold = 1 - known.sum() / wanted if wanted else 0.0
+    unknown_share = 1 - known.sum() / wanted if wanted else 0.0
     squares = np.where(known, difference, 0.0) ** 2
     count = known.sum(axis=0)
     joint_rms = np.sqrt(np.where(count > 0, squares.sum(axis=0) / np.maximum(count, 1), np.nan))
@@ -249,7 +249,7 @@ def _gap(what: str, unit: str, time_s: Floats, a: Floats, b: Floats, compared: N
     worst = max((one for one in joint_worst if one is not None), key=lambda one: abs(one.difference), default=None)
     rms = float(np.sqrt(squares.sum() / known.sum())) if known.any() else None
     correlation = _correlation(a[known], b[known])
-    return Gap(what, unit, difference, joint_rms, joint_worst, rms, worst, correlation, float(untold))
+    return Gap(what, unit, difference, joint_rms, joint_worst, rms, worst, correlation, float(unknown_share))
 
 
 def _correlation(a: Floats, b: Floats) -> float | None:

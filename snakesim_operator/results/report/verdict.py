@@ -45,26 +45,26 @@ def verdict(record: RunRecord, summary: RunSummary) -> Verdict:
         said = _control_said(record, at_s)
         before = ", ".join([moved[0].lower() + moved[1:], *_refused(summary)])
         return Verdict("bad", f"{what}{said} Before that: {before}.")
-    harm = _harm(summary)
+    trouble = _trouble(summary)
     ending = _ending(summary.ended)
     distance = distance_m(summary)
     if distance is None:
-        return Verdict("poor", f"{moved}; {_handed_over(record, summary)}{harm}.{ending}")
+        return Verdict("poor", f"{moved}; {_handed_over(record, summary)}{trouble}.{ending}")
     if abs(distance) < MOVED_M or summary.locomoting_fraction == 0:
         why = summary.last_reason or "the controller gave no reason"
         if summary.last_state == "Locomoting":
             why = "the snake stayed where it was, although its controller reported Locomoting"
         kind = "Jammed" if summary.jammed else "Did not locomote"
-        return Verdict("poor", f"{kind}: {_sentence(why)} {moved}; {harm}.{ending}")
+        return Verdict("poor", f"{kind}: {_sentence(why)} {moved}; {trouble}.{ending}")
     stop = stop_of(record, abs(distance))
     stopped = "" if stop is None else f" Locomotion ended at {stop.at_s:.1f} s of {end_s(record):.1f} s: {stop.why}"
     if stop is not None and not stop.on_purpose and (summary.jammed or stop.share > POOR_SHARE):
         kind = "Jammed" if summary.jammed else "Stopped"
         said = f"{kind} at {stop.at_s:.1f} s of {end_s(record):.1f} s: {stop.why.removeprefix('jammed: ')}"
-        return Verdict("poor", f"{said} {moved}; {_handed_over(record, summary)}{harm}.{ending}")
+        return Verdict("poor", f"{said} {moved}; {_handed_over(record, summary)}{trouble}.{ending}")
     jam = "it jammed on the way; " if summary.jammed else ""
     good: Kind = "poor" if ending or distance < 0 else "good"
-    return Verdict(good, f"{moved}; {_handed_over(record, summary)}{jam}{harm}.{stopped}{ending}")
+    return Verdict(good, f"{moved}; {_handed_over(record, summary)}{jam}{trouble}.{stopped}{ending}")
 
 
 def _ending(ended: str) -> str:
@@ -75,7 +75,7 @@ def _ending(ended: str) -> str:
     return f" The run ended early: {_sentence(ended)}"
 
 
-def _harm(summary: RunSummary) -> str:
+def _trouble(summary: RunSummary) -> str:
     """What went wrong, and stopped nothing: joints lost, other faults, commands refused."""
     lost = list(dict.fromkeys(fault.joint for fault in summary.faults if fault.joint is not None))
     others = [fault for fault in summary.faults if fault.joint is None]

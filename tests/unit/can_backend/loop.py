@@ -10,7 +10,7 @@ import numpy as np
 from snakesim_can_backend.bus.bus import VirtualWire
 from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.protocol.definitions import ModuleState
-from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.settings import CanSettings
 from snakesim_can_backend.twin.server import InProcessTwins
 from snakesim_hal.backend import Samples, SetPoints
 from snakesim_hal.model.scenario import RunConfig
@@ -80,15 +80,15 @@ class Loop:
     def plant(self) -> Plant:
         """What the twins' motors move."""
         (wire,) = self.backend._wires
-        assert isinstance(wire, VirtualWire) and isinstance(wire.other_end, InProcessTwins)
-        return wire.other_end.server.chain.plant
+        assert isinstance(wire, VirtualWire) and isinstance(wire.peer, InProcessTwins)
+        return wire.peer.server.chain.plant
 
 
 @contextmanager
 def loop(run: RunConfig | None = None, **settings: Any) -> Iterator[Loop]:
     """Open, and close at the end."""
     run = run or config()
-    backend = CanBackend(run, Settings(plant=settings.pop("plant", "inertia"), **settings))
+    backend = CanBackend(run, CanSettings(plant=settings.pop("plant", "inertia"), **settings))
     try:
         yield Loop(backend, run)
     finally:

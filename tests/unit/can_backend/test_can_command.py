@@ -13,7 +13,7 @@ from snakesim_can_backend.can_command import COLUMNS, UNKNOWN, aligned, main, sc
 from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.definitions import Action, Frame, ModuleState, Opcode, opcode_of
 from snakesim_can_backend.protocol.expanded import expanded_dbc
-from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.injection import Injection
 from snakesim_hal.model.scenario import load as load_scenario
@@ -51,7 +51,7 @@ def test_load_prints_a_table(capsys: pytest.CaptureFixture[str]) -> None:
     heading, *rows, about = capsys.readouterr().out.splitlines()
     assert heading.split() == ["joints", "50", "Hz", "100", "Hz", "200", "Hz"]
     for row, joints in zip(rows, (13, 18, 30), strict=True):
-        cells = [f"{100 * load(joints, reports_at(rate, TRIPLET, Settings())):.1f}" for rate in (50, 100, 200)]
+        cells = [f"{100 * load(joints, reports_at(rate, TRIPLET, CanSettings())):.1f}" for rate in (50, 100, 200)]
         assert [word for word in row.split() if "." in word] == cells
         assert row.count("refused") == sum(float(cell) > 80 for cell in cells)
     assert "80%" in about

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from snakesim_can_backend.protocol.definitions import PARAMETERS, Parameter
-from snakesim_can_backend.settings import Mounted, Settings
+from snakesim_can_backend.settings import CanSettings, Mounted
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.files import Table, decode
 
@@ -27,16 +27,16 @@ GOOD: dict[str, Any] = {
 }
 
 
-def read(section: dict[str, Any]) -> Settings:
-    return decode(Table(section, "crawl.toml", {}), Settings, "backends.can")
+def read(section: dict[str, Any]) -> CanSettings:
+    return decode(Table(section, "crawl.toml", {}), CanSettings, "backends.can")
 
 
 def test_everything_can_be_set_and_nothing_must() -> None:
-    assert set(GOOD) == set(Settings.__struct_fields__)
+    assert set(GOOD) == set(CanSettings.__struct_fields__)
     settings = read(GOOD)
     wanted = {**GOOD, "mounted": {"joint_2": Mounted(sign=-1, gear=9.0)}}
     assert {name: getattr(settings, name) for name in GOOD} == wanted
-    assert read({}) == Settings()
+    assert read({}) == CanSettings()
 
 
 @pytest.mark.parametrize(

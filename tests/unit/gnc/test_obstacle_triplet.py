@@ -4,7 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from snakesim_gnc.control.obstacle_triplet import ObstacleTriplet, Settings
+from snakesim_gnc.control.obstacle_triplet import ObstacleTriplet, TripletSettings
 from snakesim_hal.wire.messages import Mode, WorldContact
 from tests.unit.gnc.stage import PERIOD_S, known, make_stage
 
@@ -12,7 +12,7 @@ TAIL_S_M = 0.3
 
 
 def make_controller(stage, **settings) -> ObstacleTriplet:
-    return ObstacleTriplet(stage.robot, Settings(**settings))
+    return ObstacleTriplet(stage.robot, TripletSettings(**settings))
 
 
 def torque_joints(action) -> list[int]:
@@ -256,4 +256,4 @@ def test_the_same_views_give_the_same_commands():
 )
 def test_settings_are_bounded(wrong):
     with pytest.raises(msgspec.ValidationError):
-        msgspec.convert(wrong, Settings)
+        msgspec.convert(wrong, TripletSettings)

@@ -9,7 +9,7 @@ from snakesim_hal.model.files import read_part
 from snakesim_hal.model.scenario import RunConfig, check
 from snakesim_hal.wire.messages import Mode
 from snakesim_sim_backend.backend import SimBackend
-from snakesim_sim_backend.settings import Settings
+from snakesim_sim_backend.settings import SimSettings
 
 G = 9.81
 QUIET = {
@@ -57,7 +57,7 @@ def make_config(
 
 def open_sim(config: RunConfig, **settings: Any) -> SimBackend:
     """A backend on that configuration."""
-    return SimBackend(config, msgspec.convert(settings, Settings))
+    return SimBackend(config, msgspec.convert(settings, SimSettings))
 
 
 class Run:

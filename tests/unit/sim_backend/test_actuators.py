@@ -6,7 +6,7 @@ import pytest
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.wire.messages import Mode
 from snakesim_sim_backend.model import build
-from snakesim_sim_backend.settings import Settings
+from snakesim_sim_backend.settings import SimSettings
 from tests.unit.sim_backend.rig import Run, make_config
 
 RESPONSE_S = 0.01
@@ -196,5 +196,5 @@ def test_a_body_that_is_not_as_its_file_says():
         run.go()
     assert torque(other) == pytest.approx(2 * torque(plain), rel=1e-3) and torque(plain) > 0.01
     assert other.sim.describe() == plain.sim.describe()
-    light, heavy = (build(make_config(), Settings(mass_scale=scale)).model.body_mass.sum() for scale in (1.0, 2.0))
+    light, heavy = (build(make_config(), SimSettings(mass_scale=scale)).model.body_mass.sum() for scale in (1.0, 2.0))
     assert heavy == pytest.approx(2 * light)

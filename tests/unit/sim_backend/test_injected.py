@@ -10,13 +10,13 @@ from snakesim_hal.injection import parse
 from snakesim_hal.model.scenario import Override, load
 from snakesim_hal.wire.messages import Pace
 from snakesim_sim_backend.backend import SimBackend
-from snakesim_sim_backend.settings import Settings
+from snakesim_sim_backend.settings import SimSettings
 
 PACES: tuple[Pace, ...] = ("lockstep", "realtime", "free")
 
 
 def test_a_simulation_that_is_made_to_diverge_stops_and_keeps_the_last_good_state() -> None:
-    backend = SimBackend(load("triplet").config, Settings())
+    backend = SimBackend(load("triplet").config, SimSettings())
     assert isinstance(backend, Injectable)
     for _ in range(3):
         backend.advance()
@@ -37,7 +37,7 @@ def test_a_simulation_that_is_made_to_diverge_stops_and_keeps_the_last_good_stat
 def test_what_a_simulator_has_not_is_refused_before_it_is_opened(text: str, words: str) -> None:
     config = load("triplet", [Override("faults", [text], f"--fault {text}")]).config
     with pytest.raises(ConfigError, match=words):
-        SimBackend.check(config, Settings())
+        SimBackend.check(config, SimSettings())
     good = ["mute:joint_1@1", "slow:simulator@1", "diverge:simulator@2", "drop:actuator/joints@1"]
     config = load("triplet", [Override("faults", good, "--fault ...")]).config
-    assert SimBackend.check(config, Settings()) == PACES
+    assert SimBackend.check(config, SimSettings()) == PACES

@@ -13,7 +13,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode
 from snakesim_hal.wire.messages import DepthImage, Mode
 from snakesim_sim_backend.backend import SimBackend
-from snakesim_sim_backend.settings import Settings
+from snakesim_sim_backend.settings import SimSettings
 from tests.unit.sim_backend.rig import Run, make_config
 
 HEAD = keys.depth("head")
@@ -170,7 +170,7 @@ def test_a_model_that_breaks_is_an_error_of_the_backend(tmp_path):
 def test_a_model_that_cannot_be_is_refused_before_anything_is_opened(camera, why):
     config = make_config({"sensors": {"depth": [{**CAMERA, **camera}]}})
     with pytest.raises(ConfigError, match=why):
-        SimBackend.check(config, Settings())
+        SimBackend.check(config, SimSettings())
 
 
 def test_a_model_that_makes_something_else_is_refused(tmp_path):

@@ -25,7 +25,7 @@ from snakesim_can_backend.bus.load import (
     worst_bits,
 )
 from snakesim_can_backend.protocol.definitions import LAST_NODE, Opcode
-from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.scenario import load as load_scenario
@@ -123,12 +123,12 @@ def test_reports_come_as_nearly_as_wanted_as_whole_syncs_allow(rate_hz: float, w
 
 
 def test_reports_are_those_of_the_robot_and_of_the_settings() -> None:
-    assert reports_of(run_of(13), Settings()) == Reports(100.0, 1, 20)
-    assert reports_of(run_of(13, 200.0), Settings(contact_rate_hz=50.0, imu_rate_hz=0.0)) == Reports(200.0, 4, 0)
+    assert reports_of(run_of(13), CanSettings()) == Reports(100.0, 1, 20)
+    assert reports_of(run_of(13, 200.0), CanSettings(contact_rate_hz=50.0, imu_rate_hz=0.0)) == Reports(200.0, 4, 0)
     blind = msgspec.structs.replace(
         TRIPLET.robot, sensors=msgspec.structs.replace(TRIPLET.robot.sensors, contacts=None, imu=None)
     )
-    assert reports_of(msgspec.structs.replace(TRIPLET, robot=blind), Settings()) == Reports(100.0, 0, 0)
+    assert reports_of(msgspec.structs.replace(TRIPLET, robot=blind), CanSettings()) == Reports(100.0, 0, 0)
 
 
 # --- shares ------------------------------------------------------------------------------------------------
@@ -138,26 +138,26 @@ def test_reports_are_those_of_the_robot_and_of_the_settings() -> None:
 def test_joints_are_shared_out_evenly_tail_first(joints: int, buses: int) -> None:
     if buses > joints:
         return
-    found = shares(run_of(joints), Settings(channels=channels(buses)))
+    found = shares(run_of(joints), CanSettings(channels=channels(buses)))
     assert sum(found) == joints and len(found) == max(buses, 1)
     assert max(found) - min(found) <= 1 and found == sorted(found, reverse=True)
 
 
 def test_given_shares_are_kept() -> None:
-    assert shares(run_of(13), Settings(channels=channels(2), joints_per_channel=[3, 10])) == [3, 10]
+    assert shares(run_of(13), CanSettings(channels=channels(2), joints_per_channel=[3, 10])) == [3, 10]
 
 
 @pytest.mark.parametrize(
     ("joints", "settings", "words"),
     [
-        (13, Settings(channels=["can0", "can0"]), "names a channel twice"),
-        (63, Settings(), "63 joints; node ids of protocol version 1 go to 62"),
-        (13, Settings(channels=channels(2), joints_per_channel=[13]), "2 numbers that add up to the 13 joints"),
-        (13, Settings(channels=channels(2), joints_per_channel=[6, 6]), "2 numbers that add up to the 13 joints"),
-        (2, Settings(channels=channels(3)), "3 channels for 2 joints"),
+        (13, CanSettings(channels=["can0", "can0"]), "names a channel twice"),
+        (63, CanSettings(), "63 joints; node ids of protocol version 1 go to 62"),
+        (13, CanSettings(channels=channels(2), joints_per_channel=[13]), "2 numbers that add up to the 13 joints"),
+        (13, CanSettings(channels=channels(2), joints_per_channel=[6, 6]), "2 numbers that add up to the 13 joints"),
+        (2, CanSettings(channels=channels(3)), "3 channels for 2 joints"),
     ],
 )
-def test_shares_that_cannot_be_are_refused(joints: int, settings: Settings, words: str) -> None:
+def test_shares_that_cannot_be_are_refused(joints: int, settings: CanSettings, words: str) -> None:
     with pytest.raises(ConfigError, match=re.escape(words)):
         shares(run_of(joints), settings)
 
@@ -165,7 +165,7 @@ def test_shares_that_cannot_be_are_refused(joints: int, settings: Settings, word
 # --- refusal -----------------------------------------------------------------------------------------------
 
 
-def refusal(config: RunConfig, settings: Settings) -> str | None:
+def refusal(config: RunConfig, settings: CanSettings) -> str | None:
     try:
         check_load(config, settings)
     except ConfigError as error:
@@ -173,7 +173,7 @@ def refusal(config: RunConfig, settings: Settings) -> str | None:
     return None
 
 
-def ways_out(text: str, config: RunConfig, settings: Settings) -> list[tuple[RunConfig, Settings]]:
+def ways_out(text: str, config: RunConfig, settings: CanSettings) -> list[tuple[RunConfig, CanSettings]]:
     """The configurations that a refusal suggests."""
     advice = text.rpartition("What would fit: ")[2].rstrip(".")
     if advice == "nothing on classic CAN":
@@ -187,7 +187,7 @@ def ways_out(text: str, config: RunConfig, settings: Settings) -> list[tuple[Run
             continue
         if more := re.fullmatch(r"(\d+) channels with up to (\d+) joints each", way):
             changes = {"channels": channels(int(more[1])), "joints_per_channel": []}
-            assert max(shares(config, Settings(channels=channels(int(more[1]))))) == int(more[2])
+            assert max(shares(config, CanSettings(channels=channels(int(more[1]))))) == int(more[2])
         elif fewer := re.fullmatch(r"backends\.can\.contact_rate_hz = (\S+)", way):
             changes = {"contact_rate_hz": float(fewer[1])}
         assert changes, way
@@ -196,7 +196,7 @@ def ways_out(text: str, config: RunConfig, settings: Settings) -> list[tuple[Run
 
 
 def test_18_joints_at_200_hz_are_refused_with_the_sum_and_ways_out() -> None:
-    config, settings = run_of(18, 200.0), Settings(channels=["can7"])
+    config, settings = run_of(18, 200.0), CanSettings(channels=["can7"])
     text = refusal(config, settings)
     assert text is not None and text.startswith("18 joints at 200 Hz do not fit on can7:\n")
     assert "\n".join(arithmetic(18, Reports(200.0, 2, 40))) in text
@@ -208,7 +208,7 @@ def test_18_joints_at_200_hz_are_refused_with_the_sum_and_ways_out() -> None:
 
 
 def test_fewer_forces_are_suggested_when_that_is_enough() -> None:
-    config, settings = run_of(13, 190.0), Settings(contact_rate_hz=190.0)
+    config, settings = run_of(13, 190.0), CanSettings(contact_rate_hz=190.0)
     text = refusal(config, settings)
     assert text is not None and "backends.can.contact_rate_hz = 47.5" in text
 
@@ -230,7 +230,7 @@ def test_everything_that_is_suggested_really_fits(
         cuts = data.draw(st.lists(st.integers(1, joints - 1), min_size=buses - 1, max_size=buses - 1, unique=True))
         ends = [0, *sorted(cuts), joints]
         split = [b - a for a, b in pairwise(ends)]
-    settings = Settings(
+    settings = CanSettings(
         channels=channels(buses), joints_per_channel=split, contact_rate_hz=contact_hz, imu_rate_hz=imu_hz
     )
     config = run_of(joints, rate_hz)
@@ -243,15 +243,15 @@ def test_everything_that_is_suggested_really_fits(
 
 
 def test_the_rate_that_is_suggested_is_the_highest_whole_one() -> None:
-    config, settings = run_of(18, 200.0), Settings()
+    config, settings = run_of(18, 200.0), CanSettings()
     best = most_rate_hz(18, config, settings)
     assert best is not None
     for rate in range(best + 1, 201):
         assert refusal(run_of(18, float(rate)), settings) is not None
-    assert most_rate_hz(LAST_NODE, run_of(LAST_NODE, 21.0), Settings(imu_rate_hz=5.0)) in (None, 20)
+    assert most_rate_hz(LAST_NODE, run_of(LAST_NODE, 21.0), CanSettings(imu_rate_hz=5.0)) in (None, 20)
 
 
 def test_a_bus_that_nothing_helps() -> None:
-    text = refusal(run_of(LAST_NODE, 5000.0), Settings(channels=channels(8)))
+    text = refusal(run_of(LAST_NODE, 5000.0), CanSettings(channels=channels(8)))
     assert text is not None and "rate_hz = " in text  # slower always helps
     assert "channels with" not in text and "contact_rate_hz" not in text

@@ -77,9 +77,9 @@ def test_two_ends_of_a_virtual_bus_hear_each_other_and_not_themselves(pair: tupl
 def test_a_virtual_bus_says_when_something_may_come(pair: tuple[VirtualWire, VirtualWire]) -> None:
     near, far = pair
     assert near.idle() == math.inf
-    near.other_end = End(0.25)
+    near.peer = End(0.25)
     assert near.idle() == 0.25
-    near.other_end = End(None)
+    near.peer = End(None)
     assert near.idle() is None
     far.send(Frame(1, b""))
     assert near.idle() == 0.0
@@ -93,18 +93,18 @@ def test_closing_one_end_closes_what_lives_on_the_other() -> None:
 
 def test_wait_does_not_sleep_when_a_frame_is_there(pair: tuple[VirtualWire, VirtualWire]) -> None:
     near, far = pair
-    near.other_end = End(5.0, then_send=far)
+    near.peer = End(5.0, then_send=far)
     began = time.monotonic()
     assert wait([near], 5.0) and took_s(began) < 1.0
-    assert near.other_end.ran == 1
+    assert near.peer.ran == 1
 
 
 def test_wait_sleeps_as_long_as_nobody_wants_to_run(pair: tuple[VirtualWire, VirtualWire]) -> None:
     near, other = pair
-    near.other_end = End(0.05)
+    near.peer = End(0.05)
     began = time.monotonic()
     assert wait([near, other], 5.0) and 0.045 < took_s(began) < 1.0
-    near.other_end = End(5.0)
+    near.peer = End(5.0)
     began = time.monotonic()
     assert wait([near], 0.05) and 0.045 < took_s(began) < 1.0, "and no longer than asked for"
     assert wait([near], -1.0), "time that is over is no error"
@@ -112,7 +112,7 @@ def test_wait_sleeps_as_long_as_nobody_wants_to_run(pair: tuple[VirtualWire, Vir
 
 def test_wait_says_when_nothing_can_come(pair: tuple[VirtualWire, VirtualWire]) -> None:
     near, _ = pair
-    near.other_end = End(None)
+    near.peer = End(None)
     began = time.monotonic()
     assert not wait([near], 5.0) and took_s(began) < 1.0
 

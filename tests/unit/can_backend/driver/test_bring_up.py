@@ -32,7 +32,7 @@ from snakesim_can_backend.protocol.definitions import (
     node_of,
     opcode_of,
 )
-from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.settings import CanSettings
 from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_hal.errors import BackendError
 from snakesim_hal.injection import Injection
@@ -231,7 +231,7 @@ def test_everything_is_told_at_once() -> None:
 
 def wanted(**changed: float) -> dict[int, dict[Parameter, float]]:
     run = config()
-    given = parameters_of(run.robot, Settings(), reports_of(run, Settings()))
+    given = parameters_of(run.robot, CanSettings(), reports_of(run, CanSettings()))
     given[2] |= {Parameter[name.upper()]: value for name, value in changed.items()}
     return given
 

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from snakesim_can_backend.driver.backend import CanBackend
-from snakesim_can_backend.settings import Settings as CanSettings
+from snakesim_can_backend.settings import CanSettings
 from snakesim_can_backend.twin.server import InProcessTwins
 from snakesim_hal.conformance.rig import Rig
 from snakesim_hal.physics.thermal import Thermal
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Mode, Power
 from snakesim_sim_backend.backend import SimBackend
-from snakesim_sim_backend.settings import Settings as SimSettings
+from snakesim_sim_backend.settings import SimSettings
 from tests.unit.hal.rig import run_config
 
 RATED_NM = 4.0

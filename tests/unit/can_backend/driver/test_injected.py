@@ -12,7 +12,7 @@ from snakesim_can_backend.bus.bus_errors import BusError
 from snakesim_can_backend.bus.bus_faults import inject_into_interface
 from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.protocol.definitions import Frame, ModuleState
-from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.settings import CanSettings
 from snakesim_can_backend.twin.faults import ABOUT
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.faults.faulty_backend import FaultyBackend
@@ -60,13 +60,13 @@ def test_what_a_module_cannot_know_the_host_makes() -> None:
 @pytest.mark.parametrize(
     ("settings", "text", "words"),
     [
-        (Settings(), "diverge:simulator@1", "its modules support mute, freeze"),
-        (Settings(), "cut:bus_2@1", "this run has bus_1 to bus_1"),
-        (Settings(channels=["vcan0"]), "leak:joint_1@1", "its modules are not the driver's own"),
-        (Settings(channels=["vcan0"], twins="process"), "full:bus_1@1", "fill the queue of a kernel interface"),
+        (CanSettings(), "diverge:simulator@1", "its modules support mute, freeze"),
+        (CanSettings(), "cut:bus_2@1", "this run has bus_1 to bus_1"),
+        (CanSettings(channels=["vcan0"]), "leak:joint_1@1", "its modules are not the driver's own"),
+        (CanSettings(channels=["vcan0"], twins="process"), "full:bus_1@1", "fill the queue of a kernel interface"),
     ],
 )
-def test_what_cannot_be_had_is_refused_before_anything_is_opened(settings: Settings, text: str, words: str) -> None:
+def test_what_cannot_be_had_is_refused_before_anything_is_opened(settings: CanSettings, text: str, words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         CanBackend.check(config(faults=[text]), settings)
 
@@ -74,7 +74,7 @@ def test_what_cannot_be_had_is_refused_before_anything_is_opened(settings: Setti
 def test_everything_that_own_twins_and_a_virtual_bus_can_do_is_allowed() -> None:
     texts = [f"{kind}:joint_1@1" for kind in (*ABOUT, "wrong", "nan")]
     texts += [f"{kind}:bus_1@1" for kind in ("cut", "bus_off", "error_passive", "overflow", "full")]
-    assert CanBackend.check(config(faults=texts), Settings()) == ("lockstep", "realtime")
+    assert CanBackend.check(config(faults=texts), CanSettings()) == ("lockstep", "realtime")
 
 
 # --- the bus -------------------------------------------------------------------------------------------------

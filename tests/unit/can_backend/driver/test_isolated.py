@@ -14,7 +14,7 @@ from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.driver.module_monitor import CONCERNS_ALL
 from snakesim_can_backend.protocol.commands import command, emergency
 from snakesim_can_backend.protocol.definitions import Action, Frame, ModuleFault, ModuleState
-from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.settings import CanSettings
 from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_can_backend.twin.firmware import PASSIVE
 from snakesim_can_backend.twin.server import InProcessTwins
@@ -46,8 +46,8 @@ class Lame(Rig):
     @property
     def chain(self) -> ModuleChain:
         (wire,) = self.can._wires
-        assert isinstance(wire, VirtualWire) and isinstance(wire.other_end, InProcessTwins)
-        return wire.other_end.server.chain
+        assert isinstance(wire, VirtualWire) and isinstance(wire.peer, InProcessTwins)
+        return wire.peer.server.chain
 
     def ask(self, action: Literal["disarm", "clear"]) -> None:
         answer = self.authority.on_lifecycle(LifecycleRequest(action=action), self._now_ns)
@@ -67,7 +67,7 @@ class Lame(Rig):
 def lame_robot(may_lose: int = 1) -> Iterator[Lame]:
     """Armed, and its other joints swing."""
     run = config(robot__safety__may_lose_joints=may_lose)
-    backend = CanBackend(run, Settings(plant="inertia"))
+    backend = CanBackend(run, CanSettings(plant="inertia"))
     try:
         robot = Lame(backend, "lockstep", run.period_ns)
         robot.arm()

@@ -10,7 +10,7 @@ import pytest
 
 from snakesim_can_backend.driver import own_twins
 from snakesim_can_backend.driver.own_twins import TwinProcess, check_twins, twins_here
-from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.settings import CanSettings
 from snakesim_can_backend.twin.server import InProcessTwins
 from snakesim_hal.errors import BackendError, ConfigError
 from snakesim_hal.injection import Injection
@@ -26,22 +26,25 @@ VCAN = ["vcan0"]
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        (Settings(twins="here", channels=VCAN), r'"here" is a virtual bus .* leave `channels` empty, or .*"process"'),
-        (Settings(twins="none"), r'"none" needs a bus: name it in `backends\.can\.channels`'),
-        (Settings(twins="process"), r'"process" needs a bus'),
-        (Settings(channels=VCAN, faults=["mute:joint_1@1"]), r"`backends\.can\.faults` are for twins"),
-        (Settings(faults=["mute:joint_5@1"]), "joint_5"),
-        (Settings(faults=["melt:joint_1@1"]), "melt"),
-        (Settings(channels=VCAN, twins="process", faults=["mute:joint_9@1"]), "joint_9"),
+        (
+            CanSettings(twins="here", channels=VCAN),
+            r'"here" is a virtual bus .* leave `channels` empty, or .*"process"',
+        ),
+        (CanSettings(twins="none"), r'"none" needs a bus: name it in `backends\.can\.channels`'),
+        (CanSettings(twins="process"), r'"process" needs a bus'),
+        (CanSettings(channels=VCAN, faults=["mute:joint_1@1"]), r"`backends\.can\.faults` are for twins"),
+        (CanSettings(faults=["mute:joint_5@1"]), "joint_5"),
+        (CanSettings(faults=["melt:joint_1@1"]), "melt"),
+        (CanSettings(channels=VCAN, twins="process", faults=["mute:joint_9@1"]), "joint_9"),
     ],
 )
-def test_twins_that_cannot_be_are_refused(settings: Settings, words: str) -> None:
+def test_twins_that_cannot_be_are_refused(settings: CanSettings, words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         check_twins(RUN, settings)
 
 
 def test_twins_here_are_at_the_other_end_of_the_named_bus() -> None:
-    end = twins_here(RUN, Settings(plant="inertia"), "own-twins-test", None, stepped=True)
+    end = twins_here(RUN, CanSettings(plant="inertia"), "own-twins-test", None, stepped=True)
     try:
         assert isinstance(end, InProcessTwins) and end.server.wires[0].channel == "own-twins-test"
         assert end.server.chain.stepped and end.server.chain.count == 4
@@ -85,7 +88,7 @@ def test_a_child_is_told_everything_and_ends_when_asked(
 ) -> None:
     end = "signal.signal(signal.SIGTERM, lambda *_: (print('last words', flush=True), sys.exit(0)))\n"
     noted = child(tmp_path, monkeypatch, end + "print('a warning')\n" + SERVE)
-    settings = Settings(channels=["vcan0", "vcan1"], twins="process", plant="inertia", faults=["mute:joint_1@2"])
+    settings = CanSettings(channels=["vcan0", "vcan1"], twins="process", plant="inertia", faults=["mute:joint_1@2"])
     twins = TwinProcess(RUN, settings, "127.0.0.1:5000", stepped=True)
     reported = json.loads(noted.read_text())
     arguments = reported["arguments"]
@@ -104,7 +107,7 @@ def test_a_child_is_told_everything_and_ends_when_asked(
 
 def test_without_a_camera_and_in_real_time_it_is_told_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     noted = child(tmp_path, monkeypatch, SERVE)
-    twins = TwinProcess(RUN, Settings(channels=VCAN, twins="process"), None, stepped=False)
+    twins = TwinProcess(RUN, CanSettings(channels=VCAN, twins="process"), None, stepped=False)
     twins.stop()
     arguments = json.loads(noted.read_text())["arguments"]
     assert arguments[arguments.index("--pose") + 1] == "none" and "--stepped" not in arguments
@@ -113,7 +116,7 @@ def test_without_a_camera_and_in_real_time_it_is_told_so(tmp_path: Path, monkeyp
 def test_a_child_that_will_not_end_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(own_twins, "STOP_LIMIT_S", 0.2)
     noted = child(tmp_path, monkeypatch, "signal.signal(signal.SIGTERM, signal.SIG_IGN)\n" + SERVE)
-    twins = TwinProcess(RUN, Settings(channels=VCAN, twins="process"), None, stepped=False)
+    twins = TwinProcess(RUN, CanSettings(channels=VCAN, twins="process"), None, stepped=False)
     began = time.monotonic()
     twins.stop()
     assert gone(json.loads(noted.read_text())["pid"]) and time.monotonic() - began < 5.0
@@ -126,7 +129,7 @@ def test_a_child_that_does_not_get_ready_is_told_and_leaves_nothing(
     monkeypatch.setattr(own_twins, "START_LIMIT_S", 1.0)
     noted = child(tmp_path, monkeypatch, "print('no such plant', flush=True)\n" + ending)
     with pytest.raises(BackendError, match="the module twins did not start"):
-        TwinProcess(RUN, Settings(channels=VCAN, twins="process"), None, stepped=False)
+        TwinProcess(RUN, CanSettings(channels=VCAN, twins="process"), None, stepped=False)
     reported = json.loads(noted.read_text())
     assert gone(reported["pid"]) and not Path(reported["arguments"][2]).exists()
     assert "no such plant" in capsys.readouterr().err
@@ -134,13 +137,13 @@ def test_a_child_that_does_not_get_ready_is_told_and_leaves_nothing(
 
 def test_the_real_command_says_why_it_does_not_start(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(BackendError, match="did not start"):
-        TwinProcess(RUN, Settings(channels=["vcan77"], twins="process", plant="inertia"), None, stepped=False)
+        TwinProcess(RUN, CanSettings(channels=["vcan77"], twins="process", plant="inertia"), None, stepped=False)
     assert "vcan77" in capsys.readouterr().err
 
 
 def test_a_child_that_ends_by_itself_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     child(tmp_path, monkeypatch, "print('modules ready: 4', flush=True)\ntime.sleep(0.3)\nsys.exit(3)\n")
-    twins = TwinProcess(RUN, Settings(channels=VCAN, twins="process"), None, stepped=False)
+    twins = TwinProcess(RUN, CanSettings(channels=VCAN, twins="process"), None, stepped=False)
     assert twins.how_it_ended() is None
     wait_until(twins.how_it_ended, "the end of the child")
     assert twins.how_it_ended() == "the module twins have ended, with exit code 3"
@@ -151,7 +154,7 @@ def test_a_child_is_told_what_goes_wrong_as_in_a_terminal(tmp_path: Path, monkey
     heard = tmp_path / "heard"
     listen = "print('modules ready: 4', flush=True)\nfor line in sys.stdin:\n    "
     noted = child(tmp_path, monkeypatch, f"{listen}pathlib.Path({str(heard)!r}).open('a').write(line)\n")
-    twins = TwinProcess(RUN, Settings(channels=VCAN, twins="process"), None, stepped=False)
+    twins = TwinProcess(RUN, CanSettings(channels=VCAN, twins="process"), None, stepped=False)
     assert "--interactive" in json.loads(noted.read_text())["arguments"]
     twins.inject(Injection("mute", "joint_3", 1.0, 2.0), begins=True)
     twins.inject(Injection("mute", "joint_3", 1.0, 2.0), begins=False)
@@ -168,12 +171,12 @@ def test_a_child_that_cannot_be_started_is_an_error_of_the_backend(
 ) -> None:
     monkeypatch.setattr(own_twins.sys, "executable", str(tmp_path / "no python"))
     with pytest.raises(BackendError, match=r"the module twins cannot be started: .*No such file"):
-        TwinProcess(RUN, Settings(channels=VCAN), None, stepped=True)
+        TwinProcess(RUN, CanSettings(channels=VCAN), None, stepped=True)
 
 
 def test_a_log_that_is_gone_keeps_no_child_from_ending(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     child(tmp_path, monkeypatch, "print('modules ready', flush=True)\ntime.sleep(60)\n")
-    twins = TwinProcess(RUN, Settings(channels=VCAN), None, stepped=True)
+    twins = TwinProcess(RUN, CanSettings(channels=VCAN), None, stepped=True)
     twins._said.unlink()
     twins.stop()
     assert twins.how_it_ended() is not None

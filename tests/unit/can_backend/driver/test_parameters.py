@@ -9,7 +9,7 @@ from snakesim_can_backend.bus.load import Reports
 from snakesim_can_backend.driver.parameters import SPEED_ROOM, check_drives, check_ratings, parameters_of
 from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.definitions import PARAMETERS, Opcode, Parameter, SafeMotion
-from snakesim_can_backend.settings import Mounted, Settings
+from snakesim_can_backend.settings import CanSettings, Mounted
 from snakesim_hal.errors import BackendError, ConfigError
 from snakesim_hal.model.files import decode, read_part, shipped
 from snakesim_hal.model.joints import JointExceptions
@@ -32,7 +32,7 @@ def rated(torque_nm: float, speed_rad_s: float) -> dict[int, dict[Parameter, flo
 @pytest.mark.parametrize("name", shipped("robots"))
 def test_every_module_is_told_everything_but_its_ratings_and_within_the_ranges(name: str) -> None:
     robot = decode(read_part(name, "robots"), RobotFile)
-    wanted = parameters_of(robot, Settings(), Reports(100.0))
+    wanted = parameters_of(robot, CanSettings(), Reports(100.0))
     assert list(wanted) == list(range(1, robot.chain.modules + 1))
     for values in wanted.values():
         assert set(values) == set(Parameter) - set(RATED)
@@ -42,7 +42,7 @@ def test_every_module_is_told_everything_but_its_ratings_and_within_the_ranges(n
 
 
 def test_values_are_those_of_the_robot_file_and_of_the_settings() -> None:
-    first = parameters_of(ROBOT, Settings(watchdog_s=0.05), Reports(100.0, 3, 17))[1]
+    first = parameters_of(ROBOT, CanSettings(watchdog_s=0.05), Reports(100.0, 3, 17))[1]
     assert first == {
         Parameter.STIFFNESS: 60.0,
         Parameter.DAMPING: 1.5,
@@ -61,7 +61,7 @@ def test_values_are_those_of_the_robot_file_and_of_the_settings() -> None:
 def test_a_module_behind_a_gear_is_told_what_its_own_shaft_does() -> None:
     own = JointExceptions(sign=-1, gear=2.0, zero_rad=0.5, angle_min_rad=-0.4, angle_max_rad=1.2, torque_nm=6.0)
     robot = msgspec.structs.replace(ROBOT, joints={"joint_2": own})
-    first, second = (parameters_of(robot, Settings(), Reports(100.0))[node] for node in (1, 2))
+    first, second = (parameters_of(robot, CanSettings(), Reports(100.0))[node] for node in (1, 2))
     assert first[Parameter.TORQUE_LIMIT] == 7.0 and first[Parameter.ANGLE_LIMIT] == 1.5708
     assert second[Parameter.STIFFNESS] == first[Parameter.STIFFNESS] / 4
     assert (second[Parameter.TORQUE_LIMIT], second[Parameter.SPEED_LIMIT]) == (3.0, 15.0)
@@ -87,21 +87,21 @@ def test_drives_that_the_bus_cannot_have_are_refused(wrong: str) -> None:
     own, settings, words = MISPLACED[wrong]
     robot = msgspec.structs.replace(ROBOT, joints={"joint_2": own})
     with pytest.raises(ConfigError) as caught:
-        check_drives(robot, Settings(**settings))
+        check_drives(robot, CanSettings(**settings))
         check_ratings(robot)
     assert all(word in str(caught.value) for word in words), str(caught.value)
 
 
 @pytest.mark.parametrize("tail", [True, False])
 def test_only_the_first_module_reports_the_tail_link(tail: bool) -> None:
-    wanted = parameters_of(ROBOT, Settings(), Reports(100.0, tail=tail))
+    wanted = parameters_of(ROBOT, CanSettings(), Reports(100.0, tail=tail))
     assert [values[Parameter.TAIL] for values in wanted.values()] == [float(tail)] + [0.0] * 12
 
 
 @pytest.mark.parametrize(("action", "motion"), [("damp", SafeMotion.DAMP), ("passive", SafeMotion.PASSIVE)])
 def test_the_safe_action_is_the_robots(action: str, motion: SafeMotion) -> None:
     robot = changed("safety", action=action)
-    assert parameters_of(robot, Settings(), Reports(100.0))[1][Parameter.SAFE_ACTION] == motion
+    assert parameters_of(robot, CanSettings(), Reports(100.0))[1][Parameter.SAFE_ACTION] == motion
     check_ratings(robot)
 
 

@@ -16,7 +16,7 @@ from snakesim_can_backend.driver.reports import Reading
 from snakesim_can_backend.driver.sensors import LONG_AGO_NS, Sensors, contacts_due, described, on_surface
 from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.definitions import Opcode
-from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.settings import CanSettings
 from snakesim_can_backend.twin.frames import write_contact, write_tail_contact
 from snakesim_can_backend.twin.reports import touch
 from snakesim_hal.backend import Samples
@@ -41,7 +41,7 @@ def sensors_of(
     run: RunConfig, reports: Reports | None = None, mocap: MocapReceiver | None = None
 ) -> tuple[Reading, Sensors]:
     reading = Reading(run.robot.chain.modules)
-    return reading, Sensors(run, reports or reports_of(run, Settings()), reading, mocap)
+    return reading, Sensors(run, reports or reports_of(run, CanSettings()), reading, mocap)
 
 
 def contacts_of(samples: Samples) -> Contacts:

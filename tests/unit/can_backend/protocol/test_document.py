@@ -21,7 +21,7 @@ from snakesim_can_backend.protocol.definitions import (
     ModuleState,
     Opcode,
 )
-from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.settings import CanSettings
 from snakesim_can_backend.twin.firmware import BOOT_US, Module
 from snakesim_can_backend.twin.parameters import Parameters, from_factory
 from snakesim_hal.model.scenario import load as load_scenario
@@ -137,7 +137,7 @@ def test_the_table_of_loads() -> None:
     found = rows("What fits")
     assert [row[0] for row in found] == ["13", "18", "30"]
     for row in found:
-        loads = [100 * load(int(row[0]), reports_at(rate, config, Settings())) for rate in (50, 100, 200)]
+        loads = [100 * load(int(row[0]), reports_at(rate, config, CanSettings())) for rate in (50, 100, 200)]
         assert row[1:] == [f"{share:.1f} %" + (" refused" if share > 80 else "") for share in loads]
 
 

@@ -15,7 +15,7 @@ from snakesim_can_backend.protocol.definitions import (
     node_of,
     opcode_of,
 )
-from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.settings import CanSettings
 from snakesim_can_backend.twin.bus_time import Traffic
 from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_can_backend.twin.firmware import Module
@@ -99,7 +99,7 @@ def chain(run: RunConfig | None = None, *, stepped: bool = True, **given: Any) -
     """On the inertia plant, with the robot's gains in every flash."""
     run = run or config()
     plant = given.pop("plant", None) or InertiaPlant(run, InertiaSettings())
-    settings = Settings(**{k: given.pop(k) for k in list(given) if k in Settings.__struct_fields__})
+    settings = CanSettings(**{k: given.pop(k) for k in list(given) if k in CanSettings.__struct_fields__})
     made = ModuleChain(run, settings, plant, stepped=stepped, **given)
     motor = run.robot.motor
     for slot in made.slots:

@@ -10,7 +10,7 @@ from snakesim_hal.model.scenario import load
 from snakesim_hal.wire.messages import Mode
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.plant import MujocoPlant
-from snakesim_sim_backend.settings import PlantSettings, Settings
+from snakesim_sim_backend.settings import PlantSettings, SimSettings
 from tests.unit.can_backend.twin.rig import config
 
 STEP_S, RESPONSE_S, RATED_NM, SPEED = 1e-3, 0.01, 4.0, 5.0
@@ -118,7 +118,7 @@ def test_the_simulator_s_motors_do_the_same():
     run = load("triplet").config
     count, motor, limits = run.robot.chain.modules, run.robot.motor, run.robot.limits
     fine_s = 2e-4
-    sim = SimBackend(run, Settings(timestep_s=fine_s))
+    sim = SimBackend(run, SimSettings(timestep_s=fine_s))
     plant = MujocoPlant(run, PlantSettings(timestep_s=fine_s))
     motors = Motors(run.robot, plant.step_s)
     swing = 0.1 * np.sin(np.arange(count))

@@ -134,11 +134,11 @@ def test_the_lease_is_five_periods_but_never_less_than_50_nor_more_than_100_ms(r
 @given(tick=st.integers(0, 10_000), every=st.integers(1, 50), lag=st.integers(1, 50))
 def test_what_counts_at_a_tick_was_due_and_is_old_enough(tick: int, every: int, lag: int) -> None:
     service = Service(every_ticks=every, lag_ticks=lag)
-    counting = service.counting_at(tick)
+    counting = service.used_output_tick(tick)
     assert counting % every == 0 and counting >= 0
     assert counting == 0 or counting <= tick - lag
     assert tick - lag - counting < every  # and it is the newest such
-    assert service.counting_at(tick + 1) >= counting
+    assert service.used_output_tick(tick + 1) >= counting
 
 
 # --- flags and where values come from --------------------------------------------------------------------------

@@ -14,7 +14,7 @@ import pytest
 from snakesim_hal.errors import NotConnectedError
 from snakesim_hal.network.client import Client
 from snakesim_hal.network.local_registry import LocalRobot, local_robots, registered, robot_folder
-from snakesim_hal.network.private_channel import HostEnd, StarterEnd, ToStarter, socket_pair
+from snakesim_hal.network.private_channel import HostEnd, HostMessage, StarterEnd, socket_pair
 from snakesim_hal.network.run_key import RUN_KEY, is_proven, new_run_key, proven
 from snakesim_hal.network.session import open_session
 from snakesim_hal.wire import keys
@@ -82,7 +82,7 @@ def test_a_starter_that_does_not_read_holds_up_nothing() -> None:
     with ours, its, running(run_config()) as run:
         host = HostEnd(its)
         for _ in range(5000):
-            host.say(ToStarter(description=run.host.description))
+            host.say(HostMessage(description=run.host.description))
 
 
 def a_robot(**more: object) -> LocalRobot:

@@ -17,7 +17,7 @@ from snakesim_hal.host_process import record_of
 from snakesim_hal.record import recorder as under_test
 from snakesim_hal.record.black_box import BlackBox, digest_of, read_black_box
 from snakesim_hal.record.host_record import BLACK_BOX, DESCRIPTION, HOST_RECORD, HostRecord
-from snakesim_hal.record.recorder import Recorder
+from snakesim_hal.record.recorder import HostRecordWriter
 from snakesim_hal.safety.authority import Decision
 from snakesim_hal.wire.messages import Description, Mode
 from tests.harness.wait import wait_until
@@ -40,11 +40,11 @@ def fill(box: BlackBox, *ticks: int) -> None:
         box.record(tick, tick * 10_000_000, Samples(state(ROBOT, 0.001 * tick)), TOLD)
 
 
-def recorder(box: BlackBox, folder: Path | None, memory: int | None = None) -> Recorder:
+def recorder(box: BlackBox, folder: Path | None, memory: int | None = None) -> HostRecordWriter:
     def numbers(*, lost_ticks: int, failure: str) -> Numbers:
         return Numbers(box.ticks, lost_ticks, failure)
 
-    return Recorder(box, ROBOT, numbers, folder, memory)
+    return HostRecordWriter(box, ROBOT, numbers, folder, memory)
 
 
 def reported(folder: Path) -> Numbers:
@@ -167,7 +167,7 @@ def test_no_tick_and_no_end_waits_for_a_disk_that_hangs(
         running(run_config(pace="lockstep"), max_ticks=75) as run,
         following(run.link, Follower()),
     ):
-        with Recorder(run.host.black_box, run.host.description, partial(record_of, run.host), tmp_path, memory):
+        with HostRecordWriter(run.host.black_box, run.host.description, partial(record_of, run.host), tmp_path, memory):
             layout = run.host.black_box.layout
             disk.space, disk.hangs = len(layout.header()) + 6 * layout.row_bytes, True
             run.arm()

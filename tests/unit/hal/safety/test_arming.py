@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from snakesim_hal.safety.lifecycle import far_targets, mistaken
+from snakesim_hal.safety.lifecycle import address_mismatches, far_targets
 from snakesim_hal.wire.messages import LifecycleRequest, Mode
 from tests.unit.hal.rig import command, description
 
@@ -13,14 +13,14 @@ NONE = np.zeros(len(ROBOT.joints), dtype=np.bool_)
 GOOD = LifecycleRequest(action="arm", robot=ROBOT.robot, backend=ROBOT.backend, config_hash=ROBOT.config_hash)
 
 
-def test_a_request_that_names_everything_is_not_mistaken() -> None:
-    assert mistaken(GOOD, ROBOT) == []
+def test_a_request_that_names_everything_has_no_mismatch() -> None:
+    assert address_mismatches(GOOD, ROBOT) == []
 
 
 @pytest.mark.parametrize(("given", "named"), [(None, "none"), ("abc", "'abc'")])
 def test_a_request_without_the_configuration_says_what_to_do(given: str | None, named: str) -> None:
     request = LifecycleRequest(action="arm", robot=ROBOT.robot, backend=ROBOT.backend, config_hash=given)
-    assert mistaken(request, ROBOT) == [
+    assert address_mismatches(request, ROBOT) == [
         (
             "wrong_config",
             f"the configuration is {ROBOT.config_hash!r}, the request names {named}: read hal/description, and arm "

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_operator.console import texts
-from snakesim_operator.console.recorded import Recorded
+from snakesim_operator.console.recorded import RecordedRun
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.run.in_process import simulate
 
@@ -12,7 +12,7 @@ from snakesim_operator.run.in_process import simulate
 def test_state_faults_and_supply_are_those_of_the_instant(tmp_path: Path) -> None:
     sets = ["duration_s=2", 'faults=["nan:joint_3@1"]']
     simulate(load("triplet", [parse_set(one) for one in sets]).config, tmp_path / "run")
-    recorded = Recorded(RunRecord.load(tmp_path / "run"), tmp_path / "run")
+    recorded = RecordedRun(RunRecord.load(tmp_path / "run"), tmp_path / "run")
     moving, (_, end_s) = recorded.at(0.5), recorded.span_s
     assert moving.status is not None and moving.status.lifecycle == "armed" and not moving.status.faults
     assert moving.power is not None and "armed by" in texts.header(moving, recorded="run")

@@ -21,7 +21,7 @@ from snakesim_operator.robots.meshes import vertices
 from snakesim_operator.robots.toml_text import toml_of
 from snakesim_operator.run.in_process import simulate
 from snakesim_sim_backend.model import build
-from snakesim_sim_backend.settings import Settings
+from snakesim_sim_backend.settings import SimSettings
 
 HERE = Path(__file__).parent / "urdf"
 SLIDER, HEXA = HERE / "slider8.urdf", HERE / "hexa_snake_mm.urdf"
@@ -58,7 +58,7 @@ def ours(found: Imported, tmp_path: Path) -> mujoco.MjModel:
 def simulated(robot: str) -> mujoco.MjModel:
     """The simulator's model, the robot beside the obstacles."""
     beside = [parse_set("start.on_route=false"), parse_set("start.position_m=[-9.0, 9.0]")]
-    return build(load("peg_row", [Override("robot", robot, "--set"), *beside]).config, Settings()).model
+    return build(load("peg_row", [Override("robot", robot, "--set"), *beside]).config, SimSettings()).model
 
 
 @pytest.mark.parametrize("name", shipped("robots"))

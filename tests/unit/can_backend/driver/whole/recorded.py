@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from snakesim_can_backend.bus.bus import OtherEnd, VirtualWire
+from snakesim_can_backend.bus.bus import VirtualPeer, VirtualWire
 from snakesim_can_backend.bus.log import LoggedWire
 from snakesim_can_backend.protocol.definitions import BROADCAST, Action, Frame, ModuleState, Opcode, node_of, opcode_of
 from snakesim_can_backend.twin.firmware import Module
@@ -22,8 +22,8 @@ def none(_frame: Frame) -> bool:
 class RecordedWire(VirtualWire):
     """A virtual bus that keeps what went over it, and does not take, or loses, what a test says."""
 
-    def __init__(self, channel: str, other_end: OtherEnd | None = None) -> None:
-        super().__init__(channel, other_end)
+    def __init__(self, channel: str, peer: VirtualPeer | None = None) -> None:
+        super().__init__(channel, peer)
         self.sent: list[Frame] = []
         self.all: list[Frame] = []
         self.refuses: Which = none
@@ -76,8 +76,8 @@ def words(frames: list[Frame]) -> list[str]:
 def module_of(run: Loop, node: int) -> Module:
     wire = run.backend._wires[0]
     wire = wire._wire if isinstance(wire, LoggedWire) else wire
-    assert isinstance(wire, RecordedWire) and isinstance(wire.other_end, InProcessTwins)
-    return wire.other_end.server.chain.slots[node - 1].module
+    assert isinstance(wire, RecordedWire) and isinstance(wire.peer, InProcessTwins)
+    return wire.peer.server.chain.slots[node - 1].module
 
 
 def go(run: Loop, lifecycle: LifecycleState, ticks: int = 1) -> list[Frame]:

@@ -8,7 +8,7 @@ import pytest
 
 from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.protocol.definitions import FROM_HOST, Action, Frame, LastStop, Opcode
-from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.errors import BackendError, ConfigError
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Pose
@@ -59,8 +59,8 @@ def test_closing_goes_on_when_a_bus_is_broken(monkeypatch: pytest.MonkeyPatch) -
 
 def test_poses_need_a_delay_that_somebody_has_stated() -> None:
     with pytest.raises(ConfigError, match=r"pose_listen.*\[sensors\.pose\].*delay_s"):
-        CanBackend.check(config(), Settings(pose_listen="127.0.0.1:0"))
-    CanBackend.check(config(robot__sensors__pose__delay_s=0.02), Settings(pose_listen="127.0.0.1:0"))
+        CanBackend.check(config(), CanSettings(pose_listen="127.0.0.1:0"))
+    CanBackend.check(config(robot__sensors__pose__delay_s=0.02), CanSettings(pose_listen="127.0.0.1:0"))
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.03])

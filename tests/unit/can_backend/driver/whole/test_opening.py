@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from snakesim_can_backend.bus.bus import OtherEnd
+from snakesim_can_backend.bus.bus import VirtualPeer
 from snakesim_can_backend.driver import backend as backend_module
 from snakesim_can_backend.driver.backend import CanBackend, answer_limit_s
 from snakesim_can_backend.protocol.definitions import (
@@ -17,7 +17,7 @@ from snakesim_can_backend.protocol.definitions import (
     node_of,
     opcode_of,
 )
-from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.settings import CanSettings
 from snakesim_can_backend.twin.firmware import Module
 from snakesim_can_backend.twin.server import InProcessTwins, here
 from snakesim_hal.backend import SetPoints
@@ -57,8 +57,8 @@ def test_bring_up_enables_nothing() -> None:
 
 def test_who_does_not_answer_syncs_is_told_and_everything_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
     class Deaf(RecordedWire):
-        def __init__(self, channel: str, other_end: OtherEnd | None = None) -> None:
-            super().__init__(channel, other_end)
+        def __init__(self, channel: str, peer: VirtualPeer | None = None) -> None:
+            super().__init__(channel, peer)
             self.deaf_to = lambda frame: opcode_of(frame.id) == Opcode.JOINT_STATE and node_of(frame.id) == 2
 
     monkeypatch.setattr(backend_module, "VirtualWire", Deaf)
@@ -89,7 +89,9 @@ def left_behind(module: Module, kind: str) -> None:
 def test_what_a_killed_driver_left_is_cleared_and_nothing_else(
     kind: str, state: ModuleState, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def twins(run: RunConfig, settings: Settings, channel: str, pose: str | None, *, stepped: bool) -> InProcessTwins:
+    def twins(
+        run: RunConfig, settings: CanSettings, channel: str, pose: str | None, *, stepped: bool
+    ) -> InProcessTwins:
         end = here(run, settings, channel, pose, stepped=stepped)
         left_behind(end.server.chain.slots[1].module, kind)
         return end
@@ -104,7 +106,9 @@ def test_what_a_killed_driver_left_is_cleared_and_nothing_else(
 
 
 def test_a_module_that_is_too_weak_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    def twins(run: RunConfig, settings: Settings, channel: str, pose: str | None, *, stepped: bool) -> InProcessTwins:
+    def twins(
+        run: RunConfig, settings: CanSettings, channel: str, pose: str | None, *, stepped: bool
+    ) -> InProcessTwins:
         end = here(run, settings, channel, pose, stepped=stepped)
         end.server.chain.slots[2].module.parameters.values[Parameter.RATED_TORQUE] = 1.0
         return end
@@ -115,21 +119,24 @@ def test_a_module_that_is_too_weak_is_refused(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_paces_and_what_is_checked_before_anything_is_opened(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert CanBackend.check(config(), Settings()) == ("lockstep", "realtime")
+    assert CanBackend.check(config(), CanSettings()) == ("lockstep", "realtime")
     with pytest.raises(ConfigError, match="channel 'nocan7'"):
-        CanBackend.check(config(), Settings(channels=["nocan7"]))
+        CanBackend.check(config(), CanSettings(channels=["nocan7"]))
     asked: list[str] = []
     monkeypatch.setattr(backend_module, "check_channel", asked.append)
-    assert CanBackend.check(config(), Settings(channels=["can0", "can1"])) == ("realtime",)
-    assert CanBackend.check(config(), Settings(channels=["vcan0"], twins="process")) == ("lockstep", "realtime")
+    assert CanBackend.check(config(), CanSettings(channels=["can0", "can1"])) == ("realtime",)
+    assert CanBackend.check(config(), CanSettings(channels=["vcan0"], twins="process")) == ("lockstep", "realtime")
     assert asked == ["can0", "can1", "vcan0"]
-    for settings, text in ((Settings(twins="none"), "needs a bus"), (Settings(faults=["mute:joint_9@1"]), "joint_9")):
+    for settings, text in (
+        (CanSettings(twins="none"), "needs a bus"),
+        (CanSettings(faults=["mute:joint_9@1"]), "joint_9"),
+    ):
         with pytest.raises(ConfigError, match=text):
             CanBackend.check(config(), settings)
     with pytest.raises(ConfigError, match="do not fit"):
-        CanBackend.check(config(robot__chain__modules=40, rate_hz=200), Settings())
+        CanBackend.check(config(robot__chain__modules=40, rate_hz=200), CanSettings())
     with pytest.raises(ConfigError, match="hold"):
-        CanBackend.check(config(robot__safety__action="hold"), Settings())
+        CanBackend.check(config(robot__safety__action="hold"), CanSettings())
     assert WIRES == []
 
 
@@ -150,8 +157,8 @@ def test_it_describes_robot_and_sensors_and_delivers_them() -> None:
 
 def test_answers_are_waited_for_as_long_as_the_fullest_bus_takes() -> None:
     triplet = load_scenario("triplet", [parse_set("pace=realtime")]).config
-    assert answer_limit_s(triplet, Settings()) == pytest.approx(1.25 * 27 * 135e-6 + 0.002)
-    two = Settings(channels=["can0", "can1"])
+    assert answer_limit_s(triplet, CanSettings()) == pytest.approx(1.25 * 27 * 135e-6 + 0.002)
+    two = CanSettings(channels=["can0", "can1"])
     assert answer_limit_s(triplet, two) == pytest.approx(1.25 * 15 * 135e-6 + 0.002)
 
 

@@ -10,7 +10,7 @@ from snakesim_can_backend.driver import backend as backend_module
 from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.protocol.commands import question
 from snakesim_can_backend.protocol.definitions import Action, Frame, Opcode, node_of, opcode_of
-from snakesim_can_backend.settings import Settings
+from snakesim_can_backend.settings import CanSettings
 from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_can_backend.twin.inertia import InertiaPlant, InertiaSettings
 from snakesim_can_backend.twin.server import TwinServer
@@ -50,7 +50,7 @@ class NoProcess:
     stopped = 0
     ended: str | None = None
 
-    def __init__(self, run: RunConfig, settings: Settings, pose: str | None, *, stepped: bool) -> None:
+    def __init__(self, run: RunConfig, settings: CanSettings, pose: str | None, *, stepped: bool) -> None:
         self.started.append((settings.channels, pose, stepped))
 
     def how_it_ended(self) -> str | None:
@@ -64,7 +64,7 @@ class NoProcess:
 def two_buses(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[list[int]], Loop]]:
     """Opens a driver for two buses with so many joints each, on twins with three and one."""
     run, channels = config(robot__sensors__pose__rate_hz=100.0), ["bus_a", "bus_b"]
-    real = Settings(channels=channels, joints_per_channel=[3, 1], twins="process", plant="inertia")
+    real = CanSettings(channels=channels, joints_per_channel=[3, 1], twins="process", plant="inertia")
     chain = ModuleChain(run, real, InertiaPlant(run, InertiaSettings()), stepped=True)
     end = OneChain(TwinServer([VirtualWire(name) for name in channels], chain))
     monkeypatch.setattr(backend_module, "check_channel", lambda _channel: None)
@@ -73,7 +73,7 @@ def two_buses(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[list[int]],
     opened: list[CanBackend] = []
 
     def open_with(joints: list[int], **settings: Any) -> Loop:
-        asked = Settings(channels=channels, joints_per_channel=joints, twins="process", **settings)
+        asked = CanSettings(channels=channels, joints_per_channel=joints, twins="process", **settings)
         opened.append(CanBackend(run, asked))
         return TwoBusLoop(opened[-1], run)
 
@@ -87,8 +87,8 @@ class TwoBusLoop(Loop):
     @property
     def plant(self) -> Any:
         wire = WIRES[0]
-        assert isinstance(wire.other_end, OneChain)
-        return wire.other_end.server.chain.plant
+        assert isinstance(wire.peer, OneChain)
+        return wire.peer.server.chain.plant
 
 
 def test_every_module_is_spoken_to_on_its_own_bus(two_buses: Callable[..., Loop]) -> None:
