@@ -147,6 +147,7 @@ def record_of(host: Host, *, lost_ticks: int = 0, failure: str = "") -> HostReco
         armed_ticks=statistics.ticks,
         command_digest=host.black_box.command_digest,
         state_to_command_us={f"p{p}": statistics.state_to_command.percentile_us(p) for p in (50, 99)},
+        tick_times=statistics.times.timings(),
         rejected_commands=dict(authority.rejected),
         limited_commands=dict(authority.limited),
         faults=list(authority.since_start.kept),

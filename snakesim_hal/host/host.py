@@ -123,6 +123,7 @@ class Host:
         self._deadlines = Deadlines(config.period_ns)
         self._published = PublishTimes()
         self._published_arming = 0
+        self._tick_began_ns: int | None = None  # unless time stood since
         self._waiting_since_ns: int | None = None  # for the services' answers that end this tick
         self._newest: dict[str, int] = {}
         self._last_armed_tick = 0
@@ -232,7 +233,9 @@ class Host:
         started = time.monotonic_ns()
         try:
             samples = self._backend.sample(self._tick, self._tick * self._period_ns)
-            self._backend_time.read(started)
+            took_ns = self._backend_time.read(started)
+            if self.authority.state == "armed":
+                self.statistics.times.read.add(took_ns / 1000)
         except BackendError as error:
             self._backend_failed(error)
             return None
@@ -260,6 +263,7 @@ class Host:
         if self._published.last_tick is not None:
             self._outbox.put(keys.CLOCK, self._clock(self._published.last_tick, paused=True))
         self._show_status()
+        self._tick_began_ns = None
         until_ns = time.monotonic_ns() + STANDING_PERIOD_NS
         while not self._time_requests and (left_ns := until_ns - time.monotonic_ns()) > 0:
             self._inbox.take(left_ns * 1e-9)
@@ -330,17 +334,32 @@ class Host:
                 self.authority.fault(fault)
         except BackendError as error:
             self._backend_failed(error)
-        self._backend_time.written(started)
+        took_ns = self._backend_time.written(started)
+        if self.authority.state == "armed":
+            self.statistics.times.write.add(took_ns / 1000)
         self._tick += 1
         self._watch_network()
         self._watch_fault()
         self._show_status()
-        if self._pace == "realtime":
-            if not self._deadlines.missed(self._tick):
-                self._inbox.take_until(self._deadlines.of(self._tick))
-            elif self.authority.state == "armed":
-                self.statistics.overruns += 1
+        self._wait_for_deadline()
         self._time.tick_done(self._tick)
+
+    def _wait_for_deadline(self) -> None:
+        """Of the next tick, in real time; and count how this one kept time."""
+        armed, late_ns = self.authority.state == "armed", None
+        if self._pace == "realtime":
+            due_ns = self._deadlines.of(self._tick)
+            if self._deadlines.missed(self._tick):
+                self.statistics.overruns += armed
+            else:
+                self._inbox.take_until(due_ns)
+            late_ns = time.monotonic_ns() - due_ns
+        now_ns, began_ns = time.monotonic_ns(), self._tick_began_ns
+        self._tick_began_ns = now_ns
+        if armed and began_ns is not None:
+            self.statistics.times.cycle.add((now_ns - began_ns) / 1000)
+        if armed and late_ns is not None:
+            self.statistics.times.late.add(late_ns / 1000)
 
     def _recorded(self) -> bool:
         """Whether to record this tick: a host that stays must not fill memory while it waits."""
@@ -522,6 +541,7 @@ class Host:
             waits=self._processes.waits(),
             differing=self._differing(),
             overruns=self.statistics.overruns,
+            tick_times=self.statistics.times.timings(),
             realtime_warnings=self._realtime_warnings,
             slow_backend=self._backend_time.too_slow() if self._pace == "realtime" else [],
             injected=list(self.faults.on),

@@ -6,7 +6,7 @@ from snakesim_hal.host.participants import Participants
 from snakesim_hal.host.simulated_time import SimulatedTime
 from snakesim_hal.safety.authority import Authority, Decision
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import AppliedCommand, Description, Pace, Status
+from snakesim_hal.wire.messages import AppliedCommand, Description, Pace, Status, Timing
 
 WITHOUT = {
     keys.POSE: "mission.map=perceived with mission.localisation=dead_reckoning does without; so does a controller of "
@@ -47,6 +47,7 @@ def status_message(
     waits: Mapping[str, Sequence[str]],
     differing: list[str],
     overruns: int,
+    tick_times: dict[str, Timing],
     realtime_warnings: list[str],
     slow_backend: list[str],
     injected: list[str],
@@ -84,6 +85,7 @@ def status_message(
         alive=participants.present(),
         waiting_for=missing,
         overruns=overruns,
+        tick_times=tick_times,
         realtime_warnings=[*realtime_warnings, *slow_backend, *time.slow()],
         injected=injected,
         ready_to_arm=not against and not missing and not differing,

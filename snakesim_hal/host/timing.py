@@ -44,14 +44,18 @@ class BackendTime:
         self.read_ns = self.write_ns = 0.0
         self._ticks = 0
 
-    def read(self, since_ns: int) -> None:
-        """It has been sampled, since then."""
-        self.read_ns += SMOOTHING * (time.monotonic_ns() - since_ns - self.read_ns)
+    def read(self, since_ns: int) -> int:
+        """It has been sampled, since then. Returns how long that took, in ns."""
+        took_ns = time.monotonic_ns() - since_ns
+        self.read_ns += SMOOTHING * (took_ns - self.read_ns)
         self._ticks += 1
+        return took_ns
 
-    def written(self, since_ns: int) -> None:
-        """It has taken the set-points, and done what it does between two ticks, since then."""
-        self.write_ns += SMOOTHING * (time.monotonic_ns() - since_ns - self.write_ns)
+    def written(self, since_ns: int) -> int:
+        """It has taken the set-points, and done what it does between two ticks, since then. Returns as `read` does."""
+        took_ns = time.monotonic_ns() - since_ns
+        self.write_ns += SMOOTHING * (took_ns - self.write_ns)
+        return took_ns
 
     def too_slow(self) -> list[str]:
         """That its calls leave a tick no time for anything else, and the rate that would hold; empty: they do."""

@@ -444,6 +444,18 @@ class Fault(Message, frozen=True, kw_only=True):
     ] = "robot"
 
 
+class Timing(Message, frozen=True, kw_only=True):
+    """How long something took, many times: percentiles to 5 %, and a histogram on a logarithmic scale."""
+
+    count: Annotated[q.Count, about("how many were measured")]
+    median_us: q.Microseconds
+    p99_us: Annotated[q.Microseconds, about("99 % took no longer")]
+    max_us: q.Microseconds
+    low_us: Annotated[q.Microseconds, about("where the first bin begins; it counts all that is below, too")]
+    bin_decades: Annotated[float, q.from_zero(8.0, "1"), about("width of a bin: log10 of its end over its begin")]
+    bins: Annotated[list[q.Count], Meta(max_length=64)]
+
+
 class Status(Message, frozen=True, kw_only=True):
     """`hal/status`, latched: the state of the robot, and its reason."""
 
@@ -484,6 +496,14 @@ class Status(Message, frozen=True, kw_only=True):
         Annotated[float, q.from_zero(1e6, "1")] | None,
         about("robot time per wall time over the last second; null: not measured, such as in a pause"),
     ] = None
+    tick_times: Annotated[
+        dict[q.Name, Timing],
+        Meta(max_length=8),
+        about(
+            "while armed. cycle: from the begin of a tick to the next one's; late: begin of a tick after its deadline, "
+            "in real time; read, write: the backend's calls"
+        ),
+    ] = {}
     held_up: Annotated[
         q.Reason, about("which answer to which tick lockstep has been waiting for, if longer than half a second")
     ] = ""

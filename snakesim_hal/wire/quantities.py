@@ -55,6 +55,7 @@ Scalar = Annotated[float, bounded(-1e12, 1e12, "1")]
 Pixels = Annotated[float, bounded(-1e5, 1e5, "px")]
 FocalLength = Annotated[float, above(1e5, "px")]
 Distance = Annotated[float, from_zero(1e4, "m")]
+Microseconds = Annotated[float, from_zero(1e8, "µs")]
 Speed = Annotated[float, bounded(0.1, 10.0, "1")]  # of robot time, beside the wall clock
 Fraction = Annotated[float, bounded(0.0, 1.0, "1")]
 

@@ -176,6 +176,7 @@ class Contents:
             armed_ticks=len(armed),
             command_digest=digest_of(columns),
             state_to_command_us={"p50": None, "p99": None},
+            tick_times=status.tick_times,
             rejected_commands=status.commands_rejected,
             limited_commands=status.commands_limited,
             faults=status.faults,

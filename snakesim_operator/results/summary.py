@@ -8,7 +8,7 @@ import numpy as np
 from msgspec import Meta
 
 from snakesim_hal.arithmetic import foreign
-from snakesim_hal.wire.messages import Fault, Mode, Pace
+from snakesim_hal.wire.messages import Fault, Mode, Pace, Timing
 from snakesim_operator.results.advance import Advance, energy_j, energy_j_per_m, work_j
 from snakesim_operator.results.came_true import came_true
 from snakesim_operator.results.record import RunRecord
@@ -93,6 +93,10 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
         float | None, _number("s", "time until then in which the centre of mass moved less than 2 cm within a second")
     ] = None
     state_to_command_us: Annotated[dict[str, float | None], _number("µs", "state published to command received")]
+    tick_times: Annotated[
+        dict[str, Timing],
+        Meta(description="while armed: cycle, late (begin after the deadline), read and write (calls of the backend)"),
+    ] = {}
     rejected_commands: Annotated[dict[str, int], Meta(description="by reason")]
     limited_commands: Annotated[dict[str, int], Meta(description="joint set-points changed by the gate, by limit")]
     faults: list[Fault]
@@ -168,6 +172,7 @@ def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), h
         energy_j_per_m=energy_j_per_m(record, advance) if advance and has_power else None,
         stalled_s=advance.stalled_s if advance else None,
         state_to_command_us=host.state_to_command_us,
+        tick_times=host.tick_times,
         rejected_commands=host.rejected_commands,
         limited_commands=host.limited_commands,
         faults=host.faults,

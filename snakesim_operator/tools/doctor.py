@@ -7,6 +7,7 @@ import msgspec
 from snakesim_hal.terminal import Say, say, say_json
 from snakesim_operator.tools import computer
 from snakesim_operator.tools.computer import Finding
+from snakesim_operator.tools.kernel import kernel
 from snakesim_operator.tools.network_findings import ports, routers
 from snakesim_operator.tools.targets import RobotSelection
 
@@ -18,6 +19,7 @@ CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
     computer.kvm,
     computer.clock,
     computer.real_time,
+    kernel,
     computer.disk,
 )
 

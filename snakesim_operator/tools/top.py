@@ -12,12 +12,24 @@ from snakesim_hal.network.session import Arrival, Link, Session, open_session
 from snakesim_hal.terminal import Say, overwrite_lines, say, say_json
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
+from snakesim_hal.wire.messages import Timing
 from snakesim_operator.tools.targets import CONNECT_S, RobotSelection
 from snakesim_operator.tools.traffic import KeyTraffic, Latency, Traffic
 
 PERIOD_S = 1.0
 ONCE_S = 2.0  # long enough for two samples of the slowest key that repeats itself
 HEAD = f"{'key':<29} {'writer':<17} {'Hz':>7} {'jitter':>9} {'max gap':>9} {'bytes':>8} {'age':>8} {'heard':>8}"
+
+TIMES = {
+    "cycle": "from tick to tick",
+    "late": "begin of a tick after its deadline",
+    "read": "the backend reads its sensors",
+    "write": "the backend takes set-points",
+}
+TIMES_HEAD = (
+    f"{'while armed, ms':<47} {'median':>9} {'99 %':>9} {'most':>9}  {'histogram, from the shortest to the longest'}"
+)
+BARS = "▁▂▃▄▅▆▇█"
 
 
 @dataclass(frozen=True)
@@ -43,12 +55,13 @@ def top(request: TopRequest, where: RobotSelection, say: Say = say) -> int:
             now_ns = time.monotonic_ns()
             lines = [line for traffic in traffics for line in traffic.lines(now_ns)]
             latencies = [latency for traffic in traffics for latency in traffic.latencies()]
+            times = {robot: found for traffic in traffics for robot, found in traffic.tick_times().items() if found}
             left_out = sum(traffic.keys_left_out for traffic in traffics)
             if request.as_json:
-                content = {"keys": lines, "latencies": latencies, "left_out": left_out}
+                content = {"keys": lines, "latencies": latencies, "tick_times": times, "left_out": left_out}
                 say_json(msgspec.to_builtins(content), say)
             else:
-                table = table_of(lines, latencies, left_out)
+                table = table_of(lines, latencies, times, left_out)
                 if sys.stdout.isatty() and not request.once:
                     drawn = overwrite_lines(table, drawn)
                 else:
@@ -81,7 +94,9 @@ def _listen(link: Link, stack: contextlib.ExitStack) -> Traffic | None:
     return traffic
 
 
-def table_of(lines: list[KeyTraffic], latencies: list[Latency], left_out: int) -> list[str]:
+def table_of(
+    lines: list[KeyTraffic], latencies: list[Latency], times: dict[str, dict[str, Timing]], left_out: int
+) -> list[str]:
     """The table, as lines of text: robot by robot, what is not of the key space at the end of each."""
     if not lines:
         return ["nothing arrives"]
@@ -92,9 +107,19 @@ def table_of(lines: list[KeyTraffic], latencies: list[Latency], left_out: int) -
         for latency in latencies:
             if latency.robot == robot:
                 text.append(_latency(latency))
+        if robot in times:
+            text += [TIMES_HEAD, *(_times(name, timing) for name, timing in times[robot].items())]
     if left_out:
         text.append(f"and {left_out} messages on still more keys: somebody floods this network")
     return text
+
+
+def _times(name: str, timing: Timing) -> str:
+    """A line of how long something took, with its histogram from the shortest to the longest."""
+    most = max(timing.bins)
+    bars = "".join(" " if not count else BARS[(len(BARS) - 1) * count // most] for count in timing.bins)
+    numbers = "".join(f" {us * 1e-3:>9.3f}" for us in (timing.median_us, timing.p99_us, timing.max_us))
+    return f"{name:<10} {TIMES.get(name, ''):<36}{numbers}  {timing.low_us * 1e-3:>9.3f} |{bars}|"
 
 
 def _latency(latency: Latency) -> str:

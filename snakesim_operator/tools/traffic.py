@@ -13,7 +13,7 @@ from snakesim_hal.errors import WireError
 from snakesim_hal.network.session import Arrival
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
-from snakesim_hal.wire.messages import AppliedCommand, Clock, JointCommand, JointState, Message, Status
+from snakesim_hal.wire.messages import AppliedCommand, Clock, JointCommand, JointState, Message, Status, Timing
 
 MAX_KEYS = 512  # a stranger may invent more; they are only counted
 KEPT = 256  # newest arrivals of a key
@@ -145,6 +145,18 @@ class Traffic:
                     )
                 )
         return found
+
+    def tick_times(self) -> dict[str, dict[str, Timing]]:
+        """Of every robot, as its newest status says; empty for one that was not armed yet."""
+        with self._lock:
+            newest = dict(self._newest)
+        said = {
+            robot: _decoded(keys.STATUS, arrival)
+            for key, arrival in newest.items()
+            for robot, relative in (self._split(key),)
+            if relative == keys.STATUS
+        }
+        return {robot: status.tick_times for robot, status in said.items() if isinstance(status, Status)}
 
     def is_known(self, key: str) -> bool:
         """Whether a key is one of a robot's that are published."""

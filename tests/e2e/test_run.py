@@ -127,6 +127,8 @@ def test_other_paces_complete(tmp_path: Path, pace: str) -> None:
     if pace == "realtime" and not ended.code:
         assert summary.overruns or summary.real_time_factor == pytest.approx(1.0, abs=0.05)
         assert summary.state_to_command_us["p50"] is not None
+        assert summary.tick_times.keys() == {"cycle", "late", "read", "write"}
+        assert summary.tick_times["read"].count == 100 and summary.tick_times["cycle"].median_us > 15_000
 
 
 def test_a_run_in_processes_may_end_with_its_mission(tmp_path: Path) -> None:

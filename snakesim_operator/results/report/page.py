@@ -33,7 +33,7 @@ HERE = Path(__file__).parent
 VIEW_WIDTH = 500.0
 TURNS_SHOWN = 100  # of one joint in a chart
 POLYGON = (236.0, 226.0)
-ELSEWHERE = ("config", "faults", "rejected_commands", "limited_commands")
+ELSEWHERE = ("config", "faults", "rejected_commands", "limited_commands", "tick_times")
 
 
 def page(record: RunRecord, summary: RunSummary) -> str:

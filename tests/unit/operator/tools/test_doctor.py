@@ -3,15 +3,30 @@
 import json
 import os
 import socket
+from pathlib import Path
 
 import pytest
 
 from snakesim_operator.cli import main
+from snakesim_operator.tools.kernel import kernel
 from snakesim_operator.tools.network_findings import ports, routers
 from snakesim_operator.tools.targets import RobotSelection
 from tests.harness.endpoint import free_endpoint
 
-WHAT = {"Python", "packages", "OpenGL", "CAN", "KVM", "wake-ups", "wall clock", "priority", "memory lock", "disk"}
+WHAT = {
+    "Python",
+    "packages",
+    "OpenGL",
+    "CAN",
+    "KVM",
+    "wake-ups",
+    "wall clock",
+    "priority",
+    "memory lock",
+    "disk",
+    "kernel",
+    "governor",
+}
 
 
 def test_it_checks_everything_and_leaves_this_process_as_it_was(capsys: pytest.CaptureFixture[str]) -> None:
@@ -35,3 +50,25 @@ def test_an_endpoint_that_is_not_zenoh_is_a_failure_within_seconds() -> None:
 def test_the_default_port_is_free_or_has_a_user() -> None:
     (finding,) = ports()
     assert finding.what == "port 7447" and finding.state in ("ok", "warn")
+
+
+@pytest.mark.parametrize(
+    ("files", "warned"),
+    [
+        ({"proc/version": "Linux version 6.12 SMP PREEMPT_DYNAMIC"}, ["kernel"]),
+        ({"proc/version": "Linux version 6.12-rt SMP PREEMPT_RT"}, []),
+        ({"sys/devices/system/cpu/cpu0/cpufreq/scaling_governor": "powersave"}, ["governor"]),
+        ({"sys/devices/system/cpu/cpu0/cpufreq/scaling_governor": "performance"}, []),
+        ({"sys/bus/usb-serial/devices/ttyUSB0/latency_timer": "16"}, ["serial adapter"]),
+        ({"sys/bus/usb-serial/devices/ttyUSB0/latency_timer": "1"}, []),
+    ],
+)
+def test_what_makes_ticks_late_is_named_with_its_remedy(
+    tmp_path: Path, files: dict[str, str], warned: list[str]
+) -> None:
+    for name, content in files.items():
+        (tmp_path / name).parent.mkdir(parents=True)
+        (tmp_path / name).write_text(f"{content}\n")
+    found = list(kernel(tmp_path))
+    assert [finding.what for finding in found if finding.state == "warn"] == warned
+    assert all(finding.fix for finding in found if finding.state == "warn")
