@@ -13,6 +13,7 @@ BRINGS = {  # as imported; the first extra that brings a package is the one to n
     "record": ("foxglove_schemas_protobuf", "google", "lz4", "mcap", "zstandard"),
     "report": ("jinja2", "markupsafe"),
     "can": ("bitstruct", "can", "cantools"),
+    "commission": ("tomlkit",),
     "console": ("viser", "websockets"),
     "export": ("pyarrow",),
     "evaluate": ("dask", "distributed", "optuna", "pyarrow"),

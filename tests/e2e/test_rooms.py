@@ -14,6 +14,7 @@ pytestmark = pytest.mark.e2e
 
 REPOSITORY = Path(__file__).parents[2]
 COMMANDS = {
+    "commissioning": ("joints",),
     "console": ("console",),
     "evaluate": ("evaluate", "sweep", "optimise"),
     "figures": ("plot",),

@@ -1,0 +1,52 @@
+"""Arguments of `snakesim joints`."""
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from snakesim_hal.arguments import add_network
+from snakesim_operator.tools.robot_selection import selection_of
+
+TASK = "scenarios, robots, labs"  # under which `snakesim --help` lists it
+FILE = "the robot file that the host was started with; the values are written into it"
+
+
+def add_commands(commands: Any) -> None:
+    """Add it to the parser of `snakesim`."""
+    joints = commands.add_parser("joints", help="find zeros, directions and limits of joints, and write them down")
+    verbs = joints.add_subparsers(dest="verb", required=True, metavar="VERB")
+    zero = _by_hand(verbs, "zero", _zero, "take the present pose, which must be straight, as zero of every joint")
+    zero.add_argument("--now", action="store_true", help="do not wait for Enter: it lies straight")
+    for verb, act, about in (
+        ("direction", _direction, "turn joints by hand: which count the wrong way round, or have another's id"),
+        ("limits", _limits, "move joints by hand from end to end: their limits"),
+    ):
+        command = _by_hand(verbs, verb, act, about)
+        command.add_argument("joints", nargs="*", metavar="JOINT", help="such as joint_3; all of them without")
+
+
+def _by_hand(verbs: Any, verb: str, act: Callable[[argparse.Namespace], int], about: str) -> argparse.ArgumentParser:
+    command = verbs.add_parser(verb, help=about, description=f"{about.capitalize()}. The motors stay off.")
+    command.add_argument("file", type=Path, metavar="FILE", help=FILE)
+    add_network(command)
+    command.set_defaults(act=act)
+    return command
+
+
+def _zero(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.commissioning.by_hand import zero
+
+    return zero(arguments.file, selection_of(arguments), asks=not arguments.now)
+
+
+def _direction(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.commissioning.by_hand import direction
+
+    return direction(arguments.file, selection_of(arguments), arguments.joints)
+
+
+def _limits(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.commissioning.by_hand import limits
+
+    return limits(arguments.file, selection_of(arguments), arguments.joints)

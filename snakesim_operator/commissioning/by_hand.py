@@ -1,0 +1,207 @@
+"""`snakesim joints zero|direction|limits`: how a person moves a robot, whose motors are off, tells what its file says.
+
+Nothing here commands a joint. The robot's host must run, and be disarmed all the time.
+"""
+
+import select
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from snakesim_hal.arrays import Floats
+from snakesim_hal.errors import ConfigError, RefusedError
+from snakesim_hal.model.files import decode, find, read_part
+from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.network.session import Session, open_session
+from snakesim_hal.terminal import overwrite_lines, say
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Configuration, JointState, Status
+from snakesim_operator.commissioning.capture import NotStillError, Travel, turned, zeros
+from snakesim_operator.commissioning.robot_edit import change_joints
+from snakesim_operator.tools.targets import CONNECT_S, RobotSelection, only_robot
+
+SETTLE_S = 1.0  # of samples for a zero
+SILENT_S = 1.0
+FOUND_S = 3.0  # for configuration and status of a host that is there
+DRAWN_EVERY_S = 0.2
+DIRECTIONS = {"yaw": "to the left", "pitch": "downwards"}  # of what is ahead of the joint, seen towards the head
+
+
+class Hand:
+    """A robot that is moved by hand, and its file."""
+
+    def __init__(self, session: Session, path: Path) -> None:
+        """Raises ConfigError when the host does not run with this file."""
+        self._states = session.reader(keys.JOINTS, JointState)
+        self._statuses = session.latched_reader(keys.STATUS, Status)
+        configured = session.latched_reader(keys.CONFIG, Configuration)
+        self._status: Status | None = None
+        self.path = path
+        self.joints: Sequence[Joint] = decode(read_part(str(path), "robots"), RobotFile).joint_table
+        content = _first(configured.drain).content
+        running = msgspec.json.decode(content, type=RunConfig).robot.joint_table
+        if [(one.name, one.id, one.drive) for one in running] != [(one.name, one.id, one.drive) for one in self.joints]:
+            raise ConfigError(
+                f"{path}: its joints are not those that the host was started with, so what is measured would be "
+                f"reckoned wrongly; restart the host with this file"
+            )
+        self._status = _first(self._statuses.drain)
+
+    def angles_rad(self, until: Callable[[], bool]) -> Iterator[Floats]:
+        """Samples as they come. Raises RefusedError when the robot is armed, silent, or does not know an angle."""
+        heard_s = time.monotonic()
+        over = False
+        while not over:
+            over = until()  # what came before that still counts
+            for status in self._statuses.drain():
+                self._status = status
+            if self._status is None or self._status.lifecycle not in ("disarmed", "fault", "estop"):
+                raise RefusedError("the robot is armed: its motors hold the joints; type `snakesim disarm` first")
+            states = [state for state in self._states.drain() if state.is_of(len(self.joints))]
+            if states:
+                heard_s = time.monotonic()
+            elif time.monotonic() - heard_s > SILENT_S:
+                raise RefusedError(f"the robot has sent no joint angles for {SILENT_S:g} s; see `snakesim status`")
+            for state in states:
+                if not all(state.valid):
+                    unknown = ", ".join(
+                        joint.name for joint, ok in zip(self.joints, state.valid, strict=True) if not ok
+                    )
+                    raise RefusedError(f"{unknown}: the angle is not known; see `snakesim status`")
+                yield np.array(state.angle_rad)
+            time.sleep(0.01)
+
+    def angle_now_rad(self) -> Floats:
+        """One sample. Raises as `angles_rad`."""
+        return next(self.angles_rad(lambda: False))
+
+
+def zero(path: Path, where: RobotSelection, *, asks: bool) -> int:
+    """Take the present pose as straight. asks: wait for Enter first. Raises SnakesimError."""
+    with _hand(path, where, "joints zero") as hand:
+        if asks:
+            say("Lay the robot straight on a flat floor, let go of it, then press Enter.")
+            list(hand.angles_rad(_entered))
+        began = time.monotonic()
+        samples = np.array(list(hand.angles_rad(lambda: time.monotonic() - began > SETTLE_S)))
+        try:
+            found = zeros(hand.joints, samples)
+        except NotStillError as error:
+            raise RefusedError(f"{error} within {SETTLE_S:g} s; let go of the robot, and try again") from None
+    values: dict[str, dict[str, Any]] = {}
+    for joint, zero_rad in zip(hand.joints, found, strict=True):
+        say(f"{joint.name:<10} zero_rad {joint.drive.zero_rad:+8.4f} -> {zero_rad:+8.4f}")
+        values[joint.name] = {"zero_rad": zero_rad}
+    return _write(path, values, "straight pose")
+
+
+def direction(path: Path, where: RobotSelection, names: Sequence[str]) -> int:
+    """Ask for a turn of each joint, and set the sign of those that count it the other way round.
+
+    names: joints; none: all. Returns 1 when another joint turned than the one that was asked for.
+    """
+    values: dict[str, dict[str, Any]] = {}
+    wrong: list[str] = []
+    with _hand(path, where, "joints direction") as hand:
+        for joint in _chosen(hand.joints, names, path):
+            before_rad, turn = hand.angle_now_rad(), None
+            say(f"{joint.name}: turn what is ahead of it {DIRECTIONS[joint.axis]}, 10 degrees or more; Enter skips it")
+            for angles_rad in hand.angles_rad(_entered):
+                if (turn := turned(before_rad, angles_rad)) is not None:
+                    break
+            if turn is None:
+                say("  left as it is")
+            elif hand.joints[turn.joint] is not joint:
+                wrong.append(joint.name)
+                other = hand.joints[turn.joint].name
+                say(f"  {other} reports the turn: look at the ids and the wiring of {joint.name} and {other}")
+            elif not turn.alone:
+                wrong.append(joint.name)
+                say("  other joints turned, too: hold them, and repeat this one")
+            elif turn.by_rad > 0:
+                say(f"  {turn.by_rad:+.2f} rad: as the file says")
+            else:
+                say(f"  {turn.by_rad:+.2f} rad: mounted the other way round")
+                values[joint.name] = {"sign": -joint.drive.sign}
+    _write(path, values, "turned by hand")
+    if wrong:
+        say(f"not settled: {', '.join(wrong)}")
+    return 1 if wrong else 0
+
+
+def limits(path: Path, where: RobotSelection, names: Sequence[str]) -> int:
+    """Watch how far each joint is moved, until Enter, and write that as its limits. names: joints; none: all."""
+    with _hand(path, where, "joints limits") as hand:
+        chosen = _chosen(hand.joints, names, path)
+        say("Move each joint by hand from end to end, slowly; then press Enter.")
+        travel, drawn, due_s = None, 0, 0.0
+        for angles_rad in hand.angles_rad(_entered):
+            travel = travel or Travel(angles_rad)
+            travel.take(angles_rad)
+            if sys.stdout.isatty() and time.monotonic() >= due_s:
+                due_s = time.monotonic() + DRAWN_EVERY_S
+                drawn = overwrite_lines(_shown(hand.joints, travel, angles_rad), drawn)
+    values: dict[str, dict[str, Any]] = {}
+    for i, joint in enumerate(hand.joints):
+        found = None if travel is None or joint not in chosen else travel.limits(i)
+        if found is not None:
+            values[joint.name] = {"angle_min_rad": found[0], "angle_max_rad": found[1]}
+            say(f"{joint.name:<10} {found[0]:+.3f} to {found[1]:+.3f} rad")
+        elif joint in chosen:
+            say(f"{joint.name:<10} was not moved from end to end: left as it is")
+    return _write(path, values, "end to end by hand")
+
+
+def _shown(joints: Sequence[Joint], travel: Travel, now_rad: Floats) -> list[str]:
+    rows = zip(joints, travel.least_rad, now_rad, travel.most_rad, strict=True)
+    return [f"{joint.name:<10} {least:+7.3f}  now {now:+7.3f}  {most:+7.3f} rad" for joint, least, now, most in rows]
+
+
+@contextmanager
+def _hand(path: Path, where: RobotSelection, command: str) -> Iterator[Hand]:
+    if find(str(path), "robots") != path:
+        raise ConfigError(f"{path}: give the path of your own robot file, such as ./{path}.toml; shipped ones stay")
+    with open_session(only_robot(where, command), CONNECT_S) as session:
+        yield Hand(session, path)
+
+
+def _chosen(joints: Sequence[Joint], names: Sequence[str], path: Path) -> Sequence[Joint]:
+    known = {joint.name: joint for joint in joints}
+    if unknown := [name for name in names if name not in known]:
+        raise ConfigError(f"{path}: has no {', '.join(unknown)}; it has {joints[0].name} to {joints[-1].name}")
+    return [known[name] for name in names] or joints
+
+
+def _first(drain: Callable[[], Sequence[Any]]) -> Any:
+    until_s = time.monotonic() + FOUND_S
+    while time.monotonic() < until_s:
+        if found := drain():
+            return found[-1]
+        time.sleep(0.01)
+    raise RefusedError(f"the robot's host has not said within {FOUND_S:g} s how it is set up; see `snakesim status`")
+
+
+def _entered() -> bool:
+    """Whether a line has been typed."""
+    if not select.select([sys.stdin], [], [], 0.0)[0]:
+        return False
+    if not sys.stdin.readline():
+        raise RefusedError("the terminal is gone; nothing was written")
+    return True
+
+
+def _write(path: Path, values: dict[str, dict[str, Any]], how: str) -> int:
+    if values:
+        change_joints(path, values, how)
+        say(f"{path}: {len(values)} joints changed; restart the host with it")
+    else:
+        say(f"{path}: nothing to change")
+    return 0

@@ -1,0 +1,72 @@
+"""Zero, direction and travel of each joint, from how a person moves a robot whose motors are off. Pure.
+
+All angles are joint angles as the present robot file makes them of the drives': (n_joints,) rad, tail to head.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from snakesim_hal.arrays import Floats
+from snakesim_hal.model.joints import Joint
+
+STILL_RAD = 0.01  # a joint that nobody touches moves less, noise included
+TURNED_RAD = 0.15  # about 9 degrees: meant, not a shake
+BESIDE = 0.5  # share of it that another joint may move along
+MARGIN_RAD = 0.02  # between the end that a hand found and the limit that is written
+LEAST_TRAVEL_RAD = 0.2
+
+
+class NotStillError(Exception):
+    """A joint moved while it should lie still."""
+
+
+def zeros(joints: Sequence[Joint], angles_rad: Floats) -> list[float]:
+    """`zero_rad` of every drive, of a robot that lies straight: (n, n_joints) samples. Raises NotStillError."""
+    spread = np.ptp(angles_rad, axis=0)
+    if (moved := int(np.argmax(spread))) is not None and spread[moved] > STILL_RAD:
+        raise NotStillError(f"{joints[moved].name} moved by {spread[moved]:.3f} rad")
+    straight = np.median(angles_rad, axis=0)
+    return [
+        joint.drive.zero_rad + joint.drive.sign * joint.drive.gear * float(angle)
+        for joint, angle in zip(joints, straight, strict=True)
+    ]
+
+
+@dataclass(frozen=True)
+class Turn:
+    """Which joint a person turned."""
+
+    joint: int
+    by_rad: float
+    alone: bool  # no other one turned by half as much
+
+
+def turned(before_rad: Floats, now_rad: Floats) -> Turn | None:
+    """The joint that turned most; None while none turned far enough."""
+    by_rad = now_rad - before_rad
+    most = int(np.argmax(np.abs(by_rad)))
+    if abs(by_rad[most]) < TURNED_RAD:
+        return None
+    others = np.delete(np.abs(by_rad), most)
+    return Turn(most, float(by_rad[most]), bool((others < BESIDE * abs(by_rad[most])).all()))
+
+
+class Travel:
+    """The lowest and the highest angle at which each joint has been."""
+
+    def __init__(self, at_rad: Floats) -> None:
+        self.least_rad, self.most_rad = at_rad.copy(), at_rad.copy()
+
+    def take(self, at_rad: Floats) -> None:
+        """One more sample."""
+        np.minimum(self.least_rad, at_rad, out=self.least_rad)
+        np.maximum(self.most_rad, at_rad, out=self.most_rad)
+
+    def limits(self, joint: int) -> tuple[float, float] | None:
+        """What to write as its limits; None when it was not moved from end to end."""
+        least, most = float(self.least_rad[joint]), float(self.most_rad[joint])
+        if most - least < LEAST_TRAVEL_RAD:
+            return None
+        return least + MARGIN_RAD, most - MARGIN_RAD

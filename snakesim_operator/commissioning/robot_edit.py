@@ -1,0 +1,47 @@
+"""Changes single values of a robot file, and leaves its comments and its order as they are."""
+
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import tomlkit
+from tomlkit.items import Table
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.files import decode, read_part
+from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.textfiles import read_text
+from snakesim_hal.model.whole_file import write_whole
+from snakesim_hal.process import user_name
+
+
+def change_joints(path: Path, values: dict[str, dict[str, Any]], how: str) -> None:
+    """Set fields of `[joints.NAME]`, each with who, when and how beside it. Raises ConfigError; then nothing changed.
+
+    values: joint -> field -> value.
+    """
+    document = tomlkit.parse(read_text(path))
+    joints = _section(document, "joints", super_table=True)
+    said = f"{how}, {user_name()}, {date.today().isoformat()}"
+    for name, fields in values.items():
+        section = _section(joints, name, super_table=False)
+        for field, value in fields.items():
+            item = tomlkit.item(round(value, 5) if isinstance(value, float) else value)
+            item.comment(said)
+            section[field] = item
+    candidate = path.with_name(f".{path.name}")  # checked before it takes the file's place; beside it, as for `extends`
+    write_whole(candidate, tomlkit.dumps(document).encode())
+    try:
+        decode(read_part(str(candidate), "robots"), RobotFile)
+        candidate.replace(path)
+    finally:
+        candidate.unlink(missing_ok=True)
+
+
+def _section(within: Any, name: str, *, super_table: bool) -> Any:
+    if name not in within:
+        within[name] = tomlkit.table(is_super_table=super_table)
+    section = within[name]
+    if not isinstance(section, Table):
+        raise ConfigError(f"`{name}` is written within one line: write it as a section, [joints.{name}]")
+    return section
