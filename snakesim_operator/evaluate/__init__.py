@@ -4,6 +4,7 @@
 `suite`      reads a suite file and makes the cases; `case` is one of them, and runs in a worker
 `cluster`    the workers: processes on this computer, or a lab's cluster; `worker` is loaded into each
 `evaluation` runs the cases, keeps what is done (`store`), prints and draws it (`table`, `page`)
+`card`       the score card, and how it pairs with others
 `optimise`   searches settings with Optuna
 
 Imports `run` and `results`. Nobody else imports Dask, Optuna or Arrow.

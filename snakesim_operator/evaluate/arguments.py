@@ -24,6 +24,14 @@ def add_commands(commands: Any) -> None:
     )
     tried.add_argument("--fields", type=number(1, 100_000), metavar="N", help="fields for each row and controller")
     tried.add_argument("--rows", metavar="1,2,...", help="only these rows of the table, by number")
+    tried.add_argument(
+        "--against",
+        action="append",
+        default=[],
+        type=Path,
+        metavar="DIR",
+        help="pair with the score card there",
+    )
     _add_shared(tried)
     tried.set_defaults(act=_evaluate)
 
@@ -94,7 +102,9 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     chosen = controllers or suite.controllers
     rows = _numbers(arguments.rows or "", "--rows")
     name = Path(arguments.suite).stem
-    return go(Request(suite, source, name, chosen, fields, rows=rows, **_shared(arguments, again)))
+    return go(
+        Request(suite, source, name, chosen, fields, rows=rows, against=arguments.against, **_shared(arguments, again))
+    )
 
 
 def _numbers(text: str, flag: str) -> list[int]:

@@ -14,6 +14,7 @@ from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.textfiles import write_text
 from snakesim_hal.terminal import say
 from snakesim_operator.evaluate import store
+from snakesim_operator.evaluate.card import CARD, Card, card_of, compare, read_card, text
 from snakesim_operator.evaluate.case import Case
 from snakesim_operator.evaluate.cluster import size, solve, workers
 from snakesim_operator.evaluate.page import page
@@ -39,6 +40,7 @@ class Request:
     again: str  # the command for one case, but for `--only`
     seed: int | None = None  # None: 1, or fields that the suite draws
     rows: Sequence[int] = ()  # none: all
+    against: Sequence[Path] = ()  # other evaluations' score cards
     only: str | None = None
     out: Path | None = None
     resume: bool = False
@@ -53,6 +55,7 @@ def go(request: Request) -> int:
         return _run_one(request, request.only)
     if request.resume and request.out is None:
         raise ConfigError("--resume: name the folder of the evaluation with --out")
+    others = [read_card(path) for path in request.against]
     seed = first_field(request)
     cases = cases_of(request.suite, request.source, request.controllers, request.fields, seed)
     if wrong := next((row for row in request.rows if row not in {case.row for case in cases}), None):
@@ -65,7 +68,7 @@ def go(request: Request) -> int:
             say(f"{len(cases) - len(todo)} of {len(cases)} cases are done already")
         if todo:
             _run(request, todo, kept, out)
-        _finish(request, cases, kept.done, out)
+        _finish(request, cases, kept.done, out, others)
         return 1 if any(kept.done[case.id].error is not None for case in cases) else 0
 
 
@@ -116,12 +119,12 @@ def _run(request: Request, todo: Sequence[Case], kept: store.Store, out: Path) -
             shown.done(outcome)
 
 
-def _finish(request: Request, cases: Sequence[Case], done: store.Results, out: Path) -> None:
+def _finish(request: Request, cases: Sequence[Case], done: store.Results, out: Path, others: Sequence[Card]) -> None:
     lines = lines_of(cases, done)
     best = best_of(lines)
     failed = worst([case for case in cases if case.controller == best], done)
-    for text in table(lines):
-        say(text)
+    for words in table(lines):
+        say(words)
     if broken := [(case, why) for case in cases if (why := done[case.id].error) is not None]:
         say(f"{len(broken)} could not run, the first: {name_of(broken[0][0])}: {broken[0][1]}")
     again = [
@@ -131,9 +134,14 @@ def _finish(request: Request, cases: Sequence[Case], done: store.Results, out: P
     if again:
         say(f"the worst {len(again)} of {best}:" if len(again) > 1 else f"the worst of {best}:")
     for name, why, command in again:
-        for text in (f"  {name}: {why}", f"    {command}"):
-            say(text)
+        for words in (f"  {name}: {why}", f"    {command}"):
+            say(words)
     paths = store.write_tables(out, cases, done)
+    card = card_of(request.name, cases, done)
+    if request.suite.fresh or others:
+        for words in text(card, compare(card, others)):
+            say(words)
+    write_text(out / CARD, msgspec.json.format(msgspec.json.encode(card), indent=1).decode())
     write_text(out / PAGE, page(request.suite.title or request.name, request.source, lines, again))
-    for path in (*paths, out / PAGE):
+    for path in (*paths, out / CARD, out / PAGE):
         say(f"written: {path}")

@@ -11,6 +11,7 @@ from snakesim_hal.arithmetic import foreign
 from snakesim_hal.wire.messages import Fault, Mode, Pace, Timing
 from snakesim_operator.results.advance import Advance, energy_j, energy_j_per_m, work_j
 from snakesim_operator.results.came_true import came_true
+from snakesim_operator.results.effort import Effort
 from snakesim_operator.results.record import RunRecord
 
 SATURATED_FROM = 0.99  # of a joint's torque limit
@@ -92,6 +93,16 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     stalled_s: Annotated[
         float | None, _number("s", "time until then in which the centre of mass moved less than 2 cm within a second")
     ] = None
+    body_lengths_s: Annotated[float | None, _number("1/s", "`advance_m_s` in lengths of the body")] = None
+    cost_of_transport: Annotated[float | None, _number("1", "energy until then over weight times advance")] = None
+    propulsive_efficiency: Annotated[
+        float | None, _number("1", "sliding friction of the weight over the advance, over that energy; level ground")
+    ] = None
+    jam_ratio: Annotated[float | None, _number("1", "`stalled_s` over the time until then")] = None
+    impulse_n_s_per_m: Annotated[float | None, _number("N·s/m", "of all contacts until then over the advance")] = None
+    torque_headroom: Annotated[
+        float | None, _number("1", "share of its limit that every joint had left in 95 % of the ticks until then")
+    ] = None
     state_to_command_us: Annotated[dict[str, float | None], _number("µs", "state published to command received")]
     tick_times: Annotated[
         dict[str, Timing],
@@ -171,6 +182,7 @@ def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), h
         advance_m_s=advance.reached_m / advance.until_s if advance and advance.until_s > 0 else None,
         energy_j_per_m=energy_j_per_m(record, advance) if advance and has_power else None,
         stalled_s=advance.stalled_s if advance else None,
+        **vars(Effort.of(record, advance, has_power=has_power)),
         state_to_command_us=host.state_to_command_us,
         tick_times=host.tick_times,
         rejected_commands=host.rejected_commands,

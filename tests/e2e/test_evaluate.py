@@ -107,6 +107,17 @@ def background(*command: str, home: Path) -> Iterator[subprocess.Popen[bytes]]:
         process.wait(10)
 
 
+def test_a_part_of_it_pairs_with_the_card_of_another(home: Path, undisturbed: tuple[Ended, Path]) -> None:
+    ended = evaluate(home, "part", "--rows", "2", "--controller", "hold", "--against", str(undisturbed[1]))
+    assert ended.code == 0, ended.out + ended.err
+    assert ended.out.count("cost of transport") == 1 and "code " in ended.out and "fields 1 to 2" in ended.out
+    assert "hold against path_following" in ended.out and "of 2; p = " in ended.out
+    assert "Holm's correction for 2 comparisons" in ended.out
+    (score,) = json.loads((home / "part" / "card.json").read_bytes())["scores"]
+    assert (score["controller"], score["runs"], score["crossed"]) == ("hold", 2, 0)
+    assert score["medians"]["jam_ratio"] is not None and score["medians"]["solved_force_error"] is None
+
+
 def test_the_table_tells_what_was_crossed(undisturbed: tuple[Ended, Path]) -> None:
     ended, out = undisturbed
     rows = [line.split() for line in table_of(ended).splitlines()[1:5]]

@@ -1,0 +1,59 @@
+"""What an advance cost, in numbers that robots of any size share: energy, contact, torque and time. Pure."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from snakesim_hal.model.scene import GRAVITY_M_S2
+from snakesim_operator.results.advance import MIN_DISTANCE_M, Advance, energy_j_per_m
+from snakesim_operator.results.record import RunRecord
+
+
+@dataclass(frozen=True)
+class Effort:
+    """Until the goal was reached, or the end. None: unknown, or not enough of an advance to say."""
+
+    body_lengths_s: float | None = None
+    cost_of_transport: float | None = None  # energy over weight times advance
+    propulsive_efficiency: float | None = None  # friction of the whole weight over the advance, over energy
+    jam_ratio: float | None = None  # share of the time in which it stood
+    impulse_n_s_per_m: float | None = None  # of all contacts, over the advance
+    torque_headroom: float | None = None  # share of its limit that the joint with least had left, in 95 % of the ticks
+
+    @staticmethod
+    def of(record: RunRecord, advance: Advance | None, *, has_power: bool) -> "Effort":
+        """has_power: torques and speeds are known."""
+        if advance is None or advance.until_s <= 0:
+            return Effort()
+        links, ground = record.description.links, record.config.scene.ground
+        per_m = energy_j_per_m(record, advance) if has_power else None
+        transport = None if per_m is None else per_m / (GRAVITY_M_S2 * sum(link.mass_kg for link in links))
+        rubs = transport is not None and transport > 0 and ground.uneven is None
+        length_m = sum(link.length_m for link in links)
+        return Effort(
+            body_lengths_s=advance.reached_m / advance.until_s / length_m,
+            cost_of_transport=transport,
+            propulsive_efficiency=ground.friction / transport if rubs and transport else None,
+            jam_ratio=min(advance.stalled_s / advance.until_s, 1.0),
+            impulse_n_s_per_m=_impulse_n_s_per_m(record, advance),
+            torque_headroom=_headroom(record, advance),
+        )
+
+
+def _impulse_n_s_per_m(record: RunRecord, advance: Advance) -> float | None:
+    """From the contacts in guidance's worlds, twenty a second; None without a sensor of contacts."""
+    if record.config.robot.sensors.contacts is None or advance.reached_m < MIN_DISTANCE_M:
+        return None
+    begin_ns = record.time_s[0] * 1e9
+    worlds = [one for one in record.worlds if 0 <= (one.stamp_ns - begin_ns) * 1e-9 <= advance.until_s]
+    if len(worlds) < 2:
+        return None
+    sums_n = [sum(float(np.linalg.norm(contact.force_w)) for contact in one.contacts) for one in worlds]
+    return float(np.trapezoid(sums_n, [one.stamp_ns * 1e-9 for one in worlds])) / advance.reached_m
+
+
+def _headroom(record: RunRecord, advance: Advance) -> float | None:
+    limits_nm = np.array([joint.torque_limit_nm for joint in record.description.joints])
+    shares = (np.abs(record.torque_nm) / limits_nm)[record.time_s - record.time_s[0] <= advance.until_s]
+    known = shares[np.isfinite(shares).all(axis=1)]
+    return float(1.0 - np.percentile(known.max(axis=1), 95)) if len(known) else None

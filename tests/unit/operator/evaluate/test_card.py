@@ -1,0 +1,56 @@
+"""Score cards: controllers are compared on the fields that both were tried on, and p counts the comparisons."""
+
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from snakesim_operator.evaluate.card import card_of, compare, holm, mcnemar, text
+from snakesim_operator.evaluate.case import Outcome
+from snakesim_operator.evaluate.suite import Suite, cases_of
+
+
+def test_p_as_tabulated() -> None:
+    assert mcnemar(0, 5) == pytest.approx(0.0625) and mcnemar(1, 9) == pytest.approx(22 / 1024)
+    assert mcnemar(0, 0) == mcnemar(3, 3) == 1.0
+    assert holm([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
+
+
+def test_cards_pair_by_field_whatever_the_controller_and_its_settings() -> None:
+    numbers = {"advance_m": 1.0, "advance_m_s": 0.1, "solved_force_error": None}
+
+    def card(controllers: list[str], seed: int, crosses: bool, **more: float):
+        suite = Suite(scenario="surveyed_clutter", set={"duration_s": 3.0, **more})
+        cases = cases_of(suite, "here", controllers, 6, seed=seed)
+        done = {
+            case.id: Outcome(numbers={**numbers, "crossed": crosses == (case.controller == "hold")}) for case in cases
+        }
+        return card_of("mine", cases, done)
+
+    ours = card(["path_following", "hold"], 1, crosses=True)  # hold crosses all six, the other none
+    (paired,) = compare(ours, [])
+    assert (paired.fields, paired.only_one, paired.only_other, paired.p) == (6, 0, 6, pytest.approx(2 / 64))
+    other = card(
+        ["hold"], 4, crosses=False, **{"controllers.path_following.look_ahead_m": 0.05}
+    )  # fields 4 to 9: three are shared
+    pairs = compare(ours, [other])
+    assert [one.fields for one in pairs] == [6, 3, 3] and pairs[2].only_one == 3
+    assert all(one.p >= mcnemar(one.only_one, one.only_other) for one in pairs)
+    assert not compare(
+        card(["hold"], 1, crosses=True), [card(["hold"], 1, crosses=True, **{"scene.ground.friction": 0.3})]
+    )
+    said = "\n".join(text(ours, pairs))
+    assert "solved forces: median error                     unknown" in said and "6/6 (61-100 %)" in said
+
+
+def test_a_card_on_disk_is_the_card(tmp_path: Path) -> None:
+    from snakesim_hal.errors import ConfigError
+    from snakesim_operator.evaluate.card import CARD, read_card
+
+    suite = Suite(scenario="surveyed_clutter")
+    cases = cases_of(suite, "here", ["hold"], 1, seed=1)
+    card = card_of("mine", cases, {cases[0].id: Outcome(numbers={"crossed": False})})
+    (tmp_path / CARD).write_bytes(msgspec.json.encode(card))
+    assert read_card(tmp_path) == card
+    with pytest.raises(ConfigError, match="no score card"):
+        read_card(tmp_path / "nowhere")
