@@ -2,13 +2,14 @@
 #   PYTHON=python3.12   the interpreter that `make setup` builds on
 #   ARGS="-k gate"      further arguments for demo, test and bench
 #   QUICK=      takes the slow tests in
-#   WORKERS=1           how many tests run side by side (2)
+#   WORKERS=1           how many tests run side by side (3)
 #   UPGRADE=1           lets `make lock` take the newest versions allowed
 
 PYTHON ?=
 ARGS ?=
 UPGRADE ?=
-WORKERS ?= 2
+# More than cores: half of the time of `make test` is robots in real time, and waiting for them.
+WORKERS ?= 3
 PAYLOADS ?= 1000000
 MINUTES ?= 30
 TRIALS ?= 300

@@ -145,10 +145,9 @@ def test_many_tokens_of_services_change_nothing(robot: Robot) -> None:
     robot.unharmed(before)
 
 
-@pytest.mark.parametrize("name", ["control", "guidance", "hal"])
-def test_a_token_of_a_service_that_comes_and_goes_stops_nothing(robot: Robot, name: str) -> None:
+def test_a_token_of_a_service_that_comes_and_goes_stops_nothing(robot: Robot) -> None:
     operator = robot.operator
-    for _ in range(effort(3, 100)):
+    for name in ("control", "guidance", "hal") * effort(3, 100):
         with Stranger(robot.endpoint) as stranger:
             stranger.seem_alive(f"alive/{name}")
             time.sleep(0.05)
@@ -177,7 +176,7 @@ def test_many_robots_that_are_none_do_not_keep_a_stop_from_the_one_that_is(
 # --- Zenoh itself -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("mode", ["router", "peer"])
+@pytest.mark.parametrize("mode", ["router", pytest.param("peer", marks=pytest.mark.slow)])
 def test_a_stranger_that_joins_as_a_router_or_peer_changes_nothing(robot: Robot, mode: str) -> None:
     before = robot.health()
     with Stranger(robot.endpoint, mode=mode, listen=free_endpoint()) as stranger:

@@ -70,15 +70,17 @@ BY_BACKEND = {
     "interrupts": "by ",  # SIGINT, or its handler in the host if that comes first
 }
 QUICK = {("controller", "hangs"), ("controller", "closes"), ("backend", "exits")}
+# What `hangs` does is in make test, too: tests/e2e/test_faults.py, test_beside.py.
+SLOW = {("controller", "hangs")}
 DEEDS = [
-    (who, deed, words)
+    pytest.param(who, deed, words, id=f"{who}-{deed}", marks=[pytest.mark.slow] * ((who, deed) in SLOW))
     for who, deeds in (("controller", BY_CONTROLLER), ("backend", BY_BACKEND))
     for deed, words in deeds.items()
     if FULL or (who, deed) in QUICK
 ]
 
 
-@pytest.mark.parametrize(("who", "deed", "words"), DEEDS, ids=[f"{who}-{deed}" for who, deed, _ in DEEDS])
+@pytest.mark.parametrize(("who", "deed", "words"), DEEDS)
 def test_a_plugin_that_misbehaves_stops_its_robot_only(tmp_path: Path, who: str, deed: str, words: str) -> None:
     (tmp_path / "bad.py").write_text(BAD.replace("%s", deed))
     chosen = {"controller": "hold", "backend": "sim"} | {who: f"./bad.py:{who.capitalize()}"}

@@ -70,7 +70,8 @@ def test_anybody_may_take_the_lease_which_disarms_and_arm_and_move_within_the_li
             operator.until(lambda: operator.status()["ready_to_arm"], "ready to arm")
             assert stranger.request("arm", who="mallory")["ok"]
             time.sleep(0.5)
-            assert operator.status()["lease_holder"] == "mallory"
+            # At some time: on a busy computer he may lose it again.
+            assert "mallory" in {heard.message["lease_holder"] for heard in operator.heard("hal/status")}
     rows = [heard.message for heard in operator.heard("hal/applied")]
     assert any(row["sequence"] is not None for row in rows)
     assert beyond_limits(about, rows) == []

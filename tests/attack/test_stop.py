@@ -70,7 +70,7 @@ def test_a4_the_command_stops_the_robot_under(
 
 
 @pytest.mark.parametrize("_time", TIMES)
-@pytest.mark.parametrize("name", FLOODS if FULL else ("lease_queries", "noise_queries"))
+@pytest.mark.parametrize("name", FLOODS if FULL else ("lease_queries",))
 def test_a4_a_query_stops_the_robot_at_once_under(
     robot: Robot, name: str, _time: int, record_property: Callable[[str, object], None]
 ) -> None:

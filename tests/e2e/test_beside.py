@@ -51,9 +51,9 @@ def test_it_drives_the_motors_alike(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("backend", "deed", "words"),
     [
-        ("sim", "raises", "update() raised ZeroDivisionError"),
+        pytest.param("sim", "raises", "update() raised ZeroDivisionError", marks=pytest.mark.slow),
         ("can", "hangs", "lease of control expired"),
-        ("sim", "spins", "lease of control expired"),
+        pytest.param("sim", "spins", "lease of control expired", marks=pytest.mark.slow),
         ("can", "ends the process", "host ended with exit code 0"),
     ],
 )

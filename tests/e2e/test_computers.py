@@ -74,20 +74,30 @@ def test_a_scenario_has_its_digest(tmp_path: Path, scenario: str) -> None:
 
 
 @common
-@pytest.mark.parametrize("computer", COMPUTERS)
+@pytest.mark.parametrize(
+    "computer",
+    [
+        "SkylakeX",
+        "plain NumPy",
+        *(pytest.param(n, marks=pytest.mark.slow) for n in ("Haswell", "Nehalem", "all enabled")),
+    ],
+)
 def test_it_is_that_of_every_computer(tmp_path: Path, computer: str) -> None:
     assert digest_in(run(tmp_path, "peg_row", "--in-process", computer=COMPUTERS[computer])) == GOLDEN["peg_row"]
 
 
 @common
-@pytest.mark.parametrize("computer", ["SkylakeX", "plain NumPy"])
+@pytest.mark.parametrize("computer", ["SkylakeX", pytest.param("plain NumPy", marks=pytest.mark.slow)])
 def test_and_that_of_five_processes(tmp_path: Path, computer: str) -> None:
     ended = run(tmp_path, "triplet", "--endpoint", free_endpoint(), computer=COMPUTERS[computer])
     assert digest_in(ended) == GOLDEN["triplet"]
 
 
 @common
-@pytest.mark.parametrize("computer", ["Haswell", "Nehalem", "plain NumPy"])  # no processor lacks what these need
+# No processor lacks what these need.
+@pytest.mark.parametrize(
+    "computer", ["Nehalem", *(pytest.param(n, marks=pytest.mark.slow) for n in ("Haswell", "plain NumPy"))]
+)
 def test_and_that_of_a_program_that_imported_numpy_first(tmp_path: Path, computer: str) -> None:
     (tmp_path / "program.py").write_text(PROGRAM)
     typed = [sys.executable, "program.py", "peg_row", str(SECONDS)]

@@ -200,10 +200,10 @@ def digest(tmp_path_factory: pytest.TempPathFactory) -> str:
 @pytest.mark.parametrize(
     ("options", "prepare", "more"),
     [
-        ("size=1M", "cat /dev/zero > ballast 2> /dev/null", ["--in-process"]),
+        pytest.param("size=1M", "cat /dev/zero > ballast 2> /dev/null", ["--in-process"], marks=pytest.mark.slow),
         ("size=48k", "", ["--in-process"]),  # room for the configuration and little else
         ("size=250k", "", []),  # less than the black box alone takes: rows are lost whoever fills it first
-        ("size=1M,nr_inodes=4", "", ["--in-process"]),
+        pytest.param("size=1M,nr_inodes=4", "", ["--in-process"], marks=pytest.mark.slow),
     ],
 )
 def test_a_full_disk_neither_ends_nor_changes_a_run(

@@ -1,9 +1,10 @@
-"""A room of the operator's tools that nothing imports can be left out: the rest starts, lists its commands and runs."""
+"""Rooms of the operator's tools that nothing imports can be left out, all or one: the rest starts, lists and runs."""
 
 import shutil
 import subprocess
 import sys
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -30,11 +31,13 @@ IMPORT_ALL = (
 )
 
 
-def without(room: str, folder: Path) -> Path:
-    """A copy of the packages without a room and its entry points, with metadata that hides the installed ones."""
+def without(rooms: Sequence[str], folder: Path) -> Path:
+    """A copy of the packages without rooms and their entry points, with metadata that hides the installed ones."""
     for package in REPOSITORY.glob("snakesim*"):
         shutil.copytree(package, folder / package.name, ignore=shutil.ignore_patterns("__pycache__"))
-    shutil.rmtree(folder / "snakesim_operator" / room)
+    for room in rooms:
+        shutil.rmtree(folder / "snakesim_operator" / room)
+    gone = tuple(f"snakesim_operator.{room}." for room in rooms)
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
     metadata = folder / f"snakesim-{project['version']}.dist-info"
     metadata.mkdir()
@@ -42,14 +45,16 @@ def without(room: str, folder: Path) -> Path:
     lines: list[str] = []
     for group, entries in project["entry-points"].items():
         lines.append(f"[{group}]")
-        lines += [f"{n} = {at}" for n, at in entries.items() if not at.startswith(f"snakesim_operator.{room}.")]
+        lines += [f"{n} = {at}" for n, at in entries.items() if not at.startswith(gone)]
     (metadata / "entry_points.txt").write_text("\n".join(lines) + "\n")
     return folder
 
 
-@pytest.mark.parametrize("room", COMMANDS)
-def test_all_else_works_without(room: str, tmp_path: Path) -> None:
-    library, work = without(room, tmp_path / "library"), tmp_path / "work"
+@pytest.mark.parametrize(
+    "rooms", [pytest.param([*COMMANDS], id="all"), *(pytest.param([n], id=n, marks=pytest.mark.slow) for n in COMMANDS)]
+)
+def test_all_else_works_without(rooms: list[str], tmp_path: Path) -> None:
+    library, work = without(rooms, tmp_path / "library"), tmp_path / "work"
     work.mkdir()
 
     def run(*words: str) -> subprocess.CompletedProcess[str]:
@@ -68,12 +73,12 @@ def test_all_else_works_without(room: str, tmp_path: Path) -> None:
     shown = run("-m", "snakesim_operator", "--help")
     assert shown.returncode == 0 and not shown.stderr, shown.stderr
     listed = {words[0] for line in shown.stdout.splitlines() if (words := line.split())}
-    left = {name for other, names in COMMANDS.items() if other != room for name in names}
+    left = {name for other, names in COMMANDS.items() if other not in rooms for name in names}
     assert left | {"run", "estop"} <= listed
-    assert not listed & {*COMMANDS[room]}
-    refused = run("-m", "snakesim_operator", COMMANDS[room][0])
+    assert not listed & {name for room in rooms for name in COMMANDS[room]}
+    refused = run("-m", "snakesim_operator", COMMANDS[rooms[0]][0])
     assert refused.returncode == 2 and "no command" in refused.stderr, refused.stderr
-    if room == "console":
+    if "console" in rooms:
         beside = run("-m", "snakesim_operator", "run", "triplet", "--console")
         assert beside.returncode == 2 and "without the console" in beside.stderr, beside.stderr
     ran = run("-m", "snakesim_operator", "run", "triplet", "--in-process", "--set", "duration_s=0.2")

@@ -113,7 +113,7 @@ def test_a_service_that_is_frozen_is_no_slow_computer(tmp_path: Path) -> None:
     assert TOO_SLOW not in said[-1]
 
 
-@pytest.mark.parametrize("pace", ["realtime", "free"])
+@pytest.mark.parametrize("pace", [pytest.param("realtime", marks=pytest.mark.slow), "free"])
 def test_other_paces_complete(tmp_path: Path, pace: str) -> None:
     """Or the computer is found to be too slow, by measuring it: in these paces a lease is one of the wall clock."""
     # 50 Hz has the longest lease, 100 ms: a busy test machine may well forget a process for 50 ms.

@@ -147,7 +147,12 @@ class Lost(MotionCapture):
 
 
 @pytest.mark.parametrize(
-    ("pace", "wrong"), [("lockstep", "array"), ("realtime", "number"), ("one", "number"), ("one", "rotation")]
+    ("pace", "wrong"),
+    [
+        ("lockstep", "array"),
+        ("one", "number"),
+        *(pytest.param(*row, marks=pytest.mark.slow) for row in (("realtime", "number"), ("one", "rotation"))),
+    ],
 )
 def test_a_malformed_message_is_named_in_the_services_log_and_by_the_run(home: Path, pace: str, wrong: str) -> None:
     field, words = MALFORMED[wrong]

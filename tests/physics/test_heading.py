@@ -11,7 +11,7 @@ DENSE = parse_set("scene.random_field.0.density_per_m2=12")
 NINE_S = parse_set("duration_s=9")
 
 
-@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize("side", [1, pytest.param(-1, marks=pytest.mark.slow)])
 def test_the_snake_goes_where_somebody_steers_it(side: int) -> None:
     with InProcessRun(load("surveyed_clutter", [DENSE, NINE_S]).config) as run:
         session = run.network.session()

@@ -291,7 +291,7 @@ def test_it_goes_through_a_random_field_that_nobody_laid_out(seed: int):
     assert whole.moved_m > 1.5
 
 
-@pytest.mark.parametrize("scale", [0.0, -1.0])
+@pytest.mark.parametrize("scale", [pytest.param(0.0, marks=pytest.mark.slow), -1.0])
 def test_in_clutter_nothing_but_the_push_moves_it(scale: float):
     """Neither the paths that are replanned, since it stands, nor a push of the wrong sign."""
     field = ("scene.random_field.0.seed=10", "scene.random_field.0.density_per_m2=12")
