@@ -66,6 +66,7 @@ class Bridge:
         self._world_s = 0.0  # when it came
         self._turns = 0
         self._sensors: dict[str, list[Transform]] = {}
+        self._imus: dict[int, RosPublisher] = {}  # by link, from its first sample on
         self._publish_topics()
         self._meet(robot)
         self._relays = self._make_relays(robot)
@@ -112,14 +113,18 @@ class Bridge:
             Relay(self._session, keys.STATUS, m.Status, self._every(STATUS_HZ), self._on_status),
         ]
         listed = {sensor.key for sensor in robot.sensors}
+        if keys.IMU in listed:
+            made.append(Relay(self._session, keys.IMU, m.Imu, 1, self._on_imu, each=True))
         if keys.POSE in listed:
             made.append(Relay(self._session, keys.POSE, m.Pose, 1, self._on_pose))
         for key in sorted(listed):
             _, _, name = key.rpartition("/")
             if key == keys.depth(name):
-                made.append(self._camera(key, name, "depth", m.DepthImage, robot_in_ros.depth_image, images))
+                translated = (robot_in_ros.depth_image, robot_in_ros.compressed_depth)
+                made.append(self._camera(key, name, "depth", m.DepthImage, translated, images))
             elif key == keys.colour(name):
-                made.append(self._camera(key, name, "color", m.ColourImage, robot_in_ros.colour_image, images))
+                translated = (robot_in_ros.colour_image, robot_in_ros.compressed_colour)
+                made.append(self._camera(key, name, "color", m.ColourImage, translated, images))
             elif key == keys.ranges(name):
                 made.append(self._mounted(key, name, "scan", ros.LASER_SCAN, robot_in_ros.laser_scan))
         for key, kind in own_kinds(robot).items():
@@ -135,20 +140,30 @@ class Bridge:
         name: str,
         kind: str,
         message: type[Any],
-        translate: Callable[[int, str, Any], bytes],
+        translated: tuple[Callable[[int, str, Any], bytes], ...],
         every: int,
     ) -> Relay[Any]:
+        """One camera's topics: images, raw and compressed as image_transport names them, and intrinsics."""
         topic = f"{ros_name(name)}/{kind}"
-        images = self._publisher(f"{topic}/image_raw", ros.IMAGE, depth=1, images=True)
+        plugin = "compressedDepth" if kind == "depth" else "compressed"
+        images = (
+            self._publisher(f"{topic}/image_raw", ros.IMAGE, depth=1, images=True),
+            self._publisher(f"{topic}/image_raw/{plugin}", ros.COMPRESSED_IMAGE, depth=1, images=True),
+        )
         infos = self._publisher(f"{topic}/camera_info", ros.CAMERA_INFO, depth=1)
 
         def pass_on(seen: m.DepthImage | m.ColourImage) -> None:
             frame, stamp_ns = self._frames.optical(kind, name), self._ros_time.of(seen.stamp_ns)
             self._place(key, self._frames.of_camera(kind, name, seen))
             infos.put(robot_in_ros.camera_info(stamp_ns, frame, seen))
-            images.put(translate(stamp_ns, frame, seen))
+            for publisher, translate in zip(images, translated, strict=True):
+                if publisher.heard():
+                    publisher.put(translate(stamp_ns, frame, seen))
 
-        return Relay(self._session, key, message, every, pass_on, lambda: images.heard() or infos.heard())
+        def wanted() -> bool:
+            return infos.heard() or any(publisher.heard() for publisher in images)
+
+        return Relay(self._session, key, message, every, pass_on, wanted)
 
     def _mounted(
         self, key: str, name: str, topic: str, kind: RosType, translate: Callable[[int, str, Any], bytes]
@@ -176,6 +191,16 @@ class Bridge:
         stamp_ns = self._ros_time.of(joints.stamp_ns)
         self._joint_states.put(robot_in_ros.joint_state(stamp_ns, self._names, joints))
         self._tf.put(ros.transforms(stamp_ns, self._frames.of_joints(joints)))
+
+    def _on_imu(self, seen: m.Imu) -> None:
+        for entry, link in enumerate(seen.link):
+            name = ros_name(self._robot.links[link].name)
+            if link not in self._imus:
+                self._imus[link] = self._publisher(f"{name}/imu", ros.IMU)
+            self._place(f"{keys.IMU}/{link}", [self._frames.of_imu(link)])
+            if self._imus[link].heard():
+                stamp_ns = self._ros_time.of(seen.stamp_ns)
+                self._imus[link].put(robot_in_ros.imu(stamp_ns, self._frames.imu(link), seen, entry))
 
     def _on_world(self, world: m.World) -> None:
         self._world = self._placed = world

@@ -48,6 +48,15 @@ class Frames:
         """Frame of a lidar, a range finder, or a sensor with a message of its own."""
         return f"{self._prefix}{ros_name(sensor)}_frame"
 
+    def imu(self, index: int) -> str:
+        """Frame of the IMU of a link."""
+        return f"{self.link(index)}_imu_frame"
+
+    def of_imu(self, index: int) -> Transform:
+        """An IMU in the middle of its link."""
+        middle = (self._robot.links[index].length_m / 2, 0.0, 0.0)
+        return Transform(self.link(index), self.imu(index), middle, UNTURNED)
+
     def of_base(self, pose: World | Pose) -> Transform:
         """The base in odom."""
         if isinstance(pose, Pose):

@@ -25,6 +25,8 @@ JOINT_STATE = _type("sensor_msgs/msg/JointState")
 TRANSFORMS = _type("tf2_msgs/msg/TFMessage")
 MARKERS = _type("visualization_msgs/msg/MarkerArray")
 IMAGE = _type("sensor_msgs/msg/Image")
+COMPRESSED_IMAGE = _type("sensor_msgs/msg/CompressedImage")
+IMU = _type("sensor_msgs/msg/Imu")
 CAMERA_INFO = _type("sensor_msgs/msg/CameraInfo")
 LASER_SCAN = _type("sensor_msgs/msg/LaserScan")
 NUMBERS = _type("std_msgs/msg/Float64MultiArray")
@@ -32,7 +34,10 @@ STRING = _type("std_msgs/msg/String")
 CLOCK = _type("rosgraph_msgs/msg/Clock")
 TWIST = _type("geometry_msgs/msg/Twist")
 DIAGNOSTICS = _type("diagnostic_msgs/msg/DiagnosticArray")
-TYPES = (JOINT_STATE, TRANSFORMS, MARKERS, IMAGE, CAMERA_INFO, LASER_SCAN, NUMBERS, STRING, CLOCK, TWIST, DIAGNOSTICS)
+TYPES = (
+    *(JOINT_STATE, TRANSFORMS, MARKERS, IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, IMU, LASER_SCAN, NUMBERS, STRING, CLOCK),
+    *(TWIST, DIAGNOSTICS),
+)
 
 Triple = tuple[float, float, float]
 Wxyz = tuple[float, float, float, float]
@@ -164,6 +169,19 @@ def image(stamp_ns: int, frame: str, width: int, height: int, encoding: str, pix
     """sensor_msgs/Image. encoding: 16UC1 (mm), 32FC1 (m) or rgb8; rows without padding, little endian."""
     header = _header(stamp_ns, frame)
     return _sent(IMAGE, header, height, width, encoding, 0, len(pixels) // height, _octets(pixels))
+
+
+def compressed_image(stamp_ns: int, frame: str, described: str, data: bytes) -> bytes:
+    """sensor_msgs/CompressedImage. described: its `format`, as the plug-ins of image_transport read it."""
+    return _sent(COMPRESSED_IMAGE, _header(stamp_ns, frame), described, _octets(data))
+
+
+def imu(stamp_ns: int, frame: str, angular_velocity_rad_s: Triple, acceleration_m_s2: Triple) -> bytes:
+    """sensor_msgs/Imu without orientation, which its covariance of -1 says; covariances of 0: unknown."""
+    unknown, no_orientation = np.zeros(9), np.array([-1.0, *[0.0] * 8])
+    turn, push = _vector(angular_velocity_rad_s), _vector(acceleration_m_s2)
+    unturned = _quaternion((1.0, 0.0, 0.0, 0.0))
+    return _sent(IMU, _header(stamp_ns, frame), unturned, no_orientation, turn, unknown, push, unknown)
 
 
 def camera_info(stamp_ns: int, frame: str, width: int, height: int, k: tuple[float, float, float, float]) -> bytes:

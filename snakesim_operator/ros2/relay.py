@@ -24,7 +24,11 @@ class Relay(Generic[MessageT]):
         every: int,
         pass_on: Callable[[MessageT], None],
         wanted: Callable[[], bool] = lambda: True,
+        *,
+        each: bool = False,
     ) -> None:
+        """each: all samples since the last turn, of a key whose samples complete one another."""
+        self._each = each
         self._session, self._key, self._message = session, key, message
         self._every = every
         self._pass_on, self._wanted = pass_on, wanted
@@ -40,8 +44,12 @@ class Relay(Generic[MessageT]):
                 self._reader = None
             return
         if self._reader is None:
-            self._reader = self._session.reader(self._key, self._message, depth=DEPTH)
-        if (newest := self._reader.newest(fits)) is not None:
+            depth = None if self._each else DEPTH
+            self._reader = self._session.reader(self._key, self._message, depth=depth)
+        if self._each:
+            for sample in filter(fits, self._reader.drain()):
+                self._pass_on(sample)
+        elif (newest := self._reader.newest(fits)) is not None:
             self._pass_on(newest)
 
 

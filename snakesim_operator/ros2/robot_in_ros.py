@@ -1,5 +1,6 @@
 """What the robot says, as ROS messages: pure translation, with the frames of `frames.py`."""
 
+import struct
 from collections.abc import Iterable
 
 import numpy as np
@@ -7,6 +8,7 @@ import numpy as np
 from snakesim_hal.wire.messages import (
     ColourImage,
     DepthImage,
+    Imu,
     JointState,
     Obstacle,
     OwnSample,
@@ -18,6 +20,7 @@ from snakesim_hal.wire.messages import (
 from snakesim_hal.wire.own_sample import OwnKind
 from snakesim_operator.ros2 import messages as ros
 from snakesim_operator.ros2.messages import Marker, Rgba, Triple
+from snakesim_operator.ros2.png import png
 
 METRES_PER_NEWTON = 0.01  # length of a force arrow
 ARROW_M: Triple = (0.008, 0.016, 0.02)  # diameter of shaft and head, length of the head
@@ -25,6 +28,8 @@ CONTACT: Rgba = (0.85, 0.2, 0.1, 1.0)
 FELT: Rgba = (0.9, 0.55, 0.1, 1.0)
 SEEN: Rgba = (0.3, 0.5, 0.75, 1.0)
 MILLIMETRE = 0.001
+MOST_COUNTS = 65535  # of 16 bits
+INVERSE_DEPTH_UNUSED = struct.pack("<i2f", 0, 0.0, 0.0)  # format and two parameters, for depth in float alone
 
 
 def joint_state(stamp_ns: int, names: list[str], joints: JointState) -> bytes:
@@ -82,6 +87,25 @@ def depth_image(stamp_ns: int, frame: str, seen: DepthImage) -> bytes:
 def colour_image(stamp_ns: int, frame: str, seen: ColourImage) -> bytes:
     """As rgb8."""
     return ros.image(stamp_ns, frame, seen.width, seen.height, "rgb8", seen.rgb)
+
+
+def compressed_depth(stamp_ns: int, frame: str, seen: DepthImage) -> bytes:
+    """As a PNG of 16 bits in millimetres, 0 for nothing, behind 12 bytes of parameters that its reader skips."""
+    millimetres = np.frombuffer(seen.depth, dtype="<u2") * (seen.scale_m / MILLIMETRE)
+    counts = np.where(millimetres > MOST_COUNTS, 0, np.rint(millimetres)).astype(">u2")
+    picture = png(seen.width, seen.height, counts.tobytes(), bits=16, colour=False)
+    return ros.compressed_image(stamp_ns, frame, "16UC1; compressedDepth png", INVERSE_DEPTH_UNUSED + picture)
+
+
+def compressed_colour(stamp_ns: int, frame: str, seen: ColourImage) -> bytes:
+    """As a PNG of 8 bits, without loss. OpenCV reads it as bgr8, which `format` says."""
+    picture = png(seen.width, seen.height, seen.rgb, bits=8, colour=True)
+    return ros.compressed_image(stamp_ns, frame, "rgb8; png compressed bgr8", picture)
+
+
+def imu(stamp_ns: int, frame: str, seen: Imu, entry: int) -> bytes:
+    """One link's IMU; acceleration is the specific force, as REP 145 wants it."""
+    return ros.imu(stamp_ns, frame, seen.angular_velocity_rad_s[entry], seen.acceleration_m_s2[entry])
 
 
 def camera_info(stamp_ns: int, frame: str, seen: DepthImage | ColourImage) -> bytes:

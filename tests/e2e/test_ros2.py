@@ -129,9 +129,19 @@ def _sees(ros: RosSide) -> None:
     assert abs(clock.sec - joints.header.stamp.sec) <= 2
     image = ros.first("head/depth/image_raw", "sensor_msgs/msg/Image")
     assert (image.encoding, image.width, image.height, len(image.data)) == ("16UC1", 160, 120, 38400)
+    png = ros.first("head/depth/image_raw/compressedDepth", "sensor_msgs/msg/CompressedImage")
+    assert png.format == "16UC1; compressedDepth png" and png.data[12:20].tobytes() == b"\x89PNG\r\n\x1a\n"
+    imu = ros.first("link_7/imu", "sensor_msgs/msg/Imu")
+    assert imu.header.frame_id == "link_7_imu_frame" and 8 < imu.linear_acceleration.z < 12
     info = ros.first("head/depth/camera_info", "sensor_msgs/msg/CameraInfo")
     assert info.header.frame_id == image.header.frame_id and info.k[0] == info.p[0] > 0
-    static = ros.first("tf_static", "tf2_msgs/msg/TFMessage", latched=True).transforms
+    placed = "link_7_imu_frame"
+    static = ros.first(
+        "tf_static",
+        "tf2_msgs/msg/TFMessage",
+        lambda found: placed in {one.child_frame_id for one in found.transforms},
+        latched=True,
+    ).transforms
     assert image.header.frame_id in {one.child_frame_id for one in static}
     parents = {one.child_frame_id: one.header.frame_id for one in static}
     moving = ros.first("tf", "tf2_msgs/msg/TFMessage", lambda found: len(found.transforms) == 13).transforms

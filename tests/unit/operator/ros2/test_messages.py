@@ -1,11 +1,13 @@
 """Every message of the bridge, read back field by field."""
 
+from io import BytesIO
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 from rosbags.typesys import Stores, get_typestore
 
 from snakesim_hal.wire import messages as m
@@ -140,6 +142,34 @@ def test_colour_and_intrinsics() -> None:
     assert info.k.tolist() == [80, 0, 1.5, 0, 81, 1, 0, 0, 1]
     assert info.p.tolist() == [80, 0, 1.5, 0, 0, 81, 1, 0, 0, 0, 1, 0]
     assert info.r.tolist() == [1, 0, 0, 0, 1, 0, 0, 0, 1] and info.d.tolist() == [0] * 5
+
+
+def test_compressed_images_are_read_by_a_library_for_pictures() -> None:
+    colour = image(m.ColourImage)
+    seen = read(ros.COMPRESSED_IMAGE, robot_in_ros.compressed_colour(STAMP_NS, "f", colour))
+    assert seen.format == "rgb8; png compressed bgr8"
+    assert np.asarray(Image.open(BytesIO(seen.data.tobytes()))).tobytes() == colour.rgb
+    for scale_m in (0.001, 0.01):
+        sent = robot_in_ros.compressed_depth(STAMP_NS, "f", image(m.DepthImage, scale_m=scale_m))
+        seen = read(ros.COMPRESSED_IMAGE, sent)
+        assert (seen.format, seen.header.frame_id) == ("16UC1; compressedDepth png", "f")
+        millimetres = np.asarray(Image.open(BytesIO(seen.data.tobytes()[12:])))
+        assert np.array_equal(millimetres, np.arange(12).reshape(3, 4) * round(scale_m / 0.001))
+
+
+def test_an_imu_has_no_orientation() -> None:
+    sent = m.Imu(
+        tick=0,
+        stamp_ns=0,
+        link=[3, 5],
+        angular_velocity_rad_s=[(0, 0, 0), (1, 2, 3)],
+        acceleration_m_s2=[(0, 0, 0), (4, 5, 6)],
+    )
+    seen = read(ros.IMU, robot_in_ros.imu(STAMP_NS, "link_5_imu_frame", sent, 1))
+    assert (at(seen.header.stamp), seen.header.frame_id) == (STAMP_NS, "link_5_imu_frame")
+    turn, push = seen.angular_velocity, seen.linear_acceleration
+    assert (turn.x, turn.y, turn.z, push.x, push.y, push.z) == (1, 2, 3, 4, 5, 6)
+    assert seen.orientation_covariance[0] == -1 and seen.linear_acceleration_covariance.tolist() == [0] * 9
 
 
 @FEW
