@@ -10,7 +10,7 @@ from snakesim_hal.fault_plan import check_planned
 from snakesim_hal.model.files import Table
 from snakesim_hal.model.plugins import BACKENDS, CONTROLLERS, SERVICES, find_installed, find_plugin, plugin_settings
 from snakesim_hal.model.robot import described
-from snakesim_hal.model.scenario import CONTROL, RunConfig
+from snakesim_hal.model.scenario import CONTROL, RunConfig, description_of
 from snakesim_hal.wire.messages import JointDescription, Mode
 
 GUIDANCE = "guidance"
@@ -29,10 +29,12 @@ def check_plugins(config: RunConfig, table: Table | None = None, *, run_files: b
     controller = find(CONTROLLERS, config.controller)
     if controller is not None:
         origin = table.origin if table is not None else None
-        plugin_settings(controller, config.control_settings, source, config.control_section, origin)
+        settings = plugin_settings(controller, config.control_settings, source, config.control_section, origin)
         config = _with_what_it_needs(config, controller)
         if (lacks := what_it_lacks(described(config.robot), controller, config.controller)) is not None:
             raise ConfigError(f"robot {config.robot.name!r}: {lacks}")
+        if hasattr(controller, "check"):
+            controller.check(description_of(config), settings)
     for service in config.own_services:
         find_service(config, service, find)
     if others := [name for name in config.beside if name != CONTROL]:

@@ -102,7 +102,7 @@ def _corrected(plugin: type[Controller], residual_rad: list[float]) -> Any:
 
     class Corrected:
         Settings = plugin.Settings
-        NEEDS = getattr(plugin, "NEEDS", "world")
+        NEEDS, SENSES = getattr(plugin, "NEEDS", "world"), getattr(plugin, "SENSES", False)
 
         def __init__(self, robot: Description, settings: Any) -> None:
             self._inner = plugin(robot, settings)

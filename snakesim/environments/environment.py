@@ -14,16 +14,14 @@ from numpy.typing import NDArray
 from snakesim.configuration import checked, overrides_of
 from snakesim.environments.actions import Commands, controller_of
 from snakesim.environments.assisted import AssistedRobot
-from snakesim.environments.observations import chosen
-from snakesim.environments.progress import Progress
 from snakesim.environments.rewards import weights_of
 from snakesim.environments.stepped import Robot, SteppedRobot
+from snakesim_gnc.control.controller import Senses, Task, View
+from snakesim_gnc.control.observations import Observer, chosen
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.plugins import FILMS, find_plugin
-from snakesim_hal.model.robot import describe
-from snakesim_hal.model.scenario import Override, RunConfig, check
-from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Description, JointState, Pose
+from snakesim_hal.model.scenario import Override, RunConfig, check, description_of
+from snakesim_hal.wire.messages import JointState
 
 Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
 MAX_SEED = 2**31
@@ -89,21 +87,20 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
 
     def _declare(self, action: str, residual_rad: float, observe: Sequence[str] | None, flat: bool) -> None:
         """The spaces, with a name and a unit for every number in them."""
-        robot = _description(self.config)
+        robot = self.description = description_of(self.config)
         self._commands = Commands.of(robot, action, residual_rad)
         self.action_space = _box(self._commands.low, self._commands.high)
         self.action_names = list(self._commands.names)
         self.action_units = [self._commands.unit] * len(self.action_names)
-        self._parts = chosen(robot, observe)
-        boxes: dict[str, spaces.Space[Any]] = {name: _box(part.low, part.high) for name, part in self._parts.items()}
-        parts = self._parts.values()
-        every = _box([low for part in parts for low in part.low], [high for part in parts for high in part.high])
-        self._low, self._high = every.low, every.high
-        self.observation_space = every if flat else spaces.Dict(boxes)
-        self.observation_names = [f"{part}.{name}" for part, of in self._parts.items() for name in of.names]
+        self.parts = chosen(robot, observe)
+        boxes: dict[str, spaces.Space[Any]] = {name: _box(part.low, part.high) for name, part in self.parts.items()}
+        parts = self.parts.values()
+        every = Observer(robot, self.parts)
+        self.observation_space = spaces.Box(every.low, every.high) if flat else spaces.Dict(boxes)
+        self.observation_names = [f"{part}.{name}" for part, of in self.parts.items() for name in of.names]
         self.observation_units = [of.unit for of in parts for _ in of.names]
         ends = np.cumsum([len(part.names) for part in parts]).tolist()
-        self._slices = None if flat else dict(zip(self._parts, map(slice, [0, *ends], ends), strict=False))
+        self._slices = None if flat else dict(zip(self.parts, map(slice, [0, *ends], ends), strict=False))
 
     @property
     def digest(self) -> str:
@@ -117,7 +114,7 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
         super().reset(seed=seed)
         self.close()
         self._lay_down(seed)
-        self._progress = Progress(self.config, self._armed().description)
+        self._observer, self._task = Observer(self._armed().description, self.parts), Task.of(self.config)
         self._ticks, self._left = 0, round(self.config.duration_s * self.config.rate_hz)
         self._over = False
         observation = self._observe()
@@ -128,7 +125,7 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
         robot, target = self._armed(), self._commands.target(action)
         if self._over:
             raise gymnasium.error.ResetNeeded("the episode is over; call reset()")
-        energy_j, limited, before_m, ticks = 0.0, 0, self._progress.along_m, 0
+        energy_j, limited, before_m, ticks = 0.0, 0, self._observer.progress.along_m, 0
         while ticks < min(self._frame_skip, self._left) and robot.lifecycle == "armed":
             robot.step(self._commands.mode, target)
             energy_j += _power_w(robot.joints) * self.config.period_ns * 1e-9
@@ -136,9 +133,10 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
             ticks += 1
         self._ticks, self._left = self._ticks + ticks, self._left - ticks
         observation = self._observe()
-        stopped, reached = robot.lifecycle != "armed", self._progress.reached
+        progress = self._observer.progress
+        stopped, reached = robot.lifecycle != "armed", progress.reached
         values = {
-            "advance": self._progress.along_m - before_m,
+            "advance": progress.along_m - before_m,
             "energy": energy_j,
             "limited": limited / (max(ticks, 1) * len(target)),
             "goal": float(reached),
@@ -146,7 +144,7 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
         }
         terms = {name: self._weights[name] * value for name, value in values.items()}
         terminated, truncated = reached or stopped, self._left == 0
-        info = {**self._state(), "reward_terms": terms}
+        info = {**self._state(), "energy_j": energy_j, "reward_terms": terms}
         self._over = terminated or truncated
         if self._over:
             info["ended"] = "stopped" if stopped else "goal" if reached else "time"
@@ -159,8 +157,9 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
             return None
         if self._film is None:
             self._film = find_plugin(FILMS, "mujoco")(self.config, *self._size)
-        position_w, wxyz = (np.array(part) for part in self._progress.pose)
-        look_at_w = np.array([*self._progress.centre_w, self._progress.height_m])
+        progress = self._observer.progress
+        position_w, wxyz = (np.array(part) for part in progress.pose)
+        look_at_w = np.array([*progress.centre_w, progress.height_m])
         return self._film.picture(position_w, wxyz, np.array(self._armed().joints.angle_rad), look_at_w)
 
     def close(self) -> None:
@@ -170,6 +169,11 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
             robot.close()
         if film is not None:
             film.close()
+
+    @property
+    def _time_s(self) -> float:
+        """Since the arming."""
+        return self._ticks * self.config.period_ns * 1e-9
 
     def _armed(self) -> Robot:
         if self._robot is None:
@@ -200,15 +204,18 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
         return config
 
     def _observe(self) -> Observation:
+        """As a controller would see it at this tick."""
         robot = self._armed()
-        pose = robot.newest.get(keys.POSE)
-        self._progress.update(robot.joints, pose if isinstance(pose, Pose) else None)
-        values: list[float] = []
-        for part in self._parts.values():
-            values.extend(part.read(robot, self._progress))
-        flat = np.array(values, dtype=np.float32)
-        np.maximum(flat, self._low, out=flat)
-        np.minimum(flat, self._high, out=flat)
+        view = View(
+            tick=robot.joints.tick,
+            time_s=self._time_s,
+            period_s=self.config.period_ns * 1e-9,
+            joints=robot.joints,
+            world=None,
+            trajectory=None,
+            senses=Senses(robot.newest, {}, self._task),
+        )
+        flat = self._observer.update(view)
         if self._slices is None:
             return flat
         return {name: flat[where] for name, where in self._slices.items()}
@@ -217,8 +224,8 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
         """What of the robot is not in an observation."""
         robot = self._armed()
         info: dict[str, Any] = {
-            "time_s": self._ticks * self.config.period_ns * 1e-9,
-            "advance_m": self._progress.along_m,
+            "time_s": self._time_s,
+            "advance_m": self._observer.progress.along_m,
             "lifecycle": robot.lifecycle,
         }
         if robot.limited:
@@ -226,13 +233,6 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
         if robot.lifecycle != "armed":
             info["why"] = robot.why
         return info
-
-
-def _description(config: RunConfig) -> Description:
-    """Of the robot in it, before there is one."""
-    return describe(
-        config.robot, backend=config.backend, period_ns=config.period_ns, lease_ns=config.lease_ns, config_hash=""
-    )
 
 
 def _box(low: Sequence[float], high: Sequence[float]) -> spaces.Box:

@@ -5,14 +5,41 @@ It is created again at every arming, and called once a tick while the robot is a
 trajectory, also during a run: then it must not push, but hold, and resume without a jump when they are back.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import msgspec
 
 from snakesim_hal.backend import SetPoints
-from snakesim_hal.wire.messages import Description, JointState, Mode, Trajectory, World, WorldContact
+from snakesim_hal.model.kinematics import quaternion_from_yaw
+from snakesim_hal.model.scenario import HeadingGoal, RunConfig, WaypointGoal, start_of
+from snakesim_hal.wire.messages import Description, JointState, Message, Mode, Trajectory, World, WorldContact
+
+
+@dataclass(frozen=True)
+class Task:
+    """Where a scenario lays the robot down, and where it wants it to go."""
+
+    start_position_w: tuple[float, float, float]  # of the tail end
+    start_wxyz: tuple[float, float, float, float]
+    goal: HeadingGoal | WaypointGoal | None
+
+    @staticmethod
+    def of(config: RunConfig) -> "Task":
+        """That of a run."""
+        start = start_of(config)
+        x, y = start.position_w
+        return Task((x, y, config.robot.module.radius_m), quaternion_from_yaw(start.yaw_rad), config.mission.goal)
+
+
+@dataclass(frozen=True)
+class Senses:
+    """What a controller with SENSES = True gets besides: samples as the sensors gave them, and its task."""
+
+    newest: Mapping[str, Message]  # of `sensor/pose` and `sensor/contacts`, by key; absent: none has come yet
+    late: Mapping[str, str]  # key -> why its sample must not be used any more
+    task: Task
 
 
 @dataclass(frozen=True)
@@ -25,6 +52,7 @@ class View:
     joints: JointState
     world: World | None  # None: there is none yet, or it is too old; also for the trajectory
     trajectory: Trajectory | None
+    senses: Senses | None = None  # None: the controller did not ask for them
 
 
 @dataclass(frozen=True)
@@ -62,6 +90,8 @@ class Controller(Protocol):
     Settings: type[msgspec.Struct]  # the scenario's [control] section
     # It may have NEEDS = "joints": it asks for no world, and so runs on a robot without a pose sensor; and what it
     # needs of every joint, or a run does not begin: MODES = (Mode.POSITION, Mode.TORQUE), MEASURES = ("torque",).
+    # SENSES = True: its views have `senses`. A static method `check(robot, settings)` is called before a run begins,
+    # and raises ConfigError for settings that this robot cannot be driven with.
 
     def __init__(self, robot: Description, settings: Any) -> None: ...
 

@@ -13,6 +13,7 @@ trajectory  guidance's turn and lag, navigation's lag, and three of its turns mi
 A stamp that is further ahead of the clock than its limit is rejected as well: it is of another host, or forged.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from snakesim_hal.model.scenario import RunConfig, Service
@@ -75,6 +76,12 @@ class Limits:
         stamps = {keys.POSE: world.pose_stamp_ns, keys.CONTACTS: world.contacts_stamp_ns, DEPTH: world.depth_stamp_ns}
         found = [_off(key, stamps[key], now_ns, limit_s) for key, limit_s in self.sensors_s.items()]
         return "; ".join(filter(None, found))
+
+    def of_sensors(self, stamps_ns: Mapping[str, int | None], now_ns: int) -> dict[str, str]:
+        """Why samples are rejected, by key. stamps_ns: of the newest sample of each key that has had one."""
+        limits = {key: self.sensors_s[key] for key in stamps_ns if key in self.sensors_s}
+        found = {key: _off(key, stamps_ns[key], now_ns, limit_s) for key, limit_s in limits.items()}
+        return {key: why for key, why in found.items() if why}
 
     def against_trajectory(self, trajectory: Trajectory, now_ns: int) -> str:
         """Why a trajectory is rejected; empty when it is fresh."""

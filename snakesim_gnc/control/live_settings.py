@@ -45,6 +45,11 @@ class LiveSettings:
         client.session.on_question(keys.SETTINGS, self._waiting.put)
         self._publisher = client.session.latched_publisher(keys.SETTINGS_IN_FORCE, ControlSettings)
 
+    @property
+    def asks_for_senses(self) -> bool:
+        """Whether views of this controller have `senses`."""
+        return getattr(self.plugin, "SENSES", False)
+
     def configure(self, robot: Description) -> None:
         """For this robot from now on, whose time may have started over."""
         self._robot, self._published = robot, -1

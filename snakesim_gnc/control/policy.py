@@ -1,17 +1,18 @@
-"""A learned policy as a controller: an ONNX model from what the joints say to a target for every joint.
+"""A learned policy as a controller: an ONNX model from what the sensors say to a target for every joint.
 
 The model says in its metadata what it takes and gives; units are in the names. All of that is checked when it is made.
 """
 
 import contextlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from snakesim_gnc.control.controller import Action, Report, View
+from snakesim_gnc.control.controller import Action, Report, View, positions
+from snakesim_gnc.control.observations import Observer, Part, chosen, parts_of
 from snakesim_hal.backend import SetPoints
 from snakesim_hal.errors import ConfigError, short
 from snakesim_hal.model.files import FileStruct, expanded
@@ -28,20 +29,36 @@ with contextlib.suppress(ModuleNotFoundError):  # as this file is loaded: an arm
 
 OBSERVATIONS, ACTION = "snakesim.observations", "snakesim.action"
 JOINTS, FRAME_SKIP = "snakesim.joints", "snakesim.frame_skip"
-PARTS: dict[str, Callable[[View], Sequence[float]]] = {
-    "angle_rad": lambda view: view.joints.angle_rad,
-    "velocity_rad_s": lambda view: view.joints.velocity_rad_s,
-    "torque_nm": lambda view: view.joints.torque_nm,
-    "time_s": lambda view: [view.time_s],
-}
 MODES = {"position": Mode.POSITION, "velocity": Mode.VELOCITY, "torque": Mode.TORQUE}
 MAX_FRAME_SKIP = 1000
+
+
+class Model:
+    """A model from a file, and what its metadata say. Callable: an observation in, targets out."""
+
+    def __init__(self, robot: Description, file: str) -> None:
+        """Raises ConfigError that names the file, the field, its value and what is expected."""
+        self._session, given = _opened(file)
+        fields = _Metadata(file, given)
+        self.parts = fields.parts(robot)
+        self.action = fields.one_of(ACTION, MODES)
+        self.frame_skip = fields.whole(FRAME_SKIP, MAX_FRAME_SKIP, "ticks")
+        count = len(robot.joints)
+        joints = fields.whole(JOINTS)
+        if joints != count:
+            raise fields.wrong(JOINTS, joints, f"{count}, the number of joints of robot {robot.robot!r}")
+        width = sum(len(part.names) for part in self.parts.values())
+        self._input = _only("input", self._session.get_inputs(), width, ", ".join(self.parts), file)
+        self._output = _only("output", self._session.get_outputs(), count, "a target for each joint", file)
+
+    def __call__(self, observation: NDArray[np.float32]) -> list[float]:
+        return self._session.run([self._output], {self._input: observation[None]})[0][0].tolist()
 
 
 class Policy:
     """Asks the model every `snakesim.frame_skip` ticks, and holds its targets meanwhile."""
 
-    NEEDS = "joints"
+    NEEDS, SENSES = "joints", True
 
     class Settings(FileStruct, frozen=True, kw_only=True):
         """The model."""
@@ -51,30 +68,31 @@ class Policy:
         ]
 
     def __init__(self, robot: Description, settings: Settings) -> None:
-        """Raises ConfigError that names the file, the field, its value and what is expected."""
-        self._session, given = _opened(settings.model)
-        fields = _Metadata(settings.model, given)
-        self._parts = fields.parts()
-        self._mode = MODES[fields.one_of(ACTION, MODES)]
-        self._frame_skip = fields.whole(FRAME_SKIP, MAX_FRAME_SKIP, "ticks")
-        count = len(robot.joints)
-        joints = fields.whole(JOINTS)
-        if joints != count:
-            raise fields.wrong(JOINTS, joints, f"{count}, the number of joints of robot {robot.robot!r}")
-        width = sum(1 if part == "time_s" else count for part in self._parts)
-        self._input = _only("input", self._session.get_inputs(), width, f"{', '.join(self._parts)}", settings.model)
-        self._output = _only("output", self._session.get_outputs(), count, "a target for each joint", settings.model)
+        """Raises ConfigError for a model that does not fit."""
+        self._model = Model(robot, settings.model)
+        self._observer = Observer(robot, self._model.parts)
+        self._mode = MODES[self._model.action]
+        self._robot = robot
+        self._held: SetPoints | None = None  # set-points while a sensor is silent
         self._torque_limit_nm = [joint.torque_limit_nm for joint in robot.joints]
-        self._target = [0.0] * count
-        self._asked: int | None = None  # the tick of the last question
+        self._target: list[float] | None = None
+        self._asked = 0  # the tick of the last question
+
+    @staticmethod
+    def check(robot: Description, settings: Settings) -> None:
+        """Before a run begins. Raises ConfigError for a model that does not fit."""
+        Model(robot, settings.model)
 
     def update(self, view: View) -> Action:
-        """The model's targets; the gate limits them."""
-        if self._asked is None or view.tick - self._asked >= self._frame_skip:
-            observed = [value for part in self._parts for value in PARTS[part](view)]
-            given: NDArray[np.float32] = np.array([observed], dtype=np.float32)
-            self._target = self._session.run([self._output], {self._input: given})[0][0].tolist()
-            self._asked = view.tick
+        """The model's targets; the gate limits them. It holds its pose while a sensor that it needs is silent."""
+        late = {} if view.senses is None else view.senses.late
+        if why := "; ".join(late[key] for key in sorted(self._observer.sensors & late.keys())):
+            self._held = self._held or positions(self._robot, view.joints.angle_rad)
+            self._target = None
+            return Action(self._held, Report(why=why))
+        self._held = None
+        if self._target is None or view.tick - self._asked >= self._model.frame_skip:
+            self._target, self._asked = self._model(self._observer.update(view)), view.tick
         points = SetPoints([self._mode] * len(self._target), list(self._target), list(self._torque_limit_nm))
         reference = self._target if self._mode is Mode.POSITION else ()
         return Action(points, Report(why="a policy moves the joints", reference_rad=reference))
@@ -86,13 +104,18 @@ class _Metadata:
     def __init__(self, file: str, given: Mapping[str, str]) -> None:
         self._file, self._given = short(file), given
 
-    def parts(self) -> list[str]:
-        """The names of the observation's parts, in order."""
-        text = self._text(OBSERVATIONS, f"names out of {', '.join(PARTS)}, with commas between")
+    def parts(self, robot: Description) -> dict[str, Part]:
+        """The observation's parts, in order."""
+        there = parts_of(robot)
+        wanted = f"names out of {', '.join(there)}, each once, with commas between"
+        text = self._text(OBSERVATIONS, wanted)
         parts = [part.strip() for part in text.split(",")]
-        if not set(parts) <= set(PARTS) or len(set(parts)) < len(parts):
-            raise self.wrong(OBSERVATIONS, text, f"names out of {', '.join(PARTS)}, each once, with commas between")
-        return parts
+        if not set(parts) <= set(there) or len(set(parts)) < len(parts):
+            raise self.wrong(OBSERVATIONS, text, wanted)
+        try:
+            return chosen(robot, parts)
+        except ConfigError as error:
+            raise ConfigError(f"{self._file}: metadata `{OBSERVATIONS}` is {short(text)!r}: {error}") from None
 
     def one_of(self, field: str, allowed: Mapping[str, Any]) -> str:
         wanted = f"one of {', '.join(allowed)}"

@@ -6,7 +6,7 @@ the robot is stopped. Its output is checked (`guarded`): a controller that fails
 
 from collections.abc import Sequence
 
-from snakesim_gnc.control.controller import View
+from snakesim_gnc.control.controller import Senses, Task, View
 from snakesim_gnc.control.freshness import Limits
 from snakesim_gnc.control.guarded import Guarded
 from snakesim_gnc.control.live_settings import LiveSettings
@@ -18,7 +18,20 @@ from snakesim_hal.plugin_check import what_it_lacks
 from snakesim_hal.service import SILENCE_S, Service
 from snakesim_hal.terminal import print_stderr
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Clock, ControlState, Description, JointState, Message, Status, Trajectory, World
+from snakesim_hal.wire.messages import (
+    Clock,
+    Contacts,
+    ControlState,
+    Description,
+    JointState,
+    Message,
+    Pose,
+    Status,
+    Trajectory,
+    World,
+)
+
+SENSED: dict[str, type[Message]] = {keys.POSE: Pose, keys.CONTACTS: Contacts}
 
 
 class Control(Service):
@@ -35,6 +48,12 @@ class Control(Service):
         self._joints = client.subscribe(keys.JOINTS, JointState)
         self._world = client.subscribe(keys.WORLD, World)
         self._trajectory = client.subscribe(keys.TRAJECTORY, Trajectory)
+        asked = self._settings.asks_for_senses
+        sensors = config.robot.sensors
+        has = {keys.POSE: sensors.pose is not None, keys.CONTACTS: sensors.contacts is not None}
+        self._feeds = {key: client.subscribe(key, SENSED[key]) for key in SENSED if asked and has[key]}
+        self._sensed: dict[str, Message] = {}
+        self._task = Task.of(config) if asked else None
         self._statuses = client.session.reader(keys.STATUS, Status)
         self._arming = -1
         self._armed_at_ns = 0
@@ -50,6 +69,7 @@ class Control(Service):
         self._limits = Limits.of(self._config, robot)
         self._reports = StateReports(self._config.controller, robot)
         self._controller: Guarded | None = None
+        self._sensed.clear()
 
     def outputs(self, clock: Clock) -> list[tuple[str, Message]] | None:
         """Command the robot: while armed by the controller, otherwise to hold its pose."""
@@ -98,6 +118,7 @@ class Control(Service):
     def _act(self, clock: Clock, joints: JointState) -> list[tuple[str, Message]]:
         """Call the controller, with world and trajectory as far as they are fresh."""
         world, trajectory, missing = self._outlook(clock)
+        senses = self._senses(clock)
         try:
             controller = self._made_for(clock)
             view = View(
@@ -107,6 +128,7 @@ class Control(Service):
                 joints=joints,
                 world=world,
                 trajectory=trajectory,
+                senses=senses,
             )
             action = controller.update(view)
             self._commander.send(clock, joints, action.set_points)
@@ -132,6 +154,16 @@ class Control(Service):
         if world is not None:
             self._reports.follow(world)
         return world, trajectory, "; ".join(late)
+
+    def _senses(self, clock: Clock) -> Senses | None:
+        """The newest samples, and which of them are too old; None for a controller that does not ask."""
+        if self._task is None:
+            return None
+        for key, feed in self._feeds.items():
+            if (sample := self._client.read(feed)) is not None:
+                self._sensed[key] = sample
+        stamps = {key: getattr(sample, "stamp_ns", None) for key, sample in self._sensed.items()}
+        return Senses(dict(self._sensed), self._limits.of_sensors(stamps, clock.stamp_ns), self._task)
 
     def _made_for(self, clock: Clock) -> Guarded:
         """The controller of this arming, and of the settings in force."""

@@ -21,12 +21,12 @@ from snakesim_hal.injection import CONTROL
 from snakesim_hal.model.files import FileStruct, Table, decode, find, leaves, read_part, read_table
 from snakesim_hal.model.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
 from snakesim_hal.model.outlines import Capsule, Heading, Point, Size
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot import RobotFile, describe
 from snakesim_hal.model.route import chain_angles, lay_chain, yaw_segments_m
 from snakesim_hal.model.scene import Placed, SceneFile, check_clear, place, route_of
 from snakesim_hal.model.textfiles import parse_toml
 from snakesim_hal.model.whole_file import write_whole
-from snakesim_hal.wire.messages import Obstacle, Pace
+from snakesim_hal.wire.messages import Description, Obstacle, Pace
 from snakesim_hal.wire.quantities import above
 
 SURVEY = 0x5EED  # tells the survey's random numbers from others of the same seed
@@ -312,6 +312,13 @@ def start_of(config: RunConfig) -> StartPose:
         return StartPose(start.position_m, start.yaw_rad, np.zeros(robot.chain.modules))
     lay = lay_chain(route, start.tail_s_m, yaw_segments_m(robot.axes, robot.link_lengths_m))
     return StartPose(lay.tail_w, lay.heading_rad, chain_angles(robot.axes, lay.angles_rad))
+
+
+def description_of(config: RunConfig) -> Description:
+    """The robot in it, before there is a backend."""
+    return describe(
+        config.robot, backend=config.backend, period_ns=config.period_ns, lease_ns=config.lease_ns, config_hash=""
+    )
 
 
 def capsules_at_start(config: RunConfig) -> list[Capsule]:

@@ -4,26 +4,25 @@ import math
 
 import numpy as np
 
-from snakesim_hal.model.kinematics import link_frames, quaternion_from_yaw, rotation_from_quaternion
-from snakesim_hal.model.scenario import HeadingGoal, RunConfig, WaypointGoal, start_of
+from snakesim_gnc.control.controller import Task
+from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion
+from snakesim_hal.model.scenario import HeadingGoal, WaypointGoal
 from snakesim_hal.wire.messages import Description, JointState, Pose
 
 
 class Progress:
     """The advance of one episode, as a run's summary counts it: towards the goal, or else along the first heading."""
 
-    def __init__(self, config: RunConfig, robot: Description) -> None:
+    def __init__(self, robot: Description, task: Task) -> None:
         self._lengths_m = [link.length_m for link in robot.links]
         self._axes = [joint.axis for joint in robot.joints]
         masses = np.array([link.mass_kg for link in robot.links])
         self._shares = masses / masses.sum()
-        start = start_of(config)
-        self._start = (*start.position_w, config.robot.module.radius_m), quaternion_from_yaw(start.yaw_rad)
-        self._goal = config.mission.goal
+        self._goal = task.goal
         self._points_m = self._goal.points_m if isinstance(self._goal, WaypointGoal) else []
         self._next = 0
         self._begun = False
-        self.pose = self._start  # position and quaternion of the tail end
+        self.pose = task.start_position_w, task.start_wxyz  # position and quaternion of the tail end
         self.along_m = 0.0  # towards the goal, since the start
         self.goal_m: float | None = None  # how far the goal is from the start; None: there is none
 
