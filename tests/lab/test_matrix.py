@@ -165,10 +165,11 @@ def samples(session: zenoh.Session, witness: zenoh.Session) -> Seen:
     subscribers = [witness.declare_subscriber(f"{OWN}/**", at_witness)]
     subscribers += [session.declare_subscriber(f"{OWN}/{place}", at_session) for place in PLACES]
     settle(session, witness)
+    wait = zenoh.CongestionControl.BLOCK  # by default Zenoh drops what finds its queue full for 0.1 ms
     for place in PLACES:
-        witness.put(f"{OWN}/{place}", TO_ALL)
-        session.put(f"{OWN}/{place}", "from the session")
-        session.delete(f"{OWN}/{place}")
+        witness.put(f"{OWN}/{place}", TO_ALL, congestion_control=wait)
+        session.put(f"{OWN}/{place}", "from the session", congestion_control=wait)
+        session.delete(f"{OWN}/{place}", congestion_control=wait)
     settle(session, witness)
     for subscriber in subscribers:
         subscriber.undeclare()
