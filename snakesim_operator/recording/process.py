@@ -18,6 +18,7 @@ import msgspec
 
 from snakesim_hal.arguments import add_network, add_parent, add_scenario
 from snakesim_hal.errors import ConfigError, SnakesimError
+from snakesim_hal.injection import HAL
 from snakesim_hal.network.process_entries import own_entry, show_process
 from snakesim_hal.network.run_key import is_proven, own_run_key
 from snakesim_hal.network.session import Arrival, Link, open_session
@@ -34,6 +35,7 @@ from snakesim_operator.recording.recording import Recording, Show
 from snakesim_operator.recording.tap import Tap
 
 TURN_S = 0.02
+REST_S, QUIET_TURNS = 2.0, 2  # at the end: for as long at most; nothing must have come in so many turns
 NICE = 10  # a robot's own processes come first
 MAX_HOSTS = 100  # files: one for each host that a robot had
 FULL = 4  # exit code: the disk took no more
@@ -94,22 +96,31 @@ class Recorder:
 
 
 def record(
-    link: Link, path: Path, goes_on: Callable[[], bool], show: Show | None = None, *, raw_only: bool = False
+    link: Link,
+    path: Path,
+    goes_on: Callable[[], bool],
+    show: Show | None = None,
+    *,
+    raw_only: bool = False,
+    after_host: bool = False,
 ) -> Recorder:
     """Record a robot for as long as `goes_on` says. Raises NotConnectedError, ConfigError for a file that exists.
 
-    raw_only: without topics for viewers, of which `show` would be told."""
+    raw_only: without topics for viewers, of which `show` would be told. after_host: then until its host has left."""
     try:
         recorder = Recorder(path, None if raw_only else link.namespace or "robot", show)
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}; choose another file") from error
     with open_session(link, connect_timeout_s=START_LIMIT_S) as session:
-        tap = Tap(session)
+        tap, hosts = Tap(session), set[str]()
+        session.on_alive(lambda key, there: (hosts.add if there else hosts.discard)(key), keys.alive(HAL))
         session.declare_alive(RECORDER)
         show_process(session, own_entry(RECORDER))
         while goes_on() and not recorder.recording.failure:
             _turn(tap, recorder)
             time.sleep(TURN_S)
+        if after_host:
+            _take_rest(tap, recorder, hosts)
         _turn(tap, recorder)
     for key, number in sorted(tap.dropped.items()):
         print_stderr(f"{number} messages on {key} were dropped: the disk was too slow")
@@ -119,13 +130,24 @@ def record(
     return recorder
 
 
-def _turn(tap: Tap, recorder: Recorder) -> None:
-    for arrival in tap.take():
+def _take_rest(tap: Tap, recorder: Recorder, hosts: set[str]) -> None:
+    """What a host that has ended sent before, and what this process, which goes last, has not read yet."""
+    give_up_s, quiet = time.monotonic() + REST_S, 0
+    while quiet < QUIET_TURNS and time.monotonic() < give_up_s:
+        quiet = 0 if _turn(tap, recorder) or hosts else quiet + 1
+        time.sleep(TURN_S)
+
+
+def _turn(tap: Tap, recorder: Recorder) -> int:
+    """Write what has arrived; returns how many messages."""
+    arrived = tap.take()
+    for arrival in arrived:
         recorder.take(arrival)
     clock = recorder.recording.time.clock
     if clock is not None and not tap.dropped:
         tap.lossless = clock.pace == "lockstep"
     recorder.recording.flush_when_due()
+    return len(arrived)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -143,7 +165,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))  # its threads, woken by each message, displace nobody
     try:
         file, raw_only = given.arguments.out / RECORDING, given.arguments.raw_only
-        recorder = record(given.link, file, lambda: not ended, raw_only=raw_only)
+        recorder = record(given.link, file, lambda: not ended, raw_only=raw_only, after_host=True)
     except SnakesimError as error:
         report_error(error, f"snakesim {RECORDER}")
         return 1

@@ -7,6 +7,7 @@ import resource
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -15,16 +16,20 @@ import pytest
 from mcap.reader import make_reader
 
 from snakesim_hal.errors import ConfigError
+from snakesim_hal.injection import HAL
 from snakesim_hal.network.local_network import LocalNetwork
-from snakesim_hal.network.session import Arrival
+from snakesim_hal.network.session import Arrival, Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode, encoding_of
 from snakesim_hal.wire.messages import Clock, Done, Intent
 from snakesim_operator.recording import tap as tap_module
+from snakesim_operator.recording.process import record
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.recording.recording import Recording
 from snakesim_operator.recording.recover import recover
 from snakesim_operator.recording.tap import Tap
+from tests.harness.endpoint import free_endpoint
+from tests.harness.wait import wait_until
 
 PERIOD_NS = 10_000_000
 
@@ -209,3 +214,23 @@ def test_a_copy_that_cannot_be_made_leaves_no_file_behind(tmp_path: Path) -> Non
     with pytest.raises(ConfigError):
         recover(tmp_path / "bad.mcap", tmp_path / "copy.mcap")
     assert not (tmp_path / "copy.mcap").exists()
+
+
+def test_a_recorder_that_is_told_to_end_waits_for_what_its_host_sends_before_it_leaves(tmp_path: Path) -> None:
+    endpoint, told = free_endpoint(), threading.Event()
+    link, path = Link(endpoint, "planar13"), tmp_path / "a.mcap"
+    recorder = threading.Thread(target=lambda: record(link, path, lambda: not told.is_set(), after_host=True))
+    with open_session(Link(endpoint, "planar13", listen=True)) as host:
+        host.declare_alive(HAL)
+        clocks = host.publisher(keys.CLOCK, Clock, lossless=True)
+        recorder.start()
+        wait_until(lambda: clocks.heard() and host.present(keys.alive("recorder")), "the recorder")
+        for tick in range(40):
+            host.send(keys.CLOCK, clock(tick).payload)
+            if tick == 20:
+                told.set()
+                time.sleep(0.2)  # many of its turns
+    recorder.join()
+    assert [one.payload for one in RecordingReader(path).messages([keys.CLOCK])] == [
+        clock(t).payload for t in range(40)
+    ]
