@@ -32,6 +32,7 @@ def add_commands(commands: Any) -> None:
         metavar="DIR",
         help="pair with the score card there",
     )
+    _add_set(tried)
     _add_shared(tried)
     tried.set_defaults(act=_evaluate)
 
@@ -46,14 +47,21 @@ def add_commands(commands: Any) -> None:
     swept.set_defaults(act=_sweep)
 
     searched = commands.add_parser("optimise", help="search settings for the best mean of a number of the summary")
-    searched.add_argument("scenario", help="name of a shipped scenario, or path of a scenario file")
+    searched.add_argument("scenario", help="name of a shipped scenario or path of its file; with --rows, of a suite")
+    searched.add_argument("--rows", metavar="1,2,...", help="on these rows of a suite, with what it draws")
     searched.add_argument("--vary", action="append", required=True, metavar="KEY=LOW:HIGH", help="may be repeated")
     searched.add_argument("--goal", required=True, metavar="NAME", help="such as path_distance_m or energy_j_per_m")
     searched.add_argument("--minimise", action="store_true", help="search the smallest instead of the largest")
     searched.add_argument(
         "--trials", type=number(1, 100_000), default=50, metavar="N", help="in the file at the end (50)"
     )
-    searched.add_argument("--seeds", type=number(1, 100_000), default=1, metavar="N", help="runs for each trial (1)")
+    searched.add_argument(
+        "--seeds",
+        type=number(1, 100_000),
+        default=1,
+        metavar="N",
+        help="runs for each trial, or fields for each row (1)",
+    )
     searched.add_argument(
         "--storage", type=Path, metavar="FILE", help="SQLite file; an old one goes on (default: a new one in runs/)"
     )
@@ -90,14 +98,17 @@ def _add_workers(parser: argparse.ArgumentParser) -> None:
 
 def _evaluate(arguments: argparse.Namespace) -> int:
     _check_extra()
+    from snakesim_hal.model.scenario import parse_set
     from snakesim_operator.evaluate.evaluation import Request, go
-    from snakesim_operator.evaluate.suite import read_suite
+    from snakesim_operator.evaluate.suite import also_set, read_suite
 
     suite, source = read_suite(arguments.suite)
+    suite = also_set(suite, {one.key: one.value for one in map(parse_set, arguments.set)})
     controllers = [name.strip() for name in (arguments.controllers or "").split(",") if name.strip()]
     again = ["evaluate", arguments.suite, *(["--controllers", ",".join(controllers)] if controllers else [])]
     if arguments.rows:
         again += ["--rows", arguments.rows]
+    again += [word for value in arguments.set for word in ("--set", value)]
     fields = arguments.fields or suite.fields
     chosen = controllers or suite.controllers
     rows = _numbers(arguments.rows or "", "--rows")
@@ -143,6 +154,7 @@ def _optimise(arguments: argparse.Namespace) -> int:
     from snakesim_operator.run.folder import named_after
 
     given = {one.name: getattr(arguments, one.name) for one in dataclasses.fields(Request)}
+    given["rows"] = _numbers(arguments.rows or "", "--rows")
     given["seed"] = 1 if arguments.seed is None else arguments.seed
     return optimise(Request(**{**given, "storage": arguments.storage or named_after("optimise").with_suffix(".db")}))
 

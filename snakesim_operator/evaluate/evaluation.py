@@ -19,7 +19,7 @@ from snakesim_operator.evaluate.case import Case
 from snakesim_operator.evaluate.cluster import size, solve, workers
 from snakesim_operator.evaluate.page import page
 from snakesim_operator.evaluate.progress import Progress
-from snakesim_operator.evaluate.suite import Suite, cases_of
+from snakesim_operator.evaluate.suite import Suite, cases_of, rows_of
 from snakesim_operator.evaluate.table import best_of, lines_of, table, worst
 from snakesim_operator.run.folder import named_after
 from snakesim_operator.run.in_process import run_in_process
@@ -58,9 +58,7 @@ def go(request: Request) -> int:
     others = [read_card(path) for path in request.against]
     seed = first_field(request)
     cases = cases_of(request.suite, request.source, request.controllers, request.fields, seed)
-    if wrong := next((row for row in request.rows if row not in {case.row for case in cases}), None):
-        raise ConfigError(f"--rows {wrong}: {request.source} has rows 1 to {cases[-1].row}")
-    cases = [case for case in cases if not request.rows or case.row in request.rows]
+    cases = rows_of(cases, request.rows, request.source)
     out = request.out or named_after(request.name)
     with store.opened(out, resume=request.resume) as kept:
         todo = list({case.id: case for case in cases if case.id not in kept.done}.values())

@@ -19,7 +19,7 @@ from snakesim_hal.model.scenario import compose, parse_set
 from snakesim_hal.terminal import say
 from snakesim_operator.evaluate.case import Case, Outcome
 from snakesim_operator.evaluate.cluster import size, solve, workers
-from snakesim_operator.evaluate.suite import Suite, cases_of, seeds_of
+from snakesim_operator.evaluate.suite import Suite, also_set, cases_of, read_suite, rows_of, seeds_of
 from snakesim_operator.results.summary import RunSummary
 from snakesim_operator.run.progress import in_minutes
 
@@ -28,7 +28,7 @@ from snakesim_operator.run.progress import in_minutes
 class Request:
     """What the command line asks for."""
 
-    scenario: str
+    scenario: str  # a suite's name, where rows are given
     vary: Sequence[str]  # key=low:high
     set: Sequence[str]  # key=value
     goal: str
@@ -39,6 +39,7 @@ class Request:
     storage: Path  # SQLite
     cluster: str | None = None
     workers: int | None = None
+    rows: Sequence[int] = ()  # of the suite
 
 
 def optimise(request: Request) -> int:
@@ -111,18 +112,28 @@ def _conclude(request: Request, study: Study) -> int:
         return 1
     best = study.best_trial
     say(f"best {request.goal}: {best.value:.4g}, trial {best.number}")
+    if request.rows:
+        chosen = [*request.set, *(f"{key}={value!r}" for key, value in best.params.items())]
+        rows = ",".join(map(str, request.rows))
+        say(f"  {_command(['snakesim', 'evaluate', request.scenario, '--rows', rows], chosen)}")
+        return 0
     seeds = seeds_of(compose(request.scenario, list(map(parse_set, request.set))))
     found = {**best.params, **dict.fromkeys(seeds, request.seed)}
     chosen = [*request.set, *(f"{key}={value!r}" for key, value in found.items())]
     words = ["snakesim", "run", request.scenario, "--pace", "lockstep", "--until-goal"]
-    say("  " + shlex.join([*words, *(word for one in chosen for word in ("--set", one))]))
+    say(f"  {_command(words, chosen)}")
     return 0
+
+
+def _command(words: Sequence[str], chosen: Sequence[str]) -> str:
+    return shlex.join([*words, *(word for one in chosen for word in ("--set", one))])
 
 
 def _cases(request: Request, params: dict[str, Any]) -> list[Case]:
     always = {one.key: one.value for one in map(parse_set, request.set)}
-    suite = Suite(scenario=request.scenario, set={**always, **params})
-    return cases_of(suite, "optimise", [], request.seeds, request.seed)
+    suite = read_suite(request.scenario)[0] if request.rows else Suite(scenario=request.scenario)
+    cases = cases_of(also_set(suite, {**always, **params}), "optimise", [], request.seeds, request.seed)
+    return rows_of(cases, request.rows, request.scenario)
 
 
 def _span(text: str) -> tuple[str, FloatDistribution | IntDistribution]:

@@ -103,6 +103,19 @@ def read_suite(name: str) -> tuple[Suite, str]:
     return decode(read_table(path), Suite), str(path)
 
 
+def also_set(suite: Suite, given: dict[str, Any]) -> Suite:
+    """The suite with these keys set in every row, over what suite and row say."""
+    rows = [msgspec.structs.replace(row, set={**row.set, **given}) for row in suite.row]
+    return msgspec.structs.replace(suite, set={**suite.set, **given}, row=rows)
+
+
+def rows_of(cases: Sequence[Case], rows: Sequence[int], source: str) -> list[Case]:
+    """Those of some rows, by number; none: of all. Raises ConfigError."""
+    if wrong := next((row for row in rows if row not in {case.row for case in cases}), None):
+        raise ConfigError(f"--rows {wrong}: {source} has rows 1 to {cases[-1].row}")
+    return [case for case in cases if not rows or case.row in rows]
+
+
 def settings_of(suite: Suite, source: str) -> list[Setting]:
     """The rows of the table in order. Raises ConfigError."""
     always = [*_overrides(suite.set, f"{source}: [set]"), *_left_out(suite.unset, f"{source}: `unset`")]

@@ -231,6 +231,22 @@ def test_a_search_goes_on_where_it_ended(home: Path) -> None:
     assert "holds 2 trials already" in more.out and "trial 3:" in more.out, more.out + more.err
 
 
+@pytest.mark.slow
+def test_a_search_on_a_row_of_a_suite_prints_an_evaluation(home: Path) -> None:
+    given = ["optimise", "./quick.toml", "--rows", "2", "--set", "controller=path_following", "--set", "duration_s=0.4"]
+    given += ["--vary", "control.look_ahead_m=0.02:0.1", "--goal", "advance_m", "--trials", "1", "--seeds", "2"]
+    found = snakesim(*given, "--storage", "row.db", cwd=home)
+    _, said = found.out.split("best advance_m: ")
+    command = shlex.split(said.splitlines()[1])
+    assert command.pop(0) == "snakesim" and command[:4] == ["evaluate", "./quick.toml", "--rows", "2"], found.out
+    ended = snakesim(*command, "--controllers", "path_following", "--out", "best", cwd=home)
+    assert ended.code == 0, ended.out + ended.err
+    lines = (home / "best" / "cases.jsonl").read_text().splitlines()
+    cases = [json.loads(line)["outcome"]["numbers"] for line in lines]
+    assert len(cases) == 2 and {case["ticks"] for case in cases} == {40}, "what is set is set in a row, too"
+    assert f"{sum(case['advance_m'] for case in cases) / 2:.4g}" == said.split(",")[0]
+
+
 def test_what_a_search_prints_can_be_run(home: Path) -> None:
     given = ["optimise", "clutter", "--set", "duration_s=0.5", "--set", "controller=path_following", "--seed", "2"]
     given += ["--vary", "controllers.path_following.look_ahead_m=0.02:0.1", "--goal", "advance_m", "--trials", "1"]
