@@ -36,8 +36,7 @@ setup: $(stamp) ## Make .venv from the hashed lock (PYTHON=python3.12 to choose)
 
 demo: $(stamp) ## Run the simulated snake through a triplet of obstacles, into runs/demo, with a page to watch it
 	$(bin)/snakesim run triplet --console --pace realtime --duration 8 --out runs/demo $(ARGS)
-	@printf '%s\n' 'That was one joint pushing between three pegs; behind the last there is nothing to push off. Next:' \
-	  '  $(bin)/snakesim console runs/demo                          see it again, with a time slider' \
+	@printf '%s\n' 'Next:' '  $(bin)/snakesim console runs/demo                          see it again, with a time slider' \
 	  '  $(bin)/snakesim run peg_row --console --pace realtime      more pegs: it keeps going' \
 	  '  docs/tutorial.md, 3: write a controller                    push it your way'
 

@@ -47,12 +47,13 @@ def conclude(config: RunConfig, files: RunFiles, ending: Ending, outcome: Outcom
     """
     host = outcome.host
     lacks: list[str] = []
+    seen = ""
     if host is not None:
         explain(ending, host, config, stay=stay)
-        lacks = _leave(files, ending, outcome, host)
+        lacks, seen = _leave(files, ending, outcome, host)
     lost = files.close()
     lacks += [lack for lack in (*outcome.lost, lost) if lack and lack not in lacks]
-    _print_end(files, ending, outcome, lacks)
+    _print_end(files, ending, outcome, lacks, seen)
     last_run.remember(str(files.folder or "no folder"), _ended(ending))
     if ending.interrupted:
         return INTERRUPTED
@@ -75,22 +76,22 @@ def _ended(ending: Ending) -> str:
     return "interrupted" if ending.interrupted else ending.reason or COMPLETE
 
 
-def _leave(files: RunFiles, ending: Ending, outcome: Outcome, host: HostRecord) -> list[str]:
-    """Summary and report, in the folder and on the terminal. Returns what the record lacks."""
+def _leave(files: RunFiles, ending: Ending, outcome: Outcome, host: HostRecord) -> tuple[list[str], str]:
+    """Summary and report, in the folder and on the terminal. Returns what the record lacks, and what was seen."""
     if files.folder is None:
         _print_host(host)
-        return ["nothing was recorded"]
+        return ["nothing was recorded"], ""
     try:
         record, summary = leave(files, files.folder, ending, outcome)
-        if extras.has("report"):
-            from snakesim_operator.results.report.verdict import verdict
-
-            say(verdict(record, summary).words)
         _print_summary(summary)
     except ConfigError as error:
         _print_host(host)
-        return [*unwritten(host), str(error)]
-    return unwritten(record.host)
+        return [*unwritten(host), str(error)], ""
+    if not extras.has("report"):
+        return unwritten(record.host), ""
+    from snakesim_operator.results.report.verdict import verdict
+
+    return unwritten(record.host), verdict(record, summary).words
 
 
 def leave(
@@ -108,13 +109,15 @@ def leave(
     return record, summary
 
 
-def _print_end(files: RunFiles, ending: Ending, outcome: Outcome, lacks: Sequence[str]) -> None:
+def _print_end(files: RunFiles, ending: Ending, outcome: Outcome, lacks: Sequence[str], seen: str) -> None:
     out, host, robot = files.folder, outcome.host, outcome.robot
     for what, name in (("summary", SUMMARY), ("report", REPORT)):
         if out is not None and (out / name).is_file():
             say(f"{what + ':':<9}{out / name}")
     if out is not None and (out / SUMMARY).is_file() and not extras.has("report"):
         say(f"report:  not written; {pip_install('report')}, then `snakesim report {out}`")
+    if seen:
+        say(seen)
     if host is None:
         said = f"; the logs of its processes are in {out}" if out is not None else ""
         say(f"the run left no record: {ending.reason or 'the host ended early'}{said}")

@@ -15,6 +15,7 @@ from snakesim_operator.results.report.instants import felt_along_n
 from snakesim_operator.results.report.playback import playback
 from snakesim_operator.results.report.polygon import force_polygon, pretty, units_per_n
 from snakesim_operator.results.report.pushing import pushing
+from snakesim_operator.results.report.reasons import why_at_limit, why_empty, why_late, why_refused
 from snakesim_operator.results.report.timeline import (
     distance,
     end_s,
@@ -58,6 +59,10 @@ def page(record: RunRecord, summary: RunSummary) -> str:
         pushing=pushing(record),
         moved=distance(record) if len(record.time_s) else None,
         moved_m=distance_m(summary),
+        why_empty=why_empty(record),
+        why_at_limit=why_at_limit(record),
+        why_late=why_late(summary),
+        why_refused=why_refused(summary),
         limit_nm=max(joint.torque_limit_nm for joint in record.description.joints),
         intervals=intervals,
         joints=[(joint, [one for one in every if one.joint == joint]) for joint in most_used_joints(intervals)],

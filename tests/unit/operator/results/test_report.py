@@ -1,5 +1,6 @@
 """The report: sections, figures and words, on the triplet run."""
 
+import dataclasses
 import hashlib
 import itertools
 import math
@@ -18,6 +19,7 @@ from snakesim_operator.results.report import page as report_page
 from snakesim_operator.results.report.events import drawn_instants, events
 from snakesim_operator.results.report.instants import balanced_instants
 from snakesim_operator.results.report.page import ELSEWHERE
+from snakesim_operator.results.report.reasons import why_empty
 from snakesim_operator.results.report.timeline import propulsion_intervals, reference_rad, state_bands
 from snakesim_operator.results.report.view import nodes_xy_w
 from snakesim_operator.results.summary import RunSummary, summarise
@@ -42,6 +44,24 @@ def test_the_verdict_tells_distance_and_hand_over(page: Reader) -> None:
     )
     assert said in page.text
     assert f"Locomotion ended at 6.1 s of 10.0 s: {LOST}; no three push-points on alternating sides." in page.text
+
+
+def test_what_is_red_says_why(record: RunRecord) -> None:
+    late = dataclasses.replace(record, host=msgspec.structs.replace(record.host, answered_ticks=100))
+    html = report_page(late, summarise(late, "complete"))
+    red = re.findall(r'class="tile alarming">.*?<span>(.*?)</span>(?:<span class="why">(.*?)</span>)?</div>', html)
+    why = {what.partition(";")[0]: reason for what, reason in red}
+    assert why.keys() >= {"of the push-points carried nothing", "commands refused", "ticks whose command came in time"}
+    assert all(why.values())
+    assert why["commands refused"] == "stale 2"
+    assert "a tick is 10.0 ms" in why["ticks whose command came in time"]
+    apart = re.fullmatch(
+        r"the body was off the obstacle in (\d+) % of them, by [\d.]+ mm \(median\); it touched in (\d+) % of them; "
+        r"most often peg_\d_\d, \d+ of \d+",
+        why["of the push-points carried nothing"],
+    )
+    assert apart is not None and sum(map(int, apart.groups())) == 100
+    assert "the record does not tell why" in why_empty(dataclasses.replace(late, position_w=late.position_w * np.nan))
 
 
 def test_playback_moves_the_snake_over_a_map(record: RunRecord, page: Reader) -> None:
