@@ -12,10 +12,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from snakesim.commanding import READ, Commanding
 from snakesim_gnc.control.controller import positions
 from snakesim_hal.backend import SetPoints
 from snakesim_hal.errors import ConfigError, NotConnectedError, RefusedError, StalledError, did_you_mean
+from snakesim_hal.network.commanding import READ, Commanding
 from snakesim_hal.network.endpoint import check_endpoint, check_namespace
 from snakesim_hal.network.robot_mismatch import mismatch
 from snakesim_hal.network.session import Link, Reader, Session, open_session

@@ -14,6 +14,8 @@ from zenoh import ext, handlers  # pyright: ignore[reportMissingModuleSource]
 
 from snakesim_hal.network.session import Link, open_zenoh
 
+WAITING = 10  # queries at one key, as rmw's profile of services has it
+
 
 @dataclass(frozen=True)
 class RawPublisher:
@@ -32,14 +34,50 @@ class RawPublisher:
 
 @dataclass(frozen=True)
 class RawReader:
-    """The newest payload of one key."""
+    """The newest payloads of one key."""
 
     _subscriber: Any
+
+    def drain(self) -> list[bytes]:
+        """What has arrived since the last call, as far as it is kept."""
+        found: list[bytes] = []
+        while (payload := self.newest()) is not None:
+            found.append(payload)
+        return found
 
     def newest(self) -> bytes | None:
         """What has arrived since the last call; None: nothing."""
         sample = self._subscriber.try_recv()
         return None if sample is None else sample.payload.to_bytes()
+
+
+@dataclass(frozen=True)
+class RawQuestion:
+    """A query that waits for one reply."""
+
+    _query: Any
+    payload: bytes
+    attachment: bytes
+
+    def reply(self, payload: bytes, attachment: bytes) -> None:
+        """Answer it at the key that was asked."""
+        with self._query as query:
+            query.reply(query.key_expr, payload, attachment=attachment)
+
+
+@dataclass(frozen=True)
+class RawQueryable:
+    """The queries at one key."""
+
+    _queryable: Any
+
+    def next(self) -> RawQuestion | None:
+        """The oldest one that waits; None: there is none."""
+        query = self._queryable.try_recv()
+        if query is None:
+            return None
+        payload, attachment = (b"" if part is None else part.to_bytes() for part in (query.payload, query.attachment))
+        return RawQuestion(query, payload, attachment)
 
 
 class ForeignNetwork:
@@ -63,9 +101,15 @@ class ForeignNetwork:
         self._declared.append(made)
         return RawPublisher(made)
 
-    def reader(self, key: str) -> RawReader:
-        """The newest payload of a key."""
-        subscriber = self._zenoh.declare_subscriber(key, handlers.RingChannel(1))
+    def queryable(self, key: str) -> RawQueryable:
+        """The queries at a key, of which the newest wait."""
+        queryable = self._zenoh.declare_queryable(key, handlers.RingChannel(WAITING), complete=True)
+        self._declared.append(queryable)
+        return RawQueryable(queryable)
+
+    def reader(self, key: str, depth: int = 1) -> RawReader:
+        """The newest payloads of a key."""
+        subscriber = self._zenoh.declare_subscriber(key, handlers.RingChannel(depth))
         self._declared.append(subscriber)
         return RawReader(subscriber)
 

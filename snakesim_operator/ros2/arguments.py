@@ -19,7 +19,8 @@ def add_commands(commands: Any) -> None:
     made: argparse.ArgumentParser = commands.add_parser(
         "ros2",
         help="be a ROS 2 node for a robot, through the router of rmw_zenoh; needs no ROS",
-        epilog="Publishes joint states, transforms, markers, images, scans, the robot's URDF, diagnostics and /clock.",
+        epilog="Publishes joint states, transforms, markers, images, IMUs, scans, the robot's URDF, diagnostics and "
+        "/clock. ROS may stop the robot, and nothing else without --cmd-vel, --joint-commands or --operate.",
     )
     made.add_argument("--domain", type=number(0, LAST_DOMAIN), default=0, metavar="N", help="ROS_DOMAIN_ID (0)")
     made.add_argument(
@@ -41,6 +42,12 @@ def add_commands(commands: Any) -> None:
         help="most images a second of a camera (5)",
     )
     made.add_argument("--cmd-vel", action="store_true", help="let ROS ask for speed and direction, on cmd_vel")
+    made.add_argument(
+        "--joint-commands",
+        action="store_true",
+        help="be the robot's controller: ROS commands joints, on joint_commands",
+    )
+    made.add_argument("--operate", action="store_true", help="let ROS arm, disarm, clear and set parameters")
     made.add_argument(
         "--stamps",
         choices=["robot", "wall"],

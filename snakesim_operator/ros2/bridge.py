@@ -54,7 +54,7 @@ class Bridge:
 
     def __init__(self, session: Session, node: Node, robot: m.Description, options: Options, say: Say = say) -> None:
         self._session, self._node, self._options, self._say = session, node, options, say
-        self._prefix = f"{options.namespace.strip('/')}/" if options.namespace else ""
+        self.prefix = f"{options.namespace.strip('/')}/" if options.namespace else ""
         self._ros_time = RosTime(wall_time=options.wall_time)
         self._clocks = session.reader(keys.CLOCK, m.Clock)
         self._descriptions = session.latched_reader(keys.DESCRIPTION, m.Description)
@@ -84,18 +84,18 @@ class Bridge:
             self._ros_clock = self._node.publisher(Topic("/clock", ros.CLOCK, depth=1, best_effort=True))
         if self._options.cmd_vel:
             self._steering = Steering()
-            self._cmd_vel = self._node.subscription(Topic(f"/{self._prefix}cmd_vel", ros.TWIST, depth=1))
+            self._cmd_vel = self._node.subscription(Topic(f"/{self.prefix}cmd_vel", ros.TWIST, depth=1))
             self._intents = self._session.publisher(keys.INTENT, m.Intent)
 
     def _publisher(self, name: str, kind: RosType, **more: Any) -> RosPublisher:
-        return self._node.publisher(Topic(f"/{self._prefix}{name}", kind, **more))
+        return self._node.publisher(Topic(f"/{self.prefix}{name}", kind, **more))
 
     def _meet(self, robot: m.Description) -> None:
         """Describe the robot to ROS."""
-        self._robot, self._frames = robot, Frames(robot, self._prefix)
+        self._robot, self._frames = robot, Frames(robot, self.prefix)
         self._names = [joint.name for joint in robot.joints]
         self._sensors.clear()
-        self._described.put(ros.string(urdf_of(robot, self._prefix)))
+        self._described.put(ros.string(urdf_of(robot, self.prefix)))
         self._put_static()
 
     def _put_static(self) -> None:

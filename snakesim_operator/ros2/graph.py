@@ -10,12 +10,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import count
 
-from snakesim_hal.network.foreign_network import ForeignNetwork, RawPublisher, RawReader
+from snakesim_hal.network.foreign_network import ForeignNetwork, RawPublisher, RawQueryable, RawReader
 
-NODE, PUBLISHER, SUBSCRIPTION = "NN", "MP", "MS"
+NODE, PUBLISHER, SUBSCRIPTION, SERVER = "NN", "MP", "MS", "SS"
 NODE_ID = 0
 BEST_EFFORT, TRANSIENT_LOCAL = 2, 1  # as rmw_qos_profile_t numbers them; the defaults are left out
 GID_BYTES = 16
+ATTACHED = struct.Struct("<qqB16s")  # sequence, wall clock of the sender, length of what follows, the sender
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ class RosType:
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic and its quality of service."""
+    """A topic, or a service, and its quality of service."""
 
     name: str  # with its namespace, such as /planar13/joint_states
     type: RosType
@@ -77,7 +78,15 @@ class NodeName:
 
 def attachment(sequence: int, stamp_ns: int, gid: bytes) -> bytes:
     """Of one sample. stamp_ns: wall clock of the sender; gid: of the publisher, GID_BYTES long."""
-    return struct.pack("<qqB", sequence, stamp_ns, GID_BYTES) + gid
+    return ATTACHED.pack(sequence, stamp_ns, GID_BYTES, gid)
+
+
+def answering(request: bytes) -> bytes | None:
+    """Attachment of the reply to a request with this one: the same sequence and sender; None: it has none to read."""
+    if len(request) != ATTACHED.size:
+        return None
+    sequence, _, length, gid = ATTACHED.unpack(request)
+    return None if length != GID_BYTES or sequence < 0 else attachment(sequence, time.time_ns(), gid)
 
 
 def gid_of(token: str) -> bytes:
@@ -118,10 +127,16 @@ class Node:
         return RosPublisher(publisher, token)
 
     def subscription(self, topic: Topic) -> RawReader:
-        """The newest message of a topic, in CDR."""
-        reader = self._network.reader(topic_key(self._domain, topic))
+        """The newest messages of a topic, in CDR, as many as its depth."""
+        reader = self._network.reader(topic_key(self._domain, topic), topic.depth)
         self._network.declare_token(self._token(SUBSCRIPTION, topic))
         return reader
+
+    def server(self, service: Topic) -> RawQueryable:
+        """A service that `ros2 service list` shows: its requests, in CDR."""
+        queryable = self._network.queryable(topic_key(self._domain, service))
+        self._network.declare_token(self._token(SERVER, service))
+        return queryable
 
     def _token(self, kind: str, topic: Topic | None = None) -> str:
         return token_key(self._domain, self._network.id, next(self._entities), kind, self._name, topic)

@@ -13,10 +13,15 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_hal.wire.messages import Description
 from snakesim_operator.ros2.bridge import Bridge, Options, is_consistent
-from snakesim_operator.ros2.graph import Node, NodeName
+from snakesim_operator.ros2.driving import Driving
+from snakesim_operator.ros2.graph import Node, NodeName, Topic
+from snakesim_operator.ros2.messages import JOINT_STATE
+from snakesim_operator.ros2.operating import operating_servers
+from snakesim_operator.ros2.parameters import parameter_servers
 from snakesim_operator.tools.targets import RobotSelection, only_robot
 
 MAX_IN_BYTES = 65536  # of a message from ROS; a Twist has 52
+KEPT_COMMANDS = 64  # messages that name a joint each, between two ticks
 STARTING_S = 60.0  # a robot may take so long to start
 
 
@@ -50,7 +55,18 @@ def join(arguments: argparse.Namespace, where: RobotSelection) -> int:
                     "`ros2 run rmw_zenoh_cpp rmw_zenohd`, or give --ros-router"
                 ) from None
             name = NodeName("snakesim", f"/{options.namespace}")
-            made = Bridge(session, Node(network, arguments.domain, name), robot, options)
+            node = Node(network, arguments.domain, name)
+            made = Bridge(session, node, robot, options)
+            operate: bool = arguments.operate
+            servers = [
+                *operating_servers(session, node, link, made.prefix, operate=operate),
+                *parameter_servers(session, node, f"/{made.prefix}{name.name}", operate=operate),
+            ]
+            for server in servers:
+                opened.callback(server.close)
+            if arguments.joint_commands:
+                commands = node.subscription(Topic(f"/{made.prefix}joint_commands", JOINT_STATE, depth=KEPT_COMMANDS))
+                opened.callback(Driving(session, commands, say).close)
             say(
                 f"{link.namespace} is in ROS domain {arguments.domain} through {arguments.ros_router}; stamps are "
                 f"{'wall-clock' if wall_time else 'robot'} time; Ctrl-C ends it"
@@ -58,6 +74,8 @@ def join(arguments: argparse.Namespace, where: RobotSelection) -> int:
             due_s = time.monotonic()
             while True:
                 made.turn()
+                for server in servers:
+                    server.turn(say)
                 due_s = max(due_s + 1.0 / arguments.hz, time.monotonic())
                 time.sleep(max(0.0, due_s - time.monotonic()))
 

@@ -73,32 +73,33 @@ class Marker:
 
 
 def _sent(kind: RosType, *fields: Any) -> bytes:
-    return bytes(STORE.serialize_cdr(_made(kind.name, *fields), kind.name))
+    return bytes(STORE.serialize_cdr(made(kind.name, *fields), kind.name))
 
 
-def _made(name: str, *fields: Any) -> Any:
+def made(name: str, *fields: Any) -> Any:
+    """A ROS message, by its fields in their order."""
     known: Any = STORE.types
     return known[name](*fields)
 
 
 def _time(stamp_ns: int) -> Any:
-    return _made("builtin_interfaces/msg/Time", min(stamp_ns // 10**9, LAST_SECOND), stamp_ns % 10**9)
+    return made("builtin_interfaces/msg/Time", min(stamp_ns // 10**9, LAST_SECOND), stamp_ns % 10**9)
 
 
 def _header(stamp_ns: int, frame: str) -> Any:
-    return _made("std_msgs/msg/Header", _time(stamp_ns), frame)
+    return made("std_msgs/msg/Header", _time(stamp_ns), frame)
 
 
 def _vector(xyz: Triple) -> Any:
-    return _made("geometry_msgs/msg/Vector3", *xyz)
+    return made("geometry_msgs/msg/Vector3", *xyz)
 
 
 def _point(xyz: Triple) -> Any:
-    return _made("geometry_msgs/msg/Point", *xyz)
+    return made("geometry_msgs/msg/Point", *xyz)
 
 
 def _quaternion(wxyz: Wxyz) -> Any:
-    return _made("geometry_msgs/msg/Quaternion", *wxyz[1:], wxyz[0])
+    return made("geometry_msgs/msg/Quaternion", *wxyz[1:], wxyz[0])
 
 
 def _doubles(values: Sequence[float]) -> np.ndarray:
@@ -121,8 +122,8 @@ def string(text: str) -> bytes:
 
 def numbers(label: str, values: Sequence[float]) -> bytes:
     """std_msgs/Float64MultiArray of one dimension."""
-    dimension = _made("std_msgs/msg/MultiArrayDimension", label, len(values), len(values))
-    return _sent(NUMBERS, _made("std_msgs/msg/MultiArrayLayout", [dimension], 0), _doubles(values))
+    dimension = made("std_msgs/msg/MultiArrayDimension", label, len(values), len(values))
+    return _sent(NUMBERS, made("std_msgs/msg/MultiArrayLayout", [dimension], 0), _doubles(values))
 
 
 def joint_state(
@@ -143,8 +144,8 @@ def transforms(stamp_ns: int, all_of_them: Sequence[Transform]) -> bytes:
 
 
 def _transform(stamp_ns: int, one: Transform) -> Any:
-    pose = _made("geometry_msgs/msg/Transform", _vector(one.position_m), _quaternion(one.orientation_wxyz))
-    return _made("geometry_msgs/msg/TransformStamped", _header(stamp_ns, one.parent), one.child, pose)
+    pose = made("geometry_msgs/msg/Transform", _vector(one.position_m), _quaternion(one.orientation_wxyz))
+    return made("geometry_msgs/msg/TransformStamped", _header(stamp_ns, one.parent), one.child, pose)
 
 
 def markers(stamp_ns: int, frame: str, shapes: Sequence[Marker]) -> bytes:
@@ -155,14 +156,14 @@ def markers(stamp_ns: int, frame: str, shapes: Sequence[Marker]) -> bytes:
 
 
 def _marker(header: Any, number: int, action: int, shape: Marker) -> Any:
-    pose = _made("geometry_msgs/msg/Pose", _point(shape.position_m), _quaternion(shape.orientation_wxyz))
-    colour = _made("std_msgs/msg/ColorRGBA", *shape.rgba)
-    until_replaced = _made("builtin_interfaces/msg/Duration", 0, 0)
+    pose = made("geometry_msgs/msg/Pose", _point(shape.position_m), _quaternion(shape.orientation_wxyz))
+    colour = made("std_msgs/msg/ColorRGBA", *shape.rgba)
+    until_replaced = made("builtin_interfaces/msg/Duration", 0, 0)
     drawn = (pose, _vector(shape.size_m), colour, until_replaced, False, [_point(xyz) for xyz in shape.points_m], [])
-    no_texture = ("", _made("sensor_msgs/msg/CompressedImage", _header(0, ""), "", _octets(b"")), [])
-    no_mesh = ("", _made("visualization_msgs/msg/MeshFile", "", _octets(b"")), False)
+    no_texture = ("", made("sensor_msgs/msg/CompressedImage", _header(0, ""), "", _octets(b"")), [])
+    no_mesh = ("", made("visualization_msgs/msg/MeshFile", "", _octets(b"")), False)
     what = (shape.group, number, shape.shape, action)
-    return _made("visualization_msgs/msg/Marker", header, *what, *drawn, *no_texture, "", *no_mesh)
+    return made("visualization_msgs/msg/Marker", header, *what, *drawn, *no_texture, "", *no_mesh)
 
 
 def image(stamp_ns: int, frame: str, width: int, height: int, encoding: str, pixels: bytes) -> bytes:
@@ -189,7 +190,7 @@ def camera_info(stamp_ns: int, frame: str, width: int, height: int, k: tuple[flo
     fx, fy, cx, cy = k
     matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     projection = np.hstack([matrix, np.zeros((3, 1))])
-    whole = _made("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
+    whole = made("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
     numbers = (np.zeros(5), matrix.ravel(), np.eye(3).ravel(), projection.ravel())
     return _sent(CAMERA_INFO, _header(stamp_ns, frame), height, width, PLUMB_BOB, *numbers, 0, 0, whole)
 
@@ -210,8 +211,8 @@ def laser_scan(
 
 def diagnostics(stamp_ns: int, level: int, name: str, message: str, values: Mapping[str, str]) -> bytes:
     """diagnostic_msgs/DiagnosticArray with one status."""
-    pairs = [_made("diagnostic_msgs/msg/KeyValue", key, value) for key, value in values.items()]
-    status = _made("diagnostic_msgs/msg/DiagnosticStatus", level, name, message, name, pairs)
+    pairs = [made("diagnostic_msgs/msg/KeyValue", key, value) for key, value in values.items()]
+    status = made("diagnostic_msgs/msg/DiagnosticStatus", level, name, message, name, pairs)
     return _sent(DIAGNOSTICS, _header(stamp_ns, ""), [status])
 
 

@@ -6,6 +6,7 @@ The ROS side is plain Zenoh with rmw_zenoh's keys, and rosbags for the messages;
 import json
 import os
 import signal
+import struct
 import subprocess
 import time
 from collections.abc import Callable, Iterator
@@ -13,9 +14,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import zenoh
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from zenoh import ext, handlers  # pyright: ignore[reportMissingModuleSource]
 
 from snakesim_hal.network.session import Link, Reader, open_session
@@ -28,6 +30,38 @@ from tests.harness.wait import wait_until
 pytestmark = pytest.mark.e2e
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
+SERVICES = {  # type hashes, as ROS has them
+    "std_srvs/srv/Trigger": "eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f",
+    "rcl_interfaces/srv/ListParameters": "3e6062bfbb27bfb8730d4cef2558221f51a11646d78e7bb30a1e83afac3aad9d",
+    "rcl_interfaces/srv/DescribeParameters": "845b484d71eb0673dae682f2e3ba3c4851a65a3dcfb97bddd82c5b57e91e4cff",
+    "rcl_interfaces/srv/GetParameters": "bf9803d5c74cf989a5de3e0c2e99444599a627c7ff75f97b8c05b01003675cbc",
+    "rcl_interfaces/srv/SetParameters": "56eed9a67e169f9cb6c1f987bc88f868c14a8fc9f743a263bc734c154015d7e0",
+    "rcl_interfaces/srv/SetParametersAtomically": "0e192ef259c07fc3c07a13191d27002222e65e00ccec653ca05e856f79285fcd",
+}
+DEFINED = {
+    "std_srvs/srv/Trigger": ("uint8 structure_needs_at_least_one_member", "bool success\nstring message"),
+    "rcl_interfaces/srv/ListParameters": (
+        "string[] prefixes\nuint64 depth",
+        "rcl_interfaces/msg/ListParametersResult result",
+    ),
+    "rcl_interfaces/srv/DescribeParameters": (
+        "string[] names",
+        "rcl_interfaces/msg/ParameterDescriptor[] descriptors",
+    ),
+    "rcl_interfaces/srv/GetParameters": ("string[] names", "rcl_interfaces/msg/ParameterValue[] values"),
+    "rcl_interfaces/srv/SetParameters": (
+        "rcl_interfaces/msg/Parameter[] parameters",
+        "rcl_interfaces/msg/SetParametersResult[] results",
+    ),
+    "rcl_interfaces/srv/SetParametersAtomically": (
+        "rcl_interfaces/msg/Parameter[] parameters",
+        "rcl_interfaces/msg/SetParametersResult result",
+    ),
+}
+for _name, _texts in DEFINED.items():
+    for _text, _part in zip(_texts, ("_Request", "_Response"), strict=True):
+        ((_, _fields),) = get_types_from_msg(_text, f"{_name}{_part}").items()
+        STORE.register({f"{_name}{_part}": _fields})
 ROUTER = '{mode: "router", listen: {endpoints: ["%s"]}, scouting: {multicast: {enabled: false}}}'
 RUN = ("clutter", "--pace", "lockstep", "--duration", "600", "--stay", "--set", "rate_hz=50")
 
@@ -86,6 +120,53 @@ class RosSide:
             declared.undeclare()
         raise AssertionError(f"nothing wanted on {topic} within 30 s")
 
+    def made(self, kind: str, *fields: Any) -> Any:
+        return STORE.types[kind](*fields)
+
+    def asked(self, name: str, kind: str, request: Any) -> Any:
+        """As a client of rmw_zenoh: target and attachment are its own; None: nobody answers."""
+        key = f"0/{name}/{kind.replace('/', '::').replace('::srv::', '::srv::dds_::')}_/RIHS01_{SERVICES[kind]}"
+        sent = struct.pack("<qqB16s", 7, time.time_ns(), 16, bytes(range(16)))
+        payload = bytes(STORE.serialize_cdr(request, f"{kind}_Request"))
+        complete = zenoh.QueryTarget.ALL_COMPLETE
+        (*_, reply) = [None, *self.session.get(key, payload=payload, attachment=sent, target=complete, timeout=20.0)]
+        if reply is None:
+            return None
+        assert reply.ok is not None and reply.ok.attachment is not None
+        sequence, _, length, gid = struct.unpack("<qqB16s", reply.ok.attachment.to_bytes())
+        assert (sequence, length, gid) == (7, 16, bytes(range(16)))
+        return STORE.deserialize_cdr(reply.ok.payload.to_bytes(), f"{kind}_Response")
+
+    def trigger(self, name: str) -> None:
+        answer = self.asked(name, "std_srvs/srv/Trigger", self.made("std_srvs/srv/Trigger_Request", 0))
+        assert answer is not None and answer.success, f"{name}: {answer}"
+
+    def parameters(self, name: str, kind: str, *fields: Any) -> Any:
+        kind = f"rcl_interfaces/srv/{kind}"
+        return self.asked(f"snakesim/{name}", kind, self.made(f"{kind}_Request", *fields))
+
+    def parameter(self, name: str, value: float) -> Any:
+        arrays = [np.array([], dtype=kind) for kind in (np.uint8, np.bool_, np.int64, np.float64)]
+        made = self.made("rcl_interfaces/msg/ParameterValue", 3, False, 0, value, "", *arrays, [])
+        return self.made("rcl_interfaces/msg/Parameter", name, made)
+
+    def command(self, names: list[str], **numbers: list[float]) -> None:
+        stamp = self.made("builtin_interfaces/msg/Time", 0, 0)
+        fields = [np.array(numbers.get(word, []), dtype=np.float64) for word in ("position", "velocity", "effort")]
+        sent = self.made("sensor_msgs/msg/JointState", self.made("std_msgs/msg/Header", stamp, ""), names, *fields)
+        kind = "sensor_msgs/msg/JointState"
+        self.session.put(self.key("joint_commands", kind), bytes(STORE.serialize_cdr(sent, kind)))
+
+    def moved(self, act: Callable[[], None], there: Callable[[dict[str, float]], bool]) -> dict[str, float]:
+        """Repeat it until the joints are there; their angles in rad."""
+
+        def wanted(state: Any) -> bool:
+            act()
+            return there(dict(zip(state.name, state.position, strict=True)))
+
+        state = self.first("joint_states", "sensor_msgs/msg/JointState", wanted)
+        return dict(zip(state.name, state.position, strict=True))
+
     def tokens(self) -> list[str]:
         replies = self.session.liveliness().get("@ros2_lv/0/**", timeout=2.0)
         return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
@@ -98,10 +179,13 @@ def test_a_robot_among_ros_nodes(tmp_path: Path) -> None:
         run.wait_for(" s  ")
         refused = snakesim("ros2", "--endpoint", run.endpoint, "--ros-router", run.endpoint, cwd=tmp_path)
         assert refused.code == 2 and "itself is on this endpoint" in refused.err
-        bridge = ("ros2", "--endpoint", run.endpoint, "--ros-router", at, "--cmd-vel")
+        refused = snakesim("ros2", "--endpoint", run.endpoint, "--ros-router", at, "--joint-commands", cwd=tmp_path)
+        assert refused.code != 0 and "has a controller already, which holds the lease" in refused.err
+        bridge = ("ros2", "--endpoint", run.endpoint, "--ros-router", at, "--cmd-vel", "--operate")
         with session_at(at) as session, command(tmp_path, *bridge):
             _sees(RosSide(session))
             _steers(RosSide(session), run.endpoint)
+            _tunes(RosSide(session))
             _outlasts_a_frozen_router(RosSide(session), router.pid, run.endpoint)
             with session_at(at) as anew:
                 RosSide(anew).first("joint_states", "sensor_msgs/msg/JointState")
@@ -117,7 +201,57 @@ def test_the_bridge_waits_for_a_robot_that_is_starting(tmp_path: Path) -> None:
     with command(tmp_path, "router", "ros.json5"), session_at(at) as session, command(tmp_path, *bridge) as waiting:
         assert waiting.stdout is not None and "Waiting for it up to 60 s" in waiting.stdout.readline()
         with command(tmp_path, *late):
-            RosSide(session).first("joint_states", "sensor_msgs/msg/JointState")
+            ros = RosSide(session)
+            ros.first("joint_states", "sensor_msgs/msg/JointState")
+            assert ros.asked("arm", "std_srvs/srv/Trigger", ros.made("std_srvs/srv/Trigger_Request", 0)) is None
+            assert ros.asked("stop", "std_srvs/srv/Trigger", ros.made("std_srvs/srv/Trigger_Request", 0)).success
+
+
+def test_ros_drives_joints_under_the_lease(tmp_path: Path) -> None:
+    """Arm, command single joints, fall silent, stop, clear, disarm: all of it as a node of rmw_zenoh would."""
+    at = free_endpoint()
+    (tmp_path / "ros.json5").write_text(ROUTER % at)
+    alone = ("triplet", "--pace", "lockstep", "--duration", "600", "--stay", "--set", "services.control.external=true")
+    with running(tmp_path / "run", *alone) as run, command(tmp_path, "router", "ros.json5"):
+        bridge = ("ros2", "--endpoint", run.endpoint, "--ros-router", at, "--joint-commands", "--operate")
+        with session_at(at) as session, command(tmp_path, *bridge):
+            ros = RosSide(session)
+            limp = ros.first("joint_states", "sensor_msgs/msg/JointState")
+            ros.trigger("arm")
+            ros.command(["joint_99"], position=[0.3])
+            ros.command(["joint_7", "joint_8"], position=[0.3])
+            there = ros.moved(lambda: ros.command(["joint_7"], position=[0.3]), lambda now: now["joint_7"] > 0.28)
+            others = [abs(there[name] - was) for name, was in zip(limp.name, limp.position, strict=True)]
+            assert sorted(others)[-2] < 0.05 and there["joint_7"] == pytest.approx(0.3, abs=0.03)
+            ros.moved(lambda: ros.command(["joint_3"], velocity=[-0.5]), lambda now: now["joint_3"] < -0.2)
+            ros.first("joint_states", "sensor_msgs/msg/JointState", lambda now: max(abs(now.velocity)) < 0.05)
+            stood = ros.first("joint_states", "sensor_msgs/msg/JointState")
+            later = stood.header.stamp.sec + 3
+            stands = ros.first("joint_states", "sensor_msgs/msg/JointState", lambda now: now.header.stamp.sec >= later)
+            assert max(abs(stands.position - stood.position)) < 0.02
+            ros.trigger("stop")
+            refused = ros.asked("arm", "std_srvs/srv/Trigger", ros.made("std_srvs/srv/Trigger_Request", 0))
+            assert not refused.success and "stop" in refused.message
+            ros.trigger("clear")
+            ros.trigger("arm")
+            ros.trigger("disarm")
+
+
+def _tunes(ros: RosSide) -> None:
+    """`ros2 param list`, `describe`, `set` and `get`."""
+    name = "control.lead_s"
+    listed = ros.parameters("list_parameters", "ListParameters", [], 0)
+    assert name in listed.result.names
+    (about,) = ros.parameters("describe_parameters", "DescribeParameters", [name]).descriptors
+    assert (about.name, about.type) == (name, 3) and "[s]" in about.description and about.floating_point_range
+    wanted = ros.parameter(name, 0.3)
+    (done,) = ros.parameters("set_parameters", "SetParameters", [wanted]).results
+    assert done.successful, done.reason
+    (now, nothing) = ros.parameters("get_parameters", "GetParameters", [name, "control.x"]).values
+    assert (now.type, now.double_value, nothing.type) == (3, 0.3, 0)
+    wanted = ros.parameter(name, -1.0)
+    refused = ros.parameters("set_parameters_atomically", "SetParametersAtomically", [wanted]).result
+    assert not refused.successful and "lead_s" in refused.reason
 
 
 def _sees(ros: RosSide) -> None:

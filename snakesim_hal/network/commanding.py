@@ -38,7 +38,7 @@ class Commanding:
         self._commander = Commander(self._client, robot)
         self._last: SetPoints | None = None
         self.clock: Clock | None = None
-        self._mine = False  # the lease, at this tick
+        self._mine = False
         tune_garbage_collector()  # looking through all objects of a notebook may take longer than a lease
         self._client.announce()
         self.turn_until(self._lent, LEASE_S, lambda: f"no right to command {robot.robot}: {self._commander.refusal}")
@@ -53,9 +53,18 @@ class Commanding:
         self.clock, self._mine = clock, self._commander.holds(clock)
         return clock
 
+    def host_changed(self) -> bool:
+        """Whether another host drives the robot now, as after a restart; the lease is to be taken anew then."""
+        return self._client.new_description() is not None
+
     def read(self, key: str) -> Message | None:
         """The sample that is valid at this tick; None when there is none."""
         return self._client.read(self._feeds[key])
+
+    @property
+    def mine(self) -> bool:
+        """Whether the lease is ours at this tick."""
+        return self._mine
 
     def send(self, points: SetPoints) -> None:
         """Command these in this tick. Raises RefusedError without the lease."""

@@ -1,0 +1,64 @@
+"""Arm, disarm, clear and stop as services of ROS: the same requests as those of `snakesim arm` and the others."""
+
+from collections.abc import Callable
+from typing import Any
+
+from snakesim_hal.errors import NotConnectedError, RefusedError
+from snakesim_hal.network.session import Link, Session
+from snakesim_hal.process import user_name
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import Description, LifecycleRequest
+from snakesim_operator.ros2.graph import Node
+from snakesim_operator.ros2.server import Server, told
+from snakesim_operator.ros2.service_types import TRIGGER
+from snakesim_operator.tools.command import ask_host
+from snakesim_operator.tools.robot_selection import RobotSelection
+from snakesim_operator.tools.stop import estop
+
+DESCRIBED_S = 3.0
+WHO = f"{user_name()[:40]}, ros2"
+
+
+def operating_servers(session: Session, node: Node, link: Link, prefix: str, *, operate: bool) -> list[Server]:
+    """The services. prefix: of their names; operate: whether ROS may do more than stop."""
+    acts: dict[str, Callable[[], str]] = {"stop": lambda: _stop(link)}
+    if operate:
+        acts |= {
+            "arm": lambda: _arm(session, link),
+            "disarm": lambda: _ask(session, link, LifecycleRequest(action="disarm", who=WHO), "disarmed"),
+            "clear": lambda: _ask(session, link, LifecycleRequest(action="clear", who=WHO), "cleared"),
+        }
+    return [Server(node, f"/{prefix}{name}", TRIGGER, _triggered(act)) for name, act in acts.items()]
+
+
+def _triggered(act: Callable[[], str]) -> Callable[[Any], bytes]:
+    return lambda _request: TRIGGER.response(*told(act))
+
+
+def _stop(link: Link) -> str:
+    said: list[str] = []
+    if estop(RobotSelection(link.endpoint, link.namespace, link.session), said.append):
+        raise RefusedError(*said)
+    return "; ".join(said)
+
+
+def _arm(session: Session, link: Link) -> str:
+    """The robot and the backend that it has now; its name is that of the bridge's own."""
+    robot = session.latest(keys.DESCRIPTION, Description, DESCRIBED_S)
+    if robot is None:
+        raise NotConnectedError(f"{link.namespace} publishes no description; is its HAL host running?")
+    request = LifecycleRequest(
+        action="arm",
+        who=WHO,
+        host=robot.host,
+        robot=robot.robot,
+        backend=robot.backend,
+        config_hash=robot.config_hash,
+    )
+    return _ask(session, link, request, "armed")
+
+
+def _ask(session: Session, link: Link, request: LifecycleRequest, done: str) -> str:
+    said: list[str] = []
+    ask_host(session, keys.LIFECYCLE, request, done, link, said.append)
+    return "; ".join(said)

@@ -1,0 +1,138 @@
+"""Types of services against hashes that ROS has printed, and joint commands against what no robot may be told."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_typestore
+
+from snakesim_hal.wire.messages import Clock, JointState, Mode
+from snakesim_operator.ros2 import graph
+from snakesim_operator.ros2 import service_types as types
+from snakesim_operator.ros2.graph import NodeName, Topic, token_key
+from snakesim_operator.ros2.joint_commands import VALID_NS, JointTargets
+from snakesim_operator.ros2.parameters import NOT_SET, _descriptor, _value
+from snakesim_operator.tools.parameters import Parameter
+from tests.unit.operator.ros2.rig import of_robot, resting
+
+JAZZY = get_typestore(Stores.ROS2_JAZZY)
+# From docs/design.md of ros2/rmw_zenoh.
+ADDER = (
+    "@ros2_lv/2/f9980ee0495eaafb3e38f0d19e2eae12/0/10/SS/%/%/add_two_ints_server/%add_two_ints/"
+    "example_interfaces::srv::dds_::AddTwoInts_/"
+    "RIHS01_e118de6bf5eeb66a2491b5bda11202e7b68f198d6f67922cf30364858239c81a/::,10:,:,:,,"
+)
+
+
+def test_a_service_of_the_design_document() -> None:
+    two_ints = types.service("example_interfaces/srv/AddTwoInts", "int64 a\nint64 b", "int64 sum")
+    topic = Topic("/add_two_ints", two_ints.type)
+    zenoh_id = ADDER.split("/")[2]
+    assert token_key(2, zenoh_id, 10, graph.SERVER, NodeName("add_two_ints_server"), topic) == ADDER
+
+
+def test_hashes_as_ros2_service_info_prints_them() -> None:
+    printed = {  # `ros2 service info -v` in Lyrical; of Trigger in Jazzy
+        types.TRIGGER: "eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f",
+        types.LIST_PARAMETERS: "3e6062bfbb27bfb8730d4cef2558221f51a11646d78e7bb30a1e83afac3aad9d",
+        types.GET_PARAMETERS: "bf9803d5c74cf989a5de3e0c2e99444599a627c7ff75f97b8c05b01003675cbc",
+        types.GET_PARAMETER_TYPES: "da199c878688b3e530bdfe3ca8f74cb9fa0c303101e980a9e8f260e25e1c80ca",
+        types.DESCRIBE_PARAMETERS: "845b484d71eb0673dae682f2e3ba3c4851a65a3dcfb97bddd82c5b57e91e4cff",
+        types.SET_PARAMETERS: "56eed9a67e169f9cb6c1f987bc88f868c14a8fc9f743a263bc734c154015d7e0",
+        types.SET_PARAMETERS_ATOMICALLY: "0e192ef259c07fc3c07a13191d27002222e65e00ccec653ca05e856f79285fcd",
+    }
+    for service, digits in printed.items():
+        assert service.type.type_hash == f"RIHS01_{digits}", service.type.name
+
+
+def test_an_answer_says_who_asked_what() -> None:
+    gid = bytes(range(16))
+    assert graph.answering(graph.attachment(9, 1, gid))[:8] == (9).to_bytes(8, "little")  # pyright: ignore[reportOptionalSubscript]
+    assert graph.answering(b"") is None and graph.answering(graph.attachment(-1, 1, gid)) is None
+
+
+@pytest.mark.parametrize("value", [True, 3, 0.5, "a", [1.0, 2.5], ["a", "b"], None])
+def test_values_of_parameters_keep_their_type(value: Any) -> None:
+    sent = _value(value)
+    kinds = {True: 1, 3: 2, 0.5: 3, "a": 4, None: 0}
+    assert sent.type == (kinds[value] if not isinstance(value, list) else 8 if value[0] == 1.0 else 9)
+    fields = ("bool_value", "integer_value", "double_value", "string_value", *[""] * 3, "double_array_value")
+    if sent.type not in (NOT_SET, 9):
+        assert np.array_equal(getattr(sent, fields[sent.type - 1]), value)
+
+
+def test_a_parameter_is_described_with_unit_and_range() -> None:
+    lead = Parameter("lead_s", 0.2, unit="s", about="how far ahead", least=0.0, most=1.0)
+    seen = _descriptor("control.lead_s", lead)
+    assert (seen.description, seen.additional_constraints) == ("how far ahead [s]", ">= 0, <= 1")
+    (span,) = seen.floating_point_range
+    assert (span.from_value, span.to_value) == (0.0, 1.0)
+
+
+class TestJointTargets:
+    """What JointState messages become."""
+
+    robot = of_robot("planar13")
+
+    def said(self, names: list[str], **numbers: list[float]) -> bytes:
+        kinds: Any = JAZZY.types
+        fields = [np.array(numbers.get(word, []), dtype=np.float64) for word in ("position", "velocity", "effort")]
+        header = kinds["std_msgs/msg/Header"](kinds["builtin_interfaces/msg/Time"](0, 0), "")
+        kind = "sensor_msgs/msg/JointState"
+        return bytes(JAZZY.serialize_cdr(kinds[kind](header, names, *fields), kind))
+
+    def clock(self, stamp_ns: int, lifecycle: Any = "armed") -> Clock:
+        more: dict[str, Any] = {
+            "tick": 1,
+            "pace": "realtime",
+            "period_ns": 10_000_000,
+            "lease_epoch": 1,
+            "arming": 1,
+            "newest": {},
+        }
+        return Clock(stamp_ns=stamp_ns, lifecycle=lifecycle, **more)
+
+    def joints(self, angle_rad: float) -> JointState:
+        return resting(self.robot, [angle_rad] * len(self.robot.joints))
+
+    def test_named_joints_follow_and_the_others_stay(self) -> None:
+        targets = JointTargets(self.robot)
+        targets.set_points(self.clock(0), self.joints(0.1))
+        assert targets.take(self.said(["joint_3"], position=[0.5]), 10) and targets.take(
+            self.said(["joint_4"], effort=[-1.0]), 10
+        )
+        points = targets.set_points(self.clock(20), self.joints(0.2))
+        assert (points.target[2], points.mode[3], points.target[3]) == (0.5, Mode.TORQUE, -1.0)
+        assert set(points.target[4:]) == {0.1} and set(points.mode[4:]) == {Mode.POSITION}  # where arming found them
+
+    def test_silence_stops_where_the_joint_is(self) -> None:
+        targets = JointTargets(self.robot)
+        targets.take(self.said(["joint_3"], velocity=[1.0]), 0)
+        targets.set_points(self.clock(VALID_NS), self.joints(0.3))
+        for angle_rad in (0.4, 0.45):
+            points = targets.set_points(self.clock(VALID_NS + 1), self.joints(angle_rad))
+        assert (points.mode[2], points.target[2]) == (Mode.POSITION, 0.4)
+
+    def test_what_was_said_before_arming_moves_nothing(self) -> None:
+        targets = JointTargets(self.robot)
+        targets.take(self.said(["joint_3"], position=[0.5]), 0)
+        targets.set_points(self.clock(1, "disarmed"), self.joints(0.1))
+        assert targets.set_points(self.clock(2), self.joints(0.1)).target[2] == 0.1
+
+    @pytest.mark.parametrize(
+        ("names", "numbers", "why"),
+        [
+            (["joint_99"], {"position": [0.1]}, "names 'joint_99'; planar13 has joint_1, joint_2"),
+            (["joint_1", "joint_2"], {"position": [0.1]}, "has 1 numbers in position for 2 names"),
+            (["joint_1", "joint_1"], {"effort": [0.1, 0.1]}, "must have one for each joint"),
+            (["joint_1"], {"velocity": [np.nan]}, "has velocity nan for joint_1, must be finite"),
+            (["joint_1"], {}, "has no position, velocity or effort"),
+        ],
+    )
+    def test_a_message_is_taken_whole_or_not_at_all(
+        self, names: list[str], numbers: dict[str, list[float]], why: str
+    ) -> None:
+        targets = JointTargets(self.robot)
+        assert not targets.take(self.said(names, **numbers), 0) and targets.rejected == 1
+        assert why in targets.why and not targets.take(b"\0\1\0\0\1", 0)
+        assert set(targets.set_points(self.clock(1), self.joints(0.1)).target) == {0.1}
