@@ -79,41 +79,10 @@ def test_everything_has_a_part_that_carries_it_out(text: str, part: str) -> None
     assert parse(text).part == part
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("mute", "KIND:TARGET@START"),
-        ("mute:joint_0@1", "knows no 'mute'"),
-        ("mote:joint_1@1", "a joint such as joint_1 knows no 'mote', only mute, freeze"),
-        ("mute:control@1", "mute is for joints"),
-        ("freeze:bus_1@1", "freeze is for processes and joints"),
-        ("mute:joint_1@2-2", "must be later than its start, 2 s"),
-        ("mute:joint_1@1.2.3", "are numbers"),
-        ("mute:joint_1@1=2", "mute takes no amount; leave out =2"),
-        ("drop:sensor/joints@1=1.5", r"share of the messages = 1.5 must be from 0 to 1"),
-        ("delay:sensor/joints@1=1e999", "must be from 0 to 10 s"),
-        ("drop:operator/intent@1", "no part of a run writes this key"),
-        ("drop:hal/lease@1", "no part of a run writes this key; those with a writer are sensor/joints"),
-    ],
-)
-def test_wrong_texts_are_told_what_is_allowed(text: str, words: str) -> None:
-    with pytest.raises(ConfigError, match=words):
-        parse(text)
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("mute:joint_14@1", "no joint_14; this run has joint_1 to joint_13"),
-        ("cut:bus_1@1", "no bus_1; this run has no bus"),
-        ("kill:contrl@1", "no process 'contrl'; this run has control, host"),
-        ("drop:guidance/world@1", "guidance writes guidance/world, and this run does not start it"),
-    ],
-)
-def test_what_is_not_there_cannot_go_wrong(text: str, words: str) -> None:
+def test_what_is_not_there_cannot_go_wrong() -> None:
     check_targets([parse("mute:joint_13@1"), parse("kill:host@1")], services=["control"], joints=13, buses=0)
-    with pytest.raises(ConfigError, match=words):
-        check_targets([parse(text)], services=["control"], joints=13, buses=0)
+    with pytest.raises(ConfigError, match="guidance writes guidance/world, and this run does not start it"):
+        check_targets([parse("drop:guidance/world@1")], services=["control"], joints=13, buses=0)
 
 
 def test_a_request_is_checked_like_a_text() -> None:

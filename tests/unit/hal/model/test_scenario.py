@@ -206,25 +206,6 @@ def test_the_control_alias_means_the_chosen_controller_whatever_the_order_of_fla
 
 # --- what is wrong: one error, in words ------------------------------------------------------------------------
 
-FLAGS = {
-    "unknown section": ("robt.limits.torque_nm=1", ["unknown field `robt`", "did you mean `robot`?"]),
-    "range": ("rate_hz=0.5", ["`rate_hz` = 0.5 Hz", ">= 20"]),
-    "index": ("scene.cylinder.2.radius_m=1", ["`scene.cylinder.2`", "entries 0 to 1"]),
-    "service": ("services.guidance.every_ticks=0", ["`services.guidance.every_ticks` = 0", ">= 1"]),
-    "new service": ("services.sonar.evry_ticks=1", ["unknown field `services.sonar.evry_ticks`", "`every_ticks`"]),
-}
-
-
-@pytest.mark.parametrize("wrong", FLAGS)
-def test_a_wrong_flag_is_named(wrong: str, tmp_path: Path) -> None:
-    flag, words = FLAGS[wrong]
-    with pytest.raises(ConfigError) as caught:
-        with_flags(write_files(tmp_path), flag)
-    said = str(caught.value)
-    assert said.startswith(f"--set {flag}: "), said
-    assert all(word in said for word in words), said
-
-
 FILES = {
     "scenario type": ("crawl.toml", "rate_hz = 100", 'rate_hz = "100"', ["`rate_hz` = '100'", "a number"]),
     "scenario missing": ("crawl.toml", 'controller = "hold"\n', "", ["`controller` is missing", "a text"]),

@@ -165,26 +165,6 @@ def test_the_same_seed_gives_the_same_pegs_and_another_seed_others() -> None:
     assert [p.obstacle.radius_m for p in two[len(first) :]] != [p.obstacle.radius_m for p in first]
 
 
-IMPOSSIBLE = {
-    "too dense": ({"density_per_m2": 60.0, "radius_m": [0.1, 0.1]}, ["pegs fit", "`density_per_m2` = 60.0", "only"]),
-    "empty area": ({"high_m": [0.0, 1.0]}, ["`high_m` = (0.0, 1.0) must exceed `low_m` = (0.0, -1.0)"]),
-    "sizes swapped": ({"box_size_m": [0.2, 0.1]}, ["`box_size_m` = (0.2, 0.1)", "smallest first"]),
-    "radii swapped": ({"radius_m": [0.05, 0.02]}, ["`radius_m` = (0.05, 0.02)", "smallest first"]),
-    "route that is not there": ({"route_clearance_m": 0.1}, ["`route_clearance_m` is set", "no route"]),
-}
-
-
-@pytest.mark.parametrize("wrong", IMPOSSIBLE)
-def test_impossible_fields_are_refused_in_words(wrong: str) -> None:
-    changes, words = IMPOSSIBLE[wrong]
-    field = {**FIELD, "high_m": [1.0, 0.0], **changes}
-    with pytest.raises(ConfigError) as caught:
-        place(scene(random_field=[field]))
-    said = str(caught.value)
-    assert said.startswith("scene 'plain': `random_field.0`: ")
-    assert all(word in said for word in words), said
-
-
 # --- what a scene must not be ----------------------------------------------------------------------------------
 
 
@@ -201,26 +181,6 @@ def test_a_wall_of_no_length_and_a_route_of_equal_points_are_refused() -> None:
         place(scene(wall=[{"from_m": [1, 1], "to_m": [1, 1]}]))
     with pytest.raises(ConfigError, match=r"`route\.points_m`: .*no two neighbours"):
         route_of(scene(route={"kind": "waypoints", "points_m": [[0, 0], [0, 0]]}))
-
-
-WRONG = {
-    "typo": ({"cylinder": [{"position_m": [0, 0], "radius": 1}]}, ["`cylinder.0.radius`", "did you mean `radius_m`"]),
-    "obstacle kind": ({"pyramid": []}, ["unknown field `pyramid`", "cylinder"]),
-    "far away": ({"box": [{"position_m": [1e9, 0], "size_m": [1, 1, 1]}]}, ["`box.0.position_m.0` = 1000000000.0 m"]),
-    "degrees": ({"box": [{"position_m": [1, 0], "size_m": [1, 1, 1], "yaw_rad": 90}]}, ["yaw_rad` = 90 rad", "6.3"]),
-    "route kind": ({"route": {"kind": "spiral"}}, ["`route.kind`", "'spiral'"]),
-    "name": ({"cylinder": [{"position_m": [0, 0], "radius_m": 1, "name": "x" * 65}]}, ["`cylinder.0.name`", "64"]),
-}
-
-
-@pytest.mark.parametrize("wrong", WRONG)
-def test_wrong_scenes_are_refused_in_words(wrong: str) -> None:
-    changes, words = WRONG[wrong]
-    with pytest.raises(ConfigError) as caught:
-        scene(**changes)
-    said = str(caught.value)
-    assert said.startswith("bend.toml: ")
-    assert all(word in said for word in words), said
 
 
 # --- clear of the start ----------------------------------------------------------------------------------------
