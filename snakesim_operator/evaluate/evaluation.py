@@ -62,6 +62,7 @@ def go(request: Request) -> int:
     out = request.out or named_after(request.name)
     with store.opened(out, resume=request.resume) as kept:
         todo = list({case.id: case for case in cases if case.id not in kept.done}.values())
+        todo.sort(key=lambda case: case.field)  # whenever it ends early, every row has as many fields
         if request.resume:
             say(f"{len(cases) - len(todo)} of {len(cases)} cases are done already")
         if todo:

@@ -131,6 +131,9 @@ def test_it_can_be_repeated(home: Path, undisturbed: tuple[Ended, Path]) -> None
     assert table_of(again) == table_of(undisturbed[0])
     for name in TABLES:
         assert (home / "again" / name).read_bytes() == (undisturbed[1] / name).read_bytes(), name
+    lines = (home / "again" / "cases.jsonl").read_text().splitlines()
+    fields = [json.loads(line)["outcome"]["numbers"]["seed"] for line in lines]
+    assert fields == [1] * 4 + [2] * 4, "cut short, it would have as many fields in each row"
 
 
 def test_killed_it_leaves_nobody_behind_and_goes_on(home: Path, undisturbed: tuple[Ended, Path]) -> None:
