@@ -5,17 +5,9 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta
 
 from snakesim_can_backend.protocol.definitions import LAST_NODE
+from snakesim_hal.drivers.mounted import Mounted
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.model.joints import Gear, Sign, Zero
 from snakesim_hal.wire.quantities import from_zero
-
-
-class Mounted(FileStruct, frozen=True, kw_only=True):
-    """How an emulated module is really mounted, where that is not what the robot file says."""
-
-    sign: Sign | None = None
-    zero_rad: Zero | None = None
-    gear: Gear | None = None
 
 
 class CanSettings(FileStruct, frozen=True, kw_only=True):

@@ -43,3 +43,13 @@ def bus_errors_of(identifier: int, data: bytes, channel: str) -> list[BusError]:
         kinds.extend(states)
     counters = f"transmit errors {data[6]}, receive errors {data[7]}"
     return [BusError(kind, channel, counters) for kind in kinds or NOTHING_KNOWN]
+
+
+BUS_FAULTS = {
+    "bus_off": "the controller has left the bus after too many errors: look for a short, a wrong bit rate, a missing "
+    "terminator; bring the interface down and up again, then clear and arm",
+    "error_passive": "more than 127 errors: the bus is about to fail; look at cables, terminators and bit rate",
+    "interface_down": "nothing is sent or received; bring it up again, then clear and arm",
+    "restarted": "the controller has restarted after bus-off; clear and arm when the bus is in order",
+    "receive_overflow": "states may be missing",
+}

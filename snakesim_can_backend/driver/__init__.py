@@ -3,6 +3,6 @@
 `backend`     CanBackend, tick by tick
 `bring_up`    finds and checks every module, enabling none; `parameters` checks their parameters
 `reports`     the modules' reports as arrays; `module_monitor` detects module and bus faults
-`sensors`     IMU, contacts, power; `mocap` and `mocap_times` for the base's pose
+`sensors`     IMU, contacts, power
 `own_twins`   module twins, if the scenario asks for them
 """

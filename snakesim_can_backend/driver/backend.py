@@ -19,8 +19,7 @@ from snakesim_can_backend.bus.bus_errors import BusError
 from snakesim_can_backend.bus.load import check_load, reports_of, shares, worst_bits
 from snakesim_can_backend.bus.log import LoggedWire, open_log
 from snakesim_can_backend.driver.bring_up import Bus, configure, discovery_errors, find
-from snakesim_can_backend.driver.mocap import MocapReceiver, check_pose, pose_address
-from snakesim_can_backend.driver.module_monitor import ARM_GRACE, Finding, Watch
+from snakesim_can_backend.driver.module_monitor import ARM_GRACE, Watch
 from snakesim_can_backend.driver.own_twins import TwinProcess, check_faults, check_twins, modules_know, twins_here
 from snakesim_can_backend.driver.parameters import check_drives, check_ratings, check_watchdog, parameters_of
 from snakesim_can_backend.driver.reports import Reading
@@ -29,6 +28,9 @@ from snakesim_can_backend.protocol import commands
 from snakesim_can_backend.protocol.definitions import Action, Frame, ModuleState
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.backend import Samples, SetPoints
+from snakesim_hal.drivers.findings import Finding
+from snakesim_hal.drivers.mocap import MocapReceiver, check_pose, receiver
+from snakesim_hal.drivers.mounted import check_mounted
 from snakesim_hal.drivers.mounting import Mounting
 from snakesim_hal.errors import BackendError, ConfigError
 from snakesim_hal.injection import Injection
@@ -69,9 +71,10 @@ class CanBackend:
         check_load(config, settings)
         check_gains(config.robot)
         check_drives(config.robot, settings)
+        check_mounted(config.robot, config.backend_section, settings.mounted, twins=settings.twins_run != "none")
         check_ratings(config.robot)
         check_watchdog(config, settings)
-        check_pose(config, settings)
+        check_pose(config, settings.pose_listen)
         check_twins(config, settings)
         check_faults(config, settings)
         for channel in settings.channels:
@@ -95,9 +98,8 @@ class CanBackend:
         )
         self._unconfigured = set(range(joints))  # joints whose parameters may differ from the robot file
         try:
-            camera = config.robot.sensors.pose
-            if camera is not None and (pose_listen := pose_address(settings)):
-                self._mocap = MocapReceiver(pose_listen, camera.delay_s, self._now_ns)
+            twins = settings.twins_run != "none"
+            self._mocap = receiver(config, settings.pose_listen, twins=twins, clock=self._now_ns)
             self._buses = self._open_buses(shares(config, settings))
             self._reading = Reading(joints)
             self._description = self._describe()
@@ -188,16 +190,8 @@ class CanBackend:
                 found.append(Finding("stop_not_sent", str(error)))
             self._lifecycle = "fault"
         self._unconfigured |= self._watch.take_changed()
-        return [
-            Fault(
-                tick=self._tick,
-                what=finding.what,
-                cause=finding.cause[:500],
-                joint=None if finding.joint is None else names[finding.joint].name,
-                reach="joint" if finding.alone else "robot",
-            )
-            for finding in found
-        ]
+        joints = [joint.name for joint in names]
+        return [finding.fault(self._tick, joints) for finding in found]
 
     def inject(self, injection: Injection, *, begins: bool) -> bool:
         """Injects faults of own twins and buses; False for other kinds. Raises ConfigError."""

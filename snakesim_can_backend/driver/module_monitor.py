@@ -5,11 +5,11 @@ cleared; a persistent one is then reported again.
 """
 
 from collections.abc import Iterable, Sequence, Set
-from dataclasses import dataclass
 
-from snakesim_can_backend.bus.bus_errors import BusError
+from snakesim_can_backend.bus.bus_errors import BUS_FAULTS, BusError
 from snakesim_can_backend.driver.reports import Module, Reading
 from snakesim_can_backend.protocol.definitions import ModuleState, Opcode
+from snakesim_hal.drivers.findings import Finding, Told
 from snakesim_hal.wire.messages import LifecycleState
 
 SILENT_AFTER = 3  # Syncs without an answer
@@ -26,30 +26,6 @@ CONCERNS_ALL = {
     "duplicate_node", "module_babbling", "module_leak", "module_voltage", "module_emergency", NEVER_ARMED
 }  # fmt: skip
 
-BUS_FAULTS = {
-    "bus_off": "the controller has left the bus after too many errors: look for a short, a wrong bit rate, a missing "
-    "terminator; bring the interface down and up again, then clear and arm",
-    "error_passive": "more than 127 errors: the bus is about to fail; look at cables, terminators and bit rate",
-    "interface_down": "nothing is sent or received; bring it up again, then clear and arm",
-    "restarted": "the controller has restarted after bus-off; clear and arm when the bus is in order",
-    "receive_overflow": "states may be missing",
-}
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One detected fault."""
-
-    what: str
-    cause: str
-    joint: int | None = None  # index, tail to head
-    alone: bool = False  # whether the other joints are not affected
-
-    @property
-    def subject(self) -> tuple[str, int | str, bool]:
-        """Findings with the same subject are reported once."""
-        return self.what, self.cause if self.joint is None else self.joint, self.alone
-
 
 class Watch:
     """Remembers which findings have been reported."""
@@ -58,7 +34,7 @@ class Watch:
         """joints, channel_of: name and bus of every joint, tail to head."""
         self._names, self._channels = joints, channel_of
         self._period_s = period_s
-        self._told: set[tuple[str, int | str, bool]] = set()
+        self._told = Told()
         self._restarts = [0] * len(joints)
         self._unarmed = [0] * len(joints)  # Syncs in a row in which a module was not armed although the robot was
         self._restart_at: dict[int, int] = {}  # joint -> Sync at which its uptime decreased
@@ -75,7 +51,7 @@ class Watch:
 
     def forget(self, sync: int) -> None:
         """The fault was cleared: report persistent findings again once the modules have followed."""
-        self._told.clear()
+        self._told.forget()
         self._restarted.clear()
         self._quiet_until = sync + CLEAR_GRACE
 
@@ -106,9 +82,7 @@ class Watch:
         if lifecycle == "armed":
             found += [self._bare(i) for i in unconfigured if i not in isolated]
         found = [finding for finding in found if not (finding.alone and finding.joint in isolated)]
-        fresh = [finding for finding in found if finding.subject not in self._told]
-        self._told.update(finding.subject for finding in fresh)
-        return fresh
+        return self._told.fresh(found)
 
     def take_changed(self) -> set[int]:
         """Joints whose parameters may have changed since the last call."""

@@ -60,13 +60,6 @@ def check_drives(robot: RobotFile, settings: CanSettings) -> None:
                 f"robot {robot.name!r}, {joint.name}: `port` = {joint.drive.port!r} is not among "
                 f"`backends.can.channels` = {settings.channels}"
             )
-    for name in settings.mounted:
-        if name not in (joint.name for joint in robot.joint_table):
-            raise ConfigError(
-                f"`backends.can.mounted.{name}`: robot {robot.name!r} has joint_1 to joint_{robot.chain.modules}"
-            )
-    if settings.mounted and settings.twins_run == "none":
-        raise ConfigError("`backends.can.mounted` is for twins; the modules on this bus are mounted as they are")
 
 
 def check_ratings(robot: RobotFile, in_force: Mapping[int, Mapping[Parameter, float]] | None = None) -> None:

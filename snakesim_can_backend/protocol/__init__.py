@@ -2,5 +2,4 @@
 
 `definitions`  ids, opcodes, states, parameters     `codec`     frames to values and back, by the DBC file
 `commands`     Commands and their answers           `expanded`  the DBC with a message for every module
-`mocap_sample` the datagram of a motion-capture system
 """

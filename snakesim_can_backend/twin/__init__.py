@@ -4,12 +4,10 @@
 `server`      serves one or more buses: handles received frames, sends due ones; also inside another process
 `chain`       all modules of a robot, their motors, and the plant that they move; wall-clock or stepped time
 `firmware`    one module: states, watchdog, set-points, reports; `parameters` is its flash
-`motors`      all motors as vectors; their heat is `snakesim_hal.physics.thermal`
 `module_sensors`  sensor readings, with their noise; `reports` rounds them as the bus does; `frames` are the layouts
 `module_slot` a module's place on a bus, and its injected faults
 `bus_time`    timing of a bus: arbitration, and load
 `faults`      injected faults
-`inertia`     a plant without physics: every joint an inertia of its own
 
 Cores are pure: time is passed in, as microseconds since the twins were started. Imports no MuJoCo: plants are found by
 name, among the entry points of `snakesim.plants`.

@@ -20,14 +20,15 @@ from snakesim_can_backend.twin.bus_time import BusTime, Traffic
 from snakesim_can_backend.twin.faults import parse
 from snakesim_can_backend.twin.firmware import BOOT_US, Module
 from snakesim_can_backend.twin.frames import LENGTHS, read_sync
-from snakesim_can_backend.twin.module_sensors import ModuleSensors, PoseCamera
+from snakesim_can_backend.twin.module_sensors import ModuleSensors
 from snakesim_can_backend.twin.module_slot import ModuleSlot
-from snakesim_can_backend.twin.motors import Motors
-from snakesim_can_backend.twin.mounted import built, joint_target
 from snakesim_can_backend.twin.parameters import Parameters, from_factory
-from snakesim_hal.drivers.mounting import Mounting
+from snakesim_hal.drivers.mocap_twin import PoseCamera
+from snakesim_hal.drivers.mounted import built
+from snakesim_hal.drivers.mounting import Mounting, joint_target
 from snakesim_hal.injection import Change, Injection, Plan
 from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.physics.motors import Motors
 from snakesim_hal.physics.plant import Plant
 from snakesim_hal.physics.thermal import Thermal
 from snakesim_hal.wire.messages import Mode
@@ -59,7 +60,7 @@ class ModuleChain:
         self.count = robot.chain.modules
         self.counts = shares(config, settings)  # modules on each bus
         self.motors = Motors(robot, plant.step_s)
-        self._joints = built(robot, settings)
+        self._joints = built(robot, settings.mounted)
         self.thermal = Thermal(self._joints)
         self.buses = [BusTime(settings.bit_rate) for _ in self.counts]
         self.now_us = 0.0  # module time: since the twins were started

@@ -17,7 +17,9 @@ from snakesim_can_backend.settings import CanSettings
 from snakesim_can_backend.twin.bus_time import Traffic, by_opcode
 from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_can_backend.twin.faults import explain, parse, parse_typed
-from snakesim_can_backend.twin.server import PoseSender, TwinServer, make_plant
+from snakesim_can_backend.twin.server import TwinServer
+from snakesim_hal.drivers.mocap_twin import PoseSender
+from snakesim_hal.drivers.twin_body import make_plant
 from snakesim_hal.errors import ConfigError, SnakesimError
 from snakesim_hal.model.files import Table, decode
 from snakesim_hal.model.scenario import Loaded, Override, load, parse_set
@@ -97,7 +99,7 @@ def _serve(arguments: argparse.Namespace, open_things: ExitStack) -> int:
     for channel in settings.channels:
         wires.append(open_wire(channel, FROM_HOST, settings.bit_rate))
         open_things.callback(wires[-1].close)
-    plant = make_plant(loaded.config, settings)
+    plant = make_plant(loaded.config, "can", settings.plant, settings.plant_settings)
     chain = ModuleChain(loaded.config, settings, plant, stepped=arguments.stepped, send_pose=send_pose)
     loop = Loop(TwinServer(wires, chain), arguments, settings.bit_rate)
     on_stop_signal(loop.stop)

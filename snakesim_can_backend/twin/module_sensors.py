@@ -1,17 +1,14 @@
 """Sensor readings of modules at a Sync: the plant's state, with the noise and threshold of the robot file.
 
-The host sets the rates of the modules, and the bus is the delay: rates and delays of the robot file are not used here,
-except for the delay of motion capture.
+The host sets the rates of the modules, and the bus is the delay: rates and delays of the robot file are not used here.
 """
 
 import math
-from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_can_backend.protocol.mocap_sample import MocapSample
 from snakesim_can_backend.twin.reports import (
     ACCELERATION,
     ANGLE,
@@ -26,7 +23,6 @@ from snakesim_can_backend.twin.reports import (
 from snakesim_hal.arrays import Floats
 from snakesim_hal.drivers.mounting import Mounting
 from snakesim_hal.model.robot import RobotFile
-from snakesim_hal.model.sensors import PoseSensor
 from snakesim_hal.physics.plant import LinkLoad, Plant
 
 
@@ -101,43 +97,3 @@ class ModuleSensors:
                 force = np.array(imu.acceleration_m_s2[at])
                 reading.gyro = RATE.many(rate + self._imu.angular_velocity_noise_rad_s * self._noise(3))
                 reading.acceleration = ACCELERATION.many(force + self._imu.acceleration_noise_m_s2 * self._noise(3))
-
-
-class PoseCamera:
-    """Motion capture of the base, at every Sync, with the delay of the robot file."""
-
-    def __init__(self, sensor: PoseSensor, plant: Plant, seed: Sequence[int], period_ns: int) -> None:
-        self._plant = plant
-        self._under_way: deque[MocapSample] = deque(maxlen=1 + round(sensor.delay_s * 1e9 / period_ns))
-        self._noise = np.random.default_rng(seed).standard_normal
-        self._sigma = np.repeat([sensor.position_noise_m, 0.5 * sensor.angle_noise_rad], 3)  # quaternions halve angles
-
-    def look(self, stamp_ns: int) -> MocapSample | None:
-        """The sample that arrives at this Sync: the base's pose before the delay; None at first, or without a world.
-
-        Velocities carry no noise of their own.
-        """
-        pose = self._plant.pose()
-        if pose is None:
-            return None
-        ex, ey, ez, a, b, c = (self._sigma * self._noise(6)).tolist()
-        px, py, pz = pose.position_w
-        w, x, y, z = pose.orientation_wxyz
-        turned = np.array(
-            (
-                w - a * x - b * y - c * z,
-                x + a * w + b * z - c * y,
-                y + b * w + c * x - a * z,
-                z + c * w + a * y - b * x,
-            )
-        )
-        w, x, y, z = (turned / np.linalg.norm(turned)).tolist()
-        sample = MocapSample(
-            stamp_ns=stamp_ns,
-            position_w=(px + ex, py + ey, pz + ez),
-            orientation_wxyz=(w, x, y, z),
-            velocity_w=pose.velocity_w,
-            angular_velocity_w=pose.angular_velocity_w,
-        )
-        self._under_way.append(sample)
-        return self._under_way[0] if len(self._under_way) == self._under_way.maxlen else None

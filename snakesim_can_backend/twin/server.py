@@ -6,21 +6,18 @@ while ...:
     wait(wires, pause_s)
 """
 
-import contextlib
-import socket
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
 
 from snakesim_can_backend.bus.bus import VirtualWire, Wire
 from snakesim_can_backend.protocol.definitions import NODE_BITS, Frame, Opcode
 from snakesim_can_backend.settings import CanSettings
 from snakesim_can_backend.twin.chain import ModuleChain
+from snakesim_hal.drivers.mocap_twin import PoseSender
+from snakesim_hal.drivers.twin_body import make_plant
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.injection import Injection
-from snakesim_hal.model.plugins import PLANTS, find_plugin, plugin_settings
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.physics.plant import Plant
 
 IN_STEP_US = 2000.0  # the plant lags now by at most this, so that a Sync needs little computing
 FINEST_US = 200.0  # frames are released in groups of this length, for fewer wake-ups
@@ -84,35 +81,6 @@ class TwinServer:
                 self.unsent += not wire.send(frame)
 
 
-class PoseSender:
-    """Sends datagrams and ignores errors: motion capture does not know whether it has receivers."""
-
-    def __init__(self, address: str) -> None:
-        """address: HOST:PORT. Raises ConfigError."""
-        host, _, port = address.rpartition(":")
-        if not host or not port.isdigit() or not 0 < int(port) < 65536:
-            raise ConfigError(f"pose address {address!r}: give HOST:PORT, such as 127.0.0.1:7450")
-        self._address = (host, int(port))
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.setblocking(False)
-
-    def __call__(self, datagram: bytes) -> None:
-        """Send one."""
-        with contextlib.suppress(OSError):
-            self._socket.sendto(datagram, self._address)
-
-    def close(self) -> None:
-        """Close the socket."""
-        self._socket.close()
-
-
-def make_plant(config: RunConfig, settings: CanSettings) -> Plant:
-    """The plant that the settings name. Raises ConfigError."""
-    factory: Any = find_plugin(PLANTS, settings.plant)
-    where = "backends.can.plant_settings"
-    return factory(config, plugin_settings(factory, settings.plant_settings, f"plant {settings.plant!r}", where))
-
-
 class InProcessTwins:
     """Twins in this process, at the other end of a virtual bus: calling it runs them."""
 
@@ -147,5 +115,11 @@ def here(
 ) -> InProcessTwins:
     """All twins of a run on one virtual bus; pose: address for poses, HOST:PORT. Raises ConfigError."""
     send_pose = None if pose is None else PoseSender(pose)
-    chain = ModuleChain(config, settings, make_plant(config, settings), stepped=stepped, send_pose=send_pose)
+    chain = ModuleChain(
+        config,
+        settings,
+        make_plant(config, "can", settings.plant, settings.plant_settings),
+        stepped=stepped,
+        send_pose=send_pose,
+    )
     return InProcessTwins(TwinServer([VirtualWire(channel)], chain), send_pose, clock_ns)

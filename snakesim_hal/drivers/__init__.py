@@ -1,4 +1,10 @@
 """What every driver of real joints needs besides its protocol.
 
-Start at `mounting.py`, which converts between a joint and the shaft of its drive. Pure: no bus, no clock.
+`drive_backend`  a whole backend over a family of `Drives`: lifecycle, isolation, faults, ages, sensors
+`mounting`       between a joint and the shaft of its drive: sign, zero, gear
+`readings`       what the drives said, and how old it is         `findings`   faults, each reported once
+`mocap`          the base's pose from motion capture; `mocap_times` relates its clock, `mocap_sample` is its datagram
+`twin_body`      what emulated drives move: plant, motors, heat  `mocap_twin` an emulated motion-capture system
+
+Imports no bus, host or network.
 """

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from snakesim_hal.arrays import Floats
-from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.joints import Drive, Joint
 from snakesim_hal.wire.messages import Mode
 
 
@@ -80,3 +80,17 @@ class Mounting:
     def joint_torque_nm(self, drive_torque_nm: Floats) -> Floats:
         """Torques at the joints."""
         return drive_torque_nm * self._turns
+
+
+def joint_target(drive: Drive, mode: Mode, target: float) -> float:
+    """What a target of a module's shaft is at the joint, in the mode's unit."""
+    turns = drive.sign * drive.gear
+    match mode:
+        case Mode.POSITION:
+            return (target - drive.zero_rad) / turns
+        case Mode.VELOCITY:
+            return target / turns
+        case Mode.TORQUE:
+            return target * turns
+        case Mode.PASSIVE:
+            return 0.0

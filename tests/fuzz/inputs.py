@@ -17,9 +17,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from snakesim_can_backend.driver.mocap import MAX_BYTES, MocapReceiver
 from snakesim_can_backend.twin import faults as twin_faults
 from snakesim_hal import injection
+from snakesim_hal.drivers.mocap import MAX_BYTES, MocapReceiver
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.host.latch import ESTOP, EstopLatch
 from snakesim_hal.model import files, scenario

@@ -17,8 +17,9 @@ from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.protocol.definitions import FROM_HOST, Frame, ModuleState
 from snakesim_can_backend.settings import CanSettings
 from snakesim_can_backend.twin.chain import ModuleChain
-from snakesim_can_backend.twin.server import TwinServer, make_plant
+from snakesim_can_backend.twin.server import TwinServer
 from snakesim_hal.backend import SetPoints
+from snakesim_hal.drivers.twin_body import make_plant
 from snakesim_hal.physics.plant import Plant
 from tests.unit.can_backend.loop import Loop, config
 
@@ -92,7 +93,10 @@ def shared_bus(channel: str, **dotted: object) -> Iterator[SharedBus]:
     run = config(pace="realtime", **dotted)
     settings = CanSettings(channels=[channel], plant="inertia")
     modules_end = SocketCanWire(channel, FROM_HOST)
-    server = TwinServer([modules_end], ModuleChain(run, settings, make_plant(run, settings), stepped=False))
+    server = TwinServer(
+        [modules_end],
+        ModuleChain(run, settings, make_plant(run, "can", settings.plant, settings.plant_settings), stepped=False),
+    )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(driver, "open_wire", lambda name, bit_rate: SharedWire(name, server))
         patch.setattr(driver, "answer_limit_s", lambda *_: ANSWER_LIMIT_S)

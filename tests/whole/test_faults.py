@@ -26,19 +26,23 @@ def host_record(out: Path) -> HostRecord:
         ("can", "mute:joint_3@1", "module_silent"),
         ("can", "leak:joint_3@1", "module_leak"),
         ("can", "cut:bus_1@1-1.3", "interface_down"),
+        ("odrive", "mute:joint_3@1", "drive_silent"),
+        ("odrive", "reboot:joint_3@1", "drive_silent"),
+        ("odrive", "overheat:joint_3@1", "drive_fault"),
+        ("odrive", "cut:bus_1@1-1.3", "interface_down"),
     ],
 )
 def test_a_planned_fault_happens_at_its_tick_and_ends_the_run_as_it_should(
     tmp_path: Path, backend: str, fault: str, what: str
 ) -> None:
     ended, summary = run_to_summary(tmp_path / "run", "triplet", "--backend", backend, "--fault", fault)
-    record = host_record(tmp_path / "run")
+    record, by = host_record(tmp_path / "run"), 112 if what == "drive_fault" else 104  # a heartbeat of 10 Hz later
     assert ended.code == 1 and summary.faults[0].what == what
-    assert record.injected[0].startswith(f"tick 100: {fault} ") and 100 <= record.faults[0].tick <= 104
+    assert record.injected[0].startswith(f"tick 100: {fault} ") and 100 <= record.faults[0].tick <= by
     assert record.lifecycle == "fault"
 
 
-@pytest.mark.parametrize("backend", ["sim", "can"])
+@pytest.mark.parametrize("backend", ["sim", "can", "odrive"])
 def test_a_joint_that_may_be_lost_is_passive_and_the_run_goes_on(tmp_path: Path, backend: str) -> None:
     flags = ["--backend", backend, "--fault", "mute:joint_5@1", "--duration", "3", "--set", MAY_LOSE_ONE]
     ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)

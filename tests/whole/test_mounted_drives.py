@@ -10,14 +10,25 @@ EVERY_SECOND = [f"joint_{i}" for i in range(2, 14, 2)]
 MIXED = ["joint_3.zero_rad=0.5", "joint_4.sign=-1", "joint_5.gear=1.5", "joint_5.zero_rad=-0.2"]
 
 
-def ran(*sets: str) -> RunSummary:
-    fixed = ("backend=can", "duration_s=2")
+def ran(*sets: str, backend: str = "can") -> RunSummary:
+    fixed = (f"backend={backend}", "duration_s=2")
     return simulate(load("peg_row", [parse_set(text) for text in (*fixed, *sets)]).config).summary
 
 
 @pytest.fixture(scope="module")
 def plain() -> RunSummary:
     return ran()
+
+
+def test_drives_of_another_family_reversed_and_off_zero_move_as_others_where_the_file_says_so_and_only_there() -> None:
+    nominal = ran(backend="odrive")
+    built = (*(f"{joint}.sign=-1" for joint in EVERY_SECOND), "joint_5.zero_rad=0.4", "joint_7.gear=2")
+    in_truth = [f"backend.mounted.{text}" for text in built]
+    declared = ran(*in_truth, *(f"robot.joints.{text}" for text in built), backend="odrive")
+    undeclared = ran(*in_truth, backend="odrive")
+    assert nominal.path_distance_m and declared.path_distance_m and undeclared.path_distance_m is not None
+    assert declared.path_distance_m == pytest.approx(nominal.path_distance_m, rel=0.05)
+    assert undeclared.path_distance_m < 0.6 * nominal.path_distance_m, "it shows at once"
 
 
 def test_every_second_module_reversed_and_declared_is_the_same_run(plain: RunSummary) -> None:

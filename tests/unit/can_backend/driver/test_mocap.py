@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from snakesim_can_backend.driver.mocap import MAX_AT_ONCE, MocapReceiver
+from snakesim_hal.drivers.mocap import MAX_AT_ONCE, MocapReceiver
 from snakesim_hal.errors import BackendError, ConfigError
 from snakesim_hal.wire.messages import Pose
 
@@ -191,7 +191,7 @@ def test_a_socket_that_breaks_is_an_error_of_the_backend() -> None:
 
 @pytest.mark.parametrize("address", ["127.0.0.1:70000", "127.0.0.1:port", f"{'x' * 70}:1"])
 def test_an_address_that_is_none_is_told(address: str) -> None:
-    with pytest.raises(ConfigError, match=r"backends\.can\.pose_listen.*choose another"):
+    with pytest.raises(ConfigError, match=r"`pose_listen`.*choose another"):
         MocapReceiver(address, 0.0, lambda stamp_ns: stamp_ns)
 
 

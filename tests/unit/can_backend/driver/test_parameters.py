@@ -9,7 +9,8 @@ from snakesim_can_backend.bus.load import Reports
 from snakesim_can_backend.driver.parameters import SPEED_ROOM, check_drives, check_ratings, parameters_of
 from snakesim_can_backend.protocol.codec import codec
 from snakesim_can_backend.protocol.definitions import PARAMETERS, Opcode, Parameter, SafeMotion
-from snakesim_can_backend.settings import CanSettings, Mounted
+from snakesim_can_backend.settings import CanSettings
+from snakesim_hal.drivers.mounted import Mounted, check_mounted
 from snakesim_hal.errors import BackendError, ConfigError
 from snakesim_hal.model.files import decode, read_part, shipped
 from snakesim_hal.model.joints import JointExceptions
@@ -84,10 +85,12 @@ MISPLACED = {
 
 @pytest.mark.parametrize("wrong", MISPLACED)
 def test_drives_that_the_bus_cannot_have_are_refused(wrong: str) -> None:
-    own, settings, words = MISPLACED[wrong]
+    own, given, words = MISPLACED[wrong]
+    settings = CanSettings(**given)
     robot = msgspec.structs.replace(ROBOT, joints={"joint_2": own})
     with pytest.raises(ConfigError) as caught:
-        check_drives(robot, CanSettings(**settings))
+        check_drives(robot, settings)
+        check_mounted(robot, "backends.can", settings.mounted, twins=settings.twins_run != "none")
         check_ratings(robot)
     assert all(word in str(caught.value) for word in words), str(caught.value)
 

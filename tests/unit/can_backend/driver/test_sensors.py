@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from snakesim_can_backend.bus.load import Reports, reports_of
-from snakesim_can_backend.driver.mocap import MocapReceiver
 from snakesim_can_backend.driver.reports import Reading
 from snakesim_can_backend.driver.sensors import LONG_AGO_NS, Sensors, contacts_due, described, on_surface
 from snakesim_can_backend.protocol.codec import codec
@@ -20,6 +19,7 @@ from snakesim_can_backend.settings import CanSettings
 from snakesim_can_backend.twin.frames import write_contact, write_tail_contact
 from snakesim_can_backend.twin.reports import touch
 from snakesim_hal.backend import Samples
+from snakesim_hal.drivers.mocap import MocapReceiver
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.physics.plant import LinkLoad
 from snakesim_hal.wire import keys

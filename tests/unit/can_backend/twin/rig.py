@@ -19,10 +19,10 @@ from snakesim_can_backend.settings import CanSettings
 from snakesim_can_backend.twin.bus_time import Traffic
 from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_can_backend.twin.firmware import Module
-from snakesim_can_backend.twin.inertia import InertiaPlant, InertiaSettings
 from snakesim_can_backend.twin.parameters import Parameters, from_factory
 from snakesim_can_backend.twin.reports import Readings
 from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.physics.inertia import InertiaPlant, InertiaSettings
 from snakesim_hal.physics.thermal import HeatLimits
 from snakesim_hal.wire.messages import Mode
 from tests.unit.hal.rig import run_config

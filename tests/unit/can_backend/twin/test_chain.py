@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from snakesim_can_backend.protocol.definitions import Action, ModuleState, Opcode, Parameter
-from snakesim_can_backend.protocol.mocap_sample import MocapSample
 from snakesim_can_backend.twin.chain import MAX_AT_ONCE_US
 from snakesim_can_backend.twin.reports import ALONG, ANGLE, FORCE
+from snakesim_hal.drivers.mocap_sample import MocapSample
 from snakesim_hal.physics.plant import LinkLoad
 from snakesim_hal.wire.messages import Imu, Mode
 from tests.unit.can_backend.twin.rig import Host, chain, command, config, only, set_point, sync

@@ -10,7 +10,8 @@ import pytest
 from snakesim_can_backend.bus.bus import VirtualWire, wait
 from snakesim_can_backend.protocol.definitions import Action, Frame, ModuleState, Opcode
 from snakesim_can_backend.twin.chain import ModuleChain
-from snakesim_can_backend.twin.server import InProcessTwins, PoseSender, TwinServer
+from snakesim_can_backend.twin.server import InProcessTwins, TwinServer
+from snakesim_hal.drivers.mocap_twin import PoseSender
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.wire.messages import Mode
 from tests.unit.can_backend.twin.rig import chain, command, only, set_point, sync

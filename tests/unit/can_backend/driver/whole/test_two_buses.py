@@ -12,11 +12,11 @@ from snakesim_can_backend.protocol.commands import question
 from snakesim_can_backend.protocol.definitions import Action, Frame, Opcode, node_of, opcode_of
 from snakesim_can_backend.settings import CanSettings
 from snakesim_can_backend.twin.chain import ModuleChain
-from snakesim_can_backend.twin.inertia import InertiaPlant, InertiaSettings
 from snakesim_can_backend.twin.server import TwinServer
 from snakesim_hal.errors import BackendError
 from snakesim_hal.injection import Injection
 from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.physics.inertia import InertiaPlant, InertiaSettings
 from tests.unit.can_backend.driver.whole.recorded import WIRES, RecordedWire, go, is_action, is_set_point, words
 from tests.unit.can_backend.loop import Loop, config
 

@@ -19,9 +19,8 @@ from collections.abc import Callable
 
 import msgspec
 
-from snakesim_can_backend.driver.mocap_times import CaptureTimes
-from snakesim_can_backend.protocol.mocap_sample import MocapSample
-from snakesim_can_backend.settings import CanSettings
+from snakesim_hal.drivers.mocap_sample import MocapSample
+from snakesim_hal.drivers.mocap_times import CaptureTimes
 from snakesim_hal.errors import BackendError, ConfigError
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire import quantities as q
@@ -37,31 +36,37 @@ UNIT_WITHIN = 0.05  # of the length of a quaternion
 LONGEST_GAP_NS = 200_000_000  # between two poses that give a velocity
 MAX_SPEED_M_S = 100.0  # of the base; two poses further apart are of two bodies, or of confused markers
 
-_log = logging.getLogger("snakesim.can")
+_log = logging.getLogger("snakesim.mocap")
 
 
-def pose_address(settings: CanSettings) -> str:
-    """UDP address for poses, HOST:PORT; empty: none."""
-    return settings.pose_listen or ("" if settings.twins_run == "none" else "127.0.0.1:0")
-
-
-def check_pose(config: RunConfig, settings: CanSettings) -> None:
+def check_pose(config: RunConfig, pose_listen: str | None) -> None:
     """Raise ConfigError for poses without a stated delay."""
-    if settings.pose_listen and config.robot.sensors.pose is None:
+    if pose_listen and config.robot.sensors.pose is None:
         raise ConfigError(
-            f"`backends.can.pose_listen` = {settings.pose_listen!r} needs a section [sensors.pose] in the file of "
+            f"`{config.backend_section}.pose_listen` = {pose_listen!r} needs a section [sensors.pose] in the file of "
             f"robot {config.robot.name!r}: its `delay_s` is the age of a pose when it arrives, 0 to 1 s, from the "
             f"manual of the motion-capture system"
         )
 
 
+def receiver(
+    config: RunConfig, pose_listen: str | None, *, twins: bool, clock: Callable[[int], int]
+) -> "MocapReceiver | None":
+    """A receiver, if the robot has a [sensors.pose] and there is an address; twins send to any free port."""
+    address = pose_listen or ("127.0.0.1:0" if twins else "")
+    camera = config.robot.sensors.pose
+    if camera is None or not address:
+        return None
+    return MocapReceiver(address, camera.delay_s, clock, f"{config.backend_section}.pose_listen")
+
+
 class MocapReceiver:
     """Receives datagrams and returns the newest pose."""
 
-    def __init__(self, address: str, delay_s: float, clock: Callable[[int], int]) -> None:
+    def __init__(self, address: str, delay_s: float, clock: Callable[[int], int], setting: str = "pose_listen") -> None:
         """address: HOST:PORT to listen on; delay_s: minimum from capture to arrival. Raises ConfigError.
 
-        clock: the time in ns of the driver's clock, at the tick of a stamp.
+        clock: the time in ns of the driver's clock, at the tick of a stamp; setting: that named the address.
         """
         host, _, port = address.rpartition(":")
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -70,9 +75,9 @@ class MocapReceiver:
             self._socket.bind((host or "127.0.0.1", int(port)))
         except (OSError, OverflowError, ValueError) as error:
             self._socket.close()
-            raise ConfigError(f"`backends.can.pose_listen` = {address!r}: {error}; choose another port") from error
+            raise ConfigError(f"`{setting}` = {address!r}: {error}; choose another port") from error
         self._socket.setblocking(False)
-        self._clock = clock
+        self._clock, self._setting = clock, setting
         self._delay_ns = round(delay_s * 1e9)
         self._decoder = msgspec.json.Decoder(MocapSample)
         self._times = CaptureTimes()
@@ -141,7 +146,7 @@ class MocapReceiver:
             except BlockingIOError:
                 break
             except OSError as error:
-                raise BackendError(f"`backends.can.pose_listen`: poses cannot be received: {error}") from error
+                raise BackendError(f"`{self._setting}`: poses cannot be received: {error}") from error
             try:
                 sample = self._decoder.decode(datagram)
             except UNDECODABLE as error:

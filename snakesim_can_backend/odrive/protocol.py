@@ -1,0 +1,127 @@
+"""CANSimple: an id is node << 5 | message, all numbers little-endian, a question is the message without data.
+
+Written from ODrive's public documentation; tests hold it against the database that ODrive publishes.
+"""
+
+from enum import IntEnum, IntFlag
+from struct import Struct
+
+from snakesim_can_backend.protocol.definitions import Frame
+
+NODE_BITS = 5
+LAST_NODE = 62
+FIRMWARE = (0, 6)
+
+
+class Message(IntEnum):
+    """The low five bits of an id."""
+
+    VERSION = 0x00
+    HEARTBEAT = 0x01
+    ESTOP = 0x02
+    ERROR = 0x03
+    SET_STATE = 0x07
+    MOTION = 0x09
+    SET_MODE = 0x0B
+    SET_POSITION = 0x0C
+    SET_VELOCITY = 0x0D
+    SET_TORQUE = 0x0E
+    SET_LIMITS = 0x0F
+    CURRENT = 0x14
+    TEMPERATURE = 0x15
+    SUPPLY = 0x17
+    CLEAR_ERRORS = 0x18
+    SET_POSITION_GAIN = 0x1A
+    SET_VELOCITY_GAINS = 0x1B
+
+
+class State(IntEnum):
+    """Of an axis; others are calibrations."""
+
+    IDLE = 1
+    CLOSED_LOOP = 8
+
+
+class Control(IntEnum):
+    """What an axis controls."""
+
+    TORQUE = 1
+    VELOCITY = 2
+    POSITION = 3
+
+
+PASSTHROUGH = 1  # input mode: an input acts at once
+
+
+class Error(IntFlag):
+    """Bits of the active errors, firmware 0.6."""
+
+    INITIALIZING = 0x1
+    SYSTEM_LEVEL = 0x2
+    TIMING_ERROR = 0x4
+    MISSING_ESTIMATE = 0x8
+    BAD_CONFIG = 0x10
+    DRV_FAULT = 0x20
+    MISSING_INPUT = 0x40
+    DC_BUS_OVER_VOLTAGE = 0x100
+    DC_BUS_UNDER_VOLTAGE = 0x200
+    DC_BUS_OVER_CURRENT = 0x400
+    DC_BUS_OVER_REGEN_CURRENT = 0x800
+    CURRENT_LIMIT_VIOLATION = 0x1000
+    MOTOR_OVER_TEMP = 0x2000
+    INVERTER_OVER_TEMP = 0x4000
+    VELOCITY_LIMIT_VIOLATION = 0x8000
+    POSITION_LIMIT_VIOLATION = 0x10000
+    REQUESTED_CURRENT_TOO_HIGH = 0x20000
+    WATCHDOG_TIMER_EXPIRED = 0x1000000
+    ESTOP_REQUESTED = 0x2000000
+    SPINOUT_DETECTED = 0x4000000
+    BRAKE_RESISTOR_DISARMED = 0x8000000
+    THERMISTOR_DISCONNECTED = 0x10000000
+    CALIBRATION_ERROR = 0x40000000
+
+
+PAYLOADS = {
+    Message.VERSION: Struct("<8B"),  # protocol, hardware (3), firmware (3), unreleased
+    Message.HEARTBEAT: Struct("<IBBBx"),  # active errors, state, result of the last procedure, trajectory done
+    Message.ESTOP: Struct(""),
+    Message.ERROR: Struct("<II"),  # active errors, reason of the last disarming
+    Message.SET_STATE: Struct("<I"),
+    Message.MOTION: Struct("<ff"),  # turns, turns/s
+    Message.SET_MODE: Struct("<II"),  # what it controls, input mode
+    Message.SET_POSITION: Struct("<fhh"),  # turns; feed-forward of velocity and torque, by 0.001
+    Message.SET_VELOCITY: Struct("<ff"),  # turns/s, feed-forward of torque, N·m
+    Message.SET_TORQUE: Struct("<f"),  # N·m
+    Message.SET_LIMITS: Struct("<ff"),  # turns/s, A
+    Message.CURRENT: Struct("<ff"),  # Iq asked for and measured, A
+    Message.TEMPERATURE: Struct("<ff"),  # of the power stage and of the motor, °C
+    Message.SUPPLY: Struct("<ff"),  # V, A
+    Message.CLEAR_ERRORS: Struct(""),
+    Message.SET_POSITION_GAIN: Struct("<f"),  # (turns/s) / turn
+    Message.SET_VELOCITY_GAINS: Struct("<ff"),  # N·m / (turn/s), and of the integral
+}
+FROM_HOST = frozenset(message for message in Message if message.name.startswith("SET_")) | {
+    Message.ESTOP,
+    Message.CLEAR_ERRORS,
+}
+
+
+def write(node: int, message: Message, *values: float) -> Frame:
+    """A message of, or to, an axis."""
+    return Frame(node << NODE_BITS | message, PAYLOADS[message].pack(*values))
+
+
+def ask(node: int, message: Message) -> Frame:
+    """The question for a message."""
+    return Frame(node << NODE_BITS | message, b"")
+
+
+def parted(frame: Frame) -> tuple[int, int]:
+    """Node and message of a frame."""
+    return frame.id >> NODE_BITS, frame.id & ((1 << NODE_BITS) - 1)
+
+
+def names(errors: int) -> str:
+    """Error bits in words."""
+    said = [error.name.lower() for error in Error if errors & error and error.name]
+    return ", ".join(said) or f"0x{errors:x}"

@@ -1,0 +1,180 @@
+"""Emulated ODrive axes: the messages, states, limits and watchdog of CANSimple, on a body that a plant moves.
+
+They do *not* simulate calibration, encoders that slip, the velocity integrator, trajectories, arbitration and bit rate.
+"""
+
+import math
+import struct
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from snakesim_can_backend.bus.bus import Wire
+from snakesim_can_backend.odrive.protocol import PAYLOADS, Control, Error, Message, State, parted, write
+from snakesim_can_backend.protocol.definitions import Frame
+from snakesim_hal.drivers.twin_body import TwinBody
+from snakesim_hal.injection import Injection
+from snakesim_hal.wire.messages import Mode
+
+TURN = 2 * math.pi
+HEARTBEAT_US = 100_000.0
+COUNTS = 16384  # of the encoder, a turn
+VERSION = (2, 4, 4, 58, 0, 6, 11, 0)
+MODES = {Control.TORQUE: Mode.TORQUE, Control.VELOCITY: Mode.VELOCITY, Control.POSITION: Mode.POSITION}
+
+
+@dataclass
+class Axis:
+    """One axis: settings, inputs, state."""
+
+    node: int
+    torque_constant: float
+    wire: Wire
+    state: int = State.IDLE
+    errors: int = 0
+    disarm_reason: int = 0
+    control: int = Control.POSITION
+    inputs: tuple[float, ...] = (0.0, 0.0, 0.0)  # by `Control`, from torque on: N·m, turns/s, turns
+    position_gain: float = 20.0
+    velocity_gain: float = 0.16
+    speed_limit: float = 2.0
+    current_limit: float = 10.0
+    fed_us: float = 0.0
+
+
+class OdriveTwin:
+    """All axes of a robot, at the other end of their buses."""
+
+    def __init__(
+        self,
+        body: TwinBody,
+        wires: Sequence[Wire],
+        constants: Sequence[float],
+        watchdog_s: float,
+        clock_ns: Callable[[], int],
+    ) -> None:
+        """wires: of every joint; constants: torque constants, N·m/A; clock_ns: the time, since anything."""
+        rows = zip(body.joints, wires, constants, strict=True)
+        self.axes = [Axis(joint.id, constant, wire) for joint, wire, constant in rows]
+        self._wires = list({id(wire): wire for wire in wires}.values())
+        self._at = {(id(axis.wire), axis.node): i for i, axis in enumerate(self.axes)}
+        self._body, self._watchdog_us = body, watchdog_s * 1e6
+        self._clock_ns, self._start_ns = clock_ns, clock_ns()
+        self._heartbeat_us = -math.inf
+        self._check(0.0)
+
+    def __call__(self) -> float | None:
+        """Handle what has arrived, and let time pass up to now."""
+        self._receive()
+        self._body.advance_to((self._clock_ns() - self._start_ns) / 1000, self._check)
+        return None
+
+    def inject(self, injection: Injection, *, begins: bool) -> None:
+        """Begin or end a fault of an axis."""
+        restarts = self._body.inject(injection, begins=begins)
+        if restarts is not None:
+            old = self.axes[restarts]
+            self.axes[restarts] = Axis(old.node, old.torque_constant, old.wire)
+            self._drive(restarts, self.axes[restarts])
+
+    def close(self) -> None:
+        """Leave the buses."""
+        for wire in self._wires:
+            wire.close()
+
+    def _receive(self) -> None:
+        for wire in self._wires:
+            for frame in wire.receive():
+                node, message = parted(frame)
+                i = self._at.get((id(wire), node))
+                if i is None or self._body.deaf(i):
+                    continue
+                try:
+                    known = Message(message)
+                    values = PAYLOADS[known].unpack(frame.data) if frame.data else ()
+                except (ValueError, struct.error):
+                    continue
+                self._take(i, self.axes[i], known, values)
+
+    def _take(self, i: int, axis: Axis, message: Message, values: tuple[float, ...]) -> None:
+        if not values and message not in (Message.ESTOP, Message.CLEAR_ERRORS):
+            self._say(i, axis, message)
+            return
+        match message:
+            case Message.ESTOP:
+                self._fail(i, axis, Error.ESTOP_REQUESTED)
+            case Message.CLEAR_ERRORS:
+                axis.errors = 0
+            case Message.SET_STATE if values[0] == State.CLOSED_LOOP and not axis.errors:
+                axis.fed_us = self._body.now_us
+                axis.state = State.CLOSED_LOOP
+            case Message.SET_STATE:
+                axis.state = State.IDLE
+            case Message.SET_MODE:
+                axis.control = int(values[0])
+            case Message.SET_POSITION | Message.SET_VELOCITY | Message.SET_TORQUE:
+                axis.fed_us = self._body.now_us
+                at = {Message.SET_TORQUE: 0, Message.SET_VELOCITY: 1, Message.SET_POSITION: 2}[message]
+                axis.inputs = (*axis.inputs[:at], values[0], *axis.inputs[at + 1 :])
+            case Message.SET_LIMITS:
+                axis.speed_limit, axis.current_limit = values
+            case Message.SET_POSITION_GAIN:
+                axis.position_gain = values[0]
+            case Message.SET_VELOCITY_GAINS:
+                axis.velocity_gain = values[0]
+            case _:
+                return
+        self._drive(i, axis)
+
+    def _say(self, i: int, axis: Axis, message: Message) -> None:
+        if not self._body.silent(i):
+            axis.wire.send(self._message(i, axis, message))
+
+    def _message(self, i: int, axis: Axis, message: Message) -> Frame:
+        angle, velocity, torque = self._body.shaft(i)
+        values: tuple[float, ...]
+        match message:
+            case Message.VERSION:
+                values = VERSION
+            case Message.HEARTBEAT:
+                values = axis.errors, axis.state, 0, 0
+            case Message.ERROR:
+                values = axis.errors, axis.disarm_reason
+            case Message.MOTION:
+                values = round(angle / TURN * COUNTS) / COUNTS, velocity / TURN
+            case Message.CURRENT:
+                values = torque / axis.torque_constant, torque / axis.torque_constant
+            case Message.TEMPERATURE:
+                motor_c, board_c = self._body.temperatures(i)
+                values = board_c, motor_c
+            case Message.SUPPLY:
+                values = self._body.supply(i)
+            case _:
+                return Frame(axis.node << 5 | message, b"")
+        return write(axis.node, message, *values)
+
+    def _drive(self, i: int, axis: Axis) -> None:
+        control = Control(axis.control) if axis.control in list(Control) else Control.TORQUE
+        mode = MODES[control] if axis.state == State.CLOSED_LOOP else Mode.PASSIVE
+        target = axis.inputs[control - 1] * (1.0 if control == Control.TORQUE else TURN)
+        damping = axis.velocity_gain / TURN
+        limit_nm = axis.current_limit * axis.torque_constant
+        speed_rad_s = axis.speed_limit * TURN
+        self._body.drive(i, mode, target if mode else 0.0, limit_nm, axis.position_gain * damping, damping, speed_rad_s)
+
+    def _fail(self, i: int, axis: Axis, error: Error) -> None:
+        axis.errors |= error
+        axis.disarm_reason, axis.state = error, State.IDLE
+        self._drive(i, axis)
+
+    def _check(self, now_us: float) -> None:
+        """Watchdogs, heat, heartbeats."""
+        for i, axis in enumerate(self.axes):
+            if axis.state == State.CLOSED_LOOP and now_us - axis.fed_us > self._watchdog_us:
+                self._fail(i, axis, Error.WATCHDOG_TIMER_EXPIRED)
+        if now_us - self._heartbeat_us < HEARTBEAT_US:
+            return
+        self._heartbeat_us = now_us
+        for i, axis in enumerate(self.axes):
+            if self._body.too_hot(i):
+                self._fail(i, axis, Error.MOTOR_OVER_TEMP)
+            self._say(i, axis, Message.HEARTBEAT)

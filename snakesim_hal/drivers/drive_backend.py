@@ -1,0 +1,239 @@
+"""A whole backend over a family of drives. The family speaks the protocol, in `Drives`; all else is here.
+
+A tick: every drive is asked what it measures, and answers; it then gets its set-point, which holds until the next. All
+numbers between here and a family are those of the drives' shafts, in SI units.
+"""
+
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+import msgspec
+import numpy as np
+
+from snakesim_hal.arrays import Floats
+from snakesim_hal.backend import Samples, SetPoints
+from snakesim_hal.drivers.findings import Finding, Told
+from snakesim_hal.drivers.mocap import MocapReceiver
+from snakesim_hal.drivers.readings import Readings
+from snakesim_hal.errors import BackendError
+from snakesim_hal.injection import Injection
+from snakesim_hal.model.robot import describe
+from snakesim_hal.model.scenario import RunConfig, config_hash
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.messages import (
+    Description,
+    Fault,
+    LifecycleState,
+    Message,
+    Mode,
+    SensorDescription,
+)
+
+LATCHED = ("fault", "estop")
+SILENT_AFTER = 3  # questions without an answer
+CLEAR_GRACE = 5  # periods in which errors of drives may be of before a clear
+HEALTH_ROUNDS = 3  # in which a drive may not say its health before that is unknown
+
+
+class Drives(Protocol):
+    """The drives of one family on their buses, tail to head. Every method returns within a period."""
+
+    emulated: bool  # nothing real moves
+
+    def bring_up(self) -> None:
+        """Find every drive, check it, write its settings; nothing is enabled. May take long. Raises BackendError."""
+        ...
+
+    def read(self) -> None:
+        """Ask every drive, and put what it says into the readings; does not wait for silent ones."""
+        ...
+
+    def command(
+        self, following: frozenset[int], modes: list[Mode], targets: Floats, limits_nm: Floats, *, emergency: bool
+    ) -> None:
+        """Set-points of the drives that follow; any other is to be idle, and is told again if it is not.
+
+        A drive that begins to follow is enabled after it has its set-point. emergency: by the drives' own stop.
+        """
+        ...
+
+    def clear(self, joints: frozenset[int]) -> None:
+        """The fault was cleared: clear errors of these drives, and write settings that a restart may have lost."""
+        ...
+
+    def findings(self) -> list[Finding]:
+        """What is wrong now with drives and buses; a silent drive need not be among it."""
+        ...
+
+    def let_run(self) -> None:
+        """Receive; drives that are emulated in this process run, up to the present time."""
+        ...
+
+    def inject(self, injection: Injection, *, begins: bool) -> bool:
+        """Begin or end a fault of a bus or of drives emulated here; False for any other."""
+        ...
+
+    def close(self) -> None:
+        """Motors off, buses closed; safe in every state."""
+        ...
+
+
+class Clock:
+    """The time of a driver: a steady clock, or in lockstep the robot's own time, which `sample` sets."""
+
+    def __init__(self, config: RunConfig) -> None:
+        self._lockstep, self.robot_ns = config.pace == "lockstep", 0
+
+    def ns(self) -> int:
+        """Now."""
+        return self.robot_ns if self._lockstep else time.monotonic_ns()
+
+
+class DriveBackend:
+    """A `snakesim_hal.backend.Backend`."""
+
+    def __init__(
+        self,
+        config: RunConfig,
+        name: str,
+        hardware: str,
+        clock: Clock,
+        mocap: MocapReceiver | None,
+        make_drives: Callable[[Readings], Drives],
+    ) -> None:
+        """make_drives: opens the family's buses. Raises ConfigError and BackendError."""
+        joints = config.robot.joint_table
+        self._clock, self._mocap, self._open = clock, mocap, True
+        self._period_ns, self._lease_ns = config.period_ns, config.lease_ns
+        self._names = [joint.name for joint in joints]
+        self._readings = Readings(joints, clock.ns)
+        self._mounting = self._readings.mounting
+        self._may_lose = config.robot.safety.may_lose_joints
+        self._told = Told()
+        self._lifecycle: LifecycleState = "disarmed"
+        self._following: frozenset[int] = frozenset()
+        self._isolated: frozenset[int] = frozenset()
+        self._pending: frozenset[int] = frozenset()  # just reported as failed: their isolation is expected
+        self._tick, self._quiet = 0, 0
+        try:
+            self._drives = make_drives(self._readings)
+        except BaseException:
+            if mocap is not None:
+                mocap.close()
+            raise
+        self._description = self._describe(config, name, hardware)
+        try:
+            self._drives.bring_up()
+        except BaseException:
+            self.close()
+            raise
+
+    def describe(self) -> Description:
+        """The robot of the robot file, with the sensors that its drives are."""
+        return self._description
+
+    def sample(self, tick: int, stamp_ns: int) -> Samples:
+        """Ask all drives."""
+        self._must_be_open()
+        self._tick, self._clock.robot_ns, self._quiet = tick, stamp_ns, self._quiet - 1
+        self._readings.ask()
+        self._drives.read()
+        others: dict[str, Message] = {}
+        if tick % len(self._names) == 0:
+            lasts_ns = HEALTH_ROUNDS * len(self._names) * self._period_ns
+            others[keys.POWER] = self._readings.power(tick, stamp_ns, lasts_ns)
+        if self._mocap is not None and (pose := self._mocap.newest(tick, stamp_ns)) is not None:
+            others[keys.POSE] = pose
+        return Samples(self._readings.joints(tick, stamp_ns, self._lease_ns), others)
+
+    def enact(self, set_points: SetPoints, lifecycle: LifecycleState) -> None:
+        """Armed: all that are not isolated follow. At fault those go on that did, while they are told to damp."""
+        if not self._open:
+            return
+        back = (self._isolated | self._pending) - set_points.isolated
+        self._isolated, self._pending = set_points.isolated, frozenset()
+        everybody = frozenset(range(len(self._names))) - self._isolated
+        if lifecycle not in LATCHED and (back or self._lifecycle in LATCHED):
+            self._told.forget()
+            self._drives.clear(everybody if self._lifecycle in LATCHED else back)
+            self._quiet = CLEAR_GRACE
+        damped = {i for i in self._following if set_points.mode[i] != Mode.PASSIVE}
+        self._following = (
+            everybody if lifecycle == "armed" else everybody & damped if lifecycle == "fault" else frozenset()
+        )
+        self._lifecycle = lifecycle
+        self._drives.command(
+            self._following,
+            set_points.mode,
+            self._mounting.drive_targets(set_points.mode, set_points.target),
+            self._mounting.drive_torque_limit_nm(np.array(set_points.torque_limit_nm)),
+            emergency=lifecycle == "estop",
+        )
+
+    def advance(self) -> None:
+        """Time passes by itself; in lockstep, by a period."""
+        self._must_be_open()
+        self._clock.robot_ns += self._period_ns
+        self._drives.let_run()
+
+    def faults(self) -> list[Fault]:
+        """New ones since the last call."""
+        if not self._open:
+            return []
+        found = [*self._drives.findings(), *self._silent()]
+        found = [finding for finding in found if not (finding.alone and finding.joint in self._isolated)]
+        if self._quiet > 0:
+            found = [finding for finding in found if finding.joint is None]
+        fresh = self._told.fresh(found)
+        failed = frozenset(finding.joint for finding in fresh if finding.joint is not None)
+        few = len(self._isolated | failed) <= self._may_lose
+        if self._lifecycle == "armed" and few and all(finding.alone for finding in fresh):
+            self._pending |= failed  # the HAL isolates them
+        elif fresh and self._lifecycle not in LATCHED:
+            self._lifecycle = "fault"  # from now on only a clear ends it, also one before the next period
+        return [finding.fault(self._tick, self._names) for finding in fresh]
+
+    def inject(self, injection: Injection, *, begins: bool) -> bool:
+        """Injects faults of buses and of drives emulated here. Raises ConfigError."""
+        return self._drives.inject(injection, begins=begins)
+
+    def close(self) -> None:
+        """Motors off, buses closed."""
+        if not self._open:
+            return
+        self._open = False
+        self._drives.close()
+        if self._mocap is not None:
+            self._mocap.close()
+
+    # --- inside -----------------------------------------------------------------------------------------------
+
+    def _must_be_open(self) -> None:
+        if not self._open:
+            raise BackendError("the buses are closed; open a new backend")
+
+    def _silent(self) -> list[Finding]:
+        found: list[Finding] = []
+        for i, name in enumerate(self._names):
+            if self._readings.unanswered(i) >= SILENT_AFTER:
+                silent_ms = self._readings.age_ns(i) * 1e-6
+                cause = f"{name}: its drive has not answered for {silent_ms:.0f} ms: power, cable, id or a restart"
+                found.append(Finding("drive_silent", cause, i, alone=True))
+        return found
+
+    def _describe(self, config: RunConfig, name: str, hardware: str) -> Description:
+        plain = describe(
+            config.robot,
+            backend=name,
+            period_ns=config.period_ns,
+            lease_ns=config.lease_ns,
+            config_hash=config_hash(config),
+            emulated=self._drives.emulated,
+        )
+        rate_hz, camera = config.rate_hz, config.robot.sensors.pose
+        sensors = [SensorDescription(key=keys.JOINTS, rate_hz=rate_hz, delay_s=0.0)]
+        sensors.append(SensorDescription(key=keys.POWER, rate_hz=rate_hz / len(self._names), delay_s=0.0))
+        if self._mocap is not None and camera is not None:
+            sensors.append(SensorDescription(key=keys.POSE, rate_hz=rate_hz, delay_s=camera.delay_s))
+        return msgspec.structs.replace(plain, sensors=sensors, hardware=hardware)
