@@ -70,6 +70,14 @@ def add_commands(commands: Any) -> None:
     exported.add_argument("recordings", type=Path, nargs="+", metavar="RUN", help="folders of runs, or MCAP files")
     exported.add_argument("--format", required=True, choices=["csv", "parquet", "npz", "lerobot", "mcap"])
     exported.add_argument("--out", type=Path, metavar="PATH", help="file or folder (default: beside the recording)")
+    exported.add_argument("--images", action="store_true", help="lerobot: with what the cameras saw, in the recordings")
+    exported.add_argument("--task", metavar="TEXT", help="lerobot: the task, in words (default: the scenario's name)")
+    exported.add_argument(
+        "--fps",
+        type=number(1.0, 1000.0, "Hz"),
+        metavar="HZ",
+        help="lerobot: frames a second (default: the robot's rate)",
+    )
     exported.set_defaults(act=_export)
 
     video = commands.add_parser("video", help="film a recorded run, as MP4 or GIF")
@@ -137,8 +145,15 @@ def _export(arguments: argparse.Namespace) -> int:
 
     if arguments.format in ("parquet", "lerobot"):
         extras.check("export", f"--format {arguments.format}")
-    from snakesim_operator.playback.export import export
+    from snakesim_operator.playback.export import export, export_dataset
 
+    if arguments.format == "lerobot":
+        choice = {"images": arguments.images, "task": arguments.task, "fps": arguments.fps}
+        return export_dataset(arguments.recordings, arguments.out, say, **choice)
+    if arguments.images or arguments.task is not None or arguments.fps is not None:
+        raise ConfigError(
+            f"--images, --task and --fps are for --format lerobot, not {arguments.format}; leave them out"
+        )
     return export(arguments.recordings, arguments.format, arguments.out, say)
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.terminal import Say, printable
 from snakesim_hal.wire.own_sample import own_kinds
+from snakesim_operator.playback.episodes import read_episodes
 from snakesim_operator.playback.info import recording_of
 from snakesim_operator.playback.lerobot import write_lerobot
 from snakesim_operator.recording.recover import recover
@@ -44,29 +45,15 @@ UNITS = {
 
 
 def export(runs: Sequence[Path], form: str, out: Path | None, say: Say) -> int:
-    """Write runs in a format. Several make a LeRobot dataset, an episode each. Raises ConfigError."""
-    if len(runs) > 1 and form != "lerobot":
+    """Write a run in a format. Raises ConfigError."""
+    if len(runs) > 1:
         raise ConfigError(f"--format {form}: one run at a time; several make a dataset, with --format lerobot")
-    path = out or _beside(runs[0], form)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch(exist_ok=False)  # before the work of minutes; not through a link, wherever it leads
-        path.unlink()
-    except FileExistsError:
-        what = "a symbolic link" if path.is_symlink() else "such a file"
-        raise ConfigError(f"{path}: there is {what} already; choose another one with --out") from None
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be written: {error.strerror}; choose another one with --out") from None
+    path = _free(out or _beside(runs[0], form))
     if form == "mcap":
         count, lacks = recover(recording_of(runs[0]), path)
         say(f"{count} messages: {path}")
         return exit_code(runs[0], lacks)
-    records = [RunRecord.load(run) for run in runs]
-    if form == "lerobot":
-        frames = write_lerobot(records, path, write_parquet)
-        say(f"{len(records)} episodes, {frames} frames: {path}")
-        return max(exit_code(run, record.lacks) for run, record in zip(runs, records, strict=True))
-    record = records[0]
+    record = RunRecord.load(runs[0])
     if form == "npz":
         names: dict[str, Any] = {"joints": np.array([joint.name for joint in record.description.joints])}
         np.savez_compressed(path, **arrays(record), **names, lacks=np.array(record.lacks, dtype=str))
@@ -77,6 +64,31 @@ def export(runs: Sequence[Path], form: str, out: Path | None, say: Say) -> int:
         write_parquet(columns, path, {LACKS: json.dumps(record.lacks).encode()} if record.lacks else None)
     say(f"{len(record.time_s)} ticks: {path}")
     return exit_code(runs[0], record.lacks)
+
+
+def export_dataset(
+    runs: Sequence[Path], out: Path | None, say: Say, *, images: bool, task: str | None, fps: float | None
+) -> int:
+    """Write a LeRobot dataset, an episode a run or demonstration. Raises ConfigError."""
+    path = _free(out or _beside(runs[0], "lerobot"))
+    episodes = read_episodes(runs, task, images=images)
+    frames = write_lerobot(episodes, path, write_parquet, fps)
+    say(f"{len(episodes)} episodes, {frames} frames: {path}")
+    return max(exit_code(one.record.folder, one.record.lacks) for one in episodes)
+
+
+def _free(path: Path) -> Path:
+    """A path that can be written, where nothing is yet. Raises ConfigError."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch(exist_ok=False)  # before the work of minutes; not through a link, wherever it leads
+        path.unlink()
+    except FileExistsError:
+        what = "a symbolic link" if path.is_symlink() else "such a file"
+        raise ConfigError(f"{path}: there is {what} already; choose another one with --out") from None
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written: {error.strerror}; choose another one with --out") from None
+    return path
 
 
 def _beside(run: Path, form: str) -> Path:

@@ -18,9 +18,9 @@ from snakesim_hal.wire.messages import (
     WorldContact,
 )
 from snakesim_hal.wire.own_sample import OwnKind
+from snakesim_operator.png import png
 from snakesim_operator.ros2 import messages as ros
 from snakesim_operator.ros2.messages import Marker, Rgba, Triple
-from snakesim_operator.ros2.png import png
 
 METRES_PER_NEWTON = 0.01  # length of a force arrow
 ARROW_M: Triple = (0.008, 0.016, 0.02)  # diameter of shaft and head, length of the head

@@ -1,12 +1,16 @@
 """Arguments of the commands that read what a robot publishes: `snakesim status`, `top`, `echo`, `record`, `preview`."""
 
 import argparse
+import sys
 from pathlib import Path
 from typing import Any
 
 from snakesim_hal.arguments import add_json, add_network, number
+from snakesim_hal.errors import ConfigError
 from snakesim_operator.recording.message import RAW_ONLY
 from snakesim_operator.tools.robot_selection import selection_of
+
+MAX_TASK = 200
 
 
 def add_commands(commands: Any) -> None:
@@ -31,6 +35,13 @@ def add_commands(commands: Any) -> None:
 
     record = commands.add_parser("record", help="record everything that a robot publishes into an MCAP file")
     record.add_argument("--out", type=Path, metavar="FILE.mcap", help="the file (default: NAMESPACE-TIME.mcap)")
+    record.add_argument(
+        "--episodes",
+        type=Path,
+        metavar="DIR",
+        help="record demonstrations, one after the other, begun and ended by Enter",
+    )
+    record.add_argument("--task", metavar="TEXT", help="with --episodes: what is demonstrated, in words")
     record.add_argument(
         "--duration", type=number(0.0, 1e9, "s"), metavar="S", help="end after this time by the wall clock"
     )
@@ -84,6 +95,10 @@ def _echo(arguments: argparse.Namespace) -> int:
 def _record(arguments: argparse.Namespace) -> int:
     from snakesim_operator import extras
 
+    if arguments.episodes is not None:
+        return _record_episodes(arguments)
+    if arguments.task is not None:
+        raise ConfigError("--task is for --episodes DIR; add it, or leave --task out")
     if arguments.foxglove is not None:
         extras.check("foxglove", "--foxglove")
     from snakesim_operator.tools.record import record_robot
@@ -96,6 +111,20 @@ def _record(arguments: argparse.Namespace) -> int:
         arguments.foxglove_origin,
         raw_only=arguments.raw_only,
     )
+
+
+def _record_episodes(arguments: argparse.Namespace) -> int:
+    for name in ("out", "duration", "foxglove"):
+        if getattr(arguments, name) is not None:
+            raise ConfigError(f"--{name} and --episodes: episodes are files in a folder, begun and ended by Enter")
+    task = (arguments.task or "").strip()
+    if not 0 < len(task) <= MAX_TASK:
+        raise ConfigError(
+            f"--task: say what is demonstrated, in at most {MAX_TASK} characters: --task 'through the pegs'"
+        )
+    from snakesim_operator.tools.demonstrations import record_demonstrations
+
+    return record_demonstrations(selection_of(arguments), arguments.episodes, task, iter(sys.stdin))
 
 
 def _preview(arguments: argparse.Namespace) -> int:
