@@ -2,6 +2,9 @@
 
 source <(snakesim completion bash)        # in ~/.bashrc
 source <(snakesim completion zsh)         # in ~/.zshrc
+
+Not by shtab: the smallest installation completes, too, without one more dependency; commands of installed packages have
+parsers of their own; and each shell gets the same function.
 """
 
 import argparse
