@@ -46,6 +46,7 @@ def test_a12_a_request_without_a_name_is_not_anonymous(robot: Robot) -> None:
     assert answers and isinstance(answers[0]["ok"], bool)
 
 
+@pytest.mark.slow  # tests/e2e/test_operator.py has the quick one: a stop that outlives the host
 def test_a13_a_stop_outlives_its_run_and_its_folder_until_it_is_cleared(tmp_path: Path) -> None:
     with running(tmp_path, *STANDING, name="one") as run, joined(run) as operator:
         operator.recover()

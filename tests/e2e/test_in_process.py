@@ -48,6 +48,7 @@ def test_so_they_do_in_every_shipped_scenario(scenario: str, tmp_path: Path) -> 
     same_both_ways(tmp_path / "run", scenario)
 
 
+@pytest.mark.slow  # above is a robot with a camera, too
 def test_so_does_a_robot_with_a_camera_like_the_robot_without(tmp_path: Path) -> None:
     """An image of the camera is named by the clock, and is there for whoever reads it at that tick."""
     seeing = same_both_ways(tmp_path / "run", "peg_row", "--duration", "1", "--set", "robot=planar13_camera")
@@ -70,6 +71,7 @@ def test_so_do_joint_modules_behind_their_bus(tmp_path: Path) -> None:
     same_both_ways(tmp_path / "run", "triplet", "--duration", "1", "--backend", "can")
 
 
+@pytest.mark.slow
 def test_faults_on_request_are_the_same_too(tmp_path: Path) -> None:
     faults = ["--fault", "wrong:joint_3@0.3-0.5=0.01", "--fault", "duplicate:guidance/world@0.2-0.6"]
     result = same_both_ways(tmp_path / "run", "triplet", "--duration", "1", *faults)
