@@ -10,6 +10,13 @@ from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.quantities import from_zero
 
 
+class MountedModule(Mounted, frozen=True, kw_only=True):
+    """How an emulated module is really mounted and wired, where that is not what the robot file says."""
+
+    id: Annotated[int, Meta(ge=1, le=LAST_NODE)] | None = None  # that it has: of another joint
+    connected: bool = True  # False: its motor gets no current
+
+
 class CanSettings(FileStruct, frozen=True, kw_only=True):
     """Buses, modules on them, and their reports."""
 
@@ -26,7 +33,7 @@ class CanSettings(FileStruct, frozen=True, kw_only=True):
     plant: str = "mujoco"  # body that the twins' motors move: an entry point in the group `snakesim.plants`
     plant_settings: dict[str, Any] = {}
     # Of the twins: joint -> how its module is mounted in truth, to see what a wrong robot file does.
-    mounted: dict[str, Mounted] = {}
+    mounted: dict[str, MountedModule] = {}
     faults: list[str] = []  # of the twins, such as "mute:joint_3@2"; `snakesim modules --help` lists them
     contact_rate_hz: Annotated[float, from_zero(1e4, "Hz")] | None = None  # default: the robot file's
     imu_rate_hz: Annotated[float, from_zero(1e4, "Hz")] = 5.0

@@ -22,6 +22,7 @@ from snakesim_can_backend.twin.firmware import BOOT_US, Module
 from snakesim_can_backend.twin.frames import LENGTHS, read_sync
 from snakesim_can_backend.twin.module_sensors import ModuleSensors
 from snakesim_can_backend.twin.module_slot import ModuleSlot
+from snakesim_can_backend.twin.node_ids import node_ids
 from snakesim_can_backend.twin.parameters import Parameters, from_factory
 from snakesim_hal.drivers.mocap_twin import PoseCamera
 from snakesim_hal.drivers.mounted import built
@@ -60,7 +61,10 @@ class ModuleChain:
         self.count = robot.chain.modules
         self.counts = shares(config, settings)  # modules on each bus
         self.motors = Motors(robot, plant.step_s)
-        self._joints = built(robot, settings.mounted)
+        self._joints, self._told = built(robot, settings.mounted), robot.joint_table
+        self._nodes = node_ids(robot, settings)
+        loose = {name for name, truth in settings.mounted.items() if not truth.connected}
+        self._loose = {i for i, joint in enumerate(self._joints) if joint.name in loose}
         self.thermal = Thermal(self._joints)
         self.buses = [BusTime(settings.bit_rate) for _ in self.counts]
         self.now_us = 0.0  # module time: since the twins were started
@@ -231,7 +235,7 @@ class ModuleChain:
         self._sync_time = sync_time
 
     def _at(self, channel: int, node: int) -> list[ModuleSlot]:
-        found = [self.slots[node - 1]] if 1 <= node <= self.count else []
+        found = [self.slots[self._nodes.index(node)]] if 1 <= node <= self.count else []
         if len(self.slots) > self.count:
             found += [slot for slot in self.slots[self.count :] if slot.module.node == node]
         return [slot for slot in found if slot.channel == channel]
@@ -295,19 +299,19 @@ class ModuleChain:
                 slot.end(kind)
 
     def _seat(self, number: int, channel: int, serial: int, now_us: float, *, drives: bool = True) -> None:
-        joint = self._joints[number]
+        joint, gear = self._joints[number], self._told[number].drive.gear  # its maker does not know where it ends up
         module = Module(
-            number + 1,
+            self._nodes[number],
             serial,
-            Parameters(
-                from_factory(joint.limits.torque_nm / joint.drive.gear, joint.limits.speed_rad_s * joint.drive.gear)
-            ),
+            Parameters(from_factory(joint.limits.torque_nm / gear, joint.limits.speed_rad_s * gear)),
             self.thermal.limits[number],
             least_voltage_v=joint.limits.least_voltage_v,
             stepped=self.stepped,
             now_us=now_us,
         )
-        self.slots.append(ModuleSlot(len(self.slots), channel, number, module, joint, drives))
+        self.slots.append(
+            ModuleSlot(len(self.slots), channel, number, module, joint, drives=drives and number not in self._loose)
+        )
 
     def _serial(self, joint: int) -> int:
         return crc32(f"{self._seed}:{joint + 1}".encode())

@@ -28,7 +28,8 @@ def built(robot: RobotFile, mounted: Mapping[str, Mounted]) -> list[Joint]:
     for i, joint in enumerate(joints):
         truth = mounted.get(joint.name)
         if truth is not None:
-            differs = {field: value for field, value in msgspec.structs.asdict(truth).items() if value is not None}
+            said = {field: getattr(truth, field) for field in Mounted.__struct_fields__}  # a family may add its own
+            differs = {field: value for field, value in said.items() if value is not None}
             joints[i] = dataclasses.replace(joint, drive=msgspec.structs.replace(joint.drive, **differs))
     return joints
 

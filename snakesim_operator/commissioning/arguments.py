@@ -24,6 +24,14 @@ def add_commands(commands: Any) -> None:
     ):
         command = _by_hand(verbs, verb, act, about)
         command.add_argument("joints", nargs="*", metavar="JOINT", help="such as joint_3; all of them without")
+    judge = verbs.add_parser(
+        "check",
+        help="judge a run of `snakesim run joint_check`: signs, gears, ids, zeros, dead joints",
+        epilog="Exit code: 0 every joint is as the file says, 1 one is not or could not be judged, 2 wrong input.",
+    )
+    judge.add_argument("run", type=Path, help="folder of the run")
+    judge.add_argument("--straight", action="store_true", help="the robot lay straight at its start: judge all zeros")
+    judge.set_defaults(act=_check)
 
 
 def _by_hand(verbs: Any, verb: str, act: Callable[[argparse.Namespace], int], about: str) -> argparse.ArgumentParser:
@@ -50,3 +58,9 @@ def _limits(arguments: argparse.Namespace) -> int:
     from snakesim_operator.commissioning.by_hand import limits
 
     return limits(arguments.file, selection_of(arguments), arguments.joints)
+
+
+def _check(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.commissioning.check import check
+
+    return check(arguments.run, straight=arguments.straight)

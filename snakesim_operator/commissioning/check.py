@@ -1,0 +1,92 @@
+"""`snakesim joints check`: the record of a run of the joint check, judged and printed."""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from snakesim_hal.arrays import Floats
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.kinematics import rotation_from_quaternion
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.terminal import say
+from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import Decoder
+from snakesim_hal.wire.messages import Description, Imu
+from snakesim_operator.commissioning.judge import Measured, judged
+from snakesim_operator.recording.message import RECORDING
+from snakesim_operator.recording.reader import RecordingReader
+from snakesim_operator.results.record import RunRecord
+
+COLUMNS = ("angle_rad", "velocity_rad_s", "torque_nm", "target", "orientation_wxyz")
+
+
+def check(run: Path, *, straight: bool) -> int:
+    """Print a line a joint. Returns 0 when each is as the robot file says. Raises ConfigError."""
+    record = RunRecord.load(run)
+    if record.config.controller != "joint_check":
+        raise ConfigError(
+            f"{run}: its controller was {record.config.controller!r}; make a run with `snakesim run joint_check`, or "
+            "any other scenario with --controller joint_check"
+        )
+    rows = judged(_of(record), straight=straight)
+    for row in rows:
+        moved = f"moved {row.moved_rad:5.3f} rad" if row.moved_rad is not None else "not moved yet  "
+        turned = "link unknown    " if row.turned is None else f"link {row.turned:+5.2f} of it"
+        say(f"{row.joint:10}  {moved}  {turned}  {row.verdict}")
+    wrong = sum(not row.as_told for row in rows)
+    say(f"{len(rows) - wrong} of {len(rows)} joints are as the robot file says")
+    unseen = [joint.name for joint in record.description.joints if joint.axis == "yaw"]
+    if unseen and not straight:
+        say(f"not judged: the zeros of {', '.join(unseen)}; lay the robot straight, run again, and add --straight")
+    return 1 if wrong else 0
+
+
+def _of(record: RunRecord) -> Measured:
+    decoder = Decoder(Imu)
+    path = record.folder if record.alone else record.folder / RECORDING
+    messages = RecordingReader(path).messages([keys.IMU])
+    imus = (decoder.decode(message.payload, message.encoding) for message in messages)
+    ticks = np.round(record.time_s * record.config.rate_hz).astype(int).tolist()
+    columns: dict[str, Floats] = {name: getattr(record, name) for name in COLUMNS}
+    return measured(record.config, record.description, ticks, columns, imus)
+
+
+def measured(
+    config: RunConfig, robot: Description, ticks: Iterable[int], columns: Mapping[str, Floats], imus: Iterable[Imu]
+) -> Measured:
+    """What joints, IMUs and motion capture say. columns: those of `COLUMNS`, one row a tick."""
+    rows = {tick: row for row, tick in enumerate(ticks)}
+    rates, forces = (np.full((len(rows), len(robot.links), 3), np.nan) for _ in range(2))
+    for imu in imus:
+        row = rows.get(imu.tick)
+        if row is not None:
+            rates[row, imu.link] = imu.angular_velocity_rad_s
+            forces[row, imu.link] = imu.acceleration_m_s2
+    late = 0 if config.robot.sensors.pose is None else round(config.robot.sensors.pose.delay_s * config.rate_hz)
+    poses = np.full_like(columns["orientation_wxyz"], np.nan)
+    poses[: len(poses) - late] = columns["orientation_wxyz"][late:]
+    return Measured(
+        names=[joint.name for joint in robot.joints],
+        axes=[joint.axis for joint in robot.joints],
+        drives=[joint.drive for joint in config.robot.joint_table],
+        angle_rad=columns["angle_rad"],
+        velocity_rad_s=columns["velocity_rad_s"],
+        torque_nm=columns["torque_nm"],
+        target_rad=columns["target"],
+        link_rate_rad_s=rates,
+        link_force_m_s2=forces,
+        base_turn_rad=_turns(poses),
+    )
+
+
+def _turns(wxyz: Floats) -> Floats:
+    """Small rotations from the first known orientation, (n, 3)."""
+    turns = np.full((len(wxyz), 3), np.nan)
+    known = np.flatnonzero(np.isfinite(wxyz).all(axis=1) & (np.abs(wxyz).sum(axis=1) > 0))
+    if len(known):
+        first = rotation_from_quaternion(wxyz[known[0]])
+        for row in known:
+            turned = first.T @ rotation_from_quaternion(wxyz[row])
+            turns[row] = (turned[2, 1], turned[0, 2], turned[1, 0])
+    return turns

@@ -1,0 +1,46 @@
+"""The start check: five defects at once on emulated modules, each named; and a robot without any."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from tests.whole.command import run_to_summary, snakesim
+
+JOINTS = 9
+DEFECTS = {
+    "joint_1.zero_rad=0.15": "joint_1 .* its zero is off by .0.150 rad: zero_rad = 0.1",
+    "joint_3.sign=-1": "joint_3 .* turns the other way: sign = -1",
+    "joint_5.connected=false": "joint_5 .* did not move",
+    "joint_2.id=8": "joint_2 .* moves the link of joint_8: their ids or cables are swapped",
+    "joint_8.id=2": "joint_8 .* moves the link of joint_2: their ids or cables are swapped",
+    "joint_7.gear=2": "joint_7 .* turns 0.5",
+}
+
+
+def check(out: Path, *sets: str) -> tuple[int, list[str]]:
+    truth = [word for text in sets for word in ("--set", f"backends.can.mounted.{text}")]
+    short = ("--set", f"robot.chain.modules={JOINTS}", "--duration", "9")
+    run_to_summary(out, "joint_check", "--backend", "can", *short, *truth)
+    ended = snakesim("joints", "check", str(out), "--straight", cwd=out.parent)
+    return ended.code, ended.out.splitlines()
+
+
+def test_every_defect_is_named_and_no_sound_joint_is(tmp_path: Path) -> None:
+    code, lines = check(tmp_path / "run", *DEFECTS)
+    assert code == 1
+    for defect, said in DEFECTS.items():
+        assert any(re.match(said, line) for line in lines), f"{defect}: {lines}"
+    assert lines[-1] == f"{JOINTS - len(DEFECTS)} of {JOINTS} joints are as the robot file says", lines
+
+
+@pytest.mark.slow
+def test_a_sound_robot_passes(tmp_path: Path) -> None:
+    code, lines = check(tmp_path / "run")
+    assert code == 0 and lines[-1] == f"{JOINTS} of {JOINTS} joints are as the robot file says", lines
+
+
+def test_another_run_is_refused(tmp_path: Path) -> None:
+    run_to_summary(tmp_path / "run", "triplet", "--duration", "0.1")
+    ended = snakesim("joints", "check", "run", cwd=tmp_path)
+    assert ended.code == 2 and "snakesim run joint_check" in ended.err
