@@ -6,7 +6,7 @@
     env = gymnasium.make("SnakeSIM/Clutter-v0", action="velocity", frame_skip=5)
 
 Importing this package registers the names; it needs the extra `gym`, and nothing else of SnakeSIM imports it.
-`environment` has the environment, `vector` many of them, `stepped` and `assisted` the robot in it, `observations` and
+`environment` has the environment, `vector` many of them, `stepped` and `assisted` the robot in it,
 `rewards` what is paid; what is seen is in `snakesim_gnc.control.observations`. `docs/environments.md` is the reference.
 """
 

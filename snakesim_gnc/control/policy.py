@@ -47,6 +47,12 @@ class Model:
         joints = fields.whole(JOINTS)
         if joints != count:
             raise fields.wrong(JOINTS, joints, f"{count}, the number of joints of robot {robot.robot!r}")
+        for joint in robot.joints:
+            if not joint.has(MODES[self.action]):
+                has = [name for name, mode in MODES.items() if joint.has(mode)]
+                raise fields.wrong(ACTION, self.action, f"what {joint.name} can do: {', '.join(has)}")
+            if "torque_nm" in self.parts and "torque" not in joint.measures:
+                raise fields.wrong(OBSERVATIONS, ",".join(self.parts), f"without torque_nm: {joint.name} measures none")
         width = sum(len(part.names) for part in self.parts.values())
         self._input = _only("input", self._session.get_inputs(), width, ", ".join(self.parts), file)
         self._output = _only("output", self._session.get_outputs(), count, "a target for each joint", file)
