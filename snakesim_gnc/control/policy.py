@@ -5,6 +5,7 @@ The model says in its metadata what it takes and gives; units are in the names. 
 
 import contextlib
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -14,8 +15,8 @@ from numpy.typing import NDArray
 from snakesim_gnc.control.controller import Action, Report, View, positions
 from snakesim_gnc.control.observations import Observer, Part, chosen, parts_of
 from snakesim_hal.backend import SetPoints
-from snakesim_hal.errors import ConfigError, short
-from snakesim_hal.model.files import FileStruct, expanded
+from snakesim_hal.errors import ConfigError, did_you_mean, short
+from snakesim_hal.model.files import SHIPPED, FileStruct, expanded
 from snakesim_hal.model.plugins import pip_install
 from snakesim_hal.model.textfiles import read_bytes
 from snakesim_hal.wire.messages import Description, Mode
@@ -31,6 +32,7 @@ OBSERVATIONS, ACTION = "snakesim.observations", "snakesim.action"
 JOINTS, FRAME_SKIP = "snakesim.joints", "snakesim.frame_skip"
 MODES = {"position": Mode.POSITION, "velocity": Mode.VELOCITY, "torque": Mode.TORQUE}
 MAX_FRAME_SKIP = 1000
+POLICIES, SUFFIX = SHIPPED / "policies", ".onnx"
 
 
 class Model:
@@ -69,9 +71,7 @@ class Policy:
     class Settings(FileStruct, frozen=True, kw_only=True):
         """The model."""
 
-        model: Annotated[
-            str, Meta(min_length=1, max_length=1024), about("path of an ONNX file with metadata; docs/environments.md")
-        ]
+        model: Annotated[str, Meta(min_length=1, max_length=1024), about("shipped name, or path of an ONNX file")]
 
     def __init__(self, robot: Description, settings: Settings) -> None:
         """Raises ConfigError for a model that does not fit."""
@@ -149,9 +149,22 @@ class _Metadata:
         return self._given[field]
 
 
+def _path_of(name: str) -> Path:
+    """Of a file, or of a shipped policy by its name."""
+    if "/" in name or name.endswith(SUFFIX):
+        return expanded(name)
+    there = sorted(path.stem for path in POLICIES.glob(f"*{SUFFIX}"))
+    if name not in there:
+        raise ConfigError(
+            f"no policy called {short(name)!r}; {did_you_mean(name, there)}shipped are {', '.join(there)}. For a file "
+            f"of your own give its path, such as ./{short(name)}{SUFFIX}"
+        )
+    return POLICIES / f"{name}{SUFFIX}"
+
+
 def _opened(file: str) -> tuple[Any, Mapping[str, str]]:
     """A session with the model of a file, and its metadata."""
-    data = read_bytes(expanded(file))
+    data = read_bytes(_path_of(file))
     if RUNTIME is None:
         raise ConfigError(f"controller policy needs onnxruntime: {pip_install('policy')}")
     options = RUNTIME.SessionOptions()

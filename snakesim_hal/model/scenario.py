@@ -30,6 +30,7 @@ from snakesim_hal.wire.messages import Description, Obstacle, Pace
 from snakesim_hal.wire.quantities import above
 
 SURVEY = 0x5EED  # tells the survey's random numbers from others of the same seed
+POLICY = "policy:"  # a controller that begins so names its model behind it
 CHOSEN = (
     "control.",
     "backend.",
@@ -244,6 +245,7 @@ def compose(scenario: str, overrides: Sequence[Override] = ()) -> Table:
     path = find(scenario, "scenarios")
     table = read_table(path)
     table.values.setdefault("name", path.stem)
+    _split_policy(table, table.values.get("controller"), table.source)
     picks = [o for o in overrides if o.key in ("robot", "scene")]
     for pick in picks:
         table.put(pick.key, pick.value, pick.flag)
@@ -266,7 +268,16 @@ def compose(scenario: str, overrides: Sequence[Override] = ()) -> Table:
                 chosen = str(table.values.get(choice, "sim")).rpartition(":")[2]
                 key = f"{section}.{chosen}.{key.removeprefix(alias)}"
         table.put(key, override.value, override.flag)
+        if key == "controller":
+            _split_policy(table, override.value, override.flag)
     return table
+
+
+def _split_policy(table: Table, controller: Any, origin: str) -> None:
+    """Of `policy:MODEL` the controller `policy`, and the setting that has its model."""
+    if isinstance(controller, str) and controller.startswith(POLICY):
+        table.put("controller", POLICY[:-1], origin)
+        table.put(f"controllers.{POLICY[:-1]}.model", controller.removeprefix(POLICY), origin)
 
 
 def check(config: RunConfig) -> None:

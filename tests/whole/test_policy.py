@@ -1,6 +1,7 @@
 """A policy from an ONNX file drives a robot as it did in its environment; another is refused before anything starts."""
 
 import re
+import runpy
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -16,6 +17,7 @@ from onnx import TensorProto, helper
 import snakesim
 from snakesim.environments import SnakeEnv
 from snakesim_gnc.control.policy import Model
+from tests.e2e.documents import REPOSITORY, sections
 from tests.whole.command import snakesim as command_line
 
 JOINTS, FRAME_SKIP = 13, 5
@@ -204,6 +206,17 @@ def test_a_model_that_does_not_fit_is_refused_with_file_field_and_what_is_expect
     changes, said = WRONG[case]
     with pytest.raises(snakesim.ConfigError, match=rf"{case}\.onnx: .*{said}"):
         driven(saved(tmp_path / f"{case}.onnx", **changes))
+
+
+def test_the_snippet_of_the_documentation_makes_a_model_that_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    blocks = [code for one in sections(REPOSITORY / "docs" / "environments.md") for _, code in one.blocks]
+    (tmp_path / "named.py").write_text(next(code for code in blocks if "set_model_props" in code))
+    monkeypatch.chdir(tmp_path)
+    linear(Path("trained.onnx"), 3 * JOINTS)
+    runpy.run_path("named.py")
+    assert snakesim.run("peg_row", controller="policy:./model.onnx", duration=0.3).complete
 
 
 def test_what_is_no_model_is_refused(tmp_path: Path) -> None:

@@ -1,0 +1,67 @@
+"""Arguments of `snakesim train`. Importable without the extra that it needs."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from snakesim_hal.arguments import number
+
+TASK = "run"  # under which `snakesim --help` lists it
+
+
+def add_commands(commands: Any) -> None:
+    """Add it to the parser of `snakesim`."""
+    train = commands.add_parser(
+        "train",
+        help="search a policy for a scenario on random fields; an ONNX file for --controller policy:FILE",
+        epilog="In --out: policy.onnx, curve.csv and curve.png, as of the newest generation. The same numbers give the "
+        "same policy, whatever --workers. Exit code: 0; 2 wrong input.",
+    )
+    train.add_argument("scenario", help="name of a shipped scenario, or path of a scenario file")
+    train.add_argument("--form", choices=("feeling", "wave"), default="feeling", help="what is learned (feeling)")
+    for flag, least, default, about in (
+        ("--generations", 1, 20, "of the search"),
+        ("--population", 4, 12, "policies in a generation"),
+        ("--fields", 1, 4, "for each of them, anew in each generation"),
+        ("--check-fields", 1, 8, "on which the mean of the search is checked"),
+        ("--seed", 0, 1, "of the search"),
+    ):
+        train.add_argument(flag, type=number(least, 100_000), default=default, metavar="N", help=f"{about} ({default})")
+    train.add_argument("--duration", type=number(0.1, 3600.0, "s"), metavar="S", help="of an episode (the scenario's)")
+    train.add_argument(
+        "--reward", action="append", default=[], metavar="TERM=WEIGHT", help="as energy=-0.002; may be repeated"
+    )
+    train.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="may be repeated")
+    train.add_argument("--workers", type=number(1, 1000), metavar="N", help="processes (one a core)")
+    train.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of what comes of it")
+    train.set_defaults(act=_train)
+
+
+def _train(arguments: argparse.Namespace) -> int:
+    from snakesim_operator import extras
+
+    extras.check("train", "`snakesim train`")
+    from snakesim.training.search import Effort
+    from snakesim.training.trained import Request, train
+    from snakesim_hal.model.scenario import parse_set
+
+    chosen = ["--form", arguments.form, *(["--duration", f"{arguments.duration:g}"] if arguments.duration else [])]
+    for flag in ("generations", "population", "fields", "check_fields", "seed"):
+        chosen += [f"--{flag.replace('_', '-')}", str(getattr(arguments, flag))]
+    chosen += [word for value in arguments.reward for word in ("--reward", value)]
+    chosen += [word for value in arguments.set for word in ("--set", value)]
+    return train(
+        Request(
+            scenario=arguments.scenario,
+            duration_s=arguments.duration,
+            reward={one.key: one.value for one in map(parse_set, arguments.reward)},
+            set={one.key: one.value for one in map(parse_set, arguments.set)},
+            form=arguments.form,
+            effort=Effort(
+                arguments.generations, arguments.population, arguments.fields, arguments.check_fields, arguments.seed
+            ),
+            workers=arguments.workers,
+            out=arguments.out,
+            again=["snakesim", "train", arguments.scenario, *chosen],
+        )
+    )
