@@ -31,6 +31,7 @@ def main() -> None:
     parser.add_argument("--at", type=float, default=0.0, metavar="S", help="seconds into the recording")
     parser.add_argument("--after", type=float, default=8.0, metavar="S", help="seconds after the page was there")
     parser.add_argument("--click", action="append", default=[], metavar="LABEL", help="in this order; may be repeated")
+    parser.add_argument("--signals", default="", metavar="NAMES", help="in the tab Signals: plots are parted by ;")
     parser.add_argument("--dark", action="store_true")
     parser.add_argument("--phone", action="store_true")
     given = parser.parse_args()
@@ -45,9 +46,11 @@ def main() -> None:
         tab.value("document.querySelectorAll('[class*=Notification-closeButton]').forEach(e => e.click())")
         if given.dark:
             tab.click("Dark page")
-        for label in given.click:
+        for label in [*given.click, *(["Signals"] if given.signals else [])]:
             tab.click(label)
             time.sleep(1.0)
+        if given.signals:
+            tab.value(f"document.querySelector('iframe').src = '/signals?within&with#{given.signals}'")
         time.sleep(SETTLE_S if recorded else 0.0)
         taken = tab.picture()
     with Image.open(io.BytesIO(taken)) as picture:

@@ -73,10 +73,6 @@ class JointCharts:
         for chart in (self._angles, self._torques, self._angles_then, self._torques_then):
             chart.remove()
 
-    def forget(self) -> None:
-        """Another place in time."""
-        self._history.clear()
-
     def take(self, snapshot: RobotSnapshot) -> None:
         """Keep a sample for the charts over time; each frame."""
         joints, time_s = snapshot.joints, snapshot.time_s

@@ -11,12 +11,14 @@ from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.service import START_LIMIT_S
 from snakesim_hal.terminal import Say
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
-from snakesim_hal.wire.messages import ControlState, Status
+from snakesim_operator.console.changes import Changes
 from snakesim_operator.console.drawing import Surroundings
 from snakesim_operator.console.operations import Log, Operations
 from snakesim_operator.console.page import Page
 from snakesim_operator.console.player import Player
-from snakesim_operator.console.server import page_server
+from snakesim_operator.console.server import SECOND_STOP, page_server
+from snakesim_operator.console.signals import LiveSignals
+from snakesim_operator.console.signals_page import SignalsPage
 from snakesim_operator.console.snapshot import RobotSnapshot
 from snakesim_operator.console.watch import Watch
 
@@ -42,17 +44,28 @@ def show_live(
         log.write(line)
         say(line)
 
-    with page_server(listening, report, lambda: operations.estop("a page's second stop")) as (server, address):
+    kept = LiveSignals()
+    signals = SignalsPage(kept, SECOND_STOP)
+    signals.now_s = kept.now_s
+
+    with page_server(listening, report, lambda: operations.estop("a page's second stop"), signals.answer) as (
+        server,
+        address,
+    ):
         page = Page(server, around, operations, log)
         say(f"console: {address}")
         page.show(expected)
         whole = replace(link, largest_bytes=MAX_IMAGE_BYTES)
         with open_session(whole, START_LIMIT_S) as session:
             operations.connect(session)
-            watch, changes = Watch(session), Changes(log)
+            watch, changes = Watch(session), Changes(log.write)
             for _ in frames(stop):
                 snapshot = watch.snapshot() or expected
-                changes.note(snapshot)
+                if snapshot is not None:
+                    changes.note(snapshot.status)
+                    changes.note(snapshot.control)
+                    changes.note(snapshot.settings)
+                    kept.take(snapshot)
                 page.show(snapshot)
 
 
@@ -60,22 +73,26 @@ def show_recorded(folder: Path, at_s: float, listening: socket.socket, stop: thr
     """Show a run's record until `stop` is set. Returns the exit code. Raises ConfigError when the folder has none."""
     # What only recordings need would delay the page of a run that starts.
     from snakesim_operator.console.recorded import RecordedRun
+    from snakesim_operator.console.recorded_signals import RecordedSignals
     from snakesim_operator.results.incomplete import exit_code
-    from snakesim_operator.results.record import RunRecord
 
-    recorded, log = RecordedRun(RunRecord.load(folder), folder), Log()
+    recorded, log = RecordedRun(folder), Log()
     for lack in recorded.record.lacks:
         log.write(f"the record lacks {lack}")
+    if recorded.heard.thinned > 1:
+        log.write(f"of {recorded.heard.thinned} camera images one is kept")
     code = exit_code(folder, recorded.record.lacks)
-    with page_server(listening, say) as (server, address):
+    signals = SignalsPage(RecordedSignals(recorded))
+    with page_server(listening, say, more=signals.answer) as (server, address):
         page = Page(server, Surroundings(recorded.record.config), None, log, recorded=folder.name)
         player = Player(server, recorded.span_s, at_s)
+        signals.now_s, signals.go = (lambda: player.since_s), player.go
         say(f"console: {address}")
         shown_s = None
         for _ in frames(stop):
             time_s, jumped = player.turn()
-            if jumped:
-                page.forget()
+            if jumped or shown_s is None:
+                page.recall(recorded.before(time_s))
             if time_s != shown_s:
                 page.show(recorded.at(time_s))
                 shown_s = time_s
@@ -89,31 +106,3 @@ def frames(stop: threading.Event) -> Iterator[None]:
         yield
         due_s = max(due_s + 1 / FRAMES_PER_S, time.monotonic())
         stop.wait(due_s - time.monotonic())
-
-
-class Changes:
-    """Writes into the log what has become of the robot."""
-
-    def __init__(self, log: Log) -> None:
-        self._log = log
-        self._status: Status | None = None
-        self._control: ControlState | None = None
-
-    def note(self, snapshot: RobotSnapshot | None) -> None:
-        """Compare with the snapshot before."""
-        if snapshot is None:
-            return
-        status, before = snapshot.status, self._status
-        if status is not None:
-            if before is None or (status.lifecycle, status.why) != (before.lifecycle, before.why):
-                self._log.write(f"robot {status.lifecycle}: {status.why}")
-            known = () if before is None else before.faults
-            for fault in status.faults:
-                if fault not in known:
-                    self._log.write(f"fault {fault.what}{' at ' + fault.joint if fault.joint else ''}: {fault.cause}")
-            self._status = status
-        control = snapshot.control
-        if control is not None and control is not self._control:
-            if self._control is None or control.state != self._control.state:
-                self._log.write(f"control {control.state}: {control.reason}")
-            self._control = control

@@ -6,7 +6,7 @@ before (`pacing`), so a slow browser gets fewer frames, and never makes the loop
 
 import contextlib
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import partial
 
 import viser
@@ -63,7 +63,7 @@ class Page:
         self._stage: Stage | None = None
         self._charts: JointCharts | None = None
         self._own_sensors: OwnSensors | None = None
-        self._shown_log = -1
+        self._shown_log: list[str] = []
         self._pictures: dict[str, viser.GuiImageHandle] = {}
         self._lay_out()
         server.on_client_connect(self._came)
@@ -93,27 +93,22 @@ class Page:
             self._forces = gui.add_html("")
         with tabs.add_tab("State"):
             self._state = gui.add_html("")
-            self._streams = None
-            if self._operations is not None:
-                with gui.add_folder("Rates and ages", expand_by_default=False):
-                    self._streams = gui.add_html("")
-        if self._operations is not None:
-            self._lay_out_live(tabs)
-        gui.add_html(texts.legend(LEGEND), order=3)
-
-    def _lay_out_live(self, tabs: viser.GuiTabGroupHandle) -> None:
-        """What a recording has no page for."""
-        gui = self._server.gui
+            with gui.add_folder("Rates and ages", expand_by_default=False):
+                self._streams = gui.add_html("")
+        with tabs.add_tab("Signals"):
+            gui.add_html(texts.SIGNALS)
         with tabs.add_tab("Cameras"):
             self._cameras_tab = gui.add_folder(None)
             with self._cameras_tab:
                 self._no_camera = gui.add_html("<div style='padding:.3em .6em;opacity:.7'>no image yet</div>")
         with tabs.add_tab("Sensors"):
             self._sensors_tab = gui.add_folder(None)
-        with tabs.add_tab("Settings"):
-            self._settings_tab = gui.add_folder(None)
+        if self._operations is not None:
+            with tabs.add_tab("Settings"):
+                self._settings_tab = gui.add_folder(None)
         with tabs.add_tab("Log"):
             self._log_text = gui.add_html("")
+        gui.add_html(texts.legend(LEGEND), order=3)
 
     # --- viewers ---------------------------------------------------------------------------------------------
 
@@ -191,11 +186,18 @@ class Page:
         if controls is not None:
             controls.press(key)
 
-    def forget(self) -> None:
-        """The next snapshot is not the one after this: trail and charts start over."""
-        if self._stage is not None and self._charts is not None:
+    def recall(self, before: Iterable[RobotSnapshot]) -> None:
+        """The next snapshot is not the one after this: the trail starts over, charts begin with those before it."""
+        for snapshot in before:
+            if self._stage is None:
+                self._meet(snapshot.robot)
+                self._moment = snapshot
+            assert self._charts is not None
+            self._charts.take(snapshot)  # going back forgets
+            if self._own_sensors is not None:
+                self._own_sensors.take(snapshot)
+        if self._stage is not None:
             self._stage.forget()
-            self._charts.forget()
         self._frames = 0
 
     # --- each frame ------------------------------------------------------------------------------------------
@@ -246,7 +248,7 @@ class Page:
         if self._own_sensors is not None:
             self._own_sensors.remove()
             self._own_sensors = None
-        if robot.own and self._operations is not None:
+        if robot.own:
             with self._sensors_tab:
                 self._own_sensors = OwnSensors(self._server.gui)
 
@@ -255,12 +257,15 @@ class Page:
             for controls in self._controls.values():
                 with self._of_who_is_there(controls.client):
                     controls.show_settings(settings)
-        if settings.who is not None:
-            self._log.write(f"settings of {settings.controller} in force, as {settings.who} asked")
 
     def _show_texts(self, snapshot: RobotSnapshot | None) -> None:
         if snapshot is not None:
             self._state.content = texts.state_table(snapshot)
+            self._streams.content = texts.stream_table(snapshot)
+        lines = [*(() if snapshot is None else snapshot.log), *self._log.lines()]
+        if lines != self._shown_log:
+            self._shown_log = lines
+            self._log_text.content = texts.log(lines)
         if self._operations is None:
             self._header.content = texts.header(snapshot, recorded=self._recorded)
             return
@@ -270,11 +275,6 @@ class Page:
         if dropped := self._server.admission.dropped.total():
             control += f"; {dropped} message{'' if dropped == 1 else 's'} of browsers dropped"
         self._header.content = texts.header(snapshot, control=control)
-        if snapshot is not None and self._streams is not None:
-            self._streams.content = texts.stream_table(snapshot)
-        if self._log.written != self._shown_log:
-            self._shown_log = self._log.written
-            self._log_text.content = texts.log(self._log.lines())
 
     def _show_pictures(self, snapshot: RobotSnapshot) -> None:
         for key, image in snapshot.images.items():

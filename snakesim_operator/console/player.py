@@ -45,6 +45,16 @@ class Player:
         moved, self._moved = self._moved, False
         return self.time_s, moved
 
+    @property
+    def since_s(self) -> float:
+        """The time shown, after the first instant."""
+        return self.time_s - self._begin_s
+
+    def go(self, since_s: float) -> None:
+        """Show another instant; from any thread."""
+        self.time_s, self._moved = min(max(self._begin_s + since_s, self._begin_s), self._end_s), True
+        self._slider.value = round(self.since_s, 2)
+
     def _jump(self) -> None:
         self.time_s, self._moved = self._begin_s + self._slider.value, True
 

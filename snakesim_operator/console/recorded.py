@@ -1,36 +1,37 @@
 """Moments of a recorded run: what the live console shows, as far as the record has it."""
 
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import UNDECODABLE
-from snakesim_hal.wire.messages import AppliedCommand, ControlState, JointState, Mode, Power, Status, Trajectory, World
+from snakesim_hal.wire.messages import AppliedCommand, ControlState, JointState, Mode, Trajectory, World
 from snakesim_hal.wire.quantities import Quaternion, Vector
+from snakesim_operator.console.changes import Changes
+from snakesim_operator.console.heard import IMAGES, Heard
+from snakesim_operator.console.operations import LOG_LINES
 from snakesim_operator.console.snapshot import RobotSnapshot
-from snakesim_operator.recording.message import RECORDING
-from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.results.record import RunRecord
 
 CONTROL_LIMIT_S = 0.3  # older states are of before a gap
 MessageT = TypeVar("MessageT", ControlState, World, Trajectory)
-_TOLD: dict[str, type[Any]] = {keys.STATUS: Status, keys.POWER: Power}  # what a record of rows does not have
+CHARTED_S, CHARTED = 10.0, 200  # before an instant that is jumped to
 
 
 class RecordedRun:
     """A recorded run, by time."""
 
-    def __init__(self, record: RunRecord, kept: Path) -> None:
-        """kept: the run's folder, or its recording; a run without one has neither status nor supply."""
-        self.record = record
-        self._told = _told(kept / RECORDING if kept.is_dir() else kept)
+    def __init__(self, kept: Path) -> None:
+        """kept: the run's folder, or its recording. Raises ConfigError when it is neither."""
+        self.heard = Heard()
+        self.record = RunRecord.load(kept, hear=self.heard.take)
+        self.heard.robot = self.record.description
         self._stamps = {id(messages): [_stamp_s(m) for m in messages] for messages in self._outputs()}
+        self._log = self._written()
 
     def _outputs(self) -> tuple[Sequence[ControlState], Sequence[World], Sequence[Trajectory]]:
         return self.record.control, self.record.worlds, self.record.trajectories
@@ -58,15 +59,33 @@ class RecordedRun:
             world=self._before(record.worlds, time_s, CONTROL_LIMIT_S),
             trajectory=self._before(record.trajectories, time_s),
             control=control,
-            status=self._newest(keys.STATUS, time_s),
-            power=self._newest(keys.POWER, time_s),
+            status=self.heard.newest(keys.STATUS, time_s),
+            power=self.heard.newest(keys.POWER, time_s),
+            settings=self.heard.newest(keys.SETTINGS_IN_FORCE, time_s),
             applied=self._applied(row),
+            images={key: image for row in IMAGES for key, image in self.heard.all_newest(row, time_s).items()},
+            own=self.heard.all_newest(keys.OWN_ALL, time_s),
+            streams=self.heard.streams(time_s),
+            log=[line for at_s, line in self._log if at_s <= time_s][: -LOG_LINES - 1 : -1],
         )
 
-    def _newest(self, key: str, time_s: float) -> Any:
-        times_s, messages = self._told[key]
-        i = bisect_right(times_s, time_s) - 1
-        return messages[i] if i >= 0 else None
+    def before(self, time_s: float) -> Iterator[RobotSnapshot]:
+        """Up to an instant, as far back as charts reach."""
+        first_s = max(time_s - CHARTED_S, self.span_s[0])
+        return (self.at(at_s) for at_s in np.linspace(first_s, time_s, CHARTED, endpoint=False).tolist())
+
+    def _written(self) -> list[tuple[float, str]]:
+        """The log that a live page would have had, by robot time; times in it since the first tick."""
+        lines: list[tuple[float, str]] = []
+        told = [*self.heard.every(keys.STATUS), *self.heard.every(keys.SETTINGS_IN_FORCE)]
+        told += [(_stamp_s(state), state) for state in self.record.control]
+        fresh: list[str] = []
+        changes = Changes(fresh.append)
+        for time_s, message in sorted(told, key=lambda one: one[0]):
+            changes.note(message)
+            lines += [(time_s, f"{time_s - self.span_s[0]:8.2f} s  {line}") for line in fresh]
+            fresh.clear()
+        return lines
 
     def _before(self, messages: Sequence[MessageT], time_s: float, limit_s: float | None = None) -> MessageT | None:
         """The newest message of that time, unless it is older than the limit."""
@@ -107,21 +126,6 @@ class RecordedRun:
         x, y, z = position.tolist()
         w, i, j, k = wxyz.tolist()
         return (x, y, z), (w, i, j, k)
-
-
-def _told(path: Path) -> dict[str, tuple[list[float], list[Any]]]:
-    """Robot times and messages, by key."""
-    found: dict[str, tuple[list[float], list[Any]]] = {key: ([], []) for key in _TOLD}
-    decoders = {key: msgspec.msgpack.Decoder(message) for key, message in _TOLD.items()}
-    for one in RecordingReader(path).messages(list(_TOLD)) if path.is_file() else ():
-        try:
-            message = decoders[one.key].decode(one.payload)
-        except UNDECODABLE:
-            continue
-        times_s, messages = found[one.key]
-        times_s.append(max(one.time_ns * 1e-9, times_s[-1] if times_s else 0.0))
-        messages.append(message)
-    return found
 
 
 def _stamp_s(message: ControlState | World | Trajectory) -> float:

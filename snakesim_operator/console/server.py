@@ -36,6 +36,7 @@ PREFERENCE = (
     b' + "; path=/; SameSite=Strict"</script>'
 )
 Answer = Callable[[ServerConnection, Request], Response | None]
+More = Callable[[Request], Response | None]
 _connecting: ContextVar[Browser] = ContextVar("connecting")
 
 
@@ -69,14 +70,18 @@ class PageServer(viser.ViserServer):
 
 @contextlib.contextmanager
 def page_server(
-    listening: socket.socket, report: Callable[[str], None] = lambda _: None, stop: Callable[[], str] | None = None
+    listening: socket.socket,
+    report: Callable[[str], None] = lambda _: None,
+    stop: Callable[[], str] | None = None,
+    more: More = lambda _: None,
 ) -> Iterator[tuple[PageServer, str]]:
     """The server on a socket of `port.open_port`, and its address.
 
-    report: told what was refused, once of each kind; stop: of the pages' second stop, None for a recording.
+    report: told what was refused, once of each kind; stop: of the pages' second stop, None for a recording;
+    more: answers requests for pages beside the console's, None: it has none there.
     """
     admission, handed_on = Admission(report), HandedOn(listening.getsockname())
-    with _on_our_terms(handed_on, admission, stop is not None), contextlib.redirect_stdout(io.StringIO()):
+    with _on_our_terms(handed_on, admission, stop is not None, more), contextlib.redirect_stdout(io.StringIO()):
         server = PageServer(LOOPBACK, listening.getsockname()[1], label="SnakeSIM", verbose=False)  # prints a banner
     server.admission = admission
     pace(server)
@@ -89,7 +94,7 @@ def page_server(
 
 
 @contextlib.contextmanager
-def _on_our_terms(handed_on: HandedOn, admission: Admission, stops: bool) -> Iterator[None]:
+def _on_our_terms(handed_on: HandedOn, admission: Admission, stops: bool, more: More) -> Iterator[None]:
     """Have viser's server take connections from the front, with our checks; viser has no option for either."""
     serve = websockets.asyncio.server.serve
     quiet = logging.getLogger(f"{__name__}.websockets")  # a stranger's bytes are counted, and are no errors of ours
@@ -118,7 +123,7 @@ def _on_our_terms(handed_on: HandedOn, admission: Admission, stops: bool) -> Ite
             "max_size": MOST_BYTES,
             "create_connection": made,
             "logger": quiet,
-            "process_request": _checked(options["process_request"], admission, stops),
+            "process_request": _checked(options["process_request"], admission, stops, more),
         }
         return serve(let_in, sock=handed_on, **(options | ours))
 
@@ -129,7 +134,7 @@ def _on_our_terms(handed_on: HandedOn, admission: Admission, stops: bool) -> Ite
         websockets.asyncio.server.serve = serve  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def _checked(answer: Answer, admission: Admission, stops: bool) -> Answer:
+def _checked(answer: Answer, admission: Admission, stops: bool, more: More) -> Answer:
     """Answer requests of our own pages only. viser's page gets our scripts, and cannot be framed by others."""
 
     def check(connection: ServerConnection, request: Request) -> Response | None:
@@ -137,6 +142,8 @@ def _checked(answer: Answer, admission: Admission, stops: bool) -> Answer:
         if why is not None:
             admission.drop(None, "another origin", why)
             return connection.respond(403, f"{why}\n")
+        if "Upgrade" not in request.headers and (found := more(request)) is not None:
+            return found
         if request.path.partition("?")[0] not in PAGES or "Upgrade" in request.headers:
             return answer(connection, request)
         page = answer(connection, dataclasses.replace(request, headers=Headers()))  # as it is, without compression

@@ -1,5 +1,6 @@
 """What the console shows of one instant of a robot, live or recorded."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from snakesim_hal.model.kinematics import quaternion_from_yaw
@@ -13,6 +14,7 @@ from snakesim_hal.wire.messages import (
     ControlState,
     DepthImage,
     Description,
+    Imu,
     JointState,
     OwnSample,
     Power,
@@ -50,9 +52,11 @@ class RobotSnapshot:
     applied: AppliedCommand | None = None
     settings: ControlSettings | None = None
     power: Power | None = None
+    imu: Imu | None = None
     images: dict[str, DepthImage | ColourImage] = field(default_factory=dict)  # by key
     own: dict[str, OwnSample] = field(default_factory=dict[str, OwnSample])  # of own sensors, by key
     streams: dict[str, Stream] = field(default_factory=dict)  # by key
+    log: Sequence[str] = ()  # of a recording: what had become of the robot by then, newest first
     hosts: frozenset[str] = frozenset()  # ids of all that publish a status; more than one: an impostor
 
 

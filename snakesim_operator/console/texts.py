@@ -13,6 +13,11 @@ STATE_COLOURS = {"Locomoting": "#1a7f4b", "NotLocomoting": "#b26a00", "Idle": "#
 BAD = "#d64541"  # of text, on a light and on a dark page
 SIMULATED, EMULATED, REAL, RECORDED = "#0067b0", "#7a3fa8", "#b3261e", "#59626d"
 
+SIGNALS = (
+    "<iframe src='/signals?within' title='Signals' loading='lazy' style='border:0;width:100%;height:60vh'></iframe>"
+    "<a href='/signals' target='_blank' style='padding:0 .6em;font-size:.85em'>Signals in a page of their own</a>"
+)
+
 
 def plain(text: object) -> str:
     """Text from anywhere, harmless in a page."""

@@ -1,5 +1,6 @@
 """Reads a run's folder: configuration, description, black box, host's record, recording."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -20,7 +21,7 @@ from snakesim_hal.record.host_record import BLACK_BOX, DESCRIPTION, HOST_RECORD,
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import ControlState, Description, Trajectory, World
-from snakesim_operator.recording.message import RECORDING
+from snakesim_operator.recording.message import RECORDING, RecordedMessage
 from snakesim_operator.results.gaps import cleaned, unread, unwritten
 from snakesim_operator.results.recorded import OUTPUTS, Contents, read_recording
 
@@ -30,6 +31,7 @@ REPORT = "report.html"
 GIVE = "give the folder that `snakesim run` left, such as runs/demo, or a recording"
 UNRECORDED = "without a recording, what control, navigation and guidance reported is unknown"
 
+Hear = Callable[[RecordedMessage], None]
 DAMAGED = (*UNDECODABLE, OSError, MemoryError)
 
 
@@ -62,20 +64,21 @@ class RunRecord:
     whole: bool = True  # that recording has an end
 
     @staticmethod
-    def load(folder: Path, host: HostRecord | None = None) -> "RunRecord":
+    def load(folder: Path, host: HostRecord | None = None, hear: Hear | None = None) -> "RunRecord":
         """Read a run's folder, also of a run that was killed, or a recording. Raises ConfigError for anything else.
 
         host: the host's statistics, if known from elsewhere; None: from the folder.
+        hear: given every message of the recording.
         """
         if folder.is_file() or (not (folder / BLACK_BOX).exists() and (folder / RECORDING).is_file()):
-            return RunRecord._alone(folder if folder.is_file() else folder / RECORDING, host)
+            return RunRecord._alone(folder if folder.is_file() else folder / RECORDING, host, hear)
         if not folder.exists():
             raise ConfigError(f"{folder}: no such folder; {GIVE}")
         for name in (CONFIG, BLACK_BOX, DESCRIPTION, *([] if host is not None else [HOST_RECORD])):
             if not (folder / name).is_file():
                 raise ConfigError(f"{folder} is not the folder of a run: {name} is missing; {GIVE}")
         try:
-            return RunRecord._read(folder, host)
+            return RunRecord._read(folder, host, hear)
         except ConfigError:
             raise
         except DAMAGED as error:
@@ -83,7 +86,7 @@ class RunRecord:
             raise ConfigError(f"{folder}: the record of this run is damaged ({why}); run it again") from None
 
     @staticmethod
-    def _read(folder: Path, host: HostRecord | None) -> "RunRecord":
+    def _read(folder: Path, host: HostRecord | None, hear: Hear | None) -> "RunRecord":
         config = read(folder / CONFIG)
         description = msgspec.json.decode((folder / DESCRIPTION).read_bytes(), type=Description)
         layout, columns = read_black_box(folder / BLACK_BOX)
@@ -94,13 +97,13 @@ class RunRecord:
         if host.ended == "running":
             host = msgspec.structs.replace(host, ticks=len(columns["tick"]), command_digest=digest_of(columns))
         path = folder / RECORDING
-        contents = read_recording(path, OUTPUTS) if path.is_file() else Contents(path, lacks=[UNRECORDED])
+        contents = read_recording(path, OUTPUTS, hear) if path.is_file() else Contents(path, lacks=[UNRECORDED])
         return RunRecord._of(folder, config, description, host, contents, columns)
 
     @staticmethod
-    def _alone(path: Path, host: HostRecord | None) -> "RunRecord":
+    def _alone(path: Path, host: HostRecord | None, hear: Hear | None) -> "RunRecord":
         """Of a recording without the run's other files: a full disk may have had no room for them."""
-        contents = read_recording(path)
+        contents = read_recording(path, hear=hear)
         description = contents.description
         if description is None or contents.config is None:
             why = "; ".join(contents.lacks) or "was it recorded beside a HAL host?"

@@ -5,7 +5,7 @@ The rows have the columns of the black box, made of the messages: joints of `sen
 """
 
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -195,13 +195,21 @@ def _picked(values: list[float], row: NDArray[np.int64], known: NDArray[np.bool_
     return found
 
 
-def read_recording(path: Path, wanted: Collection[str] = ALL) -> Contents:
-    """Read a recording's messages at these keys. Raises ConfigError for a file that is none."""
+def read_recording(
+    path: Path, wanted: Collection[str] = ALL, hear: Callable[[RecordedMessage], None] | None = None
+) -> Contents:
+    """Read a recording's messages at these keys. Raises ConfigError for a file that is none.
+
+    hear: given every message, at whatever key, so that nobody has to read the file again.
+    """
     from snakesim_operator.recording.reader import RecordingReader  # needs the extra `record`
 
     contents, reader = Contents(path), RecordingReader(path)
-    for recorded in reader.messages(wanted):
-        contents.take(recorded)
+    for recorded in reader.messages(wanted if hear is None else None):
+        if hear is not None:
+            hear(recorded)
+        if hear is None or recorded.key in wanted or keys.row_key(recorded.key) in wanted:
+            contents.take(recorded)
     contents.lacks += unread(contents.refused)
     contents.lacks += [f"recording: {lack}" for lack in reader.lacks]
     contents.whole = reader.finished

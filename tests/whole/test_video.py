@@ -9,7 +9,6 @@ from PIL import Image
 
 from snakesim_operator.console.drawing import Surroundings, draw
 from snakesim_operator.console.recorded import RecordedRun
-from snakesim_operator.results.record import RunRecord
 from tests.whole.command import snakesim
 
 
@@ -60,8 +59,8 @@ def test_what_cannot_be_filmed_is_said(run: Path, more: list[str], said: str) ->
 
 
 def test_the_console_shows_a_recorded_instant_as_it_was(run: Path) -> None:
-    record = RunRecord.load(run)
-    recorded = RecordedRun(record, run)
+    recorded = RecordedRun(run)
+    record = recorded.record
     begin_s, end_s = recorded.span_s
     assert end_s - begin_s == pytest.approx(0.99, abs=0.03)
     moment = recorded.at(begin_s + 0.5)

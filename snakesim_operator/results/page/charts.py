@@ -6,6 +6,7 @@ A colour is the name of one in the palette (`--measured`): `charts.js` looks it 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from snakesim_hal.arrays import Floats
 
 Figure = dict[str, Any]
+LIBRARY = Path(__file__).parent / "vendor" / "plotly-cartesian.min.js"
 BUCKETS = 500  # of time; each keeps its smallest and its largest value
 MAP_COLUMNS = 480
 ROW = 21  # height of a row of bars

@@ -10,11 +10,10 @@ import msgspec
 from markupsafe import Markup
 
 from snakesim_hal.terminal import printable
-from snakesim_operator.results.page.charts import Figure
+from snakesim_operator.results.page.charts import LIBRARY, Figure
 from snakesim_operator.results.page.palette import themes
 
 HERE = Path(__file__).parent
-LIBRARY = HERE / "vendor" / "plotly-cartesian.min.js"
 KEPT = "\n\u202f\u00a0"  # line breaks of a configuration, and the blanks in large numbers
 MINUS = str.maketrans({"-": "−"})
 
