@@ -35,6 +35,10 @@ PREFERENCE = (
     b'<script>document.cookie = "snakesim-dark=" + matchMedia("(prefers-color-scheme: dark)").matches'
     b' + "; path=/; SameSite=Strict"</script>'
 )
+STATE_IN_SIGHT = (  # of `texts.header`: what is below is scrolled behind it
+    b"<style>div:has(> [data-robot]) {position: sticky; top: 0; z-index: 5; background: var(--mantine-color-body);"
+    b" padding-top: 2px} div:has(> div > div > div > [data-robot]) {overflow: clip !important}</style>"
+)
 Answer = Callable[[ServerConnection, Request], Response | None]
 More = Callable[[Request], Response | None]
 _connecting: ContextVar[Browser] = ContextVar("connecting")
@@ -148,7 +152,7 @@ def _checked(answer: Answer, admission: Admission, stops: bool, more: More) -> A
             return answer(connection, request)
         page = answer(connection, dataclasses.replace(request, headers=Headers()))  # as it is, without compression
         assert page is not None
-        return _with(SECOND_STOP + PREFERENCE if stops else PREFERENCE, page)
+        return _with((SECOND_STOP if stops else b"") + PREFERENCE + STATE_IN_SIGHT, page)
 
     return check
 

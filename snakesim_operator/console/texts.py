@@ -66,7 +66,7 @@ def header(snapshot: RobotSnapshot | None, *, recorded: str = "", control: str =
         )
     if control:
         lines.append(f"<div style='opacity:.75;font-size:.85em;margin-top:.35em'>{plain(control)}</div>")
-    return f"<div style='padding:0 .6em .2em;font-size:.9em;line-height:1.35'>{''.join(lines)}</div>"
+    return f"<div data-robot style='padding:0 .6em .2em;font-size:.9em;line-height:1.35'>{''.join(lines)}</div>"
 
 
 def badge(text: str, colour: str) -> str:

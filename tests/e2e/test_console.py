@@ -28,6 +28,7 @@ SILENT = "THE STOP DOES NOT ANSWER"
 COAST_LIMIT_S = 2.0  # of robot time, until joints without torque are at rest
 SMALL = 800, 400, 0.25  # width, height, pixels a dot: the browser draws without a graphics card here
 LOOK = "document.documentElement.dataset.mantineColorScheme"
+STATE_TOP = "document.querySelector('[data-robot]').getBoundingClientRect().top"
 GROUND = {"x": 0, "y": 200, "width": 370, "height": 200, "scale": 1}  # of the page: scene without notices
 
 
@@ -55,6 +56,8 @@ def test_a_page_shows_the_snake_as_it_moves_and_its_escape_key_stops_it(tmp_path
             f"{live_after_s:.1f} s, motors off {stopped_after_s:.2f} s after the key"
         )
         page.wait_for("ESTOP")
+        page.value("document.querySelectorAll('[class*=ScrollArea-viewport]').forEach(e => { e.scrollTop = 300; })")
+        assert page.value(STATE_TOP) >= 0  # in sight all the same
         assert not page.errors, page.errors
 
 
