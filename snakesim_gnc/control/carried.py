@@ -46,6 +46,11 @@ class FeltContacts:
 
     def at(self, obstacles: Sequence[str | None]) -> list[float | None]:
         """How hard each obstacle pushes the body, 0 where none is felt; empty when no sensor tells."""
+        forces = self.forces_w(obstacles)
+        return [None if name is None else math.hypot(*force) for name, force in zip(obstacles, forces, strict=False)]
+
+    def forces_w(self, obstacles: Sequence[str | None]) -> list[tuple[float, float]]:
+        """With which horizontal force each obstacle pushes the body; empty when no sensor tells."""
         if not self._last:
             return []
         sums: dict[str | None, tuple[float, float]] = {}
@@ -53,8 +58,8 @@ class FeltContacts:
             for contact in contacts:
                 x, y = sums.get(contact.obstacle, (0.0, 0.0))
                 sums[contact.obstacle] = (x + contact.force_w[0], y + contact.force_w[1])
-        count = len(self._last)
-        return [None if name is None else math.hypot(*sums.get(name, (0.0, 0.0))) / count for name in obstacles]
+        count, sizes = len(self._last), [sums.get(name, (0.0, 0.0)) for name in obstacles]
+        return [(x / count, y / count) for x, y in sizes]
 
     def along(self, direction_w: Sequence[float]) -> Carried | None:
         """What they do along a direction, (2,) of any length; None when no sensor tells."""

@@ -38,6 +38,10 @@ SIGNS = np.random.default_rng(1).choice((-1.0, 1.0), 4096)
 LARGEST_REST = 0.3  # of a push: what is not in balance turns the body a little, until it meets other obstacles
 AS_WANTED = 0.5  # share of the wanted speed from which on a body moves as it is to, whatever carries it
 POWERLESS_N = 4.0  # contacts that allow no more cannot overcome the friction of the ground
+STRAIGHT_PER_M2 = 20.0  # sum of theta'^2 below which a shape hardly tells where on its path it is
+LARGEST_SLIDE_M = 0.02
+FELT_N = 0.5  # a contact that is felt so hard is as dear as the others, but for a third
+DRAG_S = 0.3  # time constant of what all contacts are felt to do along the body
 STANDS_M_S, STANDS_S = 0.01, 0.5  # slower than this for so long counts as standing still
 
 
@@ -153,6 +157,31 @@ class ObstacleAided:
             Meta(ge=0, le=1, extra_json_schema={"unit": "s"}),
             about("time constant of the filter of the speed along the path; 0: none"),
         ] = 0.05
+        slides: Annotated[
+            float,
+            Meta(ge=0, le=1),
+            about(
+                "share of the shape's resistance to sliding along the path that is taken out: so much of the way that "
+                "the joint angles are ahead of or behind the measured place, the shape goes with them"
+            ),
+        ] = 0.0
+        servo_lag_s: Annotated[
+            float,
+            Meta(ge=0, le=1, extra_json_schema={"unit": "s"}),
+            about("by which joints are behind their targets, from latency and damping; the shape leads by it"),
+        ] = 0.0
+        empty_price: Annotated[
+            float,
+            Meta(ge=0, le=1000, extra_json_schema={"unit": "1"}),
+            about("how many times dearer the force on an obstacle is that is not felt; 0: as dear as on others"),
+        ] = 0.0
+        felt_push_s: Annotated[
+            float,
+            Meta(ge=0, le=1000, extra_json_schema={"unit": "s"}),
+            about(
+                "time constant in which the push of a moving body becomes what its contacts are felt to do; 0: never"
+            ),
+        ] = 0.0
 
     def __init__(self, robot: Description, settings: Settings) -> None:
         self._robot = robot
@@ -170,6 +199,7 @@ class ObstacleAided:
         self._last_push: PushSnapshot | None = None
         self._max_force_n = self._force_n = 0.0  # what contacts and torques allow, and what is commanded of it
         self._moved_at_s = self._slow_at_s = 0.0
+        self._felt_n = self._drag_n = 0.0  # what contacts are felt to do along the body, and what they mostly do
         self._waits = False
         self._search = ContactSearch(
             robot,
@@ -199,8 +229,10 @@ class ObstacleAided:
         ahead_m = self._look_ahead_m(located, view.period_s)
         ahead_m = scale * (ahead_m if scale >= 0 else abs(ahead_m))
         at = located.on_path.at
-        reference = self._body.all_angles(at(located.tail_s_m + ahead_m))
-        slope = self._body.all_angles(at(located.tail_s_m + SLOPE_M)) - self._body.all_angles(at(located.tail_s_m))
+        here = self._body.all_angles(at(located.tail_s_m))
+        slope = self._body.all_angles(at(located.tail_s_m + SLOPE_M)) - here
+        leads_m = self._leads_m(located, np.array(view.joints.angle_rad) - here, slope / SLOPE_M)
+        reference = self._body.all_angles(at(located.tail_s_m + leads_m + ahead_m))
         torques = scale * self._push_nm(located, slope / SLOPE_M, view.period_s)
         reference = reference + torques / self._stiffness
         restarted, before = located.restarted or self._waits or self._search.changed, self._bumpless.reference_rad
@@ -249,6 +281,18 @@ class ObstacleAided:
             jammed=bool(why) and jammed,
         )
 
+    def _leads_m(self, located: Located, off_rad: Floats, turns_per_m: Floats) -> float:
+        """How far ahead of the measured place the shape is that pushes nothing along the path.
+
+        off_rad: measured angles, less those of that place. A shape that is a millimetre off along the path pushes with
+        the stiffness of all joints that turn there, some 20 N in `peg_row`; so it is where the joints say that it is.
+        """
+        bends = self._bends
+        stiff = float(turns_per_m[bends] @ turns_per_m[bends])
+        slid_m = float(turns_per_m[bends] @ off_rad[bends]) / (stiff + STRAIGHT_PER_M2)
+        slid_m = self._set.slides * min(max(slid_m, -LARGEST_SLIDE_M), LARGEST_SLIDE_M)
+        return slid_m + self._set.servo_lag_s * located.trajectory.speed_m_s
+
     def _look_ahead_m(self, located: Located, period_s: float) -> float:
         largest_m = self._set.largest_look_ahead_m
         wanted_m_s = located.trajectory.speed_m_s
@@ -266,6 +310,9 @@ class ObstacleAided:
             return np.zeros(len(self._robot.joints))
         error = wanted_m_s - located.speed_m_s
         self._push_n += config.push_n_m * error * period_s
+        if config.felt_push_s > 0.0 and located.speed_m_s > AS_WANTED * wanted_m_s:
+            self._drag_n += (self._felt_n - self._drag_n) * min(period_s / DRAG_S, 1.0)
+            self._push_n += (self._drag_n - self._push_n) * min(period_s / config.felt_push_s, 1.0)
         self._push_n = min(max(self._push_n, 0.0), config.largest_push_n)
         force_n = min(max(self._push_n + config.push_ns_m * error, 0.0), config.largest_push_n)
         self._look(located, turns_per_m)
@@ -285,7 +332,12 @@ class ObstacleAided:
         touches = find_touches(
             located.nodes_w, self._body.radius_m, outlines, reach_m=config.reach_m, friction=config.peg_friction
         )
-        push = push_forward(located.nodes_w, touches, turns_per_m[self._bends], loose_m=config.loose_m)
+        felt = self._felt.forces_w([located.world.obstacles[k].name for k in touches.obstacle.tolist()])
+        felt_w = np.array(felt).reshape(-1, 2)  # none without a sensor
+        self._felt_n = float((felt_w * touches.tangents_w).sum()) if felt else self._push_n
+        dearer = config.empty_price * np.exp(-np.hypot(*felt_w.T) / FELT_N) if felt else 0.0
+        turns_per_m = turns_per_m[self._bends]
+        push = push_forward(located.nodes_w, touches, turns_per_m, loose_m=config.loose_m, dearer=dearer)
         self._last_push = PushSnapshot(located.world, touches, push)
         self._unit_nm, self._max_force_n = np.zeros(len(self._robot.joints)), 0.0
         largest = float(push.lambdas.max(initial=0.0))

@@ -85,11 +85,13 @@ def find_touches(nodes_w: Floats, radius_m: float, outlines: Outlines, *, reach_
     )
 
 
-def push_forward(nodes_w: Floats, touches: Touches, turns_per_m: Floats, *, loose_m: float) -> Push:
+def push_forward(
+    nodes_w: Floats, touches: Touches, turns_per_m: Floats, *, loose_m: float, dearer: Floats | float = 0.0
+) -> Push:
     """Forces and torques for 1 N along the chain.
 
     turns_per_m: (n_joints,) theta_i', rad per metre of the way, of the joints that bend. loose_m: a gap that makes a
-    contact count half.
+    contact count half. dearer: (k,) by how many times more than its size a contact's force counts, beside that.
     """
     rear, run = nodes_w[:, :-1].T, np.diff(nodes_w, axis=1).T
     lengths = np.hypot(*run.T)
@@ -104,7 +106,7 @@ def push_forward(nodes_w: Floats, touches: Touches, turns_per_m: Floats, *, loos
     lever = -(ahead * cross(touches.places_w[None] - joints[:, None], touches.directions_w[None]))
     later = np.triu(np.ones((len(joints), len(lengths)), dtype=bool), 1)
     braked = (later * cross(middles[None] - joints[:, None], tangents[None])) @ share
-    weight = 1.0 + np.maximum(touches.gap_m, 0.0) / loose_m
+    weight = 1.0 + np.maximum(touches.gap_m, 0.0) / loose_m + dearer
     costs = THRIFT * np.abs(turns_per_m)
     full = np.vstack([BALANCE * matrix / weight, costs[:, None] * lever / weight, SMALL * np.eye(len(touches))])
     lambdas = _least_squares(full, np.concatenate([BALANCE * drag, -costs * braked, np.zeros(len(touches))])) / weight

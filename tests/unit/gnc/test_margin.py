@@ -103,3 +103,16 @@ def test_no_joint_works_against_the_others_where_the_contacts_allow_it(tail_s_m:
     done, circled = (np.abs(one.torques_nm * slope).sum() for one in (thrifty, smallest))
     assert done < 0.9 * circled
     assert done < 1.5  # J per metre and newton; by virtual work 1 is the least
+
+
+@pytest.mark.parametrize("tail_s_m", [0.1, 0.3, 0.55])
+def test_dearer_contacts_leave_the_push_to_three_that_can_do_it_alone(tail_s_m: float) -> None:
+    nodes = nodes_of(make_stage(), tail_s_m)
+    touches = find_touches(nodes, BODY_RADIUS_M, Outlines.of(make_pegs(make_route())), reach_m=0.03, friction=0.0)
+    slope, three = turns(nodes), np.argsort(touches.body_s_m)[:3]
+    dearer = np.full(len(touches), 1000.0)
+    dearer[three] = 0.0
+    push = push_forward(nodes, touches, slope, loose_m=0.005, dearer=dearer)
+    usual = push_forward(nodes, touches, slope, loose_m=0.005)
+    assert push.rest < 0.1 and np.delete(push.lambdas, three).sum() < 0.2 * push.lambdas.sum()
+    assert len(touches) == 3 or np.delete(usual.lambdas, three).sum() > np.delete(push.lambdas, three).sum()
