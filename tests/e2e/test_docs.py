@@ -25,7 +25,7 @@ CONTROLLERS = [section for section in sections(REPOSITORY / "docs" / "controller
 ROBOTS = [section for section in sections(REPOSITORY / "docs" / "robots.md") if section.has_commands]
 LESSONS = [
     section
-    for page in ("first-controller", "train", "your-robot", "your-sensor")
+    for page in ("first-controller", "train", "your-robot", "your-sensor", "lab-tutorial")
     for section in sections(REPOSITORY / "docs" / f"{page}.md")
     if section.has_commands
 ]
