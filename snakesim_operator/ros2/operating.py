@@ -7,7 +7,7 @@ from snakesim_hal.errors import NotConnectedError, RefusedError
 from snakesim_hal.network.session import Link, Session
 from snakesim_hal.process import user_name
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Description, LifecycleRequest
+from snakesim_hal.wire.messages import Description, LifecycleRequest, Status
 from snakesim_operator.ros2.graph import Node
 from snakesim_operator.ros2.server import Server, told
 from snakesim_operator.ros2.service_types import TRIGGER
@@ -15,7 +15,7 @@ from snakesim_operator.tools.command import ask_host
 from snakesim_operator.tools.robot_selection import RobotSelection
 from snakesim_operator.tools.stop import estop
 
-DESCRIBED_S = 3.0
+DESCRIBED_S, READY_S = 3.0, 5.0  # a controller may be on its way
 WHO = f"{user_name()[:40]}, ros2"
 
 
@@ -47,6 +47,7 @@ def _arm(session: Session, link: Link) -> str:
     robot = session.latest(keys.DESCRIPTION, Description, DESCRIBED_S)
     if robot is None:
         raise NotConnectedError(f"{link.namespace} publishes no description; is its HAL host running?")
+    session.latest(keys.STATUS, Status, READY_S, lambda status: status.ready_to_arm)  # else the host says why not
     request = LifecycleRequest(
         action="arm",
         who=WHO,
