@@ -117,10 +117,12 @@ def _conclude(request: Request, study: Study) -> int:
         rows = ",".join(map(str, request.rows))
         say(f"  {_command(['snakesim', 'evaluate', request.scenario, '--rows', rows], chosen)}")
         return 0
-    seeds = seeds_of(compose(request.scenario, list(map(parse_set, request.set))))
+    table = compose(request.scenario, list(map(parse_set, request.set)))
+    seeds = seeds_of(table)
     found = {**best.params, **dict.fromkeys(seeds, request.seed)}
     chosen = [*request.set, *(f"{key}={value!r}" for key, value in found.items())]
-    words = ["snakesim", "run", request.scenario, "--pace", "lockstep", "--until-goal"]
+    words = ["snakesim", "run", request.scenario, "--pace", "lockstep"]
+    words += ["--until-goal"] if table.values.get("mission", {}).get("goal") else []  # without one it would be refused
     say(f"  {_command(words, chosen)}")
     return 0
 

@@ -232,6 +232,8 @@ def test_a_search_goes_on_where_it_ended(home: Path) -> None:
     assert first.code == 0 and first.out.count("trial ") >= 3, first.out + first.err
     more = snakesim(*given, "--trials", "4", cwd=home)
     assert "holds 2 trials already" in more.out and "trial 3:" in more.out, more.out + more.err
+    command = shlex.split(more.out.split("best path_distance_m: ")[1].splitlines()[1])
+    assert "--until-goal" not in command, "`snakesim run` refuses it for a mission without a goal"
 
 
 @pytest.mark.slow
