@@ -26,6 +26,7 @@ from snakesim_operator.recording.mcap_file import McapFile
 from snakesim_operator.recording.robot_time import RobotTime
 
 FLUSH_S = 0.5
+MAX_EARLY = 1000  # samples of own sensors before the description; what is more is written without its own schema
 ABOUT = "snakesim"  # the name of the metadata record
 COPIED = "lacked_before_copy"  # in it: what the recording lacked that this one was copied from
 
@@ -53,6 +54,7 @@ class Recording:
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
         self._own: dict[str, OwnKind] = {}
+        self._early: list[Arrival] | None = []  # of own sensors, until the description says what they are; None: it has
         self._flush_at = 0.0
         self._wall_ns = time.time_ns() - time.monotonic_ns()
         self.flush()
@@ -61,6 +63,19 @@ class Recording:
         """Write one message. Those that are not at a key of the key space are left out."""
         if self.failure:
             return
+        if self._early is not None and keys.row_key(arrival.key) == keys.OWN_ALL and len(self._early) < MAX_EARLY:
+            self._early.append(arrival)
+            return
+        self._write(arrival)
+        if arrival.key == keys.DESCRIPTION:
+            self._write_early()
+
+    def _write_early(self) -> None:
+        early, self._early = self._early or (), None
+        for arrival in early:
+            self._write(arrival)
+
+    def _write(self, arrival: Arrival) -> None:
         if arrival.key == keys.DESCRIPTION:
             self._meet(arrival.payload)
         channel = self._channels.get(arrival.key)
@@ -98,6 +113,7 @@ class Recording:
 
     def close(self, about: dict[str, object]) -> None:
         """Write index and metadata. about: of the recording itself, kept as JSON."""
+        self._write_early()
         if not self.failure:
             self._mcap.add_metadata(ABOUT, {name: json.dumps(value) for name, value in about.items()})
             try:

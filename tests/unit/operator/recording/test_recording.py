@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from typing import Annotated
 
 import msgspec
 import pytest
@@ -21,7 +22,9 @@ from snakesim_hal.network.local_network import LocalNetwork
 from snakesim_hal.network.session import Arrival, Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode, encoding_of
-from snakesim_hal.wire.messages import Clock, Done, Intent
+from snakesim_hal.wire.messages import Clock, Description, Done, Intent, OwnSample
+from snakesim_hal.wire.own_sample import schema_of
+from snakesim_hal.wire.quantities import bounded
 from snakesim_operator.recording import tap as tap_module
 from snakesim_operator.recording.process import record
 from snakesim_operator.recording.reader import RecordingReader
@@ -30,6 +33,7 @@ from snakesim_operator.recording.recover import recover
 from snakesim_operator.recording.tap import Tap
 from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until
+from tests.unit.hal.rig import description
 
 PERIOD_NS = 10_000_000
 
@@ -46,6 +50,12 @@ def clock(tick: int) -> Arrival:
         newest={},
     )
     return Arrival(keys.CLOCK, encode(message), encoding_of(Clock), time.monotonic_ns())
+
+
+class Whisker(OwnSample, frozen=True, kw_only=True):
+    """Bend of a whisker."""
+
+    bend_rad: Annotated[float, bounded(-2.0, 2.0, "rad")]
 
 
 def done(tick: int, service: str = "control") -> Arrival:
@@ -234,3 +244,19 @@ def test_a_recorder_that_is_told_to_end_waits_for_what_its_host_sends_before_it_
     assert [one.payload for one in RecordingReader(path).messages([keys.CLOCK])] == [
         clock(t).payload for t in range(40)
     ]
+
+
+def test_a_sample_that_comes_before_the_description_is_kept_with_its_own_schema(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    own = keys.own("left")
+    early = Arrival(own, msgspec.msgpack.encode({"tick": 3}), "application/msgpack;snakesim.OwnSample/1", 0)
+    schema = schema_of(Whisker, "test")
+    described = encode(msgspec.structs.replace(description(), own={own: schema}))
+    robot = Arrival(keys.DESCRIPTION, described, encoding_of(Description), 0)
+    recording = Recording(path)
+    for arrival in (early, clock(4), robot, msgspec.structs.replace(early, monotonic_ns=1)):
+        recording.take(arrival)
+    recording.close({})
+    with path.open("rb") as file:
+        schemas = {schema.name for schema, channel, _ in make_reader(file).iter_messages(topics=[own]) if schema}
+    assert schemas == {"snakesim.own.Whisker"} and recording.counts[own] == 2
