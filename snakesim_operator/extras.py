@@ -24,7 +24,7 @@ BRINGS = {  # as imported; the first extra that brings a package is the one to n
     "policy": ("onnxruntime",),
     "preview": ("PIL",),
     "ros2": ("rosbags", "xxhash"),
-    "train": ("cmaes", "gymnasium", "matplotlib", "onnx", "onnxruntime"),
+    "train": ("cmaes", "onnx"),
     "video": ("imageio_ffmpeg", "PIL"),
 }
 

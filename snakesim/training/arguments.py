@@ -40,7 +40,8 @@ def add_commands(commands: Any) -> None:
 def _train(arguments: argparse.Namespace) -> int:
     from snakesim_operator import extras
 
-    extras.check("train", "`snakesim train`")
+    for extra in ("train", "gym", "plot", "policy"):
+        extras.check(extra, "`snakesim train`")
     from snakesim.training.search import Effort
     from snakesim.training.trained import Request, train
     from snakesim_hal.model.scenario import parse_set
