@@ -5,11 +5,10 @@ What the motors, the encoders and the IMUs say of it is judged afterwards, from 
 
 from typing import Annotated
 
-from msgspec import Meta
-
 from snakesim_gnc.control.controller import Action, Report, View, positions
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Description
+from snakesim_hal.wire.quantities import about, bounded
 
 MARGIN_RAD = 0.02  # left before a limit
 
@@ -22,11 +21,14 @@ class JointCheck:
     class Settings(FileStruct, frozen=True):
         """How far, how fast, and when to give up."""
 
-        move_rad: Annotated[float, Meta(ge=0.01, le=0.2, extra_json_schema={"unit": "rad"})] = 0.035
-        speed_rad_s: Annotated[float, Meta(ge=0.02, le=1.0, extra_json_schema={"unit": "rad/s"})] = 0.15
-        # A joint that has not moved when its target is so far away is left, and the next one follows.
-        give_up_rad: Annotated[float, Meta(ge=0.02, le=0.5, extra_json_schema={"unit": "rad"})] = 0.15
-        rest_s: Annotated[float, Meta(ge=0.02, le=5.0, extra_json_schema={"unit": "s"})] = 0.15
+        move_rad: Annotated[float, bounded(0.01, 0.2, "rad"), about("how far each joint moves")] = 0.035
+        speed_rad_s: Annotated[float, bounded(0.02, 1.0, "rad/s"), about("of a target")] = 0.15
+        give_up_rad: Annotated[
+            float,
+            bounded(0.02, 0.5, "rad"),
+            about("a joint that has not moved when its target is so far away is left, and the next one follows"),
+        ] = 0.15
+        rest_s: Annotated[float, bounded(0.02, 5.0, "s"), about("between two joints")] = 0.15
 
     def __init__(self, robot: Description, settings: Settings) -> None:
         self._robot, self._settings = robot, settings

@@ -177,7 +177,7 @@ def test_an_armed_robot_a_shipped_file_and_an_unknown_joint_are_refused(home: Pa
     hold(home, [0.0] * JOINTS)
     before = (home / "snake.toml").read_bytes()
     with running(home / "run", "bench.toml", "--backend", "./held.py:Held", "--duration", "600") as run:
-        run.wait_for("armed")
+        run.wait_for(" of 600 s")  # armed
         for words, code, why in (
             (("zero", "snake.toml", "--now"), 1, "snakesim disarm"),
             (("zero", "planar13", "--now"), 2, "your own robot file"),

@@ -39,7 +39,7 @@ def robot(tmp_path: Path) -> str:
 def test_a_whisker_is_published_shown_recorded_and_exported(tmp_path: Path, robot: str) -> None:
     run = ("peg_row", "--set", robot, "--duration", "600", "--stay", "--pace", "realtime")
     with running(tmp_path / "run", *run) as started:
-        started.wait_for("armed")
+        started.wait_for(" of 600 s")  # armed, and moving
         with snakesim.Robot.connect(started.endpoint) as live:
             wait_until(lambda: live.read(LEFT) is not None, "a whisker")
             bent = live.read(LEFT)

@@ -72,7 +72,7 @@ def test_every_shipped_parameter_says_what_it_is(name: str) -> None:
     found = parameters_of(in_force)
     assert len(found) == len(msgspec.structs.fields(settings))
     for one in found:
-        assert one.about and one.range and (one.unit or one.name in ("push_scale", "model")), one
+        assert one.about and one.range and (one.unit or one.name in ("push_scale", "model", "slides")), one
 
 
 def test_ranges_are_told_in_words() -> None:

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from snakesim_can_backend.protocol.definitions import PARAMETERS, Parameter
-from snakesim_can_backend.settings import CanSettings, Mounted
+from snakesim_can_backend.settings import CanSettings, MountedModule
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.files import Table, decode
 
@@ -34,7 +34,7 @@ def read(section: dict[str, Any]) -> CanSettings:
 def test_everything_can_be_set_and_nothing_must() -> None:
     assert set(GOOD) == set(CanSettings.__struct_fields__)
     settings = read(GOOD)
-    wanted = {**GOOD, "mounted": {"joint_2": Mounted(sign=-1, gear=9.0)}}
+    wanted = {**GOOD, "mounted": {"joint_2": MountedModule(sign=-1, gear=9.0)}}
     assert {name: getattr(settings, name) for name in GOOD} == wanted
     assert read({}) == CanSettings()
 
