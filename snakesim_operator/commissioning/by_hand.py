@@ -42,18 +42,20 @@ class Hand:
         """Raises ConfigError when the host does not run with this file."""
         self._states = session.reader(keys.JOINTS, JointState)
         self._statuses = session.latched_reader(keys.STATUS, Status)
-        configured = session.latched_reader(keys.CONFIG, Configuration)
-        self._status: Status | None = None
-        self.path = path
         self.joints: Sequence[Joint] = decode(read_part(str(path), "robots"), RobotFile).joint_table
-        content = _first(configured.drain).content
-        running = msgspec.json.decode(content, type=RunConfig).robot.joint_table
+        configured = session.latest(keys.CONFIG, Configuration, FOUND_S)
+        status = session.latest(keys.STATUS, Status, FOUND_S)
+        if configured is None or status is None:
+            raise RefusedError(
+                f"the robot's host has not said within {FOUND_S:g} s how it is set up; see `snakesim status`"
+            )
+        self._status = status
+        running = msgspec.json.decode(configured.content, type=RunConfig).robot.joint_table
         if [(one.name, one.id, one.drive) for one in running] != [(one.name, one.id, one.drive) for one in self.joints]:
             raise ConfigError(
                 f"{path}: its joints are not those that the host was started with, so what is measured would be "
                 f"reckoned wrongly; restart the host with this file"
             )
-        self._status = _first(self._statuses.drain)
 
     def angles_rad(self, until: Callable[[], bool]) -> Iterator[Floats]:
         """Samples as they come. Raises RefusedError when the robot is armed, silent, or does not know an angle."""
@@ -63,7 +65,7 @@ class Hand:
             over = until()  # what came before that still counts
             for status in self._statuses.drain():
                 self._status = status
-            if self._status is None or self._status.lifecycle not in ("disarmed", "fault", "estop"):
+            if self._status.lifecycle not in ("disarmed", "fault", "estop"):
                 raise RefusedError("the robot is armed: its motors hold the joints; type `snakesim disarm` first")
             states = [state for state in self._states.drain() if state.is_of(len(self.joints))]
             if states:
@@ -178,15 +180,6 @@ def _chosen(joints: Sequence[Joint], names: Sequence[str], path: Path) -> Sequen
     if unknown := [name for name in names if name not in known]:
         raise ConfigError(f"{path}: has no {', '.join(unknown)}; it has {joints[0].name} to {joints[-1].name}")
     return [known[name] for name in names] or joints
-
-
-def _first(drain: Callable[[], Sequence[Any]]) -> Any:
-    until_s = time.monotonic() + FOUND_S
-    while time.monotonic() < until_s:
-        if found := drain():
-            return found[-1]
-        time.sleep(0.01)
-    raise RefusedError(f"the robot's host has not said within {FOUND_S:g} s how it is set up; see `snakesim status`")
 
 
 def _entered() -> bool:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from snakesim_hal.arrays import Floats
+from snakesim_hal.drivers.mounting import Mounting
 from snakesim_hal.model.joints import Joint
 
 STILL_RAD = 0.01  # a joint that nobody touches moves less, noise included
@@ -25,13 +26,10 @@ class NotStillError(Exception):
 def zeros(joints: Sequence[Joint], angles_rad: Floats) -> list[float]:
     """`zero_rad` of every drive, of a robot that lies straight: (n, n_joints) samples. Raises NotStillError."""
     spread = np.ptp(angles_rad, axis=0)
-    if (moved := int(np.argmax(spread))) is not None and spread[moved] > STILL_RAD:
+    moved = int(np.argmax(spread))
+    if spread[moved] > STILL_RAD:
         raise NotStillError(f"{joints[moved].name} moved by {spread[moved]:.3f} rad")
-    straight = np.median(angles_rad, axis=0)
-    return [
-        joint.drive.zero_rad + joint.drive.sign * joint.drive.gear * float(angle)
-        for joint, angle in zip(joints, straight, strict=True)
-    ]
+    return Mounting(joints).drive_angle_rad(np.median(angles_rad, axis=0)).tolist()
 
 
 @dataclass(frozen=True)
