@@ -78,16 +78,12 @@ class _Motion:
 def judged(run: Measured, *, straight: bool = False) -> list[Judged]:
     """Every joint, tail to head. straight: the robot lay straight at the start, so all angles should have been zero."""
     motions = [_motion(run, j) for j in range(len(run.names))]
-    others = [_swapped(motion, j) if isinstance(motion, _Motion) else None for j, motion in enumerate(motions)]
-    order = np.arange(len(motions))
-    for j, k in enumerate(others):
-        if k is not None and others[k] == j:
-            order[j] = k
+    order = _order(motions)
     rows: list[Judged] = []
-    for j, (motion, k) in enumerate(zip(motions, others, strict=True)):
+    for j, (motion, k) in enumerate(zip(motions, order.tolist(), strict=True)):
         if isinstance(motion, Judged):
             rows.append(motion)
-        elif k is not None:
+        elif k != j:
             said = f"moves the link of {run.names[k]}: their ids or cables are swapped"
             rows.append(Judged(run.names[j], said, False, _moved_rad(run, j)))
         else:
@@ -155,15 +151,33 @@ def _share(rate: Floats, speed: Floats, moves: NDArray[np.bool_]) -> float:
     return float(rate[known] @ speed[known] / (speed[known] @ speed[known]))
 
 
-def _swapped(motion: _Motion, j: int) -> int | None:
-    """The joint whose module stands in the place of joint j's, if all shares fit together then, and do not without."""
-    misfits: list[float] = []
-    for k in range(len(motion.seen)):
-        order = np.arange(len(motion.seen))
-        order[[j, k]] = k, j
-        misfits.append(motion.with_modules(order).misfit())
-    best = int(np.argmin(misfits))
-    return best if misfits[j] > MISFIT and misfits[best] < BETTER * misfits[j] else None
+def _order(motions: Sequence[_Motion | Judged]) -> NDArray[np.intp]:
+    """Whose module stands in the place of each joint's: swaps of two, as long as one makes the motions of both fit.
+
+    Motions are asked together: one alone may tell little, when the floor lets few links turn.
+    """
+    order = np.arange(len(motions))
+    pairs = [(j, k) for j in range(len(motions)) for k in range(j + 1, len(motions))]
+    while pairs:
+        fits = [_misfit(motions, _with_swap(order, *pair)) for pair in pairs]
+        best = pairs[int(np.argmin(fits))]
+        swapped, own = _with_swap(order, *best), [motions[j] for j in best]
+        before = _misfit(own, order)
+        if before < MISFIT or _misfit(own, swapped) > BETTER * before:
+            break
+        order = swapped
+        pairs = [pair for pair in pairs if not {*pair} & {*best}]
+    return order
+
+
+def _misfit(motions: Sequence[_Motion | Judged], order: NDArray[np.intp]) -> float:
+    return sum(motion.with_modules(order).misfit() for motion in motions if isinstance(motion, _Motion))
+
+
+def _with_swap(order: NDArray[np.intp], j: int, k: int) -> NDArray[np.intp]:
+    swapped = order.copy()
+    swapped[[j, k]] = order[[k, j]]
+    return swapped
 
 
 def _verdict(turned: float, drive: Drive) -> str:
