@@ -84,6 +84,13 @@ class Tab:
             time.sleep(0.02)
         return time.monotonic() - began
 
+    def wait_until_loaded(self, limit_s: float = 60.0) -> None:
+        """Until the page's own scripts have run: what is typed earlier, nobody hears."""
+        deadline = time.monotonic() + limit_s
+        while self.value("document.readyState") != "complete":
+            assert time.monotonic() < deadline, "the page does not load"
+            time.sleep(0.02)
+
     def click(self, label: str, hold_s: float = 0.0) -> None:
         """Press what has a label, and let go. A disabled button does nothing, as for a person."""
         # Not at a place on the screen, and in one go: the page moves and replaces things while it changes.
@@ -111,10 +118,10 @@ class Tab:
         self.send("Input.insertText", text=text)
         self.value("document.activeElement.blur()")
 
-    def press(self, key: str, code: int) -> None:
-        """Press a key."""
-        for kind in ("keyDown", "keyUp"):
-            self.send("Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=code)
+    def press(self, key: str, code: int, **more: str) -> None:
+        """Press a key. more: such as the `text` that it types."""
+        for kind, typed in (("keyDown", more), ("keyUp", {})):
+            self.send("Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=code, **typed)
 
     def size(self, width: int, height: int, *, scale: float = 1.0, mobile: bool = False) -> None:
         """The size of the window."""

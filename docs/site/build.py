@@ -5,6 +5,7 @@ So a link that works in the repository works on the site. Commands and the Pytho
 
 import argparse
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -20,6 +21,8 @@ ROOT = Path(__file__).resolve().parent.parent.parent
 PAGES = ROOT / "build" / "site"
 SITE = ROOT / "build" / "docs"
 SHOWN = ("README.md", "CHANGELOG.md", "LICENSE", "docs", "schemas", "benchmarks", "deploy", "snakesim_gnc/guidance")
+FENCE = re.compile(r"^(```\w+) +(\S.*)$", re.MULTILINE)  # a block, and a file's name or where it is typed
+TITLES = {"background": "in a terminal of its own", "of root": "as root", "by hand": ""}
 PACKAGES = [path.name for path in sorted(ROOT.glob("snakesim*")) if (path / "__init__.py").exists()]
 
 
@@ -29,6 +32,8 @@ def main() -> None:
     for file in shown_files():
         (PAGES / file).parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(ROOT / file, PAGES / file)
+        if file.suffix == ".md":
+            (PAGES / file).write_text(FENCE.sub(titled, (ROOT / file).read_text(encoding="utf-8")), encoding="utf-8")
     (PAGES / "docs" / "commands.md").write_text(command_reference(), encoding="utf-8")
     (PAGES / "assets").mkdir()
     shutil.copy(ROOT / "docs" / "site" / "iframe-worker.js", PAGES / "assets")
@@ -36,6 +41,12 @@ def main() -> None:
     config = str(ROOT / "docs" / "site" / "mkdocs.yml")
     run("mkdocs", "build", "--strict", "--quiet", "--clean", "--config-file", config, NO_MKDOCS_2_WARNING="1")
     print(f"open {SITE.relative_to(ROOT)}/index.html")
+
+
+def titled(fence: re.Match[str]) -> str:
+    """The first line of a block, as the site's Markdown names blocks."""
+    words = TITLES.get(fence[2], fence[2].replace("background on", "another terminal on"))
+    return f'{fence[1]} title="{words}"' if words else fence[1]
 
 
 def write_api(folder: Path) -> None:

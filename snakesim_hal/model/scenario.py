@@ -183,8 +183,11 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
 
     @property
     def commander(self) -> str:
-        """The controller, or `external` when the run starts none."""
-        return self.controller if self.has_own_control else "external"
+        """The controller, with its model if it is a policy, or `external` when the run starts none."""
+        if not self.has_own_control:
+            return "external"
+        model = self.control_settings.get("model") if self.controller == POLICY[:-1] else None
+        return f"{POLICY}{model}" if model else self.controller
 
     @property
     def period_ns(self) -> int:

@@ -115,6 +115,8 @@ def test_an_external_service_is_waited_for_and_not_started() -> None:
     own, external = (with_flags("triplet", *flags).config for flags in ([], ["services.control.external=true"]))
     assert own.has_own_control and own.commander == "obstacle_triplet" and "control" in own.own_services
     assert not external.has_own_control and external.commander == "external"
+    policies = [with_flags("triplet", f"controller=policy:{model}").config for model in ("clutter", "./mine.onnx")]
+    assert [policy.commander for policy in policies] == ["policy:clutter", "policy:./mine.onnx"]
     assert set(external.services) - set(external.own_services) == {"control"}
     assert list(Participants(external.services)) == list(own.services)
     for text in ("kill:control@1", "hang:control@1", "drop:actuator/joints@1"):
