@@ -1,4 +1,4 @@
-"""Types of services against hashes that ROS has printed, and joint commands against what no robot may be told."""
+"""Types of services against hashes that others have, and joint commands against what no robot may be told."""
 
 from typing import Any
 
@@ -31,8 +31,8 @@ def test_a_service_of_the_design_document() -> None:
     assert token_key(2, zenoh_id, 10, graph.SERVER, NodeName("add_two_ints_server"), topic) == ADDER
 
 
-def test_hashes_as_ros2_service_info_prints_them() -> None:
-    printed = {  # `ros2 service info -v` in Lyrical; of Trigger in Jazzy
+def test_hashes_are_those_that_others_have() -> None:
+    known = {  # of ListParameters as `ros2 service info -v` prints it, else as other programs for ROS 2 have them
         types.TRIGGER: "eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f",
         types.LIST_PARAMETERS: "3e6062bfbb27bfb8730d4cef2558221f51a11646d78e7bb30a1e83afac3aad9d",
         types.GET_PARAMETERS: "bf9803d5c74cf989a5de3e0c2e99444599a627c7ff75f97b8c05b01003675cbc",
@@ -41,7 +41,7 @@ def test_hashes_as_ros2_service_info_prints_them() -> None:
         types.SET_PARAMETERS: "56eed9a67e169f9cb6c1f987bc88f868c14a8fc9f743a263bc734c154015d7e0",
         types.SET_PARAMETERS_ATOMICALLY: "0e192ef259c07fc3c07a13191d27002222e65e00ccec653ca05e856f79285fcd",
     }
-    for service, digits in printed.items():
+    for service, digits in known.items():
         assert service.type.type_hash == f"RIHS01_{digits}", service.type.name
 
 
