@@ -297,6 +297,16 @@ def wait(wires: Sequence[Wire], timeout_s: float) -> bool:
     return True
 
 
+def inject_into(wires: Sequence[Wire], injection: Injection, *, begins: bool) -> bool:
+    """Begin or end a fault of a bus; False for a fault of something else. Raises ConfigError."""
+    if injection.target_type != "bus":
+        return False
+    if injection.number >= len(wires):
+        raise ConfigError(f"there is no {injection.target}; this robot has bus_1 to bus_{len(wires)}")
+    wires[injection.number].inject(injection.kind, begins=begins)
+    return True
+
+
 def check_interface(channel: str) -> None:
     """Raise ConfigError unless a SocketCAN interface exists and is up; the message says how to bring it up."""
     if not hasattr(socket, "AF_CAN") or not _kernel_has_can():

@@ -19,12 +19,20 @@ FLUSH_BYTES = 1 << 16
 _log = logging.getLogger("snakesim.can")
 
 
-def open_log(path: Path) -> TextIO:
-    """Begin a log. Raises ConfigError."""
+def logged(wires: list[Wire], path: str, backend: str = "can") -> list[Wire]:
+    """The wires with a log, if there is to be one. Raises ConfigError."""
+    if not path:
+        return wires
+    log = open_log(Path(path), backend)
+    return [LoggedWire(wire, log) for wire in wires]
+
+
+def open_log(path: Path, backend: str = "can") -> TextIO:
+    """Begin a log. backend: whose setting it is. Raises ConfigError."""
     try:
         return path.open("w", encoding="utf-8", errors="backslashreplace", buffering=FLUSH_BYTES)
     except OSError as error:
-        raise ConfigError(f"`backends.can.log` = {str(path)!r}: {error.strerror}; choose another file") from error
+        raise ConfigError(f"`backends.{backend}.log` = {str(path)!r}: {error.strerror}; choose another file") from error
 
 
 class LoggedWire:

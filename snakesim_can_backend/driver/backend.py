@@ -8,16 +8,15 @@ import logging
 import time
 import uuid
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import msgspec
 import numpy as np
 
 from snakesim_can_backend.bus.adapter import check_channel, open_wire
-from snakesim_can_backend.bus.bus import VirtualPeer, VirtualWire, Wire, wait
+from snakesim_can_backend.bus.bus import VirtualPeer, VirtualWire, Wire, inject_into, wait
 from snakesim_can_backend.bus.bus_errors import BusError
 from snakesim_can_backend.bus.load import check_load, reports_of, shares, worst_bits
-from snakesim_can_backend.bus.log import LoggedWire, open_log
+from snakesim_can_backend.bus.log import logged
 from snakesim_can_backend.driver.bring_up import Bus, configure, discovery_errors, find
 from snakesim_can_backend.driver.module_monitor import ARM_GRACE, Watch
 from snakesim_can_backend.driver.own_twins import TwinProcess, check_faults, check_twins, modules_know, twins_here
@@ -32,7 +31,7 @@ from snakesim_hal.drivers.findings import Finding
 from snakesim_hal.drivers.mocap import MocapReceiver, check_pose, receiver
 from snakesim_hal.drivers.mounted import check_mounted
 from snakesim_hal.drivers.mounting import Mounting
-from snakesim_hal.errors import BackendError, ConfigError
+from snakesim_hal.errors import BackendError
 from snakesim_hal.injection import Injection
 from snakesim_hal.model.robot import describe
 from snakesim_hal.model.scenario import RunConfig, config_hash
@@ -195,10 +194,7 @@ class CanBackend:
 
     def inject(self, injection: Injection, *, begins: bool) -> bool:
         """Injects faults of own twins and buses; False for other kinds. Raises ConfigError."""
-        if injection.target_type == "bus":
-            if injection.number >= len(self._wires):
-                raise ConfigError(f"there is no {injection.target}; this robot has bus_1 to bus_{len(self._wires)}")
-            self._wires[injection.number].inject(injection.kind, begins=begins)
+        if inject_into(self._wires, injection, begins=begins):
             return True
         twins = self._twins or self._local_twins
         if twins is None or not modules_know(injection, len(self._wire_of)):
@@ -263,9 +259,7 @@ class CanBackend:
             else:
                 self._local_twins = twins_here(self._config, settings, name, pose, stepped=self._lockstep)
                 self._wires.append(VirtualWire(name, self._local_twins))
-        if settings.log:
-            log = open_log(Path(settings.log))
-            self._wires = [LoggedWire(wire, log) for wire in self._wires]
+        self._wires = logged(self._wires, settings.log)
         buses, first = [], 1
         for wire, count in zip(self._wires, joints_of, strict=True):
             buses.append(Bus(wire, range(first, first + count)))

@@ -1,7 +1,8 @@
 """The backend `odrive`: axes of ODrive controllers, firmware 0.6, by CANSimple on classic CAN.
 
-`backend`   OdriveBackend: settings and checks      `axes`     the family: bring-up, questions, set-points, faults
-`protocol`  messages as bytes                       `twin`     emulated axes; `command` runs them as a process
+`backend`   OdriveBackend: settings and checks      `axes`     what a tick says to an axis, and hears
+`protocol`  messages as bytes                       `twin`     emulated axes
 
-All else that a driver needs is in `snakesim_hal.drivers`. Numbers are those of the motor's shaft: turns, A, N·m.
+All else is in `snakesim_can_backend.family` and `snakesim_hal.drivers`.
+Numbers are those of the motor's shaft: turns, A, N·m.
 """

@@ -122,6 +122,6 @@ def parted(frame: Frame) -> tuple[int, int]:
 
 
 def names(errors: int) -> str:
-    """Error bits in words."""
+    """Error bits in words; empty for none."""
     said = [error.name.lower() for error in Error if errors & error and error.name]
-    return ", ".join(said) or f"0x{errors:x}"
+    return ", ".join(said) or (f"0x{errors:x}" if errors else "")

@@ -4,18 +4,18 @@ They do *not* simulate calibration, encoders that slip, the velocity integrator,
 """
 
 import math
-import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from snakesim_can_backend.bus.bus import Wire
+from snakesim_can_backend.family.twin import CanTwin
+from snakesim_can_backend.odrive.axes import TURN, TWIN_CONSTANT
 from snakesim_can_backend.odrive.protocol import PAYLOADS, Control, Error, Message, State, parted, write
 from snakesim_can_backend.protocol.definitions import Frame
+from snakesim_hal.drivers.drive_settings import DriveSettings
 from snakesim_hal.drivers.twin_body import TwinBody
-from snakesim_hal.injection import Injection
 from snakesim_hal.wire.messages import Mode
 
-TURN = 2 * math.pi
 HEARTBEAT_US = 100_000.0
 COUNTS = 16384  # of the encoder, a turn
 VERSION = (2, 4, 4, 58, 0, 6, 11, 0)
@@ -28,7 +28,6 @@ class Axis:
 
     node: int
     torque_constant: float
-    wire: Wire
     state: int = State.IDLE
     errors: int = 0
     disarm_reason: int = 0
@@ -41,78 +40,51 @@ class Axis:
     fed_us: float = 0.0
 
 
-class OdriveTwin:
-    """All axes of a robot, at the other end of their buses."""
+class OdriveTwin(CanTwin):
+    """All axes of a robot."""
 
     def __init__(
-        self,
-        body: TwinBody,
-        wires: Sequence[Wire],
-        constants: Sequence[float],
-        watchdog_s: float,
-        clock_ns: Callable[[], int],
+        self, settings: DriveSettings, body: TwinBody, wires: Sequence[Wire], clock_ns: Callable[[], int]
     ) -> None:
-        """wires: of every joint; constants: torque constants, N·m/A; clock_ns: the time, since anything."""
-        rows = zip(body.joints, wires, constants, strict=True)
-        self.axes = [Axis(joint.id, constant, wire) for joint, wire, constant in rows]
-        self._wires = list({id(wire): wire for wire in wires}.values())
-        self._at = {(id(axis.wire), axis.node): i for i, axis in enumerate(self.axes)}
-        self._body, self._watchdog_us = body, watchdog_s * 1e6
-        self._clock_ns, self._start_ns = clock_ns, clock_ns()
+        super().__init__(body, wires, settings.watchdog_s, clock_ns)
+        constants = [joint.motor.torque_constant_nm_per_a or TWIN_CONSTANT for joint in body.joints]
+        self.axes = [Axis(joint.id, constant) for joint, constant in zip(body.joints, constants, strict=True)]
         self._heartbeat_us = -math.inf
-        self._check(0.0)
+        self.each_step(0.0)
 
-    def __call__(self) -> float | None:
-        """Handle what has arrived, and let time pass up to now."""
-        self._receive()
-        self._body.advance_to((self._clock_ns() - self._start_ns) / 1000, self._check)
-        return None
+    def addressee(self, frame: Frame) -> int:
+        """Its node."""
+        return parted(frame)[0]
 
-    def inject(self, injection: Injection, *, begins: bool) -> None:
-        """Begin or end a fault of an axis."""
-        restarts = self._body.inject(injection, begins=begins)
-        if restarts is not None:
-            old = self.axes[restarts]
-            self.axes[restarts] = Axis(old.node, old.torque_constant, old.wire)
-            self._drive(restarts, self.axes[restarts])
+    def restart(self, i: int) -> None:
+        """Settings are lost."""
+        self.axes[i] = Axis(self.axes[i].node, self.axes[i].torque_constant)
+        self._drive(i, self.axes[i])
 
-    def close(self) -> None:
-        """Leave the buses."""
-        for wire in self._wires:
-            wire.close()
+    def take(self, i: int, frame: Frame) -> None:
+        """Questions have no data."""
+        known, axis = Message(parted(frame)[1]), self.axes[i]
+        values = PAYLOADS[known].unpack(frame.data) if frame.data else ()
+        if not values and known not in (Message.ESTOP, Message.CLEAR_ERRORS):
+            self.say(i, self._message(i, axis, known))
+        else:
+            self._obey(i, axis, known, values)
 
-    def _receive(self) -> None:
-        for wire in self._wires:
-            for frame in wire.receive():
-                node, message = parted(frame)
-                i = self._at.get((id(wire), node))
-                if i is None or self._body.deaf(i):
-                    continue
-                try:
-                    known = Message(message)
-                    values = PAYLOADS[known].unpack(frame.data) if frame.data else ()
-                except (ValueError, struct.error):
-                    continue
-                self._take(i, self.axes[i], known, values)
-
-    def _take(self, i: int, axis: Axis, message: Message, values: tuple[float, ...]) -> None:
-        if not values and message not in (Message.ESTOP, Message.CLEAR_ERRORS):
-            self._say(i, axis, message)
-            return
+    def _obey(self, i: int, axis: Axis, message: Message, values: tuple[float, ...]) -> None:
         match message:
             case Message.ESTOP:
                 self._fail(i, axis, Error.ESTOP_REQUESTED)
             case Message.CLEAR_ERRORS:
                 axis.errors = 0
             case Message.SET_STATE if values[0] == State.CLOSED_LOOP and not axis.errors:
-                axis.fed_us = self._body.now_us
+                axis.fed_us = self.body.now_us
                 axis.state = State.CLOSED_LOOP
             case Message.SET_STATE:
                 axis.state = State.IDLE
             case Message.SET_MODE:
                 axis.control = int(values[0])
             case Message.SET_POSITION | Message.SET_VELOCITY | Message.SET_TORQUE:
-                axis.fed_us = self._body.now_us
+                axis.fed_us = self.body.now_us
                 at = {Message.SET_TORQUE: 0, Message.SET_VELOCITY: 1, Message.SET_POSITION: 2}[message]
                 axis.inputs = (*axis.inputs[:at], values[0], *axis.inputs[at + 1 :])
             case Message.SET_LIMITS:
@@ -125,12 +97,8 @@ class OdriveTwin:
                 return
         self._drive(i, axis)
 
-    def _say(self, i: int, axis: Axis, message: Message) -> None:
-        if not self._body.silent(i):
-            axis.wire.send(self._message(i, axis, message))
-
     def _message(self, i: int, axis: Axis, message: Message) -> Frame:
-        angle, velocity, torque = self._body.shaft(i)
+        angle, velocity, torque = self.body.shaft(i)
         values: tuple[float, ...]
         match message:
             case Message.VERSION:
@@ -144,10 +112,10 @@ class OdriveTwin:
             case Message.CURRENT:
                 values = torque / axis.torque_constant, torque / axis.torque_constant
             case Message.TEMPERATURE:
-                motor_c, board_c = self._body.temperatures(i)
+                motor_c, board_c = self.body.temperatures(i)
                 values = board_c, motor_c
             case Message.SUPPLY:
-                values = self._body.supply(i)
+                values = self.body.supply(i)
             case _:
                 return Frame(axis.node << 5 | message, b"")
         return write(axis.node, message, *values)
@@ -159,22 +127,22 @@ class OdriveTwin:
         damping = axis.velocity_gain / TURN
         limit_nm = axis.current_limit * axis.torque_constant
         speed_rad_s = axis.speed_limit * TURN
-        self._body.drive(i, mode, target if mode else 0.0, limit_nm, axis.position_gain * damping, damping, speed_rad_s)
+        self.body.drive(i, mode, target if mode else 0.0, limit_nm, axis.position_gain * damping, damping, speed_rad_s)
 
     def _fail(self, i: int, axis: Axis, error: Error) -> None:
         axis.errors |= error
         axis.disarm_reason, axis.state = error, State.IDLE
         self._drive(i, axis)
 
-    def _check(self, now_us: float) -> None:
+    def each_step(self, now_us: float) -> None:
         """Watchdogs, heat, heartbeats."""
         for i, axis in enumerate(self.axes):
-            if axis.state == State.CLOSED_LOOP and now_us - axis.fed_us > self._watchdog_us:
+            if axis.state == State.CLOSED_LOOP and now_us - axis.fed_us > self.watchdog_us:
                 self._fail(i, axis, Error.WATCHDOG_TIMER_EXPIRED)
         if now_us - self._heartbeat_us < HEARTBEAT_US:
             return
         self._heartbeat_us = now_us
         for i, axis in enumerate(self.axes):
-            if self._body.too_hot(i):
+            if self.body.too_hot(i):
                 self._fail(i, axis, Error.MOTOR_OVER_TEMP)
-            self._say(i, axis, Message.HEARTBEAT)
+            self.say(i, self._message(i, axis, Message.HEARTBEAT))

@@ -1,9 +1,10 @@
 """What the drives of a robot said, at their shafts, and when: joint states with ages, supply and heat.
 
 A joint whose drive is silent keeps its last values, and their age grows; nothing is invented. Silence is counted in
-questions without an answer, as a computer that stutters asks late, too.
+questions without an answer, as a computer that stutters asks late, too. What is not finite was not said.
 """
 
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -43,20 +44,25 @@ class Readings:
 
     def moved(self, i: int, angle_rad: float, velocity_rad_s: float) -> None:
         """A drive has said where its shaft is."""
+        if not (math.isfinite(angle_rad) and math.isfinite(velocity_rad_s)):
+            return
         self.angle_rad[i], self.velocity_rad_s[i], self._motion_ns[i] = angle_rad, velocity_rad_s, self._clock_ns()
         self._motion_at[i] = self._asked
 
     def pushed(self, i: int, torque_nm: float) -> None:
         """A drive has said its torque, at the shaft."""
-        self.torque_nm[i], self._torque_ns[i], self._torque_at[i] = torque_nm, self._clock_ns(), self._asked
+        if math.isfinite(torque_nm):
+            self.torque_nm[i], self._torque_ns[i], self._torque_at[i] = torque_nm, self._clock_ns(), self._asked
 
     def supplied(self, i: int, voltage_v: float, current_a: float) -> None:
         """A drive has said its supply."""
-        self._voltage_v[i], self._current_a[i] = voltage_v, current_a
+        if math.isfinite(voltage_v) and math.isfinite(current_a):
+            self._voltage_v[i], self._current_a[i] = voltage_v, current_a
 
     def warmed(self, i: int, motor_c: float, board_c: float) -> None:
         """A drive has said its temperatures; with its supply they are its health."""
-        self._motor_c[i], self._board_c[i], self._health_ns[i] = motor_c, board_c, self._clock_ns()
+        if math.isfinite(motor_c) and math.isfinite(board_c):
+            self._motor_c[i], self._board_c[i], self._health_ns[i] = motor_c, board_c, self._clock_ns()
 
     # --- what is known ---------------------------------------------------------------------------------------
 

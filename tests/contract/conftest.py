@@ -39,7 +39,7 @@ def pytest_snakesim_benches() -> list[Bench]:
         Bench("sim-camera", "sim", sets=LOOKS_AHEAD),
         Bench("sim-position", "sim", sets=POSITION_ONLY),
         Bench("can-virtual", "can", mute=cut_off),
-        Bench("odrive", "odrive", mute=cut_axis_off),
+        Bench("odrive", "odrive", mute=cut_drive_off),
     ]
 
 
@@ -66,13 +66,13 @@ def cut_off(backend: Any, joint: int) -> None:
     backend._reading.take = receive
 
 
-def cut_axis_off(backend: Any, joint: int) -> None:
-    """From now on the driver hears nothing of a joint's axis."""
-    axes = backend._drives
-    take, node = axes.take, axes.axes[joint].node
+def cut_drive_off(backend: Any, joint: int) -> None:
+    """From now on the driver hears nothing of a joint's drive."""
+    drives = backend._drives
+    hear = drives.hear
 
-    def receive(wire: Any, frame: Frame) -> None:
-        if frame.id >> 5 != node:
-            take(wire, frame)
+    def heard(i: int, frame: Frame) -> None:
+        if i != joint:
+            hear(i, frame)
 
-    axes.take = receive
+    drives.hear = heard

@@ -69,7 +69,7 @@ def test_an_error_of_an_axis_stays_until_the_operators_clear_and_is_reported_aga
     assert axes.run(100, "fault") == [] and axes.twin.axes[1].errors & Error.MOTOR_OVER_TEMP
     assert [fault.joint for fault in axes.run(CRASHED, "disarmed")] == ["joint_2"], "cleared while it was still hot"
     axes.go_wrong("overheat:joint_2@0-9", begins=False)
-    axes.twin._body.thermal.winding_c[:] = 20.0
+    axes.twin.body.thermal.winding_c[:] = 20.0
     axes.run(5, "fault")
     assert axes.run(CRASHED, "disarmed") == [] and axes.twin.axes[1].errors == 0
     assert axes.run(40, "armed") == [] and axes.joints is not None
@@ -119,7 +119,7 @@ def test_a_node_with_another_id_is_missing_at_the_start_and_a_stranger_later(
 
     def elsewhere(twin: OdriveTwin, *rest: Any) -> None:
         made(twin, *rest)
-        twin._at.pop((id(twin.axes[1].wire), 2))
+        twin._at.pop((id(twin.wires[1]), 2))
 
     monkeypatch.setattr(OdriveTwin, "__init__", elsewhere)
     with pytest.raises(BackendError, match=r"joint_2 \(node 2 on .*\) does not say its version: .*another id"):
@@ -129,9 +129,9 @@ def test_a_node_with_another_id_is_missing_at_the_start_and_a_stranger_later(
 @pytest.mark.parametrize(
     ("dotted", "words"),
     [
-        ({"rate_hz": 500}, "4 axes at 500 Hz need"),
+        ({"rate_hz": 500}, "4 drives at 500 Hz need"),
         ({"rate_hz": 20}, "`backends.odrive.watchdog_s` = 0.1 s at `rate_hz` = 20: one lost set-point"),
-        ({"robot__joints": {"joint_2": {"id": 63}}}, "joint_2: `id` = 63; node ids of CANSimple are 0 to 62"),
+        ({"robot__joints": {"joint_2": {"id": 63}}}, "joint_2: `id` = 63; axes have ids of 0 to 62"),
         ({"robot__joints": {"joint_2": {"port": "can7"}}}, "joint_2: `port` = 'can7' is not among"),
     ],
 )

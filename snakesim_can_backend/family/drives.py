@@ -1,0 +1,239 @@
+"""Drives on CAN: a `snakesim_hal.drivers.drive_backend.Drives` without its protocol, which a family adds.
+
+Each tick every drive is asked for motion and torque, and one of them for its health.
+"""
+
+import struct
+import time
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Callable, Sequence
+
+from snakesim_can_backend.bus.bus import VirtualPeer, Wire, inject_into, wait
+from snakesim_can_backend.bus.bus_errors import BUS_FAULTS
+from snakesim_can_backend.protocol.definitions import Frame
+from snakesim_hal.arrays import Floats
+from snakesim_hal.drivers.findings import Finding
+from snakesim_hal.drivers.following import Following, Word
+from snakesim_hal.drivers.readings import Readings
+from snakesim_hal.drivers.twin_body import FAULTS
+from snakesim_hal.errors import BackendError
+from snakesim_hal.injection import Injection
+from snakesim_hal.model.joints import Joint
+from snakesim_hal.wire.messages import Mode
+
+ASK_EVERY_S = 0.1  # in bring-up
+STRANGER_FRAMES = 3
+HOST = -1  # sender of a frame that only a host sends
+
+
+class CanDrives(ABC):
+    """All drives of a robot, tail to head. What a family adds are the abstract methods, and `unheard`."""
+
+    unheard: str  # why a drive may not say who it is
+
+    def __init__(
+        self,
+        joints: Sequence[Joint],
+        wires: Sequence[Wire],
+        readings: Readings,
+        *,
+        twin: VirtualPeer | None,
+        emulated: bool,
+        answer_s: float,
+        bring_up_s: float,
+        says_every_ns: int,
+        clock_ns: Callable[[], int],
+    ) -> None:
+        """wires: of every joint; twin: the drives, if they are emulated here.
+
+        answer_s: how long a tick waits for answers; says_every_ns: how often a drive reports its state.
+        """
+        self.emulated, self._twin = emulated, twin
+        self.wires, self.nodes = list(wires), [joint.id for joint in joints]
+        self.readings, self.clock_ns = readings, clock_ns
+        who = [f"{j.name} (node {j.id} on {wire.channel})" for j, wire in zip(joints, wires, strict=True)]
+        self.following = Following(who, says_every_ns, clock_ns)
+        self.firmware: list[tuple[int, ...]] = [()] * len(joints)  # as drives say in bring-up
+        self._buses = list({id(wire): wire for wire in wires}.values())
+        self._at = {(id(wire), node): i for i, (wire, node) in enumerate(zip(wires, self.nodes, strict=True))}
+        self._answer_s, self._bring_up_s = answer_s, bring_up_s
+        self._turn = 0  # whose health is asked for next
+        self._strangers: Counter[int] = Counter()
+        self._others = False  # whether somebody else commands drives
+        self._ours = False
+
+    # --- what a family adds; i: a joint, tail to head ----------------------------------------------------------
+
+    @abstractmethod
+    def sender(self, frame: Frame) -> int | None:
+        """The node whose message it is; `HOST` if only a host sends it; None for what does not matter."""
+
+    @abstractmethod
+    def hear(self, i: int, frame: Frame) -> None:
+        """A message of a drive, into `readings`, `following` and `firmware`. ValueError, struct.error: malformed."""
+
+    @abstractmethod
+    def identify(self, i: int) -> None:
+        """Ask for firmware and state."""
+
+    @abstractmethod
+    def unfit(self, i: int) -> str:
+        """Why a drive that said its firmware cannot be used; empty if it can."""
+
+    @abstractmethod
+    def ask(self, i: int) -> bool:
+        """Ask for motion and torque; whether the bus took the question."""
+
+    @abstractmethod
+    def ask_health(self, i: int) -> None:
+        """Ask for supply, heat and errors."""
+
+    @abstractmethod
+    def set_point(self, i: int, mode: Mode, target: float, limit_nm: float) -> None:
+        """A set-point, at the shaft."""
+
+    @abstractmethod
+    def tell(self, i: int, word: Word) -> None:
+        """Follow, be idle, or stop."""
+
+    @abstractmethod
+    def set_up(self, i: int) -> None:
+        """Write what is not in a drive's memory after a restart."""
+
+    @abstractmethod
+    def forgive(self, i: int) -> None:
+        """At the start: clear what a driver that was killed has left, and nothing else."""
+
+    @abstractmethod
+    def clear_errors(self, i: int) -> None:
+        """Clear all errors, for the operator."""
+
+    # --- Drives ------------------------------------------------------------------------------------------------
+
+    def bring_up(self) -> None:
+        """Firmware, then settings; every drive is idle, and stays so."""
+        everybody = range(len(self.nodes))
+        self._await(lambda i: bool(self.firmware[i]), self.identify)
+        reasons = [self.unfit(i) if self.firmware[i] else self.unheard for i in everybody]
+        wrong = [f"  {self.following.drives[i].who} {why}" for i, why in enumerate(reasons) if why]
+        if self._others:
+            raise BackendError("another program commands drives on this bus; end it first. Nothing was sent")
+        if wrong:
+            raise BackendError("the robot is not complete; nothing was enabled:", *wrong)
+        self._ours = True
+        for i in everybody:
+            self.tell(i, "idle")
+            self.forgive(i)
+            self.set_up(i)
+        self._await(self.readings.known, self.ask)
+        silent = [self.following.drives[i].who for i in everybody if not self.readings.known(i)]
+        if silent:
+            raise BackendError(f"{', '.join(silent)}: no motion and torque; nothing was enabled")
+        for i in everybody:
+            self.ask_health(i)
+        self._receive()
+        self._strangers.clear()
+
+    def read(self) -> None:
+        """Ask, and wait for those who answered lately."""
+        self._receive()
+        for i in range(len(self.nodes)):
+            if not self.ask(i):
+                self.readings.not_asked(i)
+        self._turn = (self._turn + 1) % len(self.nodes)
+        self.ask_health(self._turn)
+        end = time.monotonic() + self._answer_s
+        while self.readings.incomplete() and (left_s := end - time.monotonic()) > 0:
+            if not wait(self._buses, left_s):
+                break
+            self._receive()
+
+    def let_run(self) -> None:
+        """Receive."""
+        wait(self._buses, 0.0)
+        self._receive()
+
+    def command(
+        self, following: frozenset[int], modes: list[Mode], targets: Floats, limits_nm: Floats, *, emergency: bool
+    ) -> None:
+        """Set-points; enable, let go, remind."""
+        for i in sorted(following):
+            self.set_point(i, modes[i], float(targets[i]), float(limits_nm[i]))
+        for i, word in self.following.words(following, emergency=emergency):
+            self.tell(i, word)
+
+    def clear(self, joints: frozenset[int]) -> None:
+        """Errors, and what a restart has lost; what a drive says of errors from now on is of after the clear."""
+        self.following.forgive(joints)
+        for i in sorted(joints):
+            self.clear_errors(i)
+            self.set_up(i)
+
+    def inject(self, injection: Injection, *, begins: bool) -> bool:
+        """Faults of buses, and of drives that are emulated here."""
+        if inject_into(self._buses, injection, begins=begins):
+            return True
+        if self._twin is None or injection.kind not in FAULTS:
+            return False
+        self._twin.inject(injection, begins=begins)
+        return True
+
+    def close(self) -> None:
+        """Idle, as far as the buses still work."""
+        for i in range(len(self.nodes)) if self._ours else ():
+            try:
+                self.tell(i, "idle")
+            except BackendError:
+                continue
+        for wire in self._buses:
+            try:
+                wire.idle()
+            finally:
+                wire.close()
+
+    def findings(self) -> list[Finding]:
+        """Of buses, strangers and drives."""
+        found = [
+            Finding(error.kind, f"{error.channel}: {error.detail}; {BUS_FAULTS[error.kind]}")
+            for wire in self._buses
+            for error in wire.errors()
+            if error.kind in BUS_FAULTS
+        ]
+        if self._others:
+            found.append(Finding("second_host", "another program commands drives on this bus; end one of the two"))
+            self._others = False
+        for node, frames in self._strangers.items():
+            if frames >= STRANGER_FRAMES:
+                found.append(Finding("unknown_node", f"node {node} is on the bus, but is not a joint of this robot"))
+        return [*found, *self.following.findings()]
+
+    def take(self, wire: Wire, frame: Frame) -> None:
+        """One frame of a bus."""
+        node = self.sender(frame)
+        i = self._at.get((id(wire), -1 if node is None else node))
+        if i is not None:
+            try:
+                self.hear(i, frame)
+            except (ValueError, struct.error):
+                return
+        elif node == HOST:
+            self._others = True
+        elif node is not None:
+            self._strangers[node] += 1
+
+    def _receive(self) -> None:
+        for wire in self._buses:
+            for frame in wire.receive():
+                self.take(wire, frame)
+
+    def _await(self, done: Callable[[int], bool], ask: Callable[[int], object]) -> None:
+        end, ask_at = time.monotonic() + self._bring_up_s, 0.0
+        while (now := time.monotonic()) < end and not all(map(done, range(len(self.nodes)))):
+            if now >= ask_at:
+                for i in range(len(self.nodes)):
+                    ask(i)
+                ask_at = now + ASK_EVERY_S
+            if not wait(self._buses, 0.01):
+                time.sleep(0.001)
+            self._receive()

@@ -1,0 +1,68 @@
+"""Emulated drives of a family, at the other end of their buses, on a body that a plant moves."""
+
+import struct
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+
+from snakesim_can_backend.bus.bus import Wire
+from snakesim_can_backend.protocol.definitions import Frame
+from snakesim_hal.drivers.twin_body import TwinBody
+from snakesim_hal.injection import Injection
+
+
+class CanTwin(ABC):
+    """All drives of a robot. What a family adds are the abstract methods; i: a joint, tail to head."""
+
+    def __init__(self, body: TwinBody, wires: Sequence[Wire], watchdog_s: float, clock_ns: Callable[[], int]) -> None:
+        """wires: of every joint; clock_ns: the time, since anything."""
+        self.body, self.wires, self.watchdog_us = body, list(wires), watchdog_s * 1e6
+        self._buses = list({id(wire): wire for wire in wires}.values())
+        nodes = (joint.id for joint in body.joints)
+        self._at = {(id(wire), node): i for i, (wire, node) in enumerate(zip(wires, nodes, strict=True))}
+        self._clock_ns, self._start_ns = clock_ns, clock_ns()
+
+    @abstractmethod
+    def addressee(self, frame: Frame) -> int:
+        """The node that a frame is for."""
+
+    @abstractmethod
+    def take(self, i: int, frame: Frame) -> None:
+        """A frame to a drive. ValueError, struct.error: malformed."""
+
+    @abstractmethod
+    def restart(self, i: int) -> None:
+        """A drive begins anew."""
+
+    @abstractmethod
+    def each_step(self, now_us: float) -> None:
+        """Time has passed: watchdogs, heat, reports that are due."""
+
+    def __call__(self) -> float | None:
+        """Handle what has arrived, and let time pass up to now."""
+        for wire in self._buses:
+            for frame in wire.receive():
+                i = self._at.get((id(wire), self.addressee(frame)))
+                if i is None or self.body.deaf(i):
+                    continue
+                try:
+                    self.take(i, frame)
+                except (ValueError, struct.error):
+                    continue
+        self.body.advance_to((self._clock_ns() - self._start_ns) / 1000, self.each_step)
+        return None
+
+    def say(self, i: int, frame: Frame) -> None:
+        """A frame of a drive, unless it is silent."""
+        if not self.body.silent(i):
+            self.wires[i].send(frame)
+
+    def inject(self, injection: Injection, *, begins: bool) -> None:
+        """Begin or end a fault of a drive."""
+        restarts = self.body.inject(injection, begins=begins)
+        if restarts is not None:
+            self.restart(restarts)
+
+    def close(self) -> None:
+        """Leave the buses."""
+        for wire in self._buses:
+            wire.close()
