@@ -59,6 +59,7 @@ class RunRecord:
     contact_count: Floats  # (n,) obstacles touched
     own: dict[str, Floats] = field(default_factory=dict[str, Floats])  # of sensors with a message of their own
     lacks: list[str] = field(default_factory=list[str])  # missing data, as text
+    unreached: list[str] = field(default_factory=list[str])  # of these: what never came to the recorder
     replay_of: str = ""  # the recording whose sensors its services were given; empty: a run
     alone: bool = False  # `folder` is a recording, without the run's other files
     whole: bool = True  # that recording has an end
@@ -97,7 +98,10 @@ class RunRecord:
         if host.ended == "running":
             host = msgspec.structs.replace(host, ticks=len(columns["tick"]), command_digest=digest_of(columns))
         path = folder / RECORDING
-        contents = read_recording(path, OUTPUTS, hear) if path.is_file() else Contents(path, lacks=[UNRECORDED])
+        contents = Contents(path, lacks=[UNRECORDED])
+        if path.is_file():
+            contents = read_recording(path, OUTPUTS, hear)
+            contents.unreached = contents.missing(len(columns["tick"]))
         return RunRecord._of(folder, config, description, host, contents, columns)
 
     @staticmethod
@@ -143,7 +147,8 @@ class RunRecord:
             *streams,
             **known,
             own=own,
-            lacks=lacks + unwritten(host) + contents.lacks,
+            lacks=lacks + unwritten(host) + contents.unreached + contents.lacks,
+            unreached=contents.unreached,
             replay_of=contents.replay_of,
             alone=folder == contents.path,
             whole=contents.whole,

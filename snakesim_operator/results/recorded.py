@@ -63,6 +63,10 @@ class Contents:
     armed_wall_ns: list[int] = field(default_factory=list[int])  # wall clock at each clock since the first arming
     refused: Counter[str] = field(default_factory=Counter[str])  # messages that cannot be decoded, by key and reason
     lacks: list[str] = field(default_factory=list[str])
+    unreached: list[str] = field(default_factory=list[str])  # what never came to the recorder
+    ticks: int = 0  # with set-points as applied
+    ticks_lost: int | None = 0  # of these, as the file itself tells; None: it is damaged, and does not tell
+    last_tick_ns: int | None = None  # robot time of the last of them
     whole: bool = True  # the file has an end
     replay_of: str = ""  # the recording whose sensors these are
     _decoders: dict[str, Decoder[Any]] = field(default_factory=dict[str, Decoder[Any]])
@@ -99,6 +103,15 @@ class Contents:
                 self.at[key][message.tick] = message
                 if isinstance(message, Clock) and message.arming:
                     self.armed_wall_ns.append(wall_ns)
+
+    def missing(self, ticks: int) -> list[str]:
+        """Ticks of a run that never came to its recorder: nothing in the file itself tells of them."""
+        if self.ticks_lost is None or (lost := ticks - self.ticks - self.ticks_lost) <= 0:
+            return []
+        last = (
+            "none came" if self.last_tick_ns is None else f"the last that came is of {self.last_tick_ns * 1e-9:.2f} s"
+        )
+        return [f"recording: {lost} of {ticks} ticks did not reach the recorder; {last}"]
 
     def columns(self, robot: Description) -> dict[str, NDArray[Any]]:
         """A row for each tick since the first arming, named as in the black box."""
@@ -205,16 +218,20 @@ def read_recording(
     from snakesim_operator.recording.reader import RecordingReader  # needs the extra `record`
 
     contents, reader = Contents(path), RecordingReader(path)
-    for recorded in reader.messages(wanted if hear is None else None):
+    for recorded in reader.messages({*wanted, keys.APPLIED} if hear is None else None):
+        if recorded.key == keys.APPLIED:
+            contents.ticks, contents.last_tick_ns = contents.ticks + 1, recorded.time_ns
         if hear is not None:
             hear(recorded)
-        if hear is None or recorded.key in wanted or keys.row_key(recorded.key) in wanted:
+        if recorded.key in wanted or keys.row_key(recorded.key) in wanted:
             contents.take(recorded)
     contents.lacks += unread(contents.refused)
     contents.lacks += [f"recording: {lack}" for lack in reader.lacks]
-    contents.whole = reader.finished
+    contents.whole, losses = reader.finished, reader.losses
+    known = losses.lost[keys.APPLIED] + losses.dropped.get(keys.APPLIED, 0)
+    contents.ticks_lost = known if contents.whole and not losses.places else None
     contents.replay_of = str(reader.about.get("replay_of", ""))[:500]
-    if reader.losses.misplaced:
+    if losses.misplaced:
         for messages in contents.streams.values():
             messages.sort(key=lambda message: message.stamp_ns or 0)
     return contents

@@ -88,10 +88,10 @@ def _leave(files: RunFiles, ending: Ending, outcome: Outcome, host: HostRecord) 
         _print_host(host)
         return [*unwritten(host), str(error)], ""
     if not extras.has("report"):
-        return unwritten(record.host), ""
+        return [*unwritten(record.host), *record.unreached], ""
     from snakesim_operator.results.report.verdict import verdict
 
-    return unwritten(record.host), verdict(record, summary).words
+    return [*unwritten(record.host), *record.unreached], verdict(record, summary).words
 
 
 def leave(

@@ -12,9 +12,12 @@ from mcap.records import Schema
 from mcap_protobuf.decoder import DecoderFactory as ProtobufDecoder
 
 from snakesim_hal.model.scenario import load, parse_set
+from snakesim_hal.network.session import Arrival
 from snakesim_hal.wire import keys
 from snakesim_operator.recording.decoder import DecoderFactory
 from snakesim_operator.recording.message import RECORDING
+from snakesim_operator.recording.reader import RecordingReader
+from snakesim_operator.recording.recording import Recording
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.run.in_process import simulate
 from tests.whole.command import snakesim
@@ -44,6 +47,21 @@ def test_without_a_black_box_for_lack_of_room_the_hosts_numbers_stay(run: Path, 
     record = RunRecord.load(tmp_path, host)
     assert 0 < len(record.time_s) < 200 and record.host.command_digest == host.command_digest
     assert f"{200 - len(record.time_s)} of 200 ticks are missing in the black box" in record.lacks
+
+
+def test_a_run_tells_of_ticks_that_never_came_to_its_recorder(run: Path, tmp_path: Path) -> None:
+    for file in run.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    (tmp_path / RECORDING).unlink()
+    recording = Recording(tmp_path / RECORDING)
+    for message in RecordingReader(run / RECORDING).messages():
+        if not 0.5e9 < message.time_ns < 1.5e9:
+            recording.take(Arrival(message.key, message.payload, message.encoding, message.wall_ns))
+    recording.close({})
+    assert RunRecord.load(tmp_path / RECORDING).lacks == []  # nothing in the file itself tells
+    ended = snakesim("report", ".", cwd=tmp_path)
+    said = "recording: 99 of 200 ticks did not reach the recorder; the last that came is of "
+    assert ended.code == 3 and said in ended.err and said in (tmp_path / "report.html").read_text(), ended.err
 
 
 def test_info_tells_what_is_in_it_and_what_is_missing(run: Path, tmp_path: Path) -> None:

@@ -35,7 +35,7 @@ def verdict(record: RunRecord, summary: RunSummary) -> Verdict:
     """The run in plain words."""
     if summary.ticks == 0 and len(record.time_s) == 0 and not summary.faults:
         return Verdict("bad", f"Nothing was recorded: the robot was never armed ({summary.ended}).")
-    moved = _moved(summary)
+    moved = _moved(record, summary)
     stopping = [fault for fault in summary.faults if fault.reach == "robot"]
     if stopping:
         fault = stopping[0]
@@ -91,14 +91,15 @@ def _refused(summary: RunSummary) -> list[str]:
     return [f"{count} {'command' if count == 1 else 'commands'} refused ({', '.join(reasons)})"] if reasons else []
 
 
-def _moved(summary: RunSummary) -> str:
+def _moved(record: RunRecord, summary: RunSummary) -> str:
     duration = f"in {summary.duration_s:.1f} s"
     if summary.path_distance_m is not None:
         back = " backward" if summary.path_distance_m <= -MOVED_M else ""
         return f"Moved {abs(summary.path_distance_m):.2f} m{back} along the path {duration}"
     if summary.net_displacement_m is not None:
         return f"Moved {summary.net_displacement_m:.2f} m {duration}"
-    return f"Ran for {summary.duration_s:.1f} s; the distance is unknown, because the robot has no pose sensor"
+    blind = ", because the robot has no pose sensor" if record.config.robot.sensors.pose is None else ""
+    return f"Ran for {summary.duration_s:.1f} s; the distance is unknown{blind}"
 
 
 def _handed_over(record: RunRecord, summary: RunSummary) -> str:

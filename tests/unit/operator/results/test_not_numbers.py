@@ -61,8 +61,9 @@ def write_record(folder: Path, record: RunRecord) -> None:
     messages = [(keys.CONTROL_STATE, state) for state in record.control] + [
         (keys.WORLD, world) for world in record.worlds
     ]
-    record_messages(folder, [(key, msgspec.msgpack.encode(message, enc_hook=float)) for key, message in messages])
     layout, count = Layout.of(record.description), len(record.time_s)
+    encoded = [(key, msgspec.msgpack.encode(message, enc_hook=float)) for key, message in messages]
+    record_messages(folder, encoded, count)
     rows = bytearray(count * layout.row_bytes)
     columns = layout.arrays(rows)  # pyright: ignore[reportArgumentType]
     columns["tick"][:] = FIRST_TICK + np.arange(count)
@@ -71,11 +72,11 @@ def write_record(folder: Path, record: RunRecord) -> None:
     (folder / BLACK_BOX).write_bytes(layout.header() + rows)
 
 
-def record_messages(folder: Path, payloads: list[tuple[str, bytes]]) -> None:
-    """A recording with these messages alone."""
+def record_messages(folder: Path, payloads: list[tuple[str, bytes]], ticks: int) -> None:
+    """A recording with these messages, and the set-points of so many ticks, of which only the number is read."""
     (folder / RECORDING).unlink(missing_ok=True)
     recording = Recording(folder / RECORDING)
-    for key, payload in payloads:
+    for key, payload in [*payloads, *[(keys.APPLIED, b"")] * ticks]:
         message = keys.message_at(key)
         assert message is not None
         recording.take(Arrival(key, payload, encoding_of(message), 0))
@@ -190,7 +191,7 @@ def test_a_recording_with_numbers_that_are_none(base: RunRecord, tmp_path: Path,
         payloads[number] = key, msgspec.msgpack.encode(whole)[: -1 if torn else None]
         may_be_unknown = wrong is None and not torn
         refused += not may_be_unknown
-    record_messages(tmp_path, payloads)
+    record_messages(tmp_path, payloads, len(base.time_s))
     record = RunRecord.load(tmp_path)
     assert len(record.control) + len(record.worlds) == len(payloads) - refused
     lacking = [re.match(r"recording: (\d+) messages? cannot be read, (control/state|guidance/world)", lack)

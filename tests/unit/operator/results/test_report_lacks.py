@@ -54,7 +54,8 @@ def test_without_a_pose(record: RunRecord) -> None:
     count = len(record.time_s)
     blind = changed(record, position_w=np.full((count, 3), np.nan), orientation_wxyz=np.full((count, 4), np.nan))
     page = read(blind)
-    assert "it has no pose sensor" in page.text
+    assert "No playback: no valid pose was recorded." in page.text and "pose sensor" not in page.text
+    assert "pose sensor" not in verdict(blind, summarise(blind, "complete")).words  # the robot has one
     assert not [title for title in page.titles if title.startswith("Top view")]
     assert "as the controller knew it" in page.text  # distance from the controller's own place on the path
 
