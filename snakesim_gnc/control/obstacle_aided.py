@@ -124,11 +124,6 @@ class ObstacleAided:
             Meta(gt=0, le=5, extra_json_schema={"unit": "s"}),
             about("time constant of the filter of the pushing torques"),
         ] = 0.1
-        peg_friction: Annotated[
-            float,
-            Meta(ge=0, le=5, extra_json_schema={"unit": "1 (Coulomb coefficient)"}),
-            about("friction of the obstacles, as the push reckons with it"),
-        ] = 0.0
         search_after_s: Annotated[
             float,
             Meta(ge=0, le=1000, extra_json_schema={"unit": "s"}),
@@ -328,9 +323,9 @@ class ObstacleAided:
         if not located.fresh:
             return
         config = self._set
-        outlines = Outlines.of(located.world.obstacles)
+        outlines, friction = Outlines.of(located.world.obstacles), located.trajectory.peg_friction
         touches = find_touches(
-            located.nodes_w, self._body.radius_m, outlines, reach_m=config.reach_m, friction=config.peg_friction
+            located.nodes_w, self._body.radius_m, outlines, reach_m=config.reach_m, friction=friction
         )
         felt = self._felt.forces_w([located.world.obstacles[k].name for k in touches.obstacle.tolist()])
         felt_w = np.array(felt).reshape(-1, 2)  # none without a sensor

@@ -145,6 +145,7 @@ class ClutterPlanner:
             reason=reason,
             searching=self._why,
             searched_nodes=self.searched_nodes,
+            peg_friction=self._search.peg_friction,
         )
 
     def _turn(self, body: Floats, world: World, desired: DesiredMotion) -> None:

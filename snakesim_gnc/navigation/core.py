@@ -16,8 +16,9 @@ PUSH_POINTS_AHEAD_M = 3.0
 class KnownPath:
     """Follows one route at the speed that is wished for."""
 
-    def __init__(self, route: Route, obstacles: Sequence[Obstacle]) -> None:
+    def __init__(self, route: Route, obstacles: Sequence[Obstacle], peg_friction: float = 0.0) -> None:
         self.route = route
+        self._peg_friction = peg_friction
         self._path = [(float(x), float(y)) for x, y in route.points_w]
         found: list[tuple[float, str]] = []
         for obstacle in obstacles:
@@ -42,6 +43,7 @@ class KnownPath:
             push_points=self._ahead(),
             finished=finished,
             reason="the path is finished" if finished else desired.why[:500],
+            peg_friction=self._peg_friction,
         )
 
     def _ahead(self) -> list[str]:

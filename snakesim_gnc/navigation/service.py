@@ -83,4 +83,4 @@ def _along_route(config: RunConfig, known: list[Obstacle]) -> KnownPath:
         start = start_of(config)
         ahead = np.array([np.cos(start.yaw_rad), np.sin(start.yaw_rad)]) * NO_ROUTE_LENGTH_M
         route = Route(np.array([start.position_w, start.position_w + ahead]))
-    return KnownPath(route, known)
+    return KnownPath(route, known, config.mission.peg_friction)

@@ -69,7 +69,7 @@ class Mission(FileStruct, frozen=True, kw_only=True):
     map: Literal["known", "perceived"] = "known"  # the scene's obstacles as from a survey, or only what sensors measure
     # Of a known map: standard deviation of each obstacle's place, drawn from the run's seed, once for all services.
     map_error_m: Annotated[float, Meta(ge=0, le=0.1, extra_json_schema={"unit": "m"})] = 0.0
-    # Of obstacles, as navigation reckons with it where it plans.
+    # Of obstacles, as navigation reckons with it where it plans, and the controller where it pushes.
     peg_friction: Annotated[float, Meta(ge=0, le=2, extra_json_schema={"unit": "1 (Coulomb coefficient)"})] = 0.0
     localisation: Literal["pose_sensor", "dead_reckoning"] = "pose_sensor"  # or joints, IMU and contacts, and the map
 

@@ -79,6 +79,7 @@ class Stage:
     pegs: list[Obstacle]
     speed_m_s: float = 0.2
     path_id: int = 0
+    peg_friction: float = 0.0  # that the path was planned with
 
     def view(
         self,
@@ -130,6 +131,7 @@ class Stage:
             speed_m_s=self.speed_m_s,
             push_points=[],
             finished=False,
+            peg_friction=self.peg_friction,
         )
         return View(
             tick=tick,

@@ -4,6 +4,7 @@ import dataclasses
 
 import msgspec
 import numpy as np
+import pytest
 
 from snakesim_gnc.control.obstacle_aided import ObstacleAided
 from snakesim_gnc.control.undulation import CompliantUndulation, HeadSteeredUndulation, LateralUndulation
@@ -74,6 +75,18 @@ def test_a_scaled_push_is_turned_round() -> None:
     still = references(ways[2], stage, 300)
     forward, back = (references(way, stage, 300)[-1] - still[-1] for way in ways[:2])
     assert forward @ back < 0 and np.abs(still[-1] - still[0]).max() < 1e-6
+
+
+def test_a_push_reckons_with_the_friction_that_the_path_was_planned_with() -> None:
+    tilts: list[float] = []
+    for friction in (0.0, 0.2):
+        stage = make_stage()
+        stage.peg_friction = friction
+        controller = ObstacleAided(stage.robot, ObstacleAided.Settings())
+        points = [controller.update(stage.view(tick, TAIL_S_M)) for tick in range(50)][-1].report.push_points
+        assert len(points) >= 3
+        tilts.append(float(np.mean([point.normal_w[0] for point in points])))  # of the forces, along the way
+    assert tilts[0] - tilts[1] == pytest.approx(0.2, abs=0.05)
 
 
 def test_a_push_of_random_sign_goes_both_ways() -> None:
