@@ -9,7 +9,7 @@ DURATION_S = float(sys.argv[1]) if len(sys.argv) > 1 else 8.0
 CONTROLLER = {"controller": sys.argv[2]} if len(sys.argv) > 2 else {}  # such as ./mine.py:Mine; else the scenario's
 
 simulated = None
-for backend in ("sim", "can", "odrive"):
+for backend in ("sim", "can", "odrive", "moteus"):
     run = snakesim.run("triplet", duration=DURATION_S, backend=backend, **CONTROLLER)
     simulated = run if simulated is None else simulated
     rows = min(len(run.time_s), len(simulated.time_s))

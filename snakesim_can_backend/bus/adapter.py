@@ -2,7 +2,8 @@
 
 A channel is a SocketCAN interface (`can0`), or `INTERFACE:CHANNEL` of python-can: `slcan:/dev/ttyACM0`,
 `pcan:PCAN_USBBUS1`, `kvaser:0`, `gs_usb:0`, `udp_multicast:239.74.163.2`. Its adapter is configured to the bit rate; a
-kernel interface has that of `ip link`.
+kernel interface has that of `ip link`. A bus of CAN FD has a second bit rate, for data, and frames of up to 64 bytes
+with ids of 11 or 29 bits.
 """
 
 import math
@@ -12,25 +13,38 @@ from typing import Any
 
 import can
 
-from snakesim_can_backend.bus.bus import IO_ERRORS, MAX_AT_ONCE, SocketCanWire, Wire, check_interface
-from snakesim_can_backend.bus.bus_errors import BusError
+from snakesim_can_backend.bus.bus import IO_ERRORS, MAX_AT_ONCE, SocketCanWire, Wire, check_interface, message_of
+from snakesim_can_backend.bus.bus_errors import BusError, bus_errors_of
 from snakesim_can_backend.bus.load import BIT_RATE
 from snakesim_can_backend.protocol.definitions import NODE_BITS, Frame, Opcode
 from snakesim_hal.errors import BackendError, ConfigError, did_you_mean
 
 LOCAL = ("udp_multicast", "virtual")  # interfaces without an adapter, and without a bit rate
+FD = ("socketcan", "kvaser", *LOCAL)
 POLL_S = 0.0005  # of an adapter that cannot be waited for
 
 
-def open_wire(channel: str, only: Iterable[Opcode] | None = None, bit_rate: int = BIT_RATE) -> Wire:
-    """The end of a bus. only: messages to receive; None: all. Raises ConfigError and BackendError."""
+def open_wire(
+    channel: str, only: Iterable[Opcode] | None = None, bit_rate: int = BIT_RATE, data_bit_rate: int | None = None
+) -> Wire:
+    """The end of a bus. only: messages to receive; None: all. Raises ConfigError and BackendError.
+
+    data_bit_rate: of CAN FD; None: classic CAN.
+    """
     interface, name = _parted(channel)
-    return SocketCanWire(name, only) if interface == "socketcan" else AdapterWire(channel, only, bit_rate)
+    if interface == "socketcan" and data_bit_rate is None:
+        return SocketCanWire(name, only)
+    return AdapterWire(channel, only, bit_rate, data_bit_rate)
 
 
-def check_channel(channel: str) -> None:
+def check_channel(channel: str, *, fd: bool = False) -> None:
     """Raise ConfigError unless python-can knows the interface, and the kernel the one that it is to have."""
     interface, name = _parted(channel)
+    if fd and interface not in FD:
+        raise ConfigError(
+            f"channel {channel!r}: CAN FD is driven through {', '.join(FD)}; on Linux most adapters are interfaces of "
+            f"the kernel, such as can0"
+        )
     if interface == "socketcan":
         check_interface(name)
 
@@ -56,12 +70,17 @@ def _parted(channel: str) -> tuple[str, str]:
     return interface, name
 
 
-def open_bus(channel: str, bit_rate: int) -> can.BusABC:
+def open_bus(channel: str, bit_rate: int, data_bit_rate: int | None = None) -> can.BusABC:
     """python-can's bus of a channel. Raises BackendError when it cannot be opened."""
     interface, name = _parted(channel)
+    fd = data_bit_rate is not None
     settings: dict[str, Any] = {} if interface in (*LOCAL, "socketcan") else {"bitrate": bit_rate}
-    if interface == "udp_multicast":
-        settings["fd"] = False
+    if interface == "virtual":
+        settings["protocol"] = can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20
+    elif fd or interface == "udp_multicast":
+        settings["fd"] = fd
+    if fd and "bitrate" in settings:
+        settings["data_bitrate"] = data_bit_rate
     try:
         return can.Bus(interface=interface, channel=name, **settings)
     except (*IO_ERRORS, ImportError, TypeError) as error:  # the last two: of a library that is missing, or too old
@@ -69,13 +88,15 @@ def open_bus(channel: str, bit_rate: int) -> can.BusABC:
 
 
 class AdapterWire:
-    """One end of a bus, through python-can. Frames that are no classic data frames of 11 bits are dropped."""
+    """One end of a bus, through python-can. On classic CAN frames that are no data frames of 11 bits are dropped."""
 
-    def __init__(self, channel: str, only: Iterable[Opcode] | None, bit_rate: int) -> None:
+    def __init__(
+        self, channel: str, only: Iterable[Opcode] | None, bit_rate: int, data_bit_rate: int | None = None
+    ) -> None:
         """Raises BackendError when it cannot be opened."""
-        self.channel = channel
+        self.channel, self._fd = channel, data_bit_rate is not None
         self._only = None if only is None else frozenset(int(opcode) for opcode in only)
-        self._bus = open_bus(channel, bit_rate)
+        self._bus = open_bus(channel, bit_rate, data_bit_rate)
         self._file = self._descriptor()
         echoed = _parted(channel)[0] == "udp_multicast"
         self._echoes: Counter[Frame] | None = Counter() if echoed else None  # of own frames
@@ -84,7 +105,7 @@ class AdapterWire:
     def send(self, frame: Frame) -> bool:
         """Send a frame; False when the adapter did not take it."""
         try:
-            self._bus.send(can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False), timeout=0)
+            self._bus.send(message_of(frame, fd=self._fd), timeout=0)
         except can.CanError as error:
             self._found.append(BusError("not_sent", self.channel, str(error)))
             return False
@@ -102,7 +123,7 @@ class AdapterWire:
                 if (message := self._bus.recv(0)) is None:
                     break
                 if message.is_error_frame:
-                    self._found.append(BusError("error_frames", self.channel, "an error frame"))
+                    self._found += self._errors_in(message)
                 elif self._is_wanted(message, frame := Frame(message.arbitration_id, bytes(message.data))):
                     frames.append(frame)
         except IO_ERRORS as error:
@@ -133,8 +154,13 @@ class AdapterWire:
         except IO_ERRORS as error:
             raise BackendError(f"{self.channel}: cannot be closed: {error}") from error
 
+    def _errors_in(self, message: can.Message) -> list[BusError]:
+        if _parted(self.channel)[0] == "socketcan":
+            return bus_errors_of(message.arbitration_id, bytes(message.data).ljust(8, b"\0"), self.channel)
+        return [BusError("error_frames", self.channel, "an error frame")]
+
     def _is_wanted(self, message: can.Message, frame: Frame) -> bool:
-        if message.is_extended_id or message.is_remote_frame or message.is_fd:
+        if message.is_remote_frame or (not self._fd and (message.is_extended_id or message.is_fd)):
             return False
         if self._echoes and self._echoes[frame] > 0:  # UDP returns what one sends, and does not say whose it was
             self._echoes[frame] -= 1

@@ -29,6 +29,7 @@ from snakesim_hal.injection import Injection
 
 EXTENDED, REMOTE, ERROR = 0x80000000, 0x40000000, 0x20000000
 RECEIVE_BUFFER_BYTES = 1 << 20
+LAST_STANDARD_ID = 0x7FF
 MAX_AT_ONCE = 4096  # a babbling bus must not block its reader for ever
 SO_MEMINFO, MEMINFO_DROPS, MEMINFO_BYTES = 55, 8, 36  # linux/sock_diag.h
 IO_ERRORS = (OSError, ValueError, can.CanError)  # of sockets, of `select` and of python-can
@@ -187,6 +188,12 @@ class SocketCanWire:
         return struct.unpack("=9I", raw)[MEMINFO_DROPS] if len(raw) == MEMINFO_BYTES else 0
 
 
+def message_of(frame: Frame, *, fd: bool = False) -> can.Message:
+    """As python-can has it. An id that does not fit 11 bits has 29."""
+    extended = frame.id > LAST_STANDARD_ID
+    return can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=extended, is_fd=fd, bitrate_switch=fd)
+
+
 class VirtualPeer(Protocol):
     """The other end of a virtual bus, in the same process."""
 
@@ -206,11 +213,12 @@ class VirtualPeer(Protocol):
 class VirtualWire:
     """One end of python-can's virtual bus."""
 
-    def __init__(self, channel: str, peer: VirtualPeer | None = None) -> None:
+    def __init__(self, channel: str, peer: VirtualPeer | None = None, *, fd: bool = False) -> None:
         """peer: runs the other end whenever this one is idle; returns when its next run is due."""
         self.channel = channel
         self.peer = peer
-        self._bus = VirtualBus(channel=channel)
+        self._fd = fd
+        self._bus = VirtualBus(channel=channel, protocol=can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20)
         self._faults = VirtualFaults(channel)
 
     def send(self, frame: Frame) -> bool:
@@ -218,7 +226,7 @@ class VirtualWire:
         if self._faults.on and (taken := self._faults.stops_sending()) is not None:
             return taken
         try:
-            self._bus.send(can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False))
+            self._bus.send(message_of(frame, fd=self._fd))
         except IO_ERRORS as error:
             raise BackendError(f"{self.channel}: cannot send: {error}") from error
         return True

@@ -21,6 +21,7 @@ MAX_EVERY = 255  # Syncs; limit of the parameters
 MIN_RATE_HZ = 20
 FRAME_BITS = 47
 STUFFED_FROM = 34
+FD_START, FD_END = 36, 13  # bits of CAN FD with an id of 29: up to the switch of rates, and after the CRC
 
 
 def mbit(bit_rate: int) -> str:
@@ -31,6 +32,20 @@ def mbit(bit_rate: int) -> str:
 def worst_bits(length: int) -> int:
     """Bits of a frame with `length` bytes, with the maximum of stuff bits."""
     return FRAME_BITS + 8 * length + (STUFFED_FROM + 8 * length - 1) // 4
+
+
+def worst_s(length: int, bit_rate: int, data_bit_rate: int | None = None) -> float:
+    """Time of a frame, at worst-case stuffing; with a second bit rate, of CAN FD with an id of 29 bits.
+
+    There identifier and end go at the first rate; length, data and CRC at the second. Its CRC has 17 bits, or 21 above
+    16 bytes, with the count of stuff bits before it and a fixed stuff bit for every four.
+    """
+    if data_bit_rate is None:
+        return worst_bits(length) / bit_rate
+    crc = 4 + (17 if length <= 16 else 21)
+    data = 5 + 8 * length
+    slow, fast = FD_START + (FD_START - 1) // 4 + FD_END, data + data // 4 + crc + ceil(crc / 4)
+    return slow / bit_rate + fast / data_bit_rate
 
 
 @dataclass(frozen=True)

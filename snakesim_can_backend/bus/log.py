@@ -1,6 +1,6 @@
 """A log of all frames on the wires, in candump's format: `(1700000000.000000) can0 105#00112233 R`.
 
-R was received, T transmitted. Frames that were read from the wire together have one time.
+R was received, T transmitted; of CAN FD `can0 00008001##1...`. Frames that were read together have one time.
 """
 
 import contextlib
@@ -9,22 +9,23 @@ import time
 from pathlib import Path
 from typing import TextIO
 
-from snakesim_can_backend.bus.bus import Wire
+from snakesim_can_backend.bus.bus import LAST_STANDARD_ID, Wire
 from snakesim_can_backend.bus.bus_errors import BusError
 from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_hal.errors import ConfigError
 
 FLUSH_BYTES = 1 << 16
+FD_MARK = "##1"  # a second bit rate
 
 _log = logging.getLogger("snakesim.can")
 
 
-def logged(wires: list[Wire], path: str, backend: str = "can") -> list[Wire]:
+def logged(wires: list[Wire], path: str, backend: str = "can", *, fd: bool = False) -> list[Wire]:
     """The wires with a log, if there is to be one. Raises ConfigError."""
     if not path:
         return wires
     log = open_log(Path(path), backend)
-    return [LoggedWire(wire, log) for wire in wires]
+    return [LoggedWire(wire, log, fd=fd) for wire in wires]
 
 
 def open_log(path: Path, backend: str = "can") -> TextIO:
@@ -38,8 +39,8 @@ def open_log(path: Path, backend: str = "can") -> TextIO:
 class LoggedWire:
     """A wire that keeps a log. Several may share one file."""
 
-    def __init__(self, wire: Wire, log: TextIO) -> None:
-        self._wire, self._log = wire, log
+    def __init__(self, wire: Wire, log: TextIO, *, fd: bool = False) -> None:
+        self._wire, self._log, self._mark = wire, log, FD_MARK if fd else "#"
         self.channel = wire.channel
         self._full = False
 
@@ -85,7 +86,8 @@ class LoggedWire:
         place = f"({time.time():.6f}) {self.channel}"
         try:
             for frame in frames:
-                self._log.write(f"{place} {frame.id:03X}#{frame.data.hex().upper()} {direction}\n")
+                name = f"{frame.id:03X}" if frame.id <= LAST_STANDARD_ID else f"{frame.id:08X}"
+                self._log.write(f"{place} {name}{self._mark}{frame.data.hex().upper()} {direction}\n")
         except OSError as error:  # a full disk ends the log, and nothing else
             self._full = True
             _log.warning("the bus log ends here: %s", error.strerror)

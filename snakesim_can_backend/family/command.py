@@ -5,9 +5,9 @@ from collections.abc import Sequence
 
 import msgspec
 
-from snakesim_can_backend.bus.adapter import is_emulated, open_wire
-from snakesim_can_backend.bus.bus import Wire, wait
-from snakesim_can_backend.bus.load import MAX_LOAD, mbit
+from snakesim_can_backend.bus.adapter import is_emulated
+from snakesim_can_backend.bus.bus import wait
+from snakesim_can_backend.bus.load import MAX_LOAD
 from snakesim_can_backend.family.backend import CanDriveBackend
 from snakesim_hal.drivers.drive_backend import Clock
 from snakesim_hal.errors import ConfigError, SnakesimError
@@ -49,7 +49,7 @@ def serve(backend: type[CanDriveBackend], command: str, arguments: argparse.Name
     settings = msgspec.structs.replace(settings, channels=arguments.channel or settings.channels or ["vcan0"])
     if arguments.load:
         load_ = backend.load(config, settings)
-        bus = f"{load_.drives} {backend.a_drive} at {config.rate_hz:g} Hz on {mbit(settings.bit_rate)}"
+        bus = f"{load_.drives} {backend.a_drive} at {config.rate_hz:g} Hz on {backend.rates(settings)}"
         share = f"{load_.share:.0%} at worst-case stuffing"
         say(f"{bus}: {share}; {MAX_LOAD:.0%} are allowed, so up to {load_.fits_hz} Hz")
         return
@@ -57,7 +57,7 @@ def serve(backend: type[CanDriveBackend], command: str, arguments: argparse.Name
         if not is_emulated(channel):
             raise ConfigError(f"--channel {channel}: emulated drives beside real ones of the same ids are dangerous")
     config = msgspec.structs.replace(config, pace="realtime")
-    wires: list[Wire] = [open_wire(channel, bit_rate=settings.bit_rate) for channel in settings.channels]
+    wires = backend.open(settings)
     twin = backend.twin_on(config, settings, wires, Clock(config), arguments.pose)
     running = [True]
     on_stop_signal(lambda: running.clear())

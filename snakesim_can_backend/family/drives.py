@@ -71,7 +71,10 @@ class CanDrives(ABC):
 
     @abstractmethod
     def hear(self, i: int, frame: Frame) -> None:
-        """A message of a drive, into `readings`, `following` and `firmware`. ValueError, struct.error: malformed."""
+        """A message of a drive, into `readings`, `following` and `firmware`.
+
+        ValueError, LookupError, struct.error: it is malformed.
+        """
 
     @abstractmethod
     def identify(self, i: int) -> None:
@@ -215,7 +218,7 @@ class CanDrives(ABC):
         if i is not None:
             try:
                 self.hear(i, frame)
-            except (ValueError, struct.error):
+            except (ValueError, LookupError, struct.error):
                 return
         elif node == HOST:
             self._others = True

@@ -27,7 +27,7 @@ class CanTwin(ABC):
 
     @abstractmethod
     def take(self, i: int, frame: Frame) -> None:
-        """A frame to a drive. ValueError, struct.error: malformed."""
+        """A frame to a drive. ValueError, LookupError, struct.error: malformed."""
 
     @abstractmethod
     def restart(self, i: int) -> None:
@@ -46,7 +46,7 @@ class CanTwin(ABC):
                     continue
                 try:
                     self.take(i, frame)
-                except (ValueError, struct.error):
+                except (ValueError, LookupError, struct.error):
                     continue
         self.body.advance_to((self._clock_ns() - self._start_ns) / 1000, self.each_step)
         return None

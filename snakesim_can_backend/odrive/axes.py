@@ -59,7 +59,7 @@ class Axes(CanDrives):
 
     unheard = "does not say its version: it is off, has another id or bit rate, or firmware 0.5, which does not say it"
 
-    def __init__(self, _settings: object, joints: Sequence[Joint], *rest: Any, **kit: Any) -> None:
+    def __init__(self, _config: object, _settings: object, joints: Sequence[Joint], *rest: Any, **kit: Any) -> None:
         super().__init__(joints, *rest, **kit)
         self.axes = [axis_of(joint) for joint in joints]
 

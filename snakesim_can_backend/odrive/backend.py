@@ -10,6 +10,7 @@ from snakesim_can_backend.odrive.protocol import LAST_NODE
 from snakesim_can_backend.odrive.twin import HEARTBEAT_US, OdriveTwin
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.scenario import RunConfig
 
 
 class OdriveSettings(CanDriveSettings, frozen=True, kw_only=True):
@@ -25,7 +26,7 @@ class OdriveBackend(CanDriveBackend):
     traffic = Traffic((0, 0, 8, 8, 8), (0, 0, 0, 8, 8, 8), heartbeats_hz=1e6 / HEARTBEAT_US)
 
     @classmethod
-    def check_joint(cls, joint: Joint, where: str, settings: OdriveSettings, *, real: bool) -> None:
+    def check_joint(cls, joint: Joint, where: str, config: RunConfig, settings: OdriveSettings, *, real: bool) -> None:
         """Raise ConfigError for joints that no axis can be."""
         if joint.motor.damping_nm_s_per_rad <= 0:
             raise ConfigError(f"{where}: `damping_nm_s_per_rad` must be above 0: an ODrive's position loop needs it")

@@ -44,7 +44,12 @@ class OdriveTwin(CanTwin):
     """All axes of a robot."""
 
     def __init__(
-        self, settings: DriveSettings, body: TwinBody, wires: Sequence[Wire], clock_ns: Callable[[], int]
+        self,
+        _config: object,
+        settings: DriveSettings,
+        body: TwinBody,
+        wires: Sequence[Wire],
+        clock_ns: Callable[[], int],
     ) -> None:
         super().__init__(body, wires, settings.watchdog_s, clock_ns)
         constants = [joint.motor.torque_constant_nm_per_a or TWIN_CONSTANT for joint in body.joints]

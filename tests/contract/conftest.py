@@ -40,6 +40,7 @@ def pytest_snakesim_benches() -> list[Bench]:
         Bench("sim-position", "sim", sets=POSITION_ONLY),
         Bench("can-virtual", "can", mute=cut_off),
         Bench("odrive", "odrive", mute=cut_drive_off),
+        Bench("moteus", "moteus", mute=cut_drive_off),
     ]
 
 

@@ -53,27 +53,32 @@ def test_modules_of_another_program_are_found_and_driven_in_real_time(machine: M
         modules.wait(10)
 
 
-def test_odrive_axes_of_another_program_are_driven_in_real_time_as_the_robot_file_says_they_are_mounted(
-    machine: Machine, tmp_path: Path
+@pytest.mark.parametrize(
+    ("family", "command", "of"), [("odrive", "odrives", "axes"), ("moteus", "moteus", "controllers")]
+)
+def test_drives_of_another_program_are_driven_in_real_time_as_the_robot_file_says_they_are_mounted(
+    machine: Machine, tmp_path: Path, family: str, command: str, of: str
 ) -> None:
+    """ODrives on classic CAN; moteus on CAN FD, with ids of 29 bits."""
     built = ("robot.joints.joint_2.sign=-1", "robot.joints.joint_5.zero_rad=0.4")
-    as_built = [word for text in built for word in ("--set", text)]
-    log = tmp_path / "axes.log"
-    started = ("odrives", "triplet", "--channel", CHANNEL, "--pose", "127.0.0.1:7450", *as_built)
-    axes = machine.start(SNAKESIM, *started, log=log)
+    gains = ("backend.kp_nm_per_turn=1000", "backend.kd_nm_s_per_turn=100") if family == "moteus" else ()
+    sets = [word for text in (*built, *gains) for word in ("--set", text)]
+    log = tmp_path / "drives.log"
+    started = (command, "triplet", "--channel", CHANNEL, "--pose", "127.0.0.1:7450", *sets)
+    drives = machine.start(SNAKESIM, *started, log=log)
     try:
-        wait_until(lambda: "axes ready: 13" in log.read_text(), "the axes")
+        wait_until(lambda: f"{of} ready: 13" in log.read_text(), "the drives")
         where = ("--set", f'backend.channels=["{CHANNEL}"]', "--set", 'backend.pose_listen="127.0.0.1:7450"')
-        real = ("--backend", "odrive", "--set", "rate_hz=50", "--pace", "realtime", "--duration", "4", *where)
+        real = ("--backend", family, "--set", "rate_hz=50", "--pace", "realtime", "--duration", "4", *where)
         said = [""]
         while "(exit code 0)" not in said[-1] and len(said) < 5:  # a computer that stutters stops a robot now and then
-            run_to = ("triplet", *real, *as_built, "--out", str(tmp_path / "run"))
+            run_to = ("triplet", *real, *sets, "--out", str(tmp_path / "run"))
             said.append(machine.run(SNAKESIM, "run", *run_to, check=False, cwd=tmp_path))
         assert "(exit code 0)" in said[-1], "\n".join(said)
         assert json.loads((tmp_path / "run" / "summary.json").read_text())["path_distance_m"] > 0.1
     finally:
-        axes.terminate()
-        axes.wait(10)
+        drives.terminate()
+        drives.wait(10)
 
 
 @pytest.mark.slow

@@ -1,0 +1,8 @@
+"""The backend `moteus`: mjbots' controllers, by registers on CAN FD.
+
+`backend`   MoteusBackend: settings and checks      `controllers`  what a tick says to a controller, and hears
+`protocol`  registers and frames as bytes           `twin`         emulated controllers
+
+All else is in `snakesim_can_backend.family` and `snakesim_hal.drivers`.
+Numbers are those of the controller's output shaft: turns, turns/s, N·m.
+"""

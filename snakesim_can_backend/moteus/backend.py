@@ -1,0 +1,61 @@
+"""The backend `moteus`, and `snakesim moteus`, which emulates controllers as a process."""
+
+from collections.abc import Sequence
+from typing import Annotated
+
+from msgspec import Meta
+
+from snakesim_can_backend.family.backend import CanDriveBackend, CanDriveSettings
+from snakesim_can_backend.family.command import run
+from snakesim_can_backend.family.traffic import Traffic
+from snakesim_can_backend.moteus.controllers import Controllers, configured, needed
+from snakesim_can_backend.moteus.protocol import HOST_ID, LAST_ID
+from snakesim_can_backend.moteus.twin import MoteusTwin
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.scenario import RunConfig
+
+ROUNDING = 1.001  # of gains that a person has copied
+
+
+class MoteusSettings(CanDriveSettings, frozen=True, kw_only=True):
+    """The scenario's `[backends.moteus]` section. `watchdog_s` goes into every command."""
+
+    data_bit_rate: Annotated[int, Meta(ge=10_000, le=8_000_000, extra_json_schema={"unit": "bit/s"})] = 5_000_000
+    # What all controllers have in `servo.pid_position.kp` and `.kd`; the robot file's gains are sent as shares of them.
+    # Emulated ones have by default what the robot needs.
+    kp_nm_per_turn: Annotated[float, Meta(gt=0, le=1e5, extra_json_schema={"unit": "N·m/turn"})] | None = None
+    kd_nm_s_per_turn: Annotated[float, Meta(gt=0, le=1e4, extra_json_schema={"unit": "N·m·s/turn"})] | None = None
+
+    @property
+    def fd_rate(self) -> int | None:
+        """CAN FD."""
+        return self.data_bit_rate
+
+
+class MoteusBackend(CanDriveBackend):
+    """A `snakesim_hal.backend.Backend` on moteus controllers, real or emulated."""
+
+    Settings, drives, twin = MoteusSettings, Controllers, MoteusTwin
+    name, a_drive, last_id = "moteus", "controllers", LAST_ID
+    says_every_s = 0.05  # it says so whenever it is asked; but it takes a while to get ready
+    traffic = Traffic((5, 24, 48), (6, 24))  # question, answer, command; of one controller, its health
+
+    @classmethod
+    def check_joint(cls, joint: Joint, where: str, config: RunConfig, settings: MoteusSettings, *, real: bool) -> None:
+        """Raise ConfigError for joints that no controller can be."""
+        if joint.id == HOST_ID:
+            raise ConfigError(f"{where}: `id` = {HOST_ID} is the host's; controllers have ids of 1 to {LAST_ID}")
+        most, have = needed(config), configured(config, settings)
+        named = settings.kp_nm_per_turn is not None and settings.kd_nm_s_per_turn is not None
+        if (real and not named) or any(a > b * ROUNDING for a, b in zip(most, have, strict=True)):
+            raise ConfigError(
+                f"robot {config.robot.name!r} needs `servo.pid_position.kp` from {most[0]:.4g} N·m/turn on, and `.kd` "
+                f"from {most[1]:.4g} N·m·s/turn: configure all controllers alike, and say what they have in "
+                f"`backends.moteus.kp_nm_per_turn` and `kd_nm_s_per_turn`"
+            )
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """`snakesim moteus`."""
+    return run(MoteusBackend, "moteus", argv)

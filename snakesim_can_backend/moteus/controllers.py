@@ -1,0 +1,167 @@
+"""moteus controllers as a family of drives on CAN FD.
+
+Every set-point is a whole command in position mode: gains of the robot file as shares of the configured ones. Velocity
+mode is a proportional gain of 0, torque mode both gains 0, passive that without torque. Answers say mode and fault.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from snakesim_can_backend.family.drives import HOST, CanDrives
+from snakesim_can_backend.moteus.protocol import (
+    FAULTS,
+    FLOAT,
+    HOST_ID,
+    INT8,
+    INT32,
+    READ,
+    REGISTER_MAP,
+    RELATIVE,
+    REPLY,
+    WRITE,
+    Mode,
+    Register,
+    addresses,
+    framed,
+    part,
+    parts,
+)
+from snakesim_can_backend.protocol.definitions import Frame
+from snakesim_hal.drivers.following import Word
+from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.wire.messages import Mode as JointMode
+
+TURN = 2 * math.pi
+NO_LIMIT = -1.0
+IDENTITY = part(READ, INT32, Register.MAP_VERSION, count=1), part(READ, INT8, Register.HOME_STATE, count=1)
+MOTION = part(READ, FLOAT, Register.MODE, count=4), part(READ, INT8, Register.FAULT, count=1)
+HEALTH = (
+    part(READ, FLOAT, Register.POWER, count=1),
+    part(READ, FLOAT, Register.MOTOR_TEMPERATURE, count=1),
+    part(READ, FLOAT, Register.VOLTAGE, count=2),
+)
+
+
+class Controllers(CanDrives):
+    """All controllers of a robot."""
+
+    unheard = "does not say its register map: it is off, has another id, or the bus another bit rate or sample point"
+
+    def __init__(self, config: RunConfig, settings: Any, joints: Sequence[Joint], *rest: Any, **kit: Any) -> None:
+        super().__init__(joints, *rest, **kit)
+        self._kp_nm_per_turn, kd = kp, kd = configured(config, settings)
+        self._gains = [tuple(a / b for a, b in zip(gains_of(j), (kp, kd, kd), strict=True)) for j in joints]
+        self._watchdog_s = settings.watchdog_s
+        self._mode, self._home = [-1] * len(joints), [RELATIVE] * len(joints)
+
+    def sender(self, frame: Frame) -> int | None:
+        """Another host of our id is known by its writing."""
+        source, destination = addresses(frame)
+        if source == HOST_ID:
+            return HOST if frame.data[:1] < bytes([READ]) else None
+        return source if destination == HOST_ID else None
+
+    def hear(self, i: int, frame: Frame) -> None:
+        """One answer, to one of three questions."""
+        said = {
+            one.register + k: value
+            for one in parts(frame.data)
+            if one.kind == REPLY
+            for k, value in enumerate(one.values)
+        }
+        if Register.POSITION in said:
+            mode, fault = int(said[Register.MODE]), int(said[Register.FAULT])
+            self._mode[i] = mode
+            self.readings.moved(i, said[Register.POSITION] * TURN, said[Register.VELOCITY] * TURN)
+            self.readings.pushed(i, said[Register.TORQUE])
+            self.following.says(i, enabled=mode == Mode.POSITION, state=f"in mode {mode}")
+            named = f"fault {fault}, {FAULTS.get(fault, 'see its manual')}" if mode == Mode.FAULT else ""
+            self.following.drives[i].errors = "timeout: its watchdog expired" if mode == Mode.TIMEOUT else named
+        if Register.VOLTAGE in said:
+            voltage_v = said[Register.VOLTAGE]
+            self.readings.supplied(i, voltage_v, said[Register.POWER] / max(voltage_v, 1.0))
+            self.readings.warmed(i, said[Register.MOTOR_TEMPERATURE], said[Register.BOARD_TEMPERATURE])
+        if Register.MAP_VERSION in said:
+            self.firmware[i], self._home[i] = (int(said[Register.MAP_VERSION]),), int(said[Register.HOME_STATE])
+
+    def identify(self, i: int) -> None:
+        """Version of its registers, reference of its position, mode."""
+        self._send(i, *IDENTITY, reply=True)
+        self.ask(i)
+
+    def unfit(self, i: int) -> str:
+        """Another register map, or a position that means nothing."""
+        if self.firmware[i] != (REGISTER_MAP,):
+            return f"has register map {self.firmware[i][0]}; this driver knows {REGISTER_MAP}: update its firmware"
+        if self._home[i] == RELATIVE:
+            return "does not know where it is: its position has no reference (home state 0); configure its encoders"
+        return ""
+
+    def ask(self, i: int) -> bool:
+        """Mode, position, velocity, torque, fault."""
+        return self._send(i, *MOTION, reply=True)
+
+    def ask_health(self, i: int) -> None:
+        """Power, temperatures, voltage."""
+        self._send(i, *HEALTH, reply=True)
+
+    def set_point(self, i: int, mode: JointMode, target: float, limit_nm: float) -> None:
+        """A command, which would also start it: so none to one that was restarted, or may be restarting."""
+        restarted = self.following.drives[i].followed and self._mode[i] != Mode.POSITION
+        if restarted or self.readings.unanswered(i):
+            return
+        stiffness, damping, velocity_gain = self._gains[i]
+        position, velocity, torque, kp, kd = math.nan, 0.0, 0.0, 0.0, 0.0
+        match mode:
+            case JointMode.POSITION:
+                position, kp, kd = target / TURN, stiffness, damping
+            case JointMode.VELOCITY:
+                velocity, kd = target / TURN, velocity_gain
+            case JointMode.TORQUE | JointMode.PASSIVE:
+                torque = target
+        self._send(
+            i,
+            part(WRITE, INT8, Register.MODE, Mode.POSITION),
+            part(WRITE, FLOAT, Register.COMMAND, position, velocity, torque, kp, kd, limit_nm),
+            part(WRITE, FLOAT, Register.WATCHDOG, self._watchdog_s, NO_LIMIT, NO_LIMIT),
+        )
+
+    def tell(self, i: int, word: Word) -> None:
+        """A set-point is what makes it follow. A fault is off already, and a stop would clear it."""
+        if word != "follow" and self._mode[i] != Mode.FAULT:
+            self.clear_errors(i)
+
+    def set_up(self, i: int) -> None:
+        """Nothing: every command is whole."""
+
+    def forgive(self, i: int) -> None:
+        """Nothing: an expired watchdog ends when it is told to be idle."""
+
+    def clear_errors(self, i: int) -> None:
+        """Stopped: it clears faults, too."""
+        self._send(i, part(WRITE, INT8, Register.MODE, Mode.STOPPED))
+
+    def _send(self, i: int, *content: bytes, reply: bool = False) -> bool:
+        return self.wires[i].send(framed(HOST_ID, self.nodes[i], *content, reply=reply))
+
+
+def gains_of(joint: Joint) -> tuple[float, float, float]:
+    """Stiffness in N·m/turn, damping and gain of velocity mode in N·m/(turn/s), at the shaft."""
+    motor, at_shaft = joint.motor, TURN / joint.drive.gear**2
+    gains = motor.stiffness_nm_per_rad, motor.damping_nm_s_per_rad, motor.velocity_gain_nm_s_per_rad
+    stiffness, damping, velocity_gain = (gain * at_shaft for gain in gains)
+    return stiffness, damping, velocity_gain
+
+
+def needed(config: RunConfig) -> tuple[float, float]:
+    """The gains that all joints' are shares of: `servo.pid_position.kp` and `kd`."""
+    gains = [gains_of(joint) for joint in config.robot.joint_table]
+    return max(kp for kp, _, _ in gains), max(max(damping, velocity) for _, damping, velocity in gains)
+
+
+def configured(config: RunConfig, settings: Any) -> tuple[float, float]:
+    """Those that the controllers have."""
+    kp, kd = needed(config)
+    return settings.kp_nm_per_turn or kp or 1.0, settings.kd_nm_s_per_turn or kd or 1.0

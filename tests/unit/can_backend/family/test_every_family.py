@@ -1,0 +1,231 @@
+"""Drivers of every family on CAN against emulated drives in lockstep, with the robot's lifecycle as the host has it."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import can
+import pytest
+
+from snakesim_can_backend.family.backend import CanDriveBackend
+from snakesim_can_backend.moteus.backend import MoteusBackend
+from snakesim_can_backend.moteus.protocol import Mode as MoteusMode
+from snakesim_can_backend.odrive.backend import OdriveBackend
+from snakesim_can_backend.odrive.protocol import State
+from snakesim_hal.backend import SetPoints
+from snakesim_hal.errors import BackendError, ConfigError
+from snakesim_hal.injection import parse
+from snakesim_hal.wire.messages import Fault, JointState, LifecycleState, Mode
+from tests.unit.hal.rig import run_config
+
+JOINTS = 4
+SHOWN = 20  # ticks in which a fault shows: a heartbeat takes ten
+
+
+@dataclass(frozen=True)
+class Family:
+    """What a test knows of one."""
+
+    backend: type[CanDriveBackend]
+    drives: Callable[[Any], list[Any]]  # of a twin
+    follows: Callable[[Any], bool]  # one of them
+    expired: str  # in the fault of an expired watchdog
+    overheated: str
+    unheard: str
+    too_fast_hz: float
+
+
+FAMILIES = {
+    "odrive": Family(
+        OdriveBackend,
+        lambda twin: twin.axes,
+        lambda axis: axis.state == State.CLOSED_LOOP,
+        "watchdog_timer_expired",
+        "motor_over_temp",
+        "does not say its version: .*another id",
+        500,
+    ),
+    "moteus": Family(
+        MoteusBackend,
+        lambda twin: twin.controllers,
+        lambda controller: controller.mode == MoteusMode.POSITION,
+        "its watchdog expired",
+        "fault 38, over-temperature",
+        "does not say its register map: .*another id",
+        2000,
+    ),
+}
+
+
+class Robot:
+    """A backend and its drives, tick by tick."""
+
+    def __init__(self, family: Family, **settings: Any) -> None:
+        self.family = family
+        self.config = run_config(backend=family.backend.name, robot__chain__modules=JOINTS, rate_hz=100)
+        fixed: dict[str, Any] = {"plant": "inertia", "bring_up_limit_s": 0.5}
+        self.backend = family.backend(self.config, family.backend.Settings(**fixed | settings))
+        self.tick, self.isolated = 0, frozenset[int]()
+        self.joints: JointState | None = None
+
+    @property
+    def twin(self) -> Any:
+        return getattr(self.backend._drives, "_twin", None)
+
+    def following(self) -> list[bool]:
+        return [self.family.follows(drive) for drive in self.family.drives(self.twin)]
+
+    def run(self, ticks: int, lifecycle: LifecycleState) -> list[Fault]:
+        """So many periods; a fault latches, as in the host."""
+        found: list[Fault] = []
+        for _ in range(ticks):
+            self.joints = self.backend.sample(self.tick, self.tick * self.config.period_ns).joints
+            modes = [Mode.POSITION if lifecycle == "armed" else Mode.PASSIVE] * JOINTS
+            points = SetPoints(modes, [0.1] * JOINTS, [1.0] * JOINTS, self.isolated)
+            self.backend.enact(points, lifecycle)
+            self.backend.advance()
+            found += self.backend.faults()
+            if found and lifecycle in ("armed", "disarmed"):
+                lifecycle = "fault"
+            self.tick += 1
+        return found
+
+    def go_wrong(self, text: str, *, begins: bool = True) -> None:
+        assert self.backend.inject(parse(text), begins=begins)
+
+
+@pytest.fixture(params=FAMILIES.values(), ids=list(FAMILIES))
+def family(request: pytest.FixtureRequest) -> Family:
+    return request.param
+
+
+@pytest.fixture
+def robot(family: Family) -> Iterator[Robot]:
+    one = Robot(family)
+    yield one
+    one.backend.close()
+
+
+def test_an_error_of_a_drive_stays_until_the_operators_clear_and_is_reported_again_if_it_is_still_there(
+    robot: Robot,
+) -> None:
+    assert robot.run(30, "disarmed") == [] and robot.run(30, "armed") == []
+    robot.go_wrong("overheat:joint_2@0-9")
+    fault = robot.run(SHOWN, "armed")[0]
+    assert (fault.what, fault.joint) == ("drive_fault", "joint_2") and robot.family.overheated in fault.cause
+    assert robot.run(50, "fault") == [] and robot.run(50, "estop") == [] and robot.following() == [False] * JOINTS
+    assert [fault.joint for fault in robot.run(SHOWN, "disarmed")] == ["joint_2"], "cleared while it was still hot"
+    robot.go_wrong("overheat:joint_2@0-9", begins=False)
+    robot.twin.body.thermal.winding_c[:] = 20.0
+    robot.run(5, "fault")
+    assert robot.run(SHOWN, "disarmed") == []
+    assert robot.run(40, "armed") == [] and robot.joints is not None
+    assert robot.joints.angle_rad == pytest.approx([0.1] * JOINTS, abs=0.02)
+
+
+def test_a_drive_that_restarts_in_motion_stays_off_until_the_clear_and_then_has_its_settings(robot: Robot) -> None:
+    robot.run(20, "armed")
+    robot.go_wrong("reboot:joint_3@0")
+    faults = robot.run(80, "armed")
+    assert faults[0].what == "drive_silent" and faults[0].joint == "joint_3"
+    assert not faults[1:] and robot.following() == [False] * JOINTS
+    assert robot.run(10, "fault") == [] and robot.run(10, "disarmed") == []
+    robot.run(40, "armed")
+    assert robot.following() == [True] * JOINTS and robot.joints is not None
+    assert robot.joints.angle_rad == pytest.approx([0.1] * JOINTS, abs=0.02)
+    fresh, other = robot.twin.body.motors, 0
+    assert fresh._kp[2] == fresh._kp[other] and fresh._limit[2] == fresh._limit[other] == 1.0
+
+
+def test_a_drive_that_restarts_between_two_ticks_does_not_go_on_as_if_nothing_had_been(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("snakesim_hal.drivers.twin_body.BOOT_US", 10_000.0)
+    robot.run(30, "armed")
+    robot.go_wrong("reboot:joint_3@0")
+    assert [(fault.what, fault.joint) for fault in robot.run(SHOWN, "armed")] == [("drive_not_armed", "joint_3")]
+
+
+def test_a_joint_that_was_lost_while_armed_is_left_alone_until_it_is_used_again(robot: Robot) -> None:
+    robot.run(20, "armed")
+    robot.go_wrong("mute:joint_4@0")
+    robot.isolated = frozenset({3})
+    assert robot.run(60, "armed") == [] and robot.following() == [True, True, True, False]
+    robot.go_wrong("mute:joint_4@0", begins=False)
+    robot.isolated = frozenset()
+    assert robot.run(30, "disarmed") == [] and robot.run(20, "armed") == [] and robot.following() == [True] * JOINTS
+
+
+def test_drives_stop_by_their_own_watchdog_when_the_driver_is_gone_and_the_next_one_begins_anew(
+    robot: Robot,
+) -> None:
+    robot.run(20, "armed")
+    robot.backend._clock.robot_ns += 150_000_000
+    robot.twin()
+    assert robot.following() == [False] * JOINTS
+    faults = robot.run(SHOWN, "armed")
+    assert {fault.what for fault in faults} == {"drive_fault"}
+    assert all(robot.family.expired in fault.cause for fault in faults)
+    robot.backend._drives.bring_up()
+    assert robot.run(SHOWN, "disarmed") == [] and robot.run(SHOWN, "armed") == []
+
+
+def test_a_drive_with_another_id_is_missing_at_the_start_and_a_stranger_later(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    renamed = robot.family.drives(robot.twin)[0]
+    setattr(renamed, "node" if hasattr(renamed, "node") else "id", 9)
+    faults = robot.run(40, "disarmed")
+    assert {(fault.what, fault.joint) for fault in faults} == {("drive_silent", "joint_1"), ("unknown_node", None)}
+    assert any("node 9 is on the bus" in fault.cause for fault in faults)
+    twin_class = type(robot.twin)
+    made = twin_class.__init__
+
+    def elsewhere(twin: Any, *rest: Any) -> None:
+        made(twin, *rest)
+        twin._at.pop((id(twin.wires[1]), 2))
+
+    monkeypatch.setattr(twin_class, "__init__", elsewhere)
+    with pytest.raises(BackendError, match=rf"joint_2 \(node 2 on .*\) {robot.family.unheard}"):
+        Robot(robot.family)
+
+
+def test_another_program_that_commands_drives_stops_the_robot(robot: Robot) -> None:
+    robot.run(20, "armed")
+    channel = robot.backend._drives._buses[0].channel  # pyright: ignore[reportAttributeAccessIssue]
+    command = can.Message(arbitration_id=2 << 5 | 7, data=[8, 0, 0, 0], is_extended_id=False)
+    if robot.family.backend is MoteusBackend:
+        command = can.Message(arbitration_id=2, data=[1, 0, 10], is_fd=True, is_extended_id=False)
+    protocol = can.CanProtocol.CAN_FD if command.is_fd else can.CanProtocol.CAN_20
+    with can.Bus(interface="virtual", channel=channel, protocol=protocol) as bus:
+        bus.send(command)
+        assert [fault.what for fault in robot.run(3, "armed")] == ["second_host"]
+
+
+def test_a_log_of_the_bus_is_read_by_python_can_as_it_was_sent(family: Family, tmp_path: Path) -> None:
+    one = Robot(family, log=str(tmp_path / "bus.log"))
+    one.run(5, "armed")
+    one.backend.close()
+    with can.LogReader(tmp_path / "bus.log") as log:
+        frames = list(log)
+    assert len(frames) > 5 * 3 * JOINTS and {frame.is_fd for frame in frames} == {family.backend is MoteusBackend}
+    assert {frame.is_rx for frame in frames} == {True, False}
+    assert all(frame.is_extended_id == (frame.arbitration_id > 0x7FF) for frame in frames)
+
+
+@pytest.mark.parametrize(
+    ("dotted", "words"),
+    [
+        ({"rate_hz": 0}, "drives at .* Hz need .* at worst-case stuffing"),
+        ({"rate_hz": 20}, "`watchdog_s` = 0.1 s at `rate_hz` = 20: one lost set-point"),
+        ({"robot__joints": {"joint_2": {"id": 500}}}, "joint_2: `id` = 500; .* have ids of 0 to"),
+        ({"robot__joints": {"joint_2": {"port": "can7"}}}, "joint_2: `port` = 'can7' is not among"),
+    ],
+)
+def test_what_drives_cannot_do_is_refused_before_the_start(family: Family, dotted: dict[str, Any], words: str) -> None:
+    name = family.backend.name
+    fixed = {"backend": name, "robot__chain__modules": JOINTS, "rate_hz": 100}
+    config = run_config(**fixed | dotted | ({"rate_hz": family.too_fast_hz} if dotted.get("rate_hz") == 0 else {}))
+    with pytest.raises(ConfigError, match=words.replace("`watchdog_s`", f"`backends.{name}.watchdog_s`")):
+        family.backend.check(config, family.backend.Settings())

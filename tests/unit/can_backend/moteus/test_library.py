@@ -1,0 +1,167 @@
+"""Our frames against mjbots' own library: what one encodes the other reads, in both directions, and so do the twins."""
+
+import math
+from typing import Any
+
+import can
+import moteus
+import pytest
+from moteus.protocol import parse_message, parse_registers
+
+from snakesim_can_backend.bus.bus import VirtualWire, message_of
+from snakesim_can_backend.moteus import protocol
+from snakesim_can_backend.moteus.backend import MoteusBackend, MoteusSettings
+from snakesim_can_backend.moteus.controllers import HEALTH, IDENTITY, MOTION
+from snakesim_can_backend.protocol.definitions import Frame
+from snakesim_hal.backend import SetPoints
+from snakesim_hal.drivers.drive_backend import Clock
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.wire.messages import Mode
+from tests.unit.hal.rig import run_config
+
+TYPES = (moteus.INT8, moteus.INT16, moteus.INT32, moteus.F32)
+JOINTS = 4
+
+
+def theirs(number: int = 1, **options: Any) -> moteus.Controller:
+    """Their client of one controller; only its frames are used."""
+    return moteus.Controller(id=number, transport=object(), **options)  # pyright: ignore[reportArgumentType]
+
+
+def as_frame(command: Any, number: int = 1) -> Frame:
+    return Frame((0x8000 if command.reply_required else 0) | command.source << 8 | number, bytes(command.data))
+
+
+def test_registers_modes_and_faults_have_their_numbers() -> None:
+    same = {
+        "MODE": "MODE", "POSITION": "POSITION", "VELOCITY": "VELOCITY", "TORQUE": "TORQUE", "POWER": "POWER",
+        "MOTOR_TEMPERATURE": "MOTOR_TEMPERATURE", "HOME_STATE": "HOME_STATE", "VOLTAGE": "VOLTAGE",
+        "BOARD_TEMPERATURE": "TEMPERATURE", "FAULT": "FAULT", "COMMAND": "COMMAND_POSITION",
+        "WATCHDOG": "COMMAND_TIMEOUT", "MAP_VERSION": "REGISTER_MAP_VERSION",
+    }  # fmt: skip
+    assert {one.name: moteus.Register[same[one.name]] for one in protocol.Register} == {
+        one.name: one.value for one in protocol.Register
+    }
+    modes = {one.name: moteus.Mode[one.name].value for one in protocol.Mode}
+    assert modes == {one.name: one.value for one in protocol.Mode}
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        {"position": 0.25, "velocity": 0.0, "feedforward_torque": 0.0, "kp_scale": 0.5, "kd_scale": 0.75},
+        {"position": math.nan, "velocity": -1.5, "feedforward_torque": 0.0, "kp_scale": 0.0, "kd_scale": 1.0},
+        {"position": math.nan, "velocity": 0.0, "feedforward_torque": -2.5, "kp_scale": 0.0, "kd_scale": 0.0},
+    ],
+    ids=["position", "velocity", "torque"],
+)
+def test_a_command_of_ours_is_what_their_library_sends_for_it(law: dict[str, float]) -> None:
+    floats = dict.fromkeys((*law, "maximum_torque", "watchdog_timeout", "velocity_limit", "accel_limit"), moteus.F32)
+    resolution = moteus.PositionResolution()
+    for name, kind in floats.items():
+        setattr(resolution, name, kind)
+    rest: dict[str, Any] = {
+        "maximum_torque": 3.0,
+        "watchdog_timeout": 0.125,
+        "velocity_limit": -1.0,
+        "accel_limit": -1.0,
+    }
+    sent = theirs(5, position_resolution=resolution).make_position(**dict[str, Any](rest | law))
+    ours = protocol.framed(
+        0,
+        5,
+        protocol.part(protocol.WRITE, protocol.INT8, protocol.Register.MODE, protocol.Mode.POSITION),
+        protocol.part(protocol.WRITE, protocol.FLOAT, protocol.Register.COMMAND, *law.values(), 3.0),
+        protocol.part(protocol.WRITE, protocol.FLOAT, protocol.Register.WATCHDOG, 0.125, -1.0, -1.0),
+    )
+    assert parse_registers(ours.data).command == pytest.approx(parse_registers(sent.data).command, nan_ok=True)
+    assert as_frame(sent, 5).id == ours.id and len(ours.data) == 48
+    read = [one for one in protocol.parts(bytes(sent.data)) if one.kind == protocol.WRITE]
+    values = {one.register + k: value for one in read for k, value in enumerate(one.values)}
+    assert values == pytest.approx(parse_registers(sent.data).command, nan_ok=True)
+
+
+def test_a_stop_of_ours_is_theirs_and_ids_are_extended_where_theirs_are() -> None:
+    stop = protocol.part(protocol.WRITE, protocol.INT8, protocol.Register.MODE, protocol.Mode.STOPPED)
+    assert protocol.framed(0, 1, stop) == as_frame(theirs().make_stop())
+    asked = protocol.framed(0, 1, *MOTION, reply=True)
+    assert asked.id == as_frame(theirs().make_query()).id == 0x8001
+    assert message_of(asked, fd=True).is_extended_id and not message_of(Frame(0x100, b""), fd=True).is_extended_id
+    assert len(protocol.framed(0, 1, *HEALTH).data) == 6 and len(protocol.framed(0, 1, *MOTION).data) == 5
+    assert parse_registers(protocol.framed(0, 1, *IDENTITY).data).query == [(0x102, moteus.INT32), (0x00C, moteus.INT8)]
+
+
+@pytest.fixture
+def bus() -> Any:
+    """Emulated controllers of a robot, and their bus."""
+    config = run_config(backend="moteus", robot__chain__modules=JOINTS, rate_hz=100)
+    wire, clock = VirtualWire("moteus-theirs", fd=True), Clock(config)
+    twin = MoteusBackend.twin_on(config, MoteusSettings(plant="inertia"), [wire], clock, None)
+    with can.Bus(interface="virtual", channel="moteus-theirs", protocol=can.CanProtocol.CAN_FD) as ours:
+        yield ours, twin, clock
+    twin.close()
+
+
+def test_their_client_drives_our_twins_and_reads_them_in_every_resolution(bus: Any) -> None:
+    ours, twin, clock = bus
+    client, number = theirs(3), 3
+
+    def ask(command: Any) -> dict[int, Any]:
+        ours.send(message_of(as_frame(command, number), fd=True))
+        twin()
+        if (message := ours.recv(0)) is None:
+            return {}
+        result = parse_message(message)
+        assert result.id == number and message.is_fd
+        return result.values
+
+    assert ask(client.make_query())[moteus.Register.MODE] == moteus.Mode.STOPPED
+    for _ in range(100):
+        ask(client.make_position(position=0.05, velocity=0.0, watchdog_timeout=0.1))
+        clock.robot_ns += 10_000_000
+        twin()
+    for kind, close in zip(TYPES, (0.01, 0.0002, 0.0002, 0.0002), strict=True):
+        fields = dict.fromkeys((0, 1, 2, 3, 13, 14, 15), kind)
+        said = ask(client.make_custom_query(fields))
+        assert said[moteus.Register.MODE] == moteus.Mode.POSITION and said[moteus.Register.FAULT] == 0
+        assert said[moteus.Register.POSITION] == pytest.approx(0.05, abs=max(close, 0.003))
+        assert said[moteus.Register.VOLTAGE] == pytest.approx(twin.body.supply(2)[0], abs=0.3)
+    clock.robot_ns += 150_000_000
+    twin()
+    assert ask(client.make_query())[moteus.Register.MODE] == moteus.Mode.TIMEOUT
+    ask(client.make_position(position=0.1, velocity=0.0))
+    assert ask(client.make_query())[moteus.Register.MODE] == moteus.Mode.TIMEOUT, "only a stop ends it"
+    ask(client.make_stop())
+    assert ask(client.make_query())[moteus.Register.MODE] == moteus.Mode.STOPPED
+
+
+def test_every_frame_of_a_run_is_read_by_their_library_and_means_what_the_robot_file_says() -> None:
+    config = run_config(backend="moteus", robot__chain__modules=JOINTS, rate_hz=100)
+    backend = MoteusBackend(config, MoteusSettings(plant="inertia"))
+    drives: Any = backend._drives
+    sent: list[Frame] = []
+    send = drives.wires[0].send
+    drives.wires[0].send = lambda frame: sent.append(frame) or send(frame)
+    joints = backend.sample(0, 0).joints
+    for tick in range(1, 20):
+        joints = backend.sample(tick, tick * config.period_ns).joints
+        backend.enact(SetPoints([Mode.POSITION] * JOINTS, [0.2] * JOINTS, [1.5] * JOINTS, frozenset()), "armed")
+        backend.advance()
+    backend.close()
+    read = [parse_registers(frame.data) for frame in sent]
+    assert all(one.command or one.query for one in read) and not any(one.errors for one in read)
+    command = next(one.command for one in read if len(one.command) > 2)
+    motor = config.robot.joint_table[0].motor
+    kp = command[moteus.Register.COMMAND_KP_SCALE] * drives._kp_nm_per_turn
+    assert command[moteus.Register.COMMAND_POSITION] == pytest.approx(0.2 / (2 * math.pi))
+    assert kp == pytest.approx(motor.stiffness_nm_per_rad * 2 * math.pi)
+    assert command[moteus.Register.COMMAND_POSITION_MAX_TORQUE] == 1.5 and joints.valid == [True] * JOINTS
+
+
+def test_real_controllers_need_to_be_configured_for_the_robot_and_a_reference() -> None:
+    config = run_config(backend="moteus", robot__chain__modules=JOINTS, rate_hz=100)
+    with pytest.raises(ConfigError, match=r"needs `servo.pid_position.kp` from .* N·m/turn on, .*say what they have"):
+        MoteusBackend.check(config, MoteusSettings(kp_nm_per_turn=0.01))
+    config = run_config(backend="moteus", robot__joints={"joint_1": {"id": 0}}, rate_hz=100)
+    with pytest.raises(ConfigError, match="`id` = 0 is the host's"):
+        MoteusBackend.check(config, MoteusSettings())
