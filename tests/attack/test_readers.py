@@ -14,7 +14,7 @@ from tests.attack.means.floods import flood
 from tests.attack.robot import joined
 
 FAST = ("triplet", "--controller", "hold", "--pace", "realtime", "--set", "rate_hz=200", "--duration", "600", "--stay")
-WATCHED_S = effort(5, 40)
+WATCHED_S = effort(3, 40)
 
 
 @pytest.mark.parametrize("readers", [1, 4] if FULL else [2])

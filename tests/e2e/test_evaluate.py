@@ -252,6 +252,7 @@ def test_a_search_on_a_row_of_a_suite_prints_an_evaluation(home: Path) -> None:
     assert f"{sum(case['advance_m'] for case in cases) / 2:.4g}" == said.split(",")[0]
 
 
+@pytest.mark.slow  # above it is read, and a sweep is run
 def test_what_a_search_prints_can_be_run(home: Path) -> None:
     given = ["optimise", "clutter", "--set", "duration_s=0.5", "--set", "controller=path_following", "--seed", "2"]
     given += ["--vary", "controllers.path_following.look_ahead_m=0.02:0.1", "--goal", "advance_m", "--trials", "1"]

@@ -12,6 +12,7 @@ import threading
 import tomllib
 import zipfile
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import distribution, packages_distributions
 from pathlib import Path
 
@@ -274,7 +275,8 @@ def test_the_core_alone_drives_a_robot_and_every_command_says_which_extra_it_lac
     completed = snakesim("completion", "bash")
     assert completed.code == 0 and not completed.err
     stops_and_arms(snakesim)
-    said = {extra: snakesim(*words) for extra, words in NEEDS.items()}
+    with ThreadPoolExecutor(4) as side_by_side:
+        said = dict(zip(NEEDS, side_by_side.map(lambda words: snakesim(*words), NEEDS.values()), strict=True))
     unsaid = {extra: done for extra, done in said.items() if f"-m pip install 'snakesim[{extra}]'" not in done.err}
     assert not unsaid and {(done.code, done.err.count("\n")) for done in said.values()} == {(2, 1)}, said
     assert "--no-record" in snakesim("run", *WORKBENCH).err

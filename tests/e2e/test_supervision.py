@@ -182,6 +182,7 @@ def test_processes_go_wrong_on_request(tmp_path: Path) -> None:
         interrupt(run)  # a frozen host is thawed to end in order
 
 
+@pytest.mark.slow  # a kill from outside: test_failure.py; one on request: above
 def test_a_planned_kill_ends_a_run_that_does_not_stay(tmp_path: Path) -> None:
     arguments = [*LONG, "--pace", "realtime", "--set", 'faults=["kill:control@0.5"]']
     ended, summary = run_to_summary(tmp_path / "run", *arguments)
