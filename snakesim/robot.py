@@ -23,7 +23,17 @@ from snakesim_hal.network.session_file import read_session
 from snakesim_hal.process import user_name
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
-from snakesim_hal.wire.messages import Clock, Contacts, Description, JointState, LifecycleRequest, Message, Pose, Status
+from snakesim_hal.wire.messages import (
+    Clock,
+    Contacts,
+    Description,
+    JointState,
+    LifecycleRequest,
+    Message,
+    Pose,
+    Status,
+    request_to_arm,
+)
 from snakesim_hal.wire.own_sample import message_of
 from snakesim_operator.recording.process import record
 from snakesim_operator.tools.command import ask_host
@@ -185,16 +195,8 @@ class Robot:
         """Take the lease, and have the robot hold its pose until the first command. Raises RefusedError."""
         control = self._commanding()
         control.turn_until(lambda: self.status.ready_to_arm, READY_S, lambda: f"not armed: {self.status.why}")
-        robot, before = self.description, self._clock.arming
-        request = LifecycleRequest(
-            action="arm",
-            who=user_name(),
-            host=robot.host,
-            robot=robot.robot,
-            backend=robot.backend,
-            config_hash=robot.config_hash,
-        )
-        self._ask(request, "armed")
+        before = self._clock.arming
+        self._ask(request_to_arm(self.description, user_name()), "armed")
         control.turn_until(lambda: self._clock.arming > before, READY_S, lambda: f"not armed: {self.status.why}")
         if self._clock.lifecycle != "armed":
             raise RefusedError(f"not armed any more, but {self._clock.lifecycle}: {self.status.why}")

@@ -28,7 +28,7 @@ from snakesim_hal.network.local_network import LocalNetwork
 from snakesim_hal.plugin_check import find_service
 from snakesim_hal.service import ServiceLoop
 from snakesim_hal.terminal import report_error
-from snakesim_hal.wire.messages import LifecycleRequest
+from snakesim_hal.wire.messages import request_to_arm
 
 AFTER_FAULT_S = 1.5
 ARM_LIMIT_S, ARM_LIMIT_TURNS = 10.0, 100  # both: planning, or a busy computer, may take long for a turn
@@ -146,16 +146,8 @@ class InProcessRun:
                 self._parts[name].close()
 
     def _arm(self, *, given_up_after_s: float | None) -> None:
-        status, robot = self.host.status(), self.host.description
+        status = self.host.status()
         if given_up_after_s is not None:
             raise RefusedError(f"not ready to arm within {given_up_after_s:g} s: {status.why}")
         if status.ready_to_arm:
-            request = LifecycleRequest(
-                action="arm",
-                who=WHO,
-                host=robot.host,
-                robot=robot.robot,
-                backend=robot.backend,
-                config_hash=robot.config_hash,
-            )
-            self.host.ask(request, lambda _answer: None)
+            self.host.ask(request_to_arm(self.host.description, WHO), lambda _answer: None)

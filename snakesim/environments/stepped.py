@@ -26,11 +26,11 @@ from snakesim_hal.wire.messages import (
     JointCommand,
     JointState,
     LeaseRequest,
-    LifecycleRequest,
     LifecycleState,
     Message,
     Mode,
     Power,
+    request_to_arm,
 )
 
 WHO = "an environment"
@@ -180,11 +180,7 @@ class SteppedRobot:
     def _arm(self, authority: Authority) -> None:
         authority.on_lease(LeaseRequest(action="acquire", holder=CONTROL, priority=100), 0)
         self._offer(authority, [Mode.POSITION] * len(self._full_nm), list(self.joints.angle_rad))
-        robot = self.description
-        request = LifecycleRequest(
-            action="arm", who=WHO, robot=robot.robot, backend=robot.backend, config_hash=robot.config_hash
-        )
-        answer = authority.on_lifecycle(request, 0)
+        answer = authority.on_lifecycle(request_to_arm(self.description, WHO), 0)
         if not answer.ok:
             self._backend.close()
             raise RefusedError(f"not ready to arm: {answer.reason}")

@@ -25,6 +25,7 @@ from snakesim_hal.wire.messages import (
     Mode,
     Pace,
     Power,
+    request_to_arm,
 )
 
 JointTargets = Mapping[int, tuple[Mode, float]]  # joint index -> mode and target
@@ -217,10 +218,7 @@ class Rig:
             self.idle(t.TRANSPORT_PERIODS)
         here = {i: (Mode.POSITION, angle) for i, angle in enumerate(self.now.angle_rad)}
         self._offer(self.points(here))
-        request = LifecycleRequest(
-            action="arm", robot=self.robot.robot, backend=self.robot.backend, config_hash=self.robot.config_hash
-        )
-        answer = self.authority.on_lifecycle(request, self._now_ns)
+        answer = self.authority.on_lifecycle(request_to_arm(self.robot, "conformance"), self._now_ns)
         assert answer.ok, f"the robot cannot be armed: {answer.reason}"
         self.drive(here, t.ARMING_PERIODS)
         self.must_be_armed()

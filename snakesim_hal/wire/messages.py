@@ -541,6 +541,18 @@ class LifecycleRequest(Message, frozen=True, kw_only=True):
     ] = None
 
 
+def request_to_arm(robot: Description, who: str) -> LifecycleRequest:
+    """For exactly the robot, backend, configuration and host process that are described."""
+    return LifecycleRequest(
+        action="arm",
+        who=who,
+        host=robot.host,
+        robot=robot.robot,
+        backend=robot.backend,
+        config_hash=robot.config_hash,
+    )
+
+
 class EstopRequest(Message, frozen=True, kw_only=True):
     """Query payload on `hal/estop`; needs no lease. Latched until `clear` on `hal/lifecycle`."""
 

@@ -7,7 +7,7 @@ from snakesim_hal.errors import NotConnectedError, RefusedError
 from snakesim_hal.network.session import Link, Session
 from snakesim_hal.process import user_name
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Description, LifecycleRequest, Status
+from snakesim_hal.wire.messages import Description, LifecycleRequest, Status, request_to_arm
 from snakesim_operator.ros2.graph import Node
 from snakesim_operator.ros2.server import Server, told
 from snakesim_operator.ros2.service_types import TRIGGER
@@ -48,15 +48,7 @@ def _arm(session: Session, link: Link) -> str:
     if robot is None:
         raise NotConnectedError(f"{link.namespace} publishes no description; is its HAL host running?")
     session.latest(keys.STATUS, Status, READY_S, lambda status: status.ready_to_arm)  # else the host says why not
-    request = LifecycleRequest(
-        action="arm",
-        who=WHO,
-        host=robot.host,
-        robot=robot.robot,
-        backend=robot.backend,
-        config_hash=robot.config_hash,
-    )
-    return _ask(session, link, request, "armed")
+    return _ask(session, link, request_to_arm(robot, WHO), "armed")
 
 
 def _ask(session: Session, link: Link, request: LifecycleRequest, done: str) -> str:

@@ -9,7 +9,7 @@ from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Session
 from snakesim_hal.service import START_LIMIT_S
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import ControlState, Description, LifecycleRequest, Status, Trajectory
+from snakesim_hal.wire.messages import ControlState, Description, LifecycleRequest, Status, Trajectory, request_to_arm
 from snakesim_hal.wire.roles import RECORDER
 from snakesim_operator.results.ended import AT_GOAL
 from snakesim_operator.run.ending import Ending
@@ -178,7 +178,7 @@ class RunMonitor:
             return
         if self._waits_for_recorder():
             return
-        self._ask_to_arm(status, self._robot)
+        self._ask_to_arm(self._robot)
 
     def _finish_at_goal(self) -> None:
         """Ask once, when navigation says that the goal of a run that lasts until then is reached."""
@@ -204,21 +204,12 @@ class RunMonitor:
         """In Zenoh's thread: it misses nothing from now on."""
         self._recorder_is_there |= present
 
-    def _ask_to_arm(self, status: Status, robot: Description) -> None:
+    def _ask_to_arm(self, robot: Description) -> None:
         """Over the private channel, which reaches only the host that this run has started."""
         host = self._supervisor.host
         assert host is not None
         if self._asked_at is None:
-            host.ask(
-                LifecycleRequest(
-                    action="arm",
-                    who=WHO,
-                    host=robot.host,
-                    robot=status.robot,
-                    backend=status.backend,
-                    config_hash=robot.config_hash,
-                )
-            )
+            host.ask(request_to_arm(robot, WHO))
             self._asked_at = time.monotonic()
         elif host.answers:
             answer, self._asked_at = host.answers.pop(0), None

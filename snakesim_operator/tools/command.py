@@ -13,7 +13,7 @@ from snakesim_hal.network.session import Link, Reader, Session, open_session
 from snakesim_hal.process import user_name
 from snakesim_hal.terminal import Say, say
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Answer, Description, LifecycleRequest, SimulatorRequest, Status
+from snakesim_hal.wire.messages import Answer, Description, LifecycleRequest, SimulatorRequest, Status, request_to_arm
 from snakesim_operator.tools.targets import CONNECT_S, RobotSelection, only_robot
 
 ANSWER_S = 5.0
@@ -39,14 +39,7 @@ def arm(robot: str, backend: str, where: RobotSelection, say: Say = say) -> int:
                 f"not armed: {'; '.join(wrong)}. To arm, name robot and backend: "
                 f"`snakesim arm {description.robot} {description.backend}`"
             )
-        request = LifecycleRequest(
-            action="arm",
-            who=user_name(),
-            host=description.host,
-            robot=robot,
-            backend=backend,
-            config_hash=description.config_hash,
-        )
+        request = request_to_arm(description, user_name())
         return ask_host(session, keys.LIFECYCLE, request, "armed", link, say)
 
 
