@@ -91,7 +91,7 @@ soak: $(stamp) ## A long run with faults at random, and an operator who recovers
 check: $(stamp) ## Lint, format, types and import rules, without changing anything
 	$(bin)/ruff check
 	$(bin)/ruff format --check
-	nice -n 5 $(bin)/basedpyright
+	$(bin)/basedpyright
 	@for package in $(packages); do \
 	  grep -q "^root_packages = .*\"$$package\"" pyproject.toml || \
 	    { echo "check: add $$package to root_packages under [tool.importlinter] in pyproject.toml"; exit 1; }; \
