@@ -24,8 +24,8 @@ from snakesim_can_backend.bus.load import (
     what_fits,
 )
 from snakesim_can_backend.bus.strangers import Stranger, strangers
-from snakesim_can_backend.driver.backend import answer_limit_s
 from snakesim_can_backend.driver.bring_up import Bus, Identity, find
+from snakesim_can_backend.driver.modules import answer_limit_s
 from snakesim_can_backend.driver.offline import Replay, against_record, messages
 from snakesim_can_backend.driver.reports import Module, Reading
 from snakesim_can_backend.protocol.codec import codec

@@ -91,7 +91,9 @@ class Clock:
 
 
 class DriveBackend:
-    """A `snakesim_hal.backend.Backend`."""
+    """A `snakesim_hal.backend.Backend`. What a family with more than `Drives` may add is at the end."""
+
+    clear_grace = CLEAR_GRACE
 
     def __init__(
         self,
@@ -122,12 +124,12 @@ class DriveBackend:
             if mocap is not None:
                 mocap.close()
             raise
-        self._description = self._describe(config, name, hardware)
         try:
             self._drives.bring_up()
         except BaseException:
             self.close()
             raise
+        self._description = self._describe(config, name, hardware)
 
     def describe(self) -> Description:
         """The robot of the robot file, with the sensors that its drives are."""
@@ -139,25 +141,20 @@ class DriveBackend:
         self._tick, self._clock.robot_ns, self._quiet = tick, stamp_ns, self._quiet - 1
         self._readings.ask()
         self._drives.read()
-        others: dict[str, Message] = {}
-        if tick % len(self._names) == 0:
-            lasts_ns = HEALTH_ROUNDS * len(self._names) * self._period_ns
-            others[keys.POWER] = self._readings.power(tick, stamp_ns, lasts_ns)
-        if self._mocap is not None and (pose := self._mocap.newest(tick, stamp_ns)) is not None:
-            others[keys.POSE] = pose
-        return Samples(self._readings.joints(tick, stamp_ns, self._lease_ns), others)
+        return self._samples(tick, stamp_ns)
 
     def enact(self, set_points: SetPoints, lifecycle: LifecycleState) -> None:
         """Armed: all that are not isolated follow. At fault those go on that did, while they are told to damp."""
         if not self._open:
             return
+        self._announce(lifecycle, set_points.isolated)
         back = (self._isolated | self._pending) - set_points.isolated
         self._isolated, self._pending = set_points.isolated, frozenset()
         everybody = frozenset(range(len(self._names))) - self._isolated
         if lifecycle not in LATCHED and (back or self._lifecycle in LATCHED):
             self._told.forget()
             self._drives.clear(everybody if self._lifecycle in LATCHED else back)
-            self._quiet = CLEAR_GRACE
+            self._quiet = self.clear_grace
         damped = {i for i in self._following if set_points.mode[i] != Mode.PASSIVE}
         self._following = (
             everybody if lifecycle == "armed" else everybody & damped if lifecycle == "fault" else frozenset()
@@ -191,6 +188,10 @@ class DriveBackend:
         if self._lifecycle == "armed" and few and all(finding.alone for finding in fresh):
             self._pending |= failed  # the HAL isolates them
         elif fresh and self._lifecycle not in LATCHED:
+            try:
+                self._announce("fault", self._isolated)
+            except BackendError as error:  # the faults are reported all the same; the failing bus raises again
+                fresh.append(Finding("stop_not_sent", str(error)))
             self._lifecycle = "fault"  # from now on only a clear ends it, also one before the next period
         return [finding.fault(self._tick, self._names) for finding in fresh]
 
@@ -213,15 +214,6 @@ class DriveBackend:
         if not self._open:
             raise BackendError("the buses are closed; open a new backend")
 
-    def _silent(self) -> list[Finding]:
-        found: list[Finding] = []
-        for i, name in enumerate(self._names):
-            if self._readings.unanswered(i) >= SILENT_AFTER:
-                silent_ms = self._readings.age_ns(i) * 1e-6
-                cause = f"{name}: its drive has not answered for {silent_ms:.0f} ms: power, cable, id or a restart"
-                found.append(Finding("drive_silent", cause, i, alone=True))
-        return found
-
     def _describe(self, config: RunConfig, name: str, hardware: str) -> Description:
         plain = describe(
             config.robot,
@@ -231,9 +223,40 @@ class DriveBackend:
             config_hash=config_hash(config),
             emulated=self._drives.emulated,
         )
-        rate_hz, camera = config.rate_hz, config.robot.sensors.pose
+        camera = config.robot.sensors.pose
+        delay_s = camera.delay_s if self._mocap is not None and camera is not None else None
+        return msgspec.structs.replace(plain, sensors=self._described(config, delay_s), hardware=hardware)
+
+    # --- what a family may replace ------------------------------------------------------------------------------
+
+    def _announce(self, lifecycle: LifecycleState, isolated: frozenset[int]) -> None:
+        """Before anything else of a tick, and at once for a fault: for drives that know the robot's lifecycle."""
+
+    def _samples(self, tick: int, stamp_ns: int) -> Samples:
+        """Joints and other sensors, from what was read."""
+        others: dict[str, Message] = {}
+        if tick % len(self._names) == 0:
+            lasts_ns = HEALTH_ROUNDS * len(self._names) * self._period_ns
+            others[keys.POWER] = self._readings.power(tick, stamp_ns, lasts_ns)
+        if self._mocap is not None and (pose := self._mocap.newest(tick, stamp_ns)) is not None:
+            others[keys.POSE] = pose
+        return Samples(self._readings.joints(tick, stamp_ns, self._lease_ns), others)
+
+    def _silent(self) -> list[Finding]:
+        """Drives that do not answer."""
+        found: list[Finding] = []
+        for i, name in enumerate(self._names):
+            if self._readings.unanswered(i) >= SILENT_AFTER:
+                silent_ms = self._readings.age_ns(i) * 1e-6
+                cause = f"{name}: its drive has not answered for {silent_ms:.0f} ms: power, cable, id or a restart"
+                found.append(Finding("drive_silent", cause, i, alone=True))
+        return found
+
+    def _described(self, config: RunConfig, pose_delay_s: float | None) -> list[SensorDescription]:
+        """The sensors; pose_delay_s: of motion capture, None without it."""
+        rate_hz = config.rate_hz
         sensors = [SensorDescription(key=keys.JOINTS, rate_hz=rate_hz, delay_s=0.0)]
         sensors.append(SensorDescription(key=keys.POWER, rate_hz=rate_hz / len(self._names), delay_s=0.0))
-        if self._mocap is not None and camera is not None:
-            sensors.append(SensorDescription(key=keys.POSE, rate_hz=rate_hz, delay_s=camera.delay_s))
-        return msgspec.structs.replace(plain, sensors=sensors, hardware=hardware)
+        if pose_delay_s is not None:
+            sensors.append(SensorDescription(key=keys.POSE, rate_hz=rate_hz, delay_s=pose_delay_s))
+        return sensors

@@ -58,13 +58,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def cut_off(backend: Any, joint: int) -> None:
     """From now on the driver hears nothing of a joint's module."""
-    take = backend._reading.take
+    take = backend.modules.reading.take
 
     def receive(frame: Frame) -> None:
         if node_of(frame.id) != joint + 1:
             take(frame)
 
-    backend._reading.take = receive
+    backend.modules.reading.take = receive
 
 
 def cut_drive_off(backend: Any, joint: int) -> None:

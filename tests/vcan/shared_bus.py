@@ -12,7 +12,7 @@ from math import inf
 import pytest
 
 from snakesim_can_backend.bus.bus import SocketCanWire
-from snakesim_can_backend.driver import backend as driver
+from snakesim_can_backend.driver import modules as driver
 from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.protocol.definitions import FROM_HOST, Frame, ModuleState
 from snakesim_can_backend.settings import CanSettings
@@ -67,11 +67,11 @@ class SharedBus(Loop):
 
     def watch_seen(self, kind: str) -> int:
         """How often a error that is no fault was counted."""
-        return self.backend._watch.seen.get(kind, 0)
+        return self.backend.modules.watch.seen.get(kind, 0)
 
     @property
     def wire(self) -> SharedWire:
-        (wire,) = self.backend._wires
+        (wire,) = self.backend.modules.wires
         assert isinstance(wire, SharedWire)
         return wire
 

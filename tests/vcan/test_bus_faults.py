@@ -195,7 +195,7 @@ def test_frames_that_the_kernel_dropped_are_counted(channel: str, raw_socket: so
         (fault,) = run.faults
         assert fault.what == "receive_overflow"
         dropped = int(fault.cause.partition("dropped ")[2].partition(" ")[0])
-        kept = run.backend._reading.malformed
+        kept = run.backend.modules.reading.malformed
         assert dropped > 0 and dropped + kept == 50
         cleared_and_armed_again(run)
 
@@ -207,7 +207,7 @@ def test_frames_that_the_kernel_dropped_are_counted(channel: str, raw_socket: so
 def test_a_second_host_is_named(channel: str, raw_socket: socket.socket) -> None:
     with shared_bus(channel) as run:
         armed(run)
-        foreign = commands.sync(run.backend._reading.sync + 7, 0)
+        foreign = commands.sync(run.backend.modules.reading.sync + 7, 0)
         raw_socket.send(frame(*foreign))
         run.run(3, run.waving)
         assert [fault.what for fault in run.faults] == ["second_host"]

@@ -74,12 +74,12 @@ class Loop:
 
     def states(self) -> list[ModuleState]:
         """What the modules last said."""
-        return [module.state for module in self.backend._reading.modules]
+        return [module.state for module in self.backend.modules.reading.modules]
 
     @property
     def plant(self) -> Plant:
         """What the twins' motors move."""
-        (wire,) = self.backend._wires
+        (wire,) = self.backend.modules.wires
         assert isinstance(wire, VirtualWire) and isinstance(wire.peer, InProcessTwins)
         return wire.peer.server.chain.plant
 

@@ -50,8 +50,8 @@ def hot_robot(backend: str, curve: str, celsius: float) -> Iterator[Rig]:
 def windings(backend: SimBackend | CanBackend) -> Thermal:
     if isinstance(backend, SimBackend):
         return backend._windings
-    assert isinstance(backend._local_twins, InProcessTwins)
-    return backend._local_twins.server.chain.thermal
+    assert isinstance(backend.modules.local_twins, InProcessTwins)
+    return backend.modules.local_twins.server.chain.thermal
 
 
 def until_told(rig: Rig, celsius: float) -> None:

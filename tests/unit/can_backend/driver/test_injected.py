@@ -90,7 +90,7 @@ def test_an_interface_that_goes_down_stops_the_joints_and_comes_back() -> None:
         assert fault.what == "interface_down" and fault.tick - start <= 1 and run.lifecycle == "fault"
         inject(run, "cut:bus_1", begins=False)
         run.run(10)
-        assert run.states() == [ModuleState.FAULT] * 4 and run.backend._watch.seen["interface_up"] == 1
+        assert run.states() == [ModuleState.FAULT] * 4 and run.backend.modules.watch.seen["interface_up"] == 1
         reported = {f.what for f in run.faults[1:]}
         assert reported and reported <= {"module_watchdog", "module_fault"}, "now they can tell"
         cleared_and_armed_again(run)
@@ -118,7 +118,7 @@ def test_a_queue_that_stays_full_is_a_fault_after_three_periods() -> None:
         run.run(8, run.waving)
         (fault,) = run.faults
         assert fault.what == "bus_stuck" and 2 <= fault.tick - start <= 3
-        assert run.backend._watch.seen["queue_full"] > 0
+        assert run.backend.modules.watch.seen["queue_full"] > 0
         inject(run, "full:bus_1", begins=False)
         run.run(5)
         cleared_and_armed_again(run)
@@ -132,7 +132,7 @@ def test_a_queue_that_is_full_for_a_moment_is_counted() -> None:
         inject(run, "full:bus_1", begins=False)
         run.run(30, run.waving)
         assert not run.faults and run.states() == [ModuleState.ARMED] * 4
-        assert run.backend._watch.seen["queue_full"] > 0
+        assert run.backend.modules.watch.seen["queue_full"] > 0
 
 
 @pytest.mark.parametrize(("kind", "what"), [("error_passive", "error_passive"), ("overflow", "receive_overflow")])

@@ -38,14 +38,14 @@ class Lame(Rig):
         return self.backend
 
     def states(self) -> list[ModuleState]:
-        return [module.state for module in self.can._reading.modules]
+        return [module.state for module in self.can.modules.reading.modules]
 
     def inject(self, text: str, *, begins: bool = True) -> None:
         assert self.can.inject(parse(f"{text}@0"), begins=begins)
 
     @property
     def chain(self) -> ModuleChain:
-        (wire,) = self.can._wires
+        (wire,) = self.can.modules.wires
         assert isinstance(wire, VirtualWire) and isinstance(wire.peer, InProcessTwins)
         return wire.peer.server.chain
 

@@ -2,11 +2,11 @@
 
 import pytest
 
-from snakesim_can_backend.driver import backend as backend_module
+from snakesim_can_backend.driver import modules
 from tests.unit.can_backend.driver.whole.recorded import WIRES, RecordedWire
 
 
 @pytest.fixture(autouse=True)
 def recorded(monkeypatch: pytest.MonkeyPatch) -> None:
     WIRES.clear()
-    monkeypatch.setattr(backend_module, "VirtualWire", RecordedWire)
+    monkeypatch.setattr(modules, "VirtualWire", RecordedWire)

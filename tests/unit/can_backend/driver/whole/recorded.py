@@ -74,7 +74,7 @@ def words(frames: list[Frame]) -> list[str]:
 
 
 def module_of(run: Loop, node: int) -> Module:
-    wire = run.backend._wires[0]
+    wire = run.backend.modules.wires[0]
     wire = wire._wire if isinstance(wire, LoggedWire) else wire
     assert isinstance(wire, RecordedWire) and isinstance(wire.peer, InProcessTwins)
     return wire.peer.server.chain.slots[node - 1].module

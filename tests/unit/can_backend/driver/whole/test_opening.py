@@ -5,7 +5,9 @@ import pytest
 
 from snakesim_can_backend.bus.bus import VirtualPeer
 from snakesim_can_backend.driver import backend as backend_module
-from snakesim_can_backend.driver.backend import CanBackend, answer_limit_s
+from snakesim_can_backend.driver import modules
+from snakesim_can_backend.driver.backend import CanBackend
+from snakesim_can_backend.driver.modules import answer_limit_s
 from snakesim_can_backend.protocol.definitions import (
     BROADCAST,
     Action,
@@ -61,7 +63,7 @@ def test_who_does_not_answer_syncs_is_told_and_everything_is_closed(monkeypatch:
             super().__init__(channel, peer)
             self.deaf_to = lambda frame: opcode_of(frame.id) == Opcode.JOINT_STATE and node_of(frame.id) == 2
 
-    monkeypatch.setattr(backend_module, "VirtualWire", Deaf)
+    monkeypatch.setattr(modules, "VirtualWire", Deaf)
     with pytest.raises(BackendError, match="joint_2 did not answer 20 Syncs; nothing was enabled"), loop():
         pass
     (wire,) = WIRES
@@ -96,7 +98,7 @@ def test_what_a_killed_driver_left_is_cleared_and_nothing_else(
         left_behind(end.server.chain.slots[1].module, kind)
         return end
 
-    monkeypatch.setattr(backend_module, "twins_here", twins)
+    monkeypatch.setattr(modules, "twins_here", twins)
     with loop() as run:
         go(run, "disarmed", 2)
         assert run.states() == [DISARMED, state, DISARMED, DISARMED]
@@ -113,7 +115,7 @@ def test_a_module_that_is_too_weak_is_refused(monkeypatch: pytest.MonkeyPatch) -
         end.server.chain.slots[2].module.parameters.values[Parameter.RATED_TORQUE] = 1.0
         return end
 
-    monkeypatch.setattr(backend_module, "twins_here", twins)
+    monkeypatch.setattr(modules, "twins_here", twins)
     with pytest.raises(BackendError, match=r"joint_3 is rated for 1 N·m"), loop():
         pass
 

@@ -7,6 +7,7 @@ import pytest
 
 from snakesim_can_backend.bus.bus import VirtualWire
 from snakesim_can_backend.driver import backend as backend_module
+from snakesim_can_backend.driver import modules
 from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.protocol.commands import question
 from snakesim_can_backend.protocol.definitions import Action, Frame, Opcode, node_of, opcode_of
@@ -68,8 +69,8 @@ def two_buses(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[list[int]],
     chain = ModuleChain(run, real, InertiaPlant(run, InertiaSettings()), stepped=True)
     end = OneChain(TwinServer([VirtualWire(name) for name in channels], chain))
     monkeypatch.setattr(backend_module, "check_channel", lambda _channel: None)
-    monkeypatch.setattr(backend_module, "open_wire", lambda name, bit_rate: RecordedWire(name, end))
-    monkeypatch.setattr(backend_module, "TwinProcess", NoProcess)
+    monkeypatch.setattr(modules, "open_wire", lambda name, bit_rate: RecordedWire(name, end))
+    monkeypatch.setattr(modules, "TwinProcess", NoProcess)
     opened: list[CanBackend] = []
 
     def open_with(joints: list[int], **settings: Any) -> Loop:
@@ -125,7 +126,7 @@ def test_in_lockstep_nothing_that_twins_said_is_still_on_its_way_when_a_tick_goe
     for wire, node in zip(WIRES, (1, 4), strict=True):
         asked = [opcode_of(f.id) for f in wire.sent if f == question(node) or opcode_of(f.id) == Opcode.SYNC]
         assert asked == [Opcode.SYNC, Opcode.PARAMETER_REQUEST] * 20
-    assert run.backend._reading.answers_missing == 0
+    assert run.backend.modules.reading.answers_missing == 0
     run.backend.close()
 
 
