@@ -1,8 +1,8 @@
-"""Search for contacts: a body at rest without usable push-points undulates in place until it has some.
+"""Search for contacts: a body at rest without usable push-points moves on by undulation until it has some.
 
-Waves travel along the body from head to tail and sweep it sideways, by a few centimetres. What they meet is pushed at
-from both sides in turn, so a body with one contact or none shifts and turns until it lies between others. Navigation
-plans a new path from wherever that is.
+The waves travel along the body from tail to head. On ground whose friction is the same in every direction a body moves
+the way that its wave travels (with anisotropic friction, as of wheels or scales, it would be the other way), a few
+centimetres a second, and it sweeps as much to the sides. Navigation plans a new path from wherever that leads.
 """
 
 from dataclasses import dataclass
@@ -13,6 +13,9 @@ from snakesim_gnc.control.controller import View
 from snakesim_gnc.control.undulation import HeadSteeredUndulation
 from snakesim_hal.arrays import Floats
 from snakesim_hal.wire.messages import Description
+
+PERIOD_S = 1.0
+LAG_RAD = -0.9  # of a joint behind the one ahead of it: the wave travels to the head
 
 
 @dataclass(frozen=True)
@@ -27,8 +30,9 @@ class Patience:
 class ContactSearch:
     """Decides whether to search, and makes the waves."""
 
-    def __init__(self, robot: Description, patience: Patience, wave: HeadSteeredUndulation.Settings) -> None:
+    def __init__(self, robot: Description, patience: Patience, swing_rad: float) -> None:
         self._patience = patience
+        wave = HeadSteeredUndulation.Settings(amplitude_rad=swing_rad, period_s=PERIOD_S, lag_rad=LAG_RAD)
         self._wave = HeadSteeredUndulation(robot, wave)
         self._powerless_since_s: float | None = None
         self._until_s: float | None = None

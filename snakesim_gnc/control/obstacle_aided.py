@@ -25,7 +25,6 @@ from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_gnc.control.progress import Located, Progress
 from snakesim_gnc.control.push import Push, Touches, find_touches, push_forward
 from snakesim_gnc.control.push_report import push_points, why_it_stands
-from snakesim_gnc.control.undulation import HeadSteeredUndulation
 from snakesim_hal.arrays import Floats
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.outlines import Outlines
@@ -128,12 +127,12 @@ class ObstacleAided:
             float,
             Meta(ge=0, le=1000, extra_json_schema={"unit": "s"}),
             about("of standing with nothing that can push, until it undulates in search of contacts; 0: never"),
-        ] = 2.0
+        ] = 1.0
         search_s: Annotated[
             float,
             Meta(gt=0, le=1000, extra_json_schema={"unit": "s"}),
             about("how long it undulates in search of contacts"),
-        ] = 4.0
+        ] = 8.0
         search_swing_rad: Annotated[
             float, Meta(ge=0, le=2, extra_json_schema={"unit": "rad"}), about("amplitude of that undulation")
         ] = 0.5
@@ -199,7 +198,7 @@ class ObstacleAided:
         self._search = ContactSearch(
             robot,
             Patience(settings.search_after_s, settings.search_s, settings.search_until_n),
-            HeadSteeredUndulation.Settings(amplitude_rad=settings.search_swing_rad),
+            settings.search_swing_rad,
         )
 
     def update(self, view: View) -> Action:

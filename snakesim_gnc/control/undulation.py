@@ -34,8 +34,8 @@ class LateralUndulation:
         period_s: Annotated[float, Meta(gt=0, le=100, extra_json_schema={"unit": "s"}), about("of the wave")] = 2.0
         lag_rad: Annotated[
             float,
-            Meta(ge=0, le=3.2, extra_json_schema={"unit": "rad"}),
-            about("phase of a joint behind the one ahead of it"),
+            Meta(ge=-3.2, le=3.2, extra_json_schema={"unit": "rad"}),
+            about("phase of a joint behind the one ahead of it; below 0 the wave travels to the head"),
         ] = 0.9
         steering: Annotated[
             float,

@@ -1,4 +1,4 @@
-"""With felt contacts, `obstacle_aided` asks forces of those obstacles that the body really leans on."""
+"""`obstacle_aided` and what it pushes off: forces that are felt, and no obstacle at all."""
 
 import snakesim
 from snakesim_operator.results.came_true import came_true
@@ -23,3 +23,10 @@ def test_a_slow_body_that_feels_its_contacts_asks_hardly_anything_of_those_that_
     assert found is not None
     assert found.empty < 0.1  # 0.45 without
     assert (result.summary.advance_m or 0.0) > 0.2
+
+
+def test_a_body_that_nothing_can_push_moves_on_towards_its_goal():
+    alone = {"scene.random_field": [], "scene.pegs_along_route": [], "start.on_route": False}
+    found = snakesim.run("surveyed_clutter", controller="obstacle_aided", duration=6, set=alone).summary
+    assert "in search of contacts" in (found.last_reason or "")
+    assert (found.advance_m or 0.0) > 0.08  # 0.00 with a wave that travels to the tail

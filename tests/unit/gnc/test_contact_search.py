@@ -11,7 +11,7 @@ from tests.unit.gnc.stage import Stage, make_stage
 
 TAIL_S_M = 0.3
 SEARCHES = "in search of contacts"
-JUMP_RAD = 0.08  # of a target from one tick to the next; the waves themselves make 0.02
+JUMP_RAD = 0.08  # of a target from one tick to the next; the waves themselves make 0.03
 
 
 def stands(controller: ObstacleAided, stage: Stage, ticks: range) -> list[Action]:
