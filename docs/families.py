@@ -9,7 +9,7 @@ DURATION_S = float(sys.argv[1]) if len(sys.argv) > 1 else 8.0
 CONTROLLER = {"controller": sys.argv[2]} if len(sys.argv) > 2 else {}  # such as ./mine.py:Mine; else the scenario's
 
 simulated = None
-for backend in ("sim", "can", "odrive", "moteus"):
+for backend in ("sim", "can", "odrive", "moteus", "dynamixel"):
     run = snakesim.run("triplet", duration=DURATION_S, backend=backend, **CONTROLLER)
     simulated = run if simulated is None else simulated
     rows = min(len(run.time_s), len(simulated.time_s))
@@ -17,4 +17,4 @@ for backend in ("sim", "can", "odrive", "moteus"):
     alike = statistics.correlation(*torques)
     joints = " ".join(joint.removeprefix("joint_") for joint in run.summary.propulsion_joints) or "none"
     moved_m = run.metrics["path_distance_m"]
-    print(f"{backend:8} moved {moved_m:.3f} m, propulsion joints {joints}, torque correlation {alike:.2f}, {run.ended}")
+    print(f"{backend:9} moved {moved_m:.3f} m, propulsion joints {joints}, torque correlation {alike:.2f}, {run.ended}")

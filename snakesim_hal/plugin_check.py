@@ -9,7 +9,7 @@ from snakesim_hal.errors import ConfigError, short
 from snakesim_hal.fault_plan import check_planned
 from snakesim_hal.model.files import Table
 from snakesim_hal.model.plugins import BACKENDS, CONTROLLERS, SERVICES, find_installed, find_plugin, plugin_settings
-from snakesim_hal.model.robot import described
+from snakesim_hal.model.robot import described, with_modes
 from snakesim_hal.model.scenario import CONTROL, RunConfig, description_of
 from snakesim_hal.wire.messages import JointDescription, Mode
 
@@ -26,6 +26,7 @@ def check_plugins(config: RunConfig, table: Table | None = None, *, run_files: b
     """
     source = table.source if table is not None else f"scenario {config.name!r}"
     find = find_plugin if run_files else find_installed
+    config = on_backend(config, find(BACKENDS, config.backend))
     controller = find(CONTROLLERS, config.controller)
     if controller is not None:
         origin = table.origin if table is not None else None
@@ -106,6 +107,12 @@ def _with_what_it_needs(config: RunConfig, controller: Any) -> RunConfig:
     )
 
 
+def on_backend(config: RunConfig, backend: Any) -> RunConfig:
+    """With the modes that joints have on a backend: all, unless its class names them in `MODES`."""
+    modes = getattr(backend, "MODES", None)
+    return config if modes is None else msgspec.structs.replace(config, robot=with_modes(config.robot, modes))
+
+
 def check_backend(config: RunConfig, table: Table | None = None, *, run_files: bool = True) -> RunConfig:
     """What of it concerns the backend: enough for a computer with nothing but that. Raises ConfigError."""
     backend = (find_plugin if run_files else find_installed)(BACKENDS, config.backend)
@@ -114,6 +121,7 @@ def check_backend(config: RunConfig, table: Table | None = None, *, run_files: b
     source = table.source if table is not None else f"scenario {config.name!r}"
     origin = table.origin if table is not None else None
     settings = plugin_settings(backend, config.backend_settings, source, config.backend_section, origin)
+    config = on_backend(config, backend)
     paces = backend.check(config, settings)
     if config.pace in paces:
         return config

@@ -14,6 +14,7 @@ BRINGS = {  # as imported; the first extra that brings a package is the one to n
     "report": ("jinja2", "markupsafe"),
     "can": ("bitstruct", "can", "cantools"),
     "commission": ("tomlkit",),
+    "dynamixel": ("serial",),
     "console": ("viser", "websockets"),
     "export": ("pyarrow",),
     "evaluate": ("dask", "distributed", "optuna", "pyarrow"),

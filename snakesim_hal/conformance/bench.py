@@ -12,6 +12,7 @@ from snakesim_hal.conformance.loopback import Hosted
 from snakesim_hal.conformance.rig import HOLDER, Rig
 from snakesim_hal.model.plugins import BACKENDS, find_plugin, plugin_settings
 from snakesim_hal.model.scenario import Override, RunConfig, Service, load, parse_set
+from snakesim_hal.plugin_check import on_backend
 from snakesim_hal.wire.messages import Pace
 
 SCENARIO = str(Path(__file__).parent / "scenario.toml")
@@ -58,7 +59,7 @@ class Bench:
         """The scenario with the backend, at the pace of the bench. Raises ConfigError."""
         backend = self._backend if isinstance(self._backend, str) else self.name
         overrides = [Override("backend", backend, "--snakesim-backend"), *map(parse_set, self._sets)]
-        config = load(self._scenario, overrides).config
+        config = on_backend(load(self._scenario, overrides).config, self.factory)
         # The tests' own controller is the only service.
         return msgspec.structs.replace(config, pace=self.pace_of(config), services={HOLDER: Service()})
 

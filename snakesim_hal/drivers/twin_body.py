@@ -127,9 +127,13 @@ class TwinBody:
                 self.thermal.inject(i, heat=begins, hold=begins and injection.end_s != math.inf)
             case _:
                 if begins:
-                    self._boots_until_us[i] = self.now_us + BOOT_US
+                    self.boot(i)
                     return i
         return None
+
+    def boot(self, i: int) -> None:
+        """A drive restarts now; until it has, it neither hears nor says anything."""
+        self._boots_until_us[i] = self.now_us + BOOT_US
 
     def temperatures(self, i: int) -> tuple[float, float]:
         """Of a drive's winding, and of its electronics."""

@@ -6,13 +6,15 @@ long as the others. A robot whose links differ otherwise lists them in `[[links]
 
 import hashlib
 import math
+from collections.abc import Collection
 from typing import Annotated, get_args
 
+import msgspec
 from msgspec import Meta
 
 from snakesim_hal.errors import short
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.model.joints import Drive, Heat, Joint, JointExceptions, Limits, Motor, Supply, table
+from snakesim_hal.model.joints import Drive, DriveMode, Heat, Joint, JointExceptions, Limits, Motor, Supply, table
 from snakesim_hal.model.links import Link
 from snakesim_hal.model.plugins import SENSORS, find_plugin
 from snakesim_hal.model.sensors import LinkName, Mounted, OwnSensor, Sensors
@@ -157,6 +159,18 @@ def described(robot: RobotFile) -> list[JointDescription]:
         )
         for joint in robot.joint_table
     ]
+
+
+def with_modes(robot: RobotFile, modes: Collection[DriveMode]) -> RobotFile:
+    """The robot on drives that have these modes alone, whatever else its file says of its joints."""
+    drive = msgspec.structs.replace(robot.drive, modes=[mode for mode in robot.drive.modes if mode in modes])
+    joints = {
+        name: own
+        if own.modes is None
+        else msgspec.structs.replace(own, modes=[mode for mode in own.modes if mode in modes])
+        for name, own in robot.joints.items()
+    }
+    return msgspec.structs.replace(robot, drive=drive, joints=joints)
 
 
 def describe(

@@ -3,6 +3,8 @@
 Read from /proc and /sys of a folder, so that a test can lay out another computer.
 """
 
+import errno
+import fcntl
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,11 +16,12 @@ ROOT = Path("/")
 
 
 def kernel(root: Path = ROOT) -> Iterator[Finding]:
-    """Preemption, clock of the processors, processors set aside, serial adapters."""
+    """Preemption, clock of the processors, processors set aside, serial adapters and their ports."""
     yield from _preemption(root)
     yield from _governor(root)
     yield from _isolated(root)
     yield from _serial_adapters(root)
+    yield from _serial_ports(root)
 
 
 def _preemption(root: Path) -> Iterator[Finding]:
@@ -63,6 +66,27 @@ def _serial_adapters(root: Path) -> Iterator[Finding]:
             yield Finding(what="serial adapter", state="warn", detail=detail, fix=fix)
         else:
             yield Finding(what="serial adapter", state="ok", detail=f"{port}: latency timer {latency_ms or '?'} ms")
+
+
+def _serial_ports(root: Path) -> Iterator[Finding]:
+    """Whether ports of adapters may be opened, and nobody else has them for himself."""
+    for port in sorted(path for name in ("ttyUSB*", "ttyACM*") for path in (root / "dev").glob(name)):
+        try:
+            number = os.open(port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        except OSError as error:
+            fix = ["sudo usermod -aG dialout $USER    # then log in again"] if error.errno == errno.EACCES else []
+            detail = f"{port.name} cannot be opened: {error.strerror}"
+            yield Finding(what="serial port", state="warn", detail=detail, fix=fix or [f"ls -l {port}"])
+            continue
+        try:
+            fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            detail, fix = f"{port.name} is in use by another program", [f"sudo fuser -v {port}"]
+            yield Finding(what="serial port", state="warn", detail=detail, fix=fix)
+        else:
+            yield Finding(what="serial port", state="ok", detail=f"{port.name} can be opened")
+        finally:
+            os.close(number)
 
 
 def _read(path: Path) -> str | None:

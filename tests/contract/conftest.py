@@ -41,6 +41,7 @@ def pytest_snakesim_benches() -> list[Bench]:
         Bench("can-virtual", "can", mute=cut_off),
         Bench("odrive", "odrive", mute=cut_drive_off),
         Bench("moteus", "moteus", mute=cut_drive_off),
+        Bench("dynamixel", "dynamixel", mute=cut_drive_off),
     ]
 
 
@@ -72,8 +73,8 @@ def cut_drive_off(backend: Any, joint: int) -> None:
     drives = backend._drives
     hear = drives.hear
 
-    def heard(i: int, frame: Frame) -> None:
+    def heard(i: int, said: Any) -> None:
         if i != joint:
-            hear(i, frame)
+            hear(i, said)
 
     drives.hear = heard

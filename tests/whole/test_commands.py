@@ -16,7 +16,7 @@ def test_the_command_alone_lists_all_by_task(tmp_path: Path) -> None:
     assert ended.code == 0 and ended.out == snakesim("--help", cwd=tmp_path).out
     tasks = [line.rstrip(":") for line in ended.out.splitlines() if line.endswith(":") and not line.startswith(" ")]
     assert tasks[:4] == ["run", "watch", "command", "results"]
-    assert "can, modules" in ended.out, "those of installed backends"
+    assert all(name in ended.out for name in ("can, ", "dynamixels, ", "modules, ")), "those of installed backends"
 
 
 @pytest.mark.parametrize(

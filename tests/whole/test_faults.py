@@ -34,6 +34,11 @@ def host_record(out: Path) -> HostRecord:
         ("moteus", "reboot:joint_3@1", "drive_silent"),
         ("moteus", "overheat:joint_3@1", "drive_fault"),
         ("moteus", "cut:bus_1@1-1.3", "interface_down"),
+        ("dynamixel", "mute:joint_3@1", "drive_silent"),
+        ("dynamixel", "reboot:joint_3@1", "drive_silent"),
+        ("dynamixel", "overheat:joint_3@1", "drive_fault"),
+        ("dynamixel", "undervoltage:joint_3@1", "drive_fault"),
+        ("dynamixel", "cut:bus_1@1-1.3", "interface_down"),
     ],
 )
 def test_a_planned_fault_happens_at_its_tick_and_ends_the_run_as_it_should(
@@ -46,7 +51,7 @@ def test_a_planned_fault_happens_at_its_tick_and_ends_the_run_as_it_should(
     assert record.lifecycle == "fault"
 
 
-@pytest.mark.parametrize("backend", ["sim", "can", "odrive", "moteus"])
+@pytest.mark.parametrize("backend", ["sim", "can", "odrive", "moteus", "dynamixel"])
 def test_a_joint_that_may_be_lost_is_passive_and_the_run_goes_on(tmp_path: Path, backend: str) -> None:
     flags = ["--backend", backend, "--fault", "mute:joint_5@1", "--duration", "3", "--set", MAY_LOSE_ONE]
     ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)

@@ -1,5 +1,6 @@
 """`snakesim doctor`: a verdict on everything, and what to type where something is missing."""
 
+import fcntl
 import json
 import os
 import socket
@@ -72,3 +73,19 @@ def test_what_makes_ticks_late_is_named_with_its_remedy(
     found = list(kernel(tmp_path))
     assert [finding.what for finding in found if finding.state == "warn"] == warned
     assert all(finding.fix for finding in found if finding.state == "warn")
+
+
+def test_a_serial_port_in_use_is_named_and_is_free_again_later(tmp_path: Path) -> None:
+    port = tmp_path / "dev" / "ttyUSB0"
+    port.parent.mkdir()
+    port.write_text("")
+
+    def said() -> tuple[str, str]:
+        (finding,) = (one for one in kernel(tmp_path) if one.what == "serial port")
+        return finding.state, finding.detail
+
+    assert said() == ("ok", "ttyUSB0 can be opened")
+    with port.open("r+") as holder:
+        fcntl.flock(holder, fcntl.LOCK_EX)
+        assert said() == ("warn", "ttyUSB0 is in use by another program")
+    assert said()[0] == "ok"

@@ -1,0 +1,124 @@
+"""Before a motor turns: every servo is there, of a known model, and kept as the driver needs it. Enables nothing."""
+
+import struct
+import time
+from collections.abc import Iterator, Sequence
+
+from snakesim_hal.errors import BackendError
+from snakesim_serial_backend.dynamixel import registers as at
+from snakesim_serial_backend.dynamixel.packets import Packet
+from snakesim_serial_backend.dynamixel.port import Port
+from snakesim_serial_backend.dynamixel.servo import SLACK_RAD, Servo
+from snakesim_serial_backend.dynamixel.settings import DynamixelSettings
+
+WANTED = {at.STATUS_LEVEL: 2, at.TORQUE_ENABLE: 0, at.WATCHDOG: 0}
+KEPT = {at.OPERATING_MODE: at.CURRENT_BASED_POSITION, at.DELAY: 0}  # written only where it differs: it wears out
+
+
+def bring_up(
+    servos: Sequence[Servo], ports: Sequence[Port], settings: DynamixelSettings
+) -> list[tuple[Packet, Packet]]:
+    """What every servo measures, and its health. Raises BackendError."""
+    found = _find(servos, settings.bring_up_limit_s)
+    wrong: list[str] = []
+    for servo in servos:
+        said = found.get(servo.name)
+        kept = None if said is None else servo.port.read(servo.id, 0, at.KEPT)
+        if why := _unfit(servo, said, kept, settings):
+            wrong.append(f"  {servo.who} {why}")
+    if wrong:
+        strangers = _strangers(servos, ports) if len(found) < len(servos) else []
+        raise BackendError("the robot is not complete; nothing was enabled:", *wrong, *strangers)
+    for servo in servos:
+        _set_up(servo)
+    for port in ports:
+        ids = [servo.id for servo in servos if servo.port is port]
+        port.fast = len(port.read_all(ids, at.PRESENT, at.present_form.size)) == len(ids)  # older firmware: it is not
+    return [(_present(servo), _answer(servo, at.TORQUE_ENABLE, at.HEALTH_SIZE)) for servo in servos]
+
+
+def _find(servos: Sequence[Servo], limit_s: float) -> dict[str, Packet]:
+    end, found = time.monotonic() + limit_s, dict[str, Packet]()
+    while True:
+        for servo in servos:
+            if servo.name not in found and (said := servo.port.ping(servo.id)) is not None:
+                found[servo.name] = said
+        if len(found) == len(servos) or time.monotonic() > end:
+            return found
+
+
+def _unfit(servo: Servo, said: Packet | None, kept: Packet | None, settings: DynamixelSettings) -> str:
+    """Why a servo cannot be used; empty if it can, and then its units are known."""
+    if said is None or kept is None:
+        return "does not answer: it is off, or has another id or baud rate"
+    number, firmware = struct.unpack("<HB", said.data[:3])
+    model, name = at.MODELS.get(number), at.model_name(number)
+    if settings.model and name != settings.model:
+        return f"is of another model: {name}; `backends.dynamixel.model` says {settings.model}"
+    if number in at.WITHOUT_CURRENT:
+        return f"is of another model: {name} neither measures nor limits current, which this driver needs"
+    current_a = settings.current_unit_a.get(str(number), model.current_a if model else None)
+    if current_a is None:
+        return (
+            f"is of another model: {name}, whose unit of current is not known here; give that of its e-Manual, in A, "
+            f"as `backends.dynamixel.current_unit_a.{number}`"
+        )
+    if firmware < at.FIRST_FIRMWARE:
+        return f"has firmware {firmware}, and its bus watchdog needs {at.FIRST_FIRMWARE}: update it"
+    drive_mode, (offset,) = kept.data[at.DRIVE_MODE], _unpacked("<i", kept, at.HOMING_OFFSET)
+    if drive_mode or offset:
+        return (
+            f"has drive mode {drive_mode} and homing offset {offset}; both must be 0, as direction and zero are those "
+            f"of the robot file (`sign`, `zero_rad`)"
+        )
+    servo.unit_nm = current_a * servo.constant
+    (servo.most_current,) = _unpacked("<H", kept, at.CURRENT_LIMIT)
+    if servo.torque_nm > servo.most_current * servo.unit_nm:
+        return (
+            f"has a current limit of {servo.most_current * current_a:.2f} A, which is "
+            f"{servo.most_current * servo.unit_nm:.2f} N·m, and its joint may ask for {servo.torque_nm:.2f} N·m: "
+            f"raise the one, or lower `torque_nm`"
+        )
+    return ""
+
+
+def _strangers(servos: Sequence[Servo], ports: Sequence[Port]) -> Iterator[str]:
+    """Who else answers: perhaps whoever is missing."""
+    ours = {(id(servo.port), servo.id) for servo in servos}
+    for port in ports:
+        for said in port.scan():
+            if (id(port), said.id) not in ours:
+                (number,) = struct.unpack("<H", said.data[:2])
+                yield f"  id {said.id} on {port.wire.port} is no joint's: {at.model_name(number)}"
+
+
+def _set_up(servo: Servo) -> None:
+    kept = _answer(servo, 0, at.KEPT).data
+    differs = {address: value for address, value in KEPT.items() if kept[address] != value}
+    for address, value in {**WANTED, **differs}.items():
+        said = servo.port.write(servo.id, address, bytes([value]))
+        if said is None or said.error:
+            why = "does not answer" if said is None else f"says error {said.error}"
+            raise BackendError(f"{servo.who}: register {address} cannot be set to {value}: it {why}; nothing enabled")
+
+
+def _present(servo: Servo) -> Packet:
+    said = _answer(servo, at.PRESENT, at.present_form.size)
+    angle_rad = at.present_form.unpack(said.data)[2] * at.RAD
+    if at.whole_turns(angle_rad, servo.least_rad, servo.most_rad, SLACK_RAD) is None:
+        raise BackendError(
+            f"{servo.who}: woke up at {angle_rad:.2f} rad, which no number of whole turns, or more than one, brings "
+            f"into its travel of {servo.least_rad:.2f} to {servo.most_rad:.2f} rad; nothing was enabled. Turn it there "
+            f"by hand, or correct `zero_rad`"
+        )
+    return said
+
+
+def _answer(servo: Servo, address: int, size: int) -> Packet:
+    if (said := servo.port.read(servo.id, address, size)) is None:
+        raise BackendError(f"{servo.who}: has stopped answering; nothing was enabled")
+    return said
+
+
+def _unpacked(form: str, said: Packet, address: int) -> tuple[int, ...]:
+    return struct.unpack_from(form, said.data, address)

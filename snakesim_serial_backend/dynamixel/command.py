@@ -1,0 +1,119 @@
+"""`snakesim dynamixels`: the servos of a robot, emulated, as a process at the other end of pseudo terminals."""
+
+import argparse
+import contextlib
+import select
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import msgspec
+
+from snakesim_hal.drivers.drive_backend import Clock
+from snakesim_hal.errors import ConfigError, SnakesimError
+from snakesim_hal.model.files import Table, decode
+from snakesim_hal.model.scenario import Override, load, parse_set
+from snakesim_hal.process import die_with_parent, on_stop_signal, tune_garbage_collector
+from snakesim_hal.terminal import report_error, say
+from snakesim_serial_backend.dynamixel.backend import twin_on
+from snakesim_serial_backend.dynamixel.load import MAX_LOAD, cycle_bytes, cycle_s, fits_hz
+from snakesim_serial_backend.dynamixel.registers import RATE
+from snakesim_serial_backend.dynamixel.settings import NAME, DynamixelSettings
+from snakesim_serial_backend.wire import Pty
+
+POLL_S = 0.001
+TABLE_OF = (1, 4, 8, 13, 18, 24)  # servos on a port
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Exit code: 0 when stopped, 1 a fault, 2 wrong input and nothing started."""
+    arguments = parser().parse_args(argv)
+    if arguments.parent is not None:
+        die_with_parent(arguments.parent)
+    try:
+        if arguments.load:
+            for line in table():
+                say(line)
+        else:
+            serve(arguments)
+    except SnakesimError as error:
+        report_error(error, "snakesim dynamixels")
+        return 2 if isinstance(error, ConfigError) else 1
+    return 0
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command's arguments."""
+    parser = argparse.ArgumentParser(prog="snakesim dynamixels", description=__doc__)
+    add = parser.add_argument
+    add("scenario", help="name of a shipped scenario, or path of a scenario file")
+    add("--link", action="append", type=Path, metavar="FILE", help="a name for the port (./servos); repeat: more ports")
+    add("--load", action="store_true", help="print bytes, time and rate of a cycle for every baud rate, and end")
+    add("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="change any value; may be repeated")
+    add("--pose", metavar="HOST:PORT", help="where to send poses of motion capture (default: nowhere)")
+    add("--parent", type=int, help="process id of the parent; this process dies with it")
+    return parser
+
+
+def serve(arguments: argparse.Namespace) -> None:
+    """Until a stop signal."""
+    overrides = [Override("backend", NAME, "snakesim dynamixels"), *map(parse_set, arguments.set)]
+    config = load(arguments.scenario, overrides).config
+    settings: DynamixelSettings = decode(
+        Table(config.backends.get(NAME, {}), arguments.scenario), DynamixelSettings, f"backends.{NAME}"
+    )
+    links: list[Path] = arguments.link or [Path("servos")]
+    settings = msgspec.structs.replace(settings, ports=[str(link) for link in links])
+    config = msgspec.structs.replace(config, pace="realtime")
+    running = [True]
+    on_stop_signal(lambda: running.clear())
+    tune_garbage_collector()
+    with named(links) as ptys:
+        twin = twin_on(config, settings, ptys, Clock(config), arguments.pose)
+        ends = ", ".join(f"{link} ({pty.path})" for link, pty in zip(links, ptys, strict=True))
+        say(f"servos ready: {len(twin.servos)} on {ends}")
+        while running:
+            twin()
+            select.select(ptys, [], [], POLL_S)
+
+
+@contextlib.contextmanager
+def named(links: Sequence[Path]) -> Iterator[list[Pty]]:
+    """Pseudo terminals with names, which are taken away at the end. Raises ConfigError."""
+    ptys, made = [Pty() for _ in links], list[Path]()
+    try:
+        for link, pty in zip(links, ptys, strict=True):
+            try:
+                if link.is_symlink() and not link.exists():  # left behind
+                    link.unlink()
+                link.symlink_to(pty.path)
+            except OSError as error:
+                raise ConfigError(f"--link {link}: {error.strerror}; give another name") from error
+            made.append(link)
+        yield ptys
+    finally:
+        for link in made:
+            link.unlink(missing_ok=True)
+        for pty in ptys:
+            pty.close()
+
+
+def table() -> Iterator[str]:
+    """The load table."""
+    rates = list(RATE)
+    yield "servos   bytes" + "".join(f"{_baud(baud):>19}" for baud in rates)
+    for servos in TABLE_OF:
+        cells = [f"{1e3 * cycle_s(servos, baud):.1f} ms, {fits_hz(servos, baud)} Hz" for baud in rates]
+        yield f"{servos:6}{cycle_bytes(servos):8}" + "".join(f"{cell:>19}" for cell in cells)
+    yield (
+        f"A cycle on one port: fast sync read, health of one, sync write; an adapter's latency of 1 ms for each of two "
+        f"questions; the fastest rate at which it takes {MAX_LOAD:.0%} of a period"
+    )
+
+
+def _baud(baud: int) -> str:
+    return f"{baud / 1e6:g} Mbit/s" if baud >= 1_000_000 else f"{baud} bit/s"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

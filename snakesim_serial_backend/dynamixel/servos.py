@@ -1,0 +1,223 @@
+"""Dynamixel X servos as a family of drives: a `snakesim_hal.drivers.drive_backend.Drives`.
+
+Every tick all servos of a port say current, velocity and position in one fast sync read, one of them says its health,
+and all get goal current and goal position in one sync write. They stay in current-based position mode: a torque is that
+current with a goal just out of reach in its direction. Mode 0 would be torque alone, but a change of mode needs the
+torque off, and is a write to memory that wears out; and whoever has lost its driver turns on without end, in place of
+to a stop just beyond its travel.
+"""
+
+import struct
+import time
+from collections.abc import Callable, Sequence
+
+from snakesim_hal.arrays import Floats
+from snakesim_hal.drivers.findings import Finding
+from snakesim_hal.drivers.readings import Readings
+from snakesim_hal.drivers.twin_body import FAULTS
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.injection import Injection
+from snakesim_hal.wire.messages import Mode
+from snakesim_serial_backend.dynamixel import registers as at
+from snakesim_serial_backend.dynamixel.bring_up import bring_up
+from snakesim_serial_backend.dynamixel.packets import Packet
+from snakesim_serial_backend.dynamixel.port import Port
+from snakesim_serial_backend.dynamixel.servo import SLACK_RAD, TURN, Servo
+from snakesim_serial_backend.dynamixel.settings import DynamixelSettings
+from snakesim_serial_backend.dynamixel.twin import DynamixelTwin
+from snakesim_serial_backend.wire import is_emulated
+
+BOOTS_WITHIN_NS = 2_000_000_000
+INJECTED = {("bus", "cut"), *(("joint", kind) for kind in FAULTS)}
+BUS_CUT = "nothing gets through; check the adapter, its cable and its power"
+
+
+class Servos:
+    """All servos of a robot, tail to head."""
+
+    def __init__(
+        self,
+        servos: Sequence[Servo],
+        readings: Readings,
+        settings: DynamixelSettings,
+        clock_ns: Callable[[], int],
+        answer_s: float,
+        twin: DynamixelTwin | None,
+    ) -> None:
+        """twin: the servos, if they are emulated here; answer_s: how long a tick waits for answers."""
+        self._twin, self.servos = twin, list(servos)
+        self.emulated = all(map(is_emulated, settings.ports))
+        self._ports = list({id(servo.port): servo.port for servo in servos}.values())
+        self._readings, self._settings, self._clock_ns, self._answer_s = readings, settings, clock_ns, answer_s
+        self._watchdog = bytes([round(settings.watchdog_s / at.WATCHDOG_S)])
+        self._lost: set[int] = set()  # silent: asked apart, as they would silence others
+        self._turn, self._end_s = 0, 0.0
+        self._ours = False  # whether they may be written to
+
+    def bring_up(self) -> None:
+        """Find all, check what they keep, write what differs. Torque is off, and stays so."""
+        found = bring_up(self.servos, self._ports, self._settings)
+        self._ours = True
+        for i, (present, health) in enumerate(found):
+            self.hear(i, present)
+            self._check(i, health)
+
+    # --- a tick -----------------------------------------------------------------------------------------------
+
+    def read(self) -> None:
+        """Ask all of each port at once, one that was silent, and one for its health."""
+        self._end_s = time.monotonic() + self._answer_s
+        self._turn += 1
+        for port in self._ports:
+            mine = self._of(port)
+            steady, silent = [i for i in mine if i not in self._lost], [i for i in mine if i in self._lost]
+            self._ask(steady)
+            if silent:
+                self._ask_lost(silent[self._turn % len(silent)])
+            if heard := [i for i in steady if i not in self._lost]:
+                alarmed = [i for i in heard if self.servos[i].alert and not self.servos[i].errors]
+                self._ask_health((alarmed or heard)[self._turn % len(alarmed or heard)])
+        for i, servo in enumerate(self.servos):
+            if servo.booting_ns >= 0 and self._clock_ns() - servo.booting_ns < BOOTS_WITHIN_NS:
+                self._readings.not_asked(i)
+
+    def _of(self, port: Port) -> list[int]:
+        return [i for i, servo in enumerate(self.servos) if servo.port is port]
+
+    def _ask(self, left: list[int]) -> None:
+        """All of one port; without whoever is the first that is silent, as often as time allows."""
+        while left and time.monotonic() < self._end_s:
+            port = self.servos[left[0]].port
+            answers = port.read_all([self.servos[i].id for i in left], at.PRESENT, at.present_form.size)
+            for i in left:
+                if (answer := answers.get(self.servos[i].id)) is not None:
+                    self.hear(i, answer)
+            left = [i for i in left if self.servos[i].id not in answers]
+            if left:
+                self._lost.add(left.pop(0))
+
+    def _ask_lost(self, i: int) -> None:
+        servo = self.servos[i]
+        if (answer := servo.port.read(servo.id, at.PRESENT, at.present_form.size)) is not None:
+            self._lost -= set(self._of(servo.port))  # perhaps others are back, too
+            self.hear(i, answer)
+
+    def hear(self, i: int, said: Packet) -> None:
+        """What a servo measures."""
+        servo = self.servos[i]
+        current, velocity, position = at.present_form.unpack(said.data)
+        angle_rad, servo.booting_ns, servo.alert = position * at.RAD, -1, said.alert
+        if not said.alert:
+            servo.errors = 0
+        if not servo.follows:  # it may have restarted, and forgotten its turns
+            turns = at.whole_turns(angle_rad, servo.least_rad, servo.most_rad, SLACK_RAD)
+            servo.turns = servo.turns if turns is None else turns
+        self._readings.moved(i, angle_rad + servo.turns * TURN, velocity * at.SPEED)
+        self._readings.pushed(i, current * servo.unit_nm)
+        servo.current_a = abs(current) * servo.unit_nm / servo.constant
+
+    def _ask_health(self, i: int) -> None:
+        servo = self.servos[i]
+        if (said := servo.port.read(servo.id, at.TORQUE_ENABLE, at.HEALTH_SIZE)) is not None:
+            self._check(i, said)
+
+    def _check(self, i: int, said: Packet) -> None:
+        """What a servo says of its health."""
+        servo, data, first = self.servos[i], said.data, at.TORQUE_ENABLE
+        servo.enabled, servo.health_ns = bool(data[0]), self._clock_ns()
+        servo.errors, servo.watchdog = data[at.HARDWARE_ERROR - first], data[at.WATCHDOG - first]
+        volts = struct.unpack_from("<H", data, at.VOLTAGE - first)[0] * at.VOLTS
+        self._readings.supplied(i, volts, servo.current_a)
+        temperature_c = float(data[at.TEMPERATURE - first])
+        self._readings.warmed(i, temperature_c, temperature_c)
+
+    def let_run(self) -> None:
+        """Emulated servos."""
+        for port in self._ports:
+            port.wire.let_run()
+
+    def command(
+        self, following: frozenset[int], modes: list[Mode], targets: Floats, limits_nm: Floats, *, emergency: bool
+    ) -> None:
+        """Set-points; torque on and off. An emergency stop is torque off, too: servos know no other."""
+        for port in self._ports:
+            mine = self._of(port)
+            off = [i for i in mine if i not in following and (self.servos[i].follows or self.servos[i].enabled)]
+            on = [i for i in mine if i in following and not self.servos[i].follows]
+            self._tell(port, at.TORQUE_ENABLE, off, b"\0")
+            if self._settings.write_gains:
+                port.write_all(at.GAINS, [(self.servos[i].id, self.servos[i].gains()) for i in on])
+            self._tell(port, at.WATCHDOG, on, b"\0")
+            self._tell(port, at.WATCHDOG, on, self._watchdog)
+            goals = {i: self._goals(i, modes[i], targets[i], limits_nm[i]) for i in mine if i in following}
+            port.write_all(at.GOALS, [(self.servos[i].id, goal) for i, goal in goals.items()])
+            self._tell(port, at.TORQUE_ENABLE, on, b"\1")
+            for i in (*off, *on):
+                self.servos[i].told(follows=i in on, now_ns=self._clock_ns())
+
+    def _goals(self, i: int, mode: Mode, target: float, limit_nm: float) -> bytes:
+        servo, goal_rad = self.servos[i], float(self._readings.angle_rad[i])
+        match mode:
+            case Mode.POSITION:
+                goal_rad = target
+            case Mode.TORQUE if target:
+                goal_rad = servo.out_of_reach_rad(target)
+                limit_nm = min(abs(target), limit_nm)
+            case _:
+                limit_nm = 0.0
+        current = min(round(limit_nm / servo.unit_nm), servo.most_current)
+        return at.goals_form.pack(current, 0, 0, 0, round((goal_rad - servo.turns * TURN) / at.RAD))
+
+    def _tell(self, port: Port, address: int, who: Sequence[int], data: bytes) -> None:
+        port.write_all(address, [(self.servos[i].id, data) for i in who])
+
+    def clear(self, joints: frozenset[int]) -> None:
+        """Restart who has a hardware error, as nothing else clears it; a restart takes about half a second."""
+        for i in sorted(joints):
+            servo = self.servos[i]
+            if servo.errors or servo.alert:
+                servo.port.reboot(servo.id)
+                servo.errors, servo.alert, servo.booting_ns = 0, False, self._clock_ns()
+                self._lost.add(i)
+
+    def findings(self) -> list[Finding]:
+        """Of ports and servos."""
+        found = [
+            Finding("interface_down", f"{port.wire.port}: {error}; {BUS_CUT}")
+            for port in self._ports
+            if (error := port.wire.error())
+        ]
+        for i, servo in enumerate(self.servos):
+            if servo.errors:
+                cause = f"{servo.who} reports {at.error_names(servo.errors)}; a clear restarts it"
+                found.append(Finding("drive_fault", cause, i, alone=True))
+            elif servo.follows and servo.health_ns > servo.told_ns:
+                tripped = servo.watchdog == at.TRIPPED
+                if tripped or not servo.enabled:
+                    why = "its bus watchdog has stopped it" if tripped else "its torque is off: it has restarted"
+                    found.append(Finding("drive_not_armed", f"{servo.who} does not follow: {why}", i, alone=True))
+        return found
+
+    def inject(self, injection: Injection, *, begins: bool) -> bool:
+        """Faults of servos that are emulated here, and of their buses."""
+        if self._twin is None or (injection.target_type, injection.kind) not in INJECTED:
+            return False
+        if injection.target_type == "joint":
+            self._twin.inject(injection, begins=begins)
+        elif injection.number < len(self._ports):
+            self._ports[injection.number].wire.cut(begins=begins)
+        else:
+            raise ConfigError(f"there is no {injection.target}; this robot has bus_1 to bus_{len(self._ports)}")
+        return True
+
+    def close(self) -> None:
+        """Torque off, as far as the buses still work."""
+        for port in self._ports:
+            try:
+                if self._ours:
+                    self._tell(port, at.TORQUE_ENABLE, self._of(port), b"\0")
+                    port.wire.let_run()
+            finally:
+                port.wire.close()
+        if self._twin is not None:
+            self._twin.close()

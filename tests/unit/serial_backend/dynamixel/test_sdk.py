@@ -1,0 +1,170 @@
+"""ROBOTIS' own SDK talks to emulated servos, over a pseudo terminal, as to real ones."""
+
+from collections.abc import Iterator
+
+import pytest
+from dynamixel_sdk import (
+    COMM_RX_TIMEOUT,
+    COMM_SUCCESS,
+    GroupSyncRead,
+    GroupSyncWrite,
+    PortHandler,
+    Protocol2PacketHandler,
+)
+
+from snakesim_hal.drivers.drive_backend import Clock
+from snakesim_hal.injection import parse
+from snakesim_serial_backend.dynamixel import registers as at
+from snakesim_serial_backend.dynamixel.backend import twin_on
+from snakesim_serial_backend.dynamixel.packets import ALERT, Refusal
+from snakesim_serial_backend.dynamixel.settings import DynamixelSettings
+from snakesim_serial_backend.dynamixel.twin import FIRMWARE, MODEL, DynamixelTwin
+from snakesim_serial_backend.wire import Pty
+from tests.unit.hal.rig import run_config
+
+SDK = Protocol2PacketHandler()
+JOINTS = 3
+STEP_S = 0.01
+
+
+class Port(PortHandler):
+    """The SDK's port; nothing more comes when all is read that the servos have said, however busy the computer is."""
+
+    def __init__(self, pty: Pty, twin: DynamixelTwin) -> None:
+        super().__init__(pty.path)
+        self._pty, self._twin, self._read = pty, twin, 0
+        assert self.setBaudRate(1_000_000)
+
+    def clearPort(self) -> None:  # noqa: N802
+        while self._read < self._pty.given:
+            self.readPort(1000)
+
+    def writePort(self, packet: list[int]) -> int:  # noqa: N802
+        written = super().writePort(packet) or 0
+        self._pty.due = (self._pty.due or 0) + written
+        self._twin()
+        return written
+
+    def readPort(self, length: int) -> bytes:  # noqa: N802
+        data = super().readPort(length)
+        self._read += len(data)
+        return data
+
+    def isPacketTimeout(self) -> bool:  # noqa: N802
+        return self._read >= self._pty.given
+
+
+class Bench:
+    """Emulated servos, and the SDK's port on them. Time is the test's."""
+
+    def __init__(self) -> None:
+        config = run_config(backend="dynamixel", robot__chain__modules=JOINTS, rate_hz=100)
+        self.clock, self.pty = Clock(config), Pty()
+        self.twin: DynamixelTwin = twin_on(config, DynamixelSettings(plant="inertia"), [self.pty], self.clock, None)
+        self.port = Port(self.pty, self.twin)
+
+    def pass_time(self, seconds: float) -> None:
+        for _ in range(round(seconds / STEP_S)):
+            self.clock.robot_ns += round(STEP_S * 1e9)
+            self.twin()
+
+    def enable(self) -> None:
+        for servo in range(1, JOINTS + 1):
+            assert SDK.write1ByteTxRx(self.port, servo, at.OPERATING_MODE, 5) == (COMM_SUCCESS, 0)
+            assert SDK.write2ByteTxRx(self.port, servo, at.GAINS, 3000) == (COMM_SUCCESS, 0)
+            assert SDK.write1ByteTxRx(self.port, servo, at.TORQUE_ENABLE, 1) == (COMM_SUCCESS, 0)
+
+    def position(self, servo: int) -> int:
+        value, result, _ = SDK.read4ByteTxRx(self.port, servo, at.PRESENT + 6)
+        assert result == COMM_SUCCESS
+        return value
+
+    def close(self) -> None:
+        self.port.closePort()
+        self.twin.close()
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    one = Bench()
+    yield one
+    one.close()
+
+
+def test_ping_and_broadcast_ping(bench: Bench) -> None:
+    assert SDK.ping(bench.port, 2) == (MODEL, COMM_SUCCESS, 0)
+    assert SDK.ping(bench.port, 9)[1] == COMM_RX_TIMEOUT
+    found, result = SDK.broadcastPing(bench.port)
+    assert result == COMM_SUCCESS and found == {servo: [MODEL, FIRMWARE] for servo in (1, 2, 3)}
+
+
+def test_goals_of_all_move_all_and_sync_reads_say_where_they_are(bench: Bench) -> None:
+    bench.enable()
+    before = [bench.position(servo) for servo in (1, 2, 3)]
+    goals = GroupSyncWrite(bench.port, SDK, at.GOAL_POSITION, 4)
+    for servo, position in zip((1, 2, 3), before, strict=True):
+        goals.addParam(servo, list((position + 100 * servo).to_bytes(4, "little", signed=True)))
+    assert goals.txPacket() == COMM_SUCCESS
+    bench.position(1)  # the answer comes after the goals
+    bench.pass_time(1.0)
+    read = GroupSyncRead(bench.port, SDK, at.PRESENT, 10)
+    for servo in (1, 2, 3):
+        read.addParam(servo)
+    for ask in (read.txRxPacket, read.fastSyncRead):
+        assert ask() == COMM_SUCCESS
+        moved = [read.getData(servo, at.PRESENT + 6, 4) - was for servo, was in zip((1, 2, 3), before, strict=True)]
+        assert moved == pytest.approx([100, 200, 300], abs=15)
+
+
+def test_whoever_is_silent_silences_all_behind_it(bench: Bench) -> None:
+    bench.twin.inject(parse("mute:joint_2@0-9"), begins=True)
+    read = GroupSyncRead(bench.port, SDK, at.PRESENT, 10)
+    for servo in (1, 2, 3):
+        read.addParam(servo)
+    assert read.txRxPacket() != COMM_SUCCESS
+    assert read.data_dict[1] and not read.data_dict[3]
+
+
+def test_refusals(bench: Bench) -> None:
+    port = bench.port
+    assert SDK.write2ByteTxRx(port, 1, at.MODEL, 7) == (COMM_SUCCESS, Refusal.ACCESS)
+    assert SDK.write1ByteTxRx(port, 1, at.OPERATING_MODE, 9) == (COMM_SUCCESS, Refusal.RANGE)
+    assert SDK.write2ByteTxRx(port, 1, at.GOALS, 3000) == (COMM_SUCCESS, Refusal.LIMIT)
+    bench.enable()
+    assert SDK.write1ByteTxRx(port, 1, at.OPERATING_MODE, 3) == (COMM_SUCCESS, Refusal.ACCESS), "torque is on"
+
+
+def test_the_watchdog_stops_a_servo_until_it_is_cleared(bench: Bench) -> None:
+    bench.enable()
+    port = bench.port
+    assert SDK.write1ByteTxRx(port, 1, at.WATCHDOG, 5) == (COMM_SUCCESS, 0)
+    start = bench.position(1)
+    assert SDK.write4ByteTxRx(port, 1, at.GOAL_POSITION, start + 2000) == (COMM_SUCCESS, 0)
+    bench.pass_time(0.09)
+    assert SDK.read1ByteTxRx(port, 1, at.WATCHDOG)[0] == 5
+    bench.pass_time(0.2)
+    assert SDK.read1ByteTxRx(port, 1, at.WATCHDOG)[0] == at.TRIPPED
+    stopped = bench.position(1)
+    assert SDK.write4ByteTxRx(port, 1, at.GOAL_POSITION, start) == (COMM_SUCCESS, Refusal.RANGE)
+    bench.pass_time(1.0)
+    assert abs(bench.position(1) - stopped) < 200
+    assert SDK.write1ByteTxRx(port, 1, at.WATCHDOG, 0) == (COMM_SUCCESS, 0)
+    assert SDK.write4ByteTxRx(port, 1, at.GOAL_POSITION, start) == (COMM_SUCCESS, 0)
+
+
+def test_an_alert_is_in_every_answer_until_a_restart_which_is_silent_for_a_while(bench: Bench) -> None:
+    bench.enable()
+    port = bench.port
+    bench.twin.inject(parse("overheat:joint_1@0-9"), begins=True)
+    bench.pass_time(0.1)
+    errors, result, said = SDK.read1ByteTxRx(port, 1, at.HARDWARE_ERROR)
+    assert (errors, result, said & ALERT) == (at.HardwareError.OVERHEATING, COMM_SUCCESS, ALERT)
+    assert SDK.read1ByteTxRx(port, 1, at.TORQUE_ENABLE)[0] == 0
+    assert SDK.write1ByteTxRx(port, 1, at.TORQUE_ENABLE, 1)[1] & ~ALERT == Refusal.FAILED
+    bench.twin.inject(parse("overheat:joint_1@0-9"), begins=False)
+    bench.twin._body.thermal.winding_c[:] = 20.0
+    assert SDK.reboot(port, 1)[0] == COMM_SUCCESS
+    assert SDK.ping(port, 1)[1] == COMM_RX_TIMEOUT
+    bench.pass_time(0.6)
+    assert SDK.read1ByteTxRx(port, 1, at.HARDWARE_ERROR) == (0, COMM_SUCCESS, 0)
+    assert SDK.read1ByteTxRx(port, 1, at.OPERATING_MODE)[0] == 5, "kept"

@@ -1,0 +1,194 @@
+"""The Dynamixel driver against emulated servos in lockstep, with the robot's lifecycle as the host would have it."""
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from snakesim_hal.backend import SetPoints
+from snakesim_hal.drivers.mounted import Mounted
+from snakesim_hal.errors import BackendError, ConfigError
+from snakesim_hal.injection import parse
+from snakesim_hal.wire.messages import Fault, JointState, LifecycleState, Mode
+from snakesim_serial_backend.dynamixel import registers as at
+from snakesim_serial_backend.dynamixel.backend import DynamixelBackend
+from snakesim_serial_backend.dynamixel.settings import DynamixelSettings
+from snakesim_serial_backend.dynamixel.twin import DynamixelTwin
+from tests.unit.hal.rig import run_config
+
+JOINTS = 4
+NOTICED = 10  # ticks in which a fault shows: each servo says its health every fourth
+BOOTED = 60
+
+
+class Robot:
+    """A backend and its servos, tick by tick."""
+
+    def __init__(self, settings: DynamixelSettings | None = None, **dotted: Any) -> None:
+        self.config = run_config(backend="dynamixel", robot__chain__modules=JOINTS, rate_hz=100, **dotted)
+        settings = settings or DynamixelSettings(plant="inertia", bring_up_limit_s=0.5)
+        self.backend = DynamixelBackend(self.config, settings)
+        self.tick, self.isolated = 0, frozenset[int]()
+        self.mode, self.target = Mode.POSITION, 0.1
+        self.joints: JointState | None = None
+
+    @property
+    def twin(self) -> DynamixelTwin:
+        twin = getattr(self.backend._drives, "_twin", None)
+        assert isinstance(twin, DynamixelTwin)
+        return twin
+
+    def run(self, ticks: int, lifecycle: LifecycleState) -> list[Fault]:
+        """So many periods; a fault latches, as in the host."""
+        found: list[Fault] = []
+        for _ in range(ticks):
+            self.joints = self.backend.sample(self.tick, self.tick * self.config.period_ns).joints
+            modes = [self.mode if lifecycle == "armed" else Mode.PASSIVE] * JOINTS
+            self.backend.enact(SetPoints(modes, [self.target] * JOINTS, [1.0] * JOINTS, self.isolated), lifecycle)
+            self.backend.advance()
+            found += self.backend.faults()
+            if found and lifecycle in ("armed", "disarmed"):
+                lifecycle = "fault"
+            self.tick += 1
+        return found
+
+    def go_wrong(self, text: str, *, begins: bool = True) -> None:
+        assert self.backend.inject(parse(text), begins=begins)
+
+
+@pytest.fixture
+def robot() -> Iterator[Robot]:
+    one = Robot()
+    yield one
+    one.backend.close()
+
+
+def test_a_hardware_error_stays_until_the_operators_clear_restarts_the_servo(robot: Robot) -> None:
+    assert robot.run(30, "disarmed") == [] and robot.run(30, "armed") == []
+    robot.go_wrong("overheat:joint_2@0-9")
+    fault = robot.run(NOTICED, "armed")[0]
+    assert (fault.what, fault.joint) == ("drive_fault", "joint_2") and "overheating" in fault.cause
+    assert robot.run(100, "fault") == [] and robot.twin.servos[1].table[at.HARDWARE_ERROR]
+    assert [fault.joint for fault in robot.run(BOOTED + NOTICED, "disarmed")] == ["joint_2"], "it was still hot"
+    robot.go_wrong("overheat:joint_2@0-9", begins=False)
+    robot.twin._body.thermal.winding_c[:] = 20.0
+    robot.run(5, "fault")
+    assert robot.run(BOOTED, "disarmed") == [] and not robot.twin.servos[1].table[at.HARDWARE_ERROR]
+    assert robot.run(60, "armed") == [] and robot.joints is not None
+    assert robot.joints.angle_rad == pytest.approx([0.1] * JOINTS, abs=0.02)
+
+
+def test_a_servo_that_restarts_in_motion_is_enabled_with_its_settings_after_the_clear(robot: Robot) -> None:
+    robot.run(20, "armed")
+    robot.go_wrong("reboot:joint_3@0")
+    faults = robot.run(80, "armed")
+    assert [(fault.what, fault.joint) for fault in faults] == [("drive_silent", "joint_3")], "and of no other"
+    assert robot.run(10, "fault") == [] and robot.run(10, "disarmed") == []
+    assert robot.run(40, "armed") == []
+    fresh, other = robot.twin.servos[2], robot.twin.servos[0]
+    assert fresh.on and fresh.table[at.GAINS : at.GAINS + 6] == other.table[at.GAINS : at.GAINS + 6]
+    assert fresh.table[at.WATCHDOG] == other.table[at.WATCHDOG] == 5
+
+
+def test_a_joint_that_was_lost_is_left_alone_until_it_is_used_again(robot: Robot) -> None:
+    robot.run(20, "armed")
+    robot.go_wrong("mute:joint_1@0")
+    robot.isolated = frozenset({0})
+    assert robot.run(60, "armed") == [] and not robot.twin.servos[0].on
+    assert all(servo.on for servo in robot.twin.servos[1:])
+    assert robot.joints is not None and max(robot.joints.age_ns[1:]) == 0, "it silences nobody behind it"
+    robot.go_wrong("mute:joint_1@0", begins=False)
+    robot.isolated = frozenset()
+    assert robot.run(30, "disarmed") == []
+
+
+def test_servos_stop_by_their_own_watchdog_when_the_driver_is_gone(robot: Robot) -> None:
+    robot.run(40, "armed")
+    robot.mode, robot.target = Mode.TORQUE, 0.5
+    robot.run(2, "armed")
+    robot.backend._clock.robot_ns += 190_000_000
+    robot.twin()
+    assert {servo.table[at.WATCHDOG] for servo in robot.twin.servos} == {at.TRIPPED}
+    found = robot.run(NOTICED, "armed")
+    assert {fault.what for fault in found} == {"drive_not_armed"} and "watchdog" in found[0].cause
+    robot.run(5, "fault")
+    robot.mode, robot.target = Mode.POSITION, 0.1
+    assert robot.run(10, "disarmed") == [] and robot.run(60, "armed") == []
+
+
+def test_torque_mode_pushes_and_a_servo_that_is_left_alone_comes_to_a_stop_just_beyond_its_travel(
+    robot: Robot,
+) -> None:
+    robot.run(40, "armed")
+    robot.mode, robot.target = Mode.TORQUE, -0.05
+    robot.run(8, "armed")
+    assert robot.joints is not None
+    assert robot.joints.torque_nm == pytest.approx([-0.05] * JOINTS, abs=0.004)
+    servo, twin = robot.backend._drives.servos[0], robot.twin.servos[0]  # pyright: ignore
+    goal_rad = twin.get("i", at.GOAL_POSITION) * at.RAD + servo.turns * 2 * math.pi
+    assert servo.least_rad - 0.5 < goal_rad < servo.least_rad
+
+
+def test_wherever_in_its_turn_a_servo_wakes_up_its_angle_is_the_joints(robot: Robot) -> None:
+    robot.run(1, "disarmed")
+    assert robot.joints is not None
+    here = robot.joints.angle_rad
+    for zero_rad in (math.pi, -0.02, 6.0):
+        elsewhere = Robot(robot__drive={"zero_rad": zero_rad})
+        elsewhere.run(40, "armed")
+        said = elsewhere.joints
+        elsewhere.backend.close()
+        assert said is not None and said.angle_rad == pytest.approx([0.1] * JOINTS, abs=0.02)
+    assert here == pytest.approx([0.0] * JOINTS, abs=0.002)
+
+
+def test_another_id_another_model_and_settings_of_the_drive_are_named_at_the_start(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made = DynamixelTwin.__init__
+
+    def otherwise(twin: DynamixelTwin, *rest: Any) -> None:
+        made(twin, *rest)
+        first, second, third, fourth = twin.servos
+        first.table[7] = 9
+        second.put("H", at.MODEL, 1060)
+        third.put("i", at.HOMING_OFFSET, -100)
+        fourth.put("H", at.CURRENT_LIMIT, 10)
+
+    monkeypatch.setattr(DynamixelTwin, "__init__", otherwise)
+    with pytest.raises(BackendError) as raised:
+        Robot()
+    words = str(raised.value)
+    for expected in (
+        "joint_1 (id 1 on /dev/pts/",
+        "does not answer: it is off, or has another id or baud rate",
+        "is of another model: XL430-W250 neither measures nor limits current",
+        "has drive mode 0 and homing offset -100; both must be 0",
+        "has a current limit of 0.03 A",
+        "id 9 on /dev/pts/",
+        "is no joint's: XM540-W270",
+    ):
+        assert expected in words, words
+
+
+def test_a_servo_outside_of_its_travel_is_refused() -> None:
+    elsewhere = DynamixelSettings(plant="inertia", mounted={"joint_1": Mounted(zero_rad=2.5)})
+    with pytest.raises(BackendError, match=r"joint_1 .*: woke up at .* rad, which no number of whole turns"):
+        Robot(elsewhere)
+
+
+@pytest.mark.parametrize(
+    ("dotted", "words"),
+    [
+        ({"rate_hz": 250}, "4 servos at 250 Hz: a cycle of 282 bytes takes 4.8 ms at 1000000 baud"),
+        ({"rate_hz": 20}, "`backends.dynamixel.watchdog_s` = 0.1 s at `rate_hz` = 20: one lost set-point"),
+        ({"robot__joints": {"joint_2": {"id": 253}}}, "joint_2: `id` = 253; ids of protocol 2.0 are 0 to 252"),
+        ({"robot__joints": {"joint_2": {"port": "/dev/ttyUSB7"}}}, "joint_2: `port` = '/dev/ttyUSB7' is not among"),
+        ({"robot__joints": {"joint_2": {"gear": 2.0}}}, "joint_2: its servo travels 6.00 rad, and forgets whole turns"),
+    ],
+)
+def test_what_servos_cannot_do_is_refused_before_the_start(dotted: dict[str, Any], words: str) -> None:
+    config = run_config(**{"backend": "dynamixel", "robot__chain__modules": JOINTS, "rate_hz": 100, **dotted})
+    with pytest.raises(ConfigError, match=words.replace("(", r"\(")):
+        DynamixelBackend.check(config, DynamixelSettings())

@@ -1,0 +1,58 @@
+"""A serial port as an adapter has it: its latency, nobody else on it, and unplugged."""
+
+from pathlib import Path
+
+import pytest
+
+from snakesim_hal.errors import BackendError, ConfigError
+from snakesim_serial_backend.wire import USB_LATENCY_S, Pty, SerialWire, latency_s
+
+
+def test_the_latency_timer_is_the_adapters(tmp_path: Path) -> None:
+    timer = tmp_path / "sys/class/tty/ttyUSB0/device/latency_timer"
+    timer.parent.mkdir(parents=True)
+    timer.write_text("16\n")
+    assert latency_s("/dev/ttyUSB0", tmp_path) == 0.016
+    assert latency_s("/dev/ttyACM0", tmp_path) == USB_LATENCY_S, "not said"
+    assert latency_s("/dev/pts/3", tmp_path) == 0.0
+
+
+def test_a_port_is_for_one_alone_and_what_came_too_late_is_thrown_away(tmp_path: Path) -> None:
+    pty, log = Pty(), tmp_path / "bytes.txt"
+    with log.open("w") as file:
+        wire = SerialWire(pty.path, 1_000_000, file)
+        with pytest.raises(BackendError, match=r"cannot be opened: .*Is another program using it\?"):
+            SerialWire(pty.path, 1_000_000)
+        wire.send(b"first?")
+        pty.give(b"late")
+        assert wire.receive(1.0) == b"late" and wire.receive(0.0) == b""
+        pty.give(b"later")
+        assert wire.receive(1.0) == b"later"
+        wire.cut(begins=True)
+        wire.send(b"lost")
+        assert wire.error() == "it is cut" and wire.receive(0.0) == b""
+        wire.cut(begins=False)
+        assert wire.error() == ""
+        pty.due = len(b"first?")
+        assert pty.take() == b"first?"
+        wire.close()
+    lines = [line.split(maxsplit=3)[2:] for line in log.read_text().splitlines()]
+    assert lines == [["out", b"first?".hex(" ")], ["in", b"late".hex(" ")], ["in", b"later".hex(" ")]]
+    pty.close()
+
+
+def test_an_adapter_that_is_pulled_is_said_and_no_exception() -> None:
+    pty = Pty()
+    wire = SerialWire(pty.path, 57600)
+    pty.close()
+    wire.send(b"hello?")
+    wire.receive(0.0)
+    assert wire.error().startswith("it is gone")
+    wire.send(b"hello?")
+    assert wire.receive(0.0) == b""
+    wire.close()
+
+
+def test_a_port_that_is_not_there_is_named() -> None:
+    with pytest.raises(ConfigError, match="port '/dev/ttyUSB77': there is none; plug the adapter in"):
+        SerialWire("/dev/ttyUSB77", 57600)
