@@ -27,7 +27,7 @@ packages := snakesim $(wildcard snakesim_*)
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo ci compiled test test-all test-here test-vcan attack faults mutation fuzz soak kills check links bench bench-peers bench-paths golden schemas docs lock clean FORCE
+.PHONY: help setup demo compiled test test-all test-here test-vcan attack faults mutation fuzz soak kills check links bench bench-peers bench-paths golden schemas docs lock clean FORCE
 
 help: ## List these targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' Makefile
@@ -40,12 +40,7 @@ demo: $(stamp) ## Run the simulated snake through a triplet of obstacles, into r
 	  '  $(bin)/snakesim run peg_row --console --pace realtime      more pegs: it keeps going' \
 	  '  docs/tutorial.md, 3: write a controller                    push it your way'
 
-# Side by side: the emulated machine, and the check of types, use one core each, and take what the tests leave.
-ci: compiled ## Run what CI runs: check and test
-	$(MAKE) -j3 check test-here test-vcan
-
-test: compiled ## Run the tests, but for those that are slow
-	$(MAKE) -j2 test-here test-vcan
+test: test-here test-vcan ## Run the tests, but for those that are slow
 
 test-all: ## Run all tests, as before a release
 	SNAKESIM_HYPOTHESIS=explore $(MAKE) test-here test-vcan QUICK=
@@ -54,7 +49,7 @@ test-here: compiled ## Run the tests that need no CAN bus (ARGS="-k gate")
 	$(here) -n $(WORKERS) --dist worksteal || $(here) $(again)
 
 test-vcan: compiled ## Run the CAN tests on real SocketCAN, in a small VM where the kernel has none (ARGS="-m slow": kills, triplet, openings)
-	SNAKESIM_NEED_VCAN=1 nice -n 5 $(bin)/python deploy/vm/with_vcan.py -- sh -c '$(on_vcan) || exec $(on_vcan) $(again)'
+	SNAKESIM_NEED_VCAN=1 $(bin)/python deploy/vm/with_vcan.py -- sh -c '$(on_vcan) || exec $(on_vcan) $(again)'
 
 # Once: each worker would compile all that it imports, and the emulated machine would take many times as long.
 compiled: .venv/.compiled
