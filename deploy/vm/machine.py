@@ -42,7 +42,7 @@ BITRATE = 1_000_000
 CONTROLLER_QUEUE = 1000
 
 # Nobody attacks a test's guest, so what guards against it is left out: that halves the cost of a system call.
-# On a busy host the emulated timer ticks too late for the kernel's check of it, and the guest would panic: no_timer_check.
+# On a busy host the emulated timer ticks too late for the check of it at boot, which then panics: no_timer_check.
 KERNEL_OPTIONS = "console=ttyS0 quiet loglevel=3 panic=-1 no_timer_check mitigations=off nokaslr cryptomgr.notests"
 EMULATION = ("-accel", "tcg,thread=multi,tb-size=512", "-cpu", "max")
 VIRTUALIZATION = ("-accel", "kvm", "-cpu", "host")
