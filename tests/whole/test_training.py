@@ -12,8 +12,9 @@ import snakesim
 from snakesim.environments import SnakeEnv
 from snakesim.training.exported import export
 from snakesim.training.form import FORMS, OBSERVE, Policy
-from snakesim_gnc.control.policy import Model
-from snakesim_operator.cli import main
+from snakesim_gnc.control.policy import POLICIES, Model
+from snakesim_operator.cli import main, parser
+from tests.e2e.documents import REPOSITORY
 
 SMALL = ("--generations", "2", "--population", "4", "--fields", "1", "--check-fields", "1", "--duration", "0.5")
 
@@ -60,6 +61,17 @@ def test_what_was_trained_drives_simulator_and_emulated_modules(trained: Path, b
     name = f"policy:{trained / 'policy.onnx'}"
     run = snakesim.run("surveyed_clutter", controller=name, duration=1, backend=backend)
     assert run.complete and np.ptp(run["target.joint_5"]) > 0.05
+
+
+def test_the_shipped_policy_names_the_command_that_the_documentation_gives_for_it() -> None:
+    told = {one.key: one.value for one in onnx.load(POLICIES / "clutter.onnx").metadata_props}
+    given = ["train", "surveyed_clutter", "--duration", "8", "--reward", "energy=-0.002"]
+    ours, documented = (
+        vars(parser().parse_args([*words, "--out", "trained"]))
+        for words in (told["snakesim.trained_by"].split()[1:], given)
+    )
+    assert ours == documented
+    assert f"snakesim {' '.join(given)} --out trained" in (REPOSITORY / "docs" / "environments.md").read_text()
 
 
 def test_the_shipped_policy_crosses_a_field_that_it_was_not_trained_on() -> None:
