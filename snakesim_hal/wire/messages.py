@@ -456,6 +456,14 @@ class Timing(Message, frozen=True, kw_only=True):
     bins: Annotated[list[q.Count], Meta(max_length=64)]
 
 
+TICK_TIMES = {  # of `Status.tick_times`
+    "cycle": "from tick to tick",
+    "late": "begin of a tick after its deadline",
+    "read": "the backend reads its sensors",
+    "write": "the backend takes set-points",
+}
+
+
 class Status(Message, frozen=True, kw_only=True):
     """`hal/status`, latched: the state of the robot, and its reason."""
 

@@ -12,7 +12,7 @@ from snakesim_hal.network.session import Arrival, Link, Session, open_session
 from snakesim_hal.terminal import Say, overwrite_lines, say, say_json
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
-from snakesim_hal.wire.messages import Timing
+from snakesim_hal.wire.messages import TICK_TIMES, Timing
 from snakesim_operator.tools.targets import CONNECT_S, RobotSelection
 from snakesim_operator.tools.traffic import KeyTraffic, Latency, Traffic
 
@@ -20,12 +20,6 @@ PERIOD_S = 1.0
 ONCE_S = 2.0  # long enough for two samples of the slowest key that repeats itself
 HEAD = f"{'key':<29} {'writer':<17} {'Hz':>7} {'jitter':>9} {'max gap':>9} {'bytes':>8} {'age':>8} {'heard':>8}"
 
-TIMES = {
-    "cycle": "from tick to tick",
-    "late": "begin of a tick after its deadline",
-    "read": "the backend reads its sensors",
-    "write": "the backend takes set-points",
-}
 TIMES_HEAD = (
     f"{'while armed, ms':<47} {'median':>9} {'99 %':>9} {'most':>9}  {'histogram, from the shortest to the longest'}"
 )
@@ -119,7 +113,7 @@ def _times(name: str, timing: Timing) -> str:
     most = max(timing.bins)
     bars = "".join(" " if not count else BARS[(len(BARS) - 1) * count // most] for count in timing.bins)
     numbers = "".join(f" {us * 1e-3:>9.3f}" for us in (timing.median_us, timing.p99_us, timing.max_us))
-    return f"{name:<10} {TIMES.get(name, ''):<36}{numbers}  {timing.low_us * 1e-3:>9.3f} |{bars}|"
+    return f"{name:<10} {TICK_TIMES.get(name, ''):<36}{numbers}  {timing.low_us * 1e-3:>9.3f} |{bars}|"
 
 
 def _latency(latency: Latency) -> str:

@@ -7,6 +7,7 @@ import msgspec
 from markupsafe import Markup
 from msgspec import Meta
 
+from snakesim_hal.wire.messages import TICK_TIMES
 from snakesim_operator.results.page.html import render
 from snakesim_operator.results.record import CONFIG, RunRecord
 from snakesim_operator.results.report import figures
@@ -62,6 +63,7 @@ def page(record: RunRecord, summary: RunSummary) -> str:
         why_empty=why_empty(record),
         why_at_limit=why_at_limit(record),
         why_late=why_late(summary),
+        tick_times=TICK_TIMES,
         why_refused=why_refused(summary),
         limit_nm=max(joint.torque_limit_nm for joint in record.description.joints),
         intervals=intervals,
