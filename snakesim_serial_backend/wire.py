@@ -42,6 +42,7 @@ class Pty:
 
     def __init__(self) -> None:
         self._master, self._slave = os.openpty()
+        self._ends: tuple[int, ...] = (self._master, self._slave)
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
         self.path = os.ttyname(self._slave)
@@ -68,10 +69,10 @@ class Pty:
         return self._master
 
     def close(self) -> None:
-        """Both ends."""
-        for end in (self._master, self._slave):
-            with contextlib.suppress(OSError):
-                os.close(end)
+        """Both ends, once: their numbers may be another file's afterwards."""
+        ends, self._ends = self._ends, ()
+        for end in ends:
+            os.close(end)
 
     def _read(self) -> bytes:
         try:
