@@ -29,6 +29,7 @@ from snakesim_sim_backend.tether import add_tether
 
 FREE_QPOS = 7  # of the base: position and quaternion
 FREE_DOFS = 6
+CLAMP_KG = 1e6  # as rotor inertia and as damping, of all six degrees of freedom
 FOOT_GROUP = 3  # MuJoCo geom group of the feet, which are inside of the links' capsules
 ORANGE = [0.87, 0.45, 0.12, 1.0]  # colour of the robot
 AXES: dict[Axis, list[float]] = {"yaw": [0.0, 0.0, 1.0], "pitch": [0.0, 1.0, 0.0]}
@@ -43,6 +44,7 @@ class SimModel:
     first_link_body: int  # bodies of the links are consecutive
     obstacle_of_geom: list[str | None]  # (ngeom,); None: link, ground or step
     soles: Soles | None  # None: MuJoCo has the contacts with the ground, which is not flat
+    hung: bool  # its tail link is clamped
 
 
 def build(config: RunConfig, settings: SimSettings, *, motors: bool = True) -> SimModel:
@@ -86,6 +88,7 @@ def build(config: RunConfig, settings: SimSettings, *, motors: bool = True) -> S
         first_link_body=first_link_body,
         obstacle_of_geom=obstacles,
         soles=soles,
+        hung=settings.hung,
     )
 
 
@@ -137,7 +140,9 @@ def _add_snake(spec: mujoco.MjSpec, robot: RobotFile, settings: SimSettings) -> 
         rear = [0.0, 0.0, robot.module.radius_m] if i == 0 else [lengths[i - 1], 0.0, 0.0]
         body = body.add_body(name=f"link_{i}", pos=rear)
         if i == 0:
-            body.add_freejoint(name="base")
+            # A clamp is more inertia and damping than the robot can move.
+            clamp = {"armature": CLAMP_KG, "damping": CLAMP_KG} if settings.hung else {}
+            body.add_joint(name="base", type=mujoco.mjtJoint.mjJNT_FREE, **clamp)
         else:
             _add_joint(body, joints[i - 1])
         if robot.links and robot.links[i].has_inertia:

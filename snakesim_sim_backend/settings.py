@@ -39,6 +39,7 @@ class SimSettings(FileStruct, frozen=True, kw_only=True):
     motor_gain_scale: Annotated[float, Meta(ge=0.1, le=10, extra_json_schema={"unit": "1"})] = 1.0
     # Longest time that the snake may take to come to rest before the run begins.
     settle_s: Annotated[float, Meta(ge=0, le=60, extra_json_schema={"unit": "s"})] = 3.0
+    hung: bool = False  # by its tail link from a clamp, head down, clear of the ground: for `snakesim identify`
     tether: Tether | None = None
 
 

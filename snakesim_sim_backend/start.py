@@ -1,5 +1,7 @@
 """Lays the snake on the ground at the scenario's start pose, and lets it come to rest before the run begins."""
 
+import math
+
 import mujoco
 import numpy as np
 
@@ -15,6 +17,7 @@ from snakesim_sim_backend.model import FREE_QPOS, SimModel
 REST = 1e-3  # m/s and rad/s: slower is at rest
 REST_ROUNDS = 5
 ROUND_S = 0.01
+CLEAR_M = 0.2  # below the head of a hung robot
 # Friction of the ground while settling (sliding, torsion and rolling): the snake stays in place.
 GRIP = np.array([2.0, 2.0, 0.1, 0.1, 0.1])
 ALL_FRICTION = 6  # condim with which all three act
@@ -23,7 +26,7 @@ ALL_FRICTION = 6  # condim with which all three act
 def place_robot(
     sim: SimModel, data: mujoco.MjData, physics: Physics, config: RunConfig, motors: Motors, settle_s: float
 ) -> None:
-    """Put the snake at its start pose, at rest at time 0 with motors off.
+    """Put the snake at its start pose, at rest at time 0 with motors off; hung, its head is below its tail.
 
     It is placed above the highest ground under it and falls; the motors hold its start angles meanwhile. If it has
     not come to rest after `settle_s` it is stopped.
@@ -34,6 +37,10 @@ def place_robot(
     data.qpos[3:FREE_QPOS] = quaternion_from_yaw(pose.yaw_rad)
     data.qpos[FREE_QPOS:] = pose.angles_rad
     data.qpos[2] = highest_ground_m(model, data, config, pose) + config.robot.module.radius_m
+    if sim.hung:
+        data.qpos[2] += config.robot.length_m + CLEAR_M
+        yaw, down = quaternion_from_yaw(pose.yaw_rad), np.array([math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0])
+        mujoco.mju_mulQuat(data.qpos[3:FREE_QPOS], np.array(yaw), down)
     physics.begin()
     _settle(model, data, physics, config, motors, pose, settle_s)
     data.qvel[:] = 0.0

@@ -17,6 +17,7 @@ from snakesim_hal.drivers.drive_backend import Clock, DriveBackend
 from snakesim_hal.drivers.drive_settings import DriveSettings, answer_limit_s, check_settings, port_of, who
 from snakesim_hal.drivers.mocap import receiver
 from snakesim_hal.drivers.mocap_twin import PoseSender
+from snakesim_hal.drivers.mounted import as_built
 from snakesim_hal.drivers.readings import Readings
 from snakesim_hal.drivers.twin_body import TwinBody, make_plant
 from snakesim_hal.errors import ConfigError
@@ -102,7 +103,7 @@ class CanDriveBackend(DriveBackend):
         cls, config: RunConfig, settings: Any, wires: Sequence[Wire], clock: Clock, pose: str | None
     ) -> CanTwin:
         """Emulated drives of a whole robot."""
-        plant = make_plant(config, cls.name, settings.plant, settings.plant_settings)
+        plant = make_plant(as_built(config, settings.mounted), cls.name, settings.plant, settings.plant_settings)
         body = TwinBody(config, plant, settings.mounted, PoseSender(pose) if pose else None)
         return cls.twin(config, settings, body, [wires[bus] for bus in port_of(config, settings.channels)], clock.ns)
 

@@ -25,7 +25,7 @@ from snakesim_can_backend.twin.module_slot import ModuleSlot
 from snakesim_can_backend.twin.node_ids import node_ids
 from snakesim_can_backend.twin.parameters import Parameters, from_factory
 from snakesim_hal.drivers.mocap_twin import PoseCamera
-from snakesim_hal.drivers.mounted import built
+from snakesim_hal.drivers.mounted import as_built, built
 from snakesim_hal.drivers.mounting import Mounting, joint_target
 from snakesim_hal.injection import Change, Injection, Plan
 from snakesim_hal.model.scenario import RunConfig
@@ -60,7 +60,7 @@ class ModuleChain:
         robot, self.stepped, self.plant = config.robot, stepped, plant
         self.count = robot.chain.modules
         self.counts = shares(config, settings)  # modules on each bus
-        self.motors = Motors(robot, plant.step_s)
+        self.motors = Motors(as_built(config, settings.mounted).robot, plant.step_s)
         self._joints, self._told = built(robot, settings.mounted), robot.joint_table
         self._nodes = node_ids(robot, settings)
         loose = {name for name, truth in settings.mounted.items() if not truth.connected}

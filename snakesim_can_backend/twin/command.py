@@ -19,6 +19,7 @@ from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_can_backend.twin.faults import explain, parse, parse_typed
 from snakesim_can_backend.twin.server import TwinServer
 from snakesim_hal.drivers.mocap_twin import PoseSender
+from snakesim_hal.drivers.mounted import as_built
 from snakesim_hal.drivers.twin_body import make_plant
 from snakesim_hal.errors import ConfigError, SnakesimError
 from snakesim_hal.model.files import Table, decode
@@ -99,7 +100,7 @@ def _serve(arguments: argparse.Namespace, open_things: ExitStack) -> int:
     for channel in settings.channels:
         wires.append(open_wire(channel, FROM_HOST, settings.bit_rate))
         open_things.callback(wires[-1].close)
-    plant = make_plant(loaded.config, "can", settings.plant, settings.plant_settings)
+    plant = make_plant(as_built(loaded.config, settings.mounted), "can", settings.plant, settings.plant_settings)
     chain = ModuleChain(loaded.config, settings, plant, stepped=arguments.stepped, send_pose=send_pose)
     loop = Loop(TwinServer(wires, chain), arguments, settings.bit_rate)
     on_stop_signal(loop.stop)

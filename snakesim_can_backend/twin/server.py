@@ -14,6 +14,7 @@ from snakesim_can_backend.protocol.definitions import NODE_BITS, Frame, Opcode
 from snakesim_can_backend.settings import CanSettings
 from snakesim_can_backend.twin.chain import ModuleChain
 from snakesim_hal.drivers.mocap_twin import PoseSender
+from snakesim_hal.drivers.mounted import as_built
 from snakesim_hal.drivers.twin_body import make_plant
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.injection import Injection
@@ -118,7 +119,7 @@ def here(
     chain = ModuleChain(
         config,
         settings,
-        make_plant(config, "can", settings.plant, settings.plant_settings),
+        make_plant(as_built(config, settings.mounted), "can", settings.plant, settings.plant_settings),
         stepped=stepped,
         send_pose=send_pose,
     )

@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 
 from snakesim_hal.drivers.mocap_twin import PoseCamera
-from snakesim_hal.drivers.mounted import Mounted, built
+from snakesim_hal.drivers.mounted import Mounted, as_built, built
 from snakesim_hal.drivers.mounting import joint_target
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.injection import Injection
@@ -44,7 +44,7 @@ class TwinBody:
     ) -> None:
         """mounted: what is in truth not as the file says; send_pose: gets datagrams of motion capture, one a period."""
         self.plant, self.joints = plant, built(config.robot, mounted)
-        self.motors, self.thermal = Motors(config.robot, plant.step_s), Thermal(self.joints)
+        self.motors, self.thermal = Motors(as_built(config, mounted).robot, plant.step_s), Thermal(self.joints)
         self.now_us = 0.0  # since the twins were started
         self._boots_until_us = [0.0] * len(self.joints)
         self._muted: set[int] = set()

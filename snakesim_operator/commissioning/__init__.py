@@ -4,5 +4,7 @@
 `capture`      what those movements say; pure
 `check`        whether each joint is as its file says, from a run in which each moved by its motor
 `judge`        what its encoders, IMUs and motion capture say; pure
+`identify`     what each joint is, from a run in which a hanging robot was shaken: printed, drawn, written down
+`identification` of all joints; `estimate` of one, `hanging` what its links need; pure. `identified_page` draws
 `robot_edit`   single values of a robot file
 """

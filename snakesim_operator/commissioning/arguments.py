@@ -13,7 +13,7 @@ FILE = "the robot file that the host was started with; the values are written in
 
 
 def add_commands(commands: Any) -> None:
-    """Add it to the parser of `snakesim`."""
+    """Add `joints` to the parser of `snakesim`."""
     joints = commands.add_parser("joints", help="find zeros, directions and limits of joints, and write them down")
     verbs = joints.add_subparsers(dest="verb", required=True, metavar="VERB")
     zero = _by_hand(verbs, "zero", _zero, "take the present pose, which must be straight, as zero of every joint")

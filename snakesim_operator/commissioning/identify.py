@@ -1,0 +1,95 @@
+"""`snakesim identify`: the record of a run of the controller `identify`, judged, printed, drawn, and written down."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.files import find
+from snakesim_hal.model.textfiles import write_text
+from snakesim_hal.terminal import say
+from snakesim_hal.wire.messages import Mode
+from snakesim_operator.commissioning.estimate import Value
+from snakesim_operator.commissioning.identification import Identified, identified
+from snakesim_operator.commissioning.identified_page import page
+from snakesim_operator.results.record import RunRecord
+
+PAGE = "identified.html"
+CONTROLLER = "identify"
+FITS = 0.8  # share of the torque that must be explained, or the robot did not hang as it is supposed to
+COLUMNS = ("angle_rad", "velocity_rad_s", "torque_nm", "target")
+SHOWN = {
+    "friction_nm": ("dry friction", "N·m"),
+    "viscous_nm_s_per_rad": ("viscous friction", "N·m·s/rad"),
+    "armature_kg_m2": ("rotor inertia", "kg·m²"),
+    "torque_constant_nm_per_a": ("torque constant", "N·m/A"),
+    "stiffness_nm_per_rad": ("servo stiffness", "N·m/rad"),
+    "damping_nm_s_per_rad": ("servo damping", "N·m·s/rad"),
+    "response_time_s": ("response time", "s"),
+}
+
+
+def identify(run: Path, write: Path | None, out: Path | None) -> int:
+    """Print every joint, and write page and robot file. Returns 0 when all of it was found. Raises ConfigError."""
+    if write is not None and find(str(write), "robots") != write:
+        raise ConfigError(f"{write}: give the path of your own robot file, such as ./{write}.toml; shipped ones stay")
+    record = RunRecord.load(run)
+    columns = _columns(record)
+    found = identified(record.config, columns)
+    for one in found:
+        _print(one)
+    path = out or (run if run.is_dir() else run.parent) / PAGE
+    write_text(path, page(record, found))
+    say(f"page: {path}")
+    if write is not None:
+        _write(write, record, found)
+    return 1 if any(one.fits is None or one.fits < FITS for one in found) else 0
+
+
+def _columns(record: RunRecord) -> dict[str, Any]:
+    """The part in which every value is known and every joint in position mode. Raises ConfigError."""
+    if record.config.controller != CONTROLLER:
+        raise ConfigError(
+            f"{record.folder}: its controller was {record.config.controller!r}; hang the robot by its tail, and make a "
+            f"run with `snakesim run identify`"
+        )
+    columns = {name: getattr(record, name) for name in COLUMNS}
+    known = np.logical_and.reduce([np.isfinite(values).all(axis=1) for values in columns.values()])
+    known &= (record.mode == Mode.POSITION).all(axis=1)
+    known[1:] &= np.abs(np.diff(record.time_s) * record.config.rate_hz - 1) < 0.5
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], known, [False])).astype(int)))
+    runs = list(zip(edges[::2], edges[1::2], strict=True))
+    if not runs:
+        raise ConfigError(f"{record.folder}: the joints were never moved by position targets; run it again")
+    start, end = max(runs, key=lambda one: one[1] - one[0])
+    return {name: values[start:end] for name, values in columns.items()}
+
+
+def _print(one: Identified) -> None:
+    say(f"{one.joint}{'' if one.fits is None else f'   {100 * one.fits:.1f} % of its torque explained'}")
+    for field, value in one.fields.items():
+        name, unit = SHOWN[field]
+        say(f"  {name:<17} {_interval(value)} {unit}")
+    if one.latency_s is not None:
+        say(f"  {'latency':<17} {_interval(one.latency_s)} s")
+    if one.bandwidth_hz is not None:
+        say(f"  {'servo bandwidth':<17} {one.bandwidth_hz:.3g} Hz, of this joint with what it carries")
+    for why in one.unknown:
+        say(f"  unknown: {why}")
+    if one.fits is not None and one.fits < FITS:
+        say("  it does not move as a robot that hangs by its tail: look at clamp, masses and lengths")
+
+
+def _interval(value: Value) -> str:
+    return f"{value.value:.4g}, {value.value - value.within:.4g} to {value.value + value.within:.4g}"
+
+
+def _write(path: Path, record: RunRecord, found: list[Identified]) -> None:
+    from snakesim_operator.commissioning.robot_edit import change_joints
+
+    good = [one for one in found if one.fits is not None and one.fits >= FITS]
+    values = {one.joint: {field: max(of.value, 0.0) for field, of in one.fields.items()} for one in good}
+    if values:
+        change_joints(path, values, f"identified from {record.folder.name}")
+    say(f"{path}: {len(values)} joints changed; restart the host with it")
