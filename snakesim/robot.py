@@ -191,12 +191,15 @@ class Robot:
                 raise ConfigError(f"{what} is {values!r:.80}, must be {count} finite numbers, tail to head")
         self._commanding().send(points)
 
-    def arm(self) -> None:
-        """Take the lease, and have the robot hold its pose until the first command. Raises RefusedError."""
+    def arm(self, *, unchecked: bool = False) -> None:
+        """Take the lease, and have the robot hold its pose until the first command. Raises RefusedError.
+
+        unchecked: also a robot whose joints nobody has checked as they are now; see docs/commissioning.md.
+        """
         control = self._commanding()
         control.turn_until(lambda: self.status.ready_to_arm, READY_S, lambda: f"not armed: {self.status.why}")
         before = self._clock.arming
-        self._ask(request_to_arm(self.description, user_name()), "armed")
+        self._ask(request_to_arm(self.description, user_name(), unchecked=unchecked), "armed")
         control.turn_until(lambda: self._clock.arming > before, READY_S, lambda: f"not armed: {self.status.why}")
         if self._clock.lifecycle != "armed":
             raise RefusedError(f"not armed any more, but {self._clock.lifecycle}: {self.status.why}")

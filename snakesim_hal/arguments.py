@@ -111,6 +111,15 @@ def add_parent(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--parent", type=int, help=argparse.SUPPRESS)  # process id: this process dies with it
 
 
+def add_unchecked(parser: argparse.ArgumentParser) -> None:
+    """Of what arms."""
+    parser.add_argument(
+        "--unchecked",
+        action="store_true",
+        help="arm also a robot whose joints nobody has checked as they are now (simulated and emulated ones need none)",
+    )
+
+
 def add_host(parser: argparse.ArgumentParser) -> None:
     """Of a HAL host. Hidden is what a run hands to its host.
 

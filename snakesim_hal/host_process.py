@@ -21,6 +21,7 @@ from snakesim_hal.fault_plan import check_without_run
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host
 from snakesim_hal.host.latch import EstopLatch
+from snakesim_hal.model.checked import CHECK, why_unchecked
 from snakesim_hal.model.plugins import BACKENDS, find_plugin, plugin_settings
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.local_registry import LocalRobot, registered, robot_folder
@@ -83,6 +84,9 @@ def _run(given: ProcessOptions, config: RunConfig) -> Host:
         session = opened.enter_context(open_session(given.link) if given.link.listen else joined(given.link, "host"))
         refuse_second_host(session, given.link)
         described = backend.describe()
+        unchecked = ""
+        if config.controller != CHECK:
+            unchecked = why_unchecked(config.robot.checked, config.robot.joint_table, described)
         backend, faults = faults_of_host(config, backend, session)
         host = Host(
             config,
@@ -95,6 +99,7 @@ def _run(given: ProcessOptions, config: RunConfig) -> Host:
             starter=HostEnd.of(wanted.channel),
             realtime_warnings=realtime_warnings,
             faults=faults,
+            unchecked=unchecked,
         )
         serve_stops(stop_port, given.link.namespace or described.robot, host.take_stop)
         on_stop_signal(host.stop)

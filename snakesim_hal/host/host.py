@@ -81,6 +81,7 @@ class Host:
         starter: HostEnd | None = None,
         realtime_warnings: Sequence[str] = (),
         faults: Faults | None = None,
+        unchecked: str = "",
     ) -> None:
         """backend: guarded, as by `open_backend`.
 
@@ -92,6 +93,7 @@ class Host:
         latch: stores an emergency stop for later hosts.
         starter: the private channel to the process that started this host.
         realtime_warnings: real-time measures that the system refused.
+        unchecked: why only an explicit word arms it, by `why_unchecked`.
         faults: injected ones, of `faults_of_host`, as the backend is then; None: refused on request.
         """
         described = msgspec.structs.replace(backend.describe(), host=secrets.token_hex(8), arithmetic=measured())
@@ -100,6 +102,7 @@ class Host:
             self.description,
             first_epoch=time.time_ns() // 1_000_000,
             awaits_reports=config.pace == "realtime",
+            unchecked=unchecked,
         )
         self.black_box = BlackBox(self.description)
         self.statistics = RunStatistics()

@@ -96,4 +96,5 @@ def status_message(
         speed=time.speed,
         real_time_factor=time.factor,
         held_up=held_up[:500],
+        unchecked=authority.unchecked[:500],
     )

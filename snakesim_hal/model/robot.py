@@ -13,6 +13,7 @@ import msgspec
 from msgspec import Meta
 
 from snakesim_hal.errors import short
+from snakesim_hal.model.checked import Checked
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.joints import Drive, DriveMode, Heat, Joint, JointExceptions, Limits, Motor, Supply, table
 from snakesim_hal.model.links import Link
@@ -72,6 +73,7 @@ class RobotFile(FileStruct, frozen=True, kw_only=True):
     joints: Annotated[dict[str, JointExceptions], Meta(max_length=MAX_JOINTS)] = {}  # name -> what differs in it
     safety: Safety = Safety()
     sensors: Sensors = Sensors()
+    checked: Checked | None = None  # by whom its joints were found to be as this file says
 
     def __post_init__(self) -> None:
         """Links and joints must be those there are; sensors sit on a link, and not inside of it. Raises ValueError."""

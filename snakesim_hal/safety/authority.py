@@ -48,12 +48,16 @@ class Decision:
 class Authority:
     """Lifecycle, lease and gate of one robot."""
 
-    def __init__(self, description: Description, *, first_epoch: int = 0, awaits_reports: bool = False) -> None:
+    def __init__(
+        self, description: Description, *, first_epoch: int = 0, awaits_reports: bool = False, unchecked: str = ""
+    ) -> None:
         """first_epoch: different from that of any earlier host, so that commands for another host are rejected.
 
         awaits_reports: whether arming waits until every module has reported its supply.
+        unchecked: why its joints count as not checked, so that only an explicit word arms it; empty: they were.
         """
         self.description = description
+        self.unchecked = unchecked
         self.limits = JointLimits.of(description)
         self.state: LifecycleState = "disarmed"
         self.why = "not armed yet"
@@ -174,10 +178,13 @@ class Authority:
         match request.action:
             case "arm":
                 against = self._refusals(now_ns) + lifecycle.address_mismatches(request, self.description)
+                if self.unchecked and not request.unchecked:
+                    against.append(("not_checked", f"{self.unchecked}; to arm it as it is, say --unchecked"))
                 if against:
                     words = {word for word, _ in against}
                     return self._answer("; ".join(why for _, why in against), min(words, key=lifecycle.ORDER.index))
-                self._go("arm", f"armed by {request.who}, commanded by {self.lease.holder}")
+                as_it_is = ", unchecked" if self.unchecked else ""
+                self._go("arm", f"armed by {request.who}{as_it_is}, commanded by {self.lease.holder}")
                 self.arming += 1
                 self._armed_tick = self._state_tick
                 self._command = self._counting = None

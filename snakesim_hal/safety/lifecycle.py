@@ -44,7 +44,14 @@ def after(state: LifecycleState, event: Event) -> LifecycleState | None:
 
 # --- arming --------------------------------------------------------------------------------------------------
 
-ORDER = ("wrong_robot", "wrong_backend", "wrong_config", "wrong_state", "not_ready")  # the most important first
+ORDER = (
+    "wrong_robot",
+    "wrong_backend",
+    "wrong_config",
+    "wrong_state",
+    "not_checked",
+    "not_ready",
+)  # the most important first
 
 
 def address_mismatches(request: LifecycleRequest, description: Description) -> list[tuple[str, str]]:

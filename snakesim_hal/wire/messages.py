@@ -355,6 +355,8 @@ class JointDescription(Message, frozen=True, kw_only=True):
         Meta(max_length=8),
         about("beside angle and velocity; a torque that is not measured is 0, heat and voltage then stop nothing"),
     ] = msgspec.field(default_factory=lambda: list(get_args(Measurement)))
+    serial: Annotated[str, Meta(max_length=64), about("of its drive, as that says it; empty: it does not")] = ""
+    firmware: Annotated[str, Meta(max_length=64), about("of its drive, as that says it; empty: it does not")] = ""
 
     def has(self, mode: Mode) -> bool:
         """Whether it may be commanded in a mode."""
@@ -512,6 +514,10 @@ class Status(Message, frozen=True, kw_only=True):
             "in real time; read, write: the backend's calls"
         ),
     ] = {}
+    unchecked: Annotated[
+        q.Reason,
+        about("why arming needs the word `unchecked`: its joints were not checked as they are now; empty: it does not"),
+    ] = ""
     held_up: Annotated[
         q.Reason, about("which answer to which tick lockstep has been waiting for, if longer than half a second")
     ] = ""
@@ -547,9 +553,12 @@ class LifecycleRequest(Message, frozen=True, kw_only=True):
     config_hash: Annotated[
         q.Name | None, about("`Description.config_hash`; arm needs it, others may leave it null")
     ] = None
+    unchecked: Annotated[
+        bool, about("arm also where `Status.unchecked` says that the joints were not checked as they are now")
+    ] = False
 
 
-def request_to_arm(robot: Description, who: str) -> LifecycleRequest:
+def request_to_arm(robot: Description, who: str, *, unchecked: bool = False) -> LifecycleRequest:
     """For exactly the robot, backend, configuration and host process that are described."""
     return LifecycleRequest(
         action="arm",
@@ -558,6 +567,7 @@ def request_to_arm(robot: Description, who: str) -> LifecycleRequest:
         robot=robot.robot,
         backend=robot.backend,
         config_hash=robot.config_hash,
+        unchecked=unchecked,
     )
 
 

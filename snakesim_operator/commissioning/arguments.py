@@ -30,6 +30,18 @@ def add_commands(commands: Any) -> None:
         epilog="Exit code: 0 every joint is as the file says, 1 one is not or could not be judged, 2 wrong input.",
     )
     judge.add_argument("run", type=Path, help="folder of the run")
+    judge.add_argument(
+        "file",
+        type=Path,
+        nargs="?",
+        metavar="FILE",
+        help="your robot file: write into it that it was checked, if it was",
+    )
+    judge.add_argument(
+        "--by-hand",
+        action="store_true",
+        help="what it cannot judge you have turned with `joints direction`, and is right",
+    )
     judge.add_argument("--straight", action="store_true", help="the robot lay straight at its start: judge all zeros")
     judge.set_defaults(act=_check)
 
@@ -63,4 +75,4 @@ def _limits(arguments: argparse.Namespace) -> int:
 def _check(arguments: argparse.Namespace) -> int:
     from snakesim_operator.commissioning.check import check
 
-    return check(arguments.run, straight=arguments.straight)
+    return check(arguments.run, arguments.file, straight=arguments.straight, by_hand=arguments.by_hand)

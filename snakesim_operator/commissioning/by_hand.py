@@ -16,7 +16,7 @@ import numpy as np
 
 from snakesim_hal.arrays import Floats
 from snakesim_hal.errors import ConfigError, RefusedError
-from snakesim_hal.model.files import decode, find, read_part
+from snakesim_hal.model.files import decode, read_part
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig
@@ -25,7 +25,7 @@ from snakesim_hal.terminal import overwrite_lines, say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Configuration, JointState, Status
 from snakesim_operator.commissioning.capture import NotStillError, Travel, turned, zeros
-from snakesim_operator.commissioning.robot_edit import change_joints
+from snakesim_operator.commissioning.robot_edit import change_joints, must_be_own
 from snakesim_operator.tools.targets import CONNECT_S, RobotSelection, only_robot
 
 SETTLE_S = 1.0  # of samples for a zero
@@ -169,8 +169,7 @@ def _shown(joints: Sequence[Joint], travel: Travel, now_rad: Floats) -> list[str
 
 @contextmanager
 def _hand(path: Path, where: RobotSelection, command: str) -> Iterator[Hand]:
-    if find(str(path), "robots") != path:
-        raise ConfigError(f"{path}: give the path of your own robot file, such as ./{path}.toml; shipped ones stay")
+    must_be_own(path)
     with open_session(only_robot(where, command), CONNECT_S) as session:
         yield Hand(session, path)
 

@@ -1,19 +1,25 @@
 """`snakesim joints check`: the record of a run of the joint check, judged and printed."""
 
 from collections.abc import Iterable, Mapping
+from datetime import date
 from pathlib import Path
 
 import numpy as np
 
 from snakesim_hal.arrays import Floats
 from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.checked import Checked, mounting_digest
+from snakesim_hal.model.files import decode, read_part
 from snakesim_hal.model.kinematics import rotation_from_quaternion
+from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.process import user_name
 from snakesim_hal.terminal import say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import Description, Imu
 from snakesim_operator.commissioning.judge import Measured, judged
+from snakesim_operator.commissioning.robot_edit import must_be_own, write_checked
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.results.record import RunRecord
@@ -21,8 +27,11 @@ from snakesim_operator.results.record import RunRecord
 COLUMNS = ("angle_rad", "velocity_rad_s", "torque_nm", "target", "orientation_wxyz")
 
 
-def check(run: Path, *, straight: bool) -> int:
-    """Print a line a joint. Returns 0 when each is as the robot file says. Raises ConfigError."""
+def check(run: Path, path: Path | None, *, straight: bool, by_hand: bool) -> int:
+    """Print a line a joint. Returns 0 when each is as the robot file says. Raises ConfigError.
+
+    path: robot file into which to write that it was checked; by_hand: what could not be judged was turned by hand.
+    """
     record = RunRecord.load(run)
     if record.config.controller != "joint_check":
         raise ConfigError(
@@ -34,12 +43,40 @@ def check(run: Path, *, straight: bool) -> int:
         moved = f"moved {row.moved_rad:5.3f} rad" if row.moved_rad is not None else "not moved yet  "
         turned = "link unknown    " if row.turned is None else f"link {row.turned:+5.2f} of it"
         say(f"{row.joint:10}  {moved}  {turned}  {row.verdict}")
-    wrong = sum(not row.as_told for row in rows)
-    say(f"{len(rows) - wrong} of {len(rows)} joints are as the robot file says")
+    unknown = [row.joint for row in rows if row.unknown and by_hand]
+    wrong = sum(not row.as_told and row.joint not in unknown for row in rows)
+    told = f", {len(unknown)} of them as somebody found by hand" if unknown else ""
+    say(f"{len(rows) - wrong} of {len(rows)} joints are as the robot file says{told}")
     unseen = [joint.name for joint in record.description.joints if joint.axis == "yaw"]
     if unseen and not straight:
         say(f"not judged: the zeros of {', '.join(unseen)}; lay the robot straight, run again, and add --straight")
+    if path is not None:
+        _write(path, record, unknown, wrong=wrong)
     return 1 if wrong else 0
+
+
+def _write(path: Path, record: RunRecord, by_hand: list[str], *, wrong: int) -> None:
+    """That it was checked, by whom, when, on which drives. Raises ConfigError."""
+    robot, joints = record.description, record.config.robot.joint_table
+    must_be_own(path)
+    if robot.emulated:
+        raise ConfigError(f"{record.folder}: its drives were emulated, which says nothing of a real robot; not written")
+    if mounting_digest(decode(read_part(str(path), "robots"), RobotFile).joint_table) != mounting_digest(joints):
+        raise ConfigError(f"{path}: says otherwise how the joints are mounted than in {record.folder}; check it again")
+    if wrong:
+        say(f"{path}: nothing was written: {wrong} joints are not as it says, or could not be judged (--by-hand)")
+        return
+    checked = Checked(
+        by=user_name(),
+        on=date.today().isoformat(),
+        joints=mounting_digest(joints),
+        backend=robot.backend,
+        hardware=robot.hardware,
+        serials=[joint.serial for joint in robot.joints] if any(joint.serial for joint in robot.joints) else [],
+        by_hand=by_hand,
+    )
+    write_checked(path, checked)
+    say(f"{path}: checked by {checked.by} on {checked.on}; restart the host with it, and it is armed as any other")
 
 
 def _of(record: RunRecord) -> Measured:

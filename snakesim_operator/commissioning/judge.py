@@ -26,6 +26,7 @@ LEAST_TORQUE_NM = 0.1
 STRAIGHT_RAD = 0.08  # a robot that was laid straight by hand is straight within that
 LEVEL_RAD = 0.05  # gravity tells angles to that
 LEAST_GRAVITY_M_S2 = 5.0  # across the axis of a joint, to tell its angle
+UNKNOWN = "unknown: the links on both sides need an IMU or motion capture, at 30 Hz or more"
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,11 @@ class Judged:
     as_told: bool = False
     moved_rad: float | None = None  # by its encoder; None: it was not its turn
     turned: float | None = None  # share of that which turned up at this joint, without its drive; None: unknown
+
+    @property
+    def unknown(self) -> bool:
+        """Whether nothing was found wrong, and nothing right."""
+        return self.verdict == UNKNOWN
 
 
 @dataclass(frozen=True)
@@ -183,7 +189,7 @@ def _with_swap(order: NDArray[np.intp], j: int, k: int) -> NDArray[np.intp]:
 def _verdict(turned: float, drive: Drive) -> str:
     """What is wrong with its sign or gear; empty: nothing."""
     if np.isnan(turned):
-        return "unknown: the links on both sides need an IMU or motion capture, at 30 Hz or more"
+        return UNKNOWN
     if abs(turned - 1) < NEAR:
         return ""
     if abs(turned) < NEAR:

@@ -4,15 +4,23 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import tomlkit
 from tomlkit.items import Table
 
 from snakesim_hal.errors import ConfigError
-from snakesim_hal.model.files import decode, read_part
+from snakesim_hal.model.checked import Checked
+from snakesim_hal.model.files import decode, find, read_part
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.textfiles import read_text
 from snakesim_hal.model.whole_file import write_whole
 from snakesim_hal.process import user_name
+
+
+def must_be_own(path: Path) -> None:
+    """Raise ConfigError for a robot file that is shipped."""
+    if find(str(path), "robots") != path:
+        raise ConfigError(f"{path}: give the path of your own robot file, such as ./{path}.toml; shipped ones stay")
 
 
 def change_joints(path: Path, values: dict[str, dict[str, Any]], how: str) -> None:
@@ -29,6 +37,22 @@ def change_joints(path: Path, values: dict[str, dict[str, Any]], how: str) -> No
             item = tomlkit.item(round(value, 5) if isinstance(value, float) else value)
             item.comment(said)
             section[field] = item
+    _replace(path, document)
+
+
+def write_checked(path: Path, checked: Checked) -> None:
+    """Set the section [checked]. Raises ConfigError; then nothing changed."""
+    document = tomlkit.parse(read_text(path))
+    section = tomlkit.table()
+    section.comment("written by `snakesim joints check`; it counts until the joints above or their drives change")
+    for name, value in msgspec.to_builtins(checked).items():
+        if value:
+            section[name] = value
+    document["checked"] = section
+    _replace(path, document)
+
+
+def _replace(path: Path, document: tomlkit.TOMLDocument) -> None:
     candidate = path.with_name(f".{path.name}")  # checked before it takes the file's place; beside it, as for `extends`
     write_whole(candidate, tomlkit.dumps(document).encode())
     try:

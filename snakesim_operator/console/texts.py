@@ -111,6 +111,7 @@ def state_table(snapshot: RobotSnapshot) -> str:
         rows += [("waiting for", plain(", ".join(status.waiting_for)))] if status.waiting_for else []
         rows += [("derated", plain(f"{joint}: {100 * share:.0f} %")) for joint, share in sorted(status.derated.items())]
         rows += [("isolated", plain(", ".join(status.isolated)))] if status.isolated else []
+        rows += [("not checked", plain(status.unchecked))] if status.unchecked else []
         rows += [("injected", plain(what)) for what in status.injected]
         rows += [("real time", plain(what)) for what in status.realtime_warnings]
     return table([*rows, *_health(snapshot)]) + faults(status)

@@ -10,6 +10,7 @@ from snakesim_hal.arguments import (
     add_network,
     add_scenario,
     add_service,
+    add_unchecked,
     check_network,
     load_scenario,
     session_given,
@@ -37,6 +38,7 @@ def add_commands(commands: Any) -> None:
     run.add_argument(
         "--stay", action="store_true", help="faults do not end the run: processes restart, you clear and arm"
     )
+    add_unchecked(run)
     run.add_argument("--with-router", action="store_true", help="start a router for the run, as in a lab")
     run.add_argument(
         "--in-process",
@@ -100,6 +102,7 @@ def _run(arguments: argparse.Namespace) -> int:
         session=session_given(arguments),
         namespace=arguments.namespace,
         stay=arguments.stay,
+        unchecked=arguments.unchecked,
         with_router=arguments.with_router,
         insecure=arguments.insecure,
         record=not arguments.no_record,

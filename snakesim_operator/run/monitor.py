@@ -43,8 +43,13 @@ class RunMonitor:
         say: Callable[[str], None],
         *,
         stay: bool,
+        unchecked: bool = False,
     ) -> None:
-        """stay: a fault does not end the run; a person clears it and arms again."""
+        """stay: a fault does not end the run; a person clears it and arms again.
+
+        unchecked: arm also without a check of its joints.
+        """
+        self._unchecked = unchecked
         self._session, self._supervisor = session, supervisor
         self._ending, self._say, self._stay = ending, say, stay
         self._control = session.reader(keys.CONTROL_STATE, ControlState)
@@ -209,7 +214,7 @@ class RunMonitor:
         host = self._supervisor.host
         assert host is not None
         if self._asked_at is None:
-            host.ask(request_to_arm(robot, WHO))
+            host.ask(request_to_arm(robot, WHO, unchecked=self._unchecked))
             self._asked_at = time.monotonic()
         elif host.answers:
             answer, self._asked_at = host.answers.pop(0), None

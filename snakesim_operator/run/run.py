@@ -48,6 +48,7 @@ class RunRequest:
     router: str | None = None
     session: SessionFile | None = None  # how to connect to a lab's router
     namespace: str | None = None
+    unchecked: bool = False  # arm also a robot whose joints nobody has checked
     stay: bool = False  # a fault ends nothing: processes are started again, a person clears and arms
     with_router: bool = False  # the run's parts meet at a router of its own
     insecure: bool = False  # listen even where other machines can connect
@@ -182,7 +183,7 @@ def _conduct(
             say(f"network: {link.endpoint}, namespace {link.namespace}")
             if not config.has_own_control:
                 say("no control service of its own: a client that takes the lease commands and arms the robot")
-            RunMonitor(config, session, supervisor, ending, say, stay=request.stay).go()
+            RunMonitor(config, session, supervisor, ending, say, stay=request.stay, unchecked=request.unchecked).go()
     except SnakesimError as error:
         ending.because(str(error))
     finally:

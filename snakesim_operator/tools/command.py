@@ -21,8 +21,8 @@ DESCRIPTION_S = 3.0
 SHOWN_S = 1.5  # until the host's status must show what its answer says
 
 
-def arm(robot: str, backend: str, where: RobotSelection, say: Say = say) -> int:
-    """Arm a robot, if robot and backend match. Raises RefusedError with the reason."""
+def arm(robot: str, backend: str, where: RobotSelection, say: Say = say, *, unchecked: bool = False) -> int:
+    """Arm a robot, if robot and backend match. unchecked: also without a check of its joints. Raises RefusedError."""
     link = only_robot(where, f"arm {robot} {backend}")
     with open_session(link, CONNECT_S) as session:
         description = _description(session, link)
@@ -39,7 +39,7 @@ def arm(robot: str, backend: str, where: RobotSelection, say: Say = say) -> int:
                 f"not armed: {'; '.join(wrong)}. To arm, name robot and backend: "
                 f"`snakesim arm {description.robot} {description.backend}`"
             )
-        request = request_to_arm(description, user_name())
+        request = request_to_arm(description, user_name(), unchecked=unchecked)
         return ask_host(session, keys.LIFECYCLE, request, "armed", link, say)
 
 

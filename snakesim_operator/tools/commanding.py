@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from snakesim_hal.arguments import add_network
+from snakesim_hal.arguments import add_network, add_unchecked
 from snakesim_hal.errors import ConfigError
 from snakesim_operator.tools.robot_selection import RobotSelection, selection_of
 from snakesim_operator.tools.simulator_order import add_command as add_sim
@@ -20,6 +20,7 @@ def add_commands(commands: Any) -> None:
     arm = commands.add_parser("arm", help="allow a robot to move; names robot and backend, to avoid mix-ups")
     arm.add_argument("robot", metavar="ROBOT", help="name of the robot, as printed by `snakesim status`")
     arm.add_argument("backend", metavar="BACKEND", help="its backend: sim, can, ...")
+    add_unchecked(arm)
     add_network(arm)
     arm.set_defaults(act=_arm)
     for name, act, about in (
@@ -83,7 +84,7 @@ def _add_param(commands: Any) -> None:
 def _arm(arguments: argparse.Namespace) -> int:
     from snakesim_operator.tools.command import arm
 
-    return arm(arguments.robot, arguments.backend, selection_of(arguments))
+    return arm(arguments.robot, arguments.backend, selection_of(arguments), unchecked=arguments.unchecked)
 
 
 def _disarm(arguments: argparse.Namespace) -> int:

@@ -136,10 +136,9 @@ def _in_words(link: Link, status: Status) -> list[str]:
         lines.append(f"  derated: {joint} has {100 * share:.0f} % of its torque left")
     if status.isolated:
         lines.append(f"  isolated: {', '.join(status.isolated)}; passive until a clear")
-    for what in status.realtime_warnings:
-        lines.append(f"  real time: {what}")
-    for what in status.injected:
-        lines.append(f"  injected fault: {what}")
+    lines += [f"  real time: {what}" for what in status.realtime_warnings]
+    lines += [f"  not checked: {what}" for what in filter(None, [status.unchecked])]
+    lines += [f"  injected fault: {what}" for what in status.injected]
     if status.waiting_for:
         lines.append(f"  waiting for: {', '.join(status.waiting_for)}")
     ticks: dict[tuple[str, str, str], list[int]] = {}

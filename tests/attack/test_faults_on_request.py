@@ -33,7 +33,7 @@ ASKED = (
 def real(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Robot, Stranger]]:
     """A robot that really moves, and a stranger who says from its first moment on that it does not."""
     home = tmp_path_factory.mktemp("real")
-    with running(home, *STANDING, "--backend", f"{BENCH}:Bench") as run, joined(run) as operator:
+    with running(home, *STANDING, "--backend", f"{BENCH}:Bench", "--unchecked") as run, joined(run) as operator:
         about = operator.newest("hal/description")
         assert about["emulated"] is False
         with Stranger(run.endpoint) as stranger, forging(stranger, {**about, "emulated": True}):

@@ -133,7 +133,7 @@ def test_where_something_real_moves_faults_are_not_allowed(tmp_path: Path) -> No
         "        return super().update(view)\n"
     )
     arguments = ["triplet", "--backend", "./bench.py:Bench", "--controller", "./bench.py:Telling"]
-    arguments += ["--pace", "realtime"]
+    arguments += ["--pace", "realtime", "--unchecked"]
     loaded = [tmp_path / part for part in ("host", "control")]
     with running(tmp_path / "run", *arguments, "--duration", "600") as run:
         run.wait_for(" s  ")

@@ -385,3 +385,14 @@ def test_what_matters_most_is_the_word() -> None:
         ({}, "wrong_state"),
     ):
         assert rig.authority.on_lifecycle(msgspec.structs.replace(ARM, **change), 0).refusal == word
+
+
+def test_a_robot_that_nobody_checked_is_armed_by_an_explicit_word_alone() -> None:
+    rig = Rig()
+    rig.authority = Authority(rig.robot, unchecked="nobody has checked it")
+    rig.observe(0.1)
+    assert rig.acquire().ok and rig.send(0.1) is None
+    refused = rig.arm()
+    assert refused.refusal == "not_checked" and "nobody has checked it; to arm it" in refused.reason
+    armed = rig.authority.on_lifecycle(msgspec.structs.replace(ARM, unchecked=True), rig.now_ns)
+    assert armed.ok and ", unchecked" in rig.authority.why

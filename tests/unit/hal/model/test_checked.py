@@ -1,0 +1,43 @@
+"""When a real robot counts as checked."""
+
+from typing import Any
+
+import msgspec
+import pytest
+
+from snakesim_hal.model.checked import Checked, mounting_digest, why_unchecked
+from snakesim_hal.wire.messages import Description
+from tests.unit.hal.rig import description, robot_file
+
+JOINTS = robot_file().joint_table
+CHECKED = Checked(by="anna", on="2026-11-24", joints=mounting_digest(JOINTS), backend="can", hardware="can0")
+
+
+def robot(serials: str = "", **fields: Any) -> Description:
+    plain = description()
+    given = serials.split(",") if serials else [""] * len(plain.joints)
+    joints = [msgspec.structs.replace(one, serial=serial) for one, serial in zip(plain.joints, given, strict=True)]
+    return msgspec.structs.replace(plain, **{"backend": "can", "hardware": "can0", "joints": joints, **fields})
+
+
+SERIALS = [f"S{i}" for i in range(len(JOINTS))]
+
+
+@pytest.mark.parametrize(
+    ("checked", "here", "words"),
+    [
+        (None, robot(emulated=True), ""),
+        (None, robot(), "nobody has checked"),
+        (CHECKED, robot(), ""),
+        (CHECKED, robot(hardware="can1"), "it is on can can1 now, can can0 since anna checked it on 2026-11-24"),
+        (CHECKED, robot(",".join(SERIALS)), "joint_1 has drive S0, and had unknown"),
+        (msgspec.structs.replace(CHECKED, serials=SERIALS), robot(",".join(SERIALS), hardware="can1"), ""),
+        (msgspec.structs.replace(CHECKED, serials=SERIALS), robot(), "joint_1 has drive unknown, and had S0"),
+        (msgspec.structs.replace(CHECKED, joints="0"), robot(), "was changed in its file since anna"),
+    ],
+)
+def test_it_counts_for_the_joints_and_drives_that_were_judged(
+    checked: Checked | None, here: Description, words: str
+) -> None:
+    found = why_unchecked(checked, JOINTS, here)
+    assert words in found if words else found == ""
