@@ -51,8 +51,9 @@ class CanBackend(DriveBackend):
         mocap = receiver(config, settings.pose_listen, twins=twins, clock=lambda _stamp_ns: clock.ns())
         self._reports = reports_of(config, settings)
 
-        def make_modules(_readings: Readings) -> Modules:
-            self.modules = Modules(config, settings, clock, mocap.address if mocap is not None else None)
+        def make_modules(readings: Readings) -> Modules:
+            pose = mocap.address if mocap is not None else None
+            self.modules = Modules(config, settings, clock, pose, readings)
             self._sensors = Sensors(config, self._reports, self.modules.reading, mocap)
             return self.modules
 

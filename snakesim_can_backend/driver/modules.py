@@ -26,6 +26,7 @@ from snakesim_hal.arrays import Floats
 from snakesim_hal.backend import SetPoints
 from snakesim_hal.drivers.drive_backend import Clock
 from snakesim_hal.drivers.findings import Finding
+from snakesim_hal.drivers.readings import Readings
 from snakesim_hal.errors import BackendError
 from snakesim_hal.injection import Injection
 from snakesim_hal.model.scenario import RunConfig
@@ -56,8 +57,14 @@ class Modules:
 
     emulated = False  # until they have said so
 
-    def __init__(self, config: RunConfig, settings: CanSettings, clock: Clock, pose: str | None) -> None:
-        """Open the buses. pose: where own twins send motion capture. Raises ConfigError and BackendError."""
+    def __init__(
+        self, config: RunConfig, settings: CanSettings, clock: Clock, pose: str | None, readings: Readings
+    ) -> None:
+        """Open the buses. Raises ConfigError and BackendError.
+
+        pose: where own twins send motion capture; readings: are told who each module is.
+        """
+        self._readings = readings
         self._config, self._settings, self._clock = config, settings, clock
         self._lockstep = config.pace == "lockstep"
         self._reports = reports_of(config, settings)
@@ -99,6 +106,8 @@ class Modules:
             raise BackendError("the robot is not complete; nothing was enabled:", *(f"  {what}" for what in wrong))
         self._ours = True
         self.emulated = all(identity.emulated for identity in found)
+        for identity in found:
+            self._readings.identified(identity.node - 1, serial=f"{identity.serial:08X}", firmware=identity.firmware)
         self._broadcast(commands.command(Action.DISARM))
         self._configure(limit_s)
         self._await_first_states()

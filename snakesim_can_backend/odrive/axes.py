@@ -90,6 +90,11 @@ class Axes(CanDrives):
                 self._errs(i, values[0])
             case Message.VERSION:
                 self.firmware[i] = values[4:7]
+                readings.identified(i, firmware=".".join(map(str, values[4:7])))
+                if values[4:6] == FIRMWARE:  # 0.5 would take the question for a new node id
+                    self._ask(i, Message.ADDRESS)
+            case Message.ADDRESS:
+                readings.identified(i, serial=f"{int.from_bytes(values[1], 'little'):012X}")
             case _:
                 pass
 

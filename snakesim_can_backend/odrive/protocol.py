@@ -20,6 +20,7 @@ class Message(IntEnum):
     HEARTBEAT = 0x01
     ESTOP = 0x02
     ERROR = 0x03
+    ADDRESS = 0x06
     SET_STATE = 0x07
     MOTION = 0x09
     SET_MODE = 0x0B
@@ -86,6 +87,7 @@ PAYLOADS = {
     Message.HEARTBEAT: Struct("<IBBBx"),  # active errors, state, result of the last procedure, trajectory done
     Message.ESTOP: Struct(""),
     Message.ERROR: Struct("<II"),  # active errors, reason of the last disarming
+    Message.ADDRESS: Struct("<B6sB"),  # node, serial number, connection; only of 0.6: a command in 0.5
     Message.SET_STATE: Struct("<I"),
     Message.MOTION: Struct("<ff"),  # turns, turns/s
     Message.SET_MODE: Struct("<II"),  # what it controls, input mode

@@ -19,6 +19,7 @@ from snakesim_hal.wire.messages import Mode
 HEARTBEAT_US = 100_000.0
 COUNTS = 16384  # of the encoder, a turn
 VERSION = (2, 4, 4, 58, 0, 6, 11, 0)
+FIRST_SERIAL = 0x3855_0000_0001
 MODES = {Control.TORQUE: Mode.TORQUE, Control.VELOCITY: Mode.VELOCITY, Control.POSITION: Mode.POSITION}
 
 
@@ -108,6 +109,11 @@ class OdriveTwin(CanTwin):
         match message:
             case Message.VERSION:
                 values = VERSION
+            case Message.ADDRESS:
+                serial = FIRST_SERIAL + i
+                return Frame(
+                    axis.node << 5 | message, PAYLOADS[message].pack(axis.node, serial.to_bytes(6, "little"), 0)
+                )
             case Message.HEARTBEAT:
                 values = axis.errors, axis.state, 0, 0
             case Message.ERROR:

@@ -18,7 +18,7 @@ from snakesim_hal.drivers.mocap import MocapReceiver
 from snakesim_hal.drivers.readings import Readings
 from snakesim_hal.errors import BackendError
 from snakesim_hal.injection import Injection
-from snakesim_hal.model.robot import describe
+from snakesim_hal.model.robot import describe, identified
 from snakesim_hal.model.scenario import RunConfig, config_hash
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (
@@ -129,7 +129,8 @@ class DriveBackend:
         except BaseException:
             self.close()
             raise
-        self._description = self._describe(config, name, hardware)
+        described = self._describe(config, name, hardware)
+        self._description = identified(described, self._readings.serials, self._readings.firmware)
 
     def describe(self) -> Description:
         """The robot of the robot file, with the sensors that its drives are."""

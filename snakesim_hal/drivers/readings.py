@@ -28,10 +28,15 @@ class Readings:
         self.angle_rad, self.velocity_rad_s, self.torque_nm = np.zeros(count), np.zeros(count), np.zeros(count)
         self._motion_ns, self._torque_ns, self._health_ns = ([NEVER] * count for _ in range(3))
         self._voltage_v, self._current_a, self._motor_c, self._board_c = ([0.0] * count for _ in range(4))
+        self.serials, self.firmware = [""] * count, [""] * count  # empty: the drive does not say it
         self._asked = LATELY  # questions so far
         self._motion_at, self._torque_at = [0] * count, [0] * count  # the newest one that was answered
 
     # --- what drives say -------------------------------------------------------------------------------------
+
+    def identified(self, i: int, *, serial: str = "", firmware: str = "") -> None:
+        """In bring-up a drive has said who it is, as far as it does."""
+        self.serials[i], self.firmware[i] = serial or self.serials[i], firmware or self.firmware[i]
 
     def ask(self) -> None:
         """All drives are being asked for motion and torque."""

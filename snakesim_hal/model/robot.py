@@ -6,7 +6,7 @@ long as the others. A robot whose links differ otherwise lists them in `[[links]
 
 import hashlib
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Annotated, get_args
 
 import msgspec
@@ -216,6 +216,15 @@ def describe(
         sensors=sensors,
         own={keys.own(sensor.name): _own_schema(sensor) for sensor in robot.sensors.own},
     )
+
+
+def identified(robot: Description, serials: Sequence[str], firmware: Sequence[str]) -> Description:
+    """A description in which every joint's drive says who it is, tail to head."""
+    joints = [
+        msgspec.structs.replace(joint, serial=serial, firmware=version)
+        for joint, serial, version in zip(robot.joints, serials, firmware, strict=True)
+    ]
+    return msgspec.structs.replace(robot, joints=joints)
 
 
 def _own_schema(sensor: OwnSensor) -> str:

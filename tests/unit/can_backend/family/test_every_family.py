@@ -107,6 +107,12 @@ def robot(family: Family) -> Iterator[Robot]:
     one.backend.close()
 
 
+def test_the_description_says_which_drives_these_are_where_they_say_it(robot: Robot) -> None:
+    joints, says = robot.backend.describe().joints, isinstance(robot.backend, OdriveBackend)
+    assert [joint.serial for joint in joints] == [f"38550000000{i + 1}" if says else "" for i in range(JOINTS)]
+    assert {joint.firmware for joint in joints} == {"0.6.11" if says else ""}
+
+
 def test_an_error_of_a_drive_stays_until_the_operators_clear_and_is_reported_again_if_it_is_still_there(
     robot: Robot,
 ) -> None:

@@ -152,6 +152,9 @@ def test_it_describes_robot_and_sensors_and_delivers_them() -> None:
         description = run.backend.describe()
         assert description.backend == "can"
         assert [joint.name for joint in description.joints] == ["joint_1", "joint_2", "joint_3", "joint_4"]
+        serials = [joint.serial for joint in description.joints]
+        assert len(set(serials)) == 4 and all(len(serial) == 8 for serial in serials)
+        assert [joint.firmware for joint in description.joints] == ["1.0"] * 4
         go(run, "disarmed", 60)
         delivered = {"sensor/joints"}.union(*(samples.others for samples in run.samples))
         assert delivered == {sensor.key for sensor in description.sensors}
