@@ -9,6 +9,9 @@ from snakesim_hal.arguments import add_network
 from snakesim_operator.tools.robot_selection import selection_of
 
 TASK = "scenarios, robots, labs"  # under which `snakesim --help` lists it
+JOG = (
+    "Move one joint slowly, while a key is held; the motors of the others stay off. It arms the robot, checked or not."
+)
 FILE = "the robot file that the host was started with; the values are written into it"
 
 
@@ -24,6 +27,7 @@ def add_commands(commands: Any) -> None:
     ):
         command = _by_hand(verbs, verb, act, about)
         command.add_argument("joints", nargs="*", metavar="JOINT", help="such as joint_3; all of them without")
+    _add_jog(verbs)
     judge = verbs.add_parser(
         "check",
         help="judge a run of `snakesim run joint_check`: signs, gears, ids, zeros, dead joints",
@@ -46,6 +50,17 @@ def add_commands(commands: Any) -> None:
     judge.set_defaults(act=_check)
 
 
+def _add_jog(verbs: Any) -> None:
+    jog = verbs.add_parser("jog", help="move one joint slowly, while a key is held", description=JOG)
+    jog.add_argument("file", type=Path, metavar="FILE", help=FILE.partition(";")[0])
+    jog.add_argument("joint", metavar="JOINT", help="such as joint_3")
+    jog.add_argument("--speed", type=float, default=0.1, metavar="RAD_S", help="at most 0.5 rad/s (default: 0.1)")
+    jog.add_argument("--travel", type=float, default=0.2, metavar="RAD", help="to either side (default: 0.2 rad)")
+    jog.add_argument("--torque", type=float, default=0.3, metavar="SHARE", help="of the joint's limit (default: 0.3)")
+    add_network(jog)
+    jog.set_defaults(act=_jog)
+
+
 def _by_hand(verbs: Any, verb: str, act: Callable[[argparse.Namespace], int], about: str) -> argparse.ArgumentParser:
     command = verbs.add_parser(verb, help=about, description=f"{about.capitalize()}. The motors stay off.")
     command.add_argument("file", type=Path, metavar="FILE", help=FILE)
@@ -58,6 +73,15 @@ def _zero(arguments: argparse.Namespace) -> int:
     from snakesim_operator.commissioning.by_hand import zero
 
     return zero(arguments.file, selection_of(arguments), asks=not arguments.now)
+
+
+def _jog(arguments: argparse.Namespace) -> int:
+    from snakesim_operator.commissioning.jog import JogRequest, jog
+
+    wanted = JogRequest(
+        joint=arguments.joint, speed_rad_s=arguments.speed, travel_rad=arguments.travel, torque=arguments.torque
+    )
+    return jog(arguments.file, selection_of(arguments), wanted)
 
 
 def _direction(arguments: argparse.Namespace) -> int:

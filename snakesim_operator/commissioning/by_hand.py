@@ -33,6 +33,22 @@ SILENT_S = 1.0
 FOUND_S = 3.0  # for configuration and status of a host that is there
 DRAWN_EVERY_S = 0.2
 DIRECTIONS = {"yaw": "to the left", "pitch": "downwards"}  # of what is ahead of the joint, seen towards the head
+UNHEARD = f"the robot's host has not said within {FOUND_S:g} s how it is set up; see `snakesim status`"
+
+
+def running_joints(session: Session, path: Path) -> Sequence[Joint]:
+    """The joints of a robot file with which a host runs. Raises ConfigError for another file, RefusedError."""
+    joints = decode(read_part(str(path), "robots"), RobotFile).joint_table
+    configured = session.latest(keys.CONFIG, Configuration, FOUND_S)
+    if configured is None:
+        raise RefusedError(UNHEARD)
+    running = msgspec.json.decode(configured.content, type=RunConfig).robot.joint_table
+    if [(one.name, one.id, one.drive) for one in running] != [(one.name, one.id, one.drive) for one in joints]:
+        raise ConfigError(
+            f"{path}: its joints are not those that the host was started with, so what is measured would be "
+            f"reckoned wrongly; restart the host with this file"
+        )
+    return joints
 
 
 class Hand:
@@ -42,20 +58,11 @@ class Hand:
         """Raises ConfigError when the host does not run with this file."""
         self._states = session.reader(keys.JOINTS, JointState)
         self._statuses = session.latched_reader(keys.STATUS, Status)
-        self.joints: Sequence[Joint] = decode(read_part(str(path), "robots"), RobotFile).joint_table
-        configured = session.latest(keys.CONFIG, Configuration, FOUND_S)
+        self.joints = running_joints(session, path)
         status = session.latest(keys.STATUS, Status, FOUND_S)
-        if configured is None or status is None:
-            raise RefusedError(
-                f"the robot's host has not said within {FOUND_S:g} s how it is set up; see `snakesim status`"
-            )
+        if status is None:
+            raise RefusedError(UNHEARD)
         self._status = status
-        running = msgspec.json.decode(configured.content, type=RunConfig).robot.joint_table
-        if [(one.name, one.id, one.drive) for one in running] != [(one.name, one.id, one.drive) for one in self.joints]:
-            raise ConfigError(
-                f"{path}: its joints are not those that the host was started with, so what is measured would be "
-                f"reckoned wrongly; restart the host with this file"
-            )
 
     def angles_rad(self, until: Callable[[], bool]) -> Iterator[Floats]:
         """Samples as they come. Raises RefusedError when the robot is armed, silent, or does not know an angle."""

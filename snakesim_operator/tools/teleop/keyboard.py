@@ -11,16 +11,19 @@ from snakesim_hal.errors import ConfigError
 
 KEYS = {b"A": "up", b"B": "down", b"C": "right", b"D": "left"}  # after ESC [ or ESC O
 MAX_BYTES = 1024  # a paste, or a key that repeats; all of it is read, and the newest end of it counts
+WANTED = "teleop reads keys, and stdin is no terminal; start it in one, or give --joystick"
 
 
 class Keyboard:
     """stdin, a key at a time, without echo. Ctrl-C works; Ctrl-Z does not, because it would leave the robot moving."""
 
-    def __init__(self) -> None:
-        """Raises ConfigError when stdin is no terminal."""
+    def __init__(
+        self, wanted: str = "teleop reads keys, and stdin is no terminal; start it in one, or give --joystick"
+    ) -> None:
+        """Raises ConfigError, with what is wanted, when stdin is no terminal."""
         self._handle = sys.stdin.fileno()
         if not os.isatty(self._handle):
-            raise ConfigError("teleop reads keys, and stdin is no terminal; start it in one, or give --joystick")
+            raise ConfigError(wanted)
         self._before = termios.tcgetattr(self._handle)
         self.gone = False  # the terminal was closed
 

@@ -1,0 +1,108 @@
+"""`snakesim joints jog` on a robot that nobody checked, from a terminal whose key is held, let go, or lost."""
+
+import json
+import os
+import pty
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from snakesim_hal.model.files import SHIPPED
+from tests.contract.workbench import text_of_the_example
+from tests.e2e.command import SNAKESIM, environment, snakesim
+from tests.e2e.test_by_hand import JOINTS, SCENARIO
+from tests.harness.endpoint import free_endpoint
+from tests.harness.wait import wait_until
+
+REPEAT_S = 0.03  # of a key
+UP = b"\x1b[A"
+TOLD = """
+
+import json
+from pathlib import Path
+
+
+class Told(Workbench):
+    \"\"\"What it is told stands in a file.\"\"\"
+
+    ticks = 0
+
+    def enact(self, set_points, lifecycle):
+        super().enact(set_points, lifecycle)
+        self.ticks += 1
+        told = {"tick": self.ticks, "lifecycle": lifecycle, "mode": set_points.mode, "target": set_points.target}
+        Path("new.json").write_text(json.dumps({**told, "limit_nm": set_points.torque_limit_nm}))
+        Path("new.json").replace("told.json")
+"""
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Path:
+    shipped = (SHIPPED / "robots" / "planar13.toml").read_text()
+    (tmp_path / "snake.toml").write_text(shipped.replace("modules = 13", f"modules = {JOINTS}"))
+    (tmp_path / "bench.toml").write_text(SCENARIO)
+    real = text_of_the_example().replace("emulated=True", "emulated=False")
+    (tmp_path / "told.py").write_text(real + TOLD)
+    return tmp_path
+
+
+@contextmanager
+def host(home: Path) -> Iterator[str]:
+    endpoint = free_endpoint()
+    program = [*SNAKESIM, "host", "bench.toml", "--backend", "./told.py:Told", "--endpoint", endpoint]
+    with subprocess.Popen(program, cwd=home, env=environment(home), stdin=subprocess.DEVNULL) as process:
+        try:
+            wait_until(lambda: snakesim("status", "--endpoint", endpoint, cwd=home).code == 0, "the host")
+            yield endpoint
+        finally:
+            process.terminate()
+
+
+@contextmanager
+def jogging(home: Path, endpoint: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
+    """The command, once it is armed, and the other end of its terminal."""
+    ours, theirs = pty.openpty()
+    words = [*SNAKESIM, "joints", "jog", "snake.toml", "joint_2", "--endpoint", endpoint]
+    with subprocess.Popen(
+        words, cwd=home, env=environment(home), stdin=theirs, stdout=subprocess.PIPE, text=True
+    ) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline().startswith("joint_2: from ")
+            yield process, ours
+        finally:
+            process.kill()
+            os.close(ours)
+            os.close(theirs)
+
+
+def told(home: Path) -> dict[str, Any]:
+    return json.loads((home / "told.json").read_text())
+
+
+def test_it_moves_while_the_key_repeats_and_only_that_joint(home: Path) -> None:
+    with host(home) as endpoint:
+        with jogging(home, endpoint) as (process, terminal):
+            wait_until(lambda: told(home)["mode"] == [0, 1, 0, 0], "one joint with current")
+            assert told(home)["limit_nm"][1] == pytest.approx(0.3 * 7.0)
+            before = told(home)["target"][1]
+            while told(home)["target"][1] < before + 0.04:
+                os.write(terminal, UP)
+                time.sleep(REPEAT_S)
+            let_go = told(home)["tick"]
+            wait_until(lambda: told(home)["tick"] > let_go + 25, "half a second")
+            stopped = told(home)["target"][1]
+            wait_until(lambda: told(home)["tick"] > let_go + 50, "another half second")
+            assert told(home)["target"][1] == stopped and told(home)["lifecycle"] == "armed"
+            os.write(terminal, b"q")
+            assert process.wait(20) == 0
+        wait_until(lambda: told(home)["lifecycle"] == "disarmed", "the end of it")
+        with jogging(home, endpoint) as (process, _terminal):
+            wait_until(lambda: told(home)["lifecycle"] == "armed", "armed again")
+            process.kill()
+            wait_until(lambda: told(home)["lifecycle"] == "fault", "a stop after the terminal is lost")
