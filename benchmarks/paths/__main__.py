@@ -27,7 +27,7 @@ from benchmarks.paths.ways import Lab, Way
 from benchmarks.physics import config_of, wire_bytes
 from snakesim_hal.network.private_channel import StarterEnd, socket_pair
 from snakesim_hal.record.host_record import HostRecord
-from snakesim_hal.wire.messages import LifecycleRequest
+from snakesim_hal.wire.messages import request_to_arm
 
 LOOP = Path(__file__).parents[1] / "peers" / "loop.toml"
 RESULTS = Path(__file__).parents[1] / "PATHS.md"
@@ -81,8 +81,7 @@ def arm(channel: StarterEnd, host: subprocess.Popen[bytes], seconds: float) -> N
         channel.take_in()
         robot, status = channel.description, channel.status
         if robot is not None and status is not None and status.ready_to_arm and not asked:
-            named = {"robot": robot.robot, "backend": robot.backend, "config_hash": robot.config_hash}
-            channel.ask(LifecycleRequest(action="arm", who="paths", host=robot.host, **named))
+            channel.ask(request_to_arm(robot, "paths"))
             asked = True
         if time.monotonic() > deadline:
             raise TimeoutError(f"not done: {status and status.why}")

@@ -209,7 +209,7 @@ def _fused(moved: Moved) -> Floats:
     half = max(round(SLOW_S / moved.period_s), 1)
     bell = np.hanning(2 * half + 1)
     apart = np.pad(moved.angle_rad - turned, half, mode="reflect", reflect_type="odd")
-    return turned + np.convolve(apart, bell / bell.sum(), "valid")
+    return np.asarray(turned + np.convolve(apart, bell / bell.sum(), "valid"), dtype=np.float64)
 
 
 def _behind(moved: Moved, angle_rad: Floats, late_s: float, lag_s: float) -> Floats:
