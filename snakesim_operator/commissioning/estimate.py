@@ -208,8 +208,8 @@ def _fused(moved: Moved) -> Floats:
     turned = np.concatenate(([0.0], np.cumsum(turns)))
     half = max(round(SLOW_S / moved.period_s), 1)
     bell = np.hanning(2 * half + 1)
-    apart = np.pad(moved.angle_rad - turned, half, mode="reflect", reflect_type="odd")
-    return np.asarray(turned + np.convolve(apart, bell / bell.sum(), "valid"), dtype=np.float64)
+    apart: Floats = np.pad(moved.angle_rad - turned, half, mode="reflect", reflect_type="odd")
+    return turned + _filtered(apart, bell / bell.sum())
 
 
 def _behind(moved: Moved, angle_rad: Floats, late_s: float, lag_s: float) -> Floats:
