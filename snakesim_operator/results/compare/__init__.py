@@ -3,7 +3,8 @@
 `compare`   loads two run folders, prints the table, writes the page: the command
 `differ`    the numbers alone, without any file
 
-`alignment` puts both on one time axis, `difference` works the numbers out, `settings` finds what was asked differently;
+`alignment` puts both on one time axis, `difference` works the numbers out, `following` lag and gain of each joint,
+`settings` finds what was asked differently;
 `table` prints, `figures` and `page` draw with the parts of `snakesim_operator.results.report`. Imports the HAL only.
 """
 

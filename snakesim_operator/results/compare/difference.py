@@ -12,6 +12,7 @@ from snakesim_hal.errors import ConfigError
 from snakesim_hal.record.host_record import BLACK_BOX
 from snakesim_hal.wire.messages import Mode
 from snakesim_operator.results.compare.alignment import SAME_INSTANT_S, Aligned, Joints, align
+from snakesim_operator.results.compare.following import Following, following
 from snakesim_operator.results.compare.settings import Setting, differences, identity
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report.timeline import Series, distance, propulsion_intervals, reported_distance
@@ -138,6 +139,7 @@ class Difference:
     compared: list[Setting]
     settings: list[Setting]  # that differ
     advance: Advance | None
+    following: list[Following | None]  # of every joint's angle in B, that in A
     angle: Gap
     speed: Gap
     torque: Gap
@@ -186,6 +188,7 @@ def differ(a: RunRecord, b: RunRecord, apart_rad: float = APART_RAD) -> Differen
         compared=identity(a, b),
         settings=differences(a, b),
         advance=_advance(a, b, until_s),
+        following=[following(time_s, *pair) for pair in zip(on_a.angle_rad.T, on_b.angle_rad.T, strict=True)],
         angle=angle,
         speed=_gap("speed", "rad/s", time_s, on_a.velocity_rad_s, on_b.velocity_rad_s),
         torque=_gap("torque", "N·m", time_s, on_a.torque_nm, on_b.torque_nm),

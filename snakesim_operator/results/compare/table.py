@@ -2,6 +2,8 @@
 
 from typing import Any
 
+import numpy as np
+
 from snakesim_operator.results.compare.difference import Difference, Gap, order
 from snakesim_operator.results.compare.settings import Setting
 from snakesim_operator.results.compare.verdict import SAME, relation, sentences
@@ -26,6 +28,8 @@ def table(difference: Difference) -> list[str]:
         f"  {'B - A':<{NAME}}{'RMS':<{VALUE}}{'worst':<{VALUE}}where and when",
         *(_gap(gap, difference.joints) for gap in difference.gaps),
         *_beside(difference),
+        "",
+        *_by_joint(difference),
         "",
         *sentences(difference),
     ]
@@ -53,6 +57,15 @@ def for_scripts(difference: Difference) -> dict[str, Any]:
             }
             for gap in difference.gaps
         ],
+        "by_joint": {
+            name: {
+                "angle_rms_rad": None if np.isnan(rms) else float(rms),
+                "lag_s": None if fit is None else fit.lag_s,
+                "gain": None if fit is None else fit.gain,
+                "left_rad": None if fit is None else fit.left,
+            }
+            for name, rms, fit in zip(names, difference.angle.joint_rms, difference.following, strict=True)
+        },
         "parted": None if parted is None else {"joint": names[parted.joint], "time_s": parted.time_s},
         "hand_overs": {
             run: [{"joint": names[one.joint], "time_s": one.time_s} for one in order_of]
@@ -128,6 +141,18 @@ def _gap(gap: Gap, joints: list[str]) -> str:
     where = f"{joints[worst.joint]} at {worst.time_s:.2f} s, A {worst.a:+.3f}, B {worst.b:+.3f}"
     rms, most = f"{gap.rms:.4f} {gap.unit}", f"{worst.difference:+.4f} {gap.unit}"
     return f"  {gap.what:<{NAME}}{rms:<{VALUE}}{most:<{VALUE}}{where}"
+
+
+def _by_joint(difference: Difference) -> list[str]:
+    """How B's angle follows A's, joint by joint."""
+    lines = [f"  {'angle by joint':<{NAME}}{'RMS of B - A':<{VALUE}}{'B later by':<{VALUE}}{'gain, and RMS left'}"]
+    for name, rms, fit in zip(difference.joints, difference.angle.joint_rms, difference.following, strict=True):
+        apart = "unknown" if np.isnan(rms) else f"{rms:.5f} rad"
+        lag, rest = (
+            ("unknown", "") if fit is None else (f"{1000 * fit.lag_s:+.2f} ms", f"{fit.gain:.4f}, {fit.left:.5f} rad")
+        )
+        lines.append(f"  {name:<{NAME}}{apart:<{VALUE}}{lag:<{VALUE}}{rest}")
+    return lines
 
 
 def _beside(difference: Difference) -> list[str]:
