@@ -22,6 +22,7 @@ USB_LATENCY_S = 0.001  # of an adapter whose driver does not say it: a frame of 
 PEER_LIMIT_S = 5.0  # in which a pseudo terminal hands on what was written
 REOPEN_EVERY_S = 0.5
 READ_BYTES = 4096
+WRITE_LIMIT_S = 1.0
 GONE = select.POLLHUP | select.POLLERR | select.POLLNVAL
 IO_ERRORS = (OSError, termios.error, ValueError)  # of pyserial and of `select`, on a port that has gone
 
@@ -111,6 +112,9 @@ class SerialWire:
         self._note("out", data)
         try:
             self._serial.write(data)
+        except serial.SerialTimeoutException:  # pyserial says it also of what it has written, after a long pause
+            if self._pty is None:
+                return
         except IO_ERRORS:
             self._lose()
             return
@@ -166,7 +170,7 @@ class SerialWire:
     # --- inside -----------------------------------------------------------------------------------------------
 
     def _open(self) -> serial.Serial:
-        opened = serial.Serial(self.port, self.baud, timeout=0, write_timeout=0.1, exclusive=True)
+        opened = serial.Serial(self.port, self.baud, timeout=0, write_timeout=WRITE_LIMIT_S, exclusive=True)
         with contextlib.suppress(*IO_ERRORS):  # pseudo terminals and some adapters have no such thing
             opened.set_low_latency_mode(True)
         return opened

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+import serial
 
 from snakesim_hal.errors import BackendError, ConfigError
 from snakesim_serial_backend.wire import USB_LATENCY_S, Pty, SerialWire, latency_s
@@ -56,3 +57,23 @@ def test_an_adapter_that_is_pulled_is_said_and_no_exception() -> None:
 def test_a_port_that_is_not_there_is_named() -> None:
     with pytest.raises(ConfigError, match="port '/dev/ttyUSB77': there is none; plug the adapter in"):
         SerialWire("/dev/ttyUSB77", 57600)
+
+
+def test_a_computer_that_pauses_in_a_write_has_not_lost_its_port(monkeypatch: pytest.MonkeyPatch) -> None:
+    pty = Pty()
+    wire = SerialWire(pty.path, 1_000_000)
+    write = serial.Serial.write
+
+    def pauses(port: serial.Serial, data: bytes) -> None:
+        write(port, data)
+        raise serial.SerialTimeoutException("Write timeout")
+
+    monkeypatch.setattr(serial.Serial, "write", pauses)
+    wire.send(b"hello?")
+    assert wire.error() == ""
+    monkeypatch.undo()
+    wire.send(b"again")
+    pty.due = len(b"hello?again")
+    assert pty.take() == b"hello?again"
+    wire.close()
+    pty.close()
