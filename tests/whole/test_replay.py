@@ -31,7 +31,8 @@ def test_every_shipped_scenario_replays_to_the_bit(tmp_path: Path, scenario: str
     ended = snakesim(*run, cwd=tmp_path)
     assert ended.code == 0, ended.out + ended.err
     replayed = snakesim("replay", "run", "--control", cwd=tmp_path)
-    assert replayed.code == 0 and replayed.out == f"{round(DURATION_S * 100)} commands, the same to the bit\n"
+    ticks = round(DURATION_S * load(scenario).config.rate_hz)
+    assert replayed.code == 0 and replayed.out == f"{ticks} commands, the same to the bit\n"
 
 
 def test_the_replay_of_the_same_is_the_same_run(recorded: Path, tmp_path: Path) -> None:
