@@ -25,6 +25,7 @@ LOOKS_AHEAD = (
     'robot.sensors.range=[{name="front", beams=9, view_rad=2.0}]',
     f'robot.sensors.own=[{{name="whisker", model="{WHISKER}:WhiskerModel"}}]',
 )
+AS_ANOTHER = ("moteus", "sim-position")  # ODrive has the same kit, Dynamixel no velocity mode
 POSITION_ONLY = ('robot.drive.modes=["position"]', "robot.drive.measures=[]")
 ON_VCAN = ('backend.channels=["vcan0"]', 'backend.twins="process"')
 
@@ -48,6 +49,8 @@ def pytest_snakesim_benches() -> list[Bench]:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Only clauses that depend on what the bench is for: the camera, the bus. All are for `make test-all`."""
     for item in items:
+        if any(f"[{bench}" in item.name for bench in AS_ANOTHER):
+            item.add_marker(pytest.mark.slow)
         if "sim-camera" in item.name and not any(words in item.name for words in OF_SENSORS):
             item.add_marker(pytest.mark.slow)
     if os.environ.get(VCAN) != "guest":

@@ -64,6 +64,7 @@ def moves(home: Path, out: str, *words: str) -> bool:
     return run(home, out, "--duration", "0.1", *words).code == 0
 
 
+@pytest.mark.slow
 def test_a_checked_robot_is_armed_until_its_file_or_a_drive_changes(home: Path) -> None:
     refused = run(home, "never", "--duration", "0.1")
     assert refused.code == 1 and "nobody has checked that its joints are as its file says" in refused.out

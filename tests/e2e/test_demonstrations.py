@@ -107,6 +107,7 @@ def test_episodes_keep_what_was_said_of_them(demos: Path) -> None:
     assert "operator/intent" in info.out and "sensor/depth/head" in info.out, info.said
 
 
+@pytest.mark.slow
 def test_demonstrations_make_a_dataset_with_pictures(demos: Path, tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `export`")
     given = ("export", str(demos / "demos"), "--format", "lerobot", "--images")

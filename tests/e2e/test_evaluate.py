@@ -136,6 +136,7 @@ def test_it_can_be_repeated(home: Path, undisturbed: tuple[Ended, Path]) -> None
     assert fields == [1] * 4 + [2] * 4, "cut short, it would have as many fields in each row"
 
 
+@pytest.mark.slow
 def test_killed_it_leaves_nobody_behind_and_goes_on(home: Path, undisturbed: tuple[Ended, Path]) -> None:
     out = home / "killed"
     command = [*SNAKESIM, "evaluate", "./quick.toml", "--workers", "2", "--out", str(out)]
@@ -225,6 +226,7 @@ def test_a_sweep_runs_every_value(home: Path) -> None:
     assert not re.findall("goal|crossed", ended.out + page), "a scenario without a goal"
 
 
+@pytest.mark.slow
 def test_a_search_goes_on_where_it_ended(home: Path) -> None:
     given = ["optimise", "peg_row", "--set", "duration_s=0.5", "--vary", "control.propulsion_n=5:40"]
     given += ["--goal", "path_distance_m", "--storage", "search.db", "--workers", "2"]
