@@ -87,11 +87,12 @@ def _leave(files: RunFiles, ending: Ending, outcome: Outcome, host: HostRecord) 
     except ConfigError as error:
         _print_host(host)
         return [*unwritten(host), str(error)], ""
+    lacks = [*unwritten(record.host), *record.unreached]
     if not extras.has("report"):
-        return [*unwritten(record.host), *record.unreached], ""
+        return lacks, ""
     from snakesim_operator.results.report.verdict import verdict
 
-    return [*unwritten(record.host), *record.unreached], verdict(record, summary).words
+    return lacks, verdict(record, summary).words
 
 
 def leave(

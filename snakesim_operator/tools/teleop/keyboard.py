@@ -17,9 +17,7 @@ WANTED = "teleop reads keys, and stdin is no terminal; start it in one, or give 
 class Keyboard:
     """stdin, a key at a time, without echo. Ctrl-C works; Ctrl-Z does not, because it would leave the robot moving."""
 
-    def __init__(
-        self, wanted: str = "teleop reads keys, and stdin is no terminal; start it in one, or give --joystick"
-    ) -> None:
+    def __init__(self, wanted: str = WANTED) -> None:
         """Raises ConfigError, with what is wanted, when stdin is no terminal."""
         self._handle = sys.stdin.fileno()
         if not os.isatty(self._handle):
