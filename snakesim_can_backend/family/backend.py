@@ -14,12 +14,9 @@ from snakesim_can_backend.family.drives import CanDrives
 from snakesim_can_backend.family.traffic import Load, Traffic, load_of
 from snakesim_can_backend.family.twin import CanTwin
 from snakesim_hal.drivers.drive_backend import Clock, DriveBackend
-from snakesim_hal.drivers.drive_settings import DriveSettings, answer_limit_s, check_settings, port_of, who
+from snakesim_hal.drivers.drive_settings import DriveSettings, answer_limit_s, body_of, check_settings, port_of, who
 from snakesim_hal.drivers.mocap import receiver
-from snakesim_hal.drivers.mocap_twin import PoseSender
-from snakesim_hal.drivers.mounted import as_built
 from snakesim_hal.drivers.readings import Readings
-from snakesim_hal.drivers.twin_body import TwinBody, make_plant
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.injection import KINDS
 from snakesim_hal.model.joints import Joint
@@ -103,8 +100,7 @@ class CanDriveBackend(DriveBackend):
         cls, config: RunConfig, settings: Any, wires: Sequence[Wire], clock: Clock, pose: str | None
     ) -> CanTwin:
         """Emulated drives of a whole robot."""
-        plant = make_plant(as_built(config, settings.mounted), cls.name, settings.plant, settings.plant_settings)
-        body = TwinBody(config, plant, settings.mounted, PoseSender(pose) if pose else None)
+        body = body_of(config, settings, cls.name, pose)
         return cls.twin(config, settings, body, [wires[bus] for bus in port_of(config, settings.channels)], clock.ns)
 
     def __init__(self, config: RunConfig, settings: Any) -> None:

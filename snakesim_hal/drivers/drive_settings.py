@@ -6,8 +6,9 @@ from typing import Annotated, Any
 from msgspec import Meta
 
 from snakesim_hal.drivers.mocap import check_pose
-from snakesim_hal.drivers.mounted import Mounted, check_mounted
-from snakesim_hal.drivers.twin_body import FAULTS
+from snakesim_hal.drivers.mocap_twin import PoseSender
+from snakesim_hal.drivers.mounted import Mounted, as_built, check_mounted
+from snakesim_hal.drivers.twin_body import FAULTS, TwinBody, make_plant
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.fault_plan import check_backend_can
 from snakesim_hal.model.files import FileStruct
@@ -28,6 +29,12 @@ class DriveSettings(FileStruct, frozen=True, kw_only=True):
     plant: str = "mujoco"  # body of emulated drives: an entry point in the group `snakesim.plants`
     plant_settings: dict[str, Any] = {}
     mounted: dict[str, Mounted] = {}  # of emulated drives: joint -> how it is mounted in truth
+
+
+def body_of(config: RunConfig, settings: DriveSettings, backend: str, pose: str | None) -> TwinBody:
+    """What emulated drives move. pose: where its motion capture sends, HOST:PORT. Raises ConfigError."""
+    plant = make_plant(as_built(config, settings.mounted), backend, settings.plant, settings.plant_settings)
+    return TwinBody(config, plant, settings.mounted, PoseSender(pose) if pose else None)
 
 
 def check_settings(

@@ -4,12 +4,9 @@ from pathlib import Path
 from typing import TextIO
 
 from snakesim_hal.drivers.drive_backend import Clock, DriveBackend
-from snakesim_hal.drivers.drive_settings import answer_limit_s, check_settings, port_of, who
+from snakesim_hal.drivers.drive_settings import answer_limit_s, body_of, check_settings, port_of, who
 from snakesim_hal.drivers.mocap import receiver
-from snakesim_hal.drivers.mocap_twin import PoseSender
-from snakesim_hal.drivers.mounted import as_built
 from snakesim_hal.drivers.readings import Readings
-from snakesim_hal.drivers.twin_body import TwinBody, make_plant
 from snakesim_hal.errors import BackendError, ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
@@ -137,8 +134,7 @@ def twin_on(
     config: RunConfig, settings: DynamixelSettings, ptys: list[Pty], clock: Clock, pose: str | None
 ) -> DynamixelTwin:
     """Emulated servos of a whole robot."""
-    plant = make_plant(as_built(config, settings.mounted), NAME, settings.plant, settings.plant_settings)
-    body = TwinBody(config, plant, settings.mounted, PoseSender(pose) if pose else None)
+    body = body_of(config, settings, NAME, pose)
     each = [ptys[bus] for bus in port_of(config, settings.ports)]
     constants = [constant_of(joint) for joint in config.robot.joint_table]
     return DynamixelTwin(body, each, constants, settings.baud, clock.ns)
