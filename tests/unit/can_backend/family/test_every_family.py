@@ -13,10 +13,8 @@ from snakesim_can_backend.moteus.backend import MoteusBackend
 from snakesim_can_backend.moteus.protocol import Mode as MoteusMode
 from snakesim_can_backend.odrive.backend import OdriveBackend
 from snakesim_can_backend.odrive.protocol import State
-from snakesim_hal.backend import SetPoints
 from snakesim_hal.errors import BackendError, ConfigError
-from snakesim_hal.injection import parse
-from snakesim_hal.wire.messages import Fault, JointState, LifecycleState, Mode
+from tests.unit.hal.drive_rig import DriveRig
 from tests.unit.hal.rig import run_config
 
 JOINTS = 4
@@ -58,16 +56,14 @@ FAMILIES = {
 }
 
 
-class Robot:
-    """A backend and its drives, tick by tick."""
+class Robot(DriveRig):
+    """A backend of a family, and its drives."""
 
     def __init__(self, family: Family, **settings: Any) -> None:
         self.family = family
-        self.config = run_config(backend=family.backend.name, robot__chain__modules=JOINTS, rate_hz=100)
+        config = run_config(backend=family.backend.name, robot__chain__modules=JOINTS, rate_hz=100)
         fixed: dict[str, Any] = {"plant": "inertia", "bring_up_limit_s": 0.5}
-        self.backend = family.backend(self.config, family.backend.Settings(**fixed | settings))
-        self.tick, self.isolated = 0, frozenset[int]()
-        self.joints: JointState | None = None
+        super().__init__(config, family.backend(config, family.backend.Settings(**fixed | settings)))
 
     @property
     def twin(self) -> Any:
@@ -75,24 +71,6 @@ class Robot:
 
     def following(self) -> list[bool]:
         return [self.family.follows(drive) for drive in self.family.drives(self.twin)]
-
-    def run(self, ticks: int, lifecycle: LifecycleState) -> list[Fault]:
-        """So many periods; a fault latches, as in the host."""
-        found: list[Fault] = []
-        for _ in range(ticks):
-            self.joints = self.backend.sample(self.tick, self.tick * self.config.period_ns).joints
-            modes = [Mode.POSITION if lifecycle == "armed" else Mode.PASSIVE] * JOINTS
-            points = SetPoints(modes, [0.1] * JOINTS, [1.0] * JOINTS, self.isolated)
-            self.backend.enact(points, lifecycle)
-            self.backend.advance()
-            found += self.backend.faults()
-            if found and lifecycle in ("armed", "disarmed"):
-                lifecycle = "fault"
-            self.tick += 1
-        return found
-
-    def go_wrong(self, text: str, *, begins: bool = True) -> None:
-        assert self.backend.inject(parse(text), begins=begins)
 
 
 @pytest.fixture(params=FAMILIES.values(), ids=list(FAMILIES))

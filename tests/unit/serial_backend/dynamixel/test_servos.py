@@ -6,15 +6,14 @@ from typing import Any
 
 import pytest
 
-from snakesim_hal.backend import SetPoints
 from snakesim_hal.drivers.mounted import Mounted
 from snakesim_hal.errors import BackendError, ConfigError
-from snakesim_hal.injection import parse
-from snakesim_hal.wire.messages import Fault, JointState, LifecycleState, Mode
+from snakesim_hal.wire.messages import Mode
 from snakesim_serial_backend.dynamixel import registers as at
 from snakesim_serial_backend.dynamixel.backend import DynamixelBackend
 from snakesim_serial_backend.dynamixel.settings import DynamixelSettings
 from snakesim_serial_backend.dynamixel.twin import DynamixelTwin
+from tests.unit.hal.drive_rig import DriveRig
 from tests.unit.hal.rig import run_config
 
 JOINTS = 4
@@ -22,39 +21,19 @@ NOTICED = 10  # ticks in which a fault shows: each servo says its health every f
 BOOTED = 60
 
 
-class Robot:
-    """A backend and its servos, tick by tick."""
+class Robot(DriveRig):
+    """The backend and its servos."""
 
     def __init__(self, settings: DynamixelSettings | None = None, **dotted: Any) -> None:
-        self.config = run_config(backend="dynamixel", robot__chain__modules=JOINTS, rate_hz=100, **dotted)
+        config = run_config(backend="dynamixel", robot__chain__modules=JOINTS, rate_hz=100, **dotted)
         settings = settings or DynamixelSettings(plant="inertia", bring_up_limit_s=0.5)
-        self.backend = DynamixelBackend(self.config, settings)
-        self.tick, self.isolated = 0, frozenset[int]()
-        self.mode, self.target = Mode.POSITION, 0.1
-        self.joints: JointState | None = None
+        super().__init__(config, DynamixelBackend(config, settings))
 
     @property
     def twin(self) -> DynamixelTwin:
         twin = getattr(self.backend._drives, "_twin", None)
         assert isinstance(twin, DynamixelTwin)
         return twin
-
-    def run(self, ticks: int, lifecycle: LifecycleState) -> list[Fault]:
-        """So many periods; a fault latches, as in the host."""
-        found: list[Fault] = []
-        for _ in range(ticks):
-            self.joints = self.backend.sample(self.tick, self.tick * self.config.period_ns).joints
-            modes = [self.mode if lifecycle == "armed" else Mode.PASSIVE] * JOINTS
-            self.backend.enact(SetPoints(modes, [self.target] * JOINTS, [1.0] * JOINTS, self.isolated), lifecycle)
-            self.backend.advance()
-            found += self.backend.faults()
-            if found and lifecycle in ("armed", "disarmed"):
-                lifecycle = "fault"
-            self.tick += 1
-        return found
-
-    def go_wrong(self, text: str, *, begins: bool = True) -> None:
-        assert self.backend.inject(parse(text), begins=begins)
 
 
 @pytest.fixture

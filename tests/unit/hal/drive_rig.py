@@ -1,0 +1,36 @@
+"""A driver and emulated drives, tick by tick in lockstep, with the robot's lifecycle as the host has it."""
+
+from snakesim_hal.backend import SetPoints
+from snakesim_hal.drivers.drive_backend import DriveBackend
+from snakesim_hal.injection import parse
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.wire.messages import Fault, JointState, LifecycleState, Mode
+
+
+class DriveRig:
+    """While armed, every joint has the same set-point; otherwise all are passive."""
+
+    def __init__(self, config: RunConfig, backend: DriveBackend) -> None:
+        self.config, self.backend = config, backend
+        self.tick, self.isolated = 0, frozenset[int]()
+        self.mode, self.target = Mode.POSITION, 0.1
+        self.joints: JointState | None = None
+
+    def run(self, ticks: int, lifecycle: LifecycleState) -> list[Fault]:
+        """So many periods; a fault latches, as in the host."""
+        found: list[Fault] = []
+        for _ in range(ticks):
+            self.joints = self.backend.sample(self.tick, self.tick * self.config.period_ns).joints
+            count = len(self.joints.angle_rad)
+            modes = [self.mode if lifecycle == "armed" else Mode.PASSIVE] * count
+            self.backend.enact(SetPoints(modes, [self.target] * count, [1.0] * count, self.isolated), lifecycle)
+            self.backend.advance()
+            found += self.backend.faults()
+            if found and lifecycle in ("armed", "disarmed"):
+                lifecycle = "fault"
+            self.tick += 1
+        return found
+
+    def go_wrong(self, text: str, *, begins: bool = True) -> None:
+        """Begin or end a fault, such as `mute:joint_2@0-9`."""
+        assert self.backend.inject(parse(text), begins=begins)
