@@ -18,7 +18,7 @@ from snakesim_hal.backend import SetPoints
 from snakesim_hal.errors import ConfigError, RefusedError
 from snakesim_hal.network.commanding import Commanding
 from snakesim_hal.network.session import Link, Session, open_session
-from snakesim_hal.process import on_stop_signal, user_name
+from snakesim_hal.process import SERVICE_PRIORITY, on_stop_signal, set_realtime_priority, user_name
 from snakesim_hal.terminal import say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (
@@ -99,6 +99,7 @@ def jog(path: Path, where: RobotSelection, request: JogRequest) -> int:
     """Until q, Ctrl-C, or the terminal is gone. Returns 0. Raises SnakesimError."""
     keyboard = Keyboard("joints jog reads keys, and stdin is no terminal; start it in one")
     link = only_robot(where, "joints jog")
+    set_realtime_priority(SERVICE_PRIORITY)  # where it is allowed: a command that is late ends the lease
     with open_session(link, CONNECT_S) as session:
         names = [joint.name for joint in running_joints(session, path)]
         if request.joint not in names:
