@@ -37,7 +37,8 @@ PREFERENCE = (
 )
 STATE_IN_SIGHT = (  # of `texts.header`: what is below is scrolled behind it
     b"<style>div:has(> [data-robot]) {position: sticky; top: 0; z-index: 5; background: var(--mantine-color-body);"
-    b" padding-top: 2px} div:has(> div > div > div > [data-robot]) {overflow: clip !important}</style>"
+    b" padding-top: 2px} div:has(> div > div > div > [data-robot]) {overflow: clip !important; min-width: 0}"
+    b' @media (max-width: 480px) {div[style*="width: 20em"] {width: 100% !important}}</style>'  # a phone's panel
 )
 Answer = Callable[[ServerConnection, Request], Response | None]
 More = Callable[[Request], Response | None]

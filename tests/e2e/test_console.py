@@ -8,12 +8,14 @@ from pathlib import Path
 
 import pytest
 
+from snakesim_hal.model.scenario import load
 from snakesim_hal.network.session import Link, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlSettings, JointState, Status
 from snakesim_operator.console.operations import Log
 from snakesim_operator.console.page import Page
 from snakesim_operator.console.server import page_server
+from snakesim_operator.console.snapshot import expected_of
 from snakesim_operator.console_port import open_port
 from tests.browser import CHROMIUM, MISSING, Tab, chromium
 from tests.e2e.command import Running, running
@@ -29,6 +31,9 @@ COAST_LIMIT_S = 2.0  # of robot time, until joints without torque are at rest
 SMALL = 800, 400, 0.25  # width, height, pixels a dot: the browser draws without a graphics card here
 LOOK = "document.documentElement.dataset.mantineColorScheme"
 STATE_TOP = "document.querySelector('[data-robot]').getBoundingClientRect().top"
+PANEL_WIDTHS = (
+    "(panel => [panel.scrollWidth, panel.clientWidth])(document.querySelector('[class*=ScrollArea-viewport]'))"
+)
 GROUND = {"x": 0, "y": 200, "width": 370, "height": 200, "scale": 1}  # of the page: scene without notices
 
 
@@ -72,6 +77,18 @@ def test_a_page_is_dark_if_its_browser_prefers_that_until_the_viewer_chooses() -
             wait_until(lambda prefers=prefers: page.value(LOOK) == prefers, f"a {prefers} page")
         page.click("Dark page")
         wait_until(lambda: page.value(LOOK) == "light", "the viewer's choice")
+
+
+def test_a_phone_shows_all_tabs_without_scrolling_aside_and_the_second_stop_above_the_panel() -> None:
+    config = load("triplet").config
+    with page_server(open_port(None), stop=lambda: "stopped") as (server, address), chromium() as browser:
+        Page(server, None, None, Log(), recorded="a run").show(expected_of(config))
+        page = browser.open(address, 400, 800, 0.5)
+        page.wait_for("planar13")
+        for tab in ("Joints", "State", "Signals", "Log"):
+            page.click(tab)
+            wait_until(lambda: page.value(PANEL_WIDTHS) == [400, 400], f"a panel as wide as the phone in tab {tab}")
+        assert page.value("document.querySelector('#second-stop').getBoundingClientRect().bottom") < 100
 
 
 @pytest.mark.slow
