@@ -107,6 +107,7 @@ def background(*command: str, home: Path) -> Iterator[subprocess.Popen[bytes]]:
         process.wait(10)
 
 
+@pytest.mark.slow
 def test_a_part_of_it_pairs_with_the_card_of_another(home: Path, undisturbed: tuple[Ended, Path]) -> None:
     ended = evaluate(home, "part", "--rows", "2", "--controller", "hold", "--against", str(undisturbed[1]))
     assert ended.code == 0, ended.out + ended.err

@@ -42,7 +42,7 @@ def _stands(said: ControlState | World) -> bool:
 
 
 def test_processes_and_one_process_drive_the_motors_alike(tmp_path: Path) -> None:
-    same_both_ways(tmp_path / "run", "clutter", "--duration", "1")  # camera, map and planner too
+    same_both_ways(tmp_path / "run", "clutter", "--duration", "0.5")  # camera, map and planner too
 
 
 @pytest.mark.slow

@@ -24,7 +24,7 @@ def plain() -> RunSummary:
     ("backend", "others"),
     [
         ("odrive", ["joint_7.gear=2"]),
-        ("moteus", ["joint_7.gear=2"]),
+        pytest.param("moteus", ["joint_7.gear=2"], marks=pytest.mark.slow),
         ("dynamixel", []),
     ],  # a servo that forgets its turns has no room for the gear
 )

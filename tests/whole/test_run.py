@@ -23,6 +23,7 @@ def test_control_experiments_stay_where_they_are(tmp_path: Path, arguments: list
     assert summary.net_displacement_m is not None and summary.net_displacement_m < 0.02
 
 
+@pytest.mark.slow  # tests/e2e/test_computers.py holds the digests of shipped scenarios
 def test_one_seed_one_digest(tmp_path: Path) -> None:
     def digest(name: str, seed: int) -> str:
         return run_to_summary(tmp_path / name, "triplet", "--duration", "1", "--seed", str(seed))[1].command_digest
@@ -54,6 +55,7 @@ def test_a_jam_is_reported_as_such(tmp_path: Path) -> None:
     assert "jam" in ended.out.lower()
 
 
+@pytest.mark.slow  # mamba_flat is among the digests
 def test_another_robot_in_another_world(tmp_path: Path) -> None:
     ended, summary = run_to_summary(tmp_path / "run", "mamba_hills")
     assert ended.code == 0, ended.out + ended.err
@@ -74,6 +76,7 @@ def test_run_from_a_file_of_ones_own_in_another_folder(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "report.html").is_file()
 
 
+@pytest.mark.slow  # tests/e2e/test_run.py has it in processes
 def test_a_run_may_end_with_its_mission(tmp_path: Path) -> None:
     short = ["--until-goal", "--set", "mission.goal.distance_m=0.4", "--duration", "6"]
     ended, summary = run_to_summary(tmp_path / "run", "surveyed_clutter", *short)

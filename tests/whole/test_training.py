@@ -37,6 +37,7 @@ def test_a_search_leaves_a_policy_and_its_learning_curve(trained: Path) -> None:
     assert set(json.loads(told["snakesim.learned"])) == set(FORMS["feeling"])
 
 
+@pytest.mark.slow
 def test_the_number_of_processes_changes_nothing(trained: Path, tmp_path: Path) -> None:
     main(["train", "surveyed_clutter", *SMALL, "--workers", "1", "--out", str(tmp_path / "one")])
     for name in ("policy.onnx", "curve.csv"):
