@@ -84,19 +84,9 @@ def test_a_check_of_the_lab_marks_such_a_key(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("most_mb", [20, 30, 40, 100])
 def test_too_little_memory_is_one_line(tmp_path: Path, most_mb: int) -> None:
+    typed = [*SNAKESIM, "deploy", "certs", str(EXAMPLE), "--out", str(tmp_path / "lab")]
     ended = subprocess.run(
-        [
-            "sh",
-            "-c",
-            f'ulimit -v {most_mb * 1024}; exec "$@"',
-            "sh",
-            *SNAKESIM,
-            "deploy",
-            "certs",
-            str(EXAMPLE),
-            "--out",
-            str(tmp_path / "lab"),
-        ],
+        ["sh", "-c", f'ulimit -v {most_mb * 1024}; exec "$@"', "sh", *typed],
         env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"},
         capture_output=True,
         text=True,
