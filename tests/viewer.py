@@ -70,6 +70,10 @@ class Viewer:
         """Whether a button, an input or a command with this label is there."""
         return any(props.get("label") == label for props in self._of.values())
 
+    def visible(self, label: str) -> bool:
+        """Whether a button or an input with this label is there, and not hidden."""
+        return any(props.get("label") == label and props.get("visible", True) for props in self._of.values())
+
     def shows(self, text: str) -> bool:
         """Whether a text is on the page, as HTML."""
         return any(text in props.get("content", "") for props in self._of.values())
@@ -77,6 +81,10 @@ class Viewer:
     async def click(self, button: str) -> None:
         """Press a button."""
         await self.say({"type": "GuiUpdateMessage", "uuid": self.named(button), "updates": {"value": True}})
+
+    async def choose(self, label: str, value: str) -> None:
+        """Press one of a group of buttons, or choose from a list."""
+        await self.say({"type": "GuiUpdateMessage", "uuid": self.named(label), "updates": {"value": value}})
 
     async def trigger(self, command: str) -> None:
         """Press the key of a command."""

@@ -17,6 +17,7 @@ from snakesim_operator.console.admission import Admission
 from snakesim_operator.console.operations import BUTTON_NS, KEY_NS, Operations
 from snakesim_operator.console.settings_form import SettingsForm
 from snakesim_operator.console.snapshot import RobotSnapshot
+from snakesim_operator.console.texts import BAD, plain
 from snakesim_operator.console.token import ControlToken
 from snakesim_operator.tools.fault import FaultOrder
 from snakesim_operator.tools.simulator_order import SimulatorOrder
@@ -55,11 +56,14 @@ class Controls:
         self._settings_tab, self._admission = settings_tab, admission
         self._acts, self._stops = threading.Semaphore(ACTS_AT_ONCE), threading.Semaphore(STOPS_AT_ONCE)
         self._form: SettingsForm | None = None
+        self._offers_unchecked = False  # this viewer was refused because the joints were not checked
         self._way, self._driven_s = 1, -math.inf  # by keys: ahead or backwards, and when last
         self.viewer = client.client_id
         with folder:
             self._take = client.gui.add_button("Take control", icon=viser.Icon.HAND_STOP, color="blue")
             self._lifecycle = client.gui.add_button_group("Robot", ("Arm", "Disarm", "Clear"))
+            self._why_unchecked = client.gui.add_html("", visible=False)
+            self._arm_unchecked = client.gui.add_button("Arm it unchecked", color="red", visible=False)
             self._simulator = client.gui.add_folder("Simulator")
             with self._simulator:
                 time_buttons = client.gui.add_button_group("Time", ("Pause", "Resume", "Step", "Reset"))
@@ -86,9 +90,11 @@ class Controls:
         ):
             admission.admit(control, self.viewer, self._in_control)
         admission.admit(self._target, self.viewer, self._in_control)
+        admission.admit(self._arm_unchecked, self.viewer, lambda: self._in_control() and self._offers_unchecked)
         admission.admit(self._drive, self.viewer, self._in_control, DRIVE_HZ)
         self._take.on_click(lambda _: self._take_or_release())
         self._lifecycle.on_click(lambda event: self._ask(event.target.value))
+        self._arm_unchecked.on_click(lambda _: self._arm(unchecked=True))
         time_buttons.on_click(lambda event: self._change_time(event.target.value.lower()))
         self._time_speed.on_update(lambda _: self._change_time("speed"))
         with settings_tab:
@@ -116,6 +122,7 @@ class Controls:
         for one in (self._lifecycle, self._heading, self._speed, self._drive, self._faults):
             one.visible = mine
         snapshot = self._moment()
+        self._show_unchecked(snapshot if mine else None)
         self._simulator.visible = mine and snapshot is not None and snapshot.robot.simulated_time
         self._time_speed.visible = (
             snapshot is not None and snapshot.status is not None and snapshot.status.pace == "realtime"
@@ -159,11 +166,26 @@ class Controls:
             return
         match what:
             case "Arm":
-                self.do("Arm", lambda: self._operations.arm(self.who, snapshot.robot))
+                self._arm(unchecked=False)
             case "Disarm":
                 self.do("Disarm", lambda: self._operations.disarm(self.who))
             case _:
                 self.do("Clear", lambda: self._operations.clear(self.who))
+
+    def _arm(self, *, unchecked: bool) -> None:
+        """The word `unchecked` is offered, as a button of its own, once the host has refused to do without."""
+        snapshot = self._moment()
+        if snapshot is None or not self._in_control():
+            return
+        armed = self.do("Arm", lambda: self._operations.arm(self.who, snapshot.robot, unchecked=unchecked))
+        self._offers_unchecked = not armed
+        self.show()
+
+    def _show_unchecked(self, snapshot: RobotSnapshot | None) -> None:
+        why = "" if snapshot is None or snapshot.status is None else snapshot.status.unchecked
+        self._offers_unchecked &= bool(why)
+        self._why_unchecked.content = f"<div style='padding:.3em .6em;font-size:.85em;color:{BAD}'>{plain(why)}</div>"
+        self._why_unchecked.visible = self._arm_unchecked.visible = self._offers_unchecked
 
     def _change_time(self, action: str) -> None:
         if self._in_control():
@@ -219,16 +241,21 @@ class Controls:
         if form is not None and self._in_control():
             self.do("Settings", lambda: self._operations.configure(self.who, form.controller, form.asked()))
 
-    def do(self, title: str, call: Callable[[], str], at_once: threading.Semaphore | None = None) -> None:
-        """Do something, and show its outcome. Few at once, so that a viewer keeps no other one's click waiting."""
+    def do(self, title: str, call: Callable[[], str], at_once: threading.Semaphore | None = None) -> bool:
+        """Do something, and show its outcome; whether it was done.
+
+        Few at once, so that a viewer keeps no other one's click waiting.
+        """
         at_once = at_once or self._acts
         if not at_once.acquire(blocking=False):
             self.tell(title, "not done: what you asked for before is still under way", bad=True)
-            return
+            return False
         try:
             self.tell(title, call())
+            return True
         except SnakesimError as error:
             self.tell(title, str(error), bad=True)
+            return False
         finally:
             at_once.release()
 

@@ -63,9 +63,10 @@ class Operations:
         """Emergency stop: over the stop port and over the network at once."""
         return self._do(f"{who}: EMERGENCY STOP", lambda say: estop(self._where, say))
 
-    def arm(self, who: str, robot: Description) -> str:
-        """Arm the robot that the page shows, by its robot and backend."""
-        return self._do(f"{who}: arm", lambda say: arm(robot.robot, robot.backend, self._where, say))
+    def arm(self, who: str, robot: Description, *, unchecked: bool = False) -> str:
+        """Arm the robot that the page shows. unchecked: also without a check of its joints."""
+        what = f"{who}: arm{', unchecked' if unchecked else ''}"
+        return self._do(what, lambda say: arm(robot.robot, robot.backend, self._where, say, unchecked=unchecked))
 
     def disarm(self, who: str) -> str:
         """Make the joints passive."""
