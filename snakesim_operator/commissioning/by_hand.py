@@ -16,16 +16,14 @@ import numpy as np
 
 from snakesim_hal.arrays import Floats
 from snakesim_hal.errors import ConfigError, RefusedError
-from snakesim_hal.model.files import decode, read_part
 from snakesim_hal.model.joints import Joint
-from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Session, open_session
 from snakesim_hal.terminal import overwrite_lines, say
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Configuration, JointState, Status
 from snakesim_operator.commissioning.capture import NotStillError, Travel, turned, zeros
-from snakesim_operator.commissioning.robot_edit import change_joints, must_be_own
+from snakesim_operator.commissioning.robot_edit import change_joints, joints_on_drives, must_be_own
 from snakesim_operator.tools.targets import CONNECT_S, RobotSelection, only_robot
 
 SETTLE_S = 1.0  # of samples for a zero
@@ -38,11 +36,11 @@ UNHEARD = f"the robot's host has not said within {FOUND_S:g} s how it is set up;
 
 def running_joints(session: Session, path: Path) -> Sequence[Joint]:
     """The joints of a robot file with which a host runs. Raises ConfigError for another file, RefusedError."""
-    joints = decode(read_part(str(path), "robots"), RobotFile).joint_table
     configured = session.latest(keys.CONFIG, Configuration, FOUND_S)
     if configured is None:
         raise RefusedError(UNHEARD)
     running = msgspec.json.decode(configured.content, type=RunConfig).robot.joint_table
+    joints = joints_on_drives(path, running)
     if [(one.name, one.id, one.drive) for one in running] != [(one.name, one.id, one.drive) for one in joints]:
         raise ConfigError(
             f"{path}: its joints are not those that the host was started with, so what is measured would be "

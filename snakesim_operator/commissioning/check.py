@@ -9,9 +9,7 @@ import numpy as np
 from snakesim_hal.arrays import Floats
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.checked import Checked, mounting_digest
-from snakesim_hal.model.files import decode, read_part
 from snakesim_hal.model.kinematics import rotation_from_quaternion
-from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.process import user_name
 from snakesim_hal.terminal import say
@@ -19,7 +17,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import Decoder
 from snakesim_hal.wire.messages import Description, Imu
 from snakesim_operator.commissioning.judge import Measured, judged
-from snakesim_operator.commissioning.robot_edit import must_be_own, write_checked
+from snakesim_operator.commissioning.robot_edit import joints_on_drives, must_be_own, write_checked
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.results.record import RunRecord
@@ -61,7 +59,7 @@ def _write(path: Path, record: RunRecord, by_hand: list[str], *, wrong: int) -> 
     must_be_own(path)
     if robot.emulated:
         raise ConfigError(f"{record.folder}: its drives were emulated, which says nothing of a real robot; not written")
-    if mounting_digest(decode(read_part(str(path), "robots"), RobotFile).joint_table) != mounting_digest(joints):
+    if mounting_digest(joints_on_drives(path, joints)) != mounting_digest(joints):
         raise ConfigError(f"{path}: says otherwise how the joints are mounted than in {record.folder}; check it again")
     if wrong:
         say(f"{path}: nothing was written: {wrong} joints are not as it says, or could not be judged (--by-hand)")

@@ -1,5 +1,7 @@
 """Changes single values of a robot file, and leaves its comments and its order as they are."""
 
+import dataclasses
+from collections.abc import Sequence
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -11,6 +13,7 @@ from tomlkit.items import Table
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.checked import Checked
 from snakesim_hal.model.files import decode, find, read_part
+from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.textfiles import read_text
 from snakesim_hal.model.whole_file import write_whole
@@ -21,6 +24,20 @@ def must_be_own(path: Path) -> None:
     """Raise ConfigError for a robot file that is shipped."""
     if find(str(path), "robots") != path:
         raise ConfigError(f"{path}: give the path of your own robot file, such as ./{path}.toml; shipped ones stay")
+
+
+def joints_on_drives(path: Path, running: Sequence[Joint]) -> list[Joint]:
+    """The joints of a robot file with the modes that their drives have, which may be fewer. Raises ConfigError.
+
+    running: those of a host; a backend leaves out modes that its drives do not have.
+    """
+    joints = decode(read_part(str(path), "robots"), RobotFile).joint_table
+    for i, (said, runs) in enumerate(zip(joints, running, strict=False)):
+        modes = [mode for mode in said.drive.modes if mode in runs.drive.modes]
+        joints[i] = dataclasses.replace(
+            said, drive=msgspec.structs.replace(said.drive, modes=modes or said.drive.modes)
+        )
+    return joints
 
 
 def change_joints(path: Path, values: dict[str, dict[str, Any]], how: str) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from snakesim_hal.arguments import add_network, number
+from snakesim_hal.errors import ConfigError
 
 TASK = "watch"  # under which `snakesim --help` lists it
 
@@ -22,6 +23,12 @@ def add_commands(commands: Any) -> None:
     console.add_argument(
         "--port", type=number(0, 65535), help="port on the loopback interface (default: 8080, or any free one)"
     )
+    console.add_argument(
+        "--commission",
+        type=Path,
+        metavar="FILE",
+        help="the robot file that the host was started with: pages may find zeros, directions and limits, and jog",
+    )
     add_network(console)
     console.set_defaults(act=_console)
 
@@ -31,5 +38,7 @@ def _console(arguments: argparse.Namespace) -> int:
     from snakesim_operator.tools.robot_selection import selection_of
 
     if arguments.run is not None:
+        if arguments.commission is not None:
+            raise ConfigError("--commission is for a running robot; leave RUN out")
         return show_record(arguments.run, arguments.at, arguments.port)
-    return console(selection_of(arguments), arguments.port)
+    return console(selection_of(arguments), arguments.port, arguments.commission)

@@ -8,6 +8,8 @@ from pathlib import Path
 
 from snakesim_hal.arguments import add_network, add_parent, add_scenario
 from snakesim_hal.errors import ConfigError
+from snakesim_hal.model.files import decode, read_part
+from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import read
 from snakesim_hal.network.local_registry import local_robots
 from snakesim_hal.network.session import Link
@@ -19,13 +21,19 @@ from snakesim_operator.console_port import open_port
 from snakesim_operator.tools.targets import RobotSelection, only_robot
 
 
-def console(where: RobotSelection, port: int | None, say: Say = say) -> int:
-    """Show a running robot until Ctrl-C. Raises NotConnectedError when there is none."""
+def console(where: RobotSelection, port: int | None, commission: Path | None = None, say: Say = say) -> int:
+    """Show a running robot until Ctrl-C. Raises NotConnectedError when there is none, ConfigError.
+
+    commission: its robot file, into which pages may write what was found by hand.
+    """
     extras.check("console", "the console")
+    if commission is not None:
+        extras.check("commission", "commissioning")
+        decode(read_part(str(commission), "robots"), RobotFile)
     from snakesim_operator.console.console import show_live
 
     link = only_robot(where, "console")
-    show_live(link, _surroundings(link), open_port(port), _until_signal(), say)
+    show_live(link, _surroundings(link), open_port(port), _until_signal(), say, commission=commission)
     return 0
 
 

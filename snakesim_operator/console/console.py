@@ -32,10 +32,11 @@ def show_live(
     stop: threading.Event,
     say: Say,
     expected: RobotSnapshot | None = None,
+    commission: Path | None = None,
 ) -> None:
     """Show a robot until `stop` is set. Raises NotConnectedError when no network is there.
 
-    expected: what to show until there is a robot.
+    expected: what to show until there is a robot; commission: the robot file that pages may write into.
     """
     log = Log()
     operations = Operations(link, log)
@@ -52,7 +53,7 @@ def show_live(
         server,
         address,
     ):
-        page = Page(server, around, operations, log)
+        page = Page(server, around, operations, log, commission=commission)
         say(f"console: {address}")
         page.show(expected)
         whole = replace(link, largest_bytes=MAX_IMAGE_BYTES)

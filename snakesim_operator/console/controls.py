@@ -14,6 +14,7 @@ from snakesim_hal.model.kinematics import rotation_from_quaternion, yaw_of
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlSettings
 from snakesim_operator.console.admission import Admission
+from snakesim_operator.console.commissioning import Commissioning, CommissioningControls
 from snakesim_operator.console.operations import BUTTON_NS, KEY_NS, Operations
 from snakesim_operator.console.settings_form import SettingsForm
 from snakesim_operator.console.snapshot import RobotSnapshot
@@ -49,8 +50,12 @@ class Controls:
         settings_tab: viser.GuiFolderHandle,
         changed: Callable[[], None],
         admission: Admission,
+        commissioning: tuple[Commissioning, viser.GuiFolderHandle],
     ) -> None:
-        """folder, settings_tab: places on the page; snapshot: the newest; changed: called when the token has moved."""
+        """folder, settings_tab: places on the page; snapshot: the newest; changed: called when the token has moved.
+
+        commissioning: and its tab.
+        """
         self.client, self._token, self._operations = client, token, operations
         self._moment, self._changed = snapshot, changed
         self._settings_tab, self._admission = settings_tab, admission
@@ -100,6 +105,8 @@ class Controls:
         with settings_tab:
             self._apply = client.gui.add_button("Apply", visible=False, order=0)
         admission.admit(self._apply, self.viewer, self._in_control)
+        about, tab = commissioning
+        self._commissioning = CommissioningControls(client, tab, about, admission, self._in_control, self.do)
         self._kind.on_update(lambda _: self._suggest_target())
         inject.on_click(lambda event: self._inject(end=event.target.value == "End it"))
         self._drive.on_hold(lambda _: self._go(), callback_hz=DRIVE_HZ)
@@ -128,6 +135,7 @@ class Controls:
             snapshot is not None and snapshot.status is not None and snapshot.status.pace == "realtime"
         )
         self._apply.disabled = not mine
+        self._commissioning.show()
         if self._form is not None:
             self._form.enable(mine)
 

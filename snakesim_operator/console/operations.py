@@ -50,6 +50,7 @@ class Operations:
     """The robot at a link, as far as one can act on it."""
 
     def __init__(self, link: Link, log: Log) -> None:
+        self.link = link
         self._where = RobotSelection(link.endpoint, link.namespace, link.session)
         self._log = log
         self._session: Session | None = None

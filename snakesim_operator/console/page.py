@@ -8,6 +8,7 @@ import contextlib
 import threading
 from collections.abc import Iterable, Iterator
 from functools import partial
+from pathlib import Path
 
 import viser
 
@@ -16,6 +17,7 @@ from snakesim_hal.wire.messages import ControlSettings, Description
 from snakesim_hal.wire.quantities import Vector
 from snakesim_operator.console import stage, texts
 from snakesim_operator.console.charts import JointCharts
+from snakesim_operator.console.commissioning import Commissioning
 from snakesim_operator.console.controls import KEYS, Controls, add_appearance, name_of, set_appearance
 from snakesim_operator.console.drawing import Surroundings, draw
 from snakesim_operator.console.operations import Log, Operations
@@ -51,11 +53,16 @@ class Page:
         operations: Operations | None,
         log: Log,
         recorded: str = "",
+        commission: Path | None = None,
     ) -> None:
-        """around: the true surroundings, if known; operations: None shows a recording, which `recorded` names."""
+        """around: the true surroundings, if known; operations: None shows a recording, which `recorded` names.
+
+        commission: the robot file on this computer with which the host was started.
+        """
         self._server, self._around, self._operations = server, around, operations
         self._log, self._recorded = log, recorded
-        self._token = ControlToken()
+        self._token, self._commission = ControlToken(), commission
+        self._commissioning: Commissioning | None = None
         self._controls: dict[int, Controls] = {}
         self._lock = threading.Lock()  # of `_controls`; viser fills a folder from one thread at a time
         self._frames = 0
@@ -106,6 +113,11 @@ class Page:
         if self._operations is not None:
             with tabs.add_tab("Settings"):
                 self._settings_tab = gui.add_folder(None)
+            with tabs.add_tab("Commission"):
+                self._commission_tab = gui.add_folder(None)
+            self._commissioning = Commissioning(
+                gui, self._commission_tab, self._operations.link, self._commission, self._token, self._log
+            )
         with tabs.add_tab("Log"):
             self._log_text = gui.add_html("")
         gui.add_html(texts.legend(LEGEND), order=3)
@@ -126,7 +138,7 @@ class Page:
             self._forget(client.client_id)
 
     def _give_controls(self, client: viser.ClientHandle) -> None:
-        assert self._operations is not None
+        assert self._operations is not None and self._commissioning is not None
         with self._lock:
             controls = Controls(
                 client,
@@ -137,6 +149,7 @@ class Page:
                 self._settings_tab,
                 self._control_changed,
                 self._server.admission,
+                (self._commissioning, self._commission_tab),
             )
             if self._moment is not None and self._moment.settings is not None:
                 controls.show_settings(self._moment.settings)
@@ -206,6 +219,8 @@ class Page:
         """Show a snapshot; None: there is no robot yet."""
         before, self._moment = self._moment, snapshot
         self._frames += 1
+        if self._commissioning is not None:
+            self._commissioning.turn(snapshot)
         if snapshot is not None:
             if self._stage is None or before is None or before.robot.layout != snapshot.robot.layout:
                 self._meet(snapshot.robot)
@@ -262,6 +277,8 @@ class Page:
         if snapshot is not None:
             self._state.content = texts.state_table(snapshot)
             self._streams.content = texts.stream_table(snapshot)
+            if self._commissioning is not None:
+                self._commissioning.show(snapshot)
         lines = [*(() if snapshot is None else snapshot.log), *self._log.lines()]
         if lines != self._shown_log:
             self._shown_log = lines

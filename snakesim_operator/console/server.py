@@ -40,6 +40,15 @@ STATE_IN_SIGHT = (  # of `texts.header`: what is below is scrolled behind it
     b" padding-top: 2px} div:has(> div > div > div > [data-robot]) {overflow: clip !important; min-width: 0}"
     b' @media (max-width: 480px) {div[style*="width: 20em"] {width: 100% !important}}</style>'  # a phone's panel
 )
+# A button that was held is let go when its page loses the keyboard, or is hidden: the finger may come up elsewhere.
+HOLD_ENDS = b"""<script>(() => {
+  let held = null;
+  addEventListener("pointerdown", event => { held = event.target; }, true);
+  const end = () => { held?.dispatchEvent(new PointerEvent("pointercancel", {bubbles: true})); held = null; };
+  addEventListener("blur", end);
+  addEventListener("pagehide", end);
+  document.addEventListener("visibilitychange", () => { if (document.hidden) end(); });
+})()</script>"""
 Answer = Callable[[ServerConnection, Request], Response | None]
 More = Callable[[Request], Response | None]
 _connecting: ContextVar[Browser] = ContextVar("connecting")
@@ -153,7 +162,7 @@ def _checked(answer: Answer, admission: Admission, stops: bool, more: More) -> A
             return answer(connection, request)
         page = answer(connection, dataclasses.replace(request, headers=Headers()))  # as it is, without compression
         assert page is not None
-        return _with((SECOND_STOP if stops else b"") + PREFERENCE + STATE_IN_SIGHT, page)
+        return _with((SECOND_STOP + HOLD_ENDS if stops else b"") + PREFERENCE + STATE_IN_SIGHT, page)
 
     return check
 

@@ -9,6 +9,7 @@ from snakesim_hal.model.scenario import RunConfig, config_hash, start_of
 from snakesim_hal.wire.messages import (
     AppliedCommand,
     ColourImage,
+    Configuration,
     Contacts,
     ControlSettings,
     ControlState,
@@ -51,6 +52,7 @@ class RobotSnapshot:
     control: ControlState | None = None
     applied: AppliedCommand | None = None
     settings: ControlSettings | None = None
+    configuration: Configuration | None = None
     power: Power | None = None
     imu: Imu | None = None
     images: dict[str, DepthImage | ColourImage] = field(default_factory=dict)  # by key

@@ -17,6 +17,7 @@ from snakesim_hal.wire.messages import (
     AppliedCommand,
     Clock,
     ColourImage,
+    Configuration,
     Contacts,
     ControlSettings,
     ControlState,
@@ -45,6 +46,7 @@ LATCHED: dict[str, type[Message]] = {
     keys.DESCRIPTION: Description,
     keys.STATUS: Status,
     keys.SETTINGS_IN_FORCE: ControlSettings,
+    keys.CONFIG: Configuration,
 }
 STREAMS: dict[str, type[Message]] = {
     keys.CLOCK: Clock,
@@ -154,6 +156,7 @@ class Watch:
             control=self._get(keys.CONTROL_STATE, ControlState),
             applied=self._get(keys.APPLIED, AppliedCommand),
             settings=self._get(keys.SETTINGS_IN_FORCE, ControlSettings),
+            configuration=self._configuration(robot),
             power=self._get(keys.POWER, Power),
             imu=self._get(keys.IMU, Imu),
             images={key: found for key, found in self._newest.items() if isinstance(found, DepthImage | ColourImage)},
@@ -161,6 +164,11 @@ class Watch:
             streams=self._streams(clock),
             hosts=frozenset(host for host, at_s in self._hosts.items() if now_s - at_s < STATUS_LIMIT_S),
         )
+
+    def _configuration(self, robot: Description) -> Configuration | None:
+        """Of the host that describes itself, whichever of the two came first."""
+        configured = self._get(keys.CONFIG, Configuration)
+        return configured if configured is not None and configured.config_hash == robot.config_hash else None
 
     def _get(self, key: str, message: type[MessageT]) -> MessageT | None:
         return cast(MessageT | None, self._newest.get(key))
@@ -190,7 +198,7 @@ class Watch:
     def _meet(self, robot: Description) -> None:
         """Another host: nothing of the one before is of this robot's time."""
         if self.robot is not None and self.robot.host != robot.host:
-            self._newest.clear()
+            self._newest = {key: one for key, one in self._newest.items() if key == keys.CONFIG}  # which has a hash
             self._bodies.clear()
             self._hosts.clear()
         if self.robot is None or self.robot.own != robot.own:

@@ -34,6 +34,7 @@ STATE_TOP = "document.querySelector('[data-robot]').getBoundingClientRect().top"
 PANEL_WIDTHS = (
     "(panel => [panel.scrollWidth, panel.clientWidth])(document.querySelector('[class*=ScrollArea-viewport]'))"
 )
+HIDE = "Object.defineProperty(document, 'hidden', {value: true}); document.dispatchEvent(new Event('visibilitychange'))"
 GROUND = {"x": 0, "y": 200, "width": 370, "height": 200, "scale": 1}  # of the page: scene without notices
 
 
@@ -110,6 +111,19 @@ def test_a_page_says_when_its_second_stop_does_not_answer_and_stops_by_it(tmp_pa
         page.wait_for("planar13: stopped")
         with open_session(Link(run.endpoint, "planar13")) as session:
             assert session.latest(keys.STATUS, Status, 10.0, lambda one: one.lifecycle == "estop") is not None
+
+
+@pytest.mark.slow
+def test_a_held_button_is_let_go_when_its_page_loses_the_keyboard_or_is_hidden() -> None:
+    with page_server(open_port(None), stop=lambda: "stopped") as (server, address), chromium() as browser:
+        Page(server, None, None, Log(), recorded="a run")
+        page = browser.open(address, *SMALL)
+        page.wait_for("Dark page")
+        page.value("window.ends = 0; addEventListener('pointercancel', () => { ends += 1; })")
+        for count, leave in enumerate(("window.dispatchEvent(new Event('blur'))", HIDE), start=1):
+            page.value("document.body.dispatchEvent(new PointerEvent('pointerdown', {bubbles: true}))")
+            page.value(leave)
+            assert page.value("ends") == count
 
 
 @pytest.mark.slow
