@@ -27,6 +27,7 @@ def add_commands(commands: Any) -> None:
         "--out", type=Path, metavar="PATH", help="FILE.pdf, .svg or .png; with --paper a folder (default: in RUN)"
     )
     plot.add_argument("--width", type=number(1.0, 40.0, "inches"), default=3.5, help="in inches (3.5: one column)")
+    plot.add_argument("--dark", action="store_true", help="on black, for slides")
     for flag, name, default, verb in (("--from", "from_s", 0.0, "begin"), ("--to", "to_s", inf, "end")):
         plot.add_argument(
             flag, dest=name, type=number(0.0, inf, "s"), default=default, metavar="S", help=f"{verb} S seconds in"
@@ -48,5 +49,6 @@ def _plot(arguments: argparse.Namespace) -> int:
             out=arguments.out,
             width_in=arguments.width,
             span_s=(arguments.from_s, arguments.to_s),
+            dark=arguments.dark,
         )
     )

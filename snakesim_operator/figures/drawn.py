@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import matplotlib
+import matplotlib.style
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
@@ -36,6 +36,7 @@ class Request:
     out: Path | None
     width_in: float
     span_s: tuple[float, float]
+    dark: bool
 
 
 def plot(request: Request) -> int:
@@ -43,7 +44,7 @@ def plot(request: Request) -> int:
     record = RunRecord.load(request.run)
     if not len(record.time_s):
         raise ConfigError(f"{request.run}: nothing was recorded in it; the robot was never armed")
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.style.context(["dark_background", STYLE] if request.dark else STYLE):
         if request.paper:
             _write_paper(request, record)
         else:

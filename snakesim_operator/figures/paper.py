@@ -11,6 +11,7 @@
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from matplotlib import rcParams
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon
@@ -32,7 +33,7 @@ from snakesim_operator.results.report.view import nodes_xy_w
 
 MOMENTS = 4
 ARROW_M = 0.25  # of the strongest force
-BODY, OBSTACLE, SOLVED, COMMANDED, RESULTANT = "#9aa5b1", "#d9dde2", "#c0392b", "#2c6fbb", "black"
+BODY, OBSTACLE, SOLVED, COMMANDED = "#9aa5b1", "#d9dde2", "#c0392b", "#2c6fbb"
 MEASURED, REFERENCE = "#2c6fbb", "#c0392b"
 
 
@@ -80,9 +81,9 @@ def _near(record: RunRecord, instant: Instant, width_in: float) -> Figure:
     if (joint := instant.propulsion_joint) is not None:
         at = nodes_xy_w(record, instant)[joint + 1]
         torque_nm = record.torque_nm[instant.row, joint]
-        axes.plot(*at, "o", color=RESULTANT, markersize=5)
+        axes.plot(*at, "o", color=rcParams["text.color"], markersize=5)
         axes.annotate(f"$\\tau$ {torque_nm:.2f} N·m", at, (6, -12), textcoords="offset points")
-        axes.plot(*np.column_stack([at, points[0]]), "--", color=RESULTANT, linewidth=0.7)
+        axes.plot(*np.column_stack([at, points[0]]), "--", color=rcParams["text.color"], linewidth=0.7)
         points.append(at)
     low, high = np.min(points, axis=0) - ARROW_M, np.max(points, axis=0) + ARROW_M
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
@@ -194,7 +195,7 @@ def _polygon(axes: Axes, balance: Balance) -> None:
     for i, (a, b, name) in enumerate(zip(corners[:-1], corners[1:], names, strict=True)):
         _arrow(axes, a, b, COMMANDED if i == 0 else SOLVED)
         axes.annotate(name, (a + b) / 2, (3, 3), textcoords="offset points", fontsize=6.5)
-    _arrow(axes, corners[1], corners[-1], RESULTANT)
+    _arrow(axes, corners[1], corners[-1], rcParams["text.color"])
     low, high = corners.min(axis=0), corners.max(axis=0)
     air = 0.15 * float(np.max(high - low))
     axes.set(xlim=(low[0] - air, high[0] + air), ylim=(low[1] - air, high[1] + air), xlabel="[N]")

@@ -31,6 +31,10 @@ def test_signals_have_their_names_and_units_on_the_axes(run: Path) -> None:
     written = words(out)
     assert {"[rad]", "torque_nm [N·m]", "contact_count", "time [s]"} <= set(written)
     assert {"angle_rad.joint_7", "target.joint_7", "joint_1", "joint_13", "1.00", "2.50"} <= set(written)
+    light = out.read_text()
+    assert snakesim("plot", str(run), *given, "--out", str(out), "--dark", cwd=run).code == 0
+    white = "fill: #ffffff"  # the ground, or all that is written on it
+    assert 0 < light.count(white) < out.read_text().count(white)
 
 
 def test_the_papers_figures_come_from_one_command(run: Path) -> None:
