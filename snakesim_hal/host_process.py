@@ -18,6 +18,7 @@ from snakesim_hal.arguments import add_host
 from snakesim_hal.backend import BackendFactory
 from snakesim_hal.errors import BackendError, ConfigError, RefusedError, SnakesimError
 from snakesim_hal.fault_plan import check_without_run
+from snakesim_hal.host.cable_file import kept_at
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host
 from snakesim_hal.host.latch import EstopLatch
@@ -87,6 +88,7 @@ def _run(given: ProcessOptions, config: RunConfig) -> Host:
         unchecked = ""
         if config.controller != CHECK:
             unchecked = why_unchecked(config.robot.checked, config.robot.joint_table, described)
+        folder = robot_folder(described.robot, described.backend, described.hardware)
         backend, faults = faults_of_host(config, backend, session)
         host = Host(
             config,
@@ -95,11 +97,12 @@ def _run(given: ProcessOptions, config: RunConfig) -> Host:
             max_ticks=round(config.duration_s * config.rate_hz) if wanted.once else None,
             end_after_fault_s=wanted.end_after_fault,
             stay=wanted.end_after_fault is None,
-            latch=EstopLatch(robot_folder(described.robot, described.backend, described.hardware)),
+            latch=EstopLatch(folder),
             starter=HostEnd.of(wanted.channel),
             realtime_warnings=realtime_warnings,
             faults=faults,
             unchecked=unchecked,
+            cables=kept_at(folder, config.robot.joint_table, described),
         )
         serve_stops(stop_port, given.link.namespace or described.robot, host.take_stop)
         on_stop_signal(host.stop)

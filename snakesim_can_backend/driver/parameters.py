@@ -55,6 +55,11 @@ def check_drives(robot: RobotFile, settings: CanSettings) -> None:
                 f"robot {robot.name!r}: `joints.{joint.name}.id` = {joint.id}: modules on CAN have their joint's "
                 f"number as node id, here {number}; give the module that one, and leave `id` out"
             )
+        if joint.limits.cable_turns is not None:
+            raise ConfigError(
+                f"robot {robot.name!r}: `cable_turns` of {joint.name}: modules on CAN say angles up to 3.2767 rad, so "
+                f"turns cannot be counted; give the joint end stops, and leave `cable_turns` out"
+            )
         if joint.drive.port and joint.drive.port not in settings.channels:
             raise ConfigError(
                 f"robot {robot.name!r}, {joint.name}: `port` = {joint.drive.port!r} is not among "

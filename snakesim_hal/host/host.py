@@ -21,6 +21,7 @@ from snakesim_hal.allowed_faults import Faults, NoFaults
 from snakesim_hal.arithmetic import measured
 from snakesim_hal.backend import Backend, Samples
 from snakesim_hal.errors import BackendError, WireError
+from snakesim_hal.host.cable_file import CableFile
 from snakesim_hal.host.inbox import Inbox, Request
 from snakesim_hal.host.latch import EstopLatch, replying
 from snakesim_hal.host.outbox import Outbox
@@ -82,6 +83,7 @@ class Host:
         realtime_warnings: Sequence[str] = (),
         faults: Faults | None = None,
         unchecked: str = "",
+        cables: CableFile | None = None,
     ) -> None:
         """backend: guarded, as by `open_backend`.
 
@@ -94,6 +96,7 @@ class Host:
         starter: the private channel to the process that started this host.
         realtime_warnings: real-time measures that the system refused.
         unchecked: why only an explicit word arms it, by `why_unchecked`.
+        cables: of joints without end stops.
         faults: injected ones, of `faults_of_host`, as the backend is then; None: refused on request.
         """
         described = msgspec.structs.replace(backend.describe(), host=secrets.token_hex(8), arithmetic=measured())
@@ -103,6 +106,7 @@ class Host:
             first_epoch=time.time_ns() // 1_000_000,
             awaits_reports=config.pace == "realtime",
             unchecked=unchecked,
+            cables=None if cables is None else cables.cables,
         )
         self.black_box = BlackBox(self.description)
         self.statistics = RunStatistics()
@@ -116,6 +120,7 @@ class Host:
         self._pace_after_fault: Pace = pace_after_fault
         self._stay = stay
         self._latch = latch or EstopLatch(None)
+        self._cables = cables
         self._starter = starter or HostEnd(None)
         self._realtime_warnings = list(realtime_warnings)
         self._pace: Pace = config.pace
@@ -214,6 +219,8 @@ class Host:
             self._show_status(force=True)
             self.faults.close()
             self._latch.close()
+            if self._cables is not None:
+                self._cables.close()
             self._outbox.close()
 
     def take_in(self) -> None:
@@ -247,6 +254,8 @@ class Host:
     def _judge(self, samples: Samples) -> None:
         """The authority's view of new samples, before any answer to them is taken in; services compute meanwhile."""
         now_ns = self._safety_now()
+        if self._cables is not None:
+            self._cables.take(samples.joints)
         self.authority.observe(samples.joints, now_ns)
         power = samples.others.get(keys.POWER)
         if isinstance(power, Power):

@@ -4,6 +4,7 @@
 one, by the same names. `table` puts them together: one `Joint` each, tail to head.
 """
 
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -24,6 +25,7 @@ Speed = Annotated[float, above(100, "rad/s")]
 Acceleration = Annotated[float, above(1e5, "rad/s²")]
 Torque = Annotated[float, above(1000, "N·m")]
 TorqueRate = Annotated[float, above(1e5, "N·m/s")]
+CableTurns = Annotated[float, above(100, "turns")]
 Celsius = Annotated[float, above(300, "°C")]
 Kelvin = Annotated[float, above(1000, "K")]
 LeastVolts = Annotated[float, from_zero(1000, "V")]
@@ -53,6 +55,8 @@ class Limits(FileStruct, frozen=True, kw_only=True):
     angle_rad: Travel  # to either side
     angle_min_rad: Side | None = None  # of a side that differs
     angle_max_rad: Side | None = None
+    cable_turns: CableTurns | None = None  # to either side, that the cable of a joint without end stops bears
+    cable_unwound: Text = ""  # when it was, at the joint's zero; written by `snakesim joints zero`
     speed_rad_s: Speed
     acceleration_rad_s2: Acceleration
     torque_nm: Torque
@@ -72,6 +76,12 @@ class Limits(FileStruct, frozen=True, kw_only=True):
             raise ValueError(
                 f"it may turn from {self.least_rad:g} to {self.most_rad:g} rad, which leaves no travel: "
                 f"`angle_min_rad` (or minus `angle_rad`) must be below `angle_max_rad` (or `angle_rad`)"
+            )
+
+        if self.cable_turns is not None and self.cable_turns < max(-self.least_rad, self.most_rad) / (2 * math.pi):
+            raise ValueError(
+                f"`cable_turns` = {self.cable_turns:g} turns is less than its limits of {self.least_rad:g} to "
+                f"{self.most_rad:g} rad: narrow the limits"
             )
 
     @property
@@ -150,6 +160,8 @@ class JointExceptions(FileStruct, frozen=True, kw_only=True):
     angle_rad: Travel | None = None
     angle_min_rad: Side | None = None
     angle_max_rad: Side | None = None
+    cable_turns: CableTurns | None = None
+    cable_unwound: Text | None = None
     speed_rad_s: Speed | None = None
     acceleration_rad_s2: Acceleration | None = None
     torque_nm: Torque | None = None
@@ -262,6 +274,12 @@ def _check(joint: Joint) -> None:
     if peak_nm is not None and limits.torque_nm > peak_nm:
         raise ValueError(
             f"`torque_nm` = {limits.torque_nm:g} N·m is more than its motor's `peak_nm` = {peak_nm:g} N·m; lower it"
+        )
+    if limits.cable_turns is not None and joint.drive.gear != 1.0:
+        raise ValueError(
+            f"`gear` = {joint.drive.gear:g} with `cable_turns`: behind a gear a drive wakes up in one of several "
+            f"turns, and the joint's cannot be counted; use an encoder at the joint (`gear` = 1), or end stops and no "
+            f"`cable_turns`"
         )
     if joint.supply.voltage_v <= limits.least_voltage_v:
         raise ValueError(

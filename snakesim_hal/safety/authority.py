@@ -12,6 +12,7 @@ import numpy as np
 
 from snakesim_hal.backend import SetPoints
 from snakesim_hal.safety import gate, lifecycle
+from snakesim_hal.safety.cables import Cables
 from snakesim_hal.safety.derating import Derating
 from snakesim_hal.safety.fault_log import FaultLog
 from snakesim_hal.safety.gate import Applied, JointLimits
@@ -49,13 +50,21 @@ class Authority:
     """Lifecycle, lease and gate of one robot."""
 
     def __init__(
-        self, description: Description, *, first_epoch: int = 0, awaits_reports: bool = False, unchecked: str = ""
+        self,
+        description: Description,
+        *,
+        first_epoch: int = 0,
+        awaits_reports: bool = False,
+        unchecked: str = "",
+        cables: Cables | None = None,
     ) -> None:
         """first_epoch: different from that of any earlier host, so that commands for another host are rejected.
 
         awaits_reports: whether arming waits until every module has reported its supply.
         unchecked: why its joints count as not checked, so that only an explicit word arms it; empty: they were.
+        cables: of joints without end stops; whoever passes them follows them.
         """
+        self._cables = cables or Cables((), {}, {})
         self.description = description
         self.unchecked = unchecked
         self.limits = JointLimits.of(description)
@@ -305,6 +314,7 @@ class Authority:
         if self.state != "disarmed":
             first = "; first `snakesim clear`" if self.state in ("fault", "estop") else ""
             found.append(("wrong_state", f"state is {self.state}, must be disarmed{first}"))
+        found += [("cable", why) for why in self._cables.against_arming()]
         return found + [("not_ready", why) for why in self._unready(now_ns)]
 
     def _unready(self, now_ns: int) -> list[str]:

@@ -50,6 +50,7 @@ ORDER = (
     "wrong_config",
     "wrong_state",
     "not_checked",
+    "cable",
     "not_ready",
 )  # the most important first
 

@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -107,6 +108,9 @@ def zero(path: Path, where: RobotSelection, *, asks: bool) -> int:
     for joint, zero_rad in zip(hand.joints, found, strict=True):
         say(f"{joint.name:<10} zero_rad {joint.drive.zero_rad:+8.4f} -> {zero_rad:+8.4f}")
         values[joint.name] = {"zero_rad": zero_rad}
+        if joint.limits.cable_turns is not None:
+            values[joint.name]["cable_unwound"] = datetime.now(UTC).isoformat(timespec="seconds")
+            say(f"{joint.name:<10} its cable counts as unwound here: restart the host within an hour")
     return _write(path, values, "straight pose")
 
 

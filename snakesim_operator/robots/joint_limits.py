@@ -35,7 +35,8 @@ def put_limits(
     """
     endless = [joint.name for joint in joints if joint.element.get("type") == "continuous"]
     if endless:
-        warn(f"{', '.join(endless)}: continuous; here they turn by {MAX_TURN_RAD} rad to either side")
+        turn = f"here they turn by {MAX_TURN_RAD} rad to either side"
+        warn(f"{', '.join(endless)}: continuous; {turn}; where there are no end stops, give `cable_turns`")
     angles = [_turning(joint, turned) for joint, turned in zip(joints, negated, strict=True)]
     said = {key: [_number(joint, tag, attribute) for joint in joints] for tag, attribute, _, key in SAID}
     if not own:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from snakesim_hal.safety.authority import Authority
+from snakesim_hal.safety.cables import Cables
 from snakesim_hal.wire.freshness import FRESH_NS
 from snakesim_hal.wire.messages import Fault, JointCommand, LeaseRequest, LifecycleRequest, Mode
 from tests.unit.hal.rig import LEASE_NS
@@ -396,3 +397,14 @@ def test_a_robot_that_nobody_checked_is_armed_by_an_explicit_word_alone() -> Non
     assert refused.refusal == "not_checked" and "nobody has checked it; to arm it" in refused.reason
     armed = rig.authority.on_lifecycle(msgspec.structs.replace(ARM, unchecked=True), rig.now_ns)
     assert armed.ok and ", unchecked" in rig.authority.why
+
+
+def test_a_cable_of_which_nobody_knows_how_far_it_is_wound_is_not_overruled_by_a_word() -> None:
+    rig = Rig()
+    rig.authority = Authority(
+        rig.robot, unchecked="nobody has checked it", cables=Cables((), {}, {"joint_2": "unknown"})
+    )
+    rig.observe(0.1)
+    assert rig.acquire().ok and rig.send(0.1) is None
+    refused = rig.authority.on_lifecycle(msgspec.structs.replace(ARM, unchecked=True), rig.now_ns)
+    assert (refused.refusal, refused.reason) == ("cable", "joint_2: unknown")

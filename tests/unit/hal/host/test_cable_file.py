@@ -1,0 +1,128 @@
+"""How far the cables of joints without end stops are wound, over restarts: what the next host knows, and refuses."""
+
+import math
+from datetime import UTC, datetime
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from snakesim_hal.errors import ConfigError
+from snakesim_hal.host.cable_file import CABLES, FRESH_S, CableFile, kept_at
+from snakesim_hal.model.files import SHIPPED, decode, read_part
+from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.robot import RobotFile, describe
+from snakesim_hal.wire.messages import Description, JointState
+from tests.harness.wait import wait_until
+
+DECLARED = "2026-11-25T02:40:12+00:00"
+NOW_S = datetime(2026, 11, 25, 2, 50, tzinfo=UTC).timestamp()
+LATER_S = NOW_S + 10 * FRESH_S
+TURN = 2 * math.pi
+
+
+def file_of(folder: Path, joint_2: str, extra: str = "") -> RobotFile:
+    shipped = (SHIPPED / "robots" / "planar13.toml").read_text().replace("modules = 13", "modules = 3")
+    path = folder / "snake.toml"
+    path.write_text(f"{shipped}\n[joints.joint_2]\nangle_rad = 3.0\n{joint_2}\n{extra}")
+    return decode(read_part(str(path), "robots"), RobotFile)
+
+
+class Bench:
+    """A robot whose joint_2 has no end stops, and a folder for what its hosts keep."""
+
+    def __init__(self, folder: Path, joint_2: str = f'cable_turns = 0.6\ncable_unwound = "{DECLARED}"') -> None:
+        self.folder = folder
+        self.joints: list[Joint] = []
+        self.robot: Description
+        self.serial = "A1"
+        self.file(joint_2)
+
+    def file(self, joint_2: str) -> None:
+        robot = file_of(self.folder, joint_2)
+        described = describe(robot, backend="real", period_ns=10**7, lease_ns=5 * 10**7, config_hash="x")
+        self.joints, self.robot = robot.joint_table, msgspec.structs.replace(described, emulated=False)
+
+    def host(self, *angles_rad: float, now_s: float = NOW_S, ends: bool = True) -> list[str]:
+        """One that sees joint_2 at these angles of its drive, one after the other; why it does not arm in the end."""
+        serials = [msgspec.structs.replace(joint, serial=self.serial) for joint in self.robot.joints]
+        kept = CableFile(self.folder, self.joints, msgspec.structs.replace(self.robot, joints=serials), now_s)
+        for angle_rad in angles_rad:
+            kept.take(state(angle_rad))
+        against = kept.cables.against_arming()
+        if ends:
+            kept.close()
+        return against
+
+
+def state(angle_rad: float) -> JointState:
+    still = [0.0] * 3
+    return JointState(
+        tick=0, stamp_ns=0, angle_rad=[0.0, angle_rad, 0.0], velocity_rad_s=still, torque_nm=still,
+        valid=[True] * 3, age_ns=[0] * 3,
+    )  # fmt: skip
+
+
+def test_a_joint_that_was_turned_through_is_known_after_its_drive_has_forgotten_the_turn(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    assert bench.host(0.1, 1.5, 3.0, 4.0) == []  # by hand; within its limits it comes back
+    (refused,) = bench.host(4.0 - TURN, now_s=LATER_S)
+    assert "joint_2: its drive says -2.28 rad, and counted over restarts it is at +4.00 rad" in refused
+    assert "wound by up to 1.48 turns, and `cable_turns` = 0.6. Turn it by hand by 1 turn to lower angles" in refused
+    assert bench.host(4.0 - TURN, 2.0 - TURN, -TURN, -2.0 - TURN, now_s=LATER_S) != []  # its drive counts on
+    assert bench.host(-2.0, now_s=LATER_S) == []  # and has forgotten that turn, too
+
+
+def test_a_cable_that_bears_the_turn_is_no_reason(tmp_path: Path) -> None:
+    bench = Bench(tmp_path, f'cable_turns = 1.5\ncable_unwound = "{DECLARED}"')
+    assert bench.host(0.0, 2.0, 4.0) == [] == bench.host(4.0 - TURN, now_s=LATER_S)
+    assert bench.host(4.0 - TURN, 6.0 - TURN, 8.0 - TURN, 10.0 - TURN, now_s=LATER_S) == []
+    assert "by 2 turns" in bench.host(10.0 - 2 * TURN, now_s=LATER_S)[0]
+
+
+def test_what_nobody_has_kept_is_unknown_until_it_is_declared_unwound(tmp_path: Path) -> None:
+    bench = Bench(tmp_path, "cable_turns = 0.6")
+    (refused,) = bench.host(0.0)
+    assert "joint_2: how far its cable is wound is not known: no host before this one" in refused
+    assert "`snakesim joints zero`" in refused
+    bench.file(f'cable_turns = 0.6\ncable_unwound = "{DECLARED}"')
+    assert "declared unwound at" in bench.host(0.0, now_s=LATER_S)[0]  # long ago: who knows what was turned since
+    assert bench.host(0.0) == [] == bench.host(0.1, now_s=LATER_S)
+
+
+@pytest.mark.parametrize("change", ["drive", "sign", "zero"])
+def test_what_is_kept_counts_for_that_drive_as_it_is_mounted(tmp_path: Path, change: str) -> None:
+    bench = Bench(tmp_path)
+    assert bench.host(0.0) == []
+    declared = f'cable_turns = 0.6\ncable_unwound = "{DECLARED}"'
+    bench.serial = "B9" if change == "drive" else "A1"
+    bench.file(declared + {"drive": "", "sign": "\nsign = -1", "zero": "\nzero_rad = 0.5"}[change])
+    assert "of another drive, sign or zero" in bench.host(0.0, now_s=LATER_S)[0]
+
+
+def test_a_host_that_was_killed_has_kept_it_and_a_file_that_cannot_be_read_is_unknown(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    assert bench.host(*(0.05 * step for step in range(80)), ends=False) == []
+    path = tmp_path / CABLES
+    wait_until(lambda: path.is_file() and b":3." in path.read_bytes(), "what it keeps, on the disk")
+    assert "Turn it by hand" in bench.host(3.95 - TURN, now_s=LATER_S)[0]
+    path.write_text("{")
+    assert "cannot be read" in bench.host(0.0, now_s=LATER_S)[0]
+
+
+def test_only_joints_that_say_so_and_only_real_ones_are_counted(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    assert kept_at(tmp_path, bench.joints, msgspec.structs.replace(bench.robot, emulated=True)) is None
+    bench.file("")
+    assert kept_at(tmp_path, bench.joints, bench.robot) is None
+
+
+@pytest.mark.parametrize(
+    ("joint_2", "why"),
+    [("cable_turns = 0.4", "less than its limits of -3 to 3 rad"), ("cable_turns = 0.6\ngear = 9.0", "`gear` = 9")],
+)
+def test_a_cable_that_does_not_bear_the_limits_or_a_geared_drive_is_refused(
+    tmp_path: Path, joint_2: str, why: str
+) -> None:
+    with pytest.raises(ConfigError, match=why):
+        file_of(tmp_path, joint_2)
