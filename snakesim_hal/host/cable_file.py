@@ -15,15 +15,21 @@ import msgspec
 
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.whole_file import write_whole
-from snakesim_hal.safety.cables import CableJoint, Cables
+from snakesim_hal.safety.cables import TURN_RAD, CableJoint, Cables
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import Description, JointState
 
 CABLES = "cables.json"
 FRESH_S = 3600.0  # that `cable_unwound` of a robot file counts for a host that has not kept it
 AHEAD_S = 60.0  # that the clock of who declared it may be ahead
+END_STOP_RAD = 0.1  # that end stops take of a turn, at least
 CLOSE_S = 1.0  # for a disk that hangs
 WAY_OUT = "with its cable unwound and the robot straight, `snakesim joints zero`, then restart the host within an hour"
+
+NO_STOPS = (
+    "its limits of {:.3f} to {:.3f} rad leave no room for end stops: give `cable_turns`, that its cable bears to "
+    f"either side, or limits that are {END_STOP_RAD:g} rad less than a turn apart"
+)
 
 
 class KeptCable(msgspec.Struct, frozen=True, kw_only=True):
@@ -47,6 +53,8 @@ class CableFile:
         kept = self._read()
         for i, joint in enumerate(joints):
             if (turns := joint.limits.cable_turns) is None:
+                if _goes_round(joint):
+                    unknown[joint.name] = NO_STOPS.format(joint.limits.least_rad, joint.limits.most_rad)
                 continue
             described = robot.joints[i]
             wanted.append(CableJoint(joint.name, i, described.angle_min_rad, described.angle_max_rad, turns))
@@ -102,9 +110,13 @@ class CableFile:
 
 def kept_at(folder: Path, joints: Sequence[Joint], robot: Description) -> CableFile | None:
     """None: the robot has no such joints, or nothing real moves."""
-    if robot.emulated or all(joint.limits.cable_turns is None for joint in joints):
+    if robot.emulated or all(joint.limits.cable_turns is None and not _goes_round(joint) for joint in joints):
         return None
     return CableFile(folder, joints, robot, time.time())
+
+
+def _goes_round(joint: Joint) -> bool:
+    return joint.limits.most_rad - joint.limits.least_rad > TURN_RAD - END_STOP_RAD
 
 
 def _seen(kept: Mapping[str, KeptCable] | str, joint: Joint, owner: str, now_s: float) -> float | str:

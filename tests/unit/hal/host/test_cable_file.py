@@ -113,6 +113,9 @@ def test_a_host_that_was_killed_has_kept_it_and_a_file_that_cannot_be_read_is_un
 def test_only_joints_that_say_so_and_only_real_ones_are_counted(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     assert kept_at(tmp_path, bench.joints, msgspec.structs.replace(bench.robot, emulated=True)) is None
+    bench.file("angle_max_rad = 3.1415\nangle_min_rad = -3.1415")
+    no_stops = kept_at(tmp_path, bench.joints, bench.robot)
+    assert no_stops is not None and "leave no room for end stops" in no_stops.cables.against_arming()[0]
     bench.file("")
     assert kept_at(tmp_path, bench.joints, bench.robot) is None
 
