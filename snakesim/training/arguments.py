@@ -33,6 +33,7 @@ def add_commands(commands: Any) -> None:
     )
     train.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="may be repeated")
     train.add_argument("--workers", type=number(1, 1000), metavar="N", help="processes (one a core)")
+    train.add_argument("--cluster", metavar="tcp://HOST:PORT", help="scheduler of a Dask cluster, instead")
     train.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of what comes of it")
     train.set_defaults(act=_train)
 
@@ -40,7 +41,7 @@ def add_commands(commands: Any) -> None:
 def _train(arguments: argparse.Namespace) -> int:
     from snakesim_operator import extras
 
-    for extra in ("train", "gym", "plot", "policy"):
+    for extra in ("train", "gym", "plot", "policy", *(["evaluate"] if arguments.cluster else [])):
         extras.check(extra, "`snakesim train`")
     from snakesim.training.search import Effort
     from snakesim.training.trained import Request, train
@@ -62,6 +63,7 @@ def _train(arguments: argparse.Namespace) -> int:
                 arguments.generations, arguments.population, arguments.fields, arguments.check_fields, arguments.seed
             ),
             workers=arguments.workers,
+            cluster=arguments.cluster,
             out=arguments.out,
             again=["snakesim", "train", arguments.scenario, *chosen],
         )

@@ -1,9 +1,10 @@
-"""Episodes of policies, in a process for each processor."""
+"""Episodes of policies, in a process for each processor, or on the workers of a Dask cluster."""
 
 import os
 import signal
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context
 from types import TracebackType
@@ -16,8 +17,10 @@ from snakesim.training.form import OBSERVE, Policy
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.process import die_with_parent
 
+RETRIES = 2  # of an episode whose worker died
 Values = Mapping[str, float]
-_SEATS: list[SnakeEnv] = []  # of this process: one environment
+Arguments = Mapping[str, Any]  # of `SnakeEnv`
+_SEATS: list[tuple[Arguments, SnakeEnv]] = []  # of this process: one environment
 
 
 @dataclass(frozen=True)
@@ -34,14 +37,13 @@ class Episode:
 class Episodes:
     """Runs them. The same policies and fields give the same numbers, with any number of processes."""
 
-    def __init__(self, arguments: Mapping[str, Any], workers: int | None = None) -> None:
-        """arguments: of `SnakeEnv`. Raises ConfigError for wrong ones."""
-        _seat(arguments)
-        env = _SEATS[-1]
+    def __init__(self, arguments: Arguments, workers: int | None = None, cluster: str | None = None) -> None:
+        """cluster: address of a Dask scheduler. Raises ConfigError, NotConnectedError."""
+        self._arguments, self._opened = dict(arguments), ExitStack()
+        env = _seat(self._arguments)
         self.axes = [joint.axis for joint in env.description.joints]
         self.sizes = {name: len(part.names) for name, part in env.parts.items()}
-        count = workers or len(os.sched_getaffinity(0))
-        self._pool = ProcessPoolExecutor(count, get_context("spawn"), initializer=_begin, initargs=(dict(arguments),))
+        self._pool = self._opened.enter_context(_local(workers) if cluster is None else _remote(cluster))
 
     def __enter__(self) -> Self:
         return self
@@ -49,12 +51,12 @@ class Episodes:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._pool.shutdown(cancel_futures=True)
+        self._opened.close()
 
     def run(self, policies: Sequence[Values], fields: Sequence[int]) -> list[list[Episode]]:
         """Every policy on every field; those that a scene cannot have are left out."""
         made = [Policy.of(values, self.axes, self.sizes) for values in policies]
-        jobs = [(policy, field) for policy in made for field in fields]
+        jobs = [(self._arguments, policy, field) for policy in made for field in fields]
         found = list(self._pool.map(_episode, *zip(*jobs, strict=True)))
         return [
             [episode for episode in found[start : start + len(fields)] if episode is not None]
@@ -62,19 +64,38 @@ class Episodes:
         ]
 
 
-def _begin(arguments: Mapping[str, Any]) -> None:
+@contextmanager
+def _local(workers: int | None) -> Iterator[Executor]:
+    pool = ProcessPoolExecutor(workers or len(os.sched_getaffinity(0)), get_context("spawn"), initializer=_begin)
+    try:
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def _remote(address: str) -> Iterator[Executor]:
+    from snakesim_operator.dask_cluster import connected
+
+    with connected(address) as client:
+        yield client.get_executor(pure=False, retries=RETRIES)
+
+
+def _begin() -> None:
     """In each process."""
     die_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a Ctrl-C is for the command
-    _seat(arguments)
 
 
-def _seat(arguments: Mapping[str, Any]) -> None:
-    _SEATS[:] = [SnakeEnv(**{**arguments, "observe": OBSERVE, "action": "position"})]
+def _seat(arguments: Arguments) -> SnakeEnv:
+    """The environment of this process; another one for other arguments."""
+    if not _SEATS or _SEATS[-1][0] != arguments:
+        _SEATS[:] = [(arguments, SnakeEnv(**{**arguments, "observe": OBSERVE, "action": "position"}))]
+    return _SEATS[-1][1]
 
 
-def _episode(policy: Policy, field: int) -> Episode | None:
-    env = _SEATS[-1]
+def _episode(arguments: Arguments, policy: Policy, field: int) -> Episode | None:
+    env = _seat(arguments)
     try:
         seen, info = env.reset(seed=field)
     except ConfigError:  # obstacles that find no place

@@ -28,6 +28,7 @@ class Request:
     form: str
     effort: Effort
     workers: int | None
+    cluster: str | None
     out: Path
     again: Sequence[str]  # the command that does the same
 
@@ -51,7 +52,7 @@ def train(request: Request) -> int:
         export(request.out / "policy.onnx", policy, best, FRAME_SKIP, request.again)
         write_curve(request.out, curve)
 
-    with Episodes(arguments, request.workers) as episodes:
+    with Episodes(arguments, request.workers, request.cluster) as episodes:
         request.out.mkdir(parents=True, exist_ok=True)
         _, reward = search(episodes, request.form, request.effort, tell)
     used = resource.getrusage(resource.RUSAGE_CHILDREN)

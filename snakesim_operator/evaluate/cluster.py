@@ -2,7 +2,6 @@
 
 import logging
 import os
-import re
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 
@@ -10,11 +9,10 @@ import dask.config
 from distributed import Client, Future, LocalCluster, as_completed
 from distributed.scheduler import KilledWorker
 
-from snakesim_hal.errors import ConfigError, NotConnectedError, short
+from snakesim_operator.dask_cluster import connected
 from snakesim_operator.evaluate.case import Case, Outcome, code_digest, run_case
 
 DEATHS, RETRIES = 4, 2  # of the workers that run a case, and of the case, until it is given up
-MEET_S = 20.0
 LOOPBACK = "127.0.0.1"
 
 
@@ -26,7 +24,7 @@ def workers(cluster: str | None, count: int | None = None, *, dashboard: bool = 
     """
     with ExitStack() as opened:
         if cluster is not None:
-            yield opened.enter_context(_remote(cluster))
+            yield opened.enter_context(connected(cluster))
             return
         logging.getLogger("distributed").setLevel(logging.CRITICAL)
         settings = {"distributed.scheduler.allowed-failures": DEATHS, "distributed.comm.timeouts.connect": "60s"}
@@ -42,24 +40,6 @@ def workers(cluster: str | None, count: int | None = None, *, dashboard: bool = 
         )
         opened.enter_context(here)
         yield opened.enter_context(Client(here, set_as_default=False))
-
-
-@contextmanager
-def _remote(address: str) -> Iterator[Client]:
-    if not re.fullmatch(r"(tcp|tls)://[^\s/]+:\d{1,5}", address):
-        raise ConfigError(f"--cluster {short(address)}: give the scheduler as tcp://HOST:PORT")
-    try:
-        client = Client(address, timeout=MEET_S, set_as_default=False)
-    except (OSError, TimeoutError):
-        raise NotConnectedError(f"--cluster {address}: no Dask scheduler answers within {MEET_S:g} s") from None
-    with client:
-        try:
-            client.wait_for_workers(1, timeout=MEET_S)
-        except TimeoutError:
-            raise NotConnectedError(
-                f"--cluster {address}: no worker within {MEET_S:g} s; start some: dask worker {address} --nthreads 1"
-            ) from None
-        yield client
 
 
 def size(client: Client) -> int:

@@ -161,13 +161,30 @@ def test_killed_it_leaves_nobody_behind_and_goes_on(home: Path, undisturbed: tup
         assert (out / name).read_bytes() == (undisturbed[1] / name).read_bytes(), name
 
 
+def dask() -> tuple[str, tuple[str, ...], tuple[str, ...]]:
+    """Where a scheduler of our own will listen, and the commands of it and of a worker."""
+    port = free_endpoint().rpartition(":")[2]
+    address, program = f"tcp://127.0.0.1:{port}", (sys.executable, "-m", "dask")
+    scheduler = (*program, "scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard")
+    worker = (*program, "worker", address, "--nthreads", "1", "--no-nanny", "--no-dashboard", "--host", "127.0.0.1")
+    return address, scheduler, worker
+
+
+@pytest.mark.slow
+def test_training_on_a_cluster_finds_the_same_policy(home: Path) -> None:
+    address, scheduler, worker = dask()
+    small = ["--generations", "2", "--population", "4", "--fields", "1", "--check-fields", "1", "--duration", "0.5"]
+    with background(*scheduler, home=home), background(*worker, home=home):
+        there = snakesim("train", "surveyed_clutter", *small, "--cluster", address, "--out", "there", cwd=home)
+    here = snakesim("train", "surveyed_clutter", *small, "--workers", "1", "--out", "here", cwd=home)
+    assert there.code == here.code == 0, there.out + there.err + here.err
+    assert (home / "there" / "policy.onnx").read_bytes() == (home / "here" / "policy.onnx").read_bytes()
+
+
 @pytest.mark.slow
 def test_a_cluster_that_loses_a_worker_gives_the_same_table(home: Path, undisturbed: tuple[Ended, Path]) -> None:
-    port, out = free_endpoint().rpartition(":")[2], home / "cluster"
-    address = f"tcp://127.0.0.1:{port}"
-    dask = (sys.executable, "-m", "dask")
-    worker = (*dask, "worker", address, "--nthreads", "1", "--no-nanny", "--no-dashboard", "--host", "127.0.0.1")
-    scheduler = (*dask, "scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard")
+    address, scheduler, worker = dask()
+    out = home / "cluster"
     with (
         background(*scheduler, home=home),
         background(*worker, home=home) as lost,
