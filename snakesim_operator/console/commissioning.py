@@ -27,6 +27,7 @@ from snakesim_operator.console.token import ControlToken
 from snakesim_operator.tools.targets import flags_of
 
 HOLD_HZ = 20.0  # a command counts a key as held for 0.15 s
+NOBODY = -1  # as the viewer of a step: it is being ended
 LEFT_S = 60.0  # a jog in which nothing is held for so long ends
 STEPS = {
     "direction": "turn joints by hand, as it asks; Enter skips one",
@@ -51,7 +52,7 @@ class Commissioning:
         """file: the robot file on this computer with which the host was started; None: steps need a terminal."""
         self.file, self._link, self._token, self._log = file, link, token, log
         self._step: JointStep | None = None
-        self._viewer, self._held_s = -1, 0.0
+        self._viewer, self._held_s = NOBODY, 0.0
         self._lock = threading.Lock()
         self._configured: Configuration | None = None
         self._config: RunConfig | None = None
@@ -74,7 +75,9 @@ class Commissioning:
             where = shlex.split(flags_of(self._link, None))
             self._step = JointStep([verb, str(self.file), *named, *more, *where])
             self._viewer, self._held_s, self._moved = viewer, time.monotonic(), []
-        return f"{verb} {' '.join(named)}".strip()
+        what = f"joints {' '.join([verb, *named])}"
+        self._log.write(f"viewer {viewer + 1}: {what}")
+        return what
 
     def press(self, viewer: int, key: bytes) -> None:
         """A key for the step, of the viewer who started it."""
@@ -96,10 +99,10 @@ class Commissioning:
         if step is None or not step.runs:
             return
         left = step.verb == "jog" and time.monotonic() - self._held_s > LEFT_S
-        if left or self._token.holder != self._viewer:
+        if self._viewer != NOBODY and (left or self._token.holder != self._viewer):
             why = f"nothing was held for {LEFT_S:g} s" if left else "control was given up"
             self._log.write(f"joints {step.verb} ends: {why}")
-            self._viewer = -1
+            self._viewer = NOBODY
             step.end()
         if step.verb == "limits" and snapshot is not None and snapshot.joints is not None:
             now = snapshot.joints.angle_rad
