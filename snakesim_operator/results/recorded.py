@@ -65,7 +65,7 @@ class Contents:
     lacks: list[str] = field(default_factory=list[str])
     unreached: list[str] = field(default_factory=list[str])  # what never came to the recorder
     ticks: int = 0  # with set-points as applied
-    ticks_lost: int | None = 0  # of these, as the file itself tells; None: it is damaged, and does not tell
+    ticks_lost: int | None = 0  # of these, as the file itself tells; None: it does not tell
     last_tick_ns: int | None = None  # robot time of the last of them
     whole: bool = True  # the file has an end
     replay_of: str = ""  # the recording whose sensors these are
@@ -229,7 +229,9 @@ def read_recording(
     contents.lacks += [f"recording: {lack}" for lack in reader.lacks]
     contents.whole, losses = reader.finished, reader.losses
     known = losses.lost[keys.APPLIED] + losses.dropped.get(keys.APPLIED, 0)
-    contents.ticks_lost = known if contents.whole and not losses.places else None
+    chosen = reader.about.get("keys")  # of a recording that was to have these alone
+    told = contents.whole and not losses.places and not (isinstance(chosen, list) and keys.APPLIED not in chosen)
+    contents.ticks_lost = known if told else None
     contents.replay_of = str(reader.about.get("replay_of", ""))[:500]
     if losses.misplaced:
         for messages in contents.streams.values():

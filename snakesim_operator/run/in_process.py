@@ -181,7 +181,7 @@ def _recording(
         yield recording
     finally:
         if recording is not None:
-            recording.close({"version": version("snakesim"), "dropped": {}})
+            recording.close({"version": version("snakesim"), "dropped": {}, "keys": list(recorded)})
             if recording.failure:
                 files.warn(recording.failure)
 
