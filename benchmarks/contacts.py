@@ -1,4 +1,4 @@
-"""`python -m benchmarks.contacts [SCENARIO[,KEY=VALUE...]...]`: the contact estimate against the simulator's truth.
+"""`python -m benchmarks.contacts [SCENARIO[,KEY=VALUE|,-KEY...]...]`: the contact estimate against the truth.
 
 True contacts of one side within 8 cm are one push, because the estimate cannot tell them apart. With `backend=can` it
 is held against the force sensors of the emulated modules, and gets the IMU readings of the tick.

@@ -54,6 +54,13 @@ def add_scenario(parser: argparse.ArgumentParser) -> None:
         metavar="SECTION.KEY=VALUE",
         help="change any value; may be repeated",
     )
+    parser.add_argument(
+        "--unset",
+        action="append",
+        default=[],
+        metavar="SECTION.KEY",
+        help="leave out what a file may leave out, such as robot.sensors.contacts; may be repeated",
+    )
 
 
 def load_scenario(arguments: argparse.Namespace) -> "Loaded":
@@ -68,6 +75,7 @@ def load_scenario(arguments: argparse.Namespace) -> "Loaded":
         "seed": arguments.seed,
     }
     overrides = [parse_set(text) for text in arguments.set]
+    overrides += [Override(key, None, f"--unset {short(key)}") for key in arguments.unset]
     if getattr(arguments, "until_goal", False):
         overrides.append(Override("mission.until_goal", True, "--until-goal"))
     for key, value in flags.items():

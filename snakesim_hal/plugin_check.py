@@ -93,18 +93,15 @@ def what_it_lacks(joints: Sequence[JointDescription], controller: Any, name: str
 
 
 def _with_what_it_needs(config: RunConfig, controller: Any) -> RunConfig:
-    """Without a pose, and nobody else to tell it, a controller of joints runs without guidance and navigation."""
-    posed = config.robot.sensors.pose is not None or config.mission.localisation != "pose_sensor"
-    if posed or GUIDANCE not in config.own_services or not config.own_services.keys() <= {*BY_POSE, CONTROL}:
+    """Where nobody tells the pose, a controller of joints runs alone; for any other guidance reckons it."""
+    alone = GUIDANCE in config.own_services and config.own_services.keys() <= {*BY_POSE, CONTROL}
+    reckons = (
+        config.dead_reckons(description_of(config)) and config.mission.localisation == "pose_sensor"
+    )  # nobody has asked for it
+    if not (reckons and alone and getattr(controller, "NEEDS", "world") == "joints"):
         return config
-    if getattr(controller, "NEEDS", "world") == "joints":
-        left = {name: service for name, service in config.services.items() if name not in BY_POSE}
-        return msgspec.structs.replace(config, services=left)
-    raise ConfigError(
-        f"robot {config.robot.name!r} has no [sensors.pose], and without one guidance cannot tell controller "
-        f"{config.controller!r} where the body is. Add the sensor; or set mission.map=perceived and "
-        f"mission.localisation=dead_reckoning; or choose a controller that needs joints alone, such as hold"
-    )
+    left = {name: service for name, service in config.services.items() if name not in BY_POSE}
+    return msgspec.structs.replace(config, services=left)
 
 
 def on_backend(config: RunConfig, backend: Any) -> RunConfig:

@@ -33,9 +33,9 @@ class FeltContacts:
         self._last: deque[tuple[int, Sequence[WorldContact]]] = deque()  # with the stamp of the sensor
 
     def take(self, world: World) -> None:
-        """A newer world model, or again the last one."""
+        """A newer world model, or again the last one. Estimated contacts tell where the body touches, not how hard."""
         stamp_ns = world.contacts_stamp_ns
-        if stamp_ns is None:
+        if stamp_ns is None or world.contacts_from == "joint_torques":
             self._last.clear()
             return
         if self._last and stamp_ns == self._last[-1][0]:

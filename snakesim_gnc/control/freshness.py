@@ -51,7 +51,7 @@ class Limits:
             for sensor in robot.sensors
             if sensor.key in said
         }
-        if config.mission.localisation == "dead_reckoning":
+        if config.dead_reckons(robot):
             sensors_s.pop(keys.POSE, None)
         looking = [sensor for sensor in robot.sensors if sensor.key.startswith(LOOKING)]
         if looking and config.mission.map == "perceived":

@@ -6,6 +6,7 @@ For every yaw joint Newton and Euler hold for the part of the body ahead of it, 
     sum of f_c = sum of m_k a_k
 
 Accelerations come from the IMUs, which measure specific force, so weight and support cancel in the plane of the body.
+Without any IMU they are taken to be small.
 The rows weigh by their errors: the moments of accelerations add up from the head backwards and, with the sums over
 the whole body, from the tail forwards as well, so that a contact is felt best from its nearer end. The unknowns are
 friction of the ground along the links' velocities, and pushes at the ends of each link, on either side: two of them on
@@ -33,8 +34,9 @@ SLIP_M_S = 0.01  # slower links are held by friction as much as they are braked
 # Standard deviations of what goes in; of the shipped robots.
 TORQUE_NM, ACCELERATION_M_S2 = 0.012, 0.05
 SHARING = 0.06  # of the weight of each link, in each direction: the ground does not carry all links alike
-# Of links without an IMU reading, before anything is known.
-TURNING_RAD_S2, BASE_M_S2 = 30.0, 3.0
+# Of links without an IMU reading, before anything is known: turning, rad/s², and the base, m/s².
+BETWEEN_IMUS = (30.0, 3.0)
+WITHOUT_IMUS = (3.0, 0.3)  # of a snake that creeps, about 0.1 m/s: with more, hardly any push would show
 LIKELY = 1.0  # standard deviations by which a push may show to be considered
 SURE = 3.0  # standard deviations by which a push must show
 MAX_STEPS = 30  # of the search
@@ -171,7 +173,8 @@ def _motion(body: Body, spins: Floats, imu: Imu) -> tuple[Floats, Floats]:
     model = _accelerations(body, spins)[:, imu.link].reshape(2 * len(imu.link), len(spins) + 3)
     in_links = np.reshape(imu.acceleration_m_s2, (-1, 3))
     measured = np.einsum("kij,kj->ki", body.frames[imu.link], in_links)[:, :2].T.ravel()
-    before = np.append(np.full(2, BASE_M_S2), np.full(len(spins), TURNING_RAD_S2))
+    turning_rad_s2, base_m_s2 = BETWEEN_IMUS if imu.link else WITHOUT_IMUS
+    before = np.append(np.full(2, base_m_s2), np.full(len(spins), turning_rad_s2))
     precision = model[:, :-1].T @ model[:, :-1] / ACCELERATION_M_S2**2 + np.diag(before**-2.0)
     covariance = np.linalg.inv(precision)
     found = covariance @ model[:, :-1].T @ (measured - model[:, -1]) / ACCELERATION_M_S2**2

@@ -57,7 +57,9 @@ class WorldModel:
             ],
             obstacles=self._obstacles_nearby(origins),
             pose_stamp_ns=pose.stamp_ns,
+            pose_from="sensor",
             contacts_stamp_ns=None if contacts is None else contacts.stamp_ns,
+            contacts_from=None if contacts is None else "sensor",
             centre_w=(x, y, z),
         )
 

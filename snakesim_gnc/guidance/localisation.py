@@ -107,7 +107,21 @@ class Localiser:
         by = gain @ error
         left = np.eye(3) - gain
         self.covariance = left @ own @ left.T + gain @ spread @ gain.T + np.diag([common_m2, common_m2, 0.0])
-        around = then.planar_w[:2]
+        self._shift(then.planar_w[:2], by)
+
+    def correct_along(self, rows: Floats, errors_m: Floats, sds_m: Floats) -> None:
+        """Measurements of now, each along one direction: rows (m, 3) say how it changes with x, y and heading.
+
+        errors_m, sds_m: (m,) by how much it is greater than with the present base, and its standard deviation.
+        """
+        across = self.covariance @ rows.T
+        gain = across @ np.linalg.inv(rows @ across + np.diag(sds_m**2))
+        left = np.eye(3) - gain @ rows
+        self.covariance = left @ self.covariance @ left.T + (gain * sds_m**2) @ gain.T
+        self._shift(self.base.planar_w[:2].copy(), gain @ errors_m)
+
+    def _shift(self, around: Floats, by: Floats) -> None:
+        """Turn the base, and where it was, around a place (2,) by by[2], then move them by by[:2]."""
         now = self.base.planar_w
         moved = around + (about_z(by[2])[:2, :2] @ (now[:2] - around)) + by[:2]
         self.base = Base(np.array([*moved, wrapped(now[2] + by[2])]), self.base.z_m, self.base.tilt)

@@ -131,7 +131,7 @@ class PerceivedWorld:
             stamp_ns=joints.stamp_ns,
             base_position_w=_vector(base.position_w),
             base_orientation_wxyz=quaternion_of(base.rotation),
-            base_confidence=1.0 / (1.0 + (here.position_sd_m / SURE_SD_M) ** 2),
+            base_confidence=confidence_of(here.position_sd_m),
             contacts=contacts_w,
             obstacles=self.map.obstacles(now_ns, base.z_m - self._radius_m),
             pose_stamp_ns=here.pose_stamp_ns,
@@ -140,7 +140,14 @@ class PerceivedWorld:
             base_position_sd_m=min(here.position_sd_m, 1e3),
             base_yaw_sd_rad=min(here.yaw_sd_rad, 10.0),
             depth_stamp_ns=self.depth_stamp_ns,
+            pose_from="sensor" if self._trusts_pose(now_ns) else "dead_reckoning",
+            contacts_from=None if contacts is None else "sensor",
         )
+
+    def _trusts_pose(self, now_ns: int) -> bool:
+        """Whether the pose sensor has just told; else dead reckoning goes on alone, and the map helps."""
+        pose_ns = self.localiser.pose_stamp_ns
+        return pose_ns is not None and now_ns - pose_ns <= TRUSTED_NS
 
     def _body_of(self, stamp_ns: int, what: str) -> Body | None:
         """The body at a sample's stamp; None when it is unknown, which is counted."""
@@ -162,8 +169,7 @@ class PerceivedWorld:
         variance = 0.5 * float(np.trace(here.covariance[:2, :2]))
         self.map.drift(max(variance - self._variance_m2, 0.0))
         self.map.here_m2 = variance
-        pose_ns = here.pose_stamp_ns
-        if pose_ns is None or scan.stamp_ns - pose_ns > TRUSTED_NS:
+        if not self._trusts_pose(scan.stamp_ns):
             then = here.history.base_at(scan.stamp_ns)
             found = None if then is None else matched(scan, self.map.tracks, then.planar_w)
             if then is not None and found is not None:
@@ -179,6 +185,11 @@ class PerceivedWorld:
     def _name_at(self, position_w: Floats) -> str | None:
         track = self.map.at(position_w[:2])
         return None if track is None else track.name
+
+
+def confidence_of(position_sd_m: float) -> float:
+    """In a position; one half when it is known to 5 cm."""
+    return 1.0 / (1.0 + (position_sd_m / SURE_SD_M) ** 2)
 
 
 def quaternion_of(rotation: Floats) -> tuple[float, float, float, float]:

@@ -7,13 +7,16 @@ import numpy as np
 
 from snakesim_gnc.guidance.body_history import Base
 from snakesim_gnc.guidance.core import WorldModel
+from snakesim_gnc.guidance.estimated_contacts import ContactEstimator, with_estimated
 from snakesim_gnc.guidance.localisation import PoseNoise
 from snakesim_gnc.guidance.perceived_world import PerceivedWorld
+from snakesim_gnc.guidance.reckoned_pose import ReckonedPose
 from snakesim_gnc.guidance.scan import Look, Noise
 from snakesim_hal.model.scenario import RunConfig, start_of, surveyed
 from snakesim_hal.model.sensors import DepthCamera, Looking
 from snakesim_hal.network.client import Client
 from snakesim_hal.service import Service
+from snakesim_hal.terminal import print_stderr
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (
     Clock,
@@ -51,34 +54,56 @@ class Guidance(Service):
 
 
 class _Surveyed:
-    """The map is the scene's, the pose that of the sensor."""
+    """The map is the scene's; the pose that of the sensor, or reckoned; contacts those of the sensor, or estimated."""
 
     def __init__(self, client: Client, config: RunConfig) -> None:
+        sensors = config.robot.sensors
         self._known: Sequence[Obstacle] = surveyed(config)
         self._joints = client.subscribe(keys.JOINTS, JointState)
-        self._contacts = client.subscribe(keys.CONTACTS, Contacts) if config.robot.sensors.contacts else None
+        self._contacts = client.subscribe(keys.CONTACTS, Contacts) if sensors.contacts else None
         self._pose = client.subscribe(keys.POSE, Pose)
-        self._client = client
+        self._imu = client.subscribe(keys.IMU, Imu) if sensors.imu else None
+        self._client, self._config = client, config
         self._model: WorldModel | None = None
+        self._reckoned: ReckonedPose | None = None
+        self._estimator: ContactEstimator | None = None
 
     def configure(self, robot: Description) -> None:
         self._model = WorldModel(robot, self._known)
+        reckons = self._config.dead_reckons(robot)
+        self._reckoned = ReckonedPose(robot, _start(self._config), self._known) if reckons else None
+        sensed = any(sensor.key == keys.CONTACTS for sensor in robot.sensors)
+        self._estimator = None if sensed else ContactEstimator.of(robot)
+        if self._reckoned is not None:
+            print_stderr("nobody measures the pose: it is reckoned from the start, by joints, contacts and the map")
+        if self._estimator is not None:
+            print_stderr("no sensor tells contacts: they are estimated from the torques of the joints")
 
     def world(self, clock: Clock) -> World | None:
-        joints, pose = self._client.read(self._joints), self._client.read(self._pose)
-        if self._model is None or joints is None or pose is None:
+        read = self._client.read
+        joints = read(self._joints)
+        pose = read(self._pose) if self._reckoned is None else None
+        if self._model is None or joints is None or (self._reckoned is None and pose is None):
             return None
-        contacts = self._client.read(self._contacts) if self._contacts else None
-        return self._model.update(clock.tick, clock.stamp_ns, joints, contacts, pose)
+        contacts, estimated = read(self._contacts) if self._contacts else None, None
+        if contacts is None and self._estimator is not None:
+            imu = read(self._imu) if self._imu and self._reckoned is None else None
+            estimated = self._estimator.contacts(joints, imu, pose)
+            contacts = None if estimated is None else estimated.contacts
+        if self._reckoned is not None:
+            pose = self._reckoned.move(joints, contacts, estimated=estimated is not None)
+        assert pose is not None
+        world = self._model.update(clock.tick, clock.stamp_ns, joints, contacts, pose)
+        if estimated is not None:
+            world = with_estimated(world, estimated)
+        return world if self._reckoned is None else self._reckoned.told_in(world)
 
 
 class _Perceived:
     """Map and pose are what the sensors measure. Of the scene only the place where the snake is laid down is used."""
 
     def __init__(self, client: Client, config: RunConfig) -> None:
-        start, robot = start_of(config), config.robot
-        planar = np.array([*start.position_w, start.yaw_rad])
-        self._start = Base(planar, robot.module.radius_m, np.eye(3))
+        self._start, robot = _start(config), config.robot
         sensed = robot.sensors.pose
         self._noise = PoseNoise() if sensed is None else PoseNoise(sensed.position_noise_m, sensed.angle_noise_rad)
         self._joints = client.subscribe(keys.JOINTS, JointState)
@@ -121,6 +146,12 @@ class _Perceived:
         new = self._taken.get(key) != stamp_ns
         self._taken[key] = stamp_ns
         return new
+
+
+def _start(config: RunConfig) -> Base:
+    """Where the robot is laid down."""
+    start = start_of(config)
+    return Base(np.array([*start.position_w, start.yaw_rad]), config.robot.module.radius_m, np.eye(3))
 
 
 def _noise(sensor: Looking) -> Noise:

@@ -8,10 +8,7 @@ from snakesim_hal.safety.authority import Authority, Decision
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import AppliedCommand, Description, Pace, Status, Timing
 
-WITHOUT = {
-    keys.POSE: "mission.map=perceived with mission.localisation=dead_reckoning does without; so does a controller of "
-    "joints alone, as hold, on a robot without [sensors.pose]"
-}
+WITHOUT = {keys.POSE: "mission.localisation=dead_reckoning does without, and so does a robot without [sensors.pose]"}
 """How a run can do without a message."""
 
 

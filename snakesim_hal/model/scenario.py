@@ -26,10 +26,12 @@ from snakesim_hal.model.route import chain_angles, lay_chain, yaw_segments_m
 from snakesim_hal.model.scene import Placed, SceneFile, check_clear, place, route_of
 from snakesim_hal.model.textfiles import parse_toml
 from snakesim_hal.model.whole_file import write_whole
+from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Obstacle, Pace
 from snakesim_hal.wire.quantities import above
 
 SURVEY = 0x5EED  # tells the survey's random numbers from others of the same seed
+SENSOR = "sensor"  # the service of cameras, motion capture and other sensors that the backend does not have
 POLICY = "policy:"  # a controller that begins so names its model behind it
 CHOSEN = (
     "control.",
@@ -71,12 +73,11 @@ class Mission(FileStruct, frozen=True, kw_only=True):
     map_error_m: Annotated[float, Meta(ge=0, le=0.1, extra_json_schema={"unit": "m"})] = 0.0
     # Of obstacles, as navigation reckons with it where it plans, and the controller where it pushes.
     peg_friction: Annotated[float, Meta(ge=0, le=2, extra_json_schema={"unit": "1 (Coulomb coefficient)"})] = 0.0
-    localisation: Literal["pose_sensor", "dead_reckoning"] = "pose_sensor"  # or joints, IMU and contacts, and the map
+    # By the pose sensor where there is one; or by joints, IMU, contacts and the map alone.
+    localisation: Literal["pose_sensor", "dead_reckoning"] = "pose_sensor"
 
     def __post_init__(self) -> None:
-        """Dead reckoning is part of perception; only a goal can be reached."""
-        if self.localisation == "dead_reckoning" and self.map == "known":
-            raise ValueError('localisation = "dead_reckoning" needs map = "perceived"')
+        """Only a map that is known has errors of a survey; only a goal can be reached."""
         if self.map_error_m > 0 and self.map == "perceived":
             raise ValueError('`map_error_m` is of a survey; with map = "perceived" there is none')
         if self.until_goal and self.goal is None:
@@ -188,6 +189,12 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
             return "external"
         model = self.control_settings.get("model") if self.controller == POLICY[:-1] else None
         return f"{POLICY}{model}" if model else self.controller
+
+    def dead_reckons(self, robot: Description) -> bool:
+        """Whether guidance reckons the pose: it was told to, or neither the robot nor a service tells it."""
+        described = any(sensor.key == keys.POSE for sensor in robot.sensors)
+        told = described or self.robot.sensors.pose is not None or SENSOR in self.services
+        return self.mission.localisation == "dead_reckoning" or not told
 
     @property
     def period_ns(self) -> int:

@@ -690,7 +690,7 @@ class World(Message, frozen=True, kw_only=True):
     obstacles: Annotated[list[Obstacle], Meta(max_length=4096)]
     pose_stamp_ns: Annotated[q.Stamp | None, about("of the pose in it; null: unknown")] = None
     contacts_stamp_ns: Annotated[
-        q.Stamp | None, about("of the contacts in it; null: no sample yet, or no such sensor")
+        q.Stamp | None, about("of the contacts in it; null: no sample yet, and no estimate")
     ] = None
     centre_w: Annotated[q.Vector | None, about("centre of mass of the body; null: unknown")] = None
     base_position_sd_m: Annotated[
@@ -705,6 +705,14 @@ class World(Message, frozen=True, kw_only=True):
     ] = None
     depth_stamp_ns: Annotated[
         q.Stamp | None, about("of the newest image or ranges in `obstacles`; null: none, or a map that is known")
+    ] = None
+    pose_from: Annotated[
+        Literal["sensor", "dead_reckoning"] | None,
+        about("what the base's pose is of now; its age is that of `pose_stamp_ns` or of `stamp_ns`; null: not told"),
+    ] = None
+    contacts_from: Annotated[
+        Literal["sensor", "joint_torques"] | None,
+        about("what `contacts` are of: measured, or estimated; their age is that of `contacts_stamp_ns`; null: none"),
     ] = None
 
 

@@ -12,6 +12,7 @@ from snakesim_hal.wire.messages import Fault, Mode, Pace, Timing
 from snakesim_operator.results.advance import Advance, energy_j, energy_j_per_m, work_j
 from snakesim_operator.results.came_true import came_true
 from snakesim_operator.results.effort import Effort
+from snakesim_operator.results.estimates import Estimates
 from snakesim_operator.results.record import RunRecord
 
 SATURATED_FROM = 0.99  # of a joint's torque limit
@@ -54,6 +55,18 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     mean_speed_m_s: Annotated[
         float | None, _number("m/s", "path distance (or displacement) over the time in which it is known")
     ]
+    pose_from: Annotated[
+        str | None, Meta(description="what guidance had the pose from: sensor or dead_reckoning; null: unknown")
+    ] = None
+    contacts_from: Annotated[
+        str | None, Meta(description="what guidance had contacts from: sensor or joint_torques; null: none, or unknown")
+    ] = None
+    reckoned_distance_m: Annotated[
+        float | None, _number("m", "advance by the reckoned pose; null: it was measured")
+    ] = None
+    reckoned_off_m: Annotated[
+        float | None, _number("m", "the reckoned pose from the measured one, at most; null: one of them is unknown")
+    ] = None
     locomoting_fraction: Annotated[float | None, _number("1", "share of the time in state Locomoting")]
     propulsion_joints: Annotated[
         list[str] | None, Meta(description="one at a time, in order of use; null: control reported nothing")
@@ -128,6 +141,11 @@ def distance_m(summary: RunSummary) -> float | None:
     return summary.path_distance_m if summary.path_distance_m is not None else summary.net_displacement_m
 
 
+def estimates_of(summary: RunSummary) -> Estimates:
+    """What was estimated in the run."""
+    return Estimates(summary.pose_from, summary.contacts_from, summary.reckoned_distance_m, summary.reckoned_off_m)
+
+
 def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), hosts: int = 1) -> RunSummary:
     """Work out the numbers of a run."""
     config, host = record.config, record.host
@@ -158,6 +176,7 @@ def summarise(record: RunRecord, ended: str, restarts: Sequence[Restart] = (), h
         command_digest=host.command_digest,
         path_distance_m=path_m,
         net_displacement_m=net_m,
+        **vars(Estimates.of(record)),
         mean_speed_m_s=moved_m / known_s if moved_m is not None else None,
         locomoting_fraction=_locomoting_fraction(record),
         propulsion_joints=propulsion_sequence(record) if record.control else None,

@@ -21,7 +21,7 @@ from snakesim_operator.results.ended import COMPLETE, ended_early
 from snakesim_operator.results.gaps import unwritten
 from snakesim_operator.results.incomplete import INCOMPLETE
 from snakesim_operator.results.record import REPORT, SUMMARY, RunRecord
-from snakesim_operator.results.summary import Restart, RunSummary, distance_m, summarise
+from snakesim_operator.results.summary import Restart, RunSummary, distance_m, estimates_of, summarise
 from snakesim_operator.run.ending import Ending
 from snakesim_operator.run.run_files import RunFiles
 
@@ -171,6 +171,7 @@ def _print_summary(summary: RunSummary) -> None:
         ("last state", f"{summary.last_state}: {summary.last_reason}" if summary.last_state else "unknown"),
         ("command digest", digest_text(summary.command_digest, summary.own_arithmetic)),
     ]
+    rows += [("estimated", words) for words in estimates_of(summary).in_words()]
     if summary.faults:
         count = len(summary.faults) + summary.faults_left_out
         rows.append(("faults", f"{count}, the first: {summary.faults[0].cause}"))

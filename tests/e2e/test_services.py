@@ -194,7 +194,7 @@ def test_a_run_names_what_never_comes_and_gives_up_after_a_stated_time(home: Pat
     (home / "lab" / "silent.py").write_text(SERVICE + SILENT)
     flags = [*SHORT, "--set", "services.sensor.code=./lab/silent.py:Silent", "--set", "start_limit_s=3"]
     ended, summary = run_to_summary(home / "run", *flags)
-    why = "waiting for guidance, which has no sensor/pose yet (mission.map=perceived with mission.localisation="
+    why = "waiting for guidance, which has no sensor/pose yet (mission.localisation=dead_reckoning does without"
     given_up = "not ready to arm within 3 s"
     for said in (summary.ended, ended.out):
         assert f"{given_up} (start_limit_s) with every service there: " in said and why in said, ended.out

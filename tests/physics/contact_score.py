@@ -14,7 +14,7 @@ from snakesim_hal.backend import Samples
 from snakesim_hal.in_process import InProcessRun
 from snakesim_hal.model.kinematics import link_frames, rotation_from_quaternion
 from snakesim_hal.model.plugins import BACKENDS, find_plugin, offered
-from snakesim_hal.model.scenario import load, parse_set
+from snakesim_hal.model.scenario import Override, load, parse_set
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Contacts, Description, Imu, Pose
 from snakesim_sim_backend.backend import SimBackend
@@ -61,8 +61,9 @@ class Score:
 
 
 def score(scenario: str, *settings: str, seconds: float = 5.0, with_pose: bool = True) -> Score:
-    """Run a scenario in the simulator, and estimate as it goes."""
-    config = load(scenario, [parse_set(text) for text in (f"duration_s={seconds}", *settings)]).config
+    """Run a scenario in the simulator, and estimate as it goes. settings: KEY=VALUE, or -KEY to leave it out."""
+    sets = (Override(text[1:], None, text) if text.startswith("-") else parse_set(text) for text in settings)
+    config = load(scenario, [parse_set(f"duration_s={seconds}"), *sets]).config
     factory, result, seen = find_plugin(BACKENDS, config.backend), Score(), list[tuple[Samples, list[Push]]]()
 
     class Watched(factory):

@@ -15,3 +15,9 @@ def test_the_median_error_of_a_push_is_below_15_percent(scenario: str, with_pose
     assert len(found.place_m) > 0.95 * len(found.share)  # so few are missed
     assert found.ghosts < 0.1 * len(found.share)
     assert np.median(found.place_m) < 0.04
+
+
+def test_without_imus_three_of_four_pushes_are_still_found() -> None:
+    found = score("triplet", "-robot.sensors.imu", "-robot.sensors.contacts", seconds=3.0, with_pose=False)
+    assert len(found.place_m) > 0.75 * len(found.share) > 75
+    assert np.median(found.share) < 0.4 and np.median(found.place_m) < 0.05

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from snakesim_hal.model.files import SHIPPED
 from snakesim_hal.model.scenario import load, parse_set
 from snakesim_operator.results.record import UNRECORDED
 from snakesim_operator.results.report.playback import playback
@@ -98,16 +97,17 @@ def test_what_was_not_recorded_is_unknown_and_not_none(tmp_path: Path) -> None:
     assert "with none" not in compared.out and UNRECORDED in compared.out + compared.err
 
 
-def test_without_a_pose_sensor_a_controller_of_joints_runs_and_any_other_is_refused(tmp_path: Path) -> None:
-    robot = (SHIPPED / "robots" / "planar13.toml").read_text()
-    bare = "\n[".join(part for part in robot.split("\n[") if not part.startswith("sensors.pose]"))
-    (tmp_path / "bare.toml").write_text(bare)
-    short = ["triplet", "--in-process", "--duration", "1", "--set", "robot=./bare.toml"]
-    assert snakesim("run", *short, "--controller", "hold", "--out", "held", cwd=tmp_path).code == 0
-    refused = snakesim("run", *short, "--out", "refused", cwd=tmp_path)
-    assert refused.code == 2 and not (tmp_path / "refused").exists()
-    for named in ("[sensors.pose]", "obstacle_triplet", "mission.localisation=dead_reckoning", "hold"):
-        assert named in refused.err
+def test_without_a_pose_sensor_a_controller_of_joints_runs_alone_and_any_other_by_dead_reckoning(
+    tmp_path: Path,
+) -> None:
+    short = ["triplet", "--in-process", "--duration", "1", "--unset", "robot.sensors.pose"]
+    ended, summary = run_to_summary(tmp_path / "held", *short, "--controller", "hold")
+    assert ended.code == 0 and summary.pose_from is None, ended.err
+    ended, summary = run_to_summary(tmp_path / "pushed", *short)
+    assert ended.code == 0 and summary.pose_from == "dead_reckoning" and summary.contacts_from == "sensor", ended.err
+    assert summary.path_distance_m is None and (summary.reckoned_distance_m or 0.0) > 0.03
+    wrong = snakesim("run", *short, "--unset", "robot.sensors.contact", "--out", "wrong", cwd=tmp_path)
+    assert wrong.code == 2 and "contact" in wrong.err and not (tmp_path / "wrong").exists()
 
 
 def test_a_mission_without_a_goal_has_no_end(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from snakesim_operator.results.report.timeline import (
     reported_at_s,
     state_bands,
 )
-from snakesim_operator.results.summary import RunSummary, distance_m
+from snakesim_operator.results.summary import RunSummary, distance_m, estimates_of
 
 MOVED_M = 0.02  # less than this is no locomotion
 MIN_STOP_S = 0.5  # a shorter stop at the end is not worth a word
@@ -32,7 +32,13 @@ class Verdict:
 
 
 def verdict(record: RunRecord, summary: RunSummary) -> Verdict:
-    """The run in plain words."""
+    """The run in plain words, and what of it nobody measured."""
+    found = _verdict(record, summary)
+    estimates = "; ".join(estimates_of(summary).in_words())
+    return Verdict(found.kind, f"{found.words} {_sentence(estimates.capitalize())}") if estimates else found
+
+
+def _verdict(record: RunRecord, summary: RunSummary) -> Verdict:
     if summary.ticks == 0 and len(record.time_s) == 0 and not summary.faults:
         return Verdict("bad", f"Nothing was recorded: the robot was never armed ({summary.ended}).")
     moved = _moved(record, summary)

@@ -1,5 +1,6 @@
 """Standing still: when it is noticed, and what it is put down to."""
 
+import msgspec
 import pytest
 
 from snakesim_gnc.control.carried import Carried, FeltContacts
@@ -137,3 +138,10 @@ def test_forces_are_judged_as_means_over_50_ms():
         felt.take(world_with(("peg_0", 50.0 if turn % 5 == 0 else 0.0, 0.0), stamp_ns=turn * 10_000_000))
     carried = known(felt.along((1.0, 0.0)))
     assert carried.strongest_n == pytest.approx(10.0) and carried.ahead_n == pytest.approx(10.0)
+
+
+def test_estimated_contacts_are_no_measured_forces():
+    felt, world = FeltContacts(), world_with(*PUSHED)
+    felt.take(world)
+    felt.take(msgspec.structs.replace(world, contacts_stamp_ns=2, contacts_from="joint_torques"))
+    assert felt.along((1.0, 0.0)) is None and felt.at(["peg_1"]) == []

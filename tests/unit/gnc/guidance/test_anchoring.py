@@ -1,0 +1,87 @@
+"""Known obstacles hold a reckoned pose: by what the body touches, and by what it cannot lie in."""
+
+import numpy as np
+import pytest
+
+from snakesim_gnc.guidance.anchoring import ESTIMATED, MEASURED, Anchors
+from snakesim_gnc.guidance.body_history import Base
+from snakesim_gnc.guidance.localisation import Localiser, PoseNoise
+from snakesim_hal.model.kinematics import link_frames
+from snakesim_hal.wire.messages import Contact, Obstacle
+from tests.unit.gnc.stage import BODY_RADIUS_M, make_robot
+
+ROBOT = make_robot()
+LENGTHS = [link.length_m for link in ROBOT.links]
+SHAPE = 0.35 * np.sin(0.9 * np.arange(len(ROBOT.joints)))
+TRUE_W = np.array([0.2, -0.1, 0.3])  # x, y, heading
+PEG_M = 0.05
+TOUCHED = ((2, 1), (7, -1), (11, 1))  # link, and on which side of it a peg stands
+
+
+def base_at(planar_w) -> Base:
+    return Base(np.array(planar_w), BODY_RADIUS_M, np.eye(3))
+
+
+def pegs(apart_m: float = 0.0) -> list[Obstacle]:
+    """At the middles of the links of a body that lies where it is in truth."""
+    base = base_at(TRUE_W)
+    rear, frames = link_frames(base.position_w, base.rotation, SHAPE, ["yaw"] * len(SHAPE), LENGTHS)
+    found: list[Obstacle] = []
+    for link, side in TOUCHED:
+        away_m = side * (BODY_RADIUS_M + PEG_M + apart_m)
+        x, y, _ = (rear[link] + 0.5 * LENGTHS[link] * frames[link][:, 0] + away_m * frames[link][:, 1]).tolist()
+        found.append(Obstacle(name=f"{link}", shape="cylinder", position_w=(x, y, 0.1), radius_m=PEG_M, height_m=0.2))
+    return found
+
+
+def felt(side: int = 1, force_n: float = 10.0) -> list[Contact]:
+    """side: -1 for pushes from where no peg is."""
+    return [
+        Contact(
+            link=link,
+            obstacle=None,
+            position_l=(0.07, s * side * BODY_RADIUS_M, 0.0),  # 15 mm off along the link, as estimates are
+            normal_l=(0.0, -float(s * side), 0.0),
+            tangent_1_l=(1.0, 0.0, 0.0),
+            tangent_2_l=(0.0, 0.0, float(s * side)),
+            force_l=(0.0, -s * side * force_n, 0.0),
+            torque_l=(0.0, 0.0, 0.0),
+        )
+        for link, s in TOUCHED
+    ]
+
+
+def held(off_w, obstacles, contacts, trust=ESTIMATED, turns: int = 20) -> Localiser:
+    """A localiser that begins off the truth, and what is known after some turns."""
+    localiser = Localiser(ROBOT, base_at(TRUE_W + off_w), PoseNoise())
+    localiser.covariance = np.diag([0.02, 0.02, 0.03]) ** 2
+    anchors = Anchors(ROBOT, obstacles)
+    for _ in range(turns):
+        anchors.hold(localiser, SHAPE, contacts, trust)
+    return localiser
+
+
+@pytest.mark.parametrize(("trust", "turns"), [(ESTIMATED, 20), (MEASURED, 1000)])
+@pytest.mark.parametrize("off_w", [(0.0, 0.02, 0.0), (0.015, -0.01, 0.02)])
+def test_three_contacts_on_known_pegs_bring_the_pose_back(trust, turns, off_w):
+    localiser = held(np.array(off_w), pegs(), felt(), trust, turns)
+    assert np.abs(localiser.base.planar_w - TRUE_W).max() < 0.006
+    assert localiser.position_sd_m < 0.02
+
+
+def test_a_body_lies_in_no_peg_whether_it_feels_it_or_not():
+    off = np.array([0.0, 0.02, 0.0])
+    before, after = (held(off, pegs(), [], turns=n).base.planar_w for n in (0, 20))
+    assert np.linalg.norm((after - TRUE_W)[:2]) < 0.7 * np.linalg.norm((before - TRUE_W)[:2])
+
+
+@pytest.mark.parametrize("contacts", [[], felt(side=-1), felt(force_n=0.1)], ids=["none", "other side", "weak"])
+def test_pegs_that_are_not_felt_move_nothing(contacts):
+    start = held(np.zeros(3), pegs(apart_m=0.02), contacts, turns=0)
+    later = held(np.zeros(3), pegs(apart_m=0.02), contacts)
+    assert later.base.planar_w.tolist() == start.base.planar_w.tolist() == TRUE_W.tolist()
+    assert np.array_equal(later.covariance, start.covariance)
+
+
+def test_without_obstacles_there_is_nothing_to_hold_on_to():
+    assert held(np.zeros(3), [], felt()).base.planar_w.tolist() == TRUE_W.tolist()

@@ -1,0 +1,29 @@
+"""A robot of emulated servos that tells joint angles and currents alone gets along; nobody else's reading is used."""
+
+import json
+from pathlib import Path
+
+from snakesim_operator.results.record import REPORT, RunRecord
+from tests.whole.command import snakesim
+
+BARE = ("robot.sensors.contacts", "robot.sensors.imu")
+SHORT = ["triplet", "--backend", "dynamixel", "--duration", "2.5", "--in-process"]
+
+
+def test_without_force_sensors_and_motion_capture_it_gets_along_and_says_what_is_estimated(tmp_path: Path) -> None:
+    flags = [word for key in BARE for word in ("--unset", key)]
+    watched = [*SHORT, *flags, "--set", "mission.localisation=dead_reckoning", "--out", "watched"]
+    blind = [*SHORT, *flags, "--unset", "robot.sensors.pose", "--out", "blind"]
+    ended = {name: snakesim("run", *words, cwd=tmp_path) for name, words in (("watched", watched), ("blind", blind))}
+    said = {name: json.loads((tmp_path / name / "summary.json").read_text()) for name in ended}
+    assert all(one.code == 0 for one in ended.values()), ended["blind"].out + ended["blind"].err
+    assert said["watched"]["command_digest"] == said["blind"]["command_digest"], "guidance has looked at the pose"
+    assert said["watched"]["path_distance_m"] > 0.1 and said["watched"]["reckoned_off_m"] < 0.1
+    assert said["blind"]["path_distance_m"] is None and said["blind"]["reckoned_distance_m"] > 0.1
+    assert (said["blind"]["pose_from"], said["blind"]["contacts_from"]) == ("dead_reckoning", "joint_torques")
+    for text in (ended["blind"].out, (tmp_path / "blind" / REPORT).read_text()):
+        assert "pose is reckoned" in text and "contacts are estimated from joint torques" in text
+    worlds = RunRecord.load(tmp_path / "blind").worlds
+    assert all(world.pose_stamp_ns is None and world.base_position_sd_m is not None for world in worlds)
+    felt = [contact for world in worlds for contact in world.contacts]
+    assert felt and all(contact.obstacle is not None and contact.confidence < 1.0 for contact in felt)
