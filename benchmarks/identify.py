@@ -23,7 +23,7 @@ from snakesim_gnc.control.controller import View
 from snakesim_gnc.control.identify import Identify
 from snakesim_hal.arrays import Floats
 from snakesim_hal.drivers.mounted import Mounted, as_built
-from snakesim_hal.drivers.twin_body import TwinBody, make_plant
+from snakesim_hal.drivers.twin_body import make_plant, twin_body
 from snakesim_hal.model.robot import describe
 from snakesim_hal.model.scenario import RunConfig, load, parse_set
 from snakesim_hal.wire.messages import JointState, Mode
@@ -57,7 +57,7 @@ GAINS = ("stiffness_nm_per_rad", "damping_nm_s_per_rad")  # of the servo, as its
 def recorded(config: RunConfig, truth: Mapping[str, Mounted], latency_s: Mapping[str, float]) -> dict[str, Floats]:
     """The columns of a record: the controller on emulated drives. Latencies are whole steps of the plant."""
     plant = make_plant(as_built(config, truth), "can", "mujoco", config.backends["can"]["plant_settings"])
-    body, joints = TwinBody(config, plant, truth), config.robot.joint_table
+    body, joints = twin_body(config, plant, truth), config.robot.joint_table
     robot = describe(config.robot, backend="twin", period_ns=config.period_ns, lease_ns=config.lease_ns, config_hash="")
     controller = Identify(robot, msgspec.convert(config.control_settings, Identify.Settings))
     noise, sensor = np.random.default_rng(config.seed).standard_normal, config.robot.sensors.joints
@@ -97,7 +97,7 @@ def recorded(config: RunConfig, truth: Mapping[str, Mounted], latency_s: Mapping
                 motor, limits = joints[i].motor, joints[i].limits
                 gains = motor.stiffness_nm_per_rad, motor.damping_nm_s_per_rad, limits.speed_rad_s
                 body.drive(i, Mode.POSITION, target_rad, limits.torque_nm, *gains)
-            body.advance_to((step + 1) * plant.step_s * 1e6, lambda _now_us: None)
+            body.advance_to((step + 1) * plant.step_s * 1e6)
     return {name: np.array(values) for name, values in rows.items()}
 
 

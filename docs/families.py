@@ -9,8 +9,9 @@ DURATION_S = float(sys.argv[1]) if len(sys.argv) > 1 else 8.0
 CONTROLLER = {"controller": sys.argv[2]} if len(sys.argv) > 2 else {}  # such as ./mine.py:Mine; else the scenario's
 
 simulated = None
-for backend in ("sim", "can", "odrive", "moteus", "dynamixel"):
-    run = snakesim.run("triplet", duration=DURATION_S, backend=backend, **CONTROLLER)
+for backend in ("sim", "can", "odrive", "moteus", "dynamixel", "mixed"):
+    robot = "planar13_mixed" if backend == "mixed" else "planar13"
+    run = snakesim.run("triplet", duration=DURATION_S, backend=backend, set={"robot": robot}, **CONTROLLER)
     simulated = run if simulated is None else simulated
     rows = min(len(run.time_s), len(simulated.time_s))
     torques = [one["torque_nm"][:rows].ravel().tolist() for one in (simulated, run)]

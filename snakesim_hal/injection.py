@@ -110,6 +110,7 @@ KINDS: Mapping[TargetType, Mapping[str, Kind]] = {
         "error_passive": Kind("the controller has counted more than 127 errors", ("driver",), once=True),
         "overflow": Kind("received frames get lost", ("driver",), once=True),
         "full": Kind("the transmit queue is full", ("driver",)),
+        "slow": Kind("each reading of it takes longer", ("driver",), Amount("by", "s", 0.02, 0.0, 1.0)),
     },
     "simulator": {
         "slow": Kind("runs at a share of real time", ("host",), Amount("share of real time", "1", 0.1, 0.001, 1.0)),

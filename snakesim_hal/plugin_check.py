@@ -105,7 +105,9 @@ def _with_what_it_needs(config: RunConfig, controller: Any) -> RunConfig:
 
 
 def on_backend(config: RunConfig, backend: Any) -> RunConfig:
-    """With the modes that joints have on a backend: all, unless its class names them in `MODES`."""
+    """With the modes that joints have on a backend: all, unless its class names them in `MODES`, or each joint's."""
+    if hasattr(backend, "as_driven"):
+        return msgspec.structs.replace(config, robot=backend.as_driven(config.robot))
     modes = getattr(backend, "MODES", None)
     return config if modes is None else msgspec.structs.replace(config, robot=with_modes(config.robot, modes))
 

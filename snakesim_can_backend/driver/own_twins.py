@@ -50,7 +50,7 @@ def check_faults(config: RunConfig, settings: CanSettings) -> None:
     from snakesim_can_backend.twin.faults import ABOUT
 
     own, virtual = settings.twins_run != "none", not settings.channels
-    does = {*KINDS["bus"]} - (set() if virtual else {"full"}) | ({*ABOUT} if own else set())
+    does = {*KINDS["bus"]} - {"slow", "" if virtual else "full"} | ({*ABOUT} if own else set())
     because = f"its modules support {', '.join(ABOUT)}" if own else "its modules are not the driver's own twins"
     because += "" if virtual else "; and a program cannot fill the queue of a kernel interface"
     check_backend_can(config, does=does, buses=max(len(settings.channels), 1), because=because)

@@ -1,7 +1,8 @@
 """A backend over a family of drives on CAN: settings, checks, and the buses that it opens."""
 
 import uuid
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 from msgspec import Meta
@@ -9,20 +10,20 @@ from msgspec import Meta
 from snakesim_can_backend.bus.adapter import check_channel, is_emulated, open_wire
 from snakesim_can_backend.bus.bus import VirtualWire, Wire
 from snakesim_can_backend.bus.load import mbit, worst_s
-from snakesim_can_backend.bus.log import logged
+from snakesim_can_backend.bus.log import LoggedWire, open_log
 from snakesim_can_backend.family.drives import CanDrives
 from snakesim_can_backend.family.traffic import Load, Traffic, load_of
 from snakesim_can_backend.family.twin import CanTwin
-from snakesim_hal.drivers.drive_backend import Clock, DriveBackend
-from snakesim_hal.drivers.drive_settings import DriveSettings, answer_limit_s, body_of, check_settings, port_of, who
-from snakesim_hal.drivers.mocap import receiver
+from snakesim_hal.drivers.buses import Bus
+from snakesim_hal.drivers.drive_backend import Clock
+from snakesim_hal.drivers.drive_settings import DriveSettings, answer_limit_s, body_of, port_of, who
+from snakesim_hal.drivers.family import FamilyBackend, buses_of
 from snakesim_hal.drivers.readings import Readings
+from snakesim_hal.drivers.twin_body import TwinBody
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.injection import KINDS
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.physics.motor import check_gains
-from snakesim_hal.wire.messages import Pace
 
 
 class CanDriveSettings(DriveSettings, frozen=True, kw_only=True):
@@ -39,50 +40,53 @@ class CanDriveSettings(DriveSettings, frozen=True, kw_only=True):
         return None
 
 
-class CanDriveBackend(DriveBackend):
+class CanDriveBackend(FamilyBackend):
     """A `snakesim_hal.backend.Backend` on drives on CAN, real or emulated. A family gives what is declared here."""
 
-    Settings: ClassVar[type[CanDriveSettings]]
-    name: ClassVar[str]  # of the backend
+    Settings: ClassVar[type[Any]]  # `CanDriveSettings`
     a_drive: ClassVar[str]  # what the family calls one, in the plural
     last_id: ClassVar[int]
     traffic: ClassVar[Traffic]
     drives: ClassVar[
         Callable[..., CanDrives]
-    ]  # (config, settings, joints, wires, readings, and the kit's arguments by name)
-    twin: ClassVar[Callable[..., CanTwin]]  # (config, settings, body, wires, clock)
-    says_every_s: ClassVar[float | None] = None  # how often a drive reports its state; None: each period
+    ]  # (joints of the family, settings, joints of the bus, wire, readings, and the kit's arguments by name)
+    twin: ClassVar[Callable[..., CanTwin]]  # (joints of the family, settings, body, wires, clock)
+    says_every_s: ClassVar[float | None] = None  # how often a drive reports its state; None: when it is asked
 
     @classmethod
-    def check_joint(cls, joint: Joint, where: str, config: RunConfig, settings: Any, *, real: bool) -> None:
-        """Raise ConfigError for a joint that no drive of this family can be. where: the joint, for the message."""
+    def check_joint(cls, config: RunConfig, settings: Any, joint: Joint, *, real: bool) -> None:
+        """Raise ConfigError for a joint that no drive of this family can be."""
 
     @classmethod
-    def check(cls, config: RunConfig, settings: Any) -> tuple[Pace, ...]:
-        """Drives on a bus support real time only; emulated ones in this process lockstep, too. Raises ConfigError."""
-        check_gains(config.robot)
-        here = not settings.channels
-        bus_faults = {*KINDS["bus"]} - (set() if here else {"full"})
-        check_settings(config, settings, settings.channels, twins=here, bus_faults=bus_faults)
+    def ports(cls, settings: Any) -> Sequence[str]:
+        """Its channels."""
+        return settings.channels
+
+    @classmethod
+    def bus_faults(cls, settings: Any) -> Collection[str]:
+        """A full queue is that of a kernel's interface."""
+        return {*KINDS["bus"]} - {"slow", "full" if settings.channels else ""}
+
+    @classmethod
+    def check_drives(cls, config: RunConfig, settings: Any, joints: Sequence[Joint]) -> None:
+        """Channels, ids, load, and what the family adds."""
         for channel in settings.channels:
             check_channel(channel, fd=settings.fd_rate is not None)
         real = not all(map(is_emulated, settings.channels))
-        for joint in config.robot.joint_table:
+        for joint in joints:
             if joint.id > cls.last_id:
                 raise ConfigError(
                     f"{who(config, joint)}: `id` = {joint.id}; {cls.a_drive} have ids of 0 to {cls.last_id}"
                 )
-            cls.check_joint(joint, who(config, joint), config, settings, real=real)
-        cls.load(config, settings).check(cls.name, config.rate_hz, cls.rates(settings))
-        return ("lockstep", "realtime") if here else ("realtime",)
+            cls.check_joint(config, settings, joint, real=real)
+        rate_hz = config.rate_hz / settings.every_ticks
+        cls.load(rate_hz, settings, joints).check(cls.name, rate_hz, cls.rates(settings))
 
     @classmethod
-    def load(cls, config: RunConfig, settings: Any) -> Load:
+    def load(cls, rate_hz: float, settings: Any, joints: Sequence[Joint]) -> Load:
         """Of the fullest bus."""
-        on = port_of(config, settings.channels)
-        return load_of(
-            cls.traffic, on, config.rate_hz, lambda length: worst_s(length, settings.bit_rate, settings.fd_rate)
-        )
+        on = port_of(joints, settings.channels)
+        return load_of(cls.traffic, on, rate_hz, lambda length: worst_s(length, settings.bit_rate, settings.fd_rate))
 
     @staticmethod
     def rates(settings: Any) -> str:
@@ -100,37 +104,41 @@ class CanDriveBackend(DriveBackend):
         cls, config: RunConfig, settings: Any, wires: Sequence[Wire], clock: Clock, pose: str | None
     ) -> CanTwin:
         """Emulated drives of a whole robot."""
-        body = body_of(config, settings, cls.name, pose)
-        return cls.twin(config, settings, body, [wires[bus] for bus in port_of(config, settings.channels)], clock.ns)
+        body, joints = body_of(config, settings, cls.name, pose), config.robot.joint_table
+        return cls.twin(joints, settings, body, [wires[bus] for bus in port_of(joints, settings.channels)], clock.ns)
 
-    def __init__(self, config: RunConfig, settings: Any) -> None:
-        """Open the buses and find every drive; nothing is enabled. Raises ConfigError and BackendError."""
-        self.check(config, settings)
-        clock, own, fd = Clock(config), not settings.channels, settings.fd_rate is not None
-        mocap = receiver(config, settings.pose_listen, twins=own, clock=lambda _stamp_ns: clock.ns())
+    @classmethod
+    def buses(
+        cls, config: RunConfig, settings: Any, joints: Mapping[int, Joint], clock: Clock, body: TwinBody | None
+    ) -> list[Bus]:
+        """One for each channel, or one of emulated drives."""
+        fd, everybody = settings.fd_rate is not None, list(joints.values())
+        says_every_ns = config.period_ns * settings.every_ticks
+        if cls.says_every_s is not None:
+            says_every_ns = max(round(cls.says_every_s * 1e9), says_every_ns)
+        log = open_log(Path(settings.log), cls.name) if settings.log else None
 
-        def make_drives(readings: Readings) -> CanDrives:
+        def open_drives(channel: str, mine: Sequence[int], readings: Readings) -> CanDrives:
             twin = None
-            if own:
-                name, pose = f"virtual-{uuid.uuid4().hex[:8]}", mocap.address if mocap is not None else None
-                twin = self.twin_on(config, settings, [VirtualWire(name, fd=fd)], clock, pose)
-                wires: list[Wire] = [VirtualWire(name, twin, fd=fd)]
+            if body is not None:
+                other_end = [VirtualWire(channel, fd=fd)] * len(everybody)
+                twin = cls.twin(everybody, settings, body, other_end, clock.ns)
+                wire: Wire = VirtualWire(channel, twin, fd=fd)
             else:
-                wires = self.open(settings)
-            wires = logged(wires, settings.log, self.name, fd=fd)
-            says_every_ns = config.period_ns if self.says_every_s is None else round(self.says_every_s * 1e9)
-            return type(self).drives(
-                config,
+                wire = open_wire(channel, None, settings.bit_rate, settings.fd_rate)
+            return cls.drives(
+                everybody,
                 settings,
-                config.robot.joint_table,
-                [wires[bus] for bus in port_of(config, settings.channels)],
+                [joints[j] for j in mine],
+                wire if log is None else LoggedWire(wire, log, fd=fd),
                 readings,
                 twin=twin,
-                emulated=all(map(is_emulated, settings.channels)),
-                answer_s=answer_limit_s(config),
+                emulated=body is not None or is_emulated(channel),
+                answer_s=answer_limit_s(config, settings.every_ticks),
                 bring_up_s=settings.bring_up_limit_s,
                 says_every_ns=says_every_ns,
                 clock_ns=clock.ns,
             )
 
-        super().__init__(config, self.name, "+".join(settings.channels), clock, mocap, make_drives)
+        channels = [f"virtual-{uuid.uuid4().hex[:8]}"] if body is not None else settings.channels
+        return buses_of(joints, settings, channels, open_drives)

@@ -48,7 +48,7 @@ def serve(backend: type[CanDriveBackend], command: str, arguments: argparse.Name
     settings = decode(table, backend.Settings, f"backends.{backend.name}")
     settings = msgspec.structs.replace(settings, channels=arguments.channel or settings.channels or ["vcan0"])
     if arguments.load:
-        load_ = backend.load(config, settings)
+        load_ = backend.load(config.rate_hz, settings, config.robot.joint_table)
         bus = f"{load_.drives} {backend.a_drive} at {config.rate_hz:g} Hz on {backend.rates(settings)}"
         share = f"{load_.share:.0%} at worst-case stuffing"
         say(f"{bus}: {share}; {MAX_LOAD:.0%} are allowed, so up to {load_.fits_hz} Hz")

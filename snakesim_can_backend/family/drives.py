@@ -1,4 +1,4 @@
-"""Drives on CAN: a `snakesim_hal.drivers.drive_backend.Drives` without its protocol, which a family adds.
+"""Drives on one CAN bus: a `snakesim_hal.drivers.drive_backend.Drives` without its protocol, which a family adds.
 
 Each tick every drive is asked for motion and torque, and one of them for its health.
 """
@@ -28,14 +28,14 @@ HOST = -1  # sender of a frame that only a host sends
 
 
 class CanDrives(ABC):
-    """All drives of a robot, tail to head. What a family adds are the abstract methods, and `unheard`."""
+    """All drives of a bus, tail to head. What a family adds are the abstract methods, and `unheard`."""
 
     unheard: str  # why a drive may not say who it is
 
     def __init__(
         self,
         joints: Sequence[Joint],
-        wires: Sequence[Wire],
+        wire: Wire,
         readings: Readings,
         *,
         twin: VirtualPeer | None,
@@ -45,18 +45,17 @@ class CanDrives(ABC):
         says_every_ns: int,
         clock_ns: Callable[[], int],
     ) -> None:
-        """wires: of every joint; twin: the drives, if they are emulated here.
+        """twin: the drives, if they are emulated here.
 
         answer_s: how long a tick waits for answers; says_every_ns: how often a drive reports its state.
         """
         self.emulated, self._twin = emulated, twin
-        self.wires, self.nodes = list(wires), [joint.id for joint in joints]
+        self.wire, self.nodes = wire, [joint.id for joint in joints]
         self.readings, self.clock_ns = readings, clock_ns
-        who = [f"{j.name} (node {j.id} on {wire.channel})" for j, wire in zip(joints, wires, strict=True)]
+        who = [f"{j.name} (node {j.id} on {wire.channel})" for j in joints]
         self.following = Following(who, says_every_ns, clock_ns)
         self.firmware: list[tuple[int, ...]] = [()] * len(joints)  # as drives say in bring-up
-        self._buses = list({id(wire): wire for wire in wires}.values())
-        self._at = {(id(wire), node): i for i, (wire, node) in enumerate(zip(wires, self.nodes, strict=True))}
+        self._at = {node: i for i, node in enumerate(self.nodes)}
         self._answer_s, self._bring_up_s = answer_s, bring_up_s
         self._turn = 0  # whose health is asked for next
         self._strangers: Counter[int] = Counter()
@@ -148,13 +147,13 @@ class CanDrives(ABC):
         self.ask_health(self._turn)
         end = time.monotonic() + self._answer_s
         while self.readings.incomplete() and (left_s := end - time.monotonic()) > 0:
-            if not wait(self._buses, left_s):
+            if not wait([self.wire], left_s):
                 break
             self._receive()
 
     def let_run(self) -> None:
         """Receive."""
-        wait(self._buses, 0.0)
+        wait([self.wire], 0.0)
         self._receive()
 
     def command(
@@ -174,8 +173,8 @@ class CanDrives(ABC):
             self.set_up(i)
 
     def inject(self, injection: Injection, *, begins: bool) -> bool:
-        """Faults of buses, and of drives that are emulated here."""
-        if inject_into(self._buses, injection, begins=begins):
+        """Faults of the bus, and of drives that are emulated here."""
+        if inject_into([self.wire], injection, begins=begins):
             return True
         if self._twin is None or injection.kind not in FAULTS:
             return False
@@ -183,24 +182,22 @@ class CanDrives(ABC):
         return True
 
     def close(self) -> None:
-        """Idle, as far as the buses still work."""
+        """Idle, as far as the bus still works."""
         for i in range(len(self.nodes)) if self._ours else ():
             try:
                 self.tell(i, "idle")
             except BackendError:
                 continue
-        for wire in self._buses:
-            try:
-                wire.idle()
-            finally:
-                wire.close()
+        try:
+            self.wire.idle()
+        finally:
+            self.wire.close()
 
     def findings(self) -> list[Finding]:
-        """Of buses, strangers and drives."""
+        """Of bus, strangers and drives."""
         found = [
             Finding(error.kind, f"{error.channel}: {error.detail}; {BUS_FAULTS[error.kind]}")
-            for wire in self._buses
-            for error in wire.errors()
+            for error in self.wire.errors()
             if error.kind in BUS_FAULTS
         ]
         if self._others:
@@ -211,10 +208,10 @@ class CanDrives(ABC):
                 found.append(Finding("unknown_node", f"node {node} is on the bus, but is not a joint of this robot"))
         return [*found, *self.following.findings()]
 
-    def take(self, wire: Wire, frame: Frame) -> None:
-        """One frame of a bus."""
+    def take(self, frame: Frame) -> None:
+        """One frame of the bus."""
         node = self.sender(frame)
-        i = self._at.get((id(wire), -1 if node is None else node))
+        i = self._at.get(-1 if node is None else node)
         if i is not None:
             try:
                 self.hear(i, frame)
@@ -226,9 +223,8 @@ class CanDrives(ABC):
             self._strangers[node] += 1
 
     def _receive(self) -> None:
-        for wire in self._buses:
-            for frame in wire.receive():
-                self.take(wire, frame)
+        for frame in self.wire.receive():
+            self.take(frame)
 
     def _await(self, done: Callable[[int], bool], ask: Callable[[int], object]) -> None:
         end, ask_at = time.monotonic() + self._bring_up_s, 0.0
@@ -237,6 +233,6 @@ class CanDrives(ABC):
                 for i in range(len(self.nodes)):
                     ask(i)
                 ask_at = now + ASK_EVERY_S
-            if not wait(self._buses, 0.01):
+            if not wait([self.wire], 0.01):
                 time.sleep(0.001)
             self._receive()

@@ -11,7 +11,7 @@ from snakesim_hal.injection import Injection
 
 
 class CanTwin(ABC):
-    """All drives of a robot. What a family adds are the abstract methods; i: a joint, tail to head."""
+    """All drives of a family. What it adds are the abstract methods; i: a drive, tail to head."""
 
     def __init__(self, body: TwinBody, wires: Sequence[Wire], watchdog_s: float, clock_ns: Callable[[], int]) -> None:
         """wires: of every joint; clock_ns: the time, since anything."""
@@ -20,6 +20,7 @@ class CanTwin(ABC):
         nodes = (joint.id for joint in body.joints)
         self._at = {(id(wire), node): i for i, (wire, node) in enumerate(zip(wires, nodes, strict=True))}
         self._clock_ns, self._start_ns = clock_ns, clock_ns()
+        body.each_step(self.each_step)
 
     @abstractmethod
     def addressee(self, frame: Frame) -> int:
@@ -39,6 +40,11 @@ class CanTwin(ABC):
 
     def __call__(self) -> float | None:
         """Handle what has arrived, and let time pass up to now."""
+        with self.body.lock:
+            self._act()
+        return None
+
+    def _act(self) -> None:
         for wire in self._buses:
             for frame in wire.receive():
                 i = self._at.get((id(wire), self.addressee(frame)))
@@ -48,8 +54,7 @@ class CanTwin(ABC):
                     self.take(i, frame)
                 except (ValueError, LookupError, struct.error):
                     continue
-        self.body.advance_to((self._clock_ns() - self._start_ns) / 1000, self.each_step)
-        return None
+        self.body.advance_to((self._clock_ns() - self._start_ns) / 1000)
 
     def say(self, i: int, frame: Frame) -> None:
         """A frame of a drive, unless it is silent."""
@@ -58,11 +63,13 @@ class CanTwin(ABC):
 
     def inject(self, injection: Injection, *, begins: bool) -> None:
         """Begin or end a fault of a drive."""
-        restarts = self.body.inject(injection, begins=begins)
-        if restarts is not None:
-            self.restart(restarts)
+        with self.body.lock:
+            restarts = self.body.inject(injection, begins=begins)
+            if restarts is not None:
+                self.restart(restarts)
 
     def close(self) -> None:
         """Leave the buses."""
+        self.body.leave(self.each_step)
         for wire in self._buses:
             wire.close()

@@ -5,12 +5,14 @@ from typing import Annotated
 
 from msgspec import Meta
 
+from snakesim_can_backend.bus.adapter import is_emulated
 from snakesim_can_backend.family.backend import CanDriveBackend, CanDriveSettings
 from snakesim_can_backend.family.command import run
 from snakesim_can_backend.family.traffic import Traffic
 from snakesim_can_backend.moteus.controllers import Controllers, configured, needed
 from snakesim_can_backend.moteus.protocol import HOST_ID, LAST_ID
 from snakesim_can_backend.moteus.twin import MoteusTwin
+from snakesim_hal.drivers.drive_settings import who
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
@@ -42,11 +44,18 @@ class MoteusBackend(CanDriveBackend):
     traffic = Traffic((5, 24, 48), (6, 24))  # question, answer, command; of one controller, its health
 
     @classmethod
-    def check_joint(cls, joint: Joint, where: str, config: RunConfig, settings: MoteusSettings, *, real: bool) -> None:
+    def check_joint(cls, config: RunConfig, settings: MoteusSettings, joint: Joint, *, real: bool) -> None:
         """Raise ConfigError for joints that no controller can be."""
         if joint.id == HOST_ID:
+            where = who(config, joint)
             raise ConfigError(f"{where}: `id` = {HOST_ID} is the host's; controllers have ids of 1 to {LAST_ID}")
-        most, have = needed(config), configured(config, settings)
+
+    @classmethod
+    def check_drives(cls, config: RunConfig, settings: MoteusSettings, joints: Sequence[Joint]) -> None:
+        """And gains that all controllers have alike."""
+        super().check_drives(config, settings, joints)
+        real = not all(map(is_emulated, settings.channels))
+        most, have = needed(joints), configured(joints, settings)
         named = settings.kp_nm_per_turn is not None and settings.kd_nm_s_per_turn is not None
         if (real and not named) or any(a > b * ROUNDING for a, b in zip(most, have, strict=True)):
             raise ConfigError(

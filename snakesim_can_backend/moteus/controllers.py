@@ -30,7 +30,6 @@ from snakesim_can_backend.moteus.protocol import (
 from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_hal.drivers.following import Word
 from snakesim_hal.model.joints import Joint
-from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import Mode as JointMode
 
 TURN = 2 * math.pi
@@ -45,13 +44,15 @@ HEALTH = (
 
 
 class Controllers(CanDrives):
-    """All controllers of a robot."""
+    """All controllers of a bus."""
 
     unheard = "does not say its register map: it is off, has another id, or the bus another bit rate or sample point"
 
-    def __init__(self, config: RunConfig, settings: Any, joints: Sequence[Joint], *rest: Any, **kit: Any) -> None:
+    def __init__(
+        self, everybody: Sequence[Joint], settings: Any, joints: Sequence[Joint], *rest: Any, **kit: Any
+    ) -> None:
         super().__init__(joints, *rest, **kit)
-        self._kp_nm_per_turn, kd = kp, kd = configured(config, settings)
+        self._kp_nm_per_turn, kd = kp, kd = configured(everybody, settings)
         self._gains = [tuple(a / b for a, b in zip(gains_of(j), (kp, kd, kd), strict=True)) for j in joints]
         self._watchdog_s = settings.watchdog_s
         self._mode, self._home = [-1] * len(joints), [RELATIVE] * len(joints)
@@ -144,7 +145,7 @@ class Controllers(CanDrives):
         self._send(i, part(WRITE, INT8, Register.MODE, Mode.STOPPED))
 
     def _send(self, i: int, *content: bytes, reply: bool = False) -> bool:
-        return self.wires[i].send(framed(HOST_ID, self.nodes[i], *content, reply=reply))
+        return self.wire.send(framed(HOST_ID, self.nodes[i], *content, reply=reply))
 
 
 def gains_of(joint: Joint) -> tuple[float, float, float]:
@@ -155,13 +156,13 @@ def gains_of(joint: Joint) -> tuple[float, float, float]:
     return stiffness, damping, velocity_gain
 
 
-def needed(config: RunConfig) -> tuple[float, float]:
+def needed(joints: Sequence[Joint]) -> tuple[float, float]:
     """The gains that all joints' are shares of: `servo.pid_position.kp` and `kd`."""
-    gains = [gains_of(joint) for joint in config.robot.joint_table]
+    gains = [gains_of(joint) for joint in joints]
     return max(kp for kp, _, _ in gains), max(max(damping, velocity) for _, damping, velocity in gains)
 
 
-def configured(config: RunConfig, settings: Any) -> tuple[float, float]:
-    """Those that the controllers have."""
-    kp, kd = needed(config)
+def configured(joints: Sequence[Joint], settings: Any) -> tuple[float, float]:
+    """Those that the controllers have. joints: all of them."""
+    kp, kd = needed(joints)
     return settings.kp_nm_per_turn or kp or 1.0, settings.kd_nm_s_per_turn or kd or 1.0

@@ -29,7 +29,7 @@ from snakesim_can_backend.moteus.protocol import (
 )
 from snakesim_can_backend.protocol.definitions import Frame
 from snakesim_hal.drivers.twin_body import TwinBody
-from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.model.joints import Joint
 from snakesim_hal.wire.messages import Mode as JointMode
 
 OVER_TEMPERATURE = 38
@@ -58,11 +58,11 @@ class Controller:
 
 
 class MoteusTwin(CanTwin):
-    """All controllers of a robot."""
+    """All controllers of a family."""
 
     def __init__(
         self,
-        config: RunConfig,
+        everybody: Sequence[Joint],
         settings: Any,
         body: TwinBody,
         wires: Sequence[Wire],
@@ -70,7 +70,7 @@ class MoteusTwin(CanTwin):
     ) -> None:
         super().__init__(body, wires, settings.watchdog_s, clock_ns)
         self.controllers = [Controller(joint.id) for joint in body.joints]
-        self._kp, self._kd = configured(config, settings)
+        self._kp, self._kd = configured(everybody, settings)
 
     def addressee(self, frame: Frame) -> int:
         """Its destination."""

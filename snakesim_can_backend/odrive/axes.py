@@ -55,11 +55,11 @@ class Axis:
 
 
 class Axes(CanDrives):
-    """All axes of a robot."""
+    """All axes of a bus."""
 
     unheard = "does not say its version: it is off, has another id or bit rate, or firmware 0.5, which does not say it"
 
-    def __init__(self, _config: object, _settings: object, joints: Sequence[Joint], *rest: Any, **kit: Any) -> None:
+    def __init__(self, _everybody: object, _settings: object, joints: Sequence[Joint], *rest: Any, **kit: Any) -> None:
         super().__init__(joints, *rest, **kit)
         self.axes = [axis_of(joint) for joint in joints]
 
@@ -166,10 +166,10 @@ class Axes(CanDrives):
         self._ask(i, Message.ERROR)
 
     def _send(self, i: int, message: Message, *values: float) -> bool:
-        return self.wires[i].send(write(self.nodes[i], message, *values))
+        return self.wire.send(write(self.nodes[i], message, *values))
 
     def _ask(self, i: int, *questions: Message) -> bool:
-        taken = [self.wires[i].send(ask(self.nodes[i], question)) for question in questions]
+        taken = [self.wire.send(ask(self.nodes[i], question)) for question in questions]
         return all(taken)
 
 

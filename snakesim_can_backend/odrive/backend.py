@@ -8,6 +8,7 @@ from snakesim_can_backend.family.traffic import Traffic
 from snakesim_can_backend.odrive.axes import Axes
 from snakesim_can_backend.odrive.protocol import LAST_NODE
 from snakesim_can_backend.odrive.twin import HEARTBEAT_US, OdriveTwin
+from snakesim_hal.drivers.drive_settings import who
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
@@ -26,8 +27,9 @@ class OdriveBackend(CanDriveBackend):
     traffic = Traffic((0, 0, 8, 8, 8), (0, 0, 0, 8, 8, 8), heartbeats_hz=1e6 / HEARTBEAT_US)
 
     @classmethod
-    def check_joint(cls, joint: Joint, where: str, config: RunConfig, settings: OdriveSettings, *, real: bool) -> None:
+    def check_joint(cls, config: RunConfig, settings: OdriveSettings, joint: Joint, *, real: bool) -> None:
         """Raise ConfigError for joints that no axis can be."""
+        where = who(config, joint)
         if joint.motor.damping_nm_s_per_rad <= 0:
             raise ConfigError(f"{where}: `damping_nm_s_per_rad` must be above 0: an ODrive's position loop needs it")
         if joint.motor.torque_constant_nm_per_a is None and real:

@@ -42,11 +42,11 @@ class Axis:
 
 
 class OdriveTwin(CanTwin):
-    """All axes of a robot."""
+    """All axes of a family."""
 
     def __init__(
         self,
-        _config: object,
+        _everybody: object,
         settings: DriveSettings,
         body: TwinBody,
         wires: Sequence[Wire],

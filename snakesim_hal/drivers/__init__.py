@@ -1,6 +1,8 @@
 """What every driver of real joints needs besides its protocol.
 
-`drive_backend`  a whole backend over a family of `Drives`: lifecycle, isolation, faults, ages, sensors
+`drive_backend`  a whole backend over `Drives`: lifecycle, isolation, faults, ages, sensors
+`buses`          each bus with its own drives, in real time in a thread of its own
+`family`         settings, checks and buses of a family           `mixed`      a robot of several families
 `mounting`       between a joint and the shaft of its drive: sign, zero, gear
 `following`      who was told to follow, who does, who is told again
 `readings`       what the drives said, and how old it is         `findings`   faults, each reported once

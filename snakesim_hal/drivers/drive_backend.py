@@ -103,11 +103,12 @@ class DriveBackend:
         clock: Clock,
         mocap: MocapReceiver | None,
         make_drives: Callable[[Readings], Drives],
+        every_ticks: int = 1,
     ) -> None:
-        """make_drives: opens the family's buses. Raises ConfigError and BackendError."""
+        """make_drives: opens the buses; every_ticks: of the slowest. Raises ConfigError and BackendError."""
         joints = config.robot.joint_table
         self._clock, self._mocap, self._open = clock, mocap, True
-        self._period_ns, self._lease_ns = config.period_ns, config.lease_ns
+        self._period_ns, self._lease_ns, self._every = config.period_ns, config.lease_ns, every_ticks
         self._names = [joint.name for joint in joints]
         self._readings = Readings(joints, clock.ns)
         self._mounting = self._readings.mounting
@@ -155,7 +156,7 @@ class DriveBackend:
         if lifecycle not in LATCHED and (back or self._lifecycle in LATCHED):
             self._told.forget()
             self._drives.clear(everybody if self._lifecycle in LATCHED else back)
-            self._quiet = self.clear_grace
+            self._quiet = self.clear_grace * self._every
         damped = {i for i in self._following if set_points.mode[i] != Mode.PASSIVE}
         self._following = (
             everybody if lifecycle == "armed" else everybody & damped if lifecycle == "fault" else frozenset()
@@ -237,7 +238,7 @@ class DriveBackend:
         """Joints and other sensors, from what was read."""
         others: dict[str, Message] = {}
         if tick % len(self._names) == 0:
-            lasts_ns = HEALTH_ROUNDS * len(self._names) * self._period_ns
+            lasts_ns = HEALTH_ROUNDS * len(self._names) * self._every * self._period_ns
             others[keys.POWER] = self._readings.power(tick, stamp_ns, lasts_ns)
         if self._mocap is not None and (pose := self._mocap.newest(tick, stamp_ns)) is not None:
             others[keys.POSE] = pose
@@ -256,7 +257,8 @@ class DriveBackend:
     def _described(self, config: RunConfig, pose_delay_s: float | None) -> list[SensorDescription]:
         """The sensors; pose_delay_s: of motion capture, None without it."""
         rate_hz = config.rate_hz
-        sensors = [SensorDescription(key=keys.JOINTS, rate_hz=rate_hz, delay_s=0.0)]
+        delay_s = (self._every - 1) / rate_hz
+        sensors = [SensorDescription(key=keys.JOINTS, rate_hz=rate_hz, delay_s=delay_s)]
         sensors.append(SensorDescription(key=keys.POWER, rate_hz=rate_hz / len(self._names), delay_s=0.0))
         if pose_delay_s is not None:
             sensors.append(SensorDescription(key=keys.POSE, rate_hz=rate_hz, delay_s=pose_delay_s))

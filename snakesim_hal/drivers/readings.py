@@ -69,6 +69,19 @@ class Readings:
         if math.isfinite(motor_c) and math.isfinite(board_c):
             self._motor_c[i], self._board_c[i], self._health_ns[i] = motor_c, board_c, self._clock_ns()
 
+    def take(self, part: "Readings", at: Sequence[int]) -> None:
+        """All that some of the drives have said to another one, as of when they said it. at: their numbers here."""
+        for i, j in enumerate(at):
+            self.angle_rad[j], self.velocity_rad_s[j] = part.angle_rad[i], part.velocity_rad_s[i]
+            self.torque_nm[j] = part.torque_nm[i]
+            self._motion_ns[j], self._torque_ns[j] = part._motion_ns[i], part._torque_ns[i]
+            self._motion_at[j] = self._asked - part._asked + part._motion_at[i]
+            self._torque_at[j] = self._asked - part._asked + part._torque_at[i]
+            self._voltage_v[j], self._current_a[j] = part._voltage_v[i], part._current_a[i]
+            self._motor_c[j], self._board_c[j] = part._motor_c[i], part._board_c[i]
+            self._health_ns[j] = part._health_ns[i]
+            self.serials[j], self.firmware[j] = part.serials[i], part.firmware[i]
+
     # --- what is known ---------------------------------------------------------------------------------------
 
     def known(self, i: int) -> bool:

@@ -1,7 +1,8 @@
 """What emulated drives of any family move: a plant under their motors, with heat, on one clock. Time is passed in."""
 
 import math
-from collections.abc import Callable, Mapping
+import threading
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import msgspec
@@ -32,23 +33,36 @@ def make_plant(config: RunConfig, backend: str, name: str, settings: dict[str, A
     return factory(config, plugin_settings(factory, settings, f"plant {name!r}", where))
 
 
-class TwinBody:
-    """The body, and the motors in it. Drives are numbered as joints, tail to head; all are idle at first."""
+def twin_body(
+    config: RunConfig,
+    plant: Plant,
+    mounted: Mapping[str, Mounted],
+    send_pose: Callable[[bytes], None] | None = None,
+) -> "TwinBody":
+    """The body of a whole robot.
+
+    mounted: what is in truth not as the file says; send_pose: gets datagrams of motion capture, one a period.
+    """
+    return TwinBody(_Motion(config, plant, mounted, send_pose), range(config.robot.chain.modules))
+
+
+class _Motion:
+    """Plant, motors, heat and camera, on one clock: what all emulated drives of a robot share."""
 
     def __init__(
         self,
         config: RunConfig,
         plant: Plant,
         mounted: Mapping[str, Mounted],
-        send_pose: Callable[[bytes], None] | None = None,
+        send_pose: Callable[[bytes], None] | None,
     ) -> None:
-        """mounted: what is in truth not as the file says; send_pose: gets datagrams of motion capture, one a period."""
         self.plant, self.joints = plant, built(config.robot, mounted)
         self.motors, self.thermal = Motors(as_built(config, mounted).robot, plant.step_s), Thermal(self.joints)
-        self.now_us = 0.0  # since the twins were started
-        self._boots_until_us = [0.0] * len(self.joints)
-        self._muted: set[int] = set()
-        self._weak: set[int] = set()
+        self.now_us, self.each_step = 0.0, list[Callable[[float], None]]()
+        self.boots_until_us = [0.0] * len(self.joints)
+        self.muted: set[int] = set()
+        self.weak: set[int] = set()
+        self.lock = threading.RLock()
         self._step_us, self._steps, self._skipped_us = plant.step_s * 1e6, 0, 0.0
         self._send_pose, self._period_us, self._pose_us = send_pose, config.period_ns / 1000, 0.0
         camera = config.robot.sensors.pose
@@ -56,8 +70,7 @@ class TwinBody:
         if camera is not None and send_pose is not None:
             self._camera = PoseCamera(camera, plant, (config.seed, len(self.joints)), config.period_ns)
 
-    def advance_to(self, clock_us: float, each_step: Callable[[float], None]) -> None:
-        """Physics until then. each_step: the drives' own time, in us: watchdogs, and messages that are due."""
+    def advance_to(self, clock_us: float) -> None:
         if clock_us - self._skipped_us - self.now_us > MAX_AT_ONCE_US:
             self._skipped_us = clock_us - self.now_us - MAX_AT_ONCE_US
         until_us = clock_us - self._skipped_us
@@ -68,11 +81,49 @@ class TwinBody:
             self.now_us = self._steps * self._step_us
             if self._steps % HEAT_EVERY == 0:
                 self._warm()
-            each_step(self.now_us)
+            for each in self.each_step:
+                each(self.now_us)
         if self._camera is not None and self._send_pose is not None and self.now_us >= self._pose_us - 1:
             self._pose_us += self._period_us
             if (sample := self._camera.look(round(self.now_us * 1000))) is not None:
                 self._send_pose(msgspec.json.encode(sample))
+
+    def _warm(self) -> None:
+        self.thermal.pass_time(HEAT_EVERY * self.plant.step_s, self.motors.take_heat())
+        if (share_left := self.thermal.share_left()) is not None:
+            self.motors.derate(share_left)
+
+
+class TwinBody:
+    """The body, and motors in it: all, or those of one family. Drives are numbered tail to head; idle at first."""
+
+    def __init__(self, motion: _Motion, at: Sequence[int]) -> None:
+        """at: the numbers that these drives have in the robot."""
+        self._all, self._at = motion, list(at)
+        self.plant, self.motors, self.thermal, self.lock = motion.plant, motion.motors, motion.thermal, motion.lock
+        self.joints = [motion.joints[j] for j in at]
+
+    def part(self, which: Sequence[int]) -> "TwinBody":
+        """The same body for twins that are some of its drives, which they number from 0."""
+        return TwinBody(self._all, [self._at[i] for i in which])
+
+    @property
+    def now_us(self) -> float:
+        """Since the twins were started."""
+        return self._all.now_us
+
+    def each_step(self, act: Callable[[float], None]) -> None:
+        """From now on called with the drives' own time, in us, at each step: watchdogs, and messages that are due."""
+        self._all.each_step.append(act)
+
+    def leave(self, act: Callable[[float], None]) -> None:
+        """No longer."""
+        with self.lock:
+            self._all.each_step.remove(act)
+
+    def advance_to(self, clock_us: float) -> None:
+        """Physics until then. Twins of several buses hold the `lock` while they act, as those may be in threads."""
+        self._all.advance_to(clock_us)
 
     def drive(
         self, i: int, mode: Mode, target: float, limit_nm: float, stiffness: float, damping: float, speed_rad_s: float
@@ -81,35 +132,37 @@ class TwinBody:
         drive = self.joints[i].drive
         gear = drive.gear
         target = joint_target(drive, mode, target)
-        self.motors.drive(i, mode, target, limit_nm * gear, stiffness * gear**2, damping * gear**2, speed_rad_s / gear)
+        kp, kd, speed_rad_s = stiffness * gear**2, damping * gear**2, speed_rad_s / gear
+        self.motors.drive(self._at[i], mode, target, limit_nm * gear, kp, kd, speed_rad_s)
 
     def shaft(self, i: int) -> tuple[float, float, float]:
         """Angle, velocity and torque of a drive's shaft."""
         drive = self.joints[i].drive
-        turns = drive.sign * drive.gear
-        angle_rad, velocity_rad_s = float(self.plant.angle_rad[i]), float(self.plant.velocity_rad_s[i])
-        return drive.zero_rad + turns * angle_rad, turns * velocity_rad_s, float(self.motors.torque_nm[i]) / turns
+        turns, j = drive.sign * drive.gear, self._at[i]
+        angle_rad, velocity_rad_s = float(self.plant.angle_rad[j]), float(self.plant.velocity_rad_s[j])
+        return drive.zero_rad + turns * angle_rad, turns * velocity_rad_s, float(self.motors.torque_nm[j]) / turns
 
     def supply(self, i: int) -> tuple[float, float]:
         """Voltage and current of a drive."""
-        supply = self.joints[i].supply
-        power_w = self.thermal.power_w(self.motors.torque_nm, self.plant.velocity_rad_s)[i]
-        voltage_v = WEAK_V if i in self._weak else supply.voltage_v
+        supply, j = self.joints[i].supply, self._at[i]
+        power_w = self.thermal.power_w(self.motors.torque_nm, self.plant.velocity_rad_s)[j]
+        voltage_v = WEAK_V if j in self._all.weak else supply.voltage_v
         return voltage_v, supply.idle_a + float(power_w) / voltage_v
 
     def too_hot(self, i: int) -> bool:
         """Whether a drive's winding is at `stop_at_c`."""
-        return bool(self.thermal.winding_c[i] >= self.thermal.stop_at_c[i])
+        j = self._at[i]
+        return bool(self.thermal.winding_c[j] >= self.thermal.stop_at_c[j])
 
     # --- faults ----------------------------------------------------------------------------------------------
 
     def silent(self, i: int) -> bool:
         """Whether a drive says nothing now."""
-        return i in self._muted or self.now_us < self._boots_until_us[i]
+        return self._at[i] in self._all.muted or self.deaf(i)
 
     def deaf(self, i: int) -> bool:
         """Whether a drive hears nothing now: it boots."""
-        return self.now_us < self._boots_until_us[i]
+        return self.now_us < self._all.boots_until_us[self._at[i]]
 
     def inject(self, injection: Injection, *, begins: bool) -> int | None:
         """Begin or end a fault of a drive: its number if it restarts now. Raises ConfigError."""
@@ -118,13 +171,14 @@ class TwinBody:
         i = injection.number
         if i >= len(self.joints):
             raise ConfigError(f"fault {str(injection)!r}: this robot has joint_1 to joint_{len(self.joints)}")
+        motion, j = self._all, self._at[i]
         match injection.kind:
             case "mute":
-                (self._muted.add if begins else self._muted.discard)(i)
+                (motion.muted.add if begins else motion.muted.discard)(j)
             case "undervoltage":
-                (self._weak.add if begins else self._weak.discard)(i)
+                (motion.weak.add if begins else motion.weak.discard)(j)
             case "overheat":
-                self.thermal.inject(i, heat=begins, hold=begins and injection.end_s != math.inf)
+                self.thermal.inject(j, heat=begins, hold=begins and injection.end_s != math.inf)
             case _:
                 if begins:
                     self.boot(i)
@@ -133,13 +187,9 @@ class TwinBody:
 
     def boot(self, i: int) -> None:
         """A drive restarts now; until it has, it neither hears nor says anything."""
-        self._boots_until_us[i] = self.now_us + BOOT_US
+        self._all.boots_until_us[self._at[i]] = self.now_us + BOOT_US
 
     def temperatures(self, i: int) -> tuple[float, float]:
         """Of a drive's winding, and of its electronics."""
-        return float(self.thermal.winding_c[i]), float(self.thermal.board_c()[i])
-
-    def _warm(self) -> None:
-        self.thermal.pass_time(HEAT_EVERY * self.plant.step_s, self.motors.take_heat())
-        if (share_left := self.thermal.share_left()) is not None:
-            self.motors.derate(share_left)
+        j = self._at[i]
+        return float(self.thermal.winding_c[j]), float(self.thermal.board_c()[j])

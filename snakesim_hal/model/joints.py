@@ -295,8 +295,9 @@ def _check_all(joints: Sequence[Joint]) -> None:
             f"{joints[lags.index(False)].name}: `response_time_s` = 0 s, and other joints have more; give all of them "
             f"some, or none"
         )
-    for (port, number), count in Counter((joint.drive.port, joint.id) for joint in joints).items():
+    at = [(joint.drive.family, joint.drive.port, joint.id) for joint in joints]
+    for (family, port, number), count in Counter(at).items():
         if count > 1:
-            same = ", ".join(joint.name for joint in joints if (joint.drive.port, joint.id) == (port, number))
+            same = ", ".join(joint.name for joint, one in zip(joints, at, strict=True) if one == (family, port, number))
             where = f"port {port!r}" if port else "one bus"
             raise ValueError(f"{same}: all have the id {number} on {where}; without an `id` a joint has its number")

@@ -1,17 +1,18 @@
 """The backend `dynamixel`: checks, and the ports that it opens."""
 
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TextIO
 
-from snakesim_hal.drivers.drive_backend import Clock, DriveBackend
-from snakesim_hal.drivers.drive_settings import answer_limit_s, body_of, check_settings, port_of, who
-from snakesim_hal.drivers.mocap import receiver
+from snakesim_hal.drivers.buses import Bus
+from snakesim_hal.drivers.drive_backend import Clock
+from snakesim_hal.drivers.drive_settings import answer_limit_s, body_of, port_of, who
+from snakesim_hal.drivers.family import FamilyBackend, buses_of
 from snakesim_hal.drivers.readings import Readings
+from snakesim_hal.drivers.twin_body import TwinBody
 from snakesim_hal.errors import BackendError, ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.physics.motor import check_gains
-from snakesim_hal.wire.messages import Pace
 from snakesim_serial_backend.dynamixel.load import MAX_LOAD, cycle_bytes, cycle_s, fits_hz
 from snakesim_serial_backend.dynamixel.packets import LAST_ID
 from snakesim_serial_backend.dynamixel.port import Port
@@ -24,51 +25,55 @@ from snakesim_serial_backend.wire import Pty, SerialWire, is_emulated
 GAP_S, GAP_SHARE = 0.002, 0.2  # of silence, or of a period, after which no answer is expected
 
 
-class DynamixelBackend(DriveBackend):
+class DynamixelBackend(FamilyBackend):
     """A `snakesim_hal.backend.Backend` on Dynamixel X servos, real or emulated."""
 
-    Settings = DynamixelSettings
+    Settings, name = DynamixelSettings, NAME
     MODES = ("position", "torque")  # what else a robot file says its joints have, they do not have here
 
-    @staticmethod
-    def check(config: RunConfig, settings: DynamixelSettings) -> tuple[Pace, ...]:
-        """Servos on a port support real time only; emulated ones in this process lockstep, too. Raises ConfigError."""
-        check_gains(config.robot)
-        here = not settings.ports
-        check_settings(config, settings, settings.ports, twins=here, bus_faults={"cut"} if here else set())
-        check_joints(config, settings)
-        check_load(config, settings)
-        return ("lockstep", "realtime") if here else ("realtime",)
+    @classmethod
+    def ports(cls, settings: DynamixelSettings) -> Sequence[str]:
+        """Its serial ports."""
+        return settings.ports
 
-    def __init__(self, config: RunConfig, settings: DynamixelSettings) -> None:
-        """Open the ports and find every servo; nothing is enabled. Raises ConfigError and BackendError."""
-        self.check(config, settings)
-        clock, here = Clock(config), not settings.ports
-        mocap = receiver(config, settings.pose_listen, twins=here, clock=lambda _stamp_ns: clock.ns())
+    @classmethod
+    def bus_faults(cls, settings: DynamixelSettings) -> Collection[str]:
+        """Of emulated servos."""
+        return set() if settings.ports else {"cut"}
+
+    @classmethod
+    def check_drives(cls, config: RunConfig, settings: DynamixelSettings, joints: Sequence[Joint]) -> None:
+        """Servos, and the load of their ports."""
+        check_joints(config, settings, joints)
+        check_load(config.rate_hz / settings.every_ticks, settings, joints)
+
+    @classmethod
+    def buses(
+        cls,
+        config: RunConfig,
+        settings: DynamixelSettings,
+        joints: Mapping[int, Joint],
+        clock: Clock,
+        body: TwinBody | None,
+    ) -> list[Bus]:
+        """One for each port, or one of emulated servos."""
         gap_s = max(GAP_S, GAP_SHARE * config.period_ns * 1e-9)
+        log = _log(settings.log)
 
-        def make_servos(readings: Readings) -> Servos:
-            log = _log(settings.log)
-            twin, wires = None, list[SerialWire]()
-            try:
-                if here:
-                    pty = Pty()
-                    twin = twin_on(config, settings, [pty], clock, mocap.address if mocap is not None else None)
-                    wires.append(SerialWire(pty.path, settings.baud, log, pty, twin))
-                for port in settings.ports:
-                    wires.append(SerialWire(port, settings.baud, log))
-            except BaseException:
-                for wire in wires:
-                    wire.close()
-                raise
-            ports = [Port(wire, gap_s) for wire in wires]
-            servos = [
-                servo_of(joint, ports[bus])
-                for joint, bus in zip(config.robot.joint_table, port_of(config, settings.ports), strict=True)
-            ]
-            return Servos(servos, readings, settings, clock.ns, answer_limit_s(config), twin)
+        def open_servos(port: str, mine: Sequence[int], readings: Readings) -> Servos:
+            twin = None
+            if body is not None:
+                pty = Pty()
+                twin = twin_of(list(joints.values()), settings, body, [pty] * len(joints), clock)
+                wire = SerialWire(pty.path, settings.baud, log, pty, twin)
+            else:
+                wire = SerialWire(port, settings.baud, log)
+            on_it = Port(wire, gap_s)
+            servos = [servo_of(joints[j], on_it) for j in mine]
+            answer_s = answer_limit_s(config, settings.every_ticks)
+            return Servos(servos, on_it, readings, settings, clock.ns, answer_s, twin)
 
-        super().__init__(config, NAME, "+".join(settings.ports), clock, mocap, make_servos)
+        return buses_of(joints, settings, [NAME] if body is not None else settings.ports, open_servos)
 
 
 def servo_of(joint: Joint, port: Port) -> Servo:
@@ -96,10 +101,10 @@ def constant_of(joint: Joint) -> float:
     return joint.motor.torque_constant_nm_per_a or joint.limits.torque_nm / joint.drive.gear / most_a
 
 
-def check_joints(config: RunConfig, settings: DynamixelSettings) -> None:
+def check_joints(config: RunConfig, settings: DynamixelSettings, joints: Sequence[Joint]) -> None:
     """Raise ConfigError for joints that no servo can be."""
     real = not all(map(is_emulated, settings.ports))
-    for joint in config.robot.joint_table:
+    for joint in joints:
         travel_rad = (joint.limits.most_rad - joint.limits.least_rad) * joint.drive.gear
         if joint.id > LAST_ID:
             raise ConfigError(f"{who(config, joint)}: `id` = {joint.id}; ids of protocol 2.0 are 0 to {LAST_ID}")
@@ -116,15 +121,15 @@ def check_joints(config: RunConfig, settings: DynamixelSettings) -> None:
             )
 
 
-def check_load(config: RunConfig, settings: DynamixelSettings) -> None:
+def check_load(rate_hz: float, settings: DynamixelSettings, joints: Sequence[Joint]) -> None:
     """Raise ConfigError when a port cannot carry its servos."""
-    on = port_of(config, settings.ports)
+    on = port_of(joints, settings.ports)
     fullest = max(on.count(bus) for bus in set(on))
     busy_s = cycle_s(fullest, settings.baud)
-    if busy_s * config.rate_hz > MAX_LOAD:
+    if busy_s * rate_hz > MAX_LOAD:
         raise ConfigError(
-            f"{fullest} servos at {config.rate_hz:g} Hz: a cycle of {cycle_bytes(fullest)} bytes takes "
-            f"{busy_s * 1e3:.1f} ms at {settings.baud} baud, which is {busy_s * config.rate_hz:.0%} of a period; at "
+            f"{fullest} servos at {rate_hz:g} Hz: a cycle of {cycle_bytes(fullest)} bytes takes "
+            f"{busy_s * 1e3:.1f} ms at {settings.baud} baud, which is {busy_s * rate_hz:.0%} of a period; at "
             f"most {MAX_LOAD:.0%}: use rate_hz = {fits_hz(fullest, settings.baud)}, a higher "
             f"`backends.dynamixel.baud`, or more `backends.dynamixel.ports`"
         )
@@ -134,10 +139,16 @@ def twin_on(
     config: RunConfig, settings: DynamixelSettings, ptys: list[Pty], clock: Clock, pose: str | None
 ) -> DynamixelTwin:
     """Emulated servos of a whole robot."""
-    body = body_of(config, settings, NAME, pose)
-    each = [ptys[bus] for bus in port_of(config, settings.ports)]
-    constants = [constant_of(joint) for joint in config.robot.joint_table]
-    return DynamixelTwin(body, each, constants, settings.baud, clock.ns)
+    joints = config.robot.joint_table
+    each = [ptys[bus] for bus in port_of(joints, settings.ports)]
+    return twin_of(joints, settings, body_of(config, settings, NAME, pose), each, clock)
+
+
+def twin_of(
+    joints: Sequence[Joint], settings: DynamixelSettings, body: TwinBody, ptys: Sequence[Pty], clock: Clock
+) -> DynamixelTwin:
+    """Emulated servos. ptys: of every joint."""
+    return DynamixelTwin(body, ptys, [constant_of(joint) for joint in joints], settings.baud, clock.ns)
 
 
 def _log(path: str) -> TextIO | None:

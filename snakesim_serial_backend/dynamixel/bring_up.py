@@ -15,9 +15,7 @@ WANTED = {at.STATUS_LEVEL: 2, at.TORQUE_ENABLE: 0, at.WATCHDOG: 0}
 KEPT = {at.OPERATING_MODE: at.CURRENT_BASED_POSITION, at.DELAY: 0}  # written only where it differs: it wears out
 
 
-def bring_up(
-    servos: Sequence[Servo], ports: Sequence[Port], settings: DynamixelSettings
-) -> list[tuple[Packet, Packet]]:
+def bring_up(servos: Sequence[Servo], port: Port, settings: DynamixelSettings) -> list[tuple[Packet, Packet]]:
     """What every servo measures, and its health. Raises BackendError."""
     found = _find(servos, settings.bring_up_limit_s)
     wrong: list[str] = []
@@ -27,13 +25,12 @@ def bring_up(
         if why := _unfit(servo, said, kept, settings):
             wrong.append(f"  {servo.who} {why}")
     if wrong:
-        strangers = _strangers(servos, ports) if len(found) < len(servos) else []
+        strangers = _strangers(servos, port) if len(found) < len(servos) else []
         raise BackendError("the robot is not complete; nothing was enabled:", *wrong, *strangers)
     for servo in servos:
         _set_up(servo)
-    for port in ports:
-        ids = [servo.id for servo in servos if servo.port is port]
-        port.fast = len(port.read_all(ids, at.PRESENT, at.present_form.size)) == len(ids)  # older firmware: it is not
+    ids = [servo.id for servo in servos]
+    port.fast = len(port.read_all(ids, at.PRESENT, at.present_form.size)) == len(ids)  # older firmware: it is not
     return [(_present(servo), _answer(servo, at.TORQUE_ENABLE, at.HEALTH_SIZE)) for servo in servos]
 
 
@@ -82,14 +79,13 @@ def _unfit(servo: Servo, said: Packet | None, kept: Packet | None, settings: Dyn
     return ""
 
 
-def _strangers(servos: Sequence[Servo], ports: Sequence[Port]) -> Iterator[str]:
+def _strangers(servos: Sequence[Servo], port: Port) -> Iterator[str]:
     """Who else answers: perhaps whoever is missing."""
-    ours = {(id(servo.port), servo.id) for servo in servos}
-    for port in ports:
-        for said in port.scan():
-            if (id(port), said.id) not in ours:
-                (number,) = struct.unpack("<H", said.data[:2])
-                yield f"  id {said.id} on {port.wire.port} is no joint's: {at.model_name(number)}"
+    ours = {servo.id for servo in servos}
+    for said in port.scan():
+        if said.id not in ours:
+            (number,) = struct.unpack("<H", said.data[:2])
+            yield f"  id {said.id} on {port.wire.port} is no joint's: {at.model_name(number)}"
 
 
 def _set_up(servo: Servo) -> None:

@@ -1,6 +1,6 @@
 """Dynamixel X servos as a family of drives: a `snakesim_hal.drivers.drive_backend.Drives`.
 
-Every tick all servos of a port say current, velocity and position in one fast sync read, one of them says its health,
+Every tick all servos say current, velocity and position in one fast sync read, one of them says its health,
 and all get goal current and goal position in one sync write. They stay in current-based position mode: a torque is that
 current with a goal just out of reach in its direction. Mode 0 would be torque alone, but a change of mode needs the
 torque off, and is a write to memory that wears out; and whoever has lost its driver turns on without end, in place of
@@ -15,7 +15,6 @@ from snakesim_hal.arrays import Floats
 from snakesim_hal.drivers.findings import Finding
 from snakesim_hal.drivers.readings import Readings
 from snakesim_hal.drivers.twin_body import FAULTS
-from snakesim_hal.errors import ConfigError
 from snakesim_hal.injection import Injection
 from snakesim_hal.wire.messages import Mode
 from snakesim_serial_backend.dynamixel import registers as at
@@ -33,11 +32,12 @@ BUS_CUT = "nothing gets through; check the adapter, its cable and its power"
 
 
 class Servos:
-    """All servos of a robot, tail to head."""
+    """All servos of a port, tail to head."""
 
     def __init__(
         self,
         servos: Sequence[Servo],
+        port: Port,
         readings: Readings,
         settings: DynamixelSettings,
         clock_ns: Callable[[], int],
@@ -46,8 +46,8 @@ class Servos:
     ) -> None:
         """twin: the servos, if they are emulated here; answer_s: how long a tick waits for answers."""
         self._twin, self.servos = twin, list(servos)
-        self.emulated = all(map(is_emulated, settings.ports))
-        self._ports = list({id(servo.port): servo.port for servo in servos}.values())
+        self.emulated = is_emulated(port.wire.port)
+        self._port = port
         self._readings, self._settings, self._clock_ns, self._answer_s = readings, settings, clock_ns, answer_s
         self._watchdog = bytes([round(settings.watchdog_s / at.WATCHDOG_S)])
         self._lost: set[int] = set()  # silent: asked apart, as they would silence others
@@ -56,7 +56,7 @@ class Servos:
 
     def bring_up(self) -> None:
         """Find all, check what they keep, write what differs. Torque is off, and stays so."""
-        found = bring_up(self.servos, self._ports, self._settings)
+        found = bring_up(self.servos, self._port, self._settings)
         self._ours = True
         for i, (present, health) in enumerate(found):
             self.hear(i, present)
@@ -65,30 +65,25 @@ class Servos:
     # --- a tick -----------------------------------------------------------------------------------------------
 
     def read(self) -> None:
-        """Ask all of each port at once, one that was silent, and one for its health."""
+        """Ask all at once, one that was silent, and one for its health."""
         self._end_s = time.monotonic() + self._answer_s
         self._turn += 1
-        for port in self._ports:
-            mine = self._of(port)
-            steady, silent = [i for i in mine if i not in self._lost], [i for i in mine if i in self._lost]
-            self._ask(steady)
-            if silent:
-                self._ask_lost(silent[self._turn % len(silent)])
-            if heard := [i for i in steady if i not in self._lost]:
-                alarmed = [i for i in heard if self.servos[i].alert and not self.servos[i].errors]
-                self._ask_health((alarmed or heard)[self._turn % len(alarmed or heard)])
+        everybody = range(len(self.servos))
+        steady, silent = [i for i in everybody if i not in self._lost], sorted(self._lost)
+        self._ask(steady)
+        if silent:
+            self._ask_lost(silent[self._turn % len(silent)])
+        if heard := [i for i in steady if i not in self._lost]:
+            alarmed = [i for i in heard if self.servos[i].alert and not self.servos[i].errors]
+            self._ask_health((alarmed or heard)[self._turn % len(alarmed or heard)])
         for i, servo in enumerate(self.servos):
             if servo.booting_ns >= 0 and self._clock_ns() - servo.booting_ns < BOOTS_WITHIN_NS:
                 self._readings.not_asked(i)
 
-    def _of(self, port: Port) -> list[int]:
-        return [i for i, servo in enumerate(self.servos) if servo.port is port]
-
     def _ask(self, left: list[int]) -> None:
-        """All of one port; without whoever is the first that is silent, as often as time allows."""
+        """All of these; without whoever is the first that is silent, as often as time allows."""
         while left and time.monotonic() < self._end_s:
-            port = self.servos[left[0]].port
-            answers = port.read_all([self.servos[i].id for i in left], at.PRESENT, at.present_form.size)
+            answers = self._port.read_all([self.servos[i].id for i in left], at.PRESENT, at.present_form.size)
             for i in left:
                 if (answer := answers.get(self.servos[i].id)) is not None:
                     self.hear(i, answer)
@@ -99,7 +94,7 @@ class Servos:
     def _ask_lost(self, i: int) -> None:
         servo = self.servos[i]
         if (answer := servo.port.read(servo.id, at.PRESENT, at.present_form.size)) is not None:
-            self._lost -= set(self._of(servo.port))  # perhaps others are back, too
+            self._lost.clear()  # perhaps others are back, too
             self.hear(i, answer)
 
     def hear(self, i: int, said: Packet) -> None:
@@ -133,27 +128,25 @@ class Servos:
 
     def let_run(self) -> None:
         """Emulated servos."""
-        for port in self._ports:
-            port.wire.let_run()
+        self._port.wire.let_run()
 
     def command(
         self, following: frozenset[int], modes: list[Mode], targets: Floats, limits_nm: Floats, *, emergency: bool
     ) -> None:
         """Set-points; torque on and off. An emergency stop is torque off, too: servos know no other."""
-        for port in self._ports:
-            mine = self._of(port)
-            off = [i for i in mine if i not in following and (self.servos[i].follows or self.servos[i].enabled)]
-            on = [i for i in mine if i in following and not self.servos[i].follows]
-            self._tell(port, at.TORQUE_ENABLE, off, b"\0")
-            if self._settings.write_gains:
-                port.write_all(at.GAINS, [(self.servos[i].id, self.servos[i].gains()) for i in on])
-            self._tell(port, at.WATCHDOG, on, b"\0")
-            self._tell(port, at.WATCHDOG, on, self._watchdog)
-            goals = {i: self._goals(i, modes[i], targets[i], limits_nm[i]) for i in mine if i in following}
-            port.write_all(at.GOALS, [(self.servos[i].id, goal) for i, goal in goals.items()])
-            self._tell(port, at.TORQUE_ENABLE, on, b"\1")
-            for i in (*off, *on):
-                self.servos[i].told(follows=i in on, now_ns=self._clock_ns())
+        everybody = range(len(self.servos))
+        off = [i for i in everybody if i not in following and (self.servos[i].follows or self.servos[i].enabled)]
+        on = [i for i in everybody if i in following and not self.servos[i].follows]
+        self._tell(at.TORQUE_ENABLE, off, b"\0")
+        if self._settings.write_gains:
+            self._port.write_all(at.GAINS, [(self.servos[i].id, self.servos[i].gains()) for i in on])
+        self._tell(at.WATCHDOG, on, b"\0")
+        self._tell(at.WATCHDOG, on, self._watchdog)
+        goals = {i: self._goals(i, modes[i], targets[i], limits_nm[i]) for i in everybody if i in following}
+        self._port.write_all(at.GOALS, [(self.servos[i].id, goal) for i, goal in goals.items()])
+        self._tell(at.TORQUE_ENABLE, on, b"\1")
+        for i in (*off, *on):
+            self.servos[i].told(follows=i in on, now_ns=self._clock_ns())
 
     def _goals(self, i: int, mode: Mode, target: float, limit_nm: float) -> bytes:
         servo, goal_rad = self.servos[i], float(self._readings.angle_rad[i])
@@ -168,8 +161,8 @@ class Servos:
         current = min(round(limit_nm / servo.unit_nm), servo.most_current)
         return at.goals_form.pack(current, 0, 0, 0, round((goal_rad - servo.turns * TURN) / at.RAD))
 
-    def _tell(self, port: Port, address: int, who: Sequence[int], data: bytes) -> None:
-        port.write_all(address, [(self.servos[i].id, data) for i in who])
+    def _tell(self, address: int, who: Sequence[int], data: bytes) -> None:
+        self._port.write_all(address, [(self.servos[i].id, data) for i in who])
 
     def clear(self, joints: frozenset[int]) -> None:
         """Restart who has a hardware error, as nothing else clears it; a restart takes about half a second."""
@@ -181,12 +174,10 @@ class Servos:
                 self._lost.add(i)
 
     def findings(self) -> list[Finding]:
-        """Of ports and servos."""
-        found = [
-            Finding("interface_down", f"{port.wire.port}: {error}; {BUS_CUT}")
-            for port in self._ports
-            if (error := port.wire.error())
-        ]
+        """Of port and servos."""
+        found: list[Finding] = []
+        if error := self._port.wire.error():
+            found.append(Finding("interface_down", f"{self._port.wire.port}: {error}; {BUS_CUT}"))
         for i, servo in enumerate(self.servos):
             if servo.errors:
                 cause = f"{servo.who} reports {at.error_names(servo.errors)}; a clear restarts it"
@@ -199,25 +190,22 @@ class Servos:
         return found
 
     def inject(self, injection: Injection, *, begins: bool) -> bool:
-        """Faults of servos that are emulated here, and of their buses."""
+        """Faults of servos that are emulated here, and of their bus."""
         if self._twin is None or (injection.target_type, injection.kind) not in INJECTED:
             return False
         if injection.target_type == "joint":
             self._twin.inject(injection, begins=begins)
-        elif injection.number < len(self._ports):
-            self._ports[injection.number].wire.cut(begins=begins)
         else:
-            raise ConfigError(f"there is no {injection.target}; this robot has bus_1 to bus_{len(self._ports)}")
+            self._port.wire.cut(begins=begins)
         return True
 
     def close(self) -> None:
-        """Torque off, as far as the buses still work."""
-        for port in self._ports:
-            try:
-                if self._ours:
-                    self._tell(port, at.TORQUE_ENABLE, self._of(port), b"\0")
-                    port.wire.let_run()
-            finally:
-                port.wire.close()
+        """Torque off, as far as the bus still works."""
+        try:
+            if self._ours:
+                self._tell(at.TORQUE_ENABLE, range(len(self.servos)), b"\0")
+                self._port.wire.let_run()
+        finally:
+            self._port.wire.close()
         if self._twin is not None:
             self._twin.close()

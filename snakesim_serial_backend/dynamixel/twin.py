@@ -87,25 +87,29 @@ class DynamixelTwin:
             self.servos.append(servo)
         self._ports = list({id(port): port for port in ports}.values())
         self._decoders = [Decoder() for _ in self._ports]
+        body.each_step(self._check)
         for i in range(len(self.servos)):
             self._wake_up(i)
 
     def __call__(self) -> None:
         """Handle what has arrived, and let time pass up to now."""
-        for port, decoder in zip(self._ports, self._decoders, strict=True):
-            for packet in decoder.feed(port.take()):
-                if packet.instruction != Instruction.STATUS:
-                    self._take(port, packet)
-        self._body.advance_to((self._clock_ns() - self._start_ns) / 1000, self._check)
+        with self._body.lock:
+            for port, decoder in zip(self._ports, self._decoders, strict=True):
+                for packet in decoder.feed(port.take()):
+                    if packet.instruction != Instruction.STATUS:
+                        self._take(port, packet)
+            self._body.advance_to((self._clock_ns() - self._start_ns) / 1000)
 
     def inject(self, injection: Injection, *, begins: bool) -> None:
         """Begin or end a fault of a servo."""
-        restarts = self._body.inject(injection, begins=begins)
-        if restarts is not None:
-            self._wake_up(restarts)
+        with self._body.lock:
+            restarts = self._body.inject(injection, begins=begins)
+            if restarts is not None:
+                self._wake_up(restarts)
 
     def close(self) -> None:
         """Leave the ports."""
+        self._body.leave(self._check)
         for port in self._ports:
             port.close()
 

@@ -8,6 +8,9 @@ import pytest
 
 from snakesim_can_backend.protocol.definitions import Frame, node_of
 from snakesim_hal.conformance.bench import Bench
+from snakesim_hal.drivers.mixed import MixedBackend
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.wire.messages import Pace
 
 VCAN = "SNAKESIM_VCAN"  # set by deploy/vm/with_vcan.py: the kernel here has vcan0, and it is up
 IN_AN_EMULATED_MACHINE = (  # an opening takes half a minute there: `-m ""` runs the other clauses, too
@@ -25,9 +28,26 @@ LOOKS_AHEAD = (
     'robot.sensors.range=[{name="front", beams=9, view_rad=2.0}]',
     f'robot.sensors.own=[{{name="whisker", model="{WHISKER}:WhiskerModel"}}]',
 )
-AS_ANOTHER = ("moteus", "sim-position")  # ODrive has the same kit, Dynamixel no velocity mode
+AS_ANOTHER = ("moteus", "sim-position", "threads")  # ODrive has the same kit, Dynamixel no velocity mode
 POSITION_ONLY = ('robot.drive.modes=["position"]', "robot.drive.measures=[]")
+HEAD_OF_SERVOS = (
+    'robot.drive.family="odrive"',
+    'robot.joints.joint_3.family="dynamixel"',
+    'robot.joints.joint_4.family="dynamixel"',
+)
 ON_VCAN = ('backend.channels=["vcan0"]', 'backend.twins="process"')
+
+
+class InRealTime(MixedBackend):
+    """Each bus in a thread of its own, where emulated drives in this process would let it be in turn."""
+
+    @classmethod
+    def check(cls, config: RunConfig, settings: Any) -> tuple[Pace, ...]:
+        super().check(config, settings)
+        return ("realtime",)
+
+
+IN_REAL_TIME: Any = InRealTime
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -43,6 +63,8 @@ def pytest_snakesim_benches() -> list[Bench]:
         Bench("odrive", "odrive", mute=cut_drive_off),
         Bench("moteus", "moteus", mute=cut_drive_off),
         Bench("dynamixel", "dynamixel", mute=cut_drive_off),
+        Bench("mixed", "mixed", sets=HEAD_OF_SERVOS, mute=cut_drive_off),
+        Bench("threads", IN_REAL_TIME, sets=HEAD_OF_SERVOS, mute=cut_drive_off),
     ]
 
 
@@ -73,11 +95,12 @@ def cut_off(backend: Any, joint: int) -> None:
 
 def cut_drive_off(backend: Any, joint: int) -> None:
     """From now on the driver hears nothing of a joint's drive."""
-    drives = backend._drives
+    line = next(line for line in backend._drives.lines if joint in line.bus.joints)
+    drives, silent = line.drives, line.bus.joints.index(joint)
     hear = drives.hear
 
     def heard(i: int, said: Any) -> None:
-        if i != joint:
+        if i != silent:
             hear(i, said)
 
     drives.hear = heard

@@ -29,7 +29,7 @@ TYPED: dict[str, tuple[list[str], set[str]]] = {
     "its flag": (["can", "load", "peg_row", "--j"], {"--joints"}),
     "key": (["echo", "sensor/j"], {"sensor/joints"}),
     "kind of a fault": (["fault", "overh"], {"overheat"}),
-    "robot": (["arm", "pl"], {"planar13", "planar13_camera"}),
+    "robot": (["arm", "pl"], {"planar13", "planar13_camera", "planar13_mixed"}),
     "shell": (["completion", "z"], {"zsh"}),
     "file": (["router", "./"], set()),  # nothing of ours: the shell completes file names
 }

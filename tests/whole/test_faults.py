@@ -39,12 +39,15 @@ def host_record(out: Path) -> HostRecord:
         ("dynamixel", "overheat:joint_3@1", "drive_fault"),
         ("dynamixel", "undervoltage:joint_3@1", "drive_fault"),
         ("dynamixel", "cut:bus_1@1-1.3", "interface_down"),
+        ("mixed", "reboot:joint_12@1", "drive_silent"),
+        ("mixed", "cut:bus_2@1-1.3", "interface_down"),
     ],
 )
 def test_a_planned_fault_happens_at_its_tick_and_ends_the_run_as_it_should(
     tmp_path: Path, backend: str, fault: str, what: str
 ) -> None:
-    ended, summary = run_to_summary(tmp_path / "run", "triplet", "--backend", backend, "--fault", fault)
+    robot = ("--set", "robot=planar13_mixed") if backend == "mixed" else ()
+    ended, summary = run_to_summary(tmp_path / "run", "triplet", "--backend", backend, *robot, "--fault", fault)
     record, by = host_record(tmp_path / "run"), 112 if what == "drive_fault" else 104  # a heartbeat of 10 Hz later
     assert ended.code == 1 and summary.faults[0].what == what
     assert record.injected[0].startswith(f"tick 100: {fault} ") and 100 <= record.faults[0].tick <= by

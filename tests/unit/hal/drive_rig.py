@@ -1,10 +1,17 @@
 """A driver and emulated drives, tick by tick in lockstep, with the robot's lifecycle as the host has it."""
 
+from typing import Any
+
 from snakesim_hal.backend import SetPoints
 from snakesim_hal.drivers.drive_backend import DriveBackend
 from snakesim_hal.injection import parse
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import Fault, JointState, LifecycleState, Mode
+
+
+def drives_of(backend: Any, bus: int = 0) -> Any:
+    """The drives of one of its buses."""
+    return backend._drives.lines[bus].drives
 
 
 class DriveRig:

@@ -14,7 +14,7 @@ from snakesim_can_backend.moteus.protocol import Mode as MoteusMode
 from snakesim_can_backend.odrive.backend import OdriveBackend
 from snakesim_can_backend.odrive.protocol import State
 from snakesim_hal.errors import BackendError, ConfigError
-from tests.unit.hal.drive_rig import DriveRig
+from tests.unit.hal.drive_rig import DriveRig, drives_of
 from tests.unit.hal.rig import run_config
 
 JOINTS = 4
@@ -67,7 +67,7 @@ class Robot(DriveRig):
 
     @property
     def twin(self) -> Any:
-        return getattr(self.backend._drives, "_twin", None)
+        return drives_of(self.backend)._twin
 
     def following(self) -> list[bool]:
         return [self.family.follows(drive) for drive in self.family.drives(self.twin)]
@@ -177,7 +177,7 @@ def test_a_drive_with_another_id_is_missing_at_the_start_and_a_stranger_later(
 
 def test_another_program_that_commands_drives_stops_the_robot(robot: Robot) -> None:
     robot.run(20, "armed")
-    channel = robot.backend._drives._buses[0].channel  # pyright: ignore[reportAttributeAccessIssue]
+    channel = drives_of(robot.backend).wire.channel
     command = can.Message(arbitration_id=2 << 5 | 7, data=[8, 0, 0, 0], is_extended_id=False)
     if robot.family.backend is MoteusBackend:
         command = can.Message(arbitration_id=2, data=[1, 0, 10], is_fd=True, is_extended_id=False)

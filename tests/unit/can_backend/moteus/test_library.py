@@ -17,6 +17,7 @@ from snakesim_hal.backend import SetPoints
 from snakesim_hal.drivers.drive_backend import Clock
 from snakesim_hal.errors import ConfigError
 from snakesim_hal.wire.messages import Mode
+from tests.unit.hal.drive_rig import drives_of
 from tests.unit.hal.rig import run_config
 
 TYPES = (moteus.INT8, moteus.INT16, moteus.INT32, moteus.F32)
@@ -138,10 +139,10 @@ def test_their_client_drives_our_twins_and_reads_them_in_every_resolution(bus: A
 def test_every_frame_of_a_run_is_read_by_their_library_and_means_what_the_robot_file_says() -> None:
     config = run_config(backend="moteus", robot__chain__modules=JOINTS, rate_hz=100)
     backend = MoteusBackend(config, MoteusSettings(plant="inertia"))
-    drives: Any = backend._drives
+    drives = drives_of(backend)
     sent: list[Frame] = []
-    send = drives.wires[0].send
-    drives.wires[0].send = lambda frame: sent.append(frame) or send(frame)
+    send = drives.wire.send
+    drives.wire.send = lambda frame: sent.append(frame) or send(frame)
     joints = backend.sample(0, 0).joints
     for tick in range(1, 20):
         joints = backend.sample(tick, tick * config.period_ns).joints

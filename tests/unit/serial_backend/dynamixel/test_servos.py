@@ -13,7 +13,7 @@ from snakesim_serial_backend.dynamixel import registers as at
 from snakesim_serial_backend.dynamixel.backend import DynamixelBackend
 from snakesim_serial_backend.dynamixel.settings import DynamixelSettings
 from snakesim_serial_backend.dynamixel.twin import DynamixelTwin
-from tests.unit.hal.drive_rig import DriveRig
+from tests.unit.hal.drive_rig import DriveRig, drives_of
 from tests.unit.hal.rig import run_config
 
 JOINTS = 4
@@ -31,9 +31,7 @@ class Robot(DriveRig):
 
     @property
     def twin(self) -> DynamixelTwin:
-        twin = getattr(self.backend._drives, "_twin", None)
-        assert isinstance(twin, DynamixelTwin)
-        return twin
+        return drives_of(self.backend)._twin
 
 
 @pytest.fixture
@@ -104,7 +102,7 @@ def test_torque_mode_pushes_and_a_servo_that_is_left_alone_comes_to_a_stop_just_
     robot.run(8, "armed")
     assert robot.joints is not None
     assert robot.joints.torque_nm == pytest.approx([-0.05] * JOINTS, abs=0.004)
-    servo, twin = robot.backend._drives.servos[0], robot.twin.servos[0]  # pyright: ignore
+    servo, twin = drives_of(robot.backend).servos[0], robot.twin.servos[0]
     goal_rad = twin.get("i", at.GOAL_POSITION) * at.RAD + servo.turns * 2 * math.pi
     assert servo.least_rad - 0.5 < goal_rad < servo.least_rad
 
