@@ -100,11 +100,15 @@ def _clear(arguments: argparse.Namespace) -> int:
 
 
 def _estop(arguments: argparse.Namespace) -> int:
+    before = os.getpriority(os.PRIO_PROCESS, 0)
     with contextlib.suppress(PermissionError):
-        os.nice(URGENT)
+        os.setpriority(os.PRIO_PROCESS, 0, URGENT)
     from snakesim_operator.tools.stop import estop
 
-    return estop(selection_of(arguments))
+    try:
+        return estop(selection_of(arguments))
+    finally:
+        os.setpriority(os.PRIO_PROCESS, 0, before)  # a program may call the command, and go on
 
 
 def _teleop(arguments: argparse.Namespace) -> int:
