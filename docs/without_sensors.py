@@ -10,6 +10,8 @@ import snakesim
 DURATION_S = float(sys.argv[1]) if len(sys.argv) > 1 else 8.0
 SEEDS = int(sys.argv[2]) if len(sys.argv) > 2 else 3
 SCENARIO = sys.argv[3] if len(sys.argv) > 3 else "triplet"
+HIDDEN_NM = float(sys.argv[4]) if len(sys.argv) > 4 else 0.0  # friction of each gear that no file says
+HIDDEN = {f"backend.mounted.joint_{i}.friction_nm": HIDDEN_NM for i in range(1, 14) if HIDDEN_NM}
 NO_FORCES = {"robot.sensors.contacts": None}
 NO_POSE = {"mission.localisation": "dead_reckoning"}
 BARE = {**NO_FORCES, "robot.sensors.imu": None, **NO_POSE}
@@ -26,7 +28,7 @@ ROWS = (
 
 for backend, has, changes in ROWS:
     runs = [
-        snakesim.run(SCENARIO, duration=DURATION_S, backend=backend, set={**changes, "seed": seed + 1})
+        snakesim.run(SCENARIO, duration=DURATION_S, backend=backend, set={**HIDDEN, **changes, "seed": seed + 1})
         for seed in range(SEEDS)
     ]
     said = [run.summary for run in runs]

@@ -5,8 +5,8 @@ defaults follow from the normal rate of a stream:
 
 joints      as in the gate: three periods or 30 ms, and the sensor's delay; at most a lease
 world       guidance's lag, and three of its turns missed, or 0.2 s
-pose,       the sensor's delay, guidance's turn and lag, and three samples missed, or 0.2 s
-contacts
+pose,       the sensor's delay, guidance's turn and lag, and three samples missed, or 0.2 s; so of a pose that the
+contacts    service `sensor` tells, by its schedule
 depth       as the pose, for the newest of all images and ranges, when the map is perceived
 trajectory  guidance's turn and lag, navigation's lag, and three of its turns missed, or 0.2 s
 
@@ -16,7 +16,7 @@ A stamp that is further ahead of the clock than its limit is rejected as well: i
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from snakesim_hal.model.scenario import RunConfig, Service
+from snakesim_hal.model.scenario import SENSOR, RunConfig, Service
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.freshness import oldest_state_ns
 from snakesim_hal.wire.messages import Description, JointState, Trajectory, World
@@ -53,6 +53,10 @@ class Limits:
         }
         if config.dead_reckons(robot):
             sensors_s.pop(keys.POSE, None)
+        elif keys.POSE not in sensors_s and SENSOR in config.services and config.mission.map == "known":
+            teller = config.services[SENSOR]  # what it tells is in no description
+            told_s = teller.lag_ticks * period_s + _margin_s(teller.every_ticks * period_s)
+            sensors_s[keys.POSE] = own.pose_s or turn_s + lag_s + told_s
         looking = [sensor for sensor in robot.sensors if sensor.key.startswith(LOOKING)]
         if looking and config.mission.map == "perceived":
             ages_s = [sensor.delay_s + turn_s + lag_s + _margin_s(1.0 / sensor.rate_hz) for sensor in looking]

@@ -204,6 +204,26 @@ def test_a_run_names_what_never_comes_and_gives_up_after_a_stated_time(home: Pat
     assert alone.code != 0 and given_up in alone.err and why in alone.err, alone
 
 
+FROZEN = """
+
+class Frozen(MotionCapture):
+    def outputs(self, clock):
+        if clock.tick <= 50:
+            self.last = super().outputs(clock)[0][1]
+        return [(keys.POSE, msgspec.structs.replace(self.last, tick=clock.tick))]
+"""
+
+
+def test_control_holds_when_a_service_tells_an_old_pose_again_and_again(home: Path) -> None:
+    (home / "lab" / "frozen.py").write_text("import msgspec\n" + SERVICE + FROZEN)
+    code = ["--set", "services.sensor.code=./lab/frozen.py:Frozen", "--duration", "1"]
+    ended, summary = in_process.run_to_summary(home / "run", *SHORT, *code)
+    assert ended.code == 0 and summary.pose_from == "sensor", ended.out
+    assert summary.last_state == "NotLocomoting" and re.search(
+        r"sensor/pose is 0\.\d+ s old", summary.last_reason or ""
+    )
+
+
 def test_a_service_for_the_pose_brings_no_contacts_and_nobody_waits_for_them(home: Path) -> None:
     """On a robot whose file has no contact sensors."""
     robot = (home / "bare.toml").read_text()

@@ -1,11 +1,17 @@
 """A robot of emulated servos that tells joint angles and currents alone gets along; nobody else's reading is used."""
 
 import json
+import re
+import subprocess
+import sys
 from pathlib import Path
+
+import pytest
 
 from snakesim_operator.results.record import REPORT, RunRecord
 from tests.whole.command import snakesim
 
+SCRIPT = Path(__file__).parents[2] / "docs" / "without_sensors.py"
 BARE = ("robot.sensors.contacts", "robot.sensors.imu")
 SHORT = ["triplet", "--backend", "dynamixel", "--duration", "2.5", "--in-process"]
 
@@ -27,3 +33,14 @@ def test_without_force_sensors_and_motion_capture_it_gets_along_and_says_what_is
     assert all(world.pose_stamp_ns is None and world.base_position_sd_m is not None for world in worlds)
     felt = [contact for world in worlds for contact in world.contacts]
     assert felt and all(contact.obstacle is not None and contact.confidence < 1.0 for contact in felt)
+
+
+@pytest.mark.slow
+def test_the_table_has_every_family_side_by_side() -> None:
+    command = [sys.executable, str(SCRIPT), "4", "1"]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False, timeout=590)
+    assert ended.returncode == 0, ended.stderr
+    rows = re.findall(r"^(\w+) +(.+?) +moved +([0-9.]+) m, pose (.+?), .*, complete$", ended.stdout, re.MULTILINE)
+    assert [row[0] for row in rows] == ["can"] * 4 + ["odrive"] * 2 + ["moteus", "dynamixel"], ended.stdout
+    assert all(float(row[2]) > 0.2 for row in rows), ended.stdout
+    assert {row[3] == "measured" for row in rows if "alone" in row[1]} == {False}

@@ -56,6 +56,8 @@ def test_the_limits_follow_from_rates_delays_and_schedules() -> None:
     assert found.sensors_s == pytest.approx({"sensor/pose": 0.05 + 0.04 + 0.2, "sensor/contacts": 0.05 + 0.04 + 0.3})
     assert found.trajectory_s == pytest.approx(0.04 + 0.2 + 3 * 0.2)
     assert limits().joints_s == pytest.approx(0.03) and limits().sensors_s == {}
+    tracked = run_config(services={**SCHEDULE, "sensor": {"every_ticks": 10, "lag_ticks": 3}})
+    assert limits(tracked).sensors_s == pytest.approx({"sensor/pose": 0.04 + 0.03 + 0.3})  # by a service's schedule
 
 
 def test_a_run_without_guidance_or_navigation_has_limits_too() -> None:
