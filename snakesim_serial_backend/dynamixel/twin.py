@@ -93,9 +93,10 @@ class DynamixelTwin:
 
     def __call__(self) -> None:
         """Handle what has arrived, and let time pass up to now."""
+        taken = [port.take() for port in self._ports]  # may wait for the kernel; nobody else has to wait for it
         with self._body.lock:
-            for port, decoder in zip(self._ports, self._decoders, strict=True):
-                for packet in decoder.feed(port.take()):
+            for port, decoder, data in zip(self._ports, self._decoders, taken, strict=True):
+                for packet in decoder.feed(data):
                     if packet.instruction != Instruction.STATUS:
                         self._take(port, packet)
             self._body.advance_to((self._clock_ns() - self._start_ns) / 1000)
