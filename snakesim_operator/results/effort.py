@@ -42,7 +42,7 @@ class Effort:
 
 def _impulse_n_s_per_m(record: RunRecord, advance: Advance) -> float | None:
     """From the contacts in guidance's worlds, twenty a second; None without a sensor of contacts."""
-    if record.config.robot.sensors.contacts is None or advance.reached_m < MIN_DISTANCE_M:
+    if not record.feels_contacts or advance.reached_m < MIN_DISTANCE_M:
         return None
     begin_ns = record.time_s[0] * 1e9
     worlds = [one for one in record.worlds if 0 <= (one.stamp_ns - begin_ns) * 1e-9 <= advance.until_s]

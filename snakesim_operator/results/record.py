@@ -164,6 +164,11 @@ class RunRecord:
         """The obstacles where they stand."""
         return place_all(self.config)
 
+    @cached_property
+    def feels_contacts(self) -> bool:
+        """Whether the robot had contact sensors; its file may list some that its drives do not have."""
+        return any(sensor.key == keys.CONTACTS for sensor in self.description.sensors)
+
     def row_at(self, time_s: float) -> int:
         """The row whose time is nearest."""
         return int(np.argmin(np.abs(self.time_s - time_s)))

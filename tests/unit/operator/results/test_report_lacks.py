@@ -11,6 +11,7 @@ import pytest
 
 from snakesim_hal.model.kinematics import quaternion_from_yaw
 from snakesim_hal.model.scenario import Start
+from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Description, Fault
 from snakesim_operator.results.record import RunRecord
 from snakesim_operator.results.report import page as report_page
@@ -77,9 +78,9 @@ def test_without_ticks(record: RunRecord) -> None:
 
 
 def test_without_a_contact_sensor(record: RunRecord) -> None:
-    sensors = msgspec.structs.replace(record.config.robot.sensors, contacts=None)
-    robot = msgspec.structs.replace(record.config.robot, sensors=sensors)
-    page = read(changed(record, config=msgspec.structs.replace(record.config, robot=robot)))
+    """Whatever the robot file lists: its drives have none."""
+    sensors = [sensor for sensor in record.description.sensors if sensor.key != keys.CONTACTS]
+    page = read(changed(record, description=msgspec.structs.replace(record.description, sensors=sensors)))
     assert "No contact forces: the robot has no contact sensor." in page.text
 
 
