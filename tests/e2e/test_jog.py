@@ -5,7 +5,7 @@ import os
 import pty
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until
 
 REPEAT_S = 0.03  # of a key
+TRIES = 4
 UP = b"\x1b[A"
 TOLD = """
 
@@ -87,31 +88,39 @@ def told(home: Path) -> dict[str, Any]:
 
 def test_it_moves_while_the_key_repeats_and_only_that_joint(home: Path) -> None:
     with host(home) as endpoint:
-        while not moved_and_stood(home, endpoint):
-            why = snakesim("status", "--endpoint", endpoint, cwd=home).out
-            assert "lease of control expired" in why, why  # this computer was busy for longer than a lease
-            assert snakesim("clear", "--endpoint", endpoint, cwd=home).code == 0
+        steadily(home, endpoint, moved_and_stood)
         wait_until(lambda: told(home)["lifecycle"] == "disarmed", "the end of it")
-        with jogging(home, endpoint) as (process, _terminal):
-            wait_until(lambda: told(home)["lifecycle"] != "disarmed", "armed again")
-            process.kill()
-            wait_until(lambda: told(home)["lifecycle"] == "fault", "a stop after the terminal is lost")
+        steadily(home, endpoint, stopped_when_killed)
+
+
+def steadily(home: Path, endpoint: str, tried: Callable[[Path, str], bool]) -> None:
+    """Until it was done; a computer that was busy for longer than a lease may stop or refuse it."""
+    for _ in range(TRIES):
+        if tried(home, endpoint):
+            return
+        why = snakesim("status", "--endpoint", endpoint, cwd=home).out
+        assert "lease" in why, why
+        snakesim("clear", "--endpoint", endpoint, cwd=home)
+    pytest.fail("a busy computer")
 
 
 def moved_and_stood(home: Path, endpoint: str) -> bool:
-    """Hold the key, let it go, quit; False when the robot was stopped meanwhile."""
+    """Hold the key, let it go, quit; False when the robot was not armed, or stopped meanwhile."""
     with jogging(home, endpoint) as (process, terminal):
-        wait_until(lambda: told(home)["lifecycle"] != "disarmed", "armed")
-        wait_until(lambda: stopped(home) or told(home)["mode"] == [0, 1, 0, 0], "one joint with current")
+
+        def ended() -> bool:
+            return process.poll() is not None or told(home)["lifecycle"] == "fault"
+
+        wait_until(lambda: ended() or told(home)["mode"] == [0, 1, 0, 0], "one joint with current")
         before = told(home)["target"][1]
-        while not stopped(home) and told(home)["target"][1] < before + 0.04:
+        while not ended() and told(home)["target"][1] < before + 0.04:
             os.write(terminal, UP)
             time.sleep(REPEAT_S)
         let_go = told(home)["tick"]
         wait_until(lambda: told(home)["tick"] > let_go + 25, "half a second")
         half = told(home)
         wait_until(lambda: told(home)["tick"] > let_go + 50, "another half second")
-        if stopped(home):
+        if ended():
             return False
         assert half["limit_nm"][1] == pytest.approx(0.3 * 7.0)
         assert told(home)["target"][1] == half["target"][1]
@@ -119,5 +128,12 @@ def moved_and_stood(home: Path, endpoint: str) -> bool:
         return process.wait(20) == 0
 
 
-def stopped(home: Path) -> bool:
-    return told(home)["lifecycle"] == "fault"
+def stopped_when_killed(home: Path, endpoint: str) -> bool:
+    """Kill the command; False when it was not armed."""
+    with jogging(home, endpoint) as (process, _terminal):
+        wait_until(lambda: process.poll() is not None or told(home)["lifecycle"] != "disarmed", "armed again")
+        if process.poll() is not None:
+            return False
+        process.kill()
+        wait_until(lambda: told(home)["lifecycle"] == "fault", "a stop after the terminal is lost")
+        return True
