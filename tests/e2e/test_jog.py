@@ -109,7 +109,7 @@ def moved_and_stood(home: Path, endpoint: str) -> bool:
     with jogging(home, endpoint) as (process, terminal):
 
         def ended() -> bool:
-            return process.poll() is not None or told(home)["lifecycle"] == "fault"
+            return process.poll() is not None or stopped(home)
 
         wait_until(lambda: ended() or told(home)["mode"] == [0, 1, 0, 0], "one joint with current")
         before = told(home)["target"][1]
@@ -137,3 +137,7 @@ def stopped_when_killed(home: Path, endpoint: str) -> bool:
         process.kill()
         wait_until(lambda: told(home)["lifecycle"] == "fault", "a stop after the terminal is lost")
         return True
+
+
+def stopped(home: Path) -> bool:
+    return told(home)["lifecycle"] == "fault"
