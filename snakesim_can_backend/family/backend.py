@@ -72,7 +72,7 @@ class CanDriveBackend(FamilyBackend):
         """Channels, ids, load, and what the family adds."""
         for channel in settings.channels:
             check_channel(channel, fd=settings.fd_rate is not None)
-        real = not all(map(is_emulated, settings.channels))
+        real = cls.real(settings)
         for joint in joints:
             if joint.id > cls.last_id:
                 raise ConfigError(
@@ -81,6 +81,11 @@ class CanDriveBackend(FamilyBackend):
             cls.check_joint(config, settings, joint, real=real)
         rate_hz = config.rate_hz / settings.every_ticks
         cls.load(rate_hz, settings, joints).check(cls.name, rate_hz, cls.rates(settings))
+
+    @staticmethod
+    def real(settings: Any) -> bool:
+        """Whether something on a bus may really move."""
+        return not all(map(is_emulated, settings.channels))
 
     @classmethod
     def load(cls, rate_hz: float, settings: Any, joints: Sequence[Joint]) -> Load:

@@ -5,7 +5,6 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from snakesim_can_backend.bus.adapter import is_emulated
 from snakesim_can_backend.family.backend import CanDriveBackend, CanDriveSettings
 from snakesim_can_backend.family.command import run
 from snakesim_can_backend.family.traffic import Traffic
@@ -54,10 +53,9 @@ class MoteusBackend(CanDriveBackend):
     def check_drives(cls, config: RunConfig, settings: MoteusSettings, joints: Sequence[Joint]) -> None:
         """And gains that all controllers have alike."""
         super().check_drives(config, settings, joints)
-        real = not all(map(is_emulated, settings.channels))
         most, have = needed(joints), configured(joints, settings)
         named = settings.kp_nm_per_turn is not None and settings.kd_nm_s_per_turn is not None
-        if (real and not named) or any(a > b * ROUNDING for a, b in zip(most, have, strict=True)):
+        if (cls.real(settings) and not named) or any(a > b * ROUNDING for a, b in zip(most, have, strict=True)):
             raise ConfigError(
                 f"robot {config.robot.name!r} needs `servo.pid_position.kp` from {most[0]:.4g} N·m/turn on, and `.kd` "
                 f"from {most[1]:.4g} N·m·s/turn: configure all controllers alike, and say what they have in "

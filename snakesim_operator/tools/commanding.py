@@ -102,7 +102,7 @@ def _clear(arguments: argparse.Namespace) -> int:
 def _estop(arguments: argparse.Namespace) -> int:
     before = os.getpriority(os.PRIO_PROCESS, 0)
     with contextlib.suppress(PermissionError):
-        os.setpriority(os.PRIO_PROCESS, 0, URGENT)
+        os.setpriority(os.PRIO_PROCESS, 0, min(before, URGENT))
     from snakesim_operator.tools.stop import estop
 
     try:

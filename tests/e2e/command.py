@@ -9,7 +9,18 @@ from snakesim_operator.results.summary import RunSummary
 from tests.harness.command import LIMIT_S, SNAKESIM, Ended, Running, environment, running, snakesim
 from tests.harness.endpoint import free_endpoint
 
-__all__ = ["LIMIT_S", "SNAKESIM", "Ended", "Running", "environment", "run_to_summary", "running", "snakesim"]
+TOO_SLOW = "this computer is too slow: "
+__all__ = [
+    "LIMIT_S",
+    "SNAKESIM",
+    "TOO_SLOW",
+    "Ended",
+    "Running",
+    "environment",
+    "run_to_summary",
+    "running",
+    "snakesim",
+]
 
 
 def run_to_summary(out: Path, *arguments: str, **more: str) -> tuple[Ended, RunSummary]:

@@ -9,14 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from snakesim_hal.model.files import SHIPPED, decode, read_part
+from snakesim_hal.model.files import decode, read_part
 from snakesim_hal.model.robot import RobotFile
 from tests.contract.workbench import text_of_the_example
+from tests.e2e.bench import host, lab_folder
 from tests.e2e.command import SNAKESIM, environment, running, snakesim
-from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until
 
 JOINTS = 4
+BACKEND = "./held.py:Held"
 SIGN, ZERO_RAD = np.array([1.0, -1.0, 1.0, 1.0]), np.array([0.3, -0.2, 0.0, 0.1])  # as it is really mounted
 
 HELD = '''
@@ -56,31 +57,10 @@ def hold(home: Path, joints_rad: Sequence[float]) -> None:
     (home / "new.json").replace(home / "drives.json")
 
 
-@contextmanager
-def host(home: Path) -> Iterator[str]:
-    """A host, disarmed; its endpoint."""
-    endpoint = free_endpoint()
-    program = [*SNAKESIM, "host", "bench.toml", "--backend", "./held.py:Held", "--endpoint", endpoint]
-    with (home / "host.said").open("wb") as said:
-        process = subprocess.Popen(
-            program, cwd=home, env=environment(home), stdin=subprocess.DEVNULL, stdout=said, stderr=said
-        )
-        try:
-            wait_until(lambda: snakesim("status", "--endpoint", endpoint, cwd=home).code == 0, "the host")
-            yield endpoint
-        finally:
-            process.terminate()
-            process.wait(20)
-
-
 @pytest.fixture
 def home(tmp_path: Path) -> Path:
     """A lab's folder: robot file with a comment, scenario, backend."""
-    shipped = (SHIPPED / "robots" / "planar13.toml").read_text()
-    (tmp_path / "snake.toml").write_text(shipped.replace("modules = 13", f"modules = {JOINTS}"))
-    (tmp_path / "bench.toml").write_text(SCENARIO)
-    (tmp_path / "held.py").write_text(text_of_the_example() + HELD)
-    return tmp_path
+    return lab_folder(tmp_path, JOINTS, SCENARIO, {"held.py": text_of_the_example() + HELD})
 
 
 def robot(home: Path) -> RobotFile:
@@ -132,7 +112,7 @@ def seen(home: Path, endpoint: str, angle_rad: float) -> None:
 def test_what_hands_do_ends_up_in_the_robot_file(home: Path) -> None:
     pose_rad = [0.0] * JOINTS
     hold(home, pose_rad)
-    with host(home) as endpoint:
+    with host(home, BACKEND) as endpoint:
         with told(home, endpoint, "direction", "snake.toml") as process:
             for joint in range(JOINTS):
                 assert line(process).startswith(f"joint_{joint + 1}: turn what is ahead of it to the left")
@@ -143,7 +123,7 @@ def test_what_hands_do_ends_up_in_the_robot_file(home: Path) -> None:
         stale = snakesim("joints", "zero", "snake.toml", "--now", "--endpoint", endpoint, cwd=home)
         assert stale.code == 2 and "restart the host with this file" in stale.err
     hold(home, [0.0] * JOINTS)
-    with host(home) as endpoint:
+    with host(home, BACKEND) as endpoint:
         with told(home, endpoint, "limits", "snake.toml", "joint_1") as process:
             assert line(process).startswith("Move each joint")
             for angle_rad in (-0.9, 1.2):

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal.model.files import SHIPPED
 from tests.contract.workbench import text_of_the_example
+from tests.e2e.bench import host, lab_folder
 from tests.e2e.command import snakesim
-from tests.e2e.test_by_hand import HELD, JOINTS, SCENARIO, host, robot, seen
+from tests.e2e.test_by_hand import BACKEND, HELD, JOINTS, SCENARIO, robot, seen
 
 pytestmark = pytest.mark.e2e
 TURN = 2 * math.pi
@@ -27,23 +27,22 @@ def why(home: Path, endpoint: str) -> str:
 
 
 def test_a_turn_that_a_drive_has_forgotten_is_not_wound_again(tmp_path: Path) -> None:
-    shipped = (SHIPPED / "robots" / "planar13.toml").read_text()
-    (tmp_path / "snake.toml").write_text(shipped.replace("modules = 13", f"modules = {JOINTS}") + ENDLESS)
-    (tmp_path / "bench.toml").write_text(SCENARIO)
-    (tmp_path / "held.py").write_text(text_of_the_example().replace("emulated=True", "emulated=False") + HELD)
+    held = text_of_the_example().replace("emulated=True", "emulated=False") + HELD
+    with (lab_folder(tmp_path, JOINTS, SCENARIO, {"held.py": held}) / "snake.toml").open("a") as file:
+        file.write(ENDLESS)
     drives(tmp_path, 0.0)
-    with host(tmp_path) as endpoint:
+    with host(tmp_path, BACKEND) as endpoint:
         assert "joint_1: how far its cable is wound is not known" in why(tmp_path, endpoint)
         declared = snakesim("joints", "zero", "snake.toml", "--now", "--endpoint", endpoint, cwd=tmp_path)
         assert declared.code == 0 and "its cable counts as unwound here" in declared.out, declared.said
     assert robot(tmp_path).joint_table[0].limits.cable_unwound
-    with host(tmp_path) as endpoint:
+    with host(tmp_path, BACKEND) as endpoint:
         assert "cable" not in why(tmp_path, endpoint)
         for angle_rad in (2.0, 4.0):  # somebody turns it through
             drives(tmp_path, angle_rad)
             seen(tmp_path, endpoint, angle_rad)
     drives(tmp_path, 4.0 - TURN)  # it was switched off and on
-    with host(tmp_path) as endpoint:
+    with host(tmp_path, BACKEND) as endpoint:
         shown = why(tmp_path, endpoint)
         assert "counted over restarts it is at +4.00 rad" in shown, shown
         assert "Turn it by hand by 1 turn to lower angles" in shown

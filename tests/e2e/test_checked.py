@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal.model.files import SHIPPED
+from tests.e2e.bench import lab_folder
 from tests.e2e.command import Ended, snakesim
 from tests.harness.endpoint import free_endpoint
 
@@ -47,12 +47,7 @@ JOINTS = 3
 
 @pytest.fixture
 def home(tmp_path: Path) -> Path:
-    shipped = (SHIPPED / "robots" / "planar13.toml").read_text()
-    (tmp_path / "snake.toml").write_text(shipped.replace("modules = 13", f"modules = {JOINTS}"))
-    (tmp_path / "bench.toml").write_text(SCENARIO)
-    (tmp_path / "real.py").write_text(REAL)
-    (tmp_path / "serials").write_text("A1 B2 C3")
-    return tmp_path
+    return lab_folder(tmp_path, JOINTS, SCENARIO, {"real.py": REAL, "serials": "A1 B2 C3"})
 
 
 def run(home: Path, out: str, *words: str) -> Ended:

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal.model.files import SHIPPED
+from tests.e2e.bench import host
 from tests.e2e.command import SNAKESIM, environment, running, snakesim
 from tests.e2e.test_by_hand import robot
-from tests.e2e.test_checked import JOINTS, REAL, SCENARIO
+from tests.e2e.test_checked import home
 from tests.e2e.test_console_keys import LIMIT_S, until
+from tests.e2e.test_jog import BACKEND, stopped, told
 from tests.e2e.test_jog import home as bench
-from tests.e2e.test_jog import host, stopped, told
 from tests.viewer import Viewer, viewing
 
 pytestmark = pytest.mark.e2e
@@ -31,17 +31,7 @@ RUN = (
 )
 
 FORWARDS, HOLD_HZ = "Hold: forwards (+)", 20.0
-__all__ = ["bench"]
-
-
-@pytest.fixture
-def home(tmp_path: Path) -> Path:
-    shipped = (SHIPPED / "robots" / "planar13.toml").read_text()
-    (tmp_path / "snake.toml").write_text(shipped.replace("modules = 13", f"modules = {JOINTS}"))
-    (tmp_path / "bench.toml").write_text(SCENARIO)
-    (tmp_path / "real.py").write_text(REAL)
-    (tmp_path / "serials").write_text("A1 B2 C3")
-    return tmp_path
+__all__ = ["bench", "home"]
 
 
 def test_a_robot_that_nobody_checked_is_armed_by_the_page_by_an_explicit_word(home: Path) -> None:
@@ -82,7 +72,7 @@ def console(home: Path, endpoint: str) -> Iterator[str]:
 
 
 def test_a_page_finds_the_zeros_and_jogs_a_joint_while_its_button_is_held(bench: Path) -> None:
-    with host(bench) as endpoint, console(bench, endpoint) as address:
+    with host(bench, BACKEND) as endpoint, console(bench, endpoint) as address:
         asyncio.run(asyncio.wait_for(commission(address, bench, endpoint), 3 * LIMIT_S))
 
 

@@ -12,15 +12,15 @@ from typing import Any
 
 import pytest
 
-from snakesim_hal.model.files import SHIPPED
 from tests.contract.workbench import text_of_the_example
+from tests.e2e.bench import host, lab_folder
 from tests.e2e.command import SNAKESIM, environment, snakesim
 from tests.e2e.test_by_hand import JOINTS, SCENARIO
-from tests.harness.endpoint import free_endpoint
 from tests.harness.wait import wait_until
 
 REPEAT_S = 0.03  # of a key
 TRIES = 4
+BACKEND = "./told.py:Told"
 UP = b"\x1b[A"
 TOLD = """
 
@@ -44,24 +44,8 @@ class Told(Workbench):
 
 @pytest.fixture
 def home(tmp_path: Path) -> Path:
-    shipped = (SHIPPED / "robots" / "planar13.toml").read_text()
-    (tmp_path / "snake.toml").write_text(shipped.replace("modules = 13", f"modules = {JOINTS}"))
-    (tmp_path / "bench.toml").write_text(SCENARIO)
     real = text_of_the_example().replace("emulated=True", "emulated=False")
-    (tmp_path / "told.py").write_text(real + TOLD)
-    return tmp_path
-
-
-@contextmanager
-def host(home: Path) -> Iterator[str]:
-    endpoint = free_endpoint()
-    program = [*SNAKESIM, "host", "bench.toml", "--backend", "./told.py:Told", "--endpoint", endpoint]
-    with subprocess.Popen(program, cwd=home, env=environment(home), stdin=subprocess.DEVNULL) as process:
-        try:
-            wait_until(lambda: snakesim("status", "--endpoint", endpoint, cwd=home).code == 0, "the host")
-            yield endpoint
-        finally:
-            process.terminate()
+    return lab_folder(tmp_path, JOINTS, SCENARIO, {"told.py": real + TOLD})
 
 
 @contextmanager
@@ -87,7 +71,7 @@ def told(home: Path) -> dict[str, Any]:
 
 
 def test_it_moves_while_the_key_repeats_and_only_that_joint(home: Path) -> None:
-    with host(home) as endpoint:
+    with host(home, BACKEND) as endpoint:
         steadily(home, endpoint, moved_and_stood)
         wait_until(lambda: told(home)["lifecycle"] == "disarmed", "the end of it")
         steadily(home, endpoint, stopped_when_killed)

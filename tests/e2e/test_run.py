@@ -16,7 +16,7 @@ import pytest
 
 from snakesim_operator.results.record import REPORT, SUMMARY
 from snakesim_operator.results.summary import RunSummary
-from tests.e2e.command import run_to_summary, running, snakesim
+from tests.e2e.command import TOO_SLOW, run_to_summary, running, snakesim
 from tests.harness.processes import nothing_left
 from tests.whole import command
 
@@ -66,9 +66,6 @@ def test_a_busy_machine_and_a_host_that_is_held_up_cost_no_determinism(tmp_path:
         ended, loaded = run_to_summary(tmp_path / "loaded", *arguments, "--fault", "freeze:host@1-2.4")
     assert ended.code == 0, ended.out + ended.err
     assert loaded.command_digest == alone.command_digest
-
-
-TOO_SLOW = "this computer is too slow: "
 
 
 @contextmanager

@@ -8,7 +8,7 @@ import pytest
 from snakesim_hal.wire.messages import Mode
 from snakesim_operator.results.record import REPORT, RunRecord
 from snakesim_operator.results.summary import RunSummary
-from tests.e2e.command import Ended, run_to_summary
+from tests.e2e.command import TOO_SLOW, Ended, run_to_summary
 from tests.harness.processes import nothing_left
 
 pytestmark = pytest.mark.e2e
@@ -18,7 +18,6 @@ FADED_S = 0.9  # after the push has ended: three time constants of the fade
 
 
 TRIES = 4
-TOO_SLOW = "this computer is too slow: "
 
 
 def undisturbed(out: Path, fault: str) -> tuple[Ended, RunSummary]:
