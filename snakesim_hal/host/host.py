@@ -24,7 +24,7 @@ from snakesim_hal.errors import BackendError, WireError
 from snakesim_hal.host.cable_file import CableFile
 from snakesim_hal.host.inbox import Inbox, Request
 from snakesim_hal.host.latch import EstopLatch, replying
-from snakesim_hal.host.outbox import Outbox
+from snakesim_hal.host.outbox import Outbox, Outgoing
 from snakesim_hal.host.participants import Participant, Participants
 from snakesim_hal.host.run_statistics import RunStatistics
 from snakesim_hal.host.simulated_time import Refusal, SimulatedTime
@@ -60,6 +60,7 @@ STANDBY_PERIOD_NS = 20_000_000
 STANDING_PERIOD_NS = 50_000_000  # between signs of life while a simulator is paused
 HELD_UP_NS = 500_000_000  # that a tick has waited for answers until the status says so
 STATUS_GAP_NS = 10_000_000  # between status messages for frequent changes, such as a contested lease
+BEGIN_S = 0.0003  # until services compute on a new state; the host does the same afterwards, beside them
 TAKEN_SHARE = 0.25  # of a period, for late arrivals: a flood must not take all of it
 MAX_REQUESTS_KEPT = 256
 RECORDED_AFTER_NS = 2_000_000_000  # recorded after the last armed tick, in a host that stays
@@ -202,6 +203,7 @@ class Host:
                     break
                 self._publish(last)
                 if last is not before:
+                    self._let_services_begin()
                     self._judge(last)
                 yield
                 if self._pace == "lockstep" and self.authority.arming == 0:
@@ -251,6 +253,11 @@ class Host:
             return None
         return samples
 
+    def _let_services_begin(self) -> None:
+        """In real time: leave interpreter and processor to the threads that send, and to those who are to answer."""
+        if self._pace == "realtime":
+            self._inbox.wait(min(BEGIN_S, TAKEN_SHARE * self._period_ns * 1e-9))
+
     def _judge(self, samples: Samples) -> None:
         """The authority's view of new samples, before any answer to them is taken in; services compute meanwhile."""
         now_ns = self._safety_now()
@@ -273,7 +280,7 @@ class Host:
     def _wait_held(self) -> None:
         """Paused: show that the host is there, and take in what comes; physics and robot time stand."""
         if self._published.last_tick is not None:
-            self._outbox.put(keys.CLOCK, self._clock(self._published.last_tick, paused=True))
+            self._outbox.put((keys.CLOCK, self._clock(self._published.last_tick, paused=True), None))
         self._show_status()
         self._tick_began_ns = None
         until_ns = time.monotonic_ns() + STANDING_PERIOD_NS
@@ -300,17 +307,17 @@ class Host:
 
     def _publish(self, samples: Samples) -> None:
         tick = self._tick
-        self._outbox.put(keys.JOINTS, self.authority.readable(samples.joints))
-        self._newest[keys.JOINTS] = tick
-        for key, message in samples.others.items():
-            self._outbox.put(key, message, samples.encoded[key])
+        encoded = samples.encoded
+        outgoing: list[Outgoing] = [(keys.JOINTS, self.authority.readable(samples.joints), None)]
+        outgoing += [(key, message, encoded[key]) for key, message in samples.others.items()]
+        for key, _, _ in outgoing:
             self._newest[key] = tick
         for name, participant in self.participants.items():
             self._newest[name] = participant.service.used_output_tick(tick)
         clock = self._clock(tick)
         self._published_arming = self.authority.arming
         self._published.put(tick, self._safety_now(), time.monotonic_ns())
-        self._outbox.put(keys.CLOCK, clock)
+        self._outbox.put(*outgoing, (keys.CLOCK, clock, None))
 
     def _clock(self, tick: int, *, paused: bool = False) -> Clock:
         return Clock(
@@ -340,7 +347,7 @@ class Host:
         started = time.monotonic_ns()
         try:
             self._backend.enact(decision.set_points, self.authority.state)
-            self._outbox.put(keys.APPLIED, applied_message(self.description, self._tick, decision))
+            self._outbox.put((keys.APPLIED, applied_message(self.description, self._tick, decision), None))
             self._backend.advance()
             for fault in self._backend.faults():
                 self.authority.fault(fault)

@@ -102,6 +102,10 @@ class Inbox:
         """Put a request that did not come over Zenoh; from any thread."""
         self._queue.put(LocalRequest(request, reply), STOPS)
 
+    def wait(self, timeout_s: float) -> None:
+        """Until an item is there, at most so long."""
+        self._queue.wait(timeout_s)
+
     def take(self, timeout_s: float) -> bool:
         """Handle the next item; False when none came in time."""
         try:

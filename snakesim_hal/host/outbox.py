@@ -7,7 +7,7 @@ simulated time passes, the loop sends streams itself, and waits for slow subscri
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from snakesim_hal.injection import HAL
@@ -18,9 +18,12 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import IMAGES
 from snakesim_hal.wire.messages import MAX_CONFIG, Answer, Configuration, Description, Message, Status
 
-WAITING_LIMIT = 256  # queued messages; beyond that the oldest are dropped
+WAITING_LIMIT = 64  # queued actions, each of which sends one message or those of a tick; the oldest are dropped
 IMAGES_WAITING_LIMIT = 8
 FLUSH_S = 1.0  # how long queued messages are still sent at the end
+
+
+Outgoing = tuple[str, Message, bytes | None]  # key, message, and its bytes if it has been encoded already
 
 
 class Sender:
@@ -78,10 +81,21 @@ class Outbox:
         if description.host is not None:
             session.declare_token(keys.host(description.host))
 
-    def put(self, key: str, message: Message, encoded: bytes | None = None) -> None:
-        """Publish it. encoded: its bytes, if it has been encoded already."""
-        sender = self._images if isinstance(message, IMAGES) else self._streams
-        self._send(sender, lambda: self._publisher(key, type(message)).put(message, encoded))
+    def put(self, *messages: Outgoing) -> None:
+        """Publish messages in this order; images in real time by themselves, as they take long."""
+        if self._lockstep:
+            self._put(messages)
+            return
+        if self._images is not self._streams:
+            images = [one for one in messages if isinstance(one[1], IMAGES)]
+            if images:
+                self._images.do(lambda: self._put(images))
+                messages = tuple(one for one in messages if one not in images)
+        self._streams.do(lambda: self._put(messages))
+
+    def _put(self, messages: Sequence[Outgoing]) -> None:
+        for key, message, encoded in messages:
+            self._publisher(key, type(message)).put(message, encoded)
 
     def put_status(self, status: Status) -> None:
         """Publish the status."""

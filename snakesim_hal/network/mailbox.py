@@ -51,6 +51,12 @@ class Mailbox(Generic[ItemT]):
                 raise Empty
             self._bell.acquire(timeout=left_s)
 
+    def wait(self, timeout: float) -> None:
+        """Until there is an item, at most `timeout` seconds; takes none."""
+        deadline = time.monotonic() + timeout
+        while self.empty() and (left_s := deadline - time.monotonic()) > 0.0:
+            self._bell.acquire(timeout=left_s)
+
     def get_nowait(self) -> ItemT:
         """The oldest item of the lowest lane, if there is one."""
         return self.get(timeout=0.0)

@@ -32,6 +32,19 @@ def test_whoever_waits_is_woken() -> None:
         timer.join()
 
 
+def test_waiting_for_an_item_takes_none() -> None:
+    box: Mailbox[int] = Mailbox()
+    for wait_s in (0.0, -1.0, 1e-9, 0.01):
+        box.wait(wait_s)
+    timer = threading.Timer(0.02, box.put, [1])
+    timer.start()
+    box.wait(10.0)
+    assert box.qsize() == 1
+    timer.join()
+    box.wait(10.0)
+    assert box.get(timeout=10.0) == 1 and box.empty()
+
+
 def test_a_wait_that_is_shorter_than_a_hiccup_ends() -> None:
     # With `queue.SimpleQueue` this hangs after some thousand rounds.
     box: Mailbox[int] = Mailbox()
