@@ -170,7 +170,7 @@ def limit(command: JointCommand, *, measured: Measured, last: Applied, limits: J
         if mode is Mode.PASSIVE:
             targets.append(0.0)
             continue
-        same = mode.value == last_mode
+        same = mode == last_mode
         start = last_target if same else bumpless_target(joint, mode, angle, velocity, torque)
         if mode is Mode.POSITION:
             step, low, high = joint.speed_limit_rad_s, joint.angle_min_rad, joint.angle_max_rad

@@ -49,6 +49,7 @@ class PlausibilityCheck:
         self._good_s = np.zeros((2, count))  # when they were taken, by both clocks
         self._known: Mask = np.zeros(count, dtype=np.bool_)  # whether there ever were any
         self._ordinary: Columns | None = None  # the last state, if all of it was good and no joint had jumped
+        self._passed: tuple[JointState, int, Applied | None] | None = None  # it, if no check has looked at it
         self._jumps = _JumpDetector(count, SPEED_MARGIN * limits.speed_rad_s)
         self._frozen = _FrozenDetector(limits)
 
@@ -70,15 +71,14 @@ class PlausibilityCheck:
             return ImplausibleState(
                 Fault(tick=joints.tick, what="state_invalid", cause=cause), np.ones_like(self._known)
             )
-        ages_ns = np.array(joints.age_ns, dtype=np.float64)
-        taken_s = (np.array([[joints.stamp_ns], [now_ns]], dtype=np.float64) - ages_ns) * 1e-9
         newest: Columns = (joints.angle_rad, joints.velocity_rad_s, joints.torque_nm)
         columns = np.array(newest)
         if self._is_ordinary(joints):
-            self._columns, self._good_s, self._ordinary = columns, taken_s, newest
-            self._frozen.moved(columns, applied)
+            self._columns, self._ordinary, self._passed = columns, newest, (joints, now_ns, applied)
             return None
-        fresh = ages_ns <= self._limits.oldest_state_ns
+        self._look_back()
+        taken_s = _taken_s(joints, now_ns)
+        fresh = np.array(joints.age_ns, dtype=np.float64) <= self._limits.oldest_state_ns
         sound: Mask = np.isfinite(columns).all(axis=0) & fresh & np.array(joints.valid)
         elapsed_s = (taken_s - self._good_s).max(axis=0)
         jump_rad = np.where(sound, columns[0], 0.0) - self._columns[0]
@@ -110,6 +110,15 @@ class PlausibilityCheck:
             )
         return None
 
+    def _look_back(self) -> None:
+        """Take what the checks need of the state before, if that was ordinary: only now does anything depend on it."""
+        if self._passed is None:
+            return
+        joints, now_ns, applied = self._passed
+        self._passed = None
+        self._good_s = _taken_s(joints, now_ns)
+        self._frozen.moved(self._columns, applied)
+
     def _is_ordinary(self, joints: JointState) -> bool:
         """Whether every joint is fresh, near its last angle and new, as nearly always: then no check can fail.
 
@@ -135,6 +144,12 @@ class PlausibilityCheck:
         cause = (words + ", ".join(labels))[:LONGEST_CAUSE]
         joint = names[0] if len(names) == 1 else None
         return ImplausibleState(Fault(tick=tick, what=what, cause=cause, joint=joint, reach="joint"), which)
+
+
+def _taken_s(joints: JointState, now_ns: int) -> Floats:
+    """When each joint's state was taken, by stamp and by safety time, (2, n_joints)."""
+    ages_ns = np.array(joints.age_ns, dtype=np.float64)
+    return (np.array([[joints.stamp_ns], [now_ns]], dtype=np.float64) - ages_ns) * 1e-9
 
 
 def readable(joints: JointState, good: Measured) -> JointState:
