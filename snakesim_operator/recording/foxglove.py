@@ -212,7 +212,8 @@ class FoxgloveChannels:
         joints: JointState | None = _decoded(JointState, payload)
         if self._frames is None or joints is None or not joints.is_of(self._frames.joints):
             return []
-        return [self._protobuf("joint_states", self._frames.joint_states(joints, time_ns))]
+        made = self._frames.joint_states(joints, time_ns)
+        return [FoxgloveMessage(self._topic("joint_states"), JointStates, made)]
 
     def _contact_forces(self, payload: bytes) -> list[FoxgloveMessage]:
         felt: Contacts | None = _decoded(Contacts, payload)
@@ -227,7 +228,8 @@ class FoxgloveChannels:
         yield self._json("state", state)
         yield from (self._protobuf("log", one) for one in logged)
         if at == keys.CONTROL_STATE and self._frames is not None and len(wanted_rad) == self._frames.joints:
-            yield self._protobuf("joint_references", self._frames.reference(wanted_rad, time_ns))
+            made = self._frames.reference(wanted_rad, time_ns)
+            yield FoxgloveMessage(self._topic("joint_references"), JointStates, made)
 
     def _still(self, robot: Description, time_ns: int) -> Iterator[FoxgloveMessage]:
         if self._is_due("body", time_ns, STILL_NS):

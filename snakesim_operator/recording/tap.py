@@ -2,6 +2,9 @@
 
 In real time what finds no room is dropped, and counted. In lockstep nothing may be lost: there the network waits for
 room, and the robot with it, but at most once for LIMIT_S. After that the disk hangs, and the robot goes on without.
+
+In lockstep messages come as fast as the computer is, and those who make them want the processors: so the thread that
+receives takes what the kernel holds, rests, and is not woken meanwhile.
 """
 
 import threading
@@ -13,6 +16,7 @@ from snakesim_hal.wire import keys
 
 MAX_BYTES = 64 * 1024 * 1024
 LIMIT_S = 2.0
+TAKES_NS, RESTS_S = 1_000_000, 0.005  # in turn; less than the kernel holds on a connection
 
 
 class Tap:
@@ -23,6 +27,7 @@ class Tap:
         self.dropped: Counter[str] = Counter()  # by key
         self._waiting: deque[Arrival] = deque()
         self._bytes = 0
+        self._rest_at_ns = 0
         self._lock = threading.Lock()
         for row in keys.SPACE:
             if row.kind == "latched":
@@ -40,6 +45,9 @@ class Tap:
 
     def _put(self, arrival: Arrival) -> None:
         """In Zenoh's threads."""
+        if self.lossless and arrival.monotonic_ns > self._rest_at_ns:
+            time.sleep(RESTS_S)
+            self._rest_at_ns = time.monotonic_ns() + TAKES_NS
         size = len(arrival.payload)
         if self.lossless and self._bytes + size > MAX_BYTES:
             self._wait_for_room(size)

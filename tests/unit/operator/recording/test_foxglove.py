@@ -12,6 +12,8 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from foxglove_schemas_protobuf.JointState_pb2 import JointState as NamedJoint
+from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from mcap.exceptions import EndOfFile
 from mcap.reader import NonSeekingReader, make_reader
@@ -22,6 +24,8 @@ from snakesim_hal.model.scenario import load, parse_set
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode
 from snakesim_hal.wire.messages import Contacts, ControlState
+from snakesim_operator.recording import shapes
+from snakesim_operator.recording.body_frames import BodyFrames
 from snakesim_operator.recording.foxglove import FoxgloveChannels
 from snakesim_operator.recording.message import RECORDING
 from snakesim_operator.recording.reader import RecordingReader
@@ -100,6 +104,19 @@ def test_transforms_and_joints_are_those_of_the_robot(run: Path) -> None:
     states = dict(found[f"{ROBOT}/joint_states"])[at_ns]
     assert [joint.position for joint in states.joints] == record.angle_rad[row].tolist()
     assert [joint.name for joint in states.joints] == [joint.name for joint in record.description.joints]
+
+
+def test_joint_states_are_to_the_byte_what_the_library_of_their_schema_writes() -> None:
+    robot, time_ns = description(), 1_234_567_890_123
+    names, frames = [joint.name for joint in robot.joints], BodyFrames(robot)
+    for angle, speed, torque in (([0.1, -0.2, 3.0], 0.5, -1e-300), ([1.0, 2.0, 3.0], 4.0, 0.0)):
+        joints = joint_state(robot, angle, speed, torque)
+        rows = zip(names, joints.angle_rad, joints.velocity_rad_s, joints.torque_nm, strict=True)
+        whole = [NamedJoint(name=name, position=p, velocity=v, effort=e) for name, p, v, e in rows]
+        wanted = [NamedJoint(name=name, position=p) for name, p in zip(names, angle, strict=True)]
+        stamp = shapes.stamp(time_ns)
+        assert frames.joint_states(joints, time_ns) == JointStates(timestamp=stamp, joints=whole).SerializeToString()
+        assert frames.reference(angle, time_ns) == JointStates(timestamp=stamp, joints=wanted).SerializeToString()
 
 
 def test_joints_forces_and_state_come_as_often_as_the_robot_tells_them(run: Path) -> None:
