@@ -60,7 +60,7 @@ STANDBY_PERIOD_NS = 20_000_000
 STANDING_PERIOD_NS = 50_000_000  # between signs of life while a simulator is paused
 HELD_UP_NS = 500_000_000  # that a tick has waited for answers until the status says so
 STATUS_GAP_NS = 10_000_000  # between status messages for frequent changes, such as a contested lease
-BEGIN_S = 0.0003  # until services compute on a new state; the host does the same afterwards, beside them
+BEGIN_S = 0.0001  # for the threads that send a tick; then the host judges it while it is on its way to the services
 TAKEN_SHARE = 0.25  # of a period, for late arrivals: a flood must not take all of it
 MAX_REQUESTS_KEPT = 256
 RECORDED_AFTER_NS = 2_000_000_000  # recorded after the last armed tick, in a host that stays
@@ -254,8 +254,8 @@ class Host:
         return samples
 
     def _let_services_begin(self) -> None:
-        """In real time: leave interpreter and processor to the threads that send, and to those who are to answer."""
-        if self._pace == "realtime":
+        """In real time: leave the interpreter to the threads that send, unless a service in this process wants it."""
+        if self._pace == "realtime" and not self._config.beside:
             self._inbox.wait(min(BEGIN_S, TAKEN_SHARE * self._period_ns * 1e-9))
 
     def _judge(self, samples: Samples) -> None:
