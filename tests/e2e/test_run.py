@@ -73,7 +73,8 @@ def starved(pid: int) -> Iterator[None]:
     """A process gets next to nothing of one processor: others need that, and go first."""
     core = max(os.sched_getaffinity(0))
     spin = f"import os; os.sched_setaffinity(0, {{{core}}})\nwhile True: pass"
-    load = [subprocess.Popen([sys.executable, "-c", spin]) for _ in range(2)]
+    # Each in a session of its own: where a session has one share, all in one would leave enough to a quiet computer.
+    load = [subprocess.Popen([sys.executable, "-c", spin], start_new_session=True) for _ in range(4)]
     group = Path(f"/proc/{pid}/autogroup")  # its session has a share of its own, where the kernel is made so
     if group.exists():
         group.write_text("19")
