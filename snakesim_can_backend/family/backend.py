@@ -54,7 +54,7 @@ class CanDriveBackend(FamilyBackend):
     says_every_s: ClassVar[float | None] = None  # how often a drive reports its state; None: when it is asked
 
     @classmethod
-    def check_joint(cls, config: RunConfig, settings: Any, joint: Joint, *, real: bool) -> None:
+    def check_joint(cls, config: RunConfig, settings: Any, joint: Joint) -> None:
         """Raise ConfigError for a joint that no drive of this family can be."""
 
     @classmethod
@@ -72,13 +72,12 @@ class CanDriveBackend(FamilyBackend):
         """Channels, ids, load, and what the family adds."""
         for channel in settings.channels:
             check_channel(channel, fd=settings.fd_rate is not None)
-        real = cls.real(settings)
         for joint in joints:
             if joint.id > cls.last_id:
                 raise ConfigError(
                     f"{who(config, joint)}: `id` = {joint.id}; {cls.a_drive} have ids of 0 to {cls.last_id}"
                 )
-            cls.check_joint(config, settings, joint, real=real)
+            cls.check_joint(config, settings, joint)
         rate_hz = config.rate_hz / settings.every_ticks
         cls.load(rate_hz, settings, joints).check(cls.name, rate_hz, cls.rates(settings))
 

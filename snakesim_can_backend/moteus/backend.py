@@ -43,7 +43,7 @@ class MoteusBackend(CanDriveBackend):
     traffic = Traffic((5, 24, 48), (6, 24))  # question, answer, command; of one controller, its health
 
     @classmethod
-    def check_joint(cls, config: RunConfig, settings: MoteusSettings, joint: Joint, *, real: bool) -> None:
+    def check_joint(cls, config: RunConfig, settings: MoteusSettings, joint: Joint) -> None:
         """Raise ConfigError for joints that no controller can be."""
         if joint.id == HOST_ID:
             where = who(config, joint)

@@ -27,12 +27,12 @@ class OdriveBackend(CanDriveBackend):
     traffic = Traffic((0, 0, 8, 8, 8), (0, 0, 0, 8, 8, 8), heartbeats_hz=1e6 / HEARTBEAT_US)
 
     @classmethod
-    def check_joint(cls, config: RunConfig, settings: OdriveSettings, joint: Joint, *, real: bool) -> None:
+    def check_joint(cls, config: RunConfig, settings: OdriveSettings, joint: Joint) -> None:
         """Raise ConfigError for joints that no axis can be."""
         where = who(config, joint)
         if joint.motor.damping_nm_s_per_rad <= 0:
             raise ConfigError(f"{where}: `damping_nm_s_per_rad` must be above 0: an ODrive's position loop needs it")
-        if joint.motor.torque_constant_nm_per_a is None and real:
+        if joint.motor.torque_constant_nm_per_a is None and cls.real(settings):
             raise ConfigError(
                 f"{where}: `torque_constant_nm_per_a` is not given, and ODrives measure and limit amperes: take it "
                 f"from the motor's data sheet (8.27 / KV), as `axis0.config.motor.torque_constant` has it"
