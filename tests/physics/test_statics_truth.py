@@ -1,16 +1,20 @@
 """The statics against MuJoCo: what three pegs and a tether really carry while one joint holds the solved torque.
 
-No friction anywhere, stiff joints, no limit on torque. Pegs touch the straight flank of a link, well away from joints.
-The link at o_1 is tethered along the tangent there; the torque is raised slowly, and the end of all motion awaited.
+No friction anywhere; stiff joints without a limit on torque, or those of the shipped robot. Pegs touch the straight
+flank of a link, well away from joints. The link at o_1 is tethered along the tangent there; the torque is raised
+slowly, and the end of all motion awaited.
 """
 
+import dataclasses
 from dataclasses import dataclass
 
 import msgspec
 import numpy as np
 import pytest
 
-from snakesim_gnc.control.obstacle_triplet import TripletSolution, solve_triplet
+from snakesim_gnc.control.obstacle_triplet import TripletSolution, bending_torque_nm, solve_triplet
+from snakesim_gnc.control.obstacle_triplet.statics import loads
+from snakesim_hal.arrays import Floats
 from snakesim_hal.backend import SetPoints
 from snakesim_hal.model.joints import Limits, Motor
 from snakesim_hal.model.route import Route, lay_chain, sine_points
@@ -35,6 +39,7 @@ class Bench:
     tether: Tether
     joint: int
     solved: TripletSolution
+    loads_nm: Floats  # of every joint, for the solved forces
 
 
 def make_bench(seed: int) -> Bench | None:
@@ -76,6 +81,7 @@ def make_bench(seed: int) -> Bench | None:
         Cylinder(position_m=tuple((o - n * (robot.module.radius_m + PEG_RADIUS_M)).tolist()), radius_m=PEG_RADIUS_M)
         for o, n in zip(touched, normals, strict=True)
     ]
+    pushes = loads(solved.forces_n, normals, -PROPULSION_N * tangents[0])
     return Bench(
         config=make_config(points, pegs, tail_s),
         tether=Tether(
@@ -85,6 +91,7 @@ def make_bench(seed: int) -> Bench | None:
         ),
         joint=joint,
         solved=solved,
+        loads_nm=bending_torque_nm(nodes[1:-1], starts[1:-1], touched, places, pushes),
     )
 
 
@@ -120,26 +127,64 @@ def feasible_benches() -> list[tuple[int, Bench]]:
     return found
 
 
-@pytest.mark.parametrize("bench", [pytest.param(bench, id=f"seed{seed}") for seed, bench in feasible_benches()])
-def test_tension_and_contact_forces_are_those_solved_for(bench: Bench):
+def settle(bench: Bench, share: float = 1.0, ahead_rad: float | Floats = 0.0) -> tuple[float, Floats]:
+    """Tension and contact forces, for this share of the propulsion, at rest. ahead_rad: how far targets are ahead."""
     backend = SimBackend(bench.config, SimSettings(timestep_s=0.001, tether=bench.tether))
-    count = bench.config.robot.chain.modules
-    angles = backend.true_state().angles_rad.tolist()
+    count, torque_nm = bench.config.robot.chain.modules, bench.config.robot.limits.torque_nm
+    angles = np.array(backend.true_state().angles_rad)
     mode = [Mode.POSITION] * count
     mode[bench.joint] = Mode.TORQUE
     tensions, forces = [], []
     for tick in range(round((RISE_S + HOLD_S) * 100)):
-        target = list(angles)
-        target[bench.joint] = bench.solved.torque_nm * min(tick / (RISE_S * 100), 1.0)
-        backend.enact(SetPoints(mode, target, [1000.0] * count), "armed")
+        risen = share * min(tick / (RISE_S * 100), 1.0)
+        target = angles + risen * ahead_rad
+        target[bench.joint] = risen * bench.solved.torque_nm
+        backend.enact(SetPoints(mode, target.tolist(), [torque_nm] * count), "armed")
         backend.advance()
         pushed = {f"cylinder_{k}": 0.0 for k in range(3)}
         for contact in backend.true_state().contacts:
             pushed[contact.obstacle] += float(np.linalg.norm(contact.force_w))
         tensions.append(backend.tether_tension_n)
         forces.append(list(pushed.values()))
-    tension, force = np.mean(tensions[-20:]), np.mean(forces[-20:], axis=0)
-    print(f"tension {tension:.2f} N; contacts {force.round(1)} N, solved {bench.solved.forces_n.round(1)} N")
+    tension, force = float(np.mean(tensions[-20:])), np.mean(forces[-20:], axis=0)
+    solved = share * bench.solved.forces_n
+    print(f"{share:.2f}: tension {tension:.2f} N; contacts {force.round(1)} N, solved {solved.round(1)} N")
     assert np.ptp(tensions[-20:]) < 0.02 * PROPULSION_N  # at rest
+    return tension, force
+
+
+def with_shipped(bench: Bench, **more: object) -> Bench:
+    """The bench with the motors of the shipped robot, and more of it."""
+    robot = msgspec.structs.replace(bench.config.robot, motor=configure("triplet").robot.motor, **more)
+    return dataclasses.replace(bench, config=msgspec.structs.replace(bench.config, robot=robot))
+
+
+BENCHES = feasible_benches()
+each_bench = pytest.mark.parametrize("bench", [pytest.param(bench, id=f"seed{seed}") for seed, bench in BENCHES])
+
+
+@each_bench
+def test_tension_and_contact_forces_are_those_solved_for(bench: Bench):
+    tension, force = settle(bench)
     assert tension == pytest.approx(PROPULSION_N, rel=0.05)
     assert force == pytest.approx(bench.solved.forces_n, rel=0.10)
+
+
+@each_bench
+def test_so_they_are_with_shipped_servos_whose_targets_lead_by_the_load(bench: Bench):
+    shipped = with_shipped(bench)
+    gives_way, _ = settle(shipped)
+    tension, force = settle(shipped, ahead_rad=bench.loads_nm / shipped.config.robot.motor.stiffness_nm_per_rad)
+    assert tension == pytest.approx(PROPULSION_N, rel=0.005)
+    assert abs(gives_way - PROPULSION_N) > 10 * abs(tension - PROPULSION_N)  # 33.2 to 42.8 N
+    assert force == pytest.approx(bench.solved.forces_n, rel=0.01)  # 0.43 to 1.09 of them without the lead
+
+
+@each_bench
+def test_and_within_the_torque_that_the_shipped_robot_has(bench: Bench):
+    shipped = with_shipped(bench, limits=configure("triplet").robot.limits)
+    robot = shipped.config.robot
+    share = min(1.0, 0.98 * robot.limits.torque_nm / float(np.abs(bench.loads_nm).max()))
+    tension, force = settle(shipped, share, bench.loads_nm / robot.motor.stiffness_nm_per_rad)
+    assert tension == pytest.approx(share * PROPULSION_N, rel=0.01)
+    assert force == pytest.approx(share * bench.solved.forces_n, rel=0.02)

@@ -31,9 +31,10 @@ from snakesim_gnc.control.obstacle_triplet.contacts import PlannedContact, PushP
 from snakesim_gnc.control.obstacle_triplet.selection import Choice, Names, Triplets, choose
 from snakesim_gnc.control.obstacle_triplet.settings import TripletSettings
 from snakesim_gnc.control.obstacle_triplet.stall import Stall, StallWatch, explain
-from snakesim_gnc.control.obstacle_triplet.telemetry import bending, planned_contacts
+from snakesim_gnc.control.obstacle_triplet.telemetry import bending_nm, planned_contacts
 from snakesim_gnc.control.planar_body import PlanarBody
 from snakesim_gnc.control.progress import Located, Progress
+from snakesim_hal.arrays import Floats
 from snakesim_hal.backend import SetPoints
 from snakesim_hal.wire.messages import Description, Mode, Obstacle
 
@@ -78,7 +79,9 @@ class ObstacleTriplet:
         self._reference = np.empty(0)  # the same as angles of all joints
         self._planned: dict[str, tuple[Obstacle, PlannedContact]] = {}
         self._points: list[PushPoint] = []
-        self._asked_n = 0.0  # propulsion force of the tick before
+        self._asked_n = self._force_n = 0.0  # propulsion force of the tick before, wanted and as limited
+        self._stiffness = np.array([joint.stiffness_nm_per_rad for joint in robot.joints])
+        self._held_nm = np.zeros(len(robot.joints))  # of the planned forces, by the joints in position mode
         self._choice: Choice | None = None
         self._refused: list[str] = []
         self._banned: dict[Names, float] = {}  # -> arc length at which it stood still
@@ -103,15 +106,17 @@ class ObstacleTriplet:
         choice, set_ = self._choice, self._set
         turn = None if choice is None else self._body.bends[choice.joint]
         anew = choice is not None and before is not None and choice.triplet.names != before.triplet.names
-        self._hand_over.pass_to(turn, view.joints, self._reference, anew=anew)
+        reference = self._reference + self._held_rad(view, body_pose)
+        self._hand_over.pass_to(turn, view.joints, reference, anew=anew)
         self._hand_over.fade(view.period_s / set_.blend_s + abs(located.speed_m_s) * view.period_s / set_.blend_m)
-        targets: list[float] = self._hand_over.positions_rad(self._reference).tolist()
+        targets: list[float] = self._hand_over.positions_rad(reference).tolist()
         mode = [Mode.POSITION] * len(targets)
         limits_nm = self._body.torque_limit_nm
         if choice is None or turn is None:
-            self._asked_n = 0.0
+            self._asked_n = self._force_n = 0.0
             return Action(SetPoints(mode, targets, limits_nm), self._report_rest(located))
         push = self._push(view, located, choice, turn)
+        self._force_n = push.force_n
         mode[turn], targets[turn] = Mode.TORQUE, push.torque_nm
         self._watch_progress(view, located, choice, push)
         return Action(SetPoints(mode, targets, limits_nm), self._report_push(located, body_pose, choice, push))
@@ -132,6 +137,18 @@ class ObstacleTriplet:
             self._hand_over.shift(reference - self._reference)
         self._body_pose, self._reference = body_pose, reference
         return body_pose
+
+    def _held_rad(self, view: View, body_pose: BodyPose) -> Floats:
+        """How far targets are beyond the path's angles, so that its joints hold the planned forces on the path."""
+        share, choice = self._set.load_share, self._choice
+        if share == 0.0:
+            return np.zeros(len(self._held_nm))
+        wanted = np.zeros(len(self._held_nm))
+        if choice is not None and self._force_n > 0.0:
+            wanted = share * bending_nm(self._body, body_pose, choice, self._force_n)
+        keep = np.exp(-view.period_s / self._set.load_filter_s)
+        self._held_nm = keep * self._held_nm + (1.0 - keep) * wanted
+        return self._held_nm / self._stiffness
 
     def _push(self, view: View, located: Located, choice: Choice, turn: int) -> Push:
         """The propulsion: reduced with the speed of the body, and with the swing of the joint."""
@@ -243,11 +260,13 @@ class ObstacleTriplet:
 
     def _wait(self, view: View, why: str) -> Action:
         """Without a known body pose nothing pushes: every joint goes to its reference, and stays there."""
-        self._choice, self._asked_n = None, 0.0
+        self._choice, self._asked_n, self._force_n = None, 0.0, 0.0
         self._stall_watch.forget()
         if not len(self._reference):
             self._reference = np.array(view.joints.angle_rad)
             self._hand_over.start(view.joints, self._reference)
+        self._hand_over.shift(-self._held_nm / self._stiffness)  # the load fades with all else
+        self._held_nm = np.zeros(len(self._held_nm))
         self._hand_over.pass_to(None, view.joints, self._reference)
         self._hand_over.fade(view.period_s / self._set.blend_s)  # what the joint pushed with, too
         targets = self._hand_over.positions_rad(self._reference).tolist()
@@ -283,7 +302,7 @@ class ObstacleTriplet:
             push_points=planned_contacts(self._body, located.world, choice, forces_n),
             solved_force_n=forces_n,
             propulsion_torque_nm=push.torque_nm,
-            bending_torque_nm=bending(self._body, body_pose, choice, push.force_n),
+            bending_torque_nm=bending_nm(self._body, body_pose, choice, push.force_n).tolist(),
             reference_rad=self._reference.tolist(),
             condition=choice.triplet.unit.condition,
             torque_headroom_nm=self._body.torque_limit_nm[push.turn] - full_nm,

@@ -19,6 +19,12 @@ class TripletSettings(FileStruct, frozen=True, kw_only=True):
     # A body that starts and stops by jerks would shake the command.
     propulsion_rate_n_s: Annotated[float, above(1e6, "N/s"), about("how fast the propulsion force changes")] = 700.0
 
+    # A servo gives way under a load; with its target ahead by load / stiffness the joint stays where it was planned.
+    load_share: Annotated[
+        float, from_zero(1, "1"), about("share of its planned load by which a servo's target leads; 0: it gives way")
+    ] = 0.0
+    load_filter_s: Annotated[float, above(60, "s"), about("time constant of the filter of that load")] = 0.3
+
     gap_m: Annotated[
         float, from_zero(1, "m"), about("how far the skin may be from an obstacle that is to be pushed")
     ] = 0.06

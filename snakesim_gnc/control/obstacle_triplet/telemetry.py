@@ -8,14 +8,14 @@ from snakesim_gnc.control.body_on_path import BodyPose
 from snakesim_gnc.control.obstacle_triplet.selection import Choice
 from snakesim_gnc.control.obstacle_triplet.statics import torque_under
 from snakesim_gnc.control.planar_body import PlanarBody
+from snakesim_hal.arrays import Floats
 from snakesim_hal.wire.messages import World, WorldContact
 
 
-def bending(body: PlanarBody, body_pose: BodyPose, choice: Choice, force_n: float) -> list[float]:
-    """Torque of every joint for the solved forces, tail to head; the tether's force represents all resistance."""
+def bending_nm(body: PlanarBody, body_pose: BodyPose, choice: Choice, force_n: float) -> Floats:
+    """Torque of every joint for the solved forces, (n_joints,); the tether's force represents all resistance."""
     places = np.array(choice.body_s_m)
-    torques = force_n * torque_under(body.joints_w(body_pose), body.joint_s_m, places, choice.triplet.unit_wrenches)
-    return torques.tolist()
+    return force_n * torque_under(body.joints_w(body_pose), body.joint_s_m, places, choice.triplet.unit_wrenches)
 
 
 def planned_contacts(body: PlanarBody, world: World, choice: Choice, forces_n: Sequence[float]) -> list[WorldContact]:

@@ -42,6 +42,21 @@ def test_one_joint_pushes_and_all_others_hold_the_shape():
     assert targets[others] == pytest.approx(angles[others], abs=1e-3)
 
 
+def test_on_request_servos_lead_by_the_load_that_they_are_to_hold():
+    stage = make_stage()
+    controller = make_controller(stage, load_share=1.0, load_filter_s=0.05)
+    action = stay(controller, stage, 99)
+    others = [i for i in range(13) if i != action.report.propulsion_joint]
+    stiffness = np.array([joint.stiffness_nm_per_rad for joint in stage.robot.joints])
+    lead = np.array(action.set_points.target) - np.array(action.report.reference_rad)
+    load = np.array(action.report.bending_torque_nm) / stiffness
+    assert lead[others] == pytest.approx(load[others], abs=2e-3)
+    assert np.abs(load[others]).max() > 0.03
+    blind = controller.update(stage.view(99, TAIL_S_M, without="world"))
+    targets = np.array(blind.set_points.target)
+    assert targets[others] == pytest.approx(np.array(action.set_points.target)[others], abs=5e-3)  # and fades
+
+
 def test_the_report_is_the_solved_triplet():
     stage = make_stage()
     report = stay(make_controller(stage), stage, 100).report
