@@ -62,7 +62,7 @@ def _frames(log: Path) -> tuple[np.ndarray, list[tuple[float, float]]]:
     bursts: list[tuple[float, float]] = []
     first = last = 0.0
     for line in log.read_text(encoding="ascii").splitlines():
-        stamp, _channel, frame = line.split()
+        stamp, _channel, frame, *_ = line.split()
         opcode, at = opcode_of(int(frame[:3], 16)), float(stamp[1:-1])
         if opcode == Opcode.SYNC:
             syncs.append(at)
