@@ -111,7 +111,7 @@ def test_every_command_tells_of_the_damage_and_ends_with_3(
     ended = snakesim(*command, cwd=tmp_path)
     assert ended.code == INCOMPLETE, ended
     assert ended.err.startswith("snakesim: incomplete: a.mcap lacks ") and len(ended.err.splitlines()) == 1
-    assert ("breaks off at" if damage == "halved" else "sensor/joints") in ended.err
+    assert ("breaks off at" if damage == "halved" else "actuator/joints") in ended.err
     if "--json" in command:
         assert json.loads(ended.out)["lacks"]["a"] and not json.loads(ended.out)["lacks"]["b"]
 
