@@ -39,15 +39,12 @@ TX = {"lease": 2000, "queue/congestion_control/drop/wait_before_drop": 100}
 MAX_MESSAGE = "transport/link/rx/max_message_size"
 # Closing a frozen subscriber blocks a receiving thread of Zenoh, and by default it has two: three subscribers that
 # froze together blocked the controller's commands for long enough to end its lease.
-# A client has one connection to read; with two threads each message would wake both. And its one thread is that which
-# the kernel wakes when something has come: with another one, each message would wake that first, and it the receiver.
-RECEIVERS_LISTENING, RECEIVERS_CONNECTED = "(rx: (worker_threads: 16))", "(rx: (handover: app))"
-# Of 64 kB each; of the one that Zenoh keeps by default a sample that nobody has read yet makes another, filled with
-# zeros, with every packet. Not where many connect: each connection has its own.
-RX_BUFFER, RX_BYTES = "transport/link/rx/buffer_size", 16 * 65535
+# A client has one connection to read; with two threads each message would wake both. With Zenoh's `handover: app` none
+# is woken, but an image link that is full then ends the lease of control.
+RECEIVERS_LISTENING, RECEIVERS_CONNECTED = 16, 1
 RUNTIME = "ZENOH_RUNTIME"
 _environment = threading.Lock()
-_opening: list[str] = []  # sessions that are being opened
+_opening: list[int] = []  # sessions that are being opened
 MAX_OPEN_FILES = 16384  # each connection takes one, and the default limit of a process is 1024
 READER_DEPTH = 256  # so that a burst of noise on a key does not displace the valid sample
 IMAGES_DEPTH = 32  # of images, which take much memory; in lockstep a reader may lag by that many
@@ -427,22 +424,22 @@ def open_session(link: Link, connect_timeout_s: float = 5.0) -> Iterator[Session
 
 
 @contextmanager
-def _receiving_threads(receivers: str) -> Iterator[None]:
-    """The threads that Zenoh gets to receive with, in this process but not in its children, unless the user says so.
+def _receiving_threads(count: int) -> Iterator[None]:
+    """How many threads Zenoh gets to receive with, in this process but not in its children, unless the user says so.
 
     Any number of threads may open sessions at once; Zenoh reads the variable at the first one.
     """
     with _environment:
         ours = bool(_opening) or RUNTIME not in os.environ
         if ours:
-            _opening.append(receivers)
-            os.environ.setdefault(RUNTIME, receivers)
+            _opening.append(count)
+            os.environ.setdefault(RUNTIME, f"(rx: (worker_threads: {count}))")
     try:
         yield
     finally:
         if ours:
             with _environment:
-                _opening.remove(receivers)
+                _opening.remove(count)
                 if not _opening:
                     del os.environ[RUNTIME]
 
@@ -485,7 +482,6 @@ def _unless_given(link: Link) -> dict[str, Any]:
         **{f"transport/unicast/{key}": value for key, value in UNICAST.items()},
         **{f"transport/link/tx/{key}": value for key, value in TX.items()},
         MAX_MESSAGE: link.largest_bytes + ENVELOPE_BYTES,
-        **({} if link.listen else {RX_BUFFER: RX_BYTES}),
     }
 
 
