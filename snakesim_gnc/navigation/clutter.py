@@ -54,6 +54,7 @@ FORGET_M = 0.15  # beyond this from where it was stuck, what failed there is for
 FAILURES = 4
 BACK_EVERY = 3  # time at the same place: back out
 BACK_M, BACK_S = 0.1, 1.5
+SHORT_M = 0.01  # a body that was measured at its goal, and then stands so far before it, goes on
 STANDS_S = 0.8
 STANDS_M = 0.01
 
@@ -221,7 +222,8 @@ class ClutterPlanner:
             middle = body.mean(axis=0)
             if self._start is None:
                 self._start = middle
-            self._finished |= bool((middle - self._start) @ goal >= self._goal.distance_m)
+            left_m = self._goal.distance_m - float((middle - self._start) @ goal)
+            self._finished = left_m <= (SHORT_M if self._finished else 0.0)
             return goal
         points = np.array(self._goal.points_m)
         while np.hypot(*(points[self._next_point] - body[-1])) < self._goal.within_m:

@@ -145,6 +145,8 @@ def test_a_goal_is_reached() -> None:
     assert not planned(made, body).finished
     there = planned(made, body + np.array([0.6, 0.0]), 1.0)
     assert there.finished and there.speed_m_s == 0.0 and there.reason == "the goal is reached"
+    assert planned(made, body + np.array([0.495, 0.0]), 2.0).finished  # noise
+    assert not planned(made, body + np.array([0.45, 0.0]), 3.0).finished  # it was measured wrong, or slid back
     head = body[-1]
     points = [(float(head[0]) + 0.1, float(head[1])), (float(head[0]) + 1.0, float(head[1]))]
     made = planner(obstacles_of(config), WaypointGoal(points_m=points, within_m=0.2))
