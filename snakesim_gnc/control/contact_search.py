@@ -1,63 +1,89 @@
-"""Search for contacts: a body at rest without usable push-points moves on by undulation until it has some.
+"""Search for contacts: a body that does not come on moves by a wave, until it lies where it can push.
 
-The waves travel along the body from tail to head. On ground whose friction is the same in every direction a body moves
-the way that its wave travels (with anisotropic friction, as of wheels or scales, it would be the other way), a few
-centimetres a second, and it sweeps as much to the sides. Navigation plans a new path from wherever that leads.
+That it stands is told from the way that its middle has come, not from a speed: with 5 mm of noise in a pose, a speed
+along the path is hardly ever below 1 cm/s for a whole second. Whether contacts would allow a push does not matter: a
+body that they hold does not come on either. Navigation plans a new path from wherever the wave leads.
+
+Among obstacles it is the wave that feels its way (`felt_wave.py`), which pushes off whatever it meets. Where none are
+near, that one goes backward: on ground whose friction is the same in every direction, a body moves the way that its
+wave travels. There the wave travels from tail to head until there are; by itself it comes on at 8 cm/s.
 """
 
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 
 from snakesim_gnc.control.controller import View
+from snakesim_gnc.control.felt_wave import FeltWave
 from snakesim_gnc.control.undulation import HeadSteeredUndulation
 from snakesim_hal.arrays import Floats
 from snakesim_hal.wire.messages import Description
 
-PERIOD_S = 1.0
-LAG_RAD = -0.9  # of a joint behind the one ahead of it: the wave travels to the head
+MIDDLE_S = 0.2  # time constant in which the noise of poses is taken out of the middle of the body
+TO_HEAD = HeadSteeredUndulation.Settings(amplitude_rad=0.7, period_s=0.8, lag_rad=-0.75, steering=0.3)
+STANDS_M = 0.02  # a body that comes no further than this meanwhile stands, or half as far as it is to
 
 
 @dataclass(frozen=True)
 class Patience:
     """When to search, and for how long."""
 
-    after_s: float  # of standing without a push; 0: never
-    for_s: float
-    enough_n: float  # of force along the body that contacts allow: nothing is to be searched for
+    after_s: float  # of standing; 0: never
+    least_s: float
+    most_s: float
+    enough_n: float  # of force along the body that contacts allow: there is something to push off
 
 
 class ContactSearch:
-    """Decides whether to search, and makes the waves."""
+    """Decides whether to search, and makes the wave."""
 
-    def __init__(self, robot: Description, patience: Patience, swing_rad: float) -> None:
+    def __init__(self, robot: Description, patience: Patience) -> None:
         self._patience = patience
-        wave = HeadSteeredUndulation.Settings(amplitude_rad=swing_rad, period_s=PERIOD_S, lag_rad=LAG_RAD)
-        self._wave = HeadSteeredUndulation(robot, wave)
-        self._powerless_since_s: float | None = None
-        self._until_s: float | None = None
+        self._felt, self._to_head = FeltWave(robot), HeadSteeredUndulation(robot, TO_HEAD)
+        self._wave: FeltWave | HeadSteeredUndulation = self._felt
+        self._middle_w: Floats | None = None
+        self._way = deque[tuple[float, Floats]]()  # instants in s, and where the middle was
+        self._since_s: float | None = None
         self.changed = False  # it has begun or ended at this tick
 
     @property
     def active(self) -> bool:
-        """Whether the body undulates."""
-        return self._until_s is not None
+        """Whether the body moves by the wave."""
+        return self._since_s is not None
 
-    def decide(self, view: View, *, stands: bool, max_force_n: float) -> bool:
-        """Whether to undulate at this tick. max_force_n: force along the body that its contacts allow."""
-        before, enough = self.active, max_force_n >= self._patience.enough_n
-        if self._until_s is not None:
-            if enough or view.time_s >= self._until_s:
+    def decide(self, view: View, middle_w: Floats, *, wanted_m_s: float, near: bool, max_force_n: float) -> bool:
+        """Whether to search at this tick.
+
+        middle_w: (2,), of the body. near: obstacles are. max_force_n: force along the body that its contacts allow.
+        """
+        before, patience = self.active, self._patience
+        if self._since_s is None:
+            if self._stands(view, middle_w, abs(wanted_m_s)):
+                self._since_s = view.time_s
+                self._wave = self._felt if near else self._to_head
+                self._wave.start_from(np.array(view.joints.angle_rad))
+        else:
+            for_s = view.time_s - self._since_s
+            done = near if self._wave is self._to_head else max_force_n >= patience.enough_n
+            if for_s >= patience.most_s or (for_s >= patience.least_s and done):
                 self.stop()
-        elif enough or not stands:
-            self._powerless_since_s = None
-        elif self._powerless_since_s is None:
-            self._powerless_since_s = view.time_s
-        elif 0.0 < self._patience.after_s <= view.time_s - self._powerless_since_s:
-            self._until_s = view.time_s + self._patience.for_s
-            self._wave.start_from(np.array(view.joints.angle_rad))
         self.changed = self.active != before
         return self.active
+
+    def _stands(self, view: View, middle_w: Floats, wanted_m_s: float) -> bool:
+        after_s = self._patience.after_s
+        if after_s == 0.0:
+            return False
+        if self._middle_w is None:
+            self._middle_w = middle_w
+        self._middle_w = self._middle_w + min(view.period_s / MIDDLE_S, 1.0) * (middle_w - self._middle_w)
+        self._way.append((view.time_s, self._middle_w))
+        while len(self._way) > 1 and view.time_s - self._way[1][0] >= after_s:
+            self._way.popleft()
+        then_s, then_w = self._way[0]
+        stands_m = min(STANDS_M, 0.5 * wanted_m_s * after_s)
+        return view.time_s - then_s >= after_s and float(np.hypot(*(self._middle_w - then_w))) < stands_m
 
     def reference_rad(self, view: View) -> Floats:
         """Angles of all joints."""
@@ -65,4 +91,5 @@ class ContactSearch:
 
     def stop(self) -> None:
         """Not before the body has stood for a while again."""
-        self._until_s = self._powerless_since_s = None
+        self._since_s = self._middle_w = None
+        self._way.clear()

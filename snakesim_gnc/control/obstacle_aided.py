@@ -7,8 +7,8 @@ of the speed, both bounded:
 - the shape at s plus a small look-ahead l: tau_i = k (theta_i(s + l) - theta_i(s)), hence by virtual work a force
   F = l k sum theta_i'^2, also where no contacts can balance it.
 
-A negative speed backs the body out along its own path. A body that stands, and that nothing can push, undulates until
-something can (`contact_search.py`). See `docs/poal.md`.
+A negative speed backs the body out along its own path. A body that does not come on moves by a wave until it lies where
+it can push (`contact_search.py`). See `docs/poal.md`.
 """
 
 from dataclasses import dataclass
@@ -35,10 +35,10 @@ ANOTHER_SHAPE_RAD = 0.1
 SLOPE_M = 0.02  # over which theta' is taken
 SIGNS = np.random.default_rng(1).choice((-1.0, 1.0), 4096)
 LARGEST_REST = 0.3  # of a push: what is not in balance turns the body a little, until it meets other obstacles
-AS_WANTED = 0.5  # share of the wanted speed from which on a body moves as it is to, whatever carries it
-POWERLESS_N = 4.0  # contacts that allow no more cannot overcome the friction of the ground
+AS_WANTED = 0.5  # share of the wanted speed from which on a body moves as it is to
 STRAIGHT_PER_M2 = 20.0  # sum of theta'^2 below which a shape hardly tells where on its path it is
 LARGEST_SLIDE_M = 0.02
+SEVERAL = 2  # obstacles within reach: what there is to push off is among them
 FELT_N = 0.5  # a contact that is felt so hard is as dear as the others, but for a third
 DRAG_S = 0.3  # time constant of what all contacts are felt to do along the body
 STANDS_M_S, STANDS_S = 0.01, 0.5  # slower than this for so long counts as standing still
@@ -126,21 +126,23 @@ class ObstacleAided:
         search_after_s: Annotated[
             float,
             Meta(ge=0, le=1000, extra_json_schema={"unit": "s"}),
-            about("of standing with nothing that can push, until it undulates in search of contacts; 0: never"),
-        ] = 1.0
+            about("in which the body comes no 2 cm on, until it moves by a wave in search of contacts; 0: never"),
+        ] = 1.2
+        search_least_s: Annotated[
+            float,
+            Meta(ge=0, le=1000, extra_json_schema={"unit": "s"}),
+            about("how long it does so at least"),
+        ] = 2.0
         search_s: Annotated[
             float,
             Meta(gt=0, le=1000, extra_json_schema={"unit": "s"}),
-            about("how long it undulates in search of contacts"),
+            about("how long it does so at most"),
         ] = 8.0
-        search_swing_rad: Annotated[
-            float, Meta(ge=0, le=2, extra_json_schema={"unit": "rad"}), about("amplitude of that undulation")
-        ] = 0.5
         search_until_n: Annotated[
             float,
             Meta(ge=0, le=1000, extra_json_schema={"unit": "N"}),
-            about("it ends when contacts allow such a push"),
-        ] = 12.0
+            about("from the least on it ends when contacts allow such a push"),
+        ] = 20.0
         blend_s: Annotated[
             float,
             Meta(gt=0, le=10, extra_json_schema={"unit": "s"}),
@@ -192,13 +194,12 @@ class ObstacleAided:
         self._unit_nm = np.zeros(len(robot.joints))
         self._last_push: PushSnapshot | None = None
         self._max_force_n = self._force_n = 0.0  # what contacts and torques allow, and what is commanded of it
-        self._moved_at_s = self._slow_at_s = 0.0
+        self._moved_at_s = 0.0
         self._felt_n = self._drag_n = 0.0  # what contacts are felt to do along the body, and what they mostly do
         self._waits = False
         self._search = ContactSearch(
             robot,
-            Patience(settings.search_after_s, settings.search_s, settings.search_until_n),
-            settings.search_swing_rad,
+            Patience(settings.search_after_s, settings.search_least_s, settings.search_s, settings.search_until_n),
         )
 
     def update(self, view: View) -> Action:
@@ -212,12 +213,9 @@ class ObstacleAided:
             return self._rest(view)
         if self._search.active:
             self._look(located, np.zeros(len(self._robot.joints)))
-        wanted_m_s = located.trajectory.speed_m_s
-        if located.speed_m_s * wanted_m_s < AS_WANTED * wanted_m_s**2:
-            self._slow_at_s = view.time_s
-        goes = view.time_s - self._slow_at_s > STANDS_S  # whatever carries it: it has no push to look for
-        stands = abs(located.speed_m_s) < STANDS_M_S or (self._max_force_n < POWERLESS_N and not goes)
-        if self._search.decide(view, stands=stands, max_force_n=self._max_force_n):
+        middle_w, wanted_m_s = located.nodes_w.mean(axis=1), located.trajectory.speed_m_s
+        near = self._last_push is not None and len(self._last_push.touches) >= SEVERAL
+        if self._search.decide(view, middle_w, wanted_m_s=wanted_m_s, near=near, max_force_n=self._max_force_n):
             return self._undulate(view)
         scale = self._set.push_scale * self._sign(view.time_s)
         ahead_m = self._look_ahead_m(located, view.period_s)
@@ -241,7 +239,7 @@ class ObstacleAided:
         self._torques_nm[:] = self._push_n = self._force_n = 0.0
         reference = self._search.reference_rad(view)
         set_points = self._bumpless.to(view, reference, restarted=self._search.changed)
-        why = "nothing beside the body can push it: it undulates in search of contacts"
+        why = "it does not come on: it moves by a wave, in search of contacts"
         return Action(set_points, Report(why=why, reference_rad=reference.tolist()))
 
     def _sign(self, time_s: float) -> float:

@@ -72,11 +72,14 @@ class LateralUndulation:
         reference[self._body.bends] = self._amplitude_rad(view, waves, passed_s) * waves + self._bend_rad(view)
         return reference
 
-    def _amplitude_rad(self, _view: View, _waves: NDArray[np.float64], _passed_s: float) -> float:
+    def _amplitude_rad(self, _view: View, _waves: NDArray[np.float64], _passed_s: float) -> float | NDArray[np.float64]:
         return self._set.amplitude_rad
 
     def _bend_rad(self, view: View) -> float:
-        """Bend of every joint that turns the body towards the path ahead."""
+        """Bend of every joint that turns the body towards the path ahead.
+
+        A body that moves by a wave to the head turns against its bend.
+        """
         if self._set.steering == 0.0 or view.world is None or view.trajectory is None:
             return 0.0
         nodes = self._body.nodes_w(view.world, view.joints.angle_rad).T
@@ -85,7 +88,7 @@ class LateralUndulation:
         aim = ahead[min(np.searchsorted(np.hypot(*(ahead - nodes[-1]).T), AIM_M), len(ahead) - 1)] - nodes[-1]
         along = nodes[-1] - nodes[0]
         off = math.remainder(math.atan2(aim[1], aim[0]) - math.atan2(along[1], along[0]), math.tau)
-        return self._set.steering * off / len(self._body.bends)
+        return math.copysign(self._set.steering, self._set.lag_rad) * off / len(self._body.bends)
 
 
 class HeadSteeredUndulation(LateralUndulation):

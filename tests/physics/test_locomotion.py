@@ -292,9 +292,10 @@ def test_it_goes_through_a_random_field_that_nobody_laid_out(seed: int):
 
 
 @pytest.mark.parametrize("scale", [pytest.param(0.0, marks=pytest.mark.slow), -1.0])
-def test_in_clutter_nothing_but_the_push_moves_it(scale: float):
-    """Neither the paths that are replanned, since it stands, nor a push of the wrong sign."""
+def test_in_clutter_without_its_search_for_contacts_nothing_but_the_push_moves_it(scale: float):
+    """Neither the paths that are replanned, since it stands, nor a push of the wrong sign, which only shifts it."""
     field = ("scene.random_field.0.seed=10", "scene.random_field.0.density_per_m2=12")
-    whole = run(configure("surveyed_clutter", *field, f"control.push_scale={scale}"), duration_s=5.0)
+    alone = (f"control.push_scale={scale}", "control.search_after_s=0")
+    whole = run(configure("surveyed_clutter", *field, *alone), duration_s=5.0)
     assert len(whole.record.trajectories) >= 3
-    assert whole.moved_m < 0.02
+    assert whole.moved_m < 0.1  # pushed as shipped: 1.16 m

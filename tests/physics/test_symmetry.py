@@ -182,7 +182,15 @@ def test_a_reflected_snake_goes_the_reflected_way_and_a_turned_one_the_turned_wa
     assert swim(wave, yaw_rad=yaw_rad).centre[-1] == pytest.approx([turned.real, turned.imag], abs=1e-6)
 
 
-@pytest.mark.parametrize("wave", [pytest.param(Wave(), marks=pytest.mark.slow), Wave().reversed, Wave(0.3, 0.7, 4.0)])
+@pytest.mark.parametrize(
+    "wave",
+    [
+        pytest.param(Wave(), marks=pytest.mark.slow),
+        Wave().reversed,
+        Wave(0.3, 0.7, 4.0),
+        Wave(0.7, -0.75, 7.854),  # of the search for contacts
+    ],
+)
 def test_it_drifts_as_a_momentum_balance_with_coulomb_friction_says(wave: Wave) -> None:
     ours, balance = swim(wave).drift_mm_s, momentum_balance(wave).drift_mm_s
     print(f"{wave}: {ours:+.2f} mm/s, momentum balance {balance:+.2f} mm/s")

@@ -1,10 +1,17 @@
-"""A body that nothing can push undulates until something can, and goes over from one to the other without a jump."""
+"""A body that does not come on moves by a wave until it can push, and goes over without a jump."""
 
+from dataclasses import replace
+
+import msgspec
 import numpy as np
+import onnxruntime
 import pytest
 
+from snakesim.training.form import Policy
 from snakesim_gnc.control.controller import Action
+from snakesim_gnc.control.felt_wave import FeltWave
 from snakesim_gnc.control.obstacle_aided import ObstacleAided
+from snakesim_gnc.control.policy import POLICIES
 from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import Obstacle
 from tests.unit.gnc.stage import Stage, make_stage
@@ -23,16 +30,16 @@ def targets(actions: list[Action]) -> np.ndarray:
     return np.array([action.set_points.target for action in actions])
 
 
-def test_a_body_without_contacts_searches_for_some_and_pushes_when_it_has_them() -> None:
+def test_a_body_that_stands_searches_for_contacts_and_pushes_when_it_has_some() -> None:
     stage = make_stage()
     pegs, stage.pegs = stage.pegs, []
-    controller = ObstacleAided(stage.robot, ObstacleAided.Settings(search_after_s=1.0, search_s=4.0))
+    controller = ObstacleAided(stage.robot, ObstacleAided.Settings(search_after_s=1.2, search_s=4.0))
     alone = stands(controller, stage, range(350))
     searches = [SEARCHES in action.report.why for action in alone]
-    assert not any(searches[:95]) and all(searches[105:])
-    assert np.ptp(targets(alone[105:]), axis=0).min() > 0.5
+    assert not any(searches[:115]) and all(searches[125:])
+    assert np.ptp(targets(alone[125:])[:, -1]) > 0.5  # of the head
     stage.pegs = pegs
-    beside = stands(controller, stage, range(350, 500))
+    beside = stands(controller, stage, range(350, 400))
     assert not any(SEARCHES in action.report.why for action in beside[1:])
     assert max(action.report.propulsion_n or 0.0 for action in beside) > 5.0
     assert np.abs(np.diff(targets(alone + beside), axis=0)).max() < JUMP_RAD
@@ -46,15 +53,41 @@ def test_it_searches_only_for_a_while_and_then_tries_its_path_again() -> None:
     assert searches[150] and not searches[350] and searches[450]
 
 
-def test_nobody_searches_beside_obstacles_that_can_push_or_when_told_not_to() -> None:
+def test_contacts_that_allow_a_push_end_a_search_but_not_at_once() -> None:
+    """A body that they hold while it pushes is moved elsewhere."""
     stage = make_stage()
-    assert not any(
-        SEARCHES in action.report.why
-        for action in stands(ObstacleAided(stage.robot, ObstacleAided.Settings()), stage, range(500))
-    )
+    controller = ObstacleAided(stage.robot, ObstacleAided.Settings(search_after_s=1.0, search_least_s=2.0))
+    searches = [SEARCHES in action.report.why for action in stands(controller, stage, range(420))]
+    assert not any(searches[:95]) and all(searches[105:295]) and not any(searches[305:395])
+
+
+def test_noise_of_the_pose_does_not_hide_that_a_body_stands() -> None:
+    stage, noise = make_stage(), np.random.default_rng(1)
+    stage.pegs = []
+    controller = ObstacleAided(stage.robot, ObstacleAided.Settings(search_after_s=1.2))
+    views = (stage.view(tick, TAIL_S_M + noise.normal(0.0, 0.005)) for tick in range(300))
+    assert any(SEARCHES in controller.update(view).report.why for view in views)
+
+
+def test_nobody_searches_when_told_not_to() -> None:
+    stage = make_stage()
     stage.pegs = []
     never = ObstacleAided(stage.robot, ObstacleAided.Settings(search_after_s=0.0))
     assert not any(SEARCHES in action.report.why for action in stands(never, stage, range(500)))
+
+
+def test_the_wave_is_that_of_the_shipped_policy_without_its_gains_on_contact_forces() -> None:
+    stage, passed_s, draw = make_stage(), 2.3, np.random.default_rng(3)
+    view = stage.view(0, TAIL_S_M, without="world")
+    velocity, torque = draw.normal(0.0, 1.0, 13).tolist(), draw.normal(0.0, 3.0, 13).tolist()
+    joints = msgspec.structs.replace(view.joints, velocity_rad_s=velocity, torque_nm=torque)
+    session = onnxruntime.InferenceSession(POLICIES / "clutter.onnx")
+    learned = msgspec.json.decode(session.get_modelmeta().custom_metadata_map["snakesim.learned"])
+    sizes = {"time_s": 1, "goal_bearing": 2, "angle_rad": 13, "velocity_rad_s": 13, "torque_nm": 13, "contact_n": 14}
+    policy = Policy.of({**learned, "contact_behind": 0.0, "contact_ahead": 0.0}, ["yaw"] * 13, sizes)
+    seen = [passed_s, 1.0, 0.0, *joints.angle_rad, *joints.velocity_rad_s, *joints.torque_nm, *[0.0] * 14]
+    wave = FeltWave(stage.robot).reference_rad(replace(view, joints=joints), passed_s)
+    assert wave == pytest.approx(policy.targets(np.array(seen, np.float32)), abs=1e-4)
 
 
 @pytest.mark.parametrize("speed_m_s", [0.2, -0.2])
