@@ -21,8 +21,8 @@ from snakesim_hal.arrays import Floats
 from snakesim_hal.wire.messages import Description
 
 MIDDLE_S = 0.2  # time constant in which the noise of poses is taken out of the middle of the body
+STANDS_M = 0.02  # a body stands that comes no further than this, or than half of what it is to if that is less
 TO_HEAD = HeadSteeredUndulation.Settings(amplitude_rad=0.7, period_s=0.8, lag_rad=-0.75, steering=0.3)
-STANDS_M = 0.02  # a body that comes no further than this meanwhile stands, or half as far as it is to
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class ContactSearch:
     def __init__(self, robot: Description, patience: Patience) -> None:
         self._patience = patience
         self._felt, self._to_head = FeltWave(robot), HeadSteeredUndulation(robot, TO_HEAD)
-        self._wave: FeltWave | HeadSteeredUndulation = self._felt
+        self._wave: HeadSteeredUndulation = self._felt
         self._middle_w: Floats | None = None
         self._way = deque[tuple[float, Floats]]()  # instants in s, and where the middle was
         self._since_s: float | None = None

@@ -3,8 +3,8 @@
     target = (amplitude + growth share) sin(phase - lag turns) + bend + FELT_RAD tanh(sum of gains x measured)
 
 turns counts the joints that bend from the head on, share goes from 0 at the head to 1 at the tail. It is the law of the
-shipped policy `clutter` (`snakesim train`, `docs/learning.md`) with its numbers, but for the gains on contact forces,
-and with the bend of `HeadSteeredUndulation`.
+shipped policy `clutter` (`snakesim train`, `docs/environments.md`) with its numbers, but for the gains on contact
+forces, and with the bend of `HeadSteeredUndulation`.
 """
 
 import math
@@ -26,8 +26,6 @@ TORQUE_GAINS = np.array([0.673059, -0.464064, -0.666265]) / 5.0  # 1/(N m)
 
 class FeltWave(HeadSteeredUndulation):
     """A wave bent towards where the path leads, largest at the head, that feels its way."""
-
-    MEASURES = ("torque",)
 
     def __init__(self, robot: Description) -> None:
         wave = HeadSteeredUndulation.Settings(amplitude_rad=AMPLITUDE_RAD, period_s=PERIOD_S, lag_rad=LAG_RAD)
