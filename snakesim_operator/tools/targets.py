@@ -9,6 +9,7 @@ from snakesim_hal.wire import keys
 from snakesim_operator.tools.robot_selection import RobotSelection
 
 CONNECT_S = 1.0
+SEARCH_S = 3.0  # to connect, and to answer: a busy computer takes more than a second, and its robot is there
 HAL_EVERYWHERE = f"**/{keys.alive('hal')}"
 
 
@@ -22,7 +23,7 @@ def flags_of(link: Link, robot: str | None) -> str:
 
 def robots_on(session: Session) -> list[str]:
     """The namespaces of all robots whose HAL is alive on a network."""
-    return [namespace_of(key) for key in session.present(HAL_EVERYWHERE)]
+    return [namespace_of(key) for key in session.present(HAL_EVERYWHERE, SEARCH_S)]
 
 
 def namespace_of(key: str) -> str:
@@ -36,9 +37,9 @@ def find_robots(where: RobotSelection) -> list[Link]:
     found: list[Link] = []
     for link in where.networks():
         try:
-            with open_session(link, CONNECT_S) as session:
+            with open_session(link, SEARCH_S) as session:
                 if link.namespace is not None:
-                    found += [link] if session.present(keys.alive("hal")) else []
+                    found += [link] if session.present(keys.alive("hal"), SEARCH_S) else []
                 else:
                     found += [replace(link, namespace=name) for name in robots_on(session)]
         except NotConnectedError:
